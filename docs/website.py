@@ -37,9 +37,6 @@ from orthoflow.products import LayerMask, OrthoMask, SurfaceMask
 from orthoflow.records import COSTS
 from orthoflow.report.rankings import Sense, sense_of
 from orthoflow.sdk import Method, MetricSpec, port_specs
-from orthoflow.workflow.parameters import (
-    describe_method,
-)
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 DOCS: Final = ROOT / "docs"
@@ -115,12 +112,12 @@ def _linked(text: str, source: str, pages: dict[str, str]) -> str:
 
 def _methods(catalog: Catalog) -> Iterator[str]:
     yield "# Methods\n\nAs plugins declare them; `orthoflow plugins show ID` prints the same.\n"
-    infos = [describe_method(catalog, name) for name in sorted(catalog.methods)]
-    for kind in sorted({info.id.partition(".")[0] for info in infos}):
+    methods = [catalog.method(name).load() for name in sorted(catalog.methods)]
+    for kind in sorted({method.id.partition(".")[0] for method in methods}):
         yield f"## {kind}\n\n{catalog.kinds[kind].spec.summary}\n"
-        for info in infos:
-            if info.id.partition(".")[0] == kind:
-                yield from _method(info.method)
+        for method in methods:
+            if method.id.partition(".")[0] == kind:
+                yield from _method(method)
 
 
 def _method(method: type[Method]) -> Iterator[str]:
@@ -249,7 +246,7 @@ def _metrics(catalog: Catalog) -> Iterator[str]:
     )
     declared: dict[MetricSpec, list[str]] = {}
     for name in sorted(catalog.methods):
-        for spec in describe_method(catalog, name).method.metric_specs():
+        for spec in catalog.method(name).load().metric_specs():
             declared.setdefault(replace(spec, needs=()), []).append(name)
     for kind in sorted({name.partition(".")[0] for names in declared.values() for name in names}):
         yield f"## {kind}\n\n{_METRICS_HEAD}"

@@ -11,9 +11,6 @@ import pytest
 
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import discover_catalog
-from orthoflow.workflow.parameters import (
-    describe_method,
-)
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -44,7 +41,7 @@ def test_parameters_that_are_said_to_help_exist(catalog: Catalog) -> None:
     known = {
         (name.partition(".")[0], parameter)
         for name in catalog.methods
-        for parameter in describe_method(catalog, name).method.Params.model_fields
+        for parameter in catalog.method(name).load().Params.model_fields
     }
     asked = {(kinds[step], parameter) for step, parameter in named if step in kinds}
     assert len(asked) > 5

@@ -18,14 +18,13 @@ from ruamel.yaml import YAML
 
 from orthoflow.workflow.model import (
     CallSection,
-    CompareSection,
+    Comparison,
     DatasetSection,
     InputSection,
     ResourcesSection,
     StepSection,
     SweepSection,
     WorkflowFile,
-    annotation_at,
 )
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -41,7 +40,7 @@ SECTIONS: dict[str, type[BaseModel]] = {
     "`steps.<name>` or `steps.<name>.variants.<name>`: a method call": CallSection,
     "`params.<name>`: a sweep": SweepSection,
     "`resources`": ResourcesSection,
-    "`compare`": CompareSection,
+    "`compare`": Comparison,
 }
 
 EXAMPLE = """\
@@ -96,18 +95,17 @@ def all_keys() -> Iterator[tuple[str, type[BaseModel], str, FieldInfo]]:
 
 
 def _table(section: type[BaseModel]) -> Iterator[str]:
-    yield "| key | value | example | meaning |"
-    yield "|---|---|---|---|"
+    yield "| key | example | meaning |"
+    yield "|---|---|---|"
     for name, info in section.model_fields.items():
         if section is StepSection and name in CallSection.model_fields:
             continue  # in the table of the call
         key = info.alias or name
-        words = annotation_at(section, [key])[1].words
         example = written((info.examples or [""])[0])
-        yield f"| `{key}` | {words} | `{example}` | {info.description} |"
+        yield f"| `{key}` | `{example}` | {info.description} |"
     if section is DatasetSection:
         yield (
-            "| `<input>` | a text, or a list of them | `data/hall/*.jpg` | Files of the input of "
+            "| `<input>` | `data/hall/*.jpg` | Files of the input of "
             "that name, which have to be there. |"
         )
 

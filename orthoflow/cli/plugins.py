@@ -215,6 +215,7 @@ def _described(entry: MethodEntry) -> dict[str, Any]:
     """
     from orthoflow.sdk import port_specs
     from orthoflow.sdk.units import unit_of
+    from orthoflow.workflow.problems import type_text
 
     method = entry.load()
     schema = method.Params.model_json_schema()
@@ -233,7 +234,7 @@ def _described(entry: MethodEntry) -> dict[str, Any]:
         "params": [
             {
                 "name": name,
-                "type": _type_text(field, schema.get("$defs", {})),
+                "type": type_text(field, schema.get("$defs", {})),
                 "default": field.get("default"),
                 "unit": unit_of(name),
                 "description": field.get("description", ""),
@@ -293,32 +294,6 @@ def _shown(value: object, *, is_json: bool) -> str:
 def _metric_text(spec: Mapping[str, str]) -> str:
     label = re.sub(r"\{\d\}", "...", spec["label"])
     return ": ".join(part for part in (label, spec["description"]) if part)
-
-
-def _type_text(field: Mapping[str, Any], definitions: Mapping[str, Mapping[str, Any]]) -> str:
-    """Describe the type of a JSON Schema node in a few words, with its limits."""
-    if reference := field.get("$ref"):
-        return _type_text(definitions.get(reference.rpartition("/")[2], {}), definitions)
-    if choices := field.get("enum"):
-        return " | ".join(map(str, choices))
-    if "const" in field:
-        return str(field["const"])
-    if alternatives := field.get("anyOf"):
-        return " | ".join(_type_text(option, definitions) for option in alternatives)
-    if field.get("type") == "array":
-        return (
-            f"array of {_type_text(items, definitions)}"
-            if (items := field.get("items"))
-            else "array"
-        )
-    limits = {
-        "minimum": ">=",
-        "exclusiveMinimum": ">",
-        "maximum": "<=",
-        "exclusiveMaximum": "<",
-    }
-    shown = "".join(f" {sign} {field[key]}" for key, sign in limits.items() if key in field)
-    return f"{field.get('type', 'any')}{shown}"
 
 
 @click.command("new", cls=Command)

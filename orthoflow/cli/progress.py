@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib import import_module
@@ -137,17 +137,67 @@ def about(seconds: float) -> str:
     return f"{rounded} s" if rounded < 60 else duration(rounded)
 
 
-class RunState:
-    """What the cells of a run do; threads may share it."""
+class Progress:
+    """Shows a run: a live table on a terminal, one output in a notebook, lines for logs elsewhere.
 
-    def __init__(self, cells: Sequence[PlannedCell], jobs: int) -> None:
+    Attributes:
+        every_s: a notebook's output, and the running steps in a log, are shown so often.
+        console: of the terminal; None without one.
+    """
+
+    def __init__(self, cells: Sequence[PlannedCell] = (), *, jobs: int = 1) -> None:
         self._jobs = jobs
         self._lock = threading.Lock()
         self._cells = {item.cell.address: CellState(took_s=item.took_s) for item in cells}
+        self._n_cells = len(cells)
         self._reported: set[tuple[str, str]] = set()
         self._n_similar: Counter[str] = Counter()
+        self._lines: list[str] = []
+        self._stack = ExitStack()
+        self._notebook = _NotebookOutput() if in_notebook() else None
+        self.every_s = _NOTEBOOK_EVERY_S if self._notebook else _EVERY_S
+        self.console: Console | None = None
+        if sys.stderr.isatty() and not self._notebook:
+            from rich.console import Console
 
-    def take(self, event: RunEvent) -> str:
+            self.console = Console(stderr=True)
+
+    def __enter__(self) -> Self:
+        shows = (
+            _live(self.console, self.drawn)
+            if self.console
+            else _repeating(self.refresh, self.every_s)
+        )
+        self._stack.enter_context(shows)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+        if self._notebook:
+            self._notebook.show(_last(self._lines, _NOTEBOOK_LINES_KEPT))
+
+    def take(self, event: RunEvent) -> None:
+        """Show an event of the run."""
+        line = self._applied(event)
+        if isinstance(event, RunStarted):
+            self._n_cells = event.n_cells
+            left = "" if self._notebook or self.console else self.left()
+            line += f", {left}" if left else ""
+        if not line:
+            return
+        if self._notebook:
+            self._lines += [] if isinstance(event, CellStarted) else [line]
+        elif self.console:
+            # Warnings and failures stand above the table, to stay readable.
+            has_failed = isinstance(event, CellFinished) and event.result.status == "failed"
+            style = _STYLES["failed"] if has_failed else "yellow"
+            if has_failed or isinstance(event, CellReported | RunStarted):
+                self.console.print(shown(line), style=style, markup=False, highlight=False)
+        else:
+            is_end = isinstance(event, CellFinished)
+            echo_error(f"{line} ({self.n_ended} of {self._n_cells})" if is_end else line)
+
+    def _applied(self, event: RunEvent) -> str:
         """Apply an event; return the line that a log shows of it, empty for none."""
         with self._lock:
             match event:
@@ -173,7 +223,7 @@ class RunState:
                     )
                     n_similar = self._n_similar.pop(event.address, 0)
                     more = f", {counted(n_similar, 'warning')} like one above" if n_similar else ""
-                    return f"{end_text(event)}{more}"
+                    return f"{_end_text(event)}{more}"
         return ""
 
     def _reported_line(self, event: CellReported) -> str:
@@ -198,22 +248,6 @@ class RunState:
         with self._lock:
             return dict(self._cells)
 
-    def running_lines(self) -> list[str]:
-        """Describe how far each running cell is."""
-        now_s = time.monotonic()
-        lines = []
-        for address, cell in self.cells().items():
-            if cell.state == "running":
-                left_s = cell.left_s(now_s)
-                parts = [
-                    f"{100 * cell.done(now_s):.0f} %",
-                    cell.text,
-                    f"{duration(now_s - cell.started)} so far",
-                    f"about {about(left_s)} left" if left_s is not None else "",
-                ]
-                lines.append(f"{address}: {', '.join(part for part in parts if part)}")
-        return lines
-
     def left(self) -> str:
         """Estimate how long the run still takes; empty when nothing is left."""
         return left_of_run(self.cells().values(), time.monotonic(), jobs=self._jobs)
@@ -223,8 +257,67 @@ class RunState:
         """How many cells have an outcome."""
         return sum(cell.state not in ("waiting", "running") for cell in self.cells().values())
 
+    def refresh(self) -> None:
+        """Show how far the running steps are."""
+        now_s = time.monotonic()
+        running = []
+        for address, cell in self.cells().items():
+            if cell.state == "running":
+                left_s = cell.left_s(now_s)
+                parts = [
+                    f"{100 * cell.done(now_s):.0f} %",
+                    cell.text,
+                    f"{duration(now_s - cell.started)} so far",
+                    f"about {about(left_s)} left" if left_s is not None else "",
+                ]
+                running.append(f"{address}: {', '.join(part for part in parts if part)}")
+        if self._notebook:
+            left = [self.left()] if running else []
+            lines = [*_last(self._lines, _NOTEBOOK_LINES), *running, *filter(None, left)]
+            self._notebook.show(lines)
+        elif running:
+            echo_error(*running)
 
-def end_text(event: CellFinished) -> str:
+    def drawn(self) -> Group:
+        """Return the table of a terminal, and below it how far the whole run is."""
+        from rich.console import Group
+        from rich.text import Text
+
+        ended = f"{self.n_ended} of {counted(len(self.cells()), 'step')} ended"
+        left = self.left()
+        return Group(self.table(), Text(f"{ended}, {left}" if left else ended, style="dim"))
+
+    def table(self) -> Table:
+        """Return the table as it is now; of too many rows the running, failed and waiting ones."""
+        from rich.table import Table
+        from rich.text import Text
+
+        now_s = time.monotonic()
+        table = Table(box=None, pad_edge=False, header_style="bold")
+        for title in ("step", "state", "time", "left", ""):
+            table.add_column(title, no_wrap=True, overflow="ellipsis")
+        cells = self.cells()
+        urgency = {"running": 0, "failed": 1, "waiting": 2}
+        most = max(1, (self.console.height if self.console else len(cells)) - 4)
+        chosen = sorted(cells, key=lambda address: urgency.get(cells[address].state, 3))[:most]
+        for address, cell in cells.items():
+            if address not in chosen:
+                continue
+            running = cell.state == "running"
+            state = f"{100 * cell.done(now_s):3.0f} %" if running else cell.state
+            seconds = now_s - cell.started if running else cell.wall_s
+            left_s = cell.left_s(now_s) if running else None
+            table.add_row(
+                Text(shown(address)),
+                Text(state, style=_STYLES.get(cell.state, "dim")),
+                Text(duration(seconds) if seconds else ""),
+                Text(about(left_s) if left_s is not None else ""),
+                Text(shown(cell.text)),
+            )
+        return table
+
+
+def _end_text(event: CellFinished) -> str:
     """Describe how a cell ended, how long it took, and why it failed."""
     result = event.result
     if event.cached:
@@ -235,71 +328,6 @@ def end_text(event: CellFinished) -> str:
     # The summary states why something was skipped.
     why = f": {result.error_message}" if result.status == "failed" else ""
     return f"{event.address}: {result.status}{took}{why}"
-
-
-class PlainProgress:
-    """Lines on standard error, fit for log files: starts, ends, new codes, running steps."""
-
-    every_s = _EVERY_S
-
-    def __init__(self, cells: Sequence[PlannedCell] = (), *, jobs: int = 1) -> None:
-        self.state = RunState(cells, jobs)
-        self._n_cells = len(cells)
-        self._stack = ExitStack()
-
-    def __enter__(self) -> Self:
-        self._stack.enter_context(_repeating(self.refresh, self.every_s))
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
-
-    def take(self, event: RunEvent) -> None:
-        """Show an event of the run."""
-        line = self.state.take(event)
-        if isinstance(event, RunStarted):
-            self._n_cells = event.n_cells
-            left = self.state.left()
-            line += f", {left}" if left else ""
-        elif isinstance(event, CellFinished):
-            line += f" ({self.state.n_ended} of {self._n_cells})"
-        if line:
-            echo_error(line)
-
-    def refresh(self) -> None:
-        """Print how far the running steps are."""
-        if lines := self.state.running_lines():
-            echo_error(*lines)
-
-
-class NotebookProgress(PlainProgress):
-    """One output of a notebook: lines of what ended, below them what runs.
-
-    It is written again every second; a notebook keeps its last state: what ended.
-    """
-
-    every_s = _NOTEBOOK_EVERY_S
-
-    def __init__(self, cells: Sequence[PlannedCell] = (), *, jobs: int = 1) -> None:
-        super().__init__(cells, jobs=jobs)
-        self._lines: list[str] = []
-        self._output = _NotebookOutput()
-
-    def __exit__(self, *_: object) -> None:
-        super().__exit__()
-        self._output.show(_last(self._lines, _NOTEBOOK_LINES_KEPT))
-
-    def take(self, event: RunEvent) -> None:
-        """Keep an event for the next refresh."""
-        line = self.state.take(event)
-        if line and not isinstance(event, CellStarted):
-            self._lines.append(line)
-
-    def refresh(self) -> None:
-        """Write the last lines and the running steps."""
-        running = self.state.running_lines()
-        left = [self.state.left()] if running else []
-        self._output.show([*_last(self._lines, _NOTEBOOK_LINES), *running, *filter(None, left)])
 
 
 def _last(lines: Sequence[str], most: int) -> list[str]:
@@ -329,93 +357,6 @@ def in_notebook() -> bool:
     """Whether a notebook's kernel shows the output of this process; IPython in a terminal not."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return hasattr(shell, "kernel")
-
-
-class LiveProgress:
-    """A table of all cells that redraws itself, on standard error."""
-
-    def __init__(self, cells: Sequence[PlannedCell] = (), *, jobs: int = 1) -> None:
-        self.state = RunState(cells, jobs)
-        from rich.console import Console
-
-        self.console = Console(stderr=True)
-        self._live = _live(self.console, self.drawn)
-
-    def __enter__(self) -> Self:
-        self._live.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._live.stop()
-
-    def take(self, event: RunEvent) -> None:
-        """Change the table; warnings and failures are printed above it, to stay readable."""
-        line = self.state.take(event)
-        style = None
-        if isinstance(event, CellFinished):
-            line = line if event.result.status == "failed" else ""
-            style = _STYLES["failed"]
-        elif isinstance(event, CellReported):
-            style = "yellow"
-        if line and not isinstance(event, CellStarted):
-            self.console.print(shown(line), style=style, markup=False, highlight=False)
-
-    def drawn(self) -> Group:
-        """Return the table, and below it how far the whole run is."""
-        from rich.console import Group
-        from rich.text import Text
-
-        ended = f"{self.state.n_ended} of {counted(len(self.state.cells()), 'step')} ended"
-        left = self.state.left()
-        return Group(self.table(), Text(f"{ended}, {left}" if left else ended, style="dim"))
-
-    def table(self) -> Table:
-        """Return the table as it is now."""
-        from rich.table import Table
-        from rich.text import Text
-
-        now_s = time.monotonic()
-        table = Table(box=None, pad_edge=False, header_style="bold")
-        for title in ("step", "state", "time", "left", ""):
-            table.add_column(title, no_wrap=True, overflow="ellipsis")
-        shown_cells = visible_cells(self.state.cells(), self.console.height - 4)
-        for address, cell in shown_cells.items():
-            running = cell.state == "running"
-            state = f"{100 * cell.done(now_s):3.0f} %" if running else cell.state
-            seconds = now_s - cell.started if running else cell.wall_s
-            left_s = cell.left_s(now_s) if running else None
-            table.add_row(
-                Text(shown(address)),
-                Text(state, style=_STYLES.get(cell.state, "dim")),
-                Text(duration(seconds) if seconds else ""),
-                Text(about(left_s) if left_s is not None else ""),
-                Text(shown(cell.text)),
-            )
-        return table
-
-
-def visible_cells(cells: Mapping[str, CellState], height: int) -> dict[str, CellState]:
-    """Choose the rows that fit: running ones, then failed, waiting, and the rest; in their order.
-
-    Args:
-        cells: all of them.
-        height: lines there are for rows.
-    """
-    if len(cells) <= height:
-        return dict(cells)
-    urgency = {"running": 0, "failed": 1, "waiting": 2}
-    by_urgency = sorted(cells, key=lambda address: urgency.get(cells[address].state, 3))
-    chosen = set(by_urgency[: max(1, height)])
-    return {address: cell for address, cell in cells.items() if address in chosen}
-
-
-def make_progress(cells: Sequence[PlannedCell], *, jobs: int = 1) -> PlainProgress | LiveProgress:
-    """Return the live table when standard error is a terminal, lines otherwise."""
-    if in_notebook():
-        return NotebookProgress(cells, jobs=jobs)
-    if sys.stderr.isatty():
-        return LiveProgress(cells, jobs=jobs)
-    return PlainProgress(cells, jobs=jobs)
 
 
 @contextmanager

@@ -192,7 +192,7 @@ class _Call:
         return EXIT_RECORD_DIFFERS if differs else EXIT_GOOD
 
     def _make(self) -> Run:
-        from orthoflow.cli.progress import make_progress
+        from orthoflow.cli.progress import Progress
         from orthoflow.engine.scheduler import execute
         from orthoflow.records.runs import REPORT_FILE
         from orthoflow.records.writing import executed_and_written, write_run
@@ -201,7 +201,7 @@ class _Call:
         plan = self.replay.plan
 
         def run() -> RunOutcome:
-            with make_progress(plan.cells, jobs=plan.options.jobs) as progress:
+            with Progress(plan.cells, jobs=plan.options.jobs) as progress:
                 return execute(plan, self.folder, self.store, progress.take, run_id=self.run_id)
 
         def write(outcome: RunOutcome) -> Run:

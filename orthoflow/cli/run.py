@@ -193,14 +193,14 @@ class Call:
         return executed_and_written(lambda: self._execute(folder, run_id), write)
 
     def _execute(self, folder: Path, run_id: str) -> RunOutcome:
-        from orthoflow.cli.progress import make_progress
+        from orthoflow.cli.progress import Progress
         from orthoflow.engine.scheduler import execute
         from orthoflow.records.writing import begin_run
 
         # Before minutes pass.
         echo_lint(self.workflow)
         with (
-            make_progress(self.plan.cells, jobs=self.plan.options.jobs) as progress,
+            Progress(self.plan.cells, jobs=self.plan.options.jobs) as progress,
             _json_log(self.json_log, self.plan) as log,
         ):
             has_begun = False

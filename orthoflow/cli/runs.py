@@ -7,7 +7,6 @@ import json
 import operator
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -15,7 +14,7 @@ import click
 
 from orthoflow.cli.commands import EXIT_GOOD, Command, json_option
 from orthoflow.cli.tables import counted, echo, echo_folded, echo_json, echo_table, medians, number
-from orthoflow.foreign_text import csv_text, first_few
+from orthoflow.foreign_text import first_few
 
 if TYPE_CHECKING:
     from orthoflow.report.browsing import RunSummary
@@ -73,12 +72,6 @@ _SIGNS: Final[Mapping[str, Callable[[float, float], bool]]] = {
     help="Write a page with links to the report of each run.",
 )
 @click.option(
-    "--csv",
-    "as_csv",
-    is_flag=True,
-    help="Print CSV, with every metric and parameter; > FILE keeps it.",
-)
-@click.option(
     "--table",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
@@ -89,7 +82,6 @@ def runs(
     folders: tuple[Path, ...],
     where: tuple[str, ...],
     *,
-    as_csv: bool,
     as_json: bool,
     sort: str,
     metrics: tuple[str, ...],
@@ -109,24 +101,17 @@ def runs(
     table, page = chosen.pop("table"), chosen.pop("page")
     if table is not None:
         return _write_table(folders, table)
-    if as_csv and as_json:
-        raise click.UsageError("--csv and --json exclude each other")
-    for folder in folders:
-        if as_csv and folder.suffix == ".csv" and not folder.exists():
-            raise click.UsageError(f"--csv prints its table: write it into a file by > {folder}")
     found = list_runs(folders or (Path(),))
     kept = _sorted(_filtered(found, where, **chosen), sort)
     if as_json:
         echo_json(runs_json(kept, found))
-    elif as_csv:
-        _print_csv(kept, found)
     else:
         print_runs(kept, found, metrics=metrics)
     if page is not None:
         from orthoflow.report.browsing import write_run_table
 
         write_run_table(kept, page, among=found)
-        if not (as_json or as_csv):
+        if not as_json:
             echo(f"page: {page}")
     return EXIT_GOOD
 
@@ -214,30 +199,16 @@ def print_runs(
     echo(f"{counted(len(kept), 'run')}{others}")
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Condition:
-    """One `--where`: a name, a sign and a number."""
-
-    name: str
-    holds: Callable[[float, float], bool]
-    limit: float
-
-    @classmethod
-    def of(cls, text: str) -> _Condition:
-        match = _CONDITION.fullmatch(text)
-        if match is None:
-            raise click.UsageError(
-                f"--where {text!r} is not a condition: expected a name, one of "
-                f"{' '.join(_SIGNS)} and a number, e.g. --where 'rmse_u_mm < 2'"
-            )
-        return cls(name=match[1], holds=_SIGNS[match[2]], limit=float(match[3]))
-
-    def is_met_by(self, run: RunSummary) -> bool:
-        return any(
-            self.holds(float(value), self.limit)
-            for value in run.values(self.name)
-            if isinstance(value, int | float) and not isinstance(value, bool)
+def _condition(text: str) -> tuple[str, Callable[[float], bool]]:
+    """Read one `--where`: a name, and what its value has to be."""
+    match = _CONDITION.fullmatch(text)
+    if match is None:
+        raise click.UsageError(
+            f"--where {text!r} is not a condition: expected a name, one of "
+            f"{' '.join(_SIGNS)} and a number, e.g. --where 'rmse_u_mm < 2'"
         )
+    holds, limit = _SIGNS[match[2]], float(match[3])
+    return match[1], lambda value: holds(value, limit)
 
 
 def _filtered(
@@ -247,14 +218,22 @@ def _filtered(
     workflows: Sequence[str],
     states: Sequence[str],
 ) -> list[RunSummary]:
-    conditions = [_Condition.of(text) for text in where]
-    _require_known([condition.name for condition in conditions], found)
+    conditions = [_condition(text) for text in where]
+    _require_known([name for name, _ in conditions], found)
+
+    def meets(run: RunSummary, name: str, holds: Callable[[float], bool]) -> bool:
+        return any(
+            holds(float(value))
+            for value in run.values(name)
+            if isinstance(value, int | float) and not isinstance(value, bool)
+        )
+
     return [
         run
         for run in found
         if (not workflows or run.workflow in workflows)
         and (not states or run.state in states)
-        and all(condition.is_met_by(run) for condition in conditions)
+        and all(meets(run, *condition) for condition in conditions)
     ]
 
 
@@ -307,33 +286,3 @@ def _row_json(
     for name in ("labels", "n_values", "parameters"):
         del values[name]
     return values | {"facts": dict(facts), "differs": dict(differs)}
-
-
-def _print_csv(kept: Sequence[RunSummary], found: Sequence[RunSummary]) -> None:
-    from orthoflow.report.browsing import distinct_facts
-
-    distinct = distinct_facts(found)
-    metrics = list(dict.fromkeys(name for run in kept for name in run.metrics if "." in name))
-    facts = list(dict.fromkeys(name for run in kept for name in distinct[run.folder]))
-    header = [*_COLUMNS, "run_id", "reason", *metrics, *facts]
-    rows = [
-        [
-            str(run.folder),
-            run.started,
-            run.workflow,
-            run.state,
-            run.run_id,
-            run.reason,
-            *(run.metrics.get(name) for name in metrics),
-            *(_cell(distinct[run.folder].get(name)) for name in facts),
-        ]
-        for run in kept
-    ]
-    # At these line ends alone: what other letters end stands within cells.
-    echo(*csv_text([header, *rows]).removesuffix("\n").split("\n"))
-
-
-def _cell(value: object) -> str | int | float | None:
-    if value is None or isinstance(value, str | int | float):
-        return value
-    return json.dumps(value, ensure_ascii=False)

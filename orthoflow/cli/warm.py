@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -16,10 +16,7 @@ from orthoflow.cli.tables import counted, duration, echo, echo_json, size
 
 if TYPE_CHECKING:
     from orthoflow.catalog.catalog import Catalog
-    from orthoflow.engine.plan import RunPlan
     from orthoflow.engine.results import CellResult
-    from orthoflow.engine.store import Store
-    from orthoflow.workflow.expand import Cell
 
 # Shipped recipes that between them run our methods on simulated rooms, and what makes these small.
 _COARSE: Final = ("room.scan_step_m=0.05", "wall.gsd_m=0.05")
@@ -77,40 +74,23 @@ class Warmed:
     left_out: Mapping[str, str]
 
 
-@dataclass(frozen=True)
-class _Call:
-    """A method with the words and switches among its parameters, and the inputs that it gets.
-
-    Numbers decide what kernels compute, not which.
-    """
-
-    method: str
-    words: tuple[tuple[str, str | bool], ...] = ()
-    ports: frozenset[str] = frozenset()
-
-    @classmethod
-    def of(cls, cell: Cell) -> _Call:
-        """Return the call of a cell."""
-        words = [
-            (name, value)
-            for name, value in sorted(cell.params_set.items())
-            if isinstance(value, str | bool)
-        ]
-        return cls(cell.method, tuple(words), frozenset(cell.inputs))
-
-
 def _warm(workflow: str | None) -> Warmed:
     from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.engine.durability import size_of
     from orthoflow.engine.kernels import all_kernels
+    from orthoflow.workflow.document import load_workflow
+    from orthoflow.workflow.expand import expand_cells
 
     started, folder, catalog = time.monotonic(), all_kernels(), discover_catalog()
-    wanted = _calls_of(workflow, catalog) if workflow is not None else None
+    wanted = None
+    if workflow is not None:
+        cells = expand_cells(load_workflow(workflow, catalog), catalog)
+        wanted = {cell.method for cell in cells}
     n_before = _n_kernels(folder)
     results = _results(catalog, wanted)
     reasons = {method: result for method, result in results.items() if result.status != "ok"}
     missing = {method for method, result in reasons.items() if result.exit_code == 4}
-    unknown = sorted({call.method for call in wanted or ()} - set(results))
+    unknown = sorted((wanted or set()) - set(results))
     return Warmed(
         folder=str(folder),
         n_compiled=_n_kernels(folder) - n_before,
@@ -126,83 +106,57 @@ def _warm(workflow: str | None) -> Warmed:
     )
 
 
-def _calls_of(workflow: str, catalog: Catalog) -> frozenset[_Call]:
-    from orthoflow.workflow.document import load_workflow
-    from orthoflow.workflow.expand import expand_cells
+def _results(catalog: Catalog, wanted: Collection[str] | None) -> dict[str, CellResult]:
+    """Run the recipes in a store that goes away; give one result per method, a good one first.
 
-    loaded = load_workflow(workflow, catalog)
-    calls = {_Call.of(cell) for cell in expand_cells(loaded, catalog)}
-    # Where no recipe has just these inputs or words, what comes near.
-    near = {replace(call, ports=frozenset()) for call in calls}
-    return frozenset(calls | near | {_Call(call.method) for call in calls})
-
-
-def _results(catalog: Catalog, wanted: Collection[_Call] | None) -> dict[str, CellResult]:
-    """Run the recipes in a store that goes away; give one result per method, a good one first."""
-    from orthoflow.engine.plan import RunOptions, plan_run
+    Args:
+        catalog: the installed plugins.
+        wanted: methods, which run with all that they need; None for all.
+    """
+    from orthoflow.cli.progress import Progress
+    from orthoflow.engine.plan import RunOptions, needed_addresses, plan_run
+    from orthoflow.engine.scheduler import execute
     from orthoflow.engine.store import Store
     from orthoflow.workflow.document import load_workflow
     from orthoflow.workflow.expand import expand_cells
 
     found: dict[str, CellResult] = {}
-    methods = None if wanted is None else {call.method for call in wanted}
-    seen: set[_Call] = set()
+    seen: set[object] = set()
     with tempfile.TemporaryDirectory(prefix="orthoflow-warm-") as scratch:
         store = Store(Path(scratch) / "store")
         for recipe, sets in _recipes().items():
             loaded = load_workflow(recipe, catalog, sets=sets)
-            cells = _new_cells(expand_cells(loaded, catalog), wanted, seen)
-            plan = plan_run(cells, loaded, catalog, store, RunOptions())
-            for method, result in _executed(plan, Path(scratch) / recipe.stem, store):
-                if methods is None or method in methods:
-                    is_better = method not in found or found[method].status != "ok"
-                    found[method] = result if is_better else found[method]
+            cells = {cell.address: cell for cell in expand_cells(loaded, catalog)}
+            chosen: set[str] = set()
+            for address, cell in cells.items():
+                # Words, switches and inputs decide which kernels compute; numbers do not.
+                words = {k: v for k, v in cell.params_set.items() if isinstance(v, str | bool)}
+                call = (cell.method, frozenset(words.items()), frozenset(cell.inputs))
+                is_wanted = wanted is None or cell.method in wanted
+                if is_wanted and not cell.skip_reason and call not in seen:
+                    seen.add(call)
+                    chosen.add(address)
+            for address in reversed(cells):
+                if address in chosen:
+                    chosen.update(needed_addresses(cells[address]))
+            if not chosen:
+                continue
+            kept = tuple(cell for address, cell in cells.items() if address in chosen)
+            plan = plan_run(kept, loaded, catalog, store, RunOptions())
+            with Progress(plan.cells) as progress:
+                results = execute(plan, Path(scratch) / recipe.stem, store, progress.take).results
+            for cell in kept:
+                result = results[cell.address]
+                is_better = cell.method not in found or found[cell.method].status != "ok"
+                if result.status != "skipped" and (wanted is None or cell.method in wanted):
+                    found[cell.method] = result if is_better else found[cell.method]
     return found
 
 
 def _recipes() -> dict[Path, tuple[str, ...]]:
-    from orthoflow.workflow.source import (
-        shipped_workflow,
-    )
+    from orthoflow.workflow.source import shipped_workflow
 
     return {shipped_workflow(name): sets for name, sets in _RECIPES.items()}
-
-
-def _new_cells(
-    cells: Iterable[Cell], wanted: Collection[_Call] | None, seen: set[_Call]
-) -> tuple[Cell, ...]:
-    """The cells that may need other kernels than those before, and all that these need."""
-    from orthoflow.engine.plan import needed_addresses
-
-    by_address = {cell.address: cell for cell in cells}
-    chosen: set[str] = set()
-    for address, cell in by_address.items():
-        call = _Call.of(cell)
-        near = replace(call, ports=frozenset())
-        call = call if wanted is None or call in wanted else near
-        is_wanted = wanted is None or call in wanted
-        if is_wanted and call not in seen and not cell.skip_reason:
-            seen.update((call, near))
-            chosen.add(address)
-    for address in reversed(by_address):
-        if address in chosen:
-            chosen.update(needed_addresses(by_address[address]))
-    return tuple(cell for address, cell in by_address.items() if address in chosen)
-
-
-def _executed(plan: RunPlan, folder: Path, store: Store) -> list[tuple[str, CellResult]]:
-    from orthoflow.cli.progress import make_progress
-    from orthoflow.engine.scheduler import execute
-
-    if not plan.cells:
-        return []
-    with make_progress(plan.cells) as progress:
-        results = execute(plan, folder, store, progress.take).results
-    return [
-        (item.cell.method, results[item.cell.address])
-        for item in plan.cells
-        if results[item.cell.address].status != "skipped"
-    ]
 
 
 def _n_kernels(folder: Path) -> int:

@@ -12,12 +12,12 @@ from orthoflow.catalog.wording import did_you_mean
 from orthoflow.files.yaml_positions import Table
 from orthoflow.sdk.context import MEASURED_BY_THE_ENGINE
 from orthoflow.sdk.hooks import FILES
+from orthoflow.sdk.methods import port_specs
 from orthoflow.workflow.inputs import some_of
 from orthoflow.workflow.model import (
     DATA,
     INPUTS,
     SEED,
-    CompareSection,
     Comparison,
     Reference,
     StepVariant,
@@ -83,7 +83,7 @@ class _Wiring:
             if port not in (accepted or {}):
                 self.log.report(
                     (*step.location, "in", port),
-                    f"{step.calls[0].method} has no input port {port}"
+                    f"{step.calls[0].id} has no input port {port}"
                     f"{did_you_mean(port, accepted or {})}; it has "
                     f"{', '.join(accepted or {}) or 'none'}",
                     at_key=True,
@@ -131,11 +131,11 @@ class _Wiring:
 
     def _check_required(self, step: DraftStep) -> None:
         for call in step.calls:
-            for port in call.info.takes.values() if call.info else ():
+            for port in port_specs(call.method.In).values() if call.method else ():
                 if port.required and port.name not in self._wired(step):
                     self.log.report(
                         (*call.location, "use"),
-                        f"{call.method} needs port {port.name}, {_article(port.type_name)}, "
+                        f"{call.id} needs port {port.name}, {_article(port.type_name)}, "
                         "which is not wired",
                         shown=(*step.location, "in"),
                     )
@@ -151,9 +151,9 @@ def _ports(step: DraftStep, *, are_given: bool) -> Mapping[str, str] | None:
     for call in step.calls:
         if call.kind is not None and not call.kind.is_source:
             return call.kind.outputs if are_given else call.kind.inputs
-        if call.info is not None:
-            takes = {port.name: port.type_name for port in call.info.takes.values()}
-            return call.info.gives if are_given else takes
+        if call.method is not None:
+            ports = port_specs(call.method.Out if are_given else call.method.In)
+            return {port.name: port.type_name for port in ports.values()}
     return None
 
 
@@ -202,7 +202,7 @@ def _check_cycles(steps: Sequence[DraftStep], log: ProblemLog) -> None:
 
 
 def check_comparison(
-    section: CompareSection | None,
+    section: Comparison | None,
     steps: Sequence[DraftStep],
     step_names: Sequence[str],
     datasets: Sequence[str],
@@ -231,12 +231,8 @@ def check_comparison(
         known = _known(combination, ("compare", "exclude", index), factors, log)
         if known:
             excluded += _spelled_out(known, steps)
-    comparison = Comparison(
-        design=section.design,
-        baseline={**first_variants(steps), **next(_spelled_out(baseline, steps))},
-        exclude=tuple(excluded),
-        metrics=section.metrics,
-    )
+    chosen = {**first_variants(steps), **next(_spelled_out(baseline, steps))}
+    comparison = section.model_copy(update={"baseline": chosen, "exclude": tuple(excluded)})
     _check_baseline(comparison, log)
     for index, pattern in enumerate(section.metrics):
         if problem := _metric_problem(pattern, steps, step_names):
@@ -341,7 +337,7 @@ def _metric_problem(pattern: str, steps: Sequence[DraftStep], step_names: Sequen
         return f"there is no step {step} for {pattern}{did_you_mean(step, step_names)}"
     chosen = [one for one in steps if fnmatchcase(one.name, step)]
     calls = [(one, call) for one in chosen for call in one.calls]
-    methods = [(one, call.info.method) for one, call in calls if call.info is not None]
+    methods = [(one, call.method) for one, call in calls if call.method is not None]
     if not methods or len(methods) < len(calls):
         return ""
     specs = [(one, spec) for one, method in methods for spec in method.metric_specs()]
@@ -361,7 +357,7 @@ def _metric_problem(pattern: str, steps: Sequence[DraftStep], step_names: Sequen
     if matching:
         return ""
     known = [name for _, spec in specs if not _has_wildcard(name := spec.name)]
-    ids = ", ".join(dict.fromkeys(call.method for _, call in calls))
+    ids = ", ".join(dict.fromkeys(call.id for _, call in calls))
     return (
         f"step {names} reports no metric {metric}"
         f"{did_you_mean(metric, [*dict.fromkeys(known), *MEASURED_BY_THE_ENGINE])}; `orthoflow "

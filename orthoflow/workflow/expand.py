@@ -19,6 +19,7 @@ from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.wording import did_you_mean
 from orthoflow.errors import ArgumentError, WorkflowError
 from orthoflow.products.product import JsonValue
+from orthoflow.sdk.methods import Method, PortSpec, port_specs
 from orthoflow.workflow.inputs import present_inputs
 from orthoflow.workflow.model import (
     DATA,
@@ -29,7 +30,7 @@ from orthoflow.workflow.model import (
     Workflow,
     WorkflowStep,
 )
-from orthoflow.workflow.parameters import SWEEP, MethodInfo, describe_method
+from orthoflow.workflow.parameters import SWEEP
 
 # Factor -> level: the dataset, the seed, and step -> variant.
 Assignment: TypeAlias = dict[str, str]
@@ -368,7 +369,7 @@ def expand_cells(
         workflow=workflow,
         present=present_inputs(workflow),
         methods={
-            variant.method: describe_method(catalog, variant.method)
+            variant.method: catalog.method(variant.method).load()
             for step in workflow.steps.values()
             for variant in step.variants
         },
@@ -410,7 +411,7 @@ class _ExcludedError(Exception):
 class _Expansion:
     workflow: Workflow
     present: frozenset[str]
-    methods: Mapping[str, MethodInfo]
+    methods: Mapping[str, type[Method]]
     rank: Mapping[str, int]
     nodes: dict[str, dict[frozenset[tuple[str, str]], _Node]] = field(default_factory=dict)
 
@@ -480,7 +481,10 @@ class _Expansion:
         return any(map(self._uses_seed, self.workflow.steps[name].variants))
 
     def _uses_seed(self, variant: StepVariant) -> bool:
-        return self.methods[variant.method].method.determinism != "exact"
+        return self.methods[variant.method].determinism != "exact"
+
+    def _ports(self, variant: StepVariant) -> Mapping[str, PortSpec]:
+        return port_specs(self.methods[variant.method].In)
 
     def _takes_data(self, name: str) -> bool:
         """Whether datasets change a step itself."""
@@ -528,7 +532,7 @@ class _Expansion:
         cell = before.get(address)
         if cell is None:
             return False
-        is_random = self.methods[cell.method].method.determinism != "exact"
+        is_random = self.methods[cell.method].determinism != "exact"
         return is_random or any("#" in source for source in cell.sources)
 
     def _node(self, step: WorkflowStep, full: Mapping[str, str]) -> _Node:
@@ -552,7 +556,7 @@ class _Expansion:
             return _Node(cell=cell, dependence=always, causes=(cause,))
         choices = {
             port: self._choose(step.inputs[port], full)
-            for port in self.methods[variant.method].takes
+            for port in self._ports(variant)
             if port in step.inputs
         }
         assignment = dict(own)
@@ -615,10 +619,10 @@ class _Expansion:
         return node
 
     def _is_missing(self, variant: StepVariant, port: str, choices: Mapping[str, _Choice]) -> bool:
-        return choices[port].source is None and self.methods[variant.method].takes[port].required
+        return choices[port].source is None and self._ports(variant)[port].required
 
     def _all_require(self, step: WorkflowStep, port: str) -> bool:
-        takes = (self.methods[variant.method].takes for variant in step.variants)
+        takes = map(self._ports, step.variants)
         return all(port in ports and ports[port].required for ports in takes)
 
     def _cell(
@@ -648,7 +652,7 @@ class _Expansion:
         )
 
 
-def _compared_steps(workflow: Workflow, methods: Mapping[str, MethodInfo]) -> set[str]:
+def _compared_steps(workflow: Workflow, methods: Mapping[str, type[Method]]) -> set[str]:
     """Return the steps that the workflow compares, which repeats of their predecessors reach.
 
     The steps that `compare.metrics` names and all inspections that its wildcards cover, without
@@ -662,7 +666,8 @@ def _compared_steps(workflow: Workflow, methods: Mapping[str, MethodInfo]) -> se
         if step.name in patterns
         or (
             any(
-                {*methods[variant.method].gives.values()} == {_JUDGEMENT}
+                {port.type_name for port in port_specs(methods[variant.method].Out).values()}
+                == {_JUDGEMENT}
                 for variant in step.variants
             )
             and any(fnmatchcase(step.name, pattern) for pattern in patterns)

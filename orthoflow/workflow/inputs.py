@@ -37,28 +37,21 @@ from orthoflow.workflow.model import (
     DatasetSection,
     DatasetsSection,
     InputSection,
-    SeedSweep,
+    SeedSection,
     StepVariant,
     Workflow,
     WorkflowFile,
     WorkflowInputSpec,
 )
 from orthoflow.workflow.parameters import (
-    SWEEP,
     DraftStep,
     Overrides,
     Report,
     overrides_of_settings,
     resolve_call,
 )
-from orthoflow.workflow.problems import (
-    Location,
-    ProblemLog,
-)
-from orthoflow.workflow.source import (
-    read_text,
-    validate,
-)
+from orthoflow.workflow.problems import Location, ProblemLog, validate
+from orthoflow.workflow.source import read_text
 
 # Files and folders that are examined for one input: `/**` would take hours.
 #: files and folders visited for one entry of an input (a folder, or a pattern such as `**/*.e57`)
@@ -67,10 +60,6 @@ MOST_LOOKED_AT: Final = 100_000
 MOST_TABLE_BYTES: Final = 4_000_000
 #: datasets of a table
 MOST_DATASETS: Final = 10_000
-#: columns of a table of datasets
-MOST_COLUMNS: Final = 200
-#: characters of a line of a table of datasets
-MOST_LINE: Final = 10_000
 _MOST_LISTED: Final = 12
 _MOST_BESIDE: Final = 200
 _DATASETS: Final = "datasets"
@@ -111,10 +100,8 @@ def input_specs(
 def written_files(source: str) -> Mapping[str, tuple[str, ...]]:
     """Return the files that a workflow names for each input, without `--input`."""
     log = ProblemLog(file="")
-    tree = log.parse(source)
-    section = tree.get("inputs") if isinstance(tree, Table) else None
-    data = {"inputs": plain(section.value)} if section else {}
-    file = validate(WorkflowFile, data, log) or WorkflowFile()
+    log.parse(source)
+    file = validate(WorkflowFile, {"inputs": log.get(("inputs",)) or {}}, log) or WorkflowFile()
     return {name: spec.files for name, spec in file.inputs.items()}
 
 
@@ -367,27 +354,7 @@ class _Look:
                     yield path
 
 
-# Seeds --------------------------------------------------------------------------------------------
-
-
-def read_seeds(value: Value | None, log: ProblemLog, location: Location) -> tuple[int, ...]:
-    """Read a seed, or a sweep of seeds; empty if invalid."""
-    if value is None:
-        return ()
-    data = plain(value)
-    if isinstance(data, dict):
-        swept = validate(SeedSweep, data, log, location)
-        seeds = tuple(swept.sweep) if swept else ()
-        if again := [seed for index, seed in enumerate(seeds) if seed in seeds[:index]]:
-            log.report((*location, SWEEP), f"{again[0]} is swept twice; leave one of them out")
-        return tuple(dict.fromkeys(seeds))
-    try:
-        SeedSweep.model_validate({SWEEP: [data, 0]})
-    except ValueError:
-        message = "expected a whole number from 0 on, or {sweep: [NUMBER, NUMBER, ...]}"
-        log.report(location, f"{message}, got {describe(value)}")
-        return ()
-    return (data,) if isinstance(data, int) else ()
+# Datasets -----------------------------------------------------------------------------------------
 
 
 def check_no_step(
@@ -402,9 +369,6 @@ def check_no_step(
             "another name",
             at_key=True,
         )
-
-
-# Datasets -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -444,13 +408,10 @@ class DatasetReader:
     calls: Mapping[tuple[str, str], StepVariant]
     log: ProblemLog
 
-    def read(
-        self, section: Value | None, table: str | Mapping[str, JsonValue]
-    ) -> dict[str, Dataset]:
+    def read(self, table: str | Mapping[str, JsonValue]) -> dict[str, Dataset]:
         """Read the table of `--datasets`, otherwise the section, which may name a table itself.
 
         Args:
-            section: of the workflow file.
             table: from the command line, relative to the working directory; empty for none. From
                 Python it may be the content of the section, with paths relative to the same folder.
         """
@@ -461,16 +422,16 @@ class DatasetReader:
         if table:
             report = partial(self.log.report_option, f"--datasets {table}")
             return self._from_table(Path(table), table, report)
-        if section is None:
-            return {}
-        if isinstance(section, Text) and isinstance(section.value, str) and section.value:
+        section = self.log.get((_DATASETS,))
+        if isinstance(section, str) and section:
             report = partial(self.log.report, (_DATASETS,))
-            return self._from_table(self.folder / section.value, section.value, report)
-        if not isinstance(section, Table):
+            return self._from_table(self.folder / section, section, report)
+        if isinstance(section, dict):
+            return self._named(_Origin(log=self.log, folder=self.folder))
+        if (value := self.log.value((_DATASETS,))) is not None:
             form = "a CSV file, or a mapping from names to datasets, as in {hall: {scan: hall.e57}}"
-            self.log.report((_DATASETS,), f"expected {form}, got {describe(section)}")
-            return {}
-        return self._named(_Origin(log=self.log, folder=self.folder))
+            self.log.report((_DATASETS,), f"input should be {form}, got {describe(value)}")
+        return {}
 
     def _from_table(self, path: Path, name: str, report: Report) -> dict[str, Dataset]:
         try:
@@ -535,13 +496,16 @@ class DatasetReader:
                     f"workflow; give it {key}",
                     at_key=True,
                 )
-        place = (*here, "set", SEED)
+        seeds: tuple[int, ...] = ()
+        if SEED in section.set:
+            own = validate(SeedSection, {SEED: section.set[SEED]}, log, (*here, "set"))
+            seeds = own.seeds if own else ()
         settings = {key: value for key, value in section.set.items() if key != SEED}
         return Dataset(
             name=name,
             inputs=specs,
             sets=section.set,
-            seeds=read_seeds(log.value(place), log, place),
+            seeds=seeds,
             calls=self._calls(settings, (*here, "set"), origin),
         )
 
@@ -636,9 +600,9 @@ def read_rows(log: ProblemLog) -> Table:
     start = Position(line=1, column=1)
     if header is None:
         log.add(start, "", "a table of datasets begins with a line of column names, got none")
-    columns = _columns(header, log) if header else {}
+    columns = _columns(header, log) if header else []
     entries: dict[str, Entry] = {}
-    for row in rows if "name" in columns else ():
+    for row in rows if columns else ():
         entry = _row(row, columns, log)
         if entry is None:
             continue
@@ -657,21 +621,18 @@ def read_rows(log: ProblemLog) -> Table:
     return Table(position=start, entries=tuple(entries.values()))
 
 
-def _rows(log: ProblemLog) -> Iterator[tuple[Text, ...]]:
+def _rows(log: ProblemLog) -> Iterator[list[Text]]:
     """Return the fields of every non-empty line, each a text with its place."""
     separator = ""
     for number, line in enumerate(log.lines, start=1):
-        start = Position(line=number, column=1)
         if not line.strip() or line.lstrip()[0] == "#":
             continue
-        if len(line) > MOST_LINE:
-            log.add(start, "", f"a line has at most {MOST_LINE} letters, got {len(line)}")
-            return
         separator = separator or next((mark for mark in _SEPARATORS if mark in line), ",")
         try:
             fields = next(csv.reader([line], delimiter=separator, strict=True))
         except (csv.Error, StopIteration) as error:
-            log.add(start, "", f"the line cannot be read as CSV: {error}")
+            message = f"the line cannot be read as CSV: {error}"
+            log.add(Position(line=number, column=1), "", message)
             continue
         placed, at = [], 0
         for field in fields:
@@ -680,65 +641,54 @@ def _rows(log: ProblemLog) -> Iterator[tuple[Text, ...]]:
             position = Position(line=number, column=at + 1)
             placed.append(Text(position=position, value=field.strip()))
             at += len(field)
-        yield tuple(placed)
+        yield placed
 
 
-def _columns(header: tuple[Text, ...], log: ProblemLog) -> dict[str, tuple[int, Position]]:
-    """Return index and position of the columns by name; those without a name are omitted."""
-    columns: dict[str, tuple[int, Position]] = {}
-    start = header[0].position
-    if len(header) > MOST_COLUMNS:
-        log.add(start, "", f"a table has at most {MOST_COLUMNS} columns, got {len(header)}")
-        return {}
+def _columns(header: Sequence[Text], log: ProblemLog) -> list[Text]:
+    """Return the columns, some of them without a name; none if the table cannot be used."""
+    names = [str(field.value) for field in header]
     for index, field in enumerate(header):
-        name = str(field.value)
-        if name in columns:
-            log.add(field.position, name, f"the column {name} is there twice; remove one of them")
-        elif name:
-            columns[name] = (index, field.position)
-    if "name" not in columns:
-        listed = ", ".join(columns) or "none"
-        is_mapping = any(": " in name or name.endswith(":") for name in columns)
-        way_out = "; write a mapping in the workflow, under datasets:" if is_mapping else ""
-        log.add(
-            start,
-            "",
-            f"a table of datasets needs the column name; its columns are {listed}{way_out}",
-        )
-    return columns
+        if names[index] and names[index] in names[:index]:
+            message = f"the column {field.value} is there twice; remove one of them"
+            log.add(field.position, names[index], message)
+    if "name" in names:
+        return list(header)
+    is_mapping = any(": " in name or name.endswith(":") for name in names)
+    way_out = "; write a mapping in the workflow, under datasets:" if is_mapping else ""
+    listed = first_few([name for name in names if name]) or "none"
+    message = f"a table of datasets needs the column name; its columns are {listed}{way_out}"
+    log.add(header[0].position, "", message)
+    return []
 
 
-def _row(
-    row: tuple[Text, ...], columns: Mapping[str, tuple[int, Position]], log: ProblemLog
-) -> Entry | None:
+def _row(row: Sequence[Text], columns: Sequence[Text], log: ProblemLog) -> Entry | None:
     """Return the dataset of a line."""
-    start = row[0].position
-    places = [index for index, field in enumerate(row) if field.value]
-    if not places:
-        return None
-    named = {index for index, _ in columns.values()}
-    if unnamed := [index for index in places if index not in named]:
-        field = row[unnamed[0]]
-        message = f"{field.value} is in column {unnamed[0] + 1}, which has no name in the header"
-        log.add(field.position, "", message)
-        return None
-    if columns["name"][0] not in places:
-        log.add(start, "name", "the dataset needs a name in the column name")
-        return None
-    files, sets = [], []
-    for key, (index, position) in columns.items():
-        if key == "name" or index not in places:
+    start, name = row[0].position, None
+    entries: dict[bool, list[Entry]] = {False: [], True: []}
+    for index, field in enumerate(row):
+        if not field.value:
             continue
-        field = row[index]
-        if "." not in key and key != SEED:
-            files.append(Entry(position=position, key=key, value=field))
-        elif (value := _as_yaml(field, key, log)) is not None:
-            sets.append(Entry(position=position, key=key, value=value))
-    if sets:
-        table = Table(position=start, entries=tuple(sets))
-        files.append(Entry(position=start, key="set", value=table))
-    inner = Table(position=start, entries=tuple(files))
-    name = row[columns["name"][0]]
+        column = columns[index] if index < len(columns) else Text(position=start, value="")
+        key = str(column.value)
+        if not key:
+            text = f"{field.value} is in column {index + 1}, which has no name in the header"
+            log.add(field.position, "", text)
+            return None
+        if key == "name":
+            name = field
+            continue
+        is_set = "." in key or key == SEED
+        value = _as_yaml(field, key, log) if is_set else field
+        if value is not None:
+            entries[is_set].append(Entry(position=column.position, key=key, value=value))
+    if name is None:
+        if any(field.value for field in row):
+            log.add(start, "name", "the dataset needs a name in the column name")
+        return None
+    if entries[True]:
+        table = Table(position=start, entries=tuple(entries[True]))
+        entries[False].append(Entry(position=start, key="set", value=table))
+    inner = Table(position=start, entries=tuple(entries[False]))
     return Entry(position=name.position, key=str(name.value), value=inner)
 
 

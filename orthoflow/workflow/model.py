@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import math
 import re
-import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, TypeAlias
+from typing import Annotated, Any, Final, Literal, TypeAlias, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -32,9 +31,6 @@ from orthoflow.products.product import JsonValue
 from orthoflow.workflow.problems import Problem
 
 FORMAT: Final = 1
-# Errors of the models whose message is shown unchanged.
-FORMAT_TOO_NEW: Final = "format_too_new"
-NOT_A_NAME: Final = "not_a_name"
 #: `repeat` of a method call
 MOST_REPEATS: Final = 10_000
 # More values than are readable in a curve, and more runs than are practical.
@@ -57,24 +53,10 @@ _TIME: Final = re.compile(r"(\d+(?:\.\d+)?) *(s|min|h)")
 _SECONDS: Final = {"s": 1.0, "min": 60.0, "h": 3600.0}
 _REFERENCE: Final = re.compile(rf"({NAME_PATTERN})\.({NAME_PATTERN})")
 _METRIC: Final = r"[^.]+\.(.|\n)+"
+_Item = TypeVar("_Item")
 
 
 # Values -------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Expected:
-    """The expected form of a value in messages and the documentation.
-
-    Attributes:
-        words: the expected form: `true or false`.
-        noun: one item of a list.
-        choices: the words of a choice.
-    """
-
-    words: str
-    noun: str = "value"
-    choices: tuple[str, ...] = ()
 
 
 def check_name(name: str) -> str:
@@ -85,29 +67,21 @@ def check_name(name: str) -> str:
     """
     if not re.fullmatch(NAME_PATTERN, name):
         raise PydanticCustomError(
-            NOT_A_NAME, f"{{name}} cannot be a name: {NAME_RULE}", {"name": repr(name)}
+            "name", f"{{name}} cannot be a name: {NAME_RULE}", {"name": repr(name)}
         )
     return name
 
 
-def seconds_in(raw: object) -> float | None:
-    """Return a time in seconds, e.g. 1800 for `30min`; None for no time.
-
-    >>> seconds_in("30min"), seconds_in(2), seconds_in("soon")
-    (1800.0, 2.0, None)
-    """
+def _seconds(raw: object) -> float:
+    """Return a time in seconds: 1800 for `30min`."""
     seconds = 0.0
     if isinstance(raw, int | float) and not isinstance(raw, bool):
         seconds = float(raw)
     elif isinstance(raw, str) and (match := _TIME.fullmatch(raw)):
         seconds = float(match[1]) * _SECONDS[match[2]]
-    return seconds if math.isfinite(seconds) and seconds > 0 else None
-
-
-def _seconds(raw: object) -> float:
-    seconds = seconds_in(raw)
-    if seconds is None:
-        raise PydanticCustomError("time", "no time")
+    if not (math.isfinite(seconds) and seconds > 0):
+        form = "a time such as 90s, 30min, 2h or a number of seconds above 0"
+        raise PydanticCustomError("time", f"Input should be {form}")
     return seconds
 
 
@@ -135,61 +109,65 @@ class Reference:
 def _reference(raw: object) -> Reference:
     match = _REFERENCE.fullmatch(raw) if isinstance(raw, str) else None
     if match is None:
-        raise PydanticCustomError("reference", "no reference")
+        raise PydanticCustomError("reference", "Input should be step.port or inputs.name")
     return Reference(source=match[1], name=match[2])
 
 
 def _input_reference(raw: object) -> Reference:
-    reference = _reference(raw)
-    if not reference.is_input:
-        raise PydanticCustomError("reference", "no input")
-    return reference
+    if not (isinstance(raw, str) and raw.startswith(f"{INPUTS}.")):
+        raise PydanticCustomError("reference", "Input should be an input such as inputs.scan")
+    return _reference(raw)
 
 
-def _listed(raw: object) -> object:
-    return raw if isinstance(raw, list) else [raw]
+def _metric(pattern: str) -> str:
+    if not re.fullmatch(_METRIC, pattern):
+        raise PydanticCustomError("metric", "Input should be step.metric, * allowed")
+    return pattern
 
 
 def _format_version(version: int) -> int:
     if version > FORMAT:
         raise PydanticCustomError(
-            FORMAT_TOO_NEW,
+            "format",
             f"the file has workflow format {version}, this orthoflow reads {FORMAT}; upgrade "
             "orthoflow",
         )
     return version
 
 
+def _listed(raw: object) -> object:
+    # A tuple, for strict validation.
+    return tuple(raw) if isinstance(raw, list | tuple) else (raw,)
+
+
+def _each_once(values: list[_Item]) -> list[_Item]:
+    if again := [value for index, value in enumerate(values) if value in values[:index]]:
+        raise PydanticCustomError("twice", f"{again[0]} is swept twice; leave one of them out")
+    return values
+
+
 _Name: TypeAlias = Annotated[
     str, AfterValidator(check_name), WithJsonSchema({"type": "string", "pattern": NAME_PATTERN})
 ]
-_Text: TypeAlias = Annotated[str, Strict(), Field(min_length=1), Expected("a text")]
-_Flag: TypeAlias = Annotated[bool, Strict(), Expected("true or false")]
+_Text: TypeAlias = Annotated[str, Strict(), Field(min_length=1)]
+_Flag: TypeAlias = Annotated[bool, Strict()]
 # Integers; `true` is not one.
 _Positive: TypeAlias = Annotated[
     int,
     Strict(),
     Field(ge=1, le=_MOST_OF_A_NUMBER),
-    Expected("a whole number from 1 on"),
     WithJsonSchema({"type": "integer", "minimum": 1}),
 ]
 _Seed: TypeAlias = Annotated[
     int,
     Strict(),
     Field(ge=0, le=_MOST_OF_A_NUMBER),
-    Expected("a whole number from 0 on"),
     WithJsonSchema({"type": "integer", "minimum": 0}),
 ]
-_Repeats: TypeAlias = Annotated[
-    int,
-    Strict(),
-    Field(ge=1, le=MOST_REPEATS),
-    Expected(f"a whole number from 1 to {MOST_REPEATS}"),
-]
+_Repeats: TypeAlias = Annotated[int, Strict(), Field(ge=1, le=MOST_REPEATS)]
 _Seconds: TypeAlias = Annotated[
     float,
     BeforeValidator(_seconds),
-    Expected("a time such as 90s, 30min, 2h or a number of seconds above 0"),
     WithJsonSchema(
         {
             "anyOf": [
@@ -202,53 +180,39 @@ _Seconds: TypeAlias = Annotated[
 _Source: TypeAlias = Annotated[
     Reference,
     BeforeValidator(_reference),
-    Expected("step.port or inputs.name"),
     WithJsonSchema({"type": "string", "pattern": rf"^{NAME_PATTERN}\.{NAME_PATTERN}$"}),
 ]
 _InputSource: TypeAlias = Annotated[
     Reference,
     BeforeValidator(_input_reference),
-    Expected("an input such as inputs.scan"),
     WithJsonSchema({"type": "string", "pattern": rf"^{INPUTS}\.{NAME_PATTERN}$"}),
 ]
 _Metric: TypeAlias = Annotated[
-    str, Strict(), Field(pattern=rf"^{_METRIC}$"), Expected("step.metric, * allowed")
+    str,
+    Strict(),
+    AfterValidator(_metric),
+    WithJsonSchema({"type": "string", "pattern": rf"^{_METRIC}$"}),
 ]
 # A seed is a level like any other.
 _Level: TypeAlias = Annotated[
     str,
     Field(min_length=1),
     BeforeValidator(lambda raw: str(raw) if type(raw) is int else raw),
-    Expected("a text"),
     WithJsonSchema({"type": ["string", "integer"]}),
 ]
-_Assignment: TypeAlias = Annotated[dict[str, _Level], Expected("a mapping step: variant")]
+_Assignment: TypeAlias = dict[str, _Level]
+_Texts: TypeAlias = Annotated[tuple[_Text, ...], Field(min_length=1)]
+_References: TypeAlias = Annotated[tuple[_Source, ...], Field(min_length=1)]
+_Patterns: TypeAlias = tuple[_Metric, ...]
 # One value, or a list of at least one.
 _Files: TypeAlias = Annotated[
-    tuple[_Text, ...],
-    Field(min_length=1),
-    BeforeValidator(
-        _listed, json_schema_input_type=_Text | Annotated[tuple[_Text, ...], Field(min_length=1)]
-    ),
-    Expected("a text, or a list of them", "text"),
+    _Texts, BeforeValidator(_listed, json_schema_input_type=_Text | _Texts)
 ]
 _Sources: TypeAlias = Annotated[
-    tuple[_Source, ...],
-    Field(min_length=1),
-    BeforeValidator(
-        _listed,
-        json_schema_input_type=_Source | Annotated[tuple[_Source, ...], Field(min_length=1)],
-    ),
-    Expected("step.port or inputs.name, or a list of them", "reference"),
+    _References, BeforeValidator(_listed, json_schema_input_type=_Source | _References)
 ]
 _Metrics: TypeAlias = Annotated[
-    tuple[_Metric, ...],
-    Field(min_length=1),
-    BeforeValidator(
-        _listed,
-        json_schema_input_type=_Metric | Annotated[tuple[_Metric, ...], Field(min_length=1)],
-    ),
-    Expected("step.metric, * allowed, or a list of them", "text"),
+    _Patterns, BeforeValidator(_listed, json_schema_input_type=_Metric | _Patterns)
 ]
 
 
@@ -301,11 +265,7 @@ class SweepSection(FileSection):
     `--set 'STEP.PARAM={sweep: [...]}'` makes one.
     """  # noqa: D205
 
-    sweep: Annotated[
-        list[Any],
-        Field(min_length=2, max_length=MOST_SWEPT),
-        Expected(f"2 to {MOST_SWEPT} values in a list"),
-    ] = Field(
+    sweep: Annotated[list[Any], Field(min_length=2, max_length=MOST_SWEPT)] = Field(
         description="Values of the parameter; each makes a variant.",
         examples=[[0.02, 0.05, 0.1]],
     )
@@ -320,7 +280,7 @@ class CallSection(FileSection):
         "unless the step has variants.",
         examples=["plane.hough2d"],
     )
-    params: Annotated[dict[str, Any], Expected("a mapping")] = Field(
+    params: dict[str, Any] = Field(
         {},
         description="Parameters, each a value or a sweep; `orthoflow plugins show ID` lists them.",
         examples=[{"gsd_m": 0.003, "tolerance_m": {"sweep": [0.02, 0.05, 0.1]}}],
@@ -332,7 +292,7 @@ class CallSection(FileSection):
         "between run once per repeat; all others use the first repeat.",
         examples=[10],
     )
-    resources: Annotated[ResourcesSection, Expected("a mapping")] = Field(
+    resources: ResourcesSection = Field(
         ResourcesSection(),
         description="What the method may use of the machine.",
         examples=[{"cores": 2}],
@@ -350,10 +310,7 @@ class StepSection(CallSection):
     with all steps that need it. The order of steps is free.
     """  # noqa: D205
 
-    in_: Annotated[
-        dict[str, _Sources],
-        Expected("a mapping from ports to step.port or inputs.name, or to lists of these"),
-    ] = Field(
+    in_: dict[str, _Sources] = Field(
         {},
         alias="in",
         description="Source of each port's product; of a list, the first that is present.",
@@ -370,10 +327,7 @@ class StepSection(CallSection):
         description="The step is skipped when this input is given.",
         examples=["inputs.scan"],
     )
-    variants: Annotated[
-        dict[_Name, Annotated[CallSection, Expected("a mapping")]] | None,
-        Expected("a mapping from names to method calls"),
-    ] = Field(
+    variants: dict[_Name, CallSection] | None = Field(
         None,
         description="Alternatives of one kind with their own parameters, instead of `use`.",
         examples=[{"fine": {"use": "plane.hough2d"}, "quick": {"use": "plane.ransac"}}],
@@ -392,7 +346,7 @@ class DatasetSection(BaseModel):
     model_config = ConfigDict(extra="allow", frozen=True)
     __pydantic_extra__: dict[str, _Files]
 
-    set: Annotated[dict[str, Any], Expected("a mapping step.parameter: value")] = Field(
+    set: dict[str, Any] = Field(
         {},
         description="Parameters of this dataset, named as for `--set`, which overrides them; and "
         "`seed`, a number or a sweep.",
@@ -403,23 +357,17 @@ class DatasetSection(BaseModel):
 class DatasetsSection(FileSection):
     """The datasets of a file, of a table, or given from Python."""
 
-    datasets: Annotated[
-        dict[_Name, Annotated[DatasetSection, Expected("a mapping such as {scan: FILE}")]],
-        Expected("a mapping from names to datasets"),
-    ]
+    datasets: dict[_Name, DatasetSection]
 
 
-class CompareSection(FileSection):
+class Comparison(FileSection):
     """Every step behind variants runs once per combination that differs. Tables list each of these
     runs by its address: step, dataset, seed, variants and repeat, such as
     `ortho@plane=ransac,orient=pnp#2`; columns and keys of files call it `cell`. Without `compare`
     only the baseline runs, the first variant of each step.
     """  # noqa: D205
 
-    design: Annotated[
-        Design,
-        Expected("`product` or `one-at-a-time`", choices=typing.get_args(Design)),
-    ] = Field(
+    design: Design = Field(
         "product",
         description="All combinations of variants, or the baseline and every single deviation "
         "from it.",
@@ -431,12 +379,9 @@ class CompareSection(FileSection):
         "shows; by default the first.",
         examples=[{"plane": "hough2d", "orient": "bundle"}],
     )
-    exclude: Annotated[
-        list[Annotated[_Assignment, Field(min_length=1), Expected("step: variant")]],
-        Field(max_length=MOST_EXCLUDED),
-        Expected("a list of mappings step: variant"),
-    ] = Field(
-        [],
+    exclude: tuple[Annotated[_Assignment, Field(min_length=1)], ...] = Field(
+        (),
+        max_length=MOST_EXCLUDED,
         description="Combinations that are left out.",
         examples=[[{"plane": "ransac", "orient": "pnp"}]],
     )
@@ -452,10 +397,19 @@ class SeedSweep(FileSection):
     """Several seeds: random steps run once per seed, with `seed=<n>` in their address."""
 
     sweep: Annotated[
-        list[_Seed],
-        Field(min_length=2, max_length=MOST_SWEPT),
-        Expected(f"2 to {MOST_SWEPT} values in a list"),
+        list[_Seed], Field(min_length=2, max_length=MOST_SWEPT), AfterValidator(_each_once)
     ]
+
+
+class SeedSection(FileSection):
+    """The seed of a workflow or of a dataset."""
+
+    seed: _Seed | SeedSweep = 0
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Return the seed, or all of a sweep."""
+        return tuple(self.seed.sweep) if isinstance(self.seed, SeedSweep) else (self.seed,)
 
 
 class WorkflowFile(FileSection):
@@ -468,81 +422,38 @@ class WorkflowFile(FileSection):
         AfterValidator(_format_version),
         WithJsonSchema({"const": FORMAT}),
     ] = Field(FORMAT, description="Version of this format.", examples=[FORMAT])
-    name: Annotated[_Name, Expected("a name")] | None = Field(
+    name: _Name | None = Field(
         None,
         description="Name of the workflow, with which the folder of a run begins; by default the "
         "file's name.",
         examples=["palace-room"],
     )
-    seed: Annotated[_Seed | SeedSweep, Expected("a whole number from 0 on, or a sweep")] = Field(
+    seed: _Seed | SeedSweep = Field(
         0,
         description="Root of all seeds; a step's seed follows from it, the method and the repeat. "
         "A sweep runs everything random once per seed.",
         examples=[1729],
     )
-    inputs: Annotated[
-        dict[_Name, Annotated[InputSection, Expected("a mapping")]],
-        Expected("a mapping"),
-    ] = Field(
+    inputs: dict[_Name, InputSection] = Field(
         {},
         description="Input files; steps refer to them as `inputs.<name>`.",
         examples=[{"scan": {"files": "data/room.e57"}, "photos": {"optional": True}}],
     )
-    datasets: Annotated[
-        dict[_Name, Annotated[DatasetSection, Expected("a mapping such as {scan: FILE}")]] | str,
-        Expected("a CSV file, or a mapping from names to datasets, as in {hall: {scan: hall.e57}}"),
-    ] = Field(
+    datasets: dict[_Name, DatasetSection] | str = Field(
         {},
         description="The datasets on which the workflow runs: a mapping, or a CSV file.",
         examples=[{"hall": {"scan": "data/hall.e57"}, "stairs": {"scan": "data/stairs.e57"}}],
     )
-    steps: Annotated[
-        dict[_Name, Annotated[StepSection, Expected("a mapping")]],
-        Expected("a mapping"),
-    ] = Field(
+    steps: dict[_Name, StepSection] = Field(
         {},
         description="The steps, each of which calls a method.",
         examples=[{"cloud": {"use": "read.scan", "in": {"files": "inputs.scan"}}}],
     )
-    compare: Annotated[CompareSection, Expected("a mapping")] | None = Field(
+    compare: Comparison | None = Field(
         None,
         description="Which combinations of variants run and what is compared.",
         examples=[{"design": "product", "baseline": {"plane": "hough2d"}}],
     )
-
-
-def annotation_at(model: type[BaseModel], loc: Sequence[str | int]) -> tuple[object, Expected]:
-    """Return the type expected at a location of a model, and its description."""
-    here: object = model
-    expected = Expected("a mapping")
-    for part in loc:
-        metadata: Sequence[object] = ()
-        if isinstance(here, type) and issubclass(here, BaseModel):
-            fields = {info.alias or name: info for name, info in here.model_fields.items()}
-            if part in fields:
-                here, metadata = fields[str(part)].annotation, fields[str(part)].metadata
-            else:
-                here = _Files
-        else:
-            arguments = typing.get_args(here) or (None,)
-            here = arguments[1] if typing.get_origin(here) is dict else arguments[0]
-        here, inner = _unwrapped(here)
-        found = [item for item in (*inner, *metadata) if isinstance(item, Expected)]
-        expected = found[-1] if found else Expected("a value")
-    return here, expected
-
-
-def _unwrapped(annotation: object) -> tuple[object, tuple[object, ...]]:
-    """Return a type without `Annotated` and `| None`, and its annotation."""
-    metadata: tuple[object, ...] = ()
-    while True:
-        arguments = typing.get_args(annotation)
-        if typing.get_origin(annotation) is Annotated:
-            annotation, metadata = arguments[0], (*arguments[1:], *metadata)
-        elif type(None) in arguments:
-            annotation = next(item for item in arguments if item is not type(None))
-        else:
-            return annotation, metadata
 
 
 # The checked workflow -----------------------------------------------------------------------------
@@ -655,23 +566,6 @@ class Dataset:
     sets: Mapping[str, JsonValue] = field(default_factory=dict)
     seeds: tuple[int, ...] = ()
     calls: Mapping[tuple[str, str], StepVariant] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Comparison:
-    """What to compare.
-
-    Attributes:
-        design: all combinations of variants, or the baseline and every single deviation from it.
-        baseline: step -> variant, for every varied step.
-        exclude: combinations to omit; a cell whose assignment contains one is dropped.
-        metrics: `step.metric` patterns for the report, `*` allowed.
-    """
-
-    design: Design = "product"
-    baseline: Mapping[str, str] = field(default_factory=dict)
-    exclude: tuple[Mapping[str, str], ...] = ()
-    metrics: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

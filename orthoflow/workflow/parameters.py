@@ -5,97 +5,42 @@ from __future__ import annotations
 import itertools
 import json
 import re
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final, TypeAlias
 
 from pydantic import ValidationError
-from pydantic_core import ErrorDetails
 
-from orthoflow.catalog.catalog import Catalog
+from orthoflow.catalog.discovery import NAME_PATTERN
 from orthoflow.catalog.guarding import UserInterrupt, guarded
 from orthoflow.catalog.wording import describe_error, did_you_mean
 from orthoflow.errors import ArgumentError
-from orthoflow.files.yaml_positions import describe_scalar
 from orthoflow.products.product import JsonValue
 from orthoflow.sdk.hooks import KindSpec
-from orthoflow.sdk.methods import Method, PortSpec, port_specs
-from orthoflow.workflow.hints import meant_number, meant_parameter, written_form
+from orthoflow.sdk.methods import Method
 from orthoflow.workflow.model import (
     MOST_SWEPT,
     CallSection,
     Reference,
     StepVariant,
     SweepSection,
-    WorkflowStep,
 )
 from orthoflow.workflow.problems import (
     InvalidWorkflowError,
     Location,
     ProblemLog,
-)
-from orthoflow.workflow.source import (
-    as_plain,
+    meant_parameter,
+    mistakes,
     validate,
 )
 
 Report: TypeAlias = Callable[[str], None]
 
-# Keys of a call that are often written among its parameters.
-_BESIDE: Final = CallSection.model_fields.keys() - {"params"}
 SWEEP: Final = "sweep"
-# Letters of a value that a message repeats.
-_SHOWN: Final = 60
-# Letters of a name, see `NAME_PATTERN`; fewer letters of a parameter would not identify it.
+# Letters of a name, see `NAME_PATTERN`.
 _LETTERS: Final = 32
-_MIN_LETTERS: Final = 4
-# Pydantic's names of a list or a mapping of another form, and of a value of another type in one.
-_OF_LISTS: Final = frozenset(
-    ("tuple_type", "list_type", "dict_type", "missing", "too_long", "too_short")
-)
-_OF_LEAVES: Final = frozenset(
-    ("float_type", "int_type", "string_type", "bool_type", "finite_number", "int_from_float")
-)
-
-
-@dataclass(frozen=True, kw_only=True)
-class MethodInfo:
-    """A loaded method.
-
-    Attributes:
-        id: method id.
-        method: its class.
-        is_source: it has ports of its own and takes no variants.
-        takes: input ports it does not ignore.
-        gives: output port -> product type.
-    """
-
-    id: str
-    method: type[Method]
-    is_source: bool
-    takes: Mapping[str, PortSpec]
-    gives: Mapping[str, str]
-
-
-def describe_method(catalog: Catalog, method_id: str) -> MethodInfo:
-    """Load a method and read its ports.
-
-    Raises:
-        WorkflowError: no plugin has a method of that id.
-        PluginError: it cannot be loaded.
-    """
-    entry = catalog.method(method_id)
-    method = entry.load()
-    return MethodInfo(
-        id=method_id,
-        method=method,
-        is_source=entry.kind is not None and entry.kind.is_source,
-        takes=port_specs(method.In),
-        gives={port.name: port.type_name for port in port_specs(method.Out).values()},
-    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +51,7 @@ class DraftCall:
         location: of the mapping that holds `use`.
         name: of the variant, empty for a step without variants.
         call: its content; its parameters without sweeps.
-        info: the method, None when it cannot be loaded.
+        method: the method's class, None when it cannot be loaded.
         kind: ports of its kind, known even if the method is not.
         swept: for a variant made by a sweep, the parameters and their values.
         family: for such a variant, the name of the original variant.
@@ -116,21 +61,26 @@ class DraftCall:
     location: Location
     name: str
     call: CallSection
-    info: MethodInfo | None
+    method: type[Method] | None
     kind: KindSpec | None
     swept: Mapping[str, JsonValue] | None = None
     family: str = ""
     is_unswept: bool = False
 
     @property
-    def method(self) -> str:
+    def id(self) -> str:
         """Method id, empty where the file names none."""
         return self.call.use or ""
 
     @property
+    def is_source(self) -> bool:
+        """Whether its kind takes no variants."""
+        return self.kind is not None and self.kind.is_source
+
+    @property
     def parameters(self) -> tuple[str, ...]:
         """Names of the method's parameters."""
-        return tuple(self.info.method.Params.model_fields) if self.info else ()
+        return tuple(self.method.Params.model_fields) if self.method else ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -139,13 +89,9 @@ class DraftCall:
         A step without variants has its method's name, so that `plane.hough2d.cell_m` works in
         recipes with and without variants; a swept variant keeps its previous name, too.
         """
-        method = self.method.partition(".")[2]
+        method = self.id.partition(".")[2]
         before = (self.family or method,) if self.swept else ()
         return (*before, self.name or method)
-
-    def may_have(self, parameter: str) -> bool:
-        """Whether it has a parameter; a method that cannot be loaded may have any."""
-        return self.info is None or parameter in self.parameters
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,17 +105,6 @@ class DraftStep:
     only_if: Reference | None
     unless: Reference | None
     is_varied: bool
-
-    def checked(self, calls: Iterable[StepVariant]) -> WorkflowStep:
-        """Return the step with its calls resolved."""
-        return WorkflowStep(
-            name=self.name,
-            variants=tuple(calls),
-            inputs=self.inputs,
-            only_if=self.only_if.name if self.only_if else "",
-            unless=self.unless.name if self.unless else "",
-            is_varied=self.is_varied,
-        )
 
 
 # Setting parameters -------------------------------------------------------------------------------
@@ -260,7 +195,7 @@ def _parse(text: str) -> tuple[list[str], JsonValue]:
     if not raw.strip():
         raise ArgumentError("expected a value after the equals sign")
     log = ProblemLog(file="the value")
-    value = log.parse(raw)
+    log.parse(raw)
     try:
         log.raise_any()
     except InvalidWorkflowError as error:
@@ -269,7 +204,7 @@ def _parse(text: str) -> tuple[list[str], JsonValue]:
         raise ArgumentError(
             f"the value cannot be read as YAML: {error.problems[0].message}{way_out}"
         ) from error
-    return parts, as_plain(value)
+    return parts, log.get(())
 
 
 def _assign(
@@ -287,10 +222,11 @@ def _assign(
             f"{', '.join(by_name)}"
         )
     calls, keys = _select_calls(step, parts[1:])
-    chosen = [call for call in calls if call.may_have(keys[0])]
+    # A method that cannot be loaded may have any.
+    chosen = [call for call in calls if call.method is None or keys[0] in call.parameters]
     if not chosen:
         known = sorted({name for call in calls for name in call.parameters})
-        who = " or ".join(dict.fromkeys(call.method for call in calls))
+        who = " or ".join(dict.fromkeys(call.id for call in calls))
         meant = meant_parameter(keys[0], known, value) or did_you_mean(keys[0], known)
         raise ArgumentError(
             f"there is no parameter {keys[0]} in {who}{meant}; known: {', '.join(known) or 'none'}"
@@ -346,7 +282,7 @@ def resolve_call(
         _put(as_set, override)
     return StepVariant(
         name=draft.name,
-        method=draft.method,
+        method=draft.id,
         params=_resolved(draft, as_set, overrides, log, blame),
         params_set=as_set,
         repeat=draft.call.repeat,
@@ -363,28 +299,35 @@ def _resolved(
     log: ProblemLog,
     blame: Report | None,
 ) -> Mapping[str, JsonValue]:
-    info = draft.info
-    if info is None:
+    if draft.method is None:
         return {}
-    resolved: dict[str, JsonValue] = {}
+    model = draft.method.Params
+    params = (*draft.location, "params")
+    reports = {override.keys[0]: override.report for override in overrides}
     try:
-        with guarded(f"checking the parameters of {info.id}"):
-            params = info.method.Params.model_validate_json(json.dumps(as_set), strict=True)
-            resolved = params.model_dump(mode="json")
+        with guarded(f"checking the parameters of {draft.id}"):
+            checked = model.model_validate_json(json.dumps(as_set), strict=True)
+            resolved: dict[str, JsonValue] = checked.model_dump(mode="json")
             # As in the step: a default may be refused once it is given like any other value.
-            info.method.Params.model_validate_json(json.dumps(resolved), strict=True)
+            model.model_validate_json(json.dumps(resolved), strict=True)
     except ValidationError as error:
-        reports = {override.keys[0]: override.report for override in overrides}
-        reporter = _Reporter(
-            draft=draft, info=info, as_set=as_set, reports=reports, log=log, blame=blame
-        )
-        reporter.report_all(error.errors())
+        for loc, message, _ in mistakes(error, model, dict(as_set), draft.id):
+            name = str(loc[0]) if loc else ""
+            if report := reports.get(name, blame):
+                # It names the parameter itself, but nothing inside it, and datasets not even that.
+                inside = ProblemLog(file="").path(loc) or f"the parameters of {draft.id}"
+                is_named = name in reports and len(loc) == 1
+                report(message if is_named else f"{inside}: {message}")
+            elif log.value(params) is None:
+                log.report((*draft.location, "use"), message, shown=(*params, *loc))
+            else:
+                log.report((*params, *loc), message, at_key=bool(loc))
         return {}
     except UserInterrupt:
         raise
     except BaseException as error:  # noqa: BLE001 - a third party's validator may raise anything
-        message = f"checking the parameters of {info.id} failed: {describe_error(error)}"
-        log.report_plugin((*draft.location, "params"), message)
+        message = f"checking the parameters of {draft.id} failed: {describe_error(error)}"
+        log.report_plugin(params, message)
         return {}
     return resolved
 
@@ -400,110 +343,6 @@ def _put(params: dict[str, JsonValue], override: Override) -> None:
         place = inner
     # Several calls may take the same value, and later settings modify it.
     place[last] = deepcopy(override.value)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Reporter:
-    """Turns pydantic's errors into problems of the file, of a `--set` or of a dataset."""
-
-    draft: DraftCall
-    info: MethodInfo
-    as_set: Mapping[str, JsonValue]
-    reports: Mapping[str, Report]
-    log: ProblemLog
-    blame: Report | None
-
-    def report_all(self, errors: Sequence[ErrorDetails]) -> None:
-        """Report each; but a wrong form of one list or mapping is one problem."""
-        for first, group in itertools.groupby(errors, key=lambda details: details["loc"][:1]):
-            several = list(group)
-            if form := self._other_form(str(first[0]) if first else "", several):
-                self._report(first, form)
-                continue
-            # Each alternative of a type reports its own expectation.
-            places: dict[Location, list[ErrorDetails]] = {}
-            for details in several:
-                places.setdefault(self._location(details), []).append(details)
-            for location, alternatives in places.items():
-                self._report(location, self._message(alternatives, location))
-
-    def _location(self, details: ErrorDetails) -> Location:
-        """Return the location of an error in the parameters, without pydantic's names of types."""
-        here: JsonValue = dict(self.as_set)
-        location: Location = ()
-        for part in details["loc"]:
-            if isinstance(here, dict) and part in here:
-                here = here[str(part)]
-            elif isinstance(here, list) and isinstance(part, int) and part < len(here):
-                here = here[part]
-            elif details["type"] != "missing" or part != details["loc"][-1]:
-                continue
-            location = (*location, part)
-        return location
-
-    def _other_form(self, name: str, errors: Sequence[ErrorDetails]) -> str:
-        """Return how a parameter is written if its value has another form, else nothing."""
-        field_info = self.info.method.Params.model_fields.get(name)
-        kinds = {details["type"] for details in errors if len(details["loc"]) > 1}
-        kinds |= {details["type"] for details in errors} - {"missing"}
-        if field_info is None or not kinds & _OF_LISTS or not kinds <= _OF_LISTS | _OF_LEAVES:
-            return ""
-        form = written_form(field_info.annotation, field_info.description or "")
-        given = json.dumps(self.as_set.get(name), ensure_ascii=False)
-        given = given if len(given) <= _SHOWN else f"{given[:_SHOWN]} ..."
-        return form and f"{name} is written {form}, got {given}"
-
-    def _report(self, loc: tuple[int | str, ...], message: str) -> None:
-        name = str(loc[0]) if loc else ""
-        if report := self.reports.get(name, self.blame):
-            # It names the parameter itself, but nothing inside it, and datasets not even that.
-            inside = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc)
-            is_named = name in self.reports and len(loc) == 1
-            who = inside[1:] or f"the parameters of {self.info.id}"
-            report(message if is_named else f"{who}: {message}")
-            return
-        params = (*self.draft.location, "params")
-        here = (*params, *loc)
-        if self.log.value(params) is None:
-            self.log.report((*self.draft.location, "use"), message, shown=here)
-        else:
-            self.log.report(here, message, at_key=bool(loc))
-
-    def _message(self, alternatives: Sequence[ErrorDetails], location: Location) -> str:
-        details = alternatives[0]
-        name = str(location[-1]) if location else ""
-        match details["type"]:
-            case "extra_forbidden":
-                known = tuple(self.info.method.Params.model_fields) if len(location) == 1 else ()
-                listed = f"; {self.info.id} has {', '.join(known) or 'none'}" if known else ""
-                meant = meant_parameter(name, known, details["input"]) or did_you_mean(name, known)
-                if known and name in _BESIDE:
-                    meant = f" ({name} belongs beside params, not in it)"
-                return f"unknown parameter {name}{meant}{listed}"
-            case "missing":
-                return f"{self.info.id} needs parameter {name}"
-            case "value_error" | "assertion_error":
-                return str(details.get("ctx", {}).get("error", details["msg"]))
-        texts = dict.fromkeys(one["msg"].removeprefix("Input should be ") for one in alternatives)
-        words = f"input should be {' or '.join(texts)}"
-        if not details["msg"].startswith("Input should be "):
-            words = details["msg"][:1].lower() + details["msg"][1:]
-        given = details["input"]
-        meant = meant_number(name, given) if "number" in words else ""
-        if len(location) == 1 and details["type"].endswith(("_type", "enum", "literal_error")):
-            meant += self._sweep_of(given)
-        shown = "a list" if isinstance(given, list) else "a mapping"
-        if not isinstance(given, list | dict):
-            shown = describe_scalar(given)
-        return f"{words}, got {shown}{meant}"
-
-    def _sweep_of(self, value: object) -> str:
-        """Return how to sweep a list given instead of one value."""
-        is_source = self.draft.kind is not None and self.draft.kind.is_source
-        if is_source or not isinstance(value, list) or len(value) < 2:
-            return ""
-        written = json.dumps(value)
-        return f"; to try each: {{sweep: {written if len(written) <= _SHOWN else '[...]'}}}"
 
 
 # Sweeps -------------------------------------------------------------------------------------------
@@ -608,11 +447,11 @@ def _without_sweeps(draft: DraftCall) -> DraftCall:
 
 
 def _may_vary(step: DraftStep, draft: DraftCall, log: ProblemLog) -> bool:
-    if draft.kind is None or not draft.kind.is_source:
+    if not draft.is_source:
         return True
     log.report(
         (*draft.location, "use"),
-        f"{draft.method} is a source, and sources take no variants, so nothing of it can be "
+        f"{draft.id} is a source, and sources take no variants, so nothing of it can be "
         f"swept; datasets can: {{a: {{set: {{{step.name}.<parameter>: VALUE}}}}, ...}}",
         shown=(*draft.location, "params"),
     )
@@ -659,22 +498,14 @@ def variant_names(before: str, combinations: Sequence[Mapping[str, JsonValue]]) 
     ['fine-sweep-1', 'fine-sweep-2']
     """
     head = [before] if before else []
-    words = [[_word(value) for value in one.values()] for one in combinations]
-    parameters = list(combinations[0])
-    longest = sum(max(map(len, column)) for column in zip(*words, strict=True))
-    room = _LETTERS - longest - 2 * len(parameters) + 1 - sum(len(part) + 1 for part in head)
-    each = room // len(parameters)
-    short = [name.lower()[:each].rstrip("_-") for name in parameters]
-    is_plain = all(re.fullmatch(r"[a-z][a-z0-9_-]*", name) for name in short)
-    is_readable = all(
-        len(cut) >= min(_MIN_LETTERS, len(name))
-        for cut, name in zip(short, parameters, strict=True)
-    )
-    if all(all(row) for row in words) and is_plain and is_readable and len({*short}) == len(short):
-        pairs = [zip(short, row, strict=True) for row in words]
-        names = ["-".join([*head, *(f"{a}-{b}" for a, b in row)]) for row in pairs]
-        if max(Counter(names).values()) == 1:
-            return names
+    names = [
+        "-".join([*head, *(f"{name.lower()}-{_word(value)}" for name, value in one.items())])
+        for one in combinations
+    ]
+    is_stated = all(_word(value) for one in combinations for value in one.values())
+    is_short = all(re.fullmatch(NAME_PATTERN, name) for name in names)
+    if is_stated and is_short and len({*names}) == len(names):
+        return names
     # Counted in the order of the values, so that the order of the list changes nothing.
     keys = [[_ordered(one[name]) for name in sorted(one)] for one in combinations]
     in_order = sorted(range(len(keys)), key=keys.__getitem__)

@@ -96,7 +96,7 @@ def resolved_json(workflow: Workflow) -> str:
         "seed": workflow.seed,
         "inputs": {name: _input_json(spec) for name, spec in workflow.inputs.items()},
         "steps": {step.name: _step_json(step) for step in workflow.steps.values()},
-        "compare": asdict(workflow.compare) if workflow.compare else None,
+        "compare": workflow.compare.model_dump() if workflow.compare else None,
         "overrides": list(workflow.overrides),
     }
     if workflow.seeds:

@@ -9,6 +9,7 @@ from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import NAME_PATTERN
 from orthoflow.errors import PluginError
 from orthoflow.products.product import JsonValue
+from orthoflow.sdk.methods import Method, port_specs
 from orthoflow.workflow.model import (
     INPUTS,
     CallSection,
@@ -17,10 +18,6 @@ from orthoflow.workflow.model import (
     Workflow,
     WorkflowFile,
     WorkflowStep,
-)
-from orthoflow.workflow.parameters import (
-    MethodInfo,
-    describe_method,
 )
 
 # Any: JSON.
@@ -41,7 +38,7 @@ def workflow_schema(catalog: Catalog) -> dict[str, JsonValue]:
     defs: Schema = schema["$defs"]
     defs["SweepSection"] = SweepSection.model_json_schema()
     for info in methods:
-        params = info.method.Params.model_json_schema()
+        params = info.Params.model_json_schema()
         defs |= {
             f"{info.id}.{name}": _renamed(inner, info)
             for name, inner in params.pop("$defs", {}).items()
@@ -62,7 +59,7 @@ def workflow_schema(catalog: Catalog) -> dict[str, JsonValue]:
     step, call = defs["StepSection"], defs["CallSection"]
     for section, chosen in (
         (step, methods),
-        (call, [info for info in methods if not info.is_source]),
+        (call, [info for info in methods if not _is_source(info, catalog)]),
     ):
         use = section["properties"]["use"]
         section["properties"]["use"] = {
@@ -97,15 +94,20 @@ def workflow_schema(catalog: Catalog) -> dict[str, JsonValue]:
     }
 
 
-def _loadable(catalog: Catalog) -> Iterator[MethodInfo]:
+def _loadable(catalog: Catalog) -> Iterator[type[Method]]:
     for method_id in sorted(catalog.methods):
         try:
-            yield describe_method(catalog, method_id)
+            yield catalog.method(method_id).load()
         except PluginError:
             continue
 
 
-def _renamed(schema: Any, info: MethodInfo) -> Any:
+def _is_source(method: type[Method], catalog: Catalog) -> bool:
+    kind = catalog.methods[method.id].kind
+    return kind is not None and kind.is_source
+
+
+def _renamed(schema: Any, info: type[Method]) -> Any:
     """Update the references of a method's own definitions to their new place."""
     if isinstance(schema, dict):
         return {
@@ -199,7 +201,9 @@ def _call_label(variant: StepVariant) -> str:
 def _wires(step: WorkflowStep, catalog: Catalog) -> Iterator[tuple[str, str, str]]:
     """Yield source, arrow and label of each wire of a step."""
     taken = {
-        port for variant in step.variants for port in describe_method(catalog, variant.method).takes
+        port
+        for variant in step.variants
+        for port in port_specs(catalog.method(variant.method).load().In)
     }
     for port, references in step.inputs.items():
         for reference in references if port in taken else ():

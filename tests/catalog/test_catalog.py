@@ -12,16 +12,12 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from orthoflow.catalog import loading
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.cli import program
 from orthoflow.engine.environment import packages
 from orthoflow.errors import PluginError, WorkflowError
 from orthoflow.products.planes import Planes
-from orthoflow.products.product import Product
-from orthoflow.products.walls import Walls
-from orthoflow.sdk.methods import PortSpec
 from orthoflow.version import DISTRIBUTION
 from tests.laboratories import (
     LABORATORY,
@@ -425,54 +421,6 @@ def test_a_class_that_breaks_a_rule_is_refused_when_it_is_loaded(
     assert complaint in str(caught.value)
 
 
-def test_a_class_that_keeps_the_rules_is_loaded_and_may_ignore_ports(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    text = hooks(methods=method("plane.mine", "kept_class:Mine"))
-    source = CLASS.replace("cloud: PointCloud", "pass")
-    catalog = with_plugin("kept", text, tmp_path, monkeypatch, kept_class=source)
-    assert catalog.method("plane.mine").load().id == "plane.mine"
-
-
-@pytest.mark.parametrize(
-    ("change", "complaint"),
-    [
-        ({"tolerances": {"rbg": 1}}, "tolerances of Own names rbg, which is not a field"),
-        ({"tolerances": {"depth_m": 1, "gsd_m": 1}}, ""),
-    ],
-)
-def test_names_in_a_product_are_those_of_its_fields(
-    change: dict[str, object], complaint: str
-) -> None:
-    own = type("Own", (Walls,), change)
-    assert loading.product_complaint(own).startswith(complaint)
-    assert bool(loading.product_complaint(own)) == bool(complaint)
-    assert loading.product_complaint(Product) == "Product must be a frozen dataclass"
-
-
-def test_a_port_of_a_source_carries_what_somebody_announces() -> None:
-    ports = {
-        name: PortSpec(name=name, type_name=type_name, required=True)
-        for name, type_name in (("cloud", "cloud"), ("damp", "dampness"))
-    }
-    assert loading._unknown_type(ports, frozenset({"cloud", "dampness"})) == ""
-    assert loading._unknown_type(ports, frozenset({"cloud"})) == (
-        "port damp carries dampness, a product type that no plugin announces"
-    )
-
-
-def test_an_install_from_an_index_is_released_and_one_from_a_folder_is_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    text = hooks(methods=method("plane.mine", "origin_class:Mine"))
-    catalog = with_plugin("origin", text, tmp_path, monkeypatch)
-    assert catalog.methods["plane.mine"].distribution.is_released
-    url = tmp_path / "origin" / "origin-1.0.dist-info" / "direct_url.json"
-    url.write_text('{"url": "file:///somewhere", "dir_info": {}}')
-    again = discover_catalog(entry_points_in(tmp_path / "origin"))
-    assert not again.methods["plane.mine"].distribution.is_released
-
-
 def test_code_in_front_of_an_installed_release_is_not_released(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -542,26 +490,6 @@ def test_two_bad_plugins_leave_every_other_workflow_alone(
     needy = with_steps("plane: {use: plane.ransac, in: {cloud: cloud.cloud}}")
     with pytest.raises(PluginError, match=r"plane.ransac is claimed by again 1.0 and laboratory"):
         load(needy, path, catalog)
-
-
-def test_the_traceback_of_a_broken_plugin_is_shown_on_request(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = write_distribution(
-        tmp_path, "broken", {"broken_hooks.py": "raise RuntimeError('no licence')"}
-    )
-    monkeypatch.syspath_prepend(folder)
-    shown = CliRunner().invoke(program, ["plugins", "show", "broken"])
-    assert shown.exit_code == 4
-    assert shown.output.startswith("plugin broken of broken 1.0 fails to load: RuntimeError: no")
-    assert "broken_hooks.py" in shown.output
-    assert "Traceback" in shown.output
-    listed = CliRunner().invoke(program, ["plugins", "list"])
-    assert listed.exit_code == 0
-    assert "plugin broken of broken 1.0 fails to load" in listed.output
-    assert "Traceback" not in listed.output
-    assert "`orthoflow plugins show broken` prints its traceback" in listed.output
-    assert "plane     cloud" in listed.output
 
 
 def test_a_method_whose_class_does_not_load_is_shown_with_its_traceback(

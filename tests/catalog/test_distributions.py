@@ -13,7 +13,6 @@ from orthoflow.catalog.distributions import (
     describe_distribution,
     package_path,
     required_distributions,
-    source_files,
 )
 
 
@@ -64,20 +63,6 @@ def test_an_entry_point_of_no_distribution_is_known_by_its_own_name(
             is_released=False,
             source_folder=None if source is None else folder / source,
         )
-    )
-
-
-def test_modules_built_into_python_have_no_place() -> None:
-    assert package_path("sys") is None
-
-
-def test_python_files_of_packages_and_modules_are_listed_once(folder: Path) -> None:
-    (folder / "regular" / "table.csv").touch()
-    asked = (folder / "regular", None, folder / "alone.py", folder / "regular" / "inner")
-    assert source_files(asked) == (
-        folder / "alone.py",
-        folder / "regular/__init__.py",
-        folder / "regular/inner/__init__.py",
     )
 
 

@@ -14,12 +14,10 @@ from orthoflow.cli.commands import (
     LazyCommand,
     LazyGroup,
     RecordCommand,
-    Session,
     command_again,
-    current_session,
 )
 from orthoflow.cli.tables import echo
-from orthoflow.errors import ArgumentError, GeometryError, ProductError, RecordError
+from orthoflow.errors import GeometryError, ProductError, RecordError
 from tests.provenance_records import write_sample
 
 
@@ -40,15 +38,6 @@ def test_a_command_is_repeated_with_what_was_given_and_another_folder() -> None:
     assert sorted(words[1:-2]) == sorted(given[:-2])
     assert words[words.index("a=[1, 2]") - 1] == words[words.index("b=3") - 1] == "--set"
     assert words[-2:] == ["-o", "new one"]
-
-
-def test_a_command_has_the_session_of_its_program_or_one_of_its_own() -> None:
-    assert current_session() == Session(debug=False, resume_hint="")
-    session = Session(debug=True)
-    with click.Context(bake, obj=session):
-        assert current_session() is session
-    with click.Context(bake):
-        assert current_session() == Session()
 
 
 @pytest.mark.parametrize(
@@ -125,10 +114,3 @@ def test_a_product_that_breaks_its_rules_is_the_records(
     told = failing(kind("no plane"), intact)
     assert isinstance(told, RecordError)
     assert str(told) == "a product of this run breaks its own rules: no plane"
-
-
-@pytest.mark.parametrize(
-    "error", [ArgumentError("not so"), OSError(28, "full"), click.UsageError("no"), click.Abort()]
-)
-def test_what_a_user_did_is_told_as_it_is(changed: Path, error: Exception) -> None:
-    assert failing(error, changed) is error

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import pytest
@@ -66,22 +65,6 @@ def test_products_lie_below_the_address_of_their_dataset(folder: Path) -> None:
     assert found == {"paint@data=hall", "paint@data=stairs", "side"}
 
 
-def test_commands_on_the_pages_that_a_run_writes_are_of_its_record(folder: Path) -> None:
-    run = folder / "first"
-    pages = [run / "report.html", *sorted((run / "pages").glob("*.html"))]
-    assert [page.stem for page in pages] == ["report", "attic", "hall", "stairs"]
-    for page in pages:
-        text = page.read_text(encoding="utf-8")
-        # So is the record called while pages are written.
-        assert "h5.unfinished" not in text
-        commands = r"(?m)^(?:<pre[^>]*>)?orthoflow (verify|replay|show|export) (\S+)"
-        assert re.findall(commands, text) == [
-            (name, "run.h5") for name in ("verify", "replay", "show", "export")
-        ]
-        assert "<code>run.h5</code> beside" in text or "<code>../run.h5</code> seen" in text
-    assert (run / "run.h5").is_file()
-
-
 def test_the_record_of_all_datasets_verifies_and_replays(folder: Path) -> None:
     record = open_run(folder / "first").record
     assert {entry.name: [file.name for file in entry.files] for entry in record.inputs} == {
@@ -129,18 +112,6 @@ def test_later_rows_compute_nothing_again(folder: Path) -> None:
         "survey@data=cellar",
         "paint@data=cellar",
     }
-
-
-def test_some_of_the_datasets_can_be_run_alone(folder: Path) -> None:
-    done = orthoflow(
-        folder, "run", "rooms.yaml", "--datasets", "rooms.csv", "--only-data", "stairs,hall",
-        "-o", "two",
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert "all 6 steps were cached" in done.stdout
-    run = open_run(folder / "two")
-    assert run.record.overrides == ("--datasets rooms.csv", "--only-data stairs,hall")
-    assert not [address for address in run.cells if "attic" in address]
 
 
 def test_check_counts_the_datasets_and_names_every_missing_file(folder: Path) -> None:

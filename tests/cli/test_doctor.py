@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import platform
 import re
 import shutil
 import subprocess
@@ -164,34 +163,6 @@ def test_a_store_where_nothing_can_be_written_is_named() -> None:
     store = findings("--store", "/proc/none", code=4)["store"]
     assert store["found"].startswith("/proc cannot be written: ")
     assert store["cost"] == "no run can start here (choose another folder with --store DIR)"
-
-
-@pytest.mark.usefixtures("libraries")
-@pytest.mark.parametrize(
-    ("free", "verdict"), [(5 * GIB, "ok"), (5 * GIB - 1, "limited"), (GIB // 4, "limited")]
-)
-def test_little_memory_and_little_disk_are_restrictions(
-    monkeypatch: pytest.MonkeyPatch, free: int, verdict: str
-) -> None:
-    memory = measuring.AvailableMemory(available=free - 3 * GIB, total=free)
-    monkeypatch.setattr(measuring, "available_memory", lambda: memory)
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
-    found = findings()
-    for name in ("memory", "disk of the store"):
-        assert found[name]["verdict"] == verdict
-        assert bool(found[name]["cost"]) == (verdict != "ok")
-
-
-@pytest.mark.usefixtures("libraries")
-def test_what_is_not_known_or_not_tested_is_a_restriction(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail() -> None:
-        raise KeyError("MemTotal")
-
-    monkeypatch.setattr(measuring, "available_memory", fail)
-    monkeypatch.setattr(platform, "machine", lambda: "aarch64")
-    found = findings()
-    assert found["memory"]["cost"] == "cannot be measured"
-    assert found["platform"]["cost"] == "only Linux on x86-64 is tested"
 
 
 @pytest.mark.usefixtures("libraries")

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import h5py
 import pytest
-from orthoflow_provenance.verify import verify_record
 
 from orthoflow.engine.store import Store
 from orthoflow.errors import ArgumentError, RecordError
@@ -78,19 +77,6 @@ def test_a_run_is_embedded_afterwards(studio: Studio) -> None:
     assert_record_alone_is_enough(studio, second)
 
 
-def test_a_crate_may_hold_the_embedded_record(studio: Studio) -> None:
-    done = studio("export", "first", "--to", "ro-crate", "--embed", "-o", "crate")
-    assert done.exit_code == 0, done.output
-    assert verify_record(studio.folder / "crate" / "run.h5") == ()
-    assert all(entry.embedded for entry in open_run("crate").record.inputs)
-    verified = studio("verify", "crate")
-    notes = [line for line in verified.stdout.splitlines() if line.startswith("note: ")]
-    assert (verified.exit_code, len(notes)) == (0, 1), verified.stdout
-    assert "1 report page as written" in verified.stdout
-    assert "ro-crate-metadata.json" in notes[0]
-    assert studio("verify", "--strict", "crate").exit_code == 0
-
-
 def test_of_a_record_with_changed_arrays_neither_it_nor_its_seal_is_handed_on(
     studio: Studio,
 ) -> None:
@@ -120,21 +106,6 @@ def test_every_figure_is_written_on_demand(studio: Studio) -> None:
     assert (studio.folder / "first" / "export" / "figures" / "graph.svg").is_file()
     refused = studio("export", "first", "--to", "figures", "--step", "nowhere", "-o", "other")
     assert (refused.exit_code, "has no step 'nowhere'" in refused.stderr) == (2, True)
-
-
-def test_a_folder_that_is_taken_is_refused_before_inputs_are_looked_at(
-    studio: Studio, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def look(*_: object, **__: object) -> None:
-        raise AssertionError("too late")
-
-    monkeypatch.setattr("orthoflow.engine.plan.plan_run", look)
-    refused = studio("run", "studio.yaml", "-o", "first", "--input", "number=n.txt")
-    assert refused.exit_code == 2
-    assert refused.stderr == (
-        f"error: {studio.folder / 'first'} holds a finished run (run.h5); choose another folder "
-        "with -o (in Python: output=), or look at this one (orthoflow show, orthoflow.open_run)\n"
-    )
 
 
 def test_a_refused_export_of_a_record_alone_leaves_nothing(

@@ -14,13 +14,8 @@ from rich.console import Console
 
 from orthoflow.cli.progress import (
     CellState,
-    LiveProgress,
-    NotebookProgress,
-    PlainProgress,
-    about,
+    Progress,
     left_of_run,
-    make_progress,
-    visible_cells,
     working_on,
 )
 from orthoflow.diagnostics import PLAIN_WARNING, DiagnosticSpec
@@ -86,7 +81,7 @@ def running(*, fraction: float = 0.0, took_s: float | None = None) -> CellState:
 
 
 def test_a_log_has_a_line_per_start_end_and_code(capsys: pytest.CaptureFixture[str]) -> None:
-    with PlainProgress() as progress:
+    with Progress() as progress:
         for event in EVENTS:
             progress.take(event)
         progress.take(RunStarted(run_id="r1", n_cells=1, is_resumed=True))
@@ -107,10 +102,11 @@ def test_a_log_has_a_line_per_start_end_and_code(capsys: pytest.CaptureFixture[s
 
 
 def test_a_log_shows_a_long_step_again(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(PlainProgress, "every_s", 0.2)
-    with PlainProgress(planned("plane", "wall", took_s=60.0)) as progress:
+    progress = Progress(planned("plane", "wall", took_s=60.0))
+    progress.every_s = 0.2
+    with progress:
         progress.take(RunStarted(run_id="r1", n_cells=2, is_resumed=False))
         progress.take(CellStarted(address="plane"))
         progress.take(CellProgress(address="plane", fraction=0.25, text="peeling"))
@@ -126,9 +122,10 @@ def test_a_log_shows_a_long_step_again(
 
 
 def test_the_live_table_shows_every_state_and_keeps_warnings(
-    capsys: pytest.CaptureFixture[str],
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    progress = LiveProgress(planned("cloud", "plane", "wall", "other"))
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    progress = Progress(planned("cloud", "plane", "wall", "other"))
     with progress as entered:
         assert entered is progress
         for event in EVENTS[:6]:
@@ -147,29 +144,17 @@ def test_the_live_table_shows_every_state_and_keeps_warnings(
     assert "plane: warning: the side is a [guess]" in capsys.readouterr().err
 
 
-def test_rows_that_do_not_fit_are_the_least_urgent(monkeypatch: pytest.MonkeyPatch) -> None:
-    states = ["ok", "cached", "running", "failed", "waiting", "waiting"]
-    cells = {f"step{i}": CellState(state=state) for i, state in enumerate(states)}
-    assert list(visible_cells(cells, 6)) == list(cells)
-    assert list(visible_cells(cells, 3)) == ["step2", "step3", "step4"]
-    assert list(visible_cells(cells, 0)) == ["step2"]
-    for order in (("ok", "waiting"), ("waiting", "failed"), ("failed", "running")):
-        pair = {state: CellState(state=state) for state in order}
-        assert list(visible_cells(pair, 1)) == [order[1]]
-    progress = LiveProgress(planned(*"abcdefgh"))
-    monkeypatch.setattr(progress, "console", Console(height=10, file=io.StringIO()))
-    assert progress.table().row_count == 6
-
-
-@pytest.mark.parametrize(("is_terminal", "kind"), [(True, LiveProgress), (False, PlainProgress)])
-def test_a_terminal_has_a_table_and_a_file_has_lines(
-    monkeypatch: pytest.MonkeyPatch, is_terminal: bool, kind: type
-) -> None:
-    monkeypatch.setattr("sys.stderr.isatty", lambda: is_terminal)
-    made = make_progress(planned("a", "b", took_s=60.0), jobs=2)
-    assert type(made) is kind
-    # Two at a time.
-    assert made.state.left() == "about 1 min 00 s left"
+def test_rows_that_do_not_fit_are_the_least_urgent() -> None:
+    progress = Progress(planned(*"abcdef"))
+    for event in (
+        CellFinished(address="a", result=OK, cached=False),
+        CellStarted(address="c"),
+        CellFinished(address="d", result=FAILED, cached=False),
+    ):
+        progress.take(event)
+    for rows, addresses in ((6, "abcdef"), (3, "bcd"), (0, "c")):
+        progress.console = Console(height=rows + 4, file=io.StringIO())
+        assert [str(cell) for cell in progress.table().columns[0].cells] == [*addresses]
 
 
 # Notebooks ----------------------------------------------------------------------------------------
@@ -193,11 +178,9 @@ def outputs(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
 def test_a_notebook_keeps_one_output_with_a_line_per_step(
     outputs: list[list[str]],
     capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(NotebookProgress, "every_s", 0.05)
-    progress = make_progress(planned("cloud", "plane", took_s=60.0))
-    assert type(progress) is NotebookProgress
+    progress = Progress(planned("cloud", "plane", took_s=60.0))
+    progress.every_s = 0.05
     with progress:
         for event in EVENTS[:4]:
             progress.take(event)
@@ -217,36 +200,6 @@ def test_a_notebook_keeps_one_output_with_a_line_per_step(
         "last: ok in 1.2 s, plus 45.0 s of loading and compiling",
     ]
     assert capsys.readouterr().err == ""
-
-
-@pytest.mark.parametrize(("n_steps", "first_kept"), [(999, 0), (1000, 1)])
-def test_a_notebook_keeps_a_thousand_lines_and_no_running_step(
-    outputs: list[list[str]], n_steps: int, first_kept: int
-) -> None:
-    ended = [f"c{index}: cached" for index in range(n_steps)]
-    with NotebookProgress() as progress:
-        progress.take(EVENTS[0])
-        for index in range(n_steps):
-            progress.take(CellFinished(address=f"c{index}", result=OK, cached=True))
-        progress.take(CellStarted(address="plane"))
-        progress.refresh()
-    while_running, kept = (text.splitlines() for text in outputs[0])
-    n_more = n_steps + 1 - 40
-    assert while_running[:-2] == ["run r1: 5 steps", f"... {n_more} lines more", *ended[n_more:]]
-    assert while_running[-2].startswith("plane: 0 %, starting, ")
-    assert kept == [
-        "run r1: 5 steps",
-        *([f"... {first_kept} line more"] if first_kept else []),
-        *ended[first_kept:],
-    ]
-
-
-def test_ipython_in_a_terminal_is_no_notebook(
-    outputs: list[list[str]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=SimpleNamespace))
-    assert type(make_progress(())) is not NotebookProgress
-    assert outputs == []
 
 
 # Work outside of cells ----------------------------------------------------------------------------
@@ -339,14 +292,6 @@ def test_a_run_takes_as_long_as_its_longest_cell_or_its_share_of_all(
     assert left_of_run(cells, 100.0, jobs=jobs) == text
 
 
-def test_forecasts_are_rounded_up_the_coarser_the_longer() -> None:
-    seconds = (0.0, 5.4, 5.6, 56.0, 60.0, 61.0, 600.0, 601.0)
-    assert [about(one) for one in seconds] == [
-        *("5 s", "5 s", "10 s", "1 min 00 s", "1 min 00 s", "1 min 10 s"),
-        *("10 min 00 s", "11 min 00 s"),
-    ]
-
-
 # Untrusted text -----------------------------------------------------------------------------------
 
 
@@ -363,13 +308,12 @@ def test_text_of_steps_is_shown_and_not_obeyed(capsys: pytest.CaptureFixture[str
         ),
         CellFinished(address=f"b {evil}", result=result, cached=False),
     ]
-    live = LiveProgress()
-    console = Console(file=io.StringIO(), width=200, height=40)
-    live.console = console
+    live = Progress()
+    console = live.console = Console(file=io.StringIO(), width=200, height=40)
     for event in events:
         live.take(event)
     console.print(live.table())
-    with PlainProgress() as progress:
+    with Progress() as progress:
         for event in events:
             progress.take(event)
     for text in (console.file.getvalue(), capsys.readouterr().err):  # type: ignore[attr-defined]

@@ -60,18 +60,6 @@ def test_a_run_shows_every_cell_and_every_warning(finished: tuple[Path, str, str
     assert said[-1].endswith("(2 of 2)")
 
 
-def test_a_finished_folder_holds_nothing_unfinished(finished: tuple[Path, str, str]) -> None:
-    folder = finished[0] / "good"
-    assert sorted(path.name for path in folder.iterdir()) == [
-        "figures",
-        "journal.jsonl",
-        "logs",
-        "products",
-        "report.html",
-        "run.h5",
-    ]
-
-
 def test_the_record_says_what_happened(finished: tuple[Path, str, str]) -> None:
     run = open_run(finished[0] / "good")
     assert run.record.status == "ok"
@@ -323,19 +311,6 @@ def test_a_reader_that_leaves_does_not_stop_the_run(tmp_path: Path) -> None:
     assert open_run(tmp_path / "r").record.status == "ok"
 
 
-def test_show_tells_cells_metrics_warnings_and_environment(
-    finished: tuple[Path, str, str],
-) -> None:
-    shown = orthoflow(finished[0], "show", "good").stdout
-    assert "2 steps, 2 ok" in shown.splitlines()[0]
-    assert "overrides: --set survey.offset_m=-3" in shown
-    assert "input number: not given" in shown
-    assert "warning, survey: the plane lies behind the viewer" in shown
-    assert ["survey", "offset_m", "-3", "m"] in [line.split() for line in shown.splitlines()]
-    assert "environment: Python " in shown
-    assert "numpy " in shown
-
-
 def test_show_gives_json(finished: tuple[Path, str, str]) -> None:
     answer = json.loads(orthoflow(finished[0], "show", "good/run.h5", "--json").stdout)
     assert [cell["address"] for cell in answer["cells"]] == ["survey", "paint"]
@@ -376,19 +351,6 @@ def test_a_missing_run_ends_with_2(tmp_path: Path, verb: str) -> None:
     done = orthoflow(tmp_path, verb, "nowhere")
     assert done.returncode == 2
     assert done.stderr == "error: nowhere does not exist; give a run folder or its run.h5\n"
-
-
-def test_report_writes_one_page_for_several_runs(finished: tuple[Path, str, str]) -> None:
-    folder = finished[0]
-    refused = orthoflow(folder, "report", "good", "good")
-    assert refused.returncode == 2
-    assert "2 runs were given: give -o FILE, where their common report goes" in refused.stderr
-    done = orthoflow(folder, "report", "good", "good", "-o", "both.html")
-    assert (done.returncode, done.stdout) == (0, "report: both.html\n")
-    assert (folder / "both.html").read_text(encoding="utf-8").startswith("<!")
-    nowhere = orthoflow(folder, "report", "good", "-o", "none/both.html")
-    assert nowhere.returncode == 2
-    assert "none does not exist: make the folder, or choose another" in nowhere.stderr
 
 
 def test_plan_says_what_is_cached_and_what_changed(finished: tuple[Path, str, str]) -> None:

@@ -8,19 +8,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import h5py
-import pytest
 from orthoflow_provenance.record import open_record
 
 from orthoflow.cli.plan import _as_json, _summary
-from orthoflow.cli.verify import _summary as verified
-from orthoflow.engine import cleaning
-from orthoflow.engine.cleaning import GarbageReport
-from orthoflow.engine.store import Store
-from orthoflow.records.verification import Verification
 from tests.provenance_records import write_sample
 from tests.studios import said
-
-KIB = 1024
 
 
 def test_a_run_is_shown_completely(tmp_path: Path) -> None:
@@ -106,49 +98,6 @@ def test_who_shows_a_record_that_was_changed_says_so(tmp_path: Path) -> None:
     (row,) = json.loads(said("runs", tmp_path, "--json"))
     assert (row["status"], row["metrics"]) == ("damaged", {})
     assert row["reason"] == doubt.removesuffix("; ")
-
-
-@pytest.mark.parametrize(
-    ("n_inputs", "n_published", "words"),
-    [
-        (0, 0, "3 products, seal ok"),
-        (1, 0, "3 products, 1 input file, seal ok"),
-        (0, 1, "3 products, seal ok, 1 published file unchanged"),
-        (2, 2, "3 products, 2 input files, seal ok, 2 published files unchanged"),
-    ],
-)
-def test_what_was_verified_is_counted(n_inputs: int, n_published: int, words: str) -> None:
-    found = Verification(
-        path=Path("run.h5"),
-        findings=(),
-        notes=(),
-        n_products=3,
-        n_inputs=n_inputs,
-        n_published=n_published,
-    )
-    assert verified(found) == f"verified: {words}"
-
-
-def test_garbage_is_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    asked: list[tuple[Any, ...]] = []
-
-    def collect(store: Store, *, older_than_days: float | None, dry_run: bool) -> object:
-        asked.append((store.folder, older_than_days, dry_run))
-        return GarbageReport(n_results=1, n_objects=2, n_damaged=0, freed_bytes=1536)
-
-    monkeypatch.setattr(cleaning, "collect_garbage", collect)
-    store = ("--store", tmp_path)
-    assert said("cache", "gc", *store) == "removed 1 result and 2 objects, 1.5 KiB\n"
-    dry = said("cache", "gc", *store, "--dry-run", "--older-than", "2.5")
-    assert dry == "would remove 1 result and 2 objects, 1.5 KiB\n"
-    assert json.loads(said("cache", "gc", *store, "--json")) == {
-        "dry_run": False,
-        "n_results": 1,
-        "n_objects": 2,
-        "n_damaged": 0,
-        "freed_bytes": 1536,
-    }
-    assert asked == [(tmp_path, None, False), (tmp_path, 2.5, True), (tmp_path, None, False)]
 
 
 def planned(status: str, *, key: object = None) -> Any:

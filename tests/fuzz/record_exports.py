@@ -70,7 +70,6 @@ COMMANDS: Final[Sequence[Command]] = (
     ("report", "-o", "out/report.html"),
     ("show",),
     ("runs",),
-    ("runs", "--csv"),
     ("runs", "--json"),
 )
 

@@ -68,14 +68,6 @@ def test_a_new_plugin_of_every_kind_loads_and_its_comparison_is_valid(
         assert f"`{kind}: {{use: {project.method_id}}}`" in told
 
 
-def test_a_new_detector_is_compared_by_the_planes_that_it_finds(tmp_path: Path) -> None:
-    write_project(Project(name="my-finder", kind="plane"), tmp_path, discover_catalog())
-    text = (tmp_path / "my-finder" / "compare.yaml").read_text(encoding="utf-8")
-    compared = YAML(typ="safe").load(text)["compare"]["metrics"]
-    assert compared[:2] == ["check.true_planes_found", "check.label_iou_mean"]
-    assert "ctx.figure(" in (tmp_path / "my-finder" / "my_finder" / "method.py").read_text()
-
-
 @pytest.mark.parametrize("kind", ["simulate"])
 def test_a_new_plugin_passes_the_suite_as_it_is(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -236,22 +228,6 @@ def test_a_new_kind_that_cannot_be_is_refused(
     with pytest.raises(ArgumentError, match=sentence):
         write_project(project, tmp_path, discover_catalog())
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        ([], "give --kind, the kind of the method"),
-        (["--new-kind", "part", "--gives", "a,b"], "of a and b no plugin has a product type"),
-        (["--new-kind", "part", "--gives", "truth"], "no installed method makes truth of cloud"),
-        (["--kind", "plane", "--new-kind", "part"], "exclude each other: omit one of them"),
-    ],
-)
-def test_a_kind_or_a_new_one_is_asked_for(arguments: list[str], said: str, tmp_path: Path) -> None:
-    asked = ["plugins", "new", "mine", "--folder", str(tmp_path), *arguments]
-    result = CliRunner().invoke(program, asked)
-    assert result.exit_code == 2
-    assert said in " ".join(result.output.split())
 
 
 @pytest.mark.parametrize(

@@ -9,41 +9,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from orthoflow.errors import ProductError
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext, StepEvent
 from orthoflow.sdk.context import Drawing
-from orthoflow.sdk.lines import is_name, one_line
 
 SVG = b'<svg xmlns="http://www.w3.org/2000/svg"/>'
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(20)
-WEBP = b"RIFF\x10\x00\x00\x00WEBPVP8 "
 
 
 def context(folder: Path, heard: list[StepEvent] | None = None) -> StepContext:
     listen = (lambda event: None) if heard is None else heard.append
     return StepContext(rng=np.random.default_rng(1), cores=1, scratch=folder, listen=listen)
-
-
-@pytest.mark.parametrize(
-    ("content", "suffix", "media_type"),
-    [
-        (PNG, ".png", "image/png"),
-        (WEBP, ".webp", "image/webp"),
-        (SVG, ".svg", "image/svg+xml"),
-    ],
-    ids=["PNG", "WebP", "SVG"],
-)
-def test_a_picture_is_kept_by_its_kind(
-    tmp_path: Path, content: bytes, suffix: str, media_type: str
-) -> None:
-    ctx = context(tmp_path)
-    ctx.figure("wall_0", content, "A wall.")
-    (figure,) = ctx.figures
-    assert (figure.name, figure.caption, figure.media_type) == ("wall_0", "A wall.", media_type)
-    assert figure.path == tmp_path / "figures" / f"wall_0{suffix}"
-    assert figure.path.read_bytes() == content
 
 
 @pytest.mark.parametrize("name", ["../x", "/tmp/x", "..", "", "nul", "a\nb", "x" * 253, "x" * 300])
@@ -71,17 +48,6 @@ def test_what_is_no_picture_is_refused_where_it_is_drawn(tmp_path: Path, content
     assert (ctx.figures, list(tmp_path.rglob("*.svg"))) == ([], [])
 
 
-@pytest.mark.parametrize("name", ["my figure!", "rms mm", "a+b", "50%"])
-def test_names_have_letters_that_addresses_and_patterns_have(tmp_path: Path, name: str) -> None:
-    ctx = context(tmp_path)
-    with pytest.raises(ProductError, match=r"^the name of a figure has letters, digits"):
-        ctx.figure(name, PNG)
-    with pytest.raises(ProductError, match=r"^the name of a metric has letters, digits"):
-        ctx.metric(name, 1.0, "mm")
-    ctx.metric("höhe_1.5-mm", 1.0, "mm")
-    ctx.figure("höhe_1.5-mm", PNG)
-
-
 def test_two_pictures_have_names_that_differ_everywhere(tmp_path: Path) -> None:
     ctx = context(tmp_path)
     ctx.figure("depth", PNG)
@@ -89,15 +55,6 @@ def test_two_pictures_have_names_that_differ_everywhere(tmp_path: Path) -> None:
         with pytest.raises(ProductError, match=f"figure {name} was drawn twice"):
             ctx.figure(name, content)
     assert [figure.path.name for figure in ctx.figures] == ["depth.png"]
-
-
-@pytest.mark.usefixtures("charts")
-def test_a_chart_is_drawn_as_png(tmp_path: Path) -> None:
-    ctx = context(tmp_path)
-    ctx.figure("chart", Figure(figsize=(1, 1), dpi=20))
-    (figure,) = ctx.figures
-    assert figure.media_type == "image/png"
-    assert figure.path.read_bytes().startswith(b"\x89PNG")
 
 
 def test_lines_and_fractions_are_heard_in_order(tmp_path: Path) -> None:
@@ -248,16 +205,6 @@ def test_a_figure_may_have_64_mebibytes(tmp_path: Path) -> None:
     assert [figure.name for figure in ctx.figures] == ["largest"]
 
 
-def test_a_name_has_two_hundred_bytes_at_most() -> None:
-    names = ["n" * 200, "n" * 201, "ä" * 100, "ä" * 101]
-    assert [is_name(name) for name in names] == [True, False, True, False]
-
-
-def test_a_line_has_two_thousand_letters_and_tells_of_the_rest() -> None:
-    assert one_line("x" * 2000) == "x" * 2000
-    assert one_line("x" * 2001) == f"{'x' * 2000}... (2001 characters)"
-
-
 class LeadsElsewhere:
     def savefig(self, path: Path) -> None:
         path.symlink_to(__file__)
@@ -272,36 +219,6 @@ class Giant:
     def savefig(self, path: Path) -> None:
         with path.open("wb") as file:
             file.truncate(1 << 40)
-
-
-class NoPicture:
-    def savefig(self, path: Path) -> None:
-        path.write_bytes(b"no picture")
-
-
-def test_a_picture_is_asked_for_where_figures_are_wanted_alone(
-    tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
-    asked = []
-
-    def picture() -> bytes:
-        asked.append(1)
-        return PNG
-
-    ctx = context(tmp_path)
-    ctx.figure("undrawn", picture)
-    assert asked == []
-    request.getfixturevalue("charts")
-    ctx.figure("drawn", picture)
-    assert (asked, ctx.figures[1].path.read_bytes()) == ([1], PNG)
-    with pytest.raises(ProductError, match="figure other must be a PNG"):
-        ctx.figure("other", lambda: b"no picture")
-
-
-@pytest.mark.usefixtures("charts")
-def test_a_figure_that_writes_no_picture_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ProductError, match="figure chart must be a PNG"):
-        context(tmp_path).figure("chart", NoPicture())
 
 
 class Nothing:
@@ -327,18 +244,3 @@ def test_an_array_that_no_file_can_hold_is_refused(tmp_path: Path) -> None:
     for shape, dtype in [((4,), object), ((-4,), float)]:
         with pytest.raises(ProductError, match=r"^an array cannot be of type .* and shape "):
             ctx.allocate("numbers", "values", shape, dtype)
-
-
-def test_what_a_step_says_is_heard_line_by_line(tmp_path: Path) -> None:
-    heard: list[StepEvent] = []
-    ctx = context(tmp_path, heard)
-    ctx.log("one\ntwo")
-    ctx.warn(None)  # type: ignore[arg-type]
-    ctx.progress(float("nan"), "p" * (1 << 20))
-    assert [event.text for event in heard[:2]] == ["one two", "None"]
-    assert heard[2].fraction == 0.0
-    assert heard[2].text.endswith("p... (1048576 characters)")
-
-
-def test_nobody_ends_a_step_that_runs_alone(tmp_path: Path) -> None:
-    assert context(tmp_path).is_cancelled() is False

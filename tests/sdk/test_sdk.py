@@ -95,15 +95,6 @@ def test_warnings_are_collected_and_heard(tmp_path: Path) -> None:
     assert [event.diagnostic] == ctx.diagnostics
 
 
-def test_a_figure_from_bytes_is_kept_as_a_file(tmp_path: Path) -> None:
-    ctx = context(tmp_path)
-    ctx.figure("histogram", b"\x89PNG\r\n\x1a\n rest", "deviations")
-    assert ctx.figures[0].path.read_bytes() == b"\x89PNG\r\n\x1a\n rest"
-    assert ctx.figures[0].path.name == "histogram.png"
-    ctx.figure("photo", b"RIFF1234WEBP rest", "a photo")
-    assert ctx.figures[1].path.name == "photo.webp"
-
-
 class Damp(Method):
     metrics = (
         MetricSpec("n_*", label="damp patches"),

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import linecache
-from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
 from orthoflow.errors import MethodError, ProductError
-from orthoflow.products import PointLabels, Product
+from orthoflow.products import PointLabels
 from orthoflow.testing import cases as module
 from orthoflow.testing.examples import ExampleError
 
@@ -22,12 +21,6 @@ class Params(BaseModel):
 
     size_m: float
     count: int = 3
-
-
-class Other(BaseModel):
-    """What a method may check by itself."""
-
-    n: int
 
 
 class Toy:
@@ -86,35 +79,6 @@ def test_what_a_method_makes_is_not_valid_where_a_product_says_so() -> None:
     behind = caught.value.with_traceback(caught.tb.tb_next)
     assert failed(behind).startswith("what the method makes is not valid: ")
     assert " (test_cases.py:" in said
-
-
-def test_a_product_of_the_plugin_itself_is_not_taken_for_its_inputs() -> None:
-    @dataclass(frozen=True, kw_only=True)
-    class Own(Product):
-        def __post_init__(self) -> None:
-            raise ProductError("edges.share must have shape (2,), got (7,)")
-
-    with pytest.raises(ProductError) as caught:
-        Own()
-    said = failed(caught.value)
-    line = next(
-        k for k, text in enumerate(linecache.getlines(__file__), start=1) if text.strip() == "Own()"
-    )
-    assert said == (
-        "what the method makes is not valid: edges.share must have shape (2,), got (7,) "
-        f"(test_cases.py:{line})"
-    )
-
-
-def test_missing_and_wrong_parameters_are_named() -> None:
-    with pytest.raises(ValidationError) as caught:
-        Params(count="many")  # type: ignore[arg-type, call-arg]
-    said = failed(caught.value)
-    assert said.startswith("parameter size_m has no default; parameter count cannot be: ")
-    # Of another model it is an error like any other.
-    with pytest.raises(ValidationError) as caught:
-        Other(n="x")  # type: ignore[arg-type]
-    assert failed(caught.value).startswith("the method raised ValidationError")
 
 
 def test_a_missing_example_is_told_as_it_is() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from orthoflow.products import InputFiles, Photos, PointCloud, Truth, Walls
 from orthoflow.sdk import Method, Ports
@@ -14,7 +13,6 @@ from orthoflow.testing.examples import (
     example,
     example_inputs,
     example_room,
-    few_points,
 )
 
 SIZE_M = np.array([5.0, 3.6, 2.6])
@@ -61,37 +59,6 @@ def test_a_room_is_a_box_of_points_on_planes_that_are_known() -> None:
     np.testing.assert_array_equal(cloud.rgb, np.repeat(grey[:, None], 3, axis=1))
     np.testing.assert_allclose(cloud.intensity, grey / 255.0, rtol=1e-6)
     assert (grey.min(), grey.max()) == (60, 199)
-
-
-def test_a_room_that_is_turned_and_shifted_has_the_same_points() -> None:
-    shift = np.array([634512.347, 486215.781, 112.193])
-    turn = Rotation.from_euler("z", 33.0, degrees=True).as_matrix()
-    cloud, planes = example_room(n_points=600)
-    moved, found = example_room(n_points=600, turned_deg=33.0, shift_m=shift)
-    np.testing.assert_allclose(
-        moved.points_world(), cloud.points_world() @ turn.T + shift, atol=1e-6
-    )
-    np.testing.assert_allclose(found.normal, planes.normal @ turn.T, atol=1e-12)
-    np.testing.assert_allclose(found.corners, planes.corners @ turn.T + shift, atol=1e-9)
-    np.testing.assert_allclose(
-        found.offset, np.einsum("ij,ij->i", found.normal, found.corners[:, 0]), atol=1e-9
-    )
-    np.testing.assert_array_equal(moved.stations, shift[None])
-    other, _ = example_room(n_points=600, seed=2)
-    assert np.abs(other.points_world() - cloud.points_world()).max() > 0.1
-
-
-def test_a_few_points_have_all_that_a_cloud_may_have() -> None:
-    places = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
-    cloud = few_points(places)
-    np.testing.assert_array_equal(cloud.points_world(), places)
-    assert cloud.rgb is not None
-    assert cloud.intensity is not None
-    assert (cloud.rgb.shape, cloud.intensity.shape) == ((2, 3), (2,))
-    assert ((cloud.rgb > 0) & (cloud.rgb < 255)).all()
-    assert ((cloud.intensity > 0) & (cloud.intensity < 1)).all()
-    np.testing.assert_array_equal(cloud.stations, np.zeros((1, 3)))
-    assert len(few_points(np.zeros((0, 3)))) == 0
 
 
 def test_a_file_is_the_room_as_text() -> None:

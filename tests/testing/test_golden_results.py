@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar
 
-import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.products import Photo, Photos, Planes, Product
-from orthoflow.products.product import Tolerance
+from orthoflow.products import Planes, Product
 from orthoflow.sdk import Method, MethodParams, Ports
 from orthoflow.testing import golden
 from orthoflow.testing.examples import example_room
-from orthoflow.testing.golden import Sample, golden_problem, sample_of, sample_problem
-from orthoflow.testing.isolation import INSTRUCTION_SWITCHES
+from orthoflow.testing.golden import Sample, golden_problem, sample_problem
 from orthoflow.testing.trials import Trial
 
 
@@ -134,21 +129,6 @@ def test_what_other_bits_went_into_is_held_to_its_tolerances_alone(tmp_path: Pat
     assert file.read_text() == before
 
 
-def test_switched_off_instructions_are_another_environment(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    environment = golden._environment.__wrapped__
-    for name in INSTRUCTION_SWITCHES:
-        monkeypatch.delenv(name, raising=False)
-    here = environment()
-    assert environment() == here
-    seen = {here}
-    for name in INSTRUCTION_SWITCHES:
-        monkeypatch.setenv(name, "Nehalem")
-        seen.add(environment())
-    assert len(seen) == 1 + len(INSTRUCTION_SWITCHES)
-
-
 def test_an_output_that_appears_is_noticed(file: Path) -> None:
     problem = golden_problem(file, trial(), {"planes": planes(), "walls": planes()})
     assert problem.startswith("output walls is another one than golden.json has (one of them has")
@@ -161,73 +141,6 @@ def test_another_file_is_refused_in_a_sentence(tmp_path: Path) -> None:
         InputError, match=r"golden.json is not a file of golden results .*: remove it"
     ):
         golden_problem(path, trial(), {"planes": planes()})
-
-
-@dataclass(frozen=True, kw_only=True)
-class Picture(Product):
-    """A product of one raster."""
-
-    type_name = "picture"
-    tolerances: ClassVar[Mapping[str, Tolerance]] = {"rgb": Tolerance(limit=2, unit="grey")}
-    rgb: NDArray[np.uint8]
-
-
-def with_strays(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """One cell in a thousand of another colour, as where a rim falls to the other side."""
-    changed = rgb.copy()
-    changed.reshape(-1)[::1000] ^= 128
-    return changed
-
-
-@pytest.mark.parametrize(
-    ("change", "is_noticed"),
-    [
-        (lambda rgb: rgb, False),
-        (with_strays, False),
-        (lambda rgb: rgb + np.uint8(1), False),
-        (lambda rgb: rgb + np.uint8(5), True),
-        (lambda rgb: rgb[:, ::-1], True),
-        (lambda rgb: rgb[::-1], True),
-        (lambda rgb: rgb[..., ::-1], True),
-        (lambda rgb: np.roll(rgb, 1, axis=1), True),
-        (lambda rgb: rgb[:-1], True),
-    ],
-    ids=[
-        *("same", "stray cells", "within the tolerance", "brighter", "mirrored", "upside down"),
-        *("channels swapped", "a column beside", "a row less"),
-    ],
-)
-def test_a_sample_tells_a_picture_that_moved_from_noise(
-    change: Callable[[NDArray[np.uint8]], NDArray[np.uint8]], is_noticed: bool
-) -> None:
-    rgb = np.random.default_rng(3).integers(0, 250, (90, 120, 3)).astype(np.uint8)
-    before, after = (sample_of(Picture(rgb=image)) for image in (rgb, change(rgb)))
-    problem = sample_problem(before, after, Picture.tolerances)
-    assert bool(problem) == is_noticed, problem
-
-
-@pytest.mark.parametrize(
-    ("before", "after", "is_apart"),
-    [
-        (None, None, False),
-        (None, 1.0, True),
-        (1.0, None, True),
-        # An amount of 0.01 and a tenth of the larger: 1.01 / 0.9 is 1.122.
-        (1.0, 1.12, False),
-        (1.0, 1.125, True),
-        (1.125, 1.0, True),
-        (-1.0, -1.12, False),
-        (-1.125, -1.0, True),
-        (0.0, 0.01, False),
-        (0.0, 0.012, True),
-        (0.5, -0.5, True),
-    ],
-)
-def test_numbers_are_apart_beyond_an_amount_and_a_share(
-    before: float | None, after: float | None, is_apart: bool
-) -> None:
-    limit = golden._Limit(amount=0.01, share=0.1)
-    assert golden._is_apart(before, after, limit) is is_apart
 
 
 @pytest.mark.parametrize(("factor", "is_noticed"), [(0.9, False), (1.2, True)])
@@ -246,50 +159,7 @@ def test_one_of_sixteen_sampled_values_may_stray(n_moved: int, is_noticed: bool)
     assert bool(sample_problem(*pair, {})) is is_noticed
 
 
-def test_a_sample_has_thirty_two_numbers_of_nine_digits_and_no_bytes() -> None:
-    few = golden._sample(np.arange(32.0) / 3.0)
-    assert few.values == [float(f"{value / 3.0:.9g}") for value in range(32)]
-    many = golden._sample(np.arange(1000.0).reshape(10, 100))
-    assert list(many.shape) == [10, 100]
-    # All over the array, and none twice.
-    assert len(set(many.values)) == len(many.values) == 32
-    assert min(filter(None, many.values)) < 100.0
-    assert max(filter(None, many.values)) > 900.0
-    assert golden._sample(np.array([1.0, np.nan, np.inf])).values == [1.0, None, None]
-    photo = Photo(name="a.png", encoded=b"picture", width=4, height=3)
-    sample = sample_of(Photos(photos=(photo,)))
-    assert not any("encoded" in name for name in sample)
-    # Whether something is so is no number.
-    stated = {"a": [1, {"b": 2.5, "c": True, "d": "x"}], "e": None}
-    assert list(golden._numbers(stated)) == [1.0, 2.5]
-
-
-def test_the_order_of_parameters_and_of_methods_is_none(tmp_path: Path) -> None:
-    class Yours(Mine):
-        id = "plane.yours"
-
-    texts = set()
-    for order in ((Mine, Yours), (Yours, Mine)):
-        path = tmp_path / f"{order[0].id}.json"
-        for method in order:
-            assert golden_problem(path, trial(method, a=1, b=2), {"planes": planes()}) == ""
-        texts.add(path.read_text())
-        turned = golden_problem(path, trial(b=2, a=1), {"planes": planes(0.1)})
-        assert "is another one than" in turned
-    assert len(texts) == 1
-
-
 def test_an_array_that_only_one_of_two_samples_has_is_named() -> None:
     one = Sample(shape=[1], values=[2.0])
     for pair in (({"a": one}, {"a": one, "b": one}), ({"b": one, "a": one}, {"a": one})):
         assert sample_problem(*pair, {}) == "only one of them has b"
-
-
-@pytest.mark.parametrize(
-    ("after", "is_noticed"), [(0.0758759669, False), (0.0789, True), (-0.0759018587, True)]
-)
-def test_numbers_of_the_metadata_may_differ_by_a_hundredth(after: float, is_noticed: bool) -> None:
-    before, now = (
-        {"metadata": Sample(shape=[1], values=[value])} for value in (0.0759018587, after)
-    )
-    assert bool(sample_problem(before, now, {})) == is_noticed

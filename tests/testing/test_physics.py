@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from orthoflow.products import Layer, LayerMask, Layers, Orthoimages, OrthoMask, Planes
+from orthoflow.products import Layer, LayerMask, Orthoimages, OrthoMask, Planes
 from orthoflow.testing import photographed, physics
 from orthoflow.testing.examples import example_room
 from tests import samples
@@ -40,18 +40,6 @@ def test_planes_may_be_a_fiftieth_of_a_degree_off(
         physics._match_planes(found, truth)
         return
     with pytest.raises(AssertionError, match=r"plane 0 of a moved room is 0\.030 deg and 0\.00 mm"):
-        physics._match_planes(found, truth)
-
-
-@pytest.mark.parametrize(("shift_m", "fits"), [(0.0008, True), (0.0015, False)])
-def test_planes_may_be_a_millimetre_off(truth: Planes, shift_m: float, fits: bool) -> None:
-    moved = truth.offset.copy()
-    moved[1] -= shift_m
-    found = replace(truth, offset=moved)
-    if fits:
-        physics._match_planes(found, truth)
-        return
-    with pytest.raises(AssertionError, match=r"plane 1 of a moved room is 0\.000 deg and 1\.50 mm"):
         physics._match_planes(found, truth)
 
 
@@ -111,20 +99,6 @@ def judge(image: Layer) -> None:
 
 
 @pytest.mark.parametrize(
-    "image",
-    [
-        layer(),
-        layer(columns=0.15, rows=-0.15),
-        layer(share=0.35),
-        layer(lighter=12),
-    ],
-    ids=["true", "a-little-shifted", "a-third", "a-little-lighter"],
-)
-def test_cells_that_show_their_place_pass(image: Layer) -> None:
-    judge(image)
-
-
-@pytest.mark.parametrize(
     ("image", "message"),
     [
         (
@@ -162,28 +136,3 @@ def test_a_mosaic_paints_what_its_layers_show(hidden: float, passes: bool) -> No
         return
     with pytest.raises(AssertionError, match=r"wall 0 at 0\.006 m: 95% of the cells are painted"):
         physics.mosaics_show_cells_in_place(subject)
-
-
-def test_the_two_halves_of_a_wall_overlap_in_its_middle_fifth() -> None:
-    left, right = physics._two_halves(photographed.photographed_scene(0.01)).layers
-    painted = [each.mask[0] == LayerMask.PAINTED for each in (left, right)]
-    assert [each.sum() for each in painted] == [180, 179]
-    assert (painted[0] & painted[1]).sum() == 59
-    assert (painted[0] | painted[1]).all()
-    np.testing.assert_array_equal(left.quality[0], painted[0])
-    assert not left.rgb[:, ~painted[0]].any()
-
-
-def test_without_a_result_there_is_nothing_in_place() -> None:
-    from orthoflow_plugins.mosaic.seams import MosaicSeams
-    from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
-
-    empty = SimpleNamespace(
-        outputs={"layers": Layers(layers=()), "orthoimages": Orthoimages(images=())}
-    )
-    ortho: Any = SimpleNamespace(method=PointcloudDirect, run_on=lambda _name, **_: empty)
-    with pytest.raises(AssertionError, match="no layer was made"):
-        physics.cells_show_their_own_place(ortho)
-    mosaic: Any = SimpleNamespace(method=MosaicSeams, run_on=lambda _name, **_: empty)
-    with pytest.raises(AssertionError, match="no orthoimage was made"):
-        physics.mosaics_show_cells_in_place(mosaic)

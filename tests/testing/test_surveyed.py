@@ -9,34 +9,21 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from orthoflow.engine.store import digest_of
 from orthoflow.geometry import Plane
 from orthoflow.products import (
-    Calibration,
-    CheckPoints,
-    Intrinsics,
-    LayerMask,
-    Layers,
-    Openings,
-    Orthoimages,
-    OrthoMask,
-    OutlineSource,
     Planes,
     PointCloud,
     PointLabels,
-    SurfaceMask,
     Truth,
     Walls,
 )
 from orthoflow.testing.examples import example
 from orthoflow.testing.photographed import (
     PHOTOGRAPHED,
-    photographed_scene,
-    photographing_cameras,
 )
-from orthoflow.testing.surveyed import SURVEYED, settled
+from orthoflow.testing.surveyed import SURVEYED
 
 _DIGESTS = """
 import json
@@ -82,54 +69,6 @@ def test_golden_results_are_of_these_examples() -> None:
             assert (port, digest_of(makers[port]())) in recorded, (scene, port)
 
 
-def test_the_opening_is_the_void_of_the_main_wall() -> None:
-    walls, openings = example("walls"), example("openings")
-    assert isinstance(walls, Walls)
-    assert isinstance(openings, Openings)
-    wall, (opening,) = walls.walls[0], openings.openings
-    frame = wall.frame
-    rows, columns = np.nonzero(wall.mask == SurfaceMask.VOID)
-    low = np.array([columns.min(), rows.min()])
-    high = np.array([columns.max(), rows.max()]) + 1
-    cells = np.array([[low[0], low[1]], [low[0], high[1]], [high[0], high[1]], [high[0], low[1]]])
-    np.testing.assert_allclose(frame.wall_from_world(opening.outline_world)[:, :2], cells)
-    # Metres from the upper left corner, upwards.
-    np.testing.assert_allclose(opening.outline_m, frame.gsd_m * cells * [1, -1])
-    assert opening.area_m2 == pytest.approx(frame.gsd_m**2 * len(rows))
-    assert (opening.width_m, opening.height_m) == pytest.approx(frame.gsd_m * (high - low))
-    assert opening.sill_m == pytest.approx(frame.gsd_m * (frame.height - high[1]))
-    assert (opening.wall, openings.walls) == (wall.plane_index, (wall.plane_index,))
-    assert set(opening.side_source) == {OutlineSource.DEPTH}
-    assert len(set(opening.side_sigma_m)) == 1
-    assert 0.0 < opening.side_sigma_m[0] < frame.gsd_m
-    assert (opening.depth_m, opening.seen_share) == (None, 1.0)
-
-
-def test_the_lens_and_the_check_points_are_those_of_the_photographed_wall() -> None:
-    calibration, checks = PHOTOGRAPHED["calibration"](), PHOTOGRAPHED["checkpoints"]()
-    assert isinstance(calibration, Calibration)
-    assert isinstance(checks, CheckPoints)
-    first = photographing_cameras()["a.png"]
-    assert (calibration.patterns, calibration.intrinsics) == (("*",), (Intrinsics.of(first),))
-    frame = photographed_scene().frame
-    assert (len(set(checks.names)), set(checks.classes)) == (5, {"flat"})
-    assert not checks.wall.any()
-    places = frame.wall_from_world(checks.points_world)
-    np.testing.assert_allclose(places[:, :2], checks.pixels_wall)
-    np.testing.assert_allclose(places[:, 2], 0.0, atol=1e-12)
-    # All over the wall, and within it.
-    assert (checks.pixels_wall > 0).all()
-    assert (checks.pixels_wall < [frame.width, frame.height]).all()
-    assert (np.ptp(checks.pixels_wall, axis=0) > 0.6 * np.array([frame.width, frame.height])).all()
-
-
-@pytest.mark.parametrize("noise", [1e-16, -3e-13])
-def test_settled_numbers_lose_rounding_errors_and_the_sign_of_zero(noise: float) -> None:
-    exact = np.array([0.0, 1.25, -2.4, 0.978052255])
-    assert settled(exact + noise).tobytes() == settled(exact).tobytes() == exact.tobytes()
-    assert not np.signbit(settled(np.array([-1e-15]))[0])
-
-
 def test_the_rasters_lie_on_the_planes_that_the_cloud_shows() -> None:
     planes, walls, cloud = example("planes"), example("walls"), example("cloud")
     labels, truth = example("labels"), example("truth")
@@ -151,69 +90,3 @@ def test_the_rasters_lie_on_the_planes_that_the_cloud_shows() -> None:
         cells = wall.frame.wall_from_world(points[on_plane])[:, :2]
         assert (cells > -1.0).all()
         assert (cells < [wall.frame.width + 1.0, wall.frame.height + 1.0]).all()
-
-
-def test_every_state_of_a_cell_occurs() -> None:
-    walls, layers, orthoimages = example("walls"), example("layers"), example("orthoimages")
-    assert isinstance(walls, Walls)
-    assert isinstance(layers, Layers)
-    assert isinstance(orthoimages, Orthoimages)
-    for wall in walls.walls:
-        assert set(np.unique(wall.mask)) == set(SurfaceMask)
-        void = wall.mask == SurfaceMask.VOID
-        np.testing.assert_array_equal(np.isnan(wall.depth_m), void)
-        assert wall.intensity is not None
-        np.testing.assert_array_equal(np.isnan(wall.intensity), void)
-        np.testing.assert_array_equal(wall.count > 0, wall.mask == SurfaceMask.MEASURED)
-    for layer in layers.layers:
-        assert set(np.unique(layer.mask)) == set(LayerMask)
-        painted = layer.mask == LayerMask.PAINTED
-        np.testing.assert_array_equal(layer.quality > 0.0, painted)
-        assert layer.filled is not None
-        assert layer.filled.any()
-        assert painted[layer.filled > 0].all()
-        assert not layer.rgb[~painted].any()
-    for index, image in enumerate(orthoimages.images):
-        assert set(np.unique(image.mask)) == set(OrthoMask) - {
-            OrthoMask.NONE,
-            OrthoMask.CONTRADICTED,
-        }
-        left, right = layers.layers[2 * index : 2 * index + 2]
-        for place, layer in enumerate((left, right)):
-            shown = image.source == place
-            np.testing.assert_array_equal(image.rgb[shown], layer.rgb[shown])
-            assert (layer.mask[shown] == LayerMask.PAINTED).all()
-        # The better of the two; where neither sees anything, one row of four is grey.
-        seen = (left.mask == LayerMask.PAINTED) | (right.mask == LayerMask.PAINTED)
-        np.testing.assert_array_equal(image.mask == OrthoMask.PAINTED, seen)
-        np.testing.assert_array_equal(image.source >= 0, seen)
-        np.testing.assert_array_equal(image.source == 1, right.quality > left.quality)
-        filled = image.mask == OrthoMask.FILLED
-        hidden = (left.mask == LayerMask.OCCLUDED) & ~seen
-        np.testing.assert_array_equal(filled | (image.mask == OrthoMask.OCCLUDED), hidden)
-        assert {*np.flatnonzero(filled.any(axis=1))} == {
-            row for row in np.flatnonzero(hidden.any(axis=1)) if row % 4 == 0
-        }
-        assert (image.rgb[filled] == 128).all()
-        assert image.sources == (left.source, right.source) == ("left.jpg", "right.jpg")
-
-
-def test_walls_are_stained_smoothly_from_dark_to_light() -> None:
-    walls = example("walls")
-    assert isinstance(walls, Walls)
-    for wall in walls.walls:
-        assert wall.intensity is not None
-        grey = 256.0 * wall.intensity.astype(np.float64)
-        known = np.isfinite(grey)
-        assert np.nanmin(grey) >= 40.0
-        assert np.nanmax(grey) <= 215.0
-        assert np.nanstd(grey) > 20.0
-        # Straight between places eight cells apart: nowhere steeper than that and bent only there.
-        for axis in (0, 1):
-            assert np.nanmax(abs(np.diff(grey, axis=axis))) <= 175.0 / 8.0 + 1e-3
-            bend = abs(np.diff(grey, n=2, axis=axis))
-            lines = np.moveaxis(bend, axis, 0)
-            at_places = (np.arange(len(lines)) + 1) % 8 == 0
-            assert np.nanmax(lines[~at_places]) < 1e-3
-            assert np.nanmax(lines[at_places]) > 1.0
-        assert known.any()

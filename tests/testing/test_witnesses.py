@@ -54,14 +54,6 @@ def test_inputs_that_a_method_changed_are_as_before_for_the_next_one() -> None:
     assert digest_of(cloud) == before
 
 
-def test_they_are_also_where_the_method_fails() -> None:
-    cloud, _ = example_room(n_points=1000)
-    before = digest_of(cloud)
-    with pytest.raises(ValueError, match="no wall"):
-        _ = Witness(Trial(method=Meddling, inputs={"cloud": cloud}, params={"fails": True})).first
-    assert digest_of(cloud) == before
-
-
 def test_drawing_from_numpys_own_generator_is_seen() -> None:
     class Dicing(Meddling):
         id = "plane.dicing"

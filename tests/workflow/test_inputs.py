@@ -101,26 +101,11 @@ def test_missing_files_are_one_sentence(
         names(project, catalog, spec)
 
 
-def test_input_options_replace_the_files_and_start_from_the_working_directory(
-    project: Path, catalog: Catalog
-) -> None:
-    spec = "{files: photos/a.jpg}"
-    assert names(project, catalog, spec, "photos=mine.jpg") == ["mine.jpg"]
-    both = names(project, catalog, spec, "photos=mine.jpg", f"photos={project}/photos/b.jpg")
-    assert both == ["b.jpg", "mine.jpg"]
-    assert names(project, catalog, "{optional: true}", "photos=*.jpg") == ["mine.jpg"]
-
-
 def test_an_input_option_must_exist_even_when_the_input_is_optional(
     project: Path, catalog: Catalog
 ) -> None:
     with pytest.raises(InputError, match=r"there is no file a\.jpg in the working directory"):
         names(project, catalog, "{optional: true}", "photos=a.jpg")
-
-
-def test_a_link_keeps_its_own_name(project: Path, catalog: Catalog) -> None:
-    (project / "photos" / "deep" / "link.jpg").symlink_to(project / "photos" / "a.jpg")
-    assert names(project, catalog, "{files: photos/deep}") == ["c.jpg", "link.jpg"]
 
 
 def test_a_pattern_matches_what_glob_matches(
@@ -141,11 +126,6 @@ def test_a_pattern_matches_what_glob_matches(
         assert found is not None
         assert sorted(set(found)) == expected, pattern
         assert expected, pattern
-
-
-def test_a_folder_named_with_brackets_is_looked_into(project: Path, catalog: Catalog) -> None:
-    folder = project.rename(project.with_name("scans [1]"))
-    assert names(folder, catalog, "{files: photos/*.jpg}") == ["[1].jpg", "a.jpg", "b.jpg"]
 
 
 @pytest.mark.parametrize("pattern", ["photos", "photos/*.jpg", "**/*.e57", "**/**/**/*"])

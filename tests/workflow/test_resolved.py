@@ -62,40 +62,6 @@ def changed(change: Callable[[dict[str, object]], object]) -> str:
     return json.dumps(document)
 
 
-@pytest.mark.parametrize(
-    ("text", "sentence"),
-    [
-        ("not JSON", r"the resolved workflow cannot be read: : Invalid JSON"),
-        ("[]", r"the resolved workflow cannot be read: : Input should be an object"),
-        ("{}", r"the resolved workflow cannot be read: orthoflow: Field required"),
-        (
-            changed(lambda document: document.update(orthoflow=2)),
-            r"the resolved workflow cannot be read: orthoflow: Input should be 1",
-        ),
-        (
-            changed(lambda document: document.pop("seed")),
-            r"the resolved workflow cannot be read: seed: Field required",
-        ),
-        (
-            changed(lambda document: document.update(steps=[])),
-            r"the resolved workflow cannot be read: steps: Input should be an object",
-        ),
-        (
-            changed(
-                lambda document: [
-                    step["variants"][0].pop("repeat") for step in document["steps"].values()
-                ]
-            ),
-            r"the resolved workflow cannot be read: steps\..*\.repeat: Field required",
-        ),
-    ],
-    ids=["text", "list", "empty", "newer", "no seed", "steps are a list", "no repeat"],
-)
-def test_other_text_is_refused_in_a_sentence(text: str, sentence: str) -> None:
-    with pytest.raises(WorkflowError, match=sentence):
-        workflow_from_resolved(text, "")
-
-
 def _first(document: Any, key: str) -> Any:
     return next(iter(document[key].values()))
 

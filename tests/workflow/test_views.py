@@ -54,42 +54,6 @@ def test_the_resolved_workflow_is_canonical_json_without_paths_of_this_machine(
     assert document["compare"]["exclude"] == [{"plane": "ransac", "orient": "pnp"}]
 
 
-def test_the_schema_accepts_what_the_reader_accepts(catalog: Catalog) -> None:
-    schema = workflow_schema(catalog)
-    jsonschema.Draft202012Validator.check_schema(schema)
-    document = YAML(typ="safe", pure=True).load(GOOD)
-    assert not list(jsonschema.Draft202012Validator(schema).iter_errors(document))
-
-
-@pytest.mark.parametrize(
-    ("before", "after"),
-    [
-        ("seed:", "sede:"),
-        ("orthoflow: 1", "orthoflow: 2"),
-        ("cell_m: 0.02", "cell_m: -1"),
-        ("cell_m: 0.02", 'cell_m: "0.02"'),
-        ("cell_m: 0.02", "limits: {low: 1}"),
-        ("gsd_m: 1", "gds_m: 1"),
-        ("use: plane.hough2d", "use: plane.hugh2d"),
-        ("use: raster.grid", "use: raster.gird"),
-        ("use: orient.pnp,", "variants: {},"),
-        ("timeout: 30min", "timeout: soon"),
-        ("cores: 2", "cores: none"),
-        ("repeat: 10", "repeat: 0"),
-        ("optional: true", "optional: perhaps"),
-        ("planes: plane.planes", "planes: planes"),
-        ("design: product", "design: everything"),
-        ("  ties: ", "  Ties: "),
-        ("  shots: ", "  inputs: "),
-    ],
-)
-def test_the_schema_refuses_mistakes_of_form(before: str, after: str, catalog: Catalog) -> None:
-    assert before in GOOD
-    document = YAML(typ="safe", pure=True).load(GOOD.replace(before, after, 1))
-    validator = jsonschema.Draft202012Validator(workflow_schema(catalog))
-    assert list(validator.iter_errors(document))
-
-
 def test_the_schema_carries_descriptions_and_leaves_out_what_cannot_be_loaded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -140,18 +104,6 @@ steps:
     )
 
 
-def test_mermaid_counts_the_datasets_of_an_input(catalog: Catalog, write: Path) -> None:
-    text = """\
-orthoflow: 1
-inputs: {scan: {optional: true}, photos: {files: photos}}
-steps: {cloud: {use: read.scan, in: {files: inputs.scan}}}
-datasets: {hall: {scan: hall.e57}, court: {scan: court.e57}}
-"""
-    assert mermaid(load(text, write, catalog), catalog).splitlines()[1:3] == [
-        *('    input0[/"scan<br/>of 2 datasets"/]', '    input1[/"photos"/]'),
-    ]
-
-
 @pytest.mark.parametrize("name", ["direct", "direct.yaml", "workflows/direct.yaml"])
 def test_a_shipped_recipe_is_found_from_anywhere(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -160,11 +112,6 @@ def test_a_shipped_recipe_is_found_from_anywhere(
     path = shipped_workflow(name)
     assert path == shipped_workflows()["direct"]
     assert path.read_text(encoding="utf-8").count("name: direct") == 1
-
-
-def test_a_file_of_that_name_comes_before_the_recipe(catalog: Catalog, write: Path) -> None:
-    write.with_name("direct").write_text(GOOD)
-    assert load_workflow("direct", catalog).name == "palace-room"
 
 
 # --- the reference of the format ---
@@ -219,18 +166,3 @@ def test_reader_and_schema_refuse_the_same_steps(
     document = YAML(typ="safe", pure=True).load(text)
     validator = jsonschema.Draft202012Validator(workflow_schema(catalog))
     assert list(validator.iter_errors(document))
-
-
-@pytest.mark.parametrize("metrics", ["a.n_points", "[]", "[a]", "['a.*', '*.wall_s']"])
-def test_reader_and_schema_agree_on_metrics(metrics: str, catalog: Catalog, tmp_path: Path) -> None:
-    text = f"orthoflow: 1\nsteps: {{a: {{use: simulate.room}}}}\ncompare: {{metrics: {metrics}}}\n"
-    path = tmp_path / "flow.yaml"
-    path.write_text(text, encoding="utf-8")
-    document = YAML(typ="safe", pure=True).load(text)
-    is_valid = jsonschema.Draft202012Validator(workflow_schema(catalog)).is_valid(document)
-    try:
-        load_workflow(path, catalog)
-    except InvalidWorkflowError:
-        assert not is_valid
-    else:
-        assert is_valid
