@@ -325,49 +325,6 @@ def test_a_list_of_cameras_is_one_by_its_columns_and_its_ending(tmp_path: Path) 
     assert one(tmp_path / "cameras.txt", text).kind == "unknown"
 
 
-<<<<<<< HEAD
-def test_what_cannot_be_read_is_told_in_one_line(tmp_path: Path) -> None:
-    broken = one(tmp_path / "lens.yaml", "cameras: {a.jpg: {width: x}, b.jpg: {}}")
-    assert broken.kind == "unknown"
-    assert "\n" not in broken.summary
-    assert "lens.yaml" in broken.summary
-    cameras = one(tmp_path / "cameras.json", json.dumps({"cameras": 5}))
-    assert cameras.kind == "unknown"
-    assert "cameras.json" in cameras.summary
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "said"),
-    [
-        (
-            "points.csv",
-            "name;x;y;z\nA;1,5;2;3\n",
-            "points.csv:2: x must be a number, got 1,5; write a decimal point",
-        ),
-        ("points.txt", "Name,X,Y,Z\nA,1,2\n", "points.txt:2: expected 4 columns, got 3"),
-        (
-            "ties.csv",
-            "photo,u_px,v_px,x,y,z\na.jpg,1,2,3,4,five\n",
-            "ties.csv:2: z must be a number, got five",
-        ),
-        ("mine.yaml", "orthoflow: 1\nsteps:\n  a: {use: read.scan}\n", "is a workflow itself"),
-        (
-            "calibration.yaml",
-            'cameras:\n  "*.jpg": {width: 9, height: 9, fx: 9,1, fy: 9, cx: 4, cy: 4}\n',
-            "decimals have a point",
-        ),
-    ],
-)
-def test_a_faulty_table_says_what_is_wrong_with_it_and_not_that_it_is_no_scan(
-    tmp_path: Path, name: str, content: str, said: str
-) -> None:
-    found = one(tmp_path / name, content)
-    assert found.kind == "unknown"
-    assert said in found.summary
-
-
-=======
->>>>>>> a06e4e61 (Let pydantic state what is wrong with a workflow; one class shows progress; a model validates the arguments of orthoflow.run; runs has one CSV table; delete tests of what others cover)
 def names(paths: list[Path], root: Path) -> list[str]:
     return [found.path.relative_to(root).as_posix() for found in recognised(paths)]
 
