@@ -20,10 +20,8 @@ from benchmarks.large_exports import own_mib, watch
 from benchmarks.tiled_orthoimage import largest_mib
 from orthoflow.files.clouds.copc import write_copc
 from orthoflow.files.clouds.dressing import DressedCloud
-from orthoflow.files.clouds.e57 import write_e57
-from orthoflow.files.clouds.las import write_laz
 from orthoflow.files.clouds.neighbourhoods import neighbourhoods_of
-from orthoflow.files.clouds.ply import write_ply
+from orthoflow.files.clouds.writers import write_e57, write_laz, write_ply
 from orthoflow.products import PointCloud
 
 WRITERS = {"laz": write_laz, "copc": write_copc, "ply": write_ply, "e57": write_e57}

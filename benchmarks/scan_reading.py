@@ -21,9 +21,8 @@ from plane_streaming import fastest, measured
 
 from orthoflow.engine.store import digest_of
 from orthoflow.files.clouds.dressing import DressedCloud
-from orthoflow.files.clouds.e57 import write_e57
 from orthoflow.files.clouds.neighbourhoods import neighbourhoods_of
-from orthoflow.files.clouds.ply import write_ply
+from orthoflow.files.clouds.writers import write_e57, write_ply
 from orthoflow.products import InputFiles
 from orthoflow.sdk import StepContext
 

@@ -31,7 +31,7 @@ from orthoflow.geometry.levels import Colours
 
 if TYPE_CHECKING:
     from rasterio.crs import CRS
-    from rasterio.io import DatasetReader, DatasetWriter
+    from rasterio.io import DatasetReader
     from rasterio.transform import Affine
     from rasterio.windows import Window
 
@@ -52,8 +52,6 @@ MOST_CELLS: Final = 1 << 28
 #: bands of an imported orthoimage
 MOST_BANDS: Final = 4
 TILE_PX: Final = 512
-# Larger images are not kept in memory, but in a file beside the output.
-_IN_MEMORY_CELLS: Final = 1 << 26
 _CACHE_BYTES: Final = 1 << 27
 # Maximum compression ratio that a small file may state: deflate has at most 1032 to 1.
 _LARGEST_RATIO: Final = 1100
@@ -233,7 +231,7 @@ def write_raster(
 ) -> None:
     """Write one band: values with NaN for no data, labels with -1 for it, or classes.
 
-    Rasters of more than 64 million cells are written band by band of rows.
+    It is written band by band of rows.
 
     Args:
         path: file to write; its folder exists.
@@ -251,37 +249,14 @@ def write_raster(
             f"shape {values.shape}"
         )
     profile: dict[str, object] = {
-        "driver": "GTiff",
         "count": 1,
         "dtype": str(values.dtype),
         "compress": "DEFLATE",
         "predictor": 3 if values.dtype == np.float32 else 2,
-        "tiled": True,
-        "blockxsize": TILE_PX,
-        "blockysize": TILE_PX,
         "nodata": _NOTHING[str(values.dtype)],
     }
-    profile |= _placed(values.shape, place)
-    if values.size > _IN_MEMORY_CELLS:
-        _write_large_raster(path, values, profile, tags)
-    else:
-        _write(path, values[None], None, profile, tags)
-
-
-def _write_large_raster(
-    path: Path,
-    values: NDArray[np.generic],
-    profile: Mapping[str, object],
-    tags: Mapping[str, str],
-) -> None:
-    """Write one band to the disk, a row of tiles at a time."""
-    import rasterio
-
-    with _writing(path), rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES):
-        with rasterio.open(path, "w", BIGTIFF="IF_SAFER", **profile) as dataset:
-            _describe(dataset, tags, None)
-            for window in _bands(values.shape):
-                dataset.write(values[_rows(window)], 1, window=window)
+    with _writing(path):
+        _write(path, values[:, :, None], None, profile | _placed(values.shape, place), tags)
         _require_written(path, values[:, :, None])
 
 
@@ -296,8 +271,8 @@ def write_orthoimage(
 ) -> None:
     """Write a cloud-optimised RGB GeoTIFF with overviews and an internal dataset mask.
 
-    Images of more than 64 million cells are written band by band, so that arrays mapped from files
-    need not fit into memory; an uncompressed copy exists beside the file while it is written.
+    It is written band by band, so that arrays mapped from files need not fit into memory; an
+    uncompressed copy exists beside the file while it is written.
 
     Args:
         path: file to write; its folder exists.
@@ -316,44 +291,16 @@ def write_orthoimage(
             f"{path.name} takes RGB of 8 or 16 bits and a mask of one size, got {rgb.dtype} of "
             f"shape {rgb.shape} and a mask of {shown.shape}"
         )
-    image = _Image(rgb=rgb, shown=shown, tags=tags, icc_profile=icc_profile)
-    placed: dict[str, object] = {"count": 3, "dtype": rgb.dtype.name}
-    placed |= _placed(shown.shape, place)
-    if shown.size > _IN_MEMORY_CELLS:
-        _write_banded(path, image, placed)
-    else:
-        bands = np.moveaxis(rgb, 2, 0)
-        options = {"driver": "COG"} | _COG_OPTIONS
-        _write(path, bands, shown, placed | options, tags, icc_profile=icc_profile)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Image:
-    """The input of `write_orthoimage`."""
-
-    rgb: Colours
-    shown: NDArray[np.bool_]
-    tags: Mapping[str, str]
-    icc_profile: bytes | None
-
-
-def _write_banded(path: Path, image: _Image, placed: Mapping[str, object]) -> None:
-    """Write a large image via an uncompressed one, a band of tiles at a time."""
-    import rasterio
     from rasterio.shutil import copy
 
+    # The driver of cloud-optimised files copies another.
     plain = path.with_name(f"{path.name}.plain")
-    options = {"driver": "GTiff", "tiled": True, "blockxsize": TILE_PX, "blockysize": TILE_PX}
+    profile = {"count": 3, "dtype": rgb.dtype.name} | _placed(shown.shape, place)
     try:
-        with _writing(path), rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES):
-            with rasterio.open(plain, "w", BIGTIFF="IF_SAFER", **options, **placed) as dataset:
-                _describe(dataset, image.tags, image.icc_profile)
-                for window in _bands(image.shown.shape):
-                    rows = _rows(window)
-                    dataset.write(np.moveaxis(image.rgb[rows], 2, 0), window=window)
-                    dataset.write_mask(image.shown[rows], window=window)
+        with _writing(path):
+            _write(plain, rgb, shown, profile, tags, icc_profile)
             copy(plain, path, driver="COG", BIGTIFF="IF_SAFER", **_COG_OPTIONS)
-            _require_written(path, image.rgb)
+            _require_written(path, rgb)
     finally:
         plain.unlink(missing_ok=True)
 
@@ -589,35 +536,29 @@ def _placed(shape: tuple[int, ...], place: GridPlace) -> dict[str, object]:
 
 def _write(
     path: Path,
-    bands: NDArray[np.generic],
+    values: NDArray[np.generic],
     shown: NDArray[np.bool_] | None,
     profile: Mapping[str, object],
     tags: Mapping[str, str],
-    *,
     icc_profile: bytes | None = None,
 ) -> None:
-    from rasterio.io import MemoryFile
-
-    with _writing(path), MemoryFile(ext=".tif") as memory:
-        with memory.open(**profile) as dataset:
-            _describe(dataset, tags, icc_profile)
-            dataset.write(bands)
-            if shown is not None:
-                dataset.write_mask(shown)
-        # Python writes the file: GDAL only logs a disk that is full at closing.
-        with path.open("wb") as target:
-            target.write(memory.getbuffer())
-
-
-def _describe(dataset: DatasetWriter, tags: Mapping[str, str], icc_profile: bytes | None) -> None:
+    """Write a tiled GeoTIFF of values (rows, cols, bands), a row of tiles at a time."""
+    import rasterio
     from rasterio.enums import ColorInterp
 
-    if dataset.count == 3:
-        dataset.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
-    dataset.update_tags(AREA_OR_POINT="Area", **tags)
-    if icc_profile is not None:
-        text = base64.b64encode(icc_profile).decode()
-        dataset.update_tags(ns="COLOR_PROFILE", SOURCE_ICC_PROFILE=text)
+    options = {"driver": "GTiff", "tiled": True, "blockxsize": TILE_PX, "blockysize": TILE_PX}
+    with rasterio.open(path, "w", BIGTIFF="IF_SAFER", **options, **profile) as dataset:
+        if dataset.count == 3:
+            dataset.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
+        dataset.update_tags(AREA_OR_POINT="Area", **tags)
+        if icc_profile is not None:
+            text = base64.b64encode(icc_profile).decode()
+            dataset.update_tags(ns="COLOR_PROFILE", SOURCE_ICC_PROFILE=text)
+        for window in _bands(values.shape):
+            rows = _rows(window)
+            dataset.write(np.moveaxis(values[rows], 2, 0), window=window)
+            if shown is not None:
+                dataset.write_mask(shown[rows], window=window)
 
 
 @contextmanager
@@ -627,10 +568,11 @@ def _writing(path: Path) -> Iterator[None]:
     Raises:
         StoreError: the file cannot be written.
     """
+    import rasterio
     from rasterio.errors import RasterioError
 
     try:
-        with quiet():
+        with quiet(), rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES):
             yield
     except (RasterioError, OSError) as error:
         raise StoreError(f"{path.name} cannot be written: {error}; free some space") from error

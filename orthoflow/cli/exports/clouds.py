@@ -24,13 +24,10 @@ from orthoflow.cli.exports.products import (
 from orthoflow.cli.tables import counted
 from orthoflow.errors import ArgumentError
 from orthoflow.files.clouds.copc import write_copc
-from orthoflow.files.clouds.description import describe_cloud
-from orthoflow.files.clouds.dressing import Colouring, DressedCloud
-from orthoflow.files.clouds.e57 import write_e57
-from orthoflow.files.clouds.las import write_laz
+from orthoflow.files.clouds.dressing import Colouring, DressedCloud, describe_cloud
 from orthoflow.files.clouds.neighbourhoods import neighbourhoods_of
 from orthoflow.files.clouds.photo_colours import UNSEEN_GREY, PointColours, colour_points
-from orthoflow.files.clouds.ply import write_ply
+from orthoflow.files.clouds.writers import write_e57, write_laz, write_ply
 from orthoflow.files.geotiff import epsg_of, epsg_wkt
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.slabs import Slab

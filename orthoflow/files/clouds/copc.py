@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.clouds.dressing import BLOCK, DressedCloud
-from orthoflow.files.clouds.las import las_header, las_record
+from orthoflow.files.clouds.writers import las_header, las_record
 from orthoflow.files.points.scan_file import load_library
 
 # Bits of a position along an axis; the grid of a node has 2^7 cells per side.

@@ -1,28 +1,25 @@
-"""Points prepared for writing, piece by piece: selected, coloured, with plane and normal."""
+"""Points prepared for writing, piece by piece: selected, coloured, with plane and normal.
+
+`cloud.json` beside the points states what they are, and the meaning of their colours and fields.
+"""
 
 from __future__ import annotations
 
+import colorsys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.clouds.colours import (
-    deviation_colours,
-    grey_range,
-    greys,
-    plane_colour,
-    plane_colours,
-    round_scale_m,
-    sampled_pieces,
-)
 from orthoflow.files.clouds.neighbourhoods import Neighbourhoods, offsets_of
 from orthoflow.files.clouds.photo_colours import PointColours
+from orthoflow.files.sidecars import numbers, write_json
 from orthoflow.geometry.slabs import Slab
-from orthoflow.products import Planes, PointCloud, PointLabels
+from orthoflow.products import JsonValue, Planes, PointCloud, PointLabels
 
 Colouring: TypeAlias = Literal["photos", "rgb", "intensity", "plane", "deviation"]
 # Points per piece: ten copies of them take some hundred megabytes.
@@ -287,3 +284,163 @@ class DressedCloud:
         # Limit of int16.
         highest = -1 if self.labels is None else int(self.labels.plane_index.max(initial=-1))
         return np.array([plane_colour(k) for k in range(-1, highest + 1)], dtype=np.float64)
+
+
+# Hues by the golden ratio: planes with close numbers have different colours.
+_HUE_STEP: Final = 0.618033988749895
+_SATURATION: Final = 0.6
+UNKNOWN: Final = (128, 128, 128)
+# The darkest intensity keeps this share of its plane's colour.
+_DARKEST: Final = 0.4
+_PIECES: Final = 64
+_PIECE: Final = 4096
+# Behind the plane, on it, in front of it.
+BEHIND: Final = (33, 102, 172)
+ON_PLANE: Final = (247, 247, 247)
+BEFORE: Final = (178, 24, 43)
+
+
+def plane_colour(index: int) -> tuple[int, int, int]:
+    """Return the colour (red, green, blue) of a plane by its position in `Planes`; -1 is grey.
+
+    >>> plane_colour(-1), plane_colour(0)
+    ((128, 128, 128), (255, 102, 102))
+    """
+    if index < 0:
+        return UNKNOWN
+    red, green, blue = colorsys.hsv_to_rgb((index * _HUE_STEP) % 1.0, _SATURATION, 1.0)
+    return round(255 * red), round(255 * green), round(255 * blue)
+
+
+def plane_colours(
+    plane: NDArray[np.int16], palette: NDArray[np.float64], grey: NDArray[np.float64]
+) -> NDArray[np.uint8]:
+    """Return colours (n, 3) of points on planes, darkened by their grey (n,), 0..1.
+
+    Args:
+        plane: (n,) number of the plane, -1 for none.
+        palette: (p + 1, 3) `plane_colour` of -1, 0, 1 ...
+        grey: of the points.
+    """
+    shade = _DARKEST + (1.0 - _DARKEST) * grey
+    return np.rint(palette[plane + 1] * shade[:, None]).astype(np.uint8)
+
+
+def deviation_colours(deviation_m: NDArray[np.float32], full_m: float) -> NDArray[np.uint8]:
+    """Return colours (n, 3) of signed distances: blue behind, white on, red in front; grey for NaN.
+
+    >>> deviation_colours(np.array([-0.01, 0.0, 0.02, np.nan], dtype=np.float32), 0.01).tolist()
+    [[33, 102, 172], [247, 247, 247], [178, 24, 43], [128, 128, 128]]
+    """
+    share = np.clip(deviation_m / full_m, -1.0, 1.0).astype(np.float64)
+    ends = np.where(share[:, None] < 0.0, np.array(BEHIND), np.array(BEFORE))
+    weight = np.abs(np.nan_to_num(share))[:, None]
+    mixed = np.rint((1.0 - weight) * np.array(ON_PLANE) + weight * ends)
+    return np.where(np.isnan(share)[:, None], UNKNOWN, mixed).astype(np.uint8)
+
+
+def round_scale_m(largest_m: float) -> float:
+    """Return the next of 1, 2, 5, 10 ... mm, for a readable scale.
+
+    >>> round_scale_m(0.0031), round_scale_m(0.0), round_scale_m(0.09)
+    (0.005, 0.001, 0.1)
+    """
+    for power in range(-3, 6):
+        for step in (1, 2, 5):
+            if largest_m <= (scale_m := float(f"{step}e{power}")):
+                return scale_m
+    return 1e6
+
+
+def greys(cloud: PointCloud, part: slice) -> NDArray[np.float64]:
+    """Return the brightness (n,) of points: root of intensity, else mean of the colours, else 1."""
+    if cloud.intensity is not None:
+        intensity = np.nan_to_num(np.asarray(cloud.intensity[part], dtype=np.float64))
+        return np.sqrt(np.maximum(intensity, 0.0))
+    if cloud.rgb is not None:
+        grey: NDArray[np.float64] = np.asarray(cloud.rgb[part], dtype=np.float64).mean(axis=1)
+        return grey / 255.0
+    return np.ones(len(cloud.x[part]))
+
+
+def grey_range(cloud: PointCloud) -> tuple[float, float]:
+    """Return the range of grey of most points, estimated from pieces all over the cloud."""
+    if (cloud.intensity is None and cloud.rgb is None) or not len(cloud):
+        return 0.0, 1.0
+    sample = np.concatenate([greys(cloud, piece) for piece in sampled_pieces(len(cloud))])
+    low, high = np.percentile(sample, (1.0, 99.0))
+    return float(low), float(high)
+
+
+def sampled_pieces(n_points: int) -> list[slice]:
+    """Return short disjoint pieces all over a cloud; all of a small one."""
+    firsts = range(0, n_points, max(_PIECE, n_points // _PIECES))
+    return [slice(k, min(k + _PIECE, n_points)) for k in firsts]
+
+
+_MEANINGS: Final = {
+    "photos": "colour of the oriented photo that shows the point best; 128 128 128 and photo -1 "
+    "where no photo sees it",
+    "rgb": "colours of the scan",
+    "intensity": "root of the scan's intensity, from its first to its 99th percentile",
+    "plane": "a hue per plane, darker where the intensity is, or without one the colour; grey: on "
+    "no plane",
+    "deviation": "distance from the plane, positive towards the viewer; grey: on no plane",
+}
+
+
+def describe_cloud(path: Path, dressed: DressedCloud, name: str, n_points: int) -> None:
+    """Write the description of a cloud's file beside it.
+
+    Raises:
+        StoreError: the file cannot be written.
+    """
+    cloud = dressed.cloud
+    about: dict[str, JsonValue] = {
+        "file": name,
+        "points": n_points,
+        "points_of_the_cloud": len(cloud),
+        "product_digest": dressed.name,
+        "coordinates": "metres, as the scan has them; z or another axis is up as `up` says",
+        "up": numbers(cloud.up),
+        "origin_world": numbers(cloud.origin),
+        "coordinate_system_wkt": dressed.crs_wkt or None,
+        "colour": dressed.colouring,
+        "colour_meaning": _MEANINGS[dressed.colouring],
+        "normals": "least-squares planes of voxels with their neighbours, sides of "
+        f"{3.0 * dressed.neighbourhoods.side_m:.4g} m, towards the viewer; 0 0 0: no surface",
+        "cleaned": "points with fewer than 10 about them, in 3 x 3 x 3 cubes of "
+        f"{3.0 * dressed.neighbourhoods.side_m:.4g} m, are left out"
+        if dressed.is_cleaned
+        else None,
+        "wall": None
+        if dressed.wall is None
+        else {"plane_index": dressed.wall_plane, "deviation": "from the plane of this wall"},
+        "box_world": None if dressed.box_world is None else numbers(dressed.box_world),
+        "scans": [_scan(dressed, scan) for scan in dressed.scans],
+    }
+    if dressed.colouring == "deviation":
+        about["colour_scale"] = {
+            "unit": "m",
+            **{
+                f"{place_m:+g}" if place_m else "0": list(colour)
+                for place_m, colour in (
+                    (-dressed.scale_m, BEHIND),
+                    (0.0, ON_PLANE),
+                    (dressed.scale_m, BEFORE),
+                )
+            },
+            "none": list(UNKNOWN),
+        }
+    if dressed.photo_colours is not None and dressed.photo_colours.photo is not None:
+        photo = dressed.photo_colours.photo
+        counts = np.bincount(np.asarray(photo) + 1, minlength=len(dressed.photo_names) + 1)
+        about["photos"] = list(dressed.photo_names)
+        about["points_of_the_cloud_by_photo"] = [int(count) for count in counts[1:]]
+        about["points_of_the_cloud_unseen"] = int(counts[0])
+    write_json(path, about)
+
+
+def _scan(dressed: DressedCloud, scan: int) -> JsonValue:
+    station = dressed.station(scan)
+    return {"scan": scan, "station_world": None if station is None else numbers(station)}

@@ -14,15 +14,11 @@ from laspy.copc import CopcReader
 from plyfile import PlyData
 
 from orthoflow.files.clouds import copc, dressing
-from orthoflow.files.clouds.colours import plane_colour
 from orthoflow.files.clouds.copc import write_copc
-from orthoflow.files.clouds.description import describe_cloud
-from orthoflow.files.clouds.dressing import DressedCloud
-from orthoflow.files.clouds.e57 import write_e57
-from orthoflow.files.clouds.las import write_laz
+from orthoflow.files.clouds.dressing import DressedCloud, describe_cloud, plane_colour
 from orthoflow.files.clouds.neighbourhoods import neighbourhoods_of
 from orthoflow.files.clouds.photo_colours import PointColours, colour_points
-from orthoflow.files.clouds.ply import write_ply
+from orthoflow.files.clouds.writers import write_e57, write_laz, write_ply
 from orthoflow.files.images import encode_png
 from orthoflow.files.points import Wish, open_scan
 from orthoflow.geometry.frames import frame_over

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from orthoflow.files.clouds.dressing import DressedCloud
-from orthoflow.files.clouds.las import write_laz
 from orthoflow.files.clouds.neighbourhoods import neighbourhoods_of
 from orthoflow.files.clouds.photo_colours import PointColours
+from orthoflow.files.clouds.writers import write_laz
 from orthoflow.files.geotiff import epsg_wkt
 from orthoflow.geometry.frames import frame_over
 from orthoflow.geometry.slabs import Slab

@@ -360,7 +360,6 @@ def test_rasters_of_large_walls_are_published_the_same(
     for folder in folders:
         folder.mkdir()
         publishing.publish_walls(walls, folder, "sha256:" + "ab" * 32)
-        monkeypatch.setattr(geotiff, "_IN_MEMORY_CELLS", 1000)
         monkeypatch.setattr(bands, "_BAND_CELLS", 1000)
         monkeypatch.setattr(images, "_IN_MEMORY_PX", 400 * 600)
     for path in sorted(folders[0].iterdir()):
