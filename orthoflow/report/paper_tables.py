@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Final
 
 from orthoflow.foreign_text import Value, csv_text, shown
@@ -16,72 +15,18 @@ from orthoflow.report.comparisons import Column, comparison_columns
 from orthoflow.report.numbers import number, number_with_spread
 from orthoflow.report.paired import MetricOverDatasets, over_datasets
 from orthoflow.report.summaries import citations
+from orthoflow.report.tables import Table, escaped_latex
 from orthoflow.workflow.model import DATA
 
 # More stand below each other.
 _FEW_COMBINATIONS: Final = 4
 _BETTER: Final = {"LESS": "lower", "MORE": "higher", "ONE": "one", "NEITHER": ""}
-_LATEX: Final = {
-    **{sign: f"\\{sign}" for sign in "&%$#_{}"},
-    "\\": r"\textbackslash{}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "±": r"$\pm$",
-}
 # `Hoehle and Hoehle 2009, title, doi:10.1016/...`: of which only authors and year are certain.
 _CITATION: Final = re.compile(
     r"(?P<authors>[^\d]+?),? (?P<year>(?:19|20)\d\d)\b[,:]?\s*(?P<rest>.*)"
 )
 _DOI: Final = re.compile(r",?\s*doi:\s*(\S+?)[.,;]?(?=\s|$)")
 _URL: Final = re.compile(r",?\s*(https?://\S+)")
-
-
-@dataclass(frozen=True, kw_only=True)
-class PaperTable:
-    """A table of texts, ready for any of the formats.
-
-    Attributes:
-        name: of its files.
-        caption: what it shows, one sentence.
-        head: heading of each column.
-        rows: of texts.
-        numeric: places of the columns of numbers, which stand to the right.
-    """
-
-    name: str
-    caption: str
-    head: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    numeric: frozenset[int]
-
-    def latex(self) -> str:
-        """Return the table as LaTeX, for the package booktabs."""
-        columns = "".join("r" if place in self.numeric else "l" for place in range(len(self.head)))
-        lines = [" & ".join(map(_latex, row)) + r" \\" for row in (self.head, *self.rows)]
-        return "\n".join(
-            (
-                r"\begin{table}",
-                r"\centering",
-                rf"\caption{{{_latex(self.caption)}}}",
-                rf"\label{{tab:{self.name}}}",
-                rf"\begin{{tabular}}{{{columns}}}",
-                r"\toprule",
-                lines[0],
-                r"\midrule",
-                *lines[1:],
-                r"\bottomrule",
-                r"\end{tabular}",
-                r"\end{table}",
-                "",
-            )
-        )
-
-    def markdown(self) -> str:
-        """Return the table as Markdown, numbers to the right."""
-        rule = ["---:" if place in self.numeric else "---" for place in range(len(self.head))]
-        rows = [self.head, tuple(rule), *self.rows]
-        lines = [f"| {' | '.join(map(_markdown, row))} |" for row in rows]
-        return "\n".join((*lines, "", f"{_markdown(self.caption)}", ""))
 
 
 def paper_files(run: Run) -> dict[str, str]:
@@ -121,7 +66,7 @@ def _tidy(run: Run) -> Iterator[Sequence[Value]]:
                 )
 
 
-def _results(run: Run) -> PaperTable:
+def _results(run: Run) -> Table:
     """The comparison: metrics as rows where combinations are few, combinations as rows else."""
     combinations, columns = _compared(run)
     factors = _factors(combinations)
@@ -134,7 +79,7 @@ def _results(run: Run) -> PaperTable:
     texts = [[_value(value) for value in row] for row in found]
     if len(combinations) <= _FEW_COMBINATIONS:
         names = [one.name or "value" for one in combinations]
-        return PaperTable(
+        return Table(
             name="results",
             caption=caption,
             head=("metric", "better", *names),
@@ -144,7 +89,7 @@ def _results(run: Run) -> PaperTable:
             ),
             numeric=frozenset(range(2, 2 + len(combinations))),
         )
-    return PaperTable(
+    return Table(
         name="results",
         caption=caption,
         head=(
@@ -167,32 +112,22 @@ def _value(measured: Measured | None) -> str:
     return number(measured.value)
 
 
-def _over(over: Sequence[MetricOverDatasets]) -> PaperTable:
+def _over(over: Sequence[MetricOverDatasets]) -> Table:
+    def text(value: float, significant: int = 4) -> str:
+        return "--" if math.isnan(value) else number(value, significant=significant)
+
     rows = []
     for metric in over:
         for one in metric.told:
             paired = one.paired
-            interval = (
-                f"{number(paired.interval[0], significant=3)} to "
-                f"{number(paired.interval[1], significant=3)}"
-                if paired and math.isfinite(sum(paired.interval))
-                else "--"
-            )
-            rows.append(
-                (
-                    f"{metric.step}: {metric.label}",
-                    _BETTER[metric.sense.name] or "--",
-                    one.name or "all",
-                    str(one.n),
-                    "--" if math.isnan(one.median) else number(one.median),
-                    "--" if paired is None else number(paired.median, significant=3),
-                    interval,
-                    "--"
-                    if paired is None or math.isnan(paired.p_holm)
-                    else number(paired.p_holm, significant=2),
-                )
-            )
-    return PaperTable(
+            told = ["--"] * 3
+            if paired is not None:
+                low, high = (text(edge, 3) for edge in paired.interval)
+                interval = "--" if "--" in (low, high) else f"{low} to {high}"
+                told = [text(paired.median, 3), interval, text(paired.p_holm, 2)]
+            name, better = f"{metric.step}: {metric.label}", _BETTER[metric.sense.name] or "--"
+            rows.append((name, better, one.name or "all", str(one.n), text(one.median), *told))
+    return Table(
         name="datasets",
         caption="Medians over the datasets, median differences from the reference with their 95 % "
         "confidence intervals, and p of Wilcoxon's signed-rank test after Holm's correction.",
@@ -245,7 +180,7 @@ def bibtex(cited: Mapping[str, Sequence[str]]) -> str:
         suffix = chr(ord("a") + keys[key]) if keys[key] else ""
         lines = [
             # A DOI and an address are taken as they are.
-            f"  {name} = {{{value if name in ('doi', 'url') else _latex(value)}}},"
+            f"  {name} = {{{value if name in ('doi', 'url') else escaped_latex(value)}}},"
             for name, value in fields.items()
             if value
         ]
@@ -281,11 +216,3 @@ def _fields(text: str) -> dict[str, str]:
         "title": rest.strip(" ,;"),
         **fields,
     }
-
-
-def _latex(text: str) -> str:
-    return "".join(_LATEX.get(sign, sign) for sign in shown(text))
-
-
-def _markdown(text: str) -> str:
-    return shown(text).replace("\\", "\\\\").replace("|", "\\|").replace("<", "&lt;")

@@ -12,12 +12,6 @@ from orthoflow.cli.tables import counted
 from orthoflow.errors import ArgumentError
 from orthoflow.files.drawings.cad_pictures import write_cad_picture
 from orthoflow.files.drawings.dxf import write_room_dxf, write_wall_dxf
-from orthoflow.files.drawings.elevations import (
-    ElevationWall,
-    elevation_scale,
-    unfolded,
-    write_elevation,
-)
 from orthoflow.files.drawings.geojson import (
     write_room_geojson,
     write_seams_geojson,
@@ -80,40 +74,6 @@ def export_geojson(run: Run, folder: Path, chosen: Choices) -> str:
     crs = next((wall.frame.map_crs for wall in results.walls if wall.frame.map_crs), None)
     write_room_geojson(folder / "room.geojson", lines, crs)
     return f"{counted(len(walls), 'wall')}, and the room: {_said(lines)}"
-
-
-def export_elevations(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write `elevation_<n>.pdf`."""
-    results = room_results(run, chosen.cell)
-    walls = [
-        ElevationWall(
-            name=wall.name,
-            frame=wall.frame,
-            raster=next(
-                wall.rasters[kind]
-                for kind in ("ortho", "intensity", "depth")
-                if kind in wall.rasters
-            ),
-        )
-        for wall in results.walls
-        if wall.frame.raster_axes == "wall"
-    ]
-    if results.planes is None or not walls:
-        raise ArgumentError(
-            f"the run {run.record.run_id} shows no upright wall, so there is nothing to unfold"
-        )
-    up = results.planes.up
-    order, is_inside = unfolded(walls, up)
-    scale, paper, sheets = elevation_scale(order, up, chosen.scale, chosen.paper)
-    make_empty(folder)
-    origin = f"run {run.record.run_id} of {run.record.name}, {run.record.created_by}"
-    for number, shown in enumerate(sheets, start=1):
-        path = folder / f"elevation_{number}.pdf"
-        write_elevation(path, shown, up, (scale, paper), (origin, chosen.language or "en"))
-    side = "inside" if is_inside else "outside"
-    return f"{counted(len(walls), 'wall')} as seen from {side} at 1:{scale} on " + counted(
-        len(sheets), "sheet"
-    )
 
 
 def export_relief(run: Run, folder: Path, chosen: Choices) -> str:

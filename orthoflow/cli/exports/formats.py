@@ -47,7 +47,9 @@ class Format:
 
 _CLOUD_OPTIONS: Final = frozenset({"cell", "colour", "wall", "box", "clean"})
 
-_SECTION_OPTIONS: Final = frozenset({"cell", "scale", "paper", "dimensions", "language"})
+_SECTION_OPTIONS: Final = frozenset(
+    {"cell", "scale", "paper", "grid", "title_block", "dimensions", "language"}
+)
 
 FORMATS: Final[Mapping[str, Format]] = {
     "colmap": Format(
@@ -139,9 +141,9 @@ FORMATS: Final[Mapping[str, Format]] = {
         takes_rasters=True,
     ),
     "elevation": Format(
-        writer="drawings:export_elevations",
+        writer="sheets:export_elevations",
         summary="the walls of the room unfolded on one sheet, at their true heights, as PDF",
-        options=frozenset({"cell", "scale", "paper", "language"}),
+        options=frozenset({"cell", "scale", "paper", "title_block", "language"}),
         takes_rasters=True,
     ),
     "relief": Format(

@@ -7,15 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
 from orthoflow.cli.exports.choices import Choices
-from orthoflow.cli.exports.products import branch_of, last_product, make_empty, product_of
+from orthoflow.cli.exports.products import branch_of, last_product, product_of
+from orthoflow.cli.exports.sheets import grid_of, origin_of, text_of, write_drawings
 from orthoflow.cli.tables import counted
 from orthoflow.errors import ArgumentError
-from orthoflow.files.drawings.section_files import SectionDrawing, fitted, write_section
+from orthoflow.files.drawings.section_files import SectionDrawing, section_sheet, write_section
 from orthoflow.files.drawings.sections import Cut, plan_cut, section_cut, section_of
-from orthoflow.geometry.directions import basis_from_up
+from orthoflow.files.drawings.sheet_contents import Drawing
 from orthoflow.products import Planes, PointCloud, PointLabels
 from orthoflow.records.runs import Run
 from orthoflow.records.wall_results import RoomResults, room_results
@@ -76,20 +75,31 @@ def _write(
     results, planes = room
     cloud, labels = _points(run, results.address, chosen)
     made = [section_of(cut, planes, results.openings, cloud, labels) for cut in cuts]
-    make_empty(folder)
+    text = text_of(run, "", chosen)
+
+    def at(scale: int) -> list[SectionDrawing]:
+        return [
+            SectionDrawing(
+                kind=kind,
+                section=section,
+                scale=scale,
+                origin=origin_of(run),
+                has_dimensions=chosen.dimensions,
+                language=chosen.language or "en",
+            )
+            for section in made
+        ]
+
+    def drawn(scale: int) -> list[Drawing]:
+        return [
+            section_sheet(f"{kind}_{number}", drawing, planes, text, grid_of(chosen, scale))
+            for number, drawing in enumerate(at(scale), start=1)
+        ]
+
+    scale, _, _ = write_drawings(folder, drawn, chosen, alone="{stem}")
     said = []
-    for number, section in enumerate(made, start=1):
-        scale, paper = fitted(section, chosen.scale, chosen.paper, has_dimensions=chosen.dimensions)
-        drawing = SectionDrawing(
-            kind=kind,
-            section=section,
-            scale=scale,
-            paper=paper,
-            origin=f"run {run.record.run_id} of {run.record.name}, {run.record.created_by}",
-            has_dimensions=chosen.dimensions,
-            up_label=_up_label(planes) if kind == "plan" else "",
-            language=chosen.language or "en",
-        )
+    for number, drawing in enumerate(at(scale), start=1):
+        section = drawing.section
         write_section(folder, f"{kind}_{number}", drawing)
         said.append(
             f"{kind}_{number} at 1:{scale}, {section.cut.title}: "
@@ -99,13 +109,6 @@ def _write(
     if cloud is None:
         said.append("without the cloud, which neither record nor store holds: openings are missing")
     return "; ".join(said)
-
-
-def _up_label(planes: Planes) -> str:
-    """Which world axis points upwards on a plan."""
-    second = basis_from_up(planes.up)[1]
-    axis = int(np.argmax(np.abs(second)))
-    return f"{'-' if second[axis] < 0 else ''}{'xyz'[axis]}"
 
 
 def _points(

@@ -1,9 +1,9 @@
-"""The export of sheets: which paper, which scale, what is written, and how a wall is cut."""
+"""The exports of sheets: which paper, which scale, what is written, and how drawings are cut."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -13,25 +13,20 @@ from orthoflow.cli.exports.drawings import chosen_walls
 from orthoflow.cli.exports.products import make_empty
 from orthoflow.cli.tables import counted
 from orthoflow.errors import ArgumentError
+from orthoflow.files.drawings.elevations import ElevationWall, elevation, unfolded
 from orthoflow.files.drawings.key_plans import key_plan
-from orthoflow.files.drawings.papers import (
-    FOOT_M,
-    SCALES,
-    SCALES_FT,
-    nice_step,
-    paper_of,
-)
-from orthoflow.files.drawings.printed_pictures import stretch_of
+from orthoflow.files.drawings.papers import FOOT_M, SCALES, SCALES_FT, nice_step, paper_of
 from orthoflow.files.drawings.sheet_contents import (
-    MarkedArea,
+    Drawing,
+    Picture,
     SheetText,
-    WallDrawing,
     axes_of,
     north_of,
 )
-from orthoflow.files.drawings.sheet_layout import Sized, fitting_scale, lay_out, paper_for_one
+from orthoflow.files.drawings.sheet_layout import fitting_scale, lay_out, paper_for_one
 from orthoflow.files.drawings.sheets import write_sheet
 from orthoflow.files.drawings.title_blocks import TitleBlock, read_title_block
+from orthoflow.files.drawings.wall_drawings import Area, wall_picture
 from orthoflow.files.drawings.words import Phrase, label, surface_name
 from orthoflow.products import Opening
 from orthoflow.records.runs import Run
@@ -44,42 +39,138 @@ _MM_PER_INCH: Final = 25.4
 _KINDS: Final = {"through": "through_opening", "niche": "niche", "no data": "no_data"}
 
 
-def export_sheets(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write `wall_<k>_sheet_<n>.pdf`, and `wall_<k>_index.pdf` where a wall takes several."""
-    block = read_title_block(chosen.title_block) if chosen.title_block else TitleBlock()
-    results = room_results(run, chosen.cell, chosen.wall)
-    walls = chosen_walls(results, chosen)
-    digest = run.content_sha256
-    drawings = [_drawing(run, results, wall, chosen, block, digest) for wall in walls]
+def write_drawings(
+    folder: Path,
+    drawn: Callable[[int], Sequence[Drawing]],
+    chosen: Choices,
+    *,
+    alone: str = "{stem}_sheet_{number}",
+    several: str = "{stem}_sheet_{number}",
+) -> tuple[int, int, Sequence[Drawing]]:
+    """Choose scale and paper of drawings, and write their sheets and indexes into a new folder.
+
+    Args:
+        folder: made once all is laid out.
+        drawn: returns the drawings at a scale.
+        chosen: the options.
+        alone: names of files where a drawing takes one sheet.
+        several: where it takes several.
+
+    Returns:
+        n of 1 : n, the number of sheets, and the drawings at this scale.
+    """
     given = [paper_of(chosen.paper)] if chosen.paper else []
-    sizes = [_size_m(wall) for wall in walls]
-
-    def drawn(scale: int) -> list[Sized]:
-        scaled = (
-            _scaled(drawing, wall, chosen, scale)
-            for drawing, wall in zip(drawings, walls, strict=True)
-        )
-        return list(zip(scaled, sizes, strict=True))
-
     usual = SCALES_FT if chosen.units == "ft" else SCALES
     scale = chosen.scale or fitting_scale(drawn, usual, given or [paper_of(_USUAL_PAPER)])
-    sized = drawn(scale)
-    laid = [lay_out(drawing, size_m, given) for drawing, size_m in sized]
+    drawings = drawn(scale)
+    laid = [lay_out(drawing, given) for drawing in drawings]
     make_empty(folder)
     for one in laid:
-        stem = f"wall_{one.drawing.number}"
+        stem = one.drawing.stem
         for sheet, furniture in one.sheets:
-            path = folder / f"{stem}_sheet_{sheet.number}.pdf"
-            write_sheet(path, one.drawing, sheet, furniture)
+            pattern = alone if len(one.sheets) == 1 else several
+            name = pattern.format(stem=stem, number=sheet.number)
+            write_sheet(folder / f"{name}.pdf", one.drawing, sheet, furniture)
         if one.index is not None:
             drawing, sheet, furniture = one.index
             write_sheet(folder / f"{stem}_index.pdf", drawing, sheet, furniture)
-    n_sheets = sum(len(one.sheets) for one in laid)
+    return scale, sum(len(one.sheets) for one in laid), drawings
+
+
+def text_of(run: Run, name: str, chosen: Choices, notes: tuple[Phrase, ...] = ()) -> SheetText:
+    """Return the texts of the sheets of a run."""
+    return SheetText(
+        name=name,
+        block=read_title_block(chosen.title_block) if chosen.title_block else TitleBlock(),
+        notes=notes,
+        digest=run.content_sha256,
+        run=origin_of(run),
+    )
+
+
+def origin_of(run: Run) -> str:
+    """Return one line about the origin of drawings."""
+    return f"run {run.record.run_id} of {run.record.name}, {run.record.created_by}"
+
+
+def grid_of(chosen: Choices, scale: int) -> float:
+    """Return the distance of crosses in the unit of the sheets.
+
+    Raises:
+        ArgumentError: the wanted one is too small for the scale.
+    """
+    unit_m = FOOT_M if chosen.units == "ft" else 1.0
+    grid = nice_step(1e-3 * _GRID_MM * scale / unit_m) if chosen.grid is None else chosen.grid
+    if not math.isfinite(grid):
+        return 0.0
+    if 0.0 < grid * unit_m < 2e-3 * scale:
+        raise ArgumentError(
+            f"--grid {grid:g} puts crosses closer than 2 mm at 1:{scale}: take at least "
+            f"{2e-3 * scale / unit_m:g}, or 0 for none"
+        )
+    return grid
+
+
+def export_sheets(run: Run, folder: Path, chosen: Choices) -> str:
+    """Write `wall_<k>_sheet_<n>.pdf`, and `wall_<k>_index.pdf` where a wall takes several."""
+    text = text_of(run, "", chosen)
+    results = room_results(run, chosen.cell, chosen.wall)
+    walls = chosen_walls(results, chosen)
+    drawings = [_drawing(text, results, wall, chosen) for wall in walls]
+
+    def drawn(scale: int) -> list[Drawing]:
+        pairs = zip(drawings, walls, strict=True)
+        return [_scaled(drawing, wall, chosen, scale) for drawing, wall in pairs]
+
+    scale, n_sheets, sized = write_drawings(folder, drawn, chosen)
     said = f"{counted(n_sheets, 'sheet')} of {counted(len(walls), 'wall')} at 1:{scale}"
     if n_sheets > len(walls):
         larger = paper_for_one(sized)
         said += f" (on {larger} each wall takes one)" if larger else ""
     return said + _coarse(walls, scale)
+
+
+def export_elevations(run: Run, folder: Path, chosen: Choices) -> str:
+    """Write `elevation_<n>.pdf`."""
+    results = room_results(run, chosen.cell)
+    language = chosen.language or "en"
+    walls = [
+        ElevationWall(
+            name=surface_name(wall.name, language),
+            frame=wall.frame,
+            raster=wall.rasters[_first_kind(wall)],
+        )
+        for wall in results.walls
+        if wall.frame.raster_axes == "wall"
+    ]
+    if results.planes is None or not walls:
+        raise ArgumentError(
+            f"the run {run.record.run_id} shows no upright wall, so there is nothing to unfold"
+        )
+    up = results.planes.up
+    order, is_inside = unfolded(walls, up)
+    # Each wall has its own evidence.
+    notes = tuple(
+        Phrase(
+            key="of_wall",
+            values={"wall": surface_name(wall.name, language), "text": said.text(language)},
+        )
+        for wall in results.walls
+        if wall.frame.raster_axes == "wall"
+        for said in wall.accuracy[:1] or (Phrase(key="not_checked"),)
+    )
+    text = text_of(run, ", ".join(wall.name for wall in order), chosen, notes)
+
+    def drawn(scale: int) -> list[Drawing]:
+        plain = elevation(order, up, text, scale, language)
+        return [replace(plain, grid=nice_step(1e-3 * _GRID_MM * scale))]
+
+    pattern = "{stem}_{number}"
+    scale, n_sheets, _ = write_drawings(folder, drawn, chosen, alone=pattern, several=pattern)
+    side = "inside" if is_inside else "outside"
+    return f"{counted(len(walls), 'wall')} as seen from {side} at 1:{scale} on " + counted(
+        n_sheets, "sheet"
+    )
 
 
 def _coarse(walls: Sequence[WallResult], scale: int) -> str:
@@ -100,92 +191,81 @@ def _ppi(wall: WallResult, scale: int) -> float:
     return _MM_PER_INCH * scale / (1e3 * wall.frame.gsd_m)
 
 
-def _size_m(wall: WallResult) -> tuple[float, float]:
-    return wall.frame.width * wall.frame.gsd_m, wall.frame.height * wall.frame.gsd_m
-
-
-def _drawing(
-    run: Run,
-    results: RoomResults,
-    wall: WallResult,
-    chosen: Choices,
-    block: TitleBlock,
-    digest: str,
-) -> WallDrawing:
+def _drawing(text: SheetText, results: RoomResults, wall: WallResult, chosen: Choices) -> Drawing:
     """What is drawn of a wall, at no scale yet."""
     language, unit = chosen.language or "en", chosen.units or "m"
-    kinds = _kinds(wall, chosen)
-    depths = stretch_of(wall.rasters["depth"]) if "depth" in kinds else None
-    is_upright = wall.frame.raster_axes == "wall"
-    openings = results.openings_of(wall)
-    areas = tuple(_area(wall, opening, chosen) for opening in openings)
-    high_m = _size_m(wall)[1]
-    edges = [0.0, high_m]
-    for area in areas:
-        edges += [float(area.outline_m[:, 1].min()), float(area.outline_m[:, 1].max())]
+    frame = wall.frame
+    areas = [_area(wall, opening, chosen) for opening in results.openings_of(wall)]
+    high_m = frame.height * frame.gsd_m
+    edges = {0.0, round(high_m, 4)}
+    for _, outline_m in areas:
+        edges |= {round(float(outline_m[:, 1].min()), 4), round(float(outline_m[:, 1].max()), 4)}
     notes = wall.accuracy or (Phrase(key="not_checked"),)
-    return WallDrawing(
-        number=wall.number,
-        rasters={kind: wall.rasters[kind] for kind in kinds},
-        axes=axes_of(wall.frame),
-        plan=None if results.planes is None else key_plan(results.planes, wall.frame),
-        text=SheetText(
+    planes = results.planes
+    plan = None if planes is None else key_plan(planes, frame, wall.number)
+    pictures: dict[str, Picture] = {}
+    for kind in _kinds(wall, chosen):
+        is_grey = kind == "intensity" and wall.intensity_source != "laser"
+        words = label("grey" if is_grey else kind, language)
+        if frame.raster_down > 0.0:
+            words += f", {label('reflected', language)}"
+        pictures[words] = wall_picture(
+            wall.rasters[kind],
+            is_depth=kind == "depth",
+            is_flipped=frame.raster_down > 0.0,
+            areas=areas,
+            language=language,
+        )
+    return Drawing(
+        stem=f"wall_{wall.number}",
+        size_m=(frame.width * frame.gsd_m, high_m),
+        pictures=pictures,
+        axes=axes_of(frame),
+        plan=plan,
+        text=replace(
+            text,
             name=surface_name(wall.name, language),
-            block=block,
             notes=(*notes, *([wall.colours] if wall.colours else [])),
-            digest=digest,
-            run=f"run {run.record.run_id} of {run.record.name}, {run.record.created_by}",
         ),
         scale=1,
-        grid=0.0,
         unit=unit,
         language=language,
-        interval_m=0.0 if depths is None else depths.interval,
-        depth_range_m=None if depths is None else (depths.low, depths.high),
-        areas=areas,
-        heights=tuple(sorted({round(edge, 4) for edge in edges})) if is_upright else (),
-        north=north_of(wall.frame),
-        is_flipped=wall.frame.raster_down > 0.0,
-        intensity_is_grey=wall.intensity_source != "laser",
+        heights=tuple(sorted(edges)) if frame.raster_axes == "wall" else (),
+        north=north_of(frame),
+        up_label=plan.up_label if plan else "y",
     )
 
 
-def _scaled(drawing: WallDrawing, wall: WallResult, chosen: Choices, scale: int) -> WallDrawing:
+def _scaled(drawing: Drawing, wall: WallResult, chosen: Choices, scale: int) -> Drawing:
     """Give a drawing its scale, and what follows from it: the grid, and how fine cells print."""
-    unit_m = FOOT_M if drawing.unit == "ft" else 1.0
-    grid = nice_step(1e-3 * _GRID_MM * scale / unit_m) if chosen.grid is None else chosen.grid
-    if not math.isfinite(grid):
-        grid = 0.0
-    if 0.0 < grid * unit_m < 2e-3 * scale:
-        raise ArgumentError(
-            f"--grid {grid:g} puts crosses closer than 2 mm at 1:{scale}: take at least "
-            f"{2e-3 * scale / unit_m:g}, or 0 for none"
-        )
     ppi = _ppi(wall, scale)
     values = {"mm": f"{1e3 * wall.frame.gsd_m:g}", "ppi": f"{ppi:.0f}"}
     coarse = (Phrase(key="coarse", values={"least": f"{_LEAST_PPI:.0f}"}),)
     cells = Phrase(key="cells", values=values, asides=coarse if ppi < _LEAST_PPI else ())
     text = replace(drawing.text, notes=(*drawing.text.notes, cells))
-    return replace(drawing, scale=scale, grid=grid, text=text)
+    return replace(drawing, scale=scale, grid=grid_of(chosen, scale), text=text)
 
 
-def _area(wall: WallResult, opening: Opening, chosen: Choices) -> MarkedArea:
+def _area(wall: WallResult, opening: Opening, chosen: Choices) -> Area:
     """An opening of a wall, from the top-left corner of the drawn wall."""
     frame, language = wall.frame, chosen.language or "en"
     outline_m = frame.gsd_m * frame.wall_from_raster(opening.outline_m)
     unit_m, unit = (FOOT_M, "ft") if chosen.units == "ft" else (1.0, "m")
     wide, high = opening.width_m / unit_m, opening.height_m / unit_m
-    rows = [label(_KINDS[opening.kind], language), f"{wide:.2f} x {high:.2f} {unit}"]
-    return MarkedArea(text=", ".join(rows), outline_m=outline_m)
+    return f"{label(_KINDS[opening.kind], language)}, {wide:.2f} x {high:.2f} {unit}", outline_m
+
+
+def _first_kind(wall: WallResult) -> str:
+    """Its orthoimage, or else what the scan shows."""
+    return next(kind for kind in ("ortho", "intensity", "depth") if kind in wall.rasters)
 
 
 def _kinds(wall: WallResult, chosen: Choices) -> list[str]:
-    """What is shown of a wall: its orthoimage, or else what the scan shows, and what is asked."""
-    first = next(kind for kind in ("ortho", "intensity", "depth") if kind in wall.rasters)
+    """What is shown of a wall, and what is asked."""
     for kind in chosen.beside:
         if kind not in wall.rasters:
             raise ArgumentError(
                 f"--beside {kind}: the run has no {kind} of wall {wall.number}, only "
                 f"{', '.join(wall.rasters)}"
             )
-    return list(dict.fromkeys((first, *chosen.beside)))
+    return list(dict.fromkeys((_first_kind(wall), *chosen.beside)))

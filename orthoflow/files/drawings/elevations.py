@@ -3,36 +3,38 @@
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.drawings.papers import MARGIN_MM, SCALES, SIZES_MM, Paper, Part, paper_of
+from orthoflow.files.drawings.papers import Part, View
 from orthoflow.files.drawings.pens import (
-    POINTS_PER_MM,
+    TEXT_MM,
+    THIN_MM,
     line,
-    sheet_canvas,
     text_width_mm,
-    write_text,
+    write_on_white,
 )
-from orthoflow.files.drawings.printed_pictures import picture_file, write_picture
-from orthoflow.files.drawings.words import Language, label
+from orthoflow.files.drawings.sheet_contents import (
+    Axes,
+    Drawing,
+    Picture,
+    Placed,
+    SheetText,
+    up_words,
+)
+from orthoflow.files.drawings.wall_drawings import draw_raster
+from orthoflow.files.drawings.words import Language, Phrase, label
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.directions import basis_from_up
 
-if TYPE_CHECKING:
-    from reportlab.pdfgen.canvas import Canvas
-
 _GAP_MM: Final = 8.0
-# For heights on the left, and for names, scale and origin below.
-_LEFT_MM: Final = 20.0
-_BELOW_MM: Final = 34.0
-_TEXT_MM: Final = 2.5
+# Below the walls, for their names.
+_NAMES_MM: Final = 12.0
 # Walls this close to parallel follow each other along one facade.
 _PARALLEL_DEG: Final = 10.0
 
@@ -96,116 +98,73 @@ def _turned_deg(one: float, other: float) -> float:
     return abs(math.remainder(one - other, 360.0))
 
 
-def elevation_scale(
-    walls: Sequence[ElevationWall], up: NDArray[np.float64], scale: int | None, paper: str | None
-) -> tuple[int, Paper, list[list[ElevationWall]]]:
-    """Choose scale and paper, and the walls of each sheet.
-
-    Without a scale, all walls are on one sheet of A3 (or the given paper) at the largest usual
-    scale; with one, on the smallest paper that fits them, else on several sheets of A0.
-    """
-    rows = list(walls)
-    low, high = _heights(walls, up)
-    ways = [paper_of(paper)] if paper else [paper_of(name) for name in reversed(SIZES_MM)]
-    ways = [turned for way in ways for turned in (way, way.turned)]
-    if scale is None:
-        first = paper_of(paper or "A3")
-        scale = next(
-            (
-                n
-                for n in SCALES
-                if any(_fits(rows, high - low, way, n) for way in (first, first.turned))
-            ),
-            SCALES[-1],
-        )
-    way = next((way for way in ways if _fits(rows, high - low, way, scale)), None)
-    if way is not None:
-        return scale, way, [rows]
-    way = paper_of(paper or "A0")
-    sheets: list[list[ElevationWall]] = [[]]
-    for wall in rows:
-        if sheets[-1] and not _fits([*sheets[-1], wall], high - low, way, scale):
-            sheets.append([])
-        sheets[-1].append(wall)
-    return scale, way, sheets
-
-
-def _fits(walls: Sequence[ElevationWall], high_m: float, paper: Paper, scale: int) -> bool:
-    wide_mm = sum(1e3 * wall.size_m[0] / scale for wall in walls) + _GAP_MM * (len(walls) - 1)
-    return (
-        wide_mm + _LEFT_MM + 2 * MARGIN_MM <= paper.width_mm
-        and 1e3 * high_m / scale + _BELOW_MM + 2 * MARGIN_MM <= paper.height_mm
-    )
-
-
-def _heights(walls: Sequence[ElevationWall], up: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the heights of the lowest and the highest corner."""
-    heights = np.array([wall.frame.corners_world() @ up for wall in walls])
-    return float(heights.min()), float(heights.max())
-
-
-def write_elevation(
-    path: Path,
+def elevation(
     walls: Sequence[ElevationWall],
     up: NDArray[np.float64],
-    place: tuple[int, Paper],
-    texts: tuple[str, Language],
-) -> None:
-    """Write one sheet as PDF.
+    text: SheetText,
+    scale: int,
+    language: Language = "en",
+) -> Drawing:
+    """Return walls side by side, each at its height, with level lines at round heights.
 
     Args:
-        path: output file.
         walls: from left to right.
         up: (3,) unit vector of the scan.
-        place: n of 1 : n, and the paper.
-        texts: one line about the origin of the data, and the language of labels.
+        text: of its sheets.
+        scale: n of 1 : n.
+        language: of labels.
     """
-    scale, paper = place
-    origin, language = texts
-    low, high = _heights(walls, up)
-    bottom = MARGIN_MM + _BELOW_MM
-    left = MARGIN_MM + _LEFT_MM
-    with tempfile.TemporaryDirectory() as scratch, sheet_canvas(path, paper) as canvas:
-        widths = [1e3 * wall.size_m[0] / scale for wall in walls]
-        right = left + sum(widths) + _GAP_MM * (len(walls) - 1)
-        _draw_heights(canvas, (left, right), bottom, (low, high), scale)
-        total, named = left, -math.inf
-        for number, wall in enumerate(walls):
-            wide, tall = (1e3 * edge / scale for edge in wall.size_m)
-            base = bottom + 1e3 * (float(wall.frame.corners_world()[1] @ up) - low) / scale
-            picture = Path(scratch) / str(number)
-            whole = Part(left_m=0.0, top_m=0.0, right_m=wall.size_m[0], bottom_m=wall.size_m[1])
-            write_picture(wall.raster, whole, picture, scale=scale)
-            canvas.drawImage(
-                str(picture_file(picture)),
-                *(POINTS_PER_MM * value for value in (total, base, wide, tall)),
+    mm = 1e-3 * scale
+    heights = np.array([wall.frame.corners_world() @ up for wall in walls])
+    top, low = float(heights.max()), float(heights.min())
+    lefts = np.cumsum([0.0, *(wall.size_m[0] + mm * _GAP_MM for wall in walls)])
+
+    def draw(placed: Placed) -> None:
+        part = placed.view.part
+        ends = [-math.inf, -math.inf]
+        for number, (wall, left) in enumerate(zip(walls, lefts.tolist(), strict=False)):
+            down = top - float(heights[number].max())
+            wide, high = wall.size_m
+            # What of the wall lies on this part of the drawing.
+            own = Part(
+                left_m=max(part.left_m - left, 0.0),
+                top_m=max(part.top_m - down, 0.0),
+                right_m=min(part.right_m - left, wide),
+                bottom_m=min(part.bottom_m - down, high),
             )
-            box = [(total, base), (total + wide, base), (total + wide, base + tall)]
-            line(canvas, [*box, (total, base + tall)], width_mm=0.25, is_closed=True)
-            # The name of a narrow wall is one line lower.
-            below = 10.0 if total < named else 6.0
-            write_text(canvas, wall.name, (total, bottom - below), high_mm=_TEXT_MM)
-            named = total + text_width_mm(wall.name, _TEXT_MM) + 1.0 if below < 8.0 else -math.inf
-            total += wide + _GAP_MM
-        title = f"{label('elevation', language)}   {label('scale', language)} 1:{scale}"
-        write_text(canvas, title, (left, MARGIN_MM + 16.0), high_mm=3.5, is_bold=True)
-        note = f"{label('height', language)}, {label('metres', language)}"
-        write_text(canvas, note, (left, MARGIN_MM + 10.0), high_mm=_TEXT_MM)
-        write_text(canvas, origin, (left, MARGIN_MM + 4.0), high_mm=_TEXT_MM)
-        canvas.save()
+            if min(own.size_m) <= 1e-9:
+                continue
+            corner = placed.on_paper([(left + own.left_m, down + own.bottom_m)])[0]
+            view = View(kind="", part=own, corner_mm=(float(corner[0]), float(corner[1])))
+            scratch = placed.scratch.with_name(f"{placed.scratch.name}_{number}")
+            inner = replace(placed, view=view, scratch=scratch)
+            draw_raster(inner, wall.raster)
+            outline = placed.on_paper([(left + x, down + y) for x, y in own.corners_m])
+            line(placed.canvas, outline, width_mm=THIN_MM, is_closed=True)
+            # Names of narrow walls take turns in two rows.
+            x, y = placed.on_paper([(left + own.left_m, top - low)])[0]
+            long = text_width_mm(wall.name) + 2.0
+            row = 0 if x >= ends[0] else 1
+            middle = (float(x) + 0.5 * long, float(y) - 3.0 - 2.2 * TEXT_MM * row)
+            right = placed.edges_mm[2]
+            if part.bottom_m > top - low and middle[0] + 0.5 * long <= right and x >= ends[row]:
+                ends[row] = float(x) + long
+                write_on_white(placed.canvas, wall.name, middle)
 
-
-def _draw_heights(
-    canvas: Canvas,
-    across_mm: tuple[float, float],
-    bottom_mm: float,
-    heights_m: tuple[float, float],
-    scale: int,
-) -> None:
-    """Draw level lines at round heights, with numbers that do not overlap."""
-    low, high = heights_m
-    step = next(s for s in (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 50.0) if 1e3 * s / scale >= 8.0)
-    for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1):
-        y = bottom_mm + 1e3 * (k * step - low) / scale
-        line(canvas, [(across_mm[0] - 4.0, y), (across_mm[1], y)], width_mm=0.13)
-        write_text(canvas, f"{k * step:+.2f}", (MARGIN_MM, y - 1.0), high_mm=_TEXT_MM)
+    levels = {
+        round(top - float(edge), 3) for edge in np.concatenate([heights.max(1), heights.min(1)])
+    }
+    return Drawing(
+        stem="elevation",
+        size_m=(float(lefts[-1]) - mm * _GAP_MM, top - low + mm * _NAMES_MM),
+        pictures={label("elevation", language): Picture(draw=draw)},
+        axes=Axes(
+            across=None,
+            down=(top, -1.0),
+            phrase=Phrase(key="axes_elevation", values={"up": up_words(up)}),
+        ),
+        text=text,
+        scale=scale,
+        language=language,
+        heights=tuple(sorted(levels)),
+    )

@@ -34,6 +34,7 @@ class KeyPlan:
         marked: (n, 2) the marked wall: two ends, or the four corners of a level plane.
         arrow: (2, 2) from the viewer to the wall; None for level planes.
         up_label: label of the upwards direction of the plan: `N` in a map, else an axis.
+        number: of the marked wall, -1 for none.
     """
 
     walls: NDArray[np.float64]
@@ -42,6 +43,7 @@ class KeyPlan:
     marked: NDArray[np.float64]
     arrow: NDArray[np.float64] | None
     up_label: str
+    number: int = -1
 
 
 def surfaces_of(planes: Planes) -> tuple[Surface, ...]:
@@ -82,12 +84,34 @@ def _check_counts(planes: Planes) -> None:
         )
 
 
-def key_plan(planes: Planes, frame: WallFrame) -> KeyPlan:
+def key_plan(planes: Planes, frame: WallFrame, number: int = -1) -> KeyPlan:
     """Draw planes from above, and mark the position of a raster."""
+    corners = frame.corners_world()
+    is_map = frame.map_crs is not None and frame.map_crs != "site"
+    if abs(float(frame.normal_world @ planes.up)) > math.cos(math.radians(60.0)):
+        return _marked_plan(planes, corners, None, number, is_map=is_map)
+    ends = np.array([corners[:2].mean(axis=0), corners[2:].mean(axis=0)])
+    return _marked_plan(planes, ends, frame.normal_world, number, is_map=is_map)
+
+
+def cut_plan(
+    planes: Planes, ends_world: NDArray[np.float64], forward: NDArray[np.float64]
+) -> KeyPlan:
+    """Draw planes from above, and mark a vertical cut: its ends (2, 3), and where it looks (3,)."""
+    return _marked_plan(planes, ends_world, -forward, -1, is_map=False)
+
+
+def _marked_plan(
+    planes: Planes,
+    marked_world: NDArray[np.float64],
+    towards_world: NDArray[np.float64] | None,
+    number: int,
+    *,
+    is_map: bool,
+) -> KeyPlan:
     outline = outline_of(planes)
     basis = basis_from_up(planes.up)
-    corners = frame.corners_world()
-    near = corners.mean(axis=0)
+    near = marked_world.mean(axis=0)
 
     def seen(points_world: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray((points_world - near) @ basis[:2].T)
@@ -97,25 +121,27 @@ def key_plan(planes: Planes, frame: WallFrame) -> KeyPlan:
         seen(np.array([quad[:2].mean(axis=0), quad[2:].mean(axis=0)]))
         for quad in planes.corners[upright]
     ]
-    is_level = abs(float(frame.normal_world @ planes.up)) > math.cos(math.radians(60.0))
-    marked = corners if is_level else np.array([corners[:2].mean(axis=0), corners[2:].mean(axis=0)])
     arrow = None
-    if not is_level:
-        length_m = 0.25 * float(np.linalg.norm(corners[3] - corners[0]))
-        middle = seen(near[None])[0]
-        towards = seen((near + frame.normal_world)[None])[0] - middle
+    if towards_world is not None:
+        length_m = 0.25 * float(np.linalg.norm(marked_world[1] - marked_world[0]))
+        towards = basis[:2] @ towards_world
         towards /= np.linalg.norm(towards)
-        arrow = np.array([middle + length_m * towards, middle + 0.1 * length_m * towards])
-    is_map = frame.map_crs is not None and frame.map_crs != "site"
-    axis = int(np.argmax(np.abs(basis[1])))
+        arrow = length_m * np.array([towards, 0.1 * towards])
     return KeyPlan(
         walls=np.array(walls).reshape(-1, 2, 2),
-        numbers=tuple(int(number) for number in np.flatnonzero(upright)),
+        numbers=tuple(int(one) for one in np.flatnonzero(upright)),
         outlines=tuple(
             seen(np.vstack([chain, chain[:1]]) if is_closed else chain)
             for chain, is_closed in zip(outline.chains_world, outline.closed, strict=True)
         ),
-        marked=seen(marked),
+        marked=seen(marked_world),
         arrow=arrow,
-        up_label="N" if is_map else f"{'-' if basis[1][axis] < 0 else ''}{'xyz'[axis]}",
+        up_label="N" if is_map else axis_words(basis[1]),
+        number=number,
     )
+
+
+def axis_words(direction: NDArray[np.float64]) -> str:
+    """Return the scan's axis that a direction (3,) is nearest to, with its sign."""
+    axis = int(np.argmax(np.abs(direction)))
+    return f"{'-' if direction[axis] < 0.0 else ''}{'xyz'[axis]}"

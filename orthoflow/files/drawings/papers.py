@@ -94,13 +94,24 @@ class Part:
         """Width and height."""
         return self.right_m - self.left_m, self.bottom_m - self.top_m
 
+    @property
+    def corners_m(self) -> list[tuple[float, float]]:
+        """Its corners, metres to the right and down, from the top-left one clockwise."""
+        xs, ys = (self.left_m, self.right_m), (self.top_m, self.bottom_m)
+        return [(xs[0], ys[0]), (xs[1], ys[0]), (xs[1], ys[1]), (xs[0], ys[1])]
+
+
+def whole_of(size_m: tuple[float, float]) -> Part:
+    """Return all of a drawing of this width and height."""
+    return Part(left_m=0.0, top_m=0.0, right_m=size_m[0], bottom_m=size_m[1])
+
 
 @dataclass(frozen=True, kw_only=True)
 class View:
     """A picture on a sheet.
 
     Attributes:
-        kind: which picture of the wall: `ortho`, `depth`, `intensity`.
+        kind: which picture of the drawing.
         part: the part of the wall.
         corner_mm: its bottom-left corner on the paper.
     """
@@ -146,7 +157,7 @@ def together(
         paper: paper of the sheet.
         scale: n of 1 : n.
     """
-    whole = Part(left_m=0.0, top_m=0.0, right_m=size_m[0], bottom_m=size_m[1])
+    whole = whole_of(size_m)
     wide, high = _with_labels(size_m, scale)
     count, (across, up) = len(kinds), paper.area_mm
     for columns, rows in ((count, 1), (1, count)):

@@ -93,6 +93,19 @@ def line(
         canvas.setDash()
 
 
+def fill(
+    canvas: Canvas, outlines_mm: Sequence[NDArray[np.float64]], colour: Colour = BLACK
+) -> None:
+    """Fill outlines (n, 2) each; those inside another one are holes."""
+    path = canvas.beginPath()
+    for outline in outlines_mm:
+        for place, (x, y) in enumerate(outline):
+            (path.lineTo if place else path.moveTo)(x * POINTS_PER_MM, y * POINTS_PER_MM)
+        path.close()
+    canvas.setFillColorRGB(*colour)
+    canvas.drawPath(path, stroke=0, fill=1, fillMode=0)
+
+
 def box(
     canvas: Canvas, sides_mm: tuple[float, float, float, float], colour: Colour = BLACK
 ) -> None:
@@ -170,11 +183,7 @@ def write_on_white(
         np.array(middle_mm) + side * half * along + up * 0.8 * TEXT_MM * aside
         for side, up in ((-1, -1), (1, -1), (1, 1), (-1, 1))
     ]
-    path = canvas.beginPath()
-    for place, (x, y) in enumerate(corners):
-        (path.lineTo if place else path.moveTo)(x * POINTS_PER_MM, y * POINTS_PER_MM)
-    canvas.setFillColorRGB(*WHITE)
-    canvas.drawPath(path, stroke=0, fill=1)
+    fill(canvas, [np.array(corners)], WHITE)
     # Its capital letters extend as far above the middle as below it.
     x, y = np.array(middle_mm) - 0.5 * TEXT_MM * aside
     at = (float(x), float(y))

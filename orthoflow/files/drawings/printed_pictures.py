@@ -151,23 +151,12 @@ def contours(
     return found
 
 
-@dataclass(frozen=True, kw_only=True)
-class LabelPlace:
-    """The position of a number.
-
-    Attributes:
-        middle_mm: centre of the number, on the paper.
-        turned_deg: counter-clockwise, so that it is never upside down.
-    """
-
-    middle_mm: tuple[float, float]
-    turned_deg: float
-
-
 def label_place(
     points_mm: NDArray[np.float64], wide_mm: float, placed_mm: Sequence[NDArray[np.float64]]
-) -> LabelPlace | None:
-    """Find a position for a number on a line, or None.
+) -> tuple[tuple[float, float], float] | None:
+    """Find a position for a number on a line: its centre on the paper, and degrees, or None.
+
+    It is rotated counter-clockwise, so that it is never upside down.
 
     Args:
         points_mm: the line, (n, 2) on the paper.
@@ -198,7 +187,7 @@ def label_place(
         turned_deg = math.degrees(math.atan2(chord[1], chord[0]))
         if not -90.0 < turned_deg <= 90.0:
             turned_deg -= math.copysign(180.0, turned_deg)
-        return LabelPlace(middle_mm=(float(place[0]), float(place[1])), turned_deg=turned_deg)
+        return (float(place[0]), float(place[1])), turned_deg
     return None
 
 

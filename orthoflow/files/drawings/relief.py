@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.drawings.papers import Part
+from orthoflow.files.drawings.papers import whole_of
 from orthoflow.files.drawings.printed_pictures import contours, stretch_of
 from orthoflow.files.geotiff import RasterParts
 from orthoflow.files.polygons import Feature, write_features
@@ -121,8 +121,7 @@ def _contours(
 ) -> list[tuple[float, NDArray[np.float64]]]:
     """Return contours in X and Y (n, 2) of the raster's GeoTIFF."""
     size_m = frame.width * frame.gsd_m, frame.height * frame.gsd_m
-    whole = Part(left_m=0.0, top_m=0.0, right_m=size_m[0], bottom_m=size_m[1])
-    found = contours(depth, whole, scale=_CONTOUR_SCALE, interval_m=interval_m)
+    found = contours(depth, whole_of(size_m), scale=_CONTOUR_SCALE, interval_m=interval_m)
     return [(level, frame.raster_from_wall(points / frame.gsd_m)) for level, points in found]
 
 

@@ -7,7 +7,7 @@ column on the right of the sheet or a strip along its lower edge.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
@@ -17,17 +17,14 @@ from reportlab.lib.colors import Color
 from reportlab.platypus import Flowable, Image, Table
 
 from orthoflow.files.drawings.key_plans import KeyPlan
-from orthoflow.files.drawings.papers import FOOT_M, MARGIN_MM, Paper
+from orthoflow.files.drawings.papers import MARGIN_MM, Paper
 from orthoflow.files.drawings.pens import (
-    BEFORE,
-    BEHIND,
     BLACK,
     FRAME_MM,
     GREY,
     HEADING_MM,
     MATCH_DASHES_MM,
     MEDIUM_MM,
-    OPENING,
     POINTS_PER_MM,
     RED,
     TEXT_MM,
@@ -44,7 +41,7 @@ from orthoflow.files.drawings.pens import (
     write_on_white,
     write_text,
 )
-from orthoflow.files.drawings.sheet_contents import Sheet, WallDrawing
+from orthoflow.files.drawings.sheet_contents import Drawing, LegendRow, Sheet
 from orthoflow.files.drawings.words import label
 
 if TYPE_CHECKING:
@@ -127,7 +124,7 @@ class Furniture:
 
 
 def furnished(
-    paper: Paper, drawing: WallDrawing, sheet: Sheet, *, is_brief: bool = False
+    paper: Paper, drawing: Drawing, sheet: Sheet, *, is_brief: bool = False
 ) -> Furniture | None:
     """Pack the blocks beside the pictures; None if the paper is too small.
 
@@ -222,7 +219,7 @@ def _packed(
 # --- notes, legend, key plans ---
 
 
-def _notes(drawing: WallDrawing, sheet: Sheet, *, is_brief: bool) -> list[Any]:
+def _notes(drawing: Drawing, sheet: Sheet, *, is_brief: bool) -> list[Any]:
     language = drawing.language
     found: list[Any] = [_scale_bar(drawing)]
     if drawing.grid > 0.0:
@@ -241,9 +238,9 @@ def _notes(drawing: WallDrawing, sheet: Sheet, *, is_brief: bool) -> list[Any]:
     return found
 
 
-def _scale_bar(drawing: WallDrawing) -> _Picture:
+def _scale_bar(drawing: Drawing) -> _Picture:
     """Draw segments of a round length, black and white, with the length at each end."""
-    unit_m = FOOT_M if drawing.unit == "ft" else 1.0
+    unit_m = drawing.unit_m
     least = 1e-3 * drawing.scale * _SEGMENT_MM / 2.5 / unit_m
     # The largest round length that is at most 25 mm long.
     power = 10.0 ** math.floor(math.log10(least))
@@ -273,10 +270,10 @@ def _scale_bar(drawing: WallDrawing) -> _Picture:
     return _Picture(8.0, draw)
 
 
-def _legend(drawing: WallDrawing, sheet: Sheet) -> Iterator[Any]:
+def _legend(drawing: Drawing, sheet: Sheet) -> Iterator[Any]:
     language = drawing.language
-    rows: list[tuple[Callable[[Canvas], None], str]] = []
-    if drawing.grid > 0.0:
+    rows: list[LegendRow] = []
+    if drawing.grid > 0.0 and drawing.axes.across is not None:
         rows.append((lambda canvas: cross(canvas, 7.0, 2.0), label("legend_cross", language)))
     if drawing.heights:
         rows.append(
@@ -287,39 +284,21 @@ def _legend(drawing: WallDrawing, sheet: Sheet) -> Iterator[Any]:
         )
     if drawing.north is not None:
         up = np.array([[7.0, -0.5], [7.0, 4.5]])
-        text = f"{drawing.plan.up_label if drawing.plan else ''}: {label('legend_north', language)}"
+        text = f"{drawing.up_label}: {label('legend_north', language)}"
         rows.append((lambda canvas: arrow(canvas, up), text))
-    if drawing.areas:
-        sides = [(3.0, 0.3), (11.0, 0.3), (11.0, 3.7), (3.0, 3.7)]
-        rows.append(
-            (
-                lambda canvas: line(
-                    canvas, sides, width_mm=MEDIUM_MM, colour=OPENING, is_closed=True
-                ),
-                label("legend_opening", language),
-            )
-        )
-    if any(view.kind == "depth" for view in sheet.views):
-        interval = f"{1e3 * drawing.interval_m:g}"
-        for key, colour in (("legend_before", BEFORE), ("legend_behind", BEHIND)):
-            rows.append((_sample(colour), label(key, language, interval=interval)))
-        if drawing.depth_range_m is not None:
-            low, high = (f"{1e3 * value:+.0f}" for value in drawing.depth_range_m)
-            rows.append((_grey_ramp, label("legend_grey", language, low=low, high=high)))
-    rows.append((_empty_box, label("legend_empty", language)))
+    # What several pictures have in common once.
+    own = {row[1]: row for view in sheet.views for row in drawing.pictures[view.kind].legend}
+    rows += own.values()
     if len(sheet.numbered) > 1:
+        ends = [(1.0, 2.0), (13.0, 2.0)]
         rows.append(
             (
-                lambda canvas: line(
-                    canvas,
-                    [(1.0, 2.0), (13.0, 2.0)],
-                    width_mm=WIDE_MM,
-                    dashes_mm=MATCH_DASHES_MM,
-                ),
+                lambda canvas: line(canvas, ends, width_mm=WIDE_MM, dashes_mm=MATCH_DASHES_MM),
                 label("legend_match", language),
             )
         )
-    yield paragraph(label("legend", language), is_bold=True)
+    if rows:
+        yield paragraph(label("legend", language), is_bold=True)
     for draw, text in rows:
         yield _Row(draw, text)
 
@@ -344,19 +323,6 @@ class _Row(Flowable):  # type: ignore[misc] # reportlab has no types
         self.canv.translate(0.0, self.height - 4.3 * POINTS_PER_MM)
         self.symbol(self.canv)
         self.canv.restoreState()
-
-
-def _sample(colour: tuple[float, float, float]) -> Callable[[Canvas], None]:
-    return lambda canvas: line(canvas, [(1.0, 2.0), (13.0, 2.0)], width_mm=THIN_MM, colour=colour)
-
-
-def _grey_ramp(canvas: Canvas) -> None:
-    for step in range(24):
-        box(canvas, (1.0 + 0.5 * step, 0.5, 0.5, 3.0), (step / 23.0,) * 3)
-
-
-def _empty_box(canvas: Canvas) -> None:
-    line(canvas, [(3.0, 0.3), (11.0, 0.3), (11.0, 3.7), (3.0, 3.7)], colour=GREY, is_closed=True)
 
 
 class _Plan(Flowable):  # type: ignore[misc] # reportlab has no types
@@ -393,7 +359,7 @@ class _Plan(Flowable):  # type: ignore[misc] # reportlab has no types
         )
 
 
-def _key_plan(drawing: WallDrawing, plan: KeyPlan) -> tuple[str, NDArray[np.float64], Any]:
+def _key_plan(drawing: Drawing, plan: KeyPlan) -> tuple[str, NDArray[np.float64], Any]:
     """The room from above, with the number of the marked wall."""
     lines = [*plan.walls, *plan.outlines, plan.marked]
     if plan.arrow is not None:
@@ -413,42 +379,25 @@ def _key_plan(drawing: WallDrawing, plan: KeyPlan) -> tuple[str, NDArray[np.floa
         write_text(canvas, plan.up_label, (right, 11.0), is_centred=True)
         # The marked one first: where walls are close together, not all numbers fit.
         placed = {n: place(wall) for n, wall in zip(plan.numbers, plan.walls, strict=True)}
-        order = sorted(placed, key=lambda n: (n != drawing.number, -_length(placed[n])))
-        _number_walls(canvas, {n: placed[n] for n in order})
+        numbered: list[NDArray[np.float64]] = []
+        for number in sorted(placed, key=lambda n: (n != plan.number, -_length(placed[n]))):
+            middle = placed[number].mean(axis=0)
+            room = 1.5 * text_width_mm(str(number)) + TEXT_MM
+            is_close = any(float(np.linalg.norm(middle - other)) < room for other in numbered)
+            if _length(placed[number]) >= room and not is_close:
+                numbered.append(middle)
+                write_on_white(canvas, str(number), (float(middle[0]), float(middle[1])))
 
     return label("key_plan", drawing.language), np.vstack(lines), draw
-
-
-def _number_walls(canvas: Canvas, on_paper: Mapping[int, NDArray[np.float64]]) -> None:
-    """Write the numbers of walls at their middles, in this order, if there is room."""
-    placed: list[NDArray[np.float64]] = []
-    for number, wall in on_paper.items():
-        middle = wall.mean(axis=0)
-        room = 1.5 * text_width_mm(str(number)) + TEXT_MM
-        is_close = any(float(np.linalg.norm(middle - other)) < room for other in placed)
-        if _length(wall) >= room and not is_close:
-            placed.append(middle)
-            write_on_white(canvas, str(number), (float(middle[0]), float(middle[1])))
 
 
 def _length(ends: NDArray[np.float64]) -> float:
     return float(np.linalg.norm(ends[1] - ends[0]))
 
 
-def _sheet_key(drawing: WallDrawing, sheet: Sheet) -> tuple[str, NDArray[np.float64], Any]:
+def _sheet_key(drawing: Drawing, sheet: Sheet) -> tuple[str, NDArray[np.float64], Any]:
     """The division of a wall into sheets, with this one filled."""
-    boxes = {
-        number: np.array(
-            [
-                [x, -y]
-                for x, y in (
-                    *((part.left_m, part.top_m), (part.right_m, part.top_m)),
-                    *((part.right_m, part.bottom_m), (part.left_m, part.bottom_m)),
-                )
-            ]
-        )
-        for number, part in sheet.numbered
-    }
+    boxes = {number: np.array(part.corners_m) * [1.0, -1.0] for number, part in sheet.numbered}
 
     def draw(canvas: Canvas, place: Any, _wide_mm: float) -> None:
         for number, corners in boxes.items():
@@ -468,13 +417,13 @@ def _sheet_key(drawing: WallDrawing, sheet: Sheet) -> tuple[str, NDArray[np.floa
 # --- the title block ---
 
 
-def _title_flowables(drawing: WallDrawing, sheet: Sheet, wide_mm: float) -> list[Any]:
+def _title_flowables(drawing: Drawing, sheet: Sheet, wide_mm: float) -> list[Any]:
     block = drawing.text.block
     found = [_revisions(drawing, wide_mm)] if block.revisions else []
     return [*found, _title_table(drawing, sheet, wide_mm)]
 
 
-def _revisions(drawing: WallDrawing, wide_mm: float) -> Any:
+def _revisions(drawing: Drawing, wide_mm: float) -> Any:
     """The table of revisions, the newest on top."""
     rows = [
         [paragraph(text) for text in (one.mark, one.date, one.text, one.by)]
@@ -486,7 +435,7 @@ def _revisions(drawing: WallDrawing, wide_mm: float) -> Any:
     )
 
 
-def _title_table(drawing: WallDrawing, sheet: Sheet, wide_mm: float) -> Any:
+def _title_table(drawing: Drawing, sheet: Sheet, wide_mm: float) -> Any:
     block = drawing.text.block
     cells: list[tuple[list[Any], bool]] = []
     if block.logo is not None or block.organisation:
@@ -499,7 +448,9 @@ def _title_table(drawing: WallDrawing, sheet: Sheet, wide_mm: float) -> Any:
     title = [_bold(block.title or drawing.text.name)]
     if block.title:
         title.append(paragraph(drawing.text.name))
-    cells.append(([*title, paragraph(", ".join(_kinds(drawing, sheet)))], True))
+    cells.append(
+        ([*title, paragraph(", ".join(dict.fromkeys(view.kind for view in sheet.views)))], True)
+    )
     cells += [([_small(name), paragraph(value)], False) for name, value in _named(drawing, sheet)]
     cells += list(_scale_and_sheet(drawing, sheet))
     if block.note:
@@ -515,7 +466,7 @@ def _title_table(drawing: WallDrawing, sheet: Sheet, wide_mm: float) -> Any:
     return Table(rows, colWidths=widths, style=_style(*spans))
 
 
-def _named(drawing: WallDrawing, sheet: Sheet) -> Iterator[tuple[str, str]]:
+def _named(drawing: Drawing, sheet: Sheet) -> Iterator[tuple[str, str]]:
     """The fields that have a name, those of the client in the middle."""
     language, block = drawing.language, drawing.text.block
     number = label("index", language)
@@ -533,7 +484,7 @@ def _named(drawing: WallDrawing, sheet: Sheet) -> Iterator[tuple[str, str]]:
             yield label(key, language), value
 
 
-def _scale_and_sheet(drawing: WallDrawing, sheet: Sheet) -> Iterator[tuple[list[Any], bool]]:
+def _scale_and_sheet(drawing: Drawing, sheet: Sheet) -> Iterator[tuple[list[Any], bool]]:
     language = drawing.language
     inches = _INCHES.get(drawing.scale) if drawing.unit == "ft" else None
     text = f"1:{drawing.scale}" + (f' ({inches}" = 1\'-0")' if inches else "")
@@ -600,15 +551,7 @@ def _logo(path: str, most_mm: float) -> Any:
     return logo
 
 
-def _kinds(drawing: WallDrawing, sheet: Sheet) -> Iterator[str]:
-    for kind in dict.fromkeys(view.kind for view in sheet.views):
-        is_grey = kind == "intensity" and drawing.intensity_is_grey
-        yield label("grey" if is_grey else kind, drawing.language)
-    if drawing.is_flipped:
-        yield label("reflected", drawing.language)
-
-
-def _seal(drawing: WallDrawing, wide_mm: float) -> Any:
+def _seal(drawing: Drawing, wide_mm: float) -> Any:
     """The digest of the record as a QR code and as text."""
     from reportlab.graphics.barcode.qr import QrCodeWidget
     from reportlab.graphics.shapes import Drawing

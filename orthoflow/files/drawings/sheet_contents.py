@@ -1,23 +1,86 @@
-"""The contents of a sheet."""
+"""The contents of a sheet: a drawing is its size, notes, legends, and functions that draw it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.drawings.key_plans import KeyPlan
-from orthoflow.files.drawings.papers import Paper, Part, View
+from orthoflow.files.drawings.key_plans import KeyPlan, axis_words
+from orthoflow.files.drawings.papers import FOOT_M, Paper, Part, View
+from orthoflow.files.drawings.pens import POINTS_PER_MM
 from orthoflow.files.drawings.title_blocks import TitleBlock
 from orthoflow.files.drawings.words import Language, Phrase
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.directions import basis_from_up
 
+if TYPE_CHECKING:
+    from reportlab.pdfgen.canvas import Canvas
+
 Unit = Literal["m", "ft"]
+# What draws a symbol of 14 x 4 mm at the origin, and its text.
+LegendRow = tuple[Callable[["Canvas"], None], str]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Placed:
+    """A picture at its place on the paper.
+
+    Attributes:
+        canvas: the page.
+        view: the picture's part, and its place.
+        scale: n of 1 : n.
+        scratch: path without a suffix for a file of the picture.
+    """
+
+    canvas: Canvas
+    view: View
+    scale: int
+    scratch: Path
+
+    @property
+    def edges_mm(self) -> tuple[float, float, float, float]:
+        """Left, bottom, right and top on the paper."""
+        left, bottom = self.view.corner_mm
+        wide, high = (1e3 * edge / self.scale for edge in self.view.part.size_m)
+        return left, bottom, left + wide, bottom + high
+
+    @contextmanager
+    def clipped(self) -> Iterator[Canvas]:
+        """Draw inside the picture alone."""
+        left, bottom, right, top = (POINTS_PER_MM * edge for edge in self.edges_mm)
+        self.canvas.saveState()
+        frame = self.canvas.beginPath()
+        frame.rect(left, bottom, right - left, top - bottom)
+        self.canvas.clipPath(frame, stroke=0, fill=0)
+        yield self.canvas
+        self.canvas.restoreState()
+
+    def on_paper(
+        self, places_m: Sequence[tuple[float, float]] | NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return positions on the paper (n, 2), mm, of metres right and down from the corner."""
+        part = self.view.part
+        offset = np.asarray(places_m, dtype=np.float64) - [part.left_m, part.bottom_m]
+        return np.asarray(self.view.corner_mm + 1e3 / self.scale * offset * [1.0, -1.0])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Picture:
+    """A picture of a drawing.
+
+    Attributes:
+        draw: draws a part of it.
+        legend: of its symbols.
+    """
+
+    draw: Callable[[Placed], None]
+    legend: tuple[LegendRow, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,23 +88,23 @@ class Axes:
     """The coordinates beside a picture, in metres.
 
     Attributes:
-        across: coordinate at the left edge of the drawn wall, and its change per metre to the
-            right.
+        across: coordinate at the left edge of the drawing, and its change per metre to the right;
+            None if it means nothing, as over several walls.
         down: coordinate at its top edge, and its change per metre downwards.
         phrase: their meaning, for the sheet.
     """
 
-    across: tuple[float, float]
+    across: tuple[float, float] | None
     down: tuple[float, float]
     phrase: Phrase
 
 
 @dataclass(frozen=True, kw_only=True)
 class SheetText:
-    """Texts on every sheet of a wall.
+    """Texts on every sheet of a drawing.
 
     Attributes:
-        name: of the wall.
+        name: of the wall, or what is cut.
         block: the office's title block.
         notes: accuracy, colours, cells.
         digest: seal of the record.
@@ -56,58 +119,43 @@ class SheetText:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MarkedArea:
-    """An area outlined on the pictures of a wall.
+class Drawing:
+    """What is drawn to scale, on one sheet or more.
 
     Attributes:
-        text: written into it if it is wide enough, its parts (", ") below each other.
-        outline_m: (n, 2) metres to the right and down from the top-left corner of the drawn wall.
-    """
-
-    text: str
-    outline_m: NDArray[np.float64]
-
-
-@dataclass(frozen=True, kw_only=True)
-class WallDrawing:
-    """A wall drawn on one sheet or more.
-
-    Attributes:
-        number: of the wall.
-        rasters: kind of picture -> GeoTIFF.
+        stem: of its files.
+        size_m: width and height.
+        pictures: what each shows, in words -> picture; all of this size.
         axes: coordinates.
-        plan: the key plan, None without planes.
         text: its texts.
         scale: n of 1 : n.
+        plan: the key plan, None without one.
         grid: distance of the crosses in `unit`, 0 for none.
         unit: unit of all numbers beside pictures.
         language: language of labels.
-        interval_m: interval of the contours of depth.
-        depth_range_m: depths that are black and white in the grey of the depth picture.
-        areas: openings of the wall.
         heights: metres down from the top edge that have a height mark.
-        north: (2,) right and up on the paper of the up direction of the key plan; None with
-            heights.
-        is_flipped: the rows of the rasters go up the paper, as those of ceilings do.
-        intensity_is_grey: the intensity is the grey of the scan's colours, not of its laser.
+        north: (2,) right and up on the paper of the direction `up_label`; None with heights.
+        up_label: of the key plan's up direction.
     """
 
-    number: int
-    rasters: Mapping[str, Path]
+    stem: str
+    size_m: tuple[float, float]
+    pictures: Mapping[str, Picture]
     axes: Axes
-    plan: KeyPlan | None
     text: SheetText
     scale: int
-    grid: float
+    plan: KeyPlan | None = None
+    grid: float = 0.0
     unit: Unit = "m"
     language: Language = "en"
-    interval_m: float = 0.0
-    depth_range_m: tuple[float, float] | None = None
-    areas: tuple[MarkedArea, ...] = ()
     heights: tuple[float, ...] = ()
     north: tuple[float, float] | None = None
-    is_flipped: bool = False
-    intensity_is_grey: bool = False
+    up_label: str = ""
+
+    @property
+    def unit_m(self) -> float:
+        """Metres of its unit."""
+        return FOOT_M if self.unit == "ft" else 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,19 +186,18 @@ def axes_of(frame: WallFrame) -> Axes:
     kind = frame.raster_axes
     values: dict[str, object] = {"crs": frame.map_crs} if kind == "map" else {}
     if kind == "wall":
-        values = {"up": _axis_words(np.array(frame.up))}
+        values = {"up": up_words(np.array(frame.up))}
     phrase = Phrase(key=f"axes_{kind}", values=values)
     return Axes(across=(left_m, 1.0), down=(top_m, -1.0), phrase=phrase)
 
 
-def _axis_words(up: NDArray[np.float64]) -> str:
-    """Return the scan's axis along which heights count, with its sign."""
+def up_words(up: NDArray[np.float64]) -> str:
+    """Return the scan's axis along which heights count, with its sign, or its components."""
     if up.shape != (3,):
         return "?"
-    axis = int(np.argmax(np.abs(up)))
-    if abs(float(up[axis])) < 1.0 - 1e-9:
+    if float(np.abs(up).max()) < 1.0 - 1e-9:
         return f"({', '.join(f'{value:.3f}' for value in up.tolist())})"
-    return f"{'-' if up[axis] < 0.0 else ''}{'xyz'[axis]}"
+    return axis_words(up)
 
 
 def north_of(frame: WallFrame) -> tuple[float, float] | None:

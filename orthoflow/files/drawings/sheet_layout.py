@@ -1,4 +1,4 @@
-"""The paper of a wall's drawing, and the division of walls that fit on none."""
+"""The paper of a drawing, and the division of those that fit on none."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Final
 
 from orthoflow.errors import ArgumentError
 from orthoflow.files.drawings.papers import (
-    FOOT_M,
     SCALES,
     SCALES_FT,
     Layout,
@@ -19,32 +18,30 @@ from orthoflow.files.drawings.papers import (
     paper_of,
     together,
     usual_papers,
+    whole_of,
 )
 from orthoflow.files.drawings.sheet_blocks import Furniture, furnished
-from orthoflow.files.drawings.sheet_contents import Sheet, WallDrawing
+from orthoflow.files.drawings.sheet_contents import Drawing, Sheet
 from orthoflow.files.drawings.title_blocks import TitleBlock
 
 # A wall that fits on no paper is divided into sheets of this one.
 _CUT_PAPER: Final = "A1"
 
-# A drawing, and width and height of its wall in metres.
-Sized = tuple[WallDrawing, tuple[float, float]]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Sheets:
-    """The sheets of a wall.
+    """The sheets of a drawing.
 
     Attributes:
-        drawing: drawing of the wall.
+        drawing: the drawing.
         furniture: blocks beside the pictures of each sheet.
         sheets: each with its pictures.
         index: the drawing and sheet that show the division of the wall, at a smaller scale.
     """
 
-    drawing: WallDrawing
+    drawing: Drawing
     sheets: tuple[tuple[Sheet, Furniture], ...]
-    index: tuple[WallDrawing, Sheet, Furniture] | None = None
+    index: tuple[Drawing, Sheet, Furniture] | None = None
 
 
 def _ways(paper: Paper, block: TitleBlock) -> list[Paper]:
@@ -54,14 +51,13 @@ def _ways(paper: Paper, block: TitleBlock) -> list[Paper]:
 
 
 def _on_one(
-    drawing: WallDrawing,
-    size_m: tuple[float, float],
+    drawing: Drawing,
     papers: Sequence[Paper],
     *,
     is_brief: bool = False,
 ) -> tuple[Sheet, Furniture] | None:
     """Return all pictures of a wall on one sheet of the first of some papers that fits."""
-    kinds = tuple(drawing.rasters)
+    kinds, size_m = tuple(drawing.pictures), drawing.size_m
     for paper in papers:
         for way in _ways(paper, drawing.text.block):
             views = together(kinds, size_m, way, drawing.scale)
@@ -77,39 +73,36 @@ def _on_one(
 
 
 def fitting_scale(
-    drawn: Callable[[int], Sequence[Sized]], scales: Sequence[int], papers: Sequence[Paper]
+    drawn: Callable[[int], Sequence[Drawing]], scales: Sequence[int], papers: Sequence[Paper]
 ) -> int:
     """Return n of the largest scale 1 : n at which each wall fits on one sheet.
 
     Args:
-        drawn: returns the walls at a scale.
+        drawn: returns the drawings at a scale.
         scales: largest first.
         papers: available papers.
     """
     ways = [way for paper in papers for way in (paper, paper.turned)]
     for scale in scales:
-        if all(_on_one(drawing, size_m, ways) for drawing, size_m in drawn(scale)):
+        if all(_on_one(drawing, ways) for drawing in drawn(scale)):
             return scale
     return scales[-1]
 
 
-def paper_for_one(walls: Sequence[Sized]) -> str:
-    """Return the name of the smallest usual paper that fits each wall on one sheet, or ""."""
+def paper_for_one(drawings: Sequence[Drawing]) -> str:
+    """Return the name of the smallest usual paper that fits each drawing on one sheet, or ""."""
     for paper in usual_papers()[::2]:
         ways = (paper, paper.turned)
-        if all(_on_one(drawing, size_m, ways) for drawing, size_m in walls):
+        if all(_on_one(drawing, ways) for drawing in drawings):
             return paper.name
     return ""
 
 
-def lay_out(
-    drawing: WallDrawing, size_m: tuple[float, float], given: Sequence[Paper] = ()
-) -> Sheets:
+def lay_out(drawing: Drawing, given: Sequence[Paper] = ()) -> Sheets:
     """Place a wall on one sheet, or divide it into several of the same size.
 
     Args:
-        drawing: drawing of the wall.
-        size_m: its width and height.
+        drawing: the drawing.
         given: permitted papers; without any the smallest usual one that fits the wall.
 
     Raises:
@@ -118,14 +111,14 @@ def lay_out(
     papers = [way for paper in given for way in (paper, paper.turned)] or usual_papers()
     # Key plans are omitted only if the office's paper has no room for them.
     for is_brief in (False, True) if given else (False,):
-        if (alone := _on_one(drawing, size_m, papers, is_brief=is_brief)) is not None:
+        if (alone := _on_one(drawing, papers, is_brief=is_brief)) is not None:
             return Sheets(drawing=drawing, sheets=(alone,))
     paper = given[0] if given else paper_of(_CUT_PAPER)
     ways: list[tuple[tuple[Sheet, Furniture], ...]] = []
     for is_brief in (False, True):
         for way in (paper, paper.turned):
             for one in _ways(way, drawing.text.block):
-                ways += [] if ways and is_brief else _cut(drawing, size_m, one, is_brief=is_brief)
+                ways += [] if ways and is_brief else _cut(drawing, one, is_brief=is_brief)
     if not ways:
         raise ArgumentError(
             f"--paper {paper.name or f'{paper.width_mm:g}x{paper.height_mm:g}'} has no room for "
@@ -133,29 +126,34 @@ def lay_out(
             "the title block"
         )
     sheets = min(ways, key=len)
-    kind = next(iter(drawing.rasters))
+    kind = next(iter(drawing.pictures))
     numbered = tuple(
         (sheet.number, sheet.views[0].part) for sheet, _ in sheets if sheet.views[0].kind == kind
     )
     return Sheets(
-        drawing=drawing, sheets=sheets, index=_index(drawing, size_m, paper, numbered, len(sheets))
+        drawing=drawing, sheets=sheets, index=_index(drawing, paper, numbered, len(sheets))
     )
 
 
 def _cut(
-    drawing: WallDrawing, size_m: tuple[float, float], paper: Paper, *, is_brief: bool
+    drawing: Drawing, paper: Paper, *, is_brief: bool
 ) -> list[tuple[tuple[Sheet, Furniture], ...]]:
     """Return the sheets of a divided wall; none if the paper has no room for them."""
-    whole = Part(left_m=0.0, top_m=0.0, right_m=size_m[0], bottom_m=size_m[1])
+    whole = whole_of(drawing.size_m)
     # As much text as on any of them: with a key of several sheets.
-    views = (View(kind=next(iter(drawing.rasters)), part=whole, corner_mm=(0.0, 0.0)),)
+    views = (View(kind=next(iter(drawing.pictures)), part=whole, corner_mm=(0.0, 0.0)),)
     several = ((1, whole), (2, whole))
     longest = Sheet(paper=paper, views=views, count=99, numbered=several)
     first = furnished(paper, drawing, longest, is_brief=is_brief)
     if first is None:
         return []
-    grid_m = drawing.grid * (FOOT_M if drawing.unit == "ft" else 1.0)
-    laid = cut_up(tuple(drawing.rasters), size_m, first.paper, scale=drawing.scale, grid_m=grid_m)
+    laid = cut_up(
+        tuple(drawing.pictures),
+        drawing.size_m,
+        first.paper,
+        scale=drawing.scale,
+        grid_m=drawing.grid * drawing.unit_m,
+    )
     sheets = [
         Sheet(
             paper=first.paper,
@@ -189,21 +187,20 @@ def _numbered(views: Sequence[tuple[View, ...]], kind: str) -> tuple[tuple[int, 
 
 
 def _index(
-    drawing: WallDrawing,
-    size_m: tuple[float, float],
+    drawing: Drawing,
     paper: Paper,
     numbered: tuple[tuple[int, Part], ...],
     count: int,
-) -> tuple[WallDrawing, Sheet, Furniture] | None:
+) -> tuple[Drawing, Sheet, Furniture] | None:
     """Wall as large as fits on one sheet; None if it is undivided, or at no usual scale."""
-    first = next(iter(drawing.rasters))
-    whole = replace(drawing, grid=0.0, heights=(), rasters={first: drawing.rasters[first]})
+    first = next(iter(drawing.pictures))
+    whole = replace(drawing, grid=0.0, heights=(), pictures={first: drawing.pictures[first]})
     if len(numbered) < 2:
         return None
     for scale in SCALES_FT if drawing.unit == "ft" else SCALES:
         small = replace(whole, scale=scale)
         ways = (paper, paper.turned)
-        if scale > drawing.scale and (found := _on_one(small, size_m, ways, is_brief=True)):
+        if scale > drawing.scale and (found := _on_one(small, ways, is_brief=True)):
             sheet = replace(found[0], number=0, count=count, numbered=numbered)
             furniture = furnished(found[0].paper, small, sheet, is_brief=True)
             return None if furniture is None else (small, sheet, furniture)

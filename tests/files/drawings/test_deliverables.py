@@ -14,8 +14,10 @@ from click.testing import CliRunner
 from PIL import Image
 
 from orthoflow.cli.program import program
-from orthoflow.files.drawings.elevations import ElevationWall, elevation_scale, unfolded
+from orthoflow.files.drawings.elevations import ElevationWall, elevation, unfolded
 from orthoflow.files.drawings.relief import NOTHING, Light, shaded
+from orthoflow.files.drawings.sheet_contents import SheetText
+from orthoflow.files.drawings.title_blocks import TitleBlock
 from orthoflow.geometry.frames import frame_over
 from tests.drawing_runs import GSD_M, SIZE_M, WALL, box_planes, write_drawing_run
 from tests.optional import skip
@@ -90,10 +92,14 @@ def test_walls_unfold_in_the_order_of_a_viewer_who_turns_right() -> None:
     # Walls 2 (y = 3 m), 3 (x = 4 m), 4 (y = 0), 5 (x = 0) follow each other clockwise.
     start = names.index("wall 2")
     assert names[start:] + names[:start] == ["wall 2", "wall 3", "wall 4", "wall 5"]
-    scale, paper, sheets = elevation_scale(order, UP, 50, None)
-    assert scale == 50
-    assert len(sheets) == 1
-    assert paper.width_mm >= sum(1000 * wall.size_m[0] / 50 for wall in order)
+    text = SheetText(name="walls", block=TitleBlock(), notes=(), digest="0" * 64, run="run")
+    drawing = elevation(order, UP, text, 50)
+    assert drawing.size_m[0] >= sum(wall.size_m[0] for wall in order)
+    # Each floor and each ceiling has its height.
+    start, slope = drawing.axes.down
+    edges = {height for wall in order for height in (wall.frame.corners_world() @ UP).tolist()}
+    marked = {start + slope * down for down in drawing.heights}
+    assert all(min(abs(height - edge) for edge in edges) < 1e-3 for height in marked)
 
 
 def test_an_elevation_has_the_picture_in_scale(run: Path, tmp_path: Path) -> None:
@@ -101,7 +107,10 @@ def test_an_elevation_has_the_picture_in_scale(run: Path, tmp_path: Path) -> Non
     with pdfplumber.open(tmp_path / "out" / "elevation_1.pdf") as pdf:
         (page,) = pdf.pages
         (image,) = page.images
-        assert "1:25" in page.extract_text()
+        words = page.extract_text()
+        assert "1:25" in words
+        # With the title block of all sheets, in the language.
+        assert "feuille 1 sur 1" in words
     in_mm = 25.4 / 72.0
     assert (image["x1"] - image["x0"]) * in_mm == pytest.approx(
         1000 * (SIZE_M[0] - 0.2) / 25, abs=0.1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import ezdxf
 import numpy as np
@@ -12,8 +13,12 @@ import pdfplumber
 import pytest
 
 from orthoflow.errors import ArgumentError
-from orthoflow.files.drawings.section_files import SectionDrawing, fitted, write_section
+from orthoflow.files.drawings.section_files import SectionDrawing, section_sheet, write_section
 from orthoflow.files.drawings.sections import plan_cut, section_cut, section_of
+from orthoflow.files.drawings.sheet_contents import SheetText
+from orthoflow.files.drawings.sheet_layout import lay_out
+from orthoflow.files.drawings.sheets import write_sheet
+from orthoflow.files.drawings.title_blocks import TitleBlock
 from orthoflow.products import PointCloud
 from tests.drawing_runs import AXES, CORNER, SIZE_M, box_planes, box_points
 
@@ -112,14 +117,43 @@ def test_a_cut_that_meets_nothing_is_refused() -> None:
         section_cut(box_planes(), [1.0, 2.0, 1.0, 2.0])
 
 
-def test_the_three_files_show_the_same_lines_in_scale(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["plan", "section"])
+def test_a_sheet_of_it_has_title_block_coordinates_and_lines_in_scale(
+    tmp_path: Path, kind: Literal["plan", "section"]
+) -> None:
+    planes = box_planes()
+    ends = box_points(np.array([[-0.5, 1.0, 0.0], [SIZE_M[0] + 0.5, 1.0, 0.0]]))[:, :2]
+    cut = plan_cut(planes, 1.2)
+    if kind == "section":
+        cut = section_cut(planes, ends.ravel().tolist())
+    section = section_of(cut, planes, (), box_cloud())
+    drawing = SectionDrawing(kind=kind, section=section, scale=50, origin="a box")
+    text = SheetText(name="", block=TitleBlock(), notes=(), digest="0" * 64, run="run")
+    ((sheet, furniture),) = lay_out(section_sheet("x", drawing, planes, text, 1.0)).sheets
+    write_sheet(
+        tmp_path / "x.pdf", section_sheet("x", drawing, planes, text, 1.0), sheet, furniture
+    )
+    with pdfplumber.open(tmp_path / "x.pdf") as pdf:
+        (page,) = pdf.pages
+        words = " ".join(page.extract_text().split())
+        thick = [
+            c
+            for c in (*page.lines, *page.curves)
+            if c["linewidth"] == pytest.approx(0.5 * POINTS_PER_MM)
+        ]
+        lengths = [math.hypot(c["x1"] - c["x0"], c["y1"] - c["y0"]) for c in thick]
+        longest_mm = 1000 * max(one.length_m for one in section.lines) / 50
+        assert min(abs(one / POINTS_PER_MM - longest_mm) for one in lengths) < 0.01
+    for said in ("1:50", kind.title(), "slab of 20 mm", "sheet 1 of 1", "record sha256"):
+        assert said in words, said
+
+
+def test_the_files_of_a_plan_show_the_same_lines_in_scale(tmp_path: Path) -> None:
     section = section_of(plan_cut(box_planes(), 1.2), box_planes(), (), box_cloud())
-    scale, paper = fitted(section, 50, None, has_dimensions=True)
     drawing = SectionDrawing(
         kind="plan",
         section=section,
-        scale=scale,
-        paper=paper,
+        scale=50,
         origin="a box",
         has_dimensions=True,
         language="pl",
@@ -142,10 +176,6 @@ def test_the_three_files_show_the_same_lines_in_scale(tmp_path: Path) -> None:
         across = np.array([begin[1] - end[1], end[0] - begin[0], 0.0])
         outside = (np.array(dimension.dxf.defpoint) - begin) @ across
         assert outside * ((0.5 * (begin + end) - middle) @ across) > 0.0
-    with pdfplumber.open(tmp_path / "plan_1.pdf") as pdf:
-        (page,) = pdf.pages
-        assert float(page.width) == pytest.approx(paper.width_mm * POINTS_PER_MM, abs=0.1)
-        thick = [c for c in (*page.lines, *page.curves) if c["linewidth"] > 1.2]
-        longest = max(math.hypot(c["x1"] - c["x0"], c["y1"] - c["y0"]) for c in thick)
-    assert longest == pytest.approx(1000 * SIZE_M[0] / scale * POINTS_PER_MM, rel=2e-3)
-    assert f'width="{paper.width_mm:g}mm"' in (tmp_path / "plan_1.svg").read_text()
+    svg = (tmp_path / "plan_1.svg").read_text()
+    left, _, right, _ = drawing.bounds_m
+    assert f'width="{max(1000 * (right - left) / 50, 160.0):g}mm"' in svg

@@ -24,8 +24,9 @@ from orthoflow.files.drawings import pens
 from orthoflow.files.drawings.papers import FOOT_M, SCALES, Paper, Part, paper_of, usual_papers
 from orthoflow.files.drawings.printed_pictures import picture_file, write_picture
 from orthoflow.files.drawings.sheet_contents import (
+    Drawing,
+    Picture,
     SheetText,
-    WallDrawing,
     axes_of,
     north_of,
 )
@@ -338,15 +339,15 @@ def write_cff_font(path: Path, letter: str) -> None:
 # --- paper and cuts ---
 
 
-def drawing(scale: int, **more: object) -> WallDrawing:
-    """A drawing whose picture nobody opens."""
+def drawing(scale: int, size_m: tuple[float, float] = (3.8, 2.3), **more: object) -> Drawing:
+    """A drawing whose picture nobody draws."""
     frame = replace(samples.facing_east(0.01, 100, 50, (1.0, 2.0, 30.0)), up=(0.0, 0.0, 1.0))
     text = SheetText(name="wall 7", block=TitleBlock(), notes=(), digest="0" * 64, run="run")
-    plain = WallDrawing(
-        number=7,
-        rasters={"ortho": Path("a.tif")},
+    plain = Drawing(
+        stem="wall_7",
+        size_m=size_m,
+        pictures={"orthoimage": Picture(draw=lambda _placed: None)},
         axes=axes_of(frame),
-        plan=None,
         text=text,
         scale=scale,
         grid=1.0,
@@ -359,7 +360,7 @@ def drawing(scale: int, **more: object) -> WallDrawing:
     [((24.5, 4.7), 50, "A3.2"), ((3.8, 2.3), 50, "A4"), ((7.0, 5.0), 20, "A3.2")],
 )
 def test_the_paper_fits_the_content(size_m: tuple[float, float], scale: int, name: str) -> None:
-    laid = lay_out(drawing(scale), size_m)
+    laid = lay_out(drawing(scale, size_m))
     ((sheet, furniture),) = laid.sheets
     assert sheet.paper.name == name
     assert laid.index is None
@@ -367,20 +368,20 @@ def test_the_paper_fits_the_content(size_m: tuple[float, float], scale: int, nam
     for paper in usual_papers():
         if paper.width_mm * paper.height_mm < sheet.paper.width_mm * sheet.paper.height_mm - 1.0:
             with pytest.raises(ArgumentError):
-                lay_out_on_one(drawing(scale), size_m, paper)
+                lay_out_on_one(drawing(scale, size_m), paper)
     assert furniture.paper == sheet.paper
 
 
-def lay_out_on_one(one: WallDrawing, size_m: tuple[float, float], paper: Paper) -> None:
-    if len(lay_out(one, size_m, [paper]).sheets) > 1:
+def lay_out_on_one(one: Drawing, paper: Paper) -> None:
+    if len(lay_out(one, [paper]).sheets) > 1:
         raise ArgumentError("several")
 
 
 def test_the_scale_is_the_largest_at_which_all_walls_fit() -> None:
     sizes = [(3.8, 2.3), (9.0, 3.0)]
 
-    def drawn(scale: int) -> list[tuple[WallDrawing, tuple[float, float]]]:
-        return [(drawing(scale), size_m) for size_m in sizes]
+    def drawn(scale: int) -> list[Drawing]:
+        return [drawing(scale, size_m) for size_m in sizes]
 
     # 360 mm of the 400 inside the frame, with 35 for what stands beside them.
     assert fitting_scale(drawn, SCALES, [paper_of("A3")]) == 25
@@ -396,7 +397,7 @@ def test_the_scale_is_the_largest_at_which_all_walls_fit() -> None:
 def test_sheets_cover_a_wall_once_and_evenly(
     size_m: tuple[float, float], scale: int, grid: float
 ) -> None:
-    laid = lay_out(drawing(scale, grid=grid), size_m, [paper_of("A3")])
+    laid = lay_out(drawing(scale, size_m, grid=grid), [paper_of("A3")])
     parts = [sheet.views[0].part for sheet, _ in laid.sheets]
     assert len(parts) > 1
     area_m2 = sum(part.size_m[0] * part.size_m[1] for part in parts)
@@ -420,7 +421,7 @@ def test_sheets_cover_a_wall_once_and_evenly(
 
 def test_too_many_sheets_are_refused() -> None:
     with pytest.raises(ArgumentError, match="at most 200 are drawn: take a larger --paper"):
-        lay_out(drawing(1), (30.0, 4.0), [paper_of("A4")])
+        lay_out(drawing(1, (30.0, 4.0)), [paper_of("A4")])
 
 
 def test_match_lines_name_the_sheet_on_which_the_wall_goes_on(run: Path, tmp_path: Path) -> None:
