@@ -58,23 +58,6 @@ def summary(name: str, workflow: str = "hall", **facts: object) -> RunSummary:
     return RunSummary(folder=Path(name), state="ok", workflow=workflow, facts=facts)  # type: ignore[arg-type]
 
 
-def test_what_all_runs_of_a_workflow_share_tells_none_of_them() -> None:
-    runs = [
-        # The order of keys is no difference, that of a list is one.
-        summary("a", seed=1, cell_m=0.1, names=["x", "y"], box={"low": 1, "high": 2}),
-        summary("b", seed=1, cell_m=0.2, names=["x", "y"], box={"high": 2, "low": 1}),
-        # It lacks a fact, and has one that others lack.
-        summary("c", seed=1, names=["y", "x"], only=True),
-        summary("d", workflow="court", seed=2, cell_m=0.9),
-    ]
-    assert differing_facts(runs) == {
-        Path("a"): {"cell_m": 0.1, "names": ["x", "y"]},
-        Path("b"): {"cell_m": 0.2, "names": ["x", "y"]},
-        Path("c"): {"names": ["y", "x"]},
-        Path("d"): {},
-    }
-
-
 def test_the_headlines_that_most_runs_have_come_first() -> None:
     runs = [
         replace(summary(str(k)), headlines=tuple(names))

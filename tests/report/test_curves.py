@@ -51,61 +51,11 @@ def held(folder: Path, cells: list[object]) -> HeldRun:
     return HeldRun(path=folder / "run.h5", record=record(cells))  # type: ignore[arg-type]
 
 
-def test_variants_that_differ_in_one_number_are_a_sweep(tmp_path: Path) -> None:
-    (found,) = sweeps(held(tmp_path, swept(0.02, 0.05, 0.1)).record.cells)
-    assert (found.step, found.parameter) == ("plane", "tolerance_m")
-    assert list(found.values.values()) == [0.02, 0.05, 0.1]
-
-
-def test_two_values_are_a_sweep_whose_curve_says_how_little_it_shows(tmp_path: Path) -> None:
-    two, three = (curves(held(tmp_path, swept(*n)))[0] for n in ((0.02, 0.05), (0.02, 0.05, 0.1)))
-    assert [len(points(one)) for one in (two, three)] == [2, 3]
-    assert two.caption.endswith("and nothing of what lies between.")
-    assert three.caption.endswith("at a steep end the chosen value decides the result.")
-
-
 def test_one_value_other_differences_and_words_are_none(tmp_path: Path) -> None:
     mixed = [*swept(0.02), *swept(0.1, other=2)]
     assert list(sweeps(held(tmp_path, mixed).record.cells)) == []
     words = [cell(f"plane@plane={word}", params={"mode": word}) for word in "abc"]
     assert list(sweeps(held(tmp_path, words).record.cells)) == []
-
-
-def test_what_nobody_set_tells_no_lines_apart(tmp_path: Path) -> None:
-    # The default of the one gives way to small values of the other.
-    cells = [
-        cell(
-            f"plane@plane=v{value}",
-            params={"tolerance_m": value, "fit_tolerance_m": min(value, 0.015)},
-            params_set={"tolerance_m": value},
-            metrics=metrics(rms_mm=value),
-        )
-        for value in (0.005, 0.01, 0.02, 0.05)
-    ]
-    (found,) = sweeps(cells)
-    assert (found.parameter, set(found.others.values())) == ("tolerance_m", {""})
-    (curve,) = curves(held(tmp_path, [*cells]))
-    assert ways(curve) == ["MLLL"]
-    assert list(curve.lines) == [""]
-
-
-def test_curves_of_two_methods_over_one_parameter_are_told_apart(tmp_path: Path) -> None:
-    one = swept(0.02, 0.05, 0.1)
-    other = [
-        cell(
-            f"plane@plane=region-{value:g}",
-            method="plane.region",
-            params={"tolerance_m": value},
-            metrics=metrics(rms_mm=value),
-        )
-        for value in (0.02, 0.05, 0.1)
-    ]
-    (curve,) = curves(held(tmp_path, [*one, *other]))
-    assert curve.title.endswith("over plane.tolerance_m")
-    # On axes that both share, the error of the one is ten times the other's.
-    assert list(curve.lines) == ["plane.toy", "plane.region"]
-    toy, region = ([point.y for point in line] for line in curve.lines.values())
-    assert region == pytest.approx([10.0 * value for value in toy])
 
 
 def test_where_no_quality_hangs_on_a_sweep_what_differs_is_drawn(tmp_path: Path) -> None:
@@ -193,36 +143,6 @@ def test_what_is_asked_for_is_drawn_and_what_hangs_on_no_sweep_is_not(tmp_path: 
     assert titles == [[], [error, "planes found (plane)"]]
 
 
-def test_numbers_that_cannot_be_drawn_are_left_out(tmp_path: Path) -> None:
-    # A record may hold any; these ended with an error, or with nan for a place.
-    values = (0.02, 10**400, math.nan, 0.05, -1e308, 0.1)
-    cells: list[object] = [
-        cell(f"plane@plane=v{index}", params={"tolerance_m": value})
-        for index, value in enumerate(values)
-    ]
-    (found,) = sweeps(held(tmp_path, cells).record.cells)
-    assert sorted(found.values.values()) == [0.02, 0.05, 0.1]
-
-
-def test_repeats_have_bars_and_what_failed_has_no_point(tmp_path: Path) -> None:
-    (curve,) = curves(held(tmp_path, swept(0.02, 0.05, 0.1, 0.2, repeats=3, failed=3)))
-    assert len(points(curve)) == len(bars(curve)) == 3
-    assert bars(curve) == pytest.approx([0.001] * 3)
-    assert "means of the repeats" in curve.caption
-
-
-def test_no_parameter_is_drawn_over_itself(tmp_path: Path) -> None:
-    cells = [
-        cell(f"plane@plane=v{value}", params={"thinning": value},
-             metrics=metrics(thinning=float(value), n_planes=1.0 / value))
-        for value in (1, 4, 20)
-    ]  # fmt: skip
-    told = record(cells, workflow_resolved=compared_resolved("plane.*"))
-    names = [one.name for one in curves(HeldRun(path=tmp_path / "run.h5", record=told))]
-    assert names[0] == "plane.n_planes_over_plane.thinning"
-    assert "plane.thinning_over_plane.thinning" not in names
-
-
 def test_the_baseline_of_a_sweep_is_the_filled_point(tmp_path: Path) -> None:
     told = record(
         swept(0.02, 0.05, 0.1),  # type: ignore[arg-type]
@@ -259,13 +179,6 @@ def test_signed_errors_over_datasets_do_not_make_each_other_small(tmp_path: Path
     (curve,) = curves_over(parts)
     assert [y for _, y in points(curve)] == [0.02, 0.05, 0.1]
     assert "of signed errors their sizes" in curve.caption
-
-
-def test_over_datasets_the_points_are_medians(tmp_path: Path) -> None:
-    parts = {name: held(tmp_path, swept(0.02, 0.05, 0.1)) for name in ("hall", "stairs")}
-    (curve,) = curves_over(parts)
-    assert "medians of 2 datasets" in curve.caption
-    assert len(points(curve)) == 3
 
 
 def test_a_curve_counts_the_datasets_that_its_points_are_of(tmp_path: Path) -> None:

@@ -22,7 +22,6 @@ from orthoflow.report.dataset_tables import dataset_table
 from orthoflow.report.paired import (
     MethodOverDatasets,
     over_datasets,
-    paired_differences,
     who_leads,
 )
 from orthoflow.report.rankings import Sense
@@ -97,18 +96,6 @@ def methods(run: Run) -> dict[str, MethodOverDatasets]:
     return {method.name: method for method in metric.methods}
 
 
-def test_oriented_photos_stand_in_a_column_of_their_own(rooms: HeldRun) -> None:
-    resolved = json.loads(rooms.record.workflow_resolved)
-    resolved["compare"]["metrics"] = ["plane.rms_mm", "plane.n_oriented", "plane.n_photos"]
-    told = replace(rooms.record, workflow_resolved=json.dumps(resolved))
-    table = dataset_table(parts_of(replace(rooms, record=told)), {})
-    assert [label for _, label in table.columns] == [
-        *("points to the first plane, RMS / mm", "photos"),
-    ]
-    assert table.has_photos
-    assert {row.photos.text for row in table.rows} == {"5 of 6"}
-
-
 def test_what_nobody_knows_is_an_empty_cell(tmp_path: Path) -> None:
     header, *rows = dataset_rows(run_of(tmp_path, {"hall": (6.0, 1.0), "stairs": (3.0, 1.0)}))
     found = [dict(zip(header, row, strict=True)) for row in rows]
@@ -133,13 +120,6 @@ def test_a_failure_is_counted_beside_and_has_no_part_in_a_number(rooms: Run) -> 
     assert quick.spread == pytest.approx(1.4826 * 1.0)
 
 
-def test_the_baseline_is_what_others_are_compared_with(rooms: Run) -> None:
-    slow = methods(rooms)["plane=slow"]
-    assert slow.is_reference
-    assert slow.paired is None
-    assert slow.median == 4.0
-
-
 def swept(folder: Path, n_rooms: int, *, step_mm: float) -> HeldRun:
     """Two detectors at three tolerances; the second is better by some millimetres at each."""
     cells = []
@@ -162,22 +142,6 @@ def swept(folder: Path, n_rooms: int, *, step_mm: float) -> HeldRun:
     return HeldRun(
         path=folder / "run.h5", record=record(cells, workflow_resolved=json.dumps(resolved))
     )
-
-
-def test_what_sweeps_a_parameter_is_compared_at_the_same_value(tmp_path: Path) -> None:
-    (metric,) = over_datasets(parts_of(swept(tmp_path, 3, step_mm=0.5)))
-    against = {one.name: one.against for one in metric.methods}
-    assert against == {
-        "plane=hough-tolerance_m-0_02": "",
-        "plane=ransac-tolerance_m-0_02": "plane=hough-tolerance_m-0_02",
-        "plane=hough-tolerance_m-0_05": "plane=hough-tolerance_m-0_02",
-        "plane=ransac-tolerance_m-0_05": "plane=hough-tolerance_m-0_05",
-        "plane=hough-tolerance_m-0_1": "plane=hough-tolerance_m-0_02",
-        "plane=ransac-tolerance_m-0_1": "plane=hough-tolerance_m-0_1",
-    }
-    coarse = metric.methods[-1].paired
-    assert coarse is not None
-    assert (coarse.wins, coarse.median) == (3, pytest.approx(-1.0))
 
 
 @pytest.mark.parametrize(
@@ -226,45 +190,6 @@ def test_values_of_other_environments_are_not_paired(rooms: Run) -> None:
     assert (quick.paired.n, quick.paired.wins, quick.n_unlike) == (5, 3, 1)
 
 
-def test_methods_that_agree_everywhere_have_no_test() -> None:
-    paired = paired_differences({"a": 0.0, "b": 0.0}, Sense.LESS)
-    assert (paired.n, paired.wins, paired.losses, paired.median) == (2, 0, 0, 0.0)
-    assert math.isnan(paired.p)
-    assert math.isnan(paired.effect)
-    assert paired.deciding == {}
-
-
-def test_so_few_differences_that_they_show_nothing_have_no_test() -> None:
-    # Four that all agree have a p of 0.125, one has 1: an effect of -1.00 beside it says too much.
-    few = paired_differences({name: 1.0 + index for index, name in enumerate("abcd")}, Sense.LESS)
-    assert (few.n, few.losses) == (4, 4)
-    assert math.isnan(few.p)
-    assert math.isnan(few.effect)
-
-
-def test_differences_are_told_in_the_sign_of_the_metric() -> None:
-    # Of a share more is better: 0.2 worse is 0.2 less.
-    paired = paired_differences({"a": 0.2, "b": 0.1, "c": -0.1}, Sense.MORE)
-    assert (paired.wins, paired.losses) == (1, 2)
-    assert paired.median == -0.1
-    assert paired.deciding == {"a": -0.2}
-
-
-def test_a_dataset_has_a_row_with_its_own_numbers(rooms: Run) -> None:
-    table = dataset_table(parts_of(rooms), {"hall": "pages/hall.html"})
-    assert table.columns == (("plane", "points to the first plane, RMS / mm"),)
-    assert [row.name for row in table.rows] == list(RMS_MM)
-    assert table.n_whole == 6
-    hall, attic = table.rows[0], table.rows[2]
-    assert (hall.page, hall.failed, hall.limit) == ("pages/hall.html", (), "hall is dark")
-    assert hall.values[0].text == "2"
-    assert (hall.photos.text, hall.photos.sort) == ("5 of 6", 5.0)
-    assert hall.picture.startswith("data:image/webp;base64,")
-    assert attic.failed == ("plane@data=attic,plane=quick: no <plane>",)
-    assert attic.values[0].text == "4"
-    assert (attic.page, attic.picture) == ("", "")
-
-
 def test_a_dataset_that_the_run_was_broken_off_before_is_not_complete(
     rooms: HeldRun, tmp_path: Path
 ) -> None:
@@ -311,36 +236,12 @@ def test_the_page_leads_to_a_page_of_each_dataset(rooms: HeldRun, tmp_path: Path
         assert not [other for other in others if f"data={other}" in own]
 
 
-def test_a_single_file_says_how_to_get_the_pages(rooms: Run, tmp_path: Path) -> None:
-    write_report([rooms], tmp_path / "one.html")
-    page = (tmp_path / "one.html").read_text()
-    assert "orthoflow export RUN --split" in page
-    assert "pages/" not in page
-    assert not (tmp_path / "pages").exists()
-
-
 def test_pages_are_not_written_through_a_link(rooms: Run, tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "pages").symlink_to(tmp_path / "elsewhere")
     with pytest.raises(StoreError, match="pages is a link, so no pages are written there"):
         write_page(rooms, tmp_path / "report.html")
     assert list((tmp_path / "elsewhere").iterdir()) == []
-
-
-def test_a_dataset_that_cannot_be_a_name_has_no_page(tmp_path: Path) -> None:
-    rooms = run_of(tmp_path, {"hall": (1.0, 2.0), "../up": (1.0, 2.0), "attic": (1.0, 2.0)})
-    assert datasets_of(rooms) == ("hall", "attic")
-    write_page(rooms, tmp_path / "report.html")
-    assert {path.name for path in (tmp_path / "pages").iterdir()} == {"hall.html", "attic.html"}
-    assert not list(tmp_path.parent.glob("up*"))
-
-
-def test_a_single_dataset_has_a_page_as_any_run(tmp_path: Path) -> None:
-    write_page(run_of(tmp_path, {"hall": (1.0, 2.0)}), tmp_path / "report.html")
-    page = (tmp_path / "report.html").read_text()
-    assert 'id="r1-images"' in page
-    assert "One row per dataset" not in page
-    assert not (tmp_path / "pages").exists()
 
 
 def test_a_step_called_data_makes_no_datasets(rooms: Run) -> None:

@@ -11,23 +11,6 @@ from orthoflow.report.differences import Difference
 from tests.compared_runs import compared
 
 
-def test_only_what_differs_has_a_row_and_everything_is_counted() -> None:
-    pairs = [
-        Pair(cell="a", name="x", left=1, right=1),
-        Pair(cell="a", name="y", left=1, right=2),
-        Pair(cell="a", name="z", left=1, right=1),
-        Pair(cell="b", name="x", left=None, right=2),
-        Pair(cell="c", name="x", left=3, right=None),
-    ]
-    table = differences._table("Things", pairs, str)
-    assert (table.title, table.n_compared, table.n_different, table.n_alone) == ("Things", 3, 1, 2)
-    assert table.rows == (
-        Difference(cell="a", name="y", left="1", right="2"),
-        Difference(cell="b", name="x", left="-", right="2"),
-        Difference(cell="c", name="x", left="3", right="-"),
-    )
-
-
 def metric(value: float, unit: str = "mm", *, is_cost: bool = False) -> ComparedMetric:
     return ComparedMetric(
         value=value,
@@ -68,25 +51,6 @@ def test_a_parameter_of_many_cells_that_changes_alike_is_one_row() -> None:
     assert table.n_different == 5
 
 
-def test_rounding_has_no_row_and_equal_repeats_have_one() -> None:
-    pairs = [
-        Pair(cell="a", name="odd_deg", left=metric(1e-13, "deg"), right=metric(4e-13, "deg")),
-        Pair(cell="a", name="n_points", left=metric(3e7, "1"), right=metric(3e7 + 1, "1")),
-        *(
-            Pair(cell=f"a{repeat}", name="rms_mm", left=metric(2.0), right=metric(3.0))
-            for repeat in ("", "#1", "#2")
-        ),
-        Pair(cell="b#1", name="rms_mm", left=metric(2.0), right=metric(3.0)),
-    ]
-    table = differences._metric_table(pairs, {"a": "a", "a#1": "a", "a#2": "a", "b#1": "b"})
-    assert (table.n_compared, table.n_different, table.n_rounded) == (6, 5, 1)
-    assert [(row.cell, row.name, row.change) for row in table.rows] == [
-        ("b#1", "rms_mm", "1"),
-        ("a", "rms_mm, 3 repeats", "1"),
-        ("a", "n_points", "1"),
-    ]
-
-
 def test_a_product_says_how_far_each_field_lies_apart_and_why() -> None:
     distance: Any = SimpleNamespace(
         cell="wall",
@@ -106,9 +70,3 @@ def test_a_product_says_how_far_each_field_lies_apart_and_why() -> None:
     assert differences._product_row(distance).words == (
         "0.0123 m at most in depth_m; mask cannot be subtracted"
     )
-
-
-def test_files_are_named_with_the_beginning_of_their_digest() -> None:
-    file: Any = SimpleNamespace(name="a.e57", sha256="0123456789abcdef")
-    assert differences._files_text([file, file]) == "a.e57 0123456789ab, a.e57 0123456789ab"
-    assert differences._files_text([]) == "not given"

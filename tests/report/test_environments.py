@@ -9,7 +9,7 @@ import pytest
 
 from orthoflow.records import RecordedEnvironment
 from orthoflow.report import environments as module
-from orthoflow.report.environments import alike_environments, environment_words, told_apart
+from orthoflow.report.environments import alike_environments
 from tests.report_runs import HeldRun, cell, environment, record
 
 FIRST = environment()
@@ -44,17 +44,3 @@ def test_only_what_methods_use_sets_environments_apart(
 ) -> None:
     monkeypatch.setattr(module, "required_distributions", lambda _: used)
     assert first_alike(other) == ["e1", "e1" if is_alike else "e2"]
-
-
-def test_of_two_that_are_like_the_first_each_may_be_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "required_distributions", lambda _: {"mine"})
-    found = first_alike(packages("e2", mine="1"), packages("e3", mine="2"), packages("e4"))
-    assert found == ["e1", "e1", "e3", "e1"]
-
-
-def test_equal_words_are_told_apart_by_the_packages() -> None:
-    words = environment_words(FIRST)
-    assert told_apart([FIRST, packages("e2", mine="0.1")]) == {
-        "e1": words,
-        "e2": f"{words}; unlike the first with mine 0.1",
-    }

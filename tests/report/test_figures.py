@@ -11,7 +11,7 @@ import numpy as np
 from orthoflow_provenance.document import RecordedCell, RecordedFigure
 
 from orthoflow.files.images import decode_image, encode_png, encode_webp
-from orthoflow.report.figures import baseline_addresses, figure_groups, write_figures
+from orthoflow.report.figures import figure_groups, write_figures
 from tests.report_runs import HeldRun, cell, compared_resolved, record
 
 PNG, SVG, WEBP = "image/png", "image/svg+xml", "image/webp"
@@ -40,42 +40,6 @@ def noise(seed: int, side: int = 300) -> bytes:
     return encode_png(
         np.random.default_rng(seed).integers(0, 256, (side, side, 3)).astype(np.uint8)
     )
-
-
-def test_equal_figures_and_those_of_repeats_are_shown_once() -> None:
-    of = run(
-        [
-            cell("plane@plane=fine", figures=(figure("error_map", b"1"), figure("chart", b"2"))),
-            cell("plane@plane=fine#1", figures=(figure("error_map", b"3"),)),
-            cell("plane@plane=coarse", figures=(figure("error_map", b"1"), figure("other", b"4"))),
-            cell("check", figures=()),
-        ]
-    )
-    assert shown(of) == [
-        ("plane@plane=fine", "error map", 1),
-        ("plane@plane=fine", "chart", 1),
-        ("plane@plane=coarse", "other", 1),
-    ]
-    first, _ = figure_groups(of)
-    assert (first.cell, first.method) == ("plane@plane=fine", "plane.toy")
-    one, _ = first.pictures
-    assert (one.caption, one.cell, one.file) == ("about error_map", "plane@plane=fine", "")
-    assert one.uri == "data:image/png;base64,MQ=="
-
-
-def test_files_lie_beside_the_page_for_the_baseline_and_what_all_share() -> None:
-    of = run(
-        [
-            cell("scan", figures=(figure("plan", b"1"),)),
-            cell("plane@plane=fine", figures=(figure("error_map", b"2"),)),
-            cell("plane@plane=coarse", figures=(figure("error_map", b"3"),)),
-            cell("scan#1", figures=(figure("plan", b"4"),)),
-        ]
-    )
-    assert baseline_addresses(of) == ("scan", "plane@plane=fine")
-    files = [group.pictures[0].file for group in figure_groups(of, with_files=True)]
-    assert files == ["figures/scan/plan.png", "figures/plane@plane=fine/error_map.png", ""]
-    assert all(group.pictures[0].file == "" for group in figure_groups(of))
 
 
 # --- sharing the bytes of a page ---

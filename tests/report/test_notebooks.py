@@ -335,11 +335,6 @@ def test_a_comparison_shows_first_what_says_how_good_it_is() -> None:
     assert html.endswith("<p>11 more, which <code>metric_table()</code> has.</p>")
 
 
-def test_records_of_the_command_line_open_too(tmp_path: Path) -> None:
-    path, _, _ = write_sample(tmp_path)
-    assert "court-yard" in orthoflow.open_run(path)._repr_html_()
-
-
 def test_a_record_that_was_changed_opens_with_a_warning(tmp_path: Path) -> None:
     path, _, _ = write_sample(tmp_path)
     assert orthoflow.open_run(path).verify().findings == ()

@@ -26,7 +26,6 @@ from tests.report_runs import (
     compared_run,
     environment,
     given,
-    metrics,
     record,
 )
 
@@ -239,12 +238,3 @@ def test_environments_and_data_have_letters_of_their_own() -> None:
     told = [of_rooms.letters(one, "e1") for room in rooms for one in combinations_of(room)]
     assert [sign[-1] for sign in told] == ["a", "b", "b"]
     assert of_rooms.legend["b"] == "data of run r1, dataset b; r2, dataset b"
-
-
-def test_one_combination_is_no_comparison() -> None:
-    alone = HeldRun(path=Path("a.h5"), record=record([cell("plane", metrics=metrics(rms_mm=1.0))]))
-    assert comparison_table([alone]) is None
-    both = comparison_table([alone, replace(alone, path=Path("b.h5"))])
-    assert both is not None
-    assert both.shows_runs
-    assert [one.metric for one in both.columns] == ["rms_mm"]

@@ -41,26 +41,6 @@ def table(planes: Planes) -> PlaneTables:
     return found
 
 
-def test_planes_without_thickness_have_rows_without_it() -> None:
-    found = table(wall_and_floor())
-    assert (found.cell, found.viewpoint, found.materials.rows) == (PLACE[0], "stations", ())
-    assert found.planes.rows == (
-        (
-            "wall 0",
-            "270.000",
-            "0.000",
-            "-2.0000",
-            "0.5",
-            "4.00 x 3.00 m",
-            "1,200",
-            "2.00",
-            "-",
-            "-",
-        ),
-        ("floor", "0.000", "90.000", "0.0000", "0", "4.00 x 3.00 m", "800", "3.00", "-", "-"),
-    )
-
-
 def test_thickness_and_materials_stand_in_the_tables() -> None:
     thickness = Thickness(
         sigma_m=0.002, width_95_m=0.008, scan_step_m=0.005, material=(FABRIC, PLASTER)

@@ -6,12 +6,10 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
-from orthoflow_provenance.document import Metric, PublishedFile, RecordedCell, RecordedInput
+from orthoflow_provenance.document import Metric, PublishedFile, RecordedCell
 
 from orthoflow.errors import StoreError
-from orthoflow.products import CheckPoints
 from orthoflow.records.runs import Run
 from orthoflow.records.writing import NOT_YET
 from orthoflow.report import comparisons, write_figures, write_page, write_report
@@ -29,7 +27,6 @@ from tests.report_runs import (
     environment,
     given,
     metrics,
-    orthoimages_product,
     record,
     warned,
 )
@@ -43,19 +40,6 @@ def compared(tmp_path: Path) -> HeldRun:
 
 def run(*cells: object, **more: object) -> Run:
     return Run(path=Path("run.h5"), record=record(cells, **more))  # type: ignore[arg-type]
-
-
-def test_a_comparison_shows_its_inspections_over_common_points(
-    compared: HeldRun, tmp_path: Path
-) -> None:
-    write_report([compared], tmp_path / "report.html")
-    page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    (table,) = re.findall(r'aria-label="over common check points".*?</table>', page, re.DOTALL)
-    cells = re.findall(r'<th scope="row">(.*?)</th>', table)
-    assert {re.sub("<wbr>", "", name) for name in cells} == {
-        "check@plane=fine",
-        "check@plane=coarse",
-    }
 
 
 def test_the_page_needs_no_network_and_escapes_what_methods_say(
@@ -86,15 +70,6 @@ def test_a_citation_links_its_whole_doi(text: str, doi: str) -> None:
     page = str(cited(text))
     assert f'">doi:{doi}</a>' in page
     assert re.sub(r"<[^>]*>", "", page) == text
-
-
-def test_several_runs_share_one_page_with_a_common_table(compared: Run, tmp_path: Path) -> None:
-    write_report([compared, compared], tmp_path / "report.html")
-    page = (tmp_path / "report.html").read_text()
-    assert page.count("<article") == 2
-    assert "All runs beside each other" in page
-    anchors = re.findall(r"\bid=\"([^\"]*)\"", page)
-    assert len(anchors) == len(set(anchors))
 
 
 def test_a_report_that_cannot_be_written_ends_with_a_sentence(
@@ -172,34 +147,6 @@ def test_a_picture_that_cannot_be_decoded_costs_its_place_not_the_page(
     ]
 
 
-def test_what_limits_the_result_is_said_once_failures_first(compared: Run) -> None:
-    assert [(limit.text, limit.cells) for limit in limits(compared)] == [
-        ("no plane & no <wall>", ("plane@plane=broken",)),
-        ("the grid is <fine>", ("check@plane=fine",)),
-        ("the grid is <coarse>", ("check@plane=coarse",)),
-    ]
-
-
-def test_the_answers_are_the_baselines_quality_metrics(compared: Run) -> None:
-    assert [(answer.value, answer.cell) for answer in answers(compared)] == [
-        ("0.4 mm", "check@plane=fine"),
-        ("0.993", "check@plane=fine"),
-        ("1 mm", "plane@plane=fine"),
-    ]
-
-
-def test_the_answers_tell_the_final_orientation_and_the_sharper_completeness() -> None:
-    photographed = run(
-        cell("first", metrics=metrics(n_oriented=4, n_photos=6)),
-        cell("orient", metrics=metrics(n_oriented=5, n_photos=6)),
-        cell("check", metrics=metrics(completeness=0.9, completeness_seen_by_both=0.99)),
-    )
-    assert [(answer.value, answer.cell) for answer in answers(photographed)] == [
-        ("0.9", "check"),
-        ("0.99", "check"),
-    ]
-
-
 def test_check_points_of_the_own_orthoimage_are_told_before_those_of_others() -> None:
     made = given("mosaic.orthoimages", "1", "orthoimages")
     read = given("theirs.orthoimages", "2", "orthoimages")
@@ -252,27 +199,6 @@ def test_combinations_that_show_different_walls_are_a_limit(
     assert found[0].cells == tuple(one.address for one in cells)
 
 
-def test_walls_of_different_rooms_may_differ() -> None:
-    cells = [
-        rastered(10.0, area, f"data={room},plane=a") for room, area in (("x", 2.0), ("y", 9.0))
-    ]
-    assert limits(run(*cells)) == ()
-    moved = rastered(90.0, 9.0, "data=y,plane=b")
-    assert limits(run(*cells, moved))[0].text.count("m2 at omega") == 2
-
-
-def test_what_can_be_mended_is_the_first_limit() -> None:
-    scan = cell("scan", method="read.scan", **warned("a guess", code="guess"))
-    check = cell(
-        "points",
-        method="inspect.checkpoints",
-        **warned("2 of 4 are missing", code="missing", remedy="measure them"),
-    )
-    assert [limit.cells for limit in limits(run(scan, check))] == [("points",), ("scan",)]
-    check = replace(check, **warned("one is an outlier", code="outlier"))
-    assert [limit.cells for limit in limits(run(scan, check))] == [("scan",), ("points",)]
-
-
 def test_a_first_orientation_limits_nothing_once_a_later_one_has_ended(tmp_path: Path) -> None:
     first = cell("first", method="orient.pnp", **warned("photo a: few ties"))
     reties = cell("reties", method="match.guided", inputs={"c": given("first.cameras", "1", "c")})
@@ -292,77 +218,6 @@ def test_a_first_orientation_limits_nothing_once_a_later_one_has_ended(tmp_path:
     failed = replace(orient, status="failed", error_message="no disk", **warned())
     told = [limit.cells for limit in limits(run(first, reties, failed))]
     assert told == [("orient",), ("first",)]
-
-
-def test_diagnostics_of_planes_without_an_orthoimage_stand_last() -> None:
-    told = [
-        cell("a", **warned("guessed", code="guessed", subject="wall 6", remedy="set it")),
-        cell("b", **warned("cells are empty", code="empty", subject="wall 0")),
-    ]
-    image = PublishedFile(path="products/mosaic/wall_0_ortho.tif", size_bytes=1, sha256="0")
-    of_one = replace(run(*told), record=replace(run(*told).record, published=(image,)))
-    assert [limit.cells for limit in limits(of_one)] == [("b",), ("a",)]
-    # Where no images are published nothing is known of them.
-    assert [limit.cells for limit in limits(run(*told))] == [("a",), ("b",)]
-
-
-def test_diagnostics_of_other_planes_than_the_one_on_show_stand_behind() -> None:
-    told = run(
-        cell("a", **warned("empty", code="empty", subject="wall 3", remedy="raise gsd_m")),
-        cell("b", **warned("the photos are few", code="few")),
-        cell("c", **warned("cut", code="cut", subject="wall 0")),
-    )
-    first = [limit.cells for limit in limits(told)]
-    assert first == [("a",), ("b",), ("c",)]
-    assert [limit.cells for limit in limits(told, "wall 0")] == [("b",), ("c",), ("a",)]
-    assert limits(told, "wall 3")[0].cells == ("a",)
-    # A picture without a number, as one of another program, says nothing of planes.
-    assert [limit.cells for limit in limits(told, "facade")] == first
-
-
-def test_given_check_points_of_which_none_counts_are_not_asked_for_again(tmp_path: Path) -> None:
-    survey = CheckPoints(
-        names=("P<1>", "P2"),
-        points_world=np.zeros((2, 3)),
-        classes=("", ""),
-        wall=np.full(2, -1, dtype=np.int32),
-        pixels_wall=np.full((2, 2), np.nan),
-    )
-    images = orthoimages_product(0)
-    cells = (
-        cell("mosaic", outputs={"orthoimages": given("", "1", "orthoimages")}),
-        cell(
-            "survey", method="read.checkpoints", outputs={"points": given("", "2", "checkpoints")}
-        ),
-        cell(
-            "points",
-            method="inspect.checkpoints",
-            status="failed",
-            error_message="none of the 2 was found: P<1> (9 m left of wall 0)",
-            inputs={"checkpoints": given("survey.points", "2", "checkpoints")},
-        ),
-    )
-    products = {("mosaic", "orthoimages"): images, ("survey", "points"): survey}
-    asked = HeldRun(path=tmp_path / "run.h5", record=record(cells), products=products)
-    write_report([asked], tmp_path / "report.html")
-    page = (tmp_path / "report.html").read_text()
-    assert (
-        "was not measured, though 2 check points were given: none of the 2 was found: "
-        "P&lt;1&gt; (9 m left of wall 0).</p>"
-    ) in page
-    assert "surveyed check points would tell" not in page
-    # Told once.
-    assert "<li>Failed: none of the check points counts, as said above" in page
-    without = replace(asked, record=record(cells[:1]))
-    write_report([without], tmp_path / "report.html")
-    told = "surveyed check points would tell (<code>--input checkpoints=FILE</code>{})."
-    elsewhere = " in workflows that have this input, as <code>direct.yaml</code>"
-    assert told.format(elsewhere) in (tmp_path / "report.html").read_text()
-    taken = RecordedInput(name="checkpoints", files=())
-    write_report(
-        [replace(asked, record=record(cells[:1], inputs=(taken,)))], tmp_path / "report.html"
-    )
-    assert told.format("") in (tmp_path / "report.html").read_text()
 
 
 def test_what_nobody_asked_for_is_not_called_unreached(tmp_path: Path) -> None:
@@ -385,44 +240,12 @@ def test_what_nobody_asked_for_is_not_called_unreached(tmp_path: Path) -> None:
     assert "<li>Not asked for: theirs, match</li>" in page
 
 
-def test_a_page_names_the_records_of_its_runs_as_they_lie_from_it(
-    compared: HeldRun, tmp_path: Path
-) -> None:
-    first = replace(compared, path=tmp_path / "one" / "run.h5")
-    second = replace(compared, path=tmp_path / "two" / "my run.h5")
-    for folder in (first.folder, second.folder):
-        folder.mkdir()
-    write_report([first, second], tmp_path / "both.html")
-    page = (tmp_path / "both.html").read_text()
-    assert "beside this page" not in page
-    assert "<code>one/run.h5</code> seen from this page" in page
-    assert "<code>two/my run.h5</code> seen from this page" in page
-    assert "orthoflow verify &#39;my run.h5&#39; " in page
-    write_report([second], second.folder / "report.html")
-    page = (second.folder / "report.html").read_text()
-    assert "The record <code>my run.h5</code> beside this page holds" in page
-
-
 def test_a_main_wall_that_was_missed_is_told_before_what_was_found() -> None:
     plane = cell("plane", method="plane.toy", metrics=metrics(rms_mm=1.6))
     for value, first in ((0.0, ("main wall found", "no")), (1.0, None)):
         check = cell("check", method="inspect.truth", metrics=metrics(main_found=value))
         told = [(one.what, one.value) for one in answers(run(plane, check))]
         assert told == [*([first] if first else []), ("points to the first plane, RMS", "1.6 mm")]
-
-
-def test_whether_a_detector_found_what_there_is_has_columns_without_being_asked() -> None:
-    found = metrics(label_iou_mean=0.8, label_f1=0.9, true_planes_found=9.0, plane_angle_deg=0.1)
-    cells = [
-        cell(f"check@plane={name}", method="inspect.truth", metrics=found) for name in ("a", "b")
-    ]
-    table = comparison_table([run(*cells)])
-    assert table is not None
-    assert [column.metric for column in table.columns] == [
-        "label_iou_mean",
-        "true_planes_found",
-        "plane_angle_deg",
-    ]
 
 
 def test_a_third_party_method_declares_its_headlines() -> None:
@@ -564,34 +387,6 @@ def test_who_was_asked_for_a_number_and_has_none_found_nothing(
     assert value.found_nothing == found_nothing
 
 
-def test_a_comparison_has_a_row_per_combination_with_spread_failure_and_cost(
-    compared: Run,
-) -> None:
-    table = comparison_table([compared])
-    assert table is not None
-    assert [(column.step, column.metric) for column in table.columns] == [
-        ("plane", "rms_mm"),
-        ("plane", "omega_deg"),
-        ("check", "rmse_u_mm"),
-        ("check", "completeness"),
-        ("check", "wall_s"),
-        ("check", "cpu_s"),
-        ("check", "peak_rss_mib"),
-        ("check", "compile_s"),
-    ]
-    fine, coarse, broken = table.rows
-    assert fine.is_baseline
-    assert fine.values[0].text == "1.10 ± 0.10"
-    # Of the other there is a single run, so that nothing is ranked.
-    assert fine.values[0].mark is coarse.values[0].mark is Mark.NONE
-    assert fine.values[1].mark is Mark.NONE  # an angle has no good side
-    assert broken.failure == "plane@plane=broken: no plane & no <wall>"
-    assert broken.values[0].text == ""
-    assert (fine.time.text, coarse.time.text, broken.time.text) == ("5.0", "4.2", "")
-    assert "1 of 5 steps cached, with their time in run r0" in fine.remark
-    assert table.groups == {}
-
-
 def test_what_a_run_was_broken_off_before_has_no_time_and_is_not_counted(
     compared: HeldRun, tmp_path: Path
 ) -> None:
@@ -616,41 +411,6 @@ def test_what_a_run_was_broken_off_before_has_no_time_and_is_not_counted(
     assert "None of the 2 combinations was computed to its end" in page
     assert "not computed: wall@plane=coarse and 3 more" in page
     assert "found no plane" not in page
-
-
-def test_a_step_that_has_no_data_leaves_a_combination_whole() -> None:
-    cells = [
-        one
-        for name in "ab"
-        for one in (
-            cell(f"plane@plane={name}"),
-            cell(
-                f"points@plane={name}",
-                status="skipped",
-                error_message="only with the input checkpoints",
-            ),
-        )
-    ]
-    table = comparison_table([run(*cells)])
-    assert table is not None
-    assert (table.n_whole, [row.time.text for row in table.rows]) == (2, ["1.0", "1.0"])
-
-
-def test_two_runs_on_a_page_say_what_differs(compared: HeldRun, tmp_path: Path) -> None:
-    cells = [
-        replace(one, params={"cell_m": 0.02}, metrics=metrics(rms_mm=1.5, omega_deg=10.0))
-        if one.address == "plane@plane=fine"
-        else one
-        for one in compared.record.cells
-    ]
-    changed = replace(compared, record=replace(compared.record, run_id="r2", cells=tuple(cells)))
-    write_report([compared, changed], tmp_path / "report.html")
-    page = (tmp_path / "report.html").read_text()
-    assert "What differs between r1 and r2" in page
-    assert re.search(r"cell_m</th><td>0\.01 \(set\)</td><td>0\.02 \(set\)</td>", page)
-    assert re.search(r"rms_mm</th><td>1 mm</td><td>1\.5 mm</td><td class=\"n\">0\.5</td>", page)
-    assert "Environment: the same." in page
-    assert page.count(">identical</td>") == 9
 
 
 def test_values_of_different_environments_carry_letters_and_are_ranked_apart() -> None:

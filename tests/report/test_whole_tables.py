@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,6 @@ from orthoflow.report.combinations import (
     wanted_metrics,
 )
 from orthoflow.report.differences import Difference, ProductRow, differences
-from orthoflow.report.rankings import Sense, Value, rank
 from orthoflow.report.summaries import answers
 from tests.report_runs import (
     HeldRun,
@@ -85,38 +83,7 @@ def test_a_mean_is_printed_to_the_second_digit_of_its_spread(
     assert numbers.number_with_spread(value, spread) == printed
 
 
-def test_numbers_may_have_fewer_digits() -> None:
-    assert numbers.number(0.14151, significant=2) == "0.14"
-    assert numbers.number_with_unit(0.14151, "m", significant=2) == "0.14 m"
-    assert numbers.number_with_unit(0.14151, "1") == "0.1415"
-
-
 # --- ranks ---
-
-
-def marks(sense: Sense, *values: tuple[float, ...], groups: str = "") -> list[str]:
-    """Rank values of repeats, each with its spread; with none, all repeats gave the value."""
-    found = rank(
-        [
-            Value(sort=value[0], spread=value[1] if len(value) > 1 else 0.0, group=group)
-            for value, group in zip(values, groups or "a" * len(values), strict=True)
-        ],
-        sense,
-    )
-    return [value.mark.name for value in found]
-
-
-def test_what_lies_within_both_spreads_of_the_best_is_near_it() -> None:
-    # 3 and 4 in quadrature are 5.
-    assert marks(Sense.LESS, (10, 3), (15, 4), (15.1, 4)) == ["NEAR", "NEAR", "NONE"]
-    assert marks(Sense.LESS, (10, 3), (13,), (13.5,)) == ["NEAR", "NEAR", "WORST"]
-    assert marks(Sense.MORE, (10, 3), (5, 4), (4.9, 4)) == ["NEAR", "NEAR", "NONE"]
-
-
-def test_nothing_is_ranked_beside_a_single_run() -> None:
-    assert marks(Sense.LESS, (2, math.nan), (9, math.nan)) == ["NONE", "NONE"]
-    assert marks(Sense.LESS, (2, 0.1), (9, math.nan)) == ["NONE", "NONE"]
-    assert marks(Sense.LESS, (2, 0.1), (9, 0.1)) == ["BEST", "WORST"]
 
 
 # --- combinations ---

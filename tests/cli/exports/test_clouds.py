@@ -116,24 +116,6 @@ def exported(folder: Path, run: Any, **choices: Any) -> tuple[str, DressedCloud]
     return said, dressed
 
 
-def test_the_labelled_cloud_is_written_with_its_planes(tmp_path: Path) -> None:
-    said, dressed = exported(tmp_path, labelled())
-    assert said == "cloud.toy: 144 points by intensity, cloud of plane"
-    assert dressed.labels is not None
-    assert dressed.planes is not None
-    assert (dressed.wall, dressed.wall_plane, dressed.box_world) == (None, -1, None)
-    assert (dressed.is_cleaned, dressed.crs_wkt, dressed.photo_names) == (False, "", ())
-    assert dressed.name == "scan.cloud"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["cloud.json", "cloud.toy"]
-
-
-def test_without_labels_the_cloud_itself_is_written(tmp_path: Path) -> None:
-    run = ToyRun({"scan": ({}, {"cloud": cloud()})})
-    said, dressed = exported(tmp_path, run, clean=True)
-    assert said == "cloud.toy: 144 points by intensity, cloud of scan"
-    assert (dressed.planes, dressed.labels, dressed.is_cleaned) == (None, None, True)
-
-
 def test_a_box_leaves_points_out_and_says_so(tmp_path: Path) -> None:
     # Corners in any order.
     said, dressed = exported(tmp_path, labelled(), box="0.5,1,1,0,0,-1")
@@ -271,16 +253,6 @@ def test_photos_colour_a_cloud_where_any_is_oriented(
     assert about["points_of_the_cloud_unseen"] == 0
     # What was mapped for it is gone.
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cloud.json", "cloud.toy"]
-
-
-def test_cells_that_give_cameras_are_known_by_what_they_give() -> None:
-    def cell(*types: str) -> Any:
-        return SimpleNamespace(
-            outputs={f"port{k}": SimpleNamespace(type_name=name) for k, name in enumerate(types)}
-        )
-
-    cells = {"a": cell("cloud"), "b": cell("ties", "cameras"), "c": cell(), "d": cell("cameras")}
-    assert list(module._makers_of_cameras(cells)) == ["b", "d"]
 
 
 def photographed(*names: str, takes: bool = True) -> Any:

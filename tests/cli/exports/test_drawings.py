@@ -35,13 +35,6 @@ def results(**more: Any) -> Any:
     return SimpleNamespace(**(plain | more))
 
 
-def test_what_a_room_has_is_counted() -> None:
-    lines = SimpleNamespace(surfaces=(1, 2), edges=(1,), corners=(), openings=())
-    assert module._said(lines) == "2 planes, 1 edge, 0 corners"  # type: ignore[arg-type]
-    lines.openings = (1, 2, 3)
-    assert module._said(lines) == "2 planes, 1 edge, 0 corners, 3 openings"  # type: ignore[arg-type]
-
-
 # --- CAD and GIS ---
 
 
@@ -122,13 +115,6 @@ def test_files_are_of_each_wall_and_of_the_room_where_it_is_known(
     drawn_files.clear()
     assert export(run, tmp_path / "out", Choices(wall=9)) == f"1 wall{beside}"
     assert drawn_files == [of_9, *room]
-
-
-def test_a_wall_is_drawn_with_its_picture_and_its_openings() -> None:
-    one = wall(3.8, 2.3, "ortho")
-    told = module._drawn(results(openings_of=lambda _: ("door",)), one, "a.png")
-    assert (told.number, told.name, told.plane_index) == (7, "wall 7", 7)
-    assert (told.frame, told.image, told.openings) == (one.frame, "a.png", ("door",))
 
 
 @pytest.mark.parametrize("embedded", [True, False])

@@ -10,12 +10,10 @@ import numpy as np
 import pytest
 
 from orthoflow.cli.exports.products import (
-    branch_of,
     last_product,
     make_empty,
     output_of,
     product_of,
-    wanted_wall,
 )
 from orthoflow.errors import ArgumentError
 from orthoflow.products import PointLabels
@@ -57,44 +55,6 @@ def test_a_cell_that_gives_nothing_of_the_kind_is_refused() -> None:
         output_of(run, "cloud", None)
     with pytest.raises(ArgumentError, match="those of this run: none"):
         output_of(run, "cloud", "a")
-
-
-def test_walls_are_those_of_their_numbers() -> None:
-    known: dict[int, Any] = {4: "four", 0: "none"}
-    assert wanted_wall(4, known, "the run", "has") == "four"
-    assert wanted_wall(0, known, "the run", "has") == "none"
-    with pytest.raises(ArgumentError) as caught:
-        wanted_wall(1, known, "the run", "has")
-    assert str(caught.value) == "--wall 1: the run has no wall 1; it has 4, 0"
-    with pytest.raises(ArgumentError, match="it shows none"):
-        wanted_wall(1, {}, "mosaic", "shows")
-
-
-def test_a_branch_is_what_a_cell_has_chosen_as_far_as_others_know_it() -> None:
-    run = HeldRun(
-        path=Path("run.h5"),
-        record=record(
-            [
-                cell("scan"),
-                cell("plane@plane=a"),
-                cell("plane@plane=b"),
-                cell("plane@plane=a#1"),
-                cell("wall@plane=a,wall=x"),
-                cell("wall@plane=a,wall=x#1"),
-                cell("ortho@plane=a,wall=x,ortho=f"),
-                cell("ortho@plane=a,wall=y,ortho=f"),
-            ]
-        ),
-    )
-    assert list(branch_of(run, "wall@plane=a,wall=x")) == [
-        *("scan", "plane@plane=a", "wall@plane=a,wall=x", "ortho@plane=a,wall=x,ortho=f"),
-    ]
-    # A repeat goes with what all repeats share.
-    assert list(branch_of(run, "plane@plane=a#1")) == [
-        *("scan", "plane@plane=a", "plane@plane=a#1"),
-        *("wall@plane=a,wall=x", "wall@plane=a,wall=x#1"),
-        *("ortho@plane=a,wall=x,ortho=f", "ortho@plane=a,wall=y,ortho=f"),
-    ]
 
 
 def test_the_last_of_some_cells_gives_a_product(tmp_path: Path) -> None:

@@ -38,14 +38,6 @@ def test_figures_are_written_in_the_format_that_is_asked_for(tmp_path: Path) -> 
     assert len(list((tmp_path / "svg").glob("*/*.png"))) == len(pages)
 
 
-def test_of_one_cell_its_figures_alone_are_written(tmp_path: Path) -> None:
-    run = compared_run(tmp_path)
-    told = module.export_figures(run, tmp_path / "out", Choices(cell="check@plane=fine"))
-    n_figures = len(run.cells["check@plane=fine"].figures)
-    assert told.startswith(f"{n_figures} figure")
-    assert not (tmp_path / "out" / "photos_and_walls.svg").exists()
-
-
 @pytest.mark.parametrize(
     ("choices", "lacking"),
     [

@@ -49,30 +49,6 @@ def test_a_number_stands_where_its_line_is_straight() -> None:
     assert label_place(zigzag, 6.0, []) is None
 
 
-def test_numbers_of_one_line_halve_what_is_left_of_it() -> None:
-    line = np.array([[0.0, 3.0], [160.0, 3.0]])
-    placed: list[np.ndarray[tuple[int, ...], np.dtype[np.float64]]] = []
-    while place := label_place(line, 4.0, placed):
-        placed.append(np.array(place[0]))
-    # The middle, those of its halves, those of its quarters.
-    np.testing.assert_allclose(
-        placed, [[160.0 * share / 8, 3.0] for share in (4, 2, 6, 1, 3, 5, 7)], atol=1e-9
-    )
-
-
-@pytest.mark.parametrize(("widths", "has_place"), [(4.95, False), (5.05, True)])
-def test_a_line_of_five_widths_has_a_number(widths: float, has_place: bool) -> None:
-    line = np.array([[0.0, 0.0], [3.0 * widths, 0.0]])
-    assert (label_place(line, 3.0, []) is not None) is has_place
-
-
-@pytest.mark.parametrize(("apart_mm", "share"), [(11.9, 0.25), (12.1, 0.5)])
-def test_twelve_millimetres_lie_between_numbers(apart_mm: float, share: float) -> None:
-    place = label_place(np.array([[0.0, 0.0], [80.0, 0.0]]), 4.0, [np.array([40.0, apart_mm])])
-    assert place is not None
-    assert place[0] == pytest.approx((80.0 * share, 0.0))
-
-
 @pytest.mark.parametrize(("sine", "share"), [(0.89, 0.25), (0.91, 0.5)])
 def test_a_corner_below_a_number_is_a_blunt_one(sine: float, share: float) -> None:
     # From the corner both ways: the ends of the number are that sine of its width apart.

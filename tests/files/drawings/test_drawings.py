@@ -167,21 +167,6 @@ def test_a_wall_that_does_not_fit_takes_several_sheets_and_an_index(
         assert len(red) == count
 
 
-@pytest.mark.parametrize(
-    ("differ", "said"),
-    [
-        (True, "colours balanced between photos (gains: global)"),
-        (False, "colours untouched: the photos agree, or there is one only"),
-    ],
-)
-def test_balanced_colours_are_said(tmp_path: Path, differ: bool, said: str) -> None:
-    run = write_drawing_run(tmp_path / "run", gains="global", differ=differ)
-    (wall,) = room_results(photographed(open_run(run))).walls
-    assert wall.colours is not None
-    assert wall.colours.text() == said
-    assert wall.plane_index == WALL
-
-
 @pytest.mark.parametrize("has_ties", [True, False])
 def test_the_accuracy_of_a_wall_is_by_evidence_on_that_wall(
     tmp_path: Path, *, has_ties: bool
@@ -221,18 +206,6 @@ def test_a_scale_may_be_written_whole(text: str) -> None:
     assert option.type.convert(text, option, None) == 50
     with pytest.raises(BadParameter):
         option.type.convert("2:50", option, None)
-
-
-def test_no_other_raster_stands_in_for_an_orthoimage_that_is_gone(tmp_path: Path) -> None:
-    run = write_drawing_run(tmp_path / "run")
-    gone = run / "products" / "mosaic" / f"wall_{WALL}_ortho.tif"
-    gone.unlink()
-    for target in ("sheet", "dxf"):
-        done = export(run, target, tmp_path / target)
-        assert done.exit_code != 0
-        assert f"products/mosaic/{gone.name} is gone from" in done.output
-        assert f"orthoflow replay {run / 'run.h5'} -o" in done.output
-        assert not (tmp_path / target).exists()
 
 
 @pytest.mark.parametrize("target", ["sheet", "dxf", "geojson", "tiles", "gltf"])

@@ -2,33 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from pathlib import Path
-
-import ezdxf
 import numpy as np
 import pytest
 
-from orthoflow.files.drawings.dxf import LAYERS, write_wall_dxf
 from orthoflow.files.drawings.regular_openings import regular_opening
-from orthoflow.files.drawings.room_lines import room_lines
-from tests.drawing_runs import box_planes, drawn_wall
-
-
-@pytest.mark.parametrize("is_known", [True, False])
-def test_a_wall_has_the_edges_of_its_plane_where_that_is_known(
-    tmp_path: Path, is_known: bool
-) -> None:
-    lines = room_lines(box_planes(), None)
-    write_wall_dxf(tmp_path / "a.dxf", drawn_wall(box_planes(), is_known=is_known), lines)
-    document = ezdxf.readfile(tmp_path / "a.dxf")
-    counts = Counter(entity.dxf.layer for entity in document.modelspace())
-    assert counts["A-ELEV-OTLN"] == 1
-    assert counts["A-ELEV-EDGE"] == (4 if is_known else 0)  # a wall of a box meets four others
-    assert set(counts) <= set(LAYERS)
-    for name, given in LAYERS.items():
-        layer = document.layers.get(name)
-        assert (layer.dxf.color, layer.dxf.lineweight) == (given.colour, given.weight)
 
 
 def wobbled(outline: np.ndarray, seed: int, sd_m: float) -> np.ndarray:

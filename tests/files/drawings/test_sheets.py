@@ -37,7 +37,7 @@ from orthoflow.files.geotiff import GridPlace, write_raster
 from orthoflow.geometry.frames import frame_over
 from orthoflow.records.unfinished import open_run
 from tests import samples
-from tests.drawing_runs import GSD_M, WALL, write_drawing_run
+from tests.drawing_runs import WALL, write_drawing_run
 
 MM = 25.4 / 72.0
 # Height of capital letters of DejaVu Sans over its size.
@@ -242,16 +242,6 @@ def test_feet_are_written_and_measured(run: Path, tmp_path: Path) -> None:
         # A foot is half an inch.
         assert bar[0]["width"] * MM == pytest.approx(12.7, abs=0.01)
         assert "0 1 2 3 4 5 ft" in text
-
-
-def test_pictures_coarser_than_print_are_reported(run: Path, tmp_path: Path) -> None:
-    # Cells of 10 mm at 1:50 are 127 to the inch.
-    ppi = 25.4 * 50 / (1e3 * GSD_M)
-    done = export(run, tmp_path / "out", "--scale", 50)
-    assert f"{ppi:.0f} pixels per inch instead of 150: wall 2; from 1:60 on" in done.output
-    with page_of(tmp_path / "out" / f"wall_{WALL}_sheet_1.pdf") as page:
-        assert f"{ppi:.0f} pixels per inch on this paper (below 150" in words_of(page)
-    assert "instead of 150" not in export(run, tmp_path / "fine", "--scale", 100).output
 
 
 # --- languages and letters ---

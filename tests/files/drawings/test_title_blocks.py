@@ -16,14 +16,6 @@ def read(folder: Path, text: str) -> TitleBlock:
     return read_title_block(path)
 
 
-def test_every_field_is_read_as_text(tmp_path: Path) -> None:
-    names = ("project", "title", "site", "client", "organisation", "author", "checked_by", "date")
-    text = "".join(f"{name}: Ł {name}\n" for name in names)
-    assert read(tmp_path, text) == TitleBlock.model_validate({name: f"Ł {name}" for name in names})
-    block = read(tmp_path, "date: 2026-03-14\ndrawing: 17\n")
-    assert (block.date, block.drawing, block.project) == ("2026-03-14", "17", "")
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [

@@ -79,23 +79,6 @@ def test_halving_averages_what_is_shown() -> None:
     assert half[1, 2].tolist() == [7, 8, 9, 255]
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (2, 3), (3, 3), (3, 4), (5, 4), (6, 1), (6, 6), (7, 9)])
-def test_halving_is_a_loop_over_squares(shape: tuple[int, int]) -> None:
-    rng = np.random.default_rng(sum(shape))
-    cells = rng.integers(0, 256, (*shape, 4)).astype(np.uint8)
-    cells[:, :, 3] = np.where(rng.random(shape) < 0.6, 255, 0)
-    half = halved(cells)
-    assert half.shape == (-(-shape[0] // 2), -(-shape[1] // 2), 4)
-    for row, column in np.ndindex(half.shape[:2]):
-        square = cells[2 * row : 2 * row + 2, 2 * column : 2 * column + 2].reshape(-1, 4)
-        shown = square[square[:, 3] == 255, :3].astype(int)
-        # Shown where at least half of what there is of the square is.
-        assert half[row, column, 3] == (255 if 2 * len(shown) >= len(square) else 0)
-        if len(shown):
-            mean = np.floor(shown.mean(axis=0) + 0.5).astype(int)
-            assert np.abs(half[row, column, :3] - mean).max() <= (len(shown) == 3)
-
-
 def test_the_page_shows_and_measures_without_a_server(
     new_page: Callable[[], Page], tiled: Path, tmp_path: Path
 ) -> None:
@@ -156,34 +139,3 @@ def test_an_orthoimage_is_read_in_bands(tmp_path: Path) -> None:
     shown = np.concatenate([mask for _, mask in bands])
     np.testing.assert_array_equal(whole[shown], colours(WALL_SHAPE)[shown])
     assert np.count_nonzero(~shown) == 200 * 300
-
-
-@pytest.mark.parametrize(
-    ("width", "height", "n_tiles"),
-    [
-        # Whole tiles: four of the last level, and one of each level before it.
-        (8, 8, 4 + 1 + 1 + 1),
-        # Three by two, two by one of 5 x 3 cells, one of 3 x 2, of 2 x 1 and of one cell.
-        (9, 5, 6 + 2 + 1 + 1 + 1),
-        (4, 1, 1 + 1 + 1),
-        (1, 9, 3 + 2 + 1 + 1 + 1),
-    ],
-)
-@pytest.mark.parametrize("n_band", [1, 3, 4, 100])
-def test_each_level_has_as_many_tiles_as_it_fills(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    width: int,
-    height: int,
-    n_tiles: int,
-    n_band: int,
-) -> None:
-    monkeypatch.setattr(pyramid, "TILE_PX", 4)
-    cells = np.arange(3 * width * height, dtype=np.uint8).reshape(height, width, 3)
-    shown = np.ones((height, width), dtype=np.bool_)
-    levels = pyramid._Levels(folder=tmp_path / "a_files", width=width, height=height)
-    levels.write((cells[k : k + n_band], shown[k : k + n_band]) for k in range(0, height, n_band))
-    assert levels.counts == [n_tiles]
-    written = sorted(path.relative_to(tmp_path / "a_files") for path in tmp_path.rglob("*.webp"))
-    assert len(written) == n_tiles
-    assert len(list((tmp_path / "a_files").iterdir())) == pyramid.last_level(width, height) + 1
