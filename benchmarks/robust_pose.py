@@ -26,7 +26,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 from orthoflow_plugins.orient import pose
-from orthoflow_plugins.orient.parameters import OrientParams
+from orthoflow_plugins.orient.pose import OrientParams
 
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
 from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from orthoflow_plugins.inspect.checkpoints import InspectCheckpoints
 from orthoflow_plugins.inspect.truth import InspectTruth
-from orthoflow_plugins.orient.parameters import ORIENTATION_METRICS
+from orthoflow_plugins.orient.pose import ORIENTATION_METRICS
 from orthoflow_plugins.plane.detector import DETECTOR_METRICS
 from orthoflow_provenance.document import (
     Metric,

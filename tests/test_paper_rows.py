@@ -115,7 +115,7 @@ def test_eleven_parameters() -> None:
     projection = np.linalg.svd(rows)[2][-1].reshape(3, 4)
     back = x @ projection.T
     expected = 1000.0 * back[:, :2] / back[:, 2:] + shift_p
-    found = direct_linear(pixels, points, (4000, 3000)).camera.project(points)[:, :2]
+    found = direct_linear(pixels, points, (4000, 3000))[0].project(points)[:, :2]
     # Pixels: the same equations in other weights, far below the noise of 0.5 px.
     np.testing.assert_allclose(found, expected, atol=0.1)
 

@@ -35,24 +35,6 @@ _CUT_MARGIN_CELLS: Final = 6
 
 
 @dataclass(frozen=True, kw_only=True)
-class Search:
-    """How displacements are looked for.
-
-    Attributes:
-        radius_cells: how far.
-        min_score: smallest correlation; half of what patches of right places have (0.35), less
-            where patches are many and judged by their neighbours.
-        min_distinct: by how much the best correlation must exceed the next peak.
-        threads: patches are shared between so many.
-    """
-
-    radius_cells: int
-    min_score: float = 0.35
-    min_distinct: float = 0.05
-    threads: int = 1
-
-
-@dataclass(frozen=True, kw_only=True)
 class Displacements(Rows):
     """Measured displacements.
 
@@ -70,47 +52,63 @@ class Displacements(Rows):
 
 
 def measure(
-    first: Channels, second: Channels, places: NDArray[np.intp], search: Search
+    first: Channels,
+    second: Channels,
+    places: NDArray[np.intp],
+    radius_cells: int,
+    *,
+    min_score: float = 0.35,
+    min_distinct: float = 0.05,
+    threads: int = 1,
 ) -> Displacements:
     """Measure displacements from the first picture to the second at cells (n, 2) of the first.
 
     Where the first has one channel and the second three, each patch of the first is compared with
     the mixture of the second's channels that fits it best.
+
+    Args:
+        first: the first picture.
+        second: the second one.
+        places: (column, row) of the first picture.
+        radius_cells: how far is looked.
+        min_score: smallest correlation; half of what patches of right places have (0.35), less
+            where patches are many and judged by their neighbours.
+        min_distinct: by how much the best correlation must exceed the next peak.
+        threads: patches are shared between so many.
     """
-    places = _well_known(first, second, places, search)
+    places = _well_known(first, second, places, radius_cells)
     is_mixed = (first.values.shape[2], second.values.shape[2]) == (1, 3)
     kernel = search_mixtures if is_mixed else search_shifts
     found = np.zeros((len(places), 7 if is_mixed else 4))
-    reach = (HALF_PATCH_CELLS, search.radius_cells)
+    reach = (HALF_PATCH_CELLS, radius_cells)
     in_threads(
         [
             partial(kernel, first.values, second.values, places[part], reach, found[part])
-            for part in even_parts(len(places), search.threads)
+            for part in even_parts(len(places), threads)
         ]
     )
-    kept = (found[:, 2] >= search.min_score) & (found[:, 3] >= search.min_distinct)
-    if is_mixed:
-        return _mixed_and_refined(first, second, (places[kept], found[kept]), search)
-    return _refined(first, second, (places[kept], found[kept, :2]), search)
+    kept = (found[:, 2] >= min_score) & (found[:, 3] >= min_distinct)
+    refine = _mixed_and_refined if is_mixed else _refined
+    return refine(first, second, places[kept], found[kept], min_score, threads)
 
 
 def _mixed_and_refined(
     first: Channels,
     second: Channels,
-    start: tuple[NDArray[np.intp], NDArray[np.float64]],
-    search: Search,
+    places: NDArray[np.intp],
+    found: NDArray[np.float64],
+    min_score: float,
+    threads: int,
 ) -> Displacements:
     """Refine each patch in a mixture of its own: all patches, cut out, one below the other."""
-    places, found = start
     begun = found[:, :2].astype(np.intp)
     reach = HALF_PATCH_CELLS + _CUT_MARGIN_CELLS
     one = _cut_out(first, places, reach, np.ones((len(places), 1), dtype=np.float32))
     other = _cut_out(second, places + begun, reach, found[:, 4:].astype(np.float32))
     side = 2 * reach + 1
-    centres = np.column_stack(
-        [np.full(len(places), reach), reach + side * np.arange(len(places))]
-    ).astype(np.intp)
-    refined = _refined(one, other, (centres, np.zeros((len(places), 2))), search)
+    rows = reach + side * np.arange(len(places), dtype=np.intp)
+    centres = np.column_stack([np.full_like(rows, reach), rows])
+    refined = _refined(one, other, centres, np.zeros((len(places), 2)), min_score, threads)
     nth = refined.places[:, 1] // side
     return replace(refined, places=places[nth], shift_cells=refined.shift_cells + begun[nth])
 
@@ -121,8 +119,7 @@ def _cut_out(
     """Cut out patches about centres (n, 2), each mixed by its gains (n, c) to a single channel."""
     side = 2 * reach + 1
     rows, columns = picture.known.shape
-    values = np.zeros((len(centres), side, side, 1), dtype=np.float32)
-    known = np.zeros((len(centres), side, side), dtype=np.float32)
+    values, known = (np.zeros((len(centres), side, side), dtype=np.float32) for _ in range(2))
     for nth, (column, row) in enumerate(centres.tolist()):
         top, left = max(0, row - reach), max(0, column - reach)
         part = (
@@ -132,26 +129,20 @@ def _cut_out(
         height, width = picture.known[part].shape
         to = (nth, slice(top - row + reach, top - row + reach + height))
         across = slice(left - column + reach, left - column + reach + width)
-        values[*to, across, 0] = picture.values[part] @ gains[nth]
+        values[*to, across] = picture.values[part] @ gains[nth]
         known[*to, across] = picture.known[part]
     return Channels(values=values.reshape(-1, side, 1), known=known.reshape(-1, side))
 
 
 def _well_known(
-    first: Channels, second: Channels, places: NDArray[np.intp], search: Search
+    first: Channels, second: Channels, places: NDArray[np.intp], radius_cells: int
 ) -> NDArray[np.intp]:
     """Places whose search stays inside the pictures and whose patches are mostly known."""
     import cv2
 
-    reach = search.radius_cells + HALF_PATCH_CELLS + 2
-    rows, columns = first.known.shape
-    inside = (
-        (places[:, 0] >= reach)
-        & (places[:, 0] < columns - reach)
-        & (places[:, 1] >= reach)
-        & (places[:, 1] < rows - reach)
-    )
-    places = places[inside]
+    reach = radius_cells + HALF_PATCH_CELLS + 2
+    ends = np.array(first.known.shape[::-1]) - reach
+    places = places[((places >= reach) & (places < ends)).all(axis=1)]
     side = 2 * HALF_PATCH_CELLS + 1
     share = cv2.blur(first.known * second.known, (side, side))
     known = share[places[:, 1], places[:, 0]] >= _MIN_KNOWN
@@ -161,61 +152,54 @@ def _well_known(
 def _refined(
     first: Channels,
     second: Channels,
-    start: tuple[NDArray[np.intp], NDArray[np.float64]],
-    search: Search,
+    places: NDArray[np.intp],
+    found: NDArray[np.float64],
+    min_score: float,
+    threads: int,
 ) -> Displacements:
-    places, begun = start
-    window = _window(HALF_PATCH_CELLS)
-    forward = _matched((first, second), (places, begun), window, search.threads)
+    begun = found[:, :2]
+    forth, sigma_forth, score = _matched(first, second, places, begun, threads)
     # Both ways, halved: what interpolation does to one of the pictures then cancels.
-    middle = np.rint(forward.shifts).astype(np.intp)
-    back = _matched((second, first), (places + middle, -forward.shifts), window, search.threads)
-    shifts = 0.5 * (forward.shifts - back.shifts)
-    disagreement = np.abs(forward.shifts + back.shifts).max(axis=1, initial=0.0)
-    sigma = np.sqrt(0.5 * (forward.sigma**2 + back.sigma**2) + (0.5 * disagreement) ** 2)
+    middle = np.rint(forth).astype(np.intp)
+    back, sigma_back, _ = _matched(second, first, places + middle, -forth, threads)
+    shifts = 0.5 * (forth - back)
+    disagreement = np.abs(forth + back).max(axis=1, initial=0.0)
+    sigma = np.sqrt(0.5 * (sigma_forth**2 + sigma_back**2) + (0.5 * disagreement) ** 2)
     good = (
         (np.abs(shifts - begun).max(axis=1, initial=0.0) < _MAX_DRIFT_CELLS)
         & (disagreement < _MAX_DISAGREEMENT_CELLS)
-        & (forward.score >= search.min_score)
+        & (score >= min_score)
         & np.isfinite(sigma)
     )
-    return Displacements(
-        places=places, shift_cells=shifts, score=forward.score, sigma_cells=sigma
-    ).take(good)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Matched:
-    shifts: NDArray[np.float64]
-    sigma: NDArray[np.float64]
-    score: NDArray[np.float64]
+    return Displacements(places=places, shift_cells=shifts, score=score, sigma_cells=sigma).take(
+        good
+    )
 
 
 def _matched(
-    pictures: tuple[Channels, Channels],
-    start: tuple[NDArray[np.intp], NDArray[np.float64]],
-    window: NDArray[np.float64],
+    first: Channels,
+    second: Channels,
+    places: NDArray[np.intp],
+    begun: NDArray[np.float64],
     threads: int,
-) -> _Matched:
-    first, second = (Picture(picture.values, picture.known) for picture in pictures)
-    places = np.ascontiguousarray(start[0])
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Shifts (n, 2), their standard deviations (n,) and correlations (n,)."""
+    one, other = (Picture(picture.values, picture.known) for picture in (first, second))
+    places = np.ascontiguousarray(places)
     found = np.zeros((len(places), 4))
-    found[:, :2] = start[1]
+    found[:, :2] = begun
+    # The middle of a patch counts more, the border hardly.
+    steps = np.arange(-HALF_PATCH_CELLS, HALF_PATCH_CELLS + 1) / (0.6 * HALF_PATCH_CELLS)
+    bell = np.exp(-0.5 * steps**2)
+    window = np.outer(bell, bell)
     side, n_channels = len(window), first.values.shape[2]
     shapes = ((side, side), (side + 3, side, n_channels), (side, side, n_channels))
     in_threads(
         [
-            partial(match_patches, first, second, places[part], window, rooms, found[part])
+            partial(match_patches, one, other, places[part], window, rooms, found[part])
             for part in even_parts(len(places), threads)
             for rooms in [tuple(np.empty(shape) for shape in shapes)]
         ]
     )
     sigma = math.sqrt(CORRELATION_AREA_CELLS) * found[:, 2]
-    return _Matched(shifts=found[:, :2].copy(), sigma=sigma, score=found[:, 3].copy())
-
-
-def _window(half: int) -> NDArray[np.float64]:
-    """Weights of a patch's cells: the middle counts more, the border hardly."""
-    steps = np.arange(-half, half + 1) / (0.6 * half)
-    bell = np.exp(-0.5 * steps**2)
-    return np.outer(bell, bell)
+    return found[:, :2].copy(), sigma, found[:, 3].copy()

@@ -11,22 +11,17 @@ from orthoflow.errors import MethodError
 from orthoflow.products import Camera, Cameras, JsonValue, Photos, PointCloud, Ties, Walls
 from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
-from orthoflow_plugins.match.paper import (
-    footprints,
-    paper_pieces,
-    paper_wall_features,
-    with_paper_ratio,
-)
 from orthoflow_plugins.match.pictures import one_by_one, opencv_version, require_photos
 from orthoflow_plugins.match.ties import (
-    TiePiece,
-    Trace,
+    paper_ties,
     ties_by_hand_alone,
     ties_of,
+    with_paper_ratio,
     with_ties_by_hand,
 )
 
 if TYPE_CHECKING:
+    from orthoflow_plugins.match.tracing import Trace
     from orthoflow_plugins.match.warping import Before
 
 # Points of the cloud with fewer about them are outliers and hide nothing, as in `ortho`.
@@ -145,11 +140,11 @@ class MatchGuided(Method):
         details: dict[str, JsonValue] = {"intensity_source": walls.intensity_source}
         traces: dict[str, Trace] = {}
         if params.preset == "paper":
-            pieces = _masked(photos, walls, oriented, params.ratio or 1.0, ctx)
+            pieces, _ = paper_ties(photos, walls, oriented, params.ratio, ctx)
         else:
             traces = _traced(inputs, oriented, params, ctx)
             pieces = [piece for found in traces.values() for piece in found.pieces]
-            details["photos"] = {name: _note(found) for name, found in traces.items()}
+            details["photos"] = {name: found.json() for name, found in traces.items()}
         ties = ties_of(pieces, photos, walls, details)
         _report(ctx, ties, traces)
         return self.Out(ties=with_ties_by_hand(ties, inputs.hand, walls, ctx))
@@ -169,8 +164,13 @@ def _traced(
     """Trace oriented photos on the walls, and those that they help to find, by name."""
     from orthoflow_plugins.match.channels import target_of
     from orthoflow_plugins.match.joined_cells import in_cells_of_points
-    from orthoflow_plugins.match.recovering import recovered_traces
-    from orthoflow_plugins.match.tracing import CONTENTS, Desk, estimated_lens, trace_photo
+    from orthoflow_plugins.match.tracing import (
+        CONTENTS,
+        Desk,
+        estimated_lens,
+        recovered_traces,
+        trace_photo,
+    )
 
     photos = inputs.photos.photos
     indices = [index for index, photo in enumerate(photos) if photo.name in oriented]
@@ -201,25 +201,6 @@ def _traced(
     for name in recovered:
         ctx.log(f"photo {name}: found with what other photos show of the walls")
     return traces | recovered
-
-
-def _masked(
-    photos: Photos,
-    walls: Walls,
-    oriented: dict[str, Camera],
-    max_ratio: float,
-    ctx: StepContext,
-) -> list[TiePiece]:
-    """Match as markiewicz2015 did, within the footprint of each oriented photo."""
-    on_walls = list(one_by_one(paper_wall_features, walls.walls, ctx.cores))
-    pieces: list[TiePiece] = []
-    for index, photo in enumerate(photos.photos):
-        if photo.name not in oriented:
-            continue
-        ctx.progress(index / len(photos.photos), photo.name)
-        masks = footprints(oriented[photo.name].viewing(), walls)
-        pieces += paper_pieces(index, photo, on_walls, walls, masks, max_ratio=max_ratio)
-    return pieces
 
 
 def _oriented(cameras: Cameras) -> dict[str, Camera]:
@@ -258,16 +239,6 @@ def _before(inputs: MatchGuided.In, cameras: list[Camera]) -> Before | None:
         threads=1,
     )
     return Before(occluders=occluders, front_m=tuple(slab.front_m for slab in slabs))
-
-
-def _note(trace: Trace) -> JsonValue:
-    return {
-        "n_ties": trace.n_ties,
-        "n_measured": trace.n_measured,
-        "n_outliers": trace.n_outliers,
-        "channels": trace.content,
-        "held_out_px": list(trace.held_out_px),
-    }
 
 
 def _report(ctx: StepContext, ties: Ties, traces: dict[str, Trace]) -> None:

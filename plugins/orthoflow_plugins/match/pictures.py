@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from typing import Final, TypeVar
 
@@ -32,36 +31,6 @@ _MIN_SPREADS: Final = 100
 _UNKNOWN_SIGMA_CELLS: Final = 0.5
 
 
-@dataclass(frozen=True, kw_only=True)
-class WallPicture:
-    """A wall's intensity as a picture without holes.
-
-    Attributes:
-        grey: (rows, cols) uint8, void filled from around.
-        usable: (rows, cols), True where enough of the neighbourhood was measured.
-        known: (rows, cols), True where the intensity was measured.
-    """
-
-    grey: NDArray[np.uint8]
-    usable: NDArray[np.bool_]
-    known: NDArray[np.bool_]
-
-
-@dataclass(frozen=True, kw_only=True)
-class WallPoints:
-    """World points of positions on a wall.
-
-    Attributes:
-        points_world: (n, 3) float64 metres.
-        sigma_m: (n,) float64.
-        known: (n,) whether the wall has a depth there; the rest is NaN without it.
-    """
-
-    points_world: NDArray[np.float64]
-    sigma_m: NDArray[np.float64]
-    known: NDArray[np.bool_]
-
-
 def require_photos(photos: Photos) -> None:
     """Refuse an empty set of photos.
 
@@ -87,13 +56,19 @@ def require_intensity(walls: Walls) -> None:
         )
 
 
-def wall_picture(wall: Wall, *, clip_limit: float, void_margin_cells: int) -> WallPicture | None:
-    """Return a wall's intensity as a picture; None without intensity.
+def wall_picture(
+    wall: Wall, *, clip_limit: float, void_margin_cells: int
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]] | None:
+    """Return a wall's intensity as a picture without holes; None without intensity.
 
     Args:
         wall: the wall.
         clip_limit: of the local equalisation; 0 only stretches the grey levels.
         void_margin_cells: key points keep so far from the centre of larger voids.
+
+    Returns:
+        Grey (rows, cols), void filled from around; and where enough of the neighbourhood was
+        measured.
     """
     import cv2
 
@@ -109,9 +84,7 @@ def wall_picture(wall: Wall, *, clip_limit: float, void_margin_cells: int) -> Wa
     grey = np.asarray(cv2.medianBlur(np.rint(filled * 255.0).astype(np.uint8), 3), dtype=np.uint8)
     side = 2 * void_margin_cells + 1
     share = cv2.blur(known.astype(np.float32), (side, side), borderType=cv2.BORDER_REPLICATE)
-    return WallPicture(
-        grey=equalised(grey, clip_limit), usable=np.asarray(share > 0.7) & known, known=known
-    )
+    return equalised(grey, clip_limit), np.asarray(share > 0.7) & known
 
 
 def filled_smoothly(values: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -192,7 +165,7 @@ def shrunk(grey: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:
 
 def points_on_wall(
     wall: Wall, pixels_wall: NDArray[np.float64], *, usual_m: float | None = None
-) -> WallPoints:
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """Lift positions (n, 2) = (column, row) of a wall's raster onto its surface.
 
     Between cells the depth is interpolated where the surface is smooth; at an edge of the relief
@@ -202,6 +175,10 @@ def points_on_wall(
         wall: the wall.
         pixels_wall: the positions.
         usual_m: what `usual_spread_m` says of the wall, where it has been asked before.
+
+    Returns:
+        World points (n, 3) and their standard deviations (n,) in metres, and whether (n,) the wall
+        has a depth there; the rest is NaN without it.
     """
     columns, rows = pixels_wall[:, 0] - 0.5, pixels_wall[:, 1] - 0.5
     height, width = wall.frame.shape
@@ -212,34 +189,16 @@ def points_on_wall(
     smooth = spread < _SMOOTH_CELLS * wall.frame.gsd_m
     depth = np.where(smooth, _bilinear(wall.depth_m, columns, rows), nearest)
     depth = np.where(np.isfinite(depth), depth, nearest)
-    return WallPoints(
-        points_world=wall.frame.world_from_wall(pixels_wall, depth),
-        sigma_m=_sigma_m(
-            wall,
-            (centre_row, centre_column),
-            np.where(smooth, 0.0, spread),
-            usual_spread_m(wall) if usual_m is None else usual_m,
-        ),
-        known=np.isfinite(nearest),
-    )
-
-
-def _sigma_m(
-    wall: Wall,
-    cell: tuple[NDArray[np.intp], NDArray[np.intp]],
-    step_m: NDArray[np.float64],
-    usual: float,
-) -> NDArray[np.float64]:
-    gsd_m = wall.frame.gsd_m
+    gsd_m, cell = wall.frame.gsd_m, (centre_row, centre_column)
+    usual = usual_spread_m(wall) if usual_m is None else usual_m
     count = np.maximum(wall.count[cell].astype(np.float64), 1.0)
-    spread = wall.sigma_m[cell].astype(np.float64)
-    spread = np.where(np.isfinite(spread) & (count > 1.0), spread, usual)
+    own = wall.sigma_m[cell].astype(np.float64)
+    own = np.where(np.isfinite(own) & (count > 1.0), own, usual)
     # A cell's depth is a mean or median of its points, and its content lies anywhere in the cell.
-    noise = np.maximum(spread / np.sqrt(count), 0.3 * usual)
-    sigma: NDArray[np.float64] = np.sqrt(
-        noise**2 + (0.5 * _CELL_SIGMA * gsd_m) ** 2 + (step_m * _CELL_SIGMA) ** 2
-    )
-    return sigma
+    noise = np.maximum(own / np.sqrt(count), 0.3 * usual)
+    step = np.where(smooth, 0.0, spread)
+    sigma = np.sqrt(noise**2 + (0.5 * _CELL_SIGMA * gsd_m) ** 2 + (step * _CELL_SIGMA) ** 2)
+    return wall.frame.world_from_wall(pixels_wall, depth), sigma, np.isfinite(nearest)
 
 
 def usual_spread_m(wall: Wall) -> float:

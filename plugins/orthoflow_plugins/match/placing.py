@@ -3,15 +3,19 @@
 That structure agrees in nine parts is no proof: a motif that repeats agrees elsewhere, too. So the
 photo is laid on the wall at its likeliest places and a hundred overlapping patches are brought
 together there, each for itself; where most fit one pose, the place is right.
+
+But a motif that repeats, or another wall with the same tiles, may win. Photos share many more key
+points with each other than with a laser's picture. So a place counts when another photo, at a place
+of its own, shows the same things where both places say that they are: two photos that are wrong
+would have to be wrong in the same way.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain
-from threading import Lock
+from itertools import chain, combinations
 from typing import Final
 
 import numpy as np
@@ -22,10 +26,26 @@ from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.lenses import LensFreedom
 from orthoflow.geometry.resection import SeenPoints, adjust
 from orthoflow.geometry.threads import in_order
-from orthoflow.products import Photo, Wall
+from orthoflow.products import Photo, Photos, Wall
 from orthoflow_plugins.match.channels import HALF_PATCH_CELLS, Channels
-from orthoflow_plugins.match.displacements import Displacements, Search, measure
-from orthoflow_plugins.match.pictures import photo_rgb, points_on_wall, shrunk
+from orthoflow_plugins.match.displacements import Displacements, measure
+from orthoflow_plugins.match.key_points import (
+    Features,
+    PairingParams,
+    PhotoPairs,
+    find_features,
+    mapped,
+    pair_photo,
+)
+from orthoflow_plugins.match.pictures import (
+    CLIP_LIMIT,
+    equalised,
+    one_by_one,
+    photo_grey,
+    photo_rgb,
+    points_on_wall,
+    shrunk,
+)
 from orthoflow_plugins.match.structures import (
     PHOTO_SIDE_PX,
     Place,
@@ -33,11 +53,10 @@ from orthoflow_plugins.match.structures import (
     closer,
     likely_places,
     structure_of,
-    wall_structure,
 )
-from orthoflow_plugins.match.ties import TiePiece
-from orthoflow_plugins.match.tracing import agrees_around, between, fitted_pose
-from orthoflow_plugins.match.warping import Projection, project_walls, warp_photo
+from orthoflow_plugins.match.ties import TiePiece, piece_on_wall
+from orthoflow_plugins.match.tracing import agrees_around, fitted_pose
+from orthoflow_plugins.match.warping import project_walls, warp_photo
 
 # So many places of a photo are looked at patch by patch, over all walls: as cameras are held first,
 # then among all other turns. Wrong ones mostly end with their first patches.
@@ -83,6 +102,20 @@ _OTHERS_DEG: Final = tuple(
 )
 # Two poses that put the wall nearer than that are one place, as a share of the photo's longer side.
 _SAME_SHARE: Final = 0.1
+_LONGEST_SIDE_PX: Final = 1600
+_PARAMS: Final = PairingParams(max_features=4000, ratio=0.8, max_side_px=_LONGEST_SIDE_PX)
+# So many key points, in parts that both places show, tell whether the places agree; fewer may be a
+# repeated motif.
+_MIN_SHARED: Final = 24
+# Both places put a shared key point on one spot of the wall, up to so many coarse cells, and more
+# where one photo is known by a homography that ignores relief.
+_CONFIRMED_CELLS: Final = 3.0
+_APART_ROUGHLY_CELLS: Final = 6.0
+_MIN_AGREEING: Final = 0.6
+# Places overlap where they share so many coarse cells.
+_OVERLAP_CELLS: Final = 200
+# Photos that agree are right when so many do, or one of them is clear by itself.
+_MANY: Final = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,23 +197,13 @@ def turned(rgb: NDArray[np.uint8], degrees: float, scale: float = 1.0) -> Turned
     )
 
 
-@dataclass(kw_only=True)
-class PlacedWalls:
-    """Walls that photos are placed on, prepared when the first photo asks."""
-
-    walls: Sequence[Wall]
-    _ready: list[WallStructure | None] | None = None
-    _lock: Lock = field(default_factory=Lock)
-
-    def structures(self) -> list[WallStructure | None]:
-        """Structure of each wall, None where it shows nothing."""
-        with self._lock:
-            if self._ready is None:
-                self._ready = [wall_structure(wall) for wall in self.walls]
-            return self._ready
+_Likely = tuple[int, Place, TurnedPhoto]
+"""A wall, and a place there that a photo may show when it is turned so."""
 
 
-def places_of(index: int, photo: Photo, walls: PlacedWalls, cores: int = 1) -> list[Placed]:
+def places_of(
+    index: int, photo: Photo, structures: Sequence[WallStructure | None], cores: int = 1
+) -> list[Placed]:
     """Return the places on the walls where a photo may be, the best first.
 
     Only the first may be clear. A photo of which no EXIF says how it was held is tried in all ways,
@@ -189,31 +212,43 @@ def places_of(index: int, photo: Photo, walls: PlacedWalls, cores: int = 1) -> l
     Args:
         index: of the photo.
         photo: the photo.
-        walls: the walls.
+        structures: of the walls, None where one shows nothing.
         cores: ways are tried by so many threads.
     """
     rgb = photo_rgb(photo)
     longer = max(photo.width, photo.height)
     scale = min(1.0, _SIDE_PX / longer)
     small = shrunk(rgb, scale)
-    shot = (index, photo, small)
     coarse = min(1.0, PHOTO_SIDE_PX / longer)
     tiny = shrunk(rgb, coarse)
     upright_deg = 90.0 * _QUARTERS.get(photo.exif_orientation, 0)
+    lens, freedom = _lens_before(photo)
 
     def likely(turn_deg: float, *, roughly: bool) -> list[_Likely]:
         upright = turned(tiny, upright_deg + turn_deg, coarse)
         return [
-            _Likely(wall=at, place=place, upright=upright)
-            for at, structure in enumerate(walls.structures())
+            (at, place, upright)
+            for at, structure in enumerate(structures)
             if structure is not None
             for place in likely_places(upright.rgb, structure, n_most=_PLACES_EACH, roughly=roughly)
         ]
 
-    def seen_closer(each: _Likely) -> _Likely:
-        structure = walls.structures()[each.wall]
+    def on(wall: int) -> WallStructure:
+        structure = structures[wall]
         assert structure is not None  # noqa: S101 - it has places
-        return replace(each, place=closer(each.upright.rgb, structure, each.place))
+        return structure
+
+    def seen_closer(each: _Likely) -> _Likely:
+        wall, place, upright = each
+        return wall, closer(upright.rgb, on(wall), place), upright
+
+    def looked_at(each: _Likely) -> Placed | None:
+        wall, place, upright = each
+        camera = _camera_at(place, on(wall), lens, upright)
+        if camera is None:
+            return None
+        placed = _tied((index, wall), small, (camera, freedom), on(wall))
+        return None if placed is None else replace(placed, lead=place.lead)
 
     found: list[Placed] = []
     for nth, turns_deg in enumerate(_turns_deg(photo)):
@@ -221,25 +256,15 @@ def places_of(index: int, photo: Photo, walls: PlacedWalls, cores: int = 1) -> l
         some = _best(chain(*in_order(look, turns_deg, threads=cores)), _CLOSER)
         if nth > 0:
             some = list(in_order(seen_closer, some, threads=cores))
-        some = _best(some, _PLACES[nth])
-        looked = in_order(lambda each: _looked_at(shot, walls, each), some, threads=cores)
+        looked = in_order(looked_at, _best(some, _PLACES[nth]), threads=cores)
         found = _judged([*found, *(each for each in looked if each is not None)])
         if found and found[0].is_clear:
             break
     return found
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Likely:
-    """A place that a photo may show when it is turned so."""
-
-    wall: int
-    place: Place
-    upright: TurnedPhoto
-
-
 def _best(some: Iterable[_Likely], n_most: int) -> list[_Likely]:
-    return sorted(some, key=lambda each: -each.place.lead)[:n_most]
+    return sorted(some, key=lambda each: -each[1].lead)[:n_most]
 
 
 def _turns_deg(photo: Photo) -> Sequence[Sequence[float]]:
@@ -249,21 +274,6 @@ def _turns_deg(photo: Photo) -> Sequence[Sequence[float]]:
     # Faces of a panorama have no EXIF, and many show no wall: each turn costs as much as the first.
     is_face = photo.intrinsics is not None and photo.intrinsics.source == "given"
     return (_QUARTERS_DEG,) if is_face else (_QUARTERS_DEG, _OTHERS_DEG)
-
-
-def _looked_at(
-    shot: tuple[int, Photo, NDArray[np.uint8]], walls: PlacedWalls, likely: _Likely
-) -> Placed | None:
-    """Lay a photo, shrunk, on a wall and bring patches together there."""
-    index, photo, small = shot
-    structure = walls.structures()[likely.wall]
-    assert structure is not None  # noqa: S101 - it has places
-    lens, freedom = _lens_before(photo)
-    camera = _camera_at(likely.place, structure, lens, likely.upright)
-    if camera is None:
-        return None
-    placed = _tied((index, likely.wall), small, (camera, freedom), structure)
-    return None if placed is None else replace(placed, lead=likely.place.lead)
 
 
 def _judged(found: Sequence[Placed]) -> list[Placed]:
@@ -327,9 +337,9 @@ def _camera_at(
         translation=-rotation @ (middle + lens.fx / px_per_m * frame.normal_world),
     )
     pixels = place.parts_m / frame.gsd_m
-    lifted = points_on_wall(wall, pixels, usual_m=structure.usual_spread_m)
+    lifted, _, known = points_on_wall(wall, pixels, usual_m=structure.usual_spread_m)
     # On the plane where the wall is void.
-    points = np.where(lifted.known[:, None], lifted.points_world, frame.world_from_wall(pixels))
+    points = np.where(known[:, None], lifted, frame.world_from_wall(pixels))
     seen = SeenPoints(
         pixels_photo=upright.pixels_photo(place.parts_photo),
         points_world=points - origin,
@@ -368,15 +378,17 @@ def _tied(
         other = structure_of(shown / np.float32(255.0), np.asarray(np.isfinite(shown).all(axis=2)))
         own = structure.channels.part(projection.part)
         moved = _measured(own, other, radius)
-        piece = _piece(at, structure, moved, projection)
+        piece = piece_on_wall(
+            at,
+            wall,
+            projection.pixels_at(moved.places + moved.shift_cells),
+            moved.places + projection.corner + np.float64(0.5),
+            np.full(len(moved), _SIGMA_CELLS * projection.pixels_per_cell),
+            usual_m=structure.usual_spread_m,
+        )
         if len(piece) < _MIN_FIT:
             return None
-        seen = SeenPoints(
-            pixels_photo=piece.pixels_photo,
-            points_world=piece.points_world - origin,
-            sigma_px=piece.sigma_px,
-            sigma_m=piece.sigma_m,
-        )
+        seen = replace(piece, points_world=piece.points_world - origin)
         try:
             around = camera.shifted(origin)
             camera = fitted_pose(seen, around, lens=(freedom, prior)).shifted(-origin)
@@ -407,28 +419,16 @@ def _measured(first: Channels, second: Channels, radius: int) -> Displacements:
         np.arange(_APART_CELLS // 2, length, _APART_CELLS) for length in first.known.shape
     )
     places = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2).astype(np.intp)
-    search = Search(radius_cells=radius, min_score=_MIN_SCORE, min_distinct=_MIN_DISTINCT)
-    moved = measure(framed(first), framed(second), places + border, search)
+    moved = measure(
+        framed(first),
+        framed(second),
+        places + border,
+        radius,
+        min_score=_MIN_SCORE,
+        min_distinct=_MIN_DISTINCT,
+    )
     moved = moved.take(agrees_around(moved))
     return replace(moved, places=moved.places - border)
-
-
-def _piece(
-    at: tuple[int, int], structure: WallStructure, moved: Displacements, projection: Projection
-) -> TiePiece:
-    places = moved.places + moved.shift_cells
-    pixels = np.column_stack([between(projection.u, places), between(projection.v, places)])
-    cells = moved.places + projection.corner + np.float64(0.5)
-    points = points_on_wall(structure.wall, cells, usual_m=structure.usual_spread_m)
-    piece = TiePiece(
-        photo=at[0],
-        wall=at[1],
-        pixels_photo=pixels,
-        points_world=points.points_world,
-        sigma_px=np.full(len(pixels), _SIGMA_CELLS * projection.pixels_per_cell),
-        sigma_m=points.sigma_m,
-    )
-    return piece.take(points.known & np.isfinite(pixels).all(axis=1))
 
 
 def _is_same(first: Placed, second: Placed) -> bool:
@@ -438,3 +438,225 @@ def _is_same(first: Placed, second: Placed) -> bool:
     camera, pixels = second.camera, first.piece.pixels_photo
     off_px = np.linalg.norm(camera.project(first.piece.points_world)[:, :2] - pixels, axis=1)
     return float(np.median(off_px)) < _SAME_SHARE * max(camera.width, camera.height)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Laid:
+    """A photo laid on a wall.
+
+    Attributes:
+        photo: index.
+        wall: index.
+        pixels: (rows, cols, 2) float64 where the wall's coarse cells are in the photo, NaN where
+            they are not.
+        cell_px: width of a coarse cell in the photo.
+        apart_cells: how wrong the place may be.
+        placed: the place; None of a photo that key points recognised.
+    """
+
+    photo: int
+    wall: int
+    pixels: NDArray[np.float64]
+    cell_px: float
+    apart_cells: float
+    placed: Placed | None
+
+
+def confirmed(
+    photos: Photos,
+    places: Mapping[int, Sequence[Placed]],
+    recognised: Mapping[int, PhotoPairs],
+    on: tuple[Sequence[Wall], Sequence[WallStructure | None]],
+    cores: int = 1,
+) -> dict[int, Placed]:
+    """Choose the places that photos confirm for each other.
+
+    Args:
+        photos: all photos.
+        places: by index of a photo that key points did not recognise clearly, where it may be.
+        recognised: by index, the pairs of photos that they did recognise; of some in `places`, too,
+            as key points may agree by chance.
+        on: all walls, and their structures.
+        cores: photos are compared by so many threads.
+
+    Returns:
+        By index of a photo, the place by structure; not of photos whose key points are confirmed.
+    """
+    if not any(places.values()):
+        return {}
+    walls, structures = on
+    coarse = {at: one.wall for at, one in enumerate(structures) if one is not None}
+    laid = [
+        one
+        for index, some in places.items()
+        for placed in some
+        if (one := _laid_by_pose(index, placed, coarse)) is not None
+    ]
+    for index, pairs in recognised.items():
+        laid += _laid_by_homography((index, photos), pairs, coarse, walls)
+    near = [
+        (a, b)
+        for a, b in combinations(range(len(laid)), 2)
+        if laid[a].photo != laid[b].photo
+        and (laid[a].placed is not None or laid[b].placed is not None)
+        and _overlap(laid[a], laid[b])
+    ]
+    wanted = sorted({(laid[a].photo, laid[b].photo) for a, b in near})
+    shared = _shared(photos, wanted, cores)
+    agreeing = [
+        (a, b) for a, b in near if _agree(laid[a], laid[b], shared[laid[a].photo, laid[b].photo])
+    ]
+    return _chosen(laid, agreeing)
+
+
+def _laid_by_pose(index: int, placed: Placed, walls: Mapping[int, Wall]) -> _Laid | None:
+    wall = walls[placed.piece.wall]
+    projection = project_walls(placed.camera, [wall])[0]
+    if projection is None:
+        return None
+    pixels = np.full((*wall.frame.shape, 2), np.nan)
+    pixels[projection.part] = np.stack([projection.u, projection.v], axis=-1)
+    return _Laid(
+        photo=index,
+        wall=placed.piece.wall,
+        pixels=pixels,
+        cell_px=projection.pixels_per_cell,
+        apart_cells=_CONFIRMED_CELLS,
+        placed=placed,
+    )
+
+
+def _laid_by_homography(
+    shot: tuple[int, Photos],
+    pairs: PhotoPairs,
+    coarse: Mapping[int, Wall],
+    walls: Sequence[Wall],
+) -> list[_Laid]:
+    index, photos = shot
+    photo = photos.photos[index]
+    laid = []
+    for pair in pairs.pairs:
+        if pair.homography is None or pair.wall not in coarse:
+            continue
+        wall = coarse[pair.wall]
+        rows, columns = wall.frame.shape
+        cells = np.stack(np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5), axis=-1)
+        factor = wall.frame.gsd_m / walls[pair.wall].frame.gsd_m
+        with np.errstate(divide="ignore", invalid="ignore"):
+            pixels = mapped(pair.homography, cells.reshape(-1, 2) * factor)
+        inside = ((pixels >= 0.0) & (pixels < [photo.width, photo.height])).all(axis=1)
+        if inside.sum() < _OVERLAP_CELLS:
+            continue
+        pixels[~inside] = np.nan
+        area_px = float(np.ptp(pixels[inside], axis=0).prod())
+        laid.append(
+            _Laid(
+                photo=index,
+                wall=pair.wall,
+                pixels=pixels.reshape(rows, columns, 2),
+                cell_px=float(np.sqrt(area_px / inside.sum())),
+                apart_cells=_APART_ROUGHLY_CELLS,
+                placed=None,
+            )
+        )
+    return laid
+
+
+def _overlap(one: _Laid, other: _Laid) -> bool:
+    if one.wall != other.wall:
+        return False
+    both = np.isfinite(one.pixels[:, :, 0]) & np.isfinite(other.pixels[:, :, 0])
+    return int(both.sum()) >= _OVERLAP_CELLS
+
+
+def _shared(
+    photos: Photos, wanted: Sequence[tuple[int, int]], cores: int
+) -> dict[tuple[int, int], NDArray[np.float64]]:
+    """Pixels (n, 2, 2) that two photos share, in the one and in the other, by indices of photos."""
+    asked = sorted({index for pair in wanted for index in pair})
+
+    def look(index: int) -> tuple[NDArray[np.uint8], Features, float]:
+        grey = photo_grey(photos.photos[index])
+        scale = min(1.0, _LONGEST_SIDE_PX / max(grey.shape))
+        small = shrunk(grey, scale)
+        features = find_features(equalised(small, CLIP_LIMIT), _PARAMS.max_features)
+        return small, features, scale
+
+    looks = dict(zip(asked, one_by_one(look, asked, cores), strict=True))
+
+    def shared(pair: tuple[int, int]) -> NDArray[np.float64]:
+        (grey, _, scale), (_, features, other_scale) = (looks[index] for index in pair)
+        pairs = pair_photo(grey, [features], _PARAMS)
+        pixels = [np.empty((0, 2, 2))]
+        for each in pairs.pairs:
+            if each.is_shown:
+                here = pairs.features.pixels[each.matches.first[each.agreeing]] / scale
+                there = features.pixels[each.matches.second[each.agreeing]] / other_scale
+                pixels.append(np.stack([here, there], axis=1))
+        return np.concatenate(pixels)
+
+    return dict(zip(wanted, one_by_one(shared, wanted, cores), strict=True))
+
+
+def _agree(one: _Laid, other: _Laid, shared: NDArray[np.float64]) -> bool:
+    """Whether two photos show the same where both lie on one spot of the wall."""
+    from scipy.spatial import cKDTree
+
+    both = np.isfinite(one.pixels[:, :, 0]) & np.isfinite(other.pixels[:, :, 0])
+    here, there = one.pixels[both], other.pixels[both]
+    distance, nearest = (np.asarray(found) for found in cKDTree(here).query(shared[:, 0]))
+    is_shown = distance <= one.cell_px
+    if int(is_shown.sum()) < _MIN_SHARED:
+        return False
+    off = there[nearest[is_shown]] - shared[is_shown, 1]
+    off_cells = np.linalg.norm(off, axis=1) / other.cell_px
+    limit = max(one.apart_cells, other.apart_cells)
+    return bool((off_cells <= limit).mean() >= _MIN_AGREEING)
+
+
+def _chosen(laid: Sequence[_Laid], agreeing: Sequence[tuple[int, int]]) -> dict[int, Placed]:
+    """Take the places of the largest groups that agree, each photo once."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    if not agreeing:
+        return {}
+    pairs = np.array(agreeing).T
+    graph = coo_array((np.ones(pairs.shape[1]), pairs), shape=(len(laid), len(laid)))
+    group = connected_components(graph, directed=False)[1]
+    chosen: dict[int, Placed] = {}
+    groups: list[list[int]] = [
+        np.flatnonzero(group == label).tolist() for label in np.unique(group[pairs])
+    ]
+    for members in sorted(groups, key=lambda some: (-_weight(laid, some), some[0])):
+        if not _is_enough(laid, members):
+            continue
+        by_photo: dict[int, Placed] = {}
+        recognised = {laid[member].photo for member in members if laid[member].placed is None}
+        for member in members:
+            placed = laid[member].placed
+            # Key points that others confirm need no structure.
+            if placed is None or laid[member].photo in recognised:
+                continue
+            rival = by_photo.get(laid[member].photo)
+            if rival is None or placed.share > rival.share:
+                by_photo[laid[member].photo] = placed
+        # A group that puts a photo elsewhere than a heavier one does is wrong as a whole.
+        if not any(photo in chosen for photo in by_photo):
+            chosen.update(by_photo)
+    return chosen
+
+
+def _weight(laid: Sequence[_Laid], members: Sequence[int]) -> float:
+    """How much speaks for a group: photos that key points recognised, then patches that agree."""
+    is_anchored = any(laid[member].placed is None for member in members)
+    shares = [placed.share for member in members if (placed := laid[member].placed) is not None]
+    return 1e3 * is_anchored + sum(shares)
+
+
+def _is_enough(laid: Sequence[_Laid], members: Sequence[int]) -> bool:
+    some = [laid[member] for member in members]
+    return (
+        any(each.placed is None or each.placed.is_clear for each in some)
+        or len({each.photo for each in some}) >= _MANY
+    )

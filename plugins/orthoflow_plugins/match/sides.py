@@ -25,9 +25,9 @@ from orthoflow.products import (
 )
 from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
-from orthoflow_plugins.match.features import Features
-from orthoflow_plugins.match.pairing import (
+from orthoflow_plugins.match.key_points import (
     MIXTURES,
+    Features,
     PairingParams,
     mixed,
     side_matches,
@@ -217,7 +217,7 @@ def _features(planes: Planes, index: int, cloud: PointCloud, cores: int) -> Feat
         mask=np.where(known, SurfaceMask.MEASURED, SurfaceMask.VOID).astype(np.uint8),
         intensity=grey,
     )
-    return wall_features(wall, PairingParams())
+    return wall_features(wall, PairingParams().max_features)
 
 
 def _grey_on(

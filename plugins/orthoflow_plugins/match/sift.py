@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal
 
 import numpy as np
@@ -12,27 +13,23 @@ from pydantic import Field, model_validator
 from orthoflow.products import JsonValue, Photo, Photos, TieRole, Ties, Walls
 from orthoflow.sdk import DiagnosticSpec, Method, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
-from orthoflow_plugins.match.features import Features
-from orthoflow_plugins.match.pairing import (
+from orthoflow_plugins.match.key_points import (
     CLEARLY,
     LEAST,
-    Pair,
+    Features,
     PairingParams,
     PhotoPairs,
     pair_in_colours,
     wall_features,
 )
-from orthoflow_plugins.match.paper import paper_pieces, paper_wall_features, with_paper_ratio
-from orthoflow_plugins.match.pictures import (
-    one_by_one,
-    opencv_version,
-    require_photos,
-)
+from orthoflow_plugins.match.pictures import one_by_one, opencv_version, require_photos
 from orthoflow_plugins.match.ties import (
     TiePiece,
     key_point_ties,
+    paper_ties,
     ties_by_hand_alone,
     ties_of,
+    with_paper_ratio,
     with_ties_by_hand,
     without_twins,
 )
@@ -144,12 +141,11 @@ class MatchSift(Method):
         details: dict[str, JsonValue] = {"intensity_source": walls.intensity_source}
         radii_px: list[float] = []
         if params.preset == "paper":
-            on_walls = list(one_by_one(paper_wall_features, walls.walls, ctx.cores))
-            pieces = _paper(photos, walls, on_walls, params.max_ratio, ctx)
+            pieces, on_walls = paper_ties(photos, walls, None, params.ratio, ctx)
         else:
             ctx.progress(0.0, "key points of the walls")
-            find = one_by_one(lambda wall: wall_features(wall, params), walls.walls, ctx.cores)
-            on_walls = list(find)
+            find = partial(wall_features, max_features=params.max_features)
+            on_walls = list(one_by_one(find, walls.walls, ctx.cores))
             pieces, details["photos"], radii_px = _matched(photos, walls, on_walls, params, ctx)
         ties = ties_of(pieces, photos, walls, details, search_radius_px=tuple(radii_px))
         _report(ctx, ties, on_walls)
@@ -159,20 +155,6 @@ class MatchSift(Method):
     def tools(cls) -> dict[str, str]:
         """OpenCV finds and describes the key points."""
         return opencv_version()
-
-
-def _paper(
-    photos: Photos,
-    walls: Walls,
-    on_walls: Sequence[Features | None],
-    max_ratio: float,
-    ctx: StepContext,
-) -> list[TiePiece]:
-    pieces: list[TiePiece] = []
-    for index, photo in enumerate(photos.photos):
-        ctx.progress(index / len(photos.photos), photo.name)
-        pieces += paper_pieces(index, photo, on_walls, walls, None, max_ratio=max_ratio)
-    return pieces
 
 
 def _matched(
@@ -215,8 +197,8 @@ def _placed(
     ctx: StepContext,
 ) -> dict[int, Placed]:
     """Place the photos by structure in which no key points show a wall clearly, by index."""
-    from orthoflow_plugins.match.confirming import confirmed
-    from orthoflow_plugins.match.placing import PlacedWalls, places_of
+    from orthoflow_plugins.match.placing import confirmed, places_of
+    from orthoflow_plugins.match.structures import wall_structure
 
     unclear = [
         index
@@ -228,17 +210,17 @@ def _placed(
         return {}
     if params.structure == "confirmed" and len(paired) < 2:
         return {}
-    on_walls = PlacedWalls(walls=walls.walls)
+    structures = [wall_structure(wall) for wall in walls.walls]
     places: dict[int, list[Placed]] = {}
 
     def look(index: int) -> list[Placed]:
-        return places_of(index, photos.photos[index], on_walls, ctx.cores // len(unclear))
+        return places_of(index, photos.photos[index], structures, ctx.cores // len(unclear))
 
     for index, found in zip(unclear, one_by_one(look, unclear, ctx.cores), strict=True):
         ctx.progress(1.0 - 1.0 / (len(paired) + 1), f"{photos.photos[index].name}, by structure")
         places[index] = found
     recognised = {k: pairs for k, pairs in enumerate(paired) if pairs.n_recognised >= LEAST}
-    placed = confirmed(photos, places, recognised, on_walls, ctx.cores)
+    placed = confirmed(photos, places, recognised, (walls.walls, structures), ctx.cores)
     for index, found in places.items():
         if index in placed or index in recognised or not found or not found[0].is_clear:
             continue
@@ -258,31 +240,20 @@ def _placed(
 def _pieces(
     photo: int, pairs: PhotoPairs, on_walls: Sequence[Features | None], walls: Walls
 ) -> list[TiePiece]:
-    shown = without_twins(
-        [_piece(photo, pairs, pair, on_walls, walls) for pair in pairs.pairs if pair.is_shown]
-    )
-    rest = [
-        _piece(photo, pairs, pair, on_walls, walls) for pair in pairs.pairs if not pair.is_shown
-    ]
-    return sorted(shown + rest, key=lambda piece: piece.wall)
-
-
-def _piece(
-    photo: int,
-    pairs: PhotoPairs,
-    pair: Pair,
-    on_walls: Sequence[Features | None],
-    walls: Walls,
-) -> TiePiece:
-    features = on_walls[pair.wall]
-    assert features is not None  # noqa: S101 - pairs are made of walls that have key points
-    return key_point_ties(
-        (photo, pair.wall),
-        walls.walls[pair.wall],
-        (pairs.features.take(pair.matches.first), features.take(pair.matches.second)),
-        scale=pairs.scale,
-        role=TieRole.CONTROL if pair.is_shown else TieRole.REJECTED,
-    )
+    shown: list[TiePiece] = []
+    rest: list[TiePiece] = []
+    for pair in pairs.pairs:
+        features = on_walls[pair.wall]
+        assert features is not None  # noqa: S101 - pairs are made of walls that have key points
+        piece = key_point_ties(
+            (photo, pair.wall),
+            walls.walls[pair.wall],
+            (pairs.features.take(pair.matches.first), features.take(pair.matches.second)),
+            scale=pairs.scale,
+            role=TieRole.CONTROL if pair.is_shown else TieRole.REJECTED,
+        )
+        (shown if pair.is_shown else rest).append(piece)
+    return sorted(without_twins(shown) + rest, key=lambda piece: piece.wall)
 
 
 def _note(

@@ -1,24 +1,35 @@
 """Ties by pieces, each piece one photo on one wall: made from key points, joined, without twins.
 
-Ties that a person measured join them.
+Ties that a person measured join them. `preset: paper` matches as markiewicz2015 did (3.5, 3.6,
+4.3): SIFT as OpenCV sets it, and the best match. That is the one of its reference [36], openMVG: a
+key point of the wall takes its nearest descriptor in the photo where the next one is clearly
+farther (the ratio of distances, 0.8 in openMVG's documentation); without a ratio, however near it
+is. Without poses that is every key point of the wall; with them, those in the part that the photo
+shows by its first pose.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.images import used_pixels
-from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.rows import Rows
-from orthoflow.products import JsonValue, Photos, TieRole, Ties, TieWall, Wall, Walls
+from orthoflow.geometry.key_points import best_matches
+from orthoflow.geometry.resection import SeenPoints
+from orthoflow.products import Camera, JsonValue, Photos, TieRole, Ties, TieWall, Wall, Walls
 from orthoflow.sdk import DiagnosticSpec
-from orthoflow_plugins.match.features import Features
-from orthoflow_plugins.match.pictures import points_on_wall, require_intensity
+from orthoflow_plugins.match.key_points import Features, find_features, wall_features
+from orthoflow_plugins.match.pictures import (
+    one_by_one,
+    photo_grey,
+    points_on_wall,
+    require_intensity,
+)
+from orthoflow_plugins.match.warping import Projection, project_walls
 
 if TYPE_CHECKING:
     from orthoflow.sdk import StepContext
@@ -29,6 +40,9 @@ _MIN_SIGMA_PX: Final = 0.35
 _SIGMA_PER_SIZE: Final = 0.06
 # At an edge of the relief a key point belongs to neither side.
 _MAX_SIGMA_CELLS: Final = 3.0
+# What openMVG's documentation names for its best match, and key points of a picture at most.
+_PAPER_RATIO: Final = 0.8
+_PAPER_FEATURES: Final = 50_000
 BY_HAND_ALONE: Final = DiagnosticSpec(
     code="scan-without-texture",
     severity="warning",
@@ -38,56 +52,62 @@ BY_HAND_ALONE: Final = DiagnosticSpec(
 
 
 @dataclass(frozen=True, kw_only=True)
-class TiePiece(Rows):
+class TiePiece(SeenPoints):
     """Ties of one photo with one wall.
 
     Attributes:
         photo: index of the photo.
         wall: index of the wall.
-        pixels_photo: (n, 2) float64 (u, v), first pixel centre at (0.5, 0.5).
-        points_world: (n, 3) float64 metres.
-        sigma_px: (n,) float64.
-        sigma_m: (n,) float64.
         role: what they are good for.
     """
 
     photo: int
     wall: int
-    pixels_photo: NDArray[np.float64]
-    points_world: NDArray[np.float64]
-    sigma_px: NDArray[np.float64]
-    sigma_m: NDArray[np.float64]
     role: TieRole = TieRole.CONTROL
 
 
-@dataclass(frozen=True, kw_only=True)
-class Trace:
-    """What tracing a photo on the walls found.
+_NOTHING: Final = TiePiece(
+    photo=0,
+    wall=0,
+    pixels_photo=np.empty((0, 2)),
+    points_world=np.empty((0, 3)),
+    sigma_px=np.empty(0),
+    sigma_m=np.empty(0),
+)
 
-    Attributes:
-        photo: index of the photo.
-        pieces: ties per wall, outliers left out.
-        n_measured: displacements measured in the last round.
-        n_outliers: of these, dropped.
-        held_out_px: RMS of a residual coordinate of held-out ties, per round.
-        content: what was compared.
-        camera: the pose that it was traced from.
-        settled: the pose in the end.
+
+def piece_on_wall(
+    at: tuple[int, int],
+    wall: Wall,
+    pixels_photo: NDArray[np.float64],
+    cells: NDArray[np.float64],
+    sigma_px: NDArray[np.float64],
+    *,
+    usual_m: float | None = None,
+    role: TieRole = TieRole.CONTROL,
+) -> TiePiece:
+    """Ties of one photo with places of one wall; those not known on either are left out.
+
+    Args:
+        at: index of the photo and of the wall.
+        wall: the wall.
+        pixels_photo: (n, 2).
+        cells: (n, 2) (column, row) of the wall's raster, first cell centre at (0.5, 0.5).
+        sigma_px: (n,) standard deviation of a coordinate of a pixel.
+        usual_m: as `points_on_wall` has it.
+        role: of the ties.
     """
-
-    photo: int
-    pieces: tuple[TiePiece, ...]
-    n_measured: int
-    n_outliers: int
-    held_out_px: tuple[float, ...]
-    content: str
-    camera: ViewingCamera
-    settled: ViewingCamera
-
-    @property
-    def n_ties(self) -> int:
-        """Ties on all walls."""
-        return sum(len(piece) for piece in self.pieces)
+    points_world, sigma_m, known = points_on_wall(wall, cells, usual_m=usual_m)
+    piece = TiePiece(
+        photo=at[0],
+        wall=at[1],
+        pixels_photo=pixels_photo,
+        points_world=points_world,
+        sigma_px=sigma_px,
+        sigma_m=sigma_m,
+        role=role,
+    )
+    return piece.take(known & np.isfinite(pixels_photo).all(axis=1))
 
 
 def key_point_ties(
@@ -108,18 +128,79 @@ def key_point_ties(
         role: of the ties.
     """
     in_photo, on_wall = sets
-    points = points_on_wall(wall, on_wall.pixels)
-    wall_sigma_m = wall.frame.gsd_m * _sigma_px(on_wall.sizes_px)
-    piece = TiePiece(
-        photo=at[0],
-        wall=at[1],
-        pixels_photo=in_photo.pixels,
-        points_world=points.points_world,
-        sigma_px=_sigma_px(in_photo.sizes_px * scale) / scale,
-        sigma_m=np.hypot(points.sigma_m, wall_sigma_m),
-        role=role,
-    )
-    return piece.take(points.known & (piece.sigma_m < _MAX_SIGMA_CELLS * wall.frame.gsd_m))
+    known = points_on_wall(wall, on_wall.pixels)[2]
+    in_photo, on_wall = in_photo.take(known), on_wall.take(known)
+    sigma_px = _sigma_px(in_photo.sizes_px * scale) / scale
+    piece = piece_on_wall(at, wall, in_photo.pixels, on_wall.pixels, sigma_px, role=role)
+    gsd_m = wall.frame.gsd_m
+    piece = replace(piece, sigma_m=np.hypot(piece.sigma_m, gsd_m * _sigma_px(on_wall.sizes_px)))
+    return piece.take(piece.sigma_m < _MAX_SIGMA_CELLS * gsd_m)
+
+
+def paper_ties(
+    photos: Photos,
+    walls: Walls,
+    cameras: Mapping[str, Camera] | None,
+    ratio: float | None,
+    ctx: StepContext,
+) -> tuple[list[TiePiece], list[Features | None]]:
+    """Best matches of photos with every wall, as markiewicz2015 has them.
+
+    Args:
+        photos: the photos.
+        walls: the walls.
+        cameras: by photo; only what a photo shows by its pose is matched, of a photo without one
+            nothing. Without cameras all may be matched.
+        ratio: largest distance of the best match over the second best; None for any.
+        ctx: takes progress.
+
+    Returns:
+        Ties, and key points of each wall, None where it shows nothing.
+    """
+
+    def look(wall: Wall) -> Features | None:
+        return wall_features(wall, _PAPER_FEATURES, as_opencv=True)
+
+    on_walls = list(one_by_one(look, walls.walls, ctx.cores))
+    pieces: list[TiePiece] = []
+    for index, photo in enumerate(photos.photos):
+        shown: list[Projection | None] = []
+        if cameras is not None:
+            if photo.name not in cameras:
+                continue
+            shown = project_walls(cameras[photo.name].viewing(), walls.walls)
+        ctx.progress(index / len(photos.photos), photo.name)
+        in_photo = find_features(photo_grey(photo), _PAPER_FEATURES, as_opencv=True)
+        for place, (wall, features) in enumerate(zip(walls.walls, on_walls, strict=True)):
+            chosen = features
+            if features is not None and cameras is not None:
+                chosen = _within(features, shown[place], wall)
+            if chosen is None or not len(chosen) or not len(in_photo):
+                continue
+            best = best_matches(
+                chosen.descriptors, in_photo.descriptors, ratio=1.0 if ratio is None else ratio
+            )
+            pairs = in_photo.take(best.second), chosen.take(best.first)
+            pieces.append(key_point_ties((index, place), wall, pairs))
+    return pieces, on_walls
+
+
+# Any: what a user wrote, before it is checked.
+def with_paper_ratio(given: Any) -> Any:
+    """Fill in the ratio of `preset: paper` where the parameters of a matcher say none."""
+    if isinstance(given, dict) and given.get("preset") == "paper":
+        return {"ratio": _PAPER_RATIO, **given}
+    return given
+
+
+def _within(features: Features, shown: Projection | None, wall: Wall) -> Features | None:
+    """Key points of a wall in the part that a photo shows."""
+    if shown is None:
+        return None
+    mask = np.zeros(wall.frame.shape, dtype=np.bool_)
+    mask[shown.part] = np.isfinite(shown.u)
+    columns, rows = np.clip(features.pixels.astype(np.intp), 0, np.array(mask.shape[::-1]) - 1).T
+    return features.take(mask[rows, columns])
 
 
 def ties_of(
@@ -140,40 +221,42 @@ def ties_of(
         search_radius_px: one per photo, as `Ties` has it.
     """
     masks = [used_pixels(photo) for photo in photos.photos]
-    pieces = [_unmasked(piece, masks[piece.photo]) for piece in pieces]
-    counts = [len(piece) for piece in pieces]
-    total = sum(counts)
-
-    def column(values: list[int], dtype: type[np.integer]) -> NDArray[np.int32]:
-        return np.repeat(np.array(values, dtype=dtype), counts)
-
-    def joined(name: str, width: int) -> NDArray[np.float64]:
-        shape = (0, width) if width > 1 else (0,)
-        return np.concatenate([np.empty(shape), *(getattr(piece, name) for piece in pieces)])
-
+    kept: list[TiePiece] = [_NOTHING]
+    for piece in pieces:
+        used = masks[piece.photo]
+        if used is None:
+            kept.append(piece)
+            continue
+        most = np.array(used.shape[::-1]) - 1
+        columns, rows = np.clip(piece.pixels_photo.astype(np.int64), 0, most).T
+        kept.append(piece.take(used[rows, columns]))
+    counts = [len(piece) for piece in kept]
+    seen = TiePiece.joined(kept)
     return Ties(
         photo_names=tuple(photo.name for photo in photos.photos),
-        photo=column([piece.photo for piece in pieces], np.int32),
-        wall=column([piece.wall for piece in pieces], np.int32),
-        pixels_photo=joined("pixels_photo", 2),
-        points_world=joined("points_world", 3),
-        sigma_px=joined("sigma_px", 1),
-        sigma_m=joined("sigma_m", 1),
-        role=np.repeat(np.array([piece.role for piece in pieces], dtype=np.uint8), counts),
-        residual_px=np.full((total, 2), np.nan),
+        photo=np.repeat(np.array([piece.photo for piece in kept], dtype=np.int32), counts),
+        wall=np.repeat(np.array([piece.wall for piece in kept], dtype=np.int32), counts),
+        pixels_photo=seen.pixels_photo,
+        points_world=seen.points_world,
+        sigma_px=seen.sigma_px,
+        sigma_m=seen.sigma_m,
+        role=np.repeat(np.array([piece.role for piece in kept], dtype=np.uint8), counts),
+        residual_px=np.full((len(seen), 2), np.nan),
         walls=tuple(TieWall.of(wall) for wall in walls.walls),
         search_radius_px=search_radius_px,
         details=details,
     )
 
 
-def _unmasked(piece: TiePiece, used: NDArray[np.bool_] | None) -> TiePiece:
-    """Return the ties of a photo whose pixels may be used."""
-    if used is None:
-        return piece
-    most = np.array(used.shape[::-1]) - 1
-    columns, rows = np.clip(piece.pixels_photo.astype(np.int64), 0, most).T
-    return piece.take(used[rows, columns])
+def joined(pieces: Sequence[TiePiece]) -> SeenPoints:
+    """Return all ties of pieces."""
+    return TiePiece.joined([_NOTHING, *pieces])
+
+
+def parted(pieces: Sequence[TiePiece], kept: NDArray[np.bool_]) -> list[TiePiece]:
+    """Take of each piece what is kept (n,) of all of them."""
+    parts = np.split(kept, np.cumsum([len(piece) for piece in pieces])[:-1])
+    return [piece.take(part) for piece, part in zip(pieces, parts, strict=True)]
 
 
 def without_twins(pieces: Sequence[TiePiece]) -> list[TiePiece]:
@@ -184,9 +267,8 @@ def without_twins(pieces: Sequence[TiePiece]) -> list[TiePiece]:
     """
     if len(pieces) < 2:
         return list(pieces)
-    pixels = np.concatenate([piece.pixels_photo for piece in pieces])
-    points = np.concatenate([piece.points_world for piece in pieces])
-    sigma_m = np.concatenate([piece.sigma_m for piece in pieces])
+    seen = joined(pieces)
+    pixels, points, sigma_m = seen.pixels_photo, seen.points_world, seen.sigma_m
     # Twins share key point and surface, up to the rasters' cells.
     order = np.lexsort((sigma_m, pixels[:, 1].round(3), pixels[:, 0].round(3)))
     kept = np.ones(len(pixels), dtype=np.bool_)
@@ -199,10 +281,7 @@ def without_twins(pieces: Sequence[TiePiece]) -> list[TiePiece]:
         rivals = rivals[kept[rivals]]
         distance = np.linalg.norm(points[rivals] - points[nth], axis=1)
         kept[nth] = not (distance < 4.0 * (sigma_m[rivals] + sigma_m[nth])).any()
-    ends = np.cumsum([len(piece) for piece in pieces])
-    return [
-        piece.take(kept[end - len(piece) : end]) for piece, end in zip(pieces, ends, strict=True)
-    ]
+    return parted(pieces, kept)
 
 
 def ties_by_hand_alone(
@@ -239,15 +318,16 @@ def with_ties_by_hand(ties: Ties, hand: Ties | None, walls: Walls, ctx: StepCont
     kept = np.flatnonzero(known[hand.photo] >= 0)
     ctx.metric("n_by_hand", len(kept), "1")
     own_walls = walls.nearest(hand.points_world[kept])
+    # Any: the arrays of a product by name.
+    columns: dict[str, Any] = {
+        name: np.concatenate([getattr(ties, name), getattr(hand, name)[kept]])
+        for name in ("pixels_photo", "points_world", "sigma_px", "sigma_m", "role")
+    }
     return replace(
         ties,
         photo=np.concatenate([ties.photo, known[hand.photo[kept]]]),
         wall=np.concatenate([ties.wall, own_walls]),
-        pixels_photo=np.concatenate([ties.pixels_photo, hand.pixels_photo[kept]]),
-        points_world=np.concatenate([ties.points_world, hand.points_world[kept]]),
-        sigma_px=np.concatenate([ties.sigma_px, hand.sigma_px[kept]]),
-        sigma_m=np.concatenate([ties.sigma_m, hand.sigma_m[kept]]),
-        role=np.concatenate([ties.role, hand.role[kept]]),
+        **columns,
         residual_px=np.concatenate([ties.residual_px, np.full((len(kept), 2), np.nan)]),
         by_hand=np.repeat(np.array([0, 1], dtype=np.uint8), [len(ties.photo), len(kept)]),
     )

@@ -1,11 +1,18 @@
-"""One photo on all walls by its pose: measured, cleaned, the pose refitted, measured again."""
+"""One photo on all walls by its pose: measured, cleaned, the pose refitted, measured again.
+
+Where a laser sees another colour than a camera, a photo may share too few key points with the
+intensity of a wall for a first pose. With another photo of the wall it shares hundreds. So the
+oriented photos are painted on the walls, the missing one is matched with that picture, and its pose
+follows; then it is traced on the scan as any other photo, so that its ties are known from the scan
+alone.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,25 +20,31 @@ from numpy.typing import NDArray
 from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.lenses import POSE_PARAMETERS, LensFreedom, unmeasured
+from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
 from orthoflow.geometry.resection import SeenPoints, adjust, misfit
 from orthoflow.geometry.robust import MEDIAN_LENGTH, NMAD_FACTOR
-from orthoflow.products import Intrinsics, Photo, Wall
+from orthoflow.products import Camera, Intrinsics, JsonValue, Photo, Photos, Wall
 from orthoflow_plugins.match.channels import (
     CHANNELS,
-    Channels,
     WallTarget,
     colour_channels,
     textured_places,
 )
-from orthoflow_plugins.match.displacements import (
-    CORRELATION_AREA_CELLS,
-    Displacements,
-    Search,
-    measure,
+from orthoflow_plugins.match.displacements import CORRELATION_AREA_CELLS, Displacements, measure
+from orthoflow_plugins.match.key_points import Features, PairingParams, pair_photo, wall_features
+from orthoflow_plugins.match.pictures import photo_grey
+from orthoflow_plugins.match.ties import (
+    TiePiece,
+    joined,
+    key_point_ties,
+    parted,
+    piece_on_wall,
 )
-from orthoflow_plugins.match.pictures import points_on_wall
-from orthoflow_plugins.match.ties import TiePiece, Trace
 from orthoflow_plugins.match.warping import Before, Projection, View, view_of
+
+_Painted = tuple[Wall, Features | None]
+"""A wall with an intensity from photos, NaN where none shows it, and key points of that."""
+
 
 _NEIGHBOURS: Final = 12
 _MEDIAN_TOLERANCE_CELLS: Final = 0.6
@@ -54,6 +67,15 @@ _MIN_GAIN: Final = 0.03
 # Compared only where what came before leaves doubts.
 _LAST: Final = "colours"
 _FEW_SHARE: Final = 0.25
+
+# Two photos of one wall share hundreds of key points; fewer than so many may be a repeated motif.
+_MIN_AGREEING: Final = 24
+_POSE_LIMIT_SHARE: Final = 0.002
+_POSE_TRIALS: Final = 2000
+_SEED: Final = 1
+_PARAMS: Final = PairingParams()
+# Lenses of one camera: a focal length is that near to what EXIF states.
+_NEAR_FOCAL: Final = 0.1
 
 CONTENTS: Final = ("gradients", "grey", _LAST)
 """All that may be compared, in the order in which it is tried."""
@@ -85,29 +107,55 @@ class Desk:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Round:
-    pieces: list[TiePiece]
+class Trace:
+    """What tracing a photo on the walls found.
+
+    Attributes:
+        photo: index of the photo.
+        pieces: ties per wall, outliers left out.
+        n_measured: displacements measured in the last round.
+        n_outliers: of these, dropped.
+        held_out_px: RMS of a residual coordinate of held-out ties, per round.
+        content: what was compared.
+        camera: the pose that it was traced from.
+        settled: the pose in the end.
+    """
+
+    photo: int
+    pieces: tuple[TiePiece, ...]
     n_measured: int
     n_outliers: int
+    held_out_px: tuple[float, ...]
+    content: str
+    camera: ViewingCamera
+    settled: ViewingCamera
+
+    @property
+    def n_ties(self) -> int:
+        """Ties on all walls."""
+        return sum(len(piece) for piece in self.pieces)
+
+    def json(self) -> JsonValue:
+        """Return what people may want to know of it."""
+        return {
+            "n_ties": self.n_ties,
+            "n_measured": self.n_measured,
+            "n_outliers": self.n_outliers,
+            "channels": self.content,
+            "held_out_px": list(self.held_out_px),
+        }
 
 
+_Round = tuple[list[TiePiece], int]
+"""Ties per wall, outliers left out, and how many displacements were measured."""
 _Known = tuple[LensFreedom, ViewingCamera]
 """What of a lens may be off, and a camera with the lens as it is known."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Refitted:
-    """A pose by the ties of a round.
-
-    Attributes:
-        camera: the pose, and the lens where it was free.
-        held_out_px: RMS of a residual coordinate of held-out ties.
-        free: what of the lens was, None where it was held.
-    """
-
-    camera: ViewingCamera
-    held_out_px: float
-    free: _Known | None
+_Refitted = tuple[ViewingCamera, float, _Known | None]
+"""A pose by the ties of a round, the RMS of a residual coordinate of held-out ties in pixels, and
+what of the lens was free.
+"""
 
 
 def trace_photo(
@@ -131,8 +179,11 @@ def trace_photo(
     view = view_of(index, photo, camera, desk.walls, desk.before)
     found: tuple[Trace, View] | None = None
     for content in desk.contents:
-        if content == _LAST and found is not None and not _is_doubtful(found[0], desk):
-            continue
+        if content == _LAST and found is not None:
+            # Laser and camera may see different things: grey says less than edges, or little.
+            is_little = found[0].n_ties < _FEW_SHARE * desk.max_ties
+            if found[0].content == "grey" and not is_little:
+                continue
         # What one content found out about the pose is the next one's start.
         start = (view, _FIRST_RADIUS_CELLS) if found is None else (found[1], _MIN_RADIUS)
         tried = _traced(start, desk, content, lens)
@@ -161,17 +212,11 @@ def lens_by_ties(trace: Trace, lens: LensFreedom) -> tuple[ViewingCamera, float]
         trace: of the photo.
         lens: how far the lens may be off from that of its pose, the focal length among it.
     """
-    seen = _joined(trace.pieces)
     try:
-        found = adjust(seen, trace.settled, lens=lens, soft_limit=2.0)
+        found = adjust(joined(trace.pieces), trace.settled, lens=lens, soft_limit=2.0)
     except GeometryError:
         return trace.settled, math.inf
     return found.camera, math.sqrt(found.covariance[POSE_PARAMETERS, POSE_PARAMETERS])
-
-
-def _is_doubtful(found: Trace, desk: Desk) -> bool:
-    """Whether laser and camera may see different things: grey says less than edges, or little."""
-    return found.content != "grey" or found.n_ties < _FEW_SHARE * desk.max_ties
 
 
 def _is_better(tried: Trace, found: Trace) -> bool:
@@ -183,7 +228,7 @@ def _is_better(tried: Trace, found: Trace) -> bool:
 
 def _promised(trace: Trace) -> float:
     """Held-out error over the root of the number of ties and over how far apart they lie."""
-    pixels = np.concatenate([piece.pixels_photo for piece in trace.pieces])
+    pixels = joined(trace.pieces).pixels_photo
     if len(pixels) < _LEAST:
         return math.inf
     spread_px = math.sqrt(math.sqrt(max(float(np.linalg.det(np.cov(pixels.T))), 1.0)))
@@ -204,27 +249,27 @@ def _traced(
     history: list[float] = []
     for _ in range(_MAX_ROUNDS):
         found = _measured(view, desk, radius, content)
-        fit = _refitted(_joined(found.pieces), view.camera, known)
+        fit = _refitted(joined(found[0]), view.camera, known)
         if fit is None:
             # A round that finds too little does not spoil the one before.
             best = best or found
             break
-        improved = not history or fit.held_out_px < (1.0 - _MIN_GAIN) * min(history)
-        history.append(fit.held_out_px)
-        if fit.held_out_px <= min(history):
-            best, free = found, fit.free
-        if not improved or _moved_cells(found, view, fit.camera) < _SETTLED_CELLS:
+        camera, held_out_px, freed = fit
+        improved = not history or held_out_px < (1.0 - _MIN_GAIN) * min(history)
+        history.append(held_out_px)
+        if held_out_px <= min(history):
+            best, free = found, freed
+        if not improved or _moved_cells(found[0], view, camera) < _SETTLED_CELLS:
             break
-        view = view.posed(fit.camera, desk.walls)
+        view = view.posed(camera, desk.walls)
         radius = max(_MIN_RADIUS, radius // 2)
-    result = best or _Round(pieces=[], n_measured=0, n_outliers=0)
-    cleaned = _without_misfits(result.pieces, view.camera, free)
-    n_kept = sum(len(piece) for piece in cleaned)
+    pieces, n_measured = best or ([], 0)
+    cleaned = _without_misfits(pieces, view.camera, free)
     trace = Trace(
         photo=view.index,
         pieces=tuple(cleaned),
-        n_measured=result.n_measured,
-        n_outliers=result.n_measured - n_kept,
+        n_measured=n_measured,
+        n_outliers=n_measured - sum(len(piece) for piece in cleaned),
         held_out_px=tuple(history),
         content=content,
         camera=view.camera,
@@ -233,10 +278,10 @@ def _traced(
     return trace, view
 
 
-def _moved_cells(found: _Round, view: View, refitted: ViewingCamera) -> float:
+def _moved_cells(pieces: list[TiePiece], view: View, refitted: ViewingCamera) -> float:
     """How far another pose moves the photo on the walls, at the ties (RMS)."""
     squares = []
-    for piece in found.pieces:
+    for piece in pieces:
         projection = view.projections[piece.wall]
         if projection is None:
             continue
@@ -249,7 +294,11 @@ def _moved_cells(found: _Round, view: View, refitted: ViewingCamera) -> float:
 
 def _measured(view: View, desk: Desk, radius: int, content: str) -> _Round:
     targets = desk.targets
-    sizes = [_footprint(item) for item in view.projections]
+    # Visible cells of a wall, in photo pixels, so that walls of any resolution compare.
+    sizes = [
+        0 if item is None else int(np.isfinite(item.u).sum() * item.pixels_per_cell**2)
+        for item in view.projections
+    ]
     occupied: set[tuple[int, int]] = set()
     pieces: list[TiePiece] = []
     n_measured = 0
@@ -266,27 +315,17 @@ def _measured(view: View, desk: Desk, radius: int, content: str) -> _Round:
         strength = target.textures[on_wall][projection.part]
         places = textured_places(strength, usable, max(50, round(desk.max_ties * share)))
         places = _unoccupied(places, projection, occupied)
-        search = Search(radius_cells=radius, threads=desk.threads)
-        moved = measure(channels, _seen(view, index, content), places, search)
+        if content == "colours":
+            shown = colour_channels(view.colours_on_wall(projection))
+        else:
+            shown = CHANNELS[content](view.on_wall(index, projection))
+        moved = measure(channels, shown, places, radius, threads=desk.threads)
         n_measured += len(moved.places)
         moved = moved.take(agrees_around(moved))
         grain = target.grain[0][projection.part]
         pieces.append(_piece(view.index, index, target.wall, (moved, projection), grain))
     pieces.sort(key=lambda piece: piece.wall)
-    return _Round(
-        pieces=pieces,
-        n_measured=n_measured,
-        n_outliers=n_measured - sum(len(piece) for piece in pieces),
-    )
-
-
-def _seen(view: View, index: int, content: str) -> Channels:
-    """What of a photo is compared with a wall."""
-    projection = view.projections[index]
-    assert projection is not None  # noqa: S101 - the photo shows the wall
-    if content == "colours":
-        return colour_channels(view.colours_on_wall(projection))
-    return CHANNELS[content](view.on_wall(index, projection))
+    return pieces, n_measured
 
 
 def _piece(
@@ -302,24 +341,17 @@ def _piece(
     so that the areas over which residuals agree add up.
     """
     moved, projection = found
-    at = moved.places + moved.shift_cells
-    pixels = np.column_stack([between(projection.u, at), between(projection.v, at)])
-    points = points_on_wall(wall, moved.places + projection.corner + np.float64(0.5))
     alone = grain[moved.places[:, 1], moved.places[:, 0]].astype(np.float64)
     wider = np.sqrt((CORRELATION_AREA_CELLS + alone - 1.0) / CORRELATION_AREA_CELLS)
     sigma_cells = np.hypot(moved.sigma_cells * wider, _SIGMA_FLOOR_CELLS)
-    piece = TiePiece(
-        photo=photo,
-        wall=index,
-        pixels_photo=pixels,
-        points_world=points.points_world,
-        sigma_px=sigma_cells * projection.pixels_per_cell,
-        sigma_m=points.sigma_m,
+    piece = piece_on_wall(
+        (photo, index),
+        wall,
+        projection.pixels_at(moved.places + moved.shift_cells),
+        moved.places + projection.corner + np.float64(0.5),
+        sigma_cells * projection.pixels_per_cell,
     )
-    gsd_m = wall.frame.gsd_m
-    return piece.take(
-        points.known & np.isfinite(pixels).all(axis=1) & (points.sigma_m < _MAX_SIGMA_CELLS * gsd_m)
-    )
+    return piece.take(piece.sigma_m < _MAX_SIGMA_CELLS * wall.frame.gsd_m)
 
 
 def _refitted(
@@ -344,9 +376,9 @@ def _refitted(
         lengths = np.linalg.norm(residuals, axis=1)
         # Outliers that are left must not decide whether to go on.
         kept = residuals[lengths <= 3.0 * float(np.median(lengths))]
-        tried = _Refitted(camera=fitted, held_out_px=float(np.sqrt(np.mean(kept**2))), free=free)
-        if best is None or tried.held_out_px < (1.0 - _MIN_GAIN) * best.held_out_px:
-            best = tried
+        held_out_px = float(np.sqrt(np.mean(kept**2)))
+        if best is None or held_out_px < (1.0 - _MIN_GAIN) * best[1]:
+            best = fitted, held_out_px, free
     return best
 
 
@@ -380,18 +412,14 @@ def _without_misfits(
     pieces: list[TiePiece], camera: ViewingCamera, free: _Known | None = None
 ) -> list[TiePiece]:
     """Ties that fit one pose; displaced neighbourhoods pass the median of their neighbours."""
-    seen = _joined(pieces)
+    seen = joined(pieces)
     if len(seen) < _LEAST:
         return pieces
     try:
         lengths = misfit(seen, fitted_pose(seen, camera, free)).normalised
     except GeometryError:
         return pieces
-    good = lengths <= _limit(lengths)
-    ends = np.cumsum([len(piece) for piece in pieces])
-    return [
-        piece.take(good[end - len(piece) : end]) for piece, end in zip(pieces, ends, strict=True)
-    ]
+    return parted(pieces, lengths <= _limit(lengths))
 
 
 def _limit(lengths: NDArray[np.float64]) -> float:
@@ -430,31 +458,173 @@ def _unoccupied(
     return places[free]
 
 
-def _joined(pieces: Sequence[TiePiece]) -> SeenPoints:
-    return SeenPoints(
-        pixels_photo=np.concatenate([np.empty((0, 2)), *(p.pixels_photo for p in pieces)]),
-        points_world=np.concatenate([np.empty((0, 3)), *(p.points_world for p in pieces)]),
-        sigma_px=np.concatenate([np.empty(0), *(p.sigma_px for p in pieces)]),
-        sigma_m=np.concatenate([np.empty(0), *(p.sigma_m for p in pieces)]),
+def recovered_traces(
+    photos: Photos,
+    oriented: Mapping[str, Camera],
+    desk: Desk,
+    traces: Sequence[Trace],
+) -> dict[str, Trace]:
+    """Trace photos without a pose from the one that the traced photos give them.
+
+    Args:
+        photos: all photos.
+        oriented: cameras of those with a pose, by name.
+        desk: the walls.
+        traces: of the oriented photos.
+
+    Returns:
+        By name, for each photo that was found.
+    """
+    recovered: dict[str, Trace] = {}
+    known = [trace for trace in traces if trace.n_ties]
+    settled = _settled(photos, oriented, known)
+    missing = [k for k, photo in enumerate(photos.photos) if photo.name not in oriented]
+    views = [_view(trace, photos, desk) for trace in known] if missing else []
+    is_new = bool(known)
+    while is_new and missing:
+        # What was found shows more of the walls, for the next round.
+        painted = painted_walls(views, desk.walls)
+        n_before = len(recovered)
+        for index in missing:
+            photo = photos.photos[index]
+            lens = lens_of(photo, settled, photos)
+            pose = None
+            if lens is not None:
+                pose = recovered_pose(photo_grey(photo), painted, lens.posed())
+            if pose is None:
+                continue
+            found = trace_photo(index, photo, pose, desk, estimated_lens(photo, lens))
+            if found.n_ties:
+                recovered[photo.name] = found
+                views.append(_view(found, photos, desk))
+        missing = [k for k in missing if photos.photos[k].name not in recovered]
+        is_new = len(recovered) > n_before
+    return recovered
+
+
+def _settled(
+    photos: Photos, oriented: Mapping[str, Camera], traces: Sequence[Trace]
+) -> dict[str, Camera]:
+    """Cameras of traced photos by name, first those whose ties tell most of the focal length.
+
+    A lens that was only estimated is that by these ties.
+    """
+    cameras: list[tuple[float, Camera]] = []
+    for trace in traces:
+        photo = photos.photos[trace.photo]
+        camera, sigma = oriented[photo.name], 0.0
+        freedom = estimated_lens(photo, camera.intrinsics)
+        if freedom is not None:
+            found, sigma = lens_by_ties(trace, freedom)
+            lens = Intrinsics.of(found, source="estimated")
+            camera = replace(camera, intrinsics=lens)
+        cameras.append((sigma, camera))
+    cameras.sort(key=lambda each: each[0])
+    return {camera.photo: camera for _, camera in cameras}
+
+
+def _view(trace: Trace, photos: Photos, desk: Desk) -> View:
+    """Lay a photo onto the walls as it lay there in the end; its first pose hides what it hides."""
+    photo = photos.photos[trace.photo]
+    first = view_of(trace.photo, photo, trace.camera, desk.walls, desk.before)
+    return first.posed(trace.settled, desk.walls)
+
+
+def painted_walls(views: Sequence[View], walls: Sequence[Wall]) -> list[_Painted]:
+    """Paint oriented photos on the walls, in each cell the one that shows the wall largest."""
+    painted = []
+    for index, wall in enumerate(walls):
+        grey = np.full(wall.frame.shape, np.nan, dtype=np.float32)
+        laid = [
+            (view, projection)
+            for view in views
+            if (projection := view.projections[index]) is not None
+        ]
+        for view, projection in sorted(laid, key=lambda each: each[1].pixels_per_cell):
+            shown = view.on_wall(index, projection)
+            part = grey[projection.part]
+            part[np.isfinite(shown)] = shown[np.isfinite(shown)]
+        as_shown = replace(wall, intensity=grey / np.float32(255.0))
+        painted.append((as_shown, wall_features(as_shown, _PARAMS.max_features)))
+    return painted
+
+
+def recovered_pose(
+    grey: NDArray[np.uint8],
+    painted: Sequence[_Painted],
+    lens: ViewingCamera,
+) -> ViewingCamera | None:
+    """Find the pose of a photo by painted walls; None where they do not show what it shows.
+
+    Args:
+        grey: (height, width) of the photo.
+        painted: the walls.
+        lens: its interior orientation, roughly; the pose is ignored.
+    """
+    pairs = pair_photo(grey, [features for _, features in painted], _PARAMS)
+    pieces = []
+    for pair in pairs.pairs:
+        wall, features = painted[pair.wall]
+        if pair.is_shown and features is not None:
+            matches = pair.matches.take(pair.agreeing)
+            sets = (pairs.features.take(matches.first), features.take(matches.second))
+            pieces.append(key_point_ties((0, pair.wall), wall, sets, scale=pairs.scale))
+    seen = joined(pieces)
+    if len(seen) < _MIN_AGREEING:
+        return None
+    return pose_of_most(
+        seen.pixels_photo, seen.points_world, lens, _POSE_LIMIT_SHARE * max(grey.shape)
     )
 
 
-def between(raster: NDArray[np.float32], at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Values (n,) at fractional cell indices (n, 2) = (column, row); NaN beside unknown cells."""
-    height, width = raster.shape
-    inside = (at >= 0.0).all(axis=1) & (at[:, 0] < width - 1) & (at[:, 1] < height - 1)
-    left = np.where(inside, at[:, 0], 0.0).astype(np.intp)
-    top = np.where(inside, at[:, 1], 0.0).astype(np.intp)
-    a, b = at[:, 0] - left, at[:, 1] - top
-    right, below = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
-    corners = raster[[top, top, below, below], [left, right, left, right]].astype(np.float64)
-    weights = np.array([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b])
-    values: NDArray[np.float64] = (corners * weights).sum(axis=0)
-    return np.where(inside, values, np.nan)
+def lens_of(photo: Photo, oriented: Mapping[str, Camera], photos: Photos) -> Intrinsics | None:
+    """Return a photo's lens: calibrated, or as it came out for a photo of the same camera.
+
+    What came out counts more than what EXIF states, which is wrong for all photos of a lens.
+
+    Returns:
+        None when nothing is known of it.
+    """
+    focal_px = {each.name: each.exif_focal_px for each in photos.photos}
+    similar = [
+        camera.intrinsics
+        for name, camera in oriented.items()
+        if camera.intrinsics is not None
+        and (camera.intrinsics.width, camera.intrinsics.height) == (photo.width, photo.height)
+        and (
+            photo.exif_focal_px is None
+            or focal_px.get(name) == photo.exif_focal_px
+            or abs(camera.intrinsics.fx / photo.exif_focal_px - 1.0) < _NEAR_FOCAL
+        )
+    ]
+    return photo.intrinsics or next(iter(similar), None)
 
 
-def _footprint(projection: Projection | None) -> int:
-    """Visible cells of a wall, in photo pixels, so that walls of any resolution compare."""
-    if projection is None:
-        return 0
-    return int(np.isfinite(projection.u).sum() * projection.pixels_per_cell**2)
+def pose_of_most(
+    pixels: NDArray[np.float64],
+    points: NDArray[np.float64],
+    lens: ViewingCamera,
+    limit_px: float,
+) -> ViewingCamera | None:
+    """Pose that most points agree with, good enough to trace the photo from."""
+    import cv2
+
+    params: Any = cv2.UsacParams()
+    params.threshold = limit_px
+    params.maxIterations = _POSE_TRIALS
+    params.randomGeneratorState = _SEED
+    params.score = cv2.SCORE_METHOD_MSAC
+    params.loMethod = cv2.LOCAL_OPTIM_INNER_LO
+    middle = points.mean(axis=0)
+    matrix = opencv_matrix(lens)
+    observed = to_opencv(pixels)[:, None]
+    straight: Any = cv2.undistortPoints(observed, matrix, lens.distortion, P=matrix)
+    call: Any = cv2.solvePnPRansac
+    found, _, turn, shift, agreed = call(
+        points - middle, straight[:, 0], matrix, None, params=params
+    )
+    if not found or agreed is None or len(agreed) < _MIN_AGREEING:
+        return None
+    rotation = np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64)
+    pose = replace(lens, rotation=rotation, translation=np.asarray(shift).ravel())
+    return pose.shifted(-middle)

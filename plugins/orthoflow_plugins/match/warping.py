@@ -59,6 +59,15 @@ class Projection:
         """First (column, row) of the part."""
         return np.array([self.part[1].start, self.part[0].start], dtype=np.intp)
 
+    def pixels_at(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Pixels (n, 2) at fractional cells (n, 2) = (column, row) of the part; NaN beside void."""
+        return np.column_stack([between(self.u, at), between(self.v, at)])
+
+    def hide(self, mask: NDArray[np.bool_]) -> None:
+        """Take cells (rows, cols) out."""
+        self.u[mask] = np.nan
+        self.v[mask] = np.nan
+
 
 @dataclass(frozen=True, kw_only=True)
 class Before:
@@ -183,8 +192,7 @@ def _bared(
     """Projections without the cells that are hidden."""
     for projection, mask in zip(projections, hidden, strict=bool(hidden)):
         if projection is not None:
-            projection.u[mask[projection.part]] = np.nan
-            projection.v[mask[projection.part]] = np.nan
+            projection.hide(mask[projection.part])
     return projections
 
 
@@ -200,20 +208,17 @@ def project_walls(camera: ViewingCamera, walls: Sequence[Wall]) -> list[Projecti
     step = _BUFFER_CELLS * max(1.0, *(item.pixels_per_cell for _, item in shown))
     shape = (int(camera.height / step) + 1, int(camera.width / step) + 1)
     nearest = np.full(shape, np.inf, dtype=np.float32)
+    buffered = []
     for _, item in shown:
         known = np.isfinite(item.u)
-        rows = (item.v[known] / step).astype(np.intp)
-        columns = (item.u[known] / step).astype(np.intp)
-        np.minimum.at(nearest, (rows, columns), item.distance[known])
-    for wall, item in shown:
-        known = np.isfinite(item.u)
-        rows = (item.v[known] / step).astype(np.intp)
-        columns = (item.u[known] / step).astype(np.intp)
-        limit = nearest[rows, columns] + _HIDDEN_CELLS * wall.frame.gsd_m
+        cells = tuple((pixels[known] / step).astype(np.intp) for pixels in (item.v, item.u))
+        np.minimum.at(nearest, cells, item.distance[known])
+        buffered.append((known, cells))
+    for (wall, item), (known, cells) in zip(shown, buffered, strict=True):
         hidden = np.zeros(known.shape, dtype=np.bool_)
+        limit = nearest[cells] + _HIDDEN_CELLS * wall.frame.gsd_m
         hidden[known] = item.distance[known] > limit
-        item.u[hidden] = np.nan
-        item.v[hidden] = np.nan
+        item.hide(hidden)
     return list(seen)
 
 
@@ -262,9 +267,14 @@ def _in_photo(camera: ViewingCamera, wall: Wall) -> Projection | None:
     if part is None:
         return None
     u, v, distance = _project_cells(near, wall, part, 1)
-    per_cell = _pixels_per_cell(u, v)
-    if np.isfinite(u).sum() < _MIN_CELLS or per_cell is None:
+    with np.errstate(invalid="ignore"):
+        across = np.hypot(np.diff(u, axis=1), np.diff(v, axis=1))[:-1]
+        down = np.hypot(np.diff(u, axis=0), np.diff(v, axis=0))[:, :-1]
+        size = np.sqrt(across * down)
+    size = size[np.isfinite(size)]
+    if np.isfinite(u).sum() < _MIN_CELLS or not size.size:
         return None
+    per_cell = float(np.median(size))
     return Projection(part=part, u=u, v=v, distance=distance, pixels_per_cell=per_cell)
 
 
@@ -302,10 +312,15 @@ def _project_cells(
     return u, v, distance
 
 
-def _pixels_per_cell(u: NDArray[np.float32], v: NDArray[np.float32]) -> float | None:
-    with np.errstate(invalid="ignore"):
-        across = np.hypot(np.diff(u, axis=1), np.diff(v, axis=1))[:-1]
-        down = np.hypot(np.diff(u, axis=0), np.diff(v, axis=0))[:, :-1]
-        size = np.sqrt(across * down)
-    known = np.isfinite(size)
-    return float(np.median(size[known])) if known.any() else None
+def between(raster: NDArray[np.float32], at: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Values (n,) at fractional cell indices (n, 2) = (column, row); NaN beside unknown cells."""
+    height, width = raster.shape
+    inside = (at >= 0.0).all(axis=1) & (at[:, 0] < width - 1) & (at[:, 1] < height - 1)
+    left = np.where(inside, at[:, 0], 0.0).astype(np.intp)
+    top = np.where(inside, at[:, 1], 0.0).astype(np.intp)
+    a, b = at[:, 0] - left, at[:, 1] - top
+    right, below = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+    corners = raster[[top, top, below, below], [left, right, left, right]].astype(np.float64)
+    weights = np.array([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b])
+    values: NDArray[np.float64] = (corners * weights).sum(axis=0)
+    return np.where(inside, values, np.nan)

@@ -1,19 +1,20 @@
-"""A block of photos: cameras that share lenses and points, how exact they are, and its lenses.
+"""A block of photos that share lenses and points: its adjustment, and how exact it is.
 
-The covariance of all unknowns is honest about what errs together.
+COLMAP's cost functions and the Ceres solver adjust it; the covariance of all unknowns is honest
+about what errs together.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.errors import GeometryError
+from orthoflow.errors import GeometryError, MethodError
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.covariances import (
     AdjustedPoints,
@@ -26,15 +27,25 @@ from orthoflow.geometry.resection import whiten
 from orthoflow.geometry.rows import Rows
 from orthoflow.products import JsonValue, Photo
 from orthoflow.sdk import DiagnosticSpec
-from orthoflow_plugins.orient.lenses import Lens
-from orthoflow_plugins.orient.parameters import Note
-from orthoflow_plugins.orient.pose import PLACES_A_SIDE, places_in_photo
+from orthoflow_plugins.orient.pose import PLACES_A_SIDE, Lens, Note, places_in_photo
 
 # A known point is never exact: an adjustment divides by its variance.
-MIN_SIGMA_M: Final = 1e-6
+_MIN_SIGMA_M: Final = 1e-6
 _CORRELATED: Final = 0.95
 _MIN_FOR_PLANE: Final = 3
 _POSE_NAMES: Final = ("tilt", "pan", "roll", "x", "y", "distance")
+_ITERATIONS: Final = 60
+# Of the cost: the square of a hundredth of a standard deviation.
+_CONVERGED: Final = 1e-8
+# COLMAP's order: fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6.
+_MODEL: Final = "FULL_OPENCV"
+_N_VALUES: Final = 12
+_COLUMNS: Final = {"cx": 2, "cy": 3, "k1": 4, "k2": 5, "p1": 6, "p2": 7}
+# fx and fy are values of their own; so tight a prior ties them where their ratio is known.
+_TIED_ASPECT: Final = 1e-5
+# An observation this far off under a loss this narrow pulls with nothing.
+_FAR_PX: Final = -1e6
+_NOTHING: Final = 1e-9
 LENS_CONFUSED: Final = DiagnosticSpec(
     code="lens-correlated-with-pose",
     severity="warning",
@@ -102,24 +113,20 @@ class Block:
         return np.bincount(self.seen.point, minlength=len(self.points)) > 1
 
     @property
-    def column_starts(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """First columns of poses and of lenses in the block's normal matrix."""
+    def lens_starts(self) -> NDArray[np.intp]:
+        """First column of each lens in the block's normal matrix, behind the poses; and its end."""
         sizes = [lens.freedom.sigmas.size for lens in self.lenses]
-        poses = 6 * np.arange(len(self.cameras) + 1, dtype=np.intp)
-        lenses = poses[-1] + np.concatenate([[0], np.cumsum(sizes)]).astype(np.intp)
-        return poses, lenses
+        return POSE_PARAMETERS * len(self.cameras) + np.cumsum([0, *sizes], dtype=np.intp)
 
     def columns(self, photo: int) -> NDArray[np.intp]:
         """Columns of a photo's pose and of its lens in the normal matrix."""
-        poses, lenses = self.column_starts
-        lens = self.lens_of[photo]
-        return np.concatenate(
-            [np.arange(poses[photo], poses[photo] + 6), np.arange(lenses[lens], lenses[lens + 1])]
-        )
+        first, last = self.lens_starts[self.lens_of[photo] :][:2]
+        pose = POSE_PARAMETERS * photo + np.arange(POSE_PARAMETERS)
+        return np.concatenate([pose, np.arange(first, last)])
 
-    def moved(self, cameras: tuple[ViewingCamera, ...], now: NDArray[np.float64]) -> Block:
-        """Return the block after an adjustment."""
-        return replace(self, cameras=cameras, points=replace(self.points, now=now))
+    def photos_of(self, lens: int) -> list[int]:
+        """Photos that share a lens."""
+        return [photo for photo, of in enumerate(self.lens_of) if of == lens]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,6 +144,63 @@ class BlockCovariance:
     cofactors: NDArray[np.float64]
     sigma0: float
     redundancy: float
+
+
+def solve(block: Block, *, soft_limit: float) -> Block:
+    """Adjust all cameras, lenses and jointly seen points at once.
+
+    Args:
+        block: where to start.
+        soft_limit: residuals beyond so many standard deviations count less (Huber).
+
+    Raises:
+        GeometryError: the block has no solution.
+    """
+    import pyceres
+
+    ceres: Any = pyceres
+    # The solver changes poses, lenses and points in place. COLMAP's adjuster has to outlive it, and
+    # one and the same object of the problem keeps costs and losses alive.
+    scene, adjuster = _set_up(block)
+    problem = adjuster.problem
+    images = [scene.images[index + 1] for index in range(len(block.cameras))]
+    poses = [image.frame.rig_from_world for image in images]
+    lenses = [scene.cameras[index + 1].params for index in range(len(block.lenses))]
+    joint = {int(at): block.points.now[at].copy() for at in np.flatnonzero(block.is_joint)}
+    _add_observations(block, problem, ([p.params for p in poses], lenses), joint, soft_limit)
+    for lens, values in zip(block.lenses, lenses, strict=True):
+        _limit_lens(problem, lens, values)
+    options = ceres.SolverOptions()
+    options.max_num_iterations = _ITERATIONS
+    options.function_tolerance = _CONVERGED
+    # Sums of several threads come in any order.
+    options.num_threads = 1
+    kinds = ceres.LinearSolverType
+    options.linear_solver_type = kinds.DENSE_SCHUR if joint else kinds.DENSE_NORMAL_CHOLESKY
+    options.logging_type = ceres.LoggingType.SILENT
+    summary = ceres.SolverSummary()
+    ceres.solve(options, problem, summary)
+    if not summary.IsSolutionUsable() or not math.isfinite(summary.final_cost):
+        raise GeometryError(f"the block of photos has no solution: {summary.BriefReport()}")
+    now = block.points.now.copy()
+    for at, position in joint.items():
+        now[at] = position
+    cameras = []
+    for camera, pose, index in zip(block.cameras, poses, block.lens_of, strict=True):
+        values, names = np.array(lenses[index]), block.lenses[index].freedom.names
+        left, _, right = np.linalg.svd(pose.rotation.matrix())
+        adjusted = replace(
+            camera,
+            fx=float(values[0]),
+            fy=float(values[1] if "aspect" in names else values[0] * (camera.fy / camera.fx)),
+            cx=float(values[2]),
+            cy=float(values[3]),
+            distortion=values[4:9].copy(),
+            rotation=left @ right,
+            translation=np.array(pose.translation),
+        )
+        cameras.append(adjusted)
+    return replace(block, cameras=tuple(cameras), points=replace(block.points, now=now))
 
 
 def pixel_covariances(block: Block, *, alone: bool = False) -> NDArray[np.float64]:
@@ -168,41 +232,41 @@ def block_covariance(block: Block, *, soft_limit: float) -> BlockCovariance:
     Raises:
         GeometryError: the observations do not determine the block.
     """
-    n_free = int(block.column_starts[1][-1])
-    prior = np.zeros(n_free)
-    for start, lens in zip(block.column_starts[1][:-1], block.lenses, strict=True):
+    prior = np.zeros(block.lens_starts[-1])
+    for start, lens in zip(block.lens_starts, block.lenses, strict=False):
         sigmas = lens.freedom.sigmas
         prior[start : start + sigmas.size] = 1.0 / sigmas**2
-    rows = list(_rows(block, soft_limit, _groups(block)))
+    cells = np.zeros(len(block.seen), dtype=np.intp)
+    for photo, camera in enumerate(block.cameras):
+        mine = block.seen.photo == photo
+        in_photo = places_in_photo(block.seen.pixels[mine], camera)
+        cells[mine] = photo * PLACES_A_SIDE**2 + in_photo
+    rows = _rows(block, soft_limit, cells)
     normal = np.diag(prior)
     squares, n_rows = 0.0, 0
-    for part in rows:
+    for columns, _, jacobian, residuals in rows:
         # Not by BLAS: its sums depend on the number of threads.
-        normal[np.ix_(part.columns, part.columns)] += np.einsum(
-            "ij,ik->jk", part.jacobian, part.jacobian
-        )
-        squares += float((part.residuals**2).sum())
-        n_rows += len(part.residuals)
+        normal[np.ix_(columns, columns)] += np.einsum("ij,ik->jk", jacobian, jacobian)
+        squares += float((residuals**2).sum())
+        n_rows += len(residuals)
     try:
         cofactors = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     except np.linalg.LinAlgError as error:
         raise GeometryError("the ties do not determine the block of photos") from error
-    redundancy = n_rows - n_free + float((np.diag(cofactors) * prior).sum())
+    redundancy = n_rows - len(prior) + float((np.diag(cofactors) * prior).sum())
     if redundancy <= 0.0 or not (np.diag(cofactors) > 0.0).all():
         raise GeometryError("the ties do not determine the block of photos")
     sigma0 = math.sqrt(squares / redundancy)
     matrix = _honest(rows, cofactors, sigma0**2 * cofactors)
-    if _is_linked(block):
-        # Photos of one place share the errors that the scan has there.
-        shared = list(_rows(block, soft_limit, _places(block)))
-        matrix = _honest(shared, cofactors, matrix)
-    matrix = with_common_error(matrix, _adjusted_points(block, cofactors, soft_limit))
-    return BlockCovariance(
-        matrix=matrix,
-        cofactors=cofactors,
-        sigma0=sigma0,
-        redundancy=redundancy,
+    shares_lens = any(
+        lens.freedom.sigmas.size > 0 and block.lens_of.count(index) > 1
+        for index, lens in enumerate(block.lenses)
     )
+    if shares_lens or block.is_joint.any():
+        # Photos of one place share the errors that the scan has there.
+        matrix = _honest(_rows(block, soft_limit, _places(block)), cofactors, matrix)
+    matrix = with_common_error(matrix, _adjusted_points(block, cofactors, soft_limit))
+    return BlockCovariance(matrix=matrix, cofactors=cofactors, sigma0=sigma0, redundancy=redundancy)
 
 
 def lenses_json(
@@ -210,24 +274,20 @@ def lenses_json(
 ) -> JsonValue:
     """Return each lens as it came out, with standard deviations where it was free."""
     entries: list[JsonValue] = []
-    starts = block.column_starts[1]
+    sigmas = np.sqrt(np.diag(covariance))
     for index, lens in enumerate(block.lenses):
-        members = [at for at, of in enumerate(block.lens_of) if of == index]
+        members, names = block.photos_of(index), lens.freedom.names
         camera = block.cameras[members[0]]
-        columns = np.arange(starts[index], starts[index + 1])
-        sigmas = np.sqrt(np.diag(covariance)[columns])
-        names = lens.freedom.names
+        own = sigmas[block.lens_starts[index] : block.lens_starts[index + 1]]
+        own *= [camera.fx if name == "focal" else 1.0 for name in names]
         entry: dict[str, JsonValue] = {
             "photos": [photos[at].name for at in members],
             "known_from": lens.source,
             "focal_px": camera.fx,
             "centre_px": [camera.cx, camera.cy],
-            "distortion": [float(value) for value in camera.distortion],
+            "distortion": camera.distortion.tolist(),
             "free": list(names),
-            "sigmas": {
-                name: float(sigma * (camera.fx if name == "focal" else 1.0))
-                for name, sigma in zip(names, sigmas, strict=True)
-            },
+            "sigmas": dict(zip(names, own.tolist(), strict=True)),
         }
         entries.append(entry)
     return entries
@@ -237,27 +297,24 @@ def lens_statistics(block: Block) -> JsonValue:
     """Mean and SD of what is free, over lenses of one image size that are free alike."""
     kinds: dict[tuple[int, int, tuple[str, ...]], list[NDArray[np.float64]]] = {}
     for index, lens in enumerate(block.lenses):
-        camera = block.cameras[block.lens_of.index(index)]
+        camera, names = block.cameras[block.lens_of.index(index)], lens.freedom.names
         values = lens_values(camera, lens.freedom)
-        values[: 1 if "focal" in lens.freedom.names else 0] = camera.fx
-        kind = (lens.prior.width, lens.prior.height, lens.freedom.names)
-        kinds.setdefault(kind, []).append(values)
-    table: list[JsonValue] = []
-    for (width, height, names), rows in kinds.items():
-        if not names:
-            continue
-        stacked = np.array(rows)
-        spread = stacked.std(axis=0, ddof=1) if len(rows) > 1 else np.zeros(len(names))
-        table.append(
-            {
-                "width": width,
-                "height": height,
-                "n_lenses": len(rows),
-                "mean": dict(zip(names, stacked.mean(axis=0).tolist(), strict=True)),
-                "sd": dict(zip(names, spread.tolist(), strict=True)),
-            }
-        )
-    return table
+        if "focal" in names:
+            values[0] = camera.fx
+        if names:
+            kinds.setdefault((lens.prior.width, lens.prior.height, names), []).append(values)
+    return [
+        {
+            "width": width,
+            "height": height,
+            "n_lenses": len(rows),
+            "mean": dict(zip(names, np.mean(rows, axis=0).tolist(), strict=True)),
+            "sd": dict(
+                zip(names, np.std(rows, axis=0, ddof=int(len(rows) > 1)).tolist(), strict=True)
+            ),
+        }
+        for (width, height, names), rows in kinds.items()
+    ]
 
 
 def correlation_notes(
@@ -271,12 +328,11 @@ def correlation_notes(
     scale = np.sqrt(np.diag(cofactors))
     correlations = np.abs(cofactors / np.outer(scale, scale))
     for index, lens in enumerate(block.lenses):
-        members = [at for at, of in enumerate(block.lens_of) if of == index]
-        first = block.column_starts[1][index]
-        for nth, name in enumerate(lens.freedom.names):
-            rows = [correlations[6 * at : 6 * at + POSE_PARAMETERS, first + nth] for at in members]
+        members = block.photos_of(index)
+        for column, name in enumerate(lens.freedom.names, block.lens_starts[index]):
+            of_poses = correlations[: POSE_PARAMETERS * len(block.cameras), column]
             # Only what all its photos confuse stays unknown.
-            confused = np.min(rows, axis=0)
+            confused = of_poses.reshape(-1, POSE_PARAMETERS)[members].min(axis=0)
             worst = int(confused.argmax())
             if confused[worst] > _CORRELATED:
                 values = {"parameter": name, "pose": _POSE_NAMES[worst], "also": also}
@@ -285,40 +341,10 @@ def correlation_notes(
     return notes
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Rows:
-    """Equations in units of standard deviations, points eliminated.
-
-    Attributes:
-        columns: (c,) of the unknowns that take part.
-        group: of observations that may err together.
-        jacobian: (r, c).
-        residuals: (r,).
-    """
-
-    columns: NDArray[np.intp]
-    group: int
-    jacobian: NDArray[np.float64]
-    residuals: NDArray[np.float64]
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Equations:
-    """Equations of one observation, or of a photo's m, with the point still in them.
-
-    Attributes:
-        columns: (c,) of the unknowns that take part.
-        group: as in `_Rows`; -1 for several.
-        by_camera: ([m,] 2, c) by pose and lens.
-        by_point: ([m,] 2, 3).
-        residuals: ([m,] 2).
-    """
-
-    columns: NDArray[np.intp]
-    group: int
-    by_camera: NDArray[np.float64]
-    by_point: NDArray[np.float64]
-    residuals: NDArray[np.float64]
+_Rows = tuple[NDArray[np.intp], int, NDArray[np.float64], NDArray[np.float64]]
+"""Equations in standard deviations, points eliminated: columns (c,) of the unknowns that take part,
+group of observations that may err together, jacobian (r, c) and residuals (r,).
+"""
 
 
 def _honest(
@@ -327,18 +353,18 @@ def _honest(
     """Widen by what leaving out each group changes, see `geometry.covariances`."""
     by_group: dict[int, list[_Rows]] = {}
     for part in rows:
-        by_group.setdefault(part.group, []).append(part)
+        by_group.setdefault(part[1], []).append(part)
     # Fewer groups than unknowns of a photo say nothing of it.
-    if len(by_group) <= max(part.columns.size for part in rows):
+    if len(by_group) <= max(part[0].size for part in rows):
         return plain
     moves = []
     for parts in by_group.values():
-        columns = np.unique(np.concatenate([part.columns for part in parts]))
+        columns = np.unique(np.concatenate([part[0] for part in parts]))
         normal, pull = np.zeros((columns.size, columns.size)), np.zeros(columns.size)
-        for part in parts:
-            at = np.searchsorted(columns, part.columns)
-            normal[np.ix_(at, at)] += np.einsum("ij,ik->jk", part.jacobian, part.jacobian)
-            pull[at] += np.einsum("ij,i->j", part.jacobian, part.residuals)
+        for own, _, jacobian, residuals in parts:
+            at = np.searchsorted(columns, own)
+            normal[np.ix_(at, at)] += np.einsum("ij,ik->jk", jacobian, jacobian)
+            pull[at] += np.einsum("ij,i->j", jacobian, residuals)
         inner = np.eye(columns.size) - normal @ cofactors[np.ix_(columns, columns)]
         moves.append(cofactors[:, columns] @ (np.linalg.pinv(inner) @ pull))
     return widened_by_moves(plain, np.array(moves))
@@ -348,50 +374,44 @@ def _adjusted_points(
     block: Block, cofactors: NDArray[np.float64], soft_limit: float
 ) -> AdjustedPoints:
     """The places of the scan that photos see, and how far they are from there."""
-    seen = block.seen
-    known = np.flatnonzero(np.isfinite(block.points.sigma_m[seen.point]))
+    known = np.isfinite(block.points.sigma_m[block.seen.point])
     # Also what several photos see is compared with where the scan has it.
-    as_scanned = replace(
-        block,
-        points=replace(block.points, now=block.points.known),
-        seen=seen.take(known),
-    )
-    n_points, n_known = len(block.points), len(known)
+    at_scan = replace(block.points, now=block.points.known)
+    block = replace(block, points=at_scan, seen=block.seen.take(known))
+    seen, n_known = block.seen, len(block.seen)
     jacobian, pulls = (np.zeros((n_known, k, len(cofactors))) for k in (2, 3))
     residuals, by_place = np.zeros((n_known, 2)), np.zeros((n_known, 2, 3))
-    towards, information = np.zeros((n_known, 3)), np.zeros((n_points, 3, 3))
-    of_pixels = (as_scanned.seen.sigma_px**2)[:, None, None] * np.eye(2)
-    with_places = pixel_covariances(as_scanned, alone=True)
+    towards, information = np.zeros((n_known, 3)), np.zeros((len(block.points), 3, 3))
+    of_pixels = (seen.sigma_px**2)[:, None, None] * np.eye(2)
+    with_places = pixel_covariances(block, alone=True)
     for photo, camera in enumerate(block.cameras):
-        mine = np.flatnonzero(as_scanned.seen.photo == photo)
-        point, own = as_scanned.seen.point[mine], block.columns(photo)
-        linear = _seen_by(as_scanned, photo, mine, with_places[mine], soft_limit)
-        residuals[mine], by_place[mine] = linear.residuals, linear.by_point
-        jacobian[mine[:, None, None], [[0], [1]], own] = linear.by_camera
+        mine, own = np.flatnonzero(seen.photo == photo), block.columns(photo)
+        by_camera, by_point, off = _seen_by(block, photo, mine, with_places[mine], soft_limit)
+        residuals[mine], by_place[mine] = off, by_point
+        jacobian[mine[:, None, None], [[0], [1]], own] = by_camera
         # A place pulls with what it is known by, once for all photos that see it.
-        linear = _seen_by(as_scanned, photo, mine, of_pixels[mine], math.inf)
+        by_camera, by_point, _ = _seen_by(block, photo, mine, of_pixels[mine], math.inf)
         pulls[mine[:, None, None], [[0], [1], [2]], own] = np.einsum(
-            "nip,nid->ndp", linear.by_camera, linear.by_point
+            "nip,nid->ndp", by_camera, by_point
         )
-        squares = np.einsum("nid,nie->nde", linear.by_point, linear.by_point)
-        np.add.at(information, point, squares)
+        np.add.at(information, seen.point[mine], np.einsum("nid,nie->nde", by_point, by_point))
         if len(mine) >= _MIN_FOR_PLANE:
-            towards[mine] = outwards(block.points.known[point], camera.centre_world)
-    variances = np.where(np.isfinite(block.points.sigma_m), block.points.sigma_m, 0.0) ** 2
+            towards[mine] = outwards(at_scan.known[seen.point[mine]], camera.centre_world)
+    variances = np.where(np.isfinite(at_scan.sigma_m), at_scan.sigma_m, 0.0) ** 2
     held = np.linalg.inv(np.eye(3) + variances[:, None, None] * information)
     return AdjustedPoints(
-        photo=as_scanned.seen.photo,
-        places=block.points.known[as_scanned.seen.point],
+        photo=seen.photo,
+        places=at_scan.known[seen.point],
         residuals=residuals,
         jacobian=jacobian,
         by_place=by_place,
-        pulls=np.einsum("ndp,nde->npe", pulls, held[as_scanned.seen.point]),
+        pulls=np.einsum("ndp,nde->npe", pulls, held[seen.point]),
         towards=towards,
         cofactors=cofactors,
     )
 
 
-def _rows(block: Block, soft_limit: float, groups: NDArray[np.intp]) -> Iterator[_Rows]:
+def _rows(block: Block, soft_limit: float, groups: NDArray[np.intp]) -> list[_Rows]:
     """Equations of the unknowns that remain when every point is eliminated.
 
     Args:
@@ -402,31 +422,19 @@ def _rows(block: Block, soft_limit: float, groups: NDArray[np.intp]) -> Iterator
     seen = block.seen
     joint = block.is_joint[seen.point]
     covariances = pixel_covariances(block)
-    stacked: dict[int, list[_Equations]] = {}
+    rows: list[_Rows] = []
+    stacked: dict[int, list[tuple[_Rows, NDArray[np.float64]]]] = {}
     for photo in range(len(block.cameras)):
-        mine = np.flatnonzero(seen.photo == photo)
-        if not len(mine):
-            continue
-        linear = _seen_by(block, photo, mine, covariances[mine], soft_limit)
-        for group in np.unique(groups[mine]):
+        mine, columns = np.flatnonzero(seen.photo == photo), block.columns(photo)
+        by_camera, by_point, off = _seen_by(block, photo, mine, covariances[mine], soft_limit)
+        for group in np.unique(groups[mine]).tolist():
             alone = (groups[mine] == group) & ~joint[mine]
-            yield _Rows(
-                columns=block.columns(photo),
-                group=int(group),
-                jacobian=linear.by_camera[alone].reshape(-1, linear.by_camera.shape[2]),
-                residuals=linear.residuals[alone].ravel(),
-            )
+            jacobian = by_camera[alone].reshape(-1, columns.size)
+            rows.append((columns, group, jacobian, off[alone].ravel()))
         for nth in np.flatnonzero(joint[mine]):
-            one = _Equations(
-                columns=block.columns(photo),
-                group=int(groups[mine[nth]]),
-                by_camera=linear.by_camera[nth],
-                by_point=linear.by_point[nth],
-                residuals=linear.residuals[nth],
-            )
-            stacked.setdefault(int(seen.point[mine[nth]]), []).append(one)
-    for point, parts in stacked.items():
-        yield _without_point(block, point, parts)
+            one = columns, int(groups[mine[nth]]), by_camera[nth], off[nth]
+            stacked.setdefault(int(seen.point[mine[nth]]), []).append((one, by_point[nth]))
+    return rows + [_without_point(block, point, parts) for point, parts in stacked.items()]
 
 
 def _seen_by(
@@ -435,8 +443,12 @@ def _seen_by(
     mine: NDArray[np.intp],
     covariances: NDArray[np.float64],
     soft_limit: float,
-) -> _Equations:
-    """Equations of a photo's observations, in standard deviations, robust weights applied."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Equations of a photo's m observations, in standard deviations, robust weights applied.
+
+    Returns:
+        Derivatives by pose and lens (m, 2, c) and by the points (m, 2, 3), and residuals (m, 2).
+    """
     camera, seen = block.cameras[photo], block.seen
     points = seen.point[mine]
     at = np.where(
@@ -445,62 +457,34 @@ def _seen_by(
     linear = linearised(camera, at, block.lenses[block.lens_of[photo]].freedom)
     by_point = linear.by_camera_point @ camera.rotation
     residuals = seen.pixels[mine] - linear.pixels
-    all_columns = np.concatenate([residuals[:, :, None], linear.by_parameters, by_point], axis=2)
-    all_columns = whiten(covariances, all_columns)
-    lengths = np.linalg.norm(all_columns[:, :, 0], axis=1)
-    all_columns *= np.sqrt(np.minimum(1.0, soft_limit / np.maximum(lengths, 1e-12)))[:, None, None]
-    return _Equations(
-        columns=block.columns(photo),
-        group=-1,
-        by_camera=all_columns[:, :, 1:-3],
-        by_point=all_columns[:, :, -3:],
-        residuals=all_columns[:, :, 0],
-    )
+    columns = np.concatenate([residuals[:, :, None], linear.by_parameters, by_point], axis=2)
+    columns = whiten(covariances, columns)
+    lengths = np.linalg.norm(columns[:, :, 0], axis=1)
+    columns *= np.sqrt(np.minimum(1.0, soft_limit / np.maximum(lengths, 1e-12)))[:, None, None]
+    return columns[:, :, 1:-3], columns[:, :, -3:], columns[:, :, 0]
 
 
-def _without_point(block: Block, point: int, parts: list[_Equations]) -> _Rows:
+def _without_point(
+    block: Block, point: int, parts: list[tuple[_Rows, NDArray[np.float64]]]
+) -> _Rows:
     """Eliminate a point seen by several photos: what its position cannot explain remains."""
-    columns = np.unique(np.concatenate([part.columns for part in parts]))
+    columns = np.unique(np.concatenate([one[0] for one, _ in parts]))
     sigma_m = float(block.points.sigma_m[point])
     n_known = 3 if math.isfinite(sigma_m) else 0
     jacobian = np.zeros((2 * len(parts) + n_known, columns.size))
     by_point = np.zeros((len(jacobian), 3))
     residuals = np.zeros(len(jacobian))
-    for nth, part in enumerate(parts):
-        own = slice(2 * nth, 2 * nth + 2)
-        jacobian[own, np.searchsorted(columns, part.columns)] = part.by_camera
-        by_point[own], residuals[own] = part.by_point, part.residuals
+    for nth, ((own, _, by_camera, off), of_point) in enumerate(parts):
+        two = slice(2 * nth, 2 * nth + 2)
+        jacobian[two, np.searchsorted(columns, own)] = by_camera
+        by_point[two], residuals[two] = of_point, off
     if n_known:
-        least = max(sigma_m, MIN_SIGMA_M)
+        least = max(sigma_m, _MIN_SIGMA_M)
         by_point[-3:] = np.eye(3) / least
         residuals[-3:] = (block.points.known[point] - block.points.now[point]) / least
     across = np.linalg.qr(by_point, mode="complete").Q[:, 3:]
     remaining = np.einsum("ij,ik->jk", across, jacobian)
-    return _Rows(
-        columns=columns,
-        group=parts[0].group,
-        jacobian=remaining,
-        residuals=np.einsum("ij,i->j", across, residuals),
-    )
-
-
-def _groups(block: Block) -> NDArray[np.intp]:
-    """Group (m,) of each observation: a cell of its photo."""
-    groups = np.zeros(len(block.seen), dtype=np.intp)
-    for photo, camera in enumerate(block.cameras):
-        mine = block.seen.photo == photo
-        cells = places_in_photo(block.seen.pixels[mine], camera)
-        groups[mine] = photo * PLACES_A_SIDE**2 + cells
-    return groups
-
-
-def _is_linked(block: Block) -> bool:
-    """Whether photos have unknowns in common: points, or a lens that is free."""
-    shared = [
-        lens.freedom.sigmas.size > 0 and block.lens_of.count(index) > 1
-        for index, lens in enumerate(block.lenses)
-    ]
-    return any(shared) or bool(block.is_joint.any())
+    return columns, parts[0][0][1], remaining, np.einsum("ij,i->j", across, residuals)
 
 
 def _places(block: Block) -> NDArray[np.intp]:
@@ -514,3 +498,111 @@ def _places(block: Block) -> NDArray[np.intp]:
             widths.append(side_px / camera.fx * float(np.median(distances)))
     cubes = np.floor(block.points.now[seen.point] / float(np.median(widths))).astype(np.intp)
     return np.asarray(np.unique(cubes, axis=0, return_inverse=True)[1].ravel(), dtype=np.intp)
+
+
+def _set_up(block: Block) -> tuple[Any, Any]:
+    """Let COLMAP set up poses and lenses: its scene, and its adjuster.
+
+    The manifold on which a pose moves is to be had from COLMAP's adjuster only, and that wants
+    observations: two of one point per photo, so far off that they pull with nothing.
+    """
+    import pycolmap
+
+    colmap: Any = pycolmap
+    scene, config = colmap.Reconstruction(), colmap.BundleAdjustmentConfig()
+    for index, lens in enumerate(block.lenses):
+        camera = colmap.Camera(
+            model=_MODEL,
+            width=lens.prior.width,
+            height=lens.prior.height,
+            params=_values(block.cameras[block.lens_of.index(index)]),
+            camera_id=index + 1,
+        )
+        scene.add_camera_with_trivial_rig(camera)
+    for at, (viewer, lens_of) in enumerate(zip(block.cameras, block.lens_of, strict=True), 1):
+        image = colmap.Image(name=str(at), camera_id=lens_of + 1, image_id=at)
+        image.points2D = colmap.Point2DList([colmap.Point2D([_FAR_PX, _FAR_PX])] * 2)
+        pose = colmap.Rigid3d(colmap.Rotation3d(viewer.rotation), viewer.translation)
+        scene.add_image_with_trivial_frame(image, pose)
+        track = colmap.Track()
+        track.add_element(at, 0)
+        track.add_element(at, 1)
+        ahead = viewer.rotation.T @ (np.array([0.0, 0.0, 1.0]) - viewer.translation)
+        config.add_image(at)
+        config.add_constant_point(scene.add_point3D(ahead, track, np.zeros(3, np.uint8)))
+    options = colmap.BundleAdjustmentOptions()
+    options.ceres.loss_function_type = colmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = _NOTHING
+    return scene, colmap.create_default_ceres_bundle_adjuster(options, config, scene)
+
+
+def _add_observations(
+    block: Block,
+    problem: Any,
+    parameters: tuple[list[Any], list[Any]],
+    joint: dict[int, NDArray[np.float64]],
+    soft_limit: float,
+) -> None:
+    """Add what is seen: of a point of its own as a wider pixel, of a joint one as it is."""
+    import pyceres
+    import pycolmap
+    from pycolmap import cost_functions
+
+    ceres, costs = pyceres, cost_functions
+    poses, lenses = parameters
+    model = getattr(pycolmap.CameraModelId, _MODEL)
+    loss, whole = ceres.HuberLoss(soft_limit), ceres.TrivialLoss()
+    seen, covariances = block.seen, pixel_covariances(block)
+    for nth in range(len(seen)):
+        photo, point = int(seen.photo[nth]), int(seen.point[nth])
+        camera = [poses[photo], lenses[block.lens_of[photo]]]
+        if point in joint:
+            cost = costs.ReprojErrorCost(model, covariances[nth], seen.pixels[nth])
+            problem.add_residual_block(cost, loss, [joint[point], *camera])
+        else:
+            known = block.points.known[point]
+            cost = costs.ReprojErrorCost(model, covariances[nth], seen.pixels[nth], known)
+            problem.add_residual_block(cost, loss, camera)
+    for point, values in joint.items():
+        sigma_m = float(block.points.sigma_m[point])
+        if math.isfinite(sigma_m):
+            covariance = np.eye(3) * max(sigma_m, _MIN_SIGMA_M) ** 2
+            prior = ceres.factors.NormalPrior(block.points.known[point], covariance)
+            problem.add_residual_block(prior, whole, [values])
+
+
+def _values(camera: ViewingCamera) -> NDArray[np.float64]:
+    if camera.skew:
+        raise MethodError(
+            f"a lens of the block has a skew of {camera.skew:.1f} px, which no model of COLMAP "
+            "has: calibrate it without, or use orient.dlt or orient.pnp"
+        )
+    values = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion]
+    return np.pad(np.array(values), (0, _N_VALUES - len(values)))
+
+
+def _limit_lens(problem: Any, lens: Lens, values: NDArray[np.float64]) -> None:
+    """Hold what is not free of a lens, and pull the rest towards what is known of it."""
+    import pyceres
+
+    ceres: Any = pyceres
+    sigmas = dict(zip(lens.freedom.names, lens.freedom.sigmas.tolist(), strict=True))
+    if not sigmas:
+        problem.set_parameter_block_constant(values)
+        return
+    covariance = np.eye(_N_VALUES)
+    held = set(range(_N_VALUES))
+    for name, column in _COLUMNS.items():
+        if name in sigmas:
+            covariance[column, column] = sigmas[name] ** 2
+            held.discard(column)
+    prior = _values(lens.prior)
+    if "focal" in sigmas or "aspect" in sigmas:
+        focal = prior[:2]
+        shared = sigmas.get("focal", _TIED_ASPECT) ** 2
+        own = np.diag([0.0, sigmas.get("aspect", _TIED_ASPECT) ** 2])
+        covariance[:2, :2] = np.outer(focal, focal) * (shared + own)
+        held -= {0, 1}
+    problem.set_manifold(values, ceres.SubsetManifold(_N_VALUES, sorted(held)))
+    cost = ceres.factors.NormalPrior(prior, covariance)
+    problem.add_residual_block(cost, ceres.TrivialLoss(), [values])

@@ -4,30 +4,43 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence, Set
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from typing import ClassVar, Final
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.errors import GeometryError
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.resection import (
+    Misfit,
+    Resection,
+    SeenPoints,
+    fitted,
+    misfit,
+    moved_origin,
+)
 from orthoflow.products import JsonValue, Photo, Ties
 from orthoflow.sdk import DiagnosticSpec, Method, MetricSpec, StepContext
 from orthoflow.sdk.methods import Determinism
-from orthoflow_plugins.orient.adjustment import Adjusted, adjust_block, of_another_lens
-from orthoflow_plugins.orient.block import correlation_notes, lens_statistics, lenses_json
-from orthoflow_plugins.orient.gates import GATES_BEFORE_BLOCK, refusal
-from orthoflow_plugins.orient.lenses import Refined, Sharing, lens_groups
-from orthoflow_plugins.orient.parameters import (
-    ORIENTATION_METRICS,
-    OrientIn,
-    OrientOut,
-    OrientParams,
+from orthoflow_plugins.orient.block import (
+    Block,
+    BlockCovariance,
+    Observations,
+    Points,
+    block_covariance,
+    correlation_notes,
+    lens_statistics,
+    lenses_json,
+    solve,
 )
+from orthoflow_plugins.orient.gates import GATES_BEFORE_BLOCK, refusal
 from orthoflow_plugins.orient.photo_ties import (
     PhotoTies,
     no_features,
-    no_photo_ties,
     overlapping_pairs,
     photo_features,
     tie_photos,
@@ -42,7 +55,25 @@ from orthoflow_plugins.orient.photos import (
     tied_photo,
     with_believable_priors,
 )
-from orthoflow_plugins.orient.pose import TiedPhoto, estimate_pose
+from orthoflow_plugins.orient.pose import (
+    ORIENTATION_METRICS,
+    SOFT_LIMIT,
+    UNKNOWN,
+    Estimate,
+    Lens,
+    OrientIn,
+    OrientOut,
+    OrientParams,
+    Refined,
+    Sharing,
+    TiedPhoto,
+    estimate_pose,
+    focal_sigma,
+    lens_groups,
+    posed,
+    unit_deviation,
+    without_chance,
+)
 from orthoflow_plugins.orient.report import Oriented, hand_over
 
 _SHARE_BY_ITSELF: Final = 0.4
@@ -53,6 +84,23 @@ _MIN_OVERLAP: Final = 0.2
 _MAX_PHOTO_POINTS: Final = 1000
 # So shared, a lens is asked of each of its photos whether it can be its own.
 _TESTED: Final = "focal-group"
+_ROUNDS: Final = 5
+_TIE_SIGMA_START_PX: Final = 0.5
+_TIE_SIGMA_RANGE_PX: Final = (0.1, 2.0)
+# Scan ties of several photos at one place of the wall are one point of the scan.
+_SAME_PLACE_M: Final = 1e-6
+# Of photos without EXIF nobody knows whether one lens took them. A person who takes a series seldom
+# changes it, and a lens that many photos share is known far better than that of any of them. But a
+# lens may have zoomed, and a program may have turned a picture. So each photo's own ties are asked.
+# One photo in a thousand is given a lens of its own although it shares that of the others.
+_CHANCE: Final = 1e-3
+# A camera has one lens. A series that zoomed differs by more than this share of the focal length;
+# what errors of the scan that neighbouring ties have in common do to the focal length of one photo
+# is less (up to 0.7 % on photogrammetric clouds of 10 to 30 mm noise).
+_MIN_ZOOM: Final = 0.02
+_ZOOM_SIGMAS: Final = 5.0
+# Those that contradict most bend the lens, so that others contradict it, too: these leave first.
+_SHARE_OF_WORST: Final = 0.5
 NO_BLOCK: Final = DiagnosticSpec(
     code="bundle-without-result",
     severity="warning",
@@ -155,12 +203,13 @@ def _by_itself(
     against = refusal(candidate_of(tied, ties, params, found.estimate), GATES_BEFORE_BLOCK)
     if against is None:
         return found
-    return refused(tied, against.text if found.by_hand is None else found.by_hand.camera.status)
+    return refused(tied, against[1] if found.by_hand is None else found.by_hand.camera.status)
 
 
 def _adjusted(
     block: Sequence[Trusted], params: OrientColmapBundle.Params, ctx: StepContext
 ) -> Adjusted | None:
+    """Adjust photos with shared lenses, and again with lenses of their own where ties ask."""
     photos = [item.tied.photo for item in block]
     cameras = [item.estimate.resection.camera for item in block]
     between = _photo_ties(block, params, ctx)
@@ -189,16 +238,14 @@ def _photo_ties(
 ) -> PhotoTies:
     cameras = [item.estimate.resection.camera for item in block]
     shown = [item.tied.control(item.estimate.agreeing).points_world for item in block]
-    pairs = overlapping_pairs(cameras, shown, _MIN_OVERLAP)
-    if not (params.photo_ties and pairs):
-        return no_photo_ties()
+    pairs = overlapping_pairs(cameras, shown, _MIN_OVERLAP) if params.photo_ties else []
     needed = {at for pair in pairs for at in pair}
-    features = []
-    for at, item in enumerate(block):
+    features = [no_features()] * len(block)
+    for at in sorted(needed):
+        photo = block[at].tied.photo
         done = _SHARE_BY_ITSELF + (_SHARE_FEATURES - _SHARE_BY_ITSELF) * at / len(block)
-        ctx.progress(done, f"key points of {item.tied.photo.name}")
-        wanted = photo_features(item.tied.photo, params.max_features) if at in needed else None
-        features.append(wanted or no_features())
+        ctx.progress(done, f"key points of {photo.name}")
+        features[at] = photo_features(photo, params.max_features)
     return tie_photos(cameras, features, pairs, _MAX_PHOTO_POINTS)
 
 
@@ -225,3 +272,322 @@ def _report_block(
             "sigma_px": adjusted.tie_sigma_px if np.isfinite(adjusted.tie_sigma_px) else None,
         },
     }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Adjusted:
+    """A block after its adjustment.
+
+    Attributes:
+        block: cameras, lenses and points, in a world shifted to `middle`.
+        middle: (3,) metres.
+        covariance: of all unknowns.
+        estimates: one per photo, in the world.
+        tie_sigma_px: standard deviation of a coordinate of a tie between photos, in pixels of the
+            picture it was found in; NaN without ties.
+        tie_rmse_px: root mean square of such a coordinate's residual, photo pixels; NaN without.
+        n_tie_points: points that only photos see.
+        n_tie_observations: in how many photos, added up.
+    """
+
+    block: Block
+    middle: NDArray[np.float64]
+    covariance: BlockCovariance
+    estimates: tuple[Estimate, ...]
+    tie_sigma_px: float
+    tie_rmse_px: float
+    n_tie_points: int
+    n_tie_observations: int
+
+
+@dataclass(kw_only=True)
+class _Weights:
+    """What an adjustment takes of the ties, and how exact they are.
+
+    Attributes:
+        agreeing: per photo, (n,) bool of its scan ties.
+        units: standard deviation of unit weight of each photo's scan ties.
+        limits: of each photo's scan ties, in standard deviations.
+        tie_active: (m,) bool of the observations between photos.
+        tie_sigma: of these, in pixels of the picture they were found in.
+    """
+
+    agreeing: list[NDArray[np.bool_]]
+    units: list[float]
+    limits: list[float]
+    tie_active: NDArray[np.bool_]
+    tie_sigma: float
+
+
+def adjust_block(
+    photos: Sequence[Trusted],
+    ties: PhotoTies,
+    groups: tuple[tuple[int, ...], tuple[Lens, ...]],
+    params: OrientParams,
+) -> Adjusted:
+    """Adjust photos and lenses together: reject, weigh anew, until nothing changes.
+
+    Args:
+        photos: the photos.
+        ties: between them, in the world.
+        groups: index of each photo's lens, and the lenses.
+        params: what is rejected.
+
+    Raises:
+        GeometryError: the ties do not determine the block.
+    """
+    middle = np.mean([item.tied.seen.points_world.mean(axis=0) for item in photos], axis=0)
+    cameras, positions = _start(photos, groups, middle), ties.points_world - middle
+    weights = _Weights(
+        agreeing=[item.estimate.agreeing & ~item.tied.is_check for item in photos],
+        units=[max(item.estimate.resection.sigma0, 0.1) for item in photos],
+        limits=[],
+        tie_active=np.ones(len(ties.photo), dtype=np.bool_),
+        tie_sigma=_TIE_SIGMA_START_PX,
+    )
+    for nth in range(_ROUNDS):
+        used = weights
+        block = _block(photos, ties, groups, (cameras, positions, middle), used)
+        block = solve(block, soft_limit=SOFT_LIMIT)
+        cameras, positions = block.cameras, block.points.now[len(block.points) - len(positions) :]
+        fits = [
+            misfit(item.tied.seen, camera.shifted(-middle))
+            for item, camera in zip(photos, cameras, strict=True)
+        ]
+        lengths_px = _tie_residuals(ties, cameras, positions)
+        weights = _weighed(photos, fits, used, params.rejection_sigma)
+        if used.tie_active.any():
+            _weigh_between(ties, lengths_px / ties.scale, weights, params.rejection_sigma)
+        if nth >= 1 and all(
+            np.array_equal(before, after)
+            for before, after in zip(
+                [*used.agreeing, used.tie_active],
+                [*weights.agreeing, weights.tie_active],
+                strict=True,
+            )
+        ):
+            break
+    covariance = block_covariance(block, soft_limit=SOFT_LIMIT)
+    kept_px = lengths_px[used.tie_active]
+    return Adjusted(
+        block=block,
+        middle=middle,
+        covariance=covariance,
+        estimates=tuple(
+            replace(
+                item.estimate,
+                resection=_resection(block, at, covariance, middle, used.units[at]),
+                source=block.lenses[block.lens_of[at]].source,
+                fit=fit,
+                agreeing=fit.normalised <= limit,
+                limit=limit,
+            )
+            for at, (item, fit, limit) in enumerate(zip(photos, fits, weights.limits, strict=True))
+        ),
+        tie_sigma_px=used.tie_sigma if len(kept_px) else math.nan,
+        tie_rmse_px=float(np.sqrt(np.mean(kept_px**2) / 2.0)) if len(kept_px) else math.nan,
+        n_tie_points=len(np.unique(ties.point[used.tie_active])),
+        n_tie_observations=int(used.tie_active.sum()),
+    )
+
+
+def of_another_lens(photos: Sequence[Trusted], adjusted: Adjusted) -> Set[int]:
+    """Find the photos that cannot have the lens that they share by their size alone.
+
+    Args:
+        photos: of the block.
+        adjusted: the block.
+
+    Returns:
+        Indices of those that contradict it most; of the others another adjustment tells.
+    """
+    block = adjusted.block
+    widenings = [_widening(item.estimate.resection) for item in photos]
+    # Of the photos whose ties lie in enough places to tell it.
+    usual = float(np.median([each for each in widenings if each > 1.0] or [1.0]))
+    excesses: dict[int, float] = {}
+    for at, lens in enumerate(block.lens_of):
+        alone, shared = photos[at].estimate.resection, adjusted.estimates[at].resection
+        if block.lenses[lens].source != UNKNOWN or block.lens_of.count(lens) < 2:
+            continue
+        off = abs(math.log(alone.camera.fx / shared.camera.fx))
+        if off > max(_MIN_ZOOM, _ZOOM_SIGMAS * focal_sigma(alone)):
+            excesses[at] = _excess(photos[at], shared.camera, usual)
+    most = max(excesses.values(), default=0.0)
+    return frozenset(
+        at for at, excess in excesses.items() if excess > max(1.0, _SHARE_OF_WORST * most)
+    )
+
+
+def _start(
+    photos: Sequence[Trusted],
+    groups: tuple[tuple[int, ...], tuple[Lens, ...]],
+    middle: NDArray[np.float64],
+) -> tuple[ViewingCamera, ...]:
+    """Cameras to start from, in a world shifted to `middle`."""
+    alone = [item.estimate.resection.camera for item in photos]
+    cameras: list[ViewingCamera] = []
+    lens_of, lenses = groups
+    for at, item in enumerate(photos):
+        lens, own = lenses[lens_of[at]], alone[at]
+        members = [k for k, of in enumerate(lens_of) if of == lens_of[at]]
+        if not lens.freedom.sigmas.size:
+            own = posed(lens.prior, own)
+        elif lens.source == UNKNOWN:
+            # From that of the photo whose own ties tell most of the focal length.
+            best = min(members, key=lambda k: focal_sigma(photos[k].estimate.resection))
+            if best != at:
+                # With another focal length a photo stands elsewhere.
+                own = posed(alone[best], own)
+                with suppress(GeometryError):
+                    own = fitted(item.tied.control(item.estimate.agreeing), own)
+        else:
+            own = posed(alone[members[0]], own)
+        cameras.append(own.shifted(middle))
+    return tuple(cameras)
+
+
+def _block(
+    photos: Sequence[Trusted],
+    ties: PhotoTies,
+    groups: tuple[tuple[int, ...], tuple[Lens, ...]],
+    state: tuple[tuple[ViewingCamera, ...], NDArray[np.float64], NDArray[np.float64]],
+    weights: _Weights,
+) -> Block:
+    """Join scan ties and ties between photos; cameras, and points that only photos see, as now."""
+    cameras, positions, middle = state
+    seen = [
+        item.tied.seen.take(chosen) for item, chosen in zip(photos, weights.agreeing, strict=True)
+    ]
+    counts = [len(part) for part in seen]
+    units = np.repeat(weights.units, counts)
+    scan = SeenPoints.joined(seen)
+    _, first, place = np.unique(
+        np.rint(scan.points_world / _SAME_PLACE_M), axis=0, return_index=True, return_inverse=True
+    )
+    place = place.ravel().astype(np.intp)
+    sigma_m = np.zeros(len(first))
+    np.maximum.at(sigma_m, place, units * scan.sigma_m)
+    points = np.vstack([scan.points_world[first] - middle, positions])
+    active = weights.tie_active
+    return Block(
+        cameras=cameras,
+        lens_of=groups[0],
+        lenses=groups[1],
+        points=Points(
+            now=points,
+            known=points,
+            sigma_m=np.concatenate([sigma_m, np.full(len(positions), np.inf)]),
+        ),
+        seen=Observations(
+            photo=np.concatenate([np.repeat(np.arange(len(photos)), counts), ties.photo[active]]),
+            point=np.concatenate([place, len(first) + ties.point[active]]),
+            pixels=np.vstack([scan.pixels_photo, ties.pixels[active]]),
+            sigma_px=np.concatenate(
+                [np.maximum(1.0, units) * scan.sigma_px, weights.tie_sigma * ties.scale[active]]
+            ),
+        ),
+    )
+
+
+def _weighed(
+    photos: Sequence[Trusted], fits: Sequence[Misfit], used: _Weights, rejection_sigma: float
+) -> _Weights:
+    """Reject scan ties that disagree with the block, and estimate how exact the rest is."""
+    agreeing, units, limits = [], [], []
+    for item, fit, some in zip(photos, fits, used.agreeing, strict=True):
+        is_check = item.tied.is_check
+        unit = unit_deviation(fit.normalised[some])
+        limit = without_chance(fit.normalised[~is_check], rejection_sigma * unit)
+        agreeing.append((fit.normalised <= limit) & ~is_check)
+        units.append(unit)
+        limits.append(limit)
+    return replace(used, agreeing=agreeing, units=units, limits=limits)
+
+
+def _weigh_between(
+    ties: PhotoTies, lengths: NDArray[np.float64], weights: _Weights, rejection_sigma: float
+) -> None:
+    """Do the same with the ties between photos, whose residuals (m,) have these lengths."""
+    from scipy.special import chdtri  # scipy.stats would take seconds to import
+
+    active = weights.tie_active
+    # Of 2 m coordinates, 3 go into the point: its sum of squares is as chi-square of the rest.
+    squares = np.bincount(ties.point[active], lengths[active] ** 2)
+    n_seeing = np.bincount(ties.point[active])
+    is_tied = n_seeing > 1
+    usual = chdtri(2 * n_seeing[is_tied] - 3, 0.5)
+    sigma = math.sqrt(float(np.median(squares[is_tied] / usual)))
+    weights.tie_sigma = float(np.clip(sigma, *_TIE_SIGMA_RANGE_PX))
+    near = lengths <= rejection_sigma * weights.tie_sigma
+    # Of points that at least two photos still see.
+    counts = np.bincount(ties.point[near], minlength=len(ties.points_world))
+    weights.tie_active = near & (counts[ties.point] > 1)
+
+
+def _tie_residuals(
+    ties: PhotoTies, cameras: Sequence[ViewingCamera], positions: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Length (m,) in pixels of the residuals of the ties between photos."""
+    lengths = np.full(len(ties.photo), np.inf)
+    for at, camera in enumerate(cameras):
+        mine = ties.photo == at
+        off = camera.project(positions[ties.point[mine]])[:, :2] - ties.pixels[mine]
+        found = np.linalg.norm(off, axis=1)
+        lengths[mine] = np.where(np.isfinite(found), found, np.inf)
+    return lengths
+
+
+def _resection(
+    block: Block,
+    at: int,
+    covariance: BlockCovariance,
+    middle: NDArray[np.float64],
+    unit: float,
+) -> Resection:
+    """Return a photo's part of the block, with a standard deviation of unit weight, by itself."""
+    columns = block.columns(at)
+    own = covariance.matrix[np.ix_(columns, columns)]
+    cofactors = covariance.cofactors[np.ix_(columns, columns)]
+    camera = block.cameras[at].shifted(-middle)
+    to_world = moved_origin(camera, middle, len(columns))
+    return Resection(
+        camera=camera,
+        covariance=to_world @ own @ to_world.T,
+        sigma0=unit * covariance.sigma0,
+        variance_factor=unit**2 * float(np.trace(np.linalg.solve(cofactors, own))) / len(columns),
+        lens=block.lenses[block.lens_of[at]].freedom,
+    )
+
+
+def _excess(item: Trusted, shared: ViewingCamera, usual_widening: float) -> float:
+    """How much worse a photo's ties fit the shared lens, at any pose, than chance has it.
+
+    The likelihood ratio of the photo's own lens and the shared one, as chi-square over its limit.
+    """
+    from scipy.special import chdtri  # scipy.stats would take seconds to import
+
+    alone = item.estimate.resection
+    n_free = alone.lens.sigmas.size
+    if not n_free:
+        return 0.0
+    control = item.tied.control(item.estimate.agreeing)
+    limit = SOFT_LIMIT * alone.sigma0
+    try:
+        camera = fitted(control, shared, soft_limit=limit)
+    except GeometryError:
+        return math.inf
+    losses = []
+    for viewer in (camera, alone.camera):
+        lengths = misfit(control, viewer).normalised
+        # Squares, of those beyond the limit less (Huber).
+        soft = np.where(lengths <= limit, lengths**2, limit * (2.0 * lengths - limit))
+        losses.append(float(soft.sum()))
+    widening = max(_widening(alone), usual_widening)
+    chance = float(chdtri(n_free, _CHANCE))
+    return (losses[0] - losses[1]) / (alone.sigma0**2 * widening * chance)
+
+
+def _widening(alone: Resection) -> float:
+    """By how much a photo's variances grow because residuals of neighbouring ties agree."""
+    return alone.variance_factor / alone.sigma0**2

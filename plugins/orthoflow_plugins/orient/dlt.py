@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.metadata import version
 from typing import ClassVar, Final, Literal
 
@@ -28,17 +28,16 @@ from orthoflow.geometry.resection import (
 )
 from orthoflow.sdk import DiagnosticSpec, Method, MetricSpec, StepContext
 from orthoflow.sdk.methods import Determinism
-from orthoflow_plugins.orient.parameters import (
+from orthoflow_plugins.orient.photos import each_by_itself
+from orthoflow_plugins.orient.pose import (
     ORIENTATION_METRICS,
+    SOFT_LIMIT,
+    Estimate,
+    Lens,
     Note,
     OrientIn,
     OrientOut,
     OrientParams,
-)
-from orthoflow_plugins.orient.photos import each_by_itself
-from orthoflow_plugins.orient.pose import (
-    SOFT_LIMIT,
-    Estimate,
     Start,
     TiedPhoto,
     adjusted,
@@ -140,50 +139,32 @@ class OrientDlt(Method):
         return {name: version(name) for name in ("opencv-python-headless", "scipy")}
 
 
-@dataclass(frozen=True, kw_only=True)
-class DirectLinear:
-    """A camera found by a direct linear transform.
+def relief(points: NDArray[np.float64]) -> tuple[float, float]:
+    """Measure how far points (n, 3) leave the plane that fits them best.
 
-    Attributes:
-        camera: without distortion; with the skew.
-        condition: largest over second smallest singular value of the normalised equations; on
-            points of one plane it grows without bound.
+    Returns:
+        Root mean square distance from it, and standard deviation along its longer axis, metres.
     """
-
-    camera: ViewingCamera
-    condition: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class Relief:
-    """How far points leave the plane that fits them best.
-
-    Attributes:
-        rms_m: root mean square distance from it.
-        extent_m: standard deviation along its longer axis.
-    """
-
-    rms_m: float
-    extent_m: float
-
-
-def relief(points: NDArray[np.float64]) -> Relief:
-    """Measure how far points (n, 3) leave a plane."""
     centred = points - points.mean(axis=0)
     variances = np.linalg.eigvalsh(np.einsum("ni,nj->ij", centred, centred) / len(points))
     roots = np.sqrt(np.maximum(variances, 0.0))
-    return Relief(rms_m=float(roots[0]), extent_m=float(roots[2]))
+    return float(roots[0]), float(roots[2])
 
 
 def direct_linear(
     pixels: NDArray[np.float64], points_world: NDArray[np.float64], size_px: tuple[int, int]
-) -> DirectLinear:
+) -> tuple[ViewingCamera, float]:
     """Solve for the eleven parameters (Abdel-Aziz & Karara 1971, normalised after Hartley 1997).
 
     Args:
         pixels: (n, 2), at least six.
         points_world: (n, 3) metres.
         size_px: width and height of the photo.
+
+    Returns:
+        The camera, without distortion, with the skew; and the largest over the second smallest
+        singular value of the normalised equations, which grows without bound on points of one
+        plane.
 
     Raises:
         GeometryError: the points do not determine a camera.
@@ -206,10 +187,8 @@ def direct_linear(
     )
     local = inverse_px @ matrix @ np.diag([scale_m, scale_m, scale_m, 1.0])
     camera = _decomposed(local, points_world - shift_m, size_px)
-    return DirectLinear(
-        camera=camera.shifted(-shift_m),
-        condition=math.sqrt(float(values[-1]) / max(float(values[1]), 1e-300)),
-    )
+    condition = math.sqrt(float(values[-1]) / max(float(values[1]), 1e-300))
+    return camera.shifted(-shift_m), condition
 
 
 def estimate_dlt(tied: TiedPhoto, params: OrientDlt.Params) -> Estimate | str:
@@ -230,23 +209,21 @@ def estimate_dlt(tied: TiedPhoto, params: OrientDlt.Params) -> Estimate | str:
         return reason
     size_px = (tied.photo.width, tied.photo.height)
     try:
-        linear = direct_linear(control.pixels_photo, control.points_world, size_px)
-        if linear.condition > _MAX_CONDITION:
-            return _flat(control, f"the equations have condition {linear.condition:.0f}")
-        camera = linear.camera if params.skew else replace(linear.camera, skew=0.0)
-        start = Start(
-            camera=camera,
+        linear, condition = direct_linear(control.pixels_photo, control.points_world, size_px)
+        if condition > _MAX_CONDITION:
+            return _flat(control, f"the equations have condition {condition:.0f}")
+        camera = linear if params.skew else replace(linear, skew=0.0)
+        lens = Lens(
             prior=replace(camera, cx=0.5 * size_px[0], cy=0.5 * size_px[1], skew=0.0),
-            agreeing=robust.agreeing,
             freedom=_freedom(params.distortion, size_px, keeps_skew=params.skew),
             source="dlt",
-            n_least_for_lens=least,
         )
+        start = Start(camera=camera, lens=lens, agreeing=robust.agreeing, n_least_for_lens=least)
         estimate = adjusted(tied, start, params)
     except GeometryError as error:
         return f"{error}: use orient.pnp or orient.colmap-bundle"
-    skew_px = estimate.resection.camera.skew if params.skew else linear.camera.skew
-    estimate = replace(estimate, numbers={"skew_px": skew_px, "condition": linear.condition})
+    skew_px = estimate.resection.camera.skew if params.skew else linear.skew
+    estimate = replace(estimate, numbers={"skew_px": skew_px, "condition": condition})
     control = tied.control(estimate.agreeing)
     if params.distortion == _FULL or len(control) < _LEAST[_FULL]:
         return estimate
@@ -314,15 +291,15 @@ def _too_few(n_control: int, distortion: Distortion, least: int) -> str:
 
 def _too_flat(control: SeenPoints) -> str:
     """State that control lies too near a plane for eleven parameters; empty when it does not."""
-    depth = relief(control.points_world)
+    rms_m, extent_m = relief(control.points_world)
     sigma_m = float(np.sqrt(np.mean(control.sigma_m**2)))
-    if depth.rms_m < _RELIEF_SIGMAS * sigma_m:
+    if rms_m < _RELIEF_SIGMAS * sigma_m:
         return _flat(
             control,
             f"its points are known to {1000 * sigma_m:.1f} mm, and a DLT needs "
             f"{_RELIEF_SIGMAS:g} times as much relief",
         )
-    if depth.rms_m < depth.extent_m / _MAX_CONDITION:
+    if rms_m < extent_m / _MAX_CONDITION:
         return _flat(control, "a DLT needs relief")
     return ""
 
@@ -348,7 +325,7 @@ def _with_what_is_missing(
         full = adjust(
             control,
             model.camera,
-            prior=start.prior,
+            prior=start.lens.prior,
             lens=freedom,
             groups=places_in_photo(control.pixels_photo, model.camera),
             soft_limit=SOFT_LIMIT * max(model.sigma0, 1.0),
@@ -371,9 +348,9 @@ def _with_what_is_missing(
 
 
 def _flat(control: SeenPoints, why: str) -> str:
-    depth = relief(control.points_world)
+    rms_m, _ = relief(control.points_world)
     return (
-        f"the control lies within {1000 * depth.rms_m:.1f} mm (RMS) of one plane; {why}: use "
+        f"the control lies within {1000 * rms_m:.1f} mm (RMS) of one plane; {why}: use "
         "orient.pnp or orient.colmap-bundle"
     )
 

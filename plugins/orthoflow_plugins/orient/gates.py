@@ -1,29 +1,247 @@
 """What an orientation must meet before its photo may be called `ok`: a table of gates.
 
-Each gate has a name, its limits, where these come from, and the sentence of a refusal.
+Each gate names what is measured of an orientation, its limit, where that comes from, and the
+sentence of a refusal.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from functools import cached_property
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.opencv_border import to_opencv
-from orthoflow.geometry.resection import SeenPoints
-from orthoflow.products import Photo
+from orthoflow.geometry.resection import (
+    Resection,
+    SeenPoints,
+    pixels_by_point,
+    predicted_covariances,
+)
+from orthoflow.products import Photo, Ties, plane_name
 from orthoflow.sdk import DiagnosticSpec
-from orthoflow_plugins.orient.lenses import UNKNOWN
-from orthoflow_plugins.orient.parameters import (
+from orthoflow_plugins.orient.pose import (
+    UNKNOWN,
+    Estimate,
     Note,
     OrientParams,
+    camera_rays,
+    image_cells,
 )
-from orthoflow_plugins.orient.pose import Estimate, image_cells
-from orthoflow_plugins.orient.wall_errors import KnownWall, WallError, wall_error
+
+_GRID_SIDE: Final = 15
+# A view flatter than this onto the wall paints nothing useful.
+_GRAZING_COSINE: Final = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownWall:
+    """A wall as ties describe it.
+
+    Attributes:
+        index: of the wall.
+        number: for people: the place of its plane in `planes.json`.
+        name: for people.
+        corners_world: (4, 3) metres: top-left, then counter-clockwise for the viewer.
+        normal: (3,) unit vector towards the viewer.
+        gsd_m: cell of its raster, or None when the ties do not say.
+        has_side: whether the normal is known to point to the viewer.
+    """
+
+    index: int
+    number: int
+    name: str
+    corners_world: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    gsd_m: float | None
+    has_side: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class WallError:
+    """Predicted error of a photo on the walls it shows.
+
+    Attributes:
+        rms_m: standard deviation of a coordinate in the wall's plane, RMS over the footprint.
+        worst_m: the largest one in the footprint, and at the corners of the image.
+        corners_m: (4,) the same at the corners of the image, top-left, top-right, bottom-left,
+            bottom-right; NaN where a corner shows none of the walls.
+        footprint_px: (n, 2) pixels of the grid points that lie in the footprint.
+        sigmas_m: (n,) standard deviation of a coordinate in the wall's plane at these.
+    """
+
+    rms_m: float
+    worst_m: float
+    corners_m: NDArray[np.float64]
+    footprint_px: NDArray[np.float64]
+    sigmas_m: NDArray[np.float64]
+
+    @property
+    def rms_mm(self) -> float:
+        """The same in mm."""
+        return 1000.0 * self.rms_m
+
+    @property
+    def worst_mm(self) -> float:
+        """The same in mm."""
+        return 1000.0 * self.worst_m
+
+
+def known_walls(ties: Ties, chosen: NDArray[np.bool_]) -> list[KnownWall]:
+    """Describe the walls of some ties: from what their matcher says, else from the points."""
+    walls = []
+    for index in np.unique(ties.wall[chosen & (ties.wall >= 0)]):
+        if int(index) < len(ties.walls):
+            walls.append(_described(int(index), ties))
+        else:
+            points = ties.points_world[chosen & (ties.wall == index)]
+            if len(points) >= 3:
+                walls.append(_fitted(int(index), points))
+    return walls
+
+
+def wall_error(resection: Resection, walls: Sequence[KnownWall]) -> WallError | None:
+    """Predict the error on the walls from the covariance; None when the photo shows no wall."""
+    parts = [_on_one_wall(resection, wall) for wall in walls]
+    variances = np.concatenate([np.empty(0), *(part[0] for part in parts)])
+    if not variances.size:
+        return None
+    corners = _at_corners(resection, walls)
+    return WallError(
+        rms_m=float(np.sqrt(variances.mean())),
+        worst_m=float(np.sqrt(np.fmax.reduce(corners, initial=variances.max()))),
+        corners_m=np.sqrt(corners),
+        footprint_px=np.vstack([part[1] for part in parts]),
+        sigmas_m=np.sqrt(variances),
+    )
+
+
+def sigmas_on_wall(
+    resection: Resection, wall: KnownWall, shape: tuple[int, int]
+) -> NDArray[np.float64]:
+    """Predicted standard deviation of a coordinate in a wall's plane, on a grid over the wall.
+
+    Returns:
+        (rows, cols) metres, the first row at the top, NaN where the photo does not show the wall.
+    """
+    variances, _ = _variances(resection, wall, _grid(wall, shape))
+    return np.sqrt(variances).reshape(shape)
+
+
+def _on_one_wall(
+    resection: Resection, wall: KnownWall
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Variances (n,) in metres squared per coordinate, and pixels (n, 2), over the footprint."""
+    variances, pixels = _variances(resection, wall, _grid(wall, (_GRID_SIDE, _GRID_SIDE)))
+    shown = np.isfinite(variances)
+    return variances[shown], pixels[shown]
+
+
+def _at_corners(resection: Resection, walls: Sequence[KnownWall]) -> NDArray[np.float64]:
+    """Variances (4,) where the corners of the image show a wall, of several the largest."""
+    camera, worst = resection.camera, np.full(4, np.nan)
+    # The middles of the outermost pixels, which the image holds for certain.
+    corners_px = np.array(
+        [[u, v] for v in (0.5, camera.height - 0.5) for u in (0.5, camera.width - 0.5)]
+    )
+    rays = camera_rays(camera, corners_px) @ camera.rotation
+    for wall in walls:
+        top_left, bottom_left, _, top_right = wall.corners_world
+        sides = np.array([top_right - top_left, bottom_left - top_left])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            along = ((top_left - camera.centre_world) @ wall.normal) / (rays @ wall.normal)
+            points = camera.centre_world + along[:, None] * rays
+        shares = ((points - top_left) @ sides.T) / (sides**2).sum(axis=1)
+        hit = np.flatnonzero((along > 0.0) & ((shares >= 0.0) & (shares <= 1.0)).all(axis=1))
+        variances, _ = _variances(resection, wall, points[hit])
+        worst[hit] = np.fmax(worst[hit], variances)
+    return worst
+
+
+def _grid(wall: KnownWall, shape: tuple[int, int]) -> NDArray[np.float64]:
+    """Centres (rows * cols, 3) of the cells of a grid over a wall's rectangle."""
+    top_left, bottom_left, _, top_right = wall.corners_world
+    down, along = (
+        axis.ravel()
+        for axis in np.meshgrid(*((np.arange(n) + 0.5) / n for n in shape), indexing="ij")
+    )
+    points: NDArray[np.float64] = (
+        top_left
+        + along[:, None] * (top_right - top_left)
+        + down[:, None] * (bottom_left - top_left)
+    )
+    return points
+
+
+def _variances(
+    resection: Resection, wall: KnownWall, points: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Variances (n,) per coordinate and pixels (n, 2) of wall points; NaN where not shown."""
+    pixels = _seen(resection.camera, points, wall.normal)
+    variances = np.full(len(points), np.nan)
+    shown = np.isfinite(pixels[:, 0])
+    if not shown.any():
+        return variances, pixels
+    top_left, bottom_left, _, top_right = wall.corners_world
+    axes = np.vstack(
+        [
+            (top_right - top_left) / np.linalg.norm(top_right - top_left),
+            (bottom_left - top_left) / np.linalg.norm(bottom_left - top_left),
+        ]
+    )
+    plane_by_pixel = np.linalg.inv(pixels_by_point(resection.camera, points[shown]) @ axes.T)
+    covariances = plane_by_pixel @ predicted_covariances(resection, points[shown])
+    covariances = covariances @ plane_by_pixel.transpose(0, 2, 1)
+    variances[shown] = 0.5 * np.trace(covariances, axis1=1, axis2=2)
+    return variances, pixels
+
+
+def _seen(
+    camera: ViewingCamera, points: NDArray[np.float64], normal: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Pixels (n, 2) of wall points; NaN outside the image or under a grazing view."""
+    pixels = camera.project(points)[:, :2]
+    towards = camera.centre_world - points
+    cosine = np.abs(towards @ normal) / np.linalg.norm(towards, axis=1)
+    pixels[~camera.sees(pixels) | (cosine < _GRAZING_COSINE)] = np.nan
+    return pixels
+
+
+def _described(index: int, ties: Ties) -> KnownWall:
+    wall, number = ties.walls[index], ties.number(index)
+    return KnownWall(
+        index=index,
+        number=number,
+        name=wall.name or plane_name("wall", number),
+        corners_world=np.array(wall.corners_world, dtype=np.float64),
+        normal=np.array(wall.normal_world, dtype=np.float64),
+        gsd_m=wall.gsd_m,
+        has_side=True,
+    )
+
+
+def _fitted(index: int, points: NDArray[np.float64]) -> KnownWall:
+    """The bounding rectangle of points in their own plane, the side unknown."""
+    middle = points.mean(axis=0)
+    axes = np.linalg.svd(points - middle, full_matrices=False)[2]
+    local = (points - middle) @ axes[:2].T
+    low, high = local.min(axis=0), local.max(axis=0)
+    order = np.array([[low[0], low[1]], [low[0], high[1]], high, [high[0], low[1]]])
+    return KnownWall(
+        index=index,
+        number=index,
+        name=plane_name("wall", index),
+        corners_world=middle + order @ axes[:2],
+        normal=axes[2],
+        gsd_m=None,
+        has_side=False,
+    )
+
 
 _MIN_TIES: Final = 8
 _CROWDED_RATIO: Final = 10
@@ -56,7 +274,9 @@ FOCAL_ESTIMATED: Final = DiagnosticSpec(
 
 @dataclass(frozen=True, kw_only=True)
 class Candidate:
-    """An orientation to judge.
+    """An orientation to judge: what is known of it, and what the gates measure.
+
+    What a gate measures is None where nothing can be said.
 
     Attributes:
         photo: the photo.
@@ -81,17 +301,17 @@ class Candidate:
     params: OrientParams
     search_radius_px: float = math.inf
 
-    @property
+    @cached_property
     def control(self) -> NDArray[np.bool_]:
         """Control ties that agree."""
         return self.estimate.agreeing & ~self.is_check
 
-    @property
+    @cached_property
     def withheld(self) -> NDArray[np.bool_]:
         """Withheld ties that agree."""
         return self.estimate.agreeing & self.is_check
 
-    @property
+    @cached_property
     def checked(self) -> NDArray[np.bool_]:
         """Withheld ties that agree and are none of the control once more, which checks nothing.
 
@@ -102,25 +322,148 @@ class Candidate:
         place = np.unique(places, axis=0, return_inverse=True)[1].ravel()
         return self.withheld & ~np.isin(place, place[~self.is_check])
 
-    @property
+    @cached_property
     def quadrant_counts(self) -> list[int]:
         """Ties that agree in the quarters of the photo, as `image_cells` numbers them."""
         cells = self._quarters(self.seen.pixels_photo[self.estimate.agreeing])
         return [int((cells == quarter).sum()) for quarter in range(4)]
 
-    @property
+    @cached_property
     def gsd_m(self) -> float | None:
         """Smallest cell of its walls, None when the ties do not say."""
         return min((wall.gsd_m for wall in self.known if wall.gsd_m is not None), default=None)
 
-    def worst_in_quarter_m(self, quarter: int) -> float:
-        """Largest predicted error on the walls that a quarter shows; 0 when it shows none."""
-        if self.error is None:
-            return 0.0
-        here = self._quarters(self.error.footprint_px) == quarter
-        return float(self.error.sigmas_m[here].max(initial=0.0))
+    @property
+    def gsd_mm(self) -> float:
+        """The same in mm."""
+        return 1000.0 * (self.gsd_m or math.nan)
 
     @property
+    def n_ties(self) -> int:
+        """All its ties."""
+        return len(self.seen)
+
+    @property
+    def n_control(self) -> int:
+        """Control ties that agree."""
+        return int(self.control.sum())
+
+    @property
+    def n_for_control(self) -> int:
+        """Ties that are not withheld."""
+        return int((~self.is_check).sum())
+
+    @property
+    def n_agree(self) -> int:
+        """Withheld ties that agree."""
+        return int(self.withheld.sum())
+
+    @property
+    def n_check(self) -> int:
+        """Withheld ties."""
+        return int(self.is_check.sum())
+
+    @property
+    def agreeing_share(self) -> float:
+        """Share of all ties that agree."""
+        return float(self.estimate.agreeing.mean())
+
+    @property
+    def control_share(self) -> float:
+        """Share of the ties that are not withheld that agree."""
+        return self.n_control / self.n_for_control
+
+    @property
+    def chance(self) -> float:
+        """Probability that as many withheld ties agree with a wrong pose (binomial)."""
+        from scipy.special import bdtrc  # scipy.stats would take seconds to import
+
+        fit, limit = self.estimate.fit, self.estimate.limit
+        inside = self.estimate.agreeing & (fit.normalised > 0.0)
+        lengths_px = np.linalg.norm(fit.residuals_px[inside], axis=1)
+        px = float(np.median(lengths_px / fit.normalised[inside]))
+        # Wrong ties gather where the texture is, not all over the photo.
+        textured = max(hull_area(self.seen.pixels_photo), 1.0) / 4.0
+        area = min(textured, (2.0 * self.search_radius_px) ** 2)
+        found = []
+        for share in _CHANCE_RADII:
+            near = self.withheld & (fit.normalised / limit <= share)
+            places = np.floor(self.seen.pixels_photo[near] / _PLACE_PX)
+            by_chance = min(0.5, math.pi * (share * limit * px) ** 2 / area)
+            n_places = len(np.unique(places, axis=0))
+            found.append(float(bdtrc(n_places - 1, self.n_check, by_chance)))
+        return len(found) * min(found)
+
+    @property
+    def check_over_control(self) -> float | None:
+        """How often withheld ties agree, over how often the control does."""
+        if self.n_check < _MIN_CHECKS:
+            return None
+        return self.n_agree / self.n_check / self.control_share
+
+    @property
+    def check_rms_over_control(self) -> float | None:
+        """How far withheld ties deviate, over how far the control does."""
+        if self.n_agree < _MIN_CHECKS:
+            return None
+        squares = self.estimate.fit.normalised**2
+        return math.sqrt(squares[self.withheld].mean() / squares[self.control].mean())
+
+    @cached_property
+    def poor_quarter(self) -> tuple[int, str] | None:
+        """How many ties a quarter of the photo has that has too few, and why that is too few.
+
+        After markiewicz2015 each quarter needs two ties. But an obstacle before the wall, or a view
+        past the end of the wall, may fill a quarter in which no tie can be. A surveyor keeps such a
+        photo when the rest of it fixes the pose: the error predicted for the walls in that quarter
+        must be as small at its worst place as it has to be on the average of the photo. A quarter
+        that shows no wall is painted nowhere and needs nothing. Only strictly the paper's rule
+        holds as it stands.
+        """
+        params = self.params
+        for quarter, count in enumerate(self.quadrant_counts):
+            if count >= params.min_quadrant_ties:
+                continue
+            if params.quadrants == "strict":
+                return count, ""
+            worst_m = 0.0
+            if self.error is not None:
+                here = self._quarters(self.error.footprint_px) == quarter
+                worst_m = float(self.error.sigmas_m[here].max(initial=0.0))
+            most_m = params.max_sigma_wall_cells * (self.gsd_m or 0.0)
+            if worst_m > most_m:
+                allowed = f", at most {1000 * most_m:.1f} mm is allowed" if self.gsd_m else ""
+                return count, (
+                    ": the pose would be extrapolated there, with a predicted error of "
+                    f"{1000 * worst_m:.1f} mm{allowed}"
+                )
+        return None
+
+    @property
+    def n_in_poor_quarter(self) -> int | None:
+        """Ties of a quarter that has too few."""
+        return None if self.poor_quarter is None else self.poor_quarter[0]
+
+    @property
+    def before_wall_m(self) -> float | None:
+        """Least distance before a wall, of those with some control and a side."""
+        centre = self.estimate.resection.camera.centre_world
+        used = self.walls[self.control]
+        return min(
+            (
+                float((centre - wall.corners_world.mean(axis=0)) @ wall.normal)
+                for wall in self.known
+                if wall.has_side and (used == wall.index).sum() >= _MIN_ON_WALL
+            ),
+            default=None,
+        )
+
+    @property
+    def shows_wall(self) -> bool:
+        """Whether it shows a wall at all."""
+        return self.error is not None
+
+    @cached_property
     def hull_ratio(self) -> float:
         """Hull of the control over the footprint of its walls in the photo; 0 without one."""
         if self.error is None:
@@ -128,12 +471,38 @@ class Candidate:
         footprint = hull_area(self.error.footprint_px)
         return hull_area(self.seen.pixels_photo[self.control]) / max(footprint, 1.0)
 
+    @property
+    def sigma_cells(self) -> float | None:
+        """Predicted error on the wall, in its cells."""
+        return self.error.rms_m / self.gsd_m if self.error and self.gsd_m else None
+
+    @property
+    def worst_cells(self) -> float | None:
+        """Predicted error at the worst place of the wall, in its cells."""
+        return self.error.worst_m / self.gsd_m if self.error and self.gsd_m else None
+
+    @cached_property
+    def needed_tie(self) -> tuple[float, NDArray[np.float64]] | None:
+        """Largest predicted error, in cells, without one tie of a pose from few, and its pixel.
+
+        A wrong tie that the others cannot tell does no more harm than the pose without it is
+        uncertain.
+        """
+        without = [wall_error(one, self.known) for one in self.estimate.without_one]
+        if self.gsd_m is None or not without:
+            return None
+        cells = [0.0 if one is None else one.rms_m / self.gsd_m for one in without]
+        worst = int(np.argmax(np.nan_to_num(cells, nan=math.inf)))
+        pixels = self.seen.pixels_photo[self.estimate.agreeing]
+        return float(np.nan_to_num(cells[worst], nan=math.inf)), to_opencv(pixels[worst])
+
+    @property
+    def cells_without_one(self) -> float | None:
+        """The first of these."""
+        return None if self.needed_tie is None else self.needed_tie[0]
+
     def _quarters(self, pixels: NDArray[np.float64]) -> NDArray[np.intp]:
         return image_cells(pixels, (self.photo.width, self.photo.height), 2)
-
-
-Values = Mapping[str, Any]
-"""What a gate found, by the names in its sentence."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,63 +511,173 @@ class Gate:
 
     Attributes:
         name: for the record.
-        limits: numbers, or names of the parameters that hold them, by what the test calls them.
-        source: where the limits come from.
-        refuses: gives what the sentence needs where the condition is not met, else None.
-        text: the sentence; it may use the limits, too.
+        value: what of a `Candidate` is measured; None passes.
+        at_least: smallest value that passes, or the parameter that holds it.
+        at_most: largest one, likewise.
+        source: where the limit comes from.
+        text: the sentence of a refusal, of the candidate `c` and the `limit`.
     """
 
     name: str
-    limits: Mapping[str, float | str]
+    value: str
+    at_least: float | str | None = None
+    at_most: float | str | None = None
     source: str
-    refuses: Callable[..., Values | None]
     text: str
 
 
-@dataclass(frozen=True, kw_only=True)
-class Refusal:
-    """Why an orientation is not `ok`.
+CONTROL_GATES: Final = (
+    Gate(
+        name="control",
+        value="n_control",
+        at_least=12,
+        source="twice the unknowns of a pose",
+        text="only {c.n_control} of {c.n_for_control} control ties agree with one pose, at least "
+        "{limit} must",
+    ),
+    Gate(
+        name="share",
+        value="agreeing_share",
+        at_least=0.04,
+        source="robust sampling finds a pose among so few right ties (benchmarks/robust_pose.py)",
+        text="only {c.agreeing_share:.1%} of {c.n_ties} ties agree with one pose, at least "
+        "{limit:.1%} must",
+    ),
+    Gate(
+        name="chance",
+        value="chance",
+        at_most=1e-5,
+        source="one wrong pose in a hundred thousand may look right (binomial test)",
+        text="{c.n_agree} of {c.n_check} withheld ties agree with the pose, as a wrong pose could "
+        "have by chance",
+    ),
+    Gate(
+        name="check-share",
+        value="check_over_control",
+        at_least=0.5,
+        source="withheld ties agree as often as the control of a right pose",
+        text="{c.n_agree} of {c.n_check} withheld ties agree with the pose, but "
+        "{c.control_share:.0%} of the control does: the pose was fitted to chance",
+    ),
+    Gate(
+        name="check-rms",
+        value="check_rms_over_control",
+        at_most=2.0,
+        source="withheld ties deviate as much as the control of a right pose",
+        text="the check ties deviate {c.check_rms_over_control:.1f} times as much as the control, "
+        "at most {limit:g} times is plausible",
+    ),
+)
+"""What the ties themselves must show."""
 
-    Attributes:
-        gate: name of the gate that refused.
-        values: what it found, and its limits.
-        text: the reason as a sentence.
-    """
+_SIDE: Final = Gate(
+    name="side",
+    value="before_wall_m",
+    at_least=0.0,
+    source="a photo shows the front of a wall",
+    text="the pose lies behind the wall it would show, so it must be wrong",
+)
+_ON_WALLS: Final = (
+    Gate(
+        name="accuracy",
+        value="sigma_cells",
+        at_most="max_sigma_wall_cells",
+        source="the job",
+        text="its predicted error on the wall is {c.error.rms_mm:.1f} mm, at most {limit:g} cells "
+        "of {c.gsd_mm:g} mm are allowed",
+    ),
+    Gate(
+        name="accuracy-at-worst",
+        value="worst_cells",
+        at_most="max_sigma_corner_cells",
+        source="the job",
+        text="its predicted error at the worst place of the wall is {c.error.worst_mm:.1f} mm, at "
+        "most {limit:g} cells of {c.gsd_mm:g} mm are allowed",
+    ),
+)
+_SHOWN: Final = Gate(
+    name="shown",
+    value="shows_wall",
+    at_least=True,
+    source="a photo that shows no wall paints nothing",
+    text="with this pose the photo would show no wall that its ties lie on",
+)
 
-    gate: str
-    values: Values
-    text: str
+GATES: Final = (
+    *CONTROL_GATES,
+    Gate(
+        name="quarters",
+        value="n_in_poor_quarter",
+        at_least="min_quadrant_ties",
+        source="markiewicz2015, 4.3",
+        text="a quarter of the photo has {c.poor_quarter[0]} ties, each needs "
+        "{limit}{c.poor_quarter[1]}",
+    ),
+    _SIDE,
+    _SHOWN,
+    Gate(
+        name="hull",
+        value="hull_ratio",
+        at_least="min_hull_ratio",
+        source="the job",
+        text="the control covers {c.hull_ratio:.1%} of the part of the photo that shows the walls, "
+        "at least {limit:.1%} is needed",
+    ),
+    *_ON_WALLS,
+)
+"""All that an orientation by ties of a matcher must meet, in the order in which it is asked."""
+
+GATES_BEFORE_BLOCK: Final = (*CONTROL_GATES, _SIDE)
+"""What keeps a photo from harming others; what it lacks in exactness, these may bring."""
+
+GATES_BY_HAND: Final = (
+    _SIDE,
+    _SHOWN,
+    *_ON_WALLS,
+    Gate(
+        name="each-other",
+        value="cells_without_one",
+        at_most="max_sigma_corner_cells",
+        source="the job",
+        text="without the tie at (u {c.needed_tie[1][0]:.0f}, v {c.needed_tie[1][1]:.0f}) its "
+        "predicted error on the wall would be {c.cells_without_one:.1f} cells of {c.gsd_mm:g} mm, "
+        "at most {limit:g} are allowed: if that tie were wrong, the others could not reveal it; "
+        "measure more of them, farther apart",
+    ),
+)
+"""What a pose from ties that a person measured must meet."""
 
 
-def refusal(candidate: Candidate, gates: Sequence[Gate] | None = None) -> Refusal | None:
+def refusal(candidate: Candidate, gates: Sequence[Gate] | None = None) -> tuple[str, str] | None:
     """Judge an orientation; None where it meets all gates.
 
     Args:
         candidate: the orientation.
-        gates: of these the first that refuses; without them, all that its ties ask for.
+        gates: in this order; without them, all that its ties ask for.
+
+    Returns:
+        Name of the first gate that refuses, and the reason as a sentence.
     """
     if gates is None:
         gates = GATES_BY_HAND if candidate.estimate.without_one else GATES
     for gate in gates:
-        limits = {
-            name: getattr(candidate.params, limit) if isinstance(limit, str) else limit
-            for name, limit in gate.limits.items()
-        }
-        values = gate.refuses(candidate, **limits)
-        if values is not None:
-            found = limits | dict(values)
-            return Refusal(gate=gate.name, values=found, text=gate.text.format(**found))
+        limit = gate.at_most if gate.at_least is None else gate.at_least
+        if isinstance(limit, str):
+            limit = getattr(candidate.params, limit)
+        value = getattr(candidate, gate.value)
+        if value is not None and (value > limit if gate.at_least is None else value < limit):
+            return gate.name, gate.text.format(c=candidate, limit=limit)
     return None
 
 
 def too_few(n_ties: int) -> str:
     """State why ties are too few for an orientation; empty when they suffice."""
-    if n_ties < _MIN_TIES:
-        return (
-            f"{n_ties} ties with the walls, at least {_MIN_TIES} are needed: the photo "
-            "shows none of the walls, or too differently, or in cells that are too coarse"
-        )
-    return ""
+    if n_ties >= _MIN_TIES:
+        return ""
+    return (
+        f"{n_ties} ties with the walls, at least {_MIN_TIES} are needed: the photo "
+        "shows none of the walls, or too differently, or in cells that are too coarse"
+    )
 
 
 def warnings_for(candidate: Candidate) -> list[Note]:
@@ -225,261 +704,3 @@ def hull_area(pixels: NDArray[np.float64]) -> float:
         return float(ConvexHull(pixels).volume)
     except QhullError:
         return 0.0
-
-
-def _control(candidate: Candidate, *, at_least: int) -> Values | None:
-    n = int(candidate.control.sum())
-    return {"n": n, "n_all": int((~candidate.is_check).sum())} if n < at_least else None
-
-
-def _share(candidate: Candidate, *, at_least: float) -> Values | None:
-    share = float(candidate.estimate.agreeing.mean())
-    return {"share": share, "n_all": len(candidate.seen)} if share < at_least else None
-
-
-def _chance(candidate: Candidate, *, at_most: float) -> Values | None:
-    """A pose fitted to wrong ties fits withheld ties by chance only."""
-    n_check = int(candidate.is_check.sum())
-    lengths = candidate.estimate.fit.normalised / candidate.estimate.limit
-    probabilities = []
-    for share in _CHANCE_RADII:
-        near = candidate.withheld & (lengths <= share)
-        by_chance = _chance_probability(candidate, share * candidate.estimate.limit)
-        places = np.floor(candidate.seen.pixels_photo[near] / _PLACE_PX)
-        probabilities.append(_tail(len(np.unique(places, axis=0)), n_check, by_chance))
-    if len(_CHANCE_RADII) * min(probabilities) > at_most:
-        return {"n_agree": int(candidate.withheld.sum()), "n_check": n_check}
-    return None
-
-
-def _check_share(candidate: Candidate, *, of_control: float) -> Values | None:
-    share = float(candidate.control.sum() / (~candidate.is_check).sum())
-    n_check, n_agree = int(candidate.is_check.sum()), int(candidate.withheld.sum())
-    if n_agree / n_check < of_control * share and n_check >= _MIN_CHECKS:
-        return {"n_agree": n_agree, "n_check": n_check, "share": share}
-    return None
-
-
-def _check_rms(candidate: Candidate, *, of_control: float) -> Values | None:
-    if candidate.withheld.sum() < _MIN_CHECKS:
-        return None
-    squares = candidate.estimate.fit.normalised**2
-    control, check = (
-        float(np.sqrt(np.mean(squares[some]))) for some in (candidate.control, candidate.withheld)
-    )
-    return {"times": check / control} if check > of_control * control else None
-
-
-def _quarters(candidate: Candidate, *, at_least: int, cells: float) -> Values | None:
-    """Hold each quarter of the photo to its ties, or else to what the others say about it.
-
-    After markiewicz2015 each quarter needs two ties. But an obstacle before the wall, or a view
-    past the end of the wall, may fill a quarter in which no tie can be. A surveyor keeps such a
-    photo when the rest of it fixes the pose: the error predicted for the walls in that quarter must
-    be as small at its worst place as it has to be on the average of the photo. A quarter that shows
-    no wall is painted nowhere and needs nothing. Only strictly the paper's rule holds as it stands.
-    """
-    for quarter, count in enumerate(candidate.quadrant_counts):
-        if count >= at_least:
-            continue
-        if candidate.params.quadrants == "strict":
-            return {"n": count, "why": ""}
-        worst_m = candidate.worst_in_quarter_m(quarter)
-        most_m = cells * candidate.gsd_m if candidate.gsd_m else 0.0
-        if worst_m > most_m:
-            allowed = f", at most {1000 * most_m:.1f} mm is allowed" if candidate.gsd_m else ""
-            why = (
-                ": the pose would be extrapolated there, with a predicted error of "
-                f"{1000 * worst_m:.1f} mm{allowed}"
-            )
-            return {"n": count, "why": why, "worst_mm": 1000 * worst_m}
-    return None
-
-
-def _side(candidate: Candidate) -> Values | None:
-    centre = candidate.estimate.resection.camera.centre_world
-    for wall in candidate.known:
-        n_used = int((candidate.walls[candidate.control] == wall.index).sum())
-        before_m = float((centre - wall.corners_world.mean(axis=0)) @ wall.normal)
-        if wall.has_side and n_used >= _MIN_ON_WALL and before_m <= 0.0:
-            return {"before_m": before_m}
-    return None
-
-
-def _shown(candidate: Candidate) -> Values | None:
-    return {} if candidate.error is None else None
-
-
-def _hull(candidate: Candidate, *, at_least: float) -> Values | None:
-    ratio = candidate.hull_ratio
-    return {"ratio": ratio} if ratio < at_least else None
-
-
-def _accuracy(candidate: Candidate, *, cells: float) -> Values | None:
-    return _beyond(candidate, None if candidate.error is None else candidate.error.rms_m, cells)
-
-
-def _accuracy_at_worst(candidate: Candidate, *, cells: float) -> Values | None:
-    return _beyond(candidate, None if candidate.error is None else candidate.error.worst_m, cells)
-
-
-def _beyond(candidate: Candidate, error_m: float | None, cells: float) -> Values | None:
-    gsd_m = candidate.gsd_m
-    if error_m is None or gsd_m is None or error_m <= cells * gsd_m:
-        return None
-    return {"error_mm": 1000 * error_m, "gsd_mm": 1000 * gsd_m}
-
-
-def _each_other(candidate: Candidate, *, cells: float) -> Values | None:
-    """Hold a pose from few ties to what it would be worth without any of them.
-
-    A wrong tie that the others cannot tell does no more harm than the pose without it is uncertain.
-    """
-    if candidate.gsd_m is None:
-        return None
-    most_m = cells * candidate.gsd_m
-    pixels = candidate.seen.pixels_photo[candidate.estimate.agreeing]
-    errors = [
-        wall_error(resection, candidate.known) for resection in candidate.estimate.without_one
-    ]
-    for (u, v), error in zip(to_opencv(pixels).tolist(), errors, strict=True):
-        if error is not None and not error.rms_m <= most_m:
-            return {"u": u, "v": v, "error_mm": 1000 * error.rms_m, "allowed_mm": 1000 * most_m}
-    return None
-
-
-CONTROL_GATES: Final = (
-    Gate(
-        name="control",
-        limits={"at_least": 12},
-        source="twice the unknowns of a pose",
-        refuses=_control,
-        text="only {n} of {n_all} control ties agree with one pose, at least {at_least} must",
-    ),
-    Gate(
-        name="share",
-        limits={"at_least": 0.04},
-        source="robust sampling finds a pose among so few right ties (benchmarks/robust_pose.py)",
-        refuses=_share,
-        text="only {share:.1%} of {n_all} ties agree with one pose, at least {at_least:.1%} must",
-    ),
-    Gate(
-        name="chance",
-        limits={"at_most": 1e-5},
-        source="one wrong pose in a hundred thousand may look right (binomial test)",
-        refuses=_chance,
-        text="{n_agree} of {n_check} withheld ties agree with the pose, as a wrong pose could "
-        "have by chance",
-    ),
-    Gate(
-        name="check-share",
-        limits={"of_control": 0.5},
-        source="withheld ties agree as often as the control of a right pose",
-        refuses=_check_share,
-        text="{n_agree} of {n_check} withheld ties agree with the pose, but {share:.0%} of "
-        "the control does: the pose was fitted to chance",
-    ),
-    Gate(
-        name="check-rms",
-        limits={"of_control": 2.0},
-        source="withheld ties deviate as much as the control of a right pose",
-        refuses=_check_rms,
-        text="the check ties deviate {times:.1f} times as much as the control, at most "
-        "{of_control:g} times is plausible",
-    ),
-)
-"""What the ties themselves must show."""
-
-_SIDE: Final = Gate(
-    name="side",
-    limits={},
-    source="a photo shows the front of a wall",
-    refuses=_side,
-    text="the pose lies behind the wall it would show, so it must be wrong",
-)
-_ON_WALLS: Final = (
-    Gate(
-        name="accuracy",
-        limits={"cells": "max_sigma_wall_cells"},
-        source="the job",
-        refuses=_accuracy,
-        text="its predicted error on the wall is {error_mm:.1f} mm, at most {cells:g} cells of "
-        "{gsd_mm:g} mm are allowed",
-    ),
-    Gate(
-        name="accuracy-at-worst",
-        limits={"cells": "max_sigma_corner_cells"},
-        source="the job",
-        refuses=_accuracy_at_worst,
-        text="its predicted error at the worst place of the wall is {error_mm:.1f} mm, at most "
-        "{cells:g} cells of {gsd_mm:g} mm are allowed",
-    ),
-)
-_SHOWN: Final = Gate(
-    name="shown",
-    limits={},
-    source="a photo that shows no wall paints nothing",
-    refuses=_shown,
-    text="with this pose the photo would show no wall that its ties lie on",
-)
-
-GATES: Final = (
-    *CONTROL_GATES,
-    Gate(
-        name="quarters",
-        limits={"at_least": "min_quadrant_ties", "cells": "max_sigma_wall_cells"},
-        source="markiewicz2015, 4.3",
-        refuses=_quarters,
-        text="a quarter of the photo has {n} ties, each needs {at_least}{why}",
-    ),
-    _SIDE,
-    _SHOWN,
-    Gate(
-        name="hull",
-        limits={"at_least": "min_hull_ratio"},
-        source="the job",
-        refuses=_hull,
-        text="the control covers {ratio:.1%} of the part of the photo that shows the walls, at "
-        "least {at_least:.1%} is needed",
-    ),
-    *_ON_WALLS,
-)
-"""All that an orientation by ties of a matcher must meet, in the order in which it is asked."""
-
-GATES_BEFORE_BLOCK: Final = (*CONTROL_GATES, _SIDE)
-"""What keeps a photo from harming others; what it lacks in exactness, these may bring."""
-
-GATES_BY_HAND: Final = (
-    _SIDE,
-    _SHOWN,
-    *_ON_WALLS,
-    Gate(
-        name="each-other",
-        limits={"cells": "max_sigma_corner_cells"},
-        source="the job",
-        refuses=_each_other,
-        text="without the tie at (u {u:.0f}, v {v:.0f}) its predicted error on the wall would be "
-        "{error_mm:.1f} mm, at most {allowed_mm:.1f} mm is allowed: if that tie were wrong, "
-        "the others could "
-        "not reveal it; measure more of them, farther apart",
-    ),
-)
-"""What a pose from ties that a person measured must meet."""
-
-
-def _chance_probability(candidate: Candidate, limit: float) -> float:
-    """Probability that a wrong tie falls within a limit of a pose it has nothing to do with."""
-    residuals, lengths = candidate.estimate.fit.residuals_px, candidate.estimate.fit.normalised
-    inside = candidate.estimate.agreeing & (lengths > 0.0)
-    radius = limit * float(np.median(np.linalg.norm(residuals[inside], axis=1) / lengths[inside]))
-    # Wrong ties gather where the texture is, not all over the photo.
-    textured = max(hull_area(candidate.seen.pixels_photo), 1.0) / 4.0
-    searched = (2.0 * candidate.search_radius_px) ** 2
-    return min(0.5, math.pi * radius**2 / min(textured, searched))
-
-
-def _tail(n_least: int, n_all: int, probability: float) -> float:
-    """Probability of at least n_least successes in n_all trials (binomial)."""
-    from scipy.special import bdtrc  # scipy.stats would take seconds to import
-
-    return float(bdtrc(n_least - 1, n_all, probability))

@@ -14,15 +14,14 @@ from orthoflow.geometry.resection import SeenPoints, misfit
 from orthoflow.products import Camera, Cameras, JsonValue, Photo, Photos, Ties, TieWall, Walls
 from orthoflow.sdk import DiagnosticSpec, Method, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
-from orthoflow_plugins.orient.by_hand import MIN_TIES
-from orthoflow_plugins.orient.parameters import (
+from orthoflow_plugins.orient.photos import MIN_TIES, oriented_by_hand, tied_photo
+from orthoflow_plugins.orient.pose import (
     NOT_ORIENTED,
     ORIENTATION_METRICS,
     Note,
     OrientOut,
     OrientParams,
 )
-from orthoflow_plugins.orient.photos import oriented_by_hand, tied_photo
 from orthoflow_plugins.orient.report import Oriented, hand_over, measure_expected
 
 _SIDE: Final = 15
@@ -84,7 +83,7 @@ class OrientGiven(Method):
             ctx.progress(nth / len(photos), photo.name)
             known = replace(photo, intrinsics=camera.intrinsics or photo.intrinsics)
             found.append(_oriented(known, camera, ties, params, ctx))
-        unchecked = [item.camera.photo for item in found if item.numbers is None]
+        unchecked = [item.camera.photo for item in found if item.entry is None]
         return OrientOut(cameras=hand_over(ctx, ties, photos, found, _said(unchecked)))
 
 

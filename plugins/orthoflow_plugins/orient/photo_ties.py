@@ -15,7 +15,7 @@ from orthoflow.geometry.key_points import in_turns, mutual_matches, root_sift
 from orthoflow.geometry.opencv_border import from_opencv
 from orthoflow.geometry.rotations import cross_matrix
 from orthoflow.products import Photo
-from orthoflow_plugins.orient.lenses import camera_rays
+from orthoflow_plugins.orient.pose import camera_rays
 
 # Larger photos are shrunk: SIFT takes 0.23 GB per million pixels, and thousands of key points at
 # half the resolution tie photos as well as more at full.
@@ -93,25 +93,16 @@ def photo_features(photo: Photo, n_most: int) -> PhotoFeatures:
     points = np.array([(*p.pt, p.size, p.angle, p.response) for p in found], dtype=np.float64)
     # Threads find key points in any order; the image alone orders them.
     order = np.lexsort(points.T[:4])
-    order = order[_spread(points[order], grey.shape, n_most)]
+    # The strongest, in turns from the cells of a coarse grid.
+    cells = (points[order, :2] * _SPREAD_CELLS / [grey.shape[1], grey.shape[0]]).astype(np.intp)
+    columns, rows = np.clip(cells, 0, _SPREAD_CELLS - 1).T
+    order = order[in_turns(rows * _SPREAD_CELLS + columns, (-points[order, 4],), n_most)]
     # Described are those that stay: of a rich picture, one in ten.
     raw = sift.compute(grey, [found[at] for at in order.tolist()])[1]
     return PhotoFeatures(
         pixels=from_opencv(points[order, :2]) * ratios,
         scale=scale,
         descriptors=root_sift(np.asarray(raw, dtype=np.float32)),
-    )
-
-
-def no_photo_ties() -> PhotoTies:
-    """Return none."""
-    none = np.empty(0, dtype=np.intp)
-    return PhotoTies(
-        photo=none,
-        point=none,
-        pixels=np.empty((0, 2)),
-        scale=np.empty(0),
-        points_world=np.empty((0, 3)),
     )
 
 
@@ -172,14 +163,6 @@ def tie_photos(
     return _located(cameras, features, rays, tracks[:n_most])
 
 
-def _spread(points: NDArray[np.float64], shape: tuple[int, ...], n_most: int) -> NDArray[np.intp]:
-    """Positions of the strongest points, taken in turns from the cells of a coarse grid."""
-    cells = (points[:, :2] * _SPREAD_CELLS / [shape[1], shape[0]]).astype(np.intp)
-    cells = np.clip(cells, 0, _SPREAD_CELLS - 1)
-    cell = cells[:, 1] * _SPREAD_CELLS + cells[:, 0]
-    return in_turns(cell, (-points[:, 4],), n_most)
-
-
 def _off_line_px(
     first: tuple[ViewingCamera, NDArray[np.float64]],
     second: tuple[ViewingCamera, NDArray[np.float64]],
@@ -226,7 +209,7 @@ def _located(
     pixels = np.vstack([item.pixels for item in features])
     centres = np.array([camera.centre_world for camera in cameras])
     world = np.vstack([own @ camera.rotation for camera, own in zip(cameras, rays, strict=True)])
-    kept: list[NDArray[np.intp]] = []
+    kept = [np.empty(0, dtype=np.intp)]
     points = [np.empty((0, 3))]
     for length in sorted({len(track) for track in tracks}, reverse=True):
         some = np.array([track for track in tracks if len(track) == length])
@@ -239,12 +222,10 @@ def _located(
         near = (off <= _MAX_OFF_POINT_PX).all(axis=1)
         kept += list(some[near])
         points.append(found[near])
-    if not kept:
-        return no_photo_ties()
     of_all = np.concatenate(kept)
     return PhotoTies(
         photo=photo_of[of_all],
-        point=np.repeat(np.arange(len(kept)), [len(track) for track in kept]),
+        point=np.repeat(np.arange(len(kept) - 1), [len(track) for track in kept[1:]]),
         pixels=pixels[of_all],
         scale=np.array([item.scale for item in features])[photo_of[of_all]],
         points_world=np.vstack(points),

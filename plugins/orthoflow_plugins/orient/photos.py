@@ -3,45 +3,230 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, TypeVar
+from itertools import combinations
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError, MethodError
-from orthoflow.geometry.resection import SeenPoints
-from orthoflow.products import Camera, JsonValue, Photo, Photos, TieRole, Ties
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.lenses import POSE_PARAMETERS
+from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
+from orthoflow.geometry.resection import Resection, SeenPoints, adjust, misfit, stated
+from orthoflow.products import Camera, Photo, Photos, TieRole, Ties
 from orthoflow.sdk import DiagnosticSpec, StepContext
-from orthoflow_plugins.orient.by_hand import MIN_TIES, PoseByHand, pose_by_hand
 from orthoflow_plugins.orient.gates import (
     GATES_BEFORE_BLOCK,
     Candidate,
+    known_walls,
     refusal,
     too_few,
+    wall_error,
     warnings_for,
-)
-from orthoflow_plugins.orient.parameters import (
-    OrientParams,
 )
 from orthoflow_plugins.orient.pose import (
     MIN_EXIF_OFF,
     Estimate,
     Estimator,
+    Lens,
+    Note,
+    OrientParams,
+    Start,
     TiedPhoto,
     adjusted,
     focal_without_exif,
     image_cells,
+    lens_prior,
     ties_of_photo,
+    undistorted_pixels,
 )
-from orthoflow_plugins.orient.report import (
-    Oriented,
-    numbers_json,
-    photo_numbers,
-    residual_table,
+from orthoflow_plugins.orient.report import Oriented, numbers_json
+
+MIN_TIES: Final = 6
+_MAX_WRONG: Final = 2
+# So many ways to leave ties out are tried: two of 24 ties, one of any number.
+_MAX_TRIALS: Final = 300
+# Right ties are called contradictory once in a thousand photos.
+_CONTRADICTION: Final = 1e-3
+# Of the longest length of a residual that is left over: 3.5 standard deviations of a coordinate.
+_LIMIT: Final = 3.5
+# Adjusted from two starts, one pose comes out twice to far less than that.
+_ONE_POSE_RAD: Final = math.radians(2.0)
+BY_HAND: Final = DiagnosticSpec(
+    code="photo-oriented-by-hand",
+    severity="warning",
+    text="photo {subject}: oriented by ties measured by hand alone",
 )
-from orthoflow_plugins.orient.wall_errors import known_walls, wall_error
+HAND_TIES_LEFT_OUT: Final = DiagnosticSpec(
+    code="ties-by-hand-contradict",
+    severity="warning",
+    text="photo {subject}: {n} ties measured by hand contradict the others and are left out: "
+    "{places}",
+    remedy="measure them again",
+    rank_by="n",
+)
+
+
+_Fit = tuple[float, Resection, ViewingCamera]
+"""An adjustment to some ties: the probability of residuals as large by chance, were the sigmas
+right, the camera, and its lens as it was known beforehand.
+"""
+
+
+def pose_by_hand(tied: TiedPhoto) -> tuple[Estimate, Start] | str:
+    """Orient a photo by the ties that a person measured, or say why not.
+
+    Args:
+        tied: the photo; of its ties at least `MIN_TIES` are measured by a person.
+
+    Returns:
+        The orientation by them alone, and where an adjustment of all ties starts from it.
+    """
+    seen = tied.seen
+    known, hand = lens_prior(tied.photo), seen.take(tied.by_hand)
+    found = _consistent(hand, known)
+    if isinstance(found, str):
+        return found
+    kept, (_, resection, prior) = found
+    agreeing = np.zeros(len(seen), dtype=np.bool_)
+    agreeing[np.flatnonzero(tied.by_hand)[kept]] = True
+    own, camera, lens = seen.take(agreeing), resection.camera, resection.lens
+    notes: list[Note] = [(BY_HAND, {})]
+    if len(kept) < len(hand):
+        pixels = np.delete(hand.pixels_photo, kept, axis=0)
+        notes.append((HAND_TIES_LEFT_OUT, {"n": len(pixels), "places": _places(pixels)}))
+    without_one = (
+        stated(own.take(np.arange(len(own)) != k), camera, prior=prior, lens=lens)
+        for k in range(len(own))
+    )
+    estimate = Estimate(
+        resection=_as_stated(resection),
+        source=known.source,
+        fit=misfit(seen, camera),
+        agreeing=agreeing,
+        limit=_LIMIT,
+        notes=tuple(notes),
+        without_one=tuple(map(_as_stated, without_one)),
+    )
+    return estimate, Start(camera=camera, lens=replace(known, prior=prior), agreeing=agreeing)
+
+
+def _consistent(hand: SeenPoints, lens: Lens) -> tuple[NDArray[np.intp], _Fit] | str:
+    """Find the ties that fit together: all, or all but one or two that are plainly wrong."""
+    n_most = min(_MAX_WRONG, len(hand) - MIN_TIES)
+    if math.comb(len(hand), n_most) > _MAX_TRIALS:
+        n_most = 1
+    for n_wrong in range(n_most + 1):
+        fitting: list[tuple[NDArray[np.intp], _Fit]] = []
+        for wrong in combinations(range(len(hand)), n_wrong):
+            kept = np.delete(np.arange(len(hand)), list(wrong))
+            fits = _distinct(_fits(hand.take(kept), lens))
+            if len(fits) > 1:
+                return (
+                    "two poses agree with its ties measured by hand: add some outside the "
+                    "plane of the others"
+                )
+            fitting += [(kept, fit) for fit in fits]
+        if len(fitting) == 1:
+            return fitting[0]
+        if fitting:
+            doubtful = sorted(
+                {int(at) for kept, _ in fitting for at in np.setdiff1d(np.arange(len(hand)), kept)}
+            )
+            return (
+                f"its {len(hand)} ties measured by hand contradict each other, and it is not plain "
+                f"which is wrong, one of {_places(hand.pixels_photo[doubtful])}: measure them "
+                "again, or add more"
+            )
+    return (
+        f"its {len(hand)} ties measured by hand contradict each other by more than their sigma_px "
+        f"says, and leaving out up to {n_most} of them does not help ({MIN_TIES} must stay): "
+        "measure them again, or add more"
+    )
+
+
+def _fits(seen: SeenPoints, known: Lens) -> Iterator[_Fit]:
+    """Adjust from every start, and give what the ties allow."""
+    from scipy.special import chdtrc  # scipy.stats would take seconds to import
+
+    for lens in (known.prior, *known.guesses):
+        for start in _starts(seen, lens):
+            try:
+                found = adjust(seen, start, prior=lens, lens=known.freedom)
+            except GeometryError:
+                continue
+            # Observations beyond what determines the camera; a known lens is observed as well.
+            cofactors = np.diag(found.covariance / found.sigma0**2)
+            of_lens = cofactors[POSE_PARAMETERS:] / found.lens.sigmas**2
+            redundancy = float(2 * len(seen) - len(cofactors) + of_lens.sum())
+            chance = float(chdtrc(redundancy, found.sigma0**2 * redundancy))
+            is_seen = np.isfinite(misfit(seen, found.camera).normalised).all()
+            if is_seen and chance >= _CONTRADICTION:
+                yield chance, found, lens
+
+
+def _distinct(fits: Iterator[_Fit]) -> list[_Fit]:
+    """The best of each pose."""
+    kept: list[_Fit] = []
+    for fit in sorted(fits, key=lambda each: -each[0]):
+        turns = [fit[1].camera.rotation @ other[1].camera.rotation.T for other in kept]
+        cosines = np.clip([(np.trace(turn) - 1.0) / 2.0 for turn in turns], -1.0, 1.0)
+        if (np.arccos(cosines) > _ONE_POSE_RAD).all():
+            kept.append(fit)
+    return kept
+
+
+def _starts(seen: SeenPoints, lens: ViewingCamera) -> list[ViewingCamera]:
+    """Poses that fit ties exactly in the sense of SQPnP and, of points in a plane, of IPPE."""
+    import cv2
+
+    straight = undistorted_pixels(seen.pixels_photo, lens)
+    inside = np.isfinite(straight).all(axis=1)
+    if inside.sum() < 4:
+        return []
+    middle = seen.points_world.mean(axis=0)
+    pixels = np.ascontiguousarray(to_opencv(straight[inside]))
+    points = np.ascontiguousarray(seen.points_world[inside] - middle)
+    posed = [(cv2.SOLVEPNP_SQPNP, points)]
+    centroid = points.mean(axis=0)
+    _, across, axes = np.linalg.svd(points - centroid, full_matrices=False)
+    if across[2] < 1e-2 * across[1]:
+        # IPPE takes nothing but points of one plane: onto it, then.
+        flat = points - np.outer((points - centroid) @ axes[2], axes[2])
+        posed.append((cv2.SOLVEPNP_IPPE, flat))
+    call: Any = cv2.solvePnPGeneric
+    starts: list[ViewingCamera] = []
+    for method, of_method in posed:
+        try:
+            n_found, turns, shifts, _ = call(
+                of_method, pixels, opencv_matrix(lens), None, flags=method
+            )
+        except cv2.error:  # the points have no such solution
+            continue
+        for turn, shift in zip(turns[:n_found], shifts[:n_found], strict=True):
+            rotation = np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64)
+            if not np.isfinite(rotation).all():
+                continue
+            local = replace(lens, rotation=rotation, translation=np.asarray(shift).ravel())
+            starts.append(local.shifted(-middle))
+    return starts
+
+
+def _as_stated(resection: Resection) -> Resection:
+    """Take the ties' own standard deviations where few residuals are small by luck."""
+    unit = max(1.0, resection.sigma0)
+    covariance = resection.covariance * (unit / resection.sigma0) ** 2
+    return replace(resection, covariance=covariance, sigma0=unit, variance_factor=unit**2)
+
+
+def _places(pixels: NDArray[np.float64] | Sequence[NDArray[np.float64]]) -> str:
+    """Pixels as they stand in a file of ties."""
+    counted = to_opencv(np.asarray(pixels))
+    return ", ".join(f"(u {u:.0f}, v {v:.0f})" for u, v in counted)
+
 
 _SEED_LIMIT: Final = 2**31 - 1
 # More ties of a photo than that tell nothing new.
@@ -303,9 +488,10 @@ def by_itself(
         # What a person measured is never withheld, so that the others have to check the pose.
         too_few_others = too_few(int((~tied.by_hand).sum()))
         if pose is not None:
-            kept = pose.estimate.agreeing
-            joined = None if too_few_others else _joined(tied, ties, params, pose)
-            if joined is not None:
+            own, start = pose
+            kept = own.agreeing
+            joined = None if too_few_others else _joined(tied, ties, params, start)
+            if joined is not None and joined.agreeing[kept].all():
                 return Trusted(tied=tied, estimate=joined, by_hand=alone, kept=kept)
         if alone.camera.status == "ok":
             return alone
@@ -319,22 +505,22 @@ def by_itself(
 
 def oriented_by_hand(
     tied: TiedPhoto, ties: Ties, params: OrientParams
-) -> tuple[Oriented, PoseByHand | None]:
+) -> tuple[Oriented, tuple[Estimate, Start] | None]:
     """Orient a photo by the ties that a person measured alone, of which there are enough."""
     found = pose_by_hand(tied)
     if isinstance(found, str):
         return refused(tied, found), None
-    return judged(tied, candidate_of(tied, ties, params, found.estimate)), found
+    return judged(tied, candidate_of(tied, ties, params, found[0])), found
 
 
-def _joined(tied: TiedPhoto, ties: Ties, params: OrientParams, pose: PoseByHand) -> Estimate | None:
+def _joined(tied: TiedPhoto, ties: Ties, params: OrientParams, start: Start) -> Estimate | None:
     """Orient a photo by all ties from the pose by hand; None where they are against it."""
     try:
-        joined = adjusted(tied, pose.start, params)
+        joined = adjusted(tied, start, params)
     except GeometryError:
         return None
     against = refusal(candidate_of(tied, ties, params, joined), GATES_BEFORE_BLOCK)
-    return joined if against is None and joined.agreeing[pose.estimate.agreeing].all() else None
+    return joined if against is None else None
 
 
 def candidate_of(
@@ -344,6 +530,8 @@ def candidate_of(
     used = np.zeros(len(ties.photo), dtype=np.bool_)
     used[tied.chosen[estimate.agreeing]] = True
     known = known_walls(ties, used)
+    radii_px = dict(zip(ties.photo_names, ties.search_radius_px, strict=False))
+    radius_px = radii_px.get(tied.photo.name)
     return Candidate(
         photo=tied.photo,
         seen=tied.seen,
@@ -353,21 +541,20 @@ def candidate_of(
         known=known,
         error=wall_error(estimate.resection, known),
         params=params,
-        search_radius_px=_search_radius_px(ties, tied.photo.name),
+        search_radius_px=math.inf if radius_px is None else radius_px,
     )
 
 
 def judged(tied: TiedPhoto, candidate: Candidate) -> Oriented:
     """Call an orientation ok, or say why not."""
-    against = refusal(candidate)
-    numbers = photo_numbers(candidate) if candidate.control.any() else None
-    entry: dict[str, JsonValue] = {} if numbers is None else numbers_json(candidate, numbers)
+    against, estimate = refusal(candidate), candidate.estimate
+    entry = numbers_json(candidate) if candidate.control.any() else {}
     if against is not None:
-        entry["refused_by"] = against.gate
-        return replace(refused(tied, against.text), entry=entry)
-    result, estimate = candidate.estimate.resection, candidate.estimate
+        gate, reason = against
+        return replace(refused(tied, reason), entry={**entry, "refused_by": gate})
     role = np.where(candidate.checked, TieRole.CHECK, TieRole.CONTROL).astype(np.uint8)
     role[~estimate.agreeing] = TieRole.REJECTED
+    result, sigmas_px = estimate.resection, candidate.seen.sigma_px[candidate.control]
     return Oriented(
         camera=Camera(
             photo=candidate.photo.name,
@@ -376,15 +563,13 @@ def judged(tied: TiedPhoto, candidate: Candidate) -> Oriented:
             rotation_camera_from_world=result.camera.rotation,
             translation_camera_from_world=result.camera.translation,
             covariance=result.covariance[:6, :6],
-            sigma0_px=result.sigma0 * float(np.median(candidate.seen.sigma_px[candidate.control])),
+            sigma0_px=result.sigma0 * float(np.median(sigmas_px)),
             sigma_wall_m=None if candidate.error is None else candidate.error.rms_m,
         ),
         chosen=tied.chosen,
         role=role,
         residuals_px=estimate.fit.residuals_px,
-        numbers=numbers,
         entry=entry,
-        table=() if numbers is None else tuple(residual_table(candidate, numbers)),
         notes=(*estimate.notes, *warnings_for(candidate)),
         candidate=candidate,
     )
@@ -412,9 +597,3 @@ def _usable(ties: Ties, name: str) -> NDArray[np.intp]:
     if ties.by_hand is not None:
         kept = np.union1d(kept, mine[ties.by_hand[mine] > 0])
     return kept
-
-
-def _search_radius_px(ties: Ties, name: str) -> float:
-    """What the matcher says of how far it looked for the ties of a photo."""
-    radius_px = dict(zip(ties.photo_names, ties.search_radius_px, strict=False)).get(name)
-    return math.inf if radius_px is None else radius_px

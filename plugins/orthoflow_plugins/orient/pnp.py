@@ -15,16 +15,14 @@ from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
 from orthoflow.geometry.resection import SeenPoints, misfit, stated
 from orthoflow.sdk import Method, MetricSpec, StepContext
 from orthoflow.sdk.methods import Determinism
-from orthoflow_plugins.orient.parameters import (
-    ORIENTATION_METRICS,
-    OrientIn,
-    OrientOut,
-    OrientParams,
-)
 from orthoflow_plugins.orient.photos import each_by_itself
 from orthoflow_plugins.orient.pose import (
     MAX_ROUNDS,
+    ORIENTATION_METRICS,
     Estimate,
+    OrientIn,
+    OrientOut,
+    OrientParams,
     TiedPhoto,
     estimate_pose,
     expected_px,
@@ -117,7 +115,7 @@ def estimate_by_opencv(tied: TiedPhoto, params: OrientParams) -> Estimate | str:
     except GeometryError as error:
         return f"{error}: use orient.pnp with method weighted"
     return Estimate(
-        resection=resection, source=robust.source, fit=fit, agreeing=agreeing, limit=limit
+        resection=resection, source=robust.lens.source, fit=fit, agreeing=agreeing, limit=limit
     )
 
 

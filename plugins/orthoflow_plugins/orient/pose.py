@@ -1,18 +1,19 @@
-"""The pose of one photo: robust start, adjustment, and which ties agree with it."""
+"""The pose of one photo: what is known of its lens, robust start, adjustment, ties that agree."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
-from typing import Any, Final
+from typing import Any, Final, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from orthoflow.errors import GeometryError
-from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.lenses import POSE_PARAMETERS, LensFreedom
+from orthoflow.geometry.cameras import ViewingCamera, undistorted
+from orthoflow.geometry.lenses import POSE_PARAMETERS, LensFreedom, unmeasured
 from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
 from orthoflow.geometry.resection import (
     Misfit,
@@ -22,23 +23,132 @@ from orthoflow.geometry.resection import (
     first_step,
     fitted,
     misfit,
-    pixels_by_point,
     stated,
 )
 from orthoflow.geometry.robust import MEDIAN_LENGTH
-from orthoflow.products import Intrinsics, Photo, Ties
-from orthoflow_plugins.orient.lenses import (
-    UNKNOWN,
-    camera_rays,
-    focal_sigma,
-    intrinsics_of,
-    lens_prior,
-)
-from orthoflow_plugins.orient.parameters import (
-    Note,
-    OrientParams,
+from orthoflow.products import Cameras, Intrinsics, Photo, Photos, Ties
+from orthoflow.sdk import DiagnosticSpec, MethodParams, MetricSpec, Ports
+
+# What an orientation says of a photo: a spec and its values.
+Note: TypeAlias = tuple[DiagnosticSpec, Mapping[str, Any]]
+NOT_ORIENTED: Final = DiagnosticSpec(
+    code="photo-not-oriented",
+    severity="warning",
+    text="photo {subject} is not oriented: {status}",
 )
 
+
+def _median_and_worst(
+    name: str, label: str, *, is_headline: bool = False, description: str = ""
+) -> tuple[MetricSpec, MetricSpec]:
+    """Metrics of single photos: the median one and the worst one."""
+
+    def spec(which: str, **more: Any) -> MetricSpec:
+        return MetricSpec(
+            f"{name}_{which}",
+            label=f"{label}, {which} photo",
+            better="lower",
+            counted_by="n_oriented",
+            **more,
+        )
+
+    return spec("median"), spec("worst", headline=is_headline, description=description)
+
+
+ORIENTATION_METRICS: Final = (
+    MetricSpec("n_photos", label="photos"),
+    MetricSpec("n_oriented", label="photos oriented", better="higher", headline=True),
+    MetricSpec("n_refused", label="photos refused"),
+    MetricSpec("n_ties", label="ties"),
+    MetricSpec("n_control", label="control points"),
+    MetricSpec("n_check", label="check points"),
+    MetricSpec("rejected_share", label="share of the ties that is rejected"),
+    *_median_and_worst("control_rmse_px", "control points, RMS per axis"),
+    *_median_and_worst("check_rmse_px", "check points, RMS per axis"),
+    *_median_and_worst(
+        "check_rmse_mm",
+        "check points, RMS per axis on the wall",
+        is_headline=True,
+        description="mean of both axes of the photo; along one of the wall it may be more",
+    ),
+    *_median_and_worst(
+        "sigma_wall_mm",
+        "expected error of the orientation on the wall",
+        is_headline=True,
+        description="against the scan; errors of depth and scan add to it",
+    ),
+)
+"""What every orientation reports of its photos."""
+
+
+class OrientIn(Ports):
+    """Ties with the walls, and the photos they are in."""
+
+    ties: Ties
+    photos: Photos
+
+
+class OrientOut(Ports):
+    """One orientation per photo."""
+
+    cameras: Cameras
+
+
+class OrientParams(MethodParams):
+    """Rejection, withheld share, and the limits of the gates that depend on the job."""
+
+    rejection_sigma: float = Field(
+        default=3.5,
+        gt=1,
+        le=20,
+        description="Ties that deviate by more than this "
+        "many of their standard deviations are rejected.",
+    )
+    threshold_px: float | None = Field(
+        default=None,
+        gt=0,
+        description="Largest deviation of a tie from a sampled pose; without it, what the "
+        "ties' own standard deviations allow.",
+    )
+    check_share: float = Field(
+        default=0.2,
+        ge=0.2,
+        le=0.5,
+        description="Share of the ties withheld to check the orientation.",
+    )
+    min_quadrant_ties: int = Field(
+        default=2,
+        ge=0,
+        description="Ties that must agree in each quarter of a photo (markiewicz2015: 2), "
+        "unless the predicted error on the walls in that quarter stays below "
+        "max_sigma_wall_cells; 0 leaves it to the predicted error alone.",
+    )
+    quadrants: Literal["predicted", "strict"] = Field(
+        default="predicted",
+        description="strict: a photo with fewer than min_quadrant_ties in a quarter is refused "
+        "regardless of the predicted error, even if the quarter shows no wall (markiewicz2015).",
+    )
+    min_hull_ratio: float = Field(
+        default=0.4,
+        ge=0,
+        le=1,
+        description="Area of the control's hull over that of the walls in the photo.",
+    )
+    max_sigma_wall_cells: float = Field(
+        default=1.0,
+        gt=0,
+        description="Largest predicted error on the wall, RMS over what the photo shows, in "
+        "cells of its raster.",
+    )
+    max_sigma_corner_cells: float = Field(
+        default=3.0, gt=0, description="The same at the worst place of what the photo shows."
+    )
+
+
+Sharing = Literal["focal-group", "shared", "per-photo"]
+Refined = Literal["uncalibrated", "all", "none"]
+UNKNOWN: Final = "none"
+"""Source of a lens of which neither a calibration nor EXIF says anything."""
 MAX_ROUNDS: Final = 8
 """An adjustment and its rejections take turns at most so often."""
 SOFT_LIMIT: Final = 3.0
@@ -78,6 +188,119 @@ A focal length farther from it that many more ties agree with shows that it is w
 """
 _MANY_MORE: Final = 1.2
 _OTHER_LENS: Final = LensFreedom(focal_sigma=0.35, k1_sigma=0.1)
+_EXIF_FACTORS: Final = (1.0, 0.94, 1.06)
+_UNKNOWN_FACTORS: Final = (0.6, 0.75, 0.95, 1.2, 1.6, 2.2)
+# How far a calibration may be off where it is refined all the same.
+_CALIBRATED: Final = LensFreedom(
+    focal_sigma=0.01, k1_sigma=0.02, k2_sigma=0.04, tangential_sigma=1e-3
+)
+_CALIBRATED_CENTRE_SHARE: Final = 0.003
+_UNDONE: Final = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lens:
+    """A lens that one photo or several were taken with.
+
+    Attributes:
+        prior: what it is beforehand, the likeliest; its pose says nothing.
+        freedom: how far it may change.
+        source: what `prior` is known from: `calibration`, `exif`, `UNKNOWN` ...
+        guesses: what else it may be, with which a first pose is looked for.
+    """
+
+    prior: ViewingCamera
+    freedom: LensFreedom
+    source: str
+    guesses: tuple[ViewingCamera, ...] = ()
+
+
+def lens_prior(photo: Photo) -> Lens:
+    """Return what is known of a photo's lens: its calibration, else EXIF, else what is usual."""
+    if photo.intrinsics is not None:
+        prior = photo.intrinsics.posed()
+        return Lens(prior=prior, freedom=LensFreedom(), source=photo.intrinsics.source)
+    longest, exif_px = max(photo.width, photo.height), photo.exif_focal_px
+    factors = _UNKNOWN_FACTORS if exif_px is None else _EXIF_FACTORS
+    prior, *guesses = (
+        Intrinsics(
+            width=photo.width,
+            height=photo.height,
+            fx=(exif_px or longest) * factor,
+            fy=(exif_px or longest) * factor,
+            cx=0.5 * photo.width,
+            cy=0.5 * photo.height,
+            source="exif",
+        ).posed()
+        for factor in factors
+    )
+    return Lens(
+        prior=prior,
+        freedom=unmeasured(longest, has_exif=exif_px is not None),
+        source=UNKNOWN if exif_px is None else "exif",
+        guesses=tuple(guesses),
+    )
+
+
+def lens_groups(
+    photos: Sequence[Photo],
+    cameras: Sequence[ViewingCamera],
+    sharing: Sharing,
+    refined: Refined,
+    apart: Set[int] = frozenset(),
+) -> tuple[tuple[int, ...], tuple[Lens, ...]]:
+    """Group photos by lens.
+
+    Args:
+        photos: the photos.
+        cameras: each oriented by itself; where nothing is known of a lens, they start it.
+        sharing: `focal-group`: photos of one size and one focal length share a lens, or those of
+            one size of which no file says it; `shared`: all of one size do; `per-photo`: none do.
+        refined: which lenses may change.
+        apart: photos that have a lens of their own whatever they have in common with others.
+
+    Returns:
+        Index of each photo's lens, and the lenses.
+    """
+    members: dict[tuple[object, ...], list[int]] = {}
+    for at, photo in enumerate(photos):
+        known = photo.exif_focal_px if photo.intrinsics is None else photo.intrinsics
+        own = {"shared": (), "per-photo": (None, at), "focal-group": (known,)}[sharing]
+        key = (photo.width, photo.height, *((None, at) if at in apart else own))
+        members.setdefault(key, []).append(at)
+    lens_of, lenses = [0] * len(photos), []
+    for index, some in enumerate(members.values()):
+        priors = [lens_prior(photos[at]) for at in some]
+        lens = min(priors, key=lambda each: each.freedom.focal_sigma)
+        prior, freedom = lens.prior, lens.freedom
+        if lens.source == UNKNOWN:
+            focal_px = float(np.median([cameras[at].fx for at in some]))
+            prior = replace(prior, fx=focal_px, fy=focal_px)
+        if not freedom.sigmas.size and refined == "all":
+            centre_px = _CALIBRATED_CENTRE_SHARE * max(prior.width, prior.height)
+            freedom = replace(_CALIBRATED, centre_sigma_px=centre_px)
+        elif refined == "none":
+            freedom = LensFreedom()
+        lenses.append(Lens(prior=prior, freedom=freedom, source=lens.source))
+        for at in some:
+            lens_of[at] = index
+    return tuple(lens_of), tuple(lenses)
+
+
+def focal_sigma(resection: Resection) -> float:
+    """Return the standard deviation of an adjusted ln(focal length); inf where it was held."""
+    if "focal" not in resection.lens.names:
+        return math.inf
+    column = POSE_PARAMETERS + resection.lens.names.index("focal")
+    return math.sqrt(resection.covariance[column, column])
+
+
+def camera_rays(camera: ViewingCamera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Directions (n, 3) with z = 1 in camera axes; NaN where the distortion cannot be undone."""
+    found = undistorted(*camera.bent_rays(pixels.T), camera.distortion)
+    rays = np.column_stack([found[0], found[1], np.ones(len(pixels))])
+    rays[~(found[2] < _UNDONE)] = np.nan
+    return rays
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,8 +355,11 @@ class Estimate:
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """Its interior orientation."""
-        return intrinsics_of(self.resection, self.source)
+        """Its interior orientation; where it was estimated, that is its source."""
+        was_estimated = self.resection.lens.sigmas.size or self.source == UNKNOWN
+        return Intrinsics.of(
+            self.resection.camera, source="estimated" if was_estimated else self.source
+        )
 
 
 Estimator = Callable[[TiedPhoto, OrientParams], Estimate | str]
@@ -146,18 +372,14 @@ class Start:
 
     Attributes:
         camera: pose and lens.
-        prior: what the lens is beforehand; of its pose nothing is used.
+        lens: what is known of the lens beforehand.
         agreeing: (n,) bool, ties that determine the first adjustment.
-        freedom: what the adjustment may change of the lens.
-        source: what the lens is known from.
         n_least_for_lens: ties that must agree before the lens may change.
     """
 
     camera: ViewingCamera
-    prior: ViewingCamera
+    lens: Lens
     agreeing: NDArray[np.bool_]
-    freedom: LensFreedom
-    source: str
     n_least_for_lens: int = _LEAST_FOR_LENS
 
 
@@ -205,15 +427,15 @@ def no_pose(seen: SeenPoints) -> str:
 
 def robust_start(tied: TiedPhoto, params: OrientParams) -> Start | None:
     """Find the pose that most control ties agree with; None when there is none."""
-    prior, control = lens_prior(tied.photo), tied.seen.take(~tied.is_check)
+    lens, control = lens_prior(tied.photo), tied.seen.take(~tied.is_check)
     threshold_px = params.threshold_px
     if threshold_px is None:
         # A lens known only roughly misplaces even right ties.
-        slack = 1.0 if prior.source not in ("exif", UNKNOWN) else 2.0
+        slack = 1.0 if lens.source not in ("exif", UNKNOWN) else 2.0
         threshold_px = slack * params.rejection_sigma * expected_px(control)
     best: tuple[ViewingCamera, NDArray[np.bool_]] | None = None
-    for intrinsics in prior.guesses:
-        pose = _robust_pose(control, intrinsics.posed(), threshold_px, tied.seed)
+    for guess in (lens.prior, *lens.guesses):
+        pose = _robust_pose(control, guess, threshold_px, tied.seed)
         if pose is not None and (best is None or pose[1].sum() > best[1].sum()):
             best = pose
     if best is None:
@@ -223,13 +445,7 @@ def robust_start(tied: TiedPhoto, params: OrientParams) -> Start | None:
     # Points that appear twice say nothing new to a pose of six unknowns.
     if len(set(map(tuple, tied.seen.points_world[agreeing].round(4).tolist()))) < 5:
         return None
-    return Start(
-        camera=best[0],
-        prior=best[0],
-        agreeing=agreeing,
-        freedom=prior.freedom,
-        source=prior.source,
-    )
+    return Start(camera=best[0], lens=replace(lens, prior=best[0]), agreeing=agreeing)
 
 
 def adjusted(tied: TiedPhoto, start: Start, params: OrientParams) -> Estimate:
@@ -238,16 +454,16 @@ def adjusted(tied: TiedPhoto, start: Start, params: OrientParams) -> Estimate:
     Raises:
         GeometryError: the ties that agree do not determine the camera.
     """
-    seen, is_check = tied.seen, tied.is_check
+    seen, is_check, prior = tied.seen, tied.is_check, start.lens.prior
     camera, agreeing = start.camera, start.agreeing
     unit = unit_deviation(misfit(seen, camera).normalised[agreeing & ~is_check])
     for _ in range(MAX_ROUNDS):
         used = agreeing & ~is_check
-        lens = start.freedom if used.sum() >= start.n_least_for_lens else LensFreedom()
+        lens = start.lens.freedom if used.sum() >= start.n_least_for_lens else LensFreedom()
         control, soft_limit = seen.take(used), SOFT_LIMIT * unit
         # A lens that may not change is the one known beforehand.
-        begin = camera if lens.sigmas.size else posed(start.prior, camera)
-        camera = fitted(control, begin, prior=start.prior, lens=lens, soft_limit=soft_limit)
+        begin = camera if lens.sigmas.size else posed(prior, camera)
+        camera = fitted(control, begin, prior=prior, lens=lens, soft_limit=soft_limit)
         fit = misfit(seen, camera)
         before, unit = unit, unit_deviation(fit.normalised[used])
         limit = without_chance(fit.normalised[~is_check], params.rejection_sigma * unit)
@@ -255,15 +471,12 @@ def adjusted(tied: TiedPhoto, start: Start, params: OrientParams) -> Estimate:
         if np.array_equal(again & ~is_check, used) and abs(unit / before - 1.0) < _SETTLED_SHARE:
             break
         agreeing = again
+    groups = places_in_photo(control.pixels_photo, camera)
     resection = stated(
-        control,
-        camera,
-        prior=start.prior,
-        lens=lens,
-        groups=places_in_photo(control.pixels_photo, camera),
-        soft_limit=soft_limit,
+        control, camera, prior=prior, lens=lens, groups=groups, soft_limit=soft_limit
     )
-    return Estimate(resection=resection, source=start.source, fit=fit, agreeing=again, limit=limit)
+    source = start.lens.source
+    return Estimate(resection=resection, source=source, fit=fit, agreeing=again, limit=limit)
 
 
 def ties_of_photo(ties: Ties, name: str) -> NDArray[np.intp]:
@@ -315,13 +528,6 @@ def expected_px(seen: SeenPoints) -> float:
     per_metre = spread_px / max(0.5 * float(np.median(lengths)), 1e-6)
     sigma = np.hypot(np.median(seen.sigma_px), per_metre * np.median(seen.sigma_m))
     return float(sigma)
-
-
-def metres_per_pixel(camera: ViewingCamera, points_world: NDArray[np.float64]) -> float:
-    """Size of a pixel of the photo at the points, median over them."""
-    derivatives = pixels_by_point(camera, points_world)
-    across = np.linalg.svd(derivatives, compute_uv=False)
-    return float(np.median(1.0 / np.sqrt(across[:, 0] * across[:, 1])))
 
 
 def posed(lens: ViewingCamera, pose: ViewingCamera) -> ViewingCamera:

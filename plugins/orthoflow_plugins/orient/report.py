@@ -3,30 +3,58 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from functools import partial
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.files.images import decode_image, encode_webp
+from orthoflow.geometry.opencv_border import to_opencv
+from orthoflow.geometry.resection import pixels_by_point
 from orthoflow.geometry.robust import median_deviation
 from orthoflow.products import Camera, Cameras, JsonValue, Photo, ResidualRow, TieRole, Ties
 from orthoflow.sdk import StepContext
-from orthoflow_plugins.orient.figures import (
-    PhotoResiduals,
-    draw_positions,
-    draw_residuals,
-    draw_ties,
-    draw_wall_errors,
-)
-from orthoflow_plugins.orient.gates import Candidate
-from orthoflow_plugins.orient.parameters import NOT_ORIENTED, Note
-from orthoflow_plugins.orient.pose import metres_per_pixel, ties_of_photo
+from orthoflow_plugins.orient.gates import Candidate, sigmas_on_wall
+from orthoflow_plugins.orient.pose import NOT_ORIENTED, Note, ties_of_photo
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # Of a normal distribution 4.55 % lie beyond; of any, at most a quarter can (Chebyshev).
 _BEYOND: Final = 2.0
-_AXES: Final = ("u", "v")
+_SIDE_PX: Final = 900
+# markiewicz2015, Figure 17: control green, rejected red, check yellow.
+_ROLE_RGB: Final = {
+    TieRole.REJECTED: (220, 40, 40),
+    TieRole.CONTROL: (40, 200, 60),
+    TieRole.CHECK: (250, 220, 40),
+}
+_MAX_FIGURES: Final = 24
+_SUB_PIXEL_BITS: Final = 4
+# Cells along the longer side of a map of predicted errors, and pixels per cell.
+_MAP_CELLS: Final = 90
+_MAP_ZOOM: Final = 8
+_UNSEEN_BGR: Final = (60, 40, 20)
+# Histograms, with normal distributions: markiewicz2015, Figures 18, 20, 21 and 23.
+_BARS: Final = 40
+_BARS_OF_A_PHOTO: Final = 25
+# Rows of the picture of single photos, and how much of a row its highest bar takes.
+_MAX_PHOTOS: Final = 30
+_ROW_SHARE: Final = 0.8
+_BAR_COLOUR: Final = "#9db8d2"
+_CURVE_COLOUR: Final = "#b03a2e"
+# Of the plan of photos: length of an arrow, and points of a photo's control.
+_VIEW_M: Final = 0.4
+_MAX_CONTROL: Final = 300
+_PERCENTILE: Final = 99.5
+# Width of a letter of the names of photos, inches.
+_LETTER_IN: Final = 0.065
+_KINDS: Final = (TieRole.CONTROL, TieRole.CHECK)
 
 COLUMNS_SAID: Final[Mapping[str, JsonValue]] = {
     "residual": "observed - computed; u and v of the photo",
@@ -42,31 +70,6 @@ COLUMNS_SAID: Final[Mapping[str, JsonValue]] = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class PhotoNumbers:
-    """What the report says of one oriented photo.
-
-    Attributes:
-        n_control: ties that determine the pose, and withheld ones that are one of these again.
-        n_check: withheld ties that agree, and are no control.
-        n_rejected: ties that do not agree.
-        control_rmse_px: root mean square of a residual coordinate.
-        check_rmse_px: the same of the withheld ties, NaN without any.
-        check_rmse_mm: the same on the surface.
-        pixel_mm: size of a pixel on the surface.
-        hull_ratio: hull of the control over the part of the photo that shows its walls.
-    """
-
-    n_control: int
-    n_check: int
-    n_rejected: int
-    control_rmse_px: float
-    check_rmse_px: float
-    check_rmse_mm: float
-    pixel_mm: float
-    hull_ratio: float
-
-
-@dataclass(frozen=True, kw_only=True)
 class Oriented:
     """What became of one photo.
 
@@ -74,10 +77,8 @@ class Oriented:
         camera: its orientation, or why there is none.
         chosen: (n,) index into all ties of those that were used.
         role: (n,) `TieRole` of these.
-        residuals_px: (n, 2), NaN without an orientation.
-        numbers: for the metrics, None without an orientation.
+        residuals_px: (n, 2) observed - computed, NaN without an orientation.
         entry: for the record.
-        table: rows of the table of residuals.
         notes: what limits it.
         candidate: what it was judged by, of a photo that is ok.
     """
@@ -86,71 +87,63 @@ class Oriented:
     chosen: NDArray[np.intp]
     role: NDArray[np.uint8]
     residuals_px: NDArray[np.float64]
-    numbers: PhotoNumbers | None = None
     entry: JsonValue = None
-    table: tuple[ResidualRow, ...] = ()
     notes: tuple[Note, ...] = ()
     candidate: Candidate | None = None
 
+    def residuals_of(self, kind: TieRole) -> NDArray[np.float64]:
+        """Residuals (m, 2) of one role that are known."""
+        values = self.residuals_px[self.role == kind]
+        return np.asarray(values[np.isfinite(values).all(axis=1)])
 
-def photo_numbers(candidate: Candidate) -> PhotoNumbers:
-    """Summarise an orientation."""
-    residuals = candidate.estimate.fit.residuals_px
-    control, check = residuals[candidate.control], residuals[candidate.checked]
+
+def pixel_mm(candidate: Candidate) -> float:
+    """Size of a pixel of the photo at its control, median."""
     camera = candidate.estimate.resection.camera
-    pixel_mm = 1000.0 * metres_per_pixel(camera, candidate.seen.points_world[candidate.control])
-    check_rmse_px = _rms(check)
-    return PhotoNumbers(
-        n_control=int(candidate.estimate.agreeing.sum()) - len(check),
-        n_check=len(check),
-        n_rejected=int((~candidate.estimate.agreeing).sum()),
-        control_rmse_px=_rms(control),
-        check_rmse_px=check_rmse_px,
-        check_rmse_mm=check_rmse_px * pixel_mm,
-        pixel_mm=pixel_mm,
-        hull_ratio=candidate.hull_ratio,
-    )
+    derivatives = pixels_by_point(camera, candidate.seen.points_world[candidate.control])
+    across = np.linalg.svd(derivatives, compute_uv=False)
+    return 1000.0 * float(np.median(1.0 / np.sqrt(across[:, 0] * across[:, 1])))
 
 
-def numbers_json(candidate: Candidate, numbers: PhotoNumbers) -> dict[str, JsonValue]:
+def numbers_json(candidate: Candidate) -> dict[str, JsonValue]:
     """Return the numbers of an orientation as JSON."""
-    result = candidate.estimate.resection
+    estimate, error = candidate.estimate, candidate.error
+    result, n_agreeing = estimate.resection, int(estimate.agreeing.sum())
     entry: dict[str, JsonValue] = {
-        "n_control": numbers.n_control,
-        "n_check": numbers.n_check,
-        "n_rejected": numbers.n_rejected,
-        "pixel_mm": numbers.pixel_mm,
-        "hull_ratio": numbers.hull_ratio,
-        "limit_sigma": candidate.estimate.limit,
+        # Withheld ties that are one of the control again check nothing.
+        "n_control": n_agreeing - int(candidate.checked.sum()),
+        "n_check": int(candidate.checked.sum()),
+        "n_rejected": len(candidate.seen) - n_agreeing,
+        "pixel_mm": pixel_mm(candidate),
+        "hull_ratio": candidate.hull_ratio,
+        "limit_sigma": estimate.limit,
         "sigma0": result.sigma0,
         "variance_factor": result.variance_factor,
-        "lens": candidate.estimate.source,
+        "lens": estimate.source,
         "focal_px": result.camera.fx,
         "k1": float(result.camera.distortion[0]),
+        **estimate.numbers,
     }
-    entry |= candidate.estimate.numbers
-    if candidate.error is not None:
-        entry["sigma_wall_mm"] = 1000.0 * candidate.error.rms_m
-        entry["sigma_wall_worst_mm"] = 1000.0 * candidate.error.worst_m
-        entry["sigma_image_corners_mm"] = [
-            1000.0 * sigma if math.isfinite(sigma) else None
-            for sigma in candidate.error.corners_m.tolist()
-        ]
+    if error is not None:
+        entry["sigma_wall_mm"] = error.rms_mm
+        entry["sigma_wall_worst_mm"] = error.worst_mm
+        corners_mm = (1000.0 * error.corners_m).tolist()
+        entry["sigma_image_corners_mm"] = [mm if math.isfinite(mm) else None for mm in corners_mm]
     if result.lens.focal_sigma > 0.0:
         entry["focal_sigma_px"] = result.camera.fx * float(np.sqrt(result.covariance[6, 6]))
     return entry
 
 
-def residual_table(candidate: Candidate, numbers: PhotoNumbers) -> list[ResidualRow]:
+def residual_table(candidate: Candidate) -> list[ResidualRow]:
     """Return the rows of the table of residuals, control and check apart."""
-    units = {"px": 1.0, "mm": numbers.pixel_mm}
+    units = {"px": 1.0, "mm": pixel_mm(candidate)}
     if candidate.gsd_m is not None:
-        units["cell"] = numbers.pixel_mm / (1000.0 * candidate.gsd_m)
-    rows: list[ResidualRow] = []
-    for role, chosen in (("control", candidate.control), ("check", candidate.checked)):
-        residuals_px = candidate.estimate.fit.residuals_px[chosen]
-        rows += residual_rows(candidate.photo.name, role, residuals_px, units)
-    return rows
+        units["cell"] = units["mm"] / candidate.gsd_mm
+    residuals_px, name = candidate.estimate.fit.residuals_px, candidate.photo.name
+    return [
+        *residual_rows(name, "control", residuals_px[candidate.control], units),
+        *residual_rows(name, "check", residuals_px[candidate.checked], units),
+    ]
 
 
 def residual_rows(
@@ -172,13 +165,12 @@ def residual_rows(
     """
     if not len(residuals_px):
         return []
-    is_beyond = np.abs(residuals_px) > _BEYOND * _rmse(residuals_px)
-    any_axis = _share(is_beyond[:, 0] | is_beyond[:, 1])
+    is_beyond = np.abs(residuals_px) > _BEYOND * np.sqrt(np.mean(residuals_px**2, axis=0))
     rows: list[ResidualRow] = []
-    for axis, values in zip(_AXES, residuals_px.T, strict=True):
-        limit = _BEYOND / units["cell"] if "cell" in units else None
-        beyond_own = _share(np.abs(values) > _BEYOND * _rmse(values))
-        beyond_cells = None if limit is None else _share(np.abs(values) > limit)
+    for axis, values, is_far in zip("uv", residuals_px.T, is_beyond.T, strict=True):
+        beyond_cells = None
+        if "cell" in units:
+            beyond_cells = float((np.abs(values) > _BEYOND / units["cell"]).mean())
         for unit, factor in units.items():
             scaled = values * factor
             lengths, median = np.abs(scaled), float(np.median(scaled))
@@ -194,12 +186,12 @@ def residual_rows(
                 median=median,
                 nmad=median_deviation(scaled, median),
                 skewness=_skewness(scaled),
-                rmse=float(_rmse(scaled)),
+                rmse=float(np.sqrt(np.mean(scaled**2))),
                 p95=float(np.percentile(lengths, 95.0)),
                 max=float(lengths.max()),
-                beyond_own=beyond_own,
+                beyond_own=float(is_far.mean()),
                 beyond_cells=beyond_cells,
-                beyond_any=any_axis,
+                beyond_any=float(is_beyond.any(axis=1).mean()),
             )
             rows.append(row)
     return rows
@@ -225,22 +217,18 @@ def hand_over(
     for photo, oriented in zip(photos, found, strict=True):
         role[oriented.chosen] = oriented.role
         residuals[oriented.chosen] = oriented.residuals_px
-        _warn(ctx, oriented)
+        status = oriented.camera.status
+        if status != "ok":
+            ctx.report(NOT_ORIENTED, subject=photo.name, status=status)
+        for note, values in oriented.notes:
+            ctx.report(note, subject=photo.name, **values)
         mine = ties_of_photo(ties, photo.name)
-        status = f"Status: {oriented.camera.status}"
-        draw_ties(ctx, photo, ties.pixels_photo[mine], role[mine], status)
-    _measure(ctx, found)
+        draw_ties(ctx, photo, ties.pixels_photo[mine], role[mine], f"Status: {status}")
     candidates = [item.candidate for item in found if item.candidate is not None]
+    _measure(ctx, found, candidates)
     draw_wall_errors(ctx, candidates)
     draw_positions(ctx, candidates)
-    draw_residuals(
-        ctx,
-        [
-            PhotoResiduals(name=item.camera.photo, residuals_px=item.residuals_px, role=item.role)
-            for item in found
-            if item.camera.status == "ok"
-        ],
-    )
+    draw_residuals(ctx, [item for item in found if item.camera.status == "ok"])
     said: dict[str, JsonValue] = {
         "photos": {item.camera.photo: item.entry for item in found},
         "residual_columns": dict(COLUMNS_SAID),
@@ -250,7 +238,7 @@ def hand_over(
     return Cameras(
         cameras=tuple(item.camera for item in found),
         ties=replace(ties, role=role, residual_px=residuals),
-        residual_table=tuple(row for item in found for row in item.table),
+        residual_table=tuple(row for each in candidates for row in residual_table(each)),
         details=said | (details or {}),
     )
 
@@ -281,47 +269,33 @@ def _skewness(values: NDArray[np.float64]) -> float | None:
     return float(np.mean(centred**3)) / variance**1.5 if variance > 0.0 else None
 
 
-def _rmse(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Root mean square along the first axis."""
-    return np.asarray(np.sqrt(np.mean(values**2, axis=0)))
-
-
-def _share(is_beyond: NDArray[np.bool_]) -> float:
-    return float(is_beyond.mean())
-
-
-def _rms(residuals: NDArray[np.float64]) -> float:
-    """Root mean square of a coordinate of residuals (n, 2)."""
-    return float(np.sqrt(np.mean(residuals**2))) if len(residuals) else float("nan")
-
-
-def _warn(ctx: StepContext, oriented: Oriented) -> None:
-    camera = oriented.camera
-    if camera.status != "ok":
-        ctx.report(NOT_ORIENTED, subject=camera.photo, status=camera.status)
-    for note, values in oriented.notes:
-        ctx.report(note, subject=camera.photo, **values)
-
-
-def _measure(ctx: StepContext, found: Sequence[Oriented]) -> None:
-    oriented = [item for item in found if item.camera.status == "ok"]
-    numbers = [item.numbers for item in oriented if item.numbers]
+def _measure(ctx: StepContext, found: Sequence[Oriented], candidates: Sequence[Candidate]) -> None:
     n_ties = sum(len(item.role) for item in found)
+    n_oriented = sum(item.camera.status == "ok" for item in found)
+    n_rejected = sum(int((item.role == TieRole.REJECTED).sum()) for item in found)
+    n_check = [int(each.checked.sum()) for each in candidates]
     ctx.metric("n_photos", len(found), "1")
-    ctx.metric("n_oriented", len(oriented), "1")
-    ctx.metric("n_refused", len(found) - len(oriented), "1")
+    ctx.metric("n_oriented", n_oriented, "1")
+    ctx.metric("n_refused", len(found) - n_oriented, "1")
     ctx.metric("n_ties", n_ties, "1")
-    ctx.metric("n_control", sum(item.n_control for item in numbers), "1")
-    ctx.metric("n_check", sum(item.n_check for item in numbers), "1")
-    rejected = sum(int((item.role == TieRole.REJECTED).sum()) for item in found)
-    ctx.metric("rejected_share", rejected / max(n_ties, 1), "1")
-    columns = {
-        "control_rmse_px": ([item.control_rmse_px for item in numbers], "px"),
-        "check_rmse_px": ([item.check_rmse_px for item in numbers], "px"),
-        "check_rmse_mm": ([item.check_rmse_mm for item in numbers], "mm"),
-    }
-    for name, (values, unit) in columns.items():
-        _sum_up(ctx, name, values, unit)
+    n_agreeing = sum(int(each.estimate.agreeing.sum()) for each in candidates)
+    ctx.metric("n_control", n_agreeing - sum(n_check), "1")
+    ctx.metric("n_check", sum(n_check), "1")
+    ctx.metric("rejected_share", n_rejected / max(n_ties, 1), "1")
+    control, check = (
+        [
+            float(np.sqrt(np.mean(residuals**2))) if len(residuals) else math.nan
+            for residuals in some
+        ]
+        for some in (
+            [each.estimate.fit.residuals_px[each.control] for each in candidates],
+            [each.estimate.fit.residuals_px[each.checked] for each in candidates],
+        )
+    )
+    _sum_up(ctx, "control_rmse_px", control, "px")
+    _sum_up(ctx, "check_rmse_px", check, "px")
+    sizes_mm = [pixel_mm(each) for each in candidates]
+    _sum_up(ctx, "check_rmse_mm", [a * b for a, b in zip(check, sizes_mm, strict=True)], "mm")
     measure_expected(ctx, [item.camera for item in found])
 
 
@@ -330,3 +304,250 @@ def _sum_up(ctx: StepContext, name: str, values: Sequence[float], unit: str) -> 
     if known:
         ctx.metric(f"{name}_median", float(np.median(known)), unit)
         ctx.metric(f"{name}_worst", max(known), unit)
+
+
+def draw_ties(
+    ctx: StepContext,
+    photo: Photo,
+    pixels_photo: NDArray[np.float64],
+    role: NDArray[np.uint8],
+    status: str,
+) -> None:
+    """Draw a photo's ties on it: control green, check yellow, rejected red."""
+    import cv2
+
+    if len(ctx.figures) >= _MAX_FIGURES:
+        return
+    stem = photo.name.rpartition(".")[0] or photo.name
+    name = f"ties_{re.sub(r'[^A-Za-z0-9_-]', '-', stem)}"
+    if any(figure.name == name for figure in ctx.figures):
+        name = f"{name}-{len(ctx.figures)}"
+    rgb = decode_image(photo.encoded, f"photo {photo.name}")
+    scale = min(1.0, _SIDE_PX / max(photo.width, photo.height))
+    size = (max(1, round(photo.width * scale)), max(1, round(photo.height * scale)))
+    small = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    # Dimmed, so that the marks stand out.
+    canvas = np.rint(0.7 * small).astype(np.uint8)
+    unit = 1 << _SUB_PIXEL_BITS
+    for kind, colour in _ROLE_RGB.items():
+        at = np.rint(to_opencv(pixels_photo[role == kind] * scale) * unit).astype(int)
+        for u, v in at.tolist():
+            cv2.circle(canvas, (u, v), 2 * unit, colour, -1, cv2.LINE_AA, _SUB_PIXEL_BITS)
+    ctx.figure(
+        name,
+        encode_webp(canvas),
+        f"Ties of {photo.name}: control green, check yellow, rejected red. {status}. Green over "
+        "the whole wall holds the photo; green in one corner alone, or red among it everywhere, "
+        "does not.",
+    )
+
+
+def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
+    """Draw the predicted error over each wall, at every place that of the photo that knows it best.
+
+    Args:
+        ctx: takes the pictures.
+        candidates: of the photos that are ok.
+    """
+    walls = {wall.index: wall for candidate in candidates for wall in candidate.known}
+    for index in sorted(walls):
+        wall = walls[index]
+        if len(ctx.figures) >= _MAX_FIGURES:
+            return
+        across, down = np.linalg.norm(wall.corners_world[[3, 1]] - wall.corners_world[0], axis=1)
+        cell_m = max(across, down) / _MAP_CELLS
+        shape = (max(1, round(down / cell_m)), max(1, round(across / cell_m)))
+        best = np.full(shape, np.inf)
+        for candidate in candidates:
+            sigmas = sigmas_on_wall(candidate.estimate.resection, wall, shape)
+            best = np.fmin(best, sigmas)
+        shown = np.isfinite(best)
+        if not shown.any():
+            continue
+        # A corner that photos hardly reach must not darken all the rest.
+        median_m, high_m = np.percentile(best[shown], [50.0, 98.0])
+        ctx.figure(
+            f"wall_{wall.number}_predicted_error",
+            partial(_error_map, best / high_m),
+            f"Predicted error of a coordinate on {wall.name}, of the photo that knows each place "
+            f"best: black 0 to yellow {1e3 * high_m:.2g} mm and more, median "
+            f"{1e3 * median_m:.2g} mm; blue where no oriented photo shows the wall. Bright places "
+            "far from ties are where the orthoimage may be off; more ties there would help.",
+        )
+
+
+def draw_positions(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
+    """Draw where the photos were taken, and the control, along the first wall and facing it.
+
+    After skarlatos2012, Figure 3. Of a floor the second view is its plan.
+
+    Args:
+        ctx: takes the picture.
+        candidates: of the photos that are ok.
+    """
+    from matplotlib.figure import Figure
+
+    walls = {wall.index: wall for candidate in candidates for wall in candidate.known}
+    if not walls:
+        return
+    first = walls[min(walls)]
+    sides = first.corners_world[[3, 1]] - first.corners_world[0]
+    axes_world = np.vstack([sides / np.linalg.norm(sides, axis=1)[:, None], first.normal])
+    origin = first.corners_world[0]
+    figure = Figure(figsize=(11.0, 5.0))
+    panels = figure.subplots(1, 2)
+    _set_margins(figure, left_in=0.6)
+    for panel, axis, label in zip(panels, (2, 1), ("before it", "down it"), strict=True):
+        shown = axes_world[[0, axis]].T
+        for wall in walls.values():
+            ring = (wall.corners_world[[0, 1, 2, 3, 0]] - origin) @ shown
+            panel.plot(*ring.T, color="#888888", linewidth=0.8)
+        for candidate in candidates:
+            _draw_position(panel, candidate, origin, shown)
+        panel.set_aspect("equal")
+        panel.set_xlabel("along the first wall [m]", fontsize=8)
+        panel.set_ylabel(f"{label} [m]", fontsize=8)
+        panel.tick_params(labelsize=7)
+    panels[1].invert_yaxis()
+    ctx.figure(
+        "positions",
+        figure,
+        "Where the oriented photos were taken and which way they look, with their control: seen "
+        "along the first wall (left) and facing it (right); of a floor the right view is its plan. "
+        "A photo behind a wall or far from the others is oriented wrongly.",
+    )
+
+
+def draw_residuals(ctx: StepContext, photos: Sequence[Oriented]) -> None:
+    """Draw histograms of the residuals of oriented photos, all together and each by itself."""
+    pooled = {
+        kind: np.vstack([np.empty((0, 2)), *(photo.residuals_of(kind) for photo in photos)])
+        for kind in _KINDS
+    }
+    drawn = {kind: values for kind, values in pooled.items() if len(values) > 2}
+    if drawn:
+        _draw_pooled(ctx, drawn)
+        _draw_each(ctx, photos, drawn)
+
+
+def _draw_position(
+    axes: Axes, candidate: Candidate, origin: NDArray[np.float64], shown: NDArray[np.float64]
+) -> None:
+    """Draw a photo's place, view and control onto two axes (3, 2) of the world."""
+    camera = candidate.estimate.resection.camera
+    control = (candidate.seen.points_world[candidate.control] - origin) @ shown
+    step = max(1, len(control) // _MAX_CONTROL)
+    axes.plot(*control[::step].T, ".", markersize=1.0, color="#30a040")
+    x, y = ((camera.centre_world - origin) @ shown).tolist()
+    across, down = (_VIEW_M * camera.rotation[2] @ shown).tolist()
+    axes.arrow(x, y, across, down, head_width=0.2 * _VIEW_M, color=_CURVE_COLOUR, linewidth=0.8)
+    axes.annotate(candidate.photo.name, (x, y), fontsize=5.5)
+
+
+def _error_map(shares: NDArray[np.float64]) -> bytes:
+    import cv2
+
+    shown = np.isfinite(shares)
+    grey = np.rint(255.0 * np.clip(np.where(shown, shares, 0.0), 0.0, 1.0)).astype(np.uint8)
+    bgr = np.asarray(cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO), dtype=np.uint8)
+    bgr[~shown] = _UNSEEN_BGR
+    size = (_MAP_ZOOM * shares.shape[1], _MAP_ZOOM * shares.shape[0])
+    enlarged = cv2.resize(bgr, size, interpolation=cv2.INTER_NEAREST)
+    return encode_webp(np.asarray(enlarged, dtype=np.uint8)[:, :, ::-1])
+
+
+def _draw_pooled(ctx: StepContext, pooled: dict[TieRole, NDArray[np.float64]]) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 2.6 * len(pooled)))
+    panels = figure.subplots(len(pooled), 2, squeeze=False)
+    _set_margins(figure, left_in=0.4)
+    for (kind, values), row in zip(pooled.items(), panels, strict=True):
+        for label, column, axes in zip("uv", values.T, row, strict=True):
+            # One outline instead of forty bars, each of which takes its time to draw.
+            counts, edges = np.histogram(column, bins=_BARS)
+            axes.stairs(counts, edges, fill=True, color=_BAR_COLOUR)
+            grid = np.linspace(edges[0], edges[-1], 200)
+            axes.plot(grid, _normal(column, edges, grid), color=_CURVE_COLOUR, linewidth=1.0)
+            axes.set_title(
+                f"{kind.name.lower()} {label}: {len(column)} ties, SD {column.std():.2f} px",
+                fontsize=9,
+            )
+            axes.set_xlabel("observed - computed [px]", fontsize=8)
+            axes.tick_params(labelsize=7)
+    ctx.figure(
+        "residuals",
+        figure,
+        "Residuals of all oriented photos, with normal distributions: narrow hills about 0 are "
+        "good; one beside 0, or broader for check ties than for control, is a systematic error.",
+    )
+
+
+def _draw_each(
+    ctx: StepContext,
+    photos: Sequence[Oriented],
+    pooled: dict[TieRole, NDArray[np.float64]],
+) -> None:
+    """Draw a row per photo, a column per role and coordinate, all bars up to its height."""
+    from matplotlib.figure import Figure
+
+    shown = photos[:_MAX_PHOTOS]
+    columns = [(kind, axis) for kind in pooled for axis in (0, 1)]
+    figure = Figure(figsize=(2.6 * len(columns), 1.0 + 0.45 * len(shown)))
+    panels = figure.subplots(1, len(columns), sharey=True, squeeze=False)[0]
+    longest = max(len(photo.camera.photo) for photo in shown)
+    _set_margins(figure, left_in=min(0.2 + _LETTER_IN * longest, 2.6))
+    for (kind, axis), axes in zip(columns, panels, strict=True):
+        reach = max(float(np.percentile(np.abs(pooled[kind][:, axis]), _PERCENTILE)), 1e-6)
+        for row, photo in enumerate(shown):
+            _draw_row(axes, photo.residuals_of(kind)[:, axis], -row, reach)
+        axes.axvline(0.0, color="#888888", linewidth=0.5)
+        axes.set_xlim(-reach, 1.6 * reach)
+        axes.set_ylim(0.9 - len(shown), 1.0)
+        axes.set_title(f"{kind.name.lower()} {'uv'[axis]}", fontsize=9)
+        axes.set_xlabel("observed - computed [px]", fontsize=8)
+        axes.tick_params(labelsize=7)
+    panels[0].set_yticks(
+        [-row for row in range(len(shown))], [photo.camera.photo for photo in shown]
+    )
+    ctx.figure(
+        "residuals_by_photo",
+        figure,
+        "Residuals of each oriented photo, with the normal distribution of the same mean and SD: a "
+        "row that is broader than the others, or beside 0, is a photo to look at.",
+    )
+
+
+def _draw_row(axes: Axes, values: NDArray[np.float64], base: float, reach: float) -> None:
+    """Draw the residuals (n,) of a photo on the line `base`."""
+    if len(values) < 3:
+        return
+    counts, edges = np.histogram(values, bins=_BARS_OF_A_PHOTO, range=(-reach, reach))
+    grid = np.linspace(-reach, reach, 120)
+    curve = _normal(values, edges, grid)
+    scale = _ROW_SHARE / max(float(counts.max()), float(curve.max()), 1e-9)
+    axes.stairs(scale * counts + base, edges, baseline=base, fill=True, color=_BAR_COLOUR)
+    axes.plot(grid, scale * curve + base, color=_CURVE_COLOUR, linewidth=0.8)
+    axes.text(1.55 * reach, base, f"{len(values)}\nSD {values.std():.2f}", fontsize=5.5, ha="right")
+
+
+def _set_margins(figure: Figure, *, left_in: float) -> None:
+    """Leave room for labels and titles: a layout that measures them draws everything twice."""
+    width, height = figure.get_size_inches()
+    figure.subplots_adjust(
+        left=left_in / width,
+        right=1.0 - 0.15 / width,
+        bottom=0.5 / height,
+        top=1.0 - 0.3 / height,
+        wspace=0.2,
+        hspace=0.45,
+    )
+
+
+def _normal(
+    values: NDArray[np.float64], edges: NDArray[np.float64], grid: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Counts per bar of a normal distribution with the mean and SD of the values."""
+    mean, deviation = float(values.mean()), max(float(values.std()), 1e-9)
+    density = np.exp(-0.5 * ((grid - mean) / deviation) ** 2) / deviation / np.sqrt(2.0 * np.pi)
+    return np.asarray(len(values) * (edges[1] - edges[0]) * density)

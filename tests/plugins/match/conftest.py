@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.match import features, pairing
+from orthoflow_plugins.match import key_points
 
 from orthoflow.geometry.key_points import Matches
 
@@ -29,9 +29,9 @@ class _Remembered:
     tiles: dict[tuple[object, ...], Any] = field(default_factory=dict)
     described: dict[tuple[object, ...], NDArray[np.float32]] = field(default_factory=dict)
     matched: dict[tuple[object, ...], Matches] = field(default_factory=dict)
-    find: Any = features._in_tile
-    describe: Any = features._described
-    match: Any = pairing.mutual_matches
+    find: Any = key_points._in_tile
+    describe: Any = key_points._described
+    match: Any = key_points.mutual_matches
 
     def in_tile(
         self, sift: Any, picture: NDArray[np.uint8], corner: tuple[int, int], shift_px: float
@@ -79,6 +79,6 @@ _remembered = _Remembered()
 def _key_points_found_once(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Look at each picture, and match two of them, once: tests look at the same few."""
     if request.path.stem != "test_features" and request.node.originalname not in _ANEW:
-        monkeypatch.setattr(features, "_in_tile", _remembered.in_tile)
-        monkeypatch.setattr(features, "_described", _remembered.of_chosen)
-        monkeypatch.setattr(pairing, "mutual_matches", _remembered.matches)
+        monkeypatch.setattr(key_points, "_in_tile", _remembered.in_tile)
+        monkeypatch.setattr(key_points, "_described", _remembered.of_chosen)
+        monkeypatch.setattr(key_points, "mutual_matches", _remembered.matches)

@@ -9,14 +9,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from orthoflow_plugins.match.confirming import confirmed
-from orthoflow_plugins.match.pairing import PairingParams, PhotoPairs, pair_photo, wall_features
+from orthoflow_plugins.match.key_points import (
+    PairingParams,
+    PhotoPairs,
+    pair_photo,
+    wall_features,
+)
 from orthoflow_plugins.match.pictures import photo_grey
-from orthoflow_plugins.match.placing import Placed, PlacedWalls
+from orthoflow_plugins.match.placing import Placed, confirmed
+from orthoflow_plugins.match.structures import WallStructure, wall_structure
 from orthoflow_plugins.match.ties import TiePiece
 
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.products import Photos
+from orthoflow.products import Photos, Wall
 from orthoflow.testing import photographed as ms
 
 SCENE = ms.textured_wall(1)
@@ -36,6 +41,11 @@ def photos() -> Photos:
             for nth, camera in enumerate(CAMERAS)
         )
     )
+
+
+@cache
+def on_walls() -> tuple[Sequence[Wall], list[WallStructure | None]]:
+    return WALLS.walls, [wall_structure(wall) for wall in WALLS.walls]
 
 
 def place(
@@ -66,9 +76,9 @@ def moved(camera: ViewingCamera, aside_m: float) -> ViewingCamera:
 def chosen(places: dict[int, Sequence[Placed]], recognised: Sequence[int] = ()) -> dict[int, float]:
     """Metres that the chosen places are aside, by photo."""
     params = PairingParams()
-    features = [wall_features(WALLS.walls[0], params)]
+    features = [wall_features(WALLS.walls[0], params.max_features)]
     pairs = {k: pair_photo(photo_grey(photos().photos[k]), features, params) for k in recognised}
-    found = confirmed(photos(), places, pairs, PlacedWalls(walls=WALLS.walls))
+    found = confirmed(photos(), places, pairs, on_walls())
     return {
         k: float((place.camera.centre_world - CAMERAS[k].centre_world)[0])
         for k, place in found.items()
@@ -107,7 +117,7 @@ def test_photos_that_are_wrong_together_lose_to_one_that_key_points_recognise() 
 
 def test_key_points_that_agree_by_chance_do_not_keep_a_photo_from_its_place() -> None:
     near = pytest.approx(0.0, abs=1e-9)
-    features = [wall_features(WALLS.walls[0], PairingParams())]
+    features = [wall_features(WALLS.walls[0], PairingParams().max_features)]
     right = pair_photo(photo_grey(photos().photos[2]), features, PairingParams())
     (pair,) = right.pairs
     assert pair.homography is not None
@@ -116,7 +126,7 @@ def test_key_points_that_agree_by_chance_do_not_keep_a_photo_from_its_place() ->
     places = {k: [place(k)] for k in range(3)}
 
     def taken(pairs: PhotoPairs) -> dict[int, float]:
-        found = confirmed(photos(), places, {2: pairs}, PlacedWalls(walls=WALLS.walls))
+        found = confirmed(photos(), places, {2: pairs}, on_walls())
         return {
             k: float((one.camera.centre_world - CAMERAS[k].centre_world)[0])
             for k, one in found.items()

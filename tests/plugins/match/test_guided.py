@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from orthoflow_plugins.match import displacements
 from orthoflow_plugins.match.channels import (
     colour_channels,
     gradient_channels,
@@ -14,11 +16,8 @@ from orthoflow_plugins.match.channels import (
     texture,
     textured_places,
 )
-from orthoflow_plugins.match.displacements import Search, measure
 from orthoflow_plugins.match.guided import MatchGuided
-from orthoflow_plugins.match.pictures import photo_grey
 from orthoflow_plugins.match.sift import MatchSift
-from orthoflow_plugins.match.warping import project_walls, warp_photo
 from scipy.ndimage import gaussian_filter, shift
 
 from orthoflow.errors import MethodError
@@ -26,9 +25,7 @@ from orthoflow.products import Camera, Cameras, Photos, Ties, Walls
 from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
 
-SEARCH = Search(radius_cells=6, min_score=0.3)
-# Turned by 0.3 degrees and shifted by 2 cm: about five cells on the wall.
-SCREEN_M = np.array([0.0, -0.8, 0.0])
+measure = partial(displacements.measure, radius_cells=6, min_score=0.3)
 ROUGH = (0.004, -0.005, 0.003, 0.01, -0.02, 0.01)
 
 
@@ -67,7 +64,7 @@ def test_a_known_shift_is_measured_without_bias(channels, moved: tuple[float, fl
     ]
     first, second = (channels(image) for image in noisy)
     places = textured_places(texture(first), first.known > 0.0, 200)
-    found = measure(first, second, places, SEARCH)
+    found = measure(first, second, places)
     assert len(found.places) > 100
     error = found.shift_cells - moved
     np.testing.assert_allclose(error.mean(axis=0), 0.0, atol=0.02)
@@ -79,7 +76,7 @@ def test_inverted_contrast_is_matched_in_gradients() -> None:
     grey = 40.0 * gaussian_filter(rng.normal(size=(240, 300)), 2.0).astype(np.float32)
     first, second = gradient_channels(grey), gradient_channels(100.0 - grey)
     places = textured_places(texture(first), first.known > 0.0, 100)
-    found = measure(first, second, places, SEARCH)
+    found = measure(first, second, places)
     assert len(found.places) > 0.9 * len(places) - 20
     np.testing.assert_allclose(found.shift_cells, 0.0, atol=0.01)
 
@@ -98,8 +95,8 @@ def test_colours_are_mixed_in_each_patch_as_the_wall_shows_them(
     noisy = (later + rng.normal(size=later.shape)).astype(np.float32)
     places = textured_places(texture(first), first.known > 0.0, 200)
     places = places[np.abs(places[:, 0] - 150) > 12]
-    found = measure(first, colour_channels(noisy), places, SEARCH)
-    as_grey = measure(first, grey_channels(noisy.mean(axis=2)), places, SEARCH)
+    found = measure(first, colour_channels(noisy), places)
+    as_grey = measure(first, grey_channels(noisy.mean(axis=2)), places)
     assert len(found.places) > 100
     # In the half whose contrast is mixed, grey finds next to nothing.
     n_right = [int((each.places[:, 0] > 150).sum()) for each in (found, as_grey)]
@@ -157,15 +154,6 @@ def test_cells_finer_than_points_lie_apart_do_as_well(
     assert ties.walls[0].gsd_m == pytest.approx(0.003)
 
 
-def test_ties_cover_the_photo_evenly(scene: ms.TexturedWall, walls: Walls, tmp_path: Path) -> None:
-    camera = ms.camera_before(scene)
-    ties = guided(
-        ms.photos(ms.photo_of(scene, camera)), walls, ms.cameras(ms.oriented(camera)), tmp_path
-    )
-    counts = np.histogram2d(*ties.pixels_photo.T, bins=[3, 3], range=[[0, 900], [0, 640]])[0]
-    assert counts.min() > 0.25 * counts.max()
-
-
 def test_the_number_of_threads_does_not_show(
     scene: ms.TexturedWall, walls: Walls, tmp_path: Path
 ) -> None:
@@ -175,44 +163,6 @@ def test_the_number_of_threads_does_not_show(
     three = guided(photos, walls, start, tmp_path, cores=3)
     np.testing.assert_array_equal(one.pixels_photo, three.pixels_photo)
     np.testing.assert_array_equal(one.sigma_px, three.sigma_px)
-
-
-def test_a_wall_hidden_by_another_is_not_seen(scene: ms.TexturedWall, walls: Walls) -> None:
-    wall = walls.walls[0]
-    frame = replace(wall.frame, origin_world=wall.frame.origin_world + SCREEN_M)
-    # Half as wide a screen, 0.8 m before the wall.
-    screen_depth = wall.depth_m.copy()
-    screen_depth[:, wall.frame.width // 2 :] = np.nan
-    screen = replace(wall, frame=frame, depth_m=screen_depth)
-    camera = ms.camera_before(scene, centre=(1.5, -2.6, 1.0))
-    alone = project_walls(camera, [wall])[0]
-    behind = project_walls(camera, [wall, screen])[0]
-    assert alone is not None
-    assert behind is not None
-    assert behind.part == alone.part
-    column, row = alone.corner
-    rows = slice(150 - row, 200 - row)
-    hidden = slice(140 - column, 200 - column)
-    assert np.isfinite(alone.u[rows, hidden]).mean() > 0.9
-    assert np.isfinite(behind.u[rows, hidden]).mean() < 0.02
-    np.testing.assert_array_equal(alone.u[rows, 330 - column :], behind.u[rows, 330 - column :])
-
-
-def test_a_wall_is_not_seen_from_behind(scene: ms.TexturedWall, walls: Walls) -> None:
-    camera = ms.camera_before(scene, centre=(1.2, 2.6, 1.1))
-    assert project_walls(camera, walls.walls) == [None]
-
-
-def test_a_warped_photo_shows_the_walls_own_grey(scene: ms.TexturedWall, walls: Walls) -> None:
-    camera = ms.camera_before(scene)
-    projection = project_walls(camera, walls.walls)[0]
-    assert projection is not None
-    warped = warp_photo(photo_grey(ms.photo_of(scene, camera)), projection)
-    rows, columns = np.nonzero(np.isfinite(warped))
-    at = np.column_stack([columns, rows]) + projection.corner + 0.5
-    grey = scene.grey(at[:, 0] * ms.GSD_M, at[:, 1] * ms.GSD_M)
-    # 8-bit levels, and the smoothing of the texture's finest octave.
-    assert np.std(warped[rows, columns] - 255.0 * grey) < 4.0
 
 
 def test_a_photo_without_a_pose_is_found_by_what_another_shows_of_the_wall(

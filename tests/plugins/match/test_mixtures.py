@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.match.pairing import mixed
+from orthoflow_plugins.match.key_points import mixed
 from orthoflow_plugins.match.sift import MatchSift
 
 from orthoflow.files.images import decode_image, encode_png

@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.match.displacements import _window
 from orthoflow_plugins.match.patch_kernels import (
     Picture,
     match_patches,
@@ -86,14 +85,12 @@ def test_the_shift_of_highest_correlation_is_found_with_its_lead(seed: int) -> N
             assert result[3] == pytest.approx(lead, abs=1e-6)
 
 
-def test_where_no_other_place_is_the_lead_is_that_over_the_worst() -> None:
-    first = np.random.default_rng(0).normal(size=(20, 20, 2)).astype(np.float32)
-    found = np.zeros((1, 4))
-    search_shifts(first, first, np.array([[10, 10]]), (4, 1), found)
-    np.testing.assert_allclose(found, [[0.0, 0.0, 1.0, 2.0]], atol=1e-6)
-
-
 # --- fractions of a cell ---
+
+
+def _window(half: int) -> NDArray[np.float64]:
+    bell = np.exp(-0.5 * (np.arange(-half, half + 1) / (0.6 * half)) ** 2)
+    return np.outer(bell, bell)
 
 
 def matched(
@@ -226,32 +223,6 @@ def test_patches_that_fix_no_shift_have_no_deviation() -> None:
     assert math.isinf(matched(flat, second, (0.0, 0.0))[2])
     negative = Picture(-picture(), known())
     assert math.isinf(matched(first, negative, (0.0, 0.0))[2])
-
-
-def test_a_mixture_is_the_least_squares_fit_of_three_channels() -> None:
-    rng = np.random.default_rng(12)
-    colours = rng.normal(size=(SIDE, SIDE, 3)).astype(np.float32)
-    gains = np.array([-0.8, 0.5, 0.1])
-    wall = np.roll(colours @ gains, (-2, 1), axis=(0, 1))[:, :, None].astype(np.float32)
-    found = np.zeros((1, 7))
-    search_mixtures(wall, colours, np.array([[20, 22]]), (HALF, 4), found)
-    # What is at a cell of the wall is one cell to the left of it and two below in the colours.
-    np.testing.assert_array_equal(found[0, :2], [-1.0, 2.0])
-    assert found[0, 2] > 0.99
-    assert found[0, 3] > 0.3
-    # The ridge draws them together by a few thousandths.
-    np.testing.assert_allclose(found[0, 4:], gains, atol=0.01)
-
-
-def test_what_three_gains_fit_of_chance_is_no_score() -> None:
-    rng = np.random.default_rng(13)
-    scores = np.zeros((40, 7))
-    for row in scores:
-        wall = rng.normal(size=(64, 64, 1)).astype(np.float32)
-        colours = rng.normal(size=(64, 64, 3)).astype(np.float32)
-        search_mixtures(wall, colours, np.array([[32, 32]]), (10, 0), row[None])
-    # A plain least-squares fit of 121 cells would correlate by 0.16 on average.
-    assert np.median(scores[:, 2]) < 0.1
 
 
 @pytest.mark.parametrize("noise", [0.1, 1.0, 5.0])

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.match import placing
-from orthoflow_plugins.match.placing import Placed, PlacedWalls, places_of
+from orthoflow_plugins.match.placing import Placed, places_of
+from orthoflow_plugins.match.structures import WallStructure, wall_structure
 
 from orthoflow.files.images import decode_image, encode_png
 from orthoflow.products import Photo, Wall
@@ -33,8 +34,8 @@ def patchy_wall() -> Wall:
 
 
 @cache
-def patchy_walls() -> PlacedWalls:
-    return PlacedWalls(walls=[patchy_wall()])
+def patchy_walls() -> list[WallStructure | None]:
+    return [wall_structure(patchy_wall())]
 
 
 def placed(photo: Photo) -> Placed | None:
@@ -97,16 +98,6 @@ def test_a_turned_photo_says_where_its_places_are(
     assert max(height, width) <= 1200 or degrees % 90 == 0
 
 
-def test_exif_says_how_a_photo_was_held() -> None:
-    turned = np.ascontiguousarray(np.rot90(decode_image(usual_photo().encoded, "a.png")))
-    shot = replace(
-        usual_photo(), encoded=encode_png(turned), width=640, height=900, intrinsics=None
-    )
-    # Told how it was held, no other way is tried; told wrong, it shows no wall.
-    assert placed(replace(shot, exif_orientation=6)) is not None
-    assert placed(replace(shot, exif_orientation=1, exif_focal_px=840.0)) is None
-
-
 def test_a_mirrored_photo_is_placed_nowhere() -> None:
     mirrored = np.ascontiguousarray(decode_image(usual_photo().encoded, "a.png")[:, ::-1])
     assert placed(replace(usual_photo(), encoded=encode_png(mirrored), exif_focal_px=840.0)) is None
@@ -119,7 +110,7 @@ def test_a_photo_of_another_wall_is_placed_nowhere() -> None:
 
 def test_a_wall_that_shows_nothing_places_no_photo() -> None:
     blind = replace(patchy_wall(), intensity=None)
-    assert places_of(0, usual_photo(), PlacedWalls(walls=[blind])) == []
+    assert places_of(0, usual_photo(), [wall_structure(blind)]) == []
 
 
 # --- how places are judged ---

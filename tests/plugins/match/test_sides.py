@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -183,17 +182,6 @@ def test_walls_are_seen_from_the_side_of_their_photos_whichever_way_their_planes
         assert ms.wall_error_m(wall, camera.viewing(), truth) < 0.002
 
 
-def test_points_with_colour_alone_tell_the_side_too(
-    scene: ms.TexturedWall, cloud: PointCloud, photos: Photos, tmp_path: Path
-) -> None:
-    assert cloud.intensity is not None
-    grey = np.rint(255.0 * cloud.intensity).astype(np.uint8)
-    coloured = replace(cloud, intensity=None, rgb=np.column_stack([grey, grey, grey]))
-    right = planes_of(scene, cloud)
-    found, _ = faced(right.turned(0), coloured, photos, tmp_path)
-    np.testing.assert_array_equal(found.normal, right.normal)
-
-
 @pytest.mark.parametrize("viewpoint", ["stations", "view_from", "given"])
 def test_planes_whose_side_is_known_are_not_asked_about(
     scene: ms.TexturedWall, cloud: PointCloud, photos: Photos, tmp_path: Path, viewpoint: str
@@ -213,17 +201,6 @@ def test_photos_that_show_something_else_leave_the_guess(
     found, metrics = faced(wrong, cloud, photos, tmp_path)
     assert found is wrong
     assert metrics == {"n_planes_guessed": 1, "n_planes_turned": 0, "n_planes_seen": 0}
-
-
-def test_a_plane_turned_twice_is_the_plane(scene: ms.TexturedWall, cloud: PointCloud) -> None:
-    planes = planes_of(scene, cloud)
-    once = planes.turned(0)
-    np.testing.assert_array_equal(once.normal[0], -planes.normal[0])
-    np.testing.assert_array_equal(once.corners[0, 0], planes.corners[0, 3])
-    np.testing.assert_array_equal(once.corners[1], planes.corners[1])
-    twice = once.turned(0)
-    np.testing.assert_array_equal(twice.normal, planes.normal)
-    np.testing.assert_array_equal(twice.corners, planes.corners)
 
 
 # --- how a verdict comes about ---

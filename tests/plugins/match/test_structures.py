@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -13,7 +11,6 @@ from orthoflow_plugins.match.structures import (
     WallStructure,
     _energy_under,
     _part_map,
-    _widths_cells,
     closer,
     likely_places,
     structure_of,
@@ -68,29 +65,6 @@ def test_what_is_not_known_and_its_border_has_no_structure() -> None:
     np.testing.assert_array_equal(found.known == 0.0, void)
     assert not found.values[void].any()
     assert (np.linalg.norm(found.values[~void], axis=1) > 0.0).mean() > 0.99
-
-
-@pytest.mark.parametrize("photo", [(600, 900), (900, 600), (500, 500)], ids=str)
-@pytest.mark.parametrize("wall_shape", [(200, 260), (400, 200), (900, 2000)], ids=str)
-def test_widths_go_from_a_fifth_of_the_wall_to_more_than_all_of_it(
-    photo: tuple[int, int], wall_shape: tuple[int, int]
-) -> None:
-    widths = _widths_cells(photo, wall_shape)
-    heights = [width * photo[0] / photo[1] for width in widths]
-    longer = [max(pair) for pair in zip(widths, heights, strict=True)]
-    shorter = [min(pair) for pair in zip(widths, heights, strict=True)]
-    assert all(
-        second / first == pytest.approx(1.1, abs=1.2 / first) for first, second in pairwise(widths)
-    )
-    # Parts are half as long as the photo, 16 to 249 cells.
-    least_longer, least_shorter = 0.2 * min(wall_shape), 2 * 16
-    assert longer[0] >= least_longer - 1
-    assert shorter[0] >= least_shorter - 1
-    assert min(longer[0] - least_longer, shorter[0] - least_shorter) < 1.5
-    most_shorter, most_longer = 1.6 * min(wall_shape), 2 * 249
-    assert shorter[-1] <= most_shorter + 1
-    assert longer[-1] <= most_longer + 1
-    assert 1.1 * shorter[-1] > most_shorter - 2 or 1.1 * longer[-1] > most_longer - 2
 
 
 @pytest.mark.parametrize("level", [0, 1])
@@ -154,24 +128,3 @@ def test_a_piece_of_the_wall_lies_where_it_was_taken_from(
     # The rough look finds the place, a closer one says by how much it stands out.
     assert np.abs(near.centre_m - truth_m).max() < slip_m
     assert near.lead == pytest.approx(best.lead, rel=0.15)
-
-
-def test_a_wall_without_intensity_or_of_few_cells_has_no_structure(wall: Wall) -> None:
-    assert wall.intensity is not None
-    assert wall_structure(replace(wall, intensity=None)) is None
-    nothing = np.full_like(wall.intensity, np.nan)
-    assert wall_structure(replace(wall, intensity=nothing)) is None
-    for n_rows, is_enough in ((31, False), (32, True)):
-        low = replace(
-            wall,
-            frame=replace(wall.frame, height=n_rows),
-            intensity=wall.intensity[:n_rows],
-            rgb=None,
-            rgb_mask=None,
-            percentiles_m=None,
-            **{
-                name: getattr(wall, name)[:n_rows]
-                for name in ("depth_m", "sigma_m", "count", "mask")
-            },
-        )
-        assert (wall_structure(low) is not None) == is_enough

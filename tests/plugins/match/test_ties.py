@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.match.key_points import Features
 from orthoflow_plugins.match.ties import TiePiece, key_point_ties, ties_of, without_twins
 
 from orthoflow.files.images import encode_png
@@ -113,8 +114,13 @@ def test_ties_in_masked_pixels_are_left_out() -> None:
     assert ties_of([rim], photos, inspect_scenes.walls(), {}).sigma_m.tolist() == [0.3]
 
 
-def features(pixels: NDArray[np.float64], sizes: list[float]) -> Any:
-    return SimpleNamespace(pixels=pixels, sizes_px=np.array(sizes))
+def features(pixels: NDArray[np.float64], sizes: list[float]) -> Features:
+    return Features(
+        pixels=pixels,
+        sizes_px=np.array(sizes),
+        angles_deg=np.zeros(len(sizes)),
+        descriptors=np.zeros((len(sizes), 128), dtype=np.float32),
+    )
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.25])
@@ -139,13 +145,3 @@ def test_large_key_points_are_less_exact_and_those_of_voids_left_out(scale: floa
     # The surface's own deviation comes on top.
     assert (found.sigma_m >= on_raster).all()
     assert found.sigma_m[0] < found.sigma_m[1] < 3.0 * GSD_M
-
-
-def test_key_points_known_worse_than_to_three_cells_are_left_out() -> None:
-    wall = inspect_scenes.walls().walls[0]
-    sizes = [2.0, 5.6, 6.1, 44.0, 54.0]
-    pixels = np.column_stack([np.full(5, 50.5), 40.5 + 20.0 * np.arange(5)])
-    found = key_point_ties((0, 0), wall, (features(pixels, sizes), features(pixels, sizes)))
-    # They err by more from a size of six pixels on; of 54, by more than three cells.
-    np.testing.assert_array_equal(found.pixels_photo, pixels[:4])
-    assert found.sigma_px[0] == found.sigma_px[1] < found.sigma_px[2] < found.sigma_px[3]

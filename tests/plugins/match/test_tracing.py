@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.match import tracing
+from orthoflow_plugins.match import tracing, warping
 from orthoflow_plugins.match.displacements import Displacements
 
 from orthoflow.geometry.cameras import ViewingCamera
@@ -54,11 +54,11 @@ def test_three_displacements_are_too_few_to_agree() -> None:
 def test_values_between_cells_are_bilinear_and_unknown_beyond_them() -> None:
     raster = np.array([[0.0, 1.0, 2.0], [10.0, 11.0, 12.0], [20.0, 21.0, np.nan]], np.float32)
     at = np.array([[0.25, 0.5], [1.0, 0.0], [0.0, 0.75], [1.5, 0.5]])
-    np.testing.assert_allclose(tracing.between(raster, at), [5.25, 1.0, 7.5, 6.5])
+    np.testing.assert_allclose(warping.between(raster, at), [5.25, 1.0, 7.5, 6.5])
     beside = np.array([[-0.1, 0.5], [0.5, -0.1], [2.0, 0.5], [0.5, 2.0], [1.5, 1.5]])
-    assert np.isnan(tracing.between(raster, beside)).all()
+    assert np.isnan(warping.between(raster, beside)).all()
     product = np.array([[0.0, 0.0], [0.0, 8.0]], np.float32)
-    np.testing.assert_allclose(tracing.between(product, np.array([[0.5, 0.25]])), [1.0])
+    np.testing.assert_allclose(warping.between(product, np.array([[0.5, 0.25]])), [1.0])
 
 
 @pytest.mark.parametrize(

@@ -49,23 +49,6 @@ def test_cells_appear_where_their_centres_are_seen() -> None:
     assert projection.pixels_per_cell == pytest.approx(2.0, abs=1e-4)
 
 
-def test_depth_brings_cells_nearer() -> None:
-    wall = wall_at(0.0)
-    raised = replace(wall, depth_m=np.full(wall.frame.shape, 1.0, dtype=np.float32))
-    (projection,) = warping.project_walls(camera_at(), [raised])
-    assert projection is not None
-    np.testing.assert_allclose(projection.distance, 1.0, atol=1e-6)
-    assert projection.pixels_per_cell == pytest.approx(4.0, abs=1e-3)
-
-
-def test_cells_without_a_surface_appear_nowhere() -> None:
-    wall = wall_at(0.0)
-    wall.depth_m[10:20, 30:50] = np.nan
-    (projection,) = warping.project_walls(camera_at(), [wall])
-    assert projection is not None
-    np.testing.assert_array_equal(np.isnan(projection.u), np.isnan(wall.depth_m))
-
-
 def test_only_the_part_in_the_photo_is_projected_and_a_little_round_it() -> None:
     # The photo shows 1 m about its axis: columns 100 to 200 of a wall of 3 m.
     wide = wall_at(0.0, width=300, x_m=-1.5)
@@ -93,10 +76,6 @@ def test_walls_that_a_photo_does_not_show_have_no_projection(
     camera: ViewingCamera, wall: Wall
 ) -> None:
     assert warping.project_walls(camera, [wall]) == [None]
-
-
-def test_a_hundred_cells_are_enough() -> None:
-    assert warping.project_walls(camera_at(), [wall_at(0.0, width=10, height=10)])[0] is not None
 
 
 @pytest.mark.parametrize(("cosine", "is_shown"), [(0.14, False), (0.16, True)])
@@ -219,21 +198,6 @@ def test_finer_photos_are_averaged_down_to_the_cells() -> None:
     stripes = np.tile([0, 200], 30).astype(np.uint8)[None, :].repeat(60, axis=0)
     warped = warping.warp_photo(stripes, flat_projection(4.0))
     np.testing.assert_allclose(warped[1:-1, 1:-1], 100.0, atol=3.0)
-
-
-def test_colours_are_resampled_as_greys_are_and_what_is_not_shown_is_unknown() -> None:
-    rng = np.random.default_rng(1)
-    picture = rng.integers(0, 256, (20, 20, 3), dtype=np.uint8)
-    projection = flat_projection(1.0)
-    projection.u[2, 3] = projection.v[2, 3] = np.nan
-    warped = warping.warp_photo(picture, projection)
-    assert warped.shape == (10, 12, 3)
-    assert np.isnan(warped[2, 3]).all()
-    assert np.isnan(warped).sum() == 3
-    for band in range(3):
-        np.testing.assert_array_equal(
-            warped[..., band], warping.warp_photo(picture[..., band].copy(), projection)
-        )
 
 
 @pytest.mark.parametrize("y_m", [100.0, -100.0])

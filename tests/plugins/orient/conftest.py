@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from orthoflow_plugins.orient import figures
+from orthoflow_plugins.orient import report
 
 from tests.undrawn_charts import build_orient_charts_once
 
@@ -15,7 +15,7 @@ def _small_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPa
     How pictures look at their own size is for the tests of these.
     """
     if request.path.stem != "test_figures":
-        monkeypatch.setattr(figures, "_SIDE_PX", 90)
+        monkeypatch.setattr(report, "_SIDE_PX", 90)
 
 
 @pytest.fixture(autouse=True)

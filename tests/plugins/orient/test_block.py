@@ -10,16 +10,15 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.orient.block import (
     Block,
-    Lens,
     Observations,
     Points,
     block_covariance,
     correlation_notes,
-    lens_statistics,
     lenses_json,
     pixel_covariances,
+    solve,
 )
-from orthoflow_plugins.orient.colmap import solve
+from orthoflow_plugins.orient.pose import Lens
 from scipy.optimize import least_squares
 
 from orthoflow.errors import GeometryError
@@ -78,7 +77,7 @@ def by_differences(
 
     Residuals beyond `soft_limit` count as Huber has it; of points seen once, none may be.
     """
-    n_free = int(block.column_starts[1][-1])
+    n_free = int(block.lens_starts[-1])
     n_unknowns = n_free + 3 * len(block.points)
     jacobian = np.zeros((2 * len(block.seen), n_unknowns))
     for row, (photo, point) in enumerate(zip(block.seen.photo, block.seen.point, strict=True)):
@@ -103,7 +102,7 @@ def by_differences(
         off = np.linalg.norm(block.seen.pixels[row] - pixel(still, at)) / SIGMA_PX
         jacobian[own] *= np.sqrt(min(1.0, soft_limit / off))
     normal = jacobian.T @ jacobian / SIGMA_PX**2
-    for start, lens in zip(block.column_starts[1][:-1], block.lenses, strict=True):
+    for start, lens in zip(block.lens_starts, block.lenses, strict=False):
         for nth, sigma in enumerate(lens.freedom.sigmas):
             normal[start + nth, start + nth] += 1.0 / sigma**2
     known = np.repeat(np.where(np.isfinite(block.points.sigma_m), block.points.sigma_m, np.inf), 3)
@@ -254,30 +253,6 @@ def test_lenses_are_told_with_their_photos_and_deviations() -> None:
         "sigmas": {"focal": pytest.approx(19.0 * camera.fx), "k1": pytest.approx(20.0)},
     }
     assert (second["photos"], second["free"], second["sigmas"]) == (["b.png"], [], {})
-
-
-def test_lenses_that_are_free_alike_are_averaged() -> None:
-    block = block_of(freedoms=(FREEDOM, FREEDOM, LensFreedom()), lens_of=(0, 1, 2))
-    cameras = [
-        replace(camera, fx=focal, fy=focal, distortion=np.array([k1, 0.0, 0.0, 0.0, 0.0]))
-        for camera, focal, k1 in zip(
-            block.cameras, (900.0, 1_000.0, 700.0), (0.01, 0.03, 0.5), strict=True
-        )
-    ]
-    prior = block.lenses[0].prior
-    (entry,) = lens_statistics(replace(block, cameras=tuple(cameras)))  # type: ignore[misc]
-    assert entry == {
-        "width": prior.width,
-        "height": prior.height,
-        "n_lenses": 2,
-        "mean": {"focal": pytest.approx(950.0), "k1": pytest.approx(0.02)},
-        "sd": {
-            "focal": pytest.approx(100.0 / np.sqrt(2.0)),
-            "k1": pytest.approx(0.02 / np.sqrt(2.0)),
-        },
-    }
-    (alone,) = lens_statistics(block_of())  # type: ignore[misc]
-    assert (alone["n_lenses"], alone["sd"]) == (1, {"focal": 0.0, "k1": 0.0})
 
 
 def test_lenses_that_all_photos_confuse_with_their_pose_are_named() -> None:

@@ -9,21 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from orthoflow_plugins.orient import bundle as bundle_method
-from orthoflow_plugins.orient.adjustment import adjust_block
-from orthoflow_plugins.orient.block import Block, Lens, Observations, Points, block_covariance
-from orthoflow_plugins.orient.bundle import OrientColmapBundle
-from orthoflow_plugins.orient.colmap import solve
-from orthoflow_plugins.orient.lenses import lens_groups
+from orthoflow_plugins.orient.block import Block, Observations, Points, block_covariance, solve
+from orthoflow_plugins.orient.bundle import OrientColmapBundle, adjust_block
 from orthoflow_plugins.orient.photo_ties import (
     PhotoFeatures,
     PhotoTies,
-    overlapping_pairs,
     photo_features,
-    tie_photos,
 )
 from orthoflow_plugins.orient.photos import Trusted, by_itself, tied_photo
 from orthoflow_plugins.orient.pnp import OrientPnp
-from orthoflow_plugins.orient.pose import estimate_pose
+from orthoflow_plugins.orient.pose import Lens, estimate_pose, lens_groups
 
 from orthoflow.geometry.lenses import LensFreedom
 from orthoflow.geometry.resection import SeenPoints, adjust
@@ -150,37 +145,9 @@ def test_stated_errors_are_those_of_repeated_orientations(tmp_path: Path) -> Non
     assert 0.7 < rms(np.array(ratios)) < 1.5
 
 
-def with_errors_of_places(ties: Ties, seed: int) -> Ties:
-    """Ties whose points are off by what the scan is at their place, 2 mm, in whichever photo."""
-    cubes = np.floor(ties.points_world / 0.4).astype(int)
-    cubes -= cubes.min(axis=0)
-    off = 0.002 * np.random.default_rng(100 + seed).normal(size=(*(cubes.max(axis=0) + 1), 3))
-    return replace(ties, points_world=ties.points_world + off[tuple(cubes.T)])
-
-
-def test_errors_of_the_scan_that_photos_share_are_stated(tmp_path: Path) -> None:
-    ratios = []
-    for seed in range(3):
-        ties, ctx = with_errors_of_places(bs.scan_ties(seed), seed), context(tmp_path, seed=seed)
-        together = bundle(ties, bs.photos(calibrated=False), ctx, **ALONE)
-        ratios.append(errors_m(together) / sigmas_m(together))
-    # Measured: 0.80; with cells of single photos as groups alone 1.08.
-    assert 0.7 < rms(np.array(ratios)) < 1.0
-
-
 def without_exif() -> Photos:
     known = bs.photos(calibrated=False).photos
     return ms.photos(*(replace(photo, exif_focal_px=None) for photo in known))
-
-
-def test_photos_of_unknown_lenses_share_one_that_their_ties_do_not_contradict(
-    tmp_path: Path,
-) -> None:
-    together = bundle(bs.scan_ties(2), without_exif(), context(tmp_path), **ALONE)
-    assert len({camera.intrinsics for camera in together.cameras}) == 1
-    # By themselves they say 812 to 856 px.
-    assert together.cameras[0].viewing().fx == pytest.approx(840.0, abs=5.0)
-    assert rms(errors_m(together) / sigmas_m(together)) < 1.5
 
 
 def with_errors_that_reach_far(ties: Ties, seed: int, sigma_m: float) -> Ties:
@@ -279,41 +246,6 @@ def test_photos_that_zoomed_share_no_lens_where_it_matters(
     for camera, other in zip(found, true, strict=True):
         assert camera.status == "ok"
         assert ms.wall_error_m(bs.SCENE, camera.viewing(), other) < 1.5 * (camera.sigma_wall_m or 0)
-
-
-def test_lenses_of_their_own_have_a_mean_and_a_spread(tmp_path: Path) -> None:
-    ties, photos = bs.scan_ties(3), bs.photos(calibrated=False)
-    together = bundle(ties, photos, context(tmp_path), intrinsics="per-photo", **ALONE)
-    focals = [camera.viewing().fx for camera in together.cameras]
-    (entry,) = together.details["lens_statistics"]
-    assert entry["n_lenses"] == 4
-    assert entry["mean"]["focal"] == pytest.approx(np.mean(focals))
-    assert entry["sd"]["focal"] == pytest.approx(np.std(focals, ddof=1))
-
-
-def test_one_calibrated_photo_calibrates_all_that_share_its_lens(tmp_path: Path) -> None:
-    ties, known = bs.scan_ties(3), bs.photos(calibrated=True).photos[2]
-    uncalibrated = bs.photos(calibrated=False).photos
-    mixed = ms.photos(*uncalibrated[:2], known, uncalibrated[3])
-    together = bundle(ties, mixed, context(tmp_path), intrinsics="shared", **ALONE)
-    assert {camera.intrinsics for camera in together.cameras} == {known.intrinsics}
-
-
-def test_a_calibrated_lens_stays_unless_all_are_refined(tmp_path: Path) -> None:
-    ties, photos = bs.scan_ties(4), bs.photos(calibrated=True)
-    fixed = bundle(ties, photos, context(tmp_path), **ALONE)
-    refined = bundle(ties, photos, context(tmp_path), refine="all", **ALONE)
-    assert fixed.cameras[0].intrinsics == photos.photos[0].intrinsics
-    assert refined.cameras[0].intrinsics != photos.photos[0].intrinsics
-
-
-def test_a_lens_that_its_photos_cannot_tell_from_their_places_is_warned_of(tmp_path: Path) -> None:
-    ctx = context(tmp_path)
-    bundle(bs.scan_ties(5), bs.photos(calibrated=False), ctx, **ALONE)
-    assert any(
-        "the focal of the lens of a.png and the distance of its photos correlate by 0.9" in warning
-        for warning in ctx.warnings
-    )
 
 
 def test_a_photo_with_random_ties_is_refused_and_harms_none(tmp_path: Path) -> None:
@@ -458,34 +390,29 @@ def test_control_that_several_photos_see_becomes_more_exact() -> None:
     assert rms(np.array(offsets)) < 0.003
 
 
-def test_photos_of_other_places_are_no_pair() -> None:
-    first, second = bs.viewers()[0], bs.viewers()[3]
-    points = np.random.default_rng(0).uniform([0.2, -0.1, 0.4], [1.2, 0.1, 1.6], (60, 3))
-    away = replace(second, rotation=np.diag([-1.0, 1.0, -1.0]) @ second.rotation)
-    assert overlapping_pairs([first, second], [points, points], 0.2) == [(0, 1)]
-    assert overlapping_pairs([first, away], [points, points], 0.2) == []
+def test_lenses_of_their_own_have_a_mean_and_a_spread(tmp_path: Path) -> None:
+    ties, photos = bs.scan_ties(3), bs.photos(calibrated=False)
+    together = bundle(ties, photos, context(tmp_path), intrinsics="per-photo", **ALONE)
+    focals = [camera.viewing().fx for camera in together.cameras]
+    (entry,) = together.details["lens_statistics"]
+    assert entry["n_lenses"] == 4
+    assert entry["mean"]["focal"] == pytest.approx(np.mean(focals))
+    assert entry["sd"]["focal"] == pytest.approx(np.std(focals, ddof=1))
 
 
-def test_key_points_off_the_epipolar_line_are_no_tie() -> None:
-    rng = np.random.default_rng(1)
-    cameras = bs.viewers()[:2]
-    points = rng.uniform([0.9, -0.1, 0.6], [1.9, 0.1, 1.4], (40, 3))
-    descriptors = np.rint(512.0 * rng.random((40, 128)) / 8.0).astype(np.float32)
-    features = []
-    for at, camera in enumerate(cameras):
-        pixels = camera.project(points)[:, :2]
-        if at == 1:
-            pixels[:10] += rng.choice([-1.0, 1.0], (10, 2)) * rng.uniform(20.0, 40.0, (10, 2))
-        features.append(PhotoFeatures(pixels=pixels, scale=1.0, descriptors=descriptors))
-    found = tie_photos(cameras, features, [(0, 1)], 100)
-    assert len(found.points_world) >= 30
-    right = np.isin(found.pixels[found.photo == 0], features[0].pixels[10:]).all(axis=1)
-    np.testing.assert_allclose(
-        found.points_world[right],
-        points[10:][np.argsort(points[10:, 0])][
-            np.argsort(np.argsort(found.points_world[right][:, 0]))
-        ],
-        atol=1e-6,
-    )
-    assert right.sum() == 30
-    assert len(found.points_world) <= 33
+def with_errors_of_places(ties: Ties, seed: int) -> Ties:
+    """Ties whose points are off by what the scan is at their place, 2 mm, in whichever photo."""
+    cubes = np.floor(ties.points_world / 0.4).astype(int)
+    cubes -= cubes.min(axis=0)
+    off = 0.002 * np.random.default_rng(100 + seed).normal(size=(*(cubes.max(axis=0) + 1), 3))
+    return replace(ties, points_world=ties.points_world + off[tuple(cubes.T)])
+
+
+def test_errors_of_the_scan_that_photos_share_are_stated(tmp_path: Path) -> None:
+    ratios = []
+    for seed in range(3):
+        ties, ctx = with_errors_of_places(bs.scan_ties(seed), seed), context(tmp_path, seed=seed)
+        together = bundle(ties, bs.photos(calibrated=False), ctx, **ALONE)
+        ratios.append(errors_m(together) / sigmas_m(together))
+    # Measured: 0.80; with cells of single photos as groups alone 1.08.
+    assert 0.7 < rms(np.array(ratios)) < 1.0

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.orient.bundle import OrientColmapBundle
-from orthoflow_plugins.orient.by_hand import pose_by_hand
 from orthoflow_plugins.orient.dlt import OrientDlt
+from orthoflow_plugins.orient.photos import pose_by_hand
 from orthoflow_plugins.orient.pnp import OrientPnp
 from orthoflow_plugins.orient.pose import TiedPhoto
 
@@ -139,12 +139,6 @@ def test_a_gross_blunder_among_eight_is_left_out_or_refused(orient: Orient, size
     assert size_px < 50.0 or found.status == "ok"
 
 
-def test_a_blunder_among_six_is_refused(orient: Orient) -> None:
-    for seed in range(4):
-        (found,) = orient(clicked(seed, blunder=np.array([40.0, -30.0])), calibrated())[0].cameras
-        assert "its 6 ties measured by hand contradict each other" in found.status
-
-
 def test_three_blunders_among_fifteen_are_refused(orient: Orient) -> None:
     # Nothing is withheld of them, so that the gates for matched ties could not judge the pose.
     rng = np.random.default_rng(5)
@@ -189,14 +183,6 @@ def test_ties_by_hand_stand_against_a_repeated_motif(orient: Orient) -> None:
     assert wrong.status == "ok"
     assert ms.wall_error_m(SCENE, wrong.viewing(), CAMERA) > 0.2
     cameras, _ = orient(joined(replace(beside, walls=clicked(1).walls), clicked(1)), calibrated())
-    assert cameras.cameras[0].status == "ok"
-    assert error_share(cameras.cameras[0]) < 3.0
-
-
-def test_wrong_matches_do_not_harm_a_photo_that_is_tied_by_hand(orient: Orient) -> None:
-    garbage = known_ties(CAMERA, 5, n=60, wrong_share=1.0)
-    assert orient(garbage, calibrated())[0].cameras[0].status != "ok"
-    cameras, _ = orient(joined(garbage, clicked(2)), calibrated())
     assert cameras.cameras[0].status == "ok"
     assert error_share(cameras.cameras[0]) < 3.0
 
@@ -285,39 +271,3 @@ def test_a_small_plate_seen_from_afar_may_be_turned_either_way(relief_m: float) 
     said = pose_by_hand(tied(seen, np.ones(9, dtype=np.bool_)))
     assert isinstance(said, str)
     assert said.startswith("two poses agree with its ties measured by hand")
-
-
-def test_a_pose_by_hand_knows_what_it_was_found_from() -> None:
-    rng = np.random.default_rng(2)
-    points = rng.uniform([0.9, -0.2, 0.7], [1.8, 0.2, 1.5], (14, 3))
-    seen = by(points)
-    seen.pixels_photo[:] += 0.3 * rng.normal(size=(14, 2))
-    # Every second one was measured by hand, and the third of these is wrong.
-    measured = np.arange(14) % 2 == 0
-    hand = np.flatnonzero(measured)
-    more = np.concatenate([hand, [1, 3]])
-    measured[[1, 3]] = True
-    seen.pixels_photo[hand[2]] += [70.0, -50.0]
-    found = pose_by_hand(tied(seen, measured))
-    assert not isinstance(found, str)
-    estimate = found.estimate
-    agreeing = np.zeros(14, dtype=np.bool_)
-    agreeing[np.setdiff1d(more, hand[2])] = True
-    np.testing.assert_array_equal(estimate.agreeing, agreeing)
-    np.testing.assert_array_equal(found.start.agreeing, agreeing)
-    assert (estimate.limit, estimate.source) == (3.5, "calibration")
-    (first, _), (second, values) = estimate.notes
-    assert (first.code, second.code) == ("photo-oriented-by-hand", "ties-by-hand-contradict")
-    u, v = seen.pixels_photo[hand[2]] - 0.5
-    assert values == {"n": 1, "places": f"(u {u:.0f}, v {v:.0f})"}
-    # Without each of them in turn less is known than with all.
-    assert len(estimate.without_one) == agreeing.sum()
-    sure = np.trace(estimate.resection.covariance)
-    worth = [np.trace(each.covariance) for each in estimate.without_one]
-    assert min(worth) > sure
-    assert len({round(value / sure, 6) for value in worth}) == len(worth)
-    assert estimate.fit.normalised.shape == (14,)
-    assert found.start.camera is estimate.resection.camera
-    nothing_lost = pose_by_hand(tied(seen, measured & (np.arange(14) != hand[2])))
-    assert not isinstance(nothing_lost, str)
-    assert len(nothing_lost.estimate.notes) == 1

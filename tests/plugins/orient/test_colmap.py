@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from orthoflow_plugins.orient.block import Block, Lens, Observations, Points
-from orthoflow_plugins.orient.colmap import solve
+from orthoflow_plugins.orient.block import Block, Observations, Points, solve
+from orthoflow_plugins.orient.pose import Lens
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry.cameras import ViewingCamera

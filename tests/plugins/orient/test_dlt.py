@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from orthoflow_plugins.orient.dlt import (
     Distortion,
     OrientDlt,
-    direct_linear,
     estimate_dlt,
 )
+from orthoflow_plugins.orient.gates import known_walls, wall_error
 from orthoflow_plugins.orient.pose import Estimate, TiedPhoto
-from orthoflow_plugins.orient.wall_errors import known_walls, wall_error
 
 from orthoflow.files.images import encode_png
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
@@ -25,7 +24,6 @@ from orthoflow.products import Cameras, Photo, Photos, Ties, TieWall
 from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
 from tests import samples
-from tests.scenes import SURVEY_SHIFT_M
 
 SIZE_PX = (4000, 3000)
 # A grey photo: what it shows is in the ties.
@@ -148,17 +146,6 @@ def test_with_distortion_the_corners_are_right(
     assert np.sqrt(np.mean(errors**2)) <= rms_px
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_stated_errors_hold_where_the_model_does(tmp_path: Path, seed: int) -> None:
-    true = camera()
-    found = orient(ties_of(true, seed), context(tmp_path), distortion="k1").cameras[0]
-    errors = frame_errors_px(found.viewing(), true)
-    pixel_m = 2.6 / 3200.0
-    assert found.sigma_wall_m is not None
-    # Length of a two-dimensional error is root two of a coordinate's; chance lets it vary.
-    assert 0.2 < np.sqrt(np.mean(errors**2) / 2.0) * pixel_m / found.sigma_wall_m < 3.0
-
-
 @pytest.mark.parametrize("distortion", ["none", "k1"])
 def test_a_lens_with_more_distortion_than_the_model_has_is_stated_wider(
     distortion: Distortion,
@@ -232,41 +219,3 @@ def test_without_a_prior_what_exif_says_does_not_matter(tmp_path: Path) -> None:
         first.translation_camera_from_world, second.translation_camera_from_world
     )
     assert frame_errors_px(first.viewing(), camera()).max() <= 4.0
-
-
-def test_exact_points_in_survey_coordinates_give_the_exact_camera() -> None:
-    true = replace(camera(k1=0.0), cx=2050.0)
-    points = points_in_view(true, 60, relief_m=0.3, rng=np.random.default_rng(2))
-    found = direct_linear(true.project(points)[:, :2], points + SURVEY_SHIFT_M, SIZE_PX)
-    near = found.camera.shifted(SURVEY_SHIFT_M)
-    for name in ("fx", "fy", "cx", "cy"):
-        assert getattr(near, name) == pytest.approx(getattr(true, name), abs=0.05)
-    assert near.skew == pytest.approx(0.0, abs=0.05)
-    np.testing.assert_allclose(near.centre_world, true.centre_world, atol=1e-4)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_skew_is_kept_when_asked(tmp_path: Path, seed: int) -> None:
-    true = replace(camera(k1=0.0), skew=60.0)
-    ties = ties_of(true, seed, noise_px=0.5)
-    kept = orient(ties, context(tmp_path), skew=True).cameras[0]
-    assert kept.status == "ok"
-    assert kept.intrinsics is not None
-    assert kept.intrinsics.skew == pytest.approx(60.0, abs=3.0)
-    # A corner is 28 px off where the skew is left out, and no pose takes up all of it.
-    assert frame_errors_px(kept.viewing(), true).max() < 1.0
-    left_out = orient(ties, context(tmp_path), max_sigma_wall_cells=100, max_sigma_corner_cells=300)
-    (other,) = left_out.cameras
-    if other.status == "ok":
-        assert other.intrinsics is not None
-        assert other.intrinsics.skew is None
-        assert frame_errors_px(other.viewing(), true).max() > 5.0
-
-
-def test_a_lens_without_skew_is_found_without_it(tmp_path: Path) -> None:
-    true = camera(k1=-0.08)
-    ties = ties_of(true, 1, noise_px=0.5)
-    found = orient(ties, context(tmp_path), skew=True, distortion="k1").cameras[0]
-    assert found.intrinsics is not None
-    assert found.intrinsics.skew == pytest.approx(0.0, abs=3.0)
-    assert frame_errors_px(found.viewing(), true).max() < 1.5

@@ -10,10 +10,9 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.orient import figures
-from orthoflow_plugins.orient.figures import (
-    PhotoResiduals,
-    _normal,
+from orthoflow_plugins.orient import report
+from orthoflow_plugins.orient.report import (
+    Oriented,
     draw_positions,
     draw_residuals,
     draw_ties,
@@ -21,23 +20,24 @@ from orthoflow_plugins.orient.figures import (
 )
 
 from orthoflow.files.images import encode_png
-from orthoflow.products import Photo, TieRole
+from orthoflow.products import Camera, Photo, TieRole
 from orthoflow.sdk import StepContext
 
 
-def residuals(name: str, n: int, seed: int, *, shift_px: float = 0.0) -> PhotoResiduals:
+def of_residuals(name: str, values: NDArray[np.float64], role: NDArray[np.uint8]) -> Oriented:
+    chosen = np.arange(len(role))
+    return Oriented(
+        camera=Camera(photo=name, status="ok"), chosen=chosen, role=role, residuals_px=values
+    )
+
+
+def residuals(name: str, n: int, seed: int, *, shift_px: float = 0.0) -> Oriented:
     rng = np.random.default_rng(seed)
     role = np.where(np.arange(n) % 5 == 0, TieRole.CHECK, TieRole.CONTROL).astype(np.uint8)
     role[-1] = TieRole.REJECTED
     values = rng.normal(shift_px, 0.5, (n, 2))
     values[-1] = 1e6
-    return PhotoResiduals(name=name, residuals_px=values, role=role)
-
-
-def test_without_residuals_nothing_is_drawn(tmp_path: Path) -> None:
-    context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
-    draw_residuals(context, [])
-    assert context.figures == []
+    return of_residuals(name, values, role)
 
 
 # --- ties on photos ---
@@ -46,7 +46,7 @@ def test_without_residuals_nothing_is_drawn(tmp_path: Path) -> None:
 @pytest.fixture
 def exact(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures as they are before WebP loses some of them."""
-    monkeypatch.setattr(figures, "encode_webp", np.array)
+    monkeypatch.setattr(report, "encode_webp", np.array)
 
 
 def photo_of(image: NDArray[np.uint8], name: str = "west/a b.jpg") -> Photo:
@@ -110,7 +110,7 @@ def test_the_map_of_a_wall_shows_the_photo_that_knows_each_place_best(
         assert asked == shape
         return sigmas[photo] if on is wall else np.full(shape, np.inf)
 
-    monkeypatch.setattr(figures, "sigmas_on_wall", sigmas_of)
+    monkeypatch.setattr(report, "sigmas_on_wall", sigmas_of)
     candidates: Any = [
         SimpleNamespace(known=(wall, hidden), estimate=SimpleNamespace(resection=k)) for k in (1, 2)
     ]
@@ -128,7 +128,7 @@ def test_the_map_of_a_wall_shows_the_photo_that_knows_each_place_best(
     np.testing.assert_array_equal(shown, rgb.repeat(8, axis=0).repeat(8, axis=1))
     # No more pictures than enough.
     drawings.clear()
-    monkeypatch.setattr(figures, "_MAX_FIGURES", 0)
+    monkeypatch.setattr(report, "_MAX_FIGURES", 0)
     draw_wall_errors(context, candidates)
     assert not drawings
 
@@ -170,12 +170,6 @@ def test_photos_stand_before_the_wall_and_look_at_it(
     assert facing.yaxis_inverted()
 
 
-def test_without_an_oriented_photo_no_places_are_drawn(tmp_path: Path) -> None:
-    context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
-    draw_positions(context, [])
-    assert not context.figures
-
-
 # --- residuals ---
 
 
@@ -191,7 +185,7 @@ def test_residuals_of_all_photos_are_counted_by_role_and_coordinate(
     np.testing.assert_allclose(pooled.get_size_inches(), [7.0, 5.2])
     panels = np.array(pooled.axes).reshape(2, 2)
     for row, kind in enumerate((TieRole.CONTROL, TieRole.CHECK)):
-        values = np.vstack([photo.of_kind(kind) for photo in photos])
+        values = np.vstack([photo.residuals_of(kind) for photo in photos])
         assert len(values) == (3 * 239 - 1 if row == 0 else 180)
         for column in range(2):
             axes = panels[row, column]
@@ -207,48 +201,10 @@ def test_residuals_of_all_photos_are_counted_by_role_and_coordinate(
             np.testing.assert_allclose(curve, peak * share)
 
 
-def test_rows_of_photos_reach_the_same_height_and_as_far_as_nearly_all_residuals(
-    drawings: dict[str, Any], tmp_path: Path
-) -> None:
-    context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
-    photos = [residuals(f"{k}.jpg", 200 + k, k) for k in range(32)]
-    # Two residuals of a photo are no distribution.
-    photos[4] = residuals("4.jpg", 3, 4)
-    draw_residuals(context, photos)
-    figure = drawings["residuals_by_photo"]
-    np.testing.assert_allclose(figure.get_size_inches(), [2.6 * 4, 1.0 + 0.45 * 30])
-    names = [text.get_text() for text in figure.axes[0].get_yticklabels()]
-    assert names == [f"{k}.jpg" for k in range(30)]
-    np.testing.assert_array_equal(figure.axes[0].get_yticks(), -np.arange(30.0))
-    columns = [(kind, axis) for kind in (TieRole.CONTROL, TieRole.CHECK) for axis in (0, 1)]
-    for (kind, axis), axes in zip(columns, figure.axes, strict=True):
-        pooled = np.vstack([photo.of_kind(kind) for photo in photos])[:, axis]
-        reach = np.percentile(np.abs(pooled), 99.5)
-        np.testing.assert_allclose(axes.get_xlim(), (-reach, 1.6 * reach))
-        np.testing.assert_allclose(axes.get_ylim(), (0.9 - 30, 1.0))
-        assert len(axes.patches) == 29
-        middle, *curves = [line.get_data() for line in sorted(axes.lines, key=_n_places)]
-        np.testing.assert_array_equal(middle[0], 0.0)
-        rows = [row for row in range(30) if row != 4]
-        for row, stairs, (x, curve) in zip(rows, axes.patches, curves, strict=True):
-            heights, edges, baseline = stairs.get_data()
-            assert baseline == -row
-            values = photos[row].of_kind(kind)[:, axis]
-            counts = np.histogram(values, 25, (-reach, reach))[0]
-            top = 0.8 / max(counts.max(), _normal(values, edges, x).max())
-            np.testing.assert_allclose(heights + row, top * counts, atol=1e-12)
-            np.testing.assert_allclose(curve + row, top * _normal(values, edges, x), atol=1e-12)
-            assert (edges[0], edges[-1]) == (x[0], x[-1]) == (-reach, reach)
-
-
-def _n_places(line: Any) -> int:
-    return len(line.get_xdata())
-
-
 def test_two_residuals_are_not_drawn(drawings: dict[str, Any], tmp_path: Path) -> None:
     context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
     role = np.array([TieRole.CONTROL] * 3 + [TieRole.CHECK] * 2, dtype=np.uint8)
     values = np.arange(10.0).reshape(5, 2)
-    draw_residuals(context, [PhotoResiduals(name="a.jpg", residuals_px=values, role=role)])
+    draw_residuals(context, [of_residuals("a.jpg", values, role)])
     assert len(drawings["residuals"].axes) == 2
     assert len(drawings["residuals_by_photo"].axes) == 2

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from orthoflow_plugins.orient import given as given_poses
 from orthoflow_plugins.orient.given import OrientGiven
 from orthoflow_plugins.read.cameras import ReadCameras
 
@@ -161,18 +159,6 @@ def first_of(ties: Ties, count: int) -> Ties:
     names = ("photo", "wall", "pixels_photo", "points_world", "sigma_px", "sigma_m", "role")
     arrays = {name: getattr(ties, name)[:count] for name in (*names, "residual_px", "by_hand")}
     return replace(ties, **arrays)
-
-
-def test_ties_beyond_three_and_a_half_deviations_disagree_with_a_given_pose() -> None:
-    seen: Any = [None] * 4
-    residuals = np.array([[0.3, 0.4], [6.0, 8.0], [30.0, 40.0], [np.nan, np.nan]])
-    near = np.array([0.5, 3.4, 3.4, np.nan])
-    assert given_poses._disagreement(seen, near, residuals) == ()
-    for second, n_off, longest_px in ((3.4, 1, 10.0), (9.0, 2, 50.0)):
-        normalised = np.array([0.5, 3.6, second, np.nan])
-        ((spec, values),) = given_poses._disagreement(seen, normalised, residuals)
-        assert spec.code == "pose-against-ties"
-        assert values == {"n": n_off, "n_ties": 4, "longest_px": longest_px, "n_least": 6}
 
 
 @pytest.mark.parametrize("n_by_hand", [0, 3], ids=["as they are", "checked by hand"])

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from orthoflow_plugins.orient import lenses
-from orthoflow_plugins.orient.lenses import Refined, Sharing
+from orthoflow_plugins.orient import pose as lenses
+from orthoflow_plugins.orient.pose import Refined, Sharing
 
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import Intrinsics, Photo
@@ -42,18 +42,13 @@ def oriented(*focal_px: float) -> list[ViewingCamera]:
     return [replace(camera, fx=focal, fy=focal) for focal in focal_px]
 
 
-def test_a_calibration_is_the_only_guess_and_nothing_of_it_is_free() -> None:
-    prior = lenses.lens_prior(photo(exif_px=500.0, intrinsics=CALIBRATED))
-    assert prior.guesses == (CALIBRATED,)
-    assert prior.freedom.names == ()
-    assert prior.source == "calibration"
-
-
 def test_exif_is_believed_to_a_twentieth_and_tried_a_little_shorter_and_longer() -> None:
     prior = lenses.lens_prior(photo(exif_px=500.0))
-    assert [guess.fx for guess in prior.guesses] == pytest.approx([500.0, 470.0, 530.0])
+    assert [guess.fx for guess in (prior.prior, *prior.guesses)] == pytest.approx(
+        [500.0, 470.0, 530.0]
+    )
     assert prior.source == "exif"
-    for guess in prior.guesses:
+    for guess in (prior.prior, *prior.guesses):
         assert (guess.fy, guess.cx, guess.cy) == (guess.fx, 300.0, 200.0)
         assert not any(guess.distortion)
     assert prior.freedom.names == FREE
@@ -64,9 +59,11 @@ def test_exif_is_believed_to_a_twentieth_and_tried_a_little_shorter_and_longer()
 @pytest.mark.parametrize("size", [(600, 400), (400, 600)])
 def test_without_exif_lenses_from_wide_to_long_are_tried(size: tuple[int, int]) -> None:
     prior = lenses.lens_prior(photo(size=size))
-    shares = [guess.fx / 600.0 for guess in prior.guesses]
+    shares = [guess.fx / 600.0 for guess in (prior.prior, *prior.guesses)]
     assert shares == pytest.approx([0.6, 0.75, 0.95, 1.2, 1.6, 2.2])
-    assert {(guess.cx, guess.cy) for guess in prior.guesses} == {(size[0] / 2, size[1] / 2)}
+    assert {(guess.cx, guess.cy) for guess in (prior.prior, *prior.guesses)} == {
+        (size[0] / 2, size[1] / 2)
+    }
     assert (prior.source, prior.freedom.names) == ("none", FREE)
     assert prior.freedom.sigmas.tolist() == [0.35, 1e-3, 6.0, 6.0, 0.1, 0.1, 1e-3, 1e-3]
 
@@ -91,42 +88,38 @@ def test_photos_share_a_lens_by_size_and_known_focal_length(
         photo("e"),
         photo("f", exif_px=500.0, size=(400, 600)),
     ]
-    groups = lenses.lens_groups(photos, oriented(*[500.0] * 6), sharing, "uncalibrated")
-    assert groups.lens_of == lens_of
-    assert len(groups.lenses) == max(lens_of) + 1
+    lens_of_photos, found = lenses.lens_groups(
+        photos, oriented(*[500.0] * 6), sharing, "uncalibrated"
+    )
+    assert lens_of_photos == lens_of
+    assert len(found) == max(lens_of) + 1
 
 
 @pytest.mark.parametrize("sharing", ["focal-group", "shared"])
 def test_photos_that_are_told_apart_share_no_lens(sharing: Sharing) -> None:
     # An index is no focal length.
     photos = [photo("a"), photo("b"), photo("c"), photo("d", exif_px=1.0)]
-    groups = lenses.lens_groups(photos, oriented(*[500.0] * 4), sharing, "uncalibrated", {1})
-    assert groups.lens_of == ((0, 1, 0, 2) if sharing == "focal-group" else (0, 1, 0, 0))
-
-
-def test_photos_of_one_calibration_share_their_lens_whatever_exif_says() -> None:
-    photos = [
-        photo("a", exif_px=500.0, intrinsics=CALIBRATED),
-        photo("b", exif_px=700.0, intrinsics=CALIBRATED),
-        photo("c", exif_px=500.0, intrinsics=replace(CALIBRATED, fx=511.0)),
-    ]
-    groups = lenses.lens_groups(photos, oriented(1.0, 1.0, 1.0), "focal-group", "uncalibrated")
-    assert groups.lens_of == (0, 0, 1)
+    lens_of_photos, _ = lenses.lens_groups(
+        photos, oriented(*[500.0] * 4), sharing, "uncalibrated", {1}
+    )
+    assert lens_of_photos == ((0, 1, 0, 2) if sharing == "focal-group" else (0, 1, 0, 0))
 
 
 def test_of_photos_that_share_a_lens_the_best_known_one_tells_it() -> None:
     photos = [photo("a"), photo("b", exif_px=520.0), photo("c", intrinsics=CALIBRATED)]
     cameras = oriented(480.0, 500.0, 510.0)
     for n_photos, source, focal_px in ((3, "calibration", 510.0), (2, "exif", 520.0)):
-        groups = lenses.lens_groups(photos[:n_photos], cameras[:n_photos], "shared", "uncalibrated")
-        (lens,) = groups.lenses
+        _, found = lenses.lens_groups(
+            photos[:n_photos], cameras[:n_photos], "shared", "uncalibrated"
+        )
+        (lens,) = found
         assert (lens.source, lens.prior.fx) == (source, focal_px)
 
 
 def test_of_unknown_lenses_the_photos_oriented_by_themselves_tell_the_middle() -> None:
     photos = [photo("a"), photo("b"), photo("c")]
-    groups = lenses.lens_groups(photos, oriented(480.0, 500.0, 900.0), "shared", "uncalibrated")
-    (lens,) = groups.lenses
+    _, found = lenses.lens_groups(photos, oriented(480.0, 500.0, 900.0), "shared", "uncalibrated")
+    (lens,) = found
     assert (lens.prior.fx, lens.prior.fy) == (500.0, 500.0)
     assert (lens.prior.cx, lens.prior.cy) == (300.0, 200.0)
 
@@ -147,9 +140,9 @@ def test_lenses_are_refined_as_asked_for(
     refined: Refined, exif_sigmas: list[float], calibrated_sigmas: list[float]
 ) -> None:
     photos = [photo("a", exif_px=500.0), photo("b", intrinsics=CALIBRATED)]
-    groups = lenses.lens_groups(photos, oriented(500.0, 510.0), "per-photo", refined)
-    np.testing.assert_allclose(groups.lenses[0].freedom.sigmas, exif_sigmas)
-    np.testing.assert_allclose(groups.lenses[1].freedom.sigmas, calibrated_sigmas)
+    _, found = lenses.lens_groups(photos, oriented(500.0, 510.0), "per-photo", refined)
+    np.testing.assert_allclose(found[0].freedom.sigmas, exif_sigmas)
+    np.testing.assert_allclose(found[1].freedom.sigmas, calibrated_sigmas)
 
 
 def test_rays_of_pixels_come_back_through_the_lens() -> None:

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from orthoflow_plugins.orient import photos
-from orthoflow_plugins.orient.parameters import OrientParams
-from orthoflow_plugins.orient.pose import image_cells, ties_of_photo
+from orthoflow_plugins.orient.pose import OrientParams, image_cells
 
 from orthoflow.errors import MethodError
 from orthoflow.products import Photo, Photos, TieRole, Ties
@@ -42,11 +41,6 @@ def test_what_no_orientation_can_start_from_is_refused() -> None:
         photos.require(ties(0), both)
     with pytest.raises(MethodError, match="the ties name photo b, which is not among"):
         photos.require(ties(), Photos(photos=(photo("a"),)))
-
-
-def test_ties_of_a_photo_are_found_by_its_name() -> None:
-    assert ties_of_photo(ties(5), "b").tolist() == [1, 3]
-    assert ties_of_photo(ties(5), "c").tolist() == []
 
 
 def test_ties_are_split_so_that_nothing_by_hand_is_withheld() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,15 +9,14 @@ import numpy as np
 import pytest
 from orthoflow_plugins.match.guided import MatchGuided
 from orthoflow_plugins.match.sift import MatchSift
+from orthoflow_plugins.orient.gates import known_walls, wall_error
 from orthoflow_plugins.orient.pnp import OrientPnp
-from orthoflow_plugins.orient.wall_errors import known_walls, sigmas_on_wall, wall_error
 
-from orthoflow.errors import MethodError
 from orthoflow.files.images import decode_image, encode_png
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.lenses import LensFreedom, stepped
 from orthoflow.geometry.resection import SeenPoints, adjust
-from orthoflow.products import Camera, Cameras, Intrinsics, Photo, Photos, TieRole, Ties, TieWall
+from orthoflow.products import Cameras, Intrinsics, Photo, Photos, TieRole, Ties, TieWall
 from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
 from tests import samples
@@ -128,30 +126,6 @@ def test_stated_errors_are_those_of_repeated_orientations(tmp_path: Path, known:
     assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.5
 
 
-def test_the_predicted_error_is_mapped_and_grows_away_from_the_ties(tmp_path: Path) -> None:
-    camera = ms.camera_before(ms.textured_wall(0))
-    ties, ctx = known_ties(camera, 4), context(tmp_path)
-    orient(ties, calibrated(camera), ctx)
-    (figure,) = (item for item in ctx.figures if item.name == "wall_0_predicted_error")
-    assert re.search(r"black 0 to yellow 0\.\d+ mm and more, median 0\.\d+ mm", figure.caption)
-    seen = SeenPoints(
-        pixels_photo=ties.pixels_photo,
-        points_world=ties.points_world,
-        sigma_px=ties.sigma_px,
-        sigma_m=ties.sigma_m,
-    )
-    (wall,) = known_walls(ties, np.ones(len(ties.photo), np.bool_))
-    resection = adjust(seen, camera)
-    sigmas = sigmas_on_wall(resection, wall, (15, 15))
-    expected = wall_error(resection, [wall])
-    assert expected is not None
-    assert np.sqrt(np.nanmean(sigmas**2)) == pytest.approx(expected.rms_m)
-    row, column = np.unravel_index(np.nanargmin(sigmas), sigmas.shape)
-    middle = wall.corners_world[0] + [3.0 * (column + 0.5) / 15, 0.0, -2.0 * (row + 0.5) / 15]
-    far = np.linalg.norm(camera.project(middle[None])[0, :2] - [450.0, 320.0])
-    assert far < 250.0
-
-
 def test_the_error_at_the_corners_of_the_image_is_what_poses_scatter_there() -> None:
     # Its left corners look past the end of the wall.
     camera = ms.camera_before(ms.textured_wall(0), centre=(0.5, -2.0, 1.0), towards=(0.6, 0.0, 1.0))
@@ -192,32 +166,6 @@ def test_wrong_ties_are_rejected(tmp_path: Path, wrong_share: float) -> None:
     # A random tie lies within 2 px of its true place once in 45 000.
     assert rejected[:n_wrong].mean() > 0.99
     assert rejected[n_wrong:].mean() < 0.05
-
-
-def test_residuals_are_observed_less_computed(tmp_path: Path) -> None:
-    camera = ms.camera_before(ms.textured_wall(0))
-    cameras = orient(known_ties(camera, 4), calibrated(camera), context(tmp_path))
-    ties, found = cameras.ties, cameras.cameras[0].viewing()
-    assert ties is not None
-    computed = found.project(ties.points_world)[:, :2]
-    np.testing.assert_allclose(ties.residual_px, ties.pixels_photo - computed, atol=1e-9)
-
-
-def test_the_table_of_residuals_says_what_the_ties_do(tmp_path: Path) -> None:
-    camera = ms.camera_before(ms.textured_wall(0))
-    cameras = orient(known_ties(camera, 4), calibrated(camera), context(tmp_path))
-    ties, table = cameras.ties, cameras.residual_table
-    assert ties is not None
-    rows = {(row.role, row.axis, row.unit): row for row in table}
-    assert len(rows) == len(table) == 2 * 2 * 3
-    for role in (TieRole.CONTROL, TieRole.CHECK):
-        values = ties.residual_px[ties.role == role, 1]
-        row = rows[role.name.lower(), "v", "px"]
-        assert row.n == len(values)
-        assert row.rmse == pytest.approx(np.sqrt(np.mean(values**2)))
-        # 2.6 m before a lens of 840 px, a pixel is 3 mm on the wall, half a cell of 6 mm.
-        assert rows[role.name.lower(), "v", "mm"].rmse == pytest.approx(3.1 * row.rmse, rel=0.1)
-        assert rows[role.name.lower(), "v", "cell"].sd == pytest.approx(0.52 * row.sd, rel=0.1)
 
 
 def test_a_fifth_of_the_ties_is_withheld_from_everything(tmp_path: Path) -> None:
@@ -278,15 +226,6 @@ def test_an_exif_focal_length_is_improved(tmp_path: Path, factor: float) -> None
     assert found.intrinsics.fx == pytest.approx(plain.fx, rel=0.006)
 
 
-def test_nothing_known_of_the_lens_is_said(tmp_path: Path) -> None:
-    camera = ms.camera_before(ms.textured_wall(0), centre=(0.2, -1.8, 0.4))
-    plain = replace(camera, cx=450.0, cy=320.0, fy=camera.fx, distortion=np.zeros(5))
-    ctx = context(tmp_path)
-    cameras = orient(known_ties(plain, 8, n=400), ms.photos(PIXEL), ctx)
-    assert cameras.cameras[0].status == "ok"
-    assert any("neither calibration nor EXIF" in warning for warning in ctx.warnings)
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_opencvs_pose_is_the_least_squares_of_ties_that_count_alike(
     tmp_path: Path, seed: int
@@ -330,14 +269,6 @@ def test_random_ties_are_never_ok(tmp_path: Path, seed: int) -> None:
     camera = ms.camera_before(ms.textured_wall(0))
     ties = known_ties(camera, seed, n=300, wrong_share=1.0)
     assert status(ties, calibrated(camera), tmp_path) != "ok"
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_ties_of_a_mirrored_photo_are_never_ok(tmp_path: Path, seed: int) -> None:
-    camera = ms.camera_before(ms.textured_wall(0))
-    ties = known_ties(camera, seed, n=300)
-    mirrored = replace(ties, pixels_photo=[900.0, 0.0] + ties.pixels_photo * [-1.0, 1.0])
-    assert status(mirrored, calibrated(camera), tmp_path) != "ok"
 
 
 def test_a_mirrored_photo_is_refused(tmp_path: Path) -> None:
@@ -387,142 +318,3 @@ def test_ties_searched_within_a_small_radius_prove_less(tmp_path: Path) -> None:
     pixels = ties.pixels_photo + jitter
     guessed = replace(ties, pixels_photo=pixels, search_radius_px=(12.0,))
     assert status(guessed, calibrated(camera), tmp_path) != "ok"
-
-
-def test_ties_without_a_word_on_the_walls_still_orient(tmp_path: Path) -> None:
-    camera = ms.camera_before(ms.textured_wall(0))
-    ties = replace(known_ties(camera, 1), walls=())
-    assert status(ties, calibrated(camera), tmp_path) == "ok"
-
-
-def test_no_ties_at_all_are_refused(tmp_path: Path) -> None:
-    camera = ms.camera_before(ms.textured_wall(0))
-    none = known_ties(camera, 1, n=0)
-    with pytest.raises(MethodError, match=r"there are no ties between photos and walls"):
-        orient(none, calibrated(camera), context(tmp_path))
-
-
-def test_no_photos_are_refused(tmp_path: Path) -> None:
-    ties = known_ties(ms.camera_before(ms.textured_wall(0)), 1)
-    with pytest.raises(MethodError, match=r"there are no photos to orient"):
-        orient(ties, Photos(photos=()), context(tmp_path))
-
-
-def test_ties_of_other_photos_are_refused(tmp_path: Path) -> None:
-    camera = ms.camera_before(ms.textured_wall(0))
-    ties = replace(known_ties(camera, 1), photo_names=("z.png",))
-    with pytest.raises(MethodError, match=r"photo z\.png, which is not among the photos"):
-        orient(ties, calibrated(camera), context(tmp_path))
-
-
-def reference_camera(folder: Path, name: str) -> ViewingCamera:
-    rows = [line.split() for line in (folder / f"{name}.jpg.camera").read_text().splitlines()]
-    rotation = np.array(rows[4:7], dtype=np.float64).T
-    centre = np.array(rows[7], dtype=np.float64)
-    return samples.camera(
-        rotation, centre, width=3072, height=2048, fx=2759.48, fy=2764.16, cx=1521.19, cy=1007.31
-    )
-
-
-@pytest.fixture(scope="module")
-def fountain(
-    shared_data: Path, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Photos, Ties, dict[str, ViewingCamera]]:
-    """Two photos of the fountain, their ties with its wall, and the reference's cameras."""
-    from orthoflow_plugins.plane.given import GivenPlane
-    from orthoflow_plugins.raster.grid import RasterGrid
-    from orthoflow_plugins.read.scan import ReadScan
-
-    from orthoflow.products import InputFiles
-
-    folder = shared_data / "fountain-p11"
-    cameras = {name: reference_camera(folder / "images", name) for name in ("0003", "0010")}
-    tmp_path = tmp_path_factory.mktemp("fountain")
-    scan = InputFiles(name="scan", paths=(folder / "cloud_from_photos.laz",))
-    # Both stand on the same side of it.
-    viewpoint = tuple(cameras["0003"].centre_world)
-    cloud = (
-        ReadScan()
-        .run(
-            ReadScan.In(files=scan),
-            ReadScan.Params(up="-z", view_from=viewpoint),
-            context(tmp_path),
-        )
-        .cloud
-    )
-    planes = (
-        GivenPlane()
-        .run(
-            GivenPlane.In(cloud=cloud),
-            GivenPlane.Params(normal=(0.29790, 0.95458, -0.00649), offset_m=-15.9052, buffer_m=1.0),
-            context(tmp_path),
-        )
-        .planes
-    )
-    walls = (
-        RasterGrid()
-        .run(
-            RasterGrid.In(cloud=cloud, planes=planes),
-            RasterGrid.Params(gsd_m=0.01, buffer_m=3.0),
-            context(tmp_path),
-        )
-        .walls
-    )
-    photos = ms.photos(
-        *(
-            Photo(
-                name=f"{name}.jpg",
-                encoded=(folder / "images" / f"{name}.jpg").read_bytes(),
-                width=3072,
-                height=2048,
-                intrinsics=Intrinsics.of(camera),
-            )
-            for name, camera in cameras.items()
-        )
-    )
-    inputs = MatchSift.In(photos=photos, walls=walls)
-    ties = MatchSift().run(inputs, MatchSift.Params(), context(tmp_path)).ties
-    return photos, ties, cameras
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "limit_m", "limit_deg"), [("0003", 0.02, 0.12), ("0010", 0.06, 0.7)]
-)
-def test_real_photos_of_the_fountain_are_where_the_reference_has_them(
-    fountain: tuple[Photos, Ties, dict[str, ViewingCamera]],
-    tmp_path: Path,
-    name: str,
-    limit_m: float,
-    limit_deg: float,
-) -> None:
-    photos, ties, cameras = fountain
-    camera = cameras[name]
-    # One quarter of 0010 has one tie or two: the gate on that is not what is asked here.
-    posed = orient(ties, photos, context(tmp_path), min_quadrant_ties=1).cameras
-    found: Camera = posed[list(cameras).index(name)]
-    assert found.status == "ok"
-    viewer = found.viewing()
-    assert np.linalg.norm(viewer.centre_world - camera.centre_world) < limit_m
-    turn = viewer.rotation @ camera.rotation.T
-    angle = np.degrees(np.arccos(np.clip(0.5 * (np.trace(turn) - 1.0), -1.0, 1.0)))
-    assert angle < limit_deg
-
-
-@pytest.mark.slow
-def test_a_photo_of_another_place_is_refused(shared_data: Path, tmp_path: Path) -> None:
-    scene = ms.textured_wall(1)
-    path = shared_data / "cyprus-arch-photos" / "images" / "DSC_6466.JPG"
-    # The middle of it holds key points enough.
-    middle = np.ascontiguousarray(decode_image(path.read_bytes())[276:724, 435:1065])
-    photo = Photo(
-        name=path.name,
-        encoded=encode_png(middle),
-        width=630,
-        height=448,
-        intrinsics=Intrinsics(width=630, height=448, fx=1167.0, fy=1167.0, cx=315.0, cy=224.0),
-    )
-    photos = ms.photos(photo)
-    inputs = MatchSift.In(photos=photos, walls=ms.walls_of(scene))
-    ties = MatchSift().run(inputs, MatchSift.Params(), context(tmp_path)).ties
-    assert status(ties, photos, tmp_path) != "ok"

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 from orthoflow_plugins.orient.report import (
     numbers_json,
-    photo_numbers,
     residual_rows,
     residual_table,
 )
 
 from orthoflow.geometry.lenses import LensFreedom
-from orthoflow.geometry.resection import Resection
+from orthoflow.geometry.resection import Resection, SeenPoints
 from orthoflow.testing import photographed as ms
 
 UNITS = {"px": 1.0, "mm": 2.5, "cell": 0.5}
@@ -74,13 +73,6 @@ def test_shares_follow_their_three_conventions() -> None:
     assert found["u", "px"]["beyond_any"] == found["v", "px"]["beyond_any"] == 0.1
 
 
-def test_without_a_cell_there_is_no_share_beyond_cells() -> None:
-    found = rows(np.ones((3, 2)), {"px": 1.0})
-    assert found["u", "px"]["beyond_cells"] is None
-    assert found["u", "px"]["skewness"] is None
-    assert found["u", "px"]["shift_p"] == 0.0
-
-
 def test_one_residual_and_none() -> None:
     assert rows(np.array([[0.5, -0.5]]))["u", "px"]["shift_p"] is None
     assert residual_rows("a", "check", np.empty((0, 2)), UNITS) == []
@@ -121,14 +113,20 @@ def candidate(**changes: Any) -> Any:
     points[~CONTROL] += 50.0 * CAMERA.rotation[2]
     usual: dict[str, Any] = {
         "photo": SimpleNamespace(name="a.jpg"),
-        "seen": SimpleNamespace(points_world=points),
+        "seen": SeenPoints(
+            pixels_photo=np.zeros((6, 2)),
+            points_world=points,
+            sigma_px=np.ones(6),
+            sigma_m=np.zeros(6),
+        ),
         "control": CONTROL,
         "checked": CHECKED,
         "estimate": estimate,
         "hull_ratio": 0.7,
         "gsd_m": 0.002,
+        "gsd_mm": 2.0,
         "error": SimpleNamespace(
-            rms_m=0.001, worst_m=0.003, corners_m=np.array([0.004, np.nan, 0.002, 0.001])
+            rms_mm=1.0, worst_mm=3.0, corners_m=np.array([0.004, np.nan, 0.002, 0.001])
         ),
     }
     return SimpleNamespace(**{**usual, **changes})
@@ -137,22 +135,9 @@ def candidate(**changes: Any) -> Any:
 PIXEL_MM = 2000.0 / np.sqrt(CAMERA.fx * CAMERA.fy)
 
 
-def test_an_orientation_is_summed_up_in_pixels_and_on_the_wall() -> None:
-    found = photo_numbers(candidate())
-    assert (found.n_control, found.n_check, found.n_rejected) == (3, 2, 1)
-    assert found.control_rmse_px == pytest.approx(np.sqrt((4 * 1.0 + 2 * 4.0) / 6))
-    assert found.check_rmse_px == pytest.approx(np.sqrt((2 * 9.0 + 2 * 1.0) / 4))
-    assert found.pixel_mm == pytest.approx(PIXEL_MM, rel=1e-6)
-    assert found.check_rmse_mm == pytest.approx(PIXEL_MM * found.check_rmse_px)
-    assert found.hull_ratio == 0.7
-    nothing = photo_numbers(candidate(checked=np.zeros(6, dtype=np.bool_)))
-    assert np.isnan(nothing.check_rmse_px)
-    assert np.isnan(nothing.check_rmse_mm)
-
-
 def test_an_orientation_is_recorded_with_its_lens_and_errors() -> None:
     of = candidate()
-    entry = numbers_json(of, photo_numbers(of))
+    entry = numbers_json(of)
     assert entry == {
         "n_control": 3,
         "n_check": 2,
@@ -173,7 +158,7 @@ def test_an_orientation_is_recorded_with_its_lens_and_errors() -> None:
         "focal_sigma_px": pytest.approx(0.002 * CAMERA.fx),
     }
     fixed = candidate(lens=LensFreedom(), error=None)
-    left = numbers_json(fixed, photo_numbers(fixed))
+    left = numbers_json(fixed)
     assert set(entry) - set(left) == {
         "sigma_wall_mm",
         "sigma_wall_worst_mm",
@@ -185,7 +170,7 @@ def test_an_orientation_is_recorded_with_its_lens_and_errors() -> None:
 @pytest.mark.parametrize("gsd_m", [0.002, None])
 def test_the_table_has_control_and_check_in_units_of_the_wall(gsd_m: float | None) -> None:
     of = candidate(gsd_m=gsd_m)
-    table = residual_table(of, photo_numbers(of))
+    table = residual_table(of)
     units = ["px", "mm", *(["cell"] if gsd_m else [])]
     assert [(row.role, row.axis, row.unit) for row in table] == [
         (role, axis, unit) for role in ("control", "check") for axis in "uv" for unit in units

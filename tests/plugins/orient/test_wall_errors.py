@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.orient.wall_errors import (
+from orthoflow_plugins.orient.gates import (
     KnownWall,
     known_walls,
     sigmas_on_wall,
@@ -123,18 +123,6 @@ def test_corners_of_the_photo_count_where_they_show_a_wall(half_m: tuple[float, 
     np.testing.assert_allclose(found.corners_m, expected, rtol=1e-6)
     assert found.worst_m == pytest.approx(expected)
     assert found.worst_m > found.sigmas_m.max()
-
-
-def test_corners_are_numbered_by_rows() -> None:
-    # A wall that only the lower right corner shows, and one that only the upper left one does.
-    low = wall()
-    right = np.array([[1.0, 0, -1.0], [1.0, 0, -2.0], [2.5, 0, -2.0], [2.5, 0, -1.0]])
-    left = np.array([[-2.5, 0, 2.0], [-2.5, 0, 1.0], [-1.0, 0, 1.0], [-1.0, 0, 2.0]])
-    for corners, shown in ((right, [3]), (left, [0])):
-        one = KnownWall(**{**low.__dict__, "corners_world": corners.astype(np.float64)})
-        found = wall_error(posed((0.001, 0.001, 0.0)), [one])
-        assert found is not None
-        assert np.flatnonzero(np.isfinite(found.corners_m)).tolist() == shown
 
 
 def test_of_several_walls_all_count_and_at_a_corner_the_worse_one() -> None:

@@ -1,4 +1,9 @@
-"""What a photo shares with walls: first which of them it shows, then all key points they share."""
+"""Key points of photos and walls, and what a photo shares with walls by them.
+
+OpenCV's SIFT moves every key point by a quarter of a pixel, right and down, unless its precise
+upscaling is on (opencv issue 23123; measured with 5.0: 0.25 px, of all sizes). That would be a
+systematic error of the orientation, so it is taken off where the upscaling is left as it was.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +19,15 @@ from pydantic import Field
 from orthoflow.geometry.key_points import (
     Matches,
     Window,
+    in_turns,
     mutual_matches,
     mutual_matches_within,
+    root_sift,
 )
+from orthoflow.geometry.opencv_border import HALF_PIXEL
+from orthoflow.geometry.rows import Rows
 from orthoflow.products import Photo, Wall
 from orthoflow.sdk import MethodParams
-from orthoflow_plugins.match.features import Features, find_features
 from orthoflow_plugins.match.pictures import (
     CLIP_LIMIT,
     equalised,
@@ -29,6 +37,17 @@ from orthoflow_plugins.match.pictures import (
     wall_picture,
 )
 
+# OpenCV's own contrast, half of which still brings right matches, and its ratio of curvatures.
+_OPENCV_CONTRAST: Final = 0.04
+_MIN_CONTRAST: Final = 0.02
+_MAX_EDGE_RATIO: Final = 10.0
+_SHIFT_BY_UPSCALING_PX: Final = 0.25
+# SIFT doubles the image and keeps all scales: 0.23 GB per million pixels. A tile bounds it.
+_TILE_PX: Final = 2048
+_TILE_OVERLAP_PX: Final = 96
+_SPREAD_CELLS: Final = 12
+# Smaller pictures have no key points.
+_MIN_SIDE_PX: Final = 16
 # A photo is tried at this size first, then at twice, until a wall is recognised.
 _FIRST_SIDE_PX: Final = 800
 # So many key points of a photo and of each wall suffice to tell which walls a photo shows.
@@ -49,6 +68,8 @@ _VOID_MARGIN_CELLS: Final = 3
 MIN_AGREEING: Final = 8
 """Matches that agree with one homography where a photo shows a wall."""
 _SEED: Final = 1
+# Matches in one square of this side are one place.
+_PLACE_PX: Final = 2.0
 
 # Key points bear another strength of contrast, not another sign. A laser that sees red dark, or
 # bright what the eye sees dark, shows half of all edges the other way round than grey does; in a
@@ -74,6 +95,150 @@ _LONGEST_SIDE_PX: Final = 2000
 _MIN_GREY_LEVELS: Final = 8.0
 
 
+@dataclass(frozen=True, kw_only=True)
+class Features(Rows):
+    """Key points of an image: the first n of them are the n strongest, spread over the image.
+
+    Attributes:
+        pixels: (n, 2) float64 (u, v), first pixel centre at (0.5, 0.5).
+        sizes_px: (n,) float64 diameter of the described neighbourhood.
+        angles_deg: (n,) float64 main direction of the gradient, clockwise from u.
+        descriptors: (n, 128) float32 RootSIFT, or SIFT where asked for, whole numbers.
+    """
+
+    pixels: NDArray[np.float64]
+    sizes_px: NDArray[np.float64]
+    angles_deg: NDArray[np.float64]
+    descriptors: NDArray[np.float32]
+
+    def undescribed(self) -> Features:
+        """Return places and sizes without the descriptors, which are most of the bytes."""
+        return replace(self, descriptors=self.descriptors[:, :0].copy())
+
+    def strongest(self, n_most: int) -> Features:
+        """Return the first ones, without copying them."""
+        return self.take(slice(n_most))
+
+    def scaled(self, factor: float) -> Features:
+        """Return the same key points in the image enlarged by a factor."""
+        return replace(self, pixels=self.pixels * factor, sizes_px=self.sizes_px * factor)
+
+    def mirrored(self, width_px: float) -> Features:
+        """Give the key points as they would be in the image of this width, left and right swapped.
+
+        Mirroring keeps the main direction of a key point as its own: along it, the rows of the
+        4 x 4 fields of 8 directions swap, and directions turn the other way.
+        """
+        fields = self.descriptors.reshape(-1, 4, 4, 8)[:, ::-1]
+        turned = fields[..., (8 - np.arange(8)) % 8]
+        return replace(
+            self,
+            pixels=np.array([width_px, 0.0]) + self.pixels * np.array([-1.0, 1.0]),
+            angles_deg=(180.0 - self.angles_deg) % 360.0,
+            descriptors=np.ascontiguousarray(turned.reshape(-1, 128)),
+        )
+
+
+def find_features(
+    picture: NDArray[np.uint8],
+    max_features: int,
+    usable: NDArray[np.bool_] | None = None,
+    *,
+    as_opencv: bool = False,
+) -> Features:
+    """Find key points, tile by tile, in an order that depends on the image only.
+
+    Args:
+        picture: (rows, cols) grey.
+        max_features: at most so many.
+        usable: (rows, cols), False where no key point may lie; None allows all.
+        as_opencv: SIFT as OpenCV sets it (markiewicz2015): other contrast, descriptors as they are.
+    """
+    import cv2
+
+    sift: Any = cv2.SIFT_create(  # type: ignore[attr-defined]  # missing in OpenCV's stubs
+        contrastThreshold=_OPENCV_CONTRAST if as_opencv else _MIN_CONTRAST,
+        edgeThreshold=_MAX_EDGE_RATIO,
+        enable_precise_upscale=not as_opencv,
+    )
+    shift_px = HALF_PIXEL - (_SHIFT_BY_UPSCALING_PX if as_opencv else 0.0)
+    tiles = [
+        _in_tile(sift, picture, (row, column), shift_px)
+        for row in range(0, picture.shape[0], _TILE_PX)
+        for column in range(0, picture.shape[1], _TILE_PX)
+    ]
+    points = np.vstack([tile[1] for tile in tiles])
+    pixels = points[:, :2]
+    # Threads find key points in any order; the image alone orders them.
+    chosen = np.lexsort(points[:, :4].T)
+    if usable is not None:
+        most = np.array(usable.shape[::-1]) - 1
+        columns, rows = np.clip(pixels[chosen].astype(np.intp), 0, most).T
+        chosen = chosen[usable[rows, columns]]
+    # The strongest, in turns from the cells of a coarse grid.
+    scale = _SPREAD_CELLS / np.array([picture.shape[1], picture.shape[0]])
+    cells = np.minimum((pixels[chosen] * scale).astype(np.intp), _SPREAD_CELLS - 1)
+    u, v, strengths = points[chosen][:, [0, 1, 4]].T
+    chosen = chosen[
+        in_turns(cells[:, 1] * _SPREAD_CELLS + cells[:, 0], (v, u, -strengths), max_features)
+    ]
+    raw = _described(sift, picture, tiles, chosen)
+    return Features(
+        pixels=pixels[chosen],
+        sizes_px=points[chosen, 2],
+        angles_deg=points[chosen, 3],
+        descriptors=raw if as_opencv else root_sift(raw),
+    )
+
+
+_Tile = tuple[tuple[slice, slice], NDArray[np.float64], list[Any]]
+"""Key points that a tile of an image owns: rows and columns that were looked at, a margin wider
+than the tile; (n, 5) u, v, size, angle, response; and OpenCV's own, in the frame of these.
+"""
+
+
+def _in_tile(
+    sift: Any, picture: NDArray[np.uint8], corner: tuple[int, int], shift_px: float
+) -> _Tile:
+    ends = [
+        min(limit, start + _TILE_PX) for start, limit in zip(corner, picture.shape, strict=True)
+    ]
+    low = [max(0, start - _TILE_OVERLAP_PX) for start in corner]
+    part = (
+        slice(low[0], ends[0] + _TILE_OVERLAP_PX),
+        slice(low[1], ends[1] + _TILE_OVERLAP_PX),
+    )
+    view = np.ascontiguousarray(picture[part])
+    found = sift.detect(view, None) if min(view.shape) >= _MIN_SIDE_PX else ()
+    points = np.array(
+        [(*p.pt, p.size, p.angle, p.response) for p in found], dtype=np.float64
+    ).reshape(-1, 5)
+    points[:, :2] += np.array([low[1], low[0]]) + shift_px
+    ahead = points[:, :2] - np.array([corner[1], corner[0]])
+    size = np.array([ends[1] - corner[1], ends[0] - corner[0]])
+    own = np.flatnonzero(((ahead >= 0.0) & (ahead < size)).all(axis=1))
+    return part, points[own], [found[at] for at in own.tolist()]
+
+
+def _described(
+    sift: Any, picture: NDArray[np.uint8], tiles: list[_Tile], chosen: NDArray[np.intp]
+) -> NDArray[np.float32]:
+    """SIFT descriptors (n, 128) of chosen key points, counted through all tiles.
+
+    Only what is kept is described: of a rich picture that is one key point in ten, and describing
+    takes longer than finding.
+    """
+    raw = np.empty((len(chosen), 128), dtype=np.float32)
+    first = 0
+    for part, _, found in tiles:
+        wanted = np.flatnonzero((chosen >= first) & (chosen < first + len(found)))
+        if wanted.size:
+            points = [found[at - first] for at in chosen[wanted].tolist()]
+            raw[wanted] = sift.compute(np.ascontiguousarray(picture[part]), points)[1]
+        first += len(found)
+    return raw
+
+
 class PairingParams(MethodParams):
     """How photos are paired with walls by key points."""
 
@@ -91,12 +256,8 @@ class PairingParams(MethodParams):
         default=4000,
         ge=200,
         description="Larger photos are reduced to this size for matching. Smaller sizes come "
-        "first, "
-        "from 800 px on, until a wall is recognised; then the size at which a pixel is about "
-        ""
-        ""
-        ""
-        "as wide as a cell of the walls.",
+        "first, from 800 px on, until a wall is recognised; then the size at which a pixel is "
+        "about as wide as a cell of the walls.",
     )
 
     @property
@@ -156,13 +317,22 @@ class PhotoPairs:
         return sum(int(pair.agreeing.sum()) for pair in self.pairs if pair.is_shown)
 
 
-def wall_features(wall: Wall, params: PairingParams) -> Features | None:
-    """Key points of a wall's intensity; None where it shows nothing."""
-    picture = wall_picture(wall, clip_limit=CLIP_LIMIT, void_margin_cells=_VOID_MARGIN_CELLS)
+def wall_features(wall: Wall, max_features: int, *, as_opencv: bool = False) -> Features | None:
+    """Key points of a wall's intensity; None where it shows nothing.
+
+    Args:
+        wall: the wall.
+        max_features: at most so many.
+        as_opencv: as `find_features` has it, of the picture as it is.
+    """
+    clip_limit = 0.0 if as_opencv else CLIP_LIMIT
+    picture = wall_picture(wall, clip_limit=clip_limit, void_margin_cells=_VOID_MARGIN_CELLS)
     if picture is None:
         return None
-    usable = picture.usable & np.isfinite(wall.depth_m)
-    return find_features(picture.grey, params.max_features, usable)
+    grey, usable = picture
+    return find_features(
+        grey, max_features, usable & np.isfinite(wall.depth_m), as_opencv=as_opencv
+    )
 
 
 def pair_photo(
@@ -179,7 +349,7 @@ def pair_photo(
         params: how.
     """
     seeker = _Seeker(grey=grey, params=params)
-    first, key_points = seeker.first_look(walls)
+    first, features = seeker.first_look(walls)
     if not first.n_verified:
         return first
     n_mirrored = seeker.n_verified_mirrored(first, walls)
@@ -193,10 +363,19 @@ def pair_photo(
             and seeker.is_mirror_at_another_size(first, walls),
             n_recognised=first.n_verified,
         )
-    wanted = min(seeker.finest, first.scale * _cells_per_pixel(first, walls))
-    if abs(math.log(wanted / first.scale)) > _LOG_SCALE_APART:
-        key_points = seeker.key_points(wanted)
-    second = seeker.pairs(key_points, _shown(first, walls))
+    # How many wall cells a pixel of the photo, as it was matched, is wide.
+    ratios = [
+        wall.sizes_px[pair.matches.second[pair.agreeing]]
+        / (first.features.sizes_px[pair.matches.first[pair.agreeing]] * first.scale)
+        for pair in first.pairs
+        if pair.is_shown and (wall := walls[pair.wall]) is not None
+    ]
+    scale = min(seeker.finest, first.scale * float(np.median(np.concatenate(ratios))))
+    if abs(math.log(scale / first.scale)) > _LOG_SCALE_APART:
+        features = seeker.key_points(scale)
+    else:
+        scale = first.scale
+    second = seeker.pairs(features, scale, _shown(first, walls))
     best = second if second.n_verified > first.n_verified else first
     return replace(_completed(best, walls, params), n_recognised=best.n_verified)
 
@@ -266,9 +445,9 @@ def side_matches(
     scale = min(seeker.finest, _FIRST_SIDE_PX / max(grey.shape))
     while True:
         # All key points: a wall that was laid on cells roughly shares few of the strongest.
-        features = seeker.key_points(scale).features
+        features = seeker.key_points(scale)
         for side, seen in enumerate((features, features.mirrored(grey.shape[1]))):
-            for pair in seeker.pairs(_KeyPoints(features=seen, scale=scale), walls).pairs:
+            for pair in seeker.pairs(seen, scale, walls).pairs:
                 if pair.is_shown:
                     counts[pair.wall, side] = max(counts[pair.wall, side], pair.agreeing.sum())
         if counts.any() or scale >= seeker.finest:
@@ -276,26 +455,13 @@ def side_matches(
         scale = min(seeker.finest, 2.0 * scale)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Expectation:
-    """What a first look says of where a wall's key points are in a photo.
-
-    Attributes:
-        pixels: (m, 2) photo pixels expected of the wall's key points.
-        agreeing: (n,) bool, which of the first look's matches agree with that.
-        radius_px: how wrong it may be.
-    """
-
-    pixels: NDArray[np.float64]
-    agreeing: NDArray[np.bool_]
-    radius_px: float
-
-
 def rematched(
     matches: Matches,
     sets: tuple[Features, Features],
-    expected: Expectation,
+    expected: NDArray[np.float64],
     *,
+    agreeing: NDArray[np.bool_],
+    radius_px: float,
     ratio: float,
 ) -> Matches:
     """Add matches within reach of what is expected: place, size and direction of key points.
@@ -306,21 +472,23 @@ def rematched(
     Args:
         matches: of the first look; they stay.
         sets: key points of the photo and of the wall.
-        expected: from the first look.
+        expected: (m, 2) photo pixels where the wall's key points should be.
+        agreeing: (n,) bool, which of the first look's matches agree with that.
+        radius_px: how wrong it may be.
         ratio: largest distance of the best over the second best within reach.
     """
     photo, wall = sets
-    good = matches.take(expected.agreeing)
+    good = matches.take(agreeing)
     log_size = np.log2(photo.sizes_px[good.first] / wall.sizes_px[good.second])
     turn = np.exp(1j * np.radians(photo.angles_deg[good.first] - wall.angles_deg[good.second]))
     turn_deg = np.degrees(np.angle(np.median(turn.real) + 1j * np.median(turn.imag)))
-    low = photo.pixels.min(axis=0) - expected.radius_px
-    high = photo.pixels.max(axis=0) + expected.radius_px
-    near = np.flatnonzero(((expected.pixels >= low) & (expected.pixels <= high)).all(axis=1))
+    low = photo.pixels.min(axis=0) - radius_px
+    high = photo.pixels.max(axis=0) + radius_px
+    near = np.flatnonzero(((expected >= low) & (expected <= high)).all(axis=1))
     window = Window(
         first=photo.pixels.astype(np.float32),
-        second=expected.pixels[near].astype(np.float32),
-        radius=expected.radius_px,
+        second=expected[near].astype(np.float32),
+        radius=radius_px,
         first_log_size=np.log2(photo.sizes_px).astype(np.float32),
         second_log_size=(np.log2(wall.sizes_px[near]) + np.median(log_size)).astype(np.float32),
         first_angle_deg=photo.angles_deg.astype(np.float32),
@@ -338,14 +506,6 @@ def rematched(
 
 
 @dataclass(frozen=True, kw_only=True)
-class _KeyPoints:
-    """Key points of a photo shrunk by a scale, in pixels of the full photo."""
-
-    features: Features
-    scale: float
-
-
-@dataclass(frozen=True, kw_only=True)
 class _Seeker:
     """Looks for walls in one photo."""
 
@@ -357,48 +517,45 @@ class _Seeker:
         """Largest scale the photo is matched at."""
         return min(1.0, self.params.max_side_px / float(max(self.grey.shape)))
 
-    def key_points(self, scale: float) -> _KeyPoints:
+    def key_points(self, scale: float) -> Features:
+        """Key points of the photo shrunk by a scale, in pixels of the full photo."""
         small = equalised(shrunk(self.grey, scale), CLIP_LIMIT)
-        features = find_features(small, self.params.max_features)
-        return _KeyPoints(features=features.scaled(1.0 / scale), scale=scale)
+        return find_features(small, self.params.max_features).scaled(1.0 / scale)
 
-    def first_look(self, walls: Sequence[Features | None]) -> tuple[PhotoPairs, _KeyPoints]:
-        """Recognise walls at growing scales, by the strongest key points, or else by all."""
+    def first_look(self, walls: Sequence[Features | None]) -> tuple[PhotoPairs, Features]:
+        """Recognise walls at growing scales, by the strongest key points, or else by all.
+
+        Returns:
+            The best pairs, and all key points at their scale.
+        """
         scale = min(self.finest, _FIRST_SIDE_PX / max(self.grey.shape))
-        found: tuple[PhotoPairs, _KeyPoints] | None = None
+        found: tuple[PhotoPairs, Features] | None = None
         while True:
-            key_points = self.key_points(scale)
-            few = replace(key_points, features=key_points.features.strongest(_FIRST_IN_PHOTO))
-            pairs = self.pairs(few, _strongest(walls))
+            features = self.key_points(scale)
+            pairs = self.pairs(features.strongest(_FIRST_IN_PHOTO), scale, _strongest(walls))
             if pairs.n_verified < MIN_AGREEING:
-                pairs = self.pairs(key_points, walls)
+                pairs = self.pairs(features, scale, walls)
             if found is None or pairs.n_verified >= found[0].n_verified:
-                found = pairs, key_points
+                found = pairs, features
             if found[0].n_verified >= MIN_AGREEING or scale >= self.finest:
                 return found
             scale = min(self.finest, 2.0 * scale)
 
-    def pairs(self, key_points: _KeyPoints, walls: Sequence[Features | None]) -> PhotoPairs:
-        """Match key points with walls, all that are not None."""
+    def pairs(
+        self, features: Features, scale: float, walls: Sequence[Features | None]
+    ) -> PhotoPairs:
+        """Match key points, found at a scale, with walls, all that are not None."""
         radius_px = _LOOSE_SHARE * math.hypot(*self.grey.shape)
         pairs = []
         for index, wall in enumerate(walls):
             if wall is None:
                 continue
             matches = mutual_matches(
-                key_points.features.descriptors,
-                wall.descriptors,
-                ratio=self.params.max_ratio,
+                features.descriptors, wall.descriptors, ratio=self.params.max_ratio
             )
             if len(matches):
-                sets = (key_points.features, wall)
-                pairs.append(verified(index, matches, sets, radius_px))
-        return PhotoPairs(
-            features=key_points.features,
-            scale=key_points.scale,
-            pairs=tuple(pairs),
-            radius_px=radius_px,
-        )
+                pairs.append(verified(index, matches, (features, wall), radius_px))
+        return PhotoPairs(features=features, scale=scale, pairs=tuple(pairs), radius_px=radius_px)
 
     def n_verified_mirrored(self, first: PhotoPairs, walls: Sequence[Features | None]) -> int:
         """Matches that would agree, over the walls shown, had the photo been mirrored.
@@ -409,16 +566,16 @@ class _Seeker:
         mirrored = first.features.mirrored(self.grey.shape[1])
         few = len(mirrored) <= _FIRST_IN_PHOTO
         shown = _shown(first, _strongest(walls) if few else walls)
-        return self.pairs(_KeyPoints(features=mirrored, scale=first.scale), shown).n_verified
+        return self.pairs(mirrored, first.scale, shown).n_verified
 
     def is_mirror_at_another_size(
         self, first: PhotoPairs, walls: Sequence[Features | None]
     ) -> bool:
         """Whether the mirrored photo is also recognised by key points of another size of it."""
         scale = 2.0 * first.scale if 2.0 * first.scale <= self.finest else 0.5 * first.scale
-        features, shown = self.key_points(scale).features, _shown(first, walls)
+        features, shown = self.key_points(scale), _shown(first, walls)
         direct, mirrored = (
-            self.pairs(_KeyPoints(features=seen, scale=scale), shown).n_verified
+            self.pairs(seen, scale, shown).n_verified
             for seen in (features, features.mirrored(self.grey.shape[1]))
         )
         return _is_mirror(mirrored, direct)
@@ -460,15 +617,22 @@ def verified(
         with np.errstate(divide="ignore", invalid="ignore"):
             agreeing = np.hypot(*(mapped(homography, source) - target).T) < loose_px
     # Many key points of a texture may fall on one place of the other image: count places.
-    n_places = min(_n_places(source[agreeing], 2.0), _n_places(target[agreeing], 2.0))
-    if (
-        homography is None
-        or n_places < MIN_AGREEING
-        or not _is_from_the_front(homography, source[agreeing].mean(axis=0))
-    ):
-        return Pair(wall=index, matches=matches, agreeing=agreeing, is_shown=False)
+    n_places = min(
+        len(np.unique(np.floor(pixels[agreeing] / _PLACE_PX), axis=0))
+        for pixels in (source, target)
+    )
+    is_shown = homography is not None and n_places >= MIN_AGREEING
+    if homography is not None and is_shown:
+        # The wall keeps its sense of rotation in the photo; from behind it is mirrored.
+        middle = source[agreeing].mean(axis=0)
+        here, *there = mapped(homography, middle + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
+        is_shown = bool(np.linalg.det(np.array(there) - here) > 0.0)
     return Pair(
-        wall=index, matches=matches, agreeing=agreeing, is_shown=True, homography=homography
+        wall=index,
+        matches=matches,
+        agreeing=agreeing,
+        is_shown=is_shown,
+        homography=homography if is_shown else None,
     )
 
 
@@ -486,7 +650,9 @@ def _completed(
         matches = rematched(
             pair.matches,
             (pairs.features, wall),
-            Expectation(pixels=expected, agreeing=pair.agreeing, radius_px=pairs.radius_px),
+            expected,
+            agreeing=pair.agreeing,
+            radius_px=pairs.radius_px,
             ratio=params.max_ratio,
         )
         offsets = expected[matches.second] - pairs.features.pixels[matches.first]
@@ -524,25 +690,3 @@ def mapped(homography: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDAr
     """Map pixels (n, 2) by a homography."""
     lifted = np.column_stack([pixels, np.ones(len(pixels))]) @ homography.T
     return lifted[:, :2] / lifted[:, 2:]
-
-
-def _is_from_the_front(homography: NDArray[np.float64], at: NDArray[np.float64]) -> bool:
-    """Whether the wall keeps its sense of rotation in the photo; from behind it is mirrored."""
-    here = mapped(homography, at[None])[0]
-    right, down = mapped(homography, at + np.eye(2)) - here
-    return bool(right[0] * down[1] - right[1] * down[0] > 0.0)
-
-
-def _n_places(pixels: NDArray[np.float64], cell_px: float) -> int:
-    return len(np.unique(np.floor(pixels / cell_px), axis=0))
-
-
-def _cells_per_pixel(pairs: PhotoPairs, walls: Sequence[Features | None]) -> float:
-    """How many wall cells a pixel of the photo, as it was matched, is wide."""
-    ratios = [
-        wall.sizes_px[pair.matches.second[pair.agreeing]]
-        / (pairs.features.sizes_px[pair.matches.first[pair.agreeing]] * pairs.scale)
-        for pair in pairs.pairs
-        if pair.is_shown and (wall := walls[pair.wall]) is not None
-    ]
-    return float(np.median(np.concatenate(ratios))) if ratios else 1.0
