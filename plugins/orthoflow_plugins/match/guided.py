@@ -162,8 +162,7 @@ def _traced(
     ctx: StepContext,
 ) -> dict[str, Trace]:
     """Trace oriented photos on the walls, and those that they help to find, by name."""
-    from orthoflow_plugins.match.channels import target_of
-    from orthoflow_plugins.match.joined_cells import in_cells_of_points
+    from orthoflow_plugins.match.channels import in_cells_of_points, target_of
     from orthoflow_plugins.match.tracing import (
         CONTENTS,
         Desk,

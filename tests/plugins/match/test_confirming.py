@@ -98,13 +98,6 @@ def test_a_place_that_no_photo_confirms_is_not_taken_however_clear_it_is() -> No
     assert chosen({0: [wrong], 1: [place(1, is_clear=True)]}) == {}
 
 
-def test_of_several_places_of_a_photo_the_one_that_others_confirm_is_taken() -> None:
-    near = pytest.approx(0.0, abs=1e-9)
-    wrong = place(0, aside_m=0.3, share=0.6)
-    right = {1: [place(1, is_clear=True)], 2: [place(2)]}
-    assert chosen({0: [wrong, place(0)], **right}) == {0: near, 1: near, 2: near}
-
-
 def test_photos_that_are_wrong_together_lose_to_one_that_key_points_recognise() -> None:
     wrong = [place(k, aside_m=0.3, share=0.6, is_clear=True) for k in range(2)]
     assert chosen({0: wrong[:1], 1: wrong[1:]}) == {

@@ -71,16 +71,6 @@ def test_a_known_shift_is_measured_without_bias(channels, moved: tuple[float, fl
     assert np.sqrt(np.mean(error**2)) < 0.12
 
 
-def test_inverted_contrast_is_matched_in_gradients() -> None:
-    rng = np.random.default_rng(4)
-    grey = 40.0 * gaussian_filter(rng.normal(size=(240, 300)), 2.0).astype(np.float32)
-    first, second = gradient_channels(grey), gradient_channels(100.0 - grey)
-    places = textured_places(texture(first), first.known > 0.0, 100)
-    found = measure(first, second, places)
-    assert len(found.places) > 0.9 * len(places) - 20
-    np.testing.assert_allclose(found.shift_cells, 0.0, atol=0.01)
-
-
 @pytest.mark.parametrize("moved", [(0.0, 0.0), (2.37, -1.41)], ids=str)
 def test_colours_are_mixed_in_each_patch_as_the_wall_shows_them(
     moved: tuple[float, float],
@@ -243,13 +233,3 @@ def test_the_papers_mask_keeps_best_matches_from_going_astray(
     assert wrong["masked", 0.8] < 0.6 * wrong["plain", 0.8]
     right = np.linalg.norm(off, axis=1) < 2.0
     np.testing.assert_allclose(off[right].mean(axis=0), 0.0, atol=0.1)
-
-
-@pytest.mark.parametrize("params", [MatchSift.Params, MatchGuided.Params], ids=["sift", "guided"])
-def test_the_papers_preset_takes_openmvgs_ratio_unless_another_is_given(
-    params: type[MatchSift.Params | MatchGuided.Params],
-) -> None:
-    assert params(preset="paper").ratio == 0.8
-    assert params(preset="paper", ratio=0.6).ratio == 0.6
-    assert params(preset="paper", ratio=None).ratio is None
-    assert params().ratio == {MatchSift.Params: 0.85, MatchGuided.Params: None}[params]

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from orthoflow_plugins.match.joined_cells import in_cells_of_points
+from orthoflow_plugins.match.channels import in_cells_of_points
 
 from orthoflow.products import SurfaceMask, Wall
 from tests import raster_scenes as scenes

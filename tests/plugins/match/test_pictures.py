@@ -149,23 +149,10 @@ def test_a_shrunk_picture_keeps_positions_and_its_mean(factor: float) -> None:
     assert pictures.shrunk(columns, 1.0) is columns
 
 
-def test_shrinking_averages_what_it_cannot_show() -> None:
-    stripes = np.tile([0, 200], 50).astype(np.uint8)[None].repeat(60, axis=0)
-    np.testing.assert_allclose(pictures.shrunk(stripes, 0.25)[2:-2, 2:-2], 100.0, atol=4.0)
-    assert pictures.shrunk(stripes, 0.001).shape == (1, 1)
-
-
 def photo(width: int = 20) -> Photo:
     red = np.zeros((10, 20, 3), dtype=np.uint8)
     red[..., 0] = 200
     return Photo(name="a.png", encoded=encode_png(red), width=width, height=10)
-
-
-def test_a_photo_is_grey_as_rec_601_says() -> None:
-    assert (pictures.photo_grey(photo()) == 60).all()  # 0.299 of 200
-    assert pictures.photo_rgb(photo())[0, 0].tolist() == [200, 0, 0]
-    with pytest.raises(MethodError, match=r"a\.png has 20 x 10 pixels, but is listed with 21 x 10"):
-        pictures.photo_rgb(photo(21))
 
 
 def test_nothing_to_match_is_refused() -> None:
@@ -185,3 +172,10 @@ def test_nothing_to_match_is_refused() -> None:
     with pytest.raises(MethodError, match="the scan has neither intensity nor colour"):
         pictures.require_intensity(walls(silent))
     pictures.require_intensity(walls(silent, shown))
+
+
+def test_a_wall_that_shows_nothing_has_no_picture() -> None:
+    plain = np.zeros((20, 30), dtype=np.float32)
+    for intensity in (None, np.full((20, 30), np.nan, dtype=np.float32)):
+        of = wall(plain, intensity=intensity)
+        assert pictures.wall_picture(of, clip_limit=2.0, void_margin_cells=2) is None

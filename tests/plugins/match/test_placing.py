@@ -103,14 +103,14 @@ def test_a_mirrored_photo_is_placed_nowhere() -> None:
     assert placed(replace(usual_photo(), encoded=encode_png(mirrored), exif_focal_px=840.0)) is None
 
 
-def test_a_photo_of_another_wall_is_placed_nowhere() -> None:
-    other = ms.photo_of(ms.textured_wall(2), CAMERA)
-    assert placed(replace(other, exif_focal_px=840.0)) is None
-
-
 def test_a_wall_that_shows_nothing_places_no_photo() -> None:
     blind = replace(patchy_wall(), intensity=None)
     assert places_of(0, usual_photo(), [wall_structure(blind)]) == []
 
 
 # --- how places are judged ---
+
+
+def test_a_photo_of_another_wall_is_placed_nowhere() -> None:
+    other = ms.photo_of(ms.textured_wall(2), CAMERA)
+    assert placed(replace(other, exif_focal_px=840.0)) is None

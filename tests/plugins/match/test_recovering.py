@@ -53,13 +53,6 @@ def test_a_lens_that_contradicts_exif_is_that_of_photos_with_the_same_exif() -> 
     assert found.fx == 1000.0
 
 
-@pytest.mark.parametrize("size", [(640, 900), (900, 641), (901, 640)])
-def test_photos_of_another_size_have_another_lens(size: tuple[int, int]) -> None:
-    cameras = {"old.png": oriented(1000.0, width=size[0], height=size[1])}
-    assert lens_of(photo(), cameras, ms.photos()) is None
-    assert lens_of(photo(), {}, ms.photos()) is None
-
-
 def view_of(
     grey: float, part: tuple[slice, slice], size: float, *, unknown: tuple[int, int] | None = None
 ) -> Any:

@@ -12,10 +12,9 @@ from orthoflow_plugins.match.pictures import points_on_wall
 from orthoflow_plugins.match.sift import MatchSift
 from scipy.spatial.distance import cdist
 
-from orthoflow.files.images import decode_image, encode_png
+from orthoflow.files.images import encode_png
 from orthoflow.geometry.key_points import (
     Window,
-    mutual_matches,
     mutual_matches_within,
 )
 from orthoflow.products import Photo, Photos, TieRole, Ties, Walls
@@ -85,31 +84,6 @@ def test_a_photo_of_nothing_known_is_warned_of(
     assert ctx.warnings == ["photo a.png: no wall is recognised in it, so it gets no ties"]
 
 
-def test_no_tie_lies_in_void(scene: ms.TexturedWall, walls: Walls, tmp_path: Path) -> None:
-    ties = ties_of(ms.photos(ms.photo_of(scene, ms.camera_before(scene))), walls, context(tmp_path))
-    at = walls.walls[0].frame.wall_from_world(ties.points_world)
-    in_window = (at[:, 0] > 200) & (at[:, 0] < 240) & (at[:, 1] > 120) & (at[:, 1] < 150)
-    assert not in_window.any()
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_neighbours_are_those_of_brute_force(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    first = rng.integers(0, 80, (1500, 128)).astype(np.float32)
-    second = np.vstack([first[:700] + rng.integers(-6, 7, (700, 128)), first[:300]]).astype(
-        np.float32
-    )
-    found = mutual_matches(first, second, ratio=0.8)
-    distance = cdist(first.astype(np.float64), second.astype(np.float64))
-    order = np.argsort(distance, axis=1, kind="stable")
-    rows = np.arange(len(first))
-    nearest, ratio = order[:, 0], distance[rows, order[:, 0]] / distance[rows, order[:, 1]]
-    mutual = distance.argmin(axis=0)[nearest] == rows
-    expected = np.flatnonzero(mutual & (ratio <= 0.8))
-    np.testing.assert_array_equal(found.first, expected)
-    np.testing.assert_array_equal(found.second, nearest[expected])
-
-
 @pytest.mark.parametrize("as_opencv", [False, True], ids=["precise", "as OpenCV sets it"])
 def test_key_points_lie_where_they_are(*, as_opencv: bool) -> None:
     places = np.array([(u, v) for u in np.linspace(30.3, 370.7, 7) for v in (40.1, 200.6, 360.4)])
@@ -174,19 +148,6 @@ def test_neighbours_within_a_window_are_those_of_brute_force(seed: int) -> None:
     assert len(expected) > 10
     np.testing.assert_array_equal(found.first, expected)
     np.testing.assert_array_equal(found.second, nearest[expected])
-
-
-def test_mirrored_descriptors_are_those_of_the_mirrored_image(scene: ms.TexturedWall) -> None:
-    grey = decode_image(ms.photo_of(scene, ms.camera_before(scene)).encoded)[:, :, 0]
-    upright = find_features(grey, MAX_FEATURES)
-    flipped = find_features(np.ascontiguousarray(grey[:, ::-1]), MAX_FEATURES)
-    expected = upright.mirrored(grey.shape[1])
-    pairs = mutual_matches(expected.descriptors, flipped.descriptors, ratio=0.8)
-    error = np.linalg.norm(expected.pixels[pairs.first] - flipped.pixels[pairs.second], axis=1)
-    turn = expected.angles_deg[pairs.first] - flipped.angles_deg[pairs.second]
-    assert np.median(np.abs((turn + 180.0) % 360.0 - 180.0)) < 1.0
-    assert len(pairs) > 0.7 * len(upright)
-    assert np.mean(error < 0.5) > 0.97
 
 
 def test_a_mirrored_photo_is_recognised_as_such(

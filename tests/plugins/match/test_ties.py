@@ -62,16 +62,6 @@ def test_other_places_and_other_pixels_are_no_twins() -> None:
     assert beside(0.002, 0.0) == [[0.002], [0.003]]
 
 
-def test_a_twin_of_a_tie_that_was_left_out_stays() -> None:
-    places = [(0.0, 0.0, 0.0), (0.0, 0.0, 0.015), (0.0, 0.0, 0.03)]
-    pieces = [
-        piece([(5.0, 7.0)], [place], [s])
-        for place, s in zip(places, (0.002, 0.0021, 0.0022), strict=True)
-    ]
-    # The second lies near to the first; the third only near to the second.
-    assert kept(*pieces) == [[0.002], [], [0.0022]]
-
-
 def test_ties_are_joined_in_the_order_of_their_pieces() -> None:
     first = piece([(1.0, 2.0), (3.0, 4.0)], [(0, 0, 0), (1, 1, 1)], [0.1, 0.2], photo=1)
     second = piece([(5.0, 6.0)], [(2, 2, 2)], [0.3], wall=0, role=TieRole.CHECK)

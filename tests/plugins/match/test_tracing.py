@@ -3,18 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.match import tracing, warping
 from orthoflow_plugins.match.displacements import Displacements
-
-from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.products import Intrinsics, Photo
-from orthoflow.testing import photographed as ms
-
-
-def camera() -> ViewingCamera:
-    return ms.camera_before(ms.photographed_scene())
 
 
 def displacements(shifts: NDArray[np.float64]) -> Displacements:
@@ -59,29 +50,3 @@ def test_values_between_cells_are_bilinear_and_unknown_beyond_them() -> None:
     assert np.isnan(warping.between(raster, beside)).all()
     product = np.array([[0.0, 0.0], [0.0, 8.0]], np.float32)
     np.testing.assert_allclose(warping.between(product, np.array([[0.5, 0.25]])), [1.0])
-
-
-@pytest.mark.parametrize(
-    ("source", "exif_px", "is_calibrated", "focal_sigma"),
-    [
-        ("estimated", None, False, 0.35),
-        ("estimated", 840.0, False, 0.05),
-        ("estimated", None, True, None),
-        ("calibration", None, False, None),
-    ],
-)
-def test_only_a_lens_that_was_estimated_may_be_off(
-    source: str, exif_px: float | None, is_calibrated: bool, focal_sigma: float | None
-) -> None:
-    own = Intrinsics.of(camera(), source=source)
-    photo = Photo(
-        name="a.png",
-        encoded=b"",
-        width=900,
-        height=640,
-        exif_focal_px=exif_px,
-        intrinsics=own if is_calibrated else None,
-    )
-    found = tracing.estimated_lens(photo, own)
-    assert (None if found is None else found.focal_sigma) == focal_sigma
-    assert tracing.estimated_lens(photo, None) is None

@@ -199,12 +199,3 @@ def test_residuals_of_all_photos_are_counted_by_role_and_coordinate(
             share = np.exp(-0.5 * ((x - mean) / deviation) ** 2)
             peak = len(values) * (edges[1] - edges[0]) / (deviation * np.sqrt(2.0 * np.pi))
             np.testing.assert_allclose(curve, peak * share)
-
-
-def test_two_residuals_are_not_drawn(drawings: dict[str, Any], tmp_path: Path) -> None:
-    context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
-    role = np.array([TieRole.CONTROL] * 3 + [TieRole.CHECK] * 2, dtype=np.uint8)
-    values = np.arange(10.0).reshape(5, 2)
-    draw_residuals(context, [of_residuals("a.jpg", values, role)])
-    assert len(drawings["residuals"].axes) == 2
-    assert len(drawings["residuals_by_photo"].axes) == 2

@@ -379,3 +379,11 @@ def test_wrong_ties_gather_on_a_quarter_of_what_has_texture() -> None:
             candidate(agreeing=agrees, normalised=lengths, pixels=pixels), CONTROL_GATES[2:3]
         )
         assert (found is None) == is_fine
+
+
+def test_a_line_and_two_points_have_no_area() -> None:
+    line = np.outer(np.arange(5.0), [2.0, 3.0])
+    assert hull_area(line) == 0.0
+    assert hull_area(np.tile([[1.0, 2.0], [3.0, 9.0]], (4, 1))) == 0.0
+    assert hull_area(np.empty((0, 2))) == 0.0
+    assert hull_area(np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 3.0]])) == pytest.approx(3.0)

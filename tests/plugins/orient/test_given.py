@@ -77,13 +77,6 @@ def test_a_photo_taken_from_nowhere_on_earth_is_refused(folder: Path, metres: fl
         read(folder)
 
 
-def test_the_unit_of_a_model_scales_its_poses(folder: Path) -> None:
-    millimetres = replace(CAMERA, translation=1000.0 * CAMERA.translation)
-    write_colmap_model(folder / "given", oriented(millimetres))
-    (camera,) = read(folder, unit="mm")[0].cameras
-    np.testing.assert_allclose(camera.viewing().centre_world, CAMERA.centre_world, atol=1e-9)
-
-
 def test_photos_of_another_size_are_refused(folder: Path) -> None:
     write_colmap_model(folder / "given", oriented())
     small = ms.photos(replace(PIXEL, width=450, height=320))

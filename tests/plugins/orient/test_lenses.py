@@ -116,14 +116,6 @@ def test_of_photos_that_share_a_lens_the_best_known_one_tells_it() -> None:
         assert (lens.source, lens.prior.fx) == (source, focal_px)
 
 
-def test_of_unknown_lenses_the_photos_oriented_by_themselves_tell_the_middle() -> None:
-    photos = [photo("a"), photo("b"), photo("c")]
-    _, found = lenses.lens_groups(photos, oriented(480.0, 500.0, 900.0), "shared", "uncalibrated")
-    (lens,) = found
-    assert (lens.prior.fx, lens.prior.fy) == (500.0, 500.0)
-    assert (lens.prior.cx, lens.prior.cy) == (300.0, 200.0)
-
-
 @pytest.mark.parametrize(
     ("refined", "exif_sigmas", "calibrated_sigmas"),
     [
@@ -143,15 +135,6 @@ def test_lenses_are_refined_as_asked_for(
     _, found = lenses.lens_groups(photos, oriented(500.0, 510.0), "per-photo", refined)
     np.testing.assert_allclose(found[0].freedom.sigmas, exif_sigmas)
     np.testing.assert_allclose(found[1].freedom.sigmas, calibrated_sigmas)
-
-
-def test_rays_of_pixels_come_back_through_the_lens() -> None:
-    camera = ms.camera_before(ms.photographed_scene())
-    pixels = np.array([[10.0, 20.0], [450.0, 300.0], [890.0, 600.0]])
-    rays = lenses.camera_rays(camera, pixels)
-    np.testing.assert_array_equal(rays[:, 2], 1.0)
-    world = camera.centre_world + 2.5 * rays @ camera.rotation
-    np.testing.assert_allclose(camera.project(world)[:, :2], pixels, atol=1e-6)
 
 
 def test_a_pixel_beyond_what_a_lens_bends_has_no_ray() -> None:

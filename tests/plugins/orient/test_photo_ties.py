@@ -91,15 +91,6 @@ def test_points_are_tied_in_all_photos_that_see_them_where_they_are() -> None:
         assert scale == 1.0 + photo
 
 
-def test_only_pairs_that_are_asked_for_are_matched_and_linked() -> None:
-    points = scene_points()
-    ties = tie_photos(CAMERAS, seen_in(points), [(0, 1), (1, 2)], 1000)
-    assert observed(ties, points) == [[0, 1, 2]] * 30
-    none = tie_photos(CAMERAS, seen_in(points), [], 1000)
-    assert none.pixels.shape == (0, 2)
-    assert none.points_world.shape == (0, 3)
-
-
 def test_of_many_points_those_that_most_photos_see_are_kept() -> None:
     points = scene_points()
     features = seen_in(points)

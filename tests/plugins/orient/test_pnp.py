@@ -7,12 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from orthoflow_plugins.match.guided import MatchGuided
-from orthoflow_plugins.match.sift import MatchSift
 from orthoflow_plugins.orient.gates import known_walls, wall_error
 from orthoflow_plugins.orient.pnp import OrientPnp
 
-from orthoflow.files.images import decode_image, encode_png
+from orthoflow.files.images import encode_png
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.lenses import LensFreedom, stepped
 from orthoflow.geometry.resection import SeenPoints, adjust
@@ -81,30 +79,6 @@ def orient(ties: Ties, photos: Photos, ctx: StepContext, **params: object) -> Ca
 
 def status(ties: Ties, photos: Photos, tmp_path: Path) -> str:
     return orient(ties, photos, context(tmp_path)).cameras[0].status
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_the_chain_orients_within_its_stated_error(tmp_path: Path, seed: int) -> None:
-    scene = ms.textured_wall(seed)
-    camera = ms.camera_before(scene, centre=(0.6 + 0.6 * seed, -2.6, 1.1), roll=0.8 * seed)
-    photos, walls = ms.photos(ms.photo_of(scene, camera)), ms.walls_of(scene)
-    ctx = context(tmp_path, seed=seed)
-    params = MatchSift.Params(max_features=2000)
-    ties = MatchSift().run(MatchSift.In(photos=photos, walls=walls), params, ctx).ties
-    for folder in ("first", "second"):
-        (tmp_path / folder).mkdir()
-    first = orient(ties, photos, context(tmp_path / "first", seed=seed))
-    inputs = MatchGuided.In(photos=photos, walls=walls, cameras=first)
-    again = MatchGuided().run(inputs, MatchGuided.Params(), context(tmp_path)).ties
-    second = orient(again, photos, context(tmp_path / "second", seed=seed))
-    for cameras in (first, second):
-        found = cameras.cameras[0]
-        assert found.status == "ok"
-        assert found.sigma_wall_m is not None
-        error = ms.wall_error_m(scene, found.viewing(), camera)
-        assert error < 3.0 * found.sigma_wall_m
-        # A thirtieth of the raster's cell.
-        assert error < 0.0002
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["calibrated", "exif"])
@@ -269,34 +243,6 @@ def test_random_ties_are_never_ok(tmp_path: Path, seed: int) -> None:
     camera = ms.camera_before(ms.textured_wall(0))
     ties = known_ties(camera, seed, n=300, wrong_share=1.0)
     assert status(ties, calibrated(camera), tmp_path) != "ok"
-
-
-def test_a_mirrored_photo_is_refused(tmp_path: Path) -> None:
-    scene = ms.textured_wall(1)
-    camera = ms.camera_before(scene)
-    # The middle of it holds key points enough.
-    middle = replace(camera, width=630, height=448, cx=camera.cx - 135.0, cy=camera.cy - 96.0)
-    photo = ms.photo_of(scene, middle)
-    mirrored = encode_png(np.ascontiguousarray(decode_image(photo.encoded)[:, ::-1, 0]))
-    photos = ms.photos(replace(photo, encoded=mirrored))
-    inputs = MatchSift.In(photos=photos, walls=ms.walls_of(scene))
-    ties = MatchSift().run(inputs, MatchSift.Params(), context(tmp_path)).ties
-    assert status(ties, photos, tmp_path) != "ok"
-
-
-def with_an_empty_quarter(ties: Ties) -> Ties:
-    low = (ties.pixels_photo[:, 0] > 450) & (ties.pixels_photo[:, 1] > 320)
-    return replace(ties, role=np.where(low, TieRole.REJECTED, 0).astype(np.uint8))
-
-
-def test_a_quarter_behind_an_obstacle_is_as_good_as_predicted(tmp_path: Path) -> None:
-    scene = ms.textured_wall(0)
-    camera = ms.camera_before(scene)
-    ctx = context(tmp_path)
-    found = orient(with_an_empty_quarter(known_ties(camera, 1)), calibrated(camera), ctx)
-    assert found.cameras[0].status == "ok"
-    assert any("another 0: more than 10 times" in warning for warning in ctx.warnings)
-    assert ms.wall_error_m(scene, found.cameras[0].viewing(), camera) < 0.3 * ms.GSD_M
 
 
 def test_a_quarter_past_the_end_of_the_wall_needs_no_ties(tmp_path: Path) -> None:

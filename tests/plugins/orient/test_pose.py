@@ -14,7 +14,6 @@ from orthoflow_plugins.orient.pose import (
     estimate_pose,
     expected_px,
     robust_start,
-    undistorted_pixels,
     unit_deviation,
     without_chance,
 )
@@ -140,19 +139,6 @@ def test_what_is_expected_of_ties_follows_from_their_scale() -> None:
     ):
         moved = np.sqrt(expected_px(replace(seen, **change)) ** 2 - 0.6**2)
         assert moved == pytest.approx(factor * in_space, rel=1e-6)
-
-
-def test_undistorted_pixels_are_those_of_the_plain_lens() -> None:
-    viewer = replace(camera(), skew=3.0)
-    assert viewer.distortion.any()
-    plain = replace(viewer, distortion=np.zeros(5), skew=0.0)
-    seen = seen_by(viewer, 60)
-    found = undistorted_pixels(seen.pixels_photo, viewer)
-    np.testing.assert_allclose(found, plain.project(seen.points_world)[:, :2], atol=1e-6)
-    assert undistorted_pixels(seen.pixels_photo, plain) is seen.pixels_photo
-    skewed = replace(plain, skew=3.0)
-    straight = undistorted_pixels(skewed.project(seen.points_world)[:, :2], skewed)
-    np.testing.assert_allclose(straight, plain.project(seen.points_world)[:, :2], atol=1e-6)
 
 
 @pytest.mark.parametrize(
