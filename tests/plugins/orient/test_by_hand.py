@@ -231,7 +231,7 @@ def test_right_ties_are_called_contradictory_once_in_a_thousand_photos(
     found = pose_by_hand(tied(replace(seen, sigma_px=np.full(6, 3.0)), everyone))
     assert not isinstance(found, str)
     # In pixels, as none of the residuals is so small by luck that it is taken as larger.
-    squares = float((found[0].fit.residuals_px**2).sum())
+    squares = float((found[0].fit.residuals_px ** 2).sum())
     sigma_px = np.full(6, np.sqrt(squares / stats.chi2.isf(chance, 6)))
     found = pose_by_hand(tied(replace(seen, sigma_px=sigma_px), everyone))
     assert isinstance(found, str) != fits
