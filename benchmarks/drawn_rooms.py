@@ -1,25 +1,35 @@
-"""Compare methods of the two papers in drawn rooms: twice ten, whose seeds are apart.
+"""Measure the rows of docs/papers.md in drawn rooms, and write it and docs/choosing.md.
 
-    python benchmarks/drawn_rooms.py planes
-    python benchmarks/drawn_rooms.py surfaces
+    python benchmarks/drawn_rooms.py FOLDER
+    python benchmarks/drawn_rooms.py FOLDER --part surfaces --rooms 5
 
 Directions, leans and distances of all planes, decoration, scanner stations, photos and lens are
-drawn from a room's seed. Prints mean ± standard deviation (largest) over the rooms of each ten.
+drawn from a room's seed: ten rooms from 1 on, and ten others from 101 on, by which rankings are
+checked. Each room is measured four times: `planes` (plane-methods.yaml, paper_planes.yaml),
+`orient` (orient-methods.yaml), `ortho` (ortho-methods.yaml) and `surfaces`, where orthoimages are
+made from photos on a surface (backward) and from points (direct), on the scan and on points that
+semi-global matching (OpenCV) finds in the photos, as skarlatos2012 had; orientations are the true
+ones there. Check points are compared over those that all orthoimages of a room show.
 
-`planes` searches with every detector of markiewicz2015, as it finds planes (raw) and after the
-common fit. `surfaces` makes orthoimages from photos on a surface (backward) and from points
-(direct), once on the scan and once on points that semi-global matching (OpenCV) finds in the
-photos, as skarlatos2012 had. Orientations are the true ones; check points are those that all four
-orthoimages of a room show.
+Every room goes to `FOLDER/<part>-<seed>.json` as soon as it is measured, and is not measured again.
+From these files and the pages of benchmarks/pages docs/papers.md and docs/choosing.md are written:
+a place `{{part: cell metric}}` becomes mean ± standard deviation (largest) of the first ten rooms,
+`{{part: cell metric < cell metric}}` in how many rooms of each ten that holds.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import os
 import platform
+import re
 import tempfile
-from collections import defaultdict
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
@@ -33,86 +43,138 @@ from orthoflow_plugins.inspect.truth import InspectTruth
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
 from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
-from orthoflow_plugins.plane.hough2d import Hough2d
-from orthoflow_plugins.plane.hough3d import Hough3d
-from orthoflow_plugins.plane.ransac import Ransac
-from orthoflow_plugins.plane.region import Region
 from orthoflow_plugins.raster.grid import RasterGrid
 from orthoflow_plugins.simulate.room import SimulateRoom
+from ruamel.yaml import YAML
 
+from orthoflow.catalog.discovery import discover_catalog
+from orthoflow.errors import OrthoflowError
 from orthoflow.files.images import decode_image
 from orthoflow.products import Camera, Inspection, Photos, PointCloud
 from orthoflow.sdk import Method, StepContext
+from orthoflow.workflow.document import load_workflow
+from orthoflow.workflow.expand import CellOutput, expand_cells
 
+ROOT: Final = Path(__file__).resolve().parents[1]
 TENS: Final = (range(1, 11), range(101, 111))
-DETECTORS: Final[Mapping[str, tuple[type[Method], dict[str, Any]]]] = {
-    "hough2d": (Hough2d, {}),
-    "hough2d, votes": (Hough2d, {"scoring": "votes"}),
-    "hough2d, one vote per cell": (Hough2d, {"scoring": "votes", "accumulator": "unit"}),
-    "hough2d, Canny": (Hough2d, {"scoring": "votes", "accumulator": "canny"}),
-    "hough3d": (Hough3d, {}),
-    "hough3d, votes": (Hough3d, {"search": "full", "scoring": "votes"}),
-    "ransac": (Ransac, {}),
-    "ransac, 2D": (Ransac, {"model": "2d"}),
-    "region": (Region, {}),
-    "region, normals alone": (Region, {"preset": "paper"}),
+DRAWN: Final = {"geometry": "drawn", "decoration": "drawn"}
+COARSE: Final = {
+    **DRAWN,
+    "scan_step_m": 0.005,
+    "panorama_step_m": 0.03,
+    "photo_gsd_m": 0.004,
 }
+# Recipes of a part, what is set in their rooms, and cells of their walls.
+RECIPES: Final[Mapping[str, tuple[tuple[str, ...], dict[str, Any]]]] = {
+    "planes": (
+        ("workflows/plane-methods.yaml", "benchmarks/paper_planes.yaml"),
+        {**DRAWN, "scan_step_m": 0.03},
+    ),
+    "orient": (("workflows/orient-methods.yaml",), COARSE),
+    "ortho": (("workflows/ortho-methods.yaml",), COARSE),
+}
+WALL_GSD_M: Final = 0.006
 # Nearest and farthest surface from a camera.
 RANGES_M: Final = (1.5, 3.6)
 # Photos of a row of `variant2`.
 PER_ROW: Final = 6
+PLACE: Final = re.compile(r"\{\{(\w+): ([^}]+)\}\}")
+
+
+@dataclass(kw_only=True)
+class Context(StepContext):
+    """The context of a method whose figures nobody looks at."""
+
+    def figure(self, name: str, content: Any, caption: str = "") -> None:
+        """Leave the figure out."""
 
 
 def run(
-    method: type[Method], inputs: Any, seed: int, **params: Any
+    method: type[Method], inputs: Any, seed: int, /, **params: Any
 ) -> tuple[Any, dict[str, float]]:
     """Run a method; return what it gives and its metrics."""
-    folder = Path(tempfile.mkdtemp())
-    ctx = StepContext(rng=np.random.default_rng(seed), cores=2, scratch=folder)
-    out = method().run(inputs, method.Params.model_validate(params), ctx)
+    with tempfile.TemporaryDirectory() as folder:
+        ctx = Context(rng=np.random.default_rng(seed), cores=2, scratch=Path(folder))
+        out = method().run(inputs, method.Params.model_validate(params), ctx)
     return out, {metric.name: float(metric.value) for metric in ctx.metrics}
 
 
-def room_of(seed: int, **params: Any) -> SimulateRoom.Out:
-    drawn = {"geometry": "drawn", "decoration": "drawn"}
-    return run(SimulateRoom, SimulateRoom.In(), seed, **drawn, **params)[0]
+def recipes(part: str, seed: int) -> Iterator[tuple[str, float]]:
+    """Run the recipes of a part in one room; return metrics by `cell metric`."""
+    names, room = RECIPES[part]
+    catalog = discover_catalog()
+    for name in names:
+        tree = YAML(typ="safe").load((ROOT / name).read_text())
+        tree["seed"] = seed
+        tree["steps"]["room"]["params"].update(room)
+        if "wall" in tree["steps"]:
+            tree["steps"]["wall"]["params"]["gsd_m"] = WALL_GSD_M
+            tree["compare"]["design"] = "one-at-a-time"
+        for step in tree["steps"].values():
+            for variant in step.get("variants", {}).values():
+                variant.pop("repeat", None)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "recipe.yaml"
+            path.write_text(json.dumps(tree))
+            cells = expand_cells(load_workflow(path, catalog), catalog)
+        given: dict[str, Any] = {}
+        for cell in cells:
+            sources = cell.inputs.items()
+            if cell.skip_reason or not all(str(source) in given for _, source in sources):
+                continue
+            method = catalog.method(cell.method).load()
+            inputs = method.In(**{port: given[str(source)] for port, source in sources})
+            # A method that refuses what a room gives it has no number of that room.
+            with suppress(OrthoflowError):
+                out, metrics = run(method, inputs, cell.seed, **cell.params)
+                for port in vars(out):
+                    given[str(CellOutput(address=cell.address, port=port))] = getattr(out, port)
+                for metric, value in metrics.items():
+                    yield f"{cell.address} {metric}", value
+        points = {
+            address: by_point(product)
+            for address, product in given.items()
+            if address.startswith("points@")
+        }
+        yield from on_common(points)
+
+
+def on_common(points: Mapping[str, Mapping[tuple[Any, ...], float]]) -> Iterator[tuple[str, float]]:
+    """Return RMS lengths in mm over the check points that all orthoimages show, by class."""
+    if not points:
+        return
+    common = set.intersection(*(set(found) for found in points.values()))
+    for address, found in points.items():
+        name = address.removesuffix(".inspection")
+        yield f"{name} n_of_its_own", float(len(found))
+        for kind in ("flat", "vertical edge", "all"):
+            lengths = np.array([found[key] for key in common if kind in ("all", key[0])])
+            yield f"{name} common_{kind.replace(' ', '_')}", float(len(lengths))
+            if len(lengths):
+                rms_mm = float(np.sqrt(np.mean(lengths**2)))
+                yield f"{name} common_{kind.replace(' ', '_')}_mm", rms_mm
 
 
 def numbers(inspection: Inspection) -> dict[str, float]:
     return {finding.name: finding.value for finding in inspection.findings if finding.wall <= 0}
 
 
-def planes(seed: int) -> Iterator[tuple[str, str, float]]:
-    """Return every detector's errors in a room."""
-    room = room_of(seed, scan_step_m=0.03)
-    for name, (method, params) in DETECTORS.items():
-        out, metrics = run(method, method.In(cloud=room.cloud), seed, **params)
-        inputs = InspectTruth.In(truth=room.truth, planes=out.planes, labels=out.labels)
-        found = numbers(run(InspectTruth, inputs, seed)[0].inspection)
-        yield name, "raw angle / deg", abs(metrics["raw_angle_deg"])
-        yield name, "raw offset / mm", abs(metrics["raw_offset_mm"])
-        yield name, "angle / deg", abs(found["plane_angle_deg"])
-        yield name, "offset / mm", abs(found["plane_offset_mm"])
-        yield name, "planes found", found["true_planes_found"] / found["true_planes"]
-        yield name, "IoU", found["label_iou_mean"]
-
-
-def surfaces(seed: int) -> Iterator[tuple[str, str, float]]:
+def surfaces(seed: int) -> Iterator[tuple[str, float]]:
     """Return errors of orthoimages on a scanned and on a matched surface of a room."""
-    room = room_of(
+    room = run(
+        SimulateRoom,
+        SimulateRoom.In(),
         seed,
-        scan_step_m=0.005,
-        panorama_step_m=0.03,
+        **COARSE,
         photo_layout="variant2",
-        photo_gsd_m=0.004,
         # Of oblique neighbours one may stand above the other, which the matching of rows excludes.
         photo_obliquity_deg=3.0,
         check_points_most=20,
-    )
+    )[0]
     cameras = room.truth.cameras
     seen = {"photos": room.photos, "cameras": cameras}
     coloured = run(ColourPhotos, ColourPhotos.In(cloud=room.cloud, **seen), seed)[0].cloud
-    residuals = {}
+    points = {}
     for source, cloud in (("scanned", coloured), ("matched", matched_cloud(room))):
         main = room.truth.planes.names.index("main wall")
         inputs = RasterGrid.In(cloud=cloud, planes=room.truth.planes)
@@ -127,25 +189,13 @@ def surfaces(seed: int) -> Iterator[tuple[str, str, float]]:
             joined = MosaicSeams.In(layers=layers, walls=walls)
             images = run(MosaicSeams, joined, seed, gains="none")[0].orthoimages
             shown = {"orthoimages": images, "walls": walls, "truth": room.truth}
-            points = InspectCheckpoints.In(checkpoints=room.checkpoints, **shown)
-            residuals[source, way] = by_point(run(InspectCheckpoints, points, seed)[0].inspection)
+            asked = InspectCheckpoints.In(checkpoints=room.checkpoints, **shown)
+            name = f"points@{source},{way}"
+            points[name] = by_point(run(InspectCheckpoints, asked, seed)[0].inspection)
             found = numbers(run(InspectTruth, InspectTruth.In(**shown), seed)[0].inspection)
-            name = f"{source}, {way}"
-            yield name, "u / mm", found["rmse_u_mm"]
-            yield name, "v / mm", found["rmse_v_mm"]
-            yield name, "painted", found["completeness"]
-            yield name, "points found", float(len(residuals[source, way]))
-    common = set.intersection(*(set(found) for found in residuals.values()))
-    for (source, way), found in residuals.items():
-        for kind in ("flat", "vertical edge"):
-            lengths = [found[key] for key in common if key[0] == kind]
-            if lengths:
-                yield (
-                    f"{source}, {way}",
-                    f"{kind} / mm",
-                    float(np.sqrt(np.mean(np.square(lengths)))),
-                )
-                yield f"{source}, {way}", f"common {kind}", float(len(lengths))
+            for metric in ("rmse_u_mm", "rmse_v_mm", "completeness"):
+                yield f"check@{source},{way} {metric}", found[metric]
+    yield from on_common(points)
 
 
 def by_point(inspection: Inspection) -> dict[tuple[Any, ...], float]:
@@ -235,37 +285,101 @@ def matched_pair(
     return world, rectified[0][kept]
 
 
+def measured(folder: Path, part: str, seed: int) -> dict[str, float]:
+    """Return the numbers of a room, measured now unless its file is there."""
+    path = folder / f"{part}-{seed}.json"
+    if not path.is_file():
+        started_s = time.process_time()
+        values = dict(surfaces(seed) if part == "surfaces" else recipes(part, seed))
+        values["processor_s"] = time.process_time() - started_s
+        unfinished = path.with_suffix(".part")
+        unfinished.write_text(json.dumps(values, indent=0))
+        unfinished.replace(path)
+        print(f"{path.name}: {values['processor_s']:.0f} s of processor", flush=True)
+    return dict(json.loads(path.read_text()))
+
+
+Tens = Mapping[str, Sequence[Sequence[Mapping[str, float]]]]
+
+
+def filled_in(text: str, tens: Tens) -> str:
+    """Put the numbers of rooms into the places of a text.
+
+    Args:
+        text: with places `{{part: cell metric}}`, `{{part: cell metric : share}}` for per cent,
+            `: mean` without scatter, `: median`, and `{{part: cell metric < cell metric}}`.
+        tens: part -> tens -> rooms -> numbers by `cell metric`.
+    """
+    return PLACE.sub(lambda place: _text_of(place[2].strip(), tens[place[1]]), text)
+
+
+def _text_of(place: str, tens: Sequence[Sequence[Mapping[str, float]]]) -> str:
+    if " < " in place:
+        first, second = place.split(" < ")
+        return " and ".join(_how_often(first, second, rooms) for rooms in tens if rooms)
+    key, _, form = place.partition(" : ")
+    if form == "n":
+        return str(sum(key in room for room in tens[0]))
+    factor = 100.0 if form == "share" else 1.0
+    values = factor * np.abs([room[key] for room in tens[0] if key in room])
+    if not len(values):
+        raise ValueError(f"no room has {key}")
+    if form in ("mean", "median"):
+        return _number(float(getattr(np, form)(values)))
+    spread = f" ± {_number(float(values.std(ddof=1)), 2)}" if len(values) > 1 else ""
+    return f"{_number(float(values.mean()))}{spread} ({_number(float(values.max()))})"
+
+
+def _how_often(first: str, second: str, rooms: Sequence[Mapping[str, float]]) -> str:
+    both = [(abs(room[first]), abs(room[second])) for room in rooms if {first, second} <= set(room)]
+    return f"{sum(a < b for a, b in both)} of {len(both)}"
+
+
+def _number(value: float, digits: int = 3) -> str:
+    # Never as a power of ten.
+    return np.format_float_positional(
+        float(f"{value:.{digits}g}"), trim="-", fractional=False, precision=digits
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=["planes", "surfaces"])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--part", action="append", choices=[*RECIPES, "surfaces"])
     parser.add_argument("--rooms", type=int, default=10, help="of each ten")
     options = parser.parse_args()
-    measure = {"planes": planes, "surfaces": surfaces}[options.what]
-    print(f"{platform.machine()}, Python {platform.python_version()}", flush=True)
-    for seeds in TENS:
-        found: dict[tuple[str, str], list[float]] = defaultdict(list)
-        for n_rooms, seed in enumerate(seeds[: options.rooms], start=1):
-            for name, metric, value in measure(seed):
-                found[name, metric].append(value)
-            print(f"room {seed}", flush=True)
-            if n_rooms % 5 == 0 or n_rooms == options.rooms:
-                report(found, f"seeds {seeds[0]} to {seed}")
+    options.folder.mkdir(parents=True, exist_ok=True)
+    parts = [*RECIPES, "surfaces"]
+    for n_rooms in range(options.rooms):
+        for seeds in TENS:
+            for part in options.part or parts:
+                measured(options.folder, part, seeds[n_rooms])
+    tens = {
+        part: [[_read(options.folder, part, seed) for seed in seeds] for seeds in TENS]
+        for part in parts
+    }
+    rooms = {part: [[room for room in ten if room] for ten in both] for part, both in tens.items()}
+    if not all(both[0] for both in rooms.values()):
+        return
+    newest_s = max(path.stat().st_mtime for path in options.folder.glob("*.json"))
+    made = (
+        f"{datetime.fromtimestamp(newest_s, UTC):%Y-%m-%d} on {platform.machine()}, "
+        f"{os.cpu_count()} cores, Python {platform.python_version()}, in rooms of both sets: "
+        + ", ".join(f"{part} {len(one)} and {len(two)}" for part, (one, two) in rooms.items())
+    )
+    for page in sorted((ROOT / "benchmarks" / "pages").glob("*.md")):
+        text = page.read_text().replace("{{made}}", made)
+        (ROOT / "docs" / page.name).write_text(filled_in(text, rooms))
 
 
-def report(found: Mapping[tuple[str, str], list[float]], title: str) -> None:
-    """Print a table: a row per method, mean ± standard deviation and the worst room."""
-    metrics = list(dict.fromkeys(metric for _, metric in found))
-    print(f"\n| {title} | {' | '.join(metrics)} |\n| --- |{' ---: |' * len(metrics)}")
-    for name in dict.fromkeys(name for name, _ in found):
-        cells = []
-        for metric in metrics:
-            values = found.get((name, metric), [])
-            spread = np.std(values, ddof=1) if len(values) > 1 else 0.0
-            cells.append(
-                f"{np.mean(values):.3g} ± {spread:.2g} ({np.max(values):.3g})" if values else "-"
-            )
-        print(f"| {name} | {' | '.join(cells)} |")
-    print(flush=True)
+def _read(folder: Path, part: str, seed: int) -> dict[str, float]:
+    """Return the numbers of a room, with shares of planes found; none of one not measured."""
+    path = folder / f"{part}-{seed}.json"
+    room: dict[str, float] = json.loads(path.read_text()) if path.is_file() else {}
+    for key in [key for key in room if key.endswith(" true_planes_found")]:
+        cell = key.partition(" ")[0]
+        room[f"{cell} found_share"] = room[key] / room[f"{cell} true_planes"]
+    return room
 
 
 if __name__ == "__main__":

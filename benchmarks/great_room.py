@@ -117,7 +117,7 @@ def great_room(n_points: int, *, cores: int) -> GreatRoom:
         part = points.take(slice(start, start + size))
         columns = max(1, RAYS_AT_ONCE // sweep.n_rows)
         in_runs(
-            partial(_sweep, scanner, sweep, part),
+            partial(scanner.sweep, sweep, part),
             sweep.n_columns,
             n_per_run=columns,
             threads=cores,
@@ -128,10 +128,6 @@ def great_room(n_points: int, *, cores: int) -> GreatRoom:
     return GreatRoom(
         x=points.x, y=points.y, z=points.z, plane_index=plane_index, planes=tuple(draft.planes)
     )
-
-
-def _sweep(scanner: Scanner, sweep: Sweep, points: Scanned, first: int, last: int) -> None:
-    scanner.sweep(sweep, first, last, points)
 
 
 def _sweeps(n_points: int) -> list[Sweep]:

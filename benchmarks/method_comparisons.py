@@ -1,4 +1,4 @@
-"""The tables of docs/choosing.md: the shipped comparisons run, and printed as Markdown.
+"""Run the shipped comparisons, each in one drawn room, and print their tables as Markdown.
 
     python benchmarks/method_comparisons.py runs/comparisons
     python benchmarks/method_comparisons.py runs/comparisons --recipe plane-methods
@@ -7,8 +7,9 @@
 
 Each recipe runs into `FOLDER/<recipe>` on its simulated room, as `orthoflow run <recipe>.yaml` does
 it, unless that folder holds a finished run; a single report of all of them goes to
-`FOLDER/report.html`. Best values, and what is not told apart from them, are bold where a metric has
-a good side. Processor seconds are without loading and compiling; docs/performance.md has times.
+`FOLDER/report.html`. Nothing is bold where one run stands; of metrics with repeats the best value
+is, and what is not told apart from it. docs/choosing.md compares over many rooms. Processor seconds
+are without loading and compiling; docs/performance.md has times.
 """
 
 from __future__ import annotations

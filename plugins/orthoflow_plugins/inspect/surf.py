@@ -91,6 +91,9 @@ class InspectSurf(Method):
                     better="lower",
                 ),
                 MetricSpec(
+                    "surf_beyond_2rmse_[xy]_share", label="beyond twice the RMS along {0} by SURF"
+                ),
+                MetricSpec(
                     "surf_floor_rmse_[xy]_mm",
                     label="displacement along {0} by SURF, intensity with itself, RMS",
                 ),
@@ -284,6 +287,8 @@ def _numbers(items: list[_Verdict], wall: int, gsd_m: float) -> list[Finding]:
         shift = np.concatenate(joined(which, what))
         if len(shift):
             wanted = {f"{prefix}rmse_{axis}_mm" for axis in "xy"}
+            if prefix == "surf_":
+                wanted |= {f"surf_beyond_2rmse_{axis}_share" for axis in "xy"}
             numbers = displacement_findings(shift, gsd_m, wall, prefix=prefix)
             findings += [finding for finding in numbers if finding.name in wanted]
     return findings

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
 Extent = tuple[float, float, float, float]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Paint:
     """A texture with its parameters.
 
@@ -36,9 +37,13 @@ class Paint:
     period_m: float = 0.3
     seed: int = 1
 
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """The parameters of the texture, in the order of `Scene.texture_params`."""
+        return (*self.rgb, self.reflectance, self.contrast, self.period_m, self.seed)
 
-@dataclass(frozen=True, kw_only=True)
-class Surface:
+
+class Surface(NamedTuple):
     """One rectangle of a scene under construction: position, size and meaning."""
 
     centre: NDArray[np.float64]
@@ -86,7 +91,6 @@ class SceneDraft:
         """
         surfaces = self.surfaces
         holes = [(i, hole) for i, surface in enumerate(surfaces) for hole in surface.holes]
-        paints = [surface.paint for surface in surfaces]
         return Scene(
             origin=np.zeros(3),
             centre=np.array([surface.centre for surface in surfaces]),
@@ -95,13 +99,9 @@ class SceneDraft:
             extent=np.array([surface.extent for surface in surfaces], dtype=np.float64),
             plane_index=np.array([surface.plane for surface in surfaces], dtype=np.int16),
             role=np.array([surface.role for surface in surfaces], dtype=np.uint8),
-            texture=np.array([paint.kind for paint in paints], dtype=np.int32),
+            texture=np.array([surface.paint.kind for surface in surfaces], dtype=np.int32),
             texture_params=np.array(
-                [
-                    (*p.rgb, p.reflectance, p.contrast, p.period_m, p.seed, spectral_gap)
-                    for p in paints
-                ],
-                dtype=np.float64,
+                [(*surface.paint.numbers, spectral_gap) for surface in surfaces], dtype=np.float64
             ),
             hole_rectangle=np.array([index for index, _ in holes], dtype=np.int32),
             hole_extent=np.array([hole for _, hole in holes], dtype=np.float64).reshape(-1, 4),
@@ -137,18 +137,9 @@ class Side:
         holes: Sequence[Extent] = (),
     ) -> None:
         """Add a rectangle parallel to the wall, `depth_m` in front of it."""
-        self.draft.surfaces.append(
-            Surface(
-                centre=self.foot + depth_m * self.normal,
-                axis_a=self.axis_a,
-                axis_b=self.axis_b,
-                extent=extent,
-                paint=paint,
-                role=role,
-                plane=plane,
-                holes=holes,
-            )
-        )
+        centre = self.foot + depth_m * self.normal
+        axes = (self.axis_a, self.axis_b)
+        self.draft.surfaces.append(Surface(centre, *axes, extent, paint, role, plane, holes))
 
     def rims(
         self, extent: Extent, depths_m: tuple[float, float], paint: Paint, role: SurfaceRole
@@ -156,10 +147,16 @@ class Side:
         """Add the four faces that run from one depth to another along an extent's outline."""
         a0, a1, b0, b1 = extent
         low, high = min(depths_m), max(depths_m)
-        for a in (a0, a1):
-            self._across(self.axis_a, a, self.axis_b, (b0, b1, low, high), paint, role)
-        for b in (b0, b1):
-            self._across(self.axis_b, b, self.axis_a, (a0, a1, low, high), paint, role)
+        for along, axis, places, ends in (
+            (self.axis_a, self.axis_b, (a0, a1), (b0, b1)),
+            (self.axis_b, self.axis_a, (b0, b1), (a0, a1)),
+        ):
+            self.draft.surfaces += [
+                Surface(
+                    self.foot + place * along, axis, self.normal, (*ends, low, high), paint, role
+                )
+                for place in places
+            ]
 
     def box(self, extent: Extent, depth_m: float, paint: Paint, *, base_m: float = 0.0) -> None:
         """Add relief that stands `depth_m` out of the depth `base_m`; none when that is zero."""
@@ -201,26 +198,6 @@ class Side:
         plane = Plane(normal=self.normal, offset_m=float(self.normal @ foot))
         self.draft.planes.append(TruePlane(name=name, plane=plane, outline=outline))
         return len(self.draft.planes) - 1
-
-    def _across(
-        self,
-        along: NDArray[np.float64],
-        position_m: float,
-        axis: NDArray[np.float64],
-        extent: Extent,
-        paint: Paint,
-        role: SurfaceRole,
-    ) -> None:
-        self.draft.surfaces.append(
-            Surface(
-                centre=self.foot + position_m * along,
-                axis_a=axis,
-                axis_b=self.normal,
-                extent=extent,
-                paint=paint,
-                role=role,
-            )
-        )
 
 
 def wall_side(draft: SceneDraft, *, omega_deg: float, phi_deg: float, distance_m: float) -> Side:
@@ -282,24 +259,10 @@ def add_block(
     across = np.array([-math.sin(yaw), math.cos(yaw), 0.0])
     up = np.array([0.0, 0.0, 1.0])
     length, depth, height = size_m
-    half = (length / 2, depth / 2)
+    a, b = length / 2, depth / 2
     faces = [
-        (base + sign * half[0] * along, across, up, (-half[1], half[1], 0.0, height))
-        for sign in (-1.0, 1.0)
+        *((base + at * along, across, up, (-b, b, 0.0, height)) for at in (-a, a)),
+        *((base + at * across, along, up, (-a, a, 0.0, height)) for at in (-b, b)),
+        (base + height * up, along, across, (-a, a, -b, b)),
     ]
-    faces += [
-        (base + sign * half[1] * across, along, up, (-half[0], half[0], 0.0, height))
-        for sign in (-1.0, 1.0)
-    ]
-    faces.append((base + height * up, along, across, (-half[0], half[0], -half[1], half[1])))
-    draft.surfaces += [
-        Surface(
-            centre=centre,
-            axis_a=axis_a,
-            axis_b=axis_b,
-            extent=extent,
-            paint=paint,
-            role=SurfaceRole.OBJECT,
-        )
-        for centre, axis_a, axis_b, extent in faces
-    ]
+    draft.surfaces += [Surface(*face, paint, SurfaceRole.OBJECT) for face in faces]

@@ -10,6 +10,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion
 
 from orthoflow.files.images import decode_image, encode_webp
 from orthoflow.geometry import Plane, frame_over, wall_axes
@@ -18,7 +19,6 @@ from orthoflow.geometry.scene_views import SceneCameras, render_frame
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
 from orthoflow.products import CheckPoints, JsonValue, Photos, Planes, PointCloud, Truth
 from orthoflow.sdk import StepContext
-from orthoflow_plugins.simulate.building import TruePlane
 from orthoflow_plugins.simulate.photographs import Shot, true_cameras
 from orthoflow_plugins.simulate.room_model import Room
 from orthoflow_plugins.simulate.scanning import (
@@ -73,8 +73,19 @@ class Delivery:
 def cloud_of(delivery: Delivery) -> PointCloud:
     """Return the cloud; a shift of the world changes its origin and its stations, nothing else."""
     points = delivery.scan.points
-    in_room = (points.x, points.y, points.z)
-    x, y, z = (_turned_axis(row, in_room) for row in delivery.world_from_room)
+    x, y, z = (
+        # Exact where axes only change places.
+        np.asarray(
+            sum(
+                share * axis
+                for share, axis in zip(
+                    row.astype(np.float32), (points.x, points.y, points.z), strict=True
+                )
+                if share != 0.0
+            )
+        )
+        for row in delivery.world_from_room
+    )
     return PointCloud(
         origin=delivery.shift_world_m.copy(),
         x=x,
@@ -136,19 +147,6 @@ def truth_of(
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class ScanStep:
-    """Spacing of the points on a wall, as if they formed a square grid.
-
-    Attributes:
-        median_m: half of the wall is scanned at least this finely.
-        p90_m: nine tenths of the wall are.
-    """
-
-    median_m: float
-    p90_m: float
-
-
 def report_room(truth: Truth, cloud: PointCloud, ctx: StepContext) -> None:
     """Report metrics and the true orthoimage of the main wall, which need not have most points."""
     main = truth.planes.names.index("main wall")
@@ -158,8 +156,8 @@ def report_room(truth: Truth, cloud: PointCloud, ctx: StepContext) -> None:
     ctx.metric("outlier_share", truth.n_spoilt / len(cloud), "1")
     step = measured_step(truth, cloud, main)
     if step is not None:
-        ctx.metric("scan_step_median_mm", 1000.0 * step.median_m, "mm")
-        ctx.metric("scan_step_p90_mm", 1000.0 * step.p90_m, "mm")
+        ctx.metric("scan_step_median_mm", 1000.0 * step[0], "mm")
+        ctx.metric("scan_step_p90_mm", 1000.0 * step[1], "mm")
     ctx.figure(
         "main_wall",
         partial(_picture, truth, main, ctx.cores),
@@ -196,8 +194,13 @@ def _contact_sheet(photos: Photos) -> bytes:
     return encode_webp(np.vstack(rows))
 
 
-def measured_step(truth: Truth, cloud: PointCloud, plane: int) -> ScanStep | None:
-    """Measure the point spacing on a plane from tiles of 10 cm; None without tiles."""
+def measured_step(truth: Truth, cloud: PointCloud, plane: int) -> tuple[float, float] | None:
+    """Measure the point spacing on a plane from tiles of 10 cm; None without whole tiles.
+
+    Returns:
+        The spacing in metres, as if the points formed a square grid, of which half of the wall is
+        scanned at least as finely, and nine tenths of it.
+    """
     frame = frame_over(truth.planes.corners[plane], truth.planes.normal[plane], gsd_m=_TILE_M)
     counts = np.zeros(frame.shape, dtype=np.int64)
     for start in range(0, len(cloud), _CHUNK):
@@ -205,21 +208,12 @@ def measured_step(truth: Truth, cloud: PointCloud, plane: int) -> ScanStep | Non
         pixels = np.floor(frame.wall_from_world(cloud.points_world(chosen))[:, :2]).astype(int)
         inside = np.all((pixels >= 0) & (pixels < [frame.width, frame.height]), axis=1)
         np.add.at(counts, (pixels[inside, 1], pixels[inside, 0]), 1)
-    whole = counts[_inner(counts > 0)]
+    # Tiles whose neighbours all hold points are not cut by the wall's border.
+    whole = counts[binary_erosion(counts > 0, np.ones((3, 3), dtype=np.bool_))]
     if whole.size == 0:
         return None
     steps = _TILE_M / np.sqrt(whole)
-    return ScanStep(median_m=float(np.median(steps)), p90_m=float(np.percentile(steps, 90)))
-
-
-def _inner(filled: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Tiles whose neighbours all hold points, so that they are not cut by the wall's border."""
-    padded = np.pad(filled, 1)
-    inner = np.ones_like(filled)
-    for row in range(3):
-        for column in range(3):
-            inner &= padded[row : row + filled.shape[0], column : column + filled.shape[1]]
-    return inner
+    return float(np.median(steps)), float(np.percentile(steps, 90))
 
 
 def _picture(truth: Truth, plane: int, cores: int) -> bytes:
@@ -231,36 +225,30 @@ def _picture(truth: Truth, plane: int, cores: int) -> bytes:
     return encode_webp(np.nan_to_num(image.rgb).round().astype(np.uint8))
 
 
-def _turned_axis(
-    row: NDArray[np.float64], in_room: tuple[NDArray[np.float32], ...]
-) -> NDArray[np.float32]:
-    axis = int(np.argmax(np.abs(row)))
-    if np.count_nonzero(row) > 1:
-        a, b, c = row.astype(np.float32)
-        return np.asarray(a * in_room[0] + b * in_room[1] + c * in_room[2])
-    return in_room[axis] if row[axis] > 0.0 else -in_room[axis]
-
-
 def _true_planes(
     delivery: Delivery, order: NDArray[np.int64], n_points: NDArray[np.int64]
 ) -> Planes:
     chosen = [delivery.room.planes[index] for index in order]
-    turned = [item.plane.normal @ delivery.world_from_room.T for item in chosen]
+    turn, shift_m = delivery.world_from_room, delivery.shift_world_m
+    normals = [item.plane.normal @ turn.T for item in chosen]
+    corners = []
+    for item, normal in zip(chosen, normals, strict=True):
+        # The rectangle along the wall axes that contains the outline.
+        axes = wall_axes(normal, delivery.up_world)
+        along = item.outline @ turn.T @ axes.T
+        (left, low), (right, high) = along.min(axis=0), along.max(axis=0)
+        ends = np.array([[left, low], [left, high], [right, high], [right, low]])
+        corners.append(item.plane.offset_m * normal + ends @ axes + shift_m)
     count = len(chosen)
     return Planes(
-        normal=np.array(turned),
+        normal=np.array(normals),
         offset=np.array(
             [
-                item.plane.offset_m + float(normal @ delivery.shift_world_m)
-                for item, normal in zip(chosen, turned, strict=True)
+                item.plane.offset_m + float(normal @ shift_m)
+                for item, normal in zip(chosen, normals, strict=True)
             ]
         ),
-        corners=np.array(
-            [
-                _corners_world(item, normal, delivery)
-                for item, normal in zip(chosen, turned, strict=True)
-            ]
-        ),
+        corners=np.array(corners),
         covariance=np.zeros((count, 4, 4)),
         n_points=n_points.astype(np.int64),
         rms_m=np.zeros(count),
@@ -269,17 +257,6 @@ def _true_planes(
         viewpoint="stations",
         details={"true": True},
     )
-
-
-def _corners_world(
-    item: TruePlane, normal: NDArray[np.float64], delivery: Delivery
-) -> NDArray[np.float64]:
-    """Return corners of the rectangle along the wall axes that contains the plane's outline."""
-    outline = item.outline @ delivery.world_from_room.T
-    axes = wall_axes(normal, delivery.up_world)
-    low, high = (outline @ axes.T).min(axis=0), (outline @ axes.T).max(axis=0)
-    ends = np.array([[low[0], low[1]], [low[0], high[1]], [high[0], high[1]], [high[0], low[1]]])
-    return item.plane.offset_m * normal + ends @ axes + delivery.shift_world_m
 
 
 def _rms_m(cloud: PointCloud, planes: Planes, labels: NDArray[np.int16]) -> NDArray[np.float64]:
@@ -320,39 +297,29 @@ class _Spots(Rows):
         )
 
 
-def check_points(
-    scene: Scene,
-    views: SceneCameras,
-    stations: NDArray[np.float64],
-    world_from_room: NDArray[np.float64],
-    shift_world_m: NDArray[np.float64],
-    *,
-    n_most: int,
-) -> CheckPoints:
+def check_points(delivery: Delivery, views: SceneCameras, *, n_most: int) -> CheckPoints:
     """Choose check points of each class on the main wall.
 
     `flat` points are crossings of the painted lines of a fresco, with 4 cm of bare wall around;
     `vertical edge` points are front corners of mouldings. A station sees each of them.
 
     Args:
-        scene: the room, in its own frame.
-        views: the same, prepared for rendering.
-        stations: (s, 3) metres, room frame.
-        world_from_room: (3, 3) rotation.
-        shift_world_m: (3,) world position of the room's origin.
+        delivery: the scanned room.
+        views: its scene, prepared for rendering.
         n_most: maximum number of each class.
     """
+    scene, stations = delivery.room.scene, np.unique(delivery.scan.stations, axis=0)
     chosen = {
         _FLAT: _spread(_crossings(scene, views, stations), n_most),
         _VERTICAL_EDGE: _spread(_corners(scene, views, stations), n_most),
     }
-    points = np.concatenate(list(chosen.values())) @ world_from_room.T + shift_world_m
+    points = np.concatenate(list(chosen.values())) @ delivery.world_from_room.T
     names = [
         f"{kind[0].upper()}{i:02d}" for kind, found in chosen.items() for i in range(len(found))
     ]
     return CheckPoints(
         names=tuple(names),
-        points_world=points,
+        points_world=points + delivery.shift_world_m,
         classes=tuple(kind for kind, found in chosen.items() for _ in found),
         wall=np.full(len(points), -1, dtype=np.int32),
         pixels_wall=np.full((len(points), 2), np.nan),
@@ -364,10 +331,12 @@ def _crossings(
 ) -> NDArray[np.float64]:
     frescos = (scene.plane_index == _MAIN_WALL) & (scene.texture == TextureKind.FRESCO)
     spots = _Spots.joined([_lattice(scene, int(index)) for index in np.flatnonzero(frescos)])
-    clear = np.ones(len(spots.rectangle), dtype=np.bool_)
-    for right in (-_CLEAR_M, 0.0, _CLEAR_M):
-        for up in (-_CLEAR_M, 0.0, _CLEAR_M):
-            clear &= _are_seen(scene, views, spots.moved(np.array([right, up])), stations)
+    around = [
+        spots.moved(np.array([right, up]))
+        for right in (-_CLEAR_M, 0.0, _CLEAR_M)
+        for up in (-_CLEAR_M, 0.0, _CLEAR_M)
+    ]
+    clear = np.all([_are_seen(scene, views, place, stations) for place in around], axis=0)
     return spots.points(scene)[clear]
 
 

@@ -17,7 +17,6 @@ from orthoflow.files.images import encode_jpeg
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
 from orthoflow.products import (
-    Calibration,
     Camera,
     Cameras,
     Intrinsics,
@@ -26,7 +25,7 @@ from orthoflow.products import (
     TakenPhoto,
 )
 from orthoflow.sdk import StepContext
-from orthoflow_plugins.simulate.building import SceneDraft, Side
+from orthoflow_plugins.simulate.building import Paint, SceneDraft, Surface
 from orthoflow_plugins.simulate.room_model import DESIGNED, Geometry, main_wall_axes
 
 if TYPE_CHECKING:
@@ -69,23 +68,6 @@ class Shot:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShotPlan:
-    """Which photos are requested.
-
-    Attributes:
-        layout: which walls, and how many photos.
-        gsd_m: side of a pixel on the wall.
-        obliquity_deg: largest intended angle between optical axis and wall normal.
-        geometry: where the walls stand.
-    """
-
-    layout: PhotoLayout
-    gsd_m: float
-    obliquity_deg: float
-    geometry: Geometry = DESIGNED
-
-
-@dataclass(frozen=True, kw_only=True)
 class Film:
     """The degradation of the pictures.
 
@@ -102,65 +84,92 @@ class Film:
     exposures: float
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Layout:
-    """A camera and its targets.
-
-    Attributes:
-        footprint_m: width and height of a photo on the wall.
-        distance_m: distance from the wall.
-        targets: number of the wall, and (a, b) on it.
-    """
-
-    footprint_m: tuple[float, float]
-    distance_m: float
-    targets: tuple[tuple[int, float, float], ...]
-
-
 def _block(
-    wall: int, along: Sequence[float], up: Sequence[float]
+    along: Sequence[float], up: Sequence[float], walls: Sequence[int] = (0,)
 ) -> tuple[tuple[int, float, float], ...]:
-    return tuple((wall, a, b) for b in up for a in along)
+    return tuple((wall, a, b) for wall in walls for b in up for a in along)
 
 
+# Width and height of a photo on the wall, distance from it, metres; targets: number of the wall and
+# (a, b) on it.
 _LAYOUTS: Final = {
     # Six photos of the main wall that overlap by a quarter.
-    "quick": _Layout(
-        footprint_m=(2.4, 1.8),
-        distance_m=2.6,
-        targets=_block(0, (-1.75, 0.0, 1.75), (-0.65, 0.75)),
-    ),
+    "quick": ((2.4, 1.8), 2.6, _block((-1.75, 0.0, 1.75), (-0.65, 0.75))),
     # Eight photos, each of a whole wall; four walls.
-    "variant1": _Layout(
-        footprint_m=(5.9, 3.5),
-        distance_m=3.95,
-        targets=tuple((wall, a, 0.05) for wall in range(4) for a in (-0.1, 0.1)),
-    ),
+    "variant1": ((5.9, 3.5), 3.95, _block((-0.1, 0.1), (0.05,), range(4))),
     # A block over the main wall: 70 % overlap along, 50 % across.
-    "variant2": _Layout(
-        footprint_m=(2.4, 1.8),
-        distance_m=2.6,
-        targets=_block(0, (-1.8, -1.08, -0.36, 0.36, 1.08, 1.8), (-0.8, 0.1, 1.0)),
+    "variant2": (
+        (2.4, 1.8),
+        2.6,
+        _block((-1.8, -1.08, -0.36, 0.36, 1.08, 1.8), (-0.8, 0.1, 1.0)),
     ),
 }
 _WALL_NAMES: Final = ("main wall", "opposite wall", "right wall", "left wall")
 
 
-def planned_shots(plan: ShotPlan, rng: np.random.Generator) -> tuple[Shot, ...]:
+def planned_shots(
+    layout: PhotoLayout,
+    rng: np.random.Generator,
+    *,
+    gsd_m: float,
+    obliquity_deg: float,
+    geometry: Geometry = DESIGNED,
+) -> tuple[Shot, ...]:
     """Plan the photos of a layout; the generator varies their positions.
 
     The photographer aims at a place, but stands aside and holds the camera slightly askew. All
     photos share one camera with Brown distortion.
+
+    Args:
+        layout: which walls, and how many photos.
+        rng: draws lens and positions.
+        gsd_m: side of a pixel on the wall.
+        obliquity_deg: largest intended angle between optical axis and wall normal.
+        geometry: where the walls stand.
     """
-    if plan.layout == "none":
+    if layout == "none":
         return ()
-    layout = _LAYOUTS[plan.layout]
-    sides = plan.geometry.sides(SceneDraft())
-    lens = _lens(layout, plan.gsd_m, rng)
-    return tuple(
-        _shot(f"photo_{place:02d}.jpg", layout, target, sides, lens, plan.obliquity_deg, rng)
-        for place, target in enumerate(layout.targets)
+    footprint_m, distance_m, targets = _LAYOUTS[layout]
+    sides = geometry.sides(SceneDraft())
+    width, height = (max(16, round(side / gsd_m)) for side in footprint_m)
+    off_centre = rng.uniform(-0.006, 0.006, 2) * width
+    scatter = np.append(rng.uniform(-1.0, 1.0, 4), 0.0)
+    distortion = np.array([-0.08, 0.02, 0.0, 0.0, 0.0])
+    distortion += np.array([0.01, 0.005, 0.0005, 0.0005, 0.0]) * scatter
+    lens = Intrinsics(
+        width=width,
+        height=height,
+        fx=distance_m / gsd_m,
+        fy=distance_m / gsd_m,
+        cx=float(width / 2 + off_centre[0]),
+        cy=float(height / 2 + off_centre[1]),
+        distortion=tuple(distortion.tolist()),
+        source="truth",
     )
+    shots = []
+    for place, (wall, *target) in enumerate(targets):
+        side = sides[wall]
+        a, b = np.array(target) + rng.uniform(-0.02, 0.02, 2) * footprint_m
+        aim = side.foot + a * side.axis_a + b * side.axis_b
+        tilt = math.radians(obliquity_deg) * rng.uniform(0.4, 1.0)
+        turn = rng.uniform(0.0, 2.0 * math.pi)
+        aside = math.cos(turn) * side.axis_a + math.sin(turn) * side.axis_b
+        centre = place_to_stand(
+            aim + distance_m * (math.cos(tilt) * side.normal + math.sin(tilt) * aside)
+        )
+        roll_deg = float(rng.uniform(-_WORST_ROLL_DEG, _WORST_ROLL_DEG))
+        cos, sin = math.cos(math.radians(roll_deg)), math.sin(math.radians(roll_deg))
+        about_axis = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        rotation = about_axis @ looking_at(centre, aim, _UP)
+        taken = TakenPhoto(
+            photo=f"photo_{place:02d}.jpg",
+            wall=_WALL_NAMES[wall],
+            gsd_m=float(np.linalg.norm(aim - centre)) / lens.fx,
+            obliquity_deg=math.degrees(math.acos(min(1.0, float(-rotation[2] @ side.normal)))),
+            roll_deg=roll_deg,
+        )
+        shots.append(Shot(taken=taken, camera=lens.posed(rotation, -rotation @ centre)))
+    return tuple(shots)
 
 
 def with_passers_by(
@@ -180,37 +189,29 @@ def with_passers_by(
     side = DESIGNED.sides(SceneDraft())[0]
     scenes = []
     for _ in range(n_photos):
-        rows: dict[str, list[object]] = {name: [] for name in _OF_PEOPLE}
+        draft = SceneDraft()
         for person in range(count):
-            place, before_m, is_there = (
-                drawn.uniform(-2.2, 2.2),
-                drawn.uniform(0.5, 1.4),
-                drawn.random() < 0.5,
-            )
-            if not is_there:
+            place, before_m = drawn.uniform(-2.2, 2.2), drawn.uniform(0.5, 1.4)
+            if drawn.random() >= _ABSENT:
                 continue
             foot = side.foot + place * along - before_m * towards
+            centre = np.array([foot[0], foot[1], 0.0])
             for (low, high, half), rgb in zip(_BODY_M, clothes[person], strict=True):
-                rows["centre"].append([foot[0], foot[1], 0.0])
-                rows["axis_a"].append(along)
-                rows["axis_b"].append(_UP)
-                rows["extent"].append([-half, half, low, high])
-                rows["plane_index"].append(-1)
-                rows["role"].append(SurfaceRole.OBJECT)
-                rows["texture"].append(TextureKind.PLAIN)
-                rows["texture_params"].append([*rgb, 0.5, 0.1, 0.3, 900.0 + person, 0.0])
-        scenes.append(_joined(scene, rows))
+                paint = Paint(TextureKind.PLAIN, tuple(rgb), 0.5, 0.1, 0.3, 900 + person)
+                extent = (-half, half, low, high)
+                draft.surfaces.append(
+                    Surface(centre, along, _UP, extent, paint, SurfaceRole.OBJECT)
+                )
+        if not draft.surfaces:
+            scenes.append(scene)
+            continue
+        people = draft.finished(spectral_gap=0.0)
+        joined = {
+            name: np.concatenate([getattr(scene, name), getattr(people, name)])
+            for name in _OF_PEOPLE
+        }
+        scenes.append(replace(scene, **joined))
     return tuple(scenes)
-
-
-def _joined(scene: Scene, rows: dict[str, list[object]]) -> Scene:
-    if not rows["centre"]:
-        return scene
-    joined = {}
-    for name, added in rows.items():
-        before = getattr(scene, name)
-        joined[name] = np.concatenate([before, np.array(added, dtype=before.dtype)])
-    return replace(scene, **joined)
 
 
 def take_photos(
@@ -219,8 +220,10 @@ def take_photos(
     film: Film,
     ctx: StepContext,
     rng: np.random.Generator,
+    *,
+    intrinsics: Intrinsics | None = None,
 ) -> Photos:
-    """Take all photos of a room in its own frame, without camera data.
+    """Take all photos of a room in its own frame.
 
     Args:
         views: the room, or the scene of each photo.
@@ -228,6 +231,7 @@ def take_photos(
         film: their degradation.
         ctx: context of the step.
         rng: generator of all noise.
+        intrinsics: what is known of their camera.
     """
     if not shots:
         return Photos(photos=())
@@ -249,24 +253,10 @@ def take_photos(
                 width=shot.camera.width,
                 height=shot.camera.height,
                 exif_focal_px=exif_focal,
+                intrinsics=intrinsics,
             )
         )
     return Photos(photos=tuple(photos))
-
-
-def calibrated(photos: Photos, calibration: Calibration) -> Photos:
-    """Return the photos with their common calibration; an empty one changes nothing."""
-    if not calibration.intrinsics:
-        return photos
-    known = calibration.intrinsics[0]
-    return Photos(photos=tuple(replace(photo, intrinsics=known) for photo in photos.photos))
-
-
-def calibration_of(shots: tuple[Shot, ...], *, is_known: bool) -> Calibration:
-    """Return the calibration of the camera; empty if it is unknown or there is no photo."""
-    if not (shots and is_known):
-        return Calibration(patterns=(), intrinsics=())
-    return Calibration(patterns=("*",), intrinsics=(Intrinsics.of(shots[0].camera),))
 
 
 def true_cameras(
@@ -296,68 +286,13 @@ def true_cameras(
     return Cameras(cameras=tuple(cameras))
 
 
-def _lens(layout: _Layout, gsd_m: float, rng: np.random.Generator) -> Intrinsics:
-    width, height = (max(16, round(side / gsd_m)) for side in layout.footprint_m)
-    off_centre = rng.uniform(-0.006, 0.006, 2) * width
-    scatter = np.append(rng.uniform(-1.0, 1.0, 4), 0.0)
-    distortion = np.array([-0.08, 0.02, 0.0, 0.0, 0.0])
-    distortion += np.array([0.01, 0.005, 0.0005, 0.0005, 0.0]) * scatter
-    focal_px = layout.distance_m / gsd_m
-    return Intrinsics(
-        width=width,
-        height=height,
-        fx=focal_px,
-        fy=focal_px,
-        cx=float(width / 2 + off_centre[0]),
-        cy=float(height / 2 + off_centre[1]),
-        distortion=tuple(distortion.tolist()),
-        source="truth",
-    )
-
-
-def _shot(
-    name: str,
-    layout: _Layout,
-    target: tuple[int, float, float],
-    sides: Sequence[Side],
-    lens: Intrinsics,
-    obliquity_deg: float,
-    rng: np.random.Generator,
-) -> Shot:
-    wall, a, b = target
-    side = sides[wall]
-    a, b = np.array([a, b]) + rng.uniform(-0.02, 0.02, 2) * layout.footprint_m
-    aim = side.foot + a * side.axis_a + b * side.axis_b
-    tilt = math.radians(obliquity_deg) * rng.uniform(0.4, 1.0)
-    turn = rng.uniform(0.0, 2.0 * math.pi)
-    aside = math.cos(turn) * side.axis_a + math.sin(turn) * side.axis_b
-    wanted = aim + layout.distance_m * (math.cos(tilt) * side.normal + math.sin(tilt) * aside)
-    centre = _where_one_can_stand(wanted)
-    roll_deg = float(rng.uniform(-_WORST_ROLL_DEG, _WORST_ROLL_DEG))
-    rotation = _rolled(looking_at(centre, aim, _UP), roll_deg)
-    taken = TakenPhoto(
-        photo=name,
-        wall=_WALL_NAMES[wall],
-        gsd_m=float(np.linalg.norm(aim - centre)) / lens.fx,
-        obliquity_deg=math.degrees(math.acos(min(1.0, float(-rotation[2] @ side.normal)))),
-        roll_deg=roll_deg,
-    )
-    return Shot(taken=taken, camera=lens.posed(rotation, -rotation @ centre))
-
-
-def _where_one_can_stand(wanted: NDArray[np.float64]) -> NDArray[np.float64]:
+def place_to_stand(wanted: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the position nearest to a given one (3,) inside the room and outside the furniture."""
     axes = np.vstack([main_wall_axes(), _UP])
     place = np.clip(axes @ wanted, _FREE_LOW_M, _FREE_HIGH_M)
     if place[1] < -0.35 or place[1] > 1.2:
         place[2] = max(place[2], _FURNITURE_M + (0.4 if place[1] > 1.2 else 0.0))
     return axes.T @ place
-
-
-def _rolled(rotation: NDArray[np.float64], roll_deg: float) -> NDArray[np.float64]:
-    cos, sin = math.cos(math.radians(roll_deg)), math.sin(math.radians(roll_deg))
-    about_axis = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    return about_axis @ rotation
 
 
 def _developed(

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib.metadata import version
-from typing import TYPE_CHECKING, ClassVar, Final, Literal, Self
+from typing import ClassVar, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from orthoflow.geometry import UpDirection, basis_from_up, up_vector
-from orthoflow.products import Calibration, CheckPoints, Photos, PointCloud, Truth
+from orthoflow.products import Calibration, CheckPoints, Intrinsics, Photos, PointCloud, Truth
 from orthoflow.sdk import Determinism, Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow_plugins.simulate.photographs import (
     Film,
     PhotoLayout,
-    ShotPlan,
-    calibrated,
-    calibration_of,
     planned_shots,
     take_photos,
     with_passers_by,
@@ -28,15 +25,8 @@ from orthoflow_plugins.simulate.room_model import (
     MOST_TEXTILE,
     TEXTILE_BY_DESIGN,
     Geometry,
-    Room,
-    RoomPlan,
     build_room,
 )
-
-if TYPE_CHECKING:
-    from orthoflow.geometry.scene_views import SceneCameras
-    from orthoflow_plugins.simulate.deliverables import Delivery
-    from orthoflow_plugins.simulate.scanning import Errors, Scan
 
 SpectralGap = Literal["none", "easy", "hard", "inverted"]
 
@@ -266,83 +256,101 @@ class SimulateRoom(Method):
         from orthoflow.geometry.scene_views import SceneCameras
         from orthoflow_plugins.simulate.deliverables import (
             Delivery,
+            check_points,
             cloud_of,
             report_photos,
             report_room,
             truth_of,
         )
-        from orthoflow_plugins.simulate.scanning import station_positions
+        from orthoflow_plugins.simulate.scanning import (
+            Errors,
+            planned_sweeps,
+            scan_scene,
+            station_positions,
+        )
 
         scan_rng, photo_rng, wall_rng = ctx.rng.spawn(3)
+        # Of a stream of its own: noise and photos are those of the room as designed.
+        place_rng = ctx.rng.spawn(1)[0]
         if params.design_seed is not None:
             wall_rng = np.random.default_rng(params.design_seed)
+            place_rng = wall_rng.spawn(1)[0]
+        is_moved, is_drawn = params.geometry == "drawn", params.decoration == "drawn"
+        geometry = Geometry.drawn(place_rng) if is_moved else DESIGNED
         textile_share = params.textile_share
         if textile_share is None:
-            textile_share = 0.0 if params.decoration == "drawn" else TEXTILE_BY_DESIGN
-        # Of a stream of their own: noise and photos are those of the room as designed.
-        place_rng = ctx.rng.spawn(1)[0] if params.geometry == "drawn" else None
-        geometry = DESIGNED if place_rng is None else Geometry.drawn(place_rng)
+            textile_share = 0.0 if is_drawn else TEXTILE_BY_DESIGN
         room = build_room(
-            RoomPlan(
-                relief=params.relief_scale,
-                obstacle=params.obstacle,
-                spectral_gap=_SPECTRAL_GAPS[params.spectral_gap],
-                textile_share=textile_share,
-                geometry=geometry,
-            ),
-            wall_rng if params.decoration == "drawn" else None,
+            wall_rng if is_drawn else None,
+            relief=params.relief_scale,
+            obstacle=params.obstacle,
+            spectral_gap=_SPECTRAL_GAPS[params.spectral_gap],
+            textile_share=textile_share,
+            geometry=geometry,
         )
-        turn_deg = params.turn_deg
-        if place_rng is not None:
-            turn_deg += float(place_rng.uniform(0.0, 360.0))
+        turn_deg = params.turn_deg + (float(place_rng.uniform(0.0, 360.0)) if is_moved else 0.0)
+        stations = station_positions(params.n_stations, place_rng if is_moved else None)
+        seeds = scan_rng.integers(0, 2**62, size=2 * params.n_stations)
+        inversion = params.spectral_inversion_share
+        if inversion is None:
+            inversion = float(params.spectral_gap == "inverted")
+        errors = Errors(
+            noise_m=params.noise_m,
+            outlier_share=params.outlier_share,
+            beam_m=params.beam_m,
+            colour_noise=params.colour_noise_grey,
+            inversion=inversion,
+            band_seed=int(seeds[0]),
+            registration_m=params.registration_error_m,
+            bending_m=params.bending_m,
+            shared_m=params.shared_noise_m,
+            shared_length_m=params.shared_noise_length_m,
+        )
+        panorama_step_m = params.panorama_step_m or _PANORAMA_FACTOR * params.scan_step_m
+        main = room.planes[0]
+        sweeps = planned_sweeps(
+            stations, (panorama_step_m, params.scan_step_m), main.plane, main.outline, seeds
+        )
         delivery = Delivery(
             room=room,
-            scan=_scan(
-                room, params, station_positions(params.n_stations, place_rng), scan_rng, ctx
-            ),
+            scan=scan_scene(room.scene, sweeps, errors, ctx),
             world_from_room=basis_from_up(up_vector(params.up)).T @ _turn_about_up(turn_deg),
             shift_world_m=np.array(params.shift_world_m),
         )
         shots = planned_shots(
-            ShotPlan(
-                layout=params.photo_layout,
-                gsd_m=params.photo_gsd_m,
-                obliquity_deg=params.photo_obliquity_deg,
-                geometry=geometry,
-            ),
+            params.photo_layout,
             photo_rng,
+            gsd_m=params.photo_gsd_m,
+            obliquity_deg=params.photo_obliquity_deg,
+            geometry=geometry,
         )
-        calibration = calibration_of(shots, is_known=params.calibrated)
+        known = (Intrinsics.of(shots[0].camera),) if shots and params.calibrated else ()
         views = SceneCameras(room.scene, cores=ctx.cores)
         crowd = with_passers_by(room.scene, len(shots), params.n_passers_by, photo_rng)
+        film = Film(
+            noise_grey=params.photo_noise_grey,
+            vignetting=params.photo_vignetting_share,
+            supersample=params.photo_supersample,
+            exposures=params.photo_exposure_share,
+        )
         photos = take_photos(
-            views if not crowd else [SceneCameras(scene, cores=ctx.cores) for scene in crowd],
+            [SceneCameras(scene, cores=ctx.cores) for scene in crowd] or views,
             shots,
-            _film(params),
+            film,
             ctx,
             photo_rng,
+            intrinsics=known[0] if known else None,
         )
         cloud = cloud_of(delivery)
-        # Records of rooms with default parameters do not change.
-        added = {
-            "decoration": "designed",
-            "design_seed": None,
-            "photo_exposure_share": 0.0,
-            "n_passers_by": 0,
-            "turn_deg": 0.0,
-            "geometry": "designed",
-        }
-        left_out = {name for name, before in added.items() if getattr(params, name) == before}
-        settings = params.model_dump(mode="json", exclude=left_out)
-        settings["textile_share"] = textile_share
+        settings = params.model_dump(mode="json") | {"textile_share": textile_share}
         truth = truth_of(delivery, cloud, shots, settings)
         report_room(truth, cloud, ctx)
         report_photos(photos, shots, ctx)
         return self.Out(
             cloud=cloud,
-            photos=calibrated(photos, calibration),
-            calibration=calibration,
-            checkpoints=_check_points(delivery, views, params.check_points_most),
+            photos=photos,
+            calibration=Calibration(patterns=("*",) * len(known), intrinsics=known),
+            checkpoints=check_points(delivery, views, n_most=params.check_points_most),
             truth=truth,
         )
 
@@ -353,68 +361,3 @@ def _turn_about_up(turn_deg: float) -> NDArray[np.float64]:
         return np.eye(3)
     cosine, sine = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
     return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _scan(
-    room: Room,
-    params: SimulateRoom.Params,
-    stations: NDArray[np.float64],
-    rng: np.random.Generator,
-    ctx: StepContext,
-) -> Scan:
-    from orthoflow_plugins.simulate.scanning import SweepPlan, planned_sweeps, scan_scene
-
-    plan = SweepPlan(
-        stations=stations,
-        scan_step_m=params.scan_step_m,
-        panorama_step_m=params.panorama_step_m or _PANORAMA_FACTOR * params.scan_step_m,
-    )
-    main_wall = room.planes[0]
-    seeds = rng.integers(0, 2**62, size=2 * params.n_stations)
-    sweeps = planned_sweeps(plan, main_wall.plane, main_wall.outline, seeds)
-    return scan_scene(room.scene, sweeps, _errors(params, int(seeds[0])), ctx)
-
-
-def _film(params: SimulateRoom.Params) -> Film:
-    return Film(
-        noise_grey=params.photo_noise_grey,
-        vignetting=params.photo_vignetting_share,
-        supersample=params.photo_supersample,
-        exposures=params.photo_exposure_share,
-    )
-
-
-def _check_points(delivery: Delivery, views: SceneCameras, n_most: int) -> CheckPoints:
-    from orthoflow_plugins.simulate.deliverables import check_points
-
-    return check_points(
-        delivery.room.scene,
-        views,
-        np.unique(delivery.scan.stations, axis=0),
-        delivery.world_from_room,
-        delivery.shift_world_m,
-        n_most=n_most,
-    )
-
-
-def _errors(params: SimulateRoom.Params, band_seed: int) -> Errors:
-    from orthoflow_plugins.simulate.scanning import Errors
-
-    return Errors(
-        noise_m=params.noise_m,
-        outlier_share=params.outlier_share,
-        beam_m=params.beam_m,
-        colour_noise=params.colour_noise_grey,
-        inversion=_inversion(params),
-        band_seed=band_seed,
-        registration_m=params.registration_error_m,
-        bending_m=params.bending_m,
-        shared_m=params.shared_noise_m,
-        shared_length_m=params.shared_noise_length_m,
-    )
-
-
-def _inversion(params: SimulateRoom.Params) -> float:
-    if params.spectral_inversion_share is None:
-        return float(params.spectral_gap == "inverted")
-    return params.spectral_inversion_share

@@ -8,6 +8,7 @@ family: cornices, pilasters, niches, panels, and recessed doors; where all plane
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -48,36 +49,50 @@ _UP: Final = np.array([0.0, 0.0, 1.0])
 # Walls extend slightly past the corners of the room, where others hide them.
 _FULL: Final[Extent] = (-2.9, 2.9, FLOOR_M - 0.1, CEILING_M + 0.1)
 
-_STUCCO = Paint(
-    kind=TextureKind.PLAIN, rgb=(214, 206, 190), reflectance=0.7, contrast=0.18, seed=11
+STUCCO: Final = Paint(TextureKind.PLAIN, (214, 206, 190), 0.7, 0.18, seed=11)
+GILT: Final = Paint(TextureKind.PLAIN, (196, 158, 82), 0.55, 0.3, seed=12)
+OAK: Final = Paint(TextureKind.WOOD, (132, 92, 58), 0.35, 0.4, 0.12, 13)
+_DARK: Final = Paint(TextureKind.PLAIN, (92, 88, 84), 0.2, 0.4, seed=14)
+_OBJECT: Final = Paint(TextureKind.TILES, (38, 96, 160), 0.3, 0.5, 0.09, 15)
+_DAMASK: Final = Paint(TextureKind.TEXTILE, (150, 62, 58), 0.4, period_m=0.15, seed=102)
+# Walls: name; ground and from corner to corner of a drawn one; ground of the designed one.
+_WALLS: Final = (
+    (
+        "main wall",
+        Paint(TextureKind.FRESCO, (206, 180, 138), 0.5, period_m=0.34, seed=101),
+        (-2.7, 2.7),
+        Paint(TextureKind.FRESCO, (206, 180, 138), 0.5, period_m=0.32, seed=101),
+    ),
+    (
+        "opposite wall",
+        Paint(TextureKind.FRESCO, (160, 186, 152), 0.5, period_m=0.34, seed=201),
+        (-2.7, 2.7),
+        Paint(TextureKind.FRESCO, (160, 186, 152), 0.45, period_m=0.4, seed=201),
+    ),
+    (
+        "right wall",
+        Paint(TextureKind.FRESCO, (150, 170, 178), 0.5, period_m=0.34, seed=301),
+        (-2.4, 2.0),
+        Paint(TextureKind.TEXTILE, (72, 104, 120), 0.35, period_m=0.3, seed=301),
+    ),
+    (
+        "left wall",
+        Paint(TextureKind.FRESCO, (196, 150, 132), 0.5, period_m=0.34, seed=401),
+        (-2.0, 2.4),
+        Paint(TextureKind.FRESCO, (196, 150, 132), 0.45, period_m=0.36, seed=401),
+    ),
 )
-_GILT = Paint(kind=TextureKind.PLAIN, rgb=(196, 158, 82), reflectance=0.55, contrast=0.3, seed=12)
-_OAK = Paint(
-    kind=TextureKind.WOOD, rgb=(132, 92, 58), reflectance=0.35, period_m=0.12, contrast=0.4, seed=13
+# Floor and ceiling.
+_LEVELS: Final = (
+    ("floor", Paint(TextureKind.TILES, (150, 138, 122), 0.35, period_m=0.35, seed=501)),
+    ("ceiling", Paint(TextureKind.FRESCO, (206, 206, 210), 0.8, period_m=0.5, seed=502)),
 )
-_DARK = Paint(kind=TextureKind.PLAIN, rgb=(92, 88, 84), reflectance=0.2, contrast=0.4, seed=14)
-_OBJECT = Paint(
-    kind=TextureKind.TILES, rgb=(38, 96, 160), reflectance=0.3, period_m=0.09, contrast=0.5, seed=15
-)
-_OCHRE = Paint(
-    kind=TextureKind.FRESCO, rgb=(206, 180, 138), reflectance=0.5, period_m=0.34, seed=101
-)
-_GREEN = Paint(
-    kind=TextureKind.FRESCO, rgb=(160, 186, 152), reflectance=0.5, period_m=0.34, seed=201
-)
-_BLUE = Paint(
-    kind=TextureKind.FRESCO, rgb=(150, 170, 178), reflectance=0.5, period_m=0.34, seed=301
-)
-_RED = Paint(kind=TextureKind.FRESCO, rgb=(196, 150, 132), reflectance=0.5, period_m=0.34, seed=401)
-_DAMASK = Paint(
-    kind=TextureKind.TEXTILE, rgb=(150, 62, 58), reflectance=0.4, period_m=0.15, seed=102
-)
-# Drawn walls: name, ground, and from corner to corner.
-_DRAWN: Final = (
-    ("main wall", _OCHRE, (-2.7, 2.7)),
-    ("opposite wall", _GREEN, (-2.7, 2.7)),
-    ("right wall", _BLUE, (-2.4, 2.0)),
-    ("left wall", _RED, (-2.0, 2.4)),
+# Furniture of the room as designed: along the main wall and towards it, turn, size and paint. The
+# first is a screen 0.6 m in front of the main wall; no face is parallel to a wall.
+_FURNITURE: Final = (
+    (0.1, 1.78, 6.0, (0.9, 0.1, 1.3), _OBJECT),
+    (2.3, -0.9, -4.0, (0.5, 0.9, 0.75), OAK),
+    (-0.2, -1.3, 20.0, (0.8, 0.5, 0.7), _DARK),
 )
 # How far drawn objects extend behind the adjoining walls, the floor and the ceiling.
 _BEYOND_M: Final = 0.1
@@ -141,25 +156,6 @@ DESIGNED: Final = Geometry()
 
 
 @dataclass(frozen=True, kw_only=True)
-class RoomPlan:
-    """The properties of the room.
-
-    Attributes:
-        relief: scale of all mouldings, 1 = as designed (up to 15 cm).
-        obstacle: an object stands free in front of the main wall.
-        spectral_gap: 0 when the laser sees the painted patterns, 1 when others.
-        textile_share: share of the main wall covered by one repeated motif, at most `MOST_TEXTILE`.
-        geometry: where its planes lie.
-    """
-
-    relief: float
-    obstacle: bool
-    spectral_gap: float
-    textile_share: float = TEXTILE_BY_DESIGN
-    geometry: Geometry = DESIGNED
-
-
-@dataclass(frozen=True, kw_only=True)
 class Room:
     """The room as built.
 
@@ -172,40 +168,48 @@ class Room:
     planes: tuple[TruePlane, ...]
 
 
-def build_room(plan: RoomPlan, rng: np.random.Generator | None = None) -> Room:
+def build_room(
+    rng: np.random.Generator | None = None,
+    *,
+    relief: float = 1.0,
+    obstacle: bool = True,
+    spectral_gap: float = 0.3,
+    textile_share: float = TEXTILE_BY_DESIGN,
+    geometry: Geometry = DESIGNED,
+) -> Room:
     """Build the room.
 
     Args:
-        plan: its properties.
         rng: draws the four walls from a family; without it they are as designed.
+        relief: scale of all mouldings, 1 = as designed (up to 15 cm).
+        obstacle: an object stands free in front of the main wall.
+        spectral_gap: 0 when the laser sees the painted patterns, 1 when others.
+        textile_share: share of the main wall covered by one repeated motif, at most `MOST_TEXTILE`.
+        geometry: where its planes lie.
     """
     draft = SceneDraft()
-    sides = plan.geometry.sides(draft)
+    sides = geometry.sides(draft)
     if rng is None:
-        main, opposite, right, left = sides
-        _build_main_wall(main, plan)
-        _build_opposite_wall(opposite, plan)
-        _build_right_wall(right, plan)
-        _build_left_wall(left, plan)
+        for number, side in enumerate(sides):
+            _build_wall(side, number, relief, [] if number else _cloths(textile_share))
     else:
-        _draw_walls(sides, plan, rng)
-    _build_floor_and_ceiling(draft, plan.geometry)
-    _furnish(draft, plan)
-    return Room(scene=draft.finished(spectral_gap=plan.spectral_gap), planes=_clipped(draft.planes))
-
-
-def _draw_walls(sides: list[Side], plan: RoomPlan, rng: np.random.Generator) -> None:
-    # Of a stream of their own: walls with and without a cloth are otherwise the same.
-    cloth = _drawn_cloth(plan.textile_share, rng.spawn(1)[0])
-    for side, (name, ground, (a0, a1)) in zip(sides, _DRAWN, strict=True):
-        drawing = WallDrawing(
-            full=_FULL,
-            shown=(a0, a1, FLOOR_M, CEILING_M),
-            relief=plan.relief,
-            paints=WallPaints(ground=ground, relief=_STUCCO, panel=_GILT, door=_OAK),
-            cloth=cloth if side is sides[0] else None,
-        )
-        draw_wall(side, name, drawing, rng)
+        # Of a stream of their own: walls with and without a cloth are otherwise the same.
+        cloth = _drawn_cloth(textile_share, rng.spawn(1)[0])
+        for side, (name, ground, span, _) in zip(sides, _WALLS, strict=True):
+            draw_wall(side, name, ground, span, rng, relief=relief, cloth=cloth)
+            cloth = None
+    wide: Extent = (-3.4, 3.4, -3.2, 3.2)
+    for (name, paint), (normal, height_m) in zip(
+        _LEVELS, (geometry.floor, geometry.ceiling), strict=True
+    ):
+        level = flat_side(draft, normal=normal, height_m=height_m)
+        level.place(wide, 0.0, paint, SurfaceRole.WALL, plane=level.true_plane(name, wide))
+    along, towards = main_wall_axes()
+    for a, t, turn_deg, size_m, paint in _FURNITURE[0 if obstacle else 1 :]:
+        base = FLOOR_M * _UP + a * along + t * towards
+        yaw_deg = _MAIN_OMEGA_DEG - 90.0 + turn_deg
+        add_block(draft, base=base, yaw_deg=yaw_deg, size_m=size_m, paint=paint)
+    return Room(scene=draft.finished(spectral_gap=spectral_gap), planes=_clipped(draft.planes))
 
 
 def main_wall_axes() -> NDArray[np.float64]:
@@ -216,37 +220,97 @@ def main_wall_axes() -> NDArray[np.float64]:
     )
 
 
-def _build_main_wall(wall: Side, plan: RoomPlan) -> None:
-    fresco = Paint(
-        kind=TextureKind.FRESCO, rgb=(206, 180, 138), reflectance=0.5, period_m=0.32, seed=101
+# A moulding: extent, width of the bars of a frame (0: solid), height, paint, and on which depth.
+# A recess: name if it is a plane of its own, extent, depth, and paint unless the wall's.
+Moulding = tuple[Extent, float, float, Paint, float]
+Recess = tuple[str, Extent, float, Paint | None]
+
+
+def _pilasters(*middles: float) -> tuple[Moulding, ...]:
+    return tuple(
+        ((middle - half, middle + half, low, high), 0.0, height, paint, 0.0)
+        for middle in middles
+        for half, low, high, height, paint in (
+            (0.11, FLOOR_M - 0.1, 1.3, 0.07, STUCCO),
+            (0.13, FLOOR_M - 0.1, -1.2, 0.1, STUCCO),
+            (0.13, 1.12, 1.3, 0.11, GILT),
+        )
     )
-    niche: Extent = (-1.95, -1.15, -1.1, 0.75)
-    door: Extent = (1.22, 2.12, FLOOR_M - 0.1, 0.65)
-    cloths = _cloths(plan.textile_share)
-    full = wall.true_plane("main wall", _FULL)
-    in_niche = wall.true_plane("niche", niche, -0.25)
-    in_door = wall.true_plane("door", door, -0.12)
-    holes = [
-        wall.recess(niche, 0.25, fresco, plane=in_niche),
-        wall.recess(door, 0.12, _OAK, plane=in_door),
-        *cloths,
+
+
+_CORNICE: Final[tuple[Moulding, ...]] = (
+    ((-2.9, 2.9, 1.3, CEILING_M + 0.1), 0.0, 0.08, STUCCO, 0.0),
+    ((-2.9, 2.9, 1.44, CEILING_M + 0.1), 0.0, 0.15, GILT, 0.0),
+)
+# The walls as designed, in the order of `_WALLS`.
+_DESIGNS: Final[tuple[tuple[tuple[Recess, ...], tuple[Moulding, ...]], ...]] = (
+    (
+        (
+            ("niche", (-1.95, -1.15, -1.1, 0.75), 0.25, None),
+            ("door", (1.22, 2.12, FLOOR_M - 0.1, 0.65), 0.12, OAK),
+        ),
+        (
+            ((-0.53, 0.73, -0.53, 1.08), 0.08, 0.03, GILT, 0.0),
+            ((-0.53, 0.73, -1.2, -0.7), 0.06, 0.025, STUCCO, 0.0),
+            ((1.10, 2.24, FLOOR_M - 0.1, 0.77), 0.12, 0.04, STUCCO, 0.0),
+            ((1.34, 2.0, -1.3, -0.5), 0.05, 0.02, OAK, -0.12),
+            ((1.34, 2.0, -0.35, 0.5), 0.05, 0.02, OAK, -0.12),
+            *_pilasters(-2.3, -0.84, 0.94, 2.48),
+            ((-1.55 - 0.09, -1.55 + 0.09, 1.02 - 0.09, 1.02 + 0.09), 0.0, 0.045, GILT, 0.0),
+            ((1.68 - 0.09, 1.68 + 0.09, 1.02 - 0.09, 1.02 + 0.09), 0.0, 0.045, GILT, 0.0),
+            *_CORNICE,
+            ((-2.17, -0.97, FLOOR_M - 0.1, -1.32), 0.0, 0.02, STUCCO, 0.0),
+            ((-0.71, 0.81, FLOOR_M - 0.1, -1.32), 0.0, 0.02, STUCCO, 0.0),
+        ),
+    ),
+    (
+        (("", (-1.7, -0.7, -0.6, 1.0), 0.3, STUCCO), ("", (0.7, 1.7, -0.6, 1.0), 0.3, STUCCO)),
+        (*_pilasters(-2.2, 0.0, 2.2), *_CORNICE),
+    ),
+    (
+        (),
+        (
+            ((-1.9, -0.7, -0.9, 1.0), 0.07, 0.03, GILT, 0.0),
+            ((-0.5, 0.7, -0.9, 1.0), 0.07, 0.03, GILT, 0.0),
+            *_pilasters(1.3),
+            *_CORNICE,
+        ),
+    ),
+    ((), (((-0.6, 0.6, -0.2, 1.1), 0.0, 0.05, GILT, 0.0), *_pilasters(-1.6, 1.6), *_CORNICE)),
+)
+
+
+def _build_wall(
+    wall: Side,
+    number: int,
+    relief: float,
+    cloths: list[Extent],
+) -> None:
+    """Build a wall as designed."""
+    name, _, _, ground = _WALLS[number]
+    recesses, mouldings = _DESIGNS[number]
+    plane = wall.true_plane(name, _FULL)
+    planes = [
+        wall.true_plane(of, hole, -depth_m) if of else -1 for of, hole, depth_m, _ in recesses
     ]
-    wall.place(_FULL, 0.0, fresco, SurfaceRole.WALL, plane=full, holes=holes)
+    for (_, hole, depth_m, paint), own in zip(recesses, planes, strict=True):
+        wall.recess(hole, depth_m, paint or ground, plane=own)
+    holes = [*(hole for _, hole, _, _ in recesses), *cloths]
+    wall.place(_FULL, 0.0, ground, SurfaceRole.WALL, plane=plane, holes=holes)
     for cloth in cloths:
-        wall.place(cloth, 0.0, _DAMASK, SurfaceRole.WALL, plane=full)
-    wall.bars((-0.53, 0.73, -0.53, 1.08), 0.08, 0.03 * plan.relief, _GILT)
-    wall.bars((-0.53, 0.73, -1.2, -0.7), 0.06, 0.025 * plan.relief, _STUCCO)
-    wall.bars((1.10, 2.24, FLOOR_M - 0.1, 0.77), 0.12, 0.04 * plan.relief, _STUCCO)
-    for bottom, top in ((-1.3, -0.5), (-0.35, 0.5)):
-        wall.bars((1.34, 2.0, bottom, top), 0.05, 0.02 * plan.relief, _OAK, base_m=-0.12)
-    for middle in (-2.3, -0.84, 0.94, 2.48):
-        _add_pilaster(wall, middle, plan)
-    for middle, height in ((-1.55, 1.02), (1.68, 1.02)):
-        square: Extent = (middle - 0.09, middle + 0.09, height - 0.09, height + 0.09)
-        wall.box(square, 0.045 * plan.relief, _GILT)
-    _add_cornice(wall, plan)
-    for start, end in ((-2.17, -0.97), (-0.71, 0.81)):
-        wall.box((start, end, FLOOR_M - 0.1, -1.32), 0.02 * plan.relief, _STUCCO)
+        wall.place(cloth, 0.0, _DAMASK, SurfaceRole.WALL, plane=plane)
+    if name == "left wall":
+        hearth: Extent = (-0.45, 0.45, FLOOR_M - 0.1, -0.65)
+        front: Extent = (-0.75, 0.75, FLOOR_M - 0.1, -0.4)
+        wall.place(front, 0.28, STUCCO, SurfaceRole.RELIEF, holes=[hearth])
+        wall.rims(front, (0.0, 0.28), STUCCO, SurfaceRole.RELIEF)
+        wall.place(hearth, 0.03, _DARK, SurfaceRole.RELIEF)
+        wall.rims(hearth, (0.03, 0.28), _DARK, SurfaceRole.RELIEF)
+    for extent, width_m, height_m, paint, base_m in mouldings:
+        if width_m:
+            wall.bars(extent, width_m, height_m * relief, paint, base_m=base_m)
+        else:
+            wall.box(extent, height_m * relief, paint, base_m=base_m)
 
 
 def _cloths(share: float) -> list[Extent]:
@@ -275,134 +339,24 @@ def _cloths(share: float) -> list[Extent]:
 
 def _grown(small: Extent, large: Extent, area_m2: float) -> Extent:
     """Shrink the small rectangle about its middle, or grow it towards the large one."""
+    one, other = np.array(small), np.array(large)
     full = _area_m2(small)
     if area_m2 <= full:
-        a, b = 0.5 * (small[0] + small[1]), 0.5 * (small[2] + small[3])
-        scale = math.sqrt(area_m2 / full)
-        return (
-            a + scale * (small[0] - a),
-            a + scale * (small[1] - a),
-            b + scale * (small[2] - b),
-            b + scale * (small[3] - b),
-        )
-    low, high = 0.0, 1.0
-    for _ in range(50):
-        middle = 0.5 * (low + high)
-        if _area_m2(_between(small, large, middle)) < area_m2:
-            low = middle
-        else:
-            high = middle
-    return _between(small, large, high)
-
-
-def _between(first: Extent, second: Extent, share: float) -> Extent:
-    a0, a1, b0, b1 = (p + share * (q - p) for p, q in zip(first, second, strict=True))
+        middle = np.repeat([0.5 * (one[0] + one[1]), 0.5 * (one[2] + one[3])], 2)
+        grown = middle + math.sqrt(area_m2 / full) * (one - middle)
+    else:
+        low, high = 0.0, 1.0
+        for _ in range(50):
+            share = 0.5 * (low + high)
+            is_less = _area_m2((one + share * (other - one)).tolist()) < area_m2
+            low, high = (share, high) if is_less else (low, share)
+        grown = one + high * (other - one)
+    a0, a1, b0, b1 = grown.tolist()
     return a0, a1, b0, b1
 
 
-def _area_m2(extent: Extent) -> float:
+def _area_m2(extent: Sequence[float]) -> float:
     return (extent[1] - extent[0]) * (extent[3] - extent[2])
-
-
-def _build_opposite_wall(wall: Side, plan: RoomPlan) -> None:
-    fresco = Paint(
-        kind=TextureKind.FRESCO, rgb=(160, 186, 152), reflectance=0.45, period_m=0.4, seed=201
-    )
-    windows: list[Extent] = [(-1.7, -0.7, -0.6, 1.0), (0.7, 1.7, -0.6, 1.0)]
-    full = wall.true_plane("opposite wall", _FULL)
-    holes = [wall.recess(window, 0.3, _STUCCO) for window in windows]
-    wall.place(_FULL, 0.0, fresco, SurfaceRole.WALL, plane=full, holes=holes)
-    for middle in (-2.2, 0.0, 2.2):
-        _add_pilaster(wall, middle, plan)
-    _add_cornice(wall, plan)
-
-
-def _build_right_wall(wall: Side, plan: RoomPlan) -> None:
-    damask = Paint(
-        kind=TextureKind.TEXTILE, rgb=(72, 104, 120), reflectance=0.35, period_m=0.3, seed=301
-    )
-    full = wall.true_plane("right wall", _FULL)
-    wall.place(_FULL, 0.0, damask, SurfaceRole.WALL, plane=full)
-    for start, end in ((-1.9, -0.7), (-0.5, 0.7)):
-        wall.bars((start, end, -0.9, 1.0), 0.07, 0.03 * plan.relief, _GILT)
-    _add_pilaster(wall, 1.3, plan)
-    _add_cornice(wall, plan)
-
-
-def _build_left_wall(wall: Side, plan: RoomPlan) -> None:
-    fresco = Paint(
-        kind=TextureKind.FRESCO, rgb=(196, 150, 132), reflectance=0.45, period_m=0.36, seed=401
-    )
-    full = wall.true_plane("left wall", _FULL)
-    wall.place(_FULL, 0.0, fresco, SurfaceRole.WALL, plane=full)
-    hearth: Extent = (-0.45, 0.45, FLOOR_M - 0.1, -0.65)
-    front: Extent = (-0.75, 0.75, FLOOR_M - 0.1, -0.4)
-    wall.place(front, 0.28, _STUCCO, SurfaceRole.RELIEF, holes=[hearth])
-    wall.rims(front, (0.0, 0.28), _STUCCO, SurfaceRole.RELIEF)
-    wall.place(hearth, 0.03, _DARK, SurfaceRole.RELIEF)
-    wall.rims(hearth, (0.03, 0.28), _DARK, SurfaceRole.RELIEF)
-    wall.box((-0.6, 0.6, -0.2, 1.1), 0.05 * plan.relief, _GILT)
-    for middle in (-1.6, 1.6):
-        _add_pilaster(wall, middle, plan)
-    _add_cornice(wall, plan)
-
-
-def _build_floor_and_ceiling(draft: SceneDraft, geometry: Geometry) -> None:
-    tiles = Paint(
-        kind=TextureKind.TILES, rgb=(150, 138, 122), reflectance=0.35, period_m=0.35, seed=501
-    )
-    painted = Paint(
-        kind=TextureKind.FRESCO, rgb=(206, 206, 210), reflectance=0.8, period_m=0.5, seed=502
-    )
-    wide: Extent = (-3.4, 3.4, -3.2, 3.2)
-    for name, (normal, height_m), paint in (
-        ("floor", geometry.floor, tiles),
-        ("ceiling", geometry.ceiling, painted),
-    ):
-        side = flat_side(draft, normal=normal, height_m=height_m)
-        plane = side.true_plane(name, wide)
-        side.place(wide, 0.0, paint, SurfaceRole.WALL, plane=plane)
-
-
-def _furnish(draft: SceneDraft, plan: RoomPlan) -> None:
-    along, towards = main_wall_axes()
-    yaw_deg = _MAIN_OMEGA_DEG - 90.0
-    floor = FLOOR_M * _UP
-    if plan.obstacle:
-        # A screen 0.6 m in front of the main wall, turned so that no face is parallel to it.
-        add_block(
-            draft,
-            base=floor + 0.1 * along + 1.78 * towards,
-            yaw_deg=yaw_deg + 6.0,
-            size_m=(0.9, 0.1, 1.3),
-            paint=_OBJECT,
-        )
-    add_block(
-        draft,
-        base=floor + 2.3 * along - 0.9 * towards,
-        yaw_deg=yaw_deg - 4.0,
-        size_m=(0.5, 0.9, 0.75),
-        paint=_OAK,
-    )
-    add_block(
-        draft,
-        base=floor - 0.2 * along - 1.3 * towards,
-        yaw_deg=yaw_deg + 20.0,
-        size_m=(0.8, 0.5, 0.7),
-        paint=_DARK,
-    )
-
-
-def _add_pilaster(wall: Side, middle: float, plan: RoomPlan) -> None:
-    scale = plan.relief
-    wall.box((middle - 0.11, middle + 0.11, FLOOR_M - 0.1, 1.3), 0.07 * scale, _STUCCO)
-    wall.box((middle - 0.13, middle + 0.13, FLOOR_M - 0.1, -1.2), 0.1 * scale, _STUCCO)
-    wall.box((middle - 0.13, middle + 0.13, 1.12, 1.3), 0.11 * scale, _GILT)
-
-
-def _add_cornice(wall: Side, plan: RoomPlan) -> None:
-    wall.box((-2.9, 2.9, 1.3, CEILING_M + 0.1), 0.08 * plan.relief, _STUCCO)
-    wall.box((-2.9, 2.9, 1.44, CEILING_M + 0.1), 0.15 * plan.relief, _GILT)
 
 
 def _clipped(planes: list[TruePlane]) -> tuple[TruePlane, ...]:
@@ -445,43 +399,16 @@ def _cut(polygon: NDArray[np.float64], bound: Plane) -> NDArray[np.float64]:
     return np.array(kept)
 
 
-@dataclass(frozen=True, kw_only=True)
-class WallPaints:
-    """The textures of a drawn wall.
-
-    Attributes:
-        ground: the wall itself, and its niches.
-        relief: cornice, pilasters and skirting.
-        panel: mouldings of panels.
-        door: doors.
-    """
-
-    ground: Paint
-    relief: Paint
-    panel: Paint
-    door: Paint
-
-
-@dataclass(frozen=True, kw_only=True)
-class WallDrawing:
-    """How a wall is drawn.
-
-    Attributes:
-        full: extent of the wall, slightly past the corners of the room.
-        shown: extent between the adjoining walls, the floor and the ceiling.
-        relief: scale of all relief.
-        paints: its textures.
-        cloth: extent of a cloth with a repeated motif; openings in the wall open it too.
-    """
-
-    full: Extent
-    shown: Extent
-    relief: float
-    paints: WallPaints
-    cloth: Extent | None = None
-
-
-def draw_wall(wall: Side, name: str, drawing: WallDrawing, rng: np.random.Generator) -> None:
+def draw_wall(
+    wall: Side,
+    name: str,
+    ground: Paint,
+    span: tuple[float, float],
+    rng: np.random.Generator,
+    *,
+    relief: float = 1.0,
+    cloth: Extent | None = None,
+) -> None:
     """Build a wall with relief up to 0.3 m in front of it and recesses up to 0.45 m behind it.
 
     Niches and doors are registered as planes of their own.
@@ -489,79 +416,78 @@ def draw_wall(wall: Side, name: str, drawing: WallDrawing, rng: np.random.Genera
     Args:
         wall: the wall.
         name: of its plane.
-        drawing: how.
+        ground: texture of the wall itself, and of its niches.
+        span: from the one adjoining wall to the other, metres.
         rng: draws the objects.
+        relief: scale of all relief.
+        cloth: extent of a cloth with a repeated motif; openings in the wall open it too.
     """
-    plane = wall.true_plane(name, drawing.full)
-    top_m = _draw_cornice(wall, drawing, rng)
-    bays = _draw_pilasters(wall, drawing, top_m, rng)
-    holes = [
-        hole
-        for bay in bays
-        for hole in _draw_bay(wall, f"{name} {len(wall.draft.planes)}", (bay, drawing), rng)
-    ]
-    cloths = [] if drawing.cloth is None else [drawing.cloth]
-    for cloth in cloths:
-        wall.place(cloth, 0.0, _DAMASK, SurfaceRole.WALL, plane=plane, holes=holes)
+    plane = wall.true_plane(name, _FULL)
+    top_m = _draw_cornice(wall, relief, rng)
+    holes = []
+    for bay in _draw_pilasters(wall, span, top_m, relief, rng):
+        label = f"{name} {len(wall.draft.planes)}"
+        holes += _draw_bay(wall, label, (*bay, FLOOR_M, top_m), ground, relief, rng)
+    cloths = [] if cloth is None else [cloth]
+    for extent in cloths:
+        wall.place(extent, 0.0, _DAMASK, SurfaceRole.WALL, plane=plane, holes=holes)
     holes = [*holes, *cloths]
-    wall.place(drawing.full, 0.0, drawing.paints.ground, SurfaceRole.WALL, plane=plane, holes=holes)
+    wall.place(_FULL, 0.0, ground, SurfaceRole.WALL, plane=plane, holes=holes)
 
 
 def _drawn_cloth(share: float, rng: np.random.Generator) -> Extent | None:
     """Hang one cloth over a share of the main wall, anywhere on it; None hangs none."""
     if share <= 0.0:
         return None
-    _, _, (a0, a1) = _DRAWN[0]
+    a0, a1 = _WALLS[0][2]
     width_m = math.sqrt(share * _MAIN_WALL_M2 * rng.uniform(1.2, 2.0))
     height_m = share * _MAIN_WALL_M2 / width_m
     left_m, low_m = rng.uniform(a0, a1 - width_m), rng.uniform(FLOOR_M, CEILING_M - height_m)
     return (left_m, left_m + width_m, low_m, low_m + height_m)
 
 
-def _draw_cornice(wall: Side, drawing: WallDrawing, rng: np.random.Generator) -> float:
+def _draw_cornice(wall: Side, relief: float, rng: np.random.Generator) -> float:
     """Build up to three steps under the ceiling, or none; return where they begin."""
-    a0, a1, _, _ = drawing.full
-    ceiling_m = drawing.shown[3]
     n_steps = int(rng.integers(0, 4))
-    height_m, depth_m = rng.uniform(0.12, 0.45), drawing.relief * rng.uniform(0.06, 0.3)
+    height_m, depth_m = rng.uniform(0.12, 0.45), relief * rng.uniform(0.06, 0.3)
     for step in range(n_steps):
-        low_m = ceiling_m - height_m * (1.0 - step / n_steps)
-        extent = (a0, a1, low_m, ceiling_m + _BEYOND_M)
-        wall.box(extent, depth_m * (step + 1) / n_steps, drawing.paints.relief)
-    return ceiling_m - height_m if n_steps else ceiling_m
+        low_m = CEILING_M - height_m * (1.0 - step / n_steps)
+        extent = (*_FULL[:2], low_m, CEILING_M + _BEYOND_M)
+        wall.box(extent, depth_m * (step + 1) / n_steps, STUCCO)
+    return CEILING_M - height_m if n_steps else CEILING_M
 
 
 def _draw_pilasters(
-    wall: Side, drawing: WallDrawing, top_m: float, rng: np.random.Generator
-) -> list[Extent]:
+    wall: Side, span: tuple[float, float], top_m: float, relief: float, rng: np.random.Generator
+) -> list[tuple[float, float]]:
     """Build pilasters, maybe in the corners too, and a skirting; return the bays between them."""
-    a0, a1, floor_m, _ = drawing.shown
+    a0, a1 = span
     n_inner, is_cornered = int(rng.integers(0, 4)), bool(rng.random() < 0.5)
-    width_m, depth_m = rng.uniform(0.16, 0.4), drawing.relief * rng.uniform(0.03, 0.2)
-    skirting_m, thick_m = rng.uniform(0.06, 0.25), drawing.relief * rng.uniform(0.01, 0.05)
+    width_m, depth_m = rng.uniform(0.16, 0.4), relief * rng.uniform(0.03, 0.2)
+    skirting_m, thick_m = rng.uniform(0.06, 0.25), relief * rng.uniform(0.01, 0.05)
     middles = np.linspace(a0, a1, n_inner + 2)[1:-1] + rng.uniform(-0.15, 0.15, n_inner)
     ends = [(middle - 0.5 * width_m, middle + 0.5 * width_m) for middle in middles]
     if is_cornered:
         ends = [(a0 - _BEYOND_M, a0 + width_m), *ends, (a1 - width_m, a1 + _BEYOND_M)]
     for left, right in ends:
-        wall.box((left, right, floor_m - _BEYOND_M, top_m), depth_m, drawing.paints.relief)
-    starts = [right for _, right in ends] if is_cornered else [a0, *(end for _, end in ends)]
-    stops = [left for left, _ in ends] if is_cornered else [*(end for end, _ in ends), a1]
-    if is_cornered:
-        starts, stops = starts[:-1], stops[1:]
-    bays = [(a, b, floor_m, top_m) for a, b in zip(starts, stops, strict=True)]
+        wall.box((left, right, FLOOR_M - _BEYOND_M, top_m), depth_m, STUCCO)
+    starts = [right for _, right in ends][: -1 if is_cornered else None]
+    stops = [left for left, _ in ends][1 if is_cornered else 0 :]
+    if not is_cornered:
+        starts, stops = [a0, *starts], [*stops, a1]
+    bays = list(zip(starts, stops, strict=True))
     if rng.random() < 0.6:
-        for left, right, _, _ in bays:
-            skirting = (left, right, floor_m - _BEYOND_M, floor_m + skirting_m)
-            wall.box(skirting, thick_m, drawing.paints.relief)
+        for left, right in bays:
+            skirting = (left, right, FLOOR_M - _BEYOND_M, FLOOR_M + skirting_m)
+            wall.box(skirting, thick_m, STUCCO)
     return bays
 
 
 def _draw_bay(
-    wall: Side, name: str, where: tuple[Extent, WallDrawing], rng: np.random.Generator
+    wall: Side, name: str, bay: Extent, ground: Paint, relief: float, rng: np.random.Generator
 ) -> list[Extent]:
     """Build a niche, a door, a panel or nothing between two pilasters; return the wall's holes."""
-    (left, right, floor_m, top_m), drawing = where
+    left, right, floor_m, top_m = bay
     kind = str(rng.choice(["niche", "door", "panel", "bare"]))
     width_m = min(rng.uniform(0.6, 1.3), right - left - 2.0 * _BESIDE_M)
     middle_m = 0.5 * (left + right) + rng.uniform(-0.5, 0.5) * (
@@ -573,10 +499,9 @@ def _draw_bay(
         return []
     a0, a1 = middle_m - 0.5 * width_m, middle_m + 0.5 * width_m
     if kind == "panel":
-        wall.bars((a0, a1, low_m, high_m), 0.07, 0.03 * drawing.relief, drawing.paints.panel)
+        wall.bars((a0, a1, low_m, high_m), 0.07, 0.03 * relief, GILT)
         return []
-    paint = drawing.paints.ground if kind == "niche" else drawing.paints.door
     low_m = low_m if kind == "niche" else floor_m - _BEYOND_M
     extent = (a0, a1, low_m, high_m)
     plane = wall.true_plane(f"{kind} in {name}", extent, -depth_m)
-    return [wall.recess(extent, depth_m, paint, plane=plane)]
+    return [wall.recess(extent, depth_m, ground if kind == "niche" else OAK, plane=plane)]

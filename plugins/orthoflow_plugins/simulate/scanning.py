@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import Final, cast
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from orthoflow.geometry import Plane
 from orthoflow.geometry.hashed_numbers import cell_states, normals, uniforms
 from orthoflow.geometry.rows import Rows
-from orthoflow.geometry.scene_rays import RAYS_AT_ONCE, Hits, SceneRays, points_on
+from orthoflow.geometry.scene_rays import RAYS_AT_ONCE, SceneRays, points_on
 from orthoflow.geometry.scenes import Scene, TextureKind
 from orthoflow.geometry.threads import in_runs
 from orthoflow.sdk import StepContext
@@ -32,19 +32,30 @@ _MISSED: Final = -1
 SPOILT: Final = -2
 _TURN: Final = 2.0 * np.pi
 
+# Arrays of a cloud: of what is measured (`Scanned`), and of its places in the grids.
+_MEASURED: Final = (
+    ("x", np.float32),
+    ("y", np.float32),
+    ("z", np.float32),
+    ("intensity", np.float32),
+    ("rgb", np.uint8, 3),
+    ("rectangle", np.int32),
+)
+_PLACES: Final = (("scan", np.uint16), ("row", np.uint32), ("column", np.uint32))
+
 # No scan of the zenith: its points would crowd the ceiling above the station.
 LOWEST_ELEVATION_DEG: Final = -62.0
 HIGHEST_ELEVATION_DEG: Final = 62.0
 
 # Along the main wall, towards it, and above the origin, metres; clear of all objects in the room.
-_PLACES_M: Final = (
+_STATIONS_M: Final = (
     (-1.15, -0.10, 0.0),
     (1.20, 0.15, 0.12),
     (0.10, -0.60, -0.15),
     (0.05, 0.80, 0.20),
 )
 # Largest distance of a drawn station from there, along the same axes.
-_PLACES_DRAWN_M: Final = (0.3, 0.3, 0.15)
+_STATIONS_DRAWN_M: Final = (0.3, 0.3, 0.15)
 # Ranges of the values drawn per material: reflectance of black, decrease with red, increase with
 # green.
 _BLACK: Final = (0.75, 0.9)
@@ -96,7 +107,7 @@ class Errors:
         outlier_share: share of points at a random distance.
         beam_m: diameter of the spot; where it falls on two surfaces the distance mixes.
         colour_noise: standard deviation of a colour, grey levels.
-        inversion: share of inverted contrast in what the laser sees, as in `LaserBand`.
+        inversion: share of inverted contrast in what the laser sees, as in `laser_reflectance`.
         band_seed: seed of the materials in the laser's band, and of errors that points have in
             common.
         registration_m: standard deviation of each coordinate of a station.
@@ -158,28 +169,13 @@ class Scan:
     stations: NDArray[np.float64]
 
 
-@dataclass(frozen=True, kw_only=True)
-class SweepPlan:
-    """How finely to scan.
-
-    Attributes:
-        stations: (s, 3) in the room frame, metres.
-        scan_step_m: spacing of the detail scan of the main wall at the foot of the perpendicular.
-        panorama_step_m: likewise of the panorama.
-    """
-
-    stations: NDArray[np.float64]
-    scan_step_m: float
-    panorama_step_m: float
-
-
 def station_positions(
     n_stations: int, rng: np.random.Generator | None = None
 ) -> NDArray[np.float64]:
     """Return stations (s, 3) in the room frame, metres; a generator moves each a little."""
-    places = np.array(_PLACES_M[:n_stations])
+    places = np.array(_STATIONS_M[:n_stations])
     if rng is not None:
-        places += rng.uniform(-1.0, 1.0, places.shape) * _PLACES_DRAWN_M
+        places += rng.uniform(-1.0, 1.0, places.shape) * _STATIONS_DRAWN_M
     along, towards = main_wall_axes()
     up = np.array([0.0, 0.0, 1.0])
     # Not as a product of matrices, whose last digit depends on the processor.
@@ -187,7 +183,8 @@ def station_positions(
 
 
 def planned_sweeps(
-    plan: SweepPlan,
+    stations: NDArray[np.float64],
+    steps_m: tuple[float, float],
     main_wall: Plane,
     outline: NDArray[np.float64],
     seeds: NDArray[np.int64],
@@ -195,43 +192,82 @@ def planned_sweeps(
     """Plan a panorama and a detail scan of the main wall from each station.
 
     Args:
-        plan: how finely.
+        stations: (s, 3) in the room frame, metres.
+        steps_m: spacing of the panorama at the foot of the perpendicular on the main wall, and of
+            the detail scan.
         main_wall: its plane.
         outline: (4, 3) corners of the main wall in the room frame.
         seeds: two per station.
     """
+    lowest, highest = math.radians(LOWEST_ELEVATION_DEG), math.radians(HIGHEST_ELEVATION_DEG)
+    _, towards = main_wall_axes()
+    forward = math.atan2(towards[1], towards[0])
+    # Along the edges too: seen from below, the middle of an upper edge is higher than its ends.
+    shares = np.linspace(0.0, 1.0, 33)[:, None]
+    rim = np.concatenate(
+        [a + shares * (b - a) for a, b in zip(outline, np.roll(outline, -1, 0), strict=True)]
+    )
     sweeps = []
-    for index, station in enumerate(plan.stations):
+    for index, station in enumerate(stations):
         distance_m = float(main_wall.distances_m(station[None])[0])
-        panorama = _panorama(station, plan.panorama_step_m / distance_m, int(seeds[2 * index]))
-        detail = _detail(station, outline, plan.scan_step_m / distance_m, int(seeds[2 * index + 1]))
+        coarse, fine = (step_m / distance_m for step_m in steps_m)
+        panorama = Sweep(
+            station=station,
+            azimuth=0.0,
+            elevation=lowest,
+            step=coarse,
+            n_columns=max(1, math.floor(2.0 * math.pi / coarse)),
+            n_rows=max(1, math.floor((highest - lowest) / coarse)),
+            seed=int(seeds[2 * index]),
+        )
+        # The smallest window of angles that contains the main wall.
+        rays = rim - station
+        azimuths = np.arctan2(rays[:, 1], rays[:, 0]) - forward
+        azimuths = (azimuths + math.pi) % (2.0 * math.pi) - math.pi
+        elevations = np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1]))
+        detail = Sweep(
+            station=station,
+            azimuth=forward + float(azimuths.min()),
+            elevation=float(elevations.min()),
+            step=fine,
+            n_columns=max(1, math.ceil(float(np.ptp(azimuths)) / fine)),
+            n_rows=max(1, math.ceil(float(np.ptp(elevations)) / fine)),
+            seed=int(seeds[2 * index + 1]),
+        )
         sweeps += [panorama, detail]
     return sweeps
 
 
 def scan_scene(scene: Scene, sweeps: list[Sweep], errors: Errors, ctx: StepContext) -> Scan:
-    """Scan a scene whose origin is the room's."""
+    """Scan a scene whose origin is the room's; rays without a hit are left out."""
     scanner = Scanner(scene, errors)
-    sizes = [sweep.n_columns * sweep.n_rows for sweep in sweeps]
-    starts = np.concatenate([[0], np.cumsum(sizes)])
-    points = _allocated(int(starts[-1]), ctx)
-    scan = np.asarray(ctx.allocate("cloud", "scan", (len(points.x),), np.uint16))
-    row = np.asarray(ctx.allocate("cloud", "row", (len(points.x),), np.uint32))
-    column = np.asarray(ctx.allocate("cloud", "column", (len(points.x),), np.uint32))
+    starts = np.concatenate([[0], np.cumsum([sweep.n_columns * sweep.n_rows for sweep in sweeps])])
+    arrays = {
+        name: np.asarray(ctx.allocate("cloud", name, (int(starts[-1]), *more), dtype))
+        for name, dtype, *more in (*_MEASURED, *_PLACES)
+    }
+    points = Scanned(**{name: arrays[name] for name, *_ in _MEASURED})
     for index, sweep in enumerate(sweeps):
         ctx.progress(0.5 * index / len(sweeps), f"scan {index + 1} of {len(sweeps)}")
         span = slice(int(starts[index]), int(starts[index + 1]))
         in_runs(
-            partial(_sweep, scanner, sweep, points.take(span)),
+            partial(scanner.sweep, sweep, points.take(span)),
             sweep.n_columns,
             n_per_run=max(1, RAYS_AT_ONCE // sweep.n_rows),
             threads=ctx.cores,
         )
-        scan[span] = index
-        row[span] = np.tile(np.arange(sweep.n_rows, dtype=np.uint32), sweep.n_columns)
-        column[span] = np.repeat(np.arange(sweep.n_columns, dtype=np.uint32), sweep.n_rows)
+        arrays["scan"][span] = index
+        arrays["row"][span] = np.tile(np.arange(sweep.n_rows, dtype=np.uint32), sweep.n_columns)
+        arrays["column"][span] = np.repeat(
+            np.arange(sweep.n_columns, dtype=np.uint32), sweep.n_rows
+        )
+    places = {name: arrays[name] for name, *_ in _PLACES}
+    hit = points.rectangle != _MISSED
+    # A closed room has none without: then nothing is copied.
+    if not bool(hit.all()):
+        points, places = points.take(hit), {name: values[hit] for name, values in places.items()}
     stations = np.array([sweep.station for sweep in sweeps])
-    return _only_hits(Scan(points=points, scan=scan, row=row, column=column, stations=stations))
+    return Scan(points=points, stations=stations, **places)
 
 
 class Scanner:
@@ -247,81 +283,75 @@ class Scanner:
         self._normal = scene.normal
         self._is_cloth = scene.texture == TextureKind.TEXTILE
         self._errors = errors
-        self._band = LaserBand(scene=scene, inversion=errors.inversion, seed=errors.band_seed)
+        self._scene = scene
 
-    def sweep(self, sweep: Sweep, first: int, last: int, scanned: Scanned) -> None:
+    def sweep(self, sweep: Sweep, scanned: Scanned, first: int, last: int) -> None:
         """Scan some columns; every ray's noise is a function of seed, column and row alone.
 
         Args:
             sweep: the scan.
+            scanned: output, entries of the whole scan.
             first: column.
             last: last column, exclusive.
-            scanned: output, entries of the whole scan.
         """
-        echoes = self._echoes(sweep, first, last)
-        into = scanned.take(slice(first * sweep.n_rows, last * sweep.n_rows))
-        start = sweep.station[:, None]
-        into.rectangle[:] = echoes.hits.rectangle
-        measured = self._measured(sweep, echoes, into.rectangle)
-        points = points_on(start, echoes.ways, echoes.hits)
-        off = shared_errors(points, sweep.station, self._errors)
-        for coordinate, along in zip((into.x, into.y, into.z), range(3), strict=True):
-            coordinate[:] = sweep.station[along] + measured * echoes.ways[along] + off[along]
-        colours = self._rays.colours(echoes.hits.rectangle, points)
-        seen = self._band.reflectance(echoes.hits.rectangle, points, colours)
-        bright = seen * echoes.cosine**0.7
-        bright *= np.sqrt(2.0 / np.maximum(1.0, echoes.distance))
-        bright *= 1.0 + 0.03 * normals(echoes.states, 12)
-        into.intensity[:] = np.clip(bright, 0.0, 1.0)
-        for channel in range(3):
-            noise = self._errors.colour_noise * normals(echoes.states, 14 + 2 * channel)
-            into.rgb[:, channel] = np.clip(np.floor(colours[channel] + noise + 0.5), 0.0, 255.0)
-
-    def _echoes(self, sweep: Sweep, first: int, last: int) -> _Echoes:
+        errors, start = self._errors, sweep.station[:, None]
         columns, rows = np.arange(first, last), np.arange(sweep.n_rows)
         shape = (len(columns), len(rows))
         azimuth = np.broadcast_to((sweep.azimuth + columns * sweep.step)[:, None], shape).ravel()
         elevation = np.broadcast_to(sweep.elevation + rows * sweep.step, shape).ravel()
+        states = cell_states(columns[:, None], rows, sweep.seed).ravel()
         ways = _directions(azimuth, elevation)
-        hits = self._rays.cast(sweep.station[:, None], ways)
-        normal = self._normal[hits.rectangle]
-        return _Echoes(
-            azimuth=azimuth,
-            elevation=elevation,
-            ways=ways,
-            hits=hits,
-            states=cell_states(columns[:, None], rows, sweep.seed).ravel(),
-            distance=np.where(hits.rectangle < 0, 1.0, hits.t),
-            cosine=np.abs(np.einsum("ni,in->n", normal, ways)),
-        )
-
-    def _measured(
-        self, sweep: Sweep, echoes: _Echoes, rectangle: NDArray[np.int32]
-    ) -> NDArray[np.float64]:
-        """Return distances as measured; marks gross outliers and mixed distances as spoilt."""
-        states, distance = echoes.states, echoes.distance
-        sigma = _range_sigma(
-            distance, echoes.cosine, self._is_cloth[rectangle], self._errors.noise_m
-        )
+        hits = self._rays.cast(start, ways)
+        is_hit = hits.rectangle >= 0
+        distance = np.where(is_hit, hits.t, 1.0)
+        cosine = np.abs(np.einsum("ni,in->n", self._normal[hits.rectangle], ways))
+        into = scanned.take(slice(first * sweep.n_rows, last * sweep.n_rows))
+        into.rectangle[:] = hits.rectangle
+        # Noise grows with range and slope, and on cloth.
+        slope = 1.0 + 0.45 * np.minimum(1.0 / np.maximum(cosine, 0.05) - 1.0, 4.0)
+        cloth = np.where(self._is_cloth[into.rectangle], 1.4, 1.0)
+        sigma = errors.noise_m * slope * cloth * np.sqrt(0.5 + (distance / 3.0) ** 2 / 2)
         measured = distance + sigma * normals(states, 10)
-        is_hit = rectangle >= 0
-        if self._errors.beam_m > 0.0:
-            mixed = self._mixed(sweep, echoes)
+        if errors.beam_m > 0.0:
+            mixed = self._mixed(sweep.station, azimuth, elevation, states, distance)
             is_mixed = np.isfinite(mixed) & is_hit
             measured[is_mixed] = mixed[is_mixed]
-            rectangle[is_mixed] = SPOILT
-        is_gross = (uniforms(states, 0) < self._errors.outlier_share) & is_hit
-        measured[is_gross] = _gross(states[is_gross], distance[is_gross])
-        rectangle[is_gross] = SPOILT
-        return measured
+            into.rectangle[is_mixed] = SPOILT
+        # Gross outliers: most are too short, some too long.
+        short = distance * (0.3 + 0.68 * uniforms(states, 2))
+        gross = np.where(uniforms(states, 1) < 0.8, short, distance + 2.0 * uniforms(states, 2))
+        is_gross = (uniforms(states, 0) < errors.outlier_share) & is_hit
+        measured[is_gross] = gross[is_gross]
+        into.rectangle[is_gross] = SPOILT
+        points = points_on(start, ways, hits)
+        off = shared_errors(points, sweep.station, errors)
+        for along, coordinate in enumerate((into.x, into.y, into.z)):
+            coordinate[:] = sweep.station[along] + measured * ways[along] + off[along]
+        colours = self._rays.colours(hits.rectangle, points)
+        seen = laser_reflectance(
+            self._scene, hits.rectangle, points, colours, errors.inversion, errors.band_seed
+        )
+        bright = seen * cosine**0.7
+        bright *= np.sqrt(2.0 / np.maximum(1.0, distance))
+        bright *= 1.0 + 0.03 * normals(states, 12)
+        into.intensity[:] = np.clip(bright, 0.0, 1.0)
+        for channel in range(3):
+            noise = errors.colour_noise * normals(states, 14 + 2 * channel)
+            into.rgb[:, channel] = np.clip(np.floor(colours[channel] + noise + 0.5), 0.0, 255.0)
 
-    def _mixed(self, sweep: Sweep, echoes: _Echoes) -> NDArray[np.float64]:
+    def _mixed(
+        self,
+        station: NDArray[np.float64],
+        azimuth: NDArray[np.float64],
+        elevation: NDArray[np.float64],
+        states: NDArray[np.uint64],
+        distance: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
         """Mixed distances where the edge of the spot, at a hashed side, meets another depth."""
-        states, distance = echoes.states, echoes.distance
         turn, reach = _TURN * uniforms(states, 3), 0.5 * self._errors.beam_m / distance
-        aside = reach * np.cos(turn) / np.maximum(0.05, np.cos(echoes.elevation))
-        rims = _directions(echoes.azimuth + aside, echoes.elevation + reach * np.sin(turn))
-        other = self._rays.cast(sweep.station[:, None], rims).t
+        aside = reach * np.cos(turn) / np.maximum(0.05, np.cos(elevation))
+        rims = _directions(azimuth + aside, elevation + reach * np.sin(turn))
+        other = self._rays.cast(station[:, None], rims).t
         mixed = np.full(len(distance), np.nan)
         apart = np.abs(other - distance)
         beside = np.flatnonzero(np.isfinite(other) & (apart > 0.02 + 0.02 * distance))
@@ -357,100 +387,6 @@ def shared_errors(
     return off
 
 
-def _sweep(  # the range comes last, as `in_runs` gives it
-    scanner: Scanner, sweep: Sweep, scanned: Scanned, first: int, last: int
-) -> None:
-    scanner.sweep(sweep, first, last, scanned)
-
-
-def _allocated(n_points: int, ctx: StepContext) -> Scanned:
-    def array(name: str, dtype: type, *more: int) -> NDArray[np.generic]:
-        return ctx.allocate("cloud", name, (n_points, *more), dtype)
-
-    return Scanned(
-        x=cast("NDArray[np.float32]", array("x", np.float32)),
-        y=cast("NDArray[np.float32]", array("y", np.float32)),
-        z=cast("NDArray[np.float32]", array("z", np.float32)),
-        intensity=cast("NDArray[np.float32]", array("intensity", np.float32)),
-        rgb=cast("NDArray[np.uint8]", array("rgb", np.uint8, 3)),
-        rectangle=cast("NDArray[np.int32]", array("rectangle", np.int32)),
-    )
-
-
-def _only_hits(scan: Scan) -> Scan:
-    """Drop rays without a hit; a closed room has none, then nothing is copied."""
-    hit = scan.points.rectangle != _MISSED
-    if bool(hit.all()):
-        return scan
-    return Scan(
-        points=scan.points.take(hit),
-        scan=scan.scan[hit],
-        row=scan.row[hit],
-        column=scan.column[hit],
-        stations=scan.stations,
-    )
-
-
-def _panorama(station: NDArray[np.float64], step: float, seed: int) -> Sweep:
-    lowest, highest = math.radians(LOWEST_ELEVATION_DEG), math.radians(HIGHEST_ELEVATION_DEG)
-    return Sweep(
-        station=station,
-        azimuth=0.0,
-        elevation=lowest,
-        step=step,
-        n_columns=max(1, math.floor(2.0 * math.pi / step)),
-        n_rows=max(1, math.floor((highest - lowest) / step)),
-        seed=seed,
-    )
-
-
-def _detail(
-    station: NDArray[np.float64], outline: NDArray[np.float64], step: float, seed: int
-) -> Sweep:
-    """Scan the smallest window of angles that contains the main wall."""
-    _, towards = main_wall_axes()
-    forward = math.atan2(towards[1], towards[0])
-    # Along the edges too: seen from below, the middle of an upper edge is higher than its ends.
-    shares = np.linspace(0.0, 1.0, 33)[:, None]
-    edges = [a + shares * (b - a) for a, b in zip(outline, np.roll(outline, -1, 0), strict=True)]
-    rays = np.concatenate(edges) - station
-    azimuths = np.arctan2(rays[:, 1], rays[:, 0]) - forward
-    azimuths = (azimuths + math.pi) % (2.0 * math.pi) - math.pi
-    elevations = np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1]))
-    return Sweep(
-        station=station,
-        azimuth=forward + float(azimuths.min()),
-        elevation=float(elevations.min()),
-        step=step,
-        n_columns=max(1, math.ceil(float(np.ptp(azimuths)) / step)),
-        n_rows=max(1, math.ceil(float(np.ptp(elevations)) / step)),
-        seed=seed,
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Echoes:
-    """The rays of some columns and their hits, one entry per ray.
-
-    Attributes:
-        azimuth: radians; elevation likewise.
-        elevation: see azimuth.
-        ways: (3, n) unit directions.
-        hits: what they meet.
-        states: random states of their positions in the grid.
-        distance: metres to the hit, arbitrary without one.
-        cosine: of the angle of incidence.
-    """
-
-    azimuth: NDArray[np.float64]
-    elevation: NDArray[np.float64]
-    ways: NDArray[np.float64]
-    hits: Hits
-    states: NDArray[np.uint64]
-    distance: NDArray[np.float64]
-    cosine: NDArray[np.float64]
-
-
 def _directions(
     azimuth: NDArray[np.float64], elevation: NDArray[np.float64]
 ) -> NDArray[np.float64]:
@@ -458,92 +394,59 @@ def _directions(
     return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
 
 
-def _range_sigma(
-    distance: NDArray[np.float64],
-    cosine: NDArray[np.float64],
-    is_cloth: NDArray[np.bool_],
-    noise_m: float,
+def laser_reflectance(
+    scene: Scene,
+    rectangle: NDArray[np.int32],
+    points: NDArray[np.float64],
+    colours: NDArray[np.float32],
+    inversion: float,
+    seed: int,
 ) -> NDArray[np.float64]:
-    """Return the standard deviation of a distance: it grows with range and slope, and on cloth."""
-    slope = 1.0 + 0.45 * np.minimum(1.0 / np.maximum(cosine, 0.05) - 1.0, 4.0)
-    cloth = np.where(is_cloth, 1.4, 1.0)
-    return noise_m * slope * cloth * np.sqrt(0.5 + (distance / 3.0) ** 2 / 2)
+    """Return what the laser sees of points of a scene, (n,) 0..1.
 
-
-def _gross(states: NDArray[np.uint64], distance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return distances of gross outliers: most are too short, some too long."""
-    short = distance * (0.3 + 0.68 * uniforms(states, 2))
-    far = distance + 2.0 * uniforms(states, 2)
-    return np.where(uniforms(states, 1) < 0.8, short, far)
-
-
-@dataclass(frozen=True, kw_only=True)
-class LaserBand:
-    """The laser's band in one scene.
-
-    Attributes:
+    Args:
         scene: the scene with the rectangles; its origin at (0, 0, 0).
+        rectangle: (n,) rectangle of each point.
+        points: (3, n) metres.
+        colours: (4, n) red, green, blue 0..255, and the texture's own reflectance.
         inversion: 0 if the laser sees what the scene's textures show, 1 if all contrast follows
             from the materials' own response.
         seed: of materials, patches and spots.
     """
-
-    scene: Scene
-    inversion: float
-    seed: int
-
-    def reflectance(
-        self,
-        rectangle: NDArray[np.int32],
-        points: NDArray[np.float64],
-        colours: NDArray[np.float32],
-    ) -> NDArray[np.float64]:
-        """Return what the laser sees of points.
-
-        Args:
-            rectangle: (n,) rectangle of each point.
-            points: (3, n) metres.
-            colours: (4, n) red, green, blue 0..255, and the texture's own reflectance.
-
-        Returns:
-            (n,) 0..1.
-        """
-        plain: NDArray[np.float64] = colours[3].astype(np.float64)
-        if self.inversion == 0.0:
-            return plain
-        material = self.scene.texture_params[rectangle, 6].astype(np.int64)
-        states = cell_states(material, np.zeros_like(material), self.seed)
-
-        def drawn(limits: tuple[float, float], draw: int) -> NDArray[np.float64]:
-            share = uniforms(states, draw)
-            return np.asarray(limits[0] + (limits[1] - limits[0]) * share, dtype=np.float64)
-
-        red, green = colours[0] / 255.0, colours[1] / 255.0
-        own = (
-            drawn(_BLACK, 0)
-            - drawn(_RED, 1) * red ** drawn(_RED_POWER, 2)
-            + drawn(_GREEN, 3) * green ** drawn(_GREEN_POWER, 4)
-            + _OWN_PATTERN * (plain - self.scene.texture_params[rectangle, 3])
-        )
-        a, b = self._places(rectangle, points)
-        wet = _smooth_noise(a / _WET_M, b / _WET_M, material + self.seed)
-        own *= 1.0 - _WET_DARKER * np.clip((wet - _WET_FROM) / 0.1, 0.0, 1.0)
-        own[_is_spot(a, b, material + self.seed)] = 1.0
-        mixed = (1.0 - self.inversion) * plain + self.inversion * own
-        return np.asarray(np.clip(mixed, 0.01, 1.0), dtype=np.float64)
-
-    def _places(
-        self, rectangle: NDArray[np.int32], points: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        offsets = points.T - self.scene.centre[rectangle]
-        a, b = (
-            np.einsum("ni,ni->n", offsets, axis[rectangle])
-            for axis in (self.scene.axis_a, self.scene.axis_b)
-        )
-        return a, b
+    plain: NDArray[np.float64] = colours[3].astype(np.float64)
+    if inversion == 0.0:
+        return plain
+    material = scene.texture_params[rectangle, 6].astype(np.int64)
+    states = cell_states(material, np.zeros_like(material), seed)
+    black, red, red_power, green, green_power = (
+        low + (high - low) * uniforms(states, draw)
+        for draw, (low, high) in enumerate((_BLACK, _RED, _RED_POWER, _GREEN, _GREEN_POWER))
+    )
+    own = (
+        black
+        - red * (colours[0] / 255.0) ** red_power
+        + green * (colours[1] / 255.0) ** green_power
+        + _OWN_PATTERN * (plain - scene.texture_params[rectangle, 3])
+    )
+    offsets = points.T - scene.centre[rectangle]
+    a, b = (
+        np.einsum("ni,ni->n", offsets, axis[rectangle]) for axis in (scene.axis_a, scene.axis_b)
+    )
+    wet = smooth_noise(a / _WET_M, b / _WET_M, material + seed)
+    own *= 1.0 - _WET_DARKER * np.clip((wet - _WET_FROM) / 0.1, 0.0, 1.0)
+    column, row = np.floor(np.stack([a, b]) / _SPOT_EVERY_M).astype(np.int64)
+    spots = _lattice(column, row, material + seed)
+    distance = np.hypot(
+        a / _SPOT_EVERY_M - column - 0.2 - 0.6 * uniforms(spots, 6),
+        b / _SPOT_EVERY_M - row - 0.2 - 0.6 * uniforms(spots, 7),
+    )
+    is_near = distance < _SPOT_RADIUS_M / _SPOT_EVERY_M
+    own[is_near & (uniforms(spots, 8) < _SPOT_SHARE)] = 1.0
+    mixed = (1.0 - inversion) * plain + inversion * own
+    return np.asarray(np.clip(mixed, 0.01, 1.0), dtype=np.float64)
 
 
-def _smooth_noise(
+def smooth_noise(
     x: NDArray[np.float64], y: NDArray[np.float64], seed: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """Return noise 0..1 that is smooth between the points of a lattice, and differs per seed."""
@@ -556,20 +459,6 @@ def _smooth_noise(
             weight = (s if right else 1.0 - s) * (t if down else 1.0 - t)
             total += weight * uniforms(_lattice(column + right, row + down, seed), 5)
     return total
-
-
-def _is_spot(
-    a: NDArray[np.float64], b: NDArray[np.float64], seed: NDArray[np.int64]
-) -> NDArray[np.bool_]:
-    column = np.floor(a / _SPOT_EVERY_M).astype(np.int64)
-    row = np.floor(b / _SPOT_EVERY_M).astype(np.int64)
-    states = _lattice(column, row, seed)
-    distance = np.hypot(
-        a / _SPOT_EVERY_M - column - 0.2 - 0.6 * uniforms(states, 6),
-        b / _SPOT_EVERY_M - row - 0.2 - 0.6 * uniforms(states, 7),
-    )
-    is_near = distance < _SPOT_RADIUS_M / _SPOT_EVERY_M
-    return np.asarray(is_near & (uniforms(states, 8) < _SPOT_SHARE), dtype=np.bool_)
 
 
 def _lattice(

@@ -15,7 +15,6 @@ from orthoflow_plugins.simulate.building import (
     Side,
     Surface,
     add_block,
-    flat_side,
     wall_side,
 )
 
@@ -72,26 +71,6 @@ def test_a_box_is_closed_but_for_its_back() -> None:
     assert set(found) == {faces[name] for name in (*SIDES, "front")}
     assert {surface.role for surface in side.draft.surfaces} == {SurfaceRole.RELIEF}
     assert {surface.plane for surface in side.draft.surfaces} == {-1}
-
-
-@pytest.mark.parametrize(
-    ("base_m", "role"),
-    [(-0.2, SurfaceRole.RECESS), (0.0, SurfaceRole.RELIEF), (0.3, SurfaceRole.RELIEF)],
-)
-def test_a_box_may_stand_in_a_recess(base_m: float, role: SurfaceRole) -> None:
-    side = a_wall()
-    side.box(EXTENT, 0.05, PAINT, base_m=base_m)
-    faces = cuboid(EXTENT, base_m, round(base_m + 0.05, 9))
-    found = {on_wall(side, surface) for surface in side.draft.surfaces}
-    assert found == {faces[name] for name in (*SIDES, "front")}
-    assert {surface.role for surface in side.draft.surfaces} == {role}
-
-
-@pytest.mark.parametrize("depth_m", [0.0, -0.1])
-def test_nothing_stands_out_by_nothing(depth_m: float) -> None:
-    side = a_wall()
-    side.box(EXTENT, depth_m, PAINT)
-    assert side.draft.surfaces == []
 
 
 def test_bars_are_a_frame_without_gap_or_overlap() -> None:
@@ -165,21 +144,6 @@ def assert_axes(side: Side) -> None:
     assert np.linalg.det(axes) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("normal", [(0.3, 0.1, 1.0), (0.0, 0.0, 2.0), (-0.2, 0.4, -1.5)])
-def test_floors_and_ceilings_pass_through_their_height(
-    normal: tuple[float, float, float],
-) -> None:
-    side = flat_side(SceneDraft(), normal=normal, height_m=-1.5)
-    assert_axes(side)
-    np.testing.assert_allclose(np.cross(side.normal, normal), 0.0, atol=1e-12)
-    assert side.normal @ normal > 0.0
-    # The point nearest to the origin, and that over or under it.
-    np.testing.assert_allclose(np.cross(side.foot, side.normal), 0.0, atol=1e-12)
-    assert side.normal @ (np.array([0.0, 0.0, -1.5]) - side.foot) == pytest.approx(0.0, abs=1e-12)
-    assert side.axis_a @ [1.0, 0.0, 0.0] > 0.8
-    assert side.axis_a @ np.cross(side.normal, [1.0, 0.0, 0.0]) == pytest.approx(0.0, abs=1e-12)
-
-
 @pytest.mark.parametrize("yaw_deg", [0.0, 30.0, 200.0])
 def test_a_block_stands_turned_about_its_middle_and_open_below(yaw_deg: float) -> None:
     draft = SceneDraft()
@@ -200,24 +164,3 @@ def test_a_block_stands_turned_about_its_middle_and_open_below(yaw_deg: float) -
     for surface in draft.surfaces:
         assert surface.axis_a @ surface.axis_b == pytest.approx(0.0, abs=1e-12)
         assert (surface.role, surface.plane) == (SurfaceRole.OBJECT, -1)
-
-
-def test_a_finished_scene_holds_what_was_drafted() -> None:
-    side = a_wall()
-    hole: Extent = (0.0, 0.1, 0.3, 0.4)
-    side.place(EXTENT, 0.2, PAINT, SurfaceRole.RELIEF)
-    side.place(EXTENT, 0.0, PAINT, SurfaceRole.WALL, plane=7, holes=[hole, EXTENT])
-    scene = side.draft.finished(spectral_gap=0.3)
-    np.testing.assert_array_equal(scene.origin, 0.0)
-    np.testing.assert_allclose(scene.centre, [side.foot + 0.2 * side.normal, side.foot])
-    np.testing.assert_array_equal(scene.extent, [EXTENT, EXTENT])
-    assert scene.plane_index.tolist() == [-1, 7]
-    assert scene.role.tolist() == [SurfaceRole.RELIEF, SurfaceRole.WALL]
-    assert scene.hole_rectangle.tolist() == [1, 1]
-    np.testing.assert_array_equal(scene.hole_extent, [hole, EXTENT])
-    assert scene.texture.tolist() == [TextureKind.PLAIN] * 2
-    expected = [10.0, 20.0, 30.0, 0.4, PAINT.contrast, PAINT.period_m, PAINT.seed, 0.3]
-    np.testing.assert_array_equal(scene.texture_params[0], expected)
-    bare = a_wall()
-    bare.place(EXTENT, 0.0, PAINT, SurfaceRole.WALL)
-    assert bare.draft.finished(spectral_gap=0.0).hole_extent.shape == (0, 4)

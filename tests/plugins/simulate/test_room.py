@@ -54,13 +54,6 @@ def test_the_number_of_threads_changes_no_bit(tmp_path: Path) -> None:
     np.testing.assert_array_equal(one.truth.labels, two.truth.labels)
 
 
-def test_another_seed_gives_other_noise_on_the_same_grid(tmp_path: Path) -> None:
-    one = simulate(tmp_path / "one", seed=1, **COARSE).cloud
-    two = simulate(tmp_path / "two", seed=2, **COARSE).cloud
-    np.testing.assert_array_equal(one.column, two.column)
-    assert np.mean(one.x == two.x) < 0.05
-
-
 def test_survey_coordinates_change_nothing_but_the_origin(tmp_path: Path) -> None:
     near = simulate(tmp_path / "near", **COARSE)
     far = simulate(tmp_path / "far", **COARSE, shift_world_m=tuple(scenes.SURVEY_SHIFT_M))
@@ -217,23 +210,6 @@ def test_colours_are_those_of_the_scene(tmp_path: Path) -> None:
     assert wrong.mean() < 0.002
 
 
-def test_the_obstacle_can_be_left_away(tmp_path: Path) -> None:
-    there = simulate(tmp_path / "there", **CLEAN).truth.scene
-    gone = simulate(tmp_path / "gone", **CLEAN, obstacle=False).truth.scene
-    assert len(there) - len(gone) == 5
-
-
-def test_relief_scales_what_stands_out_of_the_walls(tmp_path: Path) -> None:
-    rough = simulate(tmp_path / "rough", **CLEAN)
-    flat = simulate(tmp_path / "flat", **CLEAN, relief_scale=0.0)
-    name = "main wall"
-    places = [out.truth.planes.names.index(name) for out in (rough, flat)]
-    points = [
-        int(out.truth.planes.n_points[k]) for out, k in zip((rough, flat), places, strict=True)
-    ]
-    assert points[1] > 1.5 * points[0]
-
-
 @pytest.mark.usefixtures("charts")
 def test_the_scan_step_on_the_main_wall_is_as_asked(tmp_path: Path) -> None:
     context = StepContext(rng=np.random.default_rng(1), cores=2, scratch=tmp_path)
@@ -258,15 +234,6 @@ def test_the_main_wall_is_reported_where_the_floor_has_more_points(tmp_path: Pat
     assert main > 0
     metrics = {metric.name: metric.value for metric in context.metrics}
     assert metrics["main_wall_points"] == truth.planes.n_points[main]
-
-
-def test_one_to_four_stations_give_two_scans_each(tmp_path: Path) -> None:
-    for count in (1, 4):
-        cloud = simulate(tmp_path / str(count), **COARSE, n_stations=count).cloud
-        assert cloud.stations is not None
-        assert cloud.scan is not None
-        assert cloud.stations.shape == (2 * count, 3)
-        np.testing.assert_array_equal(np.unique(cloud.scan), np.arange(2 * count))
 
 
 def relief_m(truth: Truth, name: str) -> np.ndarray:
@@ -320,11 +287,3 @@ def test_recesses_of_drawn_walls_are_true_planes(tmp_path: Path) -> None:
         )
         assert any(abs(relief_m(truth, wall) - depth_m) < 1e-6)
         assert -0.4501 <= depth_m <= -0.0499
-
-
-def test_a_seed_draws_the_same_walls_again(tmp_path: Path) -> None:
-    one = simulate(tmp_path / "one", decoration="drawn", **COARSE)
-    two = simulate(tmp_path / "two", is_new=True, decoration="drawn", **COARSE)
-    assert one is not two
-    assert_same_points(one.cloud, two.cloud)
-    np.testing.assert_array_equal(one.truth.scene.extent, two.truth.scene.extent)

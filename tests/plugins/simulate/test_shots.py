@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,11 +12,10 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.simulate import photographs
 from orthoflow_plugins.simulate.building import SceneDraft
-from orthoflow_plugins.simulate.photographs import Film, ShotPlan, planned_shots, take_photos
-from orthoflow_plugins.simulate.room_model import DESIGNED, main_wall_axes
+from orthoflow_plugins.simulate.photographs import Film, planned_shots, take_photos
+from orthoflow_plugins.simulate.room_model import DESIGNED
 
 from orthoflow.files.images import decode_image
-from orthoflow.geometry.cameras import looking_at
 from tests.raster_scenes import context
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -34,11 +34,6 @@ def rng(seed: int) -> np.random.Generator:
 def developed(image: NDArray[np.floating], **film: float) -> NDArray[np.uint8]:
     given: dict[str, Any] = {**vars(PLAIN), **film}
     return photographs._developed(image.astype(np.float32), Film(**given), rng(1))
-
-
-def test_levels_are_rounded_and_cut_off() -> None:
-    image = np.array([[[-3.0, 0.4, 0.6], [254.4, 254.6, 900.0]]])
-    np.testing.assert_array_equal(developed(image), [[[0, 0, 1], [254, 255, 255]]])
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5])
@@ -60,41 +55,6 @@ def test_noise_is_as_large_as_asked_and_of_each_channel_its_own() -> None:
     assert np.abs(np.corrcoef(channels) - np.eye(3)).max() < 0.02
 
 
-@pytest.mark.parametrize("roll_deg", [-3.0, 0.0, 2.0, 90.0])
-def test_a_camera_is_rolled_about_its_own_axis(roll_deg: float) -> None:
-    rotation = looking_at(np.array([0.3, -2.0, 0.1]), np.zeros(3), UP)
-    rolled = photographs._rolled(rotation, roll_deg)
-    np.testing.assert_allclose(rolled[2], rotation[2])
-    np.testing.assert_allclose(rolled @ rolled.T, np.eye(3), atol=1e-12)
-    # What lay to the right turns downwards in the photo.
-    right = rolled @ rotation[0]
-    turn = np.radians(roll_deg)
-    np.testing.assert_allclose(right, [np.cos(turn), np.sin(turn), 0.0], atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("wanted", "stands"),
-    [
-        ((0.3, 0.5, 0.2), (0.3, 0.5, 0.2)),
-        ((-9.0, 0.5, 0.2), (-2.3, 0.5, 0.2)),
-        ((9.0, 9.0, 9.0), (2.3, 1.95, 1.3)),
-        ((0.0, 0.0, -9.0), (0.0, 0.0, -1.15)),
-        # Behind the middle of the room over furniture, near the main wall over the screen.
-        ((0.0, -0.34, -1.0), (0.0, -0.34, -1.0)),
-        ((0.0, -0.36, -1.0), (0.0, -0.36, -0.45)),
-        ((0.0, -9.0, 0.3), (0.0, -1.65, 0.3)),
-        ((0.0, 1.19, -1.0), (0.0, 1.19, -1.0)),
-        ((0.0, 1.21, -1.0), (0.0, 1.21, -0.05)),
-    ],
-)
-def test_one_stands_where_there_is_room(
-    wanted: tuple[float, ...], stands: tuple[float, ...]
-) -> None:
-    axes = np.vstack([main_wall_axes(), UP])
-    found = axes @ photographs._where_one_can_stand(axes.T @ np.array(wanted))
-    np.testing.assert_allclose(found, stands, atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("layout", "size_m", "distance_m"),
     [("quick", (2.4, 1.8), 2.6), ("variant1", (5.9, 3.5), 3.95), ("variant2", (2.4, 1.8), 2.6)],
@@ -102,8 +62,8 @@ def test_one_stands_where_there_is_room(
 def test_lenses_of_a_layout_hold_its_footprint_and_differ_a_little(
     layout: Any, size_m: tuple[float, float], distance_m: float
 ) -> None:
-    plan = ShotPlan(layout=layout, gsd_m=0.01, obliquity_deg=10.0)
-    lenses = [planned_shots(plan, rng(seed))[0].camera for seed in range(150)]
+    plan = partial(planned_shots, layout, gsd_m=0.01, obliquity_deg=10.0)
+    lenses = [plan(rng(seed))[0].camera for seed in range(150)]
     width, height = (round(side / 0.01) for side in size_m)
     assert {(lens.width, lens.height) for lens in lenses} == {(width, height)}
     assert {(lens.fx, lens.fy) for lens in lenses} == {(distance_m / 0.01, distance_m / 0.01)}
@@ -116,20 +76,20 @@ def test_lenses_of_a_layout_hold_its_footprint_and_differ_a_little(
     ):
         assert 0.93 * scatter < np.abs(values - middle).max() <= scatter
     # No photo is so small that nothing is on it.
-    coarse = ShotPlan(layout=layout, gsd_m=1.0, obliquity_deg=10.0)
-    shot = planned_shots(coarse, rng(0))[0]
+    coarse = partial(planned_shots, layout, gsd_m=1.0, obliquity_deg=10.0)
+    shot = coarse(rng(0))[0]
     assert (shot.camera.width, shot.camera.height) == (16, 16)
 
 
 @pytest.mark.parametrize("layout", ["quick", "variant2"])
 def test_photos_look_at_their_walls_as_askew_as_planned(layout: Any) -> None:
     sides = DESIGNED.sides(SceneDraft())
-    plan = ShotPlan(layout=layout, gsd_m=0.01, obliquity_deg=8.0)
+    plan = partial(planned_shots, layout, gsd_m=0.01, obliquity_deg=8.0)
     rolls, tilts = [], []
     columns, rows = LATTICES[layout]
     targets = [(a, b) for b in rows for a in columns]
     for seed in range(20):
-        for target, shot in zip(targets, planned_shots(plan, rng(seed)), strict=True):
+        for target, shot in zip(targets, plan(rng(seed)), strict=True):
             camera, taken = shot.camera, shot.taken
             tilt = np.degrees(np.arccos(-camera.rotation[2] @ sides[0].normal))
             assert taken.wall == "main wall"
@@ -151,15 +111,15 @@ def test_photos_look_at_their_walls_as_askew_as_planned(layout: Any) -> None:
     # From four tenths of it on, but where one cannot stand there.
     assert np.quantile(tilts, 0.5) < 8.0
     assert np.mean((np.array(tilts) > 3.19) & (np.array(tilts) < 8.01)) > 0.5
-    assert planned_shots(ShotPlan(layout="none", gsd_m=0.01, obliquity_deg=8.0), rng(0)) == ()
+    assert planned_shots("none", rng(0), gsd_m=0.01, obliquity_deg=8.0) == ()
 
 
 @pytest.mark.parametrize("exposures", [0.0, 0.3])
 def test_photos_get_more_or_less_light_and_files_say_a_wrong_focal_length(
     tmp_path: Path, exposures: float
 ) -> None:
-    plan = ShotPlan(layout="variant2", gsd_m=0.05, obliquity_deg=8.0)
-    shots = planned_shots(plan, rng(1))
+    plan = partial(planned_shots, "variant2", gsd_m=0.05, obliquity_deg=8.0)
+    shots = plan(rng(1))
     seeds: list[int] = []
 
     def expose(camera: Any, *, supersample: int, seed: int) -> NDArray[np.float32]:
