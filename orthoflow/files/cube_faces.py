@@ -64,45 +64,9 @@ def face_rays(lens: Intrinsics) -> NDArray[np.float64]:
     return np.stack([across, along, np.ones_like(across)], axis=-1)
 
 
-@dataclass(frozen=True, kw_only=True)
-class PanoramaFace:
-    """A face of a panorama as a photo.
-
-    Attributes:
-        name: name of the photo.
-        panorama: the panorama's file, unmodified.
-        face: which of `FACES`.
-        width: number of columns of the panorama.
-        used: mask of the panorama (rows, columns), True where it may be used; None: all.
-    """
-
-    name: str
-    panorama: bytes
-    face: str
-    width: int
-    used: NDArray[np.bool_] | None = None
-
-    @property
-    def lens(self) -> Intrinsics:
-        """Its lens, which is exact."""
-        return face_lens(self.width)
-
-    def encoded(self) -> bytes:
-        """The photo as a PNG file."""
-        return encode_png(face_picture(decode_levels(self.panorama, self.name), self.face))
-
-    def mask(self) -> NDArray[np.bool_] | None:
-        """Return which pixels (height, width) may be used; None if all may."""
-        if self.used is None:
-            return None
-        whole = face_picture(np.where(self.used, np.uint8(255), np.uint8(0)), self.face)
-        used: NDArray[np.bool_] = whole == np.uint8(255)
-        return None if used.all() else used
-
-
 def faces_of(
     panorama: bytes, stem: str, width: int, used: NDArray[np.bool_] | None = None
-) -> tuple[PanoramaFace, ...]:
+) -> tuple[CubeFace, ...]:
     """Return the faces of a panorama as photos `<stem>_<face>.png`.
 
     Args:
@@ -116,10 +80,9 @@ def faces_of(
     """
     if not 1 <= width <= MOST_PX:
         raise InputError(f"panorama {stem} has {width} columns, at most {MOST_PX} can be read")
+    lens = face_lens(width)
     return tuple(
-        PanoramaFace(
-            name=face_name(stem, face), panorama=panorama, face=face, width=width, used=used
-        )
+        CubeFace(name=face_name(stem, face), photo=panorama, face=face, lens=lens, used=used)
         for face in FACES
     )
 
@@ -352,66 +315,61 @@ def _cut(lens: FisheyeLens, face: str, seen: NDArray[np.bool_]) -> Intrinsics:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FisheyeFace:
-    """A face of a cube around a fisheye's photo, as a photo.
+class CubeFace:
+    """A face of a cube around a panorama or a fisheye's photo, as a photo.
 
     Attributes:
         name: name of the photo.
-        photo: the fisheye photo, unmodified.
-        face: which of `FACE_FROM_CAMERA`.
-        fisheye: its lens.
-        used: mask of the fisheye photo (height, width), True where it may be used; None: all.
+        photo: the file of the whole, unmodified.
+        face: which of `FACES`.
+        lens: its lens, which is exact.
+        fisheye: lens of the whole; None for a panorama.
+        used: mask of the whole (rows, columns), True where it may be used; None: all.
     """
 
     name: str
     photo: bytes
     face: str
-    fisheye: FisheyeLens
+    lens: Intrinsics
+    fisheye: FisheyeLens | None = None
     used: NDArray[np.bool_] | None = None
 
-    @property
-    def lens(self) -> Intrinsics:
-        """Its lens, which is exact."""
-        return face_lenses(self.fisheye)[self.face]
-
     def encoded(self) -> bytes:
-        """Return the photo as a PNG file, black where the fisheye shows nothing."""
+        """Return the photo as a PNG file, black where the whole shows nothing."""
         return encode_png(self._looked_up(decode_levels(self.photo, self.name)))
 
     def mask(self) -> NDArray[np.bool_] | None:
         """Return which pixels (height, width) may be used; None if all may."""
-        seen = self.fisheye.sees(self._pixels())
+        seen = np.ones((self.lens.height, self.lens.width), dtype=np.bool_)
+        if self.fisheye is not None:
+            seen = self.fisheye.sees(self._pixels(self.fisheye))
         if self.used is not None:
             whole = self._looked_up(np.where(self.used, np.uint8(255), np.uint8(0)))
             seen &= whole == np.uint8(255)
         return None if seen.all() else seen
 
-    def _pixels(self) -> NDArray[np.float64]:
+    def _pixels(self, fisheye: FisheyeLens) -> NDArray[np.float64]:
         """Return pixels of the fisheye (height, width, 2) of those of the face."""
-        return self.fisheye.project(face_rays(self.lens) @ FACE_FROM_CAMERA[self.face])
+        return fisheye.project(face_rays(self.lens) @ FACE_FROM_CAMERA[self.face])
 
     def _looked_up(self, photo: Colours) -> Colours:
-        """Resample the face from the fisheye photo by bilinear interpolation."""
+        """Resample the face from the whole by bilinear interpolation."""
         import cv2
 
-        pixels = self._pixels()
+        if self.fisheye is None:
+            return face_picture(photo, self.face)
+        pixels = self._pixels(self.fisheye)
         pixels[~self.fisheye.sees(pixels)] = np.nan
         # OpenCV counts from the centre of the first pixel; NaN would be sampled anywhere.
-        places = np.nan_to_num(pixels - HALF_PIXEL).astype(np.float32)
-        looked_up = cv2.remap(
-            photo,
-            places[..., 0],
-            places[..., 1],
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
+        u, v = np.moveaxis(np.nan_to_num(pixels - HALF_PIXEL).astype(np.float32), -1, 0)
+        looked_up = cv2.remap(photo, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         looked_up[np.isnan(pixels[..., 0])] = 0
         return np.asarray(looked_up, dtype=photo.dtype)
 
 
 def fisheye_faces(
     photo: bytes, stem: str, lens: FisheyeLens, used: NDArray[np.bool_] | None = None
-) -> tuple[FisheyeFace, ...]:
+) -> tuple[CubeFace, ...]:
     """Return the visible parts of a fisheye photo as photos `<stem>_<face>.png`.
 
     Args:
@@ -427,6 +385,8 @@ def fisheye_faces(
     if problem:
         raise InputError(f"the fisheye lens of photo {stem} is none: {problem}")
     return tuple(
-        FisheyeFace(name=face_name(stem, face), photo=photo, face=face, fisheye=lens, used=used)
-        for face in face_lenses(lens)
+        CubeFace(
+            name=face_name(stem, face), photo=photo, face=face, lens=own, fisheye=lens, used=used
+        )
+        for face, own in face_lenses(lens).items()
     )

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.cube_faces import FACES, PanoramaFace, faces_of
+from orthoflow.files.cube_faces import FACES, CubeFace, faces_of
 from orthoflow.files.given_cameras import GivenCamera
 from orthoflow.files.points.e57 import FORMAT, number_of, pose_of
 from orthoflow.files.points.scan_file import load_library, reading
@@ -42,7 +42,7 @@ class E57Image:
     """
 
     name: str
-    content: bytes | PanoramaFace
+    content: bytes | CubeFace
     camera: GivenCamera
 
     def encoded(self) -> bytes:

@@ -266,16 +266,6 @@ def test_flipped_bits_that_no_decoder_notices_shift_what_is_behind_them() -> Non
     assert found >= 0.8 * visible
 
 
-@pytest.mark.parametrize("padding", [bytes(7), bytes(500), b"\x12\x34\x56"])
-def test_padding_behind_the_scan_of_a_jpeg_costs_nothing(padding: bytes) -> None:
-    whole = JPEGS["baseline"]
-    found, is_lost = damage(whole[:-2] + padding + whole[-2:])
-    assert "extraneous" in found
-    assert not is_lost
-    # Padding in the place of a scan that was cut is none.
-    assert damage(whole[:9000] + bytes(9000) + whole[-2:])[1]
-
-
 @pytest.mark.parametrize("kind", ["PNG", "TIFF", "WEBP"])
 def test_other_formats_that_are_cut_off_are_found(kind: str) -> None:
     encoded = saved(kind, PHOTO)

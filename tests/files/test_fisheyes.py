@@ -14,7 +14,6 @@ from orthoflow.files.cube_faces import (
     FACE_FROM_CAMERA,
     FACES,
     FisheyeLens,
-    PanoramaFace,
     face_lenses,
     faces_of,
     fisheye_faces,
@@ -153,7 +152,7 @@ def test_masks_of_panoramas_hold_for_their_faces() -> None:
         for face in faces_of(encode_png(np.zeros((64, 128), np.uint8)), "p", 128, used)
     }
     assert set(faces) == set(FACES)
-    assert all(isinstance(face, PanoramaFace) for face in faces.values())
+    assert all(face.fisheye is None for face in faces.values())
     left, right, front = (faces[name].mask() for name in ("left", "right", "front"))
     assert left is not None
     assert not left.any()
@@ -161,17 +160,6 @@ def test_masks_of_panoramas_hold_for_their_faces() -> None:
     assert front is not None
     assert not front[:, :20].any()
     assert front[:, 21:].all()
-
-
-def test_a_face_is_as_fine_as_the_photo_in_its_middle() -> None:
-    plain = replace(LENS, radial=(0.0, 0.0, 0.0, 0.0), fy=150.0)
-    faces = face_lenses(plain)
-    assert faces["front"].fx == pytest.approx(150.0, abs=0.5)
-    # A right angle off the axis a circle is pi / 2 focal lengths long per radian.
-    assert faces["left"].fx == pytest.approx(150.0 * np.pi / 2, abs=0.5)
-    # Half of each face beside is before the camera.
-    assert faces["left"].width == pytest.approx(faces["left"].height / 2, rel=0.06)
-    assert faces["up"].height == pytest.approx(faces["up"].width / 2, rel=0.06)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rasterio.transform import Affine
 
 from orthoflow.errors import InputError
 from orthoflow.files import geotiff as module
@@ -17,8 +16,6 @@ from orthoflow.files.geotiff import (
     epsg_wkt,
     require_map_crs,
 )
-
-PATH = Path("wall.tif")
 
 
 def stated(width: int, height: int = 1, count: int = 1, **tags: str) -> Any:
@@ -44,35 +41,6 @@ def test_a_larger_one_states_eleven_hundred_values_a_byte(tmp_path: Path) -> Non
 def test_a_file_that_names_another_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^wall\.tif names another file for its overviews"):
         check_header(stored(tmp_path, 100), stated(4, OVERVIEW_FILE="http://a/b.ovr"))
-
-
-@pytest.mark.parametrize(
-    ("changes", "is_square"),
-    [
-        ({}, True),
-        ({"e": -0.5 * (1.0 + 0.9e-6)}, True),
-        ({"e": -0.5 * (1.0 + 1.1e-6)}, False),
-        ({"b": 0.45e-6}, True),
-        ({"b": 0.55e-6}, False),
-        ({"d": -0.45e-6}, True),
-        ({"d": -0.55e-6}, False),
-        ({"e": 0.5}, True),
-        ({"a": -0.5}, False),
-        ({"a": 0.0}, False),
-        ({"a": float("nan")}, False),
-    ],
-    ids=str,
-)
-def test_cells_are_square_and_upright_to_a_millionth(
-    changes: dict[str, float], *, is_square: bool
-) -> None:
-    terms = {"a": 0.5, "b": 0.0, "d": 0.0, "e": -0.5} | changes
-    transform = Affine(terms["a"], terms["b"], 7.0, terms["d"], terms["e"], 9.0)
-    if is_square:
-        assert module._gsd_m(PATH, transform) == 0.5
-    else:
-        with pytest.raises(InputError, match=r"^wall\.tif has cells that are not square and upri"):
-            module._gsd_m(PATH, transform)
 
 
 # --- coordinate systems ---

@@ -603,12 +603,6 @@ def test_columns_of_realitycapture_may_be_missing_and_lines_be_comments(
     np.testing.assert_allclose(given.translation, [-1, 2, 3], atol=1e-12)
 
 
-def test_of_several_files_of_one_kind_one_must_be_named(tmp_path: Path) -> None:
-    files: dict[str, str | bytes] = {"a.xml": "<document/>", "b.xml": "<document/>"}
-    with pytest.raises(InputError, match=r"2 \.xml files, of which one must be named"):
-        read_given_cameras(write(tmp_path, files))
-
-
 @pytest.mark.parametrize("k4", [0.02, 0.3])
 def test_a_fourth_radial_term_is_taken_over_by_the_others(k4: float) -> None:
     lens = CentredLens(focal_px=500.0, radial=(-0.05, 0.02, 0.0, k4))

@@ -70,17 +70,6 @@ def test_the_first_percentile_is_black_and_the_last_one_white() -> None:
     np.testing.assert_allclose(grey[1:100], 255.0 * np.arange(99) / 98.0, atol=0.51)
 
 
-def test_a_small_picture_is_its_own_preview_and_transparent_where_nothing_is_shown() -> None:
-    image = blocks(16, 24)
-    shown = np.zeros((16, 24), dtype=np.bool_)
-    shown[:, :9] = True
-    preview = opened(images.preview_png(image, shown))
-    np.testing.assert_array_equal(preview[..., :3], image)
-    np.testing.assert_array_equal(preview[..., 3], np.where(shown, 255, 0))
-    grey = opened(images.preview_png(image[..., 0], shown, longest_side_px=24))
-    np.testing.assert_array_equal(grey[..., :3], image[..., :1].repeat(3, axis=2))
-
-
 def halves() -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Squares of 4 pixels, the left half of each of them shown, what is not is black."""
     image = blocks(64, 48, side=4)
@@ -114,23 +103,6 @@ def test_a_very_large_one_is_averaged_band_by_band(
     check_halves(images._preview(shown.shape, cells, 16))
     assert len(asked) == math.ceil(32 / band_px)
     assert asked[0] == (slice(0, 2 * min(32, band_px)), slice(0, 48))
-
-
-def test_previews_in_webp_are_those_in_png() -> None:
-    image, shown = blocks(64, 48), np.ones((64, 48), dtype=np.bool_)
-    preview = opened(images.preview_webp(image, shown, longest_side_px=32))
-    assert preview.shape[:2] == (32, 24)
-    np.testing.assert_allclose(
-        preview[2:-2:4, 2:-2:4, :3].astype(float),
-        opened(images.preview_png(image, shown, longest_side_px=32))[2:-2:4, 2:-2:4, :3],
-        atol=40,
-    )
-    parts = images.cells_webp(
-        shown.shape, lambda part: (image[part], shown[part]), longest_side_px=32
-    )
-    assert parts == images.preview_webp(image, shown, longest_side_px=32)
-    whole = images.cells_png(shown.shape, lambda part: (image[part], shown[part]))
-    assert whole == images.preview_png(image, shown)
 
 
 def test_levels_are_as_deep_as_the_file_and_in_the_order_of_colours() -> None:

@@ -23,7 +23,6 @@ from orthoflow.products import (
     TieRole,
     Ties,
     Wall,
-    Walls,
 )
 from tests import samples
 
@@ -144,51 +143,6 @@ def wall() -> Wall:
         count=np.ones((2, 3), np.uint32),
         mask=np.array([[1, 1, 2], [0, 1, 1]], np.uint8),
     )
-
-
-def walls() -> Walls:
-    return Walls(
-        walls=(wall(),),
-        up=UP,
-        intensity_source="laser",
-        buffer_front_m=0.3,
-        buffer_behind_m=0.2,
-    )
-
-
-def test_depths_alone_are_told_completely(tmp_path: Path) -> None:
-    publishing.publish_walls(walls(), tmp_path, DIGEST)
-    files = {f"wall_2_depth{suffix}" for suffix in (".tif", ".json", ".png", ".pgw")}
-    assert names_in(tmp_path) == files
-    content = "depth in metres along the normal, positive towards the viewer; NaN = no data"
-    assert json_of(tmp_path / "wall_2_depth.json") == {
-        **PLACED,
-        "wall": 2,
-        "plane_index": 2,
-        "intensity_source": "laser",
-        "buffer": {"front_m": 0.3, "behind_m": 0.2},
-        "includes_walls": [],
-        "content": content,
-        "name": "north",
-        "mask": {
-            "0": "void: no point of the scan is in this cell",
-            "1": "measured: points of the scan are in this cell",
-            "2": "recovered: interpolated from neighbouring cells",
-        },
-        "mask_counts": {"0": 1, "1": 4, "2": 1},
-        "product_digest": DIGEST,
-    }
-    read = geotiff.read_raster(tmp_path / "wall_2_depth.tif")
-    np.testing.assert_array_equal(read.values, DEPTH)
-    np.testing.assert_array_equal(read.shown, np.isfinite(DEPTH))
-    assert read.tags == {**TAGS, "content": content, "name": "north", "unit": "m"}
-    assert (read.gsd_m, read.corner_m, read.overviews, read.layout) == (0.5, (0.0, 30.0), (), "")
-    assert (tmp_path / "wall_2_depth.pgw").read_text() == WORLD_FILE
-    # From the 1st percentile of 0, 1, 2, 3, 4, black, to the 99th, white; the void is transparent.
-    grey = np.array([[0, 63, 128], [0, 192, 255]])
-    shown = picture(tmp_path / "wall_2_depth.png")
-    np.testing.assert_allclose(shown[:, :, 0][DEPTH >= 0.0], grey[DEPTH >= 0.0], atol=1)
-    np.testing.assert_array_equal(shown[:, :, 3], [[255, 255, 255], [0, 255, 255]])
 
 
 MASK = np.array([[0, 1, 2], [3, 4, 1]], np.uint8)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import base64
-import csv
-import json
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +23,6 @@ from orthoflow.products import (
     Layers,
     Orthoimage,
     Orthoimages,
-    ResidualRow,
     TieRole,
     Ties,
     Walls,
@@ -80,27 +77,6 @@ def ties() -> Ties:
         role=np.array([TieRole.CONTROL, TieRole.REJECTED], np.uint8),
         residual_px=np.array([[0.25, -0.125], [np.nan, np.nan]]),
     )
-
-
-def test_an_orthoimage_file_gives_back_every_pixel_and_shows_painted_and_filled_cells_only(
-    tmp_path: Path, frame: WallFrame
-) -> None:
-    image = orthoimage(frame)
-    publishing.publish_orthoimages(Orthoimages(images=(image,)), tmp_path, DIGEST)
-
-    read = geotiff.read_raster(tmp_path / "wall_3_ortho.tif")
-    np.testing.assert_array_equal(read.values, image.rgb)
-    np.testing.assert_array_equal(read.shown, (image.mask == 1) | (image.mask == 2))
-    np.testing.assert_array_equal(
-        geotiff.read_raster(tmp_path / "wall_3_ortho_mask.tif").values, image.mask
-    )
-    assert read.gsd_m == 0.01
-    assert read.layout == "COG"
-    assert read.overviews
-    assert "metre" in read.crs_wkt.lower()
-    assert read.tags["product_digest"] == DIGEST
-    assert json.loads(read.tags["plane"])["offset_m"] == pytest.approx(634512.347, abs=1e-9)
-    assert json.loads(read.tags["frame"])["v_world"] == [0.0, 0.0, -1.0]
 
 
 def test_no_traceback_is_printed_for_text_in_a_file_that_is_not_utf_8(
@@ -204,33 +180,6 @@ def test_estimated_lenses_are_published_as_a_calibration_file(tmp_path: Path) ->
     found = read_calibration(tmp_path / "calibration.yaml")
     assert found.patterns == ("a[1].jpg",)
     assert found.lenses == (replace(lens, source="calibration"),)
-
-
-def test_the_table_of_residuals_is_published_as_it_is(tmp_path: Path) -> None:
-    numbers = dict.fromkeys(
-        ("mean", "sd", "median", "nmad", "rmse", "p95", "max", "beyond_own", "beyond_any"), 0.5
-    )
-    row = ResidualRow(photo="a b.jpg", role="check", axis="u", unit="px", n=3, **numbers)
-    cameras = Cameras(cameras=(), residual_table=(row, replace(row, shift_p=0.25)))
-    publishing.publish_cameras(cameras, tmp_path, DIGEST)
-    with (tmp_path / "residuals.csv").open() as table:
-        found = list(csv.DictReader(table))
-    columns = [
-        "photo",
-        "role",
-        "photo_axis",
-        "unit",
-        "n",
-        "mean",
-        "shift_p",
-        "sd",
-        "median",
-        "nmad",
-    ]
-    columns += ["skewness", "rmse", "p95", "max", "beyond_own", "beyond_cells", "beyond_any"]
-    assert [list(line) for line in found] == [columns] * 2
-    assert [line["shift_p"] for line in found] == ["", "0.25"]
-    assert found[0]["n"] == "3"
 
 
 def test_previews_of_large_images_differ_in_nothing_and_profiles_are_kept(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from orthoflow.files import gltf as module
 from orthoflow.files.geotiff import GridPlace, write_raster
-from orthoflow.files.gltf import WallMesh, flat_mesh, relief_mesh
+from orthoflow.files.gltf import WallMesh, relief_mesh
 from orthoflow.geometry import WallFrame
 from tests import samples
 
@@ -72,10 +72,3 @@ def test_nodes_of_a_large_wall_are_means_of_cells(
     first = mesh.vertices[:, 2].reshape(10, 15)[0, 0]
     assert first == pytest.approx(slope()[:4, :4].mean(), abs=1e-6)
     assert area_m2(mesh) == pytest.approx(0.4 * 0.6)
-
-
-@pytest.mark.parametrize("shape", [SHAPE, (1, 60), (40, 1), (1, 1)])
-def test_without_any_depth_or_width_it_is_flat(tmp_path: Path, shape: tuple[int, int]) -> None:
-    depths_m = np.full(shape, np.nan if shape == SHAPE else 0.3, dtype=np.float32)
-    mesh = relief(tmp_path, depths_m)
-    np.testing.assert_array_equal(mesh.vertices, flat_mesh(frame(*shape)).vertices)

@@ -23,9 +23,8 @@ from orthoflow.files.calibration import (
 )
 from orthoflow.files.camera_formats import read_given_cameras
 from orthoflow.files.cube_faces import (
-    FisheyeFace,
+    CubeFace,
     FisheyeLens,
-    PanoramaFace,
     faces_of,
     fisheye_faces,
 )
@@ -235,7 +234,7 @@ class _Source:
     """
 
     name: str
-    content: Path | E57Image | PanoramaFace | FisheyeFace
+    content: Path | E57Image | CubeFace
     lens: Intrinsics | None = None
     whole: str = ""
     folder: str = ""
@@ -333,7 +332,7 @@ def _whole_photo(path: Path) -> tuple[bytes, tuple[int, int]]:
     return encoded, (width, height)
 
 
-def _of_faces(faces: Sequence[PanoramaFace | FisheyeFace], whole: str) -> list[_Source]:
+def _of_faces(faces: Sequence[CubeFace], whole: str) -> list[_Source]:
     """Faces of which masks leave something."""
     return [
         _Source(name=face.name, content=face, lens=face.lens, whole=whole)
@@ -348,7 +347,7 @@ def _inside_e57(path: Path) -> list[_Source]:
             name=image.name,
             content=image,
             lens=image.camera.lens if isinstance(image.camera.lens, Intrinsics) else None,
-            whole=path.name if isinstance(image.content, PanoramaFace) else "",
+            whole=path.name if isinstance(image.content, CubeFace) else "",
         )
         for image in read_e57_images(path)
     ]

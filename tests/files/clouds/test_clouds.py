@@ -297,58 +297,6 @@ def test_an_e57_says_of_each_scan_what_it_holds(tmp_path: Path) -> None:
             assert (intensity.minimum(), intensity.maximum()) == (0.0, 1.0)
 
 
-def test_what_a_file_holds_is_told_beside_it(tmp_path: Path) -> None:
-    def told(dress: DressedCloud) -> Any:
-        describe_cloud(tmp_path / "a.json", dress, "a.ply", 7)
-        return json.loads((tmp_path / "a.json").read_text())
-
-    cloud = corner()
-    plain = told(dressed(name="ab12"))
-    assert (plain["file"], plain["points"], plain["points_of_the_cloud"]) == (
-        *("a.ply", 7, len(cloud)),
-    )
-    assert plain["product_digest"] == "ab12"
-    assert (plain["up"], plain["origin_world"]) == ([0.0, 0.0, 1.0], ORIGIN.tolist())
-    assert [plain[key] for key in ("wall", "cleaned", "box_world", "coordinate_system_wkt")] == [
-        *[None] * 4,
-    ]
-    assert plain["colour"] == "rgb"
-    assert plain["scans"][0] == {"scan": 0, "station_world": STATIONS[0].tolist()}
-    assert plain.keys().isdisjoint({"colour_scale", "photos"})
-    side_m = 3.0 * neighbourhoods_of(cloud).side_m
-    assert f"sides of {side_m:.4g} m, towards the viewer" in plain["normals"]
-    slab = Slab(
-        frame=frame_over(planes().corners[0], planes().normal[0], gsd_m=0.01),
-        front_m=0.1,
-        behind_m=0.05,
-    )
-    box = ORIGIN + np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]])
-    photo = np.array([-1, 0, 1, 1, -1, 1], dtype=np.int16)
-    colours = PointColours(
-        rgb=np.zeros((6, 3), np.uint8), best=np.zeros(6, np.float32), photo=photo
-    )
-    rich = told(
-        dressed(
-            wall=slab,
-            wall_plane=1,
-            box_world=box,
-            is_cleaned=True,
-            crs_wkt="PROJCS[x]",
-            photo_colours=colours,
-            photo_names=("a.jpg", "b.jpg", "c.jpg"),
-        )
-    )
-    assert rich["wall"] == {"plane_index": 1, "deviation": "from the plane of this wall"}
-    assert rich["box_world"] == box.tolist()
-    assert rich["coordinate_system_wkt"] == "PROJCS[x]"
-    assert f"in 3 x 3 x 3 cubes of {side_m:.4g} m, are left out" in rich["cleaned"]
-    assert rich["photos"] == ["a.jpg", "b.jpg", "c.jpg"]
-    assert rich["points_of_the_cloud_by_photo"] == [1, 3, 0]
-    assert rich["points_of_the_cloud_unseen"] == 2
-    unknown = told(dressed(cloud=dataclasses.replace(cloud, stations=None, stations_source=None)))
-    assert unknown["scans"][1] == {"scan": 1, "station_world": None}
-
-
 def test_colours_show_what_was_asked_for(tmp_path: Path) -> None:
     cloud = corner()
     write_laz(tmp_path / "a.laz", dressed(colouring="intensity"))

@@ -11,16 +11,9 @@ import pytest
 
 from orthoflow.files.clouds.dressing import DressedCloud
 from orthoflow.files.clouds.neighbourhoods import neighbourhoods_of
-from orthoflow.files.clouds.photo_colours import PointColours
 from orthoflow.files.clouds.writers import write_laz
 from orthoflow.files.geotiff import epsg_wkt
-from orthoflow.geometry.frames import frame_over
-from orthoflow.geometry.slabs import Slab
-from orthoflow.products import PointCloud, PointLabels
-from tests import samples
-
-NORMALS = ["NormalX", "NormalY", "NormalZ"]
-SQUARE = np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [2.0, 0.0, 2.0]])
+from orthoflow.products import PointCloud
 
 
 def floor(size_m: float = 1.0) -> PointCloud:
@@ -37,40 +30,6 @@ def dressed(cloud: PointCloud) -> DressedCloud:
 def written(path: Path, dress: DressedCloud) -> laspy.LasData:
     write_laz(path, dress)
     return laspy.read(path)
-
-
-def test_extra_bytes_are_of_what_is_known(tmp_path: Path) -> None:
-    plain = dressed(floor())
-    n_points = len(plain.cloud)
-    labels = PointLabels(plane_index=np.zeros(n_points, np.int16))
-    colours = PointColours(
-        rgb=np.zeros((n_points, 3), np.uint8),
-        best=np.zeros(n_points, np.float32),
-        photo=np.arange(n_points, dtype=np.int16),
-    )
-    slab = Slab(
-        frame=frame_over(SQUARE + plain.cloud.origin, np.array([0.0, 1.0, 0.0]), gsd_m=0.1),
-        front_m=9.0,
-        behind_m=9.0,
-    )
-    planes = samples.planes(
-        normal=np.array([[0.0, 0.0, 1.0]]),
-        offset=np.zeros(1),
-        corners=SQUARE[None],
-        n_points=np.array([1]),
-        names=("floor",),
-    )
-    for more, names in (
-        ({}, []),
-        ({"labels": labels}, ["plane"]),
-        ({"planes": planes}, []),
-        ({"labels": labels, "planes": planes}, ["plane", "deviation"]),
-        ({"wall": slab}, ["deviation"]),
-        ({"photo_colours": colours}, ["photo"]),
-    ):
-        found = written(tmp_path / "a.laz", replace(plain, **more))  # type: ignore[arg-type]
-        assert list(found.point_format.extra_dimension_names) == [*NORMALS, *names]
-    np.testing.assert_array_equal(found["photo"], colours.photo)
 
 
 @pytest.mark.parametrize("crs_wkt", ["", epsg_wkt(25832)], ids=["unknown", "known"])

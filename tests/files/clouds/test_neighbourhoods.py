@@ -25,15 +25,3 @@ def test_normals_take_the_voxels_about_them_together() -> None:
     assert known.mean() > 0.99
     np.testing.assert_allclose(np.abs(found[known] @ truth), 1.0, atol=1e-4)
     assert not near.alone.any()
-
-
-def test_nine_points_beside_a_wall_are_alone_and_ten_are_not() -> None:
-    grid = np.stack(np.meshgrid(np.arange(80), np.arange(80)), axis=-1).reshape(-1, 2) / 100.0
-    wall = np.column_stack([grid, np.zeros(len(grid))])
-    for n_beside in (9, 10):
-        beside = np.array([0.4, 0.4, 3.0]) + 0.001 * np.arange(n_beside)[:, None]
-        offsets = np.vstack([wall, beside]).astype(np.float32).astype(np.float64)
-        near = neighbourhoods_of(cloud_of(offsets))
-        alone = near.alone[near.places(offsets)]
-        assert alone[: len(wall)].sum() == 0
-        assert alone[len(wall) :].tolist() == [n_beside < 10] * n_beside

@@ -139,15 +139,4 @@ def test_rows_and_columns_are_lines_over_the_fullest_wall() -> None:
     assert set(np.diff(np.flatnonzero(full_rows))) <= {22, 23}
 
 
-def test_points_at_the_end_of_the_world_do_not_hide_the_wall() -> None:
-    cloud = wall_scan()
-    x = cloud.x.copy()
-    x[:3] = (1e9, -1e9, 3e8)
-    shown = pixels(scan_lines_png(replace(cloud, x=x)))
-    assert shown.any(axis=2).mean() > 0.5 * pixels(scan_lines_png(cloud)).any(axis=2).mean()
-    # Nothing but such points: a picture of some of them, and an end.
-    far = np.where(np.arange(len(x)) % 2 == 0, 1e9, -1e9).astype(np.float32)
-    assert pixels(scan_lines_png(replace(cloud, x=far))).size
-
-
 # --- the sheet ---

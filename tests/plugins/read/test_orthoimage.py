@@ -112,17 +112,6 @@ def test_our_own_files_need_no_frame_beside_them(tmp_path: Path) -> None:
     assert image.name == ours.name
 
 
-def test_sixteen_bits_and_nodata_are_understood(tmp_path: Path) -> None:
-    values = np.full((1, 4, 5), 257 * 100, dtype=np.uint16)
-    values[0, 0, 0] = 0
-    image, place = foreign(tmp_path)
-    write(image, values, Affine(0.01, 0, 0, 0, -0.01, 0), nodata=0)
-    (found,) = read(tmp_path, image, place)
-    assert found.mask.sum() == 19
-    assert found.source[0, 0] == -1
-    assert (found.rgb[1:] == 25700).all()
-
-
 def test_what_cannot_be_placed_says_why(tmp_path: Path) -> None:
     image, place = foreign(tmp_path)
     with pytest.raises(InputError, match=r"theirs\.tif does not state its position"):

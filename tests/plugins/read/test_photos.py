@@ -383,16 +383,6 @@ def test_the_calibration_reaches_the_photos_it_names(tmp_path: Path, read: Reade
 # The rest
 
 
-def test_real_phone_photos_keep_their_stored_frame(shared_data: Path, read: Reader) -> None:
-    photos = read(*sorted((shared_data / "ceiling-808").iterdir()))
-    assert [photo.name for photo in photos] == [
-        "808_db_photo.jpg", "808_user1_photo.jpg", "808_user_photo.jpg",
-    ]  # fmt: skip
-    assert {(p.width, p.height, p.exif_orientation) for p in photos} == {(4000, 3000, 6)}
-    assert [photo.exif_focal_px for photo in photos] == pytest.approx([3004.6] * 3, abs=0.1)
-    assert "4 of 7 files of the input photos are not photos" in read.warnings
-
-
 def test_a_portrait_among_landscapes_needs_an_entry_of_its_own(
     shared_data: Path, read: Reader
 ) -> None:
