@@ -6,11 +6,11 @@ import dataclasses
 import os
 import re
 import traceback
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from importlib import metadata
 from importlib.metadata import EntryPoint
-from typing import Final, Generic, TypeVar
+from typing import Final, TypeAlias, TypeVar
 
 import pluggy
 
@@ -51,24 +51,8 @@ _KIND: Final = re.compile(NAME_PATTERN)
 _TARGET: Final = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 _Spec = TypeVar("_Spec", MethodSpec, KindSpec, ProductSpec)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Claim(Generic[_Spec]):
-    """A spec and who announced it."""
-
-    spec: _Spec
-    distribution: DistributionInfo
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Announcement:
-    """What one plugin brings."""
-
-    distribution: DistributionInfo
-    methods: tuple[MethodSpec, ...]
-    kinds: tuple[KindSpec, ...]
-    products: tuple[ProductSpec, ...]
+# A spec and who announced it.
+_AnyClaim: TypeAlias = tuple[MethodSpec | KindSpec | ProductSpec, DistributionInfo]
 
 
 def discover_catalog(entry_points: Iterable[EntryPoint] | None = None) -> Catalog:
@@ -81,7 +65,7 @@ def discover_catalog(entry_points: Iterable[EntryPoint] | None = None) -> Catalo
         entry_points: plugins to look at; None for all installed ones.
     """
     found = _installed_entry_points() if entry_points is None else entry_points
-    announcements: list[_Announcement] = []
+    claims: list[_AnyClaim] = []
     broken: list[BrokenPlugin] = []
     named = {canonical_name(name) for name in os.environ.get(DISABLED, "").split(",")}
     disabled: list[str] = []
@@ -94,14 +78,17 @@ def discover_catalog(entry_points: Iterable[EntryPoint] | None = None) -> Catalo
             continue
         try:
             with guarded(f"plugin {entry.name} of {distribution}"):
-                announcements.append(_announce(entry, distribution))
+                claims += [(spec, distribution) for spec in _announced(entry)]
         except UserInterrupt:
             raise
         except BaseException as error:  # noqa: BLE001 - plugins may raise anything, even SystemExit
             broken.append(_describe_failure(entry, distribution, error))
-    products = _collect_products(announcements)
-    kinds = _collect_kinds(announcements, frozenset(products))
-    methods = _collect_methods(announcements, kinds, products)
+    # Orthoflow's own come first.
+    claims.sort(key=lambda claim: claim[1].name != DISTRIBUTION)
+    products = _collect_products(_by_name(claims, ProductSpec))
+    by_kind = _by_name(claims, KindSpec)
+    kinds = _collect_kinds(by_kind, frozenset(products))
+    methods = _collect_methods(_by_name(claims, MethodSpec), by_kind, kinds, products)
     return Catalog(
         methods=methods,
         kinds=kinds,
@@ -117,55 +104,43 @@ def _installed_entry_points() -> Iterable[EntryPoint]:
     except ValueError:
         # One unreadable file spoils that for all. A distribution may be found twice; the first
         # counts, as on import.
-        return _readable_entry_points()
+        found: dict[str, list[EntryPoint]] = {}
+        for distribution in metadata.distributions():
+            with suppress(ValueError):
+                entries = distribution.entry_points.select(group=ENTRY_POINT_GROUP)
+                found.setdefault(distribution.name, list(entries))
+        return tuple(entry for entries in found.values() for entry in entries)
 
 
-def _readable_entry_points() -> tuple[EntryPoint, ...]:
-    found: dict[str, list[EntryPoint]] = {}
-    for distribution in metadata.distributions():
-        try:
-            entries = distribution.entry_points.select(group=ENTRY_POINT_GROUP)
-            found.setdefault(distribution.name, list(entries))
-        except ValueError:
-            continue
-    return tuple(entry for entries in found.values() for entry in entries)
-
-
-def _announce(entry: EntryPoint, distribution: DistributionInfo) -> _Announcement:
+def _announced(entry: EntryPoint) -> list[MethodSpec | KindSpec | ProductSpec]:
     # One manager per plugin: with a shared one, the second plugin of a name is dropped in silence.
     manager = pluggy.PluginManager(PROJECT)
     manager.add_hookspecs(PluginHooks)
     manager.register(entry.load(), entry.name)
     manager.check_pending()
-    announcement = _Announcement(
-        distribution=distribution,
-        methods=_specs(manager.hook.orthoflow_methods(), MethodSpec),
-        kinds=_specs(manager.hook.orthoflow_kinds(), KindSpec),
-        products=_specs(manager.hook.orthoflow_products(), ProductSpec),
-    )
-    _check_spelling(announcement)
-    if not (announcement.methods or announcement.kinds or announcement.products):
+    specs: list[MethodSpec | KindSpec | ProductSpec] = []
+    for answers, spec_class in (
+        (manager.hook.orthoflow_methods(), MethodSpec),
+        (manager.hook.orthoflow_kinds(), KindSpec),
+        (manager.hook.orthoflow_products(), ProductSpec),
+    ):
+        for answer in answers:
+            if not isinstance(answer, list | tuple):
+                raise PluginError(f"expected a list of {spec_class.__name__}, got {answer!r}")
+            for item in answer:
+                if not isinstance(item, spec_class):
+                    raise PluginError(f"expected a {spec_class.__name__}, got {item!r}")
+                _check(item)
+                specs.append(item)
+    if not specs:
         raise PluginError(
             f"{entry.value} announces nothing; give it a function orthoflow_methods with @hookimpl"
         )
-    return announcement
+    return specs
 
 
-def _specs(answers: Iterable[object], spec_class: type[_Spec]) -> tuple[_Spec, ...]:
-    specs: list[_Spec] = []
-    for answer in answers:
-        if not isinstance(answer, list | tuple):
-            raise PluginError(f"expected a list of {spec_class.__name__}, got {answer!r}")
-        for item in answer:
-            if not isinstance(item, spec_class):
-                raise PluginError(f"expected a {spec_class.__name__}, got {item!r}")
-            _check_fields(item)
-            specs.append(item)
-    return tuple(specs)
-
-
-def _check_fields(spec: MethodSpec | KindSpec | ProductSpec) -> None:
-    """Check the types of a spec's fields, which a dataclass takes as they come."""
+def _check(spec: MethodSpec | KindSpec | ProductSpec) -> None:
+    """Check types and spelling of a spec's fields, which a dataclass takes as they come."""
     for item in dataclasses.fields(spec):
         value: object = getattr(spec, item.name)
         texts = (*value, *value.values()) if isinstance(value, Mapping) else (value,)
@@ -176,25 +151,17 @@ def _check_fields(spec: MethodSpec | KindSpec | ProductSpec) -> None:
             is_fine = is_fine and isinstance(value, Mapping)
         if not is_fine:
             raise PluginError(f"{item.name} of a {type(spec).__name__} cannot be {value!r}")
-
-
-def _check_spelling(announcement: _Announcement) -> None:
-    for method in announcement.methods:
-        if not _METHOD_ID.fullmatch(method.id):
-            raise PluginError(
-                f"method id must be kind.method in lower case, e.g. plane.mine, got {method.id!r}"
-            )
-    for name in [
-        *(kind.name for kind in announcement.kinds),
-        *(product.type_name for product in announcement.products),
-    ]:
-        if not _KIND.fullmatch(name):
-            raise PluginError(f"kind and product names must match {NAME_PATTERN}, got {name!r}")
-    for target in [
-        *(method.target for method in announcement.methods),
-        *(product.target for product in announcement.products),
-        *(product.publisher for product in announcement.products if product.publisher),
-    ]:
+    name = _name(spec)
+    if isinstance(spec, MethodSpec) and not _METHOD_ID.fullmatch(name):
+        raise PluginError(
+            f"method id must be kind.method in lower case, e.g. plane.mine, got {name!r}"
+        )
+    if not (isinstance(spec, MethodSpec) or _KIND.fullmatch(name)):
+        raise PluginError(f"kind and product names must match {NAME_PATTERN}, got {name!r}")
+    targets = [] if isinstance(spec, KindSpec) else [spec.target]
+    if isinstance(spec, ProductSpec) and spec.publisher:
+        targets.append(spec.publisher)
+    for target in targets:
         if not _TARGET.fullmatch(target):
             raise PluginError(f"target must be package.module:Name, got {target!r}")
 
@@ -223,17 +190,14 @@ def _way_out(entry: EntryPoint, error: BaseException) -> str:
 
 
 def _by_name(
-    announcements: Iterable[_Announcement], specs_of: Callable[[_Announcement], Iterable[_Spec]]
-) -> dict[str, list[_Claim[_Spec]]]:
-    """Who claims each name: orthoflow itself first, then by the names of distributions."""
-    claims: dict[str, list[_Claim[_Spec]]] = {}
-    for announcement in sorted(
-        announcements, key=lambda item: item.distribution.name != DISTRIBUTION
-    ):
-        for spec in specs_of(announcement):
-            claim = _Claim(spec=spec, distribution=announcement.distribution)
-            claims.setdefault(_name(spec), []).append(claim)
-    return claims
+    claims: Iterable[_AnyClaim], spec_class: type[_Spec]
+) -> dict[str, list[tuple[_Spec, DistributionInfo]]]:
+    """Who claims each name, in order."""
+    found: dict[str, list[tuple[_Spec, DistributionInfo]]] = {}
+    for spec, distribution in claims:
+        if isinstance(spec, spec_class):
+            found.setdefault(_name(spec), []).append((spec, distribution))
+    return found
 
 
 def _name(spec: MethodSpec | KindSpec | ProductSpec) -> str:
@@ -242,49 +206,48 @@ def _name(spec: MethodSpec | KindSpec | ProductSpec) -> str:
     return spec.name if isinstance(spec, KindSpec) else spec.type_name
 
 
-def _contested(what: str, claims: list[_Claim[_Spec]], consequence: str) -> str:
-    claimants = " and ".join(str(claim.distribution) for claim in claims)
+def _contested(what: str, claims: Iterable[_AnyClaim], consequence: str) -> str:
+    claimants = " and ".join(str(distribution) for _, distribution in claims)
     return f"{what} is claimed by {claimants}: {consequence}; {DISABLED}=NAME switches a plugin off"
 
 
-def _collect_products(announcements: Iterable[_Announcement]) -> dict[str, ProductEntry]:
+def _collect_products(
+    claimed: Mapping[str, list[tuple[ProductSpec, DistributionInfo]]],
+) -> dict[str, ProductEntry]:
     entries: dict[str, ProductEntry] = {}
-    for name, claims in _by_name(announcements, lambda item: item.products).items():
-        first = claims[0]
+    for name, claims in claimed.items():
+        spec, distribution = claims[0]
         problem = ""
-        if len({(claim.spec.target, claim.spec.publisher) for claim in claims}) > 1:
-            problem = _contested(
-                f"product type {name}", claims, f"the one of {first.distribution.name} is used"
-            )
-        entries[name] = ProductEntry(
-            spec=first.spec, distribution=first.distribution, problem=problem
-        )
+        if len({(other.target, other.publisher) for other, _ in claims}) > 1:
+            used = f"the one of {distribution.name} is used"
+            problem = _contested(f"product type {name}", claims, used)
+        entries[name] = ProductEntry(spec=spec, distribution=distribution, problem=problem)
     return entries
 
 
 def _collect_kinds(
-    announcements: Iterable[_Announcement], product_types: frozenset[str]
+    claimed: Mapping[str, list[tuple[KindSpec, DistributionInfo]]], product_types: frozenset[str]
 ) -> dict[str, KindEntry]:
     entries: dict[str, KindEntry] = {}
-    for name, claims in _by_name(announcements, lambda item: item.kinds).items():
-        first = claims[0]
-        state: EntryState = "fine"
-        problem = _unknown_products(first, product_types)
-        if problem:
-            state = "broken"
-        elif any(_ports(claim.spec) != _ports(first.spec) for claim in claims):
+    for name, claims in claimed.items():
+        spec, distribution = claims[0]
+        problem = _unknown_products(claims[0], product_types)
+        state: EntryState = "broken" if problem else "fine"
+        if not problem and any(_ports(other) != _ports(spec) for other, _ in claims):
             # The same ports again do no harm: two plugins may both need a kind of their own.
             problem = _contested(
                 f"kind {name}", claims, "methods have the ports that their own plugin gives it"
             )
         entries[name] = KindEntry(
-            spec=first.spec, distribution=first.distribution, state=state, problem=problem
+            spec=spec, distribution=distribution, state=state, problem=problem
         )
     return entries
 
 
-def _unknown_products(claim: _Claim[KindSpec], product_types: frozenset[str]) -> str:
-    spec = claim.spec
+def _unknown_products(
+    claim: tuple[KindSpec, DistributionInfo], product_types: frozenset[str]
+) -> str:
+    spec, distribution = claim
     unknown = sorted(
         ({*spec.inputs.values()} - product_types - {FILES})
         | ({*spec.outputs.values()} - product_types)
@@ -292,7 +255,7 @@ def _unknown_products(claim: _Claim[KindSpec], product_types: frozenset[str]) ->
     if not unknown:
         return ""
     return (
-        f"kind {spec.name} of {claim.distribution} has ports of product types that no plugin "
+        f"kind {spec.name} of {distribution} has ports of product types that no plugin "
         f"announces: {', '.join(unknown)}"
     )
 
@@ -302,22 +265,20 @@ def _ports(spec: KindSpec) -> tuple[dict[str, str], dict[str, str], bool]:
 
 
 def _collect_methods(
-    announcements: list[_Announcement],
-    kinds: dict[str, KindEntry],
-    products: dict[str, ProductEntry],
+    claimed: Mapping[str, list[tuple[MethodSpec, DistributionInfo]]],
+    by_kind: Mapping[str, list[tuple[KindSpec, DistributionInfo]]],
+    kinds: Mapping[str, KindEntry],
+    products: Mapping[str, ProductEntry],
 ) -> dict[str, MethodEntry]:
-    own_kinds = {
-        (item.distribution.name, kind.name): _Claim(spec=kind, distribution=item.distribution)
-        for item in announcements
-        for kind in item.kinds
-    }
     product_types = frozenset(products)
     contested = {name: entry.spec.target for name, entry in products.items() if entry.problem}
 
-    def entry_of(claim: _Claim[MethodSpec]) -> MethodEntry:
-        spec, who = claim.spec, f"method {claim.spec.id} of {claim.distribution}"
-        own, shared = own_kinds.get((claim.distribution.name, spec.kind)), kinds.get(spec.kind)
-        problem = ""
+    def entry_of(spec: MethodSpec, distribution: DistributionInfo) -> MethodEntry:
+        # A plugin's own kind comes before one of another plugin.
+        claims = by_kind.get(spec.kind, [])
+        own = next((claim for claim in claims if claim[1].name == distribution.name), None)
+        shared = kinds.get(spec.kind)
+        who, problem = f"method {spec.id} of {distribution}", ""
         if shared is None:
             problem = f"{who} is of kind {spec.kind}, which no plugin announces"
         elif unusable := (
@@ -328,8 +289,8 @@ def _collect_methods(
             problem = f"{who} cannot be used: {unusable}"
         return MethodEntry(
             spec=spec,
-            distribution=claim.distribution,
-            kind=own.spec if own else shared.spec if shared else None,
+            distribution=distribution,
+            kind=own[0] if own else shared.spec if shared else None,
             product_types=product_types,
             contested=contested,
             state="broken" if problem else "fine",
@@ -337,16 +298,13 @@ def _collect_methods(
         )
 
     entries: dict[str, MethodEntry] = {}
-    for name, claims in _by_name(announcements, lambda item: item.methods).items():
-        first = entry_of(claims[0])
-        if len(claims) == 1:
-            entries[name] = first
-            continue
-        named = [f"{canonical_name(claim.distribution.name)}/{name}" for claim in claims]
-        if claims[0].distribution.name == DISTRIBUTION:
-            entries[name] = first
-        else:
-            problem = _contested(f"method {name}", claims, f"write {' or '.join(named)}")
-            entries[name] = dataclasses.replace(first, state="clash", problem=problem)
-        entries |= dict(zip(named, map(entry_of, claims), strict=True))
+    for name, claims in claimed.items():
+        every = [entry_of(*claim) for claim in claims]
+        entries[name] = every[0]
+        if len(claims) > 1:
+            named = [f"{canonical_name(who.name)}/{name}" for _, who in claims]
+            if claims[0][1].name != DISTRIBUTION:
+                problem = _contested(f"method {name}", claims, f"write {' or '.join(named)}")
+                entries[name] = dataclasses.replace(every[0], state="clash", problem=problem)
+            entries |= dict(zip(named, every, strict=True))
     return entries

@@ -27,12 +27,6 @@ if TYPE_CHECKING:
     )
 
 
-if TYPE_CHECKING:
-    from orthoflow.workflow.model import (
-        Workflow,
-    )
-
-
 DEBUG_HELP: Final = "Show tracebacks of errors."
 
 

@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 Value = TypeVar("Value")
 _NOTHING: Final = "-"
 _READDRESSED_MOST: Final = 3
+# What JSON has of each run.
+_OF_RUNS: Final = ("run_id", "name", "created_by", "status", "started", "ended", "seed")
 
 
 @click.command(cls=RecordCommand)
@@ -78,15 +80,7 @@ def comparison_json(comparison: RunComparison) -> dict[str, object]:
     """Return a comparison as JSON; every row states whether both sides are the same."""
     return {
         "runs": [
-            {
-                "run_id": record.run_id,
-                "name": record.name,
-                "created_by": record.created_by,
-                "status": record.status,
-                "started": record.started,
-                "ended": record.ended,
-                "seed": record.seed,
-            }
+            {name: getattr(record, name) for name in _OF_RUNS}
             for record in (comparison.left, comparison.right)
         ],
         "workflow": list(comparison.workflow),

@@ -18,19 +18,18 @@ from orthoflow.cli.commands import (
     EXIT_GOOD,
     EXIT_RECORD_DIFFERS,
     RecordCommand,
-    current_session,
     echo_error,
     execution_options,
     input_option,
     json_option,
     output_option,
 )
+from orthoflow.cli.run import executed
 from orthoflow.cli.tables import echo, echo_distances, echo_json, number
 from orthoflow.errors import CancelledStepError, ClusterError
 from orthoflow.foreign_text import first_few
 
 if TYPE_CHECKING:
-    from orthoflow.engine.scheduler import RunOutcome
     from orthoflow.engine.store import Store
     from orthoflow.records.comparison import ProductDistance
     from orthoflow.records.replaying import Replay, ReplayedMetric
@@ -159,14 +158,19 @@ class _Call:
         """Execute, record, report, compare, and print how far the products differ."""
         from orthoflow.records.replaying import DIFFERING, replayed_metrics
         from orthoflow.records.runs import REPORT_FILE
+        from orthoflow.report import write_report
 
-        current_session().resume_hint = (
-            "interrupted; finished steps are kept, and "
-            f"the same command with -o {self.folder} goes on from there"
-        )
         for note in self.replay.notes:
             echo(f"note: {note}", err=self.as_json)
-        made = self._make()
+        made = executed(
+            self.replay.plan,
+            self.replay.workflow,
+            self.store,
+            self.folder,
+            self.run_id,
+            embed=self.replay.is_embedded,
+            report=lambda made: write_report([made], self.folder / REPORT_FILE),
+        ).run
         distances = self._distances(made)
         metrics = replayed_metrics(self.original, made, distances, self.replay.changed_methods)
         differs = any(item.verdict == "different" for item in distances) or any(
@@ -190,32 +194,6 @@ class _Call:
         if differs:
             echo_error(f"error: the replay of {self.original.path} differs, see above")
         return EXIT_RECORD_DIFFERS if differs else EXIT_GOOD
-
-    def _make(self) -> Run:
-        from orthoflow.cli.progress import Progress
-        from orthoflow.engine.scheduler import execute
-        from orthoflow.records.runs import REPORT_FILE
-        from orthoflow.records.writing import executed_and_written, write_run
-        from orthoflow.report import write_report
-
-        plan = self.replay.plan
-
-        def run() -> RunOutcome:
-            with Progress(plan.cells, jobs=plan.options.jobs) as progress:
-                return execute(plan, self.folder, self.store, progress.take, run_id=self.run_id)
-
-        def write(outcome: RunOutcome) -> Run:
-            return write_run(
-                outcome,
-                plan,
-                self.replay.workflow,
-                self.folder,
-                self.store,
-                embed=self.replay.is_embedded,
-                before_finish=lambda made: write_report([made], self.folder / REPORT_FILE),
-            )
-
-        return executed_and_written(run, write).run
 
     def _distances(self, made: Run) -> tuple[ProductDistance, ...]:
         from orthoflow.catalog.discovery import discover_catalog

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -159,50 +159,16 @@ class Call:
 
     def make(self) -> WrittenRun:
         """Execute, record and report."""
-        from orthoflow.cli.progress import working_on
         from orthoflow.engine.journal import new_run_folder, new_run_id
         from orthoflow.records.runs import REPORT_FILE
-        from orthoflow.records.writing import executed_and_written, write_run
+        from orthoflow.records.writing import begin_run
         from orthoflow.report import write_page
 
         run_id = new_run_id()
         folder = self.folder or new_run_folder(self.workflow.name, run_id)
-        current_session().resume_hint = (
-            "interrupted; finished steps are kept, and "
-            f"the same command with -o {folder} goes on from there"
-        )
-        report = folder / REPORT_FILE
-
-        def write(outcome: RunOutcome) -> Run:
-            try:
-                with working_on("writing the products, the record and the report"):
-                    return write_run(
-                        outcome,
-                        self.plan,
-                        self.workflow,
-                        folder,
-                        self.store,
-                        embed=self.embed,
-                        before_finish=lambda run: write_page(run, report),
-                    )
-            except StoreError as error:
-                if not isinstance(error, DamageError):
-                    self._show_unfinished(folder, outcome)
-                raise
-
-        return executed_and_written(lambda: self._execute(folder, run_id), write)
-
-    def _execute(self, folder: Path, run_id: str) -> RunOutcome:
-        from orthoflow.cli.progress import Progress
-        from orthoflow.engine.scheduler import execute
-        from orthoflow.records.writing import begin_run
-
         # Before minutes pass.
         echo_lint(self.workflow)
-        with (
-            Progress(self.plan.cells, jobs=self.plan.options.jobs) as progress,
-            _json_log(self.json_log, self.plan) as log,
-        ):
+        with _json_log(self.json_log, self.plan) as log:
             has_begun = False
 
             def listen(event: RunEvent) -> None:
@@ -210,15 +176,17 @@ class Call:
                 if not has_begun:
                     has_begun = True
                     begin_run(self.plan, self.workflow, folder, self.store, run_id)
-                progress.take(event)
                 log(event)
 
-            return execute(
+            return executed(
                 self.plan,
-                folder,
+                self.workflow,
                 self.store,
-                listen,
-                run_id=run_id,
+                folder,
+                run_id,
+                embed=self.embed,
+                report=lambda run: write_page(run, folder / REPORT_FILE),
+                listen=listen,
                 on_interruption=partial(self._show_unfinished, folder),
             )
 
@@ -236,6 +204,53 @@ class Call:
 
         if show_unfinished(outcome, self.plan, self.workflow, folder, self.store, show):
             echo_error(f"report of the finished steps: {report}")
+
+
+def executed(  # noqa: PLR0913 - what a run is made of
+    plan: RunPlan,
+    workflow: Workflow,
+    store: Store,
+    folder: Path,
+    run_id: str,
+    *,
+    embed: bool,
+    report: Callable[[Run], None],
+    listen: RunListener = lambda _: None,
+    on_interruption: Callable[[RunOutcome], None] = lambda _: None,
+) -> WrittenRun:
+    """Execute a plan, show how far it is, and write products, record and report."""
+    from orthoflow.cli.progress import Progress, working_on
+    from orthoflow.engine.scheduler import execute
+    from orthoflow.records.writing import executed_and_written, write_run
+
+    current_session().resume_hint = (
+        "interrupted; finished steps are kept, and "
+        f"the same command with -o {folder} goes on from there"
+    )
+
+    def run() -> RunOutcome:
+        with Progress(plan.cells, jobs=plan.options.jobs) as progress:
+
+            def take(event: RunEvent) -> None:
+                listen(event)
+                progress.take(event)
+
+            return execute(
+                plan, folder, store, take, run_id=run_id, on_interruption=on_interruption
+            )
+
+    def write(outcome: RunOutcome) -> Run:
+        try:
+            with working_on("writing the products, the record and the report"):
+                return write_run(
+                    outcome, plan, workflow, folder, store, embed=embed, before_finish=report
+                )
+        except StoreError as error:
+            if not isinstance(error, DamageError):
+                on_interruption(outcome)
+            raise
+
+    return executed_and_written(run, write)
 
 
 @contextmanager

@@ -163,11 +163,12 @@ def example_room(
 def _grey_cloud(
     offsets_m: NDArray[np.float32], grey: NDArray[np.uint8], origin: NDArray[np.float64]
 ) -> PointCloud:
+    x, y, z = (np.ascontiguousarray(column) for column in offsets_m.T)
     return PointCloud(
         origin=origin,
-        x=np.ascontiguousarray(offsets_m[:, 0]),
-        y=np.ascontiguousarray(offsets_m[:, 1]),
-        z=np.ascontiguousarray(offsets_m[:, 2]),
+        x=x,
+        y=y,
+        z=z,
         up=up_vector("z"),
         intensity=(grey[:, 0] / 255.0).astype(np.float32),
         rgb=np.repeat(grey, 3, axis=1),
@@ -178,19 +179,8 @@ def _grey_cloud(
 
 def few_points(coordinates: NDArray[np.float64]) -> PointCloud:
     """Return a cloud of the given offsets (n, 3) with every optional array present."""
-    offsets = coordinates.astype(np.float32).reshape(-1, 3)
-    count = len(offsets)
-    return PointCloud(
-        origin=np.zeros(3),
-        x=np.ascontiguousarray(offsets[:, 0]),
-        y=np.ascontiguousarray(offsets[:, 1]),
-        z=np.ascontiguousarray(offsets[:, 2]),
-        up=up_vector("z"),
-        intensity=np.full(count, 0.5, np.float32),
-        rgb=np.full((count, 3), 128, np.uint8),
-        stations=np.zeros((1, 3)),
-        stations_source="file",
-    )
+    offsets_m = coordinates.astype(np.float32).reshape(-1, 3)
+    return _grey_cloud(offsets_m, np.full((len(offsets_m), 1), 128, np.uint8), np.zeros(3))
 
 
 def _turn_about_up(angle_deg: float) -> NDArray[np.float64]:

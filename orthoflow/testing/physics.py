@@ -19,7 +19,7 @@ from orthoflow.products import (
     Product,
     is_painted,
 )
-from orthoflow.sdk import Method, port_specs
+from orthoflow.sdk import port_specs
 from orthoflow.testing.examples import example_room
 from orthoflow.testing.photographed import (
     PHOTOGRAPHED,
@@ -239,23 +239,3 @@ def _check_cells(
     )
     off_grey = float(np.median(np.abs(difference)))
     require(off_grey < 16.0, f"{where}: half of the colours are off by {off_grey:.0f} grey or more")
-
-
-def finds_planes(method: type[Method]) -> bool:
-    """Whether the method finds planes."""
-    return method.id.startswith("plane.")
-
-
-def orients_photos(method: type[Method]) -> bool:
-    """Whether the method orients photos from ties."""
-    return method.id.startswith("orient.")
-
-
-def projects_onto_walls(method: type[Method]) -> bool:
-    """Whether the method paints layers."""
-    return method.id.startswith("ortho.")
-
-
-def joins_layers(method: type[Method]) -> bool:
-    """Whether the method makes orthoimages of layers."""
-    return method.id.startswith("mosaic.")

@@ -88,15 +88,6 @@ def run_trial(
         OrthoflowError: what the method raises.
         AssertionError: the method returned something that is not its `Out`.
     """
-    ctx, events = _context(trial, scratch, is_cancelled=is_cancelled, draws=draws)
-    method = trial.method
-    returned = method().run(method.In(**trial.inputs), method.Params(**trial.params), ctx)
-    return _what_came(method, returned, ctx, events)
-
-
-def _context(
-    trial: Trial, scratch: Path, *, is_cancelled: bool = False, draws: bool
-) -> tuple[_WatchedContext, list[StepEvent]]:
     scratch.mkdir(parents=True, exist_ok=True)
     events: list[StepEvent] = []
     ctx = _WatchedContext(
@@ -107,13 +98,9 @@ def _context(
         is_cancelled=lambda: is_cancelled,
         draws=draws,
     )
-    return ctx, events
-
-
-# Any: what a method returns is judged here.
-def _what_came(
-    method: type[Method], returned: Any, ctx: _WatchedContext, events: list[StepEvent]
-) -> TrialRun:
+    method = trial.method
+    # Any: what a method returns is judged here.
+    returned: Any = method().run(method.In(**trial.inputs), method.Params(**trial.params), ctx)
     if not isinstance(returned, method.Out):
         got = type(returned).__name__
         raise AssertionError(f"{method.id} must return an instance of its Out, got {got}")  # noqa: TRY004 - a broken rule, as every other

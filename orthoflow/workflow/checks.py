@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import Final
 
 from orthoflow.catalog.wording import did_you_mean
-from orthoflow.files.yaml_positions import Table
 from orthoflow.sdk.context import MEASURED_BY_THE_ENGINE
 from orthoflow.sdk.hooks import FILES
 from orthoflow.sdk.methods import port_specs
@@ -52,36 +50,12 @@ def check_wiring(
         input_names: names of all inputs.
         log: receives the problems.
     """
-    wiring = _Wiring(
-        steps={step.name: step for step in steps},
-        step_names=step_names,
-        input_names=input_names,
-        log=log,
-    )
+    type_of = _types(steps, step_names, input_names, log)
     for step in steps:
-        wiring.check_step(step)
-    _check_cycles(steps, log)
-
-
-def _placed(step: DraftStep) -> Iterator[tuple[str, Location, Reference]]:
-    """Yield all references of a step, each with its port and its place."""
-    for port, references in step.inputs.items():
-        for index, reference in enumerate(references):
-            yield port, (*step.location, "in", port, index), reference
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Wiring:
-    steps: Mapping[str, DraftStep]
-    step_names: Collection[str]
-    input_names: Collection[str]
-    log: ProblemLog
-
-    def check_step(self, step: DraftStep) -> None:
-        accepted = _accepted_ports(step)
+        accepted = _ports(step, are_given=False)
         for port in step.inputs if accepted is not None else ():
             if port not in (accepted or {}):
-                self.log.report(
+                log.report(
                     (*step.location, "in", port),
                     f"{step.calls[0].id} has no input port {port}"
                     f"{did_you_mean(port, accepted or {})}; it has "
@@ -89,61 +63,78 @@ class _Wiring:
                     at_key=True,
                 )
         for port, location, reference in _placed(step):
-            found = self._type_of(location, reference)
+            found = type_of(location, reference)
             wanted = (accepted or {}).get(port)
             if found is not None and wanted is not None and found != wanted:
                 message = f"expected {_article(wanted)}, but {reference} gives {_article(found)}"
-                self.log.report(location, message)
+                log.report(location, message)
         for key, condition in (("if", step.only_if), ("unless", step.unless)):
             if condition is not None:
-                self._type_of((*step.location, key), condition)
-        self._check_required(step)
+                type_of((*step.location, key), condition)
+        _check_required(step, log)
+    _check_cycles(steps, log)
 
-    def _type_of(self, location: Location, reference: Reference) -> str | None:
+
+def _types(
+    steps: Sequence[DraftStep],
+    step_names: Collection[str],
+    input_names: Collection[str],
+    log: ProblemLog,
+) -> Callable[[Location, Reference], str | None]:
+    """Return what finds the product types of references."""
+    given = {step.name: _ports(step, are_given=True) for step in steps}
+
+    def type_of(location: Location, reference: Reference) -> str | None:
         """Return the product type of a reference; None if unknown, which is reported."""
+        name, source = reference.name, reference.source
+        if reference.is_input and name in input_names:
+            return FILES
         if reference.is_input:
-            if reference.name in self.input_names:
-                return FILES
-            self.log.report(
+            log.report(
                 location,
-                f"there is no input {reference.name}"
-                f"{did_you_mean(reference.name, self.input_names)}; inputs: "
-                f"{', '.join(self.input_names) or 'none'}",
+                f"there is no input {name}{did_you_mean(name, input_names)}; inputs: "
+                f"{', '.join(input_names) or 'none'}",
             )
             return None
-        if reference.source not in self.step_names:
-            known = [*self.step_names, INPUTS]
-            self.log.report(
+        if source not in step_names:
+            log.report(
                 location,
-                f"there is no step {reference.source}{did_you_mean(reference.source, known)}; "
-                f"steps: {', '.join(self.step_names)}",
+                f"there is no step {source}{did_you_mean(source, [*step_names, INPUTS])}; "
+                f"steps: {', '.join(step_names)}",
             )
             return None
-        source = self.steps.get(reference.source)
-        given = _given_ports(source) if source else None
-        if given is not None and reference.name not in given:
-            self.log.report(
+        ports = given.get(source)
+        if ports is not None and name not in ports:
+            log.report(
                 location,
-                f"step {reference.source} has no output port {reference.name}"
-                f"{did_you_mean(reference.name, given)}; it has {', '.join(given)}",
+                f"step {source} has no output port {name}{did_you_mean(name, ports)}; it has "
+                f"{', '.join(ports)}",
             )
-        return (given or {}).get(reference.name)
+        return (ports or {}).get(name)
 
-    def _check_required(self, step: DraftStep) -> None:
-        for call in step.calls:
-            for port in port_specs(call.method.In).values() if call.method else ():
-                if port.required and port.name not in self._wired(step):
-                    self.log.report(
-                        (*call.location, "use"),
-                        f"{call.id} needs port {port.name}, {_article(port.type_name)}, "
-                        "which is not wired",
-                        shown=(*step.location, "in"),
-                    )
+    return type_of
 
-    def _wired(self, step: DraftStep) -> Collection[str]:
-        # Ports with unreadable references count as wired.
-        table = self.log.value((*step.location, "in"))
-        return {entry.key for entry in table} if isinstance(table, Table) else step.inputs
+
+def _check_required(step: DraftStep, log: ProblemLog) -> None:
+    # Ports with unreadable references count as wired.
+    written = log.get((*step.location, "in"))
+    wired = written if isinstance(written, dict) else step.inputs
+    for call in step.calls:
+        for needed in port_specs(call.method.In).values() if call.method else ():
+            if needed.required and needed.name not in wired:
+                log.report(
+                    (*call.location, "use"),
+                    f"{call.id} needs port {needed.name}, {_article(needed.type_name)}, "
+                    "which is not wired",
+                    shown=(*step.location, "in"),
+                )
+
+
+def _placed(step: DraftStep) -> Iterator[tuple[str, Location, Reference]]:
+    """Yield all references of a step, each with its port and its place."""
+    for port, references in step.inputs.items():
+        for index, reference in enumerate(references):
+            yield port, (*step.location, "in", port, index), reference
 
 
 def _ports(step: DraftStep, *, are_given: bool) -> Mapping[str, str] | None:
@@ -155,14 +146,6 @@ def _ports(step: DraftStep, *, are_given: bool) -> Mapping[str, str] | None:
             ports = port_specs(call.method.Out if are_given else call.method.In)
             return {port.name: port.type_name for port in ports.values()}
     return None
-
-
-def _accepted_ports(step: DraftStep) -> Mapping[str, str] | None:
-    return _ports(step, are_given=False)
-
-
-def _given_ports(step: DraftStep) -> Mapping[str, str] | None:
-    return _ports(step, are_given=True)
 
 
 def _article(type_name: str) -> str:

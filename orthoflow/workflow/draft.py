@@ -101,7 +101,7 @@ def _in_folder(folder: Path, depth: int) -> Iterator[Recognised]:
     files = [path for path in inside if path.is_file()]
     names = {path.name.lower() for path in files}
     if depth and not _OF_RUNS.isdisjoint(names):
-        yield Recognised(kind="unknown", path=folder, summary="a folder of results")
+        yield _unknown(folder, "a folder of results")
         return
     if any({f"images{end}", f"cameras{end}"} <= names for end in (".bin", ".txt")):
         yield _read("cameras", folder, lambda _: _cameras_summary(files))
@@ -112,34 +112,33 @@ def _in_folder(folder: Path, depth: int) -> Iterator[Recognised]:
             yield from _in_folder(path, depth + 1)
 
 
+def _unknown(path: Path, why: object) -> Recognised:
+    return Recognised(kind="unknown", path=path, summary=str(why).partition("\n")[0])
+
+
 def _file(path: Path) -> Recognised:
-    if not path.is_file():
-        return Recognised(kind="unknown", path=path, summary="a pipe or a device")
-    if text_of_path(path) is None:
-        return Recognised(kind="unknown", path=path, summary="its path is not UTF-8: rename it")
     suffix = path.suffix.lower()
+    if not path.is_file():
+        return _unknown(path, "a pipe or a device")
+    if text_of_path(path) is None:
+        return _unknown(path, "its path is not UTF-8: rename it")
     if suffix in _RASTERS and path.with_suffix(".json").is_file():
         return Recognised(kind="other", path=path, summary="an orthoimage with its frame beside it")
-    if suffix in PHOTO_SUFFIXES:
-        return _photo(path)
-    readers: dict[str, Callable[[Path], Recognised]] = {
-        **dict.fromkeys(TEXT.suffixes, _table),
-        **dict.fromkeys(_SCAN_SUFFIXES, _scan),
-        **dict.fromkeys(RAW_SUFFIXES, _raw),
-        **dict.fromkeys(_YAML, _yaml),
-        **dict.fromkeys(
-            _CAMERAS, lambda file: _read("cameras", file, lambda f: _cameras_summary([f]))
-        ),
-    }
+    if suffix in RAW_SUFFIXES:
+        return _unknown(path, f"camera raw, which is not read: {HOW_TO_DEVELOP}")
+    readers: list[tuple[Sequence[str], Callable[[Path], Recognised]]] = [
+        (PHOTO_SUFFIXES, _photo),
+        (TEXT.suffixes, _table),
+        (_SCAN_SUFFIXES, _scan),
+        (_YAML, _yaml),
+        (_CAMERAS, lambda file: _read("cameras", file, lambda one: _cameras_summary([one]))),
+    ]
     # Scanners and sidecars write JSON of all kinds.
-    if suffix not in readers or (suffix == ".json" and path.name != "cameras.json"):
-        return Recognised(kind="unknown", path=path, summary="no method reads such files")
-    return readers[suffix](path)
-
-
-def _raw(path: Path) -> Recognised:
-    summary = f"camera raw, which is not read: {HOW_TO_DEVELOP}"
-    return Recognised(kind="unknown", path=path, summary=summary)
+    is_odd = suffix == ".json" and path.name != "cameras.json"
+    for suffixes, reader in readers:
+        if suffix in suffixes and not is_odd:
+            return reader(path)
+    return _unknown(path, "no method reads such files")
 
 
 def _photo(path: Path) -> Recognised:
@@ -148,7 +147,7 @@ def _photo(path: Path) -> Recognised:
     # HEIC is opened, and related formats are recognised by the first bytes.
     problem = unreadable(path.read_bytes() if photo_format(head) == "HEIC" else head)
     if problem:
-        return Recognised(kind="unknown", path=path, summary=problem)
+        return _unknown(path, problem)
     exif = read_exif(head)
     lengths = {"mm": exif.focal_mm, "mm (35 mm equivalent)": exif.focal_35mm}
     stated = [f"{value:g} {unit}" for unit, value in lengths.items() if value]
@@ -162,15 +161,15 @@ def _scan(path: Path) -> Recognised:
     if unit is not None:
         refuse_degrees(path.name, unit)
     stated = {str(name) for name in scan.fields} & _FIELDS.keys()
-    seen = _seen_in(scan, np.ones(3) if unit is None else np.array(unit.metres))
+    fields, points_m = _seen_in(scan, np.ones(3) if unit is None else np.array(unit.metres))
     is_e57 = path.suffix.lower() == E57_SUFFIX
     photos = count_e57_images(path) if is_e57 else E57ImageCount()
     words = [scan.format_name, f"{scan.n_most:,} points"]
     if unit is not None:
         words.append(f"unit {unit.name} ({unit.source})")
     for beginning, names in (
-        ("", seen.fields),
-        ("nothing in its fields for ", stated - seen.fields),
+        ("", fields),
+        ("nothing in its fields for ", stated - fields),
     ):
         if names:
             listed = " and ".join(word for name, word in _FIELDS.items() if name in names)
@@ -178,8 +177,10 @@ def _scan(path: Path) -> Recognised:
     if photos.n_images:
         count = f"{photos.n_images} photos" if photos.n_images > 1 else "a photo"
         words.append(count if photos.n_posed else f"{count} without a pose")
-    up = seen.axis_up
-    advice = _about_extent(path.name, seen.extent_m, "m" if unit is None else unit.name)
+    up = _axis_up(points_m)
+    # The largest extent along an axis.
+    extent_m = float(np.ptp(points_m, axis=0).max()) if len(points_m) else 0.0
+    advice = _about_extent(path.name, extent_m, "m" if unit is None else unit.name)
     if up:
         advice.append(
             f"{_word(path.name)}: by its surfaces {up} points up, not z: cloud.up is {up} in the "
@@ -192,36 +193,26 @@ def _scan(path: Path) -> Recognised:
         n_points=scan.n_most,
         n_photos=photos.n_images,
         n_posed=photos.n_posed,
-        fields=seen.fields,
+        fields=fields,
         up=up,
         advice=tuple(advice),
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Seen:
-    """Return from the first points of a scan: non-empty fields, points (n, 3) in metres."""
-
-    fields: frozenset[str]
-    points_m: NDArray[np.float64]
-
-    @property
-    def extent_m(self) -> float:
-        """Return the largest extent along an axis; 0 without points."""
-        return float(np.ptp(self.points_m, axis=0).max()) if len(self.points_m) else 0.0
-
-    @property
-    def axis_up(self) -> str:
-        """Return the up axis if it is clearly not z, else ""."""
-        if not len(self.points_m):
-            return ""
-        offsets = (self.points_m - np.median(self.points_m, axis=0)).astype(np.float32)
-        quality = judge_quality(list(offsets.T), None)
-        axis = None if quality is None else quality.plainly_up(np.array([0.0, 0.0, 1.0]))
-        return "" if axis is None else "xyz"[axis]
+def _axis_up(points_m: NDArray[np.float64]) -> str:
+    """Return the up axis if surfaces show that it is clearly not z, else ""."""
+    if not len(points_m):
+        return ""
+    offsets = (points_m - np.median(points_m, axis=0)).astype(np.float32)
+    quality = judge_quality(list(offsets.T), None)
+    axis = None if quality is None else quality.plainly_up(np.array([0.0, 0.0, 1.0]))
+    return "" if axis is None else "xyz"[axis]
 
 
-def _seen_in(scan: ScanFile, unit_m: NDArray[np.float64]) -> _Seen:
+def _seen_in(
+    scan: ScanFile, unit_m: NDArray[np.float64]
+) -> tuple[frozenset[str], NDArray[np.float64]]:
+    """Return the non-empty fields of the first points of a scan, and these (n, 3) in metres."""
     kept: list[NDArray[np.float64]] = []
     found: set[str] = set()
     n_seen = 0
@@ -234,7 +225,7 @@ def _seen_in(scan: ScanFile, unit_m: NDArray[np.float64]) -> _Seen:
         n_seen += block.n_read
         if n_seen >= _LOOKED_AT:
             break
-    return _Seen(fields=frozenset(found), points_m=np.concatenate([np.empty((0, 3)), *kept]))
+    return frozenset(found), np.concatenate([np.empty((0, 3)), *kept])
 
 
 def _about_extent(name: str, extent_m: float, unit: str) -> list[str]:
@@ -260,13 +251,16 @@ _FIELDS: Final[Mapping[str, str]] = {"intensity": "intensity", "rgb": "colours"}
 
 def _table(path: Path) -> Recognised:
     """Recognise a table of points or ties, else a scan in text, which has no names in its lines."""
-    for kind, reader, noun in _TABLES:
+    with path.open("rb") as file:
+        first = file.readline(_FIRST_LINE_BYTES).decode("utf-8", "replace")
+    columns = {word.strip().lower() for word in re.split(r"[,;\t]", first)}
+    for kind, reader, noun, own in _TABLES:
         try:
             rows = reader(path)
         except InputError as error:
-            if _has_columns_of(path, kind):
-                first = str(error).partition("\n")[0]
-                return Recognised(kind="unknown", path=path, summary=first)
+            # Nothing else would name these columns.
+            if columns >= own:
+                return _unknown(path, error)
             continue
         if not _is_cloud(rows):
             return Recognised(kind=kind, path=path, summary=f"{len(rows)} {noun}")
@@ -274,43 +268,27 @@ def _table(path: Path) -> Recognised:
         found = _read("cameras", path, lambda file: _cameras_summary([file]))
         if found.kind == "cameras":
             return found
-    elif _column_names(path) >= _CAMERA_COLUMNS:
-        return Recognised(
-            kind="unknown",
-            path=path,
-            summary="a list of cameras, which is read from .csv: rename it",
-        )
+    elif columns >= _CAMERA_COLUMNS:
+        return _unknown(path, "a list of cameras, which is read from .csv: rename it")
     try:
         return _scan(path)
     except InputError as error:
-        return Recognised(kind="unknown", path=path, summary=str(error))
+        return _unknown(path, error)
 
 
-_TABLES: Final[Sequence[tuple[FileKind, Callable[[Path], Sequence[object]], str]]] = (
-    ("ties", read_measured_ties, "ties measured in photos"),
-    ("checkpoints", read_survey_points, "surveyed points"),
+_TABLES: Final[
+    Sequence[tuple[FileKind, Callable[[Path], Sequence[object]], str, frozenset[str]]]
+] = (
+    (
+        "ties",
+        read_measured_ties,
+        "ties measured in photos",
+        frozenset(("photo", "x", "y", "z")),
+    ),
+    ("checkpoints", read_survey_points, "surveyed points", frozenset(("name", "x", "y", "z"))),
 )
-
-
-_COLUMNS: Final[Mapping[FileKind, frozenset[str]]] = {
-    "ties": frozenset(("photo", "x", "y", "z")),
-    "checkpoints": frozenset(("name", "x", "y", "z")),
-}
-
-
-# Column of a list of cameras; no scan has it.
+# Columns of a list of cameras; no scan has them.
 _CAMERA_COLUMNS: Final = frozenset(("heading", "pitch", "roll"))
-
-
-def _has_columns_of(path: Path, kind: FileKind) -> bool:
-    """Whether the first line names the columns of a table, which nothing else would."""
-    return _COLUMNS[kind] <= _column_names(path)
-
-
-def _column_names(path: Path) -> frozenset[str]:
-    with path.open("rb") as file:
-        first = file.readline(_FIRST_LINE_BYTES).decode("utf-8", "replace")
-    return frozenset(word.strip().lower() for word in re.split(r"[,;\t]", first))
 
 
 def _is_cloud(rows: Sequence[object]) -> bool:
@@ -325,7 +303,7 @@ def _yaml(path: Path) -> Recognised:
     with path.open("rb") as file:
         is_workflow = re.search(rb"^steps:", file.read(_WORKFLOW_BYTES), re.MULTILINE)
     if found.kind == "unknown" and is_workflow:
-        return Recognised(kind="unknown", path=path, summary=f"{path.name} is a workflow itself")
+        return _unknown(path, f"{path.name} is a workflow itself")
     return found
 
 
@@ -341,8 +319,7 @@ def _read(kind: FileKind, path: Path, summary: Callable[[Path], str]) -> Recogni
     try:
         return Recognised(kind=kind, path=path, summary=summary(path))
     except InputError as error:
-        first = str(error).partition("\n")[0]
-        return Recognised(kind="unknown", path=path, summary=first)
+        return _unknown(path, error)
 
 
 # The workflow ------------------------------------------------------------------------------------
@@ -432,124 +409,118 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
         by_kind["photos"] = inside
         if len(inside) == 1 and has_posed:
             by_kind.setdefault("cameras", [replace(inside[0], summary="the poses of its photos")])
-    return _Drafting(by_kind=by_kind, target=target, recipe=chosen).draft()
+    return _drafted(by_kind, target, chosen)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Drafting:
-    """Return the text, from the recipe's."""
+_ByKind: TypeAlias = Mapping[FileKind, Sequence[Recognised]]
 
-    by_kind: Mapping[FileKind, Sequence[Recognised]]
-    target: Path
-    recipe: Recipe
 
-    def draft(self) -> Draft:
-        """Return the recipe with its inputs filled in, and a heading of its own."""
-        shipped = shipped_workflow(self.recipe).read_text(encoding="utf-8")
-        start, inputs, steps = re.split(r"^(?=orthoflow:|steps:)", shipped, flags=re.MULTILINE)
-        taken, left_out = self._assigned(inputs)
-        lines = []
-        for line in inputs.splitlines():
-            match = _INPUT.fullmatch(line)
-            files = taken.get(match[1], ()) if match else ()
-            lines.append(self._input_line(match[1], files) if match and files else line)
-        described = {name: _described(files) for name, files in taken.items() if files}
-        name = re.sub(r"[^A-Za-z0-9_-]+", "-", self.target.stem).strip("-") or self.recipe
-        body = re.sub(r"^name: .*$", f"name: {name}", "\n".join(lines), flags=re.MULTILINE)
-        text = f"{self._heading(start, described, left_out)}{body}\n{self._steps(steps)}"
-        return Draft(
-            recipe=self.recipe, text=text, inputs=described, left_out=left_out, advice=self._advice
-        )
-
-    def _steps(self, steps: str) -> str:
-        """Return the steps of the recipe, with the up axis if scans show it."""
-        text = _without_stand_ins(steps)
-        axes = {item.up for item in self.by_kind["scan"]}
-        (up,) = axes if len(axes) == 1 else ("",)
+def _drafted(by_kind: _ByKind, target: Path, recipe: Recipe) -> Draft:
+    """Return the recipe with its inputs filled in, and a heading of its own."""
+    shipped = shipped_workflow(recipe).read_text(encoding="utf-8")
+    start, inputs, steps = re.split(r"^(?=orthoflow:|steps:)", shipped, flags=re.MULTILINE)
+    taken, left_out = _assigned(by_kind, inputs, recipe)
+    lines = []
+    for line in inputs.splitlines():
+        match = _INPUT.fullmatch(line)
+        files = taken.get(match[1], ()) if match else ()
+        lines.append(_input_line(match[1], files, target) if match and files else line)
+    described = {name: _described(files) for name, files in taken.items()}
+    advice = _advice(by_kind)
+    name = re.sub(r"[^A-Za-z0-9_-]+", "-", target.stem).strip("-") or recipe
+    body = re.sub(r"^name: .*$", f"name: {name}", "\n".join(lines), flags=re.MULTILINE)
+    run = shlex.quote(target.name)
+    summary = [
+        f"# Made by `orthoflow new` from the recipe {recipe}.yaml.",
+        *(f"#   {name}: {text}" for name, text in described.items()),
+        *(f"# Not used: {text}" for text in left_out[:_MOST_LISTED]),
+        *(f"# Note: {text}" for text in advice[:_MOST_LISTED]),
+        "#",
+        f"#   orthoflow check {run}       is anything wrong with it?",
+        f"#   orthoflow plan {run}        what would run",
+        f"#   orthoflow run {run} --set wall.gsd_m=0.02    a coarse first look; then without",
+        "#",
+        "# The following comments are those of the recipe.",
+        "#",
+    ]
+    paragraphs = start.rstrip("\n").split("\n#\n")
+    comments = "\n#\n".join(text for text in paragraphs if not text.startswith(_NOT_OWN))
+    # The steps of the recipe, with the up axis if scans show it.
+    steps = _without_stand_ins(steps)
+    axes = {item.up for item in by_kind["scan"]}
+    (up,) = axes if len(axes) == 1 else ("",)
+    if up:
         reading = "in: {files: inputs.scan}\n"
-        return text.replace(reading, f"{reading}    params: {{up: {up}}}\n", 1) if up else text
+        steps = steps.replace(reading, f"{reading}    params: {{up: {up}}}\n", 1)
+    text = "\n".join([*map(_seen, summary), comments, f"{body}\n{steps}"])
+    return Draft(recipe=recipe, text=text, inputs=described, left_out=left_out, advice=advice)
 
-    @property
-    def _advice(self) -> list[str]:
-        advice = [text for items in self.by_kind.values() for item in items for text in item.advice]
-        equals: dict[int, list[str]] = {}
-        for scan in self.by_kind["scan"]:
-            equals.setdefault(scan.n_points, []).append(scan.path.name)
-        advice += [
-            f"{_some(names)} have {n_points:,} points each: name only one of them where they are "
-            "the same scan"
-            for n_points, names in equals.items()
-            if n_points and len(names) > 1
-        ]
-        photos = [item for item in self.by_kind.get("photos", ()) if item.kind == "photos"]
-        without = [item.path.name for item in photos if not item.lens]
-        if without and not {"calibration", "cameras"} & self.by_kind.keys():
-            advice.append(
-                f"{len(without)} of {len(photos)} photos state no focal length: {_some(without)}; "
-                "give a calibration, if there is one"
-            )
-        return advice
 
-    def _assigned(self, inputs: str) -> tuple[dict[str, Sequence[Recognised]], list[str]]:
-        """Assign files to inputs, and return the remaining ones."""
-        names = [match[1] for line in inputs.splitlines() if (match := _INPUT.fullmatch(line))]
-        taken: dict[str, Sequence[Recognised]] = {}
-        left_out = []
-        for kind, items in self.by_kind.items():
-            takes_many = kind in ("scan", "photos", "other")
-            if kind == "unknown":
-                reasons: dict[str, list[str]] = {}
-                for item in items:
-                    reasons.setdefault(item.summary, []).append(item.path.name)
-                left_out += [f"{_some(each)}: {reason}" for reason, each in reasons.items()]
-            elif kind not in names:
-                left_out += [
-                    f"{item.path.name}: {item.summary}; {self.recipe} has no input for it"
-                    for item in items
-                ]
-            elif len(items) > 1 and not takes_many:
-                each = ", ".join(item.path.name for item in items)
-                left_out.append(f"{each}: {kind} may be one of them only; name it under inputs")
-            else:
-                taken[kind] = items
-        return taken, left_out
+def _advice(by_kind: _ByKind) -> list[str]:
+    advice = [text for items in by_kind.values() for item in items for text in item.advice]
+    equals: dict[int, list[str]] = {}
+    for scan in by_kind["scan"]:
+        equals.setdefault(scan.n_points, []).append(scan.path.name)
+    advice += [
+        f"{_some(names)} have {n_points:,} points each: name only one of them where they are "
+        "the same scan"
+        for n_points, names in equals.items()
+        if n_points and len(names) > 1
+    ]
+    photos = [item for item in by_kind.get("photos", ()) if item.kind == "photos"]
+    without = [item.path.name for item in photos if not item.lens]
+    if without and not {"calibration", "cameras"} & by_kind.keys():
+        advice.append(
+            f"{len(without)} of {len(photos)} photos state no focal length: {_some(without)}; "
+            "give a calibration, if there is one"
+        )
+    return advice
 
-    def _input_line(self, name: str, items: Sequence[Recognised]) -> str:
-        paths = _folders_of_photos(items) if name == "photos" else [item.path for item in items]
-        places = [_quoted(self._place(path)) for path in paths]
-        if name == "other":
-            places += [_quoted(self._place(path.with_suffix(".json"))) for path in paths]
-        if len(places) == 1:
-            return f"  {name}: {{files: {places[0]}}}  # {_seen(_described(items))}"
-        listed = "\n".join(f"      - {place}" for place in places)
-        return f"  {name}:  # {_seen(_described(items))}\n    files:\n{listed}"
 
-    def _place(self, path: Path) -> str:
-        """Return a path relative to the workflow's folder."""
-        here, place = (Path(os.path.normpath(one.absolute())) for one in (self.target.parent, path))
-        if not place.is_relative_to(here):
-            # `..` after a link leads elsewhere than it reads.
-            here, place = here.resolve(), place.resolve()
-        return Path(os.path.relpath(place, here)).as_posix()
+def _assigned(
+    by_kind: _ByKind, inputs: str, recipe: Recipe
+) -> tuple[dict[str, Sequence[Recognised]], list[str]]:
+    """Assign files to inputs, and return the remaining ones."""
+    names = [match[1] for line in inputs.splitlines() if (match := _INPUT.fullmatch(line))]
+    taken: dict[str, Sequence[Recognised]] = {}
+    left_out = []
+    for kind, items in by_kind.items():
+        if kind == "unknown":
+            reasons: dict[str, list[str]] = {}
+            for item in items:
+                reasons.setdefault(item.summary, []).append(item.path.name)
+            left_out += [f"{_some(each)}: {reason}" for reason, each in reasons.items()]
+        elif kind not in names:
+            left_out += [
+                f"{item.path.name}: {item.summary}; {recipe} has no input for it" for item in items
+            ]
+        elif len(items) > 1 and kind not in ("scan", "photos", "other"):
+            each = ", ".join(item.path.name for item in items)
+            left_out.append(f"{each}: {kind} may be one of them only; name it under inputs")
+        elif items:
+            taken[kind] = items
+    return taken, left_out
 
-    def _heading(self, start: str, described: Mapping[str, str], left_out: Sequence[str]) -> str:
-        summary = [f"# Made by `orthoflow new` from the recipe {self.recipe}.yaml."]
-        summary += [f"#   {name}: {text}" for name, text in described.items()]
-        summary += [f"# Not used: {text}" for text in left_out[:_MOST_LISTED]]
-        summary += [f"# Note: {text}" for text in self._advice[:_MOST_LISTED]]
-        run = shlex.quote(self.target.name)
-        summary += [
-            "#",
-            f"#   orthoflow check {run}       is anything wrong with it?",
-            f"#   orthoflow plan {run}        what would run",
-            f"#   orthoflow run {run} --set wall.gsd_m=0.02    a coarse first look; then without",
-            "#",
-            "# The following comments are those of the recipe.",
-            "#",
-        ]
-        paragraphs = start.rstrip("\n").split("\n#\n")
-        kept = [text for text in paragraphs if not text.startswith(_NOT_OWN)]
-        return "\n".join(map(_seen, summary)) + "\n" + "\n#\n".join(kept) + "\n"
+
+def _input_line(name: str, items: Sequence[Recognised], target: Path) -> str:
+    paths = _folders_of_photos(items) if name == "photos" else [item.path for item in items]
+    if name == "other":
+        paths += [path.with_suffix(".json") for path in paths]
+    places = [_quoted(_place(path, target)) for path in paths]
+    about = _seen(_described(items))
+    if len(places) == 1:
+        return f"  {name}: {{files: {places[0]}}}  # {about}"
+    listed = "\n".join(f"      - {place}" for place in places)
+    return f"  {name}:  # {about}\n    files:\n{listed}"
+
+
+def _place(path: Path, target: Path) -> str:
+    """Return a path relative to the workflow's folder."""
+    here, place = (Path(os.path.normpath(one.absolute())) for one in (target.parent, path))
+    if not place.is_relative_to(here):
+        # `..` after a link leads elsewhere than it reads.
+        here, place = here.resolve(), place.resolve()
+    return Path(os.path.relpath(place, here)).as_posix()
 
 
 def _folders_of_photos(items: Sequence[Recognised]) -> list[Path]:

@@ -394,13 +394,9 @@ class _Node:
     causes: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Choice:
-    """The source of a port: the first candidate that is present, or none."""
-
-    source: CellOutput | WorkflowInput | None
-    dependence: Assignment
-    causes: tuple[str, ...] = ()
+# The source of a port, the first candidate that is present, or none; the factors on which that
+# depends; inputs with or without which there would be one.
+_Choice: TypeAlias = tuple[CellOutput | WorkflowInput | None, Assignment, tuple[str, ...]]
 
 
 class _ExcludedError(Exception):
@@ -560,21 +556,21 @@ class _Expansion:
             if port in step.inputs
         }
         assignment = dict(own)
-        for choice in choices.values():
-            assignment |= choice.dependence
+        for _, dependence, _ in choices.values():
+            assignment |= dependence
         if _is_excluded(workflow, assignment):
             raise _ExcludedError
-        inputs = {port: choice.source for port, choice in choices.items() if choice.source}
+        inputs = {port: source for port, (source, _, _) in choices.items() if source}
         missing = next((port for port in choices if self._is_missing(variant, port, choices)), "")
         if not missing:
             cell = self._cell(step, variant, assignment, inputs, "")
             return _Node(cell=cell, dependence=assignment)
-        choice = choices[missing]
-        dependence = dict(choice.dependence) | always
+        _, chosen_by, causes = choices[missing]
+        dependence = dict(chosen_by) | always
         if not self._all_require(step, missing):
             dependence |= own
-        cell = self._cell(step, variant, assignment, inputs, _reason(*choice.causes))
-        return _Node(cell=cell, dependence=dependence, causes=choice.causes)
+        cell = self._cell(step, variant, assignment, inputs, _reason(*causes))
+        return _Node(cell=cell, dependence=dependence, causes=causes)
 
     def _stopped_by(self, step: WorkflowStep, full: Mapping[str, str]) -> str:
         """Return why a step is skipped, whatever its inputs; empty if it is not."""
@@ -593,7 +589,7 @@ class _Expansion:
                     dependence[DATA] = full[DATA]
                 name = self._input_name(reference.name, full)
                 if name in self.present:
-                    return _Choice(source=WorkflowInput(name=name), dependence=dependence)
+                    return WorkflowInput(name=name), dependence, ()
                 causes[f"with the input {reference.name}"] = None
                 continue
             node = self._upstream(reference.source, full)
@@ -601,9 +597,9 @@ class _Expansion:
             dependence |= node.dependence
             if not node.cell.skip_reason:
                 output = CellOutput(address=node.cell.address, port=reference.name)
-                return _Choice(source=output, dependence=dependence)
+                return output, dependence, ()
             causes.update(dict.fromkeys(node.causes))
-        return _Choice(source=None, dependence=dependence, causes=tuple(causes))
+        return None, dependence, tuple(causes)
 
     def _input_name(self, name: str, full: Mapping[str, str]) -> str:
         """Return the name of an input: that of the dataset, if it names files for it."""
@@ -619,7 +615,7 @@ class _Expansion:
         return node
 
     def _is_missing(self, variant: StepVariant, port: str, choices: Mapping[str, _Choice]) -> bool:
-        return choices[port].source is None and self._ports(variant)[port].required
+        return choices[port][0] is None and self._ports(variant)[port].required
 
     def _all_require(self, step: WorkflowStep, port: str) -> bool:
         takes = map(self._ports, step.variants)

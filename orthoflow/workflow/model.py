@@ -21,6 +21,7 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    PlainSerializer,
     Strict,
     WithJsonSchema,
 )
@@ -458,6 +459,9 @@ class WorkflowFile(FileSection):
 
 # The checked workflow -----------------------------------------------------------------------------
 
+# As records keep it.
+_Recorded: TypeAlias = Annotated[Reference, BeforeValidator(_reference), PlainSerializer(str)]
+
 
 @dataclass(frozen=True, kw_only=True)
 class WorkflowInputSpec:
@@ -499,14 +503,17 @@ class StepVariant:
         swept: parameters that are swept -> the values of this variant; a part of `params_set`.
     """
 
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
     name: str
-    method: str
-    params: Mapping[str, JsonValue] = field(default_factory=dict)
-    params_set: Mapping[str, JsonValue] = field(default_factory=dict)
-    repeat: int = 1
-    cores: int | None = None
-    timeout_s: float | None = None
-    swept: Mapping[str, JsonValue] = field(default_factory=dict)
+    method: Annotated[str, Field(alias="use")]
+    # Any: JSON.
+    params: Mapping[str, Any] = field(default_factory=dict)
+    params_set: Mapping[str, Any] = field(default_factory=dict)
+    repeat: Annotated[int, Field(ge=1, le=MOST_REPEATS)] = 1
+    cores: Annotated[int, Field(ge=1)] | None = None
+    timeout_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    swept: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -522,10 +529,12 @@ class WorkflowStep:
         is_varied: the file lists variants, even if only one.
     """
 
-    name: str
+    name: Annotated[str, Field(exclude=True)] = ""
     variants: tuple[StepVariant, ...]
-    inputs: Mapping[str, tuple[Reference, ...]] = field(default_factory=dict)
-    only_if: str = ""
+    inputs: Annotated[Mapping[str, tuple[_Recorded, ...]], Field(alias="in")] = field(
+        default_factory=dict
+    )
+    only_if: Annotated[str, Field(alias="if")] = ""
     unless: str = ""
     is_varied: bool = False
 

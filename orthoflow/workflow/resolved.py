@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeAlias
 
-from pydantic import AfterValidator, BaseModel, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, Field, TypeAdapter, ValidationError
 
 from orthoflow.errors import WorkflowError
 from orthoflow.products.product import JsonValue
 from orthoflow.workflow.model import (
     FORMAT,
-    MOST_REPEATS,
     Comparison,
     Dataset,
-    Reference,
-    StepVariant,
     Workflow,
     WorkflowInputSpec,
     WorkflowStep,
@@ -26,31 +23,8 @@ from orthoflow.workflow.model import (
     is_acyclic,
 )
 
+_STEP: Final = TypeAdapter(WorkflowStep)
 _PLACE: Final = "the resolved workflow"
-
-
-def _reference_in(text: object) -> Reference:
-    source, _, name = str(text).partition(".")
-    return Reference(source=source, name=name)
-
-
-class _ResolvedVariant(BaseModel, extra="forbid"):
-    name: str
-    method: str = Field(alias="use")
-    params: dict[str, Any]
-    params_set: dict[str, Any]
-    repeat: int = Field(ge=1, le=MOST_REPEATS)
-    cores: int | None = Field(ge=1)
-    timeout_s: float | None = Field(gt=0, allow_inf_nan=False)
-    swept: dict[str, Any] = {}
-
-
-class _ResolvedStep(BaseModel):
-    inputs: dict[str, list[str]] = Field(alias="in")
-    only_if: str = Field(alias="if", default="")
-    unless: str
-    is_varied: bool
-    variants: list[_ResolvedVariant]
 
 
 class _ResolvedInput(BaseModel):
@@ -78,7 +52,7 @@ class _Resolved(BaseModel):
     seed: int
     seeds: tuple[int, ...] = ()
     inputs: dict[_ResolvedName, _ResolvedInput]
-    steps: dict[_ResolvedName, _ResolvedStep]
+    steps: dict[_ResolvedName, WorkflowStep]
     compare: Comparison | None
     overrides: tuple[str, ...]
     datasets: dict[_ResolvedName, _ResolvedDataset] = {}
@@ -95,7 +69,10 @@ def resolved_json(workflow: Workflow) -> str:
         "name": workflow.name,
         "seed": workflow.seed,
         "inputs": {name: _input_json(spec) for name, spec in workflow.inputs.items()},
-        "steps": {step.name: _step_json(step) for step in workflow.steps.values()},
+        "steps": {
+            name: _STEP.dump_python(step, mode="json", by_alias=True)
+            for name, step in workflow.steps.items()
+        },
         "compare": workflow.compare.model_dump() if workflow.compare else None,
         "overrides": list(workflow.overrides),
     }
@@ -122,22 +99,6 @@ def _input_json(spec: WorkflowInputSpec) -> JsonValue:
         return Path(name).name if is_private else name
 
     return {"files": [recorded(name) for name in spec.files], "optional": spec.optional}
-
-
-def _step_json(step: WorkflowStep) -> dict[str, object]:
-    variants = []
-    for variant in step.variants:
-        fields = asdict(variant)
-        if not fields["swept"]:
-            del fields["swept"]
-        variants.append({"use": fields.pop("method"), **fields})
-    return {
-        "in": {port: [str(item) for item in items] for port, items in step.inputs.items()},
-        "unless": step.unless,
-        **({"if": step.only_if} if step.only_if else {}),
-        "is_varied": step.is_varied,
-        "variants": variants,
-    }
 
 
 def workflow_from_resolved(resolved: str, source: str) -> Workflow:
@@ -170,17 +131,7 @@ def _from_resolved(document: _Resolved, source: str) -> Workflow:
         seed=document.seed,
         seeds=document.seeds,
         inputs={name: given.spec(name) for name, given in document.inputs.items()},
-        steps={
-            name: WorkflowStep(
-                name=name,
-                variants=tuple(StepVariant(**dict(variant)) for variant in given.variants),
-                inputs={port: tuple(map(_reference_in, t)) for port, t in given.inputs.items()},
-                only_if=given.only_if,
-                unless=given.unless,
-                is_varied=given.is_varied,
-            )
-            for name, given in document.steps.items()
-        },
+        steps={name: replace(step, name=name) for name, step in document.steps.items()},
         compare=document.compare,
         overrides=document.overrides,
         datasets={

@@ -23,8 +23,6 @@ from tests.laboratories import (
     LABORATORY,
     entry_points_in,
     laboratory_catalog,
-    load,
-    with_steps,
     write_distribution,
 )
 
@@ -271,17 +269,6 @@ def test_methods_of_a_kind_claimed_twice_have_the_ports_of_their_own_plugin(
         assert catalog.method(name).load().id == name
 
 
-def test_the_same_kind_announced_twice_with_the_same_ports_is_fine(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    kind = (
-        "KindSpec(name='mosaic', summary='mine', inputs={'layers': 'layers', 'walls': 'walls', "
-        "'cameras': 'cameras', 'seams': 'files'}, outputs={'orthoimages': 'orthoimages'})"
-    )
-    catalog = with_plugin("alike", hooks(kinds=kind), tmp_path, monkeypatch)
-    assert catalog.method("mosaic.seams").load().id == "mosaic.seams"
-
-
 def test_of_a_product_type_claimed_twice_one_is_used_and_methods_of_the_other_are_broken(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -435,23 +422,6 @@ def test_code_in_front_of_an_installed_release_is_not_released(
     assert not catalog.methods["plane.mine"].distribution.is_released
 
 
-def test_source_files_are_the_packages_of_hooks_and_class(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    catalog = laboratory_catalog(monkeypatch)
-    folder = LABORATORY / "laboratory"
-    entry = catalog.method("plane.hough2d")
-    assert entry.distribution.source_folder == folder
-    assert entry.source_files() == tuple(
-        folder / name for name in ("__init__.py", "hooks.py", "methods.py")
-    )
-    text = hooks(methods=method("plane.mine", "single_class:Mine"))
-    catalog = with_plugin("single", text, tmp_path, monkeypatch, single_class="")
-    entry = catalog.methods["plane.mine"]
-    assert entry.distribution.source_folder is None
-    assert [path.name for path in entry.source_files()] == ["single_class.py"]
-
-
 def test_publishers_are_loaded_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spec = "ProductSpec(type_name='notes', target='orthoflow.products.planes:Planes', summary='-'"
     catalog = with_plugin(
@@ -467,55 +437,6 @@ def test_publishers_are_loaded_by_name(tmp_path: Path, monkeypatch: pytest.Monke
         PluginError, match=r"product type notes of press .* the type_name of .* is .planes."
     ):
         catalog.product_class("notes")
-
-
-def test_two_bad_plugins_leave_every_other_workflow_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    again = write_distribution(
-        tmp_path / "again",
-        "again",
-        {"again_hooks.py": hooks(methods=method("plane.ransac", "a:B"))},
-    )
-    broken = write_distribution(
-        tmp_path / "broken", "broken", {"broken_hooks.py": "raise RuntimeError('no licence')"}
-    )
-    catalog = laboratory_catalog(monkeypatch, again, broken)
-    assert [str(plugin) for plugin in catalog.broken] == [
-        "plugin broken of broken 1.0 fails to load: RuntimeError: no licence"
-    ]
-    path = tmp_path / "flow.yaml"
-    fine = load(with_steps("plane: {use: plane.hough2d, in: {cloud: cloud.cloud}}"), path, catalog)
-    assert set(fine.steps) == {"cloud", "plane"}
-    needy = with_steps("plane: {use: plane.ransac, in: {cloud: cloud.cloud}}")
-    with pytest.raises(PluginError, match=r"plane.ransac is claimed by again 1.0 and laboratory"):
-        load(needy, path, catalog)
-
-
-def test_a_method_whose_class_does_not_load_is_shown_with_its_traceback(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    sources = {
-        "late_hooks.py": hooks(methods=method("plane.late", "late_method:Late")),
-        "late_method.py": "import no_such_library\n",
-    }
-    monkeypatch.syspath_prepend(write_distribution(tmp_path, "late", sources))
-    shown = CliRunner().invoke(program, ["plugins", "show", "plane.late"])
-    assert shown.exit_code == 4
-    sentence, _, rest = shown.output.partition("\n")
-    assert sentence == (
-        "method plane.late of late 1.0 cannot be loaded from late_method:Late: "
-        "ModuleNotFoundError: No module named 'no_such_library'; install what is missing, or "
-        "another version of late"
-    )
-    assert "state         broken" in rest
-    assert "late_method.py" in rest
-    assert "Traceback" in rest
-    answer = json.loads(
-        CliRunner().invoke(program, ["plugins", "show", "plane.late", "--json"]).output
-    )
-    assert (answer["state"], answer["distribution"]) == ("broken", "late")
-    assert "Traceback" in answer["traceback"]
 
 
 def test_a_list_says_which_classes_are_missing_and_how_they_are_mended(

@@ -399,22 +399,6 @@ def test_check_is_content_with_a_good_workflow(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout) == (0, "studio is fine: 2 steps\n")
 
 
-def test_check_says_which_variant_the_others_are_compared_with(tmp_path: Path) -> None:
-    path = write_studio(tmp_path)
-    text = path.read_text(encoding="utf-8")
-    assert "use: paint.plain" in text
-    swept = "variants: {rough: {use: paint.plain}, fine: {use: paint.plain}}"
-    path.write_text(
-        f"{text.replace('use: paint.plain', swept)}compare: {{design: product}}\n", encoding="utf-8"
-    )
-    done = orthoflow(tmp_path, "check", "studio.yaml")
-    assert done.stdout.endswith("run 3 times in all; baseline paint=rough\n"), (
-        done.stdout + done.stderr
-    )
-    done = orthoflow(tmp_path, "run", "studio.yaml", "-o", "out", *INLINE)
-    assert "baseline: paint=rough, with which the others are compared" in done.stdout.splitlines()
-
-
 def test_check_names_every_problem_with_its_place(tmp_path: Path) -> None:
     path = write_studio(tmp_path, "paint.plane")
     path.write_text(path.read_text(encoding="utf-8") + "colour: red\n", encoding="utf-8")
@@ -428,24 +412,6 @@ def test_check_names_every_problem_with_its_place(tmp_path: Path) -> None:
     assert answer["ok"] is False
     assert [problem["line"] for problem in answer["problems"]] == [8, 9]
     assert answer["warnings"] == []
-
-
-def test_check_warns_of_what_is_allowed_and_hardly_meant(tmp_path: Path) -> None:
-    path = write_studio(tmp_path)
-    path.write_text(
-        path.read_text(encoding="utf-8").replace("inputs:", "inputs:\n  more: {optional: true}", 1),
-        encoding="utf-8",
-    )
-    said = "no step takes the input more: wire it as inputs.more, or remove it"
-    done = orthoflow(tmp_path, "check", "studio.yaml")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout == f"studio is fine: 2 steps\nwarning: {said}\n"
-    answer = json.loads(orthoflow(tmp_path, "check", "studio.yaml", "--json").stdout)
-    assert (answer["ok"], answer["warnings"]) == (True, [said])
-    assert orthoflow(tmp_path, "plan", "studio.yaml").stderr == f"workflow: warning: {said}\n"
-    # Who has not checked reads it before anything runs.
-    done = orthoflow(tmp_path, "run", "studio.yaml", "-o", "r", *INLINE)
-    assert done.stderr.startswith(f"workflow: warning: {said}\n")
 
 
 def test_check_looks_for_the_files(tmp_path: Path) -> None:

@@ -9,19 +9,19 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
-from orthoflow_provenance.document import RecordedFile, RunRecord
+from orthoflow_provenance.document import RunRecord
 
 from orthoflow.cli import plugins as plugins_commands
-from orthoflow.cli.compare import _print, comparison_json
+from orthoflow.cli.compare import _print
 from orthoflow.cli.export import _refuse_filled
 from orthoflow.cli.exports.choices import Choices
 from orthoflow.cli.exports.formats import check_choices
 from orthoflow.cli.exports.products import make_empty
 from orthoflow.cli.program import program
 from orthoflow.errors import ArgumentError
-from orthoflow.records.comparison import CellFacts, Distance, Pair, ParameterValue, RunComparison
+from orthoflow.records.comparison import CellFacts, Pair, ParameterValue, RunComparison
 from tests.laboratories import laboratory_catalog
-from tests.report_runs import cell, distance, metric, record
+from tests.report_runs import cell, metric, record
 
 
 def printed(capsys: pytest.CaptureFixture[str]) -> list[str]:
@@ -29,22 +29,6 @@ def printed(capsys: pytest.CaptureFixture[str]) -> list[str]:
 
 
 # --- comparisons ---
-
-
-def part(field: str, unit: str, largest: float | None) -> Distance:
-    return Distance(unit=unit, largest=largest, limit=0.1, field=field, n_values=3)
-
-
-PRODUCTS = (
-    distance("one", "identical"),
-    distance("two", "different", "other names", part("x", "m", 0.25), part("n", "1", None)),
-    distance("three", "within tolerance", "", part("rgb", "grey", 3.0), part("k", "1", 0.5)),
-    distance("four", "different"),
-)
-FILES = tuple(
-    RecordedFile(name=f"{name}.jpg", size_bytes=3, sha256=f"{index}123456789abcdef" * 4)
-    for index, name in enumerate("abcde")
-)
 
 
 def facts(**more: Any) -> CellFacts:
@@ -82,45 +66,6 @@ def same_runs() -> RunComparison:
     )
 
 
-def different_runs() -> RunComparison:
-    left, right = runs()
-    other = facts(
-        status="failed",
-        seed=0,
-        code={"toys": "abcdef0123456789", "more": "1" * 64},
-        tools={"colmap": "4.2"},
-        error="no plane",
-    )
-    return RunComparison(
-        left=left,
-        right=right,
-        workflow=("--- a", "+++ b", "@@ -1 +1 @@", "-x", "+y"),
-        overrides=Pair(name="", left=("a=1", "b=2"), right=()),
-        inputs=(
-            Pair(name="scan", left=FILES[:3], right=FILES[:4]),
-            Pair(name="photos", left=FILES[:1], right=()),
-            Pair(name="same", left=FILES[:1], right=FILES[:1]),
-        ),
-        cells=(Pair(name="a", left=facts(), right=other), Pair(name="b", left=None, right=facts())),
-        parameters=(
-            Pair(
-                cell="a",
-                name="cell_m",
-                left=ParameterValue(value=0.123456789, is_set=True),
-                right=ParameterValue(value="ä", is_set=False),
-            ),
-        ),
-        environment=(Pair(name="python", left="3.11", right=None),),
-        metrics=(
-            Pair(cell="a", name="wall_s", left=metric(1.0, is_cost=True), right=metric(2.0)),
-            Pair(cell="a", name="rms_mm", left=metric(1.5), right=metric(1.25)),
-            Pair(cell="a", name="max_mm", left=None, right=metric(2.0)),
-            Pair(cell="a", name="same_mm", left=metric(2.0), right=metric(2.0)),
-        ),
-        products=PRODUCTS,
-    )
-
-
 def test_a_short_comparison_counts_rounding_and_says_once_what_is_said_alike(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -155,37 +100,6 @@ def test_a_short_comparison_counts_rounding_and_says_once_what_is_said_alike(
     ]
     _print(comparison)
     assert sum("tiny_mm" in line for line in printed(capsys)) == 3
-
-
-def test_a_comparison_in_json_says_of_each_row_whether_it_is_the_same() -> None:
-    found = json.loads(json.dumps(comparison_json(different_runs())))
-    assert [run["run_id"] for run in found["runs"]] == ["r1", "r2"]
-    assert found["runs"][1] == {
-        "run_id": "r2",
-        "name": "room",
-        "created_by": "orthoflow 0.1.0",
-        "status": "ok",
-        "started": "2026-01-02T03:04:05Z",
-        "ended": "2026-01-02T03:05:05Z",
-        "seed": 9,
-    }
-    assert found["workflow"] == ["--- a", "+++ b", "@@ -1 +1 @@", "-x", "+y"]
-    assert found["overrides"] == {
-        "cell": "",
-        "name": "",
-        "left": ["a=1", "b=2"],
-        "right": [],
-        "same": False,
-    }
-    rows = ("inputs", "cells", "parameters", "environment", "metrics")
-    assert [[row["same"] for row in found[name]] for name in rows] == [
-        [False, False, True],
-        [False, False],
-        [False],
-        [False],
-        [False, False, False, True],
-    ]
-    assert [item["verdict"] for item in found["products"]] == [item.verdict for item in PRODUCTS]
 
 
 # --- methods ---

@@ -249,14 +249,6 @@ def test_a_name_that_cannot_be_used_is_refused(
         write_project(Project(name=name, kind=kind), tmp_path, discover_catalog())
 
 
-def test_the_command_says_what_it_wrote_and_what_comes_next(tmp_path: Path) -> None:
-    arguments = ["plugins", "new", "my-detector", "--kind", "plane", "--folder", str(tmp_path)]
-    result = CliRunner().invoke(program, arguments)
-    assert result.exit_code == 0
-    assert "wrote my-detector/pyproject.toml" in result.output
-    assert "next: cd my-detector, python -m pip install -e '.[test]'" in result.output
-
-
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An environment with this checkout installed, and what it needs taken from the tests' own."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +11,6 @@ import pytest
 
 from orthoflow.errors import ProductError
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext, StepEvent
-from orthoflow.sdk.context import Drawing
 
 SVG = b'<svg xmlns="http://www.w3.org/2000/svg"/>'
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(20)
@@ -203,40 +201,6 @@ def test_a_figure_may_have_64_mebibytes(tmp_path: Path) -> None:
     with pytest.raises(ProductError, match="figure larger must be a file of at most 64 MiB"):
         ctx.figure("larger", OfSize(64 * 1024**2 + 1))
     assert [figure.name for figure in ctx.figures] == ["largest"]
-
-
-class LeadsElsewhere:
-    def savefig(self, path: Path) -> None:
-        path.symlink_to(__file__)
-
-
-class Pipe:
-    def savefig(self, path: Path) -> None:
-        os.mkfifo(path)
-
-
-class Giant:
-    def savefig(self, path: Path) -> None:
-        with path.open("wb") as file:
-            file.truncate(1 << 40)
-
-
-class Nothing:
-    def savefig(self, path: Path) -> None:
-        """Write nothing."""
-
-
-@pytest.mark.parametrize(
-    "drawing",
-    [LeadsElsewhere(), Pipe(), Giant(), Nothing()],
-    ids=lambda drawing: type(drawing).__name__,
-)
-@pytest.mark.usefixtures("charts")
-def test_a_figure_is_a_file_of_its_own(tmp_path: Path, drawing: Drawing) -> None:
-    ctx = context(tmp_path)
-    with pytest.raises(ProductError, match="figure chart must be a file of at most 64 MiB"):
-        ctx.figure("chart", drawing)
-    assert ctx.figures == []
 
 
 def test_an_array_that_no_file_can_hold_is_refused(tmp_path: Path) -> None:

@@ -85,16 +85,6 @@ def test_allocated_arrays_lie_in_the_scratch_folder(tmp_path: Path) -> None:
     assert next((tmp_path / "allocated").iterdir()).stat().st_size == 4000
 
 
-def test_warnings_are_collected_and_heard(tmp_path: Path) -> None:
-    heard: list[StepEvent] = []
-    ctx = context(tmp_path, listen=heard.append)
-    ctx.warn("no station known")
-    assert ctx.warnings == ["no station known"]
-    (event,) = heard
-    assert (event.kind, event.text) == ("diagnostic", "no station known")
-    assert [event.diagnostic] == ctx.diagnostics
-
-
 class Damp(Method):
     metrics = (
         MetricSpec("n_*", label="damp patches"),

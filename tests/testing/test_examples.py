@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthoflow.products import InputFiles, Photos, PointCloud, Truth, Walls
+from orthoflow.products import Photos, PointCloud, Truth, Walls
 from orthoflow.sdk import Method, Ports
 from orthoflow.testing import examples
 from orthoflow.testing.examples import (
@@ -59,17 +59,6 @@ def test_a_room_is_a_box_of_points_on_planes_that_are_known() -> None:
     np.testing.assert_array_equal(cloud.rgb, np.repeat(grey[:, None], 3, axis=1))
     np.testing.assert_allclose(cloud.intensity, grey / 255.0, rtol=1e-6)
     assert (grey.min(), grey.max()) == (60, 199)
-
-
-def test_a_file_is_the_room_as_text() -> None:
-    files = example("files")
-    assert isinstance(files, InputFiles)
-    (path,) = files.paths
-    assert path.read_text().startswith("//x y z r g b\n")
-    rows = np.loadtxt(path, comments="//")
-    cloud, _ = example_room(n_points=3000)
-    np.testing.assert_allclose(rows[:, :3], cloud.points_world(), atol=6e-5)
-    assert (rows[:, 3:] == 128).all()
 
 
 class _Idle(Method):

@@ -8,18 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
-
 from orthoflow.engine.store import digest_of
-from orthoflow.geometry import Plane
-from orthoflow.products import (
-    Planes,
-    PointCloud,
-    PointLabels,
-    Truth,
-    Walls,
-)
-from orthoflow.testing.examples import example
 from orthoflow.testing.photographed import (
     PHOTOGRAPHED,
 )
@@ -67,26 +56,3 @@ def test_golden_results_are_of_these_examples() -> None:
     for scene, makers in (("surveyed", SURVEYED), ("photographed", PHOTOGRAPHED)):
         for port in TAKEN[scene]:
             assert (port, digest_of(makers[port]())) in recorded, (scene, port)
-
-
-def test_the_rasters_lie_on_the_planes_that_the_cloud_shows() -> None:
-    planes, walls, cloud = example("planes"), example("walls"), example("cloud")
-    labels, truth = example("labels"), example("truth")
-    assert isinstance(planes, Planes)
-    assert isinstance(walls, Walls)
-    assert isinstance(cloud, PointCloud)
-    assert isinstance(labels, PointLabels)
-    assert isinstance(truth, Truth)
-    points = cloud.points_world()
-    for index, wall in enumerate(walls.walls):
-        plane = planes.plane(index)
-        assert isinstance(plane, Plane)
-        np.testing.assert_allclose(plane.distances_m(wall.frame.corners_world()), 0.0, atol=1e-8)
-        on_plane = labels.plane_index == index
-        np.testing.assert_array_equal(on_plane, truth.labels == index)
-        assert set(np.unique(labels.plane_index)) == {-1, 0, 1}
-        distances = np.abs(plane.distances_m(points[on_plane]))
-        assert np.median(distances) < 0.003  # metres; the scanner's noise is 1.5 mm
-        cells = wall.frame.wall_from_world(points[on_plane])[:, :2]
-        assert (cells > -1.0).all()
-        assert (cells < [wall.frame.width + 1.0, wall.frame.height + 1.0]).all()

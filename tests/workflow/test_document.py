@@ -157,16 +157,6 @@ def test_a_broken_plugin_harms_no_workflow_that_does_without_it(
         load_workflow(write, catalog)
 
 
-def test_mistakes_of_the_file_come_before_broken_plugins(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, write: Path
-) -> None:
-    folder = write_distribution(tmp_path / "b", "broken", {"broken_hooks.py": BROKEN_METHOD})
-    catalog = laboratory_catalog(monkeypatch, folder)
-    steps = "x: {use: plane.broken, in: {clod: cloud.cloud}}"
-    found = problems(with_steps(steps), write, catalog)
-    assert [path for _, _, path, _ in found] == ["steps.x.use", "steps.x.in.clod"]
-
-
 @pytest.mark.parametrize(
     ("written", "seconds"),
     [

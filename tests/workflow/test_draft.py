@@ -99,16 +99,6 @@ def test_a_scan_alone_is_painted_from_its_own_colours_without_a_stand_in(data: P
     assert said("check", "workflow.yaml") == "workflow is fine: 7 steps\n"
 
 
-def test_several_scans_and_two_tables_of_points(data: Path) -> None:
-    write_scan(data / "second.las")
-    (data / "more.csv").write_text(POINTS)
-    out = said("new", data, "-o", "w.yaml")
-    assert inputs_of(Path("w.yaml"))["scan"] == ["hall.las", "second.las"]
-    # Which one is to be checked with only the surveyor knows.
-    assert "checkpoints" not in inputs_of(Path("w.yaml"))
-    assert "not used: checks.csv, more.csv: checkpoints may be one of them only" in out
-
-
 def test_a_table_of_coordinates_is_a_scan_and_no_list_of_points(tmp_path: Path) -> None:
     table = tmp_path / "cloud.csv"
     rows = np.column_stack([np.arange(50) + 0.125, np.zeros(50), np.ones(50), np.full(50, 0.5)])
@@ -357,17 +347,3 @@ def test_results_of_runs_are_no_photos_of_the_next(tmp_path: Path) -> None:
     }
     # Who names it means it.
     assert {one.kind for one in recognised([run])} == {"photos", "unknown"}
-
-
-def test_a_model_of_cameras_is_one_thing(tmp_path: Path) -> None:
-    model = tmp_path / "model"
-    model.mkdir()
-    (model / "cameras.txt").write_text("1 PINHOLE 640 480 500 500 320 240\n")
-    (model / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.jpg\n\n2 1 0 0 0 0 0 0 1 b.jpg\n\n")
-    (model / "deeper").mkdir()
-    (model / "deeper" / "c.jpg").touch()
-    (found,) = recognised([tmp_path])
-    assert (found.kind, found.path, found.summary) == ("cameras", model, "2 cameras")
-    # With one of the two files it is a folder like any.
-    (model / "images.txt").unlink()
-    assert len(recognised([tmp_path])) == 2

@@ -113,11 +113,6 @@ def test_excluded_combinations_are_dropped_and_their_parts_are_kept(
     assert "mosaic@plane=ransac,orient=bundle" in cells
 
 
-def test_one_variant_excluded_alone_leaves_the_comparison(catalog: Catalog, write: Path) -> None:
-    text = GOOD.replace("{plane: ransac, orient: pnp}]", "{plane: hough2d}]")
-    assert not any("hough2d" in address for address in cells_of(text, write, catalog))
-
-
 def test_one_at_a_time_is_the_baseline_and_every_single_deviation(
     catalog: Catalog, write: Path
 ) -> None:

@@ -18,101 +18,51 @@ from tests.laboratories import (
     with_steps,
 )
 
-STEP = "x: {use: plane.hough2d, in: {cloud: cloud.cloud}%s}"
-CASES = [
-    (
-        STEP % ", params: {repeat: 3}",
-        "steps.x.params.repeat",
-        "(repeat belongs beside params, not in it)",
-    ),
-    (STEP % ", params: {cel_m: 1}", "steps.x.params.cel_m", "(did you mean cell_m?)"),
-    (
-        STEP % ", params: {cell_m: -0.02}",
-        "steps.x.params.cell_m",
-        "input should be greater than 0, go",
-    ),
-    (
-        STEP % ", params: {cell_m: .inf}",
-        "steps.x.params.cell_m",
-        "input should be a finite number, g",
-    ),
-    (STEP % ", params: {cell_m: 0.06}", "steps.x.params", "cell_m 0.06 must not exceed tolera"),
-    (
-        STEP % ", params: {normal: [1, 0, up]}",
-        "steps.x.params.normal[2]",
-        "input should be a valid number, go",
-    ),
+# What stands behind `x: {use: plane.hough2d, in: {cloud: cloud.cloud}`; the place in it; words.
+CALLS = [
+    (", params: {repeat: 3}", ".params.repeat", "(repeat belongs beside params, not in it)"),
+    (", params: {cel_m: 1}", ".params.cel_m", "(did you mean cell_m?)"),
+    (", params: {cell_m: -0.02}", ".params.cell_m", "greater than 0, go"),
+    (", params: {cell_m: .inf}", ".params.cell_m", "a finite number, g"),
+    (", params: {cell_m: 0.06}", ".params", "cell_m 0.06 must not"),
+    (", params: {normal: [1, 0, up]}", ".params.normal[2]", "a valid number, go"),
+    (", params: {cell_m: [0.02]}", ".params.cell_m", "a valid number, go"),
+    (", params: {limits: {low_m: true}}", ".params.limits.low_m", "a valid number, go"),
+    (", params: [1]", ".params", "a mapping, got a l"),
+    (", repeat: often", ".repeat", "a whole number, go"),
+    (', timeout: "30"', ".timeout", "write it without quotes"),
+    (", resources: {core: 2}", ".resources.core", "(did you mean cores?)"),
+    (", resources: {cores: 0}", ".resources.cores", "greater than or eq"),
+    (", unless: cloud.cloud", ".unless", "an input such as i"),
+    (", if: inputs.scam", ".if", "(did you mean scan?)"),
+    (", cell_m: 1", ".cell_m", "belong in params"),
+]
+STEPS = [
     (
         "x: {use: plane.ransac, in: {cloud: cloud.cloud}, params: {tolerance_m: yes}}",
-        "steps.x.params.tolerance_m",
-        "input should be a valid number or",
+        "x.params.tolerance_m",
+        "a valid number or",
     ),
-    (
-        STEP % ", params: {cell_m: [0.02]}",
-        "steps.x.params.cell_m",
-        "input should be a valid number, go",
-    ),
-    (
-        STEP % ", params: {limits: {low_m: true}}",
-        "steps.x.params.limits.low_m",
-        "input should be a valid number, go",
-    ),
-    (STEP % ", params: [1]", "steps.x.params", "input should be a mapping, got a l"),
-    (STEP % ", repeat: often", "steps.x.repeat", "input should be a whole number, go"),
-    (STEP % ', timeout: "30"', "steps.x.timeout", "write it without quotes"),
-    (STEP % ", resources: {core: 2}", "steps.x.resources.core", "(did you mean cores?)"),
-    (
-        STEP % ", resources: {cores: 0}",
-        "steps.x.resources.cores",
-        "input should be greater than or eq",
-    ),
-    (STEP % ", unless: cloud.cloud", "steps.x.unless", "input should be an input such as i"),
-    (STEP % ", if: inputs.scam", "steps.x.if", "(did you mean scan?)"),
-    ("x: {use: , in: {cloud: cloud.cloud}}", "steps.x", "needs the key use, a method such a"),
-    (STEP % ", cell_m: 1", "steps.x.cell_m", "belong in params"),
-    ("x: plane.hough2d", "steps.x", "input should be a mapping, got the"),
-    ("inputs: {use: simulate.room}", "steps.inputs", "a step cannot be called inputs, wh"),
-    ("nul: {use: simulate.room}", "steps.nul", "'nul' cannot be a name: a name sta"),
+    ("x: {use: , in: {cloud: cloud.cloud}}", "x", "needs the key use, a"),
+    ("x: plane.hough2d", "x", "a mapping, got the"),
+    ("inputs: {use: simulate.room}", "inputs", "a step cannot be called"),
+    ("nul: {use: simulate.room}", "nul", "'nul' cannot be a name: a"),
     (
         "x: {use: plane.hough2d, in: {cloud: cloud.cloud, clouds: cloud.cloud}}",
-        "steps.x.in.clouds",
+        "x.in.clouds",
         "(did you mean cloud?)",
     ),
-    (
-        "x: {use: plane.hough2d, in: {cloud: cloud}}",
-        "steps.x.in.cloud",
-        "input should be step.port or input",
-    ),
-    (
-        "x: {use: plane.hough2d, in: {cloud: []}}",
-        "steps.x.in.cloud",
-        "list should have at least 1 item a",
-    ),
-    (
-        "x: {use: plane.hough2d, in: {cloud: clud.cloud}}",
-        "steps.x.in.cloud",
-        "(did you mean cloud?)",
-    ),
-    (
-        "x: {use: read.photos, in: {files: inputs.scans}}",
-        "steps.x.in.files",
-        "(did you mean scan?)",
-    ),
+    ("x: {use: plane.hough2d, in: {cloud: cloud}}", "x.in.cloud", "step.port or input"),
+    ("x: {use: plane.hough2d, in: {cloud: []}}", "x.in.cloud", "list should have at least"),
+    ("x: {use: plane.hough2d, in: {cloud: clud.cloud}}", "x.in.cloud", "(did you mean cloud?)"),
+    ("x: {use: read.photos, in: {files: inputs.scans}}", "x.in.files", "(did you mean scan?)"),
     (
         "x: {use: plane.hough2d, in: {cloud: [cloud.clouds]}}",
-        "steps.x.in.cloud[0]",
+        "x.in.cloud[0]",
         "(did you mean cloud?)",
     ),
-    (
-        "x: {use: plane.hough2d, in: {cloud: inputs.scan}}",
-        "steps.x.in.cloud",
-        "expected the product cloud, but in",
-    ),
-    (
-        "x: {use: read.photos, in: {files: cloud.cloud}}",
-        "steps.x.in.files",
-        "expected files of an input, but cl",
-    ),
+    ("x: {use: plane.hough2d, in: {cloud: inputs.scan}}", "x.in.cloud", "expected the product"),
+    ("x: {use: read.photos, in: {files: cloud.cloud}}", "x.in.files", "expected files of an"),
     (
         (
             "x: {use: match.guided, in: {photos: y.photos, walls: z.walls, cameras: x.ties}}\n"
@@ -120,37 +70,31 @@ CASES = [
             "z: {use: raster.grid, in: {cloud: cloud.cloud, planes: p.planes}}\n"
             "p: {use: plane.hough2d, in: {cloud: cloud.cloud}}"
         ),
-        "steps.x.in.cameras",
-        "the steps form a cycle: x takes x.",
+        "x.in.cameras",
+        "the steps form a cycle: x",
     ),
     (
         "x: {in: {cloud: cloud.cloud}, params: {cell_m: 1}, variants: {a: {use: plane.hough2d}}}",
-        "steps.x.params",
-        "with variants, params belongs in e",
+        "x.params",
+        "with variants, params",
     ),
-    (
-        "x: {in: {cloud: cloud.cloud}, variants: {}}",
-        "steps.x.variants",
-        "expected at least one variant",
-    ),
+    ("x: {in: {cloud: cloud.cloud}, variants: {}}", "x.variants", "expected at least one"),
     (
         "x: {in: {cloud: cloud.cloud}, variants: {a: {use: plane.hough2d}, b: {use: orient.pnp}}}",
-        "steps.x.variants.b.use",
-        "variants of a step must be of one",
+        "x.variants.b.use",
+        "variants of a step must",
     ),
-    (
-        "x: {variants: {a: {use: simulate.room}}}",
-        "steps.x.variants.a.use",
-        "simulate.room is a source, and sou",
-    ),
+    ("x: {variants: {a: {use: simulate.room}}}", "x.variants.a.use", "simulate.room is a"),
     (
         "x: {variants: {a: {use: plane.hough2d, in: {cloud: cloud.cloud}}}}",
-        "steps.x.variants.a.in",
+        "x.variants.a.in",
         "belong in params",
     ),
-    ("x: !python {use: simulate.room}", "steps.x", "tags are not allowed"),
-    ("3: {use: simulate.room}", "steps", "a key must be text, got 3"),
+    ("x: !python {use: simulate.room}", "x", "tags are not allowed"),
+    ("3: {use: simulate.room}", "", "a key must be text, got 3"),
 ]
+CALL = "x: {use: plane.hough2d, in: {cloud: cloud.cloud}%s}"
+CASES = [*((CALL % more, f"x{path}", words) for more, path, words in CALLS), *STEPS]
 
 
 @pytest.mark.parametrize(("steps", "path", "message"), CASES)
@@ -158,27 +102,56 @@ def test_each_mistake_in_a_step_is_named_at_its_place(
     steps: str, path: str, message: str, catalog: Catalog, write: Path
 ) -> None:
     found = problems(with_steps(steps), write, catalog)
-    assert (path, True) in [(at, message in text) for _, _, at, text in found], found
+    place = f"steps.{path}".rstrip(".")
+    assert (place, True) in [(at, message in text) for _, _, at, text in found], found
 
 
 HEADS = [
-    ("name: flow\n", "orthoflow", "a workflow begins with orthoflow:"),
-    ("orthoflow: 2\n", "orthoflow", "the file has workflow format 2, th"),
-    ("orthoflow: new\n", "orthoflow", "input should be a whole number, go"),
-    ("orthoflow: 1\nseed: -1\n", "seed", "input should be greater than or eq"),
-    ("orthoflow: 1\nname: a b\n", "name", "'a b' cannot be a name: a name sta"),
-    ("orthoflow: 1\ninputs: {scan: a.e57}\n", "inputs.scan", "input should be a mapping, got the"),
+    (
+        "name: flow\n",
+        "orthoflow",
+        "a workflow begins with",
+    ),
+    (
+        "orthoflow: 2\n",
+        "orthoflow",
+        "the file has workflow",
+    ),
+    (
+        "orthoflow: new\n",
+        "orthoflow",
+        "a whole number, go",
+    ),
+    (
+        "orthoflow: 1\nseed: -1\n",
+        "seed",
+        "greater than or eq",
+    ),
+    (
+        "orthoflow: 1\nname: a b\n",
+        "name",
+        "'a b' cannot be a name: a",
+    ),
+    (
+        "orthoflow: 1\ninputs: {scan: a.e57}\n",
+        "inputs.scan",
+        "a mapping, got the",
+    ),
     (
         "orthoflow: 1\ninputs: {scan: {files: []}}\n",
         "inputs.scan.files",
-        "list should have at least 1 item a",
+        "list should have at least",
     ),
     (
         "orthoflow: 1\ninputs: {scan: {optional: no}}\n",
         "inputs.scan.optional",
-        "input should be true or false, got",
+        "true or false, got",
     ),
-    ("orthoflow: 1\n<<: {seed: 1}\n", "<<", "unknown key <<; known here: orthof"),
+    (
+        "orthoflow: 1\n<<: {seed: 1}\n",
+        "<<",
+        "unknown key <<; known",
+    ),
 ]
 
 
@@ -209,24 +182,20 @@ def test_without_steps_nobody_is_told_of_each_that_is_not_there(
 
 
 COMPARISONS = [
-    ("{desing: product}", "compare.desing", "(did you mean design?)"),
-    ("{design: one-at-time}", "compare.design", "(did you mean one-at-a-time?)"),
-    ("{baseline: {plain: ransac}}", "compare.baseline.plain", "(did you mean plane?)"),
-    ("{baseline: {plane: ransak}}", "compare.baseline.plane", "(did you mean ransac?)"),
-    ("{exclude: {plane: ransac}}", "compare.exclude", "input should be a list, got a mapp"),
-    (
-        "{exclude: [{plane: ransac, orient: dlt}]}",
-        "compare.exclude[0].orient",
-        "step orient has no variant dlt; it",
-    ),
-    ("{exclude: [{}]}", "compare.exclude[0]", "mapping should have at least 1 ite"),
+    ("{desing: product}", "desing", "(did you mean design?)"),
+    ("{design: one-at-time}", "design", "(did you mean one-at-a-time?)"),
+    ("{baseline: {plain: ransac}}", "baseline.plain", "(did you mean plane?)"),
+    ("{baseline: {plane: ransak}}", "baseline.plane", "(did you mean ransac?)"),
+    ("{exclude: {plane: ransac}}", "exclude", "a list, got a mapp"),
+    ("{exclude: [{plane: ransac, orient: dlt}]}", "exclude[0].orient", "step orient has no"),
+    ("{exclude: [{}]}", "exclude[0]", "mapping should have at"),
     (
         "{baseline: {plane: ransac}, exclude: [{plane: ransac}]}",
-        "compare.exclude",
-        "the baseline contains the excluded",
+        "exclude",
+        "the baseline contains the",
     ),
-    ("{metrics: [rms_mm]}", "compare.metrics[0]", "input should be step.metric, * all"),
-    ("{metrics: [plan.rms_mm]}", "compare.metrics[0]", "(did you mean plane?)"),
+    ("{metrics: [rms_mm]}", "metrics[0]", "step.metric, * all"),
+    ("{metrics: [plan.rms_mm]}", "metrics[0]", "(did you mean plane?)"),
 ]
 
 
@@ -236,7 +205,7 @@ def test_each_mistake_in_the_comparison_is_named_at_its_place(
 ) -> None:
     text = GOOD[: GOOD.index("compare:")] + f"compare: {section}\n"
     [found] = problems(text, write, catalog)
-    assert found[2] == path
+    assert found[2] == f"compare.{path}"
     assert message in found[3]
 
 

@@ -17,7 +17,7 @@ from orthoflow.errors import ArgumentError, OrthoflowError
 from orthoflow.products.product import JsonValue
 from orthoflow.sdk import MethodParams
 from orthoflow.workflow.document import load_workflow
-from orthoflow.workflow.expand import expand_cells, swept_indices
+from orthoflow.workflow.expand import swept_indices
 from orthoflow.workflow.model import (
     Workflow,
 )
@@ -32,7 +32,6 @@ from orthoflow.workflow.problems import (
 )
 from orthoflow.workflow.resolved import (
     resolved_json,
-    workflow_from_resolved,
 )
 from tests.laboratories import GOOD, load, with_steps
 
@@ -67,16 +66,6 @@ def test_set_overrides_a_parameter_and_is_kept(case: str, catalog: Catalog, writ
     assert workflow.steps[step].variant(variant).params[parameter] == value
     assert parameter in workflow.steps[step].variant(variant).params_set
     assert workflow.overrides == (f"--set {text}",)
-
-
-def test_set_without_variant_reaches_every_variant_that_has_the_parameter(
-    catalog: Catalog, write: Path
-) -> None:
-    plane = load(GOOD, write, catalog, "plane.tolerance_m=0.5").steps["plane"]
-    assert [variant.params["tolerance_m"] for variant in plane.variants] == [0.5, 0.5]
-    plane = load(GOOD, write, catalog, "plane.iterations=5").steps["plane"]
-    assert plane.variant("ransac").params["iterations"] == 5
-    assert "iterations" not in plane.variant("hough2d").params_set
 
 
 def test_parameters_that_disagree_are_told_where_the_method_stands(
@@ -262,47 +251,6 @@ def test_a_value_that_is_not_swept_any_more_stands_for_its_variant(catalog: Cata
         load_swept(catalog, TWO.replace("hough2d-tolerance_m-0_05}", "ransac-tolerance_m-0_07}"))
 
 
-def test_several_sweeps_make_all_combinations_and_a_variant_stands_in_front(
-    catalog: Catalog,
-) -> None:
-    text = (
-        ROOM[: ROOM.index("    use: plane.hough2d")]
-        + """\
-    in: {cloud: room.cloud}
-    variants:
-      ransac: {use: plane.ransac}
-      fine:
-        use: plane.hough2d
-        params: {cell_m: {sweep: [0.01, 0.02]}, tolerance_m: {sweep: [0.05, 1]}}
-"""
-    )
-    names = list(values_of(load_swept(catalog, text)))
-    assert names == [
-        "ransac",
-        "fine-sweep-1",
-        "fine-sweep-2",
-        "fine-sweep-3",
-        "fine-sweep-4",
-    ]
-
-
-def test_a_swept_variant_is_still_known_by_its_own_name(catalog: Catalog) -> None:
-    text = (
-        ROOM[: ROOM.index("    use: plane.hough2d")]
-        + """\
-    in: {cloud: room.cloud}
-    variants:
-      ransac: {use: plane.ransac}
-      fine: {use: plane.hough2d, params: {tolerance_m: {sweep: [0.05, 0.1]}}}
-"""
-    )
-    workflow = load_swept(catalog, f"{text}compare: {{baseline: {{plane: fine}}}}\n")
-    assert workflow.baseline == {"plane": "fine-tolerance_m-0_05"}
-    without = load_swept(catalog, f"{text}compare: {{exclude: [{{plane: fine}}]}}\n")
-    cells = [cell for cell in expand_cells(without, catalog) if cell.step == "plane"]
-    assert [cell.assignment["plane"] for cell in cells] == ["ransac"]
-
-
 def test_a_value_takes_the_place_of_a_sweep_and_a_sweep_that_of_a_value(catalog: Catalog) -> None:
     plain = load_swept(catalog, sets=["plane.tolerance_m=0.03"])
     assert values_of(plain) == {"": 0.03}
@@ -316,13 +264,6 @@ def test_a_value_takes_the_place_of_a_sweep_and_a_sweep_that_of_a_value(catalog:
     beside = load_swept(catalog, sets=["plane.cell_m=0.005"])
     assert set(values_of(beside, "cell_m").values()) == {0.005}
     assert len(beside.steps["plane"].variants) == 3
-
-
-def test_a_record_holds_the_variants_that_a_sweep_became(catalog: Catalog) -> None:
-    workflow = load_swept(catalog)
-    again = workflow_from_resolved(resolved_json(workflow), workflow.source)
-    assert values_of(again) == values_of(workflow)
-    assert again.baseline == workflow.baseline
 
 
 @pytest.mark.parametrize(
