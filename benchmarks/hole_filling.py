@@ -40,7 +40,7 @@ def filled(is_known: NDArray[np.bool_], radius: int, *, threads: int) -> NDArray
     depth_m = np.where(is_known, np.float32(1.0), np.float32(np.nan)).ravel()
     places = np.repeat(depth_m[:, None] - np.float32(1.0), 2, axis=1)
     values = cell_values(depth_m)
-    gaps = narrow_gaps(is_known, radius, threads=threads)
+    gaps = narrow_gaps(is_known, radius)
     around = Surroundings(places, SHAPE[1], 0.02)
     interpolate(gaps, around, values, values, reach_cells=radius, threads=threads)
     return depth_m
@@ -61,7 +61,7 @@ def main() -> None:
     }
     for radius in RADII_CELLS:
         tasks[f"gaps within {radius} cells found"] = lambda radius=radius: narrow_gaps(
-            is_known, radius, threads=options.threads
+            is_known, radius
         )
         tasks[f"gaps within {radius} cells filled"] = lambda radius=radius: filled(
             is_known, radius, threads=options.threads

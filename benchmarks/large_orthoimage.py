@@ -21,8 +21,8 @@ import cv2
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from ortho_backward import GSD_M, camera
-from orthoflow_plugins.ortho.painting import PaintRule, paint
-from orthoflow_plugins.ortho.photos_on_walls import VisibilityParams
+from orthoflow_plugins.ortho.dsm_backward import DsmBackward
+from orthoflow_plugins.ortho.painting import paint
 from orthoflow_plugins.ortho.surfaces import Surface, relief_of, view_of
 
 from orthoflow.files.geotiff import GridPlace, read_raster, write_orthoimage
@@ -114,19 +114,18 @@ def main() -> None:
         with measured("relief"):
             surface = Surface(
                 frame=raster.frame,
-                relief=relief_of(raster, threads=options.threads),
+                relief=relief_of(raster),
                 front_m=0.15,
                 tolerance_m=3.0 * depth_noise_m(raster.depth_m) + 0.5 * GSD_M,
             )
-        rule = PaintRule(resampling="bilinear", is_filtered=True, erosion_cells=1)
-        params = VisibilityParams(incidence_max_deg=80.0, border_share=0.05)
+        params = DsmBackward.Params()
         with measured("painting"):
             painting = paint(
                 photo,
                 view_of(viewer, surface, params),
                 surface,
                 nothing_in_the_way(viewer),
-                rule,
+                params,
                 allocate=lambda name, shape, dtype: mapped(folder / name, shape, dtype),
                 threads=options.threads,
             )

@@ -25,14 +25,18 @@ import cv2
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
-from orthoflow_plugins.ortho.occlusion import find_occluders
-from orthoflow_plugins.ortho.painting import PaintRule, paint
-from orthoflow_plugins.ortho.surfaces import Surface, relief_of, transparent_relief_of, view_of
+from orthoflow_plugins.ortho.painting import paint
+from orthoflow_plugins.ortho.surfaces import Surface, relief_of, view_of
 
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
 from orthoflow.geometry.depth_noise import depth_noise_m
-from orthoflow.geometry.occluders import depth_buffer, nothing_in_the_way
+from orthoflow.geometry.occluders import (
+    Occluders,
+    depth_buffer,
+    nothing_in_the_way,
+    occluders_before,
+)
 from orthoflow.products import PointCloud, Wall, Walls
 
 GSD_M = 0.003
@@ -177,7 +181,19 @@ def main() -> None:
     points = cloud(walls)
     rng = np.random.default_rng(0)
     photo = rng.integers(0, 256, (viewer.height, viewer.width, 3), np.uint8)
-    occluders = find_occluders(points, walls, [viewer], n_least=6, threads=options.threads)
+
+    def found() -> Occluders:
+        return occluders_before(
+            points,
+            [walls.slab(0)],
+            [viewer],
+            spacing_m=walls.points_apart_m(),
+            stations_world=None,
+            n_least=6,
+            threads=options.threads,
+        )
+
+    occluders = found()
     buffer = depth_buffer(occluders, viewer)
     ready = maps(walls, viewer)
     cv2.setNumThreads(options.threads)
@@ -187,30 +203,25 @@ def main() -> None:
     def layer(
         resampling: str, *, is_seen_through: bool = False, is_fresh: bool = options.fresh
     ) -> Callable[[], object]:
-        params = DsmBackward.Params.model_validate({"resampling": resampling})
-        rule = PaintRule(
-            resampling=params.resampling,
-            is_filtered=params.antialias,
-            erosion_cells=0 if is_seen_through else params.erosion_cells,
+        visibility = "none" if is_seen_through else "full"
+        params = DsmBackward.Params.model_validate(
+            {"resampling": resampling, "visibility": visibility}
         )
-
         allocate = allocate_anew if is_fresh else kept
 
         def task() -> object:
             surface = Surface(
                 frame=raster.frame,
-                relief=transparent_relief_of(raster, threads=options.threads)
-                if is_seen_through
-                else relief_of(raster, threads=options.threads, allocate=allocate),
+                relief=relief_of(raster, hides=not is_seen_through, allocate=allocate),
                 front_m=walls.buffer_front_m,
                 tolerance_m=3.0 * depth_noise_m(raster.depth_m) + 0.5 * GSD_M,
             )
             return paint(
                 photo,
-                view_of(viewer, surface, params, is_exact=resampling == "nearest"),
+                view_of(viewer, surface, params),
                 surface,
                 nothing_in_the_way(viewer) if is_seen_through else buffer,
-                rule,
+                params,
                 allocate=allocate,
                 threads=options.threads,
             )
@@ -229,9 +240,7 @@ def main() -> None:
         "layer cubic": layer("cubic"),
         "layer nearest": layer("nearest"),
         "cloud": lambda: depth_buffer(occluders, viewer),
-        "count in voxels": lambda: find_occluders(
-            points, walls, [viewer], n_least=6, threads=options.threads
-        ),
+        "count in voxels": found,
     }
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in tasks}
     for _ in range(options.repeat):

@@ -80,7 +80,7 @@ def one_pass(x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float
 
 def with_ours(cloud: PointCloud, slab: Slab, threads: int) -> tuple[NDArray, NDArray]:
     winners = topmost_points(cloud, slab, threads=threads)
-    intensity = values_of_winners(winners, cloud.intensity[:, None], np.nan, threads=threads)
+    intensity = values_of_winners(winners, cloud.intensity[:, None], np.nan)
     return winners["depth_m"], intensity[:, 0]
 
 

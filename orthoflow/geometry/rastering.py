@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 from orthoflow.geometry import raster_kernels as kernels
 from orthoflow.geometry.frames import WallFrame
 from orthoflow.geometry.point_kernels import Offsets, read_only
-from orthoflow.geometry.raster_kernels import BLOCK, WINNER, Entries, Target, project_points
+from orthoflow.geometry.raster_kernels import WINNER, Entries, Target, project_points
 from orthoflow.geometry.slabs import BOXED_POINTS, OffsetPoints, Slab
 from orthoflow.geometry.threads import in_parts, in_threads
 
-# 2^20 points: their entries (16 MB) stay in the processor's cache between the passes, and threads
-# rarely wait for each other.
+# Their entries (16 MB) stay in the processor's cache between the passes.
 _CHUNK: Final = 1 << 20
 
 # A gap is filled from the cells nearest to it, or from cells one farther.
@@ -50,8 +49,7 @@ def entries_inside(
 ) -> Iterator[Entries]:
     """Yield the points inside a slab, chunk by chunk, in order.
 
-    The yielded arrays are overwritten by the next chunk. Blocks of points whose box does not meet
-    the slab are not read.
+    Blocks of points whose box does not meet the slab are not read.
 
     Args:
         points: of the cloud.
@@ -69,16 +67,18 @@ def entries_inside(
         width=frame.width,
     )
     x, y, z = read_only(points.x, points.y, points.z)
-    buffers = _empty_entries(min(_CHUNK, max(1, x.size)))
+    cells = np.empty(min(_CHUNK, max(1, x.size)), dtype=np.int32)
+    depths_m, squares = np.empty((2, cells.size), dtype=np.float32)
     for first, end in _runs(points, target, rows):
-        part = slice(first, end)
-        n_blocks = -(-(part.stop - part.start) // BLOCK)
-        entries = buffers._replace(n_inside=buffers.n_inside[:n_blocks])
-        chunk = Offsets(x[part], y[part], z[part])
-        in_parts(partial(project_points, chunk, first, target, entries), n_blocks, threads=threads)
+        chunk = Offsets(x[first:end], y[first:end], z[first:end])
+        task = partial(project_points, chunk, target, cells, depths_m, squares)
+        in_parts(task, end - first, threads=threads)
+        is_inside = cells[: end - first] >= 0
         if is_left_out is not None:
-            in_parts(partial(kernels.leave_out, is_left_out, entries), n_blocks, threads=threads)
-        yield entries
+            is_inside &= ~is_left_out[first:end]
+        inside = np.flatnonzero(is_inside)
+        points_inside = (inside + first).astype(np.uint32)
+        yield Entries(cells[inside], depths_m[inside], squares[inside], points_inside)
 
 
 def _runs(points: OffsetPoints, target: Target, rows: slice | None) -> Iterator[tuple[int, int]]:
@@ -150,21 +150,21 @@ def topmost_points(
     Returns:
         (cells,) of `raster_kernels.WINNER`; `point` is `NO_POINT` where the cell is void.
     """
-    winners = empty_winners(slab.n_cells, threads=threads)
+    winners = empty_winners(slab.n_cells)
     for entries in entries_inside(points, slab, threads=threads, is_left_out=is_left_out):
         share_cells(threads, partial(kernels.keep_topmost, entries, winners))
     return winners
 
 
-def empty_winners(n_cells: int, *, threads: int) -> NDArray[np.void]:
+def empty_winners(n_cells: int) -> NDArray[np.void]:
     """Return cells without winners."""
     winners = np.empty(n_cells, dtype=WINNER)
-    in_parts(partial(kernels.empty_cells, winners), n_cells, threads=threads)
+    winners[:] = (-np.inf, np.inf, kernels.NO_POINT, 0)
     return winners
 
 
 def values_of_winners(
-    winners: NDArray[np.void], values: NDArray[_Value], nothing: float, *, threads: int
+    winners: NDArray[np.void], values: NDArray[_Value], nothing: float
 ) -> NDArray[_Value]:
     """Return the values (cells, channels) of the points that won the cells.
 
@@ -172,19 +172,15 @@ def values_of_winners(
         winners: (cells,) of `raster_kernels.WINNER`.
         values: (n, channels) of the points of the cloud.
         nothing: value for cells without a point of their own.
-        threads: number of threads.
     """
-    taken = np.empty((winners.size, values.shape[1]), dtype=values.dtype)
-    seen = np.asarray(values).view(np.ndarray)
-    seen.flags.writeable = False
-    void = values.dtype.type(nothing)
-    task = partial(kernels.take_values, winners, seen, void, taken)
-    in_parts(task, winners.size, threads=threads)
+    taken = np.full((winners.size, values.shape[1]), nothing, dtype=values.dtype)
+    has_point = winners["n_points"] > 0
+    taken[has_point] = np.asarray(values)[winners["point"][has_point]]
     return taken
 
 
 def places_of_winners(
-    points: OffsetPoints, slab: Slab, winners: NDArray[np.void], *, threads: int
+    points: OffsetPoints, slab: Slab, winners: NDArray[np.void]
 ) -> NDArray[np.float32]:
     """Return the positions of the points that won cells next to gaps, from which these are filled.
 
@@ -192,28 +188,18 @@ def places_of_winners(
         (cells, 2) right of and below the centre, in cells; 0 in cells without a void cell nearby,
         NaN in cells without a point of their own.
     """
-    is_beside = (winners["n_points"] == 0).reshape(slab.frame.shape)
-    for grown in (is_beside, is_beside.T):
-        for _ in range(_BESIDE_GAPS_CELLS):
-            before = grown.copy()
-            grown[1:] |= before[:-1]
-            grown[:-1] |= before[1:]
-    places = np.zeros((*slab.frame.shape, 2), dtype=np.float32)
-    offsets = read_only(points.x, points.y, points.z)
-    matrix = wall_from_offset(slab.frame, points.origin)
-    cells = np.flatnonzero(is_beside)
-    task = partial(kernels.find_places, cells, winners, offsets, matrix, places)
-    in_parts(task, len(cells), threads=threads)
-    return places.reshape(-1, 2)
+    import cv2
 
-
-def _empty_entries(n_points: int) -> Entries:
-    n_blocks = -(-n_points // BLOCK)
-    slots = n_blocks * BLOCK
-    return Entries(
-        cells=np.empty(slots, dtype=np.int32),
-        depths_m=np.empty(slots, dtype=np.float32),
-        squares=np.empty(slots, dtype=np.float32),
-        points=np.empty(slots, dtype=np.uint32),
-        n_inside=np.zeros(n_blocks, dtype=np.int64),
-    )
+    is_void = winners["n_points"] == 0
+    window = np.ones((2 * _BESIDE_GAPS_CELLS + 1,) * 2, dtype=np.uint8)
+    is_beside = cv2.dilate(is_void.reshape(slab.frame.shape).astype(np.uint8), window)
+    cells = np.flatnonzero((np.asarray(is_beside).ravel() > 0) & ~is_void)
+    won = winners["point"][cells]
+    offsets = np.stack([axis[won] for axis in (points.x, points.y, points.z)]).astype(np.float64)
+    matrix = wall_from_offset(slab.frame, points.origin)[:2]
+    rows, columns = np.divmod(cells, slab.frame.width)
+    on_wall = (matrix[:, :3] @ offsets).T + matrix[:, 3]
+    places = np.zeros((winners.size, 2), dtype=np.float32)
+    places[cells] = on_wall - np.column_stack([columns, rows]) - 0.5
+    places[is_void] = np.nan
+    return places

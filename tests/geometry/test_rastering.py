@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -102,16 +103,15 @@ def test_of_equal_points_the_first_wins() -> None:
     assert winners["point"][4 * 40 + 3] == 0
 
 
-@pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.parametrize(("dtype", "nothing"), [("u1", 0), ("f4", np.nan)])
-def test_cells_take_every_channel_of_their_winner(dtype: str, nothing: float, threads: int) -> None:
+def test_cells_take_every_channel_of_their_winner(dtype: str, nothing: float) -> None:
     wall = scenes.upright_wall(shape=(60, 80))
     cloud, slab = random_cloud(wall, n_points=6_000, seed=3), slab_of(wall)
     values = np.random.default_rng(3).integers(1, 256, (len(cloud), 3)).astype(dtype)
     winners = topmost_points(cloud, slab, threads=1)
     has_point = winners["point"] != NO_POINT
     assert 0 < has_point.sum() < has_point.size
-    taken = values_of_winners(winners, values, nothing, threads=threads)
+    taken = values_of_winners(winners, values, nothing)
     np.testing.assert_array_equal(taken[has_point], values[winners["point"][has_point]])
     np.testing.assert_array_equal(taken[~has_point], nothing)
 
@@ -154,9 +154,9 @@ def test_blocks_beside_a_wall_are_not_read_and_nothing_else_changes(
     part = Slab(frame=replace(frame, width=8), front_m=0.15, behind_m=0.15)
     read = {}
 
-    def project_points(offsets: Offsets, first: int, *rest: object) -> None:
-        read[first] = offsets.x.size
-        kernels.project_points(offsets, first, *rest)
+    def project_points(offsets: Offsets, *rest: Any) -> None:
+        read[offsets.x.ctypes.data] = offsets.x.size
+        kernels.project_points(offsets, *rest)
 
     monkeypatch.setattr(rastering, "project_points", project_points)
     assert cloud.boxes_m is not None
@@ -187,9 +187,7 @@ def test_only_what_may_lie_in_some_rows_is_read() -> None:
     for asked in (None, rows):
         count = np.zeros(slab.n_cells, dtype=np.uint32)
         for entries in rastering.entries_inside(cloud, slab, threads=2, rows=asked):
-            for block, n_inside in enumerate(entries.n_inside):
-                first = block * kernels.BLOCK
-                np.add.at(count, entries.cells[first : first + n_inside], 1)
+            np.add.at(count, entries.cells, 1)
         counts.append(count.reshape(60, 80))
     np.testing.assert_array_equal(counts[1][rows], counts[0][rows])
     assert counts[1].sum() < 0.4 * counts[0].sum()
@@ -210,7 +208,7 @@ def opened_void(is_void: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
 @pytest.mark.parametrize("share", [0.05, 0.3, 0.7])
 def test_narrow_gaps_are_the_void_without_its_opening(radius: int, share: float) -> None:
     is_measured = np.random.default_rng(radius).random((37, 53)) < share
-    found = narrow_gaps(is_measured, radius, threads=2)
+    found = narrow_gaps(is_measured, radius)
     expected = ~is_measured & ~opened_void(~is_measured, radius)
     np.testing.assert_array_equal(found, np.flatnonzero(expected))
 
@@ -219,21 +217,21 @@ def test_a_measured_cell_lies_within_the_radius_of_each_cell_of_a_gap() -> None:
     from scipy import ndimage
 
     is_measured = np.random.default_rng(5).random((40, 60)) < 0.4
-    found = narrow_gaps(is_measured, 3, threads=2)
+    found = narrow_gaps(is_measured, 3)
     distances = ndimage.distance_transform_edt(~is_measured).ravel()[found]
     assert distances.min() >= 1.0
     assert 2.0 < distances.max() <= 3.0
 
 
 def test_radius_zero_finds_no_gap() -> None:
-    assert narrow_gaps(np.eye(5, dtype=bool), 0, threads=2).shape == (0,)
+    assert narrow_gaps(np.eye(5, dtype=bool), 0).shape == (0,)
 
 
 def test_a_window_keeps_its_shape_to_the_cell() -> None:
     is_measured = np.ones((30, 30), dtype=bool)
     is_measured[8:20, 10:18] = False
     is_measured[5, :] = False
-    void = narrow_gaps(is_measured, 2, threads=2)
+    void = narrow_gaps(is_measured, 2)
     # The line at row 5 closes, where it does not end at the border; the window does not, but for
     # its corners, into which no disc of radius 2 reaches.
     rows, columns = np.divmod(void, 30)
@@ -269,13 +267,11 @@ def test_places_are_told_of_points_up_to_two_cells_beside_a_gap() -> None:
     kept = ~is_gap
     cloud = scenes.cloud_of(wall.world(u[kept], v[kept], np.zeros(kept.sum())))
     winners = topmost_points(cloud, slab_of(wall), threads=1)
-    for threads in (1, 3):
-        places = places_of_winners(cloud, slab_of(wall), winners, threads=threads)
-        places = places.reshape(*wall.shape, 2)
-        assert np.isnan(places[is_gap]).all()
-        is_near = np.zeros(wall.shape, dtype=np.bool_)
-        for row, column in np.argwhere(is_gap):
-            is_near[max(0, row - 2) : row + 3, max(0, column - 2) : column + 3] = True
-        told = is_near & ~is_gap
-        np.testing.assert_allclose(places[told], offsets[told], atol=2e-3)
-        assert (places[~is_near] == 0.0).all()
+    places = places_of_winners(cloud, slab_of(wall), winners).reshape(*wall.shape, 2)
+    assert np.isnan(places[is_gap]).all()
+    is_near = np.zeros(wall.shape, dtype=np.bool_)
+    for row, column in np.argwhere(is_gap):
+        is_near[max(0, row - 2) : row + 3, max(0, column - 2) : column + 3] = True
+    told = is_near & ~is_gap
+    np.testing.assert_allclose(places[told], offsets[told], atol=2e-3)
+    assert (places[~is_near] == 0.0).all()

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
@@ -13,8 +11,6 @@ from pydantic import Field
 
 from orthoflow.geometry.bands import (
     IN_MEMORY_CELLS,
-    Allocate,
-    Band,
     bands_with_reach,
     count_cells,
     in_memory,
@@ -22,26 +18,17 @@ from orthoflow.geometry.bands import (
 from orthoflow.geometry.levels import level_of
 from orthoflow.products import Layer, LayerMask
 from orthoflow.sdk import Determinism, Method, MetricSpec, StepContext
-from orthoflow_plugins.ortho.layers import (
-    CellCounts,
-    LayerStack,
-    PaintedPhotos,
-    count_shown,
-)
+from orthoflow_plugins.ortho.layers import NO_SOURCE, LayerStack, count_shown
 from orthoflow_plugins.ortho.photos_on_walls import (
     LayersOfPhotos,
     OpenedPhoto,
     PhotosOnWalls,
     VisibilityParams,
-    layers_of_photos,
-    level_of_all,
-    oriented_photos,
-    pixels_of,
+    project_photos,
 )
 
 if TYPE_CHECKING:
     from orthoflow.geometry.cameras import ViewingCamera
-    from orthoflow_plugins.ortho.forward_kernels import Catch
     from orthoflow_plugins.ortho.surfaces import Surface
 
 # Larger layers are coloured in bands of this many cells: about 600 MB.
@@ -86,64 +73,24 @@ class DsmForward(Method):
 
     def run(self, inputs: PhotosOnWalls, params: Params, ctx: StepContext) -> LayersOfPhotos:
         """Project the photos onto all walls, and sort their layers."""
-        painted = self._painted(inputs, params, ctx)
-        out = layers_of_photos(inputs, painted, ctx)
-        _report(ctx, count_shown(inputs.walls, out.layers), painted)
+
+        def project(photo: OpenedPhoto, surface: Surface, stack: LayerStack, wall: int) -> None:
+            layer = _layer(photo, surface, stack, wall, params, threads=ctx.cores)
+            if layer is not None:
+                stack.add(layer)
+
+        out, seconds = project_photos(inputs, params, ctx, project)
+        painted = [layer for layer in out.layers.layers if layer.source != NO_SOURCE]
+        filled = [layer.filled for layer in painted if layer.filled is not None]
+        n_filled = sum(int(np.count_nonzero(values)) for values in filled)
+        n_shown = sum(count_cells(layer.mask, LayerMask.PAINTED) for layer in painted)
+        n_surface, n_painted, _ = count_shown(inputs.walls, out.layers)
+        ctx.metric("n_layers", len(painted), "1")
+        ctx.metric("painted_share", n_painted / max(1, n_surface), "1")
+        ctx.metric("filled_share", n_filled / max(1, n_shown), "1")
+        for name in ("occluders_s", "painting_s"):
+            ctx.metric(name, seconds.get(name, 0.0), "s")
         return out
-
-    def _painted(self, inputs: PhotosOnWalls, params: Params, ctx: StepContext) -> PaintedPhotos:
-        """Project photo by photo onto every wall it sees."""
-        from orthoflow_plugins.ortho.occlusion import depth_buffer_of, occluders_of
-        from orthoflow_plugins.ortho.surfaces import surfaces_of
-
-        oriented = oriented_photos(inputs.walls, inputs.photos, inputs.cameras)
-        level = level_of_all([photo for photo, _ in oriented], ctx)
-        # For all photos, whichever are projected: which points are outliers depends on all cameras.
-        viewers = [camera.viewing() for _, camera in oriented]
-        seconds: defaultdict[str, float] = defaultdict(float)
-        started = ctx.clock_s()
-        occluders = occluders_of(inputs, viewers, params, ctx, method=self.id)
-        seconds["occluders_s"] = ctx.clock_s() - started
-        surfaces = surfaces_of(inputs.walls, params, ctx)
-        stack = LayerStack(inputs.walls, ctx)
-        for nth, ((photo, camera), viewer) in enumerate(zip(oriented, viewers, strict=True)):
-            ctx.progress(nth / len(oriented), photo.name)
-            pixels = pixels_of(photo, camera, level)
-            started = ctx.clock_s()
-            buffer = depth_buffer_of(occluders, viewer, photo)
-            looked = ctx.clock_s()
-            opened = OpenedPhoto(name=photo.name, pixels=pixels, viewer=viewer, buffer=buffer)
-            with stack.painting_from(photo.name):
-                for index, surface in enumerate(surfaces):
-                    layer = _layer(opened, surface, stack, index, params, threads=ctx.cores)
-                    if layer is not None:
-                        stack.add(layer)
-            seconds["occluders_s"] += looked - started
-            seconds["painting_s"] += ctx.clock_s() - looked
-        return PaintedPhotos(
-            layers=tuple(stack.painted), reached=stack.reached, seconds=dict(seconds)
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Thrown:
-    """A photo whose pixels were projected onto a wall.
-
-    Attributes:
-        photo: the photo.
-        surface: the wall.
-        catch: the pixel that each cell took.
-        border_px: quality decreases to 0 over this distance from the image border.
-        gap_cells: width of gaps that are filled.
-        threads: number of threads.
-    """
-
-    photo: OpenedPhoto
-    surface: Surface
-    catch: Catch
-    border_px: float
-    gap_cells: int
-    threads: int
 
 
 def _layer(
@@ -156,19 +103,30 @@ def _layer(
     threads: int,
 ) -> Layer | None:
     """Project a photo onto one wall; None if no pixel hits it."""
-    from orthoflow_plugins.ortho.forward_kernels import throw_pixels
+    from orthoflow.geometry.interpolation import Surroundings
+    from orthoflow.geometry.narrow_gaps import narrow_gaps
+    from orthoflow_plugins.ortho.filling import painted_between
+    from orthoflow_plugins.ortho.forward_kernels import NO_PIXEL, Catch, throw_pixels
     from orthoflow_plugins.ortho.surfaces import is_before, view_of
 
-    view = view_of(photo.viewer, surface, params, is_exact=True)
+    view = view_of(photo.viewer, surface, params)
     if not is_before(view, surface):
         return None
-    shape = surface.frame.shape
+    shape, level = surface.frame.shape, level_of(photo.pixels)
     is_large = math.prod(shape) > IN_MEMORY_CELLS
-    catch = _empty_catch(shape, stack.scratch(wall) if is_large else in_memory)
+    scratch = stack.scratch(wall) if is_large else in_memory
+    # Kernels accept plain arrays only, not mapped files.
+    catch = Catch(
+        pixel=np.asarray(scratch("pixel", shape, np.int32), np.int32).view(np.ndarray),
+        square=np.asarray(scratch("square", shape, np.float32), np.float32).view(np.ndarray),
+    )
+    catch.pixel.fill(NO_PIXEL)
+    catch.square.fill(np.inf)
     lattice = _ray_lattice(photo.viewer, surface)
     if not throw_pixels(view, surface.relief, photo.buffer, lattice, catch):
         return None
-    level, new = level_of(photo.pixels), stack.allocator(wall) if is_large else in_memory
+    new = stack.allocator(wall) if is_large else in_memory
+    filled = np.asarray(new("filled", shape, np.uint8), np.uint8)
     layer = Layer(
         frame=surface.frame,
         wall=wall,
@@ -176,79 +134,39 @@ def _layer(
         rgb=np.asarray(new("rgb", (*shape, 3), level), level),
         mask=np.asarray(new("mask", shape, np.uint8), np.uint8),
         quality=np.asarray(new("quality", shape, np.float32), np.float32),
-        filled=np.asarray(new("filled", shape, np.uint8), np.uint8),
-    )
-    thrown = _Thrown(
-        photo=photo,
-        surface=surface,
-        catch=catch,
-        border_px=view.border_px,
-        gap_cells=params.fill_gap_cells,
-        threads=threads,
+        filled=filled,
     )
     # Whether a gap is narrow depends on cells two discs away, and its colour on those one farther.
     reach_rows = 2 * params.fill_gap_cells + 2
     for band in bands_with_reach(shape, cells_most=_BAND_CELLS, reach_rows=reach_rows):
-        _lay_band(thrown, band, layer)
+        inner, width = band.inner, surface.frame.width
+        pixel, depth_m = catch.pixel[band.around], surface.relief.depth[band.around]
+        seen, quality = _seen(photo.viewer, surface, band.rows, border_px=view.border_px)
+        is_painted = pixel != NO_PIXEL
+        gaps = narrow_gaps(is_painted, params.fill_gap_cells)
+        gaps = gaps[(gaps >= inner.start * width) & (gaps < inner.stop * width)]
+        is_seen = seen.ravel()[gaps - inner.start * width]
+        gaps = gaps[is_seen & ~np.isnan(depth_m.ravel()[gaps])]
+        rgb = photo.pixels.reshape(-1, 3)[np.maximum(pixel, 0).ravel()].reshape(*pixel.shape, 3)
+        rgb[~is_painted] = 0
+        nowhere = np.where(is_painted, np.float32(0.0), np.float32(np.nan))
+        # A gap takes the colours painted around it, of whatever surface.
+        is_filled = painted_between(
+            gaps,
+            rgb,
+            Surroundings(nowhere.reshape(-1, 1).repeat(2, 1), width, np.inf),
+            depth_m.reshape(-1),
+            reach_cells=params.fill_gap_cells,
+            threads=threads,
+        )[inner]
+        is_shown = is_painted[inner] | is_filled
+        mask = np.where(seen, LayerMask.OCCLUDED, LayerMask.OUTSIDE)
+        mask[np.isnan(depth_m[inner])] = LayerMask.NO_SURFACE
+        mask[is_shown] = LayerMask.PAINTED
+        layer.rgb[band.rows], layer.mask[band.rows] = rgb[inner], mask
+        layer.quality[band.rows] = np.where(is_shown, quality, np.float32(0.0))
+        filled[band.rows] = is_filled
     return layer
-
-
-def _empty_catch(shape: tuple[int, int], allocate: Allocate) -> Catch:
-    from orthoflow_plugins.ortho.forward_kernels import NO_PIXEL, Catch
-
-    # Kernels accept plain arrays only, not mapped files.
-    catch = Catch(
-        pixel=np.asarray(allocate("pixel", shape, np.int32), np.int32).view(np.ndarray),
-        square=np.asarray(allocate("square", shape, np.float32), np.float32).view(np.ndarray),
-    )
-    catch.pixel.fill(NO_PIXEL)
-    catch.square.fill(np.inf)
-    return catch
-
-
-def _lay_band(thrown: _Thrown, band: Band, layer: Layer) -> None:
-    """Colour some rows of a layer with the pixels that they took, and the gaps between them."""
-    from orthoflow.geometry.narrow_gaps import narrow_gaps
-    from orthoflow_plugins.ortho.filling import Painted, painted_between
-    from orthoflow_plugins.ortho.forward_kernels import NO_PIXEL
-
-    around, inner = band.around, band.inner
-    pixel, depth_m = thrown.catch.pixel[around], thrown.surface.relief.depth[around]
-    width = thrown.surface.frame.width
-    is_painted = pixel != NO_PIXEL
-    seen, quality = _seen(
-        thrown.photo.viewer, thrown.surface, band.rows, border_px=thrown.border_px
-    )
-    gaps = narrow_gaps(is_painted, thrown.gap_cells, threads=thrown.threads)
-    gaps = gaps[(gaps >= inner.start * width) & (gaps < inner.stop * width)]
-    is_seen = seen.ravel()[gaps - inner.start * width]
-    gaps = gaps[is_seen & ~np.isnan(depth_m.ravel()[gaps])]
-    rgb = thrown.photo.pixels.reshape(-1, 3)[np.maximum(pixel, 0).ravel()]
-    rgb = rgb.reshape(*pixel.shape, 3)
-    rgb[~is_painted] = 0
-    is_filled = painted_between(
-        gaps,
-        rgb,
-        Painted(
-            places=np.where(is_painted.reshape(-1, 1), np.float32(0.0), np.float32(np.nan)).repeat(
-                2, axis=1
-            ),
-            depth_m=depth_m.reshape(-1),
-            # A gap takes the colours painted around it, of whatever surface.
-            layer_m=np.inf,
-        ),
-        reach_cells=thrown.gap_cells,
-        threads=thrown.threads,
-    )[inner]
-    is_shown = is_painted[inner] | is_filled
-    mask = np.where(seen, LayerMask.OCCLUDED, LayerMask.OUTSIDE)
-    mask[np.isnan(depth_m[inner])] = LayerMask.NO_SURFACE
-    mask[is_shown] = LayerMask.PAINTED
-    layer.rgb[band.rows] = rgb[inner]
-    layer.mask[band.rows] = mask
-    layer.quality[band.rows] = np.where(is_shown, quality, np.float32(0.0))
-    if layer.filled is not None:
-        layer.filled[band.rows] = is_filled
 
 
 def _ray_lattice(viewer: ViewingCamera, surface: Surface) -> NDArray[np.float64]:
@@ -266,20 +184,14 @@ def _ray_lattice(viewer: ViewingCamera, surface: Surface) -> NDArray[np.float64]
         [frame.u_world / frame.gsd_m, frame.v_world / frame.gsd_m, frame.normal_world]
     )
     rays = (viewer.rays_camera(places) @ viewer.rotation @ axes).reshape(*counts, 3)
-    return np.ascontiguousarray(_stretched(_stretched(rays, viewer.height, 0), viewer.width, 1))
-
-
-def _stretched(rays: NDArray[np.float64], size_px: int, axis: int) -> NDArray[np.float64]:
-    """Extrapolate the rays at the image's border to the last position of the lattice."""
-    from orthoflow_plugins.ortho.forward_kernels import RAY_STEP_PX
-
-    moved = np.moveaxis(rays.copy(), axis, 0)
-    border = size_px / RAY_STEP_PX
-    whole = int(np.ceil(border))
-    inner = whole - 1
-    moved[whole] = moved[inner] + (moved[whole] - moved[inner]) / (border - inner)
-    moved[whole + 1 :] = moved[whole]
-    return np.moveaxis(moved, 0, axis)
+    # The rays at the image's border are extrapolated to the last position of the lattice.
+    for lines, size_px in ((rays, viewer.height), (rays.transpose(1, 0, 2), viewer.width)):
+        border = size_px / RAY_STEP_PX
+        whole = math.ceil(border)
+        inner = lines[whole - 1].copy()
+        lines[whole] = inner + (lines[whole] - inner) / (border - (whole - 1))
+        lines[whole + 1 :] = lines[whole]
+    return rays
 
 
 def _seen(
@@ -303,16 +215,3 @@ def _seen(
             value = cosine * area_px / distance**2 * np.clip(border / border_px, 0.0, 1.0)
         quality[row] = np.where(seen[row], np.nan_to_num(value), 0.0)
     return seen, np.maximum(quality, 0.0)
-
-
-def _report(ctx: StepContext, counts: CellCounts, photos: PaintedPhotos) -> None:
-    painted = photos.layers
-    n_filled = sum(
-        int(np.count_nonzero(layer.filled)) for layer in painted if layer.filled is not None
-    )
-    n_shown = sum(count_cells(layer.mask, LayerMask.PAINTED) for layer in painted)
-    ctx.metric("n_layers", len(painted), "1")
-    ctx.metric("painted_share", counts.n_painted / max(1, counts.n_surface), "1")
-    ctx.metric("filled_share", n_filled / max(1, n_shown), "1")
-    for name in ("occluders_s", "painting_s"):
-        ctx.metric(name, photos.seconds.get(name, 0.0), "s")

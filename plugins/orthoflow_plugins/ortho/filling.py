@@ -6,14 +6,16 @@ After skarlatos2012, section 3; the picture is the pair of its Figure 5.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.levels import Colours, eight_bits
 from orthoflow.products import Layer, LayerMask
+
+if TYPE_CHECKING:
+    from orthoflow.geometry.interpolation import Surroundings
 
 Inpainting = Literal["between", "telea", "navier-stokes", "none"]
 VoidLimits = tuple[int, int, int]
@@ -28,22 +30,6 @@ _SIDE_CELLS: Final = 240
 _ZOOM: Final = 3
 _GUTTER_PX: Final = 12
 _VOID_RGB: Final = (255, 0, 255)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Painted:
-    """The painted cells of a raster, flat over its cells.
-
-    Attributes:
-        places: (cells, 2) float32, position of the painting point right of and below the cell's
-            centre, in cells; NaN without one.
-        depth_m: (cells,) float32, of the surface; NaN if unknown.
-        layer_m: depths that differ by more belong to different surfaces.
-    """
-
-    places: NDArray[np.float32]
-    depth_m: NDArray[np.float32]
-    layer_m: float
 
 
 def reach_rows(inpainting: Inpainting, radius_px: float) -> int:
@@ -131,7 +117,8 @@ def inpainted(
 def painted_between(
     gaps: NDArray[np.int64],
     rgb: Colours,
-    painted: Painted,
+    around: Surroundings,
+    depth_m: NDArray[np.float32],
     *,
     reach_cells: float,
     threads: int,
@@ -141,18 +128,18 @@ def painted_between(
     Args:
         gaps: (n,) flat indices of cells that are not painted.
         rgb: (rows, cols, 3) colours of 8 or 16 bits, written in the gaps.
-        painted: which cells are painted.
+        around: the painted cells.
+        depth_m: (cells,) of the surface; NaN if unknown.
         reach_cells: gaps without a painted cell within this distance are unchanged.
         threads: number of threads.
 
     Returns:
         (rows, cols) which gaps were painted.
     """
-    from orthoflow.geometry.interpolation import Surroundings, cell_values, interpolate
+    from orthoflow.geometry.interpolation import cell_values, interpolate
 
     is_filled = np.zeros(rgb.shape[:2], dtype=np.bool_)
-    around = Surroundings(painted.places, rgb.shape[1], painted.layer_m)
-    values = cell_values(painted.depth_m, rgb=rgb.reshape(-1, 3))
+    values = cell_values(depth_m, rgb=rgb.reshape(-1, 3))
     into = values._replace(depth_m=np.empty(0, dtype=np.float32))
     found = interpolate(gaps, around, values, into, reach_cells=reach_cells, threads=threads)
     is_filled.ravel()[gaps[found]] = True

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.compiling import compiled
 from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
-from orthoflow_plugins.ortho.views import Relief, WallView
+from orthoflow_plugins.ortho.visibility_kernels import Relief, WallView
 
 # Pixels between two exact rays, which are interpolated. With lenses of a thousand pixels focal
 # length or more the error is below a hundredth of a pixel.

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import partial
 from typing import Final
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry.bands import Allocate, count_known, row_bands
+from orthoflow.geometry.bands import Allocate, row_bands
 from orthoflow.geometry.levels import Level
-from orthoflow.products import Layer, LayerMask, Layers, Wall, Walls
+from orthoflow.products import Layer, LayerMask, Layers, Walls
 from orthoflow.sdk import DiagnosticSpec, StepContext
 
 NO_SOURCE: Final = "no photo"
@@ -30,49 +26,6 @@ NO_PHOTO: Final = DiagnosticSpec(
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class CellCounts:
-    """Cells of all walls by what photos show of them.
-
-    Attributes:
-        n_surface: cells with a depth.
-        n_painted: cells painted by some photo.
-        n_hidden: cells hidden from some photo, and painted by none.
-    """
-
-    n_surface: int
-    n_painted: int
-    n_hidden: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReachedWall:
-    """The visibility of a wall on which the photos paint nothing.
-
-    Attributes:
-        wall: its index.
-        mask: (rows, cols) uint8 `LayerMask`.
-    """
-
-    wall: int
-    mask: NDArray[np.uint8]
-
-
-@dataclass(frozen=True, kw_only=True)
-class PaintedPhotos:
-    """The result of painting all photos.
-
-    Attributes:
-        layers: photo by photo.
-        reached: walls on which none of them paints.
-        seconds: duration of each part.
-    """
-
-    layers: tuple[Layer, ...]
-    reached: tuple[ReachedWall, ...]
-    seconds: dict[str, float]
-
-
 class LayerStack:
     """Layers of walls, added photo by photo.
 
@@ -82,42 +35,18 @@ class LayerStack:
 
     def __init__(self, walls: Walls, ctx: StepContext) -> None:
         self.painted: list[Layer] = []
-        self._names = tuple(wall.name for wall in walls.walls)
-        self._ctx = ctx
+        self._walls, self._ctx = walls, ctx
         # Visibility of walls that no photo has painted so far.
         self._reached: dict[int, NDArray[np.uint8]] = {}
-
-    @property
-    def reached(self) -> tuple[ReachedWall, ...]:
-        """Return the visibility of walls on which none paints."""
-        return tuple(
-            ReachedWall(wall=wall, mask=mask) for wall, mask in sorted(self._reached.items())
-        )
 
     def allocator(self, wall: int) -> Allocate:
         """Return a function that allocates the arrays of the next layer; a large one in files."""
         prefix = f"{wall}.{len(self.painted)}"
-
-        def allocate(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
-            return self._ctx.allocate("layers", f"{prefix}.{name}", shape, dtype)
-
-        return allocate
+        return lambda name, shape, dtype: self._new(f"{prefix}.{name}", shape, dtype)
 
     def scratch(self, wall: int) -> Allocate:
         """Return a function that allocates arrays in files, reused for the next layer of a wall."""
-
-        def allocate(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
-            return self._ctx.allocate("layers", f"{wall}.scratch.{name}", shape, dtype)
-
-        return allocate
-
-    @contextmanager
-    def painting_from(self, source: str) -> Iterator[None]:
-        """Log which walls a photo painted once it was projected onto all of them."""
-        n_before = len(self.painted)
-        yield
-        names = [self._names[layer.wall] for layer in self.painted[n_before:]]
-        self._ctx.log(f"{source}: paints {', '.join(names) or 'no wall'}")
+        return lambda name, shape, dtype: self._new(f"{wall}.scratch.{name}", shape, dtype)
 
     def add(self, layer: Layer) -> None:
         """Add the layer of a photo that paints something."""
@@ -134,79 +63,69 @@ class LayerStack:
         if any(layer.wall == wall for layer in self.painted):
             return
         if wall in self._reached:
-            _add_hidden(mask, self._reached[wall])
+            for rows in row_bands(mask.shape):
+                is_hidden = mask[rows] == LayerMask.OCCLUDED
+                self._reached[wall][rows][is_hidden] = LayerMask.OCCLUDED
             return
-        kept = self._ctx.allocate("layers", f"{wall}.reached", mask.shape, np.uint8)
-        self._reached[wall] = np.asarray(kept, np.uint8)
-        self._reached[wall][...] = mask
+        kept = np.asarray(self._new(f"{wall}.reached", mask.shape, np.uint8), np.uint8)
+        kept[...] = mask
+        self._reached[wall] = kept
+
+    def joined(self, level: Level) -> Layers:
+        """Sort the layers by wall, and add an empty one for each unpainted wall.
+
+        Args:
+            level: bits of the colours.
+
+        Raises:
+            MethodError: no photo paints any wall.
+        """
+        if not self.painted:
+            raise MethodError(UNSEEN_WALLS)
+        walls, painted = self._walls.walls, {layer.wall for layer in self.painted}
+        bare = [place for place in range(len(walls)) if place not in painted]
+        if bare:
+            names = ", ".join(walls[place].name for place in bare)
+            self._ctx.report(NO_PHOTO, n_walls=len(bare), walls=names)
+        layers = [*self.painted, *(self._bare_layer(place, level) for place in bare)]
+        return Layers(
+            layers=tuple(sorted(layers, key=lambda layer: layer.wall)),
+            names=tuple(wall.name for wall in walls),
+            plane_indices=tuple(wall.plane_index for wall in walls),
+        )
+
+    def _bare_layer(self, place: int, level: Level) -> Layer:
+        """Return the layer of a wall that no photo paints, from what parts of photos reach it."""
+        wall = self._walls.walls[place]
+        shape, prefix = wall.frame.shape, f"{place}.bare"
+        mask = self._reached.get(place)
+        if mask is None:
+            mask = np.asarray(self._new(f"{prefix}.mask", shape, np.uint8), np.uint8)
+            for rows in row_bands(shape):
+                is_void = np.isnan(wall.depth_m[rows])
+                mask[rows] = np.where(is_void, LayerMask.NO_SURFACE, LayerMask.OUTSIDE)
+        return Layer(
+            frame=wall.frame,
+            wall=place,
+            source=NO_SOURCE,
+            rgb=np.asarray(self._new(f"{prefix}.rgb", (*shape, 3), level), level),
+            mask=mask,
+            quality=np.asarray(self._new(f"{prefix}.quality", shape, np.float32), np.float32),
+        )
+
+    def _new(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
+        return self._ctx.allocate("layers", name, shape, dtype)
 
 
-def joined_layers(walls: Walls, photos: PaintedPhotos, ctx: StepContext) -> Layers:
-    """Sort the layers of all photos by wall, and add an empty one for each unpainted wall.
-
-    Raises:
-        MethodError: no photo paints any wall.
-    """
-    layers = list(photos.layers)
-    if not layers:
-        raise MethodError(UNSEEN_WALLS)
-    level: Level = np.uint16 if layers[0].rgb.dtype == np.uint16 else np.uint8
-    painted = {layer.wall for layer in layers}
-    bare = [place for place in range(len(walls.walls)) if place not in painted]
-    if bare:
-        names = ", ".join(walls.walls[place].name for place in bare)
-        ctx.report(NO_PHOTO, n_walls=len(bare), walls=names)
-    for place in bare:
-        reached = [found.mask for found in photos.reached if found.wall == place]
-        layers.append(_bare_layer(walls.walls[place], place, reached, level, ctx))
-    layers.sort(key=lambda layer: layer.wall)
-    return Layers(
-        layers=tuple(layers),
-        names=tuple(wall.name for wall in walls.walls),
-        plane_indices=tuple(wall.plane_index for wall in walls.walls),
-    )
-
-
-def count_shown(walls: Walls, layers: Layers) -> CellCounts:
-    """Count the cells of all walls by what the layers show of them."""
+def count_shown(walls: Walls, layers: Layers) -> tuple[int, int, int]:
+    """Count cells of all walls: with a depth, painted by a photo, and hidden without being so."""
     n_surface = n_painted = n_hidden = 0
     for place, wall in enumerate(walls.walls):
         masks = [layer.mask for layer in layers.layers if layer.wall == place]
-        n_surface += count_known(wall.depth_m)
         for rows in row_bands(wall.frame.shape):
             is_painted = np.logical_or.reduce([m[rows] == LayerMask.PAINTED for m in masks])
             is_hidden = np.logical_or.reduce([m[rows] == LayerMask.OCCLUDED for m in masks])
+            n_surface += int(np.count_nonzero(~np.isnan(wall.depth_m[rows])))
             n_painted += int(np.count_nonzero(is_painted))
             n_hidden += int(np.count_nonzero(is_hidden & ~is_painted))
-    return CellCounts(n_surface=n_surface, n_painted=n_painted, n_hidden=n_hidden)
-
-
-def _bare_layer(
-    wall: Wall, place: int, reached: Sequence[NDArray[np.uint8]], level: Level, ctx: StepContext
-) -> Layer:
-    """Return the layer of a wall that no photo paints, from what parts of the photos reach it."""
-    shape = wall.frame.shape
-    new = partial(ctx.allocate, "layers")
-    mask = np.asarray(new(f"{place}.bare.mask", shape, np.uint8), np.uint8)
-    if reached:
-        mask[...] = reached[0]
-        for other in reached[1:]:
-            _add_hidden(other, mask)
-    else:
-        for rows in row_bands(shape):
-            is_void = np.isnan(wall.depth_m[rows])
-            mask[rows] = np.where(is_void, LayerMask.NO_SURFACE, LayerMask.OUTSIDE)
-    return Layer(
-        frame=wall.frame,
-        wall=place,
-        source=NO_SOURCE,
-        rgb=np.asarray(new(f"{place}.bare.rgb", (*shape, 3), level), level),
-        mask=mask,
-        quality=np.asarray(new(f"{place}.bare.quality", shape, np.float32), np.float32),
-    )
-
-
-def _add_hidden(other: NDArray[np.uint8], mask: NDArray[np.uint8]) -> None:
-    """Mark cells that are hidden from another photo, too."""
-    for rows in row_bands(mask.shape):
-        mask[rows][other[rows] == LayerMask.OCCLUDED] = LayerMask.OCCLUDED
+    return n_surface, n_painted, n_hidden

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
@@ -11,22 +12,30 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
-from orthoflow.files.images import decode_image, decode_levels
+from orthoflow.files.images import before_masks, decode_image, decode_levels
 from orthoflow.files.photo_files import icc_profile, stated_bits
 from orthoflow.foreign_text import first_few
 from orthoflow.geometry.levels import Colours, Level, in_levels
 from orthoflow.products import Camera, Cameras, Layers, Photo, Photos, PointCloud, Walls
 from orthoflow.sdk import DiagnosticSpec, MethodParams, Ports, StepContext
-from orthoflow_plugins.ortho.layers import PaintedPhotos, joined_layers
+from orthoflow_plugins.ortho.layers import LayerStack
 
 if TYPE_CHECKING:
     from orthoflow.geometry.cameras import ViewingCamera
     from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
-
+    from orthoflow.geometry.occluders import Occluders
+    from orthoflow_plugins.ortho.surfaces import Surface
 
 _PLAIN_BITS: Final = 8
 # Cosine between a photo's top and up, beyond which it was held upright, or upside down.
 _UPRIGHT: Final = 0.5
+NO_CLOUD: Final = DiagnosticSpec(
+    code="occluders-unknown",
+    severity="warning",
+    text="no cloud is wired to {step}: objects in front of a wall hide "
+    "nothing, and photos paint them onto it",
+    remedy="wire the cloud to {step}",
+)
 UPSIDE_DOWN: Final = DiagnosticSpec(
     code="photos-upside-down",
     severity="warning",
@@ -84,11 +93,7 @@ class VisibilityParams(MethodParams):
         default=3.0,
         ge=0,
         description="A surface hides a cell when it is above the ray by more than this many "
-        "standard "
-        "deviations of depth, and "
-        ""
-        ""
-        "tolerance_cells.",
+        "standard deviations of depth, and tolerance_cells.",
     )
     tolerance_cells: float = Field(
         default=0.5, ge=0, description="The same in cells, for detail finer than the raster."
@@ -122,6 +127,94 @@ class OpenedPhoto:
     pixels: Colours
     viewer: ViewingCamera
     buffer: DepthBuffer
+
+
+def project_photos(
+    inputs: PhotosOnWalls,
+    params: VisibilityParams,
+    ctx: StepContext,
+    project: Callable[[OpenedPhoto, Surface, LayerStack, int], None],
+    *,
+    hides: bool = True,
+) -> tuple[LayersOfPhotos, dict[str, float]]:
+    """Project photo by photo onto every wall, and sort their layers by wall.
+
+    Args:
+        inputs: walls and oriented photos.
+        params: when a photo counts as seeing a cell.
+        ctx: of the step.
+        project: projects a photo onto a wall, by its index, and adds the layer.
+        hides: whether relief and cloud hide anything.
+
+    Returns:
+        The layers, and the seconds that each part took.
+    """
+    from orthoflow.geometry.occluders import depth_buffer, nothing_in_the_way
+    from orthoflow_plugins.ortho.surfaces import surfaces_of
+
+    oriented = oriented_photos(inputs.walls, inputs.photos, inputs.cameras)
+    photos = [photo for photo, _ in oriented]
+    level = level_of_all(photos, ctx)
+    surfaces = surfaces_of(inputs.walls, params, ctx, hides=hides)
+    seconds: defaultdict[str, float] = defaultdict(float)
+    started = ctx.clock_s()
+    # For all photos, whichever are painted: which points are outliers depends on all cameras.
+    viewers = [camera.viewing() for _, camera in oriented]
+    occluders = _occluders(inputs, viewers, params, ctx) if hides else None
+    seconds["occluders_s"] = ctx.clock_s() - started
+    stack = LayerStack(inputs.walls, ctx)
+    for nth, ((photo, camera), viewer) in enumerate(zip(oriented, viewers, strict=True)):
+        ctx.progress(nth / len(oriented), photo.name)
+        started = ctx.clock_s()
+        pixels = pixels_of(photo, camera, level)
+        decoded = ctx.clock_s()
+        free = nothing_in_the_way(viewer) if occluders is None else depth_buffer(occluders, viewer)
+        buffer = before_masks(free, photo)
+        looked = ctx.clock_s()
+        opened = OpenedPhoto(name=photo.name, pixels=pixels, viewer=viewer, buffer=buffer)
+        n_before = len(stack.painted)
+        for index, surface in enumerate(surfaces):
+            project(opened, surface, stack, index)
+        names = [inputs.walls.walls[layer.wall].name for layer in stack.painted[n_before:]]
+        ctx.log(f"{photo.name}: paints {', '.join(names) or 'no wall'}")
+        seconds["decoding_s"] += decoded - started
+        seconds["occluders_s"] += looked - decoded
+        seconds["painting_s"] += ctx.clock_s() - looked
+        # The next photo is decoded after this one is released.
+        del pixels, free, buffer, opened
+    warn_of_heads(inputs.walls.up, oriented, ctx)
+    profile = shared_profile(photos, ctx)
+    used = {layer.source for layer in stack.painted}
+    layers = stack.joined(level)
+    idle = [photo.name for photo in photos if photo.name not in used]
+    if idle:
+        ctx.report(WITHOUT_WALL, n=len(idle), n_photos=len(oriented), names=first_few(idle))
+    return LayersOfPhotos(layers=replace(layers, icc_profile=profile)), dict(seconds)
+
+
+def _occluders(
+    inputs: PhotosOnWalls,
+    viewers: Sequence[ViewingCamera],
+    params: VisibilityParams,
+    ctx: StepContext,
+) -> Occluders | None:
+    """Find objects in front of the walls; None, with a warning, without a cloud."""
+    from orthoflow.geometry.occluders import occluders_before
+
+    cloud, walls = inputs.cloud, inputs.walls
+    if cloud is None:
+        ctx.report(NO_CLOUD)
+        return None
+    cloud.require_points(3)
+    return occluders_before(
+        cloud,
+        [walls.slab(index) for index in range(len(walls.walls))],
+        viewers,
+        spacing_m=walls.points_apart_m(),
+        stations_world=cloud.stations,
+        n_least=params.occluder_points_min,
+        threads=ctx.cores,
+    )
 
 
 def oriented_photos(walls: Walls, photos: Photos, cameras: Cameras) -> list[tuple[Photo, Camera]]:
@@ -164,21 +257,6 @@ def warn_of_heads(
     axis = int(np.abs(up).argmax())
     opposite = f"{'-' if up[axis] > 0.0 else ''}{'xyz'[axis]}"
     ctx.report(UPSIDE_DOWN, n_down=n_down, n_photos=len(tops), opposite=opposite)
-
-
-def layers_of_photos(
-    inputs: PhotosOnWalls, painted: PaintedPhotos, ctx: StepContext
-) -> LayersOfPhotos:
-    """Sort the layers of all photos, with the profile of their colours."""
-    oriented = oriented_photos(inputs.walls, inputs.photos, inputs.cameras)
-    warn_of_heads(inputs.walls.up, oriented, ctx)
-    profile = shared_profile([photo for photo, _ in oriented], ctx)
-    layers = joined_layers(inputs.walls, painted, ctx)
-    used = {layer.source for layer in painted.layers}
-    idle = [photo.name for photo, _ in oriented if photo.name not in used]
-    if idle:
-        ctx.report(WITHOUT_WALL, n=len(idle), n_photos=len(oriented), names=first_few(idle))
-    return LayersOfPhotos(layers=replace(layers, icc_profile=profile))
 
 
 def level_of_all(photos: Sequence[Photo], ctx: StepContext) -> Level:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Annotated, ClassVar, Final
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -13,26 +13,27 @@ from pydantic import Field
 from orthoflow.errors import MethodError
 from orthoflow.geometry.bands import (
     IN_MEMORY_CELLS,
+    Allocate,
     Band,
     bands_with_reach,
     count_cells,
     holds_cells,
     in_memory,
 )
-from orthoflow.geometry.slabs import Slab
-from orthoflow.products import Layer, LayerMask, Layers, PointCloud, Wall, Walls
+from orthoflow.products import Layer, LayerMask, Layers, PointCloud, Walls
 from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.ortho.filling import (
     Inpainting,
-    Painted,
     fillable_gaps,
     filling_preview,
     inpainted,
     painted_between,
     reach_rows,
 )
-from orthoflow_plugins.ortho.point_colours import Colouring, ColourRule, Painters, colours_of
+
+if TYPE_CHECKING:
+    from orthoflow_plugins.ortho.point_colours import CellColours, Painters
 
 # Larger walls are painted in bands of this many cells: about 600 MB.
 _BAND_CELLS: Final = 1 << 22
@@ -66,16 +67,6 @@ BLACK_POINTS: Final = DiagnosticSpec(
     "depth and paint no cell",
     rank_by="share",
 )
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Projection:
-    """A wall before its gaps are filled: colours, and the position of each winner in its cell."""
-
-    rgb: NDArray[np.uint8]
-    is_void: NDArray[np.bool_]
-    distance_cells: NDArray[np.float32]
-    painted: Painted
 
 
 class PointcloudDirect(Method):
@@ -114,7 +105,7 @@ class PointcloudDirect(Method):
             description="Most void cells in the 3x3, 5x5 and 7x7 windows around a void cell, "
             "itself and cells outside the image included, for it to be filled.",
         )
-        colouring: Colouring = Field(
+        colouring: Literal["topmost", "centre", "gaussian", "median"] = Field(
             default="topmost",
             description="Colour of a cell: of its topmost point; of the point nearest its centre "
             "on the topmost surface; gaussian mean of that surface by distance to the centre; "
@@ -164,43 +155,58 @@ class PointcloudDirect(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Project the cloud onto each wall, then fill its gaps."""
+        from orthoflow_plugins.ortho.point_colours import colours_of
+
         inputs.cloud.require_points(3)
         painters = _painters(inputs.cloud, params, ctx)
-        rule = ColourRule(
-            colouring=params.colouring,
-            layer_m=params.layer_m,
-            n_top=params.n_top,
-            threads=ctx.cores,
-        )
         layers: list[Layer] = []
         seconds = np.zeros(2)
-        most_filled, preview = -1, b""
+        n_filled, preview = [0], b""
+        reach = reach_rows(params.inpaint, params.inpaint_radius_px)
         for k, wall in enumerate(inputs.walls.walls):
             ctx.progress(k / len(inputs.walls.walls), wall.name)
-            layers.append(_empty_layer(wall, k, ctx))
-            slab, reach = inputs.walls.slab(k), reach_rows(params.inpaint, params.inpaint_radius_px)
-            for band in bands_with_reach(
-                wall.frame.shape, cells_most=_BAND_CELLS, reach_rows=reach
-            ):
+            shape = wall.frame.shape
+            new: Allocate = in_memory
+            if wall.mask.size > IN_MEMORY_CELLS:
+                new = partial(_allocated, ctx, k)
+            filled = np.asarray(new("filled", shape, np.uint8), np.uint8)
+            layer = Layer(
+                frame=wall.frame,
+                wall=k,
+                source="cloud",
+                rgb=np.asarray(new("rgb", (*shape, 3), np.uint8), np.uint8),
+                mask=np.asarray(new("mask", shape, np.uint8), np.uint8),
+                quality=np.asarray(new("quality", shape, np.float32), np.float32),
+                filled=filled,
+            )
+            slab = inputs.walls.slab(k)
+            for band in bands_with_reach(shape, cells_most=_BAND_CELLS, reach_rows=reach):
                 started = ctx.clock_s()
-                projection = _project(painters, slab.over(band.around), rule)
+                found = colours_of(painters, slab.over(band.around), params, threads=ctx.cores)
                 projected = ctx.clock_s()
-                _fill(projection, layers[-1], band, params, threads=ctx.cores)
+                _fill(found, layer, band, params, threads=ctx.cores)
                 seconds += (projected - started, ctx.clock_s() - projected)
                 # The next band is projected after this one is released.
-                del projection
-            n_filled = _n_filled(layers[-1])
-            if n_filled > most_filled:
-                most_filled, preview = n_filled, filling_preview(layers[-1])
-        _require_paint(layers)
+                del found
+            layers.append(layer)
+            n_here = int(np.count_nonzero(filled))
+            if not preview or n_here > max(n_filled):
+                preview = filling_preview(layer)
+            n_filled.append(n_here)
+        if not any(holds_cells(layer.mask, LayerMask.PAINTED) for layer in layers):
+            raise MethodError(
+                "no point of the cloud lies within the buffer of a wall: the walls were not made "
+                "from this cloud, or wall.buffer_m is too small"
+            )
         names = tuple(wall.name for wall in inputs.walls.walls)
-        _report(ctx, layers, names, seconds)
+        ctx.metric("projection_s", seconds[0], "s")
+        ctx.metric("filling_s", seconds[1], "s")
+        _report(ctx, layers, names, sum(n_filled))
         ctx.figure(
             "filling",
             preview,
             "Before and after filling; magenta is void. Fine magenta dots fill well; large "
-            "areas of it "
-            "are extrapolated from their border.",
+            "areas of it are extrapolated from their border.",
         )
         places = tuple(wall.plane_index for wall in inputs.walls.walls)
         return self.Out(layers=Layers(layers=tuple(layers), names=names, plane_indices=places))
@@ -208,6 +214,8 @@ class PointcloudDirect(Method):
 
 def _painters(cloud: PointCloud, params: PointcloudDirect.Params, ctx: StepContext) -> Painters:
     """Return the points with their colours, or their intensity as grey."""
+    from orthoflow_plugins.ortho.point_colours import Painters
+
     if cloud.rgb is not None:
         rgb = np.asarray(cloud.rgb)
         return Painters(cloud=cloud, values=rgb, is_left_out=_left_out(cloud, rgb, params, ctx))
@@ -278,38 +286,14 @@ def _left_out(
     return is_dark
 
 
-def _empty_layer(wall: Wall, index: int, ctx: StepContext) -> Layer:
-    shape = wall.frame.shape
-
-    def new(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
-        if wall.mask.size <= IN_MEMORY_CELLS:
-            return in_memory(name, shape, dtype)
-        return ctx.allocate("layers", f"{index}.{name}", shape, dtype)
-
-    return Layer(
-        frame=wall.frame,
-        wall=index,
-        source="cloud",
-        rgb=np.asarray(new("rgb", (*shape, 3), np.uint8), np.uint8),
-        mask=np.asarray(new("mask", shape, np.uint8), np.uint8),
-        quality=np.asarray(new("quality", shape, np.float32), np.float32),
-        filled=np.asarray(new("filled", shape, np.uint8), np.uint8),
-    )
-
-
-def _project(painters: Painters, slab: Slab, rule: ColourRule) -> _Projection:
-    found = colours_of(painters, slab, rule)
-    shape = slab.frame.shape
-    return _Projection(
-        rgb=found.rgb.reshape(*shape, 3),
-        is_void=~found.has_point.reshape(shape),
-        distance_cells=found.distance_cells.reshape(shape),
-        painted=Painted(places=found.places, depth_m=found.depth_m, layer_m=rule.layer_m),
-    )
+def _allocated(
+    ctx: StepContext, wall: int, name: str, shape: tuple[int, ...], dtype: DTypeLike
+) -> NDArray[np.generic]:
+    return ctx.allocate("layers", f"{wall}.{name}", shape, dtype)
 
 
 def _fill(
-    projection: _Projection,
+    found: CellColours,
     layer: Layer,
     band: Band,
     params: PointcloudDirect.Params,
@@ -317,32 +301,32 @@ def _fill(
     threads: int,
 ) -> None:
     """Fill the gaps of some rows, and write these into the layer of the wall."""
-    is_void = projection.is_void
-    rgb, is_filled = projection.rgb.copy(), np.zeros_like(is_void)
+    from orthoflow.geometry.interpolation import Surroundings
+
+    width = layer.frame.width
+    is_void = ~found.has_point.reshape(-1, width)
+    rgb, is_filled = found.rgb.reshape(-1, width, 3).copy(), np.zeros_like(is_void)
     if params.inpaint != "none" and not is_void.all():
         is_filled = fillable_gaps(is_void, params.void_limits)
     if params.inpaint == "between":
         is_filled = painted_between(
             np.flatnonzero(is_filled),
             rgb,
-            projection.painted,
+            Surroundings(found.places, width, params.layer_m),
+            found.depth_m,
             reach_cells=params.inpaint_radius_px,
             threads=threads,
         )
     elif params.inpaint != "none":
         rgb = inpainted(
-            projection.rgb,
-            is_void,
-            is_filled,
-            method=params.inpaint,
-            radius_px=params.inpaint_radius_px,
+            rgb, is_void, is_filled, method=params.inpaint, radius_px=params.inpaint_radius_px
         )
-    shown = ~is_void | is_filled
+    shown, inner = ~is_void | is_filled, band.inner
     # 1 at the centre of the cell, 0.5 in its corner: how well the point represents the cell. A
     # filled cell has a lower quality than any painted one.
-    quality = np.where(is_void, np.float32(0.0), 1.0 - projection.distance_cells / np.sqrt(2.0))
+    distance_cells = found.distance_cells.reshape(-1, width)
+    quality = np.where(is_void, np.float32(0.0), 1.0 - distance_cells / np.sqrt(2.0))
     quality[is_filled] = 0.25
-    inner = band.inner
     layer.rgb[band.rows] = rgb[inner]
     layer.mask[band.rows] = np.where(shown[inner], LayerMask.PAINTED, LayerMask.NO_SURFACE)
     layer.quality[band.rows] = quality[inner]
@@ -350,27 +334,10 @@ def _fill(
         layer.filled[band.rows] = is_filled[inner]
 
 
-def _n_filled(layer: Layer) -> int:
-    return 0 if layer.filled is None else int(np.count_nonzero(layer.filled))
-
-
-def _require_paint(layers: list[Layer]) -> None:
-    if not any(holds_cells(layer.mask, LayerMask.PAINTED) for layer in layers):
-        raise MethodError(
-            "no point of the cloud lies within the buffer of a wall: the walls were not made from "
-            "this cloud, or wall.buffer_m is too small"
-        )
-
-
-def _report(
-    ctx: StepContext, layers: list[Layer], names: Sequence[str], seconds: NDArray[np.float64]
-) -> None:
+def _report(ctx: StepContext, layers: list[Layer], names: Sequence[str], n_filled: int) -> None:
     """Report how much is painted, filled and void, and what would fill more of each wall."""
     n_cells = sum(layer.mask.size for layer in layers)
     n_shown = [count_cells(layer.mask, LayerMask.PAINTED) for layer in layers]
-    n_filled = sum(_n_filled(layer) for layer in layers)
-    ctx.metric("projection_s", seconds[0], "s")
-    ctx.metric("filling_s", seconds[1], "s")
     ctx.metric("painted_share", (sum(n_shown) - n_filled) / n_cells, "1")
     ctx.metric("filled_share", n_filled / n_cells, "1")
     ctx.metric("void_share", 1.0 - sum(n_shown) / n_cells, "1")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import SurfaceMask, Wall
-from orthoflow_plugins.raster.sampled_points import SampledPoints, points_in
+from orthoflow_plugins.raster.extents import SampledPoints, points_in
 
 # Causes are determined on tiles of about this side, each with some points of the sample.
 _TILE_M: Final = 0.05

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
 from typing import Annotated, ClassVar, Final, Literal, Self
@@ -18,17 +18,23 @@ from orthoflow.products import IntensitySource, Planes, PointCloud, Wall, Walls
 from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.raster.balancing import balanced
-from orthoflow_plugins.raster.crops import (
-    CroppedFrame,
+from orthoflow_plugins.raster.emptiness import Emptiness, Sight, emptiness_of
+from orthoflow_plugins.raster.extents import (
+    Extent,
+    Reach,
+    SampledPoints,
+    extent_of,
+    free_before_m,
+    sampled,
+)
+from orthoflow_plugins.raster.frames import (
     Polygon,
     Rectangle,
     area_m2,
     blank_outside,
     cropped,
+    mapped,
 )
-from orthoflow_plugins.raster.emptiness import Emptiness, Sight, emptiness_of
-from orthoflow_plugins.raster.extents import Extent, Reach, extent_of, free_before_m
-from orthoflow_plugins.raster.maps import mapped
 from orthoflow_plugins.raster.reporting import (
     report,
     report_empty,
@@ -37,12 +43,9 @@ from orthoflow_plugins.raster.reporting import (
     warn_of_covered,
     warn_of_wide_gaps,
 )
-from orthoflow_plugins.raster.rules import GapRule, RasterRule, Surface, SurfaceRule
-from orthoflow_plugins.raster.sampled_points import SampledPoints, sampled
 from orthoflow_plugins.raster.selection import (
     Constraint,
     Place,
-    WallChoice,
     chosen_planes,
     chosen_relief,
     covered_planes,
@@ -50,9 +53,8 @@ from orthoflow_plugins.raster.selection import (
     frame_of,
     nearest_plane,
 )
-from orthoflow_plugins.raster.walls import WallRaster, rastered_wall, require_memory
+from orthoflow_plugins.raster.walls import rastered_wall, require_memory
 
-RectangleRule = Literal["points", "room"]
 ExtentOf = Callable[[int], Extent]
 
 # A point wrongly assumed to be on a wall is farther from it than any relief.
@@ -143,20 +145,22 @@ class RasterGrid(Method):
         buffer_behind_m: float | None = Field(
             default=None, ge=0, description="Depth behind the plane instead of buffer_m."
         )
-        rectangle: RectangleRule = Field(
+        rectangle: Literal["points", "room"] = Field(
             default="room",
             description="room: the wall as far as its surface goes, cornices and pilasters in, up "
             "to adjoining walls, floor and ceiling, where they run askew to where they come "
             "nearest; points: the rectangle of its plane's points.",
         )
-        surface: Surface = Field(
-            default="median",
-            description="Depth of a cell: median of its best supported layer, without "
-            "outliers; the same denoised, with steps preserved; of the nearest point, also "
-            "of the next "
-            "cells (markiewicz2015); of its point nearest the centre; of the topmost point "
-            "(skarlatos2012); mean of all; or tin, a triangulation, "
-            "which closes windows (for comparison).",
+        surface: Literal["median", "denoised", "nearest", "centre", "topmost", "mean", "tin"] = (
+            Field(
+                default="median",
+                description="Depth of a cell: median of its best supported layer, without "
+                "outliers; the same denoised, with steps preserved; of the nearest point, also "
+                "of the next "
+                "cells (markiewicz2015); of its point nearest the centre; of the topmost point "
+                "(skarlatos2012); mean of all; or tin, a triangulation, "
+                "which closes windows (for comparison).",
+            )
         )
         denoise_cells: int = Field(
             default=4, ge=0, le=20, description="Radius of the filter of surface denoised."
@@ -268,49 +272,63 @@ class RasterGrid(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Raster the chosen planes, with one or a few passes over the cloud for each."""
+        from orthoflow.geometry.scan_steps import scan_step_m
+
         cloud, planes = inputs.cloud, inputs.planes
         cloud.require_points(3)
         points = sampled(cloud)
         extent_of = _extents(points, planes, cloud.stations, params, ctx)
-        crops, covered = _crops(planes, params, extent_of, ctx)
-        slabs = _slabs(params, crops, extent_of)
-        rule = _raster_rule(params, threads=ctx.cores)
-        rasters: list[WallRaster] = []
+        frames, covered = _frames(planes, params, extent_of, ctx)
+        slabs = {
+            index: Slab(
+                frame=frame,
+                front_m=extent_of(index).front_m,
+                behind_m=extent_of(index).behind_m,
+            )
+            for index, frame in frames.items()
+        }
+        require_memory(list(frames.values()))
+        walls: list[Wall] = []
         empty: list[Emptiness] = []
         sight = Sight(points=points, stations=cloud.stations)
-        source = _intensity_source(cloud)
+        source: IntensitySource = "none" if cloud.rgb is None else "luminance"
+        if cloud.intensity is not None:
+            source = "laser"
         if params.balance_intensity:
             cloud = balanced(cloud, list(slabs.values()), ctx)
         for k, (index, slab) in enumerate(slabs.items()):
             ctx.progress(k / len(slabs), planes.names[index])
-            rasters.append(
-                rastered_wall(
-                    cloud,
-                    slab,
-                    rule,
-                    planes=planes,
-                    index=index,
-                    allocate=partial(_allocated, ctx, k),
-                )
+            wall = rastered_wall(
+                cloud,
+                slab,
+                params,
+                planes=planes,
+                index=index,
+                allocate=partial(_allocated, ctx, k),
+                threads=ctx.cores,
             )
             free_m = free_before_m(planes, index, cloud.stations)
-            empty.append(
-                emptiness_of(rasters[-1].wall, slab, sight, free_m=free_m, threads=ctx.cores)
+            empty.append(emptiness_of(wall, slab, sight, free_m=free_m, threads=ctx.cores))
+            if params.crop is not None and np.ndim(params.crop) == 2:
+                blank_outside(wall, params.crop)
+            walls.append(wall)
+        if not any(wall.count.any() for wall in walls):
+            first = next(iter(slabs.values()))
+            raise MethodError(
+                f"no point of the cloud lies inside the rectangle and the buffer of a wall "
+                f"({first.front_m:g} m in front, {first.behind_m:g} m behind): the planes do not "
+                "belong to this cloud, or buffer_m is too small"
             )
-            outline_px = crops[index].outline_px
-            if outline_px is not None:
-                blank_outside(rasters[-1].wall, outline_px)
-        walls = tuple(raster.wall for raster in rasters)
-        _require_points_near(walls, next(iter(slabs.values())))
-        warn(ctx, rasters, source)
+        steps_m = [scan_step_m(wall.count, gsd_m=wall.frame.gsd_m) for wall in walls]
+        warn(ctx, walls, steps_m, source)
         if params.surface == "tin":
             warn_of_wide_gaps(ctx, walls)
-        report(ctx, rasters, planes.up)
+        report(ctx, walls, steps_m[0], planes.up)
         report_empty(ctx, walls, empty)
         report_tones(ctx, walls, cloud)
         return self.Out(
             walls=Walls(
-                walls=walls,
+                walls=tuple(walls),
                 up=planes.up.copy(),
                 intensity_source=source,
                 buffer_front_m=max(slab.front_m for slab in slabs.values()),
@@ -321,10 +339,7 @@ class RasterGrid(Method):
                     tuple(index for index, by in covered.items() if by == wall.plane_index)
                     for wall in walls
                 ),
-                details={
-                    "surface": params.surface,
-                    "scan_step_m": [raster.scan_step_m for raster in rasters],
-                },
+                details={"surface": params.surface, "scan_step_m": [*steps_m]},
             )
         )
 
@@ -355,49 +370,22 @@ def _extents(
     return extent
 
 
-def _log_cuts(
-    frames: Mapping[int, WallFrame],
-    planes: Planes,
-    extent_of: ExtentOf,
-    ctx: StepContext,
-    *,
-    margin_m: float,
-) -> None:
-    """Report what part of a wall is beyond its rectangle because an adjoining plane is askew."""
-    for index, frame in frames.items():
-        for side, askew_m in extent_of(index).cut_m.items():
-            cut_m = askew_m - margin_m
-            if cut_m > frame.gsd_m:
-                notify = ctx.warn if cut_m >= _LARGE_CUT_M else ctx.log
-                notify(
-                    f"{planes.names[index]}: the surface that adjoins it at its {side} is "
-                    "askew, and its "
-                    f"raster ends where that comes nearest: up to {1e3 * cut_m:.0f} mm of its "
-                    "plane are left out there, more of its relief; margin_m adds them"
-                )
-
-
-def _crops(
+def _frames(
     planes: Planes, params: RasterGrid.Params, extent_of: ExtentOf, ctx: StepContext
-) -> tuple[dict[int, CroppedFrame], dict[int, int]]:
+) -> tuple[dict[int, WallFrame], dict[int, int]]:
     """Return the grid of each chosen plane by index, whole or cropped, and the planes left out.
 
     Raises:
         MethodError: there is no such plane, or no wall contains the requested part.
     """
-    choice = WallChoice(
-        constraint=params.constraint,
-        min_area_m2=params.min_area_m2,
-        n_walls_max=params.n_walls_max,
-        skip_covered=params.skip_covered,
-        buffer_m=lambda index: extent_of(index).buffer_m,
-        ranks=params.ranks,
-        near=params.near,
-    )
-    chosen = chosen_planes(planes, choice)
-    covered = covered_planes(planes, choice, chosen)
+
+    def buffer_m(index: int) -> tuple[float, float]:
+        return extent_of(index).front_m, extent_of(index).behind_m
+
+    chosen = chosen_planes(planes, params, buffer_m)
+    covered = covered_planes(planes, params, buffer_m, chosen)
     warn_of_covered(ctx, planes.names, covered)
-    for index, wall in chosen_relief(planes, choice, chosen).items():
+    for index, wall in chosen_relief(planes, params, buffer_m, chosen).items():
         names = planes.names
         ctx.report(NEAR_RELIEF, subject=names[index], wall=names[wall], index=wall)
     frames = {
@@ -405,9 +393,9 @@ def _crops(
         for index in chosen
     }
     if params.crs is not None:
-        reach_m = max(max(extent_of(index).buffer_m) for index in frames)
+        reach_m = max(max(buffer_m(index)) for index in frames)
         frames = mapped(frames, planes, params.crs, reach_m=reach_m, ctx=ctx)
-    _log_cuts(frames, planes, extent_of, ctx, margin_m=params.margin_m)
+    _log_cuts(frames, planes, params, extent_of, ctx)
     frames = {index: extent_of(index).widened(frame) for index, frame in frames.items()}
     for place in params.near:
         index = nearest_plane(planes, list(frames), np.array(place))
@@ -417,7 +405,7 @@ def _crops(
             name = planes.names[index]
             ctx.report(NEAR_FAR, subject=name, place=str(list(place)), apart_m=apart_m)
     if params.crop is None:
-        return {index: CroppedFrame(frame=frame) for index, frame in frames.items()}, covered
+        return frames, covered
     parts = {index: cropped(frame, params.crop) for index, frame in frames.items()}
     crops = {index: part for index, part in parts.items() if part is not None}
     if not crops:
@@ -432,59 +420,28 @@ def _crops(
     return crops, covered
 
 
-def _slabs(
-    params: RasterGrid.Params, crops: Mapping[int, CroppedFrame], extent_of: ExtentOf
-) -> dict[int, Slab]:
-    """Return the slab of each chosen plane by index.
-
-    Raises:
-        MethodError: the rasters would not fit into memory.
-    """
-    slabs = {
-        index: Slab(
-            frame=crop.frame,
-            front_m=extent_of(index).front_m,
-            behind_m=extent_of(index).behind_m,
-        )
-        for index, crop in crops.items()
-    }
-    require_memory([slab.frame for slab in slabs.values()])
-    return slabs
-
-
-def _raster_rule(params: RasterGrid.Params, *, threads: int) -> RasterRule:
-    surface = SurfaceRule(
-        surface=params.surface,
-        layer_m=params.layer_m,
-        denoise_cells=params.denoise_cells,
-        percentiles=params.percentiles,
-        threads=threads,
-    )
-    gaps = GapRule(
-        gap_cells=params.recover_gap_cells,
-        scan_steps=params.recover_scan_steps,
-        layer_m=params.layer_m,
-        threads=threads,
-    )
-    return RasterRule(surface=surface, gaps=gaps)
+def _log_cuts(
+    frames: dict[int, WallFrame],
+    planes: Planes,
+    params: RasterGrid.Params,
+    extent_of: ExtentOf,
+    ctx: StepContext,
+) -> None:
+    """Report what part of a wall is beyond its rectangle because an adjoining plane is askew."""
+    for index, frame in frames.items():
+        for side, askew_m in extent_of(index).cut_m.items():
+            cut_m = askew_m - params.margin_m
+            if cut_m > frame.gsd_m:
+                notify = ctx.warn if cut_m >= _LARGE_CUT_M else ctx.log
+                notify(
+                    f"{planes.names[index]}: the surface that adjoins it at its {side} is "
+                    "askew, and its "
+                    f"raster ends where that comes nearest: up to {1e3 * cut_m:.0f} mm of its "
+                    "plane are left out there, more of its relief; margin_m adds them"
+                )
 
 
 def _allocated(
     ctx: StepContext, wall: int, name: str, shape: tuple[int, ...], dtype: DTypeLike
 ) -> NDArray[np.generic]:
     return ctx.allocate("walls", f"{wall}.{name}", shape, dtype).view(np.ndarray)
-
-
-def _require_points_near(walls: tuple[Wall, ...], slab: Slab) -> None:
-    if not any(wall.count.any() for wall in walls):
-        raise MethodError(
-            f"no point of the cloud lies inside the rectangle and the buffer of a wall "
-            f"({slab.front_m:g} m in front, {slab.behind_m:g} m behind): the planes do not belong "
-            "to this cloud, or buffer_m is too small"
-        )
-
-
-def _intensity_source(cloud: PointCloud) -> IntensitySource:
-    if cloud.intensity is not None:
-        return "laser"
-    return "none" if cloud.rgb is None else "luminance"

@@ -9,9 +9,9 @@ the whole. On large walls the triangulation consists of the triangles whose circ
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,20 +23,17 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
 
 if TYPE_CHECKING:
-    from scipy.spatial import Delaunay, cKDTree
+    from scipy.spatial import Delaunay
 
+# Some rows and columns of a raster: the first ones, and those after the last.
+_Window = tuple[int, int, int, int]
 NO_POINT: Final = np.uint32(0xFFFFFFFF)
 # A triangulation with more vertices is made in tiles; a vertex takes about 700 bytes.
 VERTICES_MOST: Final = 2_000_000
-# Maximum diameter of circumcircles within the raster.
-SPAN_MOST_CELLS: Final = 512
-# Most triangles are small, so that a smaller window suffices.
-_SPAN_CELLS: Final = 64
+# Maximum diameter of circumcircles within the raster, on large walls.
+SPAN_MOST_CELLS: Final = 128
 _TILE_CELLS: Final = 768
 _ROWS_AT_ONCE: Final = 256
-# Vertices of wide triangles are this close to cells that are this far from all points.
-_RIM_CELLS: Final = 20
-_EMPTY_CELLS: Final = 16
 _ROUNDING_CELLS: Final = 1e-6
 
 
@@ -93,7 +90,9 @@ def interpolate_net(
         MethodError: the points form no triangle.
     """
     shape, n_cells = slab.frame.shape, slab.n_cells
-    n_vertices, n_set = n_vertices_of(vertices), 0
+    n_vertices = sum(
+        int(np.count_nonzero(vertices.point[rows] != NO_POINT)) for rows in row_bands(shape)
+    )
     intensity = rgb = None
     if cloud.intensity is not None:
         intensity = np.asarray(allocate("net_intensity", (n_cells,), np.float32), np.float32)
@@ -106,51 +105,26 @@ def interpolate_net(
     )
     surface = _Surface(cloud=cloud, slab=slab, vertices=vertices, net=net)
     if n_vertices <= VERTICES_MOST:
-        n_set = surface.interpolate(_Window(0, 0, *shape))
+        n_set = surface.interpolate((0, 0, *shape), (0, 0, *shape), np.inf)
     else:
-        for tile in _tiles(shape):
-            n_set += surface.interpolate_tile(tile)
+        n_set = 0
+        for top in range(0, shape[0], _TILE_CELLS):
+            for left in range(0, shape[1], _TILE_CELLS):
+                bottom, right = min(shape[0], top + _TILE_CELLS), min(shape[1], left + _TILE_CELLS)
+                window = (
+                    max(0, top - SPAN_MOST_CELLS),
+                    max(0, left - SPAN_MOST_CELLS),
+                    min(shape[0], bottom + SPAN_MOST_CELLS),
+                    min(shape[1], right + SPAN_MOST_CELLS),
+                )
+                tile = (top, left, bottom, right)
+                n_set += surface.interpolate(tile, window, SPAN_MOST_CELLS)
     if not n_set:
         raise MethodError(
             "surface tin needs points that span triangles about the cells of each wall, and the "
             f"{n_vertices} cells with points of this one do not: take another surface"
         )
     return net
-
-
-def n_vertices_of(vertices: Vertices) -> int:
-    """Return the number of vertices."""
-    return sum(
-        int(np.count_nonzero(vertices.point[rows] != NO_POINT))
-        for rows in row_bands(vertices.point.shape)
-    )
-
-
-class _Window(NamedTuple):
-    """Some rows and columns of a raster: the first ones, and those after the last."""
-
-    top: int
-    left: int
-    bottom: int
-    right: int
-
-    def widened(self, cells: int, shape: tuple[int, int]) -> _Window:
-        return _Window(
-            max(0, self.top - cells),
-            max(0, self.left - cells),
-            min(shape[0], self.bottom + cells),
-            min(shape[1], self.right + cells),
-        )
-
-    @property
-    def cells(self) -> tuple[slice, slice]:
-        return slice(self.top, self.bottom), slice(self.left, self.right)
-
-
-def _tiles(shape: tuple[int, int]) -> Iterator[_Window]:
-    for top in range(0, shape[0], _TILE_CELLS):
-        for left in range(0, shape[1], _TILE_CELLS):
-            yield _Window(top, left, top + _TILE_CELLS, left + _TILE_CELLS).widened(0, shape)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,50 +136,21 @@ class _Surface:
     vertices: Vertices
     net: Net
 
-    def interpolate(self, window: _Window) -> int:
-        """Triangulate a whole wall; return the number of cells with a triangle."""
-        triangles = self._triangles(window)
-        return sum(
-            self._set(rows, columns, triangles, np.inf).size for rows, columns in _cells_of(window)
-        )
-
-    def interpolate_tile(self, tile: _Window) -> int:
-        """Triangulate one tile of a large wall; return the number of cells with a triangle."""
-        shape, n_set = self.slab.frame.shape, 0
-        near = self._triangles(tile.widened(_SPAN_CELLS, shape))
-        wide = []
-        for rows, columns in _cells_of(tile):
-            found_here = self._set(rows, columns, near, _SPAN_CELLS)
-            is_set = np.zeros(rows.size, dtype=np.bool_)
-            is_set[found_here] = True
-            wide.append(np.stack([rows[~is_set], columns[~is_set]]))
-            n_set += found_here.size
-        rows, columns = np.concatenate(wide, axis=1)
-        if rows.size:
-            around = tile.widened(SPAN_MOST_CELLS, shape)
-            far = self._triangles(around, rim_only=True)
-            n_set += self._set(rows, columns, far, SPAN_MOST_CELLS).size
-        return n_set
-
-    def _triangles(self, window: _Window, *, rim_only: bool = False) -> _Triangles | None:
-        """Return the triangulation of the points of a window; None if there are too few.
+    def interpolate(self, tile: _Window, window: _Window, span_cells: float) -> int:
+        """Set the values of a tile by the triangles of a window; count the cells with a triangle.
 
         Args:
-            window: the window of the points.
-            rim_only: only of points beside large gaps. Triangles whose circle contains other points
-                are dropped.
+            tile: its first row and column, and those after the last ones.
+            window: the same of the points that are triangulated.
+            span_cells: maximum diameter of the triangles' circles within the raster.
         """
-        from scipy.spatial import Delaunay, QhullError, cKDTree
+        from scipy.spatial import Delaunay, QhullError
 
-        points = self.vertices.point[window.cells]
-        has_point = points != NO_POINT
-        chosen = _beside_gaps(has_point) if rim_only else has_point
-        try:
-            delaunay = Delaunay(self._places(points[chosen], window))
-        except (QhullError, ValueError):
-            return None
-        cloud, taken = self.cloud, points[chosen]
-        values: list[NDArray[np.generic]] = [self.vertices.depth_m[window.cells][chosen][:, None]]
+        cloud, matrix = self.cloud, wall_from_offset(self.slab.frame, self.cloud.origin)
+        cells = slice(window[0], window[2]), slice(window[1], window[3])
+        has_point = self.vertices.point[cells] != NO_POINT
+        taken = self.vertices.point[cells][has_point]
+        values: list[NDArray[np.generic]] = [self.vertices.depth_m[cells][has_point][:, None]]
         if cloud.intensity is not None:
             values.append(np.asarray(cloud.intensity)[taken, np.newaxis])
         if cloud.rgb is not None:
@@ -213,51 +158,34 @@ class _Surface:
             if cloud.has_rgb is not None:
                 rgb[~np.asarray(cloud.has_rgb)[taken]] = np.nan
             values.append(rgb)
-        return _Triangles(
-            window=window,
-            shape=self.slab.frame.shape,
-            delaunay=delaunay,
-            values=np.column_stack([np.asarray(part, dtype=np.float64) for part in values]),
-            others=cKDTree(self._places(points[has_point], window), balanced_tree=False)
-            if rim_only
-            else None,
-        )
-
-    def _places(self, points: NDArray[np.uint32], window: _Window) -> NDArray[np.float64]:
-        """Return positions (n, 2) of points as column and row in a window, cell centres at .5."""
-        cloud, matrix = self.cloud, wall_from_offset(self.slab.frame, self.cloud.origin)
-        offsets = np.stack([values[points] for values in (cloud.x, cloud.y, cloud.z)])
-        corner = matrix[:2, 3] - (window.left, window.top)
-        return (matrix[:2, :3] @ offsets.astype(np.float64)).T + corner
-
-    def _set(
-        self,
-        rows: NDArray[np.int64],
-        columns: NDArray[np.int64],
-        triangles: _Triangles | None,
-        span_cells: float,
-    ) -> NDArray[np.int64]:
-        """Set the values of cells, NaN without a triangle; report which have one."""
-        n_channels = 1 + (self.net.intensity is not None) + 3 * (self.net.rgb is not None)
-        found = np.full((rows.size, n_channels), np.nan, dtype=np.float32)
-        if triangles is not None:
-            triangles.interpolate(rows, columns, span_cells, found)
-        cells = rows * self.slab.frame.width + columns
-        self.net.depth_m[cells] = found[:, 0]
-        if self.net.intensity is not None:
-            self.net.intensity[cells] = found[:, 1]
-        if self.net.rgb is not None:
-            self.net.rgb[cells] = np.rint(np.nan_to_num(found[:, -3:])).astype(np.uint8)
-        return np.flatnonzero(np.isfinite(found).any(axis=1))
-
-
-def _cells_of(window: _Window) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Yield rows and columns of the cells of a window, some rows at a time."""
-    for top in range(window.top, window.bottom, _ROWS_AT_ONCE):
-        rows, columns = np.mgrid[
-            top : min(top + _ROWS_AT_ONCE, window.bottom), window.left : window.right
-        ]
-        yield rows.ravel(), columns.ravel()
+        # Columns and rows in the window, cell centres at .5.
+        offsets = np.stack([axis[taken] for axis in (cloud.x, cloud.y, cloud.z)])
+        corner = matrix[:2, 3] - (window[1], window[0])
+        triangles = None
+        with suppress(QhullError, ValueError):
+            triangles = _Triangles(
+                window=window,
+                shape=self.slab.frame.shape,
+                delaunay=Delaunay((matrix[:2, :3] @ offsets.astype(np.float64)).T + corner),
+                values=np.column_stack([np.asarray(part, dtype=np.float64) for part in values]),
+            )
+        n_channels, n_set = sum(part.shape[1] for part in values), 0
+        for top in range(tile[0], tile[2], _ROWS_AT_ONCE):
+            rows, columns = (
+                axis.ravel()
+                for axis in np.mgrid[top : min(top + _ROWS_AT_ONCE, tile[2]), tile[1] : tile[3]]
+            )
+            found = np.full((rows.size, n_channels), np.nan, dtype=np.float32)
+            if triangles is not None:
+                triangles.interpolate(rows, columns, span_cells, found)
+            at = rows * self.slab.frame.width + columns
+            self.net.depth_m[at] = found[:, 0]
+            if self.net.intensity is not None:
+                self.net.intensity[at] = found[:, 1]
+            if self.net.rgb is not None:
+                self.net.rgb[at] = np.rint(np.nan_to_num(found[:, -3:])).astype(np.uint8)
+            n_set += int(np.isfinite(found).any(axis=1).sum())
+        return n_set
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -269,14 +197,12 @@ class _Triangles:
         shape: of the raster.
         delaunay: the triangulation, in cells of the window.
         values: (n, channels) of its vertices.
-        others: all points in the window, if the triangulation is of some of them; else None.
     """
 
     window: _Window
     shape: tuple[int, int]
     delaunay: Delaunay
     values: NDArray[np.float64]
-    others: cKDTree | None
 
     def interpolate(
         self,
@@ -289,7 +215,7 @@ class _Triangles:
 
         Computed as by scipy's LinearNDInterpolator, which does not return the triangle.
         """
-        aside = [columns - self.window.left, rows - self.window.top]
+        aside = [columns - self.window[1], rows - self.window[0]]
         centres = np.column_stack(aside).astype(np.float64) + 0.5
         simplex = np.full(len(centres), -1, dtype=np.int32)
         near = self._within_reach(centres)
@@ -340,30 +266,10 @@ class _Triangles:
             )
             centre, radius = corners[:, 0] + aside, np.hypot(*aside.T)
             # The part of the circle outside the raster contains no point of the wall.
-            low = -np.array([self.window.left, self.window.top], dtype=np.float64)
+            low = -np.array([self.window[1], self.window[0]], dtype=np.float64)
             high = low + self.shape[::-1]
             beside = np.clip(centre, low, high) - centre
             half = np.sqrt(np.maximum(radius[:, np.newaxis] ** 2 - beside[:, ::-1] ** 2, 0.0))
             span = np.minimum(centre + half, high) - np.maximum(centre - half, low)
             belongs: NDArray[np.bool_] = (span <= span_cells).all(axis=1)
-        if self.others is not None:
-            asked = np.flatnonzero(belongs)
-            nearest = np.asarray(self.others.query(centre[asked])[0])
-            belongs[asked] = nearest >= radius[asked] * (1.0 - 1e-9)
         return belongs
-
-
-def _beside_gaps(has_point: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return cells (rows, cols) with a point next to a position far from all points.
-
-    The vertices of every triangle with a wide circle qualify: between a vertex and the centre there
-    is a position that far from all points.
-    """
-    import cv2
-
-    wide = np.pad(has_point, _RIM_CELLS)
-    away = cv2.distanceTransform((~wide).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    is_near = (np.asarray(away) <= _EMPTY_CELLS).astype(np.uint8)
-    beside = np.asarray(cv2.distanceTransform(is_near, cv2.DIST_L2, cv2.DIST_MASK_PRECISE))
-    inner = slice(_RIM_CELLS, -_RIM_CELLS)
-    return has_point & (beside[inner, inner] <= _RIM_CELLS)

@@ -17,7 +17,6 @@ from orthoflow.geometry.levels import plain_tone
 from orthoflow.products import PointCloud, SurfaceMask, Wall
 from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.raster.emptiness import Emptiness
-from orthoflow_plugins.raster.walls import WallRaster
 
 # Medians of larger walls are estimated from some of their rows.
 _CELLS_ASKED: Final = 1 << 26
@@ -82,10 +81,7 @@ UNSEEN: Final = DiagnosticSpec(
     severity="warning",
     text="{subject}: {share:.1%} of its cells are empty: nothing was scanned there (sky, "
     "glass, or hidden "
-    "from all "
-    ""
-    ""
-    "stations)",
+    "from all stations)",
     rank_by="share",
 )
 PLAIN: Final = DiagnosticSpec(
@@ -143,18 +139,19 @@ _CAUSES: Final = {
 _Number = TypeVar("_Number", np.float32, np.uint32)
 
 
-def warn(ctx: StepContext, rasters: Sequence[WallRaster], intensity_source: str) -> None:
+def warn(
+    ctx: StepContext, walls: Sequence[Wall], steps_m: Sequence[float], intensity_source: str
+) -> None:
     """Report what limits the walls: missing data of the cloud, and cells finer than its points."""
     if intensity_source == "luminance":
         ctx.report(NO_INTENSITY)
     if intensity_source == "none":
         ctx.report(DEPTH_ONLY)
-    for raster in rasters:
-        wall, gsd_m = raster.wall, raster.wall.frame.gsd_m
+    for wall, step_m in zip(walls, steps_m, strict=True):
+        gsd_m = wall.frame.gsd_m
         if not wall.count.any():
             ctx.report(NO_POINT, subject=wall.name)
             continue
-        step_m = raster.scan_step_m
         is_close = step_m > _STEP_MOST_CELLS * gsd_m
         filled = count_cells(wall.mask, SurfaceMask.RECOVERED) / wall.mask.size
         if is_close or filled >= _SHARE_WORTH_WORDS:
@@ -257,15 +254,15 @@ def warn_of_wide_gaps(ctx: StepContext, walls: Sequence[Wall]) -> None:
             )
 
 
-def report(ctx: StepContext, rasters: Sequence[WallRaster], up: NDArray[np.float64]) -> None:
+def report(ctx: StepContext, walls: Sequence[Wall], step_m: float, up: NDArray[np.float64]) -> None:
     """Report metrics of the walls.
 
     Args:
         ctx: of the step.
-        rasters: of the walls.
+        walls: at least one.
+        step_m: point spacing on the first.
         up: (3,) unit vector.
     """
-    walls = [raster.wall for raster in rasters]
     frame = walls[0].frame
     omega_deg, phi_deg = omega_phi_deg(frame.normal_world, up)
     ctx.metric("omega_deg", omega_deg, "deg")
@@ -280,7 +277,7 @@ def report(ctx: StepContext, rasters: Sequence[WallRaster], up: NDArray[np.float
     ctx.metric("n_walls", len(walls), "1")
     ctx.metric("n_points_inside", sum(int(wall.count.sum(dtype=np.int64)) for wall in walls), "1")
     ctx.metric("points_per_cell", float(np.median(per_cell)), "1")
-    ctx.metric("scan_step_mm", 1000.0 * rasters[0].scan_step_m, "mm")
+    ctx.metric("scan_step_mm", 1000.0 * step_m, "mm")
     ctx.metric("gsd_mm", 1000.0 * walls[0].frame.gsd_m, "mm")
     noise_m = depth_noise_m(walls[0].depth_m)
     ctx.metric("depth_noise_mm", 1000.0 * noise_m, "mm")

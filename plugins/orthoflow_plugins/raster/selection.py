@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Final, Literal
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from orthoflow.errors import MethodError
 from orthoflow.geometry import WallFrame, frame_over
 from orthoflow.products import Planes
+
+if TYPE_CHECKING:
+    from orthoflow_plugins.raster.grid import RasterGrid
 
 Constraint = Literal["vertical", "horizontal", "any"]
 Place = tuple[float, float, float]
@@ -24,31 +27,11 @@ _PARALLEL_DEG: Final = 5.0
 _COVERED_SHARE: Final = 0.8
 
 
-@dataclass(frozen=True, kw_only=True)
-class WallChoice:
-    """The criteria by which planes are rastered.
-
-    Attributes:
-        constraint: direction of the planes.
-        min_area_m2: smallest rectangle; the plane with the most support is exempt.
-        n_walls_max: maximum number, by support.
-        skip_covered: omit planes that a larger wall shows as its relief.
-        buffer_m: returns the depths of a plane's wall in front of and behind it.
-        ranks: only these planes, whatever the other criteria; empty for no such choice.
-        near: (x, y, z) in metres: for each the plane of the right direction whose rectangle is
-            nearest, and no others; empty for no such choice.
-    """
-
-    constraint: Constraint
-    min_area_m2: float
-    n_walls_max: int
-    skip_covered: bool
-    buffer_m: Callable[[int], tuple[float, float]]
-    ranks: tuple[int, ...] = ()
-    near: tuple[Place, ...] = ()
+# Returns the depths of a plane's wall in front of and behind it.
+BufferOf = Callable[[int], tuple[float, float]]
 
 
-def chosen_planes(planes: Planes, choice: WallChoice) -> list[int]:
+def chosen_planes(planes: Planes, params: RasterGrid.Params, buffer_m: BufferOf) -> list[int]:
     """Return indices of the planes to raster, by support, largest first.
 
     Raises:
@@ -56,33 +39,33 @@ def chosen_planes(planes: Planes, choice: WallChoice) -> list[int]:
     """
     if len(planes) == 0:
         raise MethodError("no plane was found in the cloud, at least one is needed for a wall")
-    if choice.ranks:
-        missing = sorted(rank for rank in choice.ranks if rank >= len(planes))
+    if params.ranks:
+        missing = sorted(rank for rank in params.ranks if rank >= len(planes))
         if missing:
             raise MethodError(
                 f"ranks names plane {missing[0]}, but {len(planes)} planes were found, 0 to "
                 f"{len(planes) - 1}: look at planes.json"
             )
-        return sorted(set(choice.ranks))
-    fitting = [k for k in range(len(planes)) if _fits(planes, k, choice.constraint)]
+        return sorted(set(params.ranks))
+    fitting = [k for k in range(len(planes)) if _fits(planes, k, params.constraint)]
     if not fitting:
         raise MethodError(
-            f"none of the {len(planes)} planes is {choice.constraint} within {_LEAN_DEG:g} deg: "
+            f"none of the {len(planes)} planes is {params.constraint} within {_LEAN_DEG:g} deg: "
             "set constraint to any, or look for other planes"
         )
-    if choice.near:
-        return sorted({nearest_plane(planes, fitting, np.array(place)) for place in choice.near})
-    large = [k for k in fitting if area_m2(planes.corners[k]) >= choice.min_area_m2]
+    if params.near:
+        return sorted({nearest_plane(planes, fitting, np.array(place)) for place in params.near})
+    large = [k for k in fitting if area_m2(planes.corners[k]) >= params.min_area_m2]
     # The plane with the most support is exempt from the size: a scan of one small object has a wall
     # too.
     chosen: list[int] = []
     for index in sorted({fitting[0], *large}):
-        if len(chosen) == choice.n_walls_max:
+        if len(chosen) == params.n_walls_max:
             break
-        if choice.skip_covered and any(_covers(planes, wall, index, choice) for wall in chosen):
+        if params.skip_covered and any(_covers(planes, wall, index, buffer_m) for wall in chosen):
             continue
         chosen.append(index)
-    if not choice.skip_covered:
+    if not params.skip_covered:
         return chosen
     # A larger wall of less support may show one that was chosen before it, too.
     return [
@@ -90,52 +73,58 @@ def chosen_planes(planes: Planes, choice: WallChoice) -> list[int]:
         for index in chosen
         if index == chosen[0]
         or not any(
-            _is_larger(planes, wall, index) and _covers(planes, wall, index, choice)
+            _is_larger(planes, wall, index) and _covers(planes, wall, index, buffer_m)
             for wall in chosen
         )
     ]
 
 
-def covered_planes(planes: Planes, choice: WallChoice, chosen: Sequence[int]) -> dict[int, int]:
+def covered_planes(
+    planes: Planes, params: RasterGrid.Params, buffer_m: BufferOf, chosen: Sequence[int]
+) -> dict[int, int]:
     """Return planes left out, up to the last that was examined -> the wall that shows them.
 
     Args:
         planes: by support.
-        choice: the criteria.
+        params: the criteria.
+        buffer_m: depths of walls.
         chosen: result of `chosen_planes` for them.
     """
-    if not choice.skip_covered or choice.ranks or choice.near:
+    if not params.skip_covered or params.ranks or params.near:
         return {}
     found: dict[int, int] = {}
     for index in sorted(set(range(len(planes))) - set(chosen)):
-        is_large = area_m2(planes.corners[index]) >= choice.min_area_m2
-        if not is_large or not _fits(planes, index, choice.constraint):
+        is_large = area_m2(planes.corners[index]) >= params.min_area_m2
+        if not is_large or not _fits(planes, index, params.constraint):
             continue
         walls = (
             wall
             for wall in chosen
             if (wall < index or _is_larger(planes, wall, index))
-            and _covers(planes, wall, index, choice)
+            and _covers(planes, wall, index, buffer_m)
         )
         if (wall := next(walls, None)) is not None:
             found[index] = wall
     return found
 
 
-def chosen_relief(planes: Planes, choice: WallChoice, chosen: Sequence[int]) -> dict[int, int]:
+def chosen_relief(
+    planes: Planes, params: RasterGrid.Params, buffer_m: BufferOf, chosen: Sequence[int]
+) -> dict[int, int]:
     """Return planes chosen by a nearby point that lie on a better supported wall -> that wall.
 
     Args:
         planes: by support.
-        choice: the criteria; empty without `near`, and if relief is not left out anyway.
+        params: the criteria; empty without `near`, and if relief is not left out anyway.
+        buffer_m: depths of walls.
         chosen: result of `chosen_planes` for them.
     """
-    if not choice.skip_covered or not choice.near:
+    if not params.skip_covered or not params.near:
         return {}
     found: dict[int, int] = {}
     for index in chosen:
-        others = (wall for wall in range(index) if _fits(planes, wall, choice.constraint))
-        walls = (wall for wall in others if _covers(planes, wall, index, choice))
+        others = (wall for wall in range(index) if _fits(planes, wall, params.constraint))
+        walls = (wall for wall in others if _covers(planes, wall, index, buffer_m))
         if (wall := next(walls, index)) not in chosen:
             found[index] = wall
     return found
@@ -184,13 +173,13 @@ def _distance_m(corners: NDArray[np.float64], place: NDArray[np.float64]) -> flo
     return float(np.linalg.norm(place - nearest))
 
 
-def _covers(planes: Planes, wall: int, index: int, choice: WallChoice) -> bool:
+def _covers(planes: Planes, wall: int, index: int, buffer_m: BufferOf) -> bool:
     """Whether a plane is within a wall's buffer, parallel to it and mostly inside its frame."""
     normal = planes.normal[wall]
     if float(normal @ planes.normal[index]) < math.cos(math.radians(_PARALLEL_DEG)):
         return False
     depths_m = planes.corners[index] @ normal - planes.offset[wall]
-    front_m, behind_m = choice.buffer_m(wall)
+    front_m, behind_m = buffer_m(wall)
     if depths_m.min() < -behind_m or depths_m.max() > front_m:
         return False
     corners = planes.corners[wall]

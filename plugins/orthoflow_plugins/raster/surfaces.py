@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.compiling import compiled
+from orthoflow.geometry.depth_noise import depth_noise_m
 from orthoflow.geometry.interpolation import Surroundings, cell_values, interpolate
+from orthoflow.geometry.narrow_gaps import narrow_gaps
 from orthoflow.geometry.point_kernels import read_only
 from orthoflow.geometry.raster_kernels import Entries, keep_nearest, keep_topmost
 from orthoflow.geometry.rastering import (
@@ -23,16 +27,48 @@ from orthoflow.geometry.rastering import (
 )
 from orthoflow.geometry.slabs import Slab
 from orthoflow.geometry.threads import in_parts
-from orthoflow.products import PointCloud
-from orthoflow_plugins.raster import surface_kernels as kernels
-from orthoflow_plugins.raster.depth_filters import denoised, without_specks
+from orthoflow.products import PointCloud, SurfaceMask
+from orthoflow_plugins.raster import kernels
 from orthoflow_plugins.raster.nets import NO_POINT, Net, Vertices, interpolate_net
-from orthoflow_plugins.raster.rules import SurfaceRule
+from orthoflow_plugins.raster.walls import SPAN_GAPS
 
+if TYPE_CHECKING:
+    from orthoflow_plugins.raster.grid import RasterGrid
+
+# A cell takes the values of one of its points, not the mean of several.
+ONE_POINT: Final = frozenset({"nearest", "centre", "topmost", "tin"})
 # Temporary arrays are limited to this many cells.
 CELLS_AT_ONCE: Final = 1 << 20
+# In a scan with more rows times columns than this the numbers are not a grid (2 GB of indices).
+_GRID_CELLS_MOST: Final = 1 << 28
 # Number of depths sorted at once: 256 MB.
 _POINTS_AT_ONCE: Final = 1 << 26
+
+# Neighbours are within this many rows and columns.
+_NEAR_CELLS: Final = 2
+# With fewer known neighbours nothing is decided; with fewer that agree a cell is a speck.
+_KNOWN_LEAST: Final = 6
+_AGREEING_LEAST: Final = 2
+# Where cells are sparse more neighbours are used, and more must agree: at least half of the known.
+_SPARSE_CELLS: Final = 4
+_SPARSE_LEAST: Final = 3
+# Steepest surface whose sparse cells agree: 27 degrees.
+_SLOPE: Final = 0.5
+# A cell is sparse if the share of known cells is below this fraction of the maximum nearby.
+_SPARSE_SHARE: Final = 0.35
+# The shadow of an edge is narrower than twice this reach, in cells.
+_AROUND_CELLS: Final = 16
+# Cells on one surface differ by noise, in standard deviations, and by its slope.
+_CLOSE_SIGMAS: Final = 4.0
+# The first pass removes most of the noise; the second, on what remains, can be stricter at steps.
+# In standard deviations of the noise of a cell.
+_REACHES: Final = (3.0, 1.5)
+# Void cells have no weight: they are this many reaches below everything.
+_VOID_REACHES: Final = 8.0
+# Smaller differences of depth need no filter: a tenth of a cell at 1 mm.
+_NOISE_LEAST_M: Final = 2.0e-5
+
+_Number = TypeVar("_Number", np.float32, np.uint8)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,31 +98,40 @@ class CellSurface:
 
 
 def surface_of(
-    cloud: PointCloud, slab: Slab, rule: SurfaceRule, net: Net | None = None
+    cloud: PointCloud,
+    slab: Slab,
+    params: RasterGrid.Params,
+    net: Net | None = None,
+    *,
+    threads: int,
 ) -> CellSurface:
     """Bin a cloud into the raster of a wall.
 
     Args:
         cloud: the points.
         slab: of the wall, or of a part of it.
-        rule: how.
+        params: how depths follow from points.
         net: triangulation for the surface tin over these cells, if the slab is a part.
+        threads: number of threads.
     """
-    if rule.is_of_one_point:
-        surface = _surface_of_winners(cloud, slab, rule, net)
+    if params.surface in ONE_POINT:
+        surface = _surface_of_winners(cloud, slab, params, net, threads=threads)
     else:
-        surface = _surface_of_all(cloud, slab, rule)
-    if not rule.percentiles:
+        surface = _surface_of_all(cloud, slab, params, threads=threads)
+    if not params.percentiles:
         return surface
-    return replace(surface, percentiles_m=_percentiles_m(cloud, slab, surface.count, rule))
+    percentiles_m = _percentiles_m(cloud, slab, surface.count, params.percentiles, threads=threads)
+    return replace(surface, percentiles_m=percentiles_m)
 
 
-def carried_to_centres(surface: CellSurface, slab: Slab, rule: SurfaceRule) -> CellSurface:
+def carried_to_centres(
+    surface: CellSurface, slab: Slab, params: RasterGrid.Params, *, threads: int
+) -> CellSurface:
     """Extrapolate intensity and colour of cells with few points from these to the cell's centre.
 
     Rules that use a single point take its values unchanged.
     """
-    if rule.is_of_one_point or (surface.intensity is None and surface.rgb is None):
+    if params.surface in ONE_POINT or (surface.intensity is None and surface.rgb is None):
         return surface
     few = np.flatnonzero(
         (surface.count > 0) & (surface.count <= kernels.FEW_POINTS) & np.isfinite(surface.depth_m)
@@ -95,11 +140,11 @@ def carried_to_centres(surface: CellSurface, slab: Slab, rule: SurfaceRule) -> C
     rgb = None if surface.rgb is None else surface.rgb.copy()
     interpolate(
         few,
-        Surroundings(surface.places, slab.frame.width, rule.layer_m),
+        Surroundings(surface.places, slab.frame.width, params.layer_m),
         cell_values(surface.depth_m, intensity=surface.intensity, rgb=surface.rgb),
         cell_values(np.empty(0, dtype=np.float32), intensity=intensity, rgb=rgb),
         reach_cells=0.0,
-        threads=rule.threads,
+        threads=threads,
     )
     if intensity is not None and surface.intensity is not None:
         # Next to cells without intensity a cell keeps its own.
@@ -111,43 +156,51 @@ def carried_to_centres(surface: CellSurface, slab: Slab, rule: SurfaceRule) -> C
 
 
 def _surface_of_winners(
-    cloud: PointCloud, slab: Slab, rule: SurfaceRule, net: Net | None
+    cloud: PointCloud, slab: Slab, params: RasterGrid.Params, net: Net | None, *, threads: int
 ) -> CellSurface:
     """One pass: the winning point gives depth, intensity and colour."""
-    winners = empty_winners(slab.n_cells, threads=rule.threads)
-    moments = np.zeros((slab.n_cells, 2))
-    for entries in entries_inside(cloud, slab, threads=rule.threads):
+    winners = empty_winners(slab.n_cells)
+    count, moments = np.zeros(slab.n_cells, dtype=np.uint32), np.zeros((slab.n_cells, 2))
+    for entries in entries_inside(cloud, slab, threads=threads):
         share_cells(
-            rule.threads,
-            _contest(cloud, slab, rule, entries, winners),
-            partial(kernels.add_moments, entries, moments),
+            threads,
+            _contest(cloud, slab, params, entries, winners),
+            partial(kernels.add_moments, entries, count, moments),
         )
-    taken = partial(values_of_winners, winners, threads=rule.threads)
-    intensity, rgb = cloud.intensity, cloud.rgb
-    # A nearest neighbour may be in the next cell; a cell without a point of its own stays void.
-    has_point = winners["n_points"] > 0
+    intensity, rgb, has_rgb = cloud.intensity, cloud.rgb, cloud.has_rgb
+    if intensity is not None:
+        intensity = values_of_winners(winners, intensity[:, np.newaxis], np.nan)[:, 0]
+    if has_rgb is not None:
+        has_rgb = values_of_winners(winners, has_rgb[:, np.newaxis], 0)[:, 0]
     surface = CellSurface(
-        depth_m=np.where(has_point, winners["depth_m"], np.float32(np.nan)),
-        sigma_m=_spread_m(winners["n_points"], moments),
-        count=winners["n_points"].copy(),
-        intensity=None if intensity is None else taken(intensity[:, np.newaxis], np.nan)[:, 0],
-        rgb=None if rgb is None else taken(rgb, 0),
-        has_rgb=None
-        if cloud.has_rgb is None
-        else taken(cloud.has_rgb.view(np.uint8)[:, np.newaxis], 0)[:, 0] > 0,
-        places=places_of_winners(cloud, slab, winners, threads=rule.threads),
+        # A nearest neighbour may be in the next cell; a cell without its own point stays void.
+        depth_m=np.where(count > 0, winners["depth_m"], np.float32(np.nan)),
+        sigma_m=_spread_m(count, moments),
+        count=count,
+        intensity=intensity,
+        rgb=None if rgb is None else values_of_winners(winners, rgb, 0),
+        has_rgb=has_rgb,
+        places=places_of_winners(cloud, slab, winners),
     )
-    if rule.surface != "tin":
+    if params.surface != "tin":
         return surface
-    return _spanned(surface, net or interpolate_net(cloud, slab, _vertices(winners, slab)))
+    net = net or interpolate_net(cloud, slab, _vertices(winners, slab))
+    # The values of the triangulation at the centres replace those of points in cells.
+    is_known = np.isfinite(net.depth_m)[:, np.newaxis]
+    places = np.where(is_known, np.float32(0.0), np.float32(np.nan)).repeat(2, 1)
+    return replace(
+        surface, depth_m=net.depth_m, intensity=net.intensity, rgb=net.rgb, places=places
+    )
 
 
 def _contest(
-    cloud: PointCloud, slab: Slab, rule: SurfaceRule, entries: Entries, winners: NDArray[np.void]
+    cloud: PointCloud,
+    slab: Slab,
+    params: RasterGrid.Params,
+    entries: Entries,
+    winners: NDArray[np.void],
 ) -> Callable[[int, int], None]:
-    if rule.surface == "topmost":
-        return partial(keep_topmost, entries, winners)
-    if rule.surface == "nearest":
+    if params.surface == "nearest":
         return partial(
             kernels.keep_nearest_around,
             entries,
@@ -156,14 +209,17 @@ def _contest(
             winners,
             slab.frame.width,
         )
-    return partial(keep_nearest, entries, winners)
+    keep = keep_topmost if params.surface == "topmost" else keep_nearest
+    return partial(keep, entries, winners)
 
 
-def vertices_of(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> Vertices:
+def vertices_of(
+    cloud: PointCloud, slab: Slab, params: RasterGrid.Params, *, threads: int
+) -> Vertices:
     """Return the points nearest to the centres of their cells, the vertices of the surface tin."""
-    winners = empty_winners(slab.n_cells, threads=rule.threads)
-    for entries in entries_inside(cloud, slab, threads=rule.threads):
-        share_cells(rule.threads, _contest(cloud, slab, rule, entries, winners))
+    winners = empty_winners(slab.n_cells)
+    for entries in entries_inside(cloud, slab, threads=threads):
+        share_cells(threads, _contest(cloud, slab, params, entries, winners))
     return _vertices(winners, slab)
 
 
@@ -175,41 +231,26 @@ def _vertices(winners: NDArray[np.void], slab: Slab) -> Vertices:
     )
 
 
-def _spanned(surface: CellSurface, net: Net) -> CellSurface:
-    """Replace the values of points in cells by those of the triangulation at the centres."""
-    is_known = np.isfinite(net.depth_m)[:, np.newaxis]
-    return replace(
-        surface,
-        depth_m=net.depth_m,
-        intensity=net.intensity,
-        rgb=net.rgb,
-        places=np.where(is_known, np.float32(0.0), np.float32(np.nan)).repeat(2, 1),
-    )
-
-
-def _surface_of_all(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSurface:
+def _surface_of_all(
+    cloud: PointCloud, slab: Slab, params: RasterGrid.Params, *, threads: int
+) -> CellSurface:
     """Two or three passes: count, sort for a median, average the points on the surface."""
     count, moments = np.zeros(slab.n_cells, dtype=np.uint32), np.zeros((slab.n_cells, 2))
-    for entries in entries_inside(cloud, slab, threads=rule.threads):
-        share_cells(
-            rule.threads,
-            partial(kernels.count_points, entries, count),
-            partial(kernels.add_moments, entries, moments),
-        )
+    for entries in entries_inside(cloud, slab, threads=threads):
+        share_cells(threads, partial(kernels.add_moments, entries, count, moments))
     with np.errstate(invalid="ignore"):
         depth_m, layer_m = (moments[:, 0] / count).astype(np.float32), np.inf
     sigma_m = _spread_m(count, moments)
     del moments  # A third of what is held here, and what follows takes more.
-    if rule.surface != "mean":
-        layer_m = rule.layer_m
-        raster_m = without_specks(
-            _medians_m(cloud, slab, count, rule).reshape(slab.frame.shape),
-            gsd_m=slab.frame.gsd_m,
-            layer_m=layer_m,
-            threads=rule.threads,
-        )
-        if rule.surface == "denoised":
-            raster_m = denoised(raster_m, rule.denoise_cells)
+    if params.surface != "mean":
+        layer_m, gsd_m = params.layer_m, slab.frame.gsd_m
+        depth_m = np.empty(count.size, dtype=np.float32)
+        for cells, depths_m, ends in _grouped(cloud, slab, count, threads=threads):
+            _sort_depths(depths_m, ends, depth_m[cells], layer_m, threads=threads)
+        raster_m = depth_m.reshape(slab.frame.shape)
+        raster_m = without_specks(raster_m, gsd_m=gsd_m, layer_m=layer_m, threads=threads)
+        if params.surface == "denoised":
+            raster_m = denoised(raster_m, params.denoise_cells)
         depth_m = raster_m.ravel()
     few = kernels.FewPoints(
         n_inside=count,
@@ -218,8 +259,11 @@ def _surface_of_all(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSur
         n_summed=np.zeros(slab.n_cells, dtype=np.uint8),
         places=np.zeros((slab.n_cells, 2), dtype=np.float32),
     )
-    intensity, rgb, has_rgb = _averaged_values(cloud, slab, few, threads=rule.threads)
-    in_parts(partial(kernels.find_mean_places, few), slab.n_cells, threads=rule.threads)
+    intensity, rgb, has_rgb = _averaged_values(cloud, slab, few, threads=threads)
+    # Means of positions: NaN without a point, 0 in cells with many.
+    n_summed = np.where(count <= kernels.FEW_POINTS, few.n_summed, np.uint8(1))[:, np.newaxis]
+    with np.errstate(invalid="ignore"):
+        np.divide(few.places, n_summed, out=few.places)
     return CellSurface(
         depth_m=depth_m,
         sigma_m=sigma_m,
@@ -254,25 +298,10 @@ def _spread_m(n_points: NDArray[np.uint32], moments: NDArray[np.float64]) -> NDA
     return sigma_m
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Group:
-    """The depths of all points inside some neighbouring cells, cell after cell.
-
-    Attributes:
-        cells: the range of cells.
-        depths_m: (points,) float32.
-        ends: (cells,) where the depths of the next cell begin.
-    """
-
-    cells: slice
-    depths_m: NDArray[np.float32]
-    ends: NDArray[np.int64]
-
-
 def _grouped(
     cloud: PointCloud, slab: Slab, count: NDArray[np.uint32], *, threads: int
-) -> Iterator[_Group]:
-    """Yield the depths of all points inside, sorted by cell, some points at a time."""
+) -> Iterator[tuple[slice, NDArray[np.float32], NDArray[np.int64]]]:
+    """Yield a range of cells, the depths of all points inside them, and where each cell's end."""
     width = slab.frame.width
     totals = np.cumsum(count, dtype=np.int64)
     first = n_before = 0
@@ -285,116 +314,369 @@ def _grouped(
         depths_m = np.empty(int(ends[-1]), dtype=np.float32)
         rows = slice(first // width, -(-end // width))
         for entries in entries_inside(cloud, slab, threads=threads, rows=rows):
-            share_cells(
-                threads, partial(kernels.sort_into_cells, entries, first, cursors, depths_m)
-            )
-        yield _Group(cells=slice(first, end), depths_m=depths_m, ends=ends)
+            sort = partial(kernels.sort_into_cells, entries, first, cursors, depths_m)
+            share_cells(threads, sort)
+        yield slice(first, end), depths_m, ends
         first, n_before = end, int(totals[end - 1])
 
 
-def _medians_m(
-    cloud: PointCloud, slab: Slab, count: NDArray[np.uint32], rule: SurfaceRule
-) -> NDArray[np.float32]:
-    """Return medians (cells,) of the cells' best supported layers."""
-    medians_m = np.empty(count.size, dtype=np.float32)
-    for group in _grouped(cloud, slab, count, threads=rule.threads):
-        _sort_depths(group, medians_m[group.cells], rule)
-    return medians_m
-
-
-def _sort_depths(group: _Group, medians_m: NDArray[np.float32], rule: SurfaceRule) -> None:
+def _sort_depths(
+    depths_m: NDArray[np.float32],
+    ends: NDArray[np.int64],
+    medians_m: NDArray[np.float32],
+    layer_m: float,
+    *,
+    threads: int,
+) -> None:
     """Sort the depths of each cell in place, and set the medians of their best layers."""
-    task = partial(kernels.median_depths, group.ends, group.depths_m, rule.layer_m, medians_m)
-    in_parts(task, medians_m.size, threads=rule.threads)
+    task = partial(kernels.median_depths, ends, depths_m, layer_m, medians_m)
+    in_parts(task, medians_m.size, threads=threads)
 
 
 def _percentiles_m(
-    cloud: PointCloud, slab: Slab, count: NDArray[np.uint32], rule: SurfaceRule
+    cloud: PointCloud,
+    slab: Slab,
+    count: NDArray[np.uint32],
+    percentiles: tuple[float, ...],
+    *,
+    threads: int,
 ) -> NDArray[np.float32]:
     """Return percentiles (cells, k) of all points of a cell, interpolated as by numpy."""
-    percentiles_m = np.full((count.size, len(rule.percentiles)), np.nan, dtype=np.float32)
-    for group in _grouped(cloud, slab, count, threads=rule.threads):
-        into = percentiles_m[group.cells]
-        _sort_depths(group, np.empty(len(into), dtype=np.float32), rule)
-        for begin in range(0, len(into), CELLS_AT_ONCE):
+    percentiles_m = np.full((count.size, len(percentiles)), np.nan, dtype=np.float32)
+    for cells, depths_m, ends in _grouped(cloud, slab, count, threads=threads):
+        _sort_depths(depths_m, ends, np.empty(len(ends), np.float32), math.inf, threads=threads)
+        for begin in range(0, len(ends), CELLS_AT_ONCE):
             part = slice(begin, begin + CELLS_AT_ONCE)
-            n_points = count[group.cells][part].astype(np.int64)
-            first = group.ends[part] - n_points
+            n_points = count[cells][part].astype(np.int64)
             measured = np.flatnonzero(n_points)
-            n_points, first = n_points[measured], first[measured]
-            for k, percent in enumerate(rule.percentiles):
+            first, n_points = (ends[part] - n_points)[measured], n_points[measured]
+            for k, percent in enumerate(percentiles):
                 place = (n_points - 1) * (percent / 100.0)
                 lower = np.floor(place).astype(np.int64)
                 upper = np.minimum(lower + 1, n_points - 1)
-                share = place - lower
-                low_m, high_m = group.depths_m[first + lower], group.depths_m[first + upper]
-                into[part][measured, k] = low_m + share * (high_m - low_m)
+                low_m, high_m = depths_m[first + lower], depths_m[first + upper]
+                values_m = low_m + (place - lower) * (high_m - low_m)
+                percentiles_m[cells][part][measured, k] = values_m
     return percentiles_m
 
 
 def _averaged_values(
-    cloud: PointCloud,
-    slab: Slab,
-    few: kernels.FewPoints,
-    *,
-    threads: int,
+    cloud: PointCloud, slab: Slab, few: kernels.FewPoints, *, threads: int
 ) -> tuple[NDArray[np.float32] | None, NDArray[np.uint8] | None, NDArray[np.bool_] | None]:
-    channels = _channels(cloud)
-    # Integers for colours: half the memory, and exact.
-    sums = [
-        np.zeros(
-            (slab.n_cells, values.shape[1] + 1),
-            dtype=np.uint32 if values.dtype == np.uint8 else np.float64,
-        )
-        for values, _ in channels
-    ]
-    offsets, matrix = (
-        read_only(cloud.x, cloud.y, cloud.z),
-        wall_from_offset(slab.frame, cloud.origin),
-    )
+    """Return means of intensity (cells,) and colour (cells, 3), and which cells have a colour."""
+    # Values of the points, which have one (empty if all have, or if NaN marks them), and sums.
+    of_all = np.empty(0, dtype=np.bool_)
+    of_intensity, of_colour = np.empty((0, 2)), np.empty((0, 4), dtype=np.uint32)
+    channels: list[tuple[NDArray[np.generic], NDArray[np.bool_], NDArray[np.generic]]] = []
+    if cloud.intensity is not None:
+        of_intensity = np.zeros((slab.n_cells, 2))
+        channels.append((np.asarray(cloud.intensity)[:, np.newaxis], of_all, of_intensity))
+    if cloud.rgb is not None:
+        # Integers: half the memory, and exact.
+        of_colour = np.zeros((slab.n_cells, 4), dtype=np.uint32)
+        has_rgb = of_all if cloud.has_rgb is None else np.asarray(cloud.has_rgb)
+        channels.append((np.asarray(cloud.rgb), has_rgb, of_colour))
+    offsets = read_only(cloud.x, cloud.y, cloud.z)
+    matrix = wall_from_offset(slab.frame, cloud.origin)
     for entries in entries_inside(cloud, slab, threads=threads):
+        surface = (few.depths_m, few.layer_m)
         passes = [
-            partial(
-                kernels.add_values,
-                entries,
-                values,
-                has_value,
-                few.depths_m,
-                few.layer_m,
-                sum_of_values,
-            )
-            for (values, has_value), sum_of_values in zip(channels, sums, strict=True)
+            partial(kernels.add_values, entries, values, has_value, *surface, sums)
+            for values, has_value, sums in channels
         ]
         passes.append(partial(kernels.add_places, entries, offsets, matrix, few))
         share_cells(threads, *passes)
-    intensity: NDArray[np.float32] | None = None
-    rgb: NDArray[np.uint8] | None = None
-    has_rgb: NDArray[np.bool_] | None = None
-    for sum_of_values in sums:
-        if sum_of_values.shape[1] == 2:
-            intensity = np.empty(slab.n_cells, dtype=np.float32)
-        else:
-            rgb = np.empty((slab.n_cells, 3), dtype=np.uint8)
-            has_rgb = None if cloud.has_rgb is None else sum_of_values[:, -1] > 0
-        # Means take several times the memory of the result.
-        for first in range(0, slab.n_cells, CELLS_AT_ONCE):
-            part = slice(first, first + CELLS_AT_ONCE)
-            with np.errstate(invalid="ignore"):
-                means = sum_of_values[part, :-1] / sum_of_values[part, -1:]
-            if intensity is not None and means.shape[1] == 1:
-                intensity[part] = means[:, 0]
-            elif rgb is not None:
+    intensity = None if cloud.intensity is None else np.empty(slab.n_cells, dtype=np.float32)
+    rgb = None if cloud.rgb is None else np.empty((slab.n_cells, 3), dtype=np.uint8)
+    # Means take several times the memory of the result.
+    for first in range(0, slab.n_cells, CELLS_AT_ONCE):
+        part = slice(first, first + CELLS_AT_ONCE)
+        with np.errstate(invalid="ignore"):
+            if intensity is not None:
+                intensity[part] = of_intensity[part, 0] / of_intensity[part, 1]
+            if rgb is not None:
+                means = of_colour[part, :3] / of_colour[part, 3:]
                 rgb[part] = np.rint(np.nan_to_num(means))
-    return intensity, rgb, has_rgb
+    return intensity, rgb, None if cloud.has_rgb is None else of_colour[:, 3] > 0
 
 
-def _channels(cloud: PointCloud) -> list[tuple[NDArray[np.generic], NDArray[np.bool_]]]:
-    """Return values of the points, and which have one; empty if all have, or if NaN marks them."""
-    channels: list[tuple[NDArray[np.generic], NDArray[np.bool_]]] = []
-    of_all = np.empty(0, dtype=np.bool_)
-    if cloud.intensity is not None:
-        channels.append((np.asarray(cloud.intensity)[:, np.newaxis], of_all))
-    if cloud.rgb is not None:
-        has_rgb = of_all if cloud.has_rgb is None else np.asarray(cloud.has_rgb)
-        channels.append((np.asarray(cloud.rgb), has_rgb))
-    return channels
+def without_specks(
+    depth_m: NDArray[np.float32], *, gsd_m: float, layer_m: float, threads: int
+) -> NDArray[np.float32]:
+    """Make void what only an outlier measured: cells with which hardly any neighbour agrees.
+
+    A photo would paint such a cell with a distant place. In the shadow of an edge in the scan,
+    where cells are sparse that are dense beside it, there are outliers and mixed distances of both
+    sides of the edge: there most of the few neighbours must agree, allowing for a slope.
+
+    Args:
+        depth_m: (rows, cols) metres, NaN where void.
+        gsd_m: side of a cell.
+        layer_m: depths that differ by more are of different layers.
+        threads: number of threads.
+    """
+    noise_m = min(layer_m, _CLOSE_SIGMAS * depth_noise_m(depth_m))
+    is_sparse, is_speck = _sparse(np.isfinite(depth_m)), np.zeros(depth_m.shape, dtype=np.bool_)
+    slope_m = _SLOPE * gsd_m
+    task = partial(_find_specks, depth_m, is_sparse, (layer_m, noise_m, slope_m), is_speck)
+    in_parts(task, depth_m.shape[0], threads=threads)
+    return np.where(is_speck, np.float32(np.nan), depth_m)
+
+
+def _sparse(is_known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Report known cells with far fewer known neighbours than there are nearby."""
+    import cv2
+
+    near = 2 * _NEAR_CELLS + 1
+    known = np.asarray(
+        cv2.boxFilter(
+            is_known.view(np.uint8),
+            cv2.CV_8U,
+            (near, near),
+            normalize=False,
+            borderType=cv2.BORDER_CONSTANT,
+        )
+    )
+    around = cv2.dilate(known, np.ones((2 * _AROUND_CELLS + 1,) * 2, dtype=np.uint8))
+    return is_known & (known < _SPARSE_SHARE * np.asarray(around))
+
+
+def denoised(depth_m: NDArray[np.float32], radius_cells: int) -> NDArray[np.float32]:
+    """Average depths over neighbours on the same surface (bilateral filter, Tomasi 1998).
+
+    The permitted difference of depth follows from the noise of the raster, so that steps of more
+    than about six standard deviations are preserved, to the cell.
+
+    Args:
+        depth_m: (rows, cols) metres, NaN where void.
+        radius_cells: maximum distance of neighbours; half of it is the sigma of the Gaussian
+            weight.
+
+    Returns:
+        (rows, cols) metres, NaN where it was.
+    """
+    import cv2
+
+    noise_m = depth_noise_m(depth_m)
+    is_known = np.isfinite(depth_m)
+    if noise_m < _NOISE_LEAST_M or radius_cells == 0 or not is_known.any():
+        return depth_m
+    lowest = float(depth_m[is_known].min())
+    values = depth_m
+    for reach in _REACHES:
+        reach_m = reach * noise_m
+        filled = np.where(is_known, values, np.float32(lowest - _VOID_REACHES * reach_m))
+        values = np.asarray(
+            cv2.bilateralFilter(
+                filled,
+                2 * radius_cells + 1,
+                sigmaColor=reach_m,
+                sigmaSpace=0.5 * max(1.0, float(radius_cells)),
+                borderType=cv2.BORDER_REPLICATE,
+            ),
+            dtype=np.float32,
+        )
+    return np.where(is_known, values, np.float32(math.nan))
+
+
+@compiled
+def _find_specks(
+    depth_m: NDArray[np.float32],
+    is_sparse: NDArray[np.bool_],
+    agree_m: tuple[float, float, float],
+    is_speck: NDArray[np.bool_],
+    first_row: int,
+    end_row: int,
+) -> None:
+    """Report the specks among the cells of some rows.
+
+    Args:
+        depth_m: (rows, cols) metres, NaN where void.
+        is_sparse: (rows, cols) cells in gaps of an otherwise well known surface.
+        agree_m: maximum difference of depths that agree; that of sparse cells; and what the slope
+            of a surface adds to the latter for each row or column between.
+        is_speck: (rows, cols), set for known cells with which fewer than two of at least six known
+            ones in the 5 x 5 neighbourhood agree, and for sparse ones with which fewer than three,
+            or fewer than half of the known ones, in the 9 x 9 neighbourhood agree.
+        first_row: first row to visit.
+        end_row: the row after the last one.
+    """
+    columns = depth_m.shape[1]
+    layer_m, noise_m, slope_m = agree_m
+    for row in range(first_row, end_row):
+        for column in range(columns):
+            if np.isnan(depth_m[row, column]):
+                continue
+            if is_sparse[row, column]:
+                n_known, n_agreeing = _count_around(
+                    depth_m, row, column, _SPARSE_CELLS, noise_m, slope_m
+                )
+                is_speck[row, column] = n_agreeing < max(_SPARSE_LEAST, 0.5 * n_known)
+                continue
+            n_known, n_agreeing = _count_around(depth_m, row, column, _NEAR_CELLS, layer_m, 0.0)
+            is_speck[row, column] = n_agreeing < _AGREEING_LEAST and n_known >= _KNOWN_LEAST
+
+
+@compiled
+def _count_around(
+    depth_m: NDArray[np.float32],
+    row: int,
+    column: int,
+    reach: int,
+    agree_m: float,
+    slope_m: float,
+) -> tuple[int, int]:
+    """Count the known cells around a cell, and those that agree with it.
+
+    Depths agree that differ by at most `agree_m`, plus `slope_m` for each row or column between.
+    """
+    rows, columns = depth_m.shape
+    here = depth_m[row, column]
+    n_known, n_agreeing = -1, -1
+    for r in range(max(0, row - reach), min(rows, row + reach + 1)):
+        for c in range(max(0, column - reach), min(columns, column + reach + 1)):
+            other = depth_m[r, c]
+            if np.isnan(other):
+                continue
+            n_known += 1
+            n_between = max(abs(r - row), abs(c - column))
+            n_agreeing += abs(other - here) <= agree_m + n_between * slope_m
+    return n_known, n_agreeing
+
+
+def close_gaps(
+    cloud: PointCloud,
+    slab: Slab,
+    surface: CellSurface,
+    params: RasterGrid.Params,
+    *,
+    threads: int,
+) -> NDArray[np.uint8]:
+    """Fill the narrow gaps of a surface in place; their spread stays unknown, their count 0.
+
+    A gap is recovered between points that are neighbours in a scan if its rows and columns are
+    known; otherwise between the measured cells around it.
+
+    Returns:
+        (cells,) `SurfaceMask`.
+    """
+    reach_cells = params.recover_gap_cells
+    is_known = np.isfinite(surface.depth_m)
+    mask = np.full(is_known.shape, SurfaceMask.RECOVERED, dtype=np.uint8)
+    mask[surface.count > 0] = SurfaceMask.MEASURED
+    mask[~is_known] = SurfaceMask.VOID
+    was_filled = _recover_between_neighbours(cloud, slab, surface, params, threads=threads)
+    mask[was_filled] = SurfaceMask.RECOVERED
+    narrow = narrow_gaps(is_known.reshape(slab.frame.shape), reach_cells)
+    narrow = narrow[mask[narrow] == SurfaceMask.VOID]
+    values = cell_values(surface.depth_m, intensity=surface.intensity, rgb=surface.rgb)
+    is_found = interpolate(
+        narrow,
+        Surroundings(surface.places, slab.frame.width, params.layer_m),
+        values,
+        values,
+        reach_cells=reach_cells,
+        threads=threads,
+    )
+    mask[narrow[is_found]] = SurfaceMask.RECOVERED
+    return mask
+
+
+def _recover_between_neighbours(
+    cloud: PointCloud,
+    slab: Slab,
+    surface: CellSurface,
+    params: RasterGrid.Params,
+    *,
+    threads: int,
+) -> NDArray[np.bool_]:
+    """Fill void cells of a surface between neighbours in the scans' grids by linear interpolation.
+
+    A point that the scanner missed lies between its neighbours in the scan, whatever their distance
+    on the raster. So a gap between points that are neighbours, or nearly, and on one surface is
+    recovered between them; one through which the scanner looked is not, since no neighbours span
+    it. A cloud without rows and columns has no neighbours.
+
+    Returns:
+        (cells,) which were filled; their spreads stay unknown and their counts 0.
+    """
+    import cv2
+
+    was_void = ~np.isfinite(surface.depth_m)
+    is_void, n_cells = was_void.copy(), was_void.size
+    has_grid = cloud.row is not None and cloud.column is not None
+    if params.recover_scan_steps == 0 or not has_grid or not is_void.any():
+        return np.zeros(n_cells, dtype=np.bool_)
+    intensity = _unchanged(np.empty(0, np.float32) if cloud.intensity is None else cloud.intensity)
+    rgb = _unchanged(np.empty((0, 3), np.uint8) if cloud.rgb is None else cloud.rgb)
+    matrix = wall_from_offset(slab.frame, cloud.origin)
+    offsets = read_only(cloud.x, cloud.y, cloud.z)
+    span_cells = SPAN_GAPS * params.recover_gap_cells
+    window = np.ones((2 * span_cells + 1,) * 2, dtype=np.uint8)
+    near = cv2.dilate(is_void.reshape(slab.frame.shape).view(np.uint8), window)
+    is_near = np.asarray(near, dtype=np.bool_).ravel()
+    chosen = _points_on(cloud, slab, surface, is_near, params.layer_m, threads=threads)
+    for step in range(1, params.recover_scan_steps + 1):
+        sums = kernels.Sums(
+            n=np.zeros(n_cells, dtype=np.uint16),
+            depth_m=np.zeros(n_cells, dtype=np.float32),
+            intensity=np.zeros(n_cells if intensity.size else 0, dtype=np.float32),
+            rgb=np.zeros((n_cells if rgb.size else 0, 3), dtype=np.float32),
+        )
+        reach = kernels.Reach(step, float(span_cells), params.layer_m)
+        for points in _grids(cloud, chosen):
+            grid = kernels.ScanGrid(points, offsets, matrix)
+            voids = is_void.reshape(slab.frame.shape)
+            kernels.recover_between(grid, intensity, rgb, reach, voids, sums)
+        # A cell takes the mean of the triangles that cover it.
+        filled = np.flatnonzero(is_void & (sums.n > 0))
+        n = sums.n[filled].astype(np.float32)
+        is_void[filled] = False
+        surface.depth_m[filled] = sums.depth_m[filled] / n
+        if surface.intensity is not None:
+            surface.intensity[filled] = sums.intensity[filled] / n
+        if surface.rgb is not None:
+            shades = sums.rgb[filled] / n[:, np.newaxis]
+            surface.rgb[filled] = np.clip(shades + 0.5, 0.0, 255.0).astype(np.uint8)
+    return was_void & ~is_void
+
+
+def _unchanged(values: NDArray[_Number]) -> NDArray[_Number]:
+    """Return an array in the form for which kernels are compiled."""
+    view = np.asarray(values).view(np.ndarray)
+    view.flags.writeable = False
+    return view
+
+
+def _grids(cloud: PointCloud, chosen: NDArray[np.uint32]) -> Iterator[NDArray[np.int64]]:
+    """Return for each scan the indices of its chosen points by row and column."""
+    if cloud.row is None or cloud.column is None:
+        raise AssertionError("a grid was asked of a cloud without rows and columns")
+    scans = np.zeros(len(chosen), dtype=np.uint16) if cloud.scan is None else cloud.scan[chosen]
+    for scan in np.unique(scans):
+        points = chosen[scans == scan]
+        rows, columns = cloud.row[points], cloud.column[points]
+        shape = (int(np.ptp(rows)) + 1, int(np.ptp(columns)) + 1)
+        if shape[0] * shape[1] > _GRID_CELLS_MOST:
+            continue
+        grid = np.full(shape, -1, dtype=np.int64)
+        grid[rows - rows.min(), columns - columns.min()] = points
+        yield grid
+
+
+def _points_on(
+    cloud: PointCloud,
+    slab: Slab,
+    surface: CellSurface,
+    is_near: NDArray[np.bool_],
+    layer_m: float,
+    *,
+    threads: int,
+) -> NDArray[np.uint32]:
+    """Return indices of the points on the surface of some cells (cells,)."""
+    found = [np.empty(0, dtype=np.uint32)]
+    for entries in entries_inside(cloud, slab, threads=threads):
+        beside = is_near[entries.cells]
+        off_m = np.abs(entries.depths_m[beside] - surface.depth_m[entries.cells[beside]])
+        found.append(entries.points[beside][off_m <= layer_m])
+    return np.concatenate(found)

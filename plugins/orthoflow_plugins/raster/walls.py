@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
@@ -14,14 +13,12 @@ from orthoflow.errors import MethodError
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.bands import IN_MEMORY_CELLS, Allocate, bands_with_reach
 from orthoflow.geometry.levels import REC_601
-from orthoflow.geometry.scan_steps import scan_step_m
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Planes, PointCloud, SurfaceMask, Wall
-from orthoflow_plugins.raster.rules import RasterRule
 
 if TYPE_CHECKING:
+    from orthoflow_plugins.raster.grid import RasterGrid
     from orthoflow_plugins.raster.nets import Net
-    from orthoflow_plugins.raster.surfaces import CellSurface
 
 # Bytes per cell: of a finished wall, and additionally during the passes over one wall.
 _BYTES_KEPT: Final = 25
@@ -29,14 +26,10 @@ _BYTES_WORKING: Final = 90
 _MEMORY_SHARE: Final = 0.75
 # Larger walls are rastered in bands of this many cells: 1.5 GB of memory.
 _BAND_CELLS: Final = 1 << 24
-
-
-@dataclass(frozen=True, kw_only=True)
-class WallRaster:
-    """A rastered wall, and the point spacing of the scan on it."""
-
-    wall: Wall
-    scan_step_m: float
+# Outliers are detected within 20 cells.
+_REACH_OF_OUTLIERS: Final = 32
+# Maximum distance of neighbours in the scan, in radii of a narrow gap.
+SPAN_GAPS: Final = 4
 
 
 def require_memory(frames: Sequence[WallFrame]) -> None:
@@ -64,101 +57,95 @@ def require_memory(frames: Sequence[WallFrame]) -> None:
 def rastered_wall(
     cloud: PointCloud,
     slab: Slab,
-    rule: RasterRule,
+    params: RasterGrid.Params,
     *,
     planes: Planes,
     index: int,
     allocate: Allocate,
-) -> WallRaster:
-    """Raster the wall of a plane.
+    threads: int,
+) -> Wall:
+    """Raster the wall of a plane, a large one in bands of rows.
 
     Args:
         cloud: the points.
         slab: of the wall.
-        rule: how.
+        params: how.
         planes: all planes, of which the wall is one.
         index: of the wall's plane.
         allocate: returns the arrays of a large wall, by name.
+        threads: number of threads.
     """
-    if slab.n_cells > _BAND_CELLS:
-        raster = _rastered_in_bands(cloud, slab, rule, allocate)
-    else:
-        raster = _rastered(cloud, slab, rule)
-        if slab.n_cells > IN_MEMORY_CELLS:
-            raster = _in_files(raster, allocate)
-    surface, shape = raster.surface, slab.frame.shape
-    wall = Wall(
-        frame=slab.frame,
-        plane_index=index,
-        name=planes.names[index],
-        depth_m=surface.depth_m.reshape(shape),
-        sigma_m=surface.sigma_m.reshape(shape),
-        count=surface.count.reshape(shape),
-        mask=raster.mask.reshape(shape),
-        intensity=None if surface.intensity is None else surface.intensity.reshape(shape),
-        rgb=None if surface.rgb is None else surface.rgb.reshape(*shape, 3),
-        rgb_mask=None if surface.rgb is None else _where_known(raster, shape, allocate),
-        percentiles_m=None
-        if surface.percentiles_m is None
-        else surface.percentiles_m.reshape(*shape, -1),
-    )
-    return WallRaster(wall=wall, scan_step_m=scan_step_m(wall.count, gsd_m=slab.frame.gsd_m))
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Raster:
-    """The surface over a slab, and the state of its cells.
-
-    Attributes:
-        surface: flat over the cells.
-        mask: (cells,) uint8 `SurfaceMask`.
-    """
-
-    surface: CellSurface
-    mask: NDArray[np.uint8]
-
-
-def _rastered(cloud: PointCloud, slab: Slab, rule: RasterRule, net: Net | None = None) -> _Raster:
-    from orthoflow_plugins.raster.gaps import close_gaps
-    from orthoflow_plugins.raster.surfaces import carried_to_centres, surface_of
-
-    surface = surface_of(cloud, slab, rule.surface, net)
-    mask = close_gaps(cloud, slab, surface, rule.gaps)
-    surface = carried_to_centres(surface, slab, rule.surface)
-    if surface.intensity is None:
-        surface = replace(surface, intensity=_grey(surface, mask))
-    return _Raster(surface=surface, mask=mask)
-
-
-def _rastered_in_bands(
-    cloud: PointCloud, slab: Slab, rule: RasterRule, allocate: Allocate
-) -> _Raster:
-    """Raster a wall band by band, with the memory of one band."""
-    from orthoflow_plugins.raster.surfaces import CellSurface
-
-    whole: dict[str, NDArray[np.generic]] = {}
     frame, width = slab.frame, slab.frame.width
-    net = _net_in_bands(cloud, slab, rule, allocate) if rule.surface.surface == "tin" else None
-    for band in bands_with_reach(frame.shape, cells_most=_BAND_CELLS, reach_rows=rule.reach_rows):
+    is_large = slab.n_cells > _BAND_CELLS
+    net = None
+    if is_large and params.surface == "tin":
+        net = _net_in_bands(cloud, slab, params, allocate, threads=threads)
+    # Noise is filtered twice, and a gap is as wide as what spans it plus a disc on either side and
+    # a margin, between which it is interpolated.
+    reach_rows = _REACH_OF_OUTLIERS + 2 * params.denoise_cells
+    reach_rows += (SPAN_GAPS + 2) * params.recover_gap_cells + 2
+    whole: dict[str, NDArray[np.generic]] = {}
+    for band in bands_with_reach(frame.shape, cells_most=_BAND_CELLS, reach_rows=reach_rows):
         around = slice(band.around.start * width, band.around.stop * width)
         part = None if net is None else net.part(around)
-        raster = _rastered(cloud, slab.over(band.around), rule, part)
-        cells = slice(band.rows.start * width, band.rows.stop * width)
-        inner = slice(band.inner.start * width, band.inner.stop * width)
-        arrays = {"mask": raster.mask} | _fields_of(raster.surface)
-        for name, values in arrays.items():
+        found = _rastered(cloud, slab.over(band.around), params, part, threads=threads)
+        for name, values in found.items():
+            shape = (*frame.shape, *values.shape[1:])
+            if slab.n_cells <= IN_MEMORY_CELLS:
+                whole[name] = values.reshape(shape)
+                continue
             if name not in whole:
-                shape = (slab.n_cells, *values.shape[1:])
                 whole[name] = allocate(name, shape, values.dtype)
-            whole[name][cells] = values[inner]
-    mask = whole.pop("mask")
-    absent = dict.fromkeys(("intensity", "rgb", "has_rgb", "percentiles_m", "places"))
+            of_band = values.reshape(-1, width, *values.shape[1:])
+            whole[name][band.rows] = of_band[band.inner]
     # The arrays have the types of the bands' own.
-    surface = CellSurface(**cast("dict[str, Any]", absent | whole))
-    return _Raster(surface=surface, mask=mask.astype(np.uint8, copy=False))
+    arrays = cast("dict[str, Any]", whole)
+    return Wall(frame=frame, plane_index=index, name=planes.names[index], **arrays)
 
 
-def _net_in_bands(cloud: PointCloud, slab: Slab, rule: RasterRule, allocate: Allocate) -> Net:
+def _rastered(
+    cloud: PointCloud,
+    slab: Slab,
+    params: RasterGrid.Params,
+    net: Net | None,
+    *,
+    threads: int,
+) -> dict[str, NDArray[np.generic]]:
+    """Return the arrays of a `Wall` over a slab, flat over the cells."""
+    from orthoflow_plugins.raster.surfaces import carried_to_centres, close_gaps, surface_of
+
+    surface = surface_of(cloud, slab, params, net, threads=threads)
+    mask = close_gaps(cloud, slab, surface, params, threads=threads)
+    surface = carried_to_centres(surface, slab, params, threads=threads)
+    intensity, rgb, rgb_mask = surface.intensity, surface.rgb, None
+    if rgb is not None:
+        rgb_mask = (mask != SurfaceMask.VOID).astype(np.uint8)
+        if surface.has_rgb is not None:
+            rgb_mask &= surface.has_rgb
+        if intensity is None:
+            intensity = rgb.astype(np.float32) @ REC_601.astype(np.float32) / np.float32(255.0)
+            intensity[rgb_mask == 0] = np.nan
+    found = {
+        "depth_m": surface.depth_m,
+        "sigma_m": surface.sigma_m,
+        "count": surface.count,
+        "mask": mask,
+        "intensity": intensity,
+        "rgb": rgb,
+        "rgb_mask": rgb_mask,
+        "percentiles_m": surface.percentiles_m,
+    }
+    return {name: values for name, values in found.items() if values is not None}
+
+
+def _net_in_bands(
+    cloud: PointCloud,
+    slab: Slab,
+    params: RasterGrid.Params,
+    allocate: Allocate,
+    *,
+    threads: int,
+) -> Net:
     """Triangulate a large wall: its vertices are found band by band, and are kept in files."""
     from orthoflow_plugins.raster.nets import Vertices, interpolate_net
     from orthoflow_plugins.raster.surfaces import vertices_of
@@ -169,49 +156,7 @@ def _net_in_bands(cloud: PointCloud, slab: Slab, rule: RasterRule, allocate: All
         depth_m=np.asarray(allocate("net_corner_m", shape, np.float32), np.float32),
     )
     for band in bands_with_reach(shape, cells_most=_BAND_CELLS, reach_rows=0):
-        found = vertices_of(cloud, slab.over(band.rows), rule.surface)
+        found = vertices_of(cloud, slab.over(band.rows), params, threads=threads)
         vertices.point[band.rows] = found.point
         vertices.depth_m[band.rows] = found.depth_m
     return interpolate_net(cloud, slab, vertices, allocate)
-
-
-def _in_files(raster: _Raster, allocate: Allocate) -> _Raster:
-    """Move the arrays of a finished raster into files."""
-    kept: dict[str, Any] = {}
-    for name, values in (("mask", raster.mask), *_fields_of(raster.surface).items()):
-        kept[name] = allocate(name, values.shape, values.dtype)
-        kept[name][...] = values
-    mask = kept.pop("mask")
-    return _Raster(surface=replace(raster.surface, **kept), mask=mask)
-
-
-def _fields_of(surface: CellSurface) -> dict[str, NDArray[np.generic]]:
-    """Return arrays of a surface that a wall keeps, by name."""
-    found = {field.name: getattr(surface, field.name) for field in fields(surface)}
-    return {
-        name: values for name, values in found.items() if name != "places" and values is not None
-    }
-
-
-def _where_known(raster: _Raster, shape: tuple[int, int], allocate: Allocate) -> NDArray[np.uint8]:
-    """Return 1 where a cell has a colour, else 0; in a file for a large wall."""
-    mask = raster.mask.reshape(shape)
-    if mask.size <= _BAND_CELLS:
-        known = (mask > 0).astype(np.uint8)
-    else:
-        known = np.asarray(allocate("rgb_mask", shape, np.uint8), np.uint8)
-        np.minimum(mask, 1, out=known)
-    if raster.surface.has_rgb is not None:
-        known &= raster.surface.has_rgb.reshape(shape).view(np.uint8)
-    return known
-
-
-def _grey(surface: CellSurface, mask: NDArray[np.uint8]) -> NDArray[np.float32] | None:
-    rgb = surface.rgb
-    if rgb is None:
-        return None
-    grey = rgb.astype(np.float32) @ REC_601.astype(np.float32) / np.float32(255.0)
-    grey[mask == SurfaceMask.VOID] = np.nan
-    if surface.has_rgb is not None:
-        grey[~surface.has_rgb] = np.nan
-    return grey.astype(np.float32)

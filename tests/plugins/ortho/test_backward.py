@@ -5,15 +5,12 @@ from __future__ import annotations
 import dataclasses
 from itertools import count
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.ortho import dsm_backward
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
-from orthoflow_plugins.ortho.layers import CellCounts
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry import WallFrame
@@ -462,24 +459,6 @@ def test_half_of_the_weight_lies_below_the_median(
     values: list[float], weights: list[int], median: float
 ) -> None:
     assert dsm_backward._weighted_median(np.array(values), np.array(weights)) == median
-
-
-def test_walls_without_a_surface_have_no_share_of_anything(tmp_path: Path) -> None:
-    painted: Any = SimpleNamespace(
-        layers=(),
-        n_cells=np.array([3, 1]),
-        photo_gsd_m=np.array([0.002, 0.003]),
-        obliquity_deg=np.array([10.0, 40.0]),
-        seconds={"painting_s": 2.0},
-    )
-    for n_surface, share in ((0, 0.0), (8, 0.5)):
-        ctx = context(tmp_path)
-        counts = CellCounts(n_surface=n_surface, n_painted=n_surface // 2, n_hidden=n_surface // 4)
-        dsm_backward._report(ctx, counts, painted)
-        told = {metric.name: metric.value for metric in ctx.metrics}
-        assert (told["painted_share"], told["occluded_share"]) == (share, share / 2)
-        assert (told["photo_gsd_mm"], told["obliquity_deg"]) == (2.0, 10.0)
-        assert (told["n_layers"], told["painting_s"], told["decoding_s"]) == (0, 2.0, 0.0)
 
 
 def refused(cameras: Cameras, folder: Path, **changes: object) -> str:

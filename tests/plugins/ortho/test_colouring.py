@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.ortho import point_colours
 from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
 
 from orthoflow.products import Layer, LayerMask
@@ -96,13 +95,3 @@ def test_bands_do_not_show_in_colours(
         np.testing.assert_array_equal(getattr(whole, name), getattr(banded, name), err_msg=name)
     # Places are counted from the band's own corner: the last digit of float32.
     np.testing.assert_allclose(whole.quality, banded.quality, atol=1e-6)
-
-
-def test_cells_are_cut_into_parts_of_at_most_so_many_points_or_one_cell(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(point_colours, "_POINTS_AT_ONCE", 6)
-    n_points = np.array([5, 1, 7, 0, 3, 3, 1, 0, 9, 8], dtype=np.uint32)
-    parts = list(point_colours._in_parts(n_points))
-    assert [n_points[part].tolist() for part in parts] == [[5, 1], [7], [0, 3, 3], [1, 0], [9], [8]]
-    assert [part.start for part in parts] == [0, *(part.stop for part in parts[:-1])]

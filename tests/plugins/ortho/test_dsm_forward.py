@@ -1,25 +1,17 @@
-"""Rays of every sixteenth pixel, which cells a photo shows, and what is told of a projection."""
+"""Rays of every sixteenth pixel, and which cells a photo shows."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 from orthoflow_plugins.ortho import dsm_forward
-from orthoflow_plugins.ortho.forward_kernels import NO_PIXEL
-from orthoflow_plugins.ortho.layers import CellCounts
-from orthoflow_plugins.ortho.surfaces import Surface, transparent_relief_of
+from orthoflow_plugins.ortho.surfaces import Surface, relief_of
 
-from orthoflow.geometry.bands import in_memory
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.products import LayerMask
 from tests import ortho_scenes as scenes
-from tests.raster_scenes import context
 
 WHERE = scenes.frame()
 
@@ -28,7 +20,7 @@ def surface_of(depths: np.ndarray) -> Surface:
     wall = scenes.walls(WHERE, depths).walls[0]
     return Surface(
         frame=WHERE,
-        relief=transparent_relief_of(wall, threads=1),
+        relief=relief_of(wall, hides=False),
         front_m=scenes.BUFFER_M,
         tolerance_m=0.008,
     )
@@ -103,38 +95,3 @@ def test_cells_are_seen_inside_the_photo_and_worth_their_pixels(
     area = camera.fx * camera.fy * WHERE.gsd_m**2 / along**2
     worth = np.where(expected, cosine * area * np.clip(inside / 40.0, 0.0, 1.0), 0.0)
     np.testing.assert_allclose(quality.ravel(), np.nan_to_num(worth), rtol=1e-5, atol=1e-6)
-
-
-def test_an_empty_catch_has_no_pixel_and_all_is_nearer_than_nothing() -> None:
-    catch = dsm_forward._empty_catch((3, 4), in_memory)
-    assert (catch.pixel == NO_PIXEL).all()
-    assert np.isinf(catch.square).all()
-    assert (catch.pixel.dtype, catch.square.dtype) == (np.int32, np.float32)
-
-
-def test_a_projection_is_told_of_by_its_shares_and_times(tmp_path: Path) -> None:
-    def layer(n_painted: int, n_filled: int | None) -> Any:
-        mask = np.full((10, 10), LayerMask.OUTSIDE, dtype=np.uint8)
-        mask.ravel()[:n_painted] = LayerMask.PAINTED
-        filled = None
-        if n_filled is not None:
-            filled = (np.arange(100).reshape(10, 10) < n_filled).astype(np.uint8)
-        return SimpleNamespace(mask=mask, filled=filled)
-
-    def photos(layers: list[Any], **seconds: float) -> Any:
-        return SimpleNamespace(layers=layers, seconds=seconds)
-
-    layers = [layer(50, 5), layer(30, None), layer(20, 15)]
-    painted = photos(layers, occluders_s=1.5, painting_s=6.0)
-    ctx = context(tmp_path)
-    dsm_forward._report(ctx, CellCounts(n_surface=160, n_painted=40, n_hidden=7), painted)
-    assert {metric.name: metric.value for metric in ctx.metrics} == {
-        "n_layers": 3,
-        "painted_share": 0.25,
-        "filled_share": 0.2,
-        "occluders_s": 1.5,
-        "painting_s": 6.0,
-    }
-    nothing = context(tmp_path)
-    dsm_forward._report(nothing, CellCounts(n_surface=0, n_painted=0, n_hidden=0), photos([]))
-    assert {metric.name: metric.value for metric in nothing.metrics}["painted_share"] == 0.0

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from orthoflow_plugins.ortho.forward_kernels import _first_meeting
 from orthoflow_plugins.ortho.photos_on_walls import VisibilityParams
 from orthoflow_plugins.ortho.surfaces import Surface, relief_of, view_of
-from orthoflow_plugins.ortho.views import Relief, WallView
+from orthoflow_plugins.ortho.visibility_kernels import Relief, WallView
 
 from tests import ortho_scenes as scenes
 
@@ -30,13 +30,13 @@ def boxes(seed: int) -> tuple[WallView, Relief]:
     where = scenes.frame()
     surface = Surface(
         frame=where,
-        relief=relief_of(scenes.walls(where, depths).walls[0], threads=1),
+        relief=relief_of(scenes.walls(where, depths).walls[0]),
         front_m=scenes.BUFFER_M,
         tolerance_m=TOLERANCE_M,
     )
     params = VisibilityParams(incidence_max_deg=80.0, border_share=0.05)
     camera = scenes.camera(where, aside_m=rng.uniform(-0.5, 0.5))
-    view = view_of(camera, surface, params, is_exact=True)
+    view = view_of(camera, surface, params)
     # So near that rays graze: they fall by less over a cell than boxes are high.
     return view._replace(height_m=surface.relief.highest_m + 0.3), surface.relief
 

@@ -8,16 +8,13 @@ import numpy as np
 import pytest
 from orthoflow_plugins.ortho.layers import (
     NO_SOURCE,
-    CellCounts,
     LayerStack,
-    PaintedPhotos,
-    ReachedWall,
     count_shown,
-    joined_layers,
 )
 
 from orthoflow.errors import MethodError
 from orthoflow.products import Layer, LayerMask, Layers, Walls
+from orthoflow.sdk import StepContext
 from tests import samples
 from tests.raster_scenes import context
 
@@ -61,17 +58,18 @@ def layer(wall: int, source: str, mask: np.ndarray, *, deep: bool = False) -> La
     )
 
 
-def painted(*found: Layer, reached: tuple[ReachedWall, ...] = ()) -> PaintedPhotos:
-    return PaintedPhotos(layers=found, reached=reached, seconds={})
+def stacked(ctx: StepContext, *found: Layer) -> LayerStack:
+    stack = LayerStack(walls(), ctx)
+    for each in found:
+        stack.add(each)
+    return stack
 
 
 def test_layers_come_by_wall_and_then_by_photo(tmp_path: Path) -> None:
     shown = mask_of(a=PAINTED, b=HIDDEN, c=OUTSIDE)
-    photos = painted(
-        *(layer(wall, name, shown) for wall, name in ((2, "a"), (0, "a"), (1, "b"), (0, "b")))
-    )
+    photos = (layer(wall, name, shown) for wall, name in ((2, "a"), (0, "a"), (1, "b"), (0, "b")))
     ctx = context(tmp_path)
-    found = joined_layers(walls(), photos, ctx)
+    found = stacked(ctx, *photos).joined(np.uint8)
     assert [(each.wall, each.source) for each in found.layers] == [
         (0, "a"), (0, "b"), (1, "b"), (2, "a"),
     ]  # fmt: skip
@@ -79,7 +77,7 @@ def test_layers_come_by_wall_and_then_by_photo(tmp_path: Path) -> None:
     assert found.plane_indices == (4, 5, 6)
     assert ctx.warnings == []
     with pytest.raises(MethodError, match="no oriented photo sees a wall"):
-        joined_layers(walls(), painted(), ctx)
+        stacked(ctx).joined(np.uint8)
 
 
 @pytest.mark.parametrize("deep", [False, True])
@@ -87,13 +85,16 @@ def test_a_wall_that_no_photo_paints_is_bare_but_tells_what_is_hidden(
     tmp_path: Path, deep: bool
 ) -> None:
     shown = layer(0, "a", mask_of(a=PAINTED, b=HIDDEN, c=OUTSIDE), deep=deep)
-    reached = [
-        ReachedWall(wall=1, mask=mask_of(a=HIDDEN, b=OUTSIDE, c=OUTSIDE)),
-        ReachedWall(wall=1, mask=mask_of(a=OUTSIDE, b=HIDDEN, c=OUTSIDE)),
-    ]
-    photos = painted(shown, reached=tuple(reached))
     ctx = context(tmp_path)
-    found = joined_layers(walls(), photos, ctx)
+    stack = stacked(ctx, shown)
+    mask = mask_of(a=HIDDEN, b=OUTSIDE, c=OUTSIDE)
+    stack.note_reached(1, mask)
+    # The mask of the next photo lies where that of the first did.
+    mask[:3] = [[OUTSIDE], [HIDDEN], [OUTSIDE]]
+    stack.note_reached(1, mask)
+    # A photo paints this wall.
+    stack.note_reached(0, mask_of(a=HIDDEN, b=HIDDEN, c=HIDDEN))
+    found = stack.joined(np.uint16 if deep else np.uint8)
     first, second, third = found.layers
     assert first is shown
     assert ctx.warnings == ["no photo shows wall 1, wall 2: the orthoimage stays empty"]
@@ -120,8 +121,7 @@ def test_cells_are_counted_once_however_many_photos_show_them() -> None:
     )
     # Three of four rows have a depth; two are painted on the first wall, one hidden, and two on
     # the second one.
-    expected = CellCounts(n_surface=3 * 18, n_painted=12, n_hidden=6 + 12)
-    assert count_shown(walls(), layered) == expected
+    assert count_shown(walls(), layered) == (3 * 18, 12, 6 + 12)
 
 
 def test_arrays_of_each_layer_have_names_of_their_own(tmp_path: Path) -> None:
@@ -140,23 +140,3 @@ def test_arrays_of_each_layer_have_names_of_their_own(tmp_path: Path) -> None:
     stack.allocator(2)("rgb", (2, 3), np.uint8)
     stack.scratch(1)("pixel", (2, 3), np.int32)
     assert asked == ["layers 2.0.rgb", "layers 2.1.rgb", "layers 1.scratch.pixel"]
-
-
-def test_what_photos_reach_counts_until_one_paints(tmp_path: Path) -> None:
-    ctx = context(tmp_path)
-    stack = LayerStack(walls(), ctx)
-    first = mask_of(a=HIDDEN, b=OUTSIDE, c=OUTSIDE)
-    stack.note_reached(1, first)
-    # The mask of the next photo lies where that of the first did.
-    first[:3] = [[OUTSIDE], [HIDDEN], [OUTSIDE]]
-    stack.note_reached(1, first)
-    stack.note_reached(0, mask_of(a=OUTSIDE, b=OUTSIDE, c=HIDDEN))
-    assert [reached.wall for reached in stack.reached] == [0, 1]
-    np.testing.assert_array_equal(stack.reached[1].mask, mask_of(a=HIDDEN, b=HIDDEN, c=OUTSIDE))
-    with stack.painting_from("a.jpg"):
-        stack.add(layer(1, "a.jpg", mask_of(a=PAINTED, b=HIDDEN, c=OUTSIDE)))
-        stack.add(layer(2, "a.jpg", mask_of(a=PAINTED, b=HIDDEN, c=OUTSIDE)))
-    with stack.painting_from("b.jpg"):
-        stack.note_reached(1, mask_of(a=HIDDEN, b=HIDDEN, c=HIDDEN))
-    assert [reached.wall for reached in stack.reached] == [0]
-    assert [painted.wall for painted in stack.painted] == [1, 2]

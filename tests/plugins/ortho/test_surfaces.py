@@ -17,10 +17,9 @@ from orthoflow_plugins.ortho.surfaces import (
     is_before,
     relief_of,
     surfaces_of,
-    transparent_relief_of,
     view_of,
 )
-from orthoflow_plugins.ortho.views import BLOCK_CELLS, FINE_CELLS, NOTHING, NOTHING_M
+from orthoflow_plugins.ortho.visibility_kernels import BLOCK_CELLS
 
 from orthoflow.geometry.depth_noise import depth_noise_m
 from orthoflow.products import Wall
@@ -43,7 +42,7 @@ def rough(shape: tuple[int, int]) -> NDArray[np.float32]:
     depths = rng.normal(0.0, 0.003, shape)
     depths[rng.random(shape) < 0.02] = np.nan
     depths[shape[0] // 2 :, shape[1] // 3 :] += 0.08
-    depths[: FINE_CELLS + 1, : BLOCK_CELLS + 3] = np.nan
+    depths[:9, : BLOCK_CELLS + 3] = np.nan
     return depths.astype(np.float32)
 
 
@@ -67,59 +66,26 @@ SHAPES = [(8, 8), (9, 17), (32, 64), (70, 101), (100, 33), (5, 40)]
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
 def test_bounds_of_blocks_are_those_of_their_cells(shape: tuple[int, int]) -> None:
     depths = rough(shape)
-    relief = relief_of(wall_of(depths), threads=2)
+    relief, clear = relief_of(wall_of(depths)), relief_of(wall_of(depths), hides=False)
     low = np.where(np.isnan(depths), np.inf, depths)
-    high = np.where(np.isnan(depths), -np.inf, depths)
-    np.testing.assert_array_equal(relief.bottoms, of_blocks(low, BLOCK_CELLS, np.min))
-    np.testing.assert_array_equal(relief.crests, of_blocks(high, BLOCK_CELLS, np.max))
-    np.testing.assert_array_equal(relief.fine_bottoms, of_blocks(low, FINE_CELLS, np.min))
-    hiding = relief.occluding.reshape(shape) * relief.step_m
-    hiding = np.where(relief.occluding.reshape(shape) == NOTHING, NOTHING_M, hiding)
-    for tops, side in ((relief.tops, BLOCK_CELLS), (relief.fine_tops, FINE_CELLS)):
-        # The highest of the four blocks that begin a row and a column before, none outside.
-        single = np.pad(of_blocks(hiding, side, np.max), 1, constant_values=NOTHING_M)
-        expected = np.maximum.reduce(
-            [single[:-1, :-1], single[1:, :-1], single[:-1, 1:], single[1:, 1:]]
-        )
-        assert tops.shape == expected.shape
-        np.testing.assert_array_equal(tops == NOTHING_M, expected == NOTHING_M)
-        known = expected > NOTHING_M
-        np.testing.assert_allclose(tops[known], expected[known], atol=0.51 * relief.step_m)
-    assert relief.highest_m == max(NOTHING_M, float(relief.tops.max()))
-    # For others kernels would be compiled once more.
-    assert not relief.depth.flags.writeable
-    assert not relief.occluding.flags.writeable
+    for prepared in (relief, clear):
+        np.testing.assert_array_equal(prepared.bottoms, of_blocks(low, BLOCK_CELLS, np.min))
+        np.testing.assert_array_equal(prepared.depth, depths)
+        # For others kernels would be compiled once more.
+        assert not prepared.depth.flags.writeable
+        assert not prepared.occluding.flags.writeable
+    tops = of_blocks(relief.occluding, BLOCK_CELLS, np.max)
+    np.testing.assert_array_equal(relief.tops, tops)
+    assert relief.highest_m == tops.max()
+    assert clear.occluding.size == 0
+    assert clear.highest_m == clear.tops.max() == -np.inf
 
 
-@pytest.mark.parametrize("shape", SHAPES[:3], ids=str)
-def test_a_transparent_relief_has_bounds_and_hides_nothing(shape: tuple[int, int]) -> None:
-    depths = rough(shape)
-    relief, hiding = (of(wall_of(depths), threads=1) for of in (transparent_relief_of, relief_of))
-    for name in ("bottoms", "crests", "fine_bottoms", "depth"):
-        np.testing.assert_array_equal(getattr(relief, name), getattr(hiding, name))
-    assert relief.occluding.size == 0
-    assert (relief.tops == NOTHING_M).all()
-    assert (relief.fine_tops == NOTHING_M).all()
-    assert relief.highest_m == NOTHING_M
-
-
-@pytest.mark.parametrize(
-    ("depths", "step_m"),
-    [
-        ([[0.0, 0.1]], 0.1 / 32_000),
-        ([[-0.4, 0.1]], 0.4 / 32_000),
-        ([[np.nan, 0.1]], 0.1 / 32_000),
-        ([[np.nan, np.nan]], 1e-6),
-        ([[0.001, -0.002]], 1e-6),
-    ],
-)
-def test_heights_fit_into_sixteen_bits(depths: list[list[float]], step_m: float) -> None:
-    relief = relief_of(wall_of(np.array(depths)), threads=1)
-    assert relief.step_m == pytest.approx(step_m)
-    # As fine as a step where anything is.
-    known = relief.occluding != NOTHING
-    assert known.any() == bool(np.isfinite(depths).any())
-    assert np.abs(relief.occluding[known].astype(int)).max(initial=0) <= 32_000
+def test_bands_of_a_large_wall_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
+    wall = wall_of(rough((100, 33)))
+    whole = relief_of(wall).occluding
+    monkeypatch.setattr(surfaces, "_BAND_CELLS", 33 * 20)
+    np.testing.assert_array_equal(relief_of(wall).occluding, whole)
 
 
 PARAMS = VisibilityParams(
@@ -131,7 +97,7 @@ def surface_of(depths: NDArray[np.floating]) -> Surface:
     wall = wall_of(depths)
     return Surface(
         frame=wall.frame,
-        relief=transparent_relief_of(wall, threads=1),
+        relief=relief_of(wall, hides=False),
         front_m=0.2,
         tolerance_m=0.007,
     )
@@ -149,8 +115,6 @@ def test_a_camera_is_the_same_in_the_axes_of_a_wall() -> None:
     assert (view.gsd_m, view.front_m, view.tolerance_m) == (where.gsd_m, 0.2, 0.007)
     assert view.cosine_least == pytest.approx(math.cos(math.radians(70.0)))
     assert view.border_px == 0.05 * min(camera.width, camera.height)
-    assert not view.is_exact
-    assert view_of(camera, surface, PARAMS, is_exact=True).is_exact
     # A pixel at least, or none would fade.
     borderless = PARAMS.model_copy(update={"border_share": 0.0})
     assert view_of(camera, surface, borderless).border_px == 1.0
@@ -212,6 +176,6 @@ def test_a_step_of_five_cells_is_an_edge_that_hides_in_full(
 ) -> None:
     depths = np.zeros((20, 20))
     depths[:, 10:] = step_cells * GSD_M
-    relief = relief_of(wall_of(depths), threads=1)
-    beside = relief.occluding.reshape(20, 20)[5, 9] * relief.step_m
+    relief = relief_of(wall_of(depths))
+    beside = relief.occluding[5, 9]
     assert beside == pytest.approx(step_cells * GSD_M if is_edge else 0.0, abs=1e-5)

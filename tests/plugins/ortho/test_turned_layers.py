@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.ortho.painting import CellFootprint, Resampling, sample
 from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
-from orthoflow_plugins.ortho.sampling import CellFootprint, Resampling, sample
-from orthoflow_plugins.ortho.views import TileVisibility
 
-from orthoflow.geometry import frame_over
+from orthoflow.geometry import eight_bits, frame_over
 from orthoflow.products import Layer, LayerMask, Walls
 from tests import raster_scenes as scenes
 from tests import samples
@@ -76,18 +75,11 @@ def test_a_turned_photo_is_sampled_alike(resampling: Resampling, turn: Turn) -> 
     rng = np.random.default_rng(8)
     photo = rng.integers(0, 256, (*SHAPE, 3), dtype=np.uint8)
     places = rng.uniform(8.0, 22.0, (20 * 20, 2))
-    # OpenCV takes places to 1/32 of a pixel, ours to 1/64: none lies between two of these.
+    # OpenCV takes places to 1/32 of a pixel: none lies between two of these.
     places = np.rint(places * 32.0) / 32.0 + 1.0 / 256.0 * rng.choice([-1.0, 1.0], places.shape)
 
     def sampled(turn: Turn) -> NDArray[np.uint8]:
         u, v = turn.places(places, SHAPE).T.astype(np.float32).reshape(2, 20, 20)
-        visible = TileVisibility(
-            u=u.copy(),
-            v=v.copy(),
-            mask=np.ones((20, 20), dtype=np.uint8),
-            quality=np.ones((20, 20), dtype=np.float32),
-            summary=np.array([u.min(), u.max(), v.min(), v.max(), 400.0, 0.0, 0.0, 0.0]),
-        )
         footprint = CellFootprint(
             pixels_across=1.7,
             pixels_down=1.7,
@@ -95,11 +87,10 @@ def test_a_turned_photo_is_sampled_alike(resampling: Resampling, turn: Turn) -> 
             obliquity_deg=0.0,
             n_cells=400,
         )
-        whole = (slice(0, 20), slice(0, 20))
-        into = np.empty((20, 20, 3), dtype=np.uint8)
-        return sample(
-            turn.raster(photo), visible, whole, footprint, resampling, is_filtered=True, into=into
-        ).copy()
+        bounds = tuple(int(value) for value in (u.min(), u.max(), v.min(), v.max()))
+        return eight_bits(
+            sample(turn.raster(photo), u, v, bounds, footprint, resampling, antialias=True)
+        )
 
     # The same cells look at the same places, wherever these come to lie; blur and weights are
     # whole numbers, rounded on their way.

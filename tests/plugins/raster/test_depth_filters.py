@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.raster import depth_filters
-from orthoflow_plugins.raster.depth_filters import denoised, without_specks
+from orthoflow_plugins.raster import surfaces
+from orthoflow_plugins.raster.surfaces import denoised, without_specks
 
 LAYER_M = 0.1
 GSD_M = 0.01
@@ -68,7 +68,7 @@ def test_cells_are_sparse_where_far_fewer_are_known_than_beside() -> None:
     is_known = np.ones((40, 60), dtype=np.bool_)
     is_known[:, 30:] = False
     is_known[::2, 30::2] = True  # a quarter: nine of 25, or six or four
-    sparse = depth_filters._sparse(is_known)
+    sparse = surfaces._sparse(is_known)
     assert not sparse[:, :30].any()
     # Nine of 25 are more than 0.35 of them, six are less.
     inner = sparse[5:35, 35:45]
@@ -82,7 +82,7 @@ def test_cells_are_sparse_where_far_fewer_are_known_than_beside() -> None:
     # Where nothing around is denser nothing is sparse.
     alone = np.zeros((60, 80), dtype=np.bool_)
     alone[::2, ::2] = True
-    assert not depth_filters._sparse(alone)[20:40, 20:60].any()
+    assert not surfaces._sparse(alone)[20:40, 20:60].any()
 
 
 def shadow(*, agree: int, n: int = 6) -> NDArray[np.float32]:
@@ -147,7 +147,7 @@ def test_cells_are_sparse_for_what_lies_within_sixteen_of_a_dense_place() -> Non
         is_known = np.ones((60, 80), dtype=np.bool_)
         is_known[:, 30:] = False
         is_known[::6, column::6] = True
-        sparse = depth_filters._sparse(is_known)[18:42]
+        sparse = surfaces._sparse(is_known)[18:42]
         assert sparse[:, column].any() == is_sparse
         assert not sparse[:, column + 1 :].any()
 
@@ -188,7 +188,7 @@ def test_cells_are_sparse_that_have_a_third_of_the_known_ones_that_others_around
     counts = near.reshape(is_known.shape)
     most = np.array([around(counts, *place, 16).max() for place in places])
     expected = is_known & (counts < 0.35 * most.reshape(is_known.shape))
-    np.testing.assert_array_equal(depth_filters._sparse(is_known), expected)
+    np.testing.assert_array_equal(surfaces._sparse(is_known), expected)
     assert 0 < np.count_nonzero(expected) < np.count_nonzero(is_known)
 
 
@@ -211,7 +211,7 @@ def weighed(depth_m: NDArray[np.float64], radius: int, reach_m: float) -> NDArra
 def test_noise_is_taken_out_within_three_sigmas_and_then_half_of_that(
     monkeypatch: pytest.MonkeyPatch, radius: int
 ) -> None:
-    monkeypatch.setattr(depth_filters, "depth_noise_m", lambda _depth_m: 0.01)
+    monkeypatch.setattr(surfaces, "depth_noise_m", lambda _depth_m: 0.01)
     depth_m = flat(30, 30, noise_m=0.012)
     depth_m[:, 15:] += 0.05
     expected = weighed(weighed(depth_m.astype(np.float64), radius, 0.03), radius, 0.015)

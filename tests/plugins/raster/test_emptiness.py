@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.raster.emptiness import Sight, emptiness_of
+from orthoflow_plugins.raster.extents import SampledPoints
 from orthoflow_plugins.raster.grid import RasterGrid
-from orthoflow_plugins.raster.sampled_points import SampledPoints
 
 from orthoflow.diagnostics import Diagnostic
 from orthoflow.geometry.slabs import Slab

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.raster import extents
-from orthoflow_plugins.raster.extents import Extent, Reach, extent_of
+from orthoflow_plugins.raster.extents import Extent, Reach, extent_of, sampled
 from orthoflow_plugins.raster.grid import RasterGrid
-from orthoflow_plugins.raster.sampled_points import sampled
 
 from orthoflow.products import Planes, PointCloud, Thickness, Walls
 from tests import raster_scenes as scenes
@@ -365,18 +364,18 @@ def test_what_is_set_is_not_looked_for() -> None:
     assert (found.front_m, found.behind_m) == (0.15, 0.05)
     # Of steps of 2.5 cm the farther end, and 2 cm beyond.
     found = extent(wall(), back, least_m=0.06)
-    assert found.buffer_m == (0.06, pytest.approx(0.14, abs=0.03))
+    assert (found.front_m, found.behind_m) == (0.06, pytest.approx(0.14, abs=0.03))
     assert found.behind_m == round(found.behind_m, 3)
     both = Reach(front_m=0.07, behind_m=0.3, least_m=0.15)
     assert both.is_set
-    assert both.as_set.buffer_m == (0.07, 0.3)
+    assert (both.as_set.front_m, both.as_set.behind_m) == (0.07, 0.3)
     assert not Reach(front_m=None, behind_m=0.3, least_m=0.15).is_set
 
 
 def test_a_cloud_without_the_wall_gives_it_what_is_set() -> None:
     elsewhere = part((0.0, WIDTH_M), 0.8, (0.0, HEIGHT_M))
     found = extent(elsewhere, least_m=0.2)
-    assert (found.growth_m, found.buffer_m) == ((0.0, 0.0, 0.0, 0.0), (0.2, 0.2))
+    assert found == Extent(front_m=0.2, behind_m=0.2)
 
 
 def test_a_frame_is_widened_by_whole_cells() -> None:

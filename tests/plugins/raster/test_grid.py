@@ -365,7 +365,7 @@ def test_a_point_a_metre_beside_the_nearest_wall_is_told_of(
     )
     ctx = scenes.context(tmp_path)
     extent = Extent(front_m=0.1, behind_m=0.1)
-    assert list(grid._crops(planes, params, lambda _: extent, ctx)[0]) == [0]
+    assert list(grid._frames(planes, params, lambda _: extent, ctx)[0]) == [0]
     assert any(f"is {away_m:.2f} m away: check the" in said for said in ctx.warnings) == is_told
 
 
@@ -384,7 +384,8 @@ def test_what_an_adjoining_plane_cuts_off_is_told_of_beyond_a_cell_and_warned_of
     frame = samples.facing_south(0.01, 20, 10)
     extent = Extent(front_m=0.1, behind_m=0.1, cut_m={"left": askew_m})
     # Of which a margin takes two centimetres.
-    grid._log_cuts({0: frame}, known.planes(), lambda _: extent, ctx, margin_m=0.02)
+    params = RasterGrid.Params(margin_m=0.02)
+    grid._log_cuts({0: frame}, known.planes(), params, lambda _: extent, ctx)
     assert len(heard) == (told is not None)
     assert len(ctx.warnings) == (told == "warn")
     if told == "warn":

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from orthoflow_plugins.raster.frames import mapped
 from orthoflow_plugins.raster.grid import RasterGrid
-from orthoflow_plugins.raster.maps import mapped
 
 from orthoflow.errors import MethodError
 from orthoflow.files.geotiff import GridPlace, read_raster

@@ -62,7 +62,6 @@ def in_tiles(wall: tuple[PointCloud, Slab, Vertices], tile_cells: int) -> Net:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(nets, "VERTICES_MOST", 1000)
         patch.setattr(nets, "_TILE_CELLS", tile_cells)
-        patch.setattr(nets, "_SPAN_CELLS", 40)
         patch.setattr(nets, "SPAN_MOST_CELLS", SPAN_MOST)
         return interpolate_net(*wall)
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from orthoflow_plugins.raster import reporting
 from orthoflow_plugins.raster.emptiness import Emptiness
-from orthoflow_plugins.raster.walls import WallRaster
 
 from orthoflow.products import SurfaceMask, Wall
 from orthoflow.sdk import StepContext
@@ -63,7 +62,8 @@ def test_walls_are_told_in_numbers(listener: Listener) -> None:
     second = wall([[0, 0], [7, 1]])
     reporting.report(
         listener.context,
-        [WallRaster(wall=first, scan_step_m=0.0042), WallRaster(wall=second, scan_step_m=0.1)],
+        [first, second],
+        0.0042,
         UP,
     )
     assert listener.metrics == {
@@ -86,7 +86,7 @@ def test_walls_are_told_in_numbers(listener: Listener) -> None:
 
 
 def test_a_wall_of_single_points_has_no_spread(listener: Listener) -> None:
-    reporting.report(listener.context, [WallRaster(wall=wall([[1, 1, 0]]), scan_step_m=0.01)], UP)
+    reporting.report(listener.context, [wall([[1, 1, 0]])], 0.01, UP)
     assert "sigma_median_mm" not in listener.metrics
     assert listener.metrics["points_per_cell"] == 1.0
 
@@ -100,7 +100,7 @@ def test_a_wall_of_single_points_has_no_spread(listener: Listener) -> None:
     ],
 )
 def test_what_the_cloud_lacks_is_told(listener: Listener, source: str, said: list[str]) -> None:
-    reporting.warn(listener.context, [], source)
+    reporting.warn(listener.context, [], [], source)
     assert len(listener.warnings) == len(said)
     for warning, beginning in zip(listener.warnings, said, strict=True):
         assert warning.startswith(beginning)
@@ -108,21 +108,15 @@ def test_what_the_cloud_lacks_is_told(listener: Listener, source: str, said: lis
 
 def test_cells_finer_than_the_scan_are_told_with_how_many_hold_a_point(listener: Listener) -> None:
     given = [[1, 0, 2], [0, 0, 0]]
-    reporting.warn(
-        listener.context,
-        [
-            WallRaster(wall=wall([[0, 0]], name="empty"), scan_step_m=0.01),
-            WallRaster(wall=wall(given, name="coarse"), scan_step_m=0.0123),
-            WallRaster(
-                wall=wall(given, name="close", mask=[[1, 2, 1], [2, 0, 0]]), scan_step_m=0.0034
-            ),
-            WallRaster(wall=wall(given, name="just fine"), scan_step_m=0.0033),
-            WallRaster(
-                wall=wall(given, name="gaps", mask=[[1, 2, 1], [0, 0, 0]]), scan_step_m=0.003
-            ),
-        ],
-        "laser",
+    walls, steps_m = zip(
+        (wall([[0, 0]], name="empty"), 0.01),
+        (wall(given, name="coarse"), 0.0123),
+        (wall(given, name="close", mask=[[1, 2, 1], [2, 0, 0]]), 0.0034),
+        (wall(given, name="just fine"), 0.0033),
+        (wall(given, name="gaps", mask=[[1, 2, 1], [0, 0, 0]]), 0.003),
+        strict=True,
     )
+    reporting.warn(listener.context, walls, steps_m, "laser")
     empty, *fine = listener.context.diagnostics
     assert (empty.code, empty.subject) == ("wall-without-points", "empty")
     assert [(one.subject, one.values["measured"], one.values["interpolated"]) for one in fine] == [
@@ -138,7 +132,7 @@ def test_cells_finer_than_the_scan_are_told_with_how_many_hold_a_point(listener:
 
 def test_cells_that_are_advised_are_no_longer_too_fine(listener: Listener) -> None:
     step_m = 0.003_37  # asks for 0.005055 m, whose nearest number of two digits is what is given
-    reporting.warn(listener.context, [WallRaster(wall=wall([[1]]), scan_step_m=step_m)], "laser")
+    reporting.warn(listener.context, [wall([[1]])], [step_m], "laser")
     [said] = listener.context.diagnostics
     [advised] = re.findall(r"gsd_m=([0-9.]+)", said.remedy)
     assert float(advised) == 0.0051

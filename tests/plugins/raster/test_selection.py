@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.raster import selection
+from orthoflow_plugins.raster.grid import RasterGrid
 from orthoflow_plugins.raster.selection import (
-    WallChoice,
     chosen_planes,
     chosen_relief,
     covered_planes,
@@ -20,13 +20,15 @@ from orthoflow.errors import MethodError
 from orthoflow.products import Planes
 from tests import samples
 
-CHOICE = WallChoice(
-    constraint="any",
-    min_area_m2=0.5,
-    n_walls_max=10,
-    skip_covered=True,
-    buffer_m=lambda _: (0.15, 0.15),
-)
+CHOICE = RasterGrid.Params(min_area_m2=0.5, n_walls_max=10)
+
+
+def but(params: RasterGrid.Params, **changes: object) -> RasterGrid.Params:
+    return params.model_copy(update=changes)
+
+
+def buffer_m(_: int) -> tuple[float, float]:
+    return 0.15, 0.15
 
 
 def planes(*walls: tuple[float, float, float, float]) -> Planes:
@@ -88,40 +90,43 @@ MAIN = (0.0, 0.0, 5.0, 0.0)
 def test_a_plane_inside_a_walls_buffer_is_its_relief(
     other: tuple[float, float, float, float], is_covered: bool
 ) -> None:
-    chosen = chosen_planes(planes(MAIN, other), CHOICE)
+    chosen = chosen_planes(planes(MAIN, other), CHOICE, buffer_m)
     assert chosen == ([0] if is_covered else [0, 1])
 
 
 def test_covered_planes_are_named_with_the_wall_that_shows_them() -> None:
     relief, other, small = (0.08, 1.0, 3.0, 0.0), (0.0, 6.0, 3.0, 0.0), (0.1, 2.0, 1.0, 0.0)
     four = planes(MAIN, relief, other, small)
-    chosen = chosen_planes(four, CHOICE)
+    chosen = chosen_planes(four, CHOICE, buffer_m)
     assert chosen == [0, 2]
-    assert covered_planes(four, CHOICE, chosen) == {1: 0, 3: 0}
+    assert covered_planes(four, CHOICE, buffer_m, chosen) == {1: 0, 3: 0}
     # Two that are too small for a wall, or not asked for, are no riddle.
-    assert covered_planes(four, replace(CHOICE, min_area_m2=6.5), chosen) == {}
-    assert covered_planes(four, replace(CHOICE, ranks=(0, 2)), [0, 2]) == {}
+    assert covered_planes(four, but(CHOICE, min_area_m2=6.5), buffer_m, chosen) == {}
+    assert covered_planes(four, but(CHOICE, ranks=(0, 2)), buffer_m, [0, 2]) == {}
 
 
 def test_a_plane_that_a_larger_one_of_less_support_shows_is_no_wall_of_its_own() -> None:
     # The second is seen at one end of the third, which is larger and has fewer points.
     three = planes((0.0, 0.0, 3.0, -90.0), (0.1, 6.0, 3.0, 0.0), (0.0, 6.0, 9.0, 0.0))
-    chosen = chosen_planes(three, CHOICE)
+    chosen = chosen_planes(three, CHOICE, buffer_m)
     assert chosen == [0, 2]
-    assert covered_planes(three, CHOICE, chosen) == {1: 2}
+    assert covered_planes(three, CHOICE, buffer_m, chosen) == {1: 2}
     # The best supported plane stays a wall in any case.
-    assert chosen_planes(planes((0.1, 6.0, 3.0, 0.0), (0.0, 6.0, 9.0, 0.0)), CHOICE) == [0, 1]
+    assert chosen_planes(planes((0.1, 6.0, 3.0, 0.0), (0.0, 6.0, 9.0, 0.0)), CHOICE, buffer_m) == [
+        0,
+        1,
+    ]
 
 
 def test_covered_planes_are_kept_when_asked_for() -> None:
     both = planes(MAIN, (0.08, 1.0, 3.0, 0.0))
-    assert chosen_planes(both, replace(CHOICE, skip_covered=False)) == [0, 1]
+    assert chosen_planes(both, but(CHOICE, skip_covered=False), buffer_m) == [0, 1]
 
 
 def test_a_plane_is_not_covered_by_one_that_was_left_out_itself() -> None:
     # The third lies within the second's buffer, but not within the first's.
     three = planes(MAIN, (0.10, 0.0, 5.0, 0.0), (0.20, 0.0, 5.0, 0.0))
-    assert chosen_planes(three, CHOICE) == [0, 2]
+    assert chosen_planes(three, CHOICE, buffer_m) == [0, 2]
 
 
 def test_the_wall_nearest_to_a_point_is_chosen() -> None:
@@ -135,26 +140,28 @@ def test_the_wall_nearest_to_a_point_is_chosen() -> None:
         (5.6, 1.1, 1.0): 1,  # on the extension of 1's plane, and nearer than 2
     }
     for place, expected in cases.items():
-        assert chosen_planes(three, replace(CHOICE, near=(place,))) == [expected], place
-    both = replace(CHOICE, near=((6.5, 1.2, 1.0), (2.0, 2.9, 1.0), (1.0, 2.9, 1.0)))
-    assert chosen_planes(three, both) == [0, 1]
+        assert chosen_planes(three, but(CHOICE, near=(place,)), buffer_m) == [expected], place
+    both = but(CHOICE, near=((6.5, 1.2, 1.0), (2.0, 2.9, 1.0), (1.0, 2.9, 1.0)))
+    assert chosen_planes(three, both, buffer_m) == [0, 1]
 
 
 def test_a_covered_or_small_wall_is_chosen_when_a_point_is_near_it() -> None:
     both = planes(MAIN, (0.08, 1.0, 0.2, 0.0))
-    assert chosen_planes(both, CHOICE) == [0]
-    choice = replace(CHOICE, near=((1.1, 2.9, 1.0),))
-    assert chosen_planes(both, choice) == [1]
-    assert chosen_relief(both, choice, [1]) == {1: 0}
+    assert chosen_planes(both, CHOICE, buffer_m) == [0]
+    choice = but(CHOICE, near=((1.1, 2.9, 1.0),))
+    assert chosen_planes(both, choice, buffer_m) == [1]
+    assert chosen_relief(both, choice, buffer_m, [1]) == {1: 0}
     # Who wants both, or says that relief counts, needs no word.
-    assert chosen_relief(both, choice, [0, 1]) == {}
-    assert chosen_relief(both, replace(choice, skip_covered=False), [1]) == {}
-    assert chosen_relief(both, CHOICE, [0]) == {}
+    assert chosen_relief(both, choice, buffer_m, [0, 1]) == {}
+    assert chosen_relief(both, but(choice, skip_covered=False), buffer_m, [1]) == {}
+    assert chosen_relief(both, CHOICE, buffer_m, [0]) == {}
 
 
 def test_only_planes_of_the_right_direction_are_near() -> None:
     with pytest.raises(MethodError, match="none of the 1 planes is horizontal"):
-        chosen_planes(planes(MAIN), replace(CHOICE, constraint="horizontal", near=((1, 3, 1),)))
+        chosen_planes(
+            planes(MAIN), but(CHOICE, constraint="horizontal", near=((1, 3, 1),)), buffer_m
+        )
 
 
 def test_the_parts_of_a_plane_count_and_not_the_rectangle_about_them() -> None:
@@ -166,16 +173,16 @@ def test_the_parts_of_a_plane_count_and_not_the_rectangle_about_them() -> None:
         part_corners=np.concatenate([parts.corners, ends.corners[1:]]),
         part_plane=np.array([0, 0, 1], dtype=np.int32),
     )
-    place = replace(CHOICE, near=((2.5, 3.1, 1.0),))
-    assert chosen_planes(ends, place) == [0]
-    assert chosen_planes(known, place) == [1]
+    place = but(CHOICE, near=((2.5, 3.1, 1.0),))
+    assert chosen_planes(ends, place, buffer_m) == [0]
+    assert chosen_planes(known, place, buffer_m) == [1]
 
 
 def test_a_rank_that_no_plane_has_is_refused() -> None:
     two = planes(MAIN, (0.5, 0.0, 5.0, 0.0))
-    assert chosen_planes(two, replace(CHOICE, ranks=(1,))) == [1]
+    assert chosen_planes(two, but(CHOICE, ranks=(1,)), buffer_m) == [1]
     with pytest.raises(MethodError, match=r"ranks names plane 2, but 2 planes were found, 0 to 1"):
-        chosen_planes(two, replace(CHOICE, ranks=(1, 2)))
+        chosen_planes(two, but(CHOICE, ranks=(1, 2)), buffer_m)
 
 
 def leaning(degrees: float) -> Planes:
@@ -208,12 +215,12 @@ def leaning(degrees: float) -> Planes:
 def test_walls_and_floors_lean_by_ten_degrees_at_most(
     degrees: float, constraint: Any, fits: bool
 ) -> None:
-    choice = replace(CHOICE, constraint=constraint)
+    choice = but(CHOICE, constraint=constraint)
     if fits:
-        assert chosen_planes(leaning(degrees), choice) == [0]
+        assert chosen_planes(leaning(degrees), choice, buffer_m) == [0]
     else:
         with pytest.raises(MethodError, match=f"none of the 1 planes is {constraint}"):
-            chosen_planes(leaning(degrees), choice)
+            chosen_planes(leaning(degrees), choice, buffer_m)
 
 
 @pytest.mark.parametrize(
@@ -232,17 +239,17 @@ def test_walls_and_floors_lean_by_ten_degrees_at_most(
 def test_relief_is_parallel_to_five_degrees_and_four_fifths_within(
     other: tuple[float, float, float, float], is_covered: bool
 ) -> None:
-    wide = replace(CHOICE, buffer_m=lambda _: (0.5, 0.5))
-    assert chosen_planes(planes(MAIN, other), wide) == ([0] if is_covered else [0, 1])
+    assert chosen_planes(planes(MAIN, other), CHOICE, lambda _: (0.5, 0.5)) == (
+        [0] if is_covered else [0, 1]
+    )
 
 
 @pytest.mark.parametrize("depth_m", [0.2, -0.3])
 def test_a_buffer_has_a_front_and_a_back(depth_m: float) -> None:
     both = planes(MAIN, (depth_m, 1.0, 3.0, 0.0))
     for reach_m, covered in ((abs(depth_m) + 0.01, [0]), (abs(depth_m) - 0.01, [0, 1])):
-        buffer_m = (reach_m, 0.0) if depth_m > 0.0 else (0.0, reach_m)
-        choice = replace(CHOICE, buffer_m=lambda _, reach=buffer_m: reach)
-        assert chosen_planes(both, choice) == covered
+        reach = (reach_m, 0.0) if depth_m > 0.0 else (0.0, reach_m)
+        assert chosen_planes(both, CHOICE, lambda _, reach=reach: reach) == covered
 
 
 def test_planes_away_from_the_origin_are_as_large_and_as_far_as_anywhere() -> None:

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.raster.depth_filters import denoised
 from orthoflow_plugins.raster.grid import RasterGrid
+from orthoflow_plugins.raster.surfaces import denoised
 from scipy.spatial import cKDTree
 
 from orthoflow.errors import MethodError

@@ -3,21 +3,15 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import psutil
 import pytest
-from numpy.typing import NDArray
-from orthoflow_plugins.raster import walls
-from orthoflow_plugins.raster.surfaces import CellSurface
 from orthoflow_plugins.raster.walls import require_memory
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.bands import IN_MEMORY_CELLS
-from orthoflow.products import SurfaceMask
 from tests import samples
 
 GSD_M = 0.01
@@ -77,44 +71,3 @@ def test_no_wall_has_more_cells_than_32_bits_count(monkeypatch: pytest.MonkeyPat
     require_memory([frame(1 << 15, (1 << 16) - 1)])
     with pytest.raises(MethodError, match="cells of gsd_m"):
         require_memory([frame(1 << 15, 1 << 16)])
-
-
-def coloured(rgb: np.ndarray | None, n_cells: int) -> CellSurface:
-    """A flat surface with these colours."""
-    zeros = np.zeros(n_cells, dtype=np.float32)
-    return CellSurface(
-        depth_m=zeros,
-        sigma_m=zeros,
-        count=np.ones(n_cells, dtype=np.uint32),
-        intensity=None,
-        rgb=rgb,
-        places=np.zeros((n_cells, 2), dtype=np.float32),
-    )
-
-
-def test_grey_is_that_of_the_eye_and_void_has_none() -> None:
-    rgb = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255]], dtype=np.uint8)
-    mask = np.array([1, 1, 2, SurfaceMask.VOID], dtype=np.uint8)
-    grey = walls._grey(coloured(rgb, 4), mask)
-    assert grey is not None
-    assert grey.dtype == np.float32
-    np.testing.assert_allclose(grey, [0.299, 0.587, 0.114, np.nan], atol=1e-3)
-    assert walls._grey(coloured(None, 4), mask) is None
-
-
-@pytest.mark.parametrize("n_most", [5, 6])
-def test_what_is_not_void_is_known_in_memory_or_in_a_file(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, n_most: int
-) -> None:
-    asked = []
-
-    def allocate(name: str, shape: tuple[int, ...], dtype: type) -> NDArray[np.generic]:
-        asked.append(name)
-        return np.memmap(tmp_path / name, dtype=dtype, mode="w+", shape=shape)
-
-    monkeypatch.setattr(walls, "_BAND_CELLS", n_most)
-    mask = np.array([0, 1, 2, 3, 0, 1], dtype=np.uint8)
-    raster = walls._Raster(surface=coloured(None, 6), mask=mask)
-    known = walls._where_known(raster, (2, 3), allocate)  # type: ignore[arg-type]
-    assert known.tolist() == [[0, 1, 1], [1, 0, 1]]
-    assert asked == (["rgb_mask"] if n_most == 5 else [])

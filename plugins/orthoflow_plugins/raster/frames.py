@@ -1,0 +1,151 @@
+"""Grids of walls: the requested part of one, and those of level planes that are maps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import InputError, MethodError
+from orthoflow.geometry import WallFrame
+from orthoflow.geometry.bands import row_bands
+from orthoflow.geometry.frames import LEVEL_LIMIT_DEG
+from orthoflow.geometry.rings import signed_area
+from orthoflow.products import Planes, SurfaceMask, Wall
+from orthoflow.sdk import DiagnosticSpec, StepContext
+
+Rectangle = tuple[float, float, float, float]
+Polygon = tuple[tuple[float, float], ...]
+
+_UP: Final = np.array([0.0, 0.0, 1.0])
+# Maximum displacement of a point in the map of a tilted raster.
+_OFF_CELLS_MOST: Final = 0.5
+TILTED: Final = DiagnosticSpec(
+    code="map-of-a-tilted-plane",
+    severity="warning",
+    text="{subject} is tilted by {tilt_deg:.2g} deg, which would shift points by up to "
+    "{off_mm:.2g} mm in a map: its raster stays in its plane",
+    remedy="use plane.given with horizontal, or a smaller buffer",
+    rank_by="off_mm",
+)
+NO_MAP: Final = DiagnosticSpec(
+    code="map-without-a-level-plane",
+    severity="warning",
+    text="crs {crs} places no raster: none of the planes is level and seen from above",
+    remedy="leave {step}.crs out, or raster a floor",
+)
+
+
+def outline_m(crop: Rectangle | Polygon) -> NDArray[np.float64]:
+    """Corners (n, 2) of a crop as (right, down) in metres from the top-left corner of a raster."""
+    corners = np.array(crop, dtype=np.float64)
+    if corners.ndim == 2:
+        return corners
+    left, top, right, bottom = corners
+    return np.array([[left, top], [left, bottom], [right, bottom], [right, top]])
+
+
+def area_m2(crop: Rectangle | Polygon) -> float:
+    """Return the area of a crop; 0 if its corners span none."""
+    corners = outline_m(crop)
+    if len(corners) < 3:
+        return 0.0
+    return abs(signed_area(corners - corners[0]))
+
+
+def cropped(frame: WallFrame, crop: Rectangle | Polygon) -> WallFrame | None:
+    """Remove whole columns and rows outside a crop from a grid; None if the crop misses it.
+
+    The remaining cells are unchanged, so that rasters of two crops fit onto each other.
+    """
+    outline_px = outline_m(crop) / frame.gsd_m
+    # A tolerance of a millionth of a cell, as in `frame_over`.
+    first = np.floor(outline_px.min(axis=0) + 1e-6).clip(0, None).astype(np.int64)
+    last = np.ceil(outline_px.max(axis=0) - 1e-6).astype(np.int64)
+    width, height = np.minimum(last, [frame.width, frame.height]) - first
+    if width <= 0 or height <= 0:
+        return None
+    return replace(
+        frame,
+        origin_world=frame.world_from_wall(first[None].astype(np.float64))[0],
+        width=int(width),
+        height=int(height),
+        left_m=frame.left_m + float(first[0]) * frame.gsd_m,
+    )
+
+
+def blank_outside(wall: Wall, crop: Rectangle | Polygon) -> None:
+    """Make the cells of a cropped wall void whose centres are outside the crop (even-odd rule)."""
+    corners = outline_m(crop) / wall.frame.gsd_m
+    # From the first cell of the cropped grid.
+    corners -= np.floor(corners.min(axis=0) + 1e-6).clip(0, None)
+    columns = np.arange(wall.frame.width) + 0.5
+    for rows in row_bands(wall.mask.shape):
+        centres = np.arange(rows.start, rows.stop)[:, None] + 0.5
+        outside = np.ones(wall.mask[rows].shape, dtype=np.bool_)
+        for (x, y), (next_x, next_y) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            crosses = (y > centres) != (next_y > centres)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                at = x + (centres - y) * (next_x - x) / (next_y - y)
+            outside ^= crosses & (columns < at)
+        wall.mask[rows][outside] = SurfaceMask.VOID
+        for values in (wall.depth_m, wall.sigma_m, wall.intensity, wall.percentiles_m):
+            if values is not None:
+                values[rows][outside] = np.nan
+        for numbers in (wall.count, wall.rgb, wall.rgb_mask):
+            if numbers is not None:
+                numbers[rows][outside] = 0
+
+
+def mapped(
+    frames: Mapping[int, WallFrame], planes: Planes, crs: str, *, reach_m: float, ctx: StepContext
+) -> dict[int, WallFrame]:
+    """Return the grids with level planes placed in the map; the others stay in their planes.
+
+    Args:
+        frames: grid of each plane by index.
+        planes: the planes.
+        crs: coordinate system of the cloud, whose x is east and y north.
+        reach_m: maximum distance of points from a plane, which a tilt displaces.
+        ctx: receives warnings.
+
+    Raises:
+        MethodError: there is no such system, or z is not up.
+    """
+    from orthoflow.files.geotiff import require_map_crs
+
+    try:
+        require_map_crs(crs)
+    except InputError as error:
+        raise MethodError(f"crs: {error}") from error
+    if not np.allclose(planes.up, _UP, atol=1e-9):
+        raise MethodError(
+            f"crs {crs} needs a cloud whose z is up, x east and y north, got up "
+            f"{planes.up.tolist()}: bring it into the coordinate system with register.similarity, "
+            "or leave crs out"
+        )
+    placed = dict(frames)
+    for index, frame in frames.items():
+        east, north, up = frame.normal_world.tolist()
+        tilt_rad = math.atan2(math.hypot(east, north), up)
+        if math.degrees(tilt_rad) > LEVEL_LIMIT_DEG:
+            continue
+        # How far a point is displaced at most, by its depth and by foreshortening of slopes.
+        extent_m = frame.gsd_m * math.hypot(frame.width, frame.height)
+        off_m = reach_m * math.sin(tilt_rad) + extent_m * (1.0 - math.cos(tilt_rad))
+        if off_m > _OFF_CELLS_MOST * frame.gsd_m:
+            name, tilt_deg = planes.names[index], math.degrees(tilt_rad)
+            ctx.report(TILTED, subject=name, tilt_deg=tilt_deg, off_mm=1e3 * off_m)
+            continue
+        # The part of whole cells beyond the rectangle is distributed evenly to all sides.
+        middle = frame.wall_from_world(planes.corners[index].mean(axis=0)[None])[0, :2]
+        beyond = middle - 0.5 * np.array([frame.width, frame.height])
+        origin = frame.world_from_wall(beyond[None])[0]
+        placed[index] = replace(frame, origin_world=origin, map_crs=crs)
+    if not any(frame.map_crs for frame in placed.values()):
+        ctx.report(NO_MAP, crs=crs)
+    return placed
