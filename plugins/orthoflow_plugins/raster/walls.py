@@ -91,7 +91,7 @@ def rastered_wall(
         found = _rastered(cloud, slab.over(band.around), params, part, threads=threads)
         for name, values in found.items():
             shape = (*frame.shape, *values.shape[1:])
-            if slab.n_cells <= IN_MEMORY_CELLS:
+            if slab.n_cells <= min(IN_MEMORY_CELLS, _BAND_CELLS):
                 whole[name] = values.reshape(shape)
                 continue
             if name not in whole:

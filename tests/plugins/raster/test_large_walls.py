@@ -36,6 +36,7 @@ def small_bands(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let walls of a megacell count as large."""
     monkeypatch.setattr(bands, "_BAND_CELLS", BAND_CELLS)
     monkeypatch.setattr("orthoflow_plugins.ortho.surfaces._IN_MEMORY_MOST", 0)
+    monkeypatch.setattr("orthoflow_plugins.ortho.surfaces._BAND_CELLS", BAND_CELLS)
     monkeypatch.setattr("orthoflow_plugins.ortho.painting.TILE_CELLS", 128)
     monkeypatch.setattr("orthoflow_plugins.mosaic.seams._IN_MEMORY_MOST", 0)
     monkeypatch.setattr("orthoflow_plugins.mosaic.agreement._ROWS_AT_ONCE", 64)

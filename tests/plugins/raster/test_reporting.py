@@ -253,7 +253,7 @@ def test_gaps_that_a_net_of_triangles_leaves_open_are_told(
     small = wall([[1, 1], [1, 0]])
     reporting.warn_of_wide_gaps(listener.context, [large, closed, small])
     (said,) = listener.context.diagnostics
-    assert (said.subject, said.values["gap_m"], said.values["n_measured"]) == ("wall 0", 2.56, 4)
+    assert (said.subject, said.values["gap_m"], said.values["n_measured"]) == ("wall 0", 0.64, 4)
 
 
 @pytest.mark.parametrize(("n_void", "is_told"), [(1, False), (3, True)])
