@@ -191,9 +191,10 @@ def places_of_winners(
     import cv2
 
     is_void = winners["n_points"] == 0
-    window = np.ones((2 * _BESIDE_GAPS_CELLS + 1,) * 2, dtype=np.uint8)
-    is_beside = cv2.dilate(is_void.reshape(slab.frame.shape).astype(np.uint8), window)
-    cells = np.flatnonzero((np.asarray(is_beside).ravel() > 0) & ~is_void)
+    around = ndimage.maximum_filter(
+        is_void.reshape(slab.frame.shape), 2 * _BESIDE_GAPS_CELLS + 1, mode="constant"
+    )
+    cells = np.flatnonzero(np.asarray(around).ravel() & ~is_void)
     won = winners["point"][cells]
     offsets = np.stack([axis[won] for axis in (points.x, points.y, points.z)]).astype(np.float64)
     matrix = wall_from_offset(slab.frame, points.origin)[:2]
