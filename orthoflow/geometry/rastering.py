@@ -188,7 +188,7 @@ def places_of_winners(
         (cells, 2) right of and below the centre, in cells; 0 in cells without a void cell nearby,
         NaN in cells without a point of their own.
     """
-    import cv2
+    from scipy import ndimage  # noqa: PLC0415 - few who load this need it
 
     is_void = winners["n_points"] == 0
     around = ndimage.maximum_filter(

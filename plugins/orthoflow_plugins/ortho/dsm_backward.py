@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar, Final, Literal
+from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from orthoflow.geometry.bands import holds_cells
 from orthoflow.products import Layer, LayerMask
 from orthoflow.sdk import Determinism, DiagnosticSpec, Method, MetricSpec, StepContext
 from orthoflow_plugins.ortho.layers import NO_SOURCE, LayerStack, count_shown
+from orthoflow_plugins.ortho.parameters import BackwardParams
 from orthoflow_plugins.ortho.photos_on_walls import (
     LayersOfPhotos,
     OpenedPhoto,
     PhotosOnWalls,
-    VisibilityParams,
     project_photos,
 )
 
@@ -59,36 +58,13 @@ class DsmBackward(Method):
         "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (3.7, 4.4)",
     )
 
-    class Params(VisibilityParams):
-        """How colours are sampled, and when a cell counts as seen."""
-
-        resampling: Literal["nearest", "bilinear", "cubic", "lanczos"] = Field(
-            default="bilinear",
-            description="Interpolation of colours; nearest paints the photo's pixels unchanged.",
-        )
-        antialias: bool = Field(
-            default=True,
-            description="Average over the cell where the photo is finer than the wall "
-            "(not with nearest).",
-        )
-        visibility: Literal["full", "none"] = Field(
-            default="full",
-            description="What hides cells: relief and cloud (full), or nothing, for "
-            "comparison and for flat walls without objects in front.",
-        )
-        erosion_cells: int = Field(
-            default=1,
-            ge=0,
-            le=20,
-            description=(
-                "Cells this close to a hidden patch are not painted, because edges smear there."
-            ),
-        )
-
+    Params = BackwardParams
     In = PhotosOnWalls
     Out = LayersOfPhotos
 
-    def run(self, inputs: PhotosOnWalls, params: Params, ctx: StepContext) -> LayersOfPhotos:
+    def run(
+        self, inputs: PhotosOnWalls, params: BackwardParams, ctx: StepContext
+    ) -> LayersOfPhotos:
         """Project the photos onto all walls, and sort their layers."""
         from orthoflow_plugins.ortho.painting import CellFootprint, paint
         from orthoflow_plugins.ortho.surfaces import is_before, view_of

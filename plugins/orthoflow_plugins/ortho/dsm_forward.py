@@ -19,11 +19,11 @@ from orthoflow.geometry.levels import level_of
 from orthoflow.products import Layer, LayerMask
 from orthoflow.sdk import Determinism, Method, MetricSpec, StepContext
 from orthoflow_plugins.ortho.layers import NO_SOURCE, LayerStack, count_shown
+from orthoflow_plugins.ortho.parameters import VisibilityParams
 from orthoflow_plugins.ortho.photos_on_walls import (
     LayersOfPhotos,
     OpenedPhoto,
     PhotosOnWalls,
-    VisibilityParams,
     project_photos,
 )
 

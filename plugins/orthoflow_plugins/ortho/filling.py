@@ -6,19 +6,18 @@ After skarlatos2012, section 3; the picture is the pair of its Figure 5.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.levels import Colours, eight_bits
 from orthoflow.products import Layer, LayerMask
+from orthoflow_plugins.ortho.parameters import Inpainting
 
 if TYPE_CHECKING:
     from orthoflow.geometry.interpolation import Surroundings
 
-Inpainting = Literal["between", "telea", "navier-stokes", "none"]
-VoidLimits = tuple[int, int, int]
 
 _WINDOWS: Final = (3, 5, 7)
 # Radius around a gap within which the positions of points in painted cells are needed.
@@ -40,7 +39,7 @@ def reach_rows(inpainting: Inpainting, radius_px: float) -> int:
     return reach if inpainting == "between" else reach + _FRONT_CELLS
 
 
-def fillable_gaps(is_void: NDArray[np.bool_], limits: VoidLimits) -> NDArray[np.bool_]:
+def fillable_gaps(is_void: NDArray[np.bool_], limits: tuple[int, int, int]) -> NDArray[np.bool_]:
     """Return void cells with few void cells around them.
 
     The void cells in the 3 x 3, 5 x 5 and 7 x 7 windows around a void cell are counted, the cell

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from threading import Lock
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from orthoflow.geometry.compiling import compiled, interpreted
 from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 from orthoflow.geometry.levels import Colours, level_of
 from orthoflow.geometry.threads import in_threads
+from orthoflow_plugins.ortho.parameters import BackwardParams, Resampling
 from orthoflow_plugins.ortho.surfaces import Surface
 from orthoflow_plugins.ortho.visibility_kernels import (
     OCCLUDED,
@@ -27,10 +28,6 @@ from orthoflow_plugins.ortho.visibility_kernels import (
     look_at_cells,
 )
 
-if TYPE_CHECKING:
-    from orthoflow_plugins.ortho.dsm_backward import DsmBackward
-
-Resampling = Literal["nearest", "bilinear", "cubic", "lanczos"]
 Tile = tuple[slice, slice]
 
 TILE_CELLS: Final = 512
@@ -86,7 +83,7 @@ def paint(
     view: WallView,
     surface: Surface,
     buffer: DepthBuffer,
-    params: DsmBackward.Params,
+    params: BackwardParams,
     *,
     allocate: Allocate,
     threads: int,

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from orthoflow.errors import MethodError
 from orthoflow.files.images import before_masks, decode_image, decode_levels
@@ -17,8 +16,9 @@ from orthoflow.files.photo_files import icc_profile, stated_bits
 from orthoflow.foreign_text import first_few
 from orthoflow.geometry.levels import Colours, Level, in_levels
 from orthoflow.products import Camera, Cameras, Layers, Photo, Photos, PointCloud, Walls
-from orthoflow.sdk import DiagnosticSpec, MethodParams, Ports, StepContext
+from orthoflow.sdk import DiagnosticSpec, Ports, StepContext
 from orthoflow_plugins.ortho.layers import LayerStack
+from orthoflow_plugins.ortho.parameters import VisibilityParams
 
 if TYPE_CHECKING:
     from orthoflow.geometry.cameras import ViewingCamera
@@ -81,35 +81,6 @@ class LayersOfPhotos(Ports):
     """A layer for each wall and photo that paints on it."""
 
     layers: Layers
-
-
-class VisibilityParams(MethodParams):
-    """When a photo counts as seeing a cell."""
-
-    incidence_max_deg: float = Field(
-        default=80.0, gt=0, lt=90, description="Cells seen more obliquely are not painted."
-    )
-    tolerance_sigma: float = Field(
-        default=3.0,
-        ge=0,
-        description="A surface hides a cell when it is above the ray by more than this many "
-        "standard deviations of depth, and tolerance_cells.",
-    )
-    tolerance_cells: float = Field(
-        default=0.5, ge=0, description="The same in cells, for detail finer than the raster."
-    )
-    occluder_points_min: int = Field(
-        default=6,
-        ge=1,
-        description="Points of the cloud with fewer about them, themselves included, are "
-        "outliers and hide nothing.",
-    )
-    border_share: float = Field(
-        default=0.05,
-        ge=0,
-        le=0.5,
-        description="Quality falls to 0 over this share of a photo's shorter side.",
-    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +25,7 @@ from orthoflow.geometry.rastering import (
 )
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
-
-if TYPE_CHECKING:
-    from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
+from orthoflow_plugins.ortho.parameters import DirectParams
 
 # Sigma of the Gaussian in cells: a point in the corner of its cell has a weight of a seventh.
 _SIGMA_CELLS: Final = 0.36
@@ -73,7 +71,7 @@ class CellColours:
 
 
 def colours_of(
-    painters: Painters, slab: Slab, params: PointcloudDirect.Params, *, threads: int
+    painters: Painters, slab: Slab, params: DirectParams, *, threads: int
 ) -> CellColours:
     """Colour the cells of a wall.
 

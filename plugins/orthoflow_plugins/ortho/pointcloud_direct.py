@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal
+from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
-from pydantic import Field
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry.bands import (
@@ -21,16 +20,16 @@ from orthoflow.geometry.bands import (
     in_memory,
 )
 from orthoflow.products import Layer, LayerMask, Layers, PointCloud, Walls
-from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, MetricSpec, Ports, StepContext
+from orthoflow.sdk import DiagnosticSpec, Method, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.ortho.filling import (
-    Inpainting,
     fillable_gaps,
     filling_preview,
     inpainted,
     painted_between,
     reach_rows,
 )
+from orthoflow_plugins.ortho.parameters import DirectParams
 
 if TYPE_CHECKING:
     from orthoflow_plugins.ortho.point_colours import CellColours, Painters
@@ -93,54 +92,7 @@ class PointcloudDirect(Method):
         ),
     )
 
-    class Params(MethodParams):
-        """Which gaps are filled, and how."""
-
-        void_limits: tuple[
-            Annotated[int, Field(ge=0, le=9)],
-            Annotated[int, Field(ge=0, le=25)],
-            Annotated[int, Field(ge=0, le=49)],
-        ] = Field(
-            default=(7, 23, 46),
-            description="Most void cells in the 3x3, 5x5 and 7x7 windows around a void cell, "
-            "itself and cells outside the image included, for it to be filled.",
-        )
-        colouring: Literal["topmost", "centre", "gaussian", "median"] = Field(
-            default="topmost",
-            description="Colour of a cell: of its topmost point; of the point nearest its centre "
-            "on the topmost surface; gaussian mean of that surface by distance to the centre; "
-            "median of its n_top highest points.",
-        )
-        skip_below_grey: Annotated[int, Field(ge=0, le=255)] | None = Field(
-            default=None,
-            description="Points of which no channel reaches this have no "
-            "colour, as points that no camera saw in many files: they paint no cell, and "
-            "keep their depth. 1: those of pure "
-            "black; 10: almost black ones, too; 0: none. Without it those of pure black, where "
-            "these are specks: at most a tenth of all, and more than there are almost black ones.",
-        )
-        layer_m: float = Field(
-            default=0.02,
-            gt=0,
-            description="Points at most this far below the topmost "
-            "one are on its surface (not with topmost).",
-        )
-        n_top: int = Field(
-            default=5, ge=1, le=50, description="Maximum number of points for the median."
-        )
-        inpaint: Inpainting = Field(
-            default="between",
-            description="How gaps are filled: by interpolation between the "
-            "painted cells around them; telea and navier-stokes of OpenCV, as skarlatos2012 "
-            "has it; none.",
-        )
-        inpaint_radius_px: float = Field(
-            default=3.0,
-            gt=0,
-            le=100,
-            description="Radius from which a gap takes its colour; with between, "
-            "a gap without a painted cell within it stays void.",
-        )
+    Params = DirectParams
 
     class In(Ports):
         """Walls, whose frames and buffers are used, and the coloured cloud."""
@@ -153,7 +105,7 @@ class PointcloudDirect(Method):
 
         layers: Layers
 
-    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+    def run(self, inputs: In, params: DirectParams, ctx: StepContext) -> Out:
         """Project the cloud onto each wall, then fill its gaps."""
         from orthoflow_plugins.ortho.point_colours import colours_of
 
@@ -212,7 +164,7 @@ class PointcloudDirect(Method):
         return self.Out(layers=Layers(layers=tuple(layers), names=names, plane_indices=places))
 
 
-def _painters(cloud: PointCloud, params: PointcloudDirect.Params, ctx: StepContext) -> Painters:
+def _painters(cloud: PointCloud, params: DirectParams, ctx: StepContext) -> Painters:
     """Return the points with their colours, or their intensity as grey."""
     from orthoflow_plugins.ortho.point_colours import Painters
 
@@ -243,7 +195,7 @@ def _mask(ctx: StepContext, n_points: int) -> NDArray[np.bool_]:
 
 
 def _left_out(
-    cloud: PointCloud, rgb: NDArray[np.uint8], params: PointcloudDirect.Params, ctx: StepContext
+    cloud: PointCloud, rgb: NDArray[np.uint8], params: DirectParams, ctx: StepContext
 ) -> NDArray[np.bool_] | None:
     """Find the points (n,) without a colour, or too dark to have one; None if there are none.
 
@@ -296,7 +248,7 @@ def _fill(
     found: CellColours,
     layer: Layer,
     band: Band,
-    params: PointcloudDirect.Params,
+    params: DirectParams,
     *,
     threads: int,
 ) -> None:

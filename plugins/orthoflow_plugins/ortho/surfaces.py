@@ -16,7 +16,7 @@ from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.depth_noise import depth_noise_m
 from orthoflow.products import Wall, Walls
 from orthoflow.sdk import StepContext
-from orthoflow_plugins.ortho.photos_on_walls import VisibilityParams
+from orthoflow_plugins.ortho.parameters import VisibilityParams
 from orthoflow_plugins.ortho.visibility_kernels import BLOCK_CELLS, Relief, WallView
 
 # Surfaces of walls with more cells are kept in files, and computed in bands of so many.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +13,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import MethodError
 from orthoflow.geometry import WallFrame, frame_over
 from orthoflow.products import Planes
-
-if TYPE_CHECKING:
-    from orthoflow_plugins.raster.grid import RasterGrid
-
-Constraint = Literal["vertical", "horizontal", "any"]
-Place = tuple[float, float, float]
+from orthoflow_plugins.raster.parameters import Constraint, RasterParams
 
 # Maximum tilt of a plane that counts as vertical or horizontal.
 _LEAN_DEG: Final = 10.0
@@ -31,7 +26,7 @@ _COVERED_SHARE: Final = 0.8
 BufferOf = Callable[[int], tuple[float, float]]
 
 
-def chosen_planes(planes: Planes, params: RasterGrid.Params, buffer_m: BufferOf) -> list[int]:
+def chosen_planes(planes: Planes, params: RasterParams, buffer_m: BufferOf) -> list[int]:
     """Return indices of the planes to raster, by support, largest first.
 
     Raises:
@@ -80,7 +75,7 @@ def chosen_planes(planes: Planes, params: RasterGrid.Params, buffer_m: BufferOf)
 
 
 def covered_planes(
-    planes: Planes, params: RasterGrid.Params, buffer_m: BufferOf, chosen: Sequence[int]
+    planes: Planes, params: RasterParams, buffer_m: BufferOf, chosen: Sequence[int]
 ) -> dict[int, int]:
     """Return planes left out, up to the last that was examined -> the wall that shows them.
 
@@ -109,7 +104,7 @@ def covered_planes(
 
 
 def chosen_relief(
-    planes: Planes, params: RasterGrid.Params, buffer_m: BufferOf, chosen: Sequence[int]
+    planes: Planes, params: RasterParams, buffer_m: BufferOf, chosen: Sequence[int]
 ) -> dict[int, int]:
     """Return planes chosen by a nearby point that lie on a better supported wall -> that wall.
 

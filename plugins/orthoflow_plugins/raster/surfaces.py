@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,15 +30,14 @@ from orthoflow.geometry.threads import in_parts
 from orthoflow.products import PointCloud, SurfaceMask
 from orthoflow_plugins.raster import kernels
 from orthoflow_plugins.raster.nets import NO_POINT, Net, Vertices, interpolate_net
-from orthoflow_plugins.raster.walls import SPAN_GAPS
-
-if TYPE_CHECKING:
-    from orthoflow_plugins.raster.grid import RasterGrid
+from orthoflow_plugins.raster.parameters import RasterParams
 
 # A cell takes the values of one of its points, not the mean of several.
 ONE_POINT: Final = frozenset({"nearest", "centre", "topmost", "tin"})
 # Temporary arrays are limited to this many cells.
 CELLS_AT_ONCE: Final = 1 << 20
+# Maximum distance of neighbours in the scan, in radii of a narrow gap.
+SPAN_GAPS: Final = 4
 # In a scan with more rows times columns than this the numbers are not a grid (2 GB of indices).
 _GRID_CELLS_MOST: Final = 1 << 28
 # Number of depths sorted at once: 256 MB.
@@ -100,7 +99,7 @@ class CellSurface:
 def surface_of(
     cloud: PointCloud,
     slab: Slab,
-    params: RasterGrid.Params,
+    params: RasterParams,
     net: Net | None = None,
     *,
     threads: int,
@@ -125,7 +124,7 @@ def surface_of(
 
 
 def carried_to_centres(
-    surface: CellSurface, slab: Slab, params: RasterGrid.Params, *, threads: int
+    surface: CellSurface, slab: Slab, params: RasterParams, *, threads: int
 ) -> CellSurface:
     """Extrapolate intensity and colour of cells with few points from these to the cell's centre.
 
@@ -156,7 +155,7 @@ def carried_to_centres(
 
 
 def _surface_of_winners(
-    cloud: PointCloud, slab: Slab, params: RasterGrid.Params, net: Net | None, *, threads: int
+    cloud: PointCloud, slab: Slab, params: RasterParams, net: Net | None, *, threads: int
 ) -> CellSurface:
     """One pass: the winning point gives depth, intensity and colour."""
     winners = empty_winners(slab.n_cells)
@@ -196,7 +195,7 @@ def _surface_of_winners(
 def _contest(
     cloud: PointCloud,
     slab: Slab,
-    params: RasterGrid.Params,
+    params: RasterParams,
     entries: Entries,
     winners: NDArray[np.void],
 ) -> Callable[[int, int], None]:
@@ -213,9 +212,7 @@ def _contest(
     return partial(keep, entries, winners)
 
 
-def vertices_of(
-    cloud: PointCloud, slab: Slab, params: RasterGrid.Params, *, threads: int
-) -> Vertices:
+def vertices_of(cloud: PointCloud, slab: Slab, params: RasterParams, *, threads: int) -> Vertices:
     """Return the points nearest to the centres of their cells, the vertices of the surface tin."""
     winners = empty_winners(slab.n_cells)
     for entries in entries_inside(cloud, slab, threads=threads):
@@ -232,7 +229,7 @@ def _vertices(winners: NDArray[np.void], slab: Slab) -> Vertices:
 
 
 def _surface_of_all(
-    cloud: PointCloud, slab: Slab, params: RasterGrid.Params, *, threads: int
+    cloud: PointCloud, slab: Slab, params: RasterParams, *, threads: int
 ) -> CellSurface:
     """Two or three passes: count, sort for a median, average the points on the surface."""
     count, moments = np.zeros(slab.n_cells, dtype=np.uint32), np.zeros((slab.n_cells, 2))
@@ -548,7 +545,7 @@ def close_gaps(
     cloud: PointCloud,
     slab: Slab,
     surface: CellSurface,
-    params: RasterGrid.Params,
+    params: RasterParams,
     *,
     threads: int,
 ) -> NDArray[np.uint8]:
@@ -586,7 +583,7 @@ def _recover_between_neighbours(
     cloud: PointCloud,
     slab: Slab,
     surface: CellSurface,
-    params: RasterGrid.Params,
+    params: RasterParams,
     *,
     threads: int,
 ) -> NDArray[np.bool_]:

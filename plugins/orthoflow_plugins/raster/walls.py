@@ -15,9 +15,9 @@ from orthoflow.geometry.bands import IN_MEMORY_CELLS, Allocate, bands_with_reach
 from orthoflow.geometry.levels import REC_601
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Planes, PointCloud, SurfaceMask, Wall
+from orthoflow_plugins.raster.parameters import RasterParams
 
 if TYPE_CHECKING:
-    from orthoflow_plugins.raster.grid import RasterGrid
     from orthoflow_plugins.raster.nets import Net
 
 # Bytes per cell: of a finished wall, and additionally during the passes over one wall.
@@ -28,8 +28,6 @@ _MEMORY_SHARE: Final = 0.75
 _BAND_CELLS: Final = 1 << 24
 # Outliers are detected within 20 cells.
 _REACH_OF_OUTLIERS: Final = 32
-# Maximum distance of neighbours in the scan, in radii of a narrow gap.
-SPAN_GAPS: Final = 4
 
 
 def require_memory(frames: Sequence[WallFrame]) -> None:
@@ -57,7 +55,7 @@ def require_memory(frames: Sequence[WallFrame]) -> None:
 def rastered_wall(
     cloud: PointCloud,
     slab: Slab,
-    params: RasterGrid.Params,
+    params: RasterParams,
     *,
     planes: Planes,
     index: int,
@@ -75,6 +73,8 @@ def rastered_wall(
         allocate: returns the arrays of a large wall, by name.
         threads: number of threads.
     """
+    from orthoflow_plugins.raster.surfaces import SPAN_GAPS
+
     frame, width = slab.frame, slab.frame.width
     is_large = slab.n_cells > _BAND_CELLS
     net = None
@@ -106,7 +106,7 @@ def rastered_wall(
 def _rastered(
     cloud: PointCloud,
     slab: Slab,
-    params: RasterGrid.Params,
+    params: RasterParams,
     net: Net | None,
     *,
     threads: int,
@@ -141,7 +141,7 @@ def _rastered(
 def _net_in_bands(
     cloud: PointCloud,
     slab: Slab,
-    params: RasterGrid.Params,
+    params: RasterParams,
     allocate: Allocate,
     *,
     threads: int,

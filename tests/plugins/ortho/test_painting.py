@@ -16,7 +16,7 @@ from orthoflow_plugins.ortho.painting import (
     sample,
     sample_bilinear,
 )
-from orthoflow_plugins.ortho.photos_on_walls import VisibilityParams
+from orthoflow_plugins.ortho.parameters import VisibilityParams
 from orthoflow_plugins.ortho.surfaces import Surface, relief_of, view_of
 
 from tests import ortho_scenes as scenes

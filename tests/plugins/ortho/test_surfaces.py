@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.ortho import surfaces
-from orthoflow_plugins.ortho.photos_on_walls import VisibilityParams
+from orthoflow_plugins.ortho.parameters import VisibilityParams
 from orthoflow_plugins.ortho.surfaces import (
     Surface,
     is_before,

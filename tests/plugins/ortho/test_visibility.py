@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
-from orthoflow_plugins.ortho.photos_on_walls import VisibilityParams
+from orthoflow_plugins.ortho.parameters import VisibilityParams
 from orthoflow_plugins.ortho.surfaces import Surface, relief_of, view_of
 from orthoflow_plugins.ortho.visibility_kernels import (
     NO_SURFACE,
