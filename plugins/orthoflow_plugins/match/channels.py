@@ -144,7 +144,7 @@ def _complete(joined: Wall, around: Surroundings) -> None:
     depth_m, intensity = joined.depth_m.reshape(-1), joined.intensity.reshape(-1)
     known = np.isfinite(joined.depth_m)
     values = cell_values(depth_m, intensity=intensity)
-    gaps = narrow_gaps(known, _GAP_CELLS, threads=1)
+    gaps = narrow_gaps(known, _GAP_CELLS)
     found = interpolate(gaps, around, values, values, reach_cells=_GAP_CELLS, threads=1)
     joined.mask.reshape(-1)[gaps[found]] = SurfaceMask.RECOVERED
     carried = cell_values(np.empty(0, dtype=np.float32), intensity=intensity.copy())
