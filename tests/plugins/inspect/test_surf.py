@@ -111,3 +111,32 @@ def test_an_image_on_cells_of_its_own_is_compared_there(tmp_path: Path) -> None:
     elsewhere = replace(coarse, origin_world=coarse.origin_world + 0.5 * coarse.normal_world)
     with pytest.raises(MethodError, match=r"lies 0\.500 m before wall 0"):
         inspect(tmp_path, inspect_scenes.image_of(means, elsewhere))
+
+
+def some_pairs(count: int, shift_cells: float = 1.0) -> KeyPairs:
+    places = np.column_stack([np.arange(count, dtype=np.float64), np.full(count, 9.0)])
+    shift = np.full((count, 2), shift_cells)
+    return KeyPairs(
+        places=places, shift=shift, found=2.0 * shift, n_points=(40, 30), n_matched=count
+    )
+
+
+@pytest.mark.parametrize(("n_pairs", "is_inspected"), [(9, False), (10, True)])
+def test_ten_pairs_say_something(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n_pairs: int, is_inspected: bool
+) -> None:
+    monkeypatch.setattr(surf, "find_key_pairs", lambda *_, **__: some_pairs(n_pairs))
+    metrics, found, context = inspect(tmp_path, displaced(0.0, 0.0), unfit="warn")
+    assert metrics["n_walls_inspected"] == is_inspected
+    assert [f"{n_pairs} pairs of SURF" in text for text in context.warnings] == (
+        [] if is_inspected else [True]
+    )
+    if is_inspected:
+        assert metrics["matched_kept_share"] == 1.0
+        assert (metrics["n_key_points"], metrics["n_key_points_intensity"]) == (40, 30)
+        assert metrics["surf_rmse_x_mm"] == pytest.approx(2.0 * metrics["rmse_x_mm"])
+        # What the floor was laid aside by is taken off.
+        assert metrics["floor_rmse_x_mm"] == pytest.approx(0.5e3 * GSD_M)
+        assert metrics["floor_rmse_y_mm"] == pytest.approx(0.75e3 * GSD_M)
+        assert metrics["surf_floor_rmse_y_mm"] == pytest.approx(1.75e3 * GSD_M)
+        assert len(found.displacement_m) == 10
