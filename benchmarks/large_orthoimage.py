@@ -26,7 +26,7 @@ from orthoflow_plugins.ortho.painting import paint
 from orthoflow_plugins.ortho.surfaces import Surface, relief_of, view_of
 
 from orthoflow.files.geotiff import GridPlace, read_raster, write_orthoimage
-from orthoflow.files.images import preview_png
+from orthoflow.files.images import cells_png
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.depth_noise import depth_noise_m
 from orthoflow.geometry.occluders import nothing_in_the_way
@@ -136,7 +136,7 @@ def main() -> None:
         with measured("cloud-optimised GeoTIFF"):
             write_orthoimage(path, painting.rgb, shown, place=GridPlace(gsd_m=GSD_M), tags={})
         with measured("preview"):
-            preview_png(painting.rgb, shown)
+            cells_png(shown.shape, lambda part: (painting.rgb[part], shown[part]))
         print(f"file of {path.stat().st_size / 2**20:.0f} MiB, {shown.mean():.1%} painted")
         if options.side <= 4000:
             print("reads back:", np.array_equal(read_raster(path).values, painting.rgb))

@@ -193,38 +193,18 @@ def _stretched(
     return np.rint(np.clip(scaled, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
-def preview_png(
-    image: NDArray[np.uint8], shown: NDArray[np.bool_], *, longest_side_px: int = PREVIEW_SIDE_PX
-) -> bytes:
-    """Return a small PNG of a raster, transparent where empty.
-
-    Args:
-        image: (rows, cols) grey or (rows, cols, 3) RGB.
-        shown: (rows, cols), True where the image has content.
-        longest_side_px: larger images are averaged down to this; smaller ones are unchanged.
-    """
-    return encode_png(_preview(shown.shape, _cells_of(image, shown), longest_side_px))
-
-
 def cells_png(shape: tuple[int, ...], cells: Cells) -> bytes:
-    """Return the PNG of `preview_png` of a raster computed in parts, never as a whole."""
+    """Return a small PNG of a raster computed in parts, transparent where empty.
+
+    It is averaged down to `PREVIEW_SIDE_PX`; a smaller one is unchanged.
+    """
     return encode_png(_preview(shape, cells, PREVIEW_SIDE_PX))
-
-
-def preview_webp(
-    image: NDArray[np.uint8],
-    shown: NDArray[np.bool_],
-    *,
-    longest_side_px: int = PREVIEW_SIDE_PX,
-) -> bytes:
-    """Return the picture of `preview_png` as lossy WebP."""
-    return cells_webp(shown.shape, _cells_of(image, shown), longest_side_px=longest_side_px)
 
 
 def cells_webp(
     shape: tuple[int, ...], cells: Cells, *, longest_side_px: int, least_px: int = 0
 ) -> bytes:
-    """Return the WebP of `preview_webp` of a raster computed in parts, never as a whole.
+    """Return the picture of `cells_png` as lossy WebP, with another longest side.
 
     If it has fewer cells on its longer side than `least_px`, each becomes a square of pixels.
     """
@@ -243,10 +223,6 @@ def shrunk_webp(encoded: bytes, name: str, *, longest_side_px: int) -> bytes:
     if max(image.shape[:2]) > longest_side_px:
         image = _shrink(image, longest_side_px)
     return encode_webp(image, quality=80)
-
-
-def _cells_of(image: NDArray[np.uint8], shown: NDArray[np.bool_]) -> Cells:
-    return lambda part: (image[part], shown[part])
 
 
 def _preview(shape: tuple[int, ...], cells: Cells, longest_side_px: int) -> NDArray[np.uint8]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -86,141 +86,91 @@ def colour_points(
     )
     for place, (photo, camera) in enumerate(oriented):
         progress(place / len(oriented), photo.name)
-        ready = _ReadyPhoto(
-            camera=camera.shifted(cloud.origin),
-            buffer=before_masks(depth_buffer(occluders, camera), photo),
-            tolerance_m=tolerance_m,
-            place=place,
-        )
-        _colour(cloud, photo, ready, colours)
+        buffer = before_masks(depth_buffer(occluders, camera), photo)
+        _colour(cloud, photo, camera.shifted(cloud.origin), buffer, tolerance_m, colours, place)
 
 
 def spacing_of(cloud: PointCloud) -> float:
     """Estimate the spacing of points of a surface, metres, from the cubes that they occupy."""
-    return _extent(cloud).spacing_m
-
-
-@dataclass(frozen=True, kw_only=True)
-class _ReadyPhoto:
-    """A photo's camera, relative to the cloud's origin, and its depth buffer."""
-
-    camera: ViewingCamera
-    buffer: DepthBuffer
-    tolerance_m: float
-    place: int
+    return _extent(cloud)[3]
 
 
 def _colour(
     cloud: PointCloud,
     photo: Photo,
-    ready: _ReadyPhoto,
+    camera: ViewingCamera,
+    buffer: DepthBuffer,
+    tolerance_m: float,
     colours: PointColours,
+    place: int,
 ) -> None:
-    """Colour the points that a photo sees better than those before it, replacing their colours."""
+    """Colour the points that a photo sees better than those before it, replacing their colours.
+
+    Args:
+        cloud: the points, which are projected part by part.
+        photo: the photo.
+        camera: its camera, relative to the cloud's origin.
+        buffer: its depths.
+        tolerance_m: points at most this far behind the nearest one are seen, too.
+        colours: of the photos before it; replaced.
+        place: number of the photo.
+    """
     import cv2
 
     image = decode_image(photo.encoded, photo.name)
-    for shown in _points_in_photo(cloud, ready.camera):
-        quality = _quality(shown, ready.camera)
-        wins = _is_seen(shown, ready.buffer, ready.tolerance_m) & (
-            quality > colours.best[shown.index]
-        )
-        index = shown.index[wins]
-        if len(index) == 0:
-            continue
-        at = to_opencv(shown.pixels[wins]).astype(np.float32)
-        for start in range(0, len(at), _REMAPPED_AT_ONCE):
-            part = slice(start, start + _REMAPPED_AT_ONCE)
-            taken = cv2.remap(
-                image, at[part, :1], at[part, 1:], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-            )
-            colours.rgb[index[part]] = np.asarray(taken)[:, 0]
-        colours.best[index] = quality[wins]
-        if colours.photo is not None:
-            colours.photo[index] = ready.place
-
-
-@dataclass(frozen=True, kw_only=True)
-class _ShownPoints:
-    """Some points of a cloud projected into a photo.
-
-    Attributes:
-        index: (n,) int64 points inside the photo.
-        pixels: (n, 2) float64 column, row.
-        depth_m: (n,) float64 along the optical axis.
-    """
-
-    index: NDArray[np.int64]
-    pixels: NDArray[np.float64]
-    depth_m: NDArray[np.float64]
-
-
-def _points_in_photo(cloud: PointCloud, camera: ViewingCamera) -> Iterator[_ShownPoints]:
-    """Project a cloud, part by part; return the points inside the photo.
-
-    Args:
-        cloud: the points.
-        camera: relative to the cloud's origin.
-    """
+    size = np.array([camera.width, camera.height], dtype=np.float64)
     for start in range(0, len(cloud), _PROJECTED_AT_ONCE):
         part = slice(start, start + _PROJECTED_AT_ONCE)
         offsets = np.column_stack([cloud.x[part], cloud.y[part], cloud.z[part]])
         projected = camera.project(offsets.astype(np.float64))
         inside = np.flatnonzero(camera.sees(projected[:, :2]))
-        yield _ShownPoints(
-            index=start + inside, pixels=projected[inside, :2], depth_m=projected[inside, 2]
-        )
+        pixels, depth_m = projected[inside, :2], projected[inside, 2]
+        index = start + inside
+        # No nearer surface hides them by more than the tolerance.
+        cells = (pixels / buffer.reduction).astype(np.int64)
+        is_seen = depth_m <= buffer.nearest[cells[:, 1], cells[:, 0]] + tolerance_m
+        # Pixels per metre squared, decreasing near the photo's border.
+        rim = np.minimum(pixels, size - pixels).min(axis=1) / size.min()
+        quality = (camera.fx / depth_m) ** 2 * np.clip(rim / _BORDER_SHARE, 1e-3, 1.0)
+        wins = is_seen & (quality.astype(np.float32) > colours.best[index])
+        index = index[wins]
+        if len(index) == 0:
+            continue
+        at = to_opencv(pixels[wins]).astype(np.float32)
+        for first in range(0, len(at), _REMAPPED_AT_ONCE):
+            few = slice(first, first + _REMAPPED_AT_ONCE)
+            taken = cv2.remap(
+                image, at[few, :1], at[few, 1:], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            )
+            colours.rgb[index[few]] = np.asarray(taken)[:, 0]
+        colours.best[index] = quality[wins]
+        if colours.photo is not None:
+            colours.photo[index] = place
 
 
-def _is_seen(shown: _ShownPoints, buffer: DepthBuffer, tolerance_m: float) -> NDArray[np.bool_]:
-    """Report which points (n,) no nearer surface hides by more than the tolerance."""
-    places = (shown.pixels / buffer.reduction).astype(np.int64)
-    return shown.depth_m <= buffer.nearest[places[:, 1], places[:, 0]] + tolerance_m
+def _extent(
+    cloud: PointCloud,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float, float]:
+    """Return the extent of most of a cloud, metres from its origin, and its point spacing.
 
-
-def _quality(shown: _ShownPoints, camera: ViewingCamera) -> NDArray[np.float32]:
-    """Return pixels per metre squared, decreasing near the photo's border."""
-    size = np.array([camera.width, camera.height], dtype=np.float64)
-    rim = np.minimum(shown.pixels, size - shown.pixels).min(axis=1) / size.min()
-    quality: NDArray[np.float32] = (
-        (camera.fx / shown.depth_m) ** 2 * np.clip(rim / _BORDER_SHARE, 1e-3, 1.0)
-    ).astype(np.float32)
-    return quality
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Extent:
-    """The extent of most of a cloud, metres from its origin, and its point spacing.
-
-    Attributes:
-        low: (3,) float64.
-        high: (3,) float64.
-        side_m: side of the cubes used for the estimate.
-        spacing_m: approximate spacing of the points of a surface.
+    Returns:
+        (3,) lowest and (3,) highest coordinates, the side of the cubes used for the estimate, and
+        the approximate spacing of the points of a surface.
     """
-
-    low: NDArray[np.float64]
-    high: NDArray[np.float64]
-    side_m: float
-    spacing_m: float
-
-
-def _extent(cloud: PointCloud) -> _Extent:
     every = slice(None, None, max(1, len(cloud) // _SAMPLED_MOST))
     sample = np.column_stack([cloud.x[every], cloud.y[every], cloud.z[every]]).astype(np.float64)
     low, high = np.percentile(sample, (_OUTSIDE_PERCENT, 100.0 - _OUTSIDE_PERCENT), axis=0)
     inside = sample[np.all((sample >= low) & (sample <= high), axis=1)]
     side_m = max(float((high - low).max()) / _CUBES, 1e-6)
     cubes = np.unique(np.floor((inside - low) / side_m).astype(np.int64), axis=0)
-    spacing_m = side_m * float(np.sqrt(len(cubes) / max(1, len(cloud))))
-    return _Extent(low=low, high=high, side_m=side_m, spacing_m=spacing_m)
+    return low, high, side_m, side_m * float(np.sqrt(len(cubes) / max(1, len(cloud))))
 
 
 def _box_of(cloud: PointCloud, cameras: Sequence[ViewingCamera]) -> Box:
     """Return the box around cameras and cloud without outliers, with the point spacing."""
     from orthoflow.geometry.occluders import Box
 
-    extent = _extent(cloud)
+    low, high, side_m, spacing_m = _extent(cloud)
     centres = np.array([camera.centre_world for camera in cameras]) - cloud.origin
-    places = np.vstack([extent.low - extent.side_m, extent.high + extent.side_m, centres])
-    return Box(low=places.min(axis=0), high=places.max(axis=0), spacing_m=extent.spacing_m)
+    places = np.vstack([low - side_m, high + side_m, centres])
+    return Box(low=places.min(axis=0), high=places.max(axis=0), spacing_m=spacing_m)

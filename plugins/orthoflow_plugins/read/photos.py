@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -206,7 +206,13 @@ class ReadPhotos(Method):
         masks.warn_of_unused(ctx)
         _warn(ctx, read, calibration)
         photos = Photos(photos=tuple(item.photo for item in read))
-        _report_metrics(ctx, photos)
+        known = [photo.intrinsics is not None for photo in photos.photos]
+        by_exif = [photo.exif_focal_px is not None for photo in photos.photos]
+        n_pixels = sum(photo.width * photo.height for photo in photos.photos)
+        ctx.metric("n_photos", len(photos.photos), "1")
+        ctx.metric("n_calibrated", sum(known), "1")
+        ctx.metric("n_exif_focal", sum(by_exif), "1")
+        ctx.metric("megapixels", n_pixels / 1e6, "Mpx")
         ctx.figure("photos", sheet.encoded(), sheet.caption)
         return self.Out(photos=photos)
 
@@ -290,14 +296,14 @@ class _Cubes:
         return lens if isinstance(lens, FisheyeLens) else None
 
     def _of_panorama(self, path: Path) -> list[_Source]:
-        encoded, (width, height) = _whole_photo(path)
-        if width != 2 * height:
+        encoded, size = _whole_photo(path)
+        if size[0] != 2 * size[1]:
             raise InputError(
-                f"photo {path.name} is named in panoramas, but has {width} x {height} pixels: a "
+                f"photo {path.name} is named in panoramas, but has {size[0]} x {size[1]} pixels: a "
                 "panorama over the whole sphere is twice as wide as high"
             )
-        used = self._used(path.name, (width, height), encoded)
-        return _of_faces(faces_of(encoded, path.stem, width, used), path.name)
+        used = self._used(path.name, size, encoded)
+        return _of_faces(faces_of(encoded, path.stem, size[0], used), path.name)
 
     def _faces(self, path: Path, lens: FisheyeLens) -> list[_Source]:
         encoded, size = _whole_photo(path)
@@ -308,8 +314,7 @@ class _Cubes:
                 "stored, without the EXIF rotation"
             )
         used = self._used(path.name, size, encoded)
-        faces = fisheye_faces(encoded, path.stem, lens, used)
-        return _of_faces(faces, path.name)
+        return _of_faces(fisheye_faces(encoded, path.stem, lens, used), path.name)
 
     def _used(self, name: str, size: tuple[int, int], encoded: bytes) -> NDArray[np.bool_] | None:
         mask = self.masks.encoded(name, size)
@@ -398,7 +403,15 @@ def _sources(ctx: StepContext, files: InputFiles, masks: Set[Path], cubes: _Cube
     if others:
         counts = {"n": len(others), "n_files": len(files.paths)}
         ctx.report(NO_PHOTOS, subject=files.name, names=_names(others), **counts)
-    return sorted(_by_their_paths(sources), key=lambda source: source.name)
+    # Photos of one file name are called by their paths within the input.
+    counts = Counter(source.name for source in sources)
+    named = (
+        replace(source, name=f"{source.folder}/{source.name}")
+        if counts[source.name] > 1 and source.folder
+        else source
+        for source in sources
+    )
+    return sorted(named, key=lambda source: source.name)
 
 
 def _folders(paths: Sequence[Path]) -> dict[Path, str]:
@@ -406,16 +419,6 @@ def _folders(paths: Sequence[Path]) -> dict[Path, str]:
     common = os.path.commonpath([path.parent for path in paths]) if paths else ""
     relative = {path: path.parent.relative_to(common).as_posix() for path in paths}
     return {path: "" if folder == "." else folder for path, folder in relative.items()}
-
-
-def _by_their_paths(sources: Sequence[_Source]) -> Iterator[_Source]:
-    """Call photos of one file name by their paths within the input."""
-    counts = Counter(source.name for source in sources)
-    for source in sources:
-        if counts[source.name] > 1 and source.folder:
-            yield replace(source, name=f"{source.folder}/{source.name}")
-        else:
-            yield source
 
 
 def _refuse_raw(input_name: str, photos: Sequence[str], others: Sequence[str]) -> None:
@@ -593,16 +596,6 @@ def _warn_of_matches(
     unused = [pattern for pattern in calibration.patterns if pattern not in used]
     if unused:
         ctx.report(UNUSED_ENTRIES, n=len(unused), names=_names(unused))
-
-
-def _report_metrics(ctx: StepContext, photos: Photos) -> None:
-    known = [photo.intrinsics is not None for photo in photos.photos]
-    by_exif = [photo.exif_focal_px is not None for photo in photos.photos]
-    pixels = sum(photo.width * photo.height for photo in photos.photos)
-    ctx.metric("n_photos", len(photos.photos), "1")
-    ctx.metric("n_calibrated", sum(known), "1")
-    ctx.metric("n_exif_focal", sum(by_exif), "1")
-    ctx.metric("megapixels", pixels / 1e6, "Mpx")
 
 
 def _counted(names: Sequence[str]) -> str:

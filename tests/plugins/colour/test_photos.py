@@ -11,7 +11,6 @@ from orthoflow_plugins.colour.photos import ColourPhotos
 
 from orthoflow.errors import MethodError
 from orthoflow.files.clouds import photo_colours as module
-from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 from orthoflow.products import Cameras, Photos, PointCloud
 from tests import ortho_scenes
 from tests import raster_scenes as scenes
@@ -83,54 +82,6 @@ def test_photos_that_are_not_oriented_or_look_elsewhere_are_refused(tmp_path: Pa
 
 
 # --- one photo ---
-
-
-def test_points_of_a_photo_are_those_inside_it_part_by_part(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(module, "_PROJECTED_AT_ONCE", 7)
-    where = ortho_scenes.frame()
-    viewer = ortho_scenes.camera(where)
-    shares = np.random.default_rng(0).uniform(-1.5, 2.5, (40, 2))
-    cloud = scenes.cloud_of(where.world_from_wall(shares * [where.width, where.height]))
-    near = viewer.shifted(cloud.origin)
-    parts = list(module._points_in_photo(cloud, near))
-    offsets = np.column_stack([cloud.x, cloud.y, cloud.z]).astype(np.float64)
-    projected = near.project(offsets)
-    inside = np.flatnonzero(near.sees(projected[:, :2]))
-    assert 0 < len(inside) < 40
-    np.testing.assert_array_equal(np.concatenate([part.index for part in parts]), inside)
-    pixels = np.concatenate([part.pixels for part in parts])
-    np.testing.assert_allclose(pixels, projected[inside, :2])
-    depths = np.concatenate([part.depth_m for part in parts])
-    np.testing.assert_allclose(depths, projected[inside, 2])
-
-
-def test_nearer_photos_are_better_and_their_borders_worse() -> None:
-    viewer = ortho_scenes.camera(ortho_scenes.frame())
-    width, height = float(viewer.width), float(viewer.height)
-    middle = 0.5 * np.array([width, height])
-    share = module._BORDER_SHARE * min(width, height)
-    pixels = np.array(
-        [middle, middle, [0.5 * share, middle[1]], [middle[0], height - 0.25 * share], [0.0, 0.0]]
-    )
-    shown = module._ShownPoints(
-        index=np.arange(5), pixels=pixels, depth_m=np.array([2.0, 4.0, 2.0, 2.0, 2.0])
-    )
-    best = (viewer.fx / 2.0) ** 2
-    expected = best * np.array([1.0, 0.25, 0.5, 0.25, 1e-3])
-    np.testing.assert_allclose(module._quality(shown, viewer), expected, rtol=1e-5)
-
-
-def test_points_behind_what_the_buffer_holds_are_not_seen() -> None:
-    nearest = np.array([[1.0, 2.0], [3.0, np.inf]], dtype=np.float32)
-    buffer = DepthBuffer(nearest=nearest, reduction=4.0)
-    pixels = np.array([[0.0, 3.9], [4.1, 3.9], [3.9, 4.1], [7.9, 7.9]])
-    for away_m, expected in ((0.09, [True] * 4), (0.11, [False, False, False, True])):
-        shown = module._ShownPoints(
-            index=np.arange(4), pixels=pixels, depth_m=np.array([1.0, 2.0, 3.0, 99.0]) + away_m
-        )
-        np.testing.assert_array_equal(module._is_seen(shown, buffer, 0.1), expected)
 
 
 def test_the_box_holds_the_cameras_and_the_cloud_but_for_outliers() -> None:
