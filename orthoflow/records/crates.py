@@ -7,14 +7,12 @@ import json
 import mimetypes
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Final, TypeAlias
 
 from orthoflow_provenance.document import (
     RecordedCell,
-    RecordedEnvironment,
     RecordedFile,
     RecordedProduct,
     RunRecord,
@@ -42,265 +40,35 @@ from orthoflow.version import DISTRIBUTION
 
 Entity: TypeAlias = dict[str, JsonValue]
 
-WORKFLOW_FILE: Final = "workflow.yaml"
-RESOLVED_FILE: Final = "workflow-resolved.json"
-_DONE: Final = "http://schema.org/CompletedActionStatus"
-_FAILED: Final = "http://schema.org/FailedActionStatus"
-_UNIT_CODES: Final = {
-    "s": "https://qudt.org/vocab/unit/SEC",
-    "MiB": "https://qudt.org/vocab/unit/MebiBYTE",
-    "1": "https://qudt.org/vocab/unit/UNITLESS",
-}
-
-
-def ref(identifier: str) -> dict[str, JsonValue]:
-    """Reference an entity."""
-    return {"@id": identifier}
-
-
-def refs(identifiers: Iterator[str] | tuple[str, ...]) -> list[JsonValue]:
-    """Reference entities, each once."""
-    return [ref(identifier) for identifier in dict.fromkeys(identifiers)]
-
-
-def file_id(file: RecordedFile) -> str:
-    """Name a file that is not in the crate by its content (RFC 6920).
-
-    >>> file_id(RecordedFile(name="a", size_bytes=0, sha256="00" * 32))[:20]
-    'ni:///sha-256;AAAAAA'
-    """
-    digest = base64.urlsafe_b64encode(bytes.fromhex(file.sha256)).decode().rstrip("=")
-    return f"ni:///sha-256;{digest}"
-
-
-def product_id(product: RecordedProduct) -> str:
-    """Name a product by its digest."""
-    return f"#product-{product.digest.removeprefix('sha256:')}"
-
-
-def environment_file(environment: RecordedEnvironment) -> str:
-    """Name of the list of packages of an environment."""
-    return f"requirements-{environment.id.removeprefix('sha256:')[:12]}.txt"
-
-
-def ran(record: RunRecord) -> tuple[RecordedCell, ...]:
-    """Cells that were executed; skipped ones are no actions."""
-    return tuple(cell for cell in record.cells if cell.status != "skipped")
-
-
-def tool_id(cell: RecordedCell) -> str:
-    """Name the method of a cell."""
-    return f"#method-{cell.method}"
-
-
-def step_id(cell: RecordedCell) -> str:
-    """Name the step of a cell, one per variant."""
-    variant = cell.assignment.get(cell.step, "")
-    return f"{WORKFLOW_FILE}#{cell.step}{f'.{variant}' if variant else ''}"
-
-
-def action_id(cell: RecordedCell) -> str:
-    """Name the execution of a cell."""
-    return f"#run-of-{cell.address}"
-
-
-def formal_id(owner: str, name: str) -> str:
-    """Name a formal parameter: an input, output or setting of a method or of the workflow."""
-    return f"{owner}/{name}" if "#" in owner else f"{owner}#{name}"
-
-
-def status_of(*, is_ok: bool) -> str:
-    """Name of the status of an action."""
-    return _DONE if is_ok else _FAILED
-
-
-def value_type(value: JsonValue) -> str:
-    """Schema.org's name for the type of a setting; non-scalars are written as JSON text."""
-    names = {bool: "Boolean", int: "Integer", float: "Float"}
-    return names.get(type(value), "Text")
-
-
-def port_type(product: RecordedProduct) -> str:
-    """Schema.org's name for the type of a port: files of the user, or products of the record."""
-    return "File" if product.type_name == "files" else "CreativeWork"
-
-
-def value_text(value: JsonValue) -> JsonValue:
-    """Return a setting as a scalar."""
-    if isinstance(value, bool | int | float | str):
-        return value
-    return json.dumps(value, ensure_ascii=False)
-
-
-def formal(identifier: str, name: str, additional_type: str) -> Entity:
-    """A formal parameter."""
-    return {
-        "@id": identifier,
-        "@type": "FormalParameter",
-        "additionalType": additional_type,
-        "name": name,
-    }
-
-
-def method_entities(record: RunRecord) -> Iterator[Entity]:
-    """Methods with their ports and settings, and their distributions."""
-    by_tool: dict[str, list[RecordedCell]] = {}
-    for cell in ran(record):
-        by_tool.setdefault(tool_id(cell), []).append(cell)
-    brought: dict[str, Entity] = {}
-    for tool, cells in by_tool.items():
-        first = cells[0]
-        origin = f"#distribution-{first.distribution}"
-        brought[origin] = {
-            "@id": origin,
-            "@type": "SoftwareApplication",
-            "name": first.distribution,
-            "version": first.distribution_version,
-        }
-        settings = {name: value for cell in cells for name, value in cell.params.items()}
-        ports = {port: product for cell in cells for port, product in cell.inputs.items()}
-        outputs = {port: product for cell in cells for port, product in cell.outputs.items()}
-        yield {
-            "@id": tool,
-            "@type": "SoftwareApplication",
-            "name": first.method,
-            "softwareVersion": f"{first.distribution_version}, result version "
-            f"{first.result_version}",
-            "description": f"{first.determinism} method of {first.distribution}",
-            "input": refs(formal_id(tool, name) for name in (*ports, *settings)),
-            "output": refs(formal_id(tool, f"out/{name}") for name in outputs),
-            "softwareRequirements": ref(origin),
-            "mainEntity": ref(origin),
-            "citation": list(first.citations),
-        }
-        for port, product in ports.items():
-            yield formal(formal_id(tool, port), port, port_type(product))
-        for name, value in settings.items():
-            yield formal(formal_id(tool, name), name, value_type(value))
-        for port, product in outputs.items():
-            yield formal(formal_id(tool, f"out/{port}"), port, port_type(product))
-    yield from brought.values()
-
-
-def cell_entities(record: RunRecord) -> Iterator[Entity]:
-    """The executions: an action per cell, its control, its settings, costs and metrics."""
-    files = {entry.name: entry.files for entry in record.inputs}
-    for cell in ran(record):
-        action = action_id(cell)
-        settings = list(_settings(cell))
-        costs = list(_costs(cell))
-        metrics = list(_metrics(cell))
-        taken = [
-            identifier
-            for product in cell.inputs.values()
-            for identifier in _sources(product, files)
-        ]
-        content: Entity = {
-            "@id": action,
-            "@type": "CreateAction",
-            "name": f"{cell.method} as {cell.address}",
-            "description": _history(cell),
-            "instrument": ref(tool_id(cell)),
-            "startTime": cell.started,
-            "endTime": cell.ended,
-            "actionStatus": status_of(is_ok=cell.status == "ok"),
-            "object": refs((*taken, *(str(entity["@id"]) for entity in settings))),
-            "result": refs(
-                (
-                    *(product_id(product) for product in cell.outputs.values()),
-                    *(str(entity["@id"]) for entity in metrics),
-                )
-            ),
-            "resourceUsage": refs(tuple(str(entity["@id"]) for entity in costs)),
-        }
-        if cell.status == "failed":
-            content["error"] = cell.error_message
-        yield content
-        yield {
-            "@id": f"#control-of-{cell.address}",
-            "@type": "ControlAction",
-            "name": f"orchestrate {cell.address}",
-            "instrument": ref(step_id(cell)),
-            "object": ref(action),
-        }
-        yield from (*settings, *costs, *metrics)
-
-
-def _sources(
-    product: RecordedProduct, files: Mapping[str, tuple[RecordedFile, ...]]
-) -> Iterator[str]:
-    owner, _, name = product.source.rpartition(".")
-    if owner == "inputs":
-        yield from (file_id(file) for file in files.get(name, ()))
-    else:
-        yield product_id(product)
-
-
-def _history(cell: RecordedCell) -> str:
-    if cell.cached_from:
-        return f"computed by the earlier run {cell.cached_from} and taken from the store"
-    return "computed in this run" if cell.status == "ok" else "failed in this run"
-
-
-def _settings(cell: RecordedCell) -> Iterator[Entity]:
-    for name, value in cell.params.items():
-        example = [ref(formal_id(tool_id(cell), name))]
-        if name in cell.params_set:
-            example.append(ref(formal_id(step_id(cell), name)))
-        yield {
-            "@id": f"#setting-{cell.address}/{name}",
-            "@type": "PropertyValue",
-            "name": name,
-            "value": value_text(value),
-            "exampleOfWork": list(example),
-        }
-
-
-def _costs(cell: RecordedCell) -> Iterator[Entity]:
-    for cost in cost_metrics(cell):
-        yield {
-            "@id": f"#cost-{cell.address}/{cost.name}",
-            "@type": "PropertyValue",
-            "name": cost.name,
-            "propertyID": cost.name,
-            "unitCode": _UNIT_CODES[cost.unit],
-            "value": str(cost.value),
-        }
-
-
-def _metrics(cell: RecordedCell) -> Iterator[Entity]:
-    for metric in cell.metrics:
-        yield {
-            "@id": f"#metric-{cell.address}/{metric.name}",
-            "@type": "PropertyValue",
-            "name": metric.name,
-            "unitText": metric.unit,
-            "value": metric.value,
-        }
-
-
 NO_LICENSE: Final = "not stated: ask who made these results"
 METADATA_FILE: Final = "ro-crate-metadata.json"
+WORKFLOW_FILE: Final = "workflow.yaml"
+RESOLVED_FILE: Final = "workflow-resolved.json"
 _CRATE: Final = "https://w3id.org/ro/crate/1.1"
+_WORKFLOW_CRATE: Final = "https://w3id.org/workflowhub/workflow-ro-crate/1.0"
 _PROFILES: Final = {
     "https://w3id.org/ro/wfrun/process/0.5": "Process Run Crate",
     "https://w3id.org/ro/wfrun/workflow/0.5": "Workflow Run Crate",
     "https://w3id.org/ro/wfrun/provenance/0.5": "Provenance Run Crate",
-    "https://w3id.org/workflowhub/workflow-ro-crate/1.0": "Workflow RO-Crate",
+    _WORKFLOW_CRATE: "Workflow RO-Crate",
 }
-_WORKFLOW_CRATE: Final = "https://w3id.org/workflowhub/workflow-ro-crate/1.0"
 _BIOSCHEMAS: Final = "https://bioschemas.org/profiles/ComputationalWorkflow/1.0-RELEASE"
 _REQUIREMENTS: Final = "https://pip.pypa.io/en/stable/reference/requirements-file-format/"
 _LANGUAGE: Final = "#orthoflow-workflow-format"
 _ENGINE: Final = "#engine"
-_ORCID: Final = re.compile(r"https://orcid\.org/(\d{4}-){3}\d{3}[\dX]$")
 _RUN: Final = "#run"
+_ORCID: Final = re.compile(r"https://orcid\.org/(\d{4}-){3}\d{3}[\dX]$")
 _CONTEXT: Final[list[JsonValue]] = [
     f"{_CRATE}/context",
     "https://w3id.org/ro/terms/workflow-run/context",
     {"buildInstructions": "https://codemeta.github.io/terms/buildInstructions"},
 ]
 _MEDIA_TYPES: Final = {".h5": "application/x-hdf5", ".tif": "image/tiff", ".yaml": "text/yaml"}
+_UNIT_CODES: Final = {
+    "s": "https://qudt.org/vocab/unit/SEC",
+    "MiB": "https://qudt.org/vocab/unit/MebiBYTE",
+    "1": "https://qudt.org/vocab/unit/UNITLESS",
+}
 
 
 def write_crate(
@@ -335,7 +103,7 @@ def write_crate(
         WORKFLOW_FILE: run.record.workflow_source,
         RESOLVED_FILE: run.record.workflow_resolved,
         **{
-            environment_file(environment): "".join(
+            _environment_file(environment.id): "".join(
                 f"{name}=={version}\n" for name, version in environment.packages.items()
             )
             for environment in run.record.environments
@@ -394,310 +162,391 @@ def crate_metadata(
         license_text: URL or name of the license of the results.
         author: who made the results, by name or ORCID; empty if unknown.
     """
-    crate = _Crate(
-        record=record, files=tuple(files), license_text=license_text, author=author.strip()
+    crate = _Crate()
+    cells = [cell for cell in record.cells if cell.status != "skipped"]
+    crate.add(
+        METADATA_FILE,
+        "CreativeWork",
+        about=_ref("./"),
+        conformsTo=_refs((_CRATE, _WORKFLOW_CRATE)),
     )
-    return {"@context": _CONTEXT, "@graph": list(crate.graph())}
+    _add_run(crate, record, files, license_text)
+    if author.strip():
+        _add_author(crate, author.strip())
+    _add_files(crate, record, files)
+    taken = {product.source for cell in cells for product in cell.inputs.values()}
+    given: dict[str, str] = {}
+    for position, cell in enumerate(cells):
+        _add_cell(crate, record, cell, position, given)
+        for port, product in cell.outputs.items():
+            source = f"{cell.address}.{port}"
+            given[source] = f"{_tool_id(cell)}/out/{port}"
+            if source not in taken:
+                _add_final(crate, source, given[source], product)
+    return {"@context": _CONTEXT, "@graph": list(crate.entities.values())}
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Crate:
-    """One crate: the entities that represent the run as a whole."""
+    """The entities of a crate by their ids."""
 
-    record: RunRecord
-    files: tuple[str, ...]
-    license_text: str
-    author: str
+    def __init__(self) -> None:
+        self.entities: dict[str, Entity] = {}
 
-    def graph(self) -> Iterator[Entity]:
-        """Return all entities, the descriptor and the root first."""
-        yield {
-            "@id": METADATA_FILE,
-            "@type": "CreativeWork",
-            "about": ref("./"),
-            "conformsTo": refs((_CRATE, _WORKFLOW_CRATE)),
-        }
-        yield self._root()
-        if self.author:
-            name = self.author.removesuffix(self._orcid).strip(" ,<(")
-            yield {"@id": self._author_id, "@type": "Person", "name": name or self.author}
-        for profile, name in _PROFILES.items():
-            version = profile.rpartition("/")[2]
-            yield {"@id": profile, "@type": "CreativeWork", "name": name, "version": version}
-        yield self._workflow()
-        yield {
-            "@id": _LANGUAGE,
-            "@type": "ComputerLanguage",
-            "name": "orthoflow workflow",
-            "version": "1",
-        }
-        yield from self._steps()
-        yield from self._formals()
-        yield from self._plain_files()
-        yield from self._input_files()
-        yield from self._products()
-        yield from self._run()
-        yield from method_entities(self.record)
-        yield from cell_entities(self.record)
+    def add(self, identifier: str, kind: JsonValue, /, **facts: JsonValue) -> str:
+        """Add an entity; one that is known keeps what it has, and its lists grow."""
+        entity = self.entities.setdefault(identifier, {"@id": identifier, "@type": kind})
+        for name, value in facts.items():
+            if name in entity and isinstance(value, list):
+                self.extend(identifier, name, value)
+            else:
+                entity.setdefault(name, value)
+        return identifier
 
-    @property
-    def _cells(self) -> tuple[RecordedCell, ...]:
-        return ran(self.record)
+    def extend(self, identifier: str, name: str, more: Iterable[JsonValue]) -> None:
+        """Extend a list of an entity, by what is not in it yet; nothing without the entity."""
+        if identifier in self.entities:
+            known = self.entities[identifier].setdefault(name, [])
+            assert isinstance(known, list)  # noqa: S101 - lists alone are extended
+            known += [item for item in more if item not in known]
 
-    def _root(self) -> Entity:
-        record = self.record
-        root: Entity = {
-            "@id": "./",
-            "@type": "Dataset",
-            "name": f"{record.name}, run {record.run_id}",
-            "description": f"Run of the workflow {record.name} with {record.created_by}: "
-            f"{len(record.cells)} steps, {record.status}. {RECORD_FILE} is the record of all of "
-            f"it. {_how_to_read(record)}",
-            "datePublished": record.ended,
-            "license": self.license_text,
-            "conformsTo": refs(tuple(_PROFILES)),
-            "hasPart": refs((*self.files, *self._input_ids())),
-            "mainEntity": ref(WORKFLOW_FILE),
-            "mentions": refs((_RUN, *(action_id(cell) for cell in self._cells))),
-        }
-        if self.author:
-            root["author"] = root["creator"] = ref(self._author_id)
-        return root
+    def link(self, identifier: str, name: str, *targets: str) -> None:
+        """Extend a list of references."""
+        self.extend(identifier, name, _refs(targets))
 
-    @property
-    def _author_id(self) -> str:
-        return self._orcid or "#author"
+    def formal(self, identifier: str, name: str, kind: str) -> str:
+        """Add a formal parameter: an input, output or setting of a method or of the workflow."""
+        return self.add(identifier, "FormalParameter", additionalType=kind, name=name)
 
-    @property
-    def _orcid(self) -> str:
-        found = _ORCID.search(self.author)
-        return found[0] if found else ""
-
-    def _input_ids(self) -> tuple[str, ...]:
-        return tuple(file_id(file) for entry in self.record.inputs for file in entry.files)
-
-    def _workflow(self) -> Entity:
-        options = " ".join(self.record.overrides)
-        said = f"ran with {options}" if options else "ran as it stands"
-        return {
-            "@id": WORKFLOW_FILE,
-            "@type": ["File", "SoftwareSourceCode", "ComputationalWorkflow", "HowTo"],
-            "name": self.record.name,
-            "description": f"The workflow as its author wrote it; it {said}. {RESOLVED_FILE} has "
-            "what ran, with every parameter.",
-            "version": self.record.created_by,
-            "encodingFormat": "text/yaml",
-            "conformsTo": ref(_BIOSCHEMAS),
-            "programmingLanguage": ref(_LANGUAGE),
-            "hasPart": refs(tuple(tool_id(cell) for cell in self._cells)),
-            "step": refs(tuple(step_id(cell) for cell in self._cells)),
-            "input": refs(tuple(str(entity["@id"]) for entity in self._workflow_inputs())),
-            "output": refs(tuple(_output_id(source) for source in self._final)),
-            "connection": refs(tuple(f"#to-{_output_id(source)}" for source in self._final)),
-            "buildInstructions": refs(self._environment_files()),
-        }
-
-    @property
-    def _final(self) -> dict[str, tuple[RecordedCell, str]]:
-        """Return outputs that no other cell takes, by `address.port`."""
-        taken = {product.source for cell in self._cells for product in cell.inputs.values()}
-        return {
-            f"{cell.address}.{port}": (cell, port)
-            for cell in self._cells
-            for port in cell.outputs
-            if f"{cell.address}.{port}" not in taken
-        }
-
-    def _environment_files(self) -> tuple[str, ...]:
-        return tuple(environment_file(item) for item in self.record.environments)
-
-    def _workflow_inputs(self) -> Iterator[Entity]:
-        for entry in self.record.inputs:
-            if entry.files:
-                yield formal(_input_id(entry.name), entry.name, "File")
-        seen: set[str] = set()
-        for cell in self._cells:
-            step = step_id(cell)
-            for name in cell.params_set:
-                identifier = formal_id(step, name)
-                if identifier not in seen and name in cell.params:
-                    seen.add(identifier)
-                    kind = value_type(cell.params[name])
-                    yield formal(identifier, f"{cell.step}.{name}", kind)
-
-    def _formals(self) -> Iterator[Entity]:
-        yield from self._workflow_inputs()
-        for source, (cell, port) in self._final.items():
-            yield formal(_output_id(source), source, "CreativeWork")
-            tool = formal_id(tool_id(cell), f"out/{port}")
-            yield _connection(f"#to-{_output_id(source)}", tool, _output_id(source))
-
-    def _steps(self) -> Iterator[Entity]:
-        environments = {item.id: environment_file(item) for item in self.record.environments}
-        outputs = {
-            f"{cell.address}.{port}": formal_id(tool_id(cell), f"out/{port}")
-            for cell in self._cells
-            for port in cell.outputs
-        }
-        steps: dict[str, Entity] = {}
-        connections: dict[str, Entity] = {}
-        for position, cell in enumerate(self._cells):
-            step, tool = step_id(cell), tool_id(cell)
-            targets = {
-                _source_id(product.source, outputs): formal_id(tool, port)
-                for port, product in cell.inputs.items()
-            }
-            targets |= {
-                formal_id(step, name): formal_id(tool, name)
-                for name in cell.params_set
-                if name in cell.params
-            }
-            made = {
-                f"#connection-{step}-{source}-{target}": _connection(
-                    f"#connection-{step}-{source}-{target}", source, target
-                )
-                for source, target in targets.items()
-            }
-            connections |= made
-            known = steps.setdefault(
-                step,
-                {
-                    "@id": step,
-                    "@type": "HowToStep",
-                    "name": step.partition("#")[2],
-                    "position": str(position),
-                    "workExample": ref(tool),
-                    "connection": [],
-                },
-            )
-            known["connection"] = _joined(known["connection"], made)
-            if cell.environment in environments:
-                known["buildInstructions"] = ref(environments[cell.environment])
-        yield from (*steps.values(), *connections.values())
-
-    def _plain_files(self) -> Iterator[Entity]:
-        lists = set(self._environment_files())
-        published = {file.path: file for file in self.record.published}
-        for name in self.files:
-            if name == WORKFLOW_FILE:
-                continue
-            entity: Entity = {"@id": name, "@type": "File", "name": name.rpartition("/")[2]}
-            entity["encodingFormat"] = _media_type(name)
-            if name in lists:
-                entity["conformsTo"] = ref(_REQUIREMENTS)
-                entity["name"] = "Python packages that were installed"
-            if name == RECORD_FILE:
-                entity["description"] = _how_to_read(self.record)
-            if name in published:
-                entity["contentSize"] = str(published[name].size_bytes)
-                entity["sha256"] = published[name].sha256
-            yield entity
-        yield {"@id": _REQUIREMENTS, "@type": "WebPage", "name": "Requirements file format"}
-
-    def _input_files(self) -> Iterator[Entity]:
-        ports: dict[str, list[str]] = {}
-        for cell in self._cells:
-            for port, product in cell.inputs.items():
-                owner, _, name = product.source.rpartition(".")
-                if owner == "inputs":
-                    target = formal_id(tool_id(cell), port)
-                    ports.setdefault(name, []).append(target)
-        found: dict[str, Entity] = {}
-        for entry in self.record.inputs:
-            examples = (_input_id(entry.name), *ports.get(entry.name, ()))
-            for file in entry.files:
-                entity = found.setdefault(
-                    file_id(file),
-                    {
-                        "@id": file_id(file),
-                        "@type": "File",
-                        "name": file.name,
-                        "contentSize": str(file.size_bytes),
-                        "sha256": file.sha256,
-                        "encodingFormat": _media_type(file.name),
-                        "exampleOfWork": [],
-                    },
-                )
-                entity["exampleOfWork"] = _joined(entity["exampleOfWork"], examples)
-                if entry.embedded:
-                    entity["isPartOf"] = ref(RECORD_FILE)
-        yield from found.values()
-
-    def _products(self) -> Iterator[Entity]:
-        found: dict[str, Entity] = {}
-        examples: dict[str, list[str]] = {}
-        final = self._final
-        for cell in self._cells:
-            tool = tool_id(cell)
-            for port, product in cell.inputs.items():
-                examples.setdefault(product_id(product), []).append(formal_id(tool, port))
-            for port, product in cell.outputs.items():
-                identifier = product_id(product)
-                source = f"{cell.address}.{port}"
-                named = [formal_id(tool, f"out/{port}")]
-                named += [_output_id(source)] if source in final else []
-                examples.setdefault(identifier, []).extend(named)
-                entity = found.setdefault(
-                    identifier,
-                    {
-                        "@id": identifier,
-                        "@type": "CreativeWork",
-                        "name": f"{product.type_name} of {cell.address}",
-                        "identifier": product.digest,
-                        "additionalType": product.type_name,
-                    },
-                )
-                if product.embedded:
-                    entity["isPartOf"] = ref(RECORD_FILE)
-        for identifier, entity in found.items():
-            entity["exampleOfWork"] = refs(tuple(examples[identifier]))
-            yield entity
-
-    def _run(self) -> Iterator[Entity]:
-        record = self.record
-        settings = tuple(
-            f"#setting-{cell.address}/{name}"
-            for cell in self._cells
-            for name in cell.params_set
-            if name in cell.params
+    def connect(self, owner: str, identifier: str, source: str, target: str) -> None:
+        """Connect two formal parameters, in a step or in the workflow."""
+        self.add(
+            identifier,
+            "ParameterConnection",
+            sourceParameter=_ref(source),
+            targetParameter=_ref(target),
         )
-        results = [product_id(cell.outputs[port]) for cell, port in self._final.values()]
-        published = [name for name in self.files if name.startswith(f"{PRODUCTS_FOLDER}/")]
-        content: Entity = {
-            "@id": _RUN,
-            "@type": "CreateAction",
-            "name": f"run {record.run_id} of {record.name}",
-            "description": f"{len(self._cells)} steps, seed {record.seed}",
-            "instrument": ref(WORKFLOW_FILE),
-            "startTime": record.started,
-            "endTime": record.ended,
-            "actionStatus": status_of(is_ok=record.status == "ok"),
-            "object": refs((*self._input_ids(), *settings, RESOLVED_FILE)),
-            "result": refs((RECORD_FILE, *results, *published)),
-        }
-        if record.status == "failed":
-            failed = [cell.address for cell in self._cells if cell.status == "failed"]
-            content["error"] = f"failed: {', '.join(failed)}"
-        yield content
-        yield {
-            "@id": "#orchestration",
-            "@type": "OrganizeAction",
-            "name": f"orchestrate {record.name} with {record.created_by}",
-            "instrument": ref(_ENGINE),
-            "startTime": record.started,
-            "endTime": record.ended,
-            "object": refs(tuple(f"#control-of-{cell.address}" for cell in self._cells)),
-            "result": ref(_RUN),
-        }
-        name, _, version = record.created_by.partition(" ")
-        yield {
-            "@id": _ENGINE,
-            "@type": "SoftwareApplication",
-            "name": name,
-            "softwareVersion": version,
-            "description": f"Python package: pip install {DISTRIBUTION}=={version}, or, where no "
-            "index has that version, of its wheel or sources, which those who made this crate have",
-        }
+        self.link(owner, "connection", identifier)
+
+
+def _ref(identifier: str) -> dict[str, JsonValue]:
+    return {"@id": identifier}
+
+
+def _refs(identifiers: Iterable[str]) -> list[JsonValue]:
+    """Reference entities, each once."""
+    return [_ref(identifier) for identifier in dict.fromkeys(identifiers)]
+
+
+def _file_id(file: RecordedFile) -> str:
+    """Name a file that is not in the crate by its content (RFC 6920)."""
+    digest = base64.urlsafe_b64encode(bytes.fromhex(file.sha256)).decode().rstrip("=")
+    return f"ni:///sha-256;{digest}"
+
+
+def _product_id(product: RecordedProduct) -> str:
+    return f"#product-{product.digest.removeprefix('sha256:')}"
+
+
+def _environment_file(environment_id: str) -> str:
+    """Name of the list of packages of an environment."""
+    return f"requirements-{environment_id.removeprefix('sha256:')[:12]}.txt"
+
+
+def _tool_id(cell: RecordedCell) -> str:
+    return f"#method-{cell.method}"
+
+
+def _status(*, is_ok: bool) -> str:
+    return f"http://schema.org/{'Completed' if is_ok else 'Failed'}ActionStatus"
+
+
+def _value_type(value: JsonValue) -> str:
+    """Schema.org's name for the type of a setting; non-scalars are written as JSON text."""
+    return {bool: "Boolean", int: "Integer", float: "Float"}.get(type(value), "Text")
+
+
+def _port_type(product: RecordedProduct) -> str:
+    return "File" if product.type_name == "files" else "CreativeWork"
+
+
+def _add_author(crate: _Crate, author: str) -> None:
+    orcid = found[0] if (found := _ORCID.search(author)) else ""
+    name = author.removesuffix(orcid).strip(" ,<(") or author
+    person = crate.add(orcid or "#author", "Person", name=name)
+    crate.add("./", "Dataset", author=_ref(person), creator=_ref(person))
+
+
+def _add_run(crate: _Crate, record: RunRecord, files: list[str], license_text: str) -> None:
+    """Add the root, the workflow, its run, and the program that ran it."""
+    crate.add(
+        "./",
+        "Dataset",
+        name=f"{record.name}, run {record.run_id}",
+        description=f"Run of the workflow {record.name} with {record.created_by}: "
+        f"{len(record.cells)} steps, {record.status}. {RECORD_FILE} is the record of all of it. "
+        f"{_how_to_read(record)}",
+        datePublished=record.ended,
+        license=license_text,
+        conformsTo=_refs(_PROFILES),
+        hasPart=_refs(files),
+        mainEntity=_ref(WORKFLOW_FILE),
+        mentions=_refs([_RUN]),
+    )
+    for profile, name in _PROFILES.items():
+        crate.add(profile, "CreativeWork", name=name, version=profile.rpartition("/")[2])
+    options = " ".join(record.overrides)
+    said = f"ran with {options}" if options else "ran as it stands"
+    crate.add(
+        WORKFLOW_FILE,
+        ["File", "SoftwareSourceCode", "ComputationalWorkflow", "HowTo"],
+        name=record.name,
+        description=f"The workflow as its author wrote it; it {said}. {RESOLVED_FILE} has what "
+        "ran, with every parameter.",
+        version=record.created_by,
+        encodingFormat="text/yaml",
+        conformsTo=_ref(_BIOSCHEMAS),
+        programmingLanguage=_ref(_LANGUAGE),
+        buildInstructions=_refs(_environment_file(item.id) for item in record.environments),
+        **{name: [] for name in ("hasPart", "step", "input", "output", "connection")},
+    )
+    crate.add(_LANGUAGE, "ComputerLanguage", name="orthoflow workflow", version="1")
+    ran = [cell for cell in record.cells if cell.status != "skipped"]
+    crate.add(
+        _RUN,
+        "CreateAction",
+        name=f"run {record.run_id} of {record.name}",
+        description=f"{len(ran)} steps, seed {record.seed}",
+        instrument=_ref(WORKFLOW_FILE),
+        startTime=record.started,
+        endTime=record.ended,
+        actionStatus=_status(is_ok=record.status == "ok"),
+        object=_refs([RESOLVED_FILE]),
+        result=_refs(
+            [RECORD_FILE, *(name for name in files if name.startswith(f"{PRODUCTS_FOLDER}/"))]
+        ),
+    )
+    if record.status == "failed":
+        failed = [cell.address for cell in ran if cell.status == "failed"]
+        crate.add(_RUN, "CreateAction", error=f"failed: {', '.join(failed)}")
+    crate.add(
+        "#orchestration",
+        "OrganizeAction",
+        name=f"orchestrate {record.name} with {record.created_by}",
+        instrument=_ref(_ENGINE),
+        startTime=record.started,
+        endTime=record.ended,
+        object=[],
+        result=_ref(_RUN),
+    )
+    name, _, version = record.created_by.partition(" ")
+    crate.add(
+        _ENGINE,
+        "SoftwareApplication",
+        name=name,
+        softwareVersion=version,
+        description=f"Python package: pip install {DISTRIBUTION}=={version}, or, where no index "
+        "has that version, of its wheel or sources, which those who made this crate have",
+    )
+
+
+def _add_files(crate: _Crate, record: RunRecord, files: list[str]) -> None:
+    """Add the files in the crate, and the input files, which are named by their content."""
+    lists = {_environment_file(item.id) for item in record.environments}
+    published = {file.path: file for file in record.published}
+    for name in files:
+        if name == WORKFLOW_FILE:
+            continue
+        facts: Entity = {"encodingFormat": _media_type(name)}
+        title = name.rpartition("/")[2]
+        if name in lists:
+            title = "Python packages that were installed"
+            facts["conformsTo"] = _ref(_REQUIREMENTS)
+        if name == RECORD_FILE:
+            facts["description"] = _how_to_read(record)
+        if file := published.get(name):
+            facts |= {"contentSize": str(file.size_bytes), "sha256": file.sha256}
+        crate.add(name, "File", name=title, **facts)
+    crate.add(_REQUIREMENTS, "WebPage", name="Requirements file format")
+    for entry in record.inputs:
+        if entry.files:
+            given = crate.formal(f"{WORKFLOW_FILE}#inputs/{entry.name}", entry.name, "File")
+            crate.link(WORKFLOW_FILE, "input", given)
+        part: Entity = {"isPartOf": _ref(RECORD_FILE)} if entry.embedded else {}
+        for file in entry.files:
+            crate.add(
+                _file_id(file),
+                "File",
+                name=file.name,
+                contentSize=str(file.size_bytes),
+                sha256=file.sha256,
+                encodingFormat=_media_type(file.name),
+                exampleOfWork=_refs([given]),
+                **part,
+            )
+        named = [_file_id(file) for file in entry.files]
+        crate.link("./", "hasPart", *named)
+        crate.link(_RUN, "object", *named)
+
+
+def _add_cell(
+    crate: _Crate, record: RunRecord, cell: RecordedCell, position: int, given: dict[str, str]
+) -> None:
+    """Add a cell: its method, its step of the workflow, and its execution.
+
+    Args:
+        crate: is extended.
+        record: the record of the cell.
+        cell: one that was executed.
+        position: place of the cell in the run, from 0.
+        given: formal parameter of each output of an earlier cell, by `address.port`.
+    """
+    tool = _add_method(crate, cell)
+    variant = cell.assignment.get(cell.step, "")
+    title = f"{cell.step}{f'.{variant}' if variant else ''}"
+    known = {item.id for item in record.environments}
+    made_with = {"buildInstructions": _ref(_environment_file(cell.environment))}
+    step = crate.add(
+        f"{WORKFLOW_FILE}#{title}",
+        "HowToStep",
+        name=title,
+        position=str(position),
+        workExample=_ref(tool),
+        connection=[],
+        **(made_with if cell.environment in known else {}),
+    )
+    crate.link(WORKFLOW_FILE, "hasPart", tool)
+    crate.link(WORKFLOW_FILE, "step", step)
+    action = _add_action(crate, cell)
+    crate.link("./", "mentions", action)
+    control = f"#control-of-{cell.address}"
+    orchestrated = f"orchestrate {cell.address}"
+    crate.add(
+        control, "ControlAction", name=orchestrated, instrument=_ref(step), object=_ref(action)
+    )
+    crate.link("#orchestration", "object", control)
+    files = {entry.name: entry.files for entry in record.inputs}
+    for port, product in cell.inputs.items():
+        owner, _, name = product.source.rpartition(".")
+        if owner != "inputs" and product.source not in given:
+            raise RecordError(
+                f"the record says that {product.source} was taken, which no step that ran gave: "
+                "`orthoflow verify` says what else does not fit"
+            )
+        source = f"{WORKFLOW_FILE}#inputs/{name}" if owner == "inputs" else given[product.source]
+        target = f"{tool}/{port}"
+        crate.connect(step, f"#connection-{step}-{source}-{target}", source, target)
+        taken = [_product_id(product)]
+        if owner == "inputs":
+            taken = [_file_id(file) for file in files.get(name, ())]
+        crate.link(action, "object", *taken)
+        for one in taken:
+            crate.link(one, "exampleOfWork", target)
+    for name, value in cell.params.items():
+        setting = crate.add(
+            f"#setting-{cell.address}/{name}",
+            "PropertyValue",
+            name=name,
+            value=value
+            if isinstance(value, bool | int | float | str)
+            else json.dumps(value, ensure_ascii=False),
+            exampleOfWork=_refs([f"{tool}/{name}"]),
+        )
+        crate.link(action, "object", setting)
+        if name in cell.params_set:
+            of_step = crate.formal(f"{step}/{name}", f"{cell.step}.{name}", _value_type(value))
+            crate.link(setting, "exampleOfWork", of_step)
+            crate.link(WORKFLOW_FILE, "input", of_step)
+            crate.link(_RUN, "object", setting)
+            target = f"{tool}/{name}"
+            crate.connect(step, f"#connection-{step}-{of_step}-{target}", of_step, target)
+
+
+def _add_method(crate: _Crate, cell: RecordedCell) -> str:
+    """Add the method of a cell with its ports and settings, and its distribution."""
+    tool, origin = _tool_id(cell), f"#distribution-{cell.distribution}"
+    version = cell.distribution_version
+    crate.add(origin, "SoftwareApplication", name=cell.distribution, version=version)
+    inputs = [
+        *(
+            crate.formal(f"{tool}/{port}", port, _port_type(one))
+            for port, one in cell.inputs.items()
+        ),
+        *(crate.formal(f"{tool}/{name}", name, _value_type(v)) for name, v in cell.params.items()),
+    ]
+    outputs = [
+        crate.formal(f"{tool}/out/{port}", port, _port_type(one))
+        for port, one in cell.outputs.items()
+    ]
+    return crate.add(
+        tool,
+        "SoftwareApplication",
+        name=cell.method,
+        softwareVersion=f"{version}, result version {cell.result_version}",
+        description=f"{cell.determinism} method of {cell.distribution}",
+        input=_refs(inputs),
+        output=_refs(outputs),
+        softwareRequirements=_ref(origin),
+        mainEntity=_ref(origin),
+        citation=list(cell.citations),
+    )
+
+
+def _add_action(crate: _Crate, cell: RecordedCell) -> str:
+    """Add the execution of a cell with its products, metrics and costs."""
+    said = "computed in this run" if cell.status == "ok" else "failed in this run"
+    if cell.cached_from:
+        said = f"computed by the earlier run {cell.cached_from} and taken from the store"
+    made = []
+    for port, product in cell.outputs.items():
+        made.append(
+            crate.add(
+                _product_id(product),
+                "CreativeWork",
+                name=f"{product.type_name} of {cell.address}",
+                identifier=product.digest,
+                additionalType=product.type_name,
+                exampleOfWork=_refs([f"{_tool_id(cell)}/out/{port}"]),
+                **({"isPartOf": _ref(RECORD_FILE)} if product.embedded else {}),
+            )
+        )
+    for metric in cell.metrics:
+        identifier, value = f"#metric-{cell.address}/{metric.name}", metric.value
+        facts: Entity = {"name": metric.name, "unitText": metric.unit, "value": value}
+        made.append(crate.add(identifier, "PropertyValue", **facts))
+    costs = [
+        crate.add(
+            f"#cost-{cell.address}/{cost.name}",
+            "PropertyValue",
+            name=cost.name,
+            propertyID=cost.name,
+            unitCode=_UNIT_CODES[cost.unit],
+            value=str(cost.value),
+        )
+        for cost in cost_metrics(cell)
+    ]
+    return crate.add(
+        f"#run-of-{cell.address}",
+        "CreateAction",
+        name=f"{cell.method} as {cell.address}",
+        description=said,
+        instrument=_ref(_tool_id(cell)),
+        startTime=cell.started,
+        endTime=cell.ended,
+        actionStatus=_status(is_ok=cell.status == "ok"),
+        object=[],
+        result=_refs(made),
+        resourceUsage=_refs(costs),
+        **({"error": cell.error_message} if cell.status == "failed" else {}),
+    )
+
+
+def _add_final(crate: _Crate, source: str, of_tool: str, product: RecordedProduct) -> None:
+    """Add an output that no other cell takes as one of the workflow."""
+    output = crate.formal(f"{WORKFLOW_FILE}#out/{source}", source, "CreativeWork")
+    crate.link(WORKFLOW_FILE, "output", output)
+    crate.connect(WORKFLOW_FILE, f"#to-{output}", of_tool, output)
+    crate.link(_product_id(product), "exampleOfWork", output)
+    crate.link(_RUN, "result", _product_id(product))
 
 
 def _how_to_read(record: RunRecord) -> str:
@@ -717,49 +566,6 @@ def _how_to_read(record: RunRecord) -> str:
     )
 
 
-def _input_id(name: str) -> str:
-    return f"{WORKFLOW_FILE}#inputs/{name}"
-
-
-def _output_id(source: str) -> str:
-    return f"{WORKFLOW_FILE}#out/{source}"
-
-
-def _source_id(source: str, outputs: Mapping[str, str]) -> str:
-    """Return the formal parameter from which a port takes its product."""
-    owner, _, name = source.rpartition(".")
-    if owner == "inputs":
-        return _input_id(name)
-    if source not in outputs:
-        raise RecordError(
-            f"the record says that {source} was taken, which no step that ran gave: "
-            "`orthoflow verify` says what else does not fit"
-        )
-    return outputs[source]
-
-
-def _connection(identifier: str, source: str, target: str) -> Entity:
-    return {
-        "@id": identifier,
-        "@type": "ParameterConnection",
-        "sourceParameter": ref(source),
-        "targetParameter": ref(target),
-    }
-
-
-def _joined(known: JsonValue, more: Iterable[str]) -> list[JsonValue]:
-    """Add references to a list of references, each once."""
-    before = (
-        [str(item["@id"]) for item in known if isinstance(item, dict)]
-        if isinstance(known, list)
-        else []
-    )
-    return refs((*before, *more))
-
-
 def _media_type(name: str) -> str:
-    return (
-        _MEDIA_TYPES.get(Path(name).suffix.lower())
-        or mimetypes.guess_type(name)[0]
-        or "application/octet-stream"
-    )
+    known = _MEDIA_TYPES.get(Path(name).suffix.lower())
+    return known or mimetypes.guess_type(name)[0] or "application/octet-stream"

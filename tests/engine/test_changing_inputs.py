@@ -71,23 +71,6 @@ def test_a_changed_input_fails_its_step(world: World, change: Callable[[Path], o
     assert not outcome.cached
 
 
-def restrict(path: Path) -> None:
-    path.chmod(0o600)
-
-
-@pytest.mark.parametrize("change", [Path.touch, restrict])
-def test_an_input_that_is_only_touched_stays_the_same(
-    world: World, change: Callable[[Path], object]
-) -> None:
-    assert run_while(world, change) == ("ok", "")
-
-
-def test_an_input_that_vanishes_is_said(world: World) -> None:
-    status, reason = run_while(world, Path.unlink)
-    assert status == "failed"
-    assert "numbers.txt" in reason
-
-
 def test_an_input_that_is_no_file_is_refused_without_waiting_for_it(world: World) -> None:
     path = world.folder / "numbers.txt"
     path.unlink()

@@ -18,9 +18,7 @@ from orthoflow.engine import dask as engine_dask
 from orthoflow.engine import local, measuring
 from orthoflow.engine.dask import CORES, DaskExecutor, look_around
 from orthoflow.engine.journal import (
-    CellFinished,
     CellProgress,
-    CellStarted,
     RunEvent,
     RunListener,
 )
@@ -133,20 +131,6 @@ def test_workers_of_its_own_give_the_same_digests(office: Office) -> None:
     assert digests(office.world.run(STEPS, into="own", executor="dask", force=("second",))) == (
         office.quiet
     )
-
-
-def test_workers_of_its_own_take_no_more_cores_than_there_are(office: Office) -> None:
-    slow = "use: work.slow, in: {numbers: first.numbers}, params: {steps: 5, amount: "
-    steps = "  first: {use: make.range}\n"
-    steps += "".join(f"  slow{k}: {{{slow}{k}}}}}\n" for k in range(4))
-    fresh = World(folder=office.world.folder / "cores", site=office.world.site)
-    fresh.folder.mkdir()
-    assert fresh.run(f"steps:\n{steps}", executor="dask", jobs=4, cores=2).status == "ok"
-    under_way, most = 0, 0
-    for event in fresh.events:
-        under_way += isinstance(event, CellStarted) - isinstance(event, CellFinished)
-        most = max(most, under_way)
-    assert most == 2
 
 
 def test_when_memory_is_short_the_largest_step_of_all_own_workers_goes(
@@ -328,24 +312,3 @@ def test_workers_that_do_not_say_their_cores_get_no_work(
         plan = office.world.plan(STEPS, executor="dask", scheduler=silent.scheduler_address)
         with pytest.raises(ArgumentError, match="no worker there says how many cores it has"):
             DaskExecutor(plan, tmp_path, Capacity.of_jobs(1, 1), lambda *_: None)
-
-
-@pytest.mark.parametrize(
-    ("workers", "expected"),
-    [
-        ([(1, 4.0)], (1, 4, 4, 4)),
-        ([(2, 4.0), (8, 16.0)], (5, 20, 16, 4)),
-        ([(1, 1.0), (1, 1.0)], (2, 2, 1, 1)),
-        # Half a core is room for one task all the same.
-        ([(1, 0.5)], (1, 0, 1, 1)),
-    ],
-)
-def test_workers_have_room_for_as_many_tasks_as_threads_and_cores(
-    workers: list[tuple[int, float]], expected: tuple[int, int, int, int]
-) -> None:
-    known = {
-        str(number): {"nthreads": n_threads, "resources": {CORES: n_cores}}
-        for number, (n_threads, n_cores) in enumerate(workers)
-    }
-    capacity = engine_dask._capacity(known)
-    assert dataclasses.astuple(capacity) == expected

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -10,23 +9,6 @@ import pytest
 from orthoflow.engine.local import Capacity, InlineExecutor
 from orthoflow.engine.worker import Task
 from tests.engine_world import toy_world
-
-
-def test_with_nothing_in_line_nothing_ends() -> None:
-    executor = InlineExecutor(
-        Capacity.of_jobs(1, 1), tell=lambda address, event: None, is_interrupted=lambda: False
-    )
-    assert executor.poll(0.0) == ()
-
-
-def test_results_keep_the_code_of_success_or_of_their_error(tmp_path: Path) -> None:
-    text = "steps: {a: {use: make.range}, b: {use: work.unreadable, in: {numbers: a.numbers}}}"
-    with toy_world(tmp_path) as world:
-        outcome = world.run(text, executor="inline")
-    codes = {address: result.exit_code for address, result in outcome.results.items()}
-    assert codes == {"a": 0, "b": 2}
-    (kept,) = (tmp_path / "store" / "results").glob("*.json")
-    assert json.loads(kept.read_text())["exit_code"] == 0
 
 
 def test_what_is_in_line_ends_as_interrupted_once_it_is_cancelled(

@@ -9,9 +9,6 @@ import pytest
 
 from orthoflow.engine.local import (
     describe_exit,
-    describe_memory,
-    describe_timeout,
-    duration,
 )
 from orthoflow.engine.measuring import is_for_want_of_memory
 
@@ -45,34 +42,6 @@ def test_a_crash_is_named_by_its_signal(number: signal.Signals) -> None:
     told = describe_exit(WHO, -number, 0, "")
     assert told.startswith(f"{WHO} crashed (")
     assert told.endswith(f", {number.name})")
-
-
-@pytest.mark.parametrize(
-    ("seconds", "said"),
-    [
-        (0.5, "0.5 s"),
-        (59.0, "59 s"),
-        (60.0, "1 min"),
-        (90.0, "90 s"),
-        (3540.0, "59 min"),
-        (3600.0, "1 h"),
-        (5400.0, "90 min"),
-        (7200.0, "2 h"),
-        (7201.0, "7201 s"),
-    ],
-)
-def test_a_timeout_is_told_in_the_largest_whole_unit(seconds: float, said: str) -> None:
-    assert duration(seconds) == said
-    sentence = f"{WHO} ran past its timeout of {said} and was stopped"
-    assert str(describe_timeout(WHO, seconds)) == sentence
-
-
-def test_want_of_memory_and_unknown_signals_are_told() -> None:
-    assert str(describe_memory(WHO, 5 << 29)) == (
-        f"{WHO} needed more memory than the machine has (2.5 GiB when stopped); give it less data "
-        "or coarser parameters"
-    )
-    assert "(signal 99)" in describe_exit(WHO, -99, 0, "")
 
 
 @pytest.mark.parametrize(

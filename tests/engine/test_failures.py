@@ -5,27 +5,20 @@ from __future__ import annotations
 import errno
 import os
 import re
-import resource
-import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from orthoflow.engine import measuring as machine_memory
-from orthoflow.engine.local import describe_exit
 from orthoflow.engine.measuring import (
     AvailableMemory,
-    MemoryGuard,
-    Victim,
-    available_memory,
     process_memory,
     tree_memory,
 )
 from orthoflow.engine.results import CellResult
-from orthoflow.errors import ArgumentError, StoreError
+from orthoflow.errors import ArgumentError
 from tests.engine_world import World, has_ended, toy_world
 from tests.optional import skip
 
@@ -230,87 +223,6 @@ def test_a_method_that_eats_all_memory_is_stopped_and_the_coordinator_lives(
     assert 500 < result.peak_rss_mib < 2000
 
 
-@pytest.mark.parametrize(
-    ("available", "held", "expected"),
-    [
-        (4096, {"a": 9000}, None),
-        (100, {"a": 600, "b": 700}, Victim(address="b", n_bytes=700 * MIB)),
-        (100, {"a": 100, "b": 200}, None),
-        (100, {}, None),
-    ],
-    ids=["enough is left", "the largest goes", "somebody else eats", "nothing runs"],
-)
-def test_the_guard_stops_the_largest_step_when_memory_is_short(
-    monkeypatch: pytest.MonkeyPatch,
-    available: int,
-    held: dict[str, int],
-    expected: Victim | None,
-) -> None:
-    groups = {address: index for index, address in enumerate(held)}
-    sizes = {index: held[address] * MIB for address, index in groups.items()}
-    memory = AvailableMemory(available=available * MIB, total=8192 * MIB)
-    monkeypatch.setattr(machine_memory, "available_memory", lambda: memory)
-    monkeypatch.setattr(machine_memory, "tree_memory", lambda group: sizes[group])
-    guard = MemoryGuard()
-    assert guard.check(groups) == expected
-    assert (guard.interval_s == 0.25) == (available > 2500)
-
-
-@pytest.mark.parametrize(
-    ("total_gib", "floor_mib"), [(1, 128), (4, 512), (16, 512), (64, 1966)], ids=str
-)
-def test_the_floor_grows_with_the_machine(total_gib: int, floor_mib: int) -> None:
-    memory = AvailableMemory(available=0, total=total_gib << 30)
-    assert memory.floor // MIB == floor_mib
-
-
-def test_this_machine_has_memory() -> None:
-    memory = available_memory()
-    assert 0 < memory.available <= memory.total
-
-
-HOARDING = """
-import time
-from orthoflow.engine.measuring import MemorySampler
-
-with MemorySampler() as sampler:
-    before = sampler.peak_mib
-    hoard = bytearray(200 << 20)
-    hoard[:: 1 << 12] = b"x" * len(hoard[:: 1 << 12])
-    time.sleep(0.2)
-    del hoard
-print(sampler.peak_mib - before)
-"""
-
-
-def test_the_sampler_sees_memory_that_is_given_back() -> None:
-    # In a process of its own: what other tests used and gave back would hide it.
-    done = subprocess.run(
-        [sys.executable, "-c", HOARDING], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    assert 190 < float(done.stdout) < 230
-
-
-def test_a_gone_process_has_no_memory() -> None:
-    process = subprocess.Popen(["true"])
-    process.wait()
-    assert process_memory(process.pid) == 0
-
-
-def test_a_kill_from_outside_is_named() -> None:
-    assert describe_exit("method a.b", -signal.SIGKILL, 3 << 30, "") == (
-        "method a.b was killed from outside (SIGKILL) while it held 3.0 GiB of memory"
-    )
-    assert "signal 64" in describe_exit("method a.b", -64, 0, "").replace("SIGRTMAX", "signal 64")
-
-
-def test_a_bus_error_hints_at_the_disk() -> None:
-    assert "bus error, as when the disk is full" in describe_exit(
-        "method a.b", -signal.SIGBUS, 0, ""
-    )
-
-
 # Full disk ----------------------------------------------------------------------------------------
 
 
@@ -346,20 +258,6 @@ steps:
     )
 
 
-def test_a_disk_that_fills_up_under_a_mapped_file_fails_the_cell(tiny_world: World) -> None:
-    result = bad_result(tiny_world, "fills_mapped")
-    assert result.error_type == "DiskSpaceError"
-    assert "disk" in result.error_message
-
-
-def test_a_disk_that_is_full_from_the_start_is_one_sentence(tiny_world: World) -> None:
-    filler = tiny_world.folder / "store" / ".filler"
-    with pytest.raises(OSError, match="No space left"):
-        filler.write_bytes(bytes(4 * MIB))
-    with pytest.raises(StoreError, match=r"cannot write to .*store.*: No space left on the disk"):
-        tiny_world.run("steps: {a: {use: make.range}}")
-
-
 def test_a_run_folder_that_cannot_be_written_is_one_sentence(world: World) -> None:
     plan_first = "steps: {a: {use: make.range}}"
     (world.folder / "file").write_text("no folder")
@@ -367,16 +265,3 @@ def test_a_run_folder_that_cannot_be_written_is_one_sentence(world: World) -> No
         ArgumentError, match=r"file/run cannot be a folder, because .*/file is a file; "
     ):
         world.run(plan_first, into="file/run")
-
-
-def test_files_larger_than_allowed_fail_the_cell(world: World) -> None:
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1 * MIB, before[1]))
-    try:
-        outcome = world.run(
-            "steps: {a: {use: make.range, params: {count: 1000000}}}", executor="inline"
-        )
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert outcome.results["a"].error_type == "StoreError"
-    assert "the file would be larger than allowed" in outcome.results["a"].error_message

@@ -13,8 +13,7 @@ import pytest
 from orthoflow.engine.cleaning import check_store, collect_garbage
 from orthoflow.engine.journal import CellStarted, RunEvent
 from orthoflow.engine.scheduler import RunOutcome, execute
-from orthoflow.engine.store import Store
-from orthoflow.errors import DamageError, StoreError
+from orthoflow.errors import StoreError
 from tests.engine_world import World, digests
 
 STEPS = """
@@ -152,20 +151,6 @@ def test_what_is_computed_again_and_differs_takes_what_follows_along(
     assert given.digest == digests(again)["means.numbers"]
 
 
-def test_a_result_that_another_run_set_aside_meanwhile_is_computed_again(world: World) -> None:
-    first = run(world, STEPS)
-    plan = world.plan(STEPS, force=("means",), executor="inline")
-    path = product_file(world, first, "scan")
-    flip(path)
-    other = Store(world.store.folder)
-    assert not other.is_sound(first.results["scan"].outputs["scan"].digest)
-    again = execute(plan, world.folder / "again", world.store)
-    assert digests(again) == digests(first)
-    # What was put there since is sound, and stays.
-    assert not other.damage(first.results["scan"].outputs["scan"].digest)
-    assert len(list(world.store.damaged.iterdir())) == 1
-
-
 def test_what_lies_aside_is_counted_and_is_garbage(world: World) -> None:
     first = run(world, STEPS)
     flip(product_file(world, first, "noise"))
@@ -208,12 +193,3 @@ def test_a_store_that_cannot_be_written_still_tells_good_from_damaged(
     assert store.get_product(digests(first)["means.numbers"], Numbers).values.size == 8
     with pytest.raises(StoreError, match=r"objects/.* is damaged, but cannot be set aside: .*read"):
         store.get_product(digests(first)["scan.scan"], Scan)
-
-
-def test_a_product_that_is_read_with_its_arrays_missing_is_damage(world: World) -> None:
-    from toy_plugin.products import Scan
-
-    first = run(world, STEPS)
-    os.truncate(product_file(world, first, "scan"), 3000)
-    with pytest.raises(DamageError, match="was damaged; run again to compute it again"):
-        world.store.get_product(digests(first)["scan.scan"], Scan, is_checked=True)

@@ -125,12 +125,6 @@ def test_a_folder_that_others_may_write_to_is_not_used(
     assert tmp_path not in all_kernels().parents
 
 
-def test_a_link_to_a_private_folder_is_not_one(tmp_path: Path) -> None:
-    (tmp_path / "link").symlink_to(tmp_path)
-    assert is_private(tmp_path)
-    assert not is_private(tmp_path / "link")
-
-
 def test_old_states_of_the_code_are_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
 from orthoflow.catalog.discovery import discover_catalog
-from orthoflow.engine import keys
 from orthoflow.engine.keys import library_versions, method_facts
 from tests.engine_world import World
 
@@ -103,14 +101,3 @@ def test_a_plugin_whose_files_changed_under_the_same_version_computes_again(
     with file.open("a") as stream:
         stream.write("# other\n")
     assert reasons(world)["first"] == ("will run", "code changed")
-
-
-def test_bytecode_and_compiled_kernels_are_no_part_of_the_code(world: World) -> None:
-    entry = world.catalog().method("work.add")
-    before = keys.plugin_files(entry)
-    for name in ("__pycache__/works.cpython-311.pyc", "works.add-1.py311.nbi"):
-        path = world.site / "toy_plugin" / name
-        path.parent.mkdir(exist_ok=True)
-        path.touch()
-    assert keys.plugin_files(entry) == before
-    assert {Path(path).suffix for path in before} == {".py"}

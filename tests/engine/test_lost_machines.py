@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -109,31 +109,6 @@ def machines(world: World, host: str = "127.0.0.1") -> Iterator[Machines]:
         opened.close()
 
 
-@contextmanager
-def cable() -> Iterator[Callable[[str], None]]:
-    """Give what sets the link to a network of its own up or down."""
-    name = f"far{os.getpid()}"
-    link, far_link = f"v{os.getpid()}a", f"v{os.getpid()}b"
-
-    def tell(*words: str) -> None:
-        subprocess.run(["ip", *words], check=True, capture_output=True)
-
-    with ExitStack() as stack:
-        try:
-            tell("netns", "add", name)
-            stack.callback(tell, "netns", "delete", name)
-            tell("link", "add", link, "type", "veth", "peer", "name", far_link, "netns", name)
-        except (FileNotFoundError, subprocess.CalledProcessError):
-            skip("right", "a network namespace")
-        tell("addr", "add", f"{HERE}/30", "dev", link)
-        tell("link", "set", link, "up")
-        inside = ("netns", "exec", name, "ip")
-        tell(*inside, "addr", "add", f"{AWAY}/30", "dev", far_link)
-        tell(*inside, "link", "set", far_link, "up")
-        tell(*inside, "link", "set", "lo", "up")
-        yield lambda state: tell("link", "set", link, state)
-
-
 class Once:
     """Does something in a thread as soon as a slow step says something."""
 
@@ -156,28 +131,6 @@ def ended(world: World, machines: Machines, listen: Callable[[RunEvent], None]) 
                 return outcome
         time.sleep(5.0)
     raise AssertionError("three times the same command did not end it")
-
-
-@pytest.mark.parametrize("off_s", [20.0, None])
-def test_a_worker_that_is_cut_off_is_done_without(
-    world: World, quiet: dict[str, str], off_s: float | None
-) -> None:
-    shutil.rmtree(world.folder / "store")
-    with cable() as set_link, machines(world, HERE) as office:
-        office.work("near", HERE)
-        office.work("far", AWAY, ["ip", "netns", "exec", f"far{os.getpid()}"])
-        time.sleep(5.0)
-
-        def cut() -> None:
-            time.sleep(1.0)
-            set_link("down")
-            if off_s is not None:
-                time.sleep(off_s)
-                set_link("up")
-
-        listen = Once(cut)
-        assert digests(ended(world, office, listen)) == quiet
-        listen.thread.join()
 
 
 def test_a_shared_folder_that_goes_away_for_a_while_loses_nothing(

@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 import os
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from orthoflow.engine import keys, method_versions
+from orthoflow.engine import method_versions
 from orthoflow.engine.cleaning import collect_garbage
 from orthoflow.engine.keys import CellKey, MethodFacts, cell_key
 from orthoflow.engine.plan import RunOptions, explain
 from orthoflow.engine.results import ProductRef
-from orthoflow.engine.store import Preimage, Store
-from orthoflow.errors import ArgumentError, InputError
+from orthoflow.engine.store import Preimage
+from orthoflow.errors import ArgumentError
 from orthoflow.system import usable_cores
-from orthoflow.workflow.expand import Cell, WorkflowInput
+from orthoflow.workflow.expand import Cell
 from tests.engine_world import World, forget_toys
 
 CHAIN = """
@@ -73,18 +71,6 @@ RIGHT = dataclasses.replace(LEFT, digest="sha256:" + "2" * 64)
 INPUTS = {"left": LEFT, "right": RIGHT}
 
 
-def test_code_that_changed_or_went_is_not_the_one_in_the_keys(tmp_path: Path) -> None:
-    file = tmp_path / "method.py"
-    file.write_text("one")
-    code = {"plugin": keys.files_digest([file])}
-    facts = dataclasses.replace(FACTS, code=code, sources={"plugin": (file,)})
-    assert facts.is_code_unchanged()
-    file.write_text("other")
-    assert not facts.is_code_unchanged()
-    file.unlink()
-    assert not facts.is_code_unchanged()
-
-
 def test_a_machine_whose_methods_cannot_be_asked_does_not_fit(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -97,14 +83,6 @@ def test_a_machine_whose_methods_cannot_be_asked_does_not_fit(
     monkeypatch.setattr(method_versions, "_methods_here", lambda _: "")
     said = method_versions.misfit(planned)
     assert said == "its methods cannot be loaded (JSONDecodeError)"
-
-
-@pytest.mark.parametrize(("name", "least"), [("jobs", 1), ("cores", 1), ("retries", 0)])
-def test_the_least_of_an_option_is_taken_and_less_is_refused(name: str, least: int) -> None:
-    taken: dict[str, Any] = {name: least}
-    assert getattr(RunOptions(**taken), name) == least
-    with pytest.raises(ArgumentError, match=f"{name} must be {least} or more, got {least - 1}"):
-        RunOptions(**{name: least - 1})
 
 
 def test_an_executor_and_its_cores_are_those_that_are_asked_for() -> None:
@@ -155,25 +133,6 @@ DIFFERENT = {
         inputs={"left": LEFT, "right": dataclasses.replace(RIGHT, type_name="heights")}
     ),
 }
-
-
-def test_a_key_is_the_digest_of_what_is_said_of_a_cell() -> None:
-    key = cell_key(CELL, FACTS, INPUTS)
-    assert key.key == hashlib.sha256(key.preimage.encode()).hexdigest()
-    assert json.loads(key.preimage) == {
-        "what": "orthoflow/cell",
-        "v": 1,
-        "method": "work.noise",
-        "result_version": 1,
-        "code": {"plugin": "aa"},
-        "params": {"amount": 1.0},
-        "seed": 5,
-        "tools": {"tool": "1"},
-        "inputs": {
-            "left": f"numbers@1:sha256:{'1' * 64}",
-            "right": f"numbers@1:sha256:{'2' * 64}",
-        },
-    }
 
 
 def test_whatever_decides_a_result_changes_the_key() -> None:
@@ -234,14 +193,6 @@ def test_the_changed_ingredient_is_named(earlier: Preimage, reason: str) -> None
     assert explain(NOW, "step", [earlier]) == reason
 
 
-def test_the_nearest_earlier_result_of_the_same_step_is_compared() -> None:
-    far = preimage_of(cell=dataclasses.replace(CELL, params={"amount": 9.0}), result_version=3)
-    near = preimage_of(cell=dataclasses.replace(CELL, params={"amount": 8.0}))
-    elsewhere = preimage_of("elsewhere", result_version=2)
-    assert explain(NOW, "step", [far, elsewhere, near]) == "params.amount: 8.0 -> 1.0"
-    assert explain(NOW, "new step", [far, elsewhere]) == "result_version 2 -> 1"
-
-
 @pytest.mark.parametrize("text", ["", "[]", "{"])
 def test_an_unreadable_earlier_preimage_does_no_harm(text: str) -> None:
     earlier = Preimage(key="x", step="step", text=text)
@@ -251,20 +202,6 @@ def test_an_unreadable_earlier_preimage_does_no_harm(text: str) -> None:
 
 
 # Plans --------------------------------------------------------------------------------------------
-
-
-def test_a_first_plan_knows_only_the_first_step(world: World) -> None:
-    assert world.status(CHAIN) == {
-        "first": ("will run", "never ran before"),
-        "second": ("will run", "no result of its method is stored"),
-        "third": ("will run", "no result of its method is stored"),
-    }
-    assert not world.store.folder.exists()
-
-
-def test_after_a_run_all_is_cached(world: World) -> None:
-    run(world, CHAIN)
-    assert statuses(world, CHAIN) == dict.fromkeys(("first", "second", "third"), "cached")
 
 
 def test_a_changed_parameter_reruns_only_what_depends_on_it(world: World) -> None:
@@ -304,11 +241,6 @@ def test_forced_steps_run_and_equal_results_end_it_there(world: World) -> None:
     assert outcome.results["second"].run_id == outcome.run_id
 
 
-def test_an_unknown_forced_step_is_named(world: World) -> None:
-    with pytest.raises(ArgumentError, match=r"--force secnd.*did you mean second"):
-        world.plan(CHAIN, force=("secnd",))
-
-
 def test_a_selection_leaves_out_the_rest(world: World) -> None:
     assert list(statuses(world, CHAIN, until=("second",))) == ["first", "second"]
     assert list(statuses(world, CHAIN, only=("first",))) == ["first"]
@@ -336,26 +268,12 @@ def test_a_moved_file_is_the_same_file(world: World) -> None:
     assert set(statuses(world, moved).values()) == {"cached"}
 
 
-def test_a_missing_input_file_is_an_input_error(world: World) -> None:
-    with pytest.raises(InputError, match=r"data\.txt"):
-        world.plan(FROM_FILE)
-
-
 def test_a_step_whose_data_are_absent_is_skipped_with_all_behind_it(world: World) -> None:
     steps = FROM_FILE.replace("{files: data.txt}", "{optional: true}")
     assert statuses(world, steps) == {"first": "skipped", "second": "skipped"}
     outcome = world.run(steps, executor="inline")
     assert {r.status for r in outcome.results.values()} == {"skipped"}
     assert outcome.exit_code == 0
-
-
-def test_changed_code_of_an_unreleased_plugin_counts(world: World) -> None:
-    (world.site / "toy_plugin-1.0.dist-info" / "direct_url.json").write_text("{}")
-    run(world, CHAIN)
-    works = world.site / "toy_plugin" / "works.py"
-    works.write_text(works.read_text().replace("values + params.amount", "values - params.amount"))
-    forget_toys()
-    assert world.status(CHAIN)["first"] == ("will run", "code changed")
 
 
 def test_a_raised_result_version_counts(world: World) -> None:
@@ -366,59 +284,6 @@ def test_a_raised_result_version_counts(world: World) -> None:
     )
     forget_toys()
     assert world.status(CHAIN)["first"] == ("will run", "code changed, result_version 1 -> 2")
-
-
-def test_a_changed_publisher_writes_its_files_anew(world: World) -> None:
-    (world.site / "toy_plugin-1.0.dist-info" / "direct_url.json").write_text("{}")
-    steps = "steps: {a: {use: make.range}}"
-    first = world.run(steps, into="one", executor="inline").results["a"].outputs["numbers"]
-    (file,) = world.store.published_files(first.digest)
-    products = world.site / "toy_plugin" / "products.py"
-    products.write_text(products.read_text().replace('f"{digest} {', 'f"other {'))
-    forget_toys()
-    second = world.run(steps, into="two", executor="inline").results["a"].outputs["numbers"]
-    assert second == first
-    assert file.read_text().startswith("other [")
-
-
-def test_planning_a_large_comparison_looks_earlier_results_up_once(
-    world: World, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    variants = "".join(
-        f"      v{i}: {{use: work.add, params: {{amount: {i}.5}}}}\n" for i in range(60)
-    )
-    steps = f"""
-steps:
-  first: {{use: make.range}}
-  second:
-    in: {{numbers: first.numbers}}
-    variants:
-{variants}
-  third: {{use: work.add, in: {{numbers: second.numbers}}}}
-compare: {{design: product}}
-"""
-    run(world, steps)
-    asked: list[str] = []
-    look_up = Store.earlier_preimages
-
-    def watched(store: Store, method: str) -> tuple[Preimage, ...]:
-        asked.append(method)
-        return look_up(store, method)
-
-    monkeypatch.setattr(Store, "earlier_preimages", watched)
-    plan = world.plan(steps, sets=["third.amount=9.0"])
-    assert len(plan.cells) == 121
-    # Reading all earlier results for each of 60 cells would take minutes in an old store.
-    assert asked == ["work.add"]
-
-
-def test_an_input_that_is_not_wired_in_the_workflow_is_still_digested(world: World) -> None:
-    write_data(world, "5")
-    plan = world.plan("inputs: {data: {files: data.txt}}\n" + CHAIN.lstrip())
-    given = plan.inputs["data"]
-    assert given is not None
-    assert [(file.name, file.size_bytes) for file in given.files] == [("data.txt", 1)]
-    assert str(WorkflowInput(name="data")) == "inputs.data"
 
 
 # What failed last time ----------------------------------------------------------------------------
@@ -458,22 +323,6 @@ def test_a_result_takes_back_the_failure_before_it(world: World) -> None:
 
 
 # How long it takes --------------------------------------------------------------------------------
-
-
-def test_the_plan_knows_how_long_a_method_took_before(world: World) -> None:
-    assert {item.took_s for item in world.plan(CHAIN).cells} == {None}
-    run(world, CHAIN)
-    assert {item.took_s for item in world.plan(CHAIN).cells} == {0.0}
-    changed = world.plan(CHAIN, sets=["first.count=7"])
-    results = {item.cell.address: item.result for item in world.plan(CHAIN).cells}
-    for item in changed.cells:
-        before = results[item.cell.address]
-        assert before is not None
-        # A second to start a process comes on top.
-        assert item.took_s == before.wall_s + 1.0
-    other_names = CHAIN.replace("second", "other").replace("first:", "begin:")
-    renamed = world.plan(other_names.replace("first.", "begin."), sets=["begin.count=8"])
-    assert all(item.took_s is not None and item.took_s >= 1.0 for item in renamed.cells)
 
 
 def test_of_what_a_method_took_the_nearest_counts(world: World) -> None:

@@ -11,18 +11,14 @@ import pytest
 from orthoflow.engine.journal import (
     JOURNAL,
     RECORD_FILE,
-    CellDamaged,
     CellEnded,
     Journal,
     RunWent,
-    cell_file_name,
     is_running,
     kept_from_others,
-    new_run_folder,
-    new_run_id,
     require_run_folder,
 )
-from orthoflow.errors import ArgumentError, RecordError, StoreError
+from orthoflow.errors import ArgumentError, StoreError
 
 
 def ended(address: str, status: str = "ok", *, cached: bool = False, error: str = "") -> CellEnded:
@@ -39,48 +35,6 @@ def ended(address: str, status: str = "ok", *, cached: bool = False, error: str 
 
 def lines(folder: Path) -> list[dict[str, object]]:
     return [json.loads(line) for line in (folder / JOURNAL).read_text().splitlines()]
-
-
-def test_a_run_goes_on_with_what_its_journal_says(tmp_path: Path) -> None:
-    folder = tmp_path / "runs" / "hall"
-    with Journal(folder, "hall", run_id="r1") as journal:
-        assert (journal.run_id, journal.is_resumed, journal.finished_keys) == ("r1", False, set())
-        began = journal.started
-        for line in (
-            ended("a"), ended("b", cached=True), ended("c", "failed"), ended("d", "skipped"),
-            CellDamaged(time=began, address="a", key="k", what="product.h5"),
-        ):  # fmt: skip
-            journal.write(line)
-        assert journal.damaged == {"a": "product.h5"}
-    # People may read it, and nobody runs it.
-    assert not (folder / JOURNAL).stat().st_mode & 0o111
-    assert [line["event"] for line in lines(folder)] == ["run", *["finished"] * 4, "damaged"]
-    with Journal(folder, "hall", run_id="r2") as journal:
-        assert (journal.run_id, journal.is_resumed, journal.started) == ("r1", True, began)
-        # Only what this run computed itself.
-        assert journal.finished_keys == {"key of a"}
-        assert journal.damaged == {"a": "product.h5"}
-    assert lines(folder)[-1]["event"] == "resumed"
-    with pytest.raises(ArgumentError, match="holds an unfinished run of hall, not of court; choo"):
-        Journal(folder, "court")
-
-
-def test_letters_stand_in_a_journal_as_they_are(tmp_path: Path) -> None:
-    with Journal(tmp_path, "hall") as journal:
-        journal.write(ended("größe"))
-    assert '"address": "größe"' in (tmp_path / JOURNAL).read_text(encoding="utf-8")
-
-
-def test_a_run_without_an_id_gets_one_of_its_own(tmp_path: Path) -> None:
-    with Journal(tmp_path / "a", "hall") as one, Journal(tmp_path / "b", "hall") as other:
-        assert one.run_id != other.run_id
-        assert one.started.endswith("Z")
-    assert new_run_id() != new_run_id()
-    assert new_run_folder("hall", "r1") == Path("runs/hall-r1")
-    with pytest.raises(
-        RecordError, match=r"the run cannot lie below runs/: .*name its folder with"
-    ):
-        new_run_folder("../hall", "r1")
 
 
 def test_a_run_folder_is_of_one_run_at_a_time(tmp_path: Path) -> None:
@@ -113,18 +67,6 @@ def test_nobody_goes_on_with_a_run_while_what_came_out_is_written(tmp_path: Path
     # Of a folder without a journal there is nobody to keep out.
     with kept_from_others(tmp_path / "new"):
         assert not (tmp_path / "new").exists()
-
-
-def test_below_a_file_there_is_no_folder(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").touch()
-    for place in (tmp_path / "notes.txt", tmp_path / "notes.txt" / "run"):
-        with pytest.raises(ArgumentError) as caught:
-            Journal(place, "hall")
-        assert str(caught.value) == (
-            f"{place} cannot be a folder, because {tmp_path / 'notes.txt'} is a file; choose "
-            "another "
-            "folder with -o (in Python: output=)"
-        )
 
 
 def test_a_line_that_was_cut_off_is_removed_and_a_damaged_one_is_told(tmp_path: Path) -> None:
@@ -199,29 +141,3 @@ def test_a_folder_of_something_else_is_refused_as_it_is(tmp_path: Path) -> None:
     (tmp_path / RECORD_FILE).touch()
     with pytest.raises(ArgumentError, match="holds a finished run"):
         Journal(tmp_path, "hall")
-
-
-@pytest.mark.parametrize("letter", ["a", "ä"])
-def test_names_of_files_have_two_hundred_bytes_and_stay_apart(letter: str) -> None:
-    n_fitting = 200 // len(letter.encode())
-    fitting = letter * n_fitting
-    assert cell_file_name(fitting) == fitting
-    one, other = (cell_file_name(fitting + end) for end in ("b", "c"))
-    assert one != other
-    for name in (one, other):
-        assert 195 <= len(name.encode()) <= 200
-        assert name.startswith(letter * 90)
-
-
-def test_a_file_is_called_after_its_cell_in_two_hundred_bytes() -> None:
-    longest = "a" * 200
-    assert cell_file_name(longest) == longest
-    for address in ("a" * 201, "ä" * 101, "é" * 150 + "x"):
-        name = cell_file_name(address)
-        assert len(name.encode()) <= 200
-        # As much of it as there is room for, and what tells it from others that begin alike.
-        begin, _, digest = name.rpartition("-")
-        assert address.startswith(begin)
-        assert len(begin.encode()) >= 186
-        assert len(digest) == 12
-        assert cell_file_name(address + "b") != name

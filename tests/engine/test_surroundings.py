@@ -27,7 +27,6 @@ from tests.optional import skip_unless
 from tests.stored_runs import WORKFLOW
 
 IN_THIS_PROCESS = ("--executor", "inline")
-YEAR_S = 365 * 86_400
 NOBODY = 65534
 _LIBC = ctypes.CDLL(None, use_errno=True)
 _PR_CAPBSET_DROP = 24
@@ -292,21 +291,6 @@ def test_too_little_memory_is_said_and_nothing_is_lost(desk: Desk, mib: int) -> 
 
 
 # Clocks -------------------------------------------------------------------------------------------
-
-
-def test_files_from_the_future_are_taken_as_any_others(used_desk: Desk) -> None:
-    desk = used_desk
-    for path in desk.folder.rglob("*"):
-        if path.is_file():
-            state = path.stat()
-            os.utime(path, (state.st_atime + YEAR_S, state.st_mtime + YEAR_S))
-    code, said = desk.forked("run", "toy.yaml", "-o", "second", *IN_THIS_PROCESS)
-    assert code == 0, said
-    assert all(cell.cached_from for cell in open_run(desk.folder / "second").cells.values())
-    for command in (("cache", "verify"), ("cache", "list"), ("cache", "gc", "--older-than", "1")):
-        assert desk.forked(*command)[0] == 0
-    assert desk.forked("run", "toy.yaml", "-o", "third", *IN_THIS_PROCESS)[0] == 0
-    assert all(cell.cached_from for cell in open_run(desk.folder / "third").cells.values())
 
 
 def test_a_clock_that_goes_back_changes_dates_alone(

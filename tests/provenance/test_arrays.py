@@ -14,12 +14,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from orthoflow_provenance.arrays import (
     payload_digest,
-    read_payload,
     read_product_file,
     write_product_file,
 )
 from orthoflow_provenance.document import RecordFormatError
-from orthoflow_provenance.hdf5 import create_file, create_group, safe_open
 
 from tests.provenance_records import Given, cloud_payload, walls_payload
 
@@ -61,12 +59,6 @@ def test_a_product_comes_back_from_its_file(
         np.testing.assert_array_equal(stored.arrays[name], array)
 
 
-def test_equal_products_give_equal_files(tmp_path: Path) -> None:
-    for name in ("a.h5", "b.h5"):
-        write_product_file(tmp_path / name, walls_payload())
-    assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
-
-
 def test_mapped_arrays_are_aligned_read_only_views_of_the_file(tmp_path: Path) -> None:
     payload = cloud_payload()
     write_product_file(tmp_path / "cloud.h5", payload)
@@ -78,14 +70,6 @@ def test_mapped_arrays_are_aligned_read_only_views_of_the_file(tmp_path: Path) -
         assert array.flags.c_contiguous
         assert not array.flags.writeable
         np.testing.assert_array_equal(array, payload.arrays[axis])
-
-
-def test_arrays_are_loaded_when_mapping_is_not_wanted(tmp_path: Path) -> None:
-    write_product_file(tmp_path / "cloud.h5", cloud_payload())
-    stored = read_product_file(tmp_path / "cloud.h5", map_arrays=False)
-    assert stored.arrays["x"].base is None
-    assert not stored.arrays["x"].flags.writeable
-    np.testing.assert_array_equal(stored.arrays["x"], cloud_payload().arrays["x"])
 
 
 def test_rasters_are_packed_with_checksums_and_clouds_lie_plain(tmp_path: Path) -> None:
@@ -114,16 +98,6 @@ def test_arrays_of_any_memory_layout_larger_than_a_block_come_back(
     assert payload_digest(stored) == digest
 
 
-def test_a_payload_can_be_read_from_any_group(tmp_path: Path) -> None:
-    payload = walls_payload()
-    write_product_file(tmp_path / "product.h5", payload)
-    with safe_open(tmp_path / "product.h5") as source, create_file(tmp_path / "a.h5") as file:
-        source.copy(source["product"], create_group(file, "inside"), name="here")
-    with safe_open(tmp_path / "a.h5") as file:
-        stored = read_payload(file["inside/here"], map_arrays=True)
-    assert stored.digest == payload_digest(stored) == payload_digest(payload)
-
-
 @pytest.mark.parametrize(
     ("payload", "message"),
     [
@@ -147,23 +121,6 @@ def test_payloads_that_cannot_be_stored_leave_no_file(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_product_file_of_another_format_is_refused(tmp_path: Path) -> None:
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["x"] = 1
-    with pytest.raises(
-        RecordFormatError, match="must be of format orthoflow-product, but it names"
-    ):
-        read_product_file(tmp_path / "a.h5")
-
-
-def test_a_product_file_of_a_newer_format_is_refused(tmp_path: Path) -> None:
-    write_product_file(tmp_path / "a.h5", walls_payload())
-    with h5py.File(tmp_path / "a.h5", "r+") as file:
-        file.attrs["format_version"] = np.bytes_(b"2.0")
-    with pytest.raises(RecordFormatError, match=r"has format version '2\.0.*reads version 1"):
-        read_product_file(tmp_path / "a.h5")
-
-
 def test_a_product_without_one_of_its_parts_is_refused(tmp_path: Path) -> None:
     for part, message in (
         ("metadata", "lacks the dataset metadata"),
@@ -174,16 +131,6 @@ def test_a_product_without_one_of_its_parts_is_refused(tmp_path: Path) -> None:
             del file["product"][part]
         with pytest.raises(RecordFormatError, match=message):
             read_product_file(tmp_path / "a.h5")
-
-
-def test_a_missing_product_file_is_an_error_of_the_operating_system(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError):
-        read_product_file(tmp_path / "a.h5")
-
-
-def test_a_folder_that_does_not_exist_is_an_error_of_the_operating_system(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError):
-        write_product_file(tmp_path / "nowhere" / "a.h5", walls_payload())
 
 
 FULL_DISK = """

@@ -59,12 +59,6 @@ def test_names_that_lead_elsewhere_or_are_no_names_everywhere_are_refused(name: 
         path_below(Path("folder"), name)
 
 
-@pytest.mark.parametrize("name", TAKEN, ids=ascii)
-def test_ordinary_names_are_taken_as_they_are(tmp_path: Path, name: str) -> None:
-    assert name_problem(name) == ""
-    assert path_below(tmp_path, f"walls/{name}") == tmp_path / "walls" / name
-
-
 @pytest.mark.parametrize(
     ("path", "problem"),
     [

@@ -50,8 +50,3 @@ def test_classes_of_points_are_compared_apart() -> None:
     assert rows["edge", "a"].rms_mm == pytest.approx(5.0)
     assert rows["flat", "b"].rms_mm == pytest.approx(3.0)
     assert rows["flat", "a"].n_lost == 1
-
-
-def test_inspections_of_different_places_are_not_compared() -> None:
-    found = {"a": inspection({1: (1.0, 0.0)}), "b": inspection({2: (1.0, 0.0)})}
-    assert [*over_common_points(found)] == []

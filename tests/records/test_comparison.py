@@ -11,43 +11,13 @@ import pytest
 
 from orthoflow.engine.store import Store
 from orthoflow.records import comparison as module
-from orthoflow.records.comparison import Difference, Pair, ParameterValue, compare_runs
+from orthoflow.records.comparison import Pair, compare_runs
 from orthoflow.records.runs import Run
 from orthoflow.records.unfinished import open_run
 from orthoflow.report.pages import write_report
 from tests.compared_runs import compared, number
-from tests.report_runs import HeldRun, cell, metrics, record
+from tests.report_runs import HeldRun, cell, record
 from tests.studios import Studio, open_studio
-
-
-@pytest.mark.parametrize(
-    ("left", "right", "is_same", "is_shared", "either"),
-    [(1, 1, True, True, 1), (1, 2, False, True, 1), (1, None, False, False, 1),
-     (None, 2, False, False, 2)],
-)  # fmt: skip
-def test_a_pair_is_what_both_or_one_of_them_say(
-    left: int | None, right: int | None, is_same: bool, is_shared: bool, either: int
-) -> None:
-    pair = Pair(name="x", left=left, right=right)
-    assert (pair.is_same, pair.is_shared, pair.either) == (is_same, is_shared, either)
-
-
-def test_rows_are_counted_by_who_says_something() -> None:
-    sides = [(1, 1), (1, 2), (3, 4), (1, None), (None, 1), (None, 2), (None, 3), (None, None)]
-    rows = [Pair(name="x", left=left, right=right) for left, right in sides]
-    assert Difference.of(rows) == Difference(n_different=2, n_shared=3, n_left=1, n_right=3)
-    values = [(1.0, 1.0), (1.0, 1.0 + 1e-9), (1.0, 1.1)]
-    numbers = [Pair(name="x", left=number(one), right=number(two)) for one, two in values]
-    assert Difference.of(numbers) == Difference(
-        n_different=1, n_shared=3, n_left=0, n_right=0, n_rounded=1
-    )
-
-
-def test_a_number_is_the_same_whatever_machine_measured_it() -> None:
-    here = number(1.0)
-    assert here == replace(here, is_cost=True, is_cached=True, environment="there")
-    assert here != number(2.0)
-    assert here != number(1.0, unit="m")
 
 
 def test_a_comparison_is_a_sentence_and_a_table_of_what_moved() -> None:
@@ -81,27 +51,6 @@ def test_a_comparison_is_a_sentence_and_a_table_of_what_moved() -> None:
     # What shares nothing is not alike.
     apart = compared(rows[3], alone=("wall",))
     assert "; no inputs, parameters, metrics in common; " in repr(apart)
-
-
-def test_times_and_memory_are_costs_whoever_measured_them() -> None:
-    told = cell("plane", metrics=metrics(rms_mm=1.0, search_s=2.0), cached_from="r0")
-    found = module._metrics(told)
-    assert {name for name, one in found.items() if one.is_cost} == {*found} - {"rms_mm"}
-    assert {"search_s", "wall_s"} < {*found}
-    assert all(one.is_cached and one.environment == "e1" for one in found.values())
-    assert not any(one.is_cached for one in module._metrics(cell("plane")).values())
-
-
-def test_what_only_one_of_the_runs_has_stands_alone() -> None:
-    left, right = (
-        HeldRun(path=Path("run.h5"), record=record([cell(name, params={"x": value}, seed=None)]))
-        for name, value in (("scan", 1), ("room", 2))
-    )
-    one, two = (ParameterValue(value=value, is_set=True) for value in (1, 2))
-    assert module._per_cell(left, right, {"room": "room"}, module._parameters) == (
-        Pair(cell="scan", name="x", left=one, right=None),
-        Pair(cell="room", name="x", left=None, right=two),
-    )
 
 
 @pytest.fixture(scope="module")
@@ -156,20 +105,6 @@ def test_the_same_workflow_computed_twice_is_the_same(studio: Studio) -> None:
     ]
 
 
-def test_a_set_parameter_is_told_from_a_default(studio: Studio) -> None:
-    [row] = [
-        row
-        for row in studio.json("compare", "first", "grey")["parameters"]
-        if row["name"] == "grey"
-    ]
-    assert row["left"] == {"value": 128, "is_set": False}
-    assert row["right"] == {"value": 131, "is_set": True}
-    shown = studio("compare", "first", "grey").stdout
-    assert "parameters (* set, others are defaults): 1 of 3 differ" in shown
-    assert ["paint.grey", "128", "131*"] in [line.split() for line in shown.splitlines()]
-    assert "--set paint.grey=131" in shown
-
-
 def test_a_plain_run_is_compared_with_the_variant_that_does_the_same(studio: Studio) -> None:
     plain, variants = open_run("first"), open_run("swept")
     told = compare_runs(plain, variants)
@@ -215,18 +150,6 @@ def test_distances_are_told_in_the_units_of_the_type(studio: Studio) -> None:
     shown = studio("compare", "first", "grey").stdout
     assert "3 grey levels (images/0/rgb)" in shown
     assert "12 of 12 values differ by more than 2 grey, the largest by 3" in shown
-
-
-def test_products_of_other_shapes_are_different_without_a_number(studio: Studio) -> None:
-    [_, paint] = studio.json("compare", "first", "fine")["products"]
-    assert paint["verdict"] == "different"
-    assert None in [distance["largest"] for distance in paint["distances"]]
-
-
-def test_files_are_compared_by_content(studio: Studio) -> None:
-    assert changes(studio, "file")["inputs"] == [("", "number")]
-    shown = studio("compare", "first", "file").stdout.splitlines()
-    assert any(line.startswith("number  not given  n.txt ") for line in shown)
 
 
 def test_the_workflow_is_compared_line_by_line(
@@ -290,16 +213,6 @@ def test_what_was_skipped_has_no_versions_to_differ_in() -> None:
     assert facts[0] == facts[1]
     assert str(facts[1]) == "skipped, cloud.toy, no scan"
     assert module._facts(replace(loaded, status="ok")).result_version == 1
-
-
-@pytest.mark.parametrize("preimage", ["", "[1]", "{", "[" * 50_000, '{"code": 5, "tools": [1]}'])
-def test_a_preimage_that_says_nothing_costs_nothing(studio: Studio, preimage: str) -> None:
-    first, second = (open_run(studio.folder / name) for name in ("first", "first"))
-    for address, recorded in second.cells.items():
-        second.cells[address] = replace(recorded, key_preimage=preimage)  # type: ignore[index]
-    (pair, *_) = compare_runs(first, second).cells
-    assert pair.right is not None
-    assert (pair.right.code, pair.right.tools) == ({}, {})
 
 
 def _swept(**values: float) -> HeldRun:

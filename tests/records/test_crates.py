@@ -243,43 +243,6 @@ def test_who_made_it_is_told_where_it_is_given(
     assert entities(told, "Dataset")[0]["author"] == {"@id": identifier}
 
 
-def test_who_has_the_crate_alone_is_told_how_to_read_and_verify_it(
-    studio: Studio, crate: dict[str, Any]
-) -> None:
-    (record,) = (entity for entity in entities(crate, "File") if entity["@id"] == "run.h5")
-    told = record["description"]
-    assert told in entities(crate, "Dataset")[0]["description"]
-    commands = [part for part in told.split("`") if part.startswith("orthoflow ")]
-    assert commands[0] == "orthoflow verify run.h5"
-    for command in commands[:2]:
-        _, name, file = command.split()
-        done = studio(name, str(studio.folder / "crate" / file))
-        assert done.exit_code == 0, done.output
-    (workflow,) = entities(crate, "ComputationalWorkflow")
-    assert (
-        "it ran with --set paint.grey=131 --input number=n.txt. workflow" in workflow["description"]
-    )
-    (engine,) = (entity for entity in crate["@graph"] if entity["@id"] == "#engine")
-    assert f"orthoflow-tls=={engine['softwareVersion']}" in engine["description"]
-
-
-def test_of_a_record_that_holds_its_input_files_nobody_looks_for_them_elsewhere(
-    studio: Studio,
-) -> None:
-    run = open_run(studio.folder / "first").record
-    for is_embedded, said in (
-        (False, "the input files; "),
-        (True, "the input files, which lie in it; "),
-    ):
-        inputs = tuple(replace(entry, embedded=is_embedded) for entry in run.inputs)
-        graph: dict[str, Any] = crate_metadata(replace(run, inputs=inputs), [], license_text="CC0")
-        assert said in entities(graph, "Dataset")[0]["description"]
-        (number,) = (entity for entity in graph["@graph"] if entity.get("name") == "n.txt")
-        assert number.get("isPartOf") == ({"@id": "run.h5"} if is_embedded else None)
-    graph = crate_metadata(replace(run, inputs=()), [], license_text="CC0")
-    assert "computes it anew from it alone; " in entities(graph, "Dataset")[0]["description"]
-
-
 def test_products_that_the_record_holds_are_part_of_it(studio: Studio) -> None:
     run = open_run(studio.folder / "first").record
     for is_embedded in (False, True):

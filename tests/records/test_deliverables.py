@@ -92,14 +92,3 @@ def test_walls_are_ranked_with_what_speaks_for_and_against_them(tmp_path: Path) 
     assert by_number[3]["painted_share"] == 0.2
     assert by_number[2]["reason"] == "already included in wall 0"
     assert by_number[2]["orthoimage"] is None
-
-
-def test_colours_of_the_scan_need_no_ties(tmp_path: Path) -> None:
-    (wall,) = written(tmp_path, image(0, 0.98, None))
-    assert (wall["recommended"], wall["reason"]) == (True, "98% painted")
-    assert wall["expected_mm_median"] is None
-
-
-def test_a_run_without_orthoimages_has_no_table(tmp_path: Path) -> None:
-    write_walls_json(tmp_path, [])
-    assert not list(tmp_path.iterdir())

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from orthoflow_provenance.arrays import ArrayDifference
 
 from orthoflow.errors import PluginError
 from orthoflow.products.product import Payload, Tolerance
@@ -74,21 +71,6 @@ def compared(left: Any, right: Any, *, types: tuple[str, str] = ("toy", "toy")) 
     return found
 
 
-def test_the_same_digest_is_the_same_product() -> None:
-    one = payload(depth_m=[1.0])
-    found = compared(one, one)
-    assert (found.verdict, found.reason, found.distances) == ("identical", "", ())
-    assert (found.cell, found.port, found.type_name) == ("cell", "out", "toy")
-    assert found.left == found.right != ""
-
-
-def test_what_only_one_run_has_is_different() -> None:
-    for pair in ((payload(), ...), (..., payload())):
-        found = compared(*pair)
-        assert (found.verdict, found.reason) == ("different", "only one of the runs has it")
-        assert (found.left == "") is (pair[0] is ...)
-
-
 @pytest.mark.parametrize(
     ("apart", "verdict", "n_values"), [(0.0009, "within tolerance", 0), (0.0011, "different", 2)]
 )
@@ -104,19 +86,6 @@ def test_values_may_lie_apart_as_their_type_allows(
     assert distance.largest == pytest.approx(apart)
     assert distance.limit == 0.001
     assert (found.reason == "") is (n_values == 0)
-
-
-def test_the_fields_that_lie_apart_are_counted() -> None:
-    before = payload(depth_m=[1.0], n=[1], rgb=np.array([[1]], dtype=np.uint8))
-    after = payload(depth_m=[2.0], n=[3], rgb=np.array([[9]], dtype=np.uint8))
-    found = compared(before, after)
-    assert found.verdict == "different"
-    assert found.reason.endswith("; 2 more fields differ")
-    assert {one.unit: one.largest for one in found.distances} == {"m": 1.0, "1": 2.0, "grey": 8.0}
-
-
-def test_equal_values_of_other_digests_are_identical() -> None:
-    assert compared(payload(n=[1]), payload(n=[1])).verdict == "identical"
 
 
 def test_what_cannot_be_had_is_not_measured() -> None:
@@ -138,41 +107,3 @@ def test_grey_of_sixteen_bits_counts_in_steps_of_257(dtype: Any, limit: float) -
     assert module._limit("rgb", metres, one) == 2.0
     assert module._limit("gb", grey, one) == 2.0
     assert module._limit("rgb", grey, payload(rgb=np.zeros(3, dtype=dtype))) == limit
-
-
-def test_a_value_in_a_list_is_told_by_its_name_and_unit() -> None:
-    def told(**beside: Any) -> Any:
-        metadata = {"findings": [{"value": 0.5}, {**beside, "value": 2.0}]}
-        name, at = "findings/1/value", payload(metadata=metadata)
-        found = module._named(difference(name, "1", 0.5, 1), at)
-        return found.name, found.unit
-
-    assert told(name="rms_mm", unit="mm") == ("rms_mm, findings/1/value", "mm")
-    assert told(unit="mm") == ("findings/1/value", "1")
-
-
-def difference(name: str, unit: str, largest: float, n_values: int) -> ArrayDifference:
-    one = compared_differences()[0]
-    return replace(one, name=name, unit=unit, largest=largest, n_values=n_values, limit=0.5)
-
-
-def compared_differences() -> list[ArrayDifference]:
-    from orthoflow_provenance.arrays import measure_payloads
-
-    return list(measure_payloads(payload(n=[1]), payload(n=[2]), {"n": (0.0, "1")}))
-
-
-def test_of_each_unit_the_farthest_field_is_told_and_all_values_counted() -> None:
-    found = module._by_unit(
-        [
-            difference("a", "m", 0.2, 3),
-            difference("b", "px", 9.0, 1),
-            difference("c", "m", 0.7, 4),
-            difference("d", "deg", math.inf, 2),
-        ]
-    )
-    assert [(one.unit, one.largest, one.field, one.n_values) for one in found] == [
-        ("m", 0.7, "c", 7),
-        ("px", 9.0, "b", 1),
-        ("deg", None, "d", 2),
-    ]

@@ -27,14 +27,6 @@ def alone(run: Path, tmp_path: Path) -> Run:
     return open_run(tmp_path / "court.h5")
 
 
-def test_files_beside_a_record_are_taken(run: Path) -> None:
-    said: list[str] = []
-    whole = open_run(run)
-    with with_files(whole, said.append) as found:
-        assert found is whole
-    assert said == []
-
-
 def test_rasters_are_made_of_the_products_and_go_away_again(alone: Run) -> None:
     said: list[str] = []
     with with_files(alone, said.append) as found:

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import h5py
-import numpy as np
 import pytest
 
 from orthoflow.diagnostics import PLAIN_WARNING
@@ -363,24 +362,6 @@ def test_drawings_that_run_something_are_not_written(
         done = finished(*command)
         assert done.exit_code == 0, done.output
     assert not [path for path in folder.rglob("*") if path.name == "active.svg"]
-
-
-@pytest.mark.parametrize("command", [("compare",), ("show",), ("report",)], ids=" ".join)
-def test_what_fails_on_a_damaged_record_is_said_to_be_its_fault(
-    finished: Studio, folder: Path, command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shutil.copytree(finished.folder / "first", folder / "run")
-    with h5py.File(folder / "run" / "run.h5", "r+") as file:
-        file["cells/paint"].attrs["method"] = np.bytes_("other")
-    # Nothing there reads the preimage, so let something fail in its place.
-    monkeypatch.setattr("orthoflow.records.unfinished.open_run", lambda _: {}["missing"])
-    runs = (finished.folder / "first", folder / "run") if command[0] == "compare" else ("run",)
-    done = finished(command[0], *runs)
-    assert done.exit_code == 3, done.output
-    assert "is not as it was written: /cells/paint: its attribute" in done.output
-    done = finished(command[0], *[finished.folder / "first"] * len(runs))
-    assert done.exit_code == 1
-    assert "orthoflow itself failed" in done.output
 
 
 # What a key states besides what the cell says itself: any of it may be there, none of it is needed.

@@ -10,7 +10,6 @@ import pytest
 from orthoflow_provenance.document import Metric, RecordedCell
 
 import orthoflow
-from orthoflow.errors import ArgumentError
 from orthoflow.records.runs import Run
 from orthoflow.records.tables import RunSet, join_runs
 from tests.report_runs import cell, given, record
@@ -106,11 +105,6 @@ def test_statistics_are_over_the_union_each_cell_once() -> None:
     assert (row["variant.plane"], row["n"], row["median"], row["mean"]) == ("x", 3, 2.0, 3.0)
     assert (row["lowest"], row["highest"], row["better"]) == (1.0, 6.0, "lower")
     assert row["standard_deviation"] == pytest.approx(7**0.5)
-
-
-def test_no_run_is_no_table() -> None:
-    with pytest.raises(ArgumentError, match="at least one run"):
-        orthoflow.open_runs([])
 
 
 def test_the_command_and_the_library_give_one_table(

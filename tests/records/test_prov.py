@@ -5,7 +5,6 @@ import datetime as dt
 import json
 import math
 from collections.abc import Iterator
-from typing import Any
 
 import pytest
 from orthoflow_provenance.document import RunRecord
@@ -22,8 +21,6 @@ from prov.model import (
 
 from orthoflow.records.prov import prov_document
 from orthoflow.records.unfinished import open_run
-from tests.report_runs import cell as recorded_cell
-from tests.report_runs import record
 from tests.studios import Studio, open_finished_studio
 
 
@@ -31,11 +28,6 @@ from tests.studios import Studio, open_finished_studio
 def studio(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Studio]:
     with pytest.MonkeyPatch.context() as patch:
         yield open_finished_studio(tmp_path_factory.mktemp("prov"), patch)
-
-
-def named(document: ProvDocument, name: str) -> object:
-    (found,) = [r for r in document.get_records() if str(r.identifier) == name]
-    return found
 
 
 def test_the_graph_of_a_run_is_read_by_the_prov_package(studio: Studio) -> None:
@@ -86,14 +78,6 @@ def studio_record(studio: Studio) -> RunRecord:
     return open_run(studio.folder / "first").record
 
 
-def test_input_files_are_told_by_their_digests(studio: Studio) -> None:
-    record = studio_record(studio)
-    document = prov_document(record)
-    (file,) = [file for entry in record.inputs for file in entry.files]
-    entity = named(document, f"file:{file.sha256}")
-    assert {str(k): str(v) for k, v in entity.attributes}["orthoflow:sha256"] == file.sha256  # type: ignore[attr-defined]
-
-
 @pytest.mark.parametrize("strange", ["a b", "x:y", "../../etc", "é\n#", "%41", '"'])
 def test_strange_names_stay_names(studio: Studio, strange: str) -> None:
     record = studio_record(studio)
@@ -113,18 +97,3 @@ def test_strange_names_stay_names(studio: Studio, strange: str) -> None:
     assert told["parameter:none"] == "null"
     assert math.isnan(told["parameter:nan"])
     assert told["parameter:large"] == 10**30
-
-
-def test_software_is_named_with_its_version_and_what_is_not_known_is_unknown() -> None:
-    made = record(
-        [
-            recorded_cell("a", distribution="some-methods", distribution_version="1.2"),
-            recorded_cell("b", distribution="bare"),
-            recorded_cell("c"),
-        ]
-    )
-    document = json.loads(prov_document(made).serialize(format="json") or "")
-    relations: Any = document["wasAssociatedWith"]
-    agents = {entry["prov:activity"]: entry["prov:agent"] for entry in relations.values()}
-    names = {activity[-1]: agent.partition(":")[2] for activity, agent in agents.items()}
-    assert names == {"a": "some-methods%201.2", "b": "bare", "c": "unknown"}

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import hashlib
 from collections.abc import Mapping
-from contextlib import AbstractContextManager
 from pathlib import Path
 
 import numpy as np
 import pytest
-from orthoflow_provenance import record as reader
 from orthoflow_provenance.arrays import write_product_file
 from orthoflow_provenance.document import (
     Metric,
@@ -24,11 +21,10 @@ from orthoflow_provenance.document import (
 )
 from orthoflow_provenance.record import write_record
 
-import orthoflow
 from orthoflow.engine.journal import cell_file_name
 from orthoflow.errors import ArgumentError, RecordError
 from orthoflow.products import Planes
-from orthoflow.records.published import cell_metrics, publish_products, write_metrics_csv
+from orthoflow.records.published import publish_products
 from orthoflow.records.runs import Run
 from orthoflow.records.unfinished import open_run
 from orthoflow.records.verification import verify_run
@@ -170,44 +166,6 @@ def run(run_folder: Path) -> Run:
     return open_run(run_folder)
 
 
-def test_a_run_opens_by_folder_and_by_record_alike(run_folder: Path) -> None:
-    by_folder = orthoflow.open_run(run_folder)
-    assert by_folder == orthoflow.open_run(str(run_folder / "run.h5"))
-    assert by_folder.record.run_id == "20260102-abc"
-    assert list(by_folder.cells) == ["cloud", "plane@plane=given", "wall"]
-    assert by_folder.folder == run_folder
-
-
-def test_a_run_that_is_held_open_looks_at_its_record_once(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    looked_at = []
-
-    def safe_open(path: Path) -> AbstractContextManager[object]:
-        looked_at.append(path)
-        return reader_safe_open(path)
-
-    reader_safe_open = reader.safe_open
-    monkeypatch.setattr(reader, "safe_open", safe_open)
-    place = ("plane@plane=given", "planes")
-    with run.held_open() as held:
-        # Also parts of a run, which are runs of their own.
-        for one in (held, held, dataclasses.replace(held, record=held.record)):
-            (payload,) = one.payloads([place])
-            np.testing.assert_array_equal(payload.arrays["offset"], one_plane().offset)
-    assert looked_at == [run.path]
-    assert len(list(run.payloads([place, place]))) == 2
-    assert looked_at == [run.path] * 2
-    assert not list(run.payloads([]))
-    assert looked_at == [run.path] * 2
-
-
-def test_a_record_that_is_gone_cannot_be_held_open(run: Run) -> None:
-    run.path.unlink()
-    with pytest.raises(ArgumentError, match="is not a file"), run.held_open():
-        pass
-
-
 def test_a_product_comes_back_as_it_was(run: Run) -> None:
     planes = run.product("plane@plane=given", "planes")
     assert isinstance(planes, Planes)
@@ -232,39 +190,6 @@ def test_metrics_hold_what_the_method_and_the_engine_measured_of_good_cells_only
         ("plane@plane=given", "peak_rss_mib", 128.0, "MiB"),
     ]
     assert {row.cell for row in run.metric_rows()} == {"cloud", "plane@plane=given"}
-
-
-def test_published_files_and_metrics_lie_below_products(run: Run) -> None:
-    folder = run.folder / "products"
-    assert run.files["plane@plane=given"] == (
-        folder / "plane@plane=given" / "metrics.csv",
-        folder / "plane@plane=given" / "planes.json",
-    )
-    assert "wall" not in run.files
-    with (folder / "metrics.csv").open(encoding="utf-8", newline="") as file:
-        rows = list(csv.reader(file))
-    assert rows[0] == ["cell", "step", "method", "metric", "value", "unit"]
-    assert rows[4] == ["plane@plane=given", "plane", "plane.given", "rms_mm", "2.0", "mm"]
-    assert len(rows) == 8
-
-
-def test_numbers_in_metrics_csv_keep_every_digit(tmp_path: Path) -> None:
-    value = 0.1 + 0.2
-    cell = dataclasses.replace(cloud_cell(), metrics=(Metric(name="x", value=value, unit="1"),))
-    write_metrics_csv(tmp_path / "metrics.csv", cell_metrics(cell))
-    with (tmp_path / "metrics.csv").open(encoding="utf-8", newline="") as file:
-        assert float(next(iter(csv.DictReader(file)))["value"]) == value
-
-
-def test_two_outputs_that_publish_the_same_name_both_stay(tmp_path: Path) -> None:
-    for port in ("a", "b"):
-        (tmp_path / port).mkdir()
-        (tmp_path / port / "planes.json").write_text(port, encoding="utf-8")
-    files = {port: as_stored(tmp_path / port / "planes.json") for port in ("a", "b")}
-    publish_products(tmp_path / "run", [cloud_cell()], {"cloud": files}, "r")
-    cell = tmp_path / "run" / "products" / "cloud"
-    assert (cell / "planes.json").read_text(encoding="utf-8") == "a"
-    assert (cell / "b_planes.json").read_text(encoding="utf-8") == "b"
 
 
 def test_no_published_file_takes_the_place_of_another_or_of_the_metrics(tmp_path: Path) -> None:
@@ -340,17 +265,6 @@ def test_products_are_not_published_through_a_link(tmp_path: Path) -> None:
     assert not (tmp_path / "run" / "products").is_symlink()
 
 
-def test_orthoimages_come_in_the_order_of_the_walls(run: Run) -> None:
-    folder = run.folder / "products" / "plane@plane=given"
-    for k in (10, 2, 0):
-        (folder / f"wall_{k}_ortho.tif").touch()
-    assert [path.name for path in run.orthoimages] == [
-        "wall_0_ortho.tif",
-        "wall_2_ortho.tif",
-        "wall_10_ortho.tif",
-    ]
-
-
 def test_a_long_address_gets_a_folder_name_that_file_systems_take() -> None:
     address = "ortho@" + ",".join(f"step{i}=variant{i}" for i in range(40))
     other = address + "x"
@@ -404,19 +318,6 @@ def test_a_missing_path_is_an_argument_error(tmp_path: Path) -> None:
 def test_a_folder_without_a_record_is_an_unfinished_run(tmp_path: Path) -> None:
     with pytest.raises(ArgumentError, match=r"holds no run.h5: .* repeat the run with -o "):
         open_run(tmp_path)
-
-
-@pytest.mark.parametrize("content", [b"", b"not HDF5 at all", b"\x89HDF\r\n\x1a\n cut off"])
-def test_a_file_that_is_no_record_is_refused_with_one_sentence(
-    tmp_path: Path, content: bytes
-) -> None:
-    path = tmp_path / "run.h5"
-    path.write_bytes(content)
-    with pytest.raises(RecordError) as caught:
-        open_run(path)
-    assert str(caught.value).count("run.h5") == 1
-    assert str(caught.value).startswith(str(path))
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.99])

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
 from orthoflow.engine.plan import RunOptions, plan_run
 from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.engine.store import Store
-from orthoflow.records import replaying
 from orthoflow.records.replaying import UnreplayableRunError, plan_replay
 from orthoflow.records.runs import Run
 from orthoflow.records.writing import write_run
@@ -19,8 +16,6 @@ from orthoflow.workflow import expand as cells
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import expand_cells
 from tests.engine_world import World
-from tests.report_runs import cell as recorded_cell
-from tests.report_runs import given
 
 WORKFLOW = """
 orthoflow: 1
@@ -114,36 +109,3 @@ def test_a_record_whose_workflow_asks_for_the_impossible_is_refused(
     said = rf"the resolved workflow cannot be read: steps\.last\.variants\.0\.{field}: .*{reason}"
     with pytest.raises(UnreplayableRunError, match=said):
         plan_replay(run, catalog, Store(world.folder / "fresh"), INLINE)
-
-
-def test_a_cell_is_replayed_as_it_was_recorded() -> None:
-    variants = (
-        SimpleNamespace(name="once", cores=2, timeout_s=9.0),
-        SimpleNamespace(name="often", cores=None, timeout_s=None),
-    )
-    workflow: Any = SimpleNamespace(steps={"draw": SimpleNamespace(variants=variants)})
-    known = {
-        "params": {"count": 3},
-        "seed": 77,
-        "inputs": {"numbers": given("first.numbers", "1", "numbers")},
-    }
-    cell = replaying._cell(recorded_cell("draw@draw=once#2", **known), workflow)
-    assert (cell.address, cell.step, cell.repeat, cell.seed) == ("draw@draw=once#2", "draw", 2, 77)
-    assert (cell.cores, cell.timeout_s, cell.skip_reason) == (2, 9.0, "")
-    assert cell.params == {"count": 3}
-    assert cell.inputs == {"numbers": cells.CellOutput(address="first", port="numbers")}
-    # Without a seed of its own it is given a generator all the same.
-    other = recorded_cell("draw@draw=often", status="skipped", error_message="needs first")
-    cell = replaying._cell(other, workflow)
-    assert (cell.seed, cell.cores, cell.timeout_s) == (0, None, None)
-    assert cell.skip_reason == "needs first"
-    # A message of a cell that ran is no reason to skip it.
-    failed = recorded_cell("gone", status="failed", error_message="no plane")
-    assert replaying._cell(failed, workflow).skip_reason == ""
-
-
-def test_sources_are_inputs_or_outputs_of_cells() -> None:
-    assert replaying._source("inputs.scan") == cells.WorkflowInput(name="scan")
-    assert replaying._source("plane@plane=v1.5.planes") == cells.CellOutput(
-        address="plane@plane=v1.5", port="planes"
-    )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import json
 import shutil
 import sys
@@ -24,7 +22,6 @@ from cryptography.hazmat.primitives.serialization import (
 )
 
 from orthoflow.cli import sign
-from orthoflow.records import verification
 from tests import hostile_records as hostile
 from tests.studios import Studio, open_studio
 
@@ -94,18 +91,6 @@ def test_a_signed_record_is_told_by_the_key_of_its_signer(
     # Signed again with the same key it stays signed.
     assert finished("sign", run, "--key", "jane").exit_code == 0
     assert finished("verify", run, "--signer", signer).exit_code == 0
-
-
-def test_verifying_without_a_key_says_that_the_signature_was_not_checked(
-    finished: Studio, run: Path
-) -> None:
-    assert "signature" not in finished("verify", run).output
-    finished("sign", run, "--key", "jane")
-    done = finished("verify", run)
-    assert done.exit_code == 0
-    assert "note: there is a signature, said to be of the key SHA256:" in done.output
-    assert "not checked: name the signer's public key with --signer" in done.output
-    assert finished.json("verify", run)["signed_with"] == ""
 
 
 def test_a_missing_signature_and_anothers_are_findings(finished: Studio, run: Path) -> None:
@@ -240,14 +225,6 @@ def test_on_a_terminal_the_password_is_asked_for_out_of_sight(
     assert sign._password(Path("jane")) == PASSWORD
     # What is asked goes to where messages go: stdout may be a file.
     assert asked == [("password of jane", True, True)]
-
-
-def test_a_public_key_of_no_form_has_no_fingerprint() -> None:
-    for key in ("", "alone", "ssh-ed25519 no*base64"):
-        assert verification._fingerprint(key) == "of no known form"
-    digest = base64.b64encode(hashlib.sha256(b"key").digest()).decode().rstrip("=")
-    text = base64.b64encode(b"key").decode()
-    assert verification._fingerprint(f"ssh-ed25519 {text} jane") == f"SHA256:{digest}"
 
 
 def test_without_the_library_the_commands_say_so_and_others_do_without(

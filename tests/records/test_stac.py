@@ -168,19 +168,3 @@ def test_an_item_names_the_coordinate_system_where_there_is_one(tmp_path: Path) 
         assert item["properties"]["gsd"] == 0.5
         assert item["properties"]["processing_digest"] == "sha256:12"
         assert [link["href"] for link in item["links"]] == ["../../collection.json"] * 3
-
-
-def test_a_collection_reaches_as_far_as_what_lies_on_earth() -> None:
-    run = Run(path=Path("run.h5"), record=record([cell("mosaic")]))
-    moved = tuple((lon + 5.0, lat - 7.0) for lon, lat in SQUARE)
-    here, there, nowhere = placed(outline=SQUARE), placed(outline=moved), placed()
-    for orthos, bbox, is_told in (
-        ([here], [10.0, 50.0, 11.0, 51.0], False),
-        ([here, there], [10.0, 43.0, 16.0, 51.0], False),
-        ([nowhere, here], [10.0, 50.0, 11.0, 51.0], True),
-        ([nowhere], [-180.0, -90.0, 180.0, 90.0], True),
-    ):
-        told: Any = stac._collection(run, orthos)
-        assert told["extent"]["spatial"]["bbox"] == [bbox]
-        assert ("lie in the plane of their wall" in told["description"]) is is_told
-        assert len(told["links"]) == 1 + len(orthos)

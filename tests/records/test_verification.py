@@ -19,7 +19,6 @@ from orthoflow.errors import RecordError
 from orthoflow.products.inspections import Finding
 from orthoflow.records import verification as module
 from orthoflow.records.verification import (
-    Verification,
     published_state,
     require_unchanged,
     verify_run,
@@ -62,11 +61,6 @@ STATES = {
     "folder": "no file",
     "pipe": "no file",
 }
-
-
-@pytest.mark.parametrize("name", STATES)
-def test_a_published_file_is_as_it_was_or_it_is_said_how_not(folder: Path, name: str) -> None:
-    assert published_state(folder, published(f"products/{name}")) == STATES[name]
 
 
 def test_a_file_that_cannot_be_read_is_told(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -145,70 +139,6 @@ def test_only_what_the_record_vouches_for_is_used(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("signed", "changed", "said"),
-    [
-        ((), (), ""),
-        (("x",), (), "the seal of r holds, but its signature is not the one asked for"),
-        (
-            (),
-            ("y",),
-            "the seal of r holds, but published files beside it are not as they were written",
-        ),
-        (
-            ("x",),
-            ("y",),
-            (
-                "the seal of r holds, but its signature is not the one asked for and published "
-                "files beside it are not as they were written"
-            ),
-        ),
-    ],
-)
-def test_what_is_wrong_beside_a_whole_record_is_named(
-    signed: tuple[str, ...], changed: tuple[str, ...], said: str
-) -> None:
-    signature = Verification(path=Path("r"), findings=signed)
-    check = module._PublishedCheck(changed=changed)
-    assert module._wrong_beside(Path("r"), signature, check) == said
-
-
-def refusing(*_: object) -> None:
-    raise RecordError("the signature is of another record")
-
-
-@pytest.mark.parametrize("is_asked", [True, False])
-def test_a_signature_counts_where_it_is_asked_for(
-    monkeypatch: pytest.MonkeyPatch, is_asked: bool
-) -> None:
-    signer = Path("key.pub") if is_asked else None
-    key: Any = SimpleNamespace(fingerprint="SHA256:abc")
-    monkeypatch.setattr(module, "check_signature", lambda *_: key)
-    monkeypatch.setattr(module, "read_signature", lambda *_: key)
-    found = module._check_signature(Path("r"), signer)
-    assert found.findings == ()
-    assert found.signed_with == ("SHA256:abc" if is_asked else "")
-    assert len(found.notes) == (0 if is_asked else 1)
-    assert all(
-        "said to be of the key SHA256:abc, that was not checked" in x.text for x in found.notes
-    )
-    monkeypatch.setattr(module, "check_signature", refusing)
-    monkeypatch.setattr(module, "read_signature", refusing)
-    found = module._check_signature(Path("r"), signer)
-    said = ("the signature is of another record",)
-    texts = tuple(note.text for note in found.notes)
-    assert (found.findings, texts) == ((said, ()) if is_asked else ((), said))
-    assert found.signed_with == ""
-
-
-def test_a_record_without_a_signature_has_nothing_said_of_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(module, "read_signature", lambda *_: None)
-    found = module._check_signature(Path("r"), None)
-    assert (found.findings, found.notes, found.signed_with) == ((), (), "")
-
-
-@pytest.mark.parametrize(
     ("stated", "said"),
     [
         ({"creator": "CloudCompare"}, "x.h5 is not a record of orthoflow: it does not name"),
@@ -241,23 +171,6 @@ def test_a_file_of_another_program_or_version_cannot_be_checked(
     found = verify_run(path)
     assert found.findings[0].startswith(f"/: {said}")
     assert found.wrong == f"{path} cannot be checked"
-
-
-def test_a_record_with_something_forbidden_is_not_as_it_was_written(tmp_path: Path) -> None:
-    path = tmp_path / "x.h5"
-    with h5py.File(path, "w") as file:
-        file.attrs.update(
-            {
-                "format": np.bytes_("orthoflow-run"),
-                "format_version": np.bytes_("1.0"),
-                "creator": "C",
-            }
-        )
-    found = verify_run(path)
-    assert found.findings == (
-        "/: x.h5:/@creator has a type outside the format: the file is not opened",
-    )
-    assert found.wrong == f"{path} is not as it was written"
 
 
 @pytest.mark.parametrize(

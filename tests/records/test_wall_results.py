@@ -94,12 +94,6 @@ def test_an_inspection_says_how_exact_a_wall_is_by_findings_on_it() -> None:
     assert first_said.text("de") == "first: RMSE seitlich 4.0 mm, in der Höhe 5.0 mm"
 
 
-def test_places_in_walls_become_numbers() -> None:
-    numbered = module._numbered(inspection(("a", 1.0, 1), ("b", 2.0, -1), walls=(0, 1, 5)), [4, 7])
-    assert numbered.wall.tolist() == [4, 7, -1]
-    assert [item.wall for item in numbered.findings] == [7, -1]
-
-
 def checkpoints(count: int) -> Any:
     product = CheckPoints(
         names=tuple(f"P{k}" for k in range(count)),
@@ -184,17 +178,6 @@ def test_the_last_orthoimages_are_meant_or_else_the_last_walls() -> None:
         module._pictured(run, "e")
 
 
-def test_the_first_product_that_the_record_holds_counts() -> None:
-    run: Any = ToyRun(
-        a=cell(outputs={"x": output("planes", embedded=False), "y": output("cloud")}),
-        b=cell(outputs={"x": output("cloud"), "z": output("planes")}),
-        c=cell(outputs={"w": output("planes")}),
-    )
-    assert module._upstream_product(run, ("a", "b", "c"), "planes") == ("b", "z")
-    assert module._upstream_product(run, ("c", "b"), "planes") == ("c", "w")
-    assert module._upstream_product(run, ("a",), "planes") is None
-
-
 PUBLISHED = (
     "products/mosaic/wall_2_ortho.tif",
     "products/mosaic/images_wall_10_depth.tif",
@@ -204,15 +187,6 @@ PUBLISHED = (
     "products/other/wall_4_ortho.tif",
     "products/mosaic/wall_5_intensity.tif",
 )
-
-
-def test_rasters_are_known_by_the_names_of_their_files() -> None:
-    run: Any = ToyRun(published=PUBLISHED)
-    assert module._rasters(run, "mosaic") == {
-        (2, "ortho"): PUBLISHED[0],
-        (10, "depth"): PUBLISHED[1],
-        (5, "intensity"): PUBLISHED[6],
-    }
 
 
 @pytest.mark.parametrize(("wall", "is_asked"), [(None, True), (2, True), (10, False)])

@@ -100,23 +100,6 @@ def test_what_the_store_lost_is_computed_again_three_times(n_lost: int, n_execut
     assert len(executed) == n_executed
 
 
-def test_a_run_keeps_the_id_it_was_given(executed: Executed) -> None:
-    assert executed.outcome.run_id == "20260102-abc"
-    assert executed.write().record.run_id == "20260102-abc"
-
-
-def test_what_is_returned_is_what_is_read_again(executed: Executed) -> None:
-    assert executed.write() == open_run(executed.folder)
-    assert verify_run(executed.folder).findings == ()
-
-
-def test_skipped_and_wired_inputs_are_told_apart(executed: Executed) -> None:
-    run = executed.write()
-    assert run.record.inputs[0].files == ()
-    assert run.cells["survey"].inputs == {}
-    assert run.cells["paint"].inputs["planes"].source == "survey.planes"
-
-
 def test_the_record_has_no_name_while_the_report_is_written(executed: Executed) -> None:
     seen: list[tuple[bool, int]] = []
 
