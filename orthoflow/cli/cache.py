@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import click
 
@@ -20,13 +20,10 @@ from orthoflow.cli.commands import (
 )
 from orthoflow.cli.tables import counted, echo, echo_json, echo_table, size
 
-if TYPE_CHECKING:
-    from orthoflow.engine.cleaning import Aside
-
 _SUMMARIES: Final = {
     "list": "List the stored results with their size and age.",
     "gc": "Remove objects that no stored result needs.",
-    "verify": "Check every byte of the store, and set damaged parts aside.",
+    "verify": "Check every byte of the store, and remove what is damaged.",
 }
 
 
@@ -48,11 +45,9 @@ def cache_list(store: Path, *, as_json: bool) -> int:
 
     Equal products of several results are stored once, but count for each.
     """
-    from orthoflow.engine.cleaning import lying_aside
     from orthoflow.engine.store import Store, list_results
 
-    opened = Store(store)
-    results = list_results(opened)
+    results = list_results(Store(store))
     if as_json:
         echo_json([asdict(result) for result in results])
         return EXIT_GOOD
@@ -71,7 +66,6 @@ def cache_list(store: Path, *, as_json: bool) -> int:
         ],
     )
     echo(f"{counted(len(results), 'result')} in {store}")
-    _echo_set_aside(lying_aside(opened))
     return EXIT_GOOD
 
 
@@ -109,7 +103,7 @@ def cache_gc(store: Path, older_than: float | None, *, dry_run: bool, as_json: b
 def cache_verify(store: Path, *, as_json: bool) -> int:
     """Check every byte of the stored results, products, published files and figures.
 
-    What is damaged is set aside: the next run that needs it computes it again. Ends with 3 when
+    What is damaged is removed: the next run that needs it computes it again. Ends with 3 when
     something was damaged. Runs may use the store meanwhile.
     """
     from orthoflow.engine.cleaning import check_store
@@ -126,19 +120,9 @@ def cache_verify(store: Path, *, as_json: bool) -> int:
         f"{counted(found.n_results, 'result')} and {counted(found.n_objects, 'object')} in {store} "
         "are as they were stored"
     )
-    _echo_set_aside(found.aside)
     if found.damaged:
         echo_error(
-            f"error: {counted(len(found.damaged), 'part')} of {store} were damaged and set aside, "
+            f"error: {counted(len(found.damaged), 'part')} of {store} were damaged and removed, "
             "see above; the next run computes what it needs of them again"
         )
     return code
-
-
-def _echo_set_aside(aside: Aside) -> None:
-    """Report how much was set aside, if anything."""
-    if aside.count:
-        echo(
-            f"set aside because damaged: {aside.count}, {size(aside.size_bytes)}; "
-            "`orthoflow cache gc` removes them"
-        )

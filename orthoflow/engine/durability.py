@@ -10,12 +10,12 @@ import shutil
 import subprocess
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Final
 
 from orthoflow.errors import StoreError
-from orthoflow.system import FileLock, file_lock, flags
+from orthoflow.system import file_lock, flags
 
 _REASONS = {
     errno.ENOSPC: "No space left on the disk; free some, or choose another folder",
@@ -166,7 +166,10 @@ def whole_folder(final: Path) -> Iterator[Path]:
 
 
 def remove_tree(folder: Path) -> None:
-    """Remove a folder that may be gone already or be removed by another process meanwhile."""
+    """Remove a folder or file that may be gone already, or be removed by another meanwhile."""
+    if folder.is_symlink() or folder.is_file():
+        folder.unlink(missing_ok=True)
+        return
     try:
         shutil.rmtree(folder, ignore_errors=True)
     except RecursionError:
@@ -215,18 +218,7 @@ def shared_lock(path: Path) -> Iterator[None]:
     Raises:
         StoreError: the lock file cannot be created, or the file system has no locks.
     """
-    with _waited_for(path, is_shared=True):
-        yield
-
-
-@contextmanager
-def taking_turns(path: Path) -> Iterator[None]:
-    """Hold an exclusive lock; waits while another process holds it.
-
-    Raises:
-        StoreError: the lock file cannot be created, or the file system has no locks.
-    """
-    with _waited_for(path, is_shared=False):
+    with _lock(path, is_shared=True, waits=True):
         yield
 
 
@@ -241,8 +233,8 @@ def exclusive_lock(path: Path, busy: str) -> Iterator[None]:
     Raises:
         StoreError: another process holds it, or it cannot be created.
     """
-    with _opened(path) as lock:
-        if not _taken(lock, path, is_shared=False, waits=False):
+    with _lock(path, is_shared=False, waits=False) as is_held:
+        if not is_held:
             raise StoreError(busy)
         yield
 
@@ -251,35 +243,23 @@ def is_locked(path: Path) -> bool:
     """Whether a living process holds the lock file, shared or exclusively."""
     if not path.exists():
         return False
-    with _opened(path) as lock:
-        return not _taken(lock, path, is_shared=False, waits=False)
+    with _lock(path, is_shared=False, waits=False) as is_held:
+        return not is_held
 
 
 @contextmanager
-def _waited_for(path: Path, *, is_shared: bool) -> Iterator[None]:
-    with _opened(path) as lock:
-        _taken(lock, path, is_shared=is_shared, waits=True)
-        yield
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[FileLock]:
+def _lock(path: Path, *, is_shared: bool, waits: bool) -> Iterator[bool]:
     with writing_to(path.parent):
         path.parent.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(path, flags("O_RDWR", "O_CREAT"), 0o666)
-    lock = file_lock(path, descriptor)
-    try:
-        yield lock
-    finally:
-        lock.close()
-        os.close(descriptor)
-
-
-def _taken(lock: FileLock, path: Path, *, is_shared: bool, waits: bool) -> bool:
-    try:
-        return lock.take(is_shared=is_shared, waits=waits)
-    except OSError as error:
-        raise StoreError(
-            f"cannot lock {path}: {error.strerror or error}; the store must lie on a file system "
-            "with locks"
-        ) from error
+    with ExitStack() as stack:
+        stack.callback(os.close, descriptor)
+        lock = stack.enter_context(closing(file_lock(path, descriptor)))
+        try:
+            is_held = lock.take(is_shared=is_shared, waits=waits)
+        except OSError as error:
+            raise StoreError(
+                f"cannot lock {path}: {error.strerror or error}; the store must lie on a file "
+                "system with locks"
+            ) from error
+        yield is_held

@@ -106,79 +106,43 @@ _FORMAT: Final = "orthoflow/journal/1"
 _LONGEST_FILE_NAME: Final = 200  # bytes, with room for a suffix; file systems stop at 255
 
 
+LineEvent: TypeAlias = Literal[
+    "run", "resumed", "interrupted", "ended", "started", "finished", "damaged"
+]
+
+
 @dataclass(frozen=True, kw_only=True)
-class RunBegan:
-    """The first line of a journal.
+class JournalLine:
+    """One line of a journal: its run began or went on, or one of its cells did.
 
     Attributes:
-        time: ISO 8601 UTC, as in every line; a resumed run takes its start from here.
-        format: of the journal.
-        run_id: id of the run.
-        workflow: name of the workflow.
-    """
-
-    event: Literal["run"] = "run"
-    time: str
-    format: str = _FORMAT
-    run_id: str
-    workflow: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunWent:
-    """The run as a whole was continued, interrupted or ended."""
-
-    event: Literal["resumed", "interrupted", "ended"]
-    time: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class CellBegan:
-    """A cell was passed to the executor."""
-
-    event: Literal["started"] = "started"
-    time: str
-    address: str
-    key: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class CellEnded:
-    """A cell has its outcome.
-
-    Attributes:
-        event: of the line.
+        event: `run` in the first line; `resumed`, `interrupted` or `ended` of the run as a whole;
+            `started`, `finished` or `damaged`, of the stored result, of a cell.
         time: ISO 8601 UTC.
-        address: address of the cell.
+        format: name and version of this file, in its first line, as are `run_id` and `workflow`.
+        run_id: id of the run.
+        workflow: name of its workflow.
+        address: address of the cell, and of all that follows.
         key: its cache key.
         status: ok, failed or skipped.
-        cached: it was in the store.
+        cached: its result was in the store.
         error: the sentence of a failure.
         error_type: class of a failure.
+        what: the damaged parts.
     """
 
-    event: Literal["finished"] = "finished"
+    event: LineEvent
     time: str
-    address: str
-    key: str
-    status: CellStatus
-    cached: bool
-    error: str
+    format: str = ""
+    run_id: str = ""
+    workflow: str = ""
+    address: str = ""
+    key: str = ""
+    status: CellStatus | Literal[""] = ""
+    cached: bool = False
+    error: str = ""
     error_type: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
-class CellDamaged:
-    """The stored result of a cell was damaged; `what` names the parts."""
-
-    event: Literal["damaged"] = "damaged"
-    time: str
-    address: str
-    key: str
-    what: str
-
-
-JournalLine: TypeAlias = RunBegan | RunWent | CellBegan | CellEnded | CellDamaged
+    what: str = ""
 
 
 class Journal:
@@ -228,16 +192,20 @@ class Journal:
         self._lock.close()
         os.close(self._descriptor)
 
-    def write(self, line: JournalLine) -> None:
+    def write(self, event: LineEvent, **facts: str | bool) -> None:
         """Append a line and sync it to the disk.
+
+        Args:
+            event: of the line.
+            facts: its fields, see `JournalLine`; its time is now unless given.
 
         Raises:
             StoreError: the disk cannot be written.
         """
-        if isinstance(line, CellDamaged):
-            self.damaged[line.address] = line.what
-        content = _codec().dump_python(line, mode="json")
-        text = json.dumps(content, ensure_ascii=False).encode() + b"\n"
+        if event == "damaged":
+            self.damaged[str(facts["address"])] = str(facts["what"])
+        line = {"event": event, "time": now(), **facts}
+        text = json.dumps(line, ensure_ascii=False).encode() + b"\n"
         with writing_to(self._folder):
             while text:
                 text = text[os.write(self._descriptor, text) :]
@@ -250,23 +218,22 @@ class Journal:
         if (self._folder / RECORD_FILE).exists():
             self._reopen(lines)
         self.is_resumed = bool(lines)
-        first = next((line for line in lines if isinstance(line, RunBegan)), None)
+        first = next((line for line in lines if line.event == "run"), None)
         if lines and first is None:
             raise self._damage()
-        first = first or RunBegan(time=now(), run_id=run_id or new_run_id(), workflow=name)
-        _check_workflow(self._folder, first, name)
-        self.run_id = first.run_id
-        self.damaged = {line.address: line.what for line in lines if isinstance(line, CellDamaged)}
-        self.started = first.time
+        self.run_id = first.run_id if first else run_id or new_run_id()
+        self.started = first.time if first else now()
+        self.damaged = {line.address: line.what for line in lines if line.event == "damaged"}
         self.finished_keys = frozenset(
             line.key
             for line in lines
-            if isinstance(line, CellEnded) and line.status == "ok" and not line.cached
+            if line.event == "finished" and line.status == "ok" and not line.cached
         )
-        if self.is_resumed:
-            self.write(RunWent(event="resumed", time=now()))
+        if first:
+            _check_workflow(self._folder, first, name)
+            self.write("resumed")
             return
-        self.write(first)
+        self.write("run", time=self.started, format=_FORMAT, run_id=self.run_id, workflow=name)
         with writing_to(self._folder):
             sync_folder(self._folder)
 
@@ -317,7 +284,7 @@ def require_run_folder(folder: Path, name: str) -> None:
     if is_running(folder):
         raise _is_in_use(folder)
     for line in readable_lines(folder):
-        if isinstance(line, RunBegan):
+        if line.event == "run":
             _check_workflow(folder, line, name)
 
 
@@ -344,7 +311,7 @@ def _is_in_use(folder: Path) -> ArgumentError:
     )
 
 
-def _check_workflow(folder: Path, first: RunBegan, name: str) -> None:
+def _check_workflow(folder: Path, first: JournalLine, name: str) -> None:
     if first.workflow != name:
         raise ArgumentError(
             f"{folder} holds an unfinished run of {first.workflow}, not of {name}; {_ANOTHER}"
@@ -367,7 +334,7 @@ def _is_finished(folder: Path) -> ArgumentError:
 
 def _lacked_room(lines: Sequence[JournalLine]) -> bool:
     """Whether a cell failed because the disk was full: with more space, the run continues."""
-    ends = {line.address: line for line in lines if isinstance(line, CellEnded)}
+    ends = {line.address: line for line in lines if line.event == "finished"}
     return any(end.error_type == DiskSpaceError.__name__ for end in ends.values())
 
 

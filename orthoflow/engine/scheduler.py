@@ -18,9 +18,6 @@ from orthoflow.engine.durability import exclusive_lock, is_locked, remove_tree, 
 from orthoflow.engine.environment import environment, now
 from orthoflow.engine.journal import (
     LOGS,
-    CellBegan,
-    CellDamaged,
-    CellEnded,
     CellFinished,
     CellLogged,
     CellProgress,
@@ -29,7 +26,6 @@ from orthoflow.engine.journal import (
     Journal,
     RunListener,
     RunStarted,
-    RunWent,
     cell_file_name,
     ignore,
 )
@@ -239,7 +235,7 @@ class _Run:
 
     def outcome(self) -> RunOutcome:
         """Return the results of the run, in the order of the plan."""
-        self._journal.write(RunWent(event="ended", time=now()))
+        self._journal.write("ended")
         return self._outcome_of(item.cell.address for item in self._plan.cells)
 
     def so_far(self) -> RunOutcome:
@@ -269,7 +265,7 @@ class _Run:
         while self._running:
             for end in executor.poll(_POLL_S):
                 self._take(end)
-        self._journal.write(RunWent(event="interrupted", time=now()))
+        self._journal.write("interrupted")
         raise CancelledStepError(
             f"the run was interrupted; the same command "
             f"continues it with -o {self._tasks.logs.parent.name}"
@@ -331,14 +327,12 @@ class _Run:
         is_done = key.key in self._journal.finished_keys or key.key in self._made
         if cell.step in self._plan.options.force and not is_done:
             return None
-        taken = self._store.take(key.key)
-        if taken.damage:
-            damaged = _STORED_RESULT_DAMAGED.of("", {"damage": taken.damage})
+        result, damage = self._store.take(key.key)
+        if damage:
+            damaged = _STORED_RESULT_DAMAGED.of("", {"damage": damage})
             self._listen(CellReported(address=cell.address, diagnostic=damaged))
-            self._journal.write(
-                CellDamaged(time=now(), address=cell.address, key=key.key, what=taken.damage)
-            )
-        return taken.result
+            self._journal.write("damaged", address=cell.address, key=key.key, what=damage)
+        return result
 
     def _is_held_up(
         self, cell: Cell, refs: Mapping[str, ProductRef], *, again: bool = False
@@ -382,7 +376,7 @@ class _Run:
         cores = _cores(cell, executor.capacity)
         task = self._tasks.make(cell, ready.key, ready.refs, cores)
         del self._waiting[cell.address]
-        self._journal.write(CellBegan(time=now(), address=cell.address, key=task.key))
+        self._journal.write("started", address=cell.address, key=task.key)
         self._listen(CellStarted(address=cell.address))
         self._running[task.address] = task
         executor.start(task)
@@ -422,7 +416,7 @@ class _Run:
             return False
         refs = {port: given.ref for port, given in task.inputs.items()}
         is_fault_of_store = self._is_held_up(cell, refs, again=True)
-        # Another run may have set aside what this one was about to read, and replaced it since.
+        # Another run may have removed what this one was about to read, and replaced it since.
         is_fault_of_store |= result.error_type == DamageError.__name__
         self._repeats[cell.address] = repeats + 1
         return is_fault_of_store and repeats < _MOST_REPEATS
@@ -448,15 +442,13 @@ class _Run:
         elif is_cached and result.key not in self._made:
             self._resumed.add(cell.address)
         self._journal.write(
-            CellEnded(
-                time=now(),
-                address=cell.address,
-                key=result.key,
-                status=result.status,
-                cached=is_cached,
-                error=result.error_message,
-                error_type=result.error_type,
-            )
+            "finished",
+            address=cell.address,
+            key=result.key,
+            status=result.status,
+            cached=is_cached,
+            error=result.error_message,
+            error_type=result.error_type,
         )
         self._listen(CellFinished(address=cell.address, result=result, cached=is_cached))
 

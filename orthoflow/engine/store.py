@@ -5,16 +5,16 @@ Layout below the store's folder:
     objects/<digest>/product.h5     a product, `object.json` beside it, `files/` what it publishes
     objects/<digest>/blob           a figure
     results/<key>.json              what a cell gave, naming objects
-    damaged/                        what was set aside; garbage
     preimages/<method>/<key>.json   small copies of the keys' preimages, for explanations
     failures/<key>                  how cells failed last time; disposable
     digests.json                    memory of input files' digests; disposable
     scratch/<run id>/               work in progress; removed with its run
     lock                            shared by runs, exclusive for garbage collection
-    damaged.lock                    held by who sets something aside
 
-Everything has the digest of its bytes (`objects`, `checked_json`) and is checked when a run, or an
-export, uses it. Damaged objects are set aside, never removed: another run may have them open.
+Everything has the digest of its bytes and is checked when a run, or an export, uses it. What is
+damaged is removed and computed again. Figures name themselves, and keys their preimages; results
+and descriptions of objects begin with the digest of the rest. It says what is damaged, not who did
+it: whoever can write to the store can write digests, too.
 """
 
 from __future__ import annotations
@@ -24,13 +24,14 @@ import errno
 import hashlib
 import json
 import os
+import stat
 import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
-from typing import Final, Protocol, TypeVar
+from typing import Final, Literal, Protocol, TypeVar
 
 from orthoflow_provenance.document import (
     RecordFormatError,
@@ -38,34 +39,28 @@ from orthoflow_provenance.document import (
     sha256_text,
     shared_fields,
 )
+from pydantic import TypeAdapter
 
 from orthoflow.engine.durability import (
     folder_size,
+    is_checked,
     place_folder,
     remove_tree,
     shared_lock,
     sync_tree,
-    taking_turns,
+    with_digest,
     write_whole,
     writing_to,
 )
 from orthoflow.engine.environment import time_of_file
-from orthoflow.engine.file_digests import FileDigests
-from orthoflow.engine.objects import (
-    BLOB,
-    PRODUCT,
-    PUBLISHED,
-    SHORTAGES,
-    WHOLE,
-    CheckedFiles,
-    describe_product,
-    files_of,
-    missing_part,
-    part_name,
-    read_description,
-    require_plain_files,
+from orthoflow.engine.file_digests import FileDigests, file_sha256
+from orthoflow.engine.results import (
+    CellResult,
+    ProductRef,
+    name_problem,
+    result_from_json,
+    result_to_json,
 )
-from orthoflow.engine.results import CellResult, ProductRef, result_from_json, result_to_json
 from orthoflow.errors import ArgumentError, DamageError, ProductError, StoreError
 from orthoflow.foreign_text import open_file, parse_json
 from orthoflow.products.product import Payload, Product
@@ -76,9 +71,16 @@ from orthoflow.sdk.lines import one_line
 _MADE: Final = ("scratch", "results", "objects", "preimages")
 # Other files that may be created first, such as a lock. A separate disk has `lost+found`, and
 # systems create hidden files everywhere.
-_OURS: Final = frozenset(
-    {*_MADE, "failures", "damaged", "digests.json", "lock"} | {"damaged.lock", "lost+found"}
-)
+_OURS: Final = frozenset({*_MADE, "failures", "digests.json", "lock", "lost+found"})
+PRODUCT: Final = "product.h5"
+PUBLISHED: Final = "files"
+BLOB: Final = "blob"
+DESCRIPTION: Final = "object.json"
+# The missing part if nothing of an object exists.
+WHOLE: Final = "whole object"
+_PARTS: Final = {PRODUCT: "product file", BLOB: "figure", DESCRIPTION: "description"}
+# The machine lacks a resource: that does not mean damage.
+_SHORTAGES: Final = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 
 
 def is_store(folder: Path) -> bool:
@@ -128,7 +130,6 @@ __all__ = [
     "Preimage",
     "Publisher",
     "Store",
-    "TakenResult",
     "canonical_json",
     "digest_of",
 ]
@@ -148,16 +149,22 @@ class Publisher(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TakenResult:
-    """The stored result for a key.
+class StoredProduct:
+    """The content of a product's `object.json`.
 
     Attributes:
-        result: None if there is none, or an incomplete one.
-        damage: its damaged parts, empty without any.
+        format: name and version of this file.
+        object: name of its object: a description does not describe another.
+        type: of the product.
+        publisher: tag of the code that wrote the published files; empty if none did.
+        files: size and SHA-256 of each file as it was stored, by path in the folder.
     """
 
-    result: CellResult | None
-    damage: str = ""
+    format: Literal["orthoflow/object/1"] = "orthoflow/object/1"
+    object: str
+    type: str
+    publisher: str
+    files: Mapping[str, tuple[int, str]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,11 +196,11 @@ class Store:
         self.results = self.folder / "results"
         self.objects = self.folder / "objects"
         self.preimages = self.folder / "preimages"
-        self.damaged = self.folder / "damaged"
         self.failures = self.folder / "failures"
         self.lock_file = self.folder / "lock"
         self._workspace = workspace or self.scratch / "loose"
-        self._checked = CheckedFiles()
+        # Unchanged files need not be read twice; the first read checks them.
+        self._sound: set[tuple[Path, int, int, int, int]] = set()
         self._found_damaged: dict[str, str] = {}
 
     def file_digests(self) -> FileDigests:
@@ -238,8 +245,10 @@ class Store:
                 final = self._object(digest)
                 tag = publisher_tag if publisher else ""
                 if not self._is_there(final, tag):
-                    self._finish_object(aside, product, publisher, digest)
-                    describe_product(aside, final.name, type(product).type_name, tag)
+                    if publisher is not None:
+                        publish_into(aside / PUBLISHED, product, publisher, digest)
+                        sync_tree(aside / PUBLISHED)
+                    _describe(aside, final.name, type(product).type_name, tag)
                     self._place(aside, final)
         except RecordFormatError as error:
             raise ProductError(f"a {product.type_name} cannot be stored: {error}") from error
@@ -278,7 +287,7 @@ class Store:
         try:
             stored = read_product_file(path, map_arrays=True)
         except (OSError, ValueError, KeyError, RuntimeError) as error:
-            if isinstance(error, OSError) and error.errno in SHORTAGES:
+            if isinstance(error, OSError) and error.errno in _SHORTAGES:
                 raise StoreError(f"cannot read {path}: {error.strerror}") from error
             raise DamageError(f"{damaged} ({error})") from error
         return cls.from_payload(Payload(**shared_fields(stored, Payload)))
@@ -296,15 +305,11 @@ class Store:
             DamageError: the product is missing, or its published files are unknown.
         """
         folder = self._object(digest)
-        found = read_description(folder)
+        found = _read_description(folder)
         if found is None:
             raise DamageError(f"the store {self.folder} has no sound product {digest}")
-        prefix = f"{PUBLISHED}/"
-        return {
-            folder / name: file.sha256
-            for name, file in sorted(found.files.items())
-            if name.startswith(prefix)
-        }
+        files = sorted(found.files.items())
+        return {folder / name: sha256 for name, (_, sha256) in files if _is_published(name)}
 
     # Figures ------------------------------------------------------------------------------------
 
@@ -345,7 +350,7 @@ class Store:
         return not self.damage(name, again=again)
 
     def damage(self, name: str, *, with_published: bool = False, again: bool = False) -> str:
-        """Return the damaged part of an object, and set it aside; empty if it is intact.
+        """Return the damaged part of an object, and remove the object; empty if it is intact.
 
         Args:
             name: of the object: digest of a product, or SHA-256 of a figure.
@@ -353,16 +358,15 @@ class Store:
             again: also check files that this process has found intact and that are unchanged since.
 
         Raises:
-            StoreError: it cannot be set aside.
+            StoreError: it cannot be removed.
             OSError: the machine lacks memory or open files.
         """
         folder = self._object(name)
-
-        def damaged_part() -> str:
-            return self._damaged_part(folder, with_published=with_published, again=again)
-
+        damaged_part = partial(
+            self._damaged_part, folder, with_published=with_published, again=again
+        )
         part = damaged_part()
-        if part and not self._set_aside(folder, damaged_part):
+        if part and not self._remove_damaged(folder, damaged_part):
             # It is gone, or another run has replaced it, or a read failed only once.
             part = damaged_part()
         if part and part != WHOLE:
@@ -370,7 +374,7 @@ class Store:
         return part
 
     def damaged_objects(self, names: Iterable[str]) -> tuple[str, ...]:
-        """Check every byte of objects, set damaged ones aside and name them."""
+        """Check every byte of objects, remove damaged ones and name them."""
         wanted = dict.fromkeys(names)
         return tuple(name for name in wanted if self.damage(name, with_published=True, again=True))
 
@@ -379,20 +383,20 @@ class Store:
         for name in result.objects:
             folder = self.objects / name
             with contextlib.suppress(OSError):
-                for path in files_of(folder):
-                    self._checked.trust(folder / path)
+                self._sound.update(_identity(folder / path) for path in _files_of(folder))
 
     # Results ------------------------------------------------------------------------------------
 
     def result(self, key: str) -> CellResult | None:
         """Result of a key; None without one, or if objects of it are visibly incomplete."""
         result = self._read_result(key)
-        if result is None or any(missing_part(self.objects / name) for name in result.objects):
-            return None
-        return result
+        return None if result is None or self._missing_parts(result) else result
 
-    def take(self, key: str) -> TakenResult:
-        """Use the result of a key in a run: visibly damaged parts are set aside and named.
+    def take(self, key: str) -> tuple[CellResult | None, str]:
+        """Use the result of a key in a run; visibly damaged parts are removed.
+
+        Returns:
+            The result, None if there is none or an incomplete one; and its damaged parts.
 
         Raises:
             StoreError: the store cannot be read.
@@ -400,34 +404,29 @@ class Store:
         result = self._read_result(key)
         if result is None:
             path = self.results / f"{key}.json"
-            is_damaged = self._set_aside(path, lambda: self._read_result(key) is None)
-            return TakenResult(result=None, damage="result file" if is_damaged else "")
-        damage: dict[str, None] = {}
-        for name in sorted(result.objects):
-            folder = self.objects / name
-            if part := missing_part(folder):
-                self._set_aside(folder, partial(missing_part, folder))
-                damage[self._found_damaged.get(name, part)] = None
-        if damage:
-            return TakenResult(result=None, damage=", ".join(damage))
+            is_damaged = self._remove_damaged(path, lambda: self._read_result(key) is None)
+            return None, "result file" if is_damaged else ""
+        if missing := self._missing_parts(result):
+            for name in missing:
+                folder = self.objects / name
+                self._remove_damaged(folder, partial(self._missing_part, folder))
+            return None, ", ".join(dict.fromkeys(missing.values()))
         with contextlib.suppress(OSError):
             os.utime(self.results / f"{key}.json")
-        return TakenResult(result=result)
+        return result, ""
 
     def damage_of_result(self, key: str) -> str:
-        """Return why a result is unusable, and set it aside; empty if it is complete.
+        """Return why a result is unusable, and remove it; empty if it is complete.
 
         Raises:
-            StoreError: it cannot be set aside.
+            StoreError: it cannot be removed.
         """
         result = self._read_result(key)
         reason = "result file" if result is None else ""
-        for name in sorted(result.objects) if result is not None else ():
-            if part := missing_part(self.objects / name):
-                part = self._found_damaged.get(name, part)
-                reason = f"needs objects/{name[:12]}, which is damaged ({part})"
+        for name, part in self._missing_parts(result).items() if result is not None else ():
+            reason = f"needs objects/{name[:12]}, which is damaged ({part})"
         if reason:
-            self._set_aside(self.results / f"{key}.json", lambda: self.result(key) is None)
+            self._remove_damaged(self.results / f"{key}.json", lambda: self.result(key) is None)
         return reason
 
     def size_bytes(self, result: CellResult) -> int:
@@ -496,78 +495,153 @@ class Store:
             folder.mkdir(parents=True)
         return folder
 
-    def _finish_object(
-        self, aside: Path, product: Product, publisher: Publisher | None, digest: str
-    ) -> None:
-        if publisher is None:
-            return
-        files = aside / "files"
-        publish_into(files, product, publisher, digest)
-        sync_tree(files)
-
     def _place(self, aside: Path, final: Path) -> None:
         if os.path.lexists(final):
-            old = self._workspace / f"replaced-{uuid.uuid4().hex}"
             with contextlib.suppress(FileNotFoundError):
-                final.rename(old)
-            remove_tree(old)
+                self._remove(final)
         place_folder(aside, final)
+
+    def _remove(self, path: Path) -> None:
+        """Remove a file or folder at once: nobody finds a part of it."""
+        gone = self._workspace / f"removed-{uuid.uuid4().hex}"
+        gone.parent.mkdir(parents=True, exist_ok=True)
+        path.rename(gone)
+        remove_tree(gone)
 
     def _read_result(self, key: str) -> CellResult | None:
         path = self.results / f"{key}.json"
         try:
             result = result_from_json(path.read_text(encoding="utf-8"), path.name)
         except (OSError, UnicodeDecodeError) as error:
-            if isinstance(error, OSError) and error.errno in SHORTAGES:
+            if isinstance(error, OSError) and error.errno in _SHORTAGES:
                 raise
             return None
         return result if result.key == key and result.status == "ok" else None
 
     def _is_there(self, folder: Path, publisher_tag: str) -> bool:
         """Whether an equal object is stored, intact, and its published files are current."""
-        found = read_description(folder)
+        found = _read_description(folder)
         is_current = found is not None and found.publisher == publisher_tag
         return is_current and not self._damaged_part(folder, with_published=True, again=True)
 
+    def _missing_parts(self, result: CellResult) -> dict[str, str]:
+        """Return the damaged part of each object of a result that is visibly incomplete."""
+        parts = {name: self._missing_part(self.objects / name) for name in sorted(result.objects)}
+        return {name: self._found_damaged.get(name, part) for name, part in parts.items() if part}
+
+    def _missing_part(self, folder: Path) -> str:
+        """Part of an object that is missing or of another size; empty if none."""
+        return self._damaged_part(folder, with_published=True, by_size=True)
+
     def _damaged_part(
-        self, folder: Path, *, with_published: bool = False, again: bool = False
+        self,
+        folder: Path,
+        *,
+        with_published: bool = False,
+        again: bool = False,
+        by_size: bool = False,
     ) -> str:
-        files = files_of(folder)
+        files = _files_of(folder)
         if not files:
-            return missing_part(folder)
-        for name, expected in files.items():
-            if name.startswith(f"{PUBLISHED}/") and not with_published:
+            return _PARTS[DESCRIPTION] if folder.is_dir() else WHOLE
+        for name, (size_bytes, sha256) in files.items():
+            path = folder / name
+            if _is_published(name) and not with_published:
                 continue
-            if again:
-                self._checked.forget(folder / name)
-            if not self._checked.is_sound(folder / name, expected):
-                return part_name(name)
+            try:
+                identity = _identity(path)
+                if again:
+                    self._sound.discard(identity)
+                is_sound = identity in self._sound or (
+                    stat.S_ISREG(path.lstat().st_mode)
+                    and size_bytes in (identity[2], -1)
+                    and (by_size or file_sha256(path) == sha256)
+                )
+            except OSError as error:
+                if error.errno in _SHORTAGES and not by_size:
+                    raise
+                is_sound = False
+            if not is_sound:
+                return _part_name(name)
+            if not by_size:
+                self._sound.add(identity)
         return ""
 
-    def _set_aside(self, path: Path, is_damaged: Callable[[], object]) -> bool:
-        """Move a file or folder out of the way, if it exists and is still damaged.
+    def _remove_damaged(self, path: Path, is_damaged: Callable[[], object]) -> bool:
+        """Remove a file or folder, if it exists and is still damaged.
 
         Raises:
-            StoreError: it cannot be moved.
+            StoreError: it cannot be removed.
         """
-        if not os.path.lexists(path):
-            # Reading a store leaves no lock there, and creates no folder for it.
+        # Another run may have been faster, and may have stored an intact one.
+        if not os.path.lexists(path) or not is_damaged():
             return False
         try:
-            with writing_to(self.folder), taking_turns(self.folder / "damaged.lock"):
-                # Another run may have been faster, and may have stored an intact one.
-                if not os.path.lexists(path) or not is_damaged():
-                    return False
-                self.damaged.mkdir(exist_ok=True)
-                path.rename(self.damaged / f"{path.name}-{uuid.uuid4().hex[:8]}")
+            with writing_to(self.folder):
+                self._remove(path)
         except StoreError as error:
             if error.errno == errno.ENOENT:
                 return False
             raise StoreError(
                 f"{path.parent.name}/{path.name[:12]} in the store {self.folder} is damaged, but "
-                f"cannot be set aside: {error}"
+                f"cannot be removed: {error}"
             ) from error
         return True
+
+
+def _identity(path: Path) -> tuple[Path, int, int, int, int]:
+    found = path.lstat()
+    return (path, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns)
+
+
+def _is_published(name: str) -> bool:
+    return name.startswith(f"{PUBLISHED}/")
+
+
+def _part_name(path: str) -> str:
+    """Return the readable name of a file of an object."""
+    return _PARTS.get(path) or f"published file {path.removeprefix(f'{PUBLISHED}/')}"
+
+
+@cache
+def _codec() -> TypeAdapter[StoredProduct]:
+    return TypeAdapter(StoredProduct)
+
+
+def _describe(folder: Path, name: str, type_name: str, publisher: str) -> None:
+    """Write `object.json` for the files that lie in a folder."""
+    published = sorted(path for path in (folder / PUBLISHED).rglob("*") if path.is_file())
+    files = {
+        path.relative_to(folder).as_posix(): (path.stat().st_size, file_sha256(path))
+        for path in (folder / PRODUCT, *published)
+    }
+    said = StoredProduct(object=name, type=type_name, publisher=publisher, files=files)
+    text = json.dumps(_codec().dump_python(said, mode="json"))
+    write_whole(folder / DESCRIPTION, with_digest(text).encode())
+
+
+def _read_description(folder: Path) -> StoredProduct | None:
+    """Read `object.json`; None if it is damaged, belongs to another object, or is missing."""
+    try:
+        text = (folder / DESCRIPTION).read_text(encoding="utf-8")
+        found = _codec().validate_json(text, strict=True)
+    except OSError as error:
+        if error.errno in _SHORTAGES:
+            raise
+        return None
+    except ValueError:
+        return None
+    return found if is_checked(text) and found.object == folder.name else None
+
+
+def _files_of(folder: Path) -> Mapping[str, tuple[int, str]]:
+    """Return size, -1 if unknown, and SHA-256 of an object's files; empty if they are unknown."""
+    if folder.is_symlink():
+        return {}
+    if (folder / BLOB).exists():
+        return {BLOB: (-1, folder.name)}
+    found = _read_description(folder)
+    return found.files if found is not None else {}
 
 
 def stores_at(folder: str | Path) -> tuple[Store, ...]:
@@ -579,7 +653,12 @@ def publish_into(folder: Path, product: Product, publisher: Publisher, digest: s
     """Let a product publish its files in a new folder: plain files only."""
     folder.mkdir(parents=True)
     publisher(product, folder, digest)
-    require_plain_files(folder, f"a {product.type_name}")
+    for path in folder.rglob("*"):
+        problem = name_problem(path.name)
+        if path.is_symlink() or not (problem or path.is_file() or path.is_dir()):
+            problem = "is a link or a device"
+        if problem:
+            raise ProductError(f"a {product.type_name} publishes {path.name!r}, which {problem}")
 
 
 def digest_of(product: Product) -> str:

@@ -363,8 +363,9 @@ def _add_files(crate: _Crate, record: RunRecord, files: list[str]) -> None:
             facts["conformsTo"] = _ref(_REQUIREMENTS)
         if name == RECORD_FILE:
             facts["description"] = _how_to_read(record)
-        if file := published.get(name):
-            facts |= {"contentSize": str(file.size_bytes), "sha256": file.sha256}
+        if name in published:
+            facts["contentSize"] = str(published[name].size_bytes)
+            facts["sha256"] = published[name].sha256
         crate.add(name, "File", name=title, **facts)
     crate.add(_REQUIREMENTS, "WebPage", name="Requirements file format")
     for entry in record.inputs:

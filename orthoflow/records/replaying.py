@@ -2,47 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, Literal
-
-from orthoflow_provenance.document import (
-    RecordedCell,
-)
-
-from orthoflow.engine.keys import read_preimage, stated_versions
-from orthoflow.records.runs import Run
-
-if TYPE_CHECKING:
-    from orthoflow.catalog.catalog import Catalog
-    from orthoflow.engine.store import Store
-if TYPE_CHECKING:
-    from orthoflow.engine.store import Store
 import dataclasses
 import json
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Final, Literal
 
+from orthoflow_provenance.document import RecordedCell
 from pydantic import ValidationError
 
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.engine.environment import environment
-from orthoflow.engine.keys import input_digest
+from orthoflow.engine.keys import input_digest, read_preimage, stated_versions
 from orthoflow.engine.plan import RunOptions, RunPlan, plan_run
 from orthoflow.engine.store import Store
 from orthoflow.errors import PluginError, RecordError, WorkflowError
 from orthoflow.records.comparison import ComparedMetric, Pair, ProductDistance, compare_metrics
 from orthoflow.records.input_files import LaidOutInputs, find_inputs
+from orthoflow.records.runs import Run
 from orthoflow.records.verification import verify_run
 from orthoflow.workflow.expand import Cell, CellOutput, WorkflowInput
 from orthoflow.workflow.inputs import MissingInputsError
-from orthoflow.workflow.model import (
-    StepVariant,
-    Workflow,
-)
-from orthoflow.workflow.resolved import (
-    workflow_from_resolved,
-)
+from orthoflow.workflow.model import StepVariant, Workflow
+from orthoflow.workflow.resolved import workflow_from_resolved
 
 _ENVIRONMENT: tuple[str, ...] = ("python", "os", "cpu")
 
@@ -121,10 +104,7 @@ def plan_replay(
             tuple(f"{run.path} is not as it was written: {finding}" for finding in findings)
         )
     workflow = _workflow(run)
-    check = _MethodCheck(catalog=catalog)
-    for cell in run.record.cells:
-        if cell.status != "skipped":
-            check.add(cell)
+    missing, others = _method_problems(run, catalog)
     digests = store.file_digests()
     search = find_inputs(
         workflow,
@@ -135,12 +115,12 @@ def plan_replay(
         extracted=laid_out.extracted if laid_out else None,
         noted=[one.file_digests() for one in earlier],
     )
-    if check.others or search.is_changed:
-        raise UnreplayableRunError((*check.others, *check.missing, *search.problems))
+    if others or search.is_changed:
+        raise UnreplayableRunError((*others, *missing, *search.problems))
     if search.problems:
-        raise MissingInputsError((*check.missing, *search.problems))
-    if check.missing:
-        raise MissingMethodsError(tuple(check.missing))
+        raise MissingInputsError((*missing, *search.problems))
+    if missing:
+        raise MissingMethodsError(missing)
     if store.folder.is_dir():
         digests.save()
     paths = {
@@ -244,58 +224,49 @@ def _loose_ends(run: Run) -> Iterator[str]:
         given[cell.address] = set(cell.outputs)
 
 
-@dataclass(kw_only=True)
-class _MethodCheck:
-    """Compares the recorded methods with the installed ones; each problem is reported once."""
-
-    catalog: Catalog
-    missing: list[str] = field(default_factory=list)
-    others: list[str] = field(default_factory=list)
-
-    def add(self, cell: RecordedCell) -> None:
-        """Check the method of one more cell."""
-        if cell.seed is not None and cell.seed < 0:
-            _add(self.others, f"step {cell.address}: a seed is not negative, got {cell.seed}")
+def _method_problems(run: Run, catalog: Catalog) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Compare recorded methods with installed ones: what is missing, what differs; each once."""
+    missing: list[str] = []
+    others: list[str] = []
+    for cell in run.record.cells:
+        if cell.status == "skipped":
+            continue
+        origin = f"{cell.distribution} {cell.distribution_version}".strip()
         try:
-            cls = self.catalog.method(cell.method).load()
-            for product in cell.outputs.values():
-                found = self.catalog.product_class(product.type_name).encoding_version
-                # Older encodings are read; a newer one belongs to a later version of the type.
-                if found < product.encoding_version:
-                    _add(
-                        self.others,
-                        f"product type {product.type_name}: the installed one has encoding "
-                        f"version {found}, the record has {product.encoding_version}",
-                    )
+            others += _differences(cell, catalog, origin)
         except (WorkflowError, PluginError) as error:
-            origin = f"{cell.distribution} {cell.distribution_version}".strip()
             install = f"; install {origin}" if origin else ""
-            _add(self.missing, f"method {cell.method} of {origin}: {error}{install}")
-            return
-        if cls.result_version != cell.result_version:
-            _add(
-                self.others,
-                f"method {cell.method}: the installed one has result version "
-                f"{cls.result_version}, the record was made with {cell.result_version} "
-                f"({cell.distribution} {cell.distribution_version})",
-            )
-            return
-        try:
-            cls.Params.model_validate_json(json.dumps(dict(cell.params)), strict=True)
-        except ValidationError as error:
-            first = error.errors()[0]
-            name = ".".join(str(part) for part in first["loc"])
-            _add(
-                self.others,
-                f"step {cell.address}: the installed {cell.method} refuses the recorded "
-                f"parameter {name}: {first['msg']} (the record was made with "
-                f"{cell.distribution} {cell.distribution_version})",
-            )
+            missing.append(f"method {cell.method} of {origin}: {error}{install}")
+    return tuple(dict.fromkeys(missing)), tuple(dict.fromkeys(others))
 
 
-def _add(problems: list[str], problem: str) -> None:
-    if problem not in problems:
-        problems.append(problem)
+def _differences(cell: RecordedCell, catalog: Catalog, origin: str) -> Iterator[str]:
+    """Return in what the installed method differs from a recorded one, so far as it decides."""
+    if cell.seed is not None and cell.seed < 0:
+        yield f"step {cell.address}: a seed is not negative, got {cell.seed}"
+    cls = catalog.method(cell.method).load()
+    for product in cell.outputs.values():
+        found = catalog.product_class(product.type_name).encoding_version
+        if found < product.encoding_version:
+            yield (
+                f"product type {product.type_name}: the installed one has encoding version {found},"
+                f" the record has {product.encoding_version}"
+            )
+    if cls.result_version != cell.result_version:
+        yield (
+            f"method {cell.method}: the installed one has result version {cls.result_version}, the "
+            f"record was made with {cell.result_version} ({origin})"
+        )
+        return
+    try:
+        cls.Params.model_validate_json(json.dumps(dict(cell.params)), strict=True)
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(str(part) for part in first["loc"])
+        yield (
+            f"step {cell.address}: the installed {cell.method} refuses the recorded parameter "
+            f"{name}: {first['msg']} (the record was made with {origin})"
+        )
 
 
 def _cell(recorded: RecordedCell, workflow: Workflow) -> Cell:

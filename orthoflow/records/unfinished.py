@@ -35,11 +35,9 @@ from orthoflow_provenance.record import write_record
 from orthoflow.engine.durability import write_whole, writing_to
 from orthoflow.engine.journal import (
     RECORD_FILE,
-    CellEnded,
-    RunBegan,
     readable_lines,
 )
-from orthoflow.errors import ArgumentError, StoreError
+from orthoflow.errors import ArgumentError, DamageError, StoreError
 from orthoflow.records.published import publish_products
 from orthoflow.records.runs import Run, find_record, read_run
 from orthoflow.records.verification import published_state
@@ -124,11 +122,11 @@ def open_unfinished(folder: Path) -> Run:
             f"{error}; repeat the run with -o {folder} to finish it"
         ) from error
     lines = readable_lines(folder)
-    ended = [line for line in lines if isinstance(line, CellEnded)]
+    ended = [line for line in lines if line.event == "finished"]
     found = {line.address: (line, store.result(line.key)) for line in ended if line.key}
     results = {address: result for address, (_, result) in found.items() if result is not None}
     cached = {address for address, (line, _) in found.items() if line.cached}
-    began = next((line for line in lines if isinstance(line, RunBegan)), None)
+    began = next((line for line in lines if line.event == "run"), None)
     record = dataclasses.replace(
         record,
         # A resumed run keeps its first id.
@@ -136,14 +134,18 @@ def open_unfinished(folder: Path) -> Run:
         started=began.time if began else record.started,
         ended=lines[-1].time if lines else record.ended,
         status="failed" if any(one.status == "failed" for one in results.values()) else "ok",
-        environments=_environments(results),
+        environments=recorded_environments(results),
         cells=tuple(
-            _Filled(
-                cell=cell,
+            recorded_cell(
+                cell,
+                results[cell.address],
+                store,
                 sources=sources.get(cell.address, {}),
                 embedded=embedded,
-                is_cached=cell.address in cached,
-            ).with_result(results.get(cell.address), store)
+                cached_from=results[cell.address].run_id if cell.address in cached else "",
+            )
+            if cell.address in results
+            else cell
             for cell in record.cells
         ),
     )
@@ -166,43 +168,57 @@ def open_unfinished(folder: Path) -> Run:
     )
 
 
-def _environments(results: Mapping[str, CellResult]) -> tuple[RecordedEnvironment, ...]:
+def recorded_environments(
+    results: Mapping[str, CellResult],
+) -> tuple[RecordedEnvironment, ...]:
+    """Return the environments of results, each once."""
     given = (result.environment for result in results.values())
     return tuple({one.id: one for one in given if one is not None}.values())
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Filled:
-    """A cell of the outline, and the data to record with its result."""
+def recorded_cell(
+    cell: RecordedCell,
+    result: CellResult,
+    store: Store,
+    *,
+    sources: Mapping[str, str],
+    embedded: Collection[str],
+    cached_from: str,
+) -> RecordedCell:
+    """Return a cell as recorded with its result.
 
-    cell: RecordedCell
-    sources: Mapping[str, str]
-    embedded: Collection[str]
-    is_cached: bool
+    Args:
+        cell: the cell without a result.
+        result: what the store keeps of it.
+        store: has the figures.
+        sources: source of each input port.
+        embedded: product types whose arrays go into the record.
+        cached_from: the earlier run that computed it, if any.
 
-    def with_result(self, result: CellResult | None, store: Store) -> RecordedCell:
-        """Return the cell as recorded with a result; unchanged without one."""
-        if result is None:
-            return self.cell
-        return dataclasses.replace(
-            self.cell,
-            **shared_fields(result, CellOutcome),
-            environment=result.environment.id if result.environment else "",
-            cached_from=result.run_id if self.is_cached else "",
-            figures=tuple(
-                RecordedFigure(data=store.blob(figure.sha256), **shared_fields(figure, Figure))
-                for figure in result.figures
-            ),
-            inputs={
-                port: RecordedProduct(
-                    source=self.sources.get(port, ""), **shared_fields(ref, ProductRef)
-                )
-                for port, ref in result.inputs.items()
-            },
-            outputs={
-                port: RecordedProduct(
-                    embedded=ref.type_name in self.embedded, **shared_fields(ref, ProductRef)
-                )
-                for port, ref in result.outputs.items()
-            },
-        )
+    Raises:
+        DamageError: a figure is missing or damaged.
+    """
+    figures = []
+    for figure in result.figures:
+        try:
+            data = store.blob(figure.sha256)
+        except DamageError as error:
+            raise DamageError(f"the figure {figure.name} is damaged") from error
+        figures.append(RecordedFigure(data=data, **shared_fields(figure, Figure)))
+    return dataclasses.replace(
+        cell,
+        **shared_fields(result, CellOutcome),
+        environment=result.environment.id if result.environment else "",
+        cached_from=cached_from,
+        figures=tuple(figures),
+        inputs={
+            port: RecordedProduct(source=sources.get(port, ""), **shared_fields(ref, ProductRef))
+            for port, ref in result.inputs.items()
+        },
+        outputs={
+            port: RecordedProduct(
+                embedded=ref.type_name in embedded, **shared_fields(ref, ProductRef)
+            )
+            for port, ref in result.outputs.items()
+        },
+    )

@@ -11,17 +11,11 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Final
 
 from orthoflow_provenance.document import (
-    CellOutcome,
-    Figure,
     InputFileError,
     MethodIdentity,
-    ProductRef,
     RecordedCell,
-    RecordedEnvironment,
-    RecordedFigure,
     RecordedFile,
     RecordedInput,
-    RecordedProduct,
     RecordFormatError,
     RunRecord,
     shared_fields,
@@ -37,7 +31,12 @@ from orthoflow.foreign_text import first_few
 from orthoflow.records.input_files import ChangedInputsError, embedded_inputs, find_inputs
 from orthoflow.records.published import publish_products
 from orthoflow.records.runs import Run, read_run
-from orthoflow.records.unfinished import OUTLINE_FILE, write_outline
+from orthoflow.records.unfinished import (
+    OUTLINE_FILE,
+    recorded_cell,
+    recorded_environments,
+    write_outline,
+)
 from orthoflow.version import __version__
 from orthoflow.workflow.inputs import MissingInputsError
 from orthoflow.workflow.resolved import (
@@ -47,7 +46,6 @@ from orthoflow.workflow.resolved import (
 
 if TYPE_CHECKING:
     from orthoflow.engine.plan import RunPlan
-    from orthoflow.engine.results import FigureRef
     from orthoflow.engine.scheduler import RunOutcome
     from orthoflow.engine.store import Store
     from orthoflow.workflow.expand import Cell
@@ -238,14 +236,19 @@ def begin_run(
         build_record(_with_missing(outcome, plan), plan, workflow, store),
         run_folder,
         store,
-        sources={
-            item.cell.address: {port: str(source) for port, source in item.cell.inputs.items()}
-            for item in plan.cells
-        },
-        embedded=[
-            name for name, spec in plan.products.items() if resolve_name(spec.target).embedded
-        ],
+        sources={item.cell.address: _sources(item.cell) for item in plan.cells},
+        embedded=_embedded_types(plan),
     )
+
+
+def _sources(cell: Cell) -> dict[str, str]:
+    return {port: str(source) for port, source in cell.inputs.items()}
+
+
+def _embedded_types(plan: RunPlan, *, embed: bool = False) -> frozenset[str]:
+    """Return the product types whose arrays go into a record."""
+    specs = plan.products.items()
+    return frozenset(name for name, one in specs if embed or resolve_name(one.target).embedded)
 
 
 def _with_missing(outcome: RunOutcome, plan: RunPlan) -> RunOutcome:
@@ -325,11 +328,26 @@ def build_record(
     overrides = (*workflow.overrides, *plan.options.selection.options)
     workflow = dataclasses.replace(workflow, overrides=overrides)
     results = outcome.results
-    recorder = _CellRecorder(outcome=outcome, plan=plan, store=store, embed=embed)
+    embedded = _embedded_types(plan, embed=embed)
     cells = tuple(
-        recorder.record(item.cell, results[item.cell.address])
-        for item in plan.cells
-        if item.cell.address in results
+        recorded_cell(
+            RecordedCell(
+                status="skipped",
+                address=cell.address,
+                step=cell.step,
+                assignment=dict(cell.assignment),
+                repeat=cell.repeat,
+                params=dict(cell.params),
+                params_set=dict(cell.params_set),
+            ),
+            results[cell.address],
+            store,
+            sources=_sources(cell),
+            embedded=embedded,
+            cached_from=outcome.cached.get(cell.address, ""),
+        )
+        for cell in (item.cell for item in plan.cells)
+        if cell.address in results
     )
     return RunRecord(
         run_id=outcome.run_id,
@@ -343,7 +361,7 @@ def build_record(
         workflow_resolved=resolved_json(workflow),
         overrides=overrides,
         inputs=_recorded_inputs(plan, embed=embed),
-        environments=_recorded_environments(results),
+        environments=recorded_environments(results),
         cells=cells,
     )
 
@@ -397,55 +415,6 @@ def write_embedded(run: Run, path: Path, store: Store, inputs: Sequence[str] = (
     return read_run(path)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _CellRecorder:
-    """Turns cells with their results into recorded cells."""
-
-    outcome: RunOutcome
-    plan: RunPlan
-    store: Store
-    embed: bool
-
-    def record(self, cell: Cell, result: CellResult) -> RecordedCell:
-        """Return the recorded form of one cell."""
-        return RecordedCell(
-            **shared_fields(result, CellOutcome),
-            address=cell.address,
-            step=cell.step,
-            assignment=dict(cell.assignment),
-            repeat=cell.repeat,
-            params=dict(cell.params),
-            params_set=dict(cell.params_set),
-            environment=result.environment.id if result.environment else "",
-            cached_from=self.outcome.cached.get(cell.address, ""),
-            figures=tuple(_recorded_figure(figure, self.store) for figure in result.figures),
-            inputs={
-                port: RecordedProduct(
-                    source=str(cell.inputs.get(port, "")), **shared_fields(ref, ProductRef)
-                )
-                for port, ref in result.inputs.items()
-            },
-            outputs={
-                port: RecordedProduct(
-                    embedded=self._is_embedded(ref), **shared_fields(ref, ProductRef)
-                )
-                for port, ref in result.outputs.items()
-            },
-        )
-
-    def _is_embedded(self, ref: ProductRef) -> bool:
-        target = self.plan.products[ref.type_name].target
-        return self.embed or bool(resolve_name(target).embedded)
-
-
-def _recorded_figure(figure: FigureRef, store: Store) -> RecordedFigure:
-    try:
-        data = store.blob(figure.sha256)
-    except DamageError as error:
-        raise DamageError(f"the figure {figure.name} is damaged") from error
-    return RecordedFigure(data=data, **shared_fields(figure, Figure))
-
-
 def _recorded_inputs(plan: RunPlan, *, embed: bool) -> tuple[RecordedInput, ...]:
     return tuple(
         RecordedInput(
@@ -458,11 +427,6 @@ def _recorded_inputs(plan: RunPlan, *, embed: bool) -> tuple[RecordedInput, ...]
         )
         for name, given in plan.inputs.items()
     )
-
-
-def _recorded_environments(results: Mapping[str, CellResult]) -> tuple[RecordedEnvironment, ...]:
-    given = (result.environment for result in results.values())
-    return tuple({found.id: found for found in given if found is not None}.values())
 
 
 def _published(outcome: RunOutcome, store: Store) -> dict[str, dict[str, Mapping[Path, str]]]:

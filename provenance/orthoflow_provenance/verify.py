@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Iterator, Mapping, Set
-from dataclasses import dataclass
+from collections.abc import Container, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import h5py
 import numpy as np
@@ -19,8 +18,9 @@ from orthoflow_provenance.document import (
     RUN_FORMAT,
     ForeignFormatError,
     LockedFileError,
+    PublishedFile,
     RecordedCell,
-    RecordedInput,
+    RecordedFile,
     RecordFormatError,
     RunRecord,
     cost_metrics,
@@ -55,11 +55,14 @@ from orthoflow_provenance.record import (
 )
 
 _LETTERS_MOST: Final = 60
+_OF_RESULTS: Final = (
+    *("key", "key_preimage", "started", "ended", "environment", "determinism"),
+    *("distribution", "distribution_version"),
+)
 _PRODUCT_ATTRIBUTES: Final = frozenset({"type", "encoding_version", "digest", "mapped"})
 
 
-@dataclass(frozen=True, kw_only=True)
-class Finding:
+class Finding(NamedTuple):
     """Something in a record that is not as it should be.
 
     Attributes:
@@ -89,23 +92,15 @@ def verify_record(path: Path, *, with_arrays: bool = True) -> tuple[Finding, ...
     try:
         with safe_open(path) as file:
             check_format(file, RUN_FORMAT)
-            return tuple(_findings(file, path, with_arrays=with_arrays))
-    except LockedFileError as error:
-        return (Finding(code="locked", place="/", problem=str(error)),)
-    except ForeignFormatError as error:
-        return (Finding(code="foreign", place="/", problem=str(error)),)
+            found = list(_document_findings(file, with_arrays=with_arrays))
+            # Last: what was changed has been named where it can be.
+            found += _seal_findings(file, path) if with_arrays else ()
+            return tuple(found)
     except RecordFormatError as error:
-        return (Finding(code="damaged", place="/", problem=str(error)),)
+        codes = {LockedFileError: "locked", ForeignFormatError: "foreign"}
+        return (Finding(codes.get(type(error), "damaged"), "/", str(error)),)
     except HDF5_ERRORS as error:
-        problem = f"{path.name} cannot be read: {error}"
-        return (Finding(code="damaged", place="/", problem=problem),)
-
-
-def _findings(file: h5py.File, path: Path, *, with_arrays: bool) -> Iterator[Finding]:
-    yield from _document_findings(file, with_arrays=with_arrays)
-    # Last: what was changed has been named where it can be.
-    if with_arrays:
-        yield from _file_findings(file, path)
+        return (Finding("damaged", "/", f"{path.name} cannot be read: {error}"),)
 
 
 def _document_findings(file: h5py.File, *, with_arrays: bool) -> Iterator[Finding]:
@@ -117,42 +112,39 @@ def _document_findings(file: h5py.File, *, with_arrays: bool) -> Iterator[Findin
         document: Any = parse_json(text, f"/{DOCUMENT}")
         contents = _contents(document)
     except RecordFormatError as error:
-        yield Finding(code="document", place=f"/{DOCUMENT}", problem=str(error))
+        yield Finding("document", f"/{DOCUMENT}", str(error))
         return
     yield from _object_findings(file, record, nodes, contents)
-    yield from _content_findings(file, record, contents, with_arrays=with_arrays)
+    yield from _content_findings(file, contents, with_arrays=with_arrays)
+    if with_arrays:
+        yield from _product_findings(file, record)
     yield from _run_findings(record)
-    for entry in record.inputs:
-        yield from _input_findings(entry)
-    yield from _published_findings(record)
-    environments = {entry.id for entry in record.environments}
     outputs = {
         f"{cell.address}.{port}": product.digest
         for cell in record.cells
         for port, product in cell.outputs.items()
     }
-    yield from _name_findings(record)
     for cell in record.cells:
-        yield from _cell_findings(cell, environments)
+        yield from _cell_findings(cell, record)
         yield from _reference_findings(cell, outputs)
 
 
-def _file_findings(file: h5py.File, path: Path) -> Iterator[Finding]:
+def _seal_findings(file: h5py.File, path: Path) -> Iterator[Finding]:
     """Check the bytes of the file."""
     n_bytes = bytes_behind_end(path)
     if n_bytes:
         how = f"{n_bytes} bytes stand behind" if n_bytes > 0 else f"{-n_bytes} bytes are missing at"
-        yield Finding(code="appended", place="/", problem=f"{how} the end that the file states")
+        yield Finding("appended", "/", f"{how} the end that the file states")
     try:
         seal = read_text(file, SEAL)
         offset = dataset_of(file, SEAL).id.get_offset()
     except RecordFormatError as error:
-        yield Finding(code="seal", place=f"/{SEAL}", problem=f"the seal is broken: {error}")
+        yield Finding("seal", f"/{SEAL}", f"the seal is broken: {error}")
         return
     found = "" if offset is None or len(seal) != 64 else file_sha256(path, offset)
     if found != seal:
         problem = f"the seal is {seal:.80}, the bytes of the file have the SHA-256 {found}"
-        yield Finding(code="seal", place=f"/{SEAL}", problem=f"{problem}: the file was changed")
+        yield Finding("seal", f"/{SEAL}", f"{problem}: the file was changed")
 
 
 def _object_findings(
@@ -160,21 +152,18 @@ def _object_findings(
 ) -> Iterator[Finding]:
     """Compare every object that is not named by digest with what the document says."""
     places = {product_path(digest).rpartition("/")[2] for digest in _embedded(record)}
-    missing = set(nodes) | {f"/{SEAL}", f"/{PRODUCTS}", f"/{FILES}"}
+    known = set(nodes) | {f"/{SEAL}", f"/{PRODUCTS}", f"/{FILES}"}
+    missing = set(known)
     for path, item in _objects(file):
         missing.discard(path)
         _, top, *below = path.split("/")
-        is_known = path in nodes or path in {f"/{SEAL}", f"/{PRODUCTS}", f"/{FILES}"}
+        is_known = path in known
         if top == PRODUCTS and below:
-            is_known = below[0] in places and (
-                len(below) == 1 or below[1] in {"metadata", "arrays"}
-            )
+            is_known = below[0] in places and below[1:2] in ([], ["metadata"], ["arrays"])
         elif top == FILES and below:
             is_known = below[0] in contents
         if not is_known:
-            yield Finding(
-                code="object", place=path, problem="is in the file, but not in the document"
-            )
+            yield Finding("object", path, "is in the file, but not in the document")
             continue
         node = nodes.get(path, Node(attributes={}))
         is_product = top == PRODUCTS and len(below) == 1
@@ -185,9 +174,9 @@ def _object_findings(
         except RecordFormatError as error:
             problem = str(error)
         if problem:
-            yield Finding(code="object", place=path, problem=problem)
+            yield Finding("object", path, problem)
     for path in sorted(missing):
-        yield Finding(code="object", place=path, problem="is missing in the file")
+        yield Finding("object", path, "is missing in the file")
 
 
 def _attribute_problems(
@@ -265,93 +254,63 @@ def _contents(document: Mapping[str, Any]) -> dict[str, tuple[str, int | None]]:
 
 
 def _content_findings(
-    file: h5py.File,
-    record: RunRecord,
-    contents: Mapping[str, tuple[str, int | None]],
-    *,
-    with_arrays: bool,
+    file: h5py.File, contents: Mapping[str, tuple[str, int | None]], *, with_arrays: bool
 ) -> Iterator[Finding]:
-    """Check what the document names by digest."""
+    """Check the files that the document names by digest; large ones with the arrays."""
     for sha256, (name, size_bytes) in contents.items():
-        place = f"/{FILES}/{sha256}"
+        problem = ""
         try:
             dataset = dataset_of(open_group(file, FILES), sha256)
-            if (
-                dataset.dtype != np.uint8
-                or dataset.ndim != 1
-                or (size_bytes is not None and dataset.size != size_bytes)
-            ):
+            is_bytes = dataset.dtype == np.uint8 and dataset.ndim == 1
+            if not is_bytes or size_bytes not in (None, dataset.size):
                 problem = f"does not hold the {size_bytes} bytes of {name}"
-            elif with_arrays or size_bytes is None:
-                found = dataset_sha256(dataset)
-                problem = "" if found == sha256 else f"does not hold the bytes of {name}"
-            else:
-                problem = ""
+            elif (with_arrays or size_bytes is None) and dataset_sha256(dataset) != sha256:
+                problem = f"does not hold the bytes of {name}"
         except RecordFormatError as error:
             problem = str(error)
         if problem:
-            yield Finding(code="file", place=place, problem=problem)
-    for digest in _embedded(record) if with_arrays else ():
+            yield Finding("file", f"/{FILES}/{sha256}", problem)
+
+
+def _product_findings(file: h5py.File, record: RunRecord) -> Iterator[Finding]:
+    for digest in _embedded(record):
         place = product_path(digest)
         try:
             payload = read_payload(open_group(file, place), map_arrays=True)
             found = payload_digest(payload)
             if found != digest or payload.digest != digest:
                 problem = f"has the digest {found}, the record says {digest}"
-                yield Finding(code="product", place=place, problem=problem)
+                yield Finding("product", place, problem)
         except RecordFormatError as error:
-            yield Finding(code="product", place=place, problem=str(error))
+            yield Finding("product", place, str(error))
 
 
 def _run_findings(record: RunRecord) -> Iterator[Finding]:
+    """Check fields of the run, its inputs and its published files, and what files are named by."""
     for name in ("run_id", "name", "created_by", "started", "ended", "workflow_source"):
         if not getattr(record, name):
-            yield Finding(code="field", place="/", problem=f"{name} must not be empty")
-    has_failed = any(cell.status == "failed" for cell in record.cells)
-    if has_failed != (record.status == "failed"):
+            yield Finding("field", "/", f"{name} must not be empty")
+    if any(cell.status == "failed" for cell in record.cells) != (record.status == "failed"):
         problem = f"the run is {record.status}, which does not fit the status of its cells"
-        yield Finding(code="field", place="/@status", problem=problem)
+        yield Finding("field", "/@status", problem)
     try:
         parse_json(record.workflow_resolved, "workflow_resolved")
     except RecordFormatError as error:
-        yield Finding(code="field", place=f"/{DOCUMENT}", problem=str(error))
-
-
-def _input_findings(entry: RecordedInput) -> Iterator[Finding]:
-    place = f"/inputs/{entry.name}"
-    for file in entry.files:
-        if problem := name_problem(file.name):
-            yield Finding(
-                code="name", place=place, problem=f"the name of the file {file.name!r} {problem}"
-            )
+        yield Finding("field", f"/{DOCUMENT}", str(error))
+    files: list[tuple[str, str, str, RecordedFile | PublishedFile]] = [
+        (f"/inputs/{entry.name}", file.name, name_problem(file.name), file)
+        for entry in record.inputs
+        for file in entry.files
+    ]
+    files += [("/published", one.path, path_problem(one.path), one) for one in record.published]
+    for place, name, problem, file in files:
+        if problem:
+            yield Finding("name", place, f"{name!r} {problem}, so no file can be named so")
         if not (is_sha256(file.sha256) and file.size_bytes >= 0):
-            yield Finding(
-                code="field",
-                place=place,
-                problem=f"the file {file.name!r} needs a size and a SHA-256",
-            )
-
-
-def _published_findings(record: RunRecord) -> Iterator[Finding]:
-    place = "/published"
-    for file in record.published:
-        if problem := path_problem(file.path):
-            yield Finding(
-                code="name",
-                place=place,
-                problem=f"{file.path!r} {problem}: it must be a path from the folder of the record",
-            )
-        if not (is_sha256(file.sha256) and file.size_bytes >= 0):
-            yield Finding(
-                code="field",
-                place=place,
-                problem=f"the file {file.path!r} needs a size and a SHA-256",
-            )
-    paths = [file.path for file in record.published]
-    if twice := colliding(paths):
-        yield Finding(
-            code="name", place=place, problem=f"{twice!r} is named twice, as some systems see it"
-        )
+            yield Finding("field", place, f"the file {name!r} needs a size and a SHA-256")
+    if twice := colliding(file.path for file in record.published):
+        yield Finding("name", "/published", f"{twice!r} is named twice, as some systems see it")
+    yield from _name_findings(record)
 
 
 def _name_findings(record: RunRecord) -> Iterator[Finding]:
@@ -363,91 +322,55 @@ def _name_findings(record: RunRecord) -> Iterator[Finding]:
         # Names of files cut the longest addresses.
         named += [(place, cell.address[:_LETTERS_MOST]), (f"{place}@step", cell.step)]
         named += [(f"{place}/outputs/{port}", port) for port in cell.outputs]
-        yield from _figure_findings(cell)
+        for figure in cell.figures:
+            suffix = FIGURE_SUFFIXES.get(figure.media_type, "")
+            if not suffix:
+                problem = f"the figure {figure.name!r} has the media type {figure.media_type!r}"
+                problem += ", not that of a PNG, WebP or SVG file"
+                yield Finding("name", f"{place}/figures", problem)
+            if problem := name_problem(figure.name) or name_problem(f"{figure.name}{suffix}"):
+                problem = f"the name of the figure {figure.name!r} {problem}"
+                yield Finding("name", f"{place}/figures", problem)
+        if twice := colliding(figure.name for figure in cell.figures):
+            problem = f"two figures are named {twice!r}, as some systems see it"
+            yield Finding("field", f"{place}/figures", problem)
     for place, name in named:
         # What must not be empty is said elsewhere.
         if name and (problem := name_problem(name)):
-            yield Finding(
-                code="name", place=place, problem=f"{name!r} {problem}, so no file can be named so"
-            )
+            yield Finding("name", place, f"{name!r} {problem}, so no file can be named so")
 
 
-def _figure_findings(cell: RecordedCell) -> Iterator[Finding]:
-    place = f"/{CELLS}/{cell.address}/figures"
-    for figure in cell.figures:
-        suffix = FIGURE_SUFFIXES.get(figure.media_type, "")
-        if not suffix:
-            problem = f"the figure {figure.name!r} has the media type {figure.media_type!r}"
-            yield Finding(
-                code="name", place=place, problem=f"{problem}, not that of a PNG, WebP or SVG file"
-            )
-        if problem := name_problem(figure.name) or name_problem(f"{figure.name}{suffix}"):
-            yield Finding(
-                code="name",
-                place=place,
-                problem=f"the name of the figure {figure.name!r} {problem}",
-            )
-    if twice := colliding(figure.name for figure in cell.figures):
-        problem = f"two figures are named {twice!r}, as some systems see it"
-        yield Finding(code="field", place=place, problem=problem)
-
-
-def _cell_findings(cell: RecordedCell, environments: Set[str]) -> Iterator[Finding]:
+def _cell_findings(cell: RecordedCell, record: RunRecord) -> Iterator[Finding]:
     place = f"/{CELLS}/{cell.address}"
-    required = ["step", "method"]
-    if cell.status == "ok":
-        required += ["key", "key_preimage", "started", "ended", "environment", "determinism"]
-        required += ["distribution", "distribution_version"]
-    else:
-        required.append("error_message")
+    required = ["step", "method", *(["error_message"] if cell.status != "ok" else _OF_RESULTS)]
     for name in required:
         if not getattr(cell, name):
-            yield Finding(
-                code="field", place=place, problem=f"{name} must not be empty ({cell.status} cell)"
-            )
+            yield Finding("field", place, f"{name} must not be empty ({cell.status} cell)")
     if cell.key and cell.key != sha256_text(cell.key_preimage):
-        yield Finding(
-            code="key", place=f"{place}@key", problem="the key is not the SHA-256 of its preimage"
-        )
-    if cell.environment and cell.environment not in environments:
-        yield Finding(
-            code="reference",
-            place=f"{place}@environment",
-            problem=f"there is no environment {cell.environment}",
-        )
+        yield Finding("key", f"{place}@key", "the key is not the SHA-256 of its preimage")
+    if cell.environment not in {"", *(entry.id for entry in record.environments)}:
+        problem = f"there is no environment {cell.environment}"
+        yield Finding("reference", f"{place}@environment", problem)
     for metric in cell.metrics:
         if not math.isfinite(metric.value) or not metric.name or not metric.unit:
-            yield Finding(
-                code="field",
-                place=f"{place}/metrics",
-                problem=f"the metric {metric.name!r} must be a finite number with a unit, got "
-                f"{metric.value} {metric.unit!r}",
-            )
+            problem = f"the metric {metric.name!r} must be a finite number with a unit, got "
+            yield Finding("field", f"{place}/metrics", f"{problem}{metric.value} {metric.unit!r}")
     for cost in cost_metrics(cell):
         if not math.isfinite(cost.value) or cost.value < 0:
-            problem = f"must not be negative, got {cost.value}"
-            yield Finding(code="field", place=f"{place}@{cost.name}", problem=problem)
+            yield Finding(
+                "field", f"{place}@{cost.name}", f"must not be negative, got {cost.value}"
+            )
 
 
 def _reference_findings(cell: RecordedCell, outputs: Mapping[str, str]) -> Iterator[Finding]:
     """Check that digests are digests and that an input is what its source gave."""
-    for folder, products in (
-        ("inputs", cell.inputs),
-        ("outputs", cell.outputs),
-    ):
+    for folder, products in (("inputs", cell.inputs), ("outputs", cell.outputs)):
         for port, product in products.items():
-            place = f"/{CELLS}/{cell.address}/{folder}/{port}"
-            scheme, _, digits = product.digest.partition(":")
+            place, digest = f"/{CELLS}/{cell.address}/{folder}/{port}", product.digest
+            scheme, _, digits = digest.partition(":")
             if scheme != "sha256" or not is_sha256(digits):
-                yield Finding(
-                    code="reference",
-                    place=place,
-                    problem=f"{product.digest!r} is not a SHA-256 digest",
-                )
-            if product.source and outputs.get(product.source, product.digest) != product.digest:
-                yield Finding(
-                    code="reference",
-                    place=place,
-                    problem=f"has the digest {product.digest}, but its source {product.source} "
-                    f"gave {outputs[product.source]}",
-                )
+                yield Finding("reference", place, f"{digest!r} is not a SHA-256 digest")
+            given = outputs.get(product.source, digest) if product.source else digest
+            if given != digest:
+                problem = f"has the digest {digest}, but its source {product.source} gave {given}"
+                yield Finding("reference", place, problem)

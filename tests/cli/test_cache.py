@@ -67,7 +67,7 @@ def test_a_run_says_what_it_found_damaged(say: Said, tmp_path: Path) -> None:
     assert (code, "damaged" in text) == (0, False)
 
 
-def test_verify_names_what_is_damaged_and_sets_it_aside(say: Said, tmp_path: Path) -> None:
+def test_verify_names_what_is_damaged_and_removes_it(say: Said, tmp_path: Path) -> None:
     assert say("cache", "verify") == (
         0,
         "0 results and 0 objects in .orthoflow are as they were stored\n",
@@ -88,11 +88,8 @@ def test_verify_names_what_is_damaged_and_sets_it_aside(say: Said, tmp_path: Pat
         f"needs objects/{name[:12]}, which is damaged (figure)",
     ]
     assert found["damaged"][0]["name"] == f"objects/{name}"
-    assert found["aside"]["count"] == 2
-    code, text = say("cache", "verify")
-    assert (code, "set aside because damaged: 2, " in text) == (0, True)
-    assert "set aside because damaged: 2, " in say("cache", "list")[1]
-    assert json.loads(say("cache", "gc", "--json")[1])["n_damaged"] == 2
+    assert not figure.exists()
+    assert say("cache", "verify")[0] == 0
     assert say(*RUN, "again")[0] == 0
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from orthoflow.engine.cleaning import check_store, collect_garbage
+from orthoflow.engine.cleaning import check_store
 from orthoflow.engine.journal import CellStarted, RunEvent
 from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.errors import StoreError
@@ -151,19 +151,17 @@ def test_what_is_computed_again_and_differs_takes_what_follows_along(
     assert given.digest == digests(again)["means.numbers"]
 
 
-def test_what_lies_aside_is_counted_and_is_garbage(world: World) -> None:
+def test_what_is_damaged_is_found_once_and_removed(world: World) -> None:
     first = run(world, STEPS)
     flip(product_file(world, first, "noise"))
     found = check_store(world.store)
-    assert (found.n_results, found.n_objects, found.aside.count) == (2, 2, 2)
-    assert found.aside.size_bytes > 1000
+    assert (found.n_results, found.n_objects, len(found.damaged)) == (2, 2, 2)
+    assert not product_file(world, first, "noise").exists()
     assert check_store(world.store).damaged == ()
-    assert collect_garbage(world.store, dry_run=True).n_damaged == 2
-    assert collect_garbage(world.store).n_damaged == 2
-    assert check_store(world.store).aside.count == 0
+    assert computed(run(world, STEPS, into="again")) == {"noise"}
 
 
-def test_a_result_file_that_is_damaged_is_set_aside(world: World) -> None:
+def test_a_result_file_that_is_damaged_is_made_again(world: World) -> None:
     first = run(world, STEPS)
     path = world.store.results / f"{first.results['noise'].key}.json"
     text = path.read_text()
@@ -191,5 +189,5 @@ def test_a_store_that_cannot_be_written_still_tells_good_from_damaged(
     monkeypatch.setattr("pathlib.Path.rename", refuse)
     store = world.store
     assert store.get_product(digests(first)["means.numbers"], Numbers).values.size == 8
-    with pytest.raises(StoreError, match=r"objects/.* is damaged, but cannot be set aside: .*read"):
+    with pytest.raises(StoreError, match=r"objects/.* is damaged, but cannot be removed: .*read"):
         store.get_product(digests(first)["scan.scan"], Scan)

@@ -11,26 +11,19 @@ import pytest
 from orthoflow.engine.journal import (
     JOURNAL,
     RECORD_FILE,
-    CellEnded,
     Journal,
-    RunWent,
     is_running,
     kept_from_others,
     require_run_folder,
 )
 from orthoflow.errors import ArgumentError, StoreError
 
+Facts = dict[str, str | bool]
 
-def ended(address: str, status: str = "ok", *, cached: bool = False, error: str = "") -> CellEnded:
-    return CellEnded(
-        time="2026-01-02T03:04:05Z",
-        address=address,
-        key=f"key of {address}",
-        status=status,  # type: ignore[arg-type]
-        cached=cached,
-        error="",
-        error_type=error,
-    )
+
+def ended(address: str, status: str = "ok", *, error: str = "") -> Facts:
+    facts: Facts = {"address": address, "key": f"key of {address}", "status": status}
+    return {**facts, "cached": False, "error": "", "error_type": error}
 
 
 def lines(folder: Path) -> list[dict[str, object]]:
@@ -71,13 +64,13 @@ def test_nobody_goes_on_with_a_run_while_what_came_out_is_written(tmp_path: Path
 
 def test_a_line_that_was_cut_off_is_removed_and_a_damaged_one_is_told(tmp_path: Path) -> None:
     with Journal(tmp_path, "hall") as journal:
-        journal.write(ended("a"))
+        journal.write("finished", **ended("a"))
     path = tmp_path / JOURNAL
     whole = path.read_bytes()
     path.write_bytes(whole + b'{"event": "finish')
     with Journal(tmp_path, "hall") as journal:
         assert journal.finished_keys == {"key of a"}
-        journal.write(ended("b"))
+        journal.write("finished", **ended("b"))
     assert path.read_bytes().startswith(whole)
     assert [line["event"] for line in lines(tmp_path)] == [
         *("run", "finished", "resumed", "finished"),
@@ -102,11 +95,12 @@ def test_a_line_that_was_cut_off_is_removed_and_a_damaged_one_is_told(tmp_path: 
     ids=["ok", "failed", "no room", "room at last"],
 )
 def test_a_finished_run_goes_on_only_where_the_disk_was_full(
-    tmp_path: Path, ends: list[CellEnded], goes_on: bool
+    tmp_path: Path, ends: list[Facts], goes_on: bool
 ) -> None:
     with Journal(tmp_path, "hall", run_id="r1") as journal:
-        for line in [*ends, RunWent(event="ended", time="2026-01-02T03:04:05Z")]:
-            journal.write(line)
+        for line in ends:
+            journal.write("finished", **line)
+        journal.write("ended")
     (tmp_path / RECORD_FILE).write_text("the record")
     if not goes_on:
         with pytest.raises(

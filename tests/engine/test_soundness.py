@@ -1,4 +1,4 @@
-"""Looking at every byte of a store: what is damaged is named and set aside, and nothing else."""
+"""Looking at every byte of a store: what is damaged is named and removed, and nothing else."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from orthoflow.engine.cleaning import Aside, Damage, Soundness, check_store
+from orthoflow.engine.cleaning import Damage, Soundness, check_store
 from orthoflow.engine.results import CellResult, ProductRef
 from orthoflow.engine.store import Store
 from orthoflow.products.product import Product
@@ -40,16 +40,12 @@ def kept(store: Store, name: str, value: float) -> tuple[str, ProductRef]:
 
 
 def test_what_is_sound_is_counted_and_left(store: Store) -> None:
-    assert check_store(store) == Soundness(
-        n_results=0, n_objects=0, damaged=(), aside=Aside(count=0, size_bytes=0)
-    )
+    assert check_store(store) == Soundness(n_results=0, n_objects=0, damaged=())
     key, ref = kept(store, "one", 1.0)
     # What others put there is not ours.
     (store.objects / "notes").mkdir()
     (store.results / "notes.txt").touch()
-    assert check_store(store) == Soundness(
-        n_results=1, n_objects=1, damaged=(), aside=Aside(count=0, size_bytes=0)
-    )
+    assert check_store(store) == Soundness(n_results=1, n_objects=1, damaged=())
     assert store.result(key) is not None
     assert store.is_sound(ref.digest)
 

@@ -15,7 +15,7 @@ from orthoflow_plugins.read.scan import ReadScan
 
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import discover_catalog
-from orthoflow.engine.journal import JOURNAL, CellBegan, CellEnded, Journal
+from orthoflow.engine.journal import JOURNAL, Journal
 from orthoflow.engine.results import (
     CellResult,
     FigureRef,
@@ -470,11 +470,8 @@ def _read_product(path: Path) -> object:
 
 def _journal_files(folder: Path) -> None:
     with Journal(folder / "run", "toy") as journal:
-        journal.write(CellBegan(time="2026-01-01T00:00:00Z", address="a", key=_KEY))
-        ended = CellEnded(
-            time="2026-01-01T00:00:01Z", address="a", key=_KEY, status="ok", cached=False, error=""
-        )
-        journal.write(ended)
+        journal.write("started", address="a", key=_KEY)
+        journal.write("finished", address="a", key=_KEY, status="ok", cached=False, error="")
     (folder / "run" / JOURNAL).rename(folder / JOURNAL)
     (folder / "run").rmdir()
 
