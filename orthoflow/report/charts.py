@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.files.clouds.colours import plane_colour
 from orthoflow.foreign_text import shown
 
 if TYPE_CHECKING:
@@ -20,6 +21,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ChartFormat: TypeAlias = Literal["svg", "pdf", "png"]
+# From above, in metres: name, number and corners (4, 2) of a wall; name, foot (2,) and viewing
+# direction (2,) of a photo.
+PlanWall: TypeAlias = tuple[str, int, NDArray[np.float64]]
+PlanPhoto: TypeAlias = tuple[str, NDArray[np.float64], NDArray[np.float64]]
 
 # Two columns of a journal are 85 mm wide each.
 COLUMN_INCHES: Final = 85.0 / 25.4
@@ -163,23 +168,6 @@ def _limit(axes: Axes, points: Sequence[ChartPoint], bounds: tuple[float, float]
     axes.set_ylim(begin, high + margin)
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlanWall:
-    """A wall from above: its corners (4, 2), metres."""
-
-    name: str
-    corners_m: NDArray[np.float64]
-
-
-@dataclass(frozen=True, kw_only=True)
-class PlanPhoto:
-    """A photo from above: where it was taken (2,), metres, and which way it looks (2,)."""
-
-    name: str
-    foot_m: NDArray[np.float64]
-    look: NDArray[np.float64]
-
-
 def plan_chart(
     walls: Sequence[PlanWall],
     photos: Sequence[PlanPhoto],
@@ -190,31 +178,42 @@ def plan_chart(
     """Draw walls and photos from above, to scale.
 
     Args:
-        walls: as lines, each with its name.
+        walls: as lines, each with its name, in the colour of its plane.
         photos: as dots with an arrow where they look; names where there is room.
         labels: of both axes.
         suffix: format of the file.
     """
     from matplotlib.figure import Figure  # noqa: PLC0415 - pages without charts need none
 
-    every = np.vstack([*(wall.corners_m for wall in walls), *(photo.foot_m for photo in photos)])
-    span = float(np.ptp(every, axis=0).max()) or 1.0
+    feet, looks = (np.array([photo[k] for photo in photos]).reshape(-1, 2) for k in (1, 2))
+    span = float(np.ptp(np.vstack([*(wall[2] for wall in walls), feet]), axis=0).max()) or 1.0
     with styled():
         figure = Figure(figsize=(1.5 * COLUMN_INCHES, 1.2 * COLUMN_INCHES), layout="constrained")
         axes = figure.subplots()
-        for index, wall in enumerate(walls):
-            ring = np.vstack([wall.corners_m, wall.corners_m[:1]])
-            axes.plot(*ring.T, color=COLOURS[0], linewidth=1.6)
-            place, turn = wall.corners_m.mean(axis=0), index % 2
-            _name(axes, wall.name, place, colour=COLOURS[0], above=bool(turn))
-        feet = np.array([photo.foot_m for photo in photos]).reshape(-1, 2)
-        looks = _ARROW_SHARE * span * np.array([photo.look for photo in photos]).reshape(-1, 2)
+        for index, (name, number, corners_m) in enumerate(walls):
+            # Of a colour for clouds on black a darker one for paper.
+            colour = tuple(0.7 / 255.0 * part for part in plane_colour(number))
+            ring = np.vstack([corners_m, corners_m[:1]])
+            axes.plot(*ring.T, color=colour, linewidth=1.6)
+            _name(axes, name, corners_m.mean(axis=0), colour=colour, above=bool(index % 2))
+        arrows = _ARROW_SHARE * span * looks
         axes.quiver(
-            *feet.T, *looks.T, angles="xy", scale_units="xy", scale=1, color=COLOURS[1], width=0.004
+            *feet.T,
+            *arrows.T,
+            angles="xy",
+            scale_units="xy",
+            scale=1,
+            color=COLOURS[1],
+            width=0.004,
         )
         axes.scatter(feet[:, 0], feet[:, 1], s=14, color=COLOURS[5], zorder=3)
-        for photo in _with_room(photos, span):
-            _name(axes, photo.name, photo.foot_m, colour=COLOURS[5], above=False)
+        # Names lie on no other one's; of many photos none is named.
+        named: list[NDArray[np.float64]] = []
+        for name, foot_m, _ in photos if len(photos) <= _NAMED_PHOTOS else ():
+            room_m = np.array([0.16, 0.03]) * span
+            if all(np.any(np.abs(foot_m - other) > room_m) for other in named):
+                named.append(foot_m)
+                _name(axes, name, foot_m, colour=COLOURS[5], above=False)
         axes.set_aspect("equal", adjustable="datalim")
         axes.margins(0.08)
         axes.set_xlabel(labels[0])
@@ -222,17 +221,7 @@ def plan_chart(
         return saved(figure, suffix)
 
 
-def _with_room(photos: Sequence[PlanPhoto], span_m: float) -> Iterator[PlanPhoto]:
-    """Photos whose names lie on no other one's; of many none is named."""
-    taken: list[NDArray[np.float64]] = []
-    for photo in photos if len(photos) <= _NAMED_PHOTOS else ():
-        room_m = np.array([0.16, 0.03]) * span_m
-        if all(np.any(np.abs(photo.foot_m - other) > room_m) for other in taken):
-            taken.append(photo.foot_m)
-            yield photo
-
-
-def _name(axes: Axes, name: str, place: NDArray[np.float64], *, colour: str, above: bool) -> None:
+def _name(axes: Axes, name: str, place: NDArray[np.float64], *, colour: Any, above: bool) -> None:
     axes.annotate(
         shown(name),
         (float(place[0]), float(place[1])),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -80,7 +80,7 @@ def photo_plan(run: Run, walls: Sequence[Picture]) -> PhotoPlan | None:
                 if picture.frame is not None and picture.cell in (baseline or {picture.cell})
             }
             up = _up(run)
-            drawn_walls, photos = _drawn(up, oriented, list(frames.values()))
+            drawn_walls, photos = _drawn(up, oriented, frames)
             return PhotoPlan(
                 walls=drawn_walls,
                 photos=photos,
@@ -153,24 +153,25 @@ def _caption(address: str, cameras: Sequence[Camera], oriented: Sequence[Camera]
 def _drawn(
     up: NDArray[np.float64],
     oriented: Sequence[Camera],
-    walls: Sequence[tuple[str, WallFrame]],
+    walls: Mapping[int, tuple[str, WallFrame]],
 ) -> tuple[tuple[PlanWall, ...], tuple[PlanPhoto, ...]]:
-    """Lay walls and photos into the view from above."""
-    axes = _axes(up, [frame for _, frame in walls])
+    """Lay walls, by number, and photos into the view from above."""
+    axes = _axes(up, [frame for _, frame in walls.values()])
+    photos = []
+    for camera in oriented:
+        rotation, translation = (
+            camera.rotation_camera_from_world,
+            camera.translation_camera_from_world,
+        )
+        if rotation is not None and translation is not None:
+            # Where the middle of the photo looks.
+            photos.append((camera.photo, -rotation.T @ translation @ axes, rotation[2] @ axes))
     return (
         tuple(
-            PlanWall(
-                name=name,
-                corners_m=np.asarray(frame.corners_world(), dtype=np.float64) @ axes,
-            )
-            for name, frame in walls
+            (name, number, np.asarray(frame.corners_world(), dtype=np.float64) @ axes)
+            for number, (name, frame) in walls.items()
         ),
-        tuple(
-            PlanPhoto(
-                name=camera.photo, foot_m=_centre(camera) @ axes, look=_looks_at(camera) @ axes
-            )
-            for camera in oriented
-        ),
+        tuple(photos),
     )
 
 
@@ -184,21 +185,3 @@ def _axes(up: NDArray[np.float64], frames: Sequence[WallFrame]) -> NDArray[np.fl
         right = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     right = right / np.linalg.norm(right)
     return np.column_stack([right, np.cross(up, right)])
-
-
-def _centre(camera: Camera) -> NDArray[np.float64]:
-    rotation, translation = _pose(camera)
-    return np.asarray(-rotation.T @ translation, dtype=np.float64)
-
-
-def _looks_at(camera: Camera) -> NDArray[np.float64]:
-    """Where the middle of the photo looks, a unit vector of the world."""
-    rotation, _ = _pose(camera)
-    return np.asarray(rotation[2], dtype=np.float64)
-
-
-def _pose(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    rotation, translation = camera.rotation_camera_from_world, camera.translation_camera_from_world
-    if rotation is None or translation is None:
-        raise AssertionError("only oriented photos are drawn")
-    return rotation, translation

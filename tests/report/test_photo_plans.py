@@ -47,12 +47,13 @@ def test_a_photo_stands_before_its_wall_and_looks_at_it(tmp_path: Path) -> None:
     # Of two variants the baseline's.
     assert plan.cell == "orient@plane=fine"
     [photo], [wall] = plan.photos, plan.walls
-    corners = wall.corners_m
+    _, foot_m, look = photo
+    _, _, corners = wall
     # 2 m to the south of a wall of 1.2 m from west to east.
     assert np.ptp(corners[:, 0]) == pytest.approx(1.2)
-    assert corners[:, 0].min() < photo.foot_m[0] < corners[:, 0].max()
-    assert corners[:, 1].min() - photo.foot_m[1] == pytest.approx(2.0, rel=0.02)
-    np.testing.assert_allclose(photo.look, [0.0, 1.0], atol=0.05)
+    assert corners[:, 0].min() < foot_m[0] < corners[:, 0].max()
+    assert corners[:, 1].min() - foot_m[1] == pytest.approx(2.0, rel=0.02)
+    np.testing.assert_allclose(look, [0.0, 1.0], atol=0.05)
 
 
 def test_refused_photos_are_named_and_names_are_escaped(tmp_path: Path) -> None:
@@ -184,9 +185,9 @@ def test_the_page_has_a_table_of_photos(tmp_path: Path) -> None:
 
 
 def test_walls_and_photos_lie_in_metres_of_the_world() -> None:
-    walls, photos = module._drawn(UP, PHOTOS, WALLS)
-    assert [wall.name for wall in walls] == ["hall", "end"]
-    assert np.ptp(walls[0].corners_m, axis=0) == pytest.approx([12.0, 0.0], abs=1e-9)
-    assert np.ptp(walls[1].corners_m, axis=0) == pytest.approx([0.0, 4.0], abs=1e-9)
-    np.testing.assert_allclose([photo.foot_m for photo in photos], [[103.0, 194.0], [109.0, 197.0]])
-    np.testing.assert_allclose([photo.look for photo in photos], [[0.0, 1.0], [-0.6, 0.8]])
+    walls, photos = module._drawn(UP, PHOTOS, dict(enumerate(WALLS)))
+    assert [wall[0] for wall in walls] == ["hall", "end"]
+    assert np.ptp(walls[0][2], axis=0) == pytest.approx([12.0, 0.0], abs=1e-9)
+    assert np.ptp(walls[1][2], axis=0) == pytest.approx([0.0, 4.0], abs=1e-9)
+    np.testing.assert_allclose([photo[1] for photo in photos], [[103.0, 194.0], [109.0, 197.0]])
+    np.testing.assert_allclose([photo[2] for photo in photos], [[0.0, 1.0], [-0.6, 0.8]])
