@@ -113,38 +113,20 @@ def _places(layers: Sequence[ProjectLayer]) -> dict[str, float]:
 
 def _write_virtual(path: Path, raster: Path, shift_m: float) -> tuple[float, float, float, float]:
     """Write a virtual raster that shifts X; return left, bottom, right and top."""
-    import rasterio
+    from rasterio.shutil import copy
 
     with RasterParts(raster) as parts:
         rows, columns = parts.shape
         left, top, gsd_m = parts.corner_m[0] + shift_m, parts.corner_m[1], parts.gsd_m
-    with rasterio.open(raster) as dataset:
-        types, nodata = dataset.dtypes, dataset.nodata
-        is_masked = any("per_dataset" in flag.name for flag in dataset.mask_flag_enums[0])
-    root = ET.Element("VRTDataset", {"rasterXSize": str(columns), "rasterYSize": str(rows)})
-    ET.SubElement(root, "GeoTransform").text = f"{left!r}, {gsd_m!r}, 0, {top!r}, 0, {-gsd_m!r}"
-    where = os.path.relpath(raster, path.parent)
-    size = {"xOff": "0", "yOff": "0", "xSize": str(columns), "ySize": str(rows)}
-
-    def add_band(parent: ET.Element, kind: str, source_band: str, attributes: object) -> None:
-        given = attributes if isinstance(attributes, dict) else {}
-        band = ET.SubElement(parent, "VRTRasterBand", {"dataType": kind, **given})
-        if nodata is not None:
-            ET.SubElement(band, "NoDataValue").text = "nan" if np.isnan(nodata) else f"{nodata:g}"
-        if len(types) >= 3 and given.get("band", "").isdigit():
-            colour = ("Red", "Green", "Blue", "Alpha")[int(given["band"]) - 1]
-            ET.SubElement(band, "ColorInterp").text = colour
-        source = ET.SubElement(band, "SimpleSource")
-        ET.SubElement(source, "SourceFilename", {"relativeToVRT": "1"}).text = where
-        ET.SubElement(source, "SourceBand").text = source_band
-        ET.SubElement(source, "SrcRect", size)
-        ET.SubElement(source, "DstRect", size)
-
-    kinds = {"uint8": "Byte", "uint16": "UInt16", "float32": "Float32", "int16": "Int16"}
-    for number, kind in enumerate(types, start=1):
-        add_band(root, kinds.get(kind, "Float32"), str(number), {"band": str(number)})
-    if is_masked:
-        add_band(ET.SubElement(root, "MaskBand"), "Byte", "mask,1", {})
-    ET.indent(root)
+    copy(raster, path, driver="VRT")
+    root = ET.parse(path).getroot()
+    # Coordinate systems of walls cannot be transformed into each other.
+    for element in root.findall("SRS"):
+        root.remove(element)
+    for element in root.iter("GeoTransform"):
+        element.text = f"{left!r}, {gsd_m!r}, 0, {top!r}, 0, {-gsd_m!r}"
+    for element in root.iter("SourceFilename"):
+        element.text = os.path.relpath(raster, path.parent)
+        element.set("relativeToVRT", "1")
     write_text(path, ET.tostring(root, encoding="unicode") + "\n")
     return left, top - rows * gsd_m, left + columns * gsd_m, top
