@@ -157,7 +157,12 @@ def export_elevations(run: Run, folder: Path, chosen: Choices) -> str:
         )
         for wall in results.walls
         if wall.frame.raster_axes == "wall"
-        for said in wall.accuracy[:1] or (Phrase(key="not_checked"),)
+        for said in (
+            next(
+                (one for one in wall.accuracy if one.key != "plane_noise"),
+                Phrase(key="not_checked"),
+            ),
+        )
     )
     text = text_of(run, ", ".join(wall.name for wall in order), chosen, notes)
 

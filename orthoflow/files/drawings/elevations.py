@@ -35,6 +35,8 @@ from orthoflow.geometry.directions import basis_from_up
 _GAP_MM: Final = 8.0
 # Below the walls, for their names.
 _NAMES_MM: Final = 12.0
+# Between heights that have marks of their own.
+_LEVELS_MM: Final = 1.5
 # Walls this close to parallel follow each other along one facade.
 _PARALLEL_DEG: Final = 10.0
 
@@ -141,19 +143,21 @@ def elevation(
             draw_raster(inner, wall.raster)
             outline = placed.on_paper([(left + x, down + y) for x, y in own.corners_m])
             line(placed.canvas, outline, width_mm=THIN_MM, is_closed=True)
-            # Names of narrow walls take turns in two rows.
-            x, y = placed.on_paper([(left + own.left_m, top - low)])[0]
+            # Names of narrow walls take turns in two rows, inside the frame.
             long = text_width_mm(wall.name) + 2.0
+            x, y = placed.on_paper([(left + own.left_m, top - low)])[0].tolist()
+            x = min(x, placed.edges_mm[2] - long)
             row = 0 if x >= ends[0] else 1
-            middle = (float(x) + 0.5 * long, float(y) - 3.0 - 2.2 * TEXT_MM * row)
-            right = placed.edges_mm[2]
-            if part.bottom_m > top - low and middle[0] + 0.5 * long <= right and x >= ends[row]:
-                ends[row] = float(x) + long
+            if part.bottom_m > top - low and x >= ends[row]:
+                ends[row] = x + long
+                middle = (x + 0.5 * long, y - 3.0 - 2.2 * TEXT_MM * row)
                 write_on_white(placed.canvas, wall.name, middle)
 
-    levels = {
-        round(top - float(edge), 3) for edge in np.concatenate([heights.max(1), heights.min(1)])
-    }
+    # Walls that end nearly level share a mark.
+    levels: list[float] = []
+    for down in sorted({*(top - heights.max(axis=1)), *(top - heights.min(axis=1))}):
+        if not levels or down - levels[-1] >= mm * _LEVELS_MM:
+            levels.append(float(down))
     return Drawing(
         stem="elevation",
         size_m=(float(lefts[-1]) - mm * _GAP_MM, top - low + mm * _NAMES_MM),
@@ -166,5 +170,5 @@ def elevation(
         text=text,
         scale=scale,
         language=language,
-        heights=tuple(sorted(levels)),
+        heights=tuple(levels),
     )

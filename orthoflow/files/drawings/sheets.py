@@ -97,7 +97,11 @@ def _draw_grid(placed: Placed, drawing: Drawing) -> None:
     canvas, part = placed.canvas, placed.view.part
     left, bottom, right, top = placed.edges_mm
     columns: dict[float, float] = {}
-    if drawing.axes.across is not None:
+    bottom_m = part.bottom_m
+    if drawing.axes.across is None:
+        # Below the lowest height are the names of what is drawn.
+        bottom_m = min(bottom_m, max(drawing.heights, default=bottom_m) + 1e-6)
+    else:
         limits = (part.left_m, part.right_m)
         columns = {
             value: float(placed.on_paper([(place, part.top_m)])[0, 0])
@@ -105,7 +109,7 @@ def _draw_grid(placed: Placed, drawing: Drawing) -> None:
         }
     rows = {
         value: float(placed.on_paper([(part.left_m, place)])[0, 1])
-        for place, value in _marks(drawing.axes.down, (part.top_m, part.bottom_m), drawing)
+        for place, value in _marks(drawing.axes.down, (part.top_m, bottom_m), drawing)
     }
     # A quarter of a metre needs two digits.
     digits = len(f"{drawing.grid:.4f}".rstrip("0").partition(".")[2])
