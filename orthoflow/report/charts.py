@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.clouds.colours import plane_colour
 from orthoflow.foreign_text import shown
 
 if TYPE_CHECKING:
@@ -184,6 +183,8 @@ def plan_chart(
         suffix: format of the file.
     """
     from matplotlib.figure import Figure  # noqa: PLC0415 - pages without charts need none
+
+    from orthoflow.files.clouds.dressing import plane_colour  # noqa: PLC0415 - likewise
 
     feet, looks = (np.array([photo[k] for photo in photos]).reshape(-1, 2) for k in (1, 2))
     span = float(np.ptp(np.vstack([*(wall[2] for wall in walls), feet]), axis=0).max()) or 1.0

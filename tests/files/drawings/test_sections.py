@@ -144,7 +144,8 @@ def test_a_sheet_of_it_has_title_block_coordinates_and_lines_in_scale(
         lengths = [math.hypot(c["x1"] - c["x0"], c["y1"] - c["y0"]) for c in thick]
         longest_mm = 1000 * max(one.length_m for one in section.lines) / 50
         assert min(abs(one / POINTS_PER_MM - longest_mm) for one in lengths) < 0.01
-    for said in ("1:50", kind.title(), "slab of 20 mm", "sheet 1 of 1", "record sha256"):
+    slab = f"slab of {1e3 * section.slab_m:.0f} mm"
+    for said in ("1:50", kind.title(), slab, "sheet 1 of 1", "record sha256"):
         assert said in words, said
 
 
