@@ -35,7 +35,7 @@ import rasterio
 import trimesh
 from click.testing import CliRunner
 from laspy.copc import CopcReader
-from orthoflow_plugins.plane.open3d_library import load_open3d
+from orthoflow_plugins.plane.comparators import load_open3d
 from PIL import Image
 from pystac.validation import RegisteredValidator
 

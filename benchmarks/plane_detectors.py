@@ -25,18 +25,16 @@ import numba
 import numpy as np
 from great_room import FULL_POINTS, great_room
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.candidates import FoundPlane, name_points
-from orthoflow_plugins.plane.cloud import PreparedCloud, Search, prepare
+from orthoflow_plugins.plane.cloud import PreparedCloud, prepare
 from orthoflow_plugins.plane.detector import DetectorParams
 from orthoflow_plugins.plane.hough2d import Hough2d, PlanProposer
 from orthoflow_plugins.plane.hough3d import Hough3d, SpaceProposer
 from orthoflow_plugins.plane.planes import measure_planes
 from orthoflow_plugins.plane.ransac import ConsensusProposer, Ransac
 from orthoflow_plugins.plane.region import Region, region_proposer
-from orthoflow_plugins.plane.search import Proposer, find_planes
+from orthoflow_plugins.plane.search import FoundPlane, Proposer, Search, find_planes
 from plane_peers import PEERS, measured
 
-from orthoflow.geometry import basis_from_up
 from orthoflow.products import PointCloud
 
 CELL_M, SHARE = 0.02, 0.005
@@ -68,14 +66,8 @@ def detect(
 ) -> tuple[PreparedCloud, list[FoundPlane]]:
     """What a method does up to its labels, without statistics, files and figures."""
     params = {"n_planes_max": most, "min_share": SHARE}
-    prepared = prepare(
-        cloud,
-        basis_from_up(cloud.up),
-        cell_m=CELL_M if method == "hough2d" else 0.5,
-        least_share=SHARE,
-        parts=cores,
-        counts_plan=method == "hough2d",
-    )
+    plan_cell_m = CELL_M if method == "hough2d" else None
+    prepared = prepare(cloud, parts=cores, plan_cell_m=plan_cell_m)
     search = Search(
         cloud=prepared,
         params=DetectorParams.model_validate(params),
@@ -84,7 +76,8 @@ def detect(
     )
     found = find_planes(search, proposer_of(method, search, params))
     labels = np.empty(len(cloud), dtype=np.int16)
-    name_points(prepared, np.arange(len(found) + 1, dtype=np.int16), labels)
+    names = np.append(np.arange(len(found)), -1).astype(np.int16)
+    prepared.write_labels(names, labels)
     return prepared, found
 
 

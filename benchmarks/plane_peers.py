@@ -50,7 +50,7 @@ class Peer:
 
 
 def _open3d_ransac(points: Points, _wall: NDArray[np.float64]) -> PeerPlane:
-    from orthoflow_plugins.plane.open3d_library import load_open3d
+    from orthoflow_plugins.plane.comparators import load_open3d
 
     open3d = load_open3d("the benchmark")
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(np.float64)))
@@ -60,7 +60,7 @@ def _open3d_ransac(points: Points, _wall: NDArray[np.float64]) -> PeerPlane:
 
 
 def _open3d_patches(points: Points, wall: NDArray[np.float64]) -> PeerPlane:
-    from orthoflow_plugins.plane.open3d_library import load_open3d
+    from orthoflow_plugins.plane.comparators import load_open3d
 
     open3d = load_open3d("the benchmark")
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(np.float64)))

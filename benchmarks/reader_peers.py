@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from orthoflow_plugins.plane.open3d_library import load_open3d
+from orthoflow_plugins.plane.comparators import load_open3d
 from plane_streaming import measured
 
 Fields = dict[str, Any]

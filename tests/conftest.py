@@ -234,7 +234,7 @@ def world(tmp_path: Path) -> Iterator[World]:
 @pytest.fixture(scope="session")
 def _open3d() -> None:
     """Skip where open3d does not load, with the sentence that a user would get."""
-    from orthoflow_plugins.plane.open3d_library import load_open3d
+    from orthoflow_plugins.plane.comparators import load_open3d
 
     from orthoflow.errors import PluginError
 

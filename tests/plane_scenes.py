@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.cloud import PreparedCloud, Search, prepare
+from orthoflow_plugins.plane.cloud import PreparedCloud, prepare
 from orthoflow_plugins.plane.detector import DetectorParams
+from orthoflow_plugins.plane.search import Search
 
 from orthoflow.products import PointCloud
 from orthoflow.sdk import StepContext
@@ -96,17 +97,10 @@ def context(folder: Path, *, cores: int = 2) -> StepContext:
 
 
 def prepared(
-    points: NDArray[np.float64], *, parts: int = 1, cell_m: float = 0.5, counts_plan: bool = False
+    points: NDArray[np.float64], *, parts: int = 1, plan_cell_m: float | None = None
 ) -> PreparedCloud:
     """A cloud of points (n, 3) as the passes take it."""
-    return prepare(
-        cloud_of(points),
-        np.eye(3),
-        cell_m=cell_m,
-        least_share=0.005,
-        parts=parts,
-        counts_plan=counts_plan,
-    )
+    return prepare(cloud_of(points), parts=parts, plan_cell_m=plan_cell_m)
 
 
 def search_in(cloud: PreparedCloud, **params: object) -> Search:

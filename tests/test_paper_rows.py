@@ -1,7 +1,7 @@
 """Rows of docs/papers.md recomputed with numpy, scipy and OpenCV from the papers' own words.
 
 Others are recomputed beside their modules in tests/plugins: votes of cells and places
-(plane/test_vote_kernels), inPaint (ortho/test_direct), residuals (orient/test_report), matches with
+(plane/test_votes), inPaint (ortho/test_direct), residuals (orient/test_report), matches with
 a ratio (match/test_sift).
 """
 
@@ -43,7 +43,7 @@ def normal_of(omega_deg: float, phi_deg: float) -> NDArray[np.float64]:
 def test_the_fullest_bin_of_the_plan(accumulator: str) -> None:
     """Figures 10b and 10c of markiewicz2015: cells of 20 mm vote for lines at steps of 1 deg."""
     points = sampled(ROOM[:4]) @ turned(17.37).T
-    search = search_in(prepared(points, cell_m=0.02, counts_plan=True), min_share=0.02)
+    search = search_in(prepared(points, plan_cell_m=0.02), min_share=0.02)
     params = Hough2d.Params.model_validate(
         {"scoring": "votes", "accumulator": accumulator, "constraint": "vertical"}
     )

@@ -27,8 +27,8 @@ _METHODS: Final = {
     "plane.region:Region": (
         "regions grown over neighbouring points with similar normals and one plane"
     ),
-    "plane.open3d_ransac:Open3dRansac": "open3d's segment_plane, plane after plane, for comparison",
-    "plane.open3d_patches:Open3dPatches": "open3d's detect_planar_patches, for comparison",
+    "plane.comparators:Open3dRansac": "open3d's segment_plane, plane after plane, for comparison",
+    "plane.comparators:Open3dPatches": "open3d's detect_planar_patches, for comparison",
     "plane.given:GivenPlane": "a reference plane that the user gives",
     "raster.grid:RasterGrid": "depth, intensity and colour per cell of each wall",
     "match.sift:MatchSift": "key points of the photos and of the walls, RootSIFT, mutual and "

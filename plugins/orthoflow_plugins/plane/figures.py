@@ -1,14 +1,10 @@
-"""Pictures of what was found and how: deviations, planes, thickness, accumulators, normals.
-
-Margins are fixed: engines that find them out draw everything once more to measure it.
-"""
+"""Pictures of what was found and how: deviations, planes, thickness, accumulators, normals."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,96 +13,66 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import omega_phi_deg, wall_axes
 from orthoflow.geometry.directions import basis_from_up
-from orthoflow.products import Planes, PointCloud, Spread, Thickness
+from orthoflow.products import Planes, PointCloud, Thickness
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.plane.detector import Materials
-from orthoflow_plugins.plane.kernels import PlanCounts, PlanGrid
-from orthoflow_plugins.plane.planes import Assembly, Normality
-from orthoflow_plugins.plane.slab_kernels import HISTOGRAM_BINS
+from orthoflow_plugins.plane.kernels import HISTOGRAM_BINS
+from orthoflow_plugins.plane.planes import Deviations, Normality
 from orthoflow_plugins.plane.thickness import RowPoints
-from orthoflow_plugins.plane.voxels import SurfaceVoxels
 
-
-@dataclass(frozen=True, kw_only=True)
-class Margins:
-    """Where the panels of a figure lie, in inches.
-
-    Attributes:
-        left: from the figure's edge to the panels; right, bottom and top alike.
-        right: see left.
-        bottom: see left.
-        top: see left.
-        across: between panels side by side.
-        down: between panels one above the other.
-    """
-
-    left: float
-    right: float
-    bottom: float
-    top: float
-    across: float
-    down: float = 0.0
-
-
-def space_out(figure: Figure, margins: Margins, *, n_rows: int, n_columns: int) -> None:
-    """Lay the panels of a figure, which stand in equal rows and columns, within its margins."""
-    width, height = figure.get_size_inches()
-    gaps_across, gaps_down = (n_columns - 1) * margins.across, (n_rows - 1) * margins.down
-    panel_width = (width - margins.left - margins.right - gaps_across) / n_columns
-    panel_height = (height - margins.bottom - margins.top - gaps_down) / n_rows
-    figure.subplots_adjust(
-        left=margins.left / width,
-        right=1.0 - margins.right / width,
-        bottom=margins.bottom / height,
-        top=1.0 - margins.top / height,
-        wspace=margins.across / panel_width,
-        hspace=margins.down / panel_height,
-    )
+if TYPE_CHECKING:
+    from orthoflow_plugins.plane.hough2d import PlanProposer
+    from orthoflow_plugins.plane.voxels import SurfaceVoxels
 
 
 _PANELS_MOST: Final = 4
-_DEVIATIONS: Final = Margins(left=0.3, right=0.1, bottom=0.45, top=0.3, across=0.3, down=0.75)
 _POINTS_MOST: Final = 25_000
 _NAMED_MOST: Final = 12
 # The view is from above, a little aside, along parallel lines.
 _AZIMUTH_DEG: Final = -60.0
 _ELEVATION_DEG: Final = 35.0
 _GREY: Final = "#c8c8c8"
-_SCENE: Final = Margins(left=0.05, right=0.05, bottom=0.05, top=0.05, across=0.1)
+_BLUE: Final = "#9db8d2"
+_RED: Final = "#b03a2e"
 _PLANES_MOST: Final = 12
 _CLASSED_MOST: Final = 4
-_THICKNESS: Final = Margins(left=0.7, right=0.1, bottom=0.45, top=0.1, across=0.45, down=0.5)
-# The names of materials stand between panels.
-_WITH_NAMES: Final = replace(_THICKNESS, across=1.3)
 
 
-def draw_deviations(ctx: StepContext, assembly: Assembly) -> None:
+def draw_deviations(
+    ctx: StepContext,
+    planes: Planes,
+    deviations: Deviations,
+    normalities: Sequence[Normality | None],
+) -> None:
     """Draw how the points of the first planes lie about them, with the Gauss curve of the fit."""
-    deviations, names = assembly.deviations, assembly.planes.names
-    count = min(_PANELS_MOST, len(names))
-    figure = Figure(figsize=(3.2 * count, 5.4))
-    space_out(figure, _DEVIATIONS, n_rows=2, n_columns=count)
-    edges_mm = 1000.0 * np.linspace(
-        -deviations.tolerance_m, deviations.tolerance_m, HISTOGRAM_BINS + 1
-    )
+    count = min(_PANELS_MOST, len(planes))
+    figure = Figure(figsize=(3.2 * count, 5.4), layout="constrained")
+    panels = figure.subplots(2, count, squeeze=False)
+    tolerance_mm = 1000.0 * deviations.tolerance_m
+    edges_mm = np.linspace(-tolerance_mm, tolerance_mm, HISTOGRAM_BINS + 1)
     middles_mm = 0.5 * (edges_mm[1:] + edges_mm[:-1])
-    for index in range(count):
-        axes = figure.add_subplot(2, count, index + 1)
-        axes.stairs(deviations.histogram[index], edges_mm, fill=True, color="#9db8d2")
+    for index, (axes, below) in enumerate(panels.T):
+        axes.stairs(deviations.histogram[index], edges_mm, fill=True, color=_BLUE)
         sigma_mm = 1000.0 * float(deviations.rms_fit_m[index])
         if sigma_mm > 0.0:
             offset_mm = middles_mm - 1000.0 * float(deviations.mean_fit_m[index])
             scale = float(deviations.n_fit[index]) * (edges_mm[1] - edges_mm[0])
             curve = np.exp(-0.5 * (offset_mm / sigma_mm) ** 2)
             curve *= scale / (sigma_mm * math.sqrt(2.0 * math.pi))
-            axes.plot(middles_mm, curve, color="#b03a2e", linewidth=1.0)
-        axes.set_title(f"{names[index]}: {sigma_mm:.1f} mm", fontsize=9)
-        axes.set_xlabel("distance to the plane [mm]", fontsize=8)
-        axes.tick_params(labelsize=7)
+            axes.plot(middles_mm, curve, color=_RED, linewidth=1.0)
+        axes.set_title(f"{planes.names[index]}: {sigma_mm:.1f} mm", fontsize=9)
+        _label(axes, "distance to the plane [mm]")
         axes.set_yticks([])
-        shape = assembly.normalities[index]
-        if shape is not None:
-            _draw_quantiles(figure.add_subplot(2, count, count + index + 1), shape)
+        shape = normalities[index]
+        if shape is None:
+            below.set_axis_off()
+            continue
+        reach = float(shape.expected_sigmas[-1])
+        below.plot([-reach, reach], [-reach, reach], color=_RED, linewidth=1.0)
+        below.plot(shape.expected_sigmas, shape.found_sigmas, ".", markersize=4, color="#33658a")
+        skewness, kurtosis = shape.skewness, shape.excess_kurtosis
+        below.set_title(f"skewness {skewness:+.2f}, kurtosis {kurtosis:+.2f}", fontsize=8)
+        _label(below, "normal quantile [sigma]")
     ctx.figure(
         "deviations",
         figure,
@@ -116,6 +82,12 @@ def draw_deviations(ctx: StepContext, assembly: Assembly) -> None:
         "quantiles against those of a normal distribution, which would lie on the line: a second "
         "hill, or ends that leave the line early, are relief or another surface on the plane.",
     )
+
+
+def _label(axes: Axes, across: str, down: str = "") -> None:
+    axes.set_xlabel(across, fontsize=8)
+    axes.set_ylabel(down, fontsize=8)
+    axes.tick_params(labelsize=7)
 
 
 def draw_planes(
@@ -138,9 +110,10 @@ def draw_planes(
     shown = points_m[::every]
     view = _view(planes.up)
     flat, index = shown @ view.T, plane_of_point[::every]
+    # Not a constrained layout, which draws all the points once more to measure them.
     figure = Figure(figsize=(11.0, 4.8))
-    space_out(figure, _SCENE, n_rows=1, n_columns=2)
-    left, right = figure.subplots(1, 2)
+    edges = {"left": 0.01, "right": 0.99, "bottom": 0.01, "top": 0.99, "wspace": 0.02}
+    left, right = figure.subplots(1, 2, gridspec_kw=edges)
     on_none = index < 0
     left.plot(*flat[on_none].T, ".", markersize=0.8, color=_GREY)
     right.plot(*flat.T, ",", color="#e4e4e4")
@@ -150,7 +123,13 @@ def draw_planes(
         colour = f"C{k % 10}"
         if from_the_front[k]:
             left.plot(*flat[index == k].T, ".", markersize=1.5, color=colour)
-        _draw_rectangles(right, planes, k, view, cloud, colour)
+        parts = planes.corners[k][None]
+        if planes.part_corners is not None and planes.part_plane is not None:
+            parts = planes.part_corners[planes.part_plane == k]
+        for place, part in enumerate(parts):
+            around = (part[[0, 1, 2, 3, 0]] - cloud.origin) @ view.T
+            name = planes.names[k] if k < _NAMED_MOST and place == 0 else None
+            right.plot(*around.T, color=colour, linewidth=1.3, label=name)
     corners = (planes.corners.reshape(-1, 3) - cloud.origin) @ view.T
     low, high = corners.min(axis=0), corners.max(axis=0)
     margin = 0.04 * (high - low)
@@ -183,50 +162,45 @@ def draw_thickness(
         return
     first = known[:_CLASSED_MOST]
     classes = [
-        label for label in _classes(known[0][1]) if any(_classes(item)[label] for _, item in first)
+        label for label in _CLASSES if any(getattr(item, _CLASSES[label]) for _, item in first)
     ]
-    named = any(item.material for _, item in first)
-    n_rows, n_columns = 1 if row is None else 2, 1 + len(classes) + int(named)
-    figure = Figure(figsize=(3.4 * n_columns, 2.9 * n_rows))
+    bars = [
+        (f"{spread.name}, {planes.names[k]}", 1000.0 * spread.sigma_m)
+        for k, item in first
+        for spread in item.material
+    ]
+    n_rows, n_columns = 1 if row is None else 2, 1 + len(classes) + bool(bars)
+    figure = Figure(figsize=(3.4 * n_columns, 2.9 * n_rows), layout="constrained")
     grid = figure.add_gridspec(n_rows, n_columns)
-    across = _WITH_NAMES if named else _THICKNESS
-    space_out(figure, across, n_rows=n_rows, n_columns=n_columns)
-    _draw_sigmas(figure.add_subplot(grid[0, 0]), planes, known)
+    sigmas = [(planes.names[k], 1000.0 * item.sigma_m) for k, item in known]
+    axes = _draw_bars(figure.add_subplot(grid[0, 0]), sigmas, _BLUE, "thickness [mm]")
+    steps_mm = [1000.0 * item.scan_step_m for _, item in known]
+    axes.plot(steps_mm, range(len(known)), "|", color=_RED, label="scan step")
+    axes.legend(fontsize=7)
     for place, label in enumerate(classes):
         axes = figure.add_subplot(grid[0, 1 + place])
         for k, item in first:
-            spreads = _classes(item)[label]
+            spreads = getattr(item, _CLASSES[label])
             middles = [0.5 * (spread.low + spread.high) for spread in spreads]
             sigmas_mm = [1000.0 * spread.sigma_m for spread in spreads]
             axes.plot(middles, sigmas_mm, "o-", markersize=3, label=planes.names[k])
         axes.set_ylim(bottom=0.0)
-        axes.set_xlabel(label, fontsize=8)
-        axes.tick_params(labelsize=7)
+        _label(axes, label)
         if place == 0:
             axes.legend(fontsize=7)
-    if named:
-        _draw_materials(figure.add_subplot(grid[0, -1]), planes, first)
+    if bars:
+        _draw_bars(figure.add_subplot(grid[0, -1]), bars, "#d2b89d", "thickness by material [mm]")
     if row is not None:
         _draw_row(figure.add_subplot(grid[1, :]), planes, row, materials)
+    drawn = [label.partition(" [")[0] for label in classes] + ["material"] * bool(bars)
     ctx.figure(
         "thickness",
         figure,
         "Thickness of the cloud, one standard deviation in millimetres: on each plane beside the "
-        f"scan step there{_drawn_by(classes, is_by_material=named)}."
+        f"scan step there{''.join(f', by {name}' for name in drawn)}."
         f"{'' if row is None else ' Below, one row of the scan on the first plane.'} "
         "A cloud thicker than its scan step shows noise, or scans that do not fit each other.",
     )
-
-
-def _draw_quantiles(axes: Axes, shape: Normality) -> None:
-    reach = float(shape.expected_sigmas[-1])
-    axes.plot([-reach, reach], [-reach, reach], color="#b03a2e", linewidth=1.0)
-    axes.plot(shape.expected_sigmas, shape.found_sigmas, ".", markersize=4, color="#33658a")
-    axes.set_title(
-        f"skewness {shape.skewness:+.2f}, kurtosis {shape.excess_kurtosis:+.2f}", fontsize=8
-    )
-    axes.set_xlabel("normal quantile [sigma]", fontsize=8)
-    axes.tick_params(labelsize=7)
 
 
 def _view(up: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -238,65 +212,20 @@ def _view(up: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array([right, rise]) @ basis_from_up(up)
 
 
-def _draw_rectangles(
-    axes: Axes,
-    planes: Planes,
-    k: int,
-    view: NDArray[np.float64],
-    cloud: PointCloud,
-    colour: str,
-) -> None:
-    corners = planes.corners[k][None]
-    if planes.part_corners is not None and planes.part_plane is not None:
-        corners = planes.part_corners[planes.part_plane == k]
-    label = planes.names[k] if k < _NAMED_MOST else None
-    for part in corners:
-        around = np.vstack([part, part[:1]]) - cloud.origin
-        axes.plot(*(around @ view.T).T, color=colour, linewidth=1.3, label=label)
-        label = None
+# What the thickness is drawn along, by its label.
+_CLASSES: Final = {
+    "angle of incidence [deg]": "incidence_deg",
+    "range [m]": "range_m",
+    "intensity [0..1]": "intensity",
+}
 
 
-def _drawn_by(classes: Sequence[str], *, is_by_material: bool) -> str:
-    """Name what else the thickness is drawn along; empty where it is nothing."""
-    drawn = [label.partition(" [")[0] for label in classes] + ["material"] * is_by_material
-    *most, last = drawn or [""]
-    return f", and by {', '.join(most)}{' and ' if most else ''}{last}" if last else ""
-
-
-def _classes(thickness: Thickness) -> dict[str, tuple[Spread, ...]]:
-    """Spreads by the quantity that is drawn along, by its label."""
-    return {
-        "angle of incidence [deg]": thickness.incidence_deg,
-        "range [m]": thickness.range_m,
-        "intensity [0..1]": thickness.intensity,
-    }
-
-
-def _draw_sigmas(axes: Axes, planes: Planes, known: list[tuple[int, Thickness]]) -> None:
-    places = range(len(known))
-    axes.barh(places, [1000.0 * item.sigma_m for _, item in known], color="#9db8d2")
-    steps_mm = [1000.0 * item.scan_step_m for _, item in known]
-    axes.plot(steps_mm, places, "|", color="#b03a2e", label="scan step")
-    axes.set_yticks(places, [planes.names[k] for k, _ in known], fontsize=7)
+def _draw_bars(axes: Axes, bars: Sequence[tuple[str, float]], colour: str, label: str) -> Axes:
+    axes.barh(range(len(bars)), [value for _, value in bars], color=colour)
+    axes.set_yticks(range(len(bars)), [name for name, _ in bars])
     axes.invert_yaxis()
-    axes.set_xlabel("thickness [mm]", fontsize=8)
-    axes.tick_params(labelsize=7)
-    axes.legend(fontsize=7)
-
-
-def _draw_materials(axes: Axes, planes: Planes, known: list[tuple[int, Thickness]]) -> None:
-    """Thickness of each material on the first planes."""
-    bars = [
-        (f"{spread.name}, {planes.names[k]}", 1000.0 * spread.sigma_m)
-        for k, item in known
-        for spread in item.material
-    ]
-    places = range(len(bars))
-    axes.barh(places, [sigma_mm for _, sigma_mm in bars], color="#d2b89d")
-    axes.set_yticks(places, [text for text, _ in bars], fontsize=7)
-    axes.invert_yaxis()
-    axes.set_xlabel("thickness by material [mm]", fontsize=8)
-    axes.tick_params(labelsize=7)
+    _label(axes, label)
+    return axes
 
 
 def _draw_row(axes: Axes, planes: Planes, row: RowPoints, materials: Materials) -> None:
@@ -309,14 +238,11 @@ def _draw_row(axes: Axes, planes: Planes, row: RowPoints, materials: Materials) 
             axes.plot(row.along_m[mine], distance_mm, ".", markersize=2, label=name)
         if materials:
             axes.legend(fontsize=7, markerscale=3)
-    axes.set_xlabel(f"along {planes.names[0]} [m], row {row.row} of scan {row.scan}", fontsize=8)
-    axes.set_ylabel("distance [mm]", fontsize=8)
-    axes.tick_params(labelsize=7)
+    across = f"along {planes.names[0]} [m], row {row.row} of scan {row.scan}"
+    _label(axes, across, "distance [mm]")
 
 
 _PIXELS_MOST: Final = 900
-# Between the panels stands the legend of the first.
-_ACCUMULATOR: Final = Margins(left=0.6, right=0.2, bottom=0.5, top=0.1, across=1.5)
 _SECTION_POINTS_MOST: Final = 2_000_000
 _SECTION_CELLS_MOST: Final = 2_000
 _BIN_DEG: Final = 1.0
@@ -326,48 +252,9 @@ _MAP_MOST_DEG: Final = 15.0
 _MAP_PIXELS_MOST: Final = 700
 
 
-class PlanVotes(Protocol):
-    """What a plan looked like before any plane was taken from it.
-
-    Attributes:
-        grid: where the cells of the plan lie.
-        plan: points per cell.
-        centre_m: (2,) centre of the plan in the (e1, e2) frame of the cloud's offsets.
-        reach_m: distances of lines from there run from minus this to this.
-        first: (angles, bins) votes of that plan, None where it did not vote.
-        voters: who voted, to finish a sentence.
-    """
-
-    grid: PlanGrid
-    plan: PlanCounts
-    centre_m: NDArray[np.float64]
-    reach_m: float
-    first: NDArray[np.int64] | None
-    voters: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class SpacePicture:
-    """What an accumulator held.
-
-    Attributes:
-        best: (o, p) best score of any distance, over omega 0..180 and phi -90..90 degrees; NaN
-            where no direction of that phi was asked about.
-        over_omega: (3, o, d) votes over omega and distance, for each phi of `sections_deg`; NaN
-            where no direction was asked about.
-        over_phi: (3, p, d) votes over phi and distance, for each omega of `sections_deg`.
-        sections_deg: where it was cut.
-        reach_m: distances run from minus this to this, from the middle of the scene's box.
-    """
-
-    best: NDArray[np.float64]
-    over_omega: NDArray[np.float64]
-    over_phi: NDArray[np.float64]
-    sections_deg: tuple[float, ...]
-    reach_m: float
-
-
-def draw_accumulator(ctx: StepContext, votes: PlanVotes, planes: Planes, cloud: PointCloud) -> None:
+def draw_accumulator(
+    ctx: StepContext, votes: PlanProposer, planes: Planes, cloud: PointCloud
+) -> None:
     """Draw the plan with the walls found, and the parameter space with their maxima.
 
     Args:
@@ -378,21 +265,14 @@ def draw_accumulator(ctx: StepContext, votes: PlanVotes, planes: Planes, cloud: 
     """
     if votes.first is None:
         return
-    figure = Figure(figsize=(11.0, 4.6))
-    space_out(figure, _ACCUMULATOR, n_rows=1, n_columns=2)
+    figure = Figure(figsize=(11.0, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2)
     basis, grid, reach_m = basis_from_up(planes.up), votes.grid, votes.reach_m
     low = grid.low_m[:2]
     high = low + grid.cell_m * np.array(grid.shape[:2])
-    image = np.log1p(_thinned_sum(votes.plan.cells))
+    image = np.log1p(_thinned_sum(votes.plan))
     left.imshow(image.T, origin="lower", cmap="gray_r", extent=(low[0], high[0], low[1], high[1]))
-    right.imshow(
-        np.sqrt(_thinned_sum(votes.first).T),
-        origin="lower",
-        aspect="auto",
-        cmap="gray",
-        extent=(0.0, 180.0, -reach_m, reach_m),
-    )
+    _show_votes(right, _thinned_sum(votes.first), (0.0, 180.0, -reach_m, reach_m))
     for index in np.flatnonzero(np.abs(planes.normal @ planes.up) < 0.5):
         corners = (planes.corners[index] - cloud.origin) @ basis.T
         left.plot(corners[[1, 2], 0], corners[[1, 2], 1], linewidth=1.2, label=planes.names[index])
@@ -418,16 +298,62 @@ def draw_accumulator(ctx: StepContext, votes: PlanVotes, planes: Planes, cloud: 
     )
 
 
-def draw_space(ctx: StepContext, picture: SpacePicture, planes: Planes) -> None:
+def draw_space(
+    ctx: StepContext,
+    best: NDArray[np.float64],
+    over_omega: Mapping[float, NDArray[np.float64]],
+    over_phi: Mapping[float, NDArray[np.float64]],
+    reach_m: float,
+    planes: Planes,
+) -> None:
     """Draw an accumulator's best votes with the planes found, and its sections.
 
     Args:
         ctx: takes the figures.
-        picture: what it held.
+        best: see `hough3d.sections_of`, which gives the next three, too.
+        over_omega: see best.
+        over_phi: see best.
+        reach_m: see best.
         planes: the planes, world.
     """
-    _draw_best(ctx, picture, planes)
-    _draw_sections(ctx, picture)
+    figure = Figure(figsize=(7.0, 4.6), layout="constrained")
+    axes = figure.subplots()
+    _show_votes(axes, np.maximum(best, 0.0), (0.0, 180.0, -90.0, 90.0))
+    for normal in planes.normal:
+        omega_deg, phi_deg = omega_phi_deg(normal, planes.up)
+        if omega_deg >= 180.0:
+            omega_deg, phi_deg = omega_deg - 180.0, -phi_deg
+        axes.plot(omega_deg, phi_deg, "o", fillstyle="none", markersize=9)
+    _label(axes, "omega [deg]", "phi [deg]")
+    ctx.figure(
+        "accumulator",
+        figure,
+        "The best votes of any distance over the direction of the normal; circles mark the planes. "
+        "Directions are even over the hemisphere: towards the poles one stands for several. A "
+        "bright spot without a circle is a direction whose plane was missed.",
+    )
+    figure = Figure(figsize=(10.0, 6.4), layout="constrained")
+    for column, above, below in zip(figure.subplots(2, 3).T, over_omega, over_phi, strict=True):
+        _show_votes(column[0], over_omega[above], (0.0, 180.0, -reach_m, reach_m))
+        _show_votes(column[1], over_phi[below], (-90.0, 90.0, -reach_m, reach_m))
+        column[0].set_title(f"phi = {above:.0f} deg", fontsize=9)
+        column[1].set_title(f"omega = {below:.0f} deg", fontsize=9)
+        _label(column[0], "omega [deg]", "distance from the middle [m]")
+        _label(column[1], "phi [deg]", "distance from the middle [m]")
+    ctx.figure(
+        "accumulator-sections",
+        figure,
+        "Votes over direction and distance before any plane was taken, in sections of one phi "
+        "(above) and of one omega (below); the brighter the more, by the square root. Planes are "
+        "sharp spots where bands cross; without any, there is no plane to find.",
+    )
+
+
+def _show_votes(
+    axes: Axes, votes: NDArray[np.float64], extent: tuple[float, float, float, float]
+) -> None:
+    """Show (across, up) votes, the brighter the more, by the square root."""
+    axes.imshow(np.sqrt(votes.T), origin="lower", aspect="auto", cmap="gray", extent=extent)
 
 
 def draw_sections(ctx: StepContext, planes: Planes, cloud: PointCloud, *, cell_m: float) -> None:
@@ -461,10 +387,8 @@ def draw_sections(ctx: StepContext, planes: Planes, cloud: PointCloud, *, cell_m
         axes.imshow(
             np.log1p(counts.T), origin="lower", cmap="gray_r", extent=extent, aspect="equal"
         )
-        axes.set_xlabel(f"{names[first]} [m from the cloud's origin]", fontsize=8)
-        axes.set_ylabel(f"{names[second]} [m]", fontsize=8)
+        _label(axes, f"{names[first]} [m from the cloud's origin]", f"{names[second]} [m]")
         axes.set_title(f"{names[across]} = {middle[across]:.2f} m", fontsize=9)
-        axes.tick_params(labelsize=7)
     ctx.figure(
         "voxels",
         figure,
@@ -486,127 +410,35 @@ def draw_normals(
         planes: the planes, world.
         cloud: where they are from.
     """
-    centroids_m = voxels.centroids() @ voxels.grid.basis
-    normals = voxels.normals.astype(np.float64) @ voxels.grid.basis
+    centroids_m = voxels.table.centroids() @ voxels.table.grid.basis
+    normals = voxels.normals.astype(np.float64) @ voxels.table.grid.basis
     first = planes.normal[0]
     away_deg = np.degrees(np.arccos(np.clip(np.abs(normals @ first), 0.0, 1.0)))
     depth_m = centroids_m @ first - (planes.offset[0] - float(first @ cloud.origin))
-    on_plane = (np.abs(depth_m) < 0.5 * voxels.grid.cell_m) & (away_deg < 45.0)
+    on_plane = (np.abs(depth_m) < 0.5 * voxels.table.grid.cell_m) & (away_deg < 45.0)
     placed = (centroids_m - (planes.corners[0, 0] - cloud.origin)) @ wall_axes(first, planes.up).T
     size_m = np.linalg.norm(planes.corners[0, [3, 1]] - planes.corners[0, 0], axis=1)
     over = ((placed >= 0.0) & (placed < size_m)).all(axis=1)
     scatter_deg = float(np.median(away_deg[on_plane & over])) if (on_plane & over).any() else 0.0
     ctx.metric("n_regions", n_regions, "1")
     ctx.metric("neighbourhood_mm", 1000.0 * voxels.neighbourhood.size_m, "mm")
-    ctx.metric("cell_mm", 1000.0 * voxels.grid.cell_m, "mm")
+    ctx.metric("cell_mm", 1000.0 * voxels.table.grid.cell_m, "mm")
     ctx.metric("normal_scatter_deg", scatter_deg, "deg")
     shown = over & (np.abs(depth_m) < _MAP_DEPTH_M) & np.isfinite(voxels.spreads[:, 0])
-    picture = _normal_map(
-        placed[shown], depth_m[shown], away_deg[shown], size_m, voxels.grid.cell_m
-    )
-    across_deg = np.degrees(np.arcsin(np.clip(normals @ basis_from_up(planes.up)[1], -1.0, 1.0)))
-    angles_deg = {f"angle between normal and {planes.names[0]}": away_deg, "Ny": across_deg}
-    _draw_normals(ctx, angles_deg, voxels.counts, picture, size_m)
-
-
-def _thinned_sum(values: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Sum blocks of an image until it is small enough to draw."""
-    rows, columns = (max(1, -(-size // _PIXELS_MOST)) for size in values.shape)
-    padded = np.pad(values, ((0, -values.shape[0] % rows), (0, -values.shape[1] % columns)))
-    blocks = padded.reshape(padded.shape[0] // rows, rows, padded.shape[1] // columns, columns)
-    thinned: NDArray[np.float64] = blocks.sum(axis=(1, 3)).astype(np.float64)
-    return thinned
-
-
-def _draw_best(ctx: StepContext, picture: SpacePicture, planes: Planes) -> None:
-    figure = Figure(figsize=(7.0, 4.6), layout="constrained")
-    axes = figure.subplots()
-    axes.imshow(
-        np.sqrt(np.maximum(picture.best.T, 0.0)),
-        origin="lower",
-        aspect="auto",
-        cmap="gray",
-        extent=(0.0, 180.0, -90.0, 90.0),
-    )
-    for normal in planes.normal:
-        omega_deg, phi_deg = omega_phi_deg(normal, planes.up)
-        if omega_deg >= 180.0:
-            omega_deg, phi_deg = omega_deg - 180.0, -phi_deg
-        axes.plot(omega_deg, phi_deg, "o", fillstyle="none", markersize=9)
-    axes.set_xlabel("omega [deg]")
-    axes.set_ylabel("phi [deg]")
-    ctx.figure(
-        "accumulator",
-        figure,
-        "The best votes of any distance over the direction of the normal; circles mark the planes. "
-        "Directions are even over the hemisphere: towards the poles one stands for several. A "
-        "bright spot without a circle is a direction whose plane was missed.",
-    )
-
-
-def _draw_sections(ctx: StepContext, picture: SpacePicture) -> None:
-    figure = Figure(figsize=(10.0, 6.4), layout="constrained")
-    axes = figure.subplots(2, 3)
-    for place, cut_deg in enumerate(picture.sections_deg):
-        _draw_section(axes[0, place], picture.over_omega[place], (0.0, 180.0), picture.reach_m)
-        _draw_section(axes[1, place], picture.over_phi[place], (-90.0, 90.0), picture.reach_m)
-        axes[0, place].set_title(f"phi = {cut_deg:.0f} deg", fontsize=9)
-        axes[1, place].set_title(f"omega = {cut_deg:.0f} deg", fontsize=9)
-        axes[0, place].set_xlabel("omega [deg]", fontsize=8)
-        axes[1, place].set_xlabel("phi [deg]", fontsize=8)
-    for row in axes:
-        row[0].set_ylabel("distance from the middle [m]", fontsize=8)
-    ctx.figure(
-        "accumulator-sections",
-        figure,
-        "Votes over direction and distance before any plane was taken, in sections of one phi "
-        "(above) and of one omega (below); the brighter the more, by the square root. Planes are "
-        "sharp spots where bands cross; without any, there is no plane to find.",
-    )
-
-
-def _draw_section(
-    axes: Axes, section: NDArray[np.float64], span_deg: tuple[float, float], reach_m: float
-) -> None:
-    axes.imshow(
-        np.sqrt(section.T),
-        origin="lower",
-        aspect="auto",
-        cmap="gray",
-        extent=(*span_deg, -reach_m, reach_m),
-    )
-    axes.tick_params(labelsize=7)
-
-
-def _normal_map(
-    placed: NDArray[np.float64],
-    depth_m: NDArray[np.float64],
-    away_deg: NDArray[np.float64],
-    size_m: NDArray[np.float64],
-    cell_m: float,
-) -> NDArray[np.float64]:
-    """(rows, columns) angle of the voxel nearest to the viewer, NaN without one."""
-    pixel_m = max(cell_m, float(size_m.max()) / _MAP_PIXELS_MOST)
-    shape = np.maximum(1, np.ceil(size_m / pixel_m).astype(int))[::-1]
-    picture = np.full(tuple(shape), np.nan)
-    order = np.argsort(depth_m, kind="stable")
+    # The angle of the voxel nearest to the viewer, NaN without one.
+    pixel_m = max(voxels.table.grid.cell_m, float(size_m.max()) / _MAP_PIXELS_MOST)
+    picture = np.full(np.maximum(1, np.ceil(size_m / pixel_m).astype(int))[::-1], np.nan)
+    order = np.flatnonzero(shown)[np.argsort(depth_m[shown], kind="stable")]
     columns, rows = (placed[order] / pixel_m).astype(np.int64).T
     picture[rows, columns] = away_deg[order]
-    return picture
-
-
-def _draw_normals(
-    ctx: StepContext,
-    angles_deg: Mapping[str, NDArray[np.float64]],
-    counts: NDArray[np.int64],
-    picture: NDArray[np.float64],
-    size_m: NDArray[np.float64],
-) -> None:
+    across_deg = np.degrees(np.arcsin(np.clip(normals @ basis_from_up(planes.up)[1], -1.0, 1.0)))
+    angles_deg = {f"angle between normal and {planes.names[0]}": away_deg, "Ny": across_deg}
+    counts = voxels.counts.astype(np.float64)
     figure = Figure(figsize=(14.0, 4.0), layout="constrained")
     *histograms, right = figure.subplots(1, 3, width_ratios=(2.0, 2.0, 3.0))
     for axes, (name, values_deg) in zip(histograms, angles_deg.items(), strict=True):
         edges_deg = np.arange(-90.0 if values_deg.min() < 0.0 else 0.0, 90.0 + _BIN_DEG, _BIN_DEG)
-        histogram, _ = np.histogram(values_deg, edges_deg, weights=counts.astype(np.float64))
+        histogram, _ = np.histogram(values_deg, edges_deg, weights=counts)
         shares = histogram / max(1.0, float(counts.sum()))
         axes.stairs(shares, edges_deg, fill=True, color="#9db8d2")
         axes.set_xlabel(f"{name} [deg]", fontsize=9)
@@ -629,3 +461,12 @@ def _draw_normals(
         "behind it; what has the wall's colour is told from it by its distance alone. Normals of a "
         "good wall gather near 0 degrees; a broad hill means noise or relief.",
     )
+
+
+def _thinned_sum(values: NDArray[np.int64] | NDArray[np.int32]) -> NDArray[np.float64]:
+    """Sum blocks of an image until it is small enough to draw."""
+    rows, columns = (max(1, -(-size // _PIXELS_MOST)) for size in values.shape)
+    padded = np.pad(values, ((0, -values.shape[0] % rows), (0, -values.shape[1] % columns)))
+    blocks = padded.reshape(padded.shape[0] // rows, rows, padded.shape[1] // columns, columns)
+    thinned: NDArray[np.float64] = blocks.sum(axis=(1, 3)).astype(np.float64)
+    return thinned

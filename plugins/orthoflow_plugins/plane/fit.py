@@ -33,23 +33,23 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry import Plane
-from orthoflow_plugins.plane.kernels import FREE, LEVEL, VERTICAL, refine_robustly
-from orthoflow_plugins.plane.slab_kernels import STEPS_PER_TOLERANCE
+from orthoflow.geometry import Plane, basis_from_up
+from orthoflow_plugins.plane.kernels import (
+    FREE,
+    LEVEL,
+    STEPS_PER_TOLERANCE,
+    VERTICAL,
+    refine_robustly,
+)
 from orthoflow_plugins.plane.support import CellSums, SurfaceRaster
 
-# What a fit may change: everything, or a normal kept exactly horizontal, or kept along up; and
-# which of height, slope along u and slope along v are its unknowns then.
+# What a fit may change: everything, or a normal kept exactly horizontal, or kept along up; that of
+# the compiled fit, and which of height, slope along u and slope along v are unknowns.
 Freedom = Literal["free", "vertical", "horizontal"]
-_KERNEL_FREEDOMS: Final[dict[Freedom, int]] = {
-    "free": FREE,
-    "vertical": VERTICAL,
-    "horizontal": LEVEL,
-}
-_UNKNOWNS: Final[dict[Freedom, tuple[int, ...]]] = {
-    "free": (0, 1, 2),
-    "vertical": (0, 1),
-    "horizontal": (0,),
+_FREEDOMS: Final[dict[Freedom, tuple[int, list[int]]]] = {
+    "free": (FREE, [0, 1, 2]),
+    "vertical": (VERTICAL, [0, 1]),
+    "horizontal": (LEVEL, [0]),
 }
 
 # In standard deviations of a cell: beyond, a cell has no weight (Beaton & Tukey 1974).
@@ -113,58 +113,44 @@ def refine_plane(
     Returns:
         The plane, or None where fewer than three points or only a line of points support it.
     """
+    basis = np.eye(3) if freedom == "free" else basis_from_up(up)
     # Every other point of an array, or all: one kernel for both.
-    packed = np.ascontiguousarray(points)
+    packed = np.ascontiguousarray(points if freedom == "free" else points @ basis.T)
+    row = np.append(basis @ start.normal, start.offset_m)
     for tolerance_m in tolerances_m:
-        row = np.append(start.normal, start.offset_m)
-        if not refine_robustly(packed, row, tolerance_m, _KERNEL_FREEDOMS[freedom], up):
+        if not refine_robustly(packed, row, tolerance_m, _FREEDOMS[freedom][0]):
             return None
-        # Twice, because Plane accepts no length that is off by more than rounding.
-        normal = row[:3] / np.linalg.norm(row[:3])
-        start = Plane(normal=normal / np.linalg.norm(normal), offset_m=float(row[3]))
-    return start
-
-
-@dataclass(frozen=True, kw_only=True)
-class CellHeights:
-    """Cells as observations of the height over a plane that is nearly right.
-
-    Attributes:
-        design: (n, p) derivatives of a height by the unknowns.
-        heights_m: (n,) mean height of the points of each cell.
-        noise_m2: (n,) variance of that mean by the noise of the points.
-        mixture_m2: (n,) its variance by points that do not belong to the surface.
-        rows: (n,) place of the cell on the plane.
-        columns: see rows.
-    """
-
-    design: NDArray[np.float64]
-    heights_m: NDArray[np.float64]
-    noise_m2: NDArray[np.float64]
-    mixture_m2: NDArray[np.float64]
-    rows: NDArray[np.int64]
-    columns: NDArray[np.int64]
+    normal = row[:3] @ basis
+    # Twice, because Plane accepts no length that is off by more than rounding.
+    normal /= np.linalg.norm(normal)
+    return Plane(normal=normal / np.linalg.norm(normal), offset_m=float(row[3]))
 
 
 @dataclass(frozen=True, kw_only=True)
 class CellFit:
-    """A robust fit to cells.
+    """A robust fit to cells, which are observations of the height over a plane nearly right.
 
     Attributes:
-        observed: the cells.
-        solution: (p,) the unknowns.
+        design: (n, p) derivatives of a height by the unknowns.
+        heights_m: (n,) mean height of the points of each cell.
+        rows: (n,) place of the cell on the plane.
+        columns: see rows.
         limit_m: (n,) residual at which a cell has no weight any more.
         variance_m2: (n,) variance of each cell.
+        solution: (p,) the unknowns.
     """
 
-    observed: CellHeights
-    solution: NDArray[np.float64]
+    design: NDArray[np.float64]
+    heights_m: NDArray[np.float64]
+    rows: NDArray[np.int64]
+    columns: NDArray[np.int64]
     limit_m: NDArray[np.float64]
     variance_m2: NDArray[np.float64]
+    solution: NDArray[np.float64]
 
     def residuals_m(self) -> NDArray[np.float64]:
         """(n,) heights above the plane."""
-        return np.asarray(self.observed.heights_m - self.observed.design @ self.solution)
+        return np.asarray(self.heights_m - self.design @ self.solution)
 
     def faded(self) -> NDArray[np.float64]:
         """(n,) how far residuals are from where weights begin to fade, 0, to the limit, 1."""
@@ -177,12 +163,12 @@ class CellFit:
 
     def stepped(self) -> CellFit | None:
         """Solve with the weights of this one; None where the cells do not fix a plane."""
-        weighted = self.weights() * self.observed.design.T
-        normal_matrix = weighted @ self.observed.design
+        weighted = self.weights() * self.design.T
+        normal_matrix = weighted @ self.design
         extremes = np.abs(np.linalg.eigvalsh(normal_matrix))
         if extremes.max() > 1e12 * extremes.min():
             return None
-        solution = np.linalg.solve(normal_matrix, weighted @ self.observed.heights_m)
+        solution = np.linalg.solve(normal_matrix, weighted @ self.heights_m)
         return replace(self, solution=np.asarray(solution, dtype=np.float64))
 
 
@@ -251,26 +237,24 @@ def adjust_plane(
     u, v = (centres[rows, columns] for centres in raster.centres_m())
     centre = np.array([u.mean(), v.mean()])
     full = np.column_stack([np.ones(len(rows)), u - centre[0], v - centre[1]])
-    unknowns = list(_UNKNOWNS[freedom])
-    fit = _solved(
-        CellHeights(
-            design=full[:, unknowns],
-            heights_m=heights_m,
-            noise_m2=noise_m2,
-            mixture_m2=mixture_m2,
-            rows=rows,
-            columns=columns,
-        ),
-        settled_m,
-    )
+    unknowns = _FREEDOMS[freedom][1]
+    fit = _solved(full[:, unknowns], heights_m, rows, columns, noise_m2, mixture_m2, settled_m)
     if fit is None:
         return None
     change = np.zeros(3)
     change[unknowns] = fit.solution
-    plane, jacobian = _tilted(raster, change, centre)
+    # Height and slopes at the centre of the cells.
+    axes = raster.axes
+    normal = raster.plane.normal - change[1:] @ axes
+    offset_m = raster.plane.offset_m + float(change @ [1.0, *-centre])
+    length = float(np.linalg.norm(normal))
+    jacobian = np.zeros((4, 3))
+    jacobian[:3, 1:], jacobian[3] = -axes.T, (1.0, *-centre)
+    normal = normal / length
     bend_per_m, bend_share = _bend(full, heights_m)
     return AdjustedPlane(
-        plane=plane,
+        # Twice, because Plane accepts no length that is off by more than rounding.
+        plane=Plane(normal=normal / np.linalg.norm(normal), offset_m=offset_m / length),
         moved_m=float(np.abs(full @ change).max()),
         bend_per_m=bend_per_m,
         bend_share=bend_share,
@@ -316,24 +300,34 @@ def _cell_variances(
     return blended / number, (1.5 * excess / fit_tolerance_m) ** 2
 
 
-def _solved(observed: CellHeights, settled_m: float) -> CellFit | None:
+def _solved(
+    design: NDArray[np.float64],
+    heights_m: NDArray[np.float64],
+    rows: NDArray[np.int64],
+    columns: NDArray[np.int64],
+    noise_m2: NDArray[np.float64],
+    mixture_m2: NDArray[np.float64],
+    settled_m: float,
+) -> CellFit | None:
     """Weighted least squares with the cells' own variance estimated along; outliers lose weight."""
-    solution = np.zeros(observed.design.shape[1])
-    solution[0] = _densest_layer(observed.heights_m)[0]
-    noise_m2 = float(np.median(observed.noise_m2 + observed.mixture_m2))
+    solution = np.zeros(design.shape[1])
+    solution[0] = _densest_layer(heights_m)[0]
+    usual_m2 = float(np.median(noise_m2 + mixture_m2))
     for _ in range(_STEPS_MOST):
-        residuals = observed.heights_m - observed.design @ solution
-        scale_m = max(_densest_layer(residuals)[1], _FLATTEST_M)
-        surface_m2 = max(scale_m**2 - noise_m2, _FLATTEST_M**2)
+        scale_m = max(_densest_layer(heights_m - design @ solution)[1], _FLATTEST_M)
+        surface_m2 = max(scale_m**2 - usual_m2, _FLATTEST_M**2)
         fit = CellFit(
-            observed=observed,
+            design=design,
+            heights_m=heights_m,
+            rows=rows,
+            columns=columns,
+            limit_m=_TUKEY * np.sqrt(surface_m2 + noise_m2),
+            variance_m2=surface_m2 + noise_m2 + mixture_m2,
             solution=solution,
-            limit_m=_TUKEY * np.sqrt(surface_m2 + observed.noise_m2),
-            variance_m2=surface_m2 + observed.noise_m2 + observed.mixture_m2,
         ).stepped()
         if fit is None:
             return None
-        moved_m = float(np.abs(observed.design @ (fit.solution - solution)).max())
+        moved_m = float(np.abs(design @ (fit.solution - solution)).max())
         solution = fit.solution
         if moved_m < settled_m:
             break
@@ -372,33 +366,15 @@ def _bend(design: NDArray[np.float64], heights_m: NDArray[np.float64]) -> tuple[
     return strongest, 1.0 - max(0.0, squares - float(terms @ right)) / variance
 
 
-def _tilted(
-    raster: SurfaceRaster, change: NDArray[np.float64], centre: NDArray[np.float64]
-) -> tuple[Plane, NDArray[np.float64]]:
-    """Apply height and slopes at a point of the plane; gives the Jacobian (4, 3) too."""
-    height_m, slope_u, slope_v = change
-    u, v = raster.axes
-    normal = raster.plane.normal - slope_u * u - slope_v * v
-    offset_m = raster.plane.offset_m + height_m - slope_u * centre[0] - slope_v * centre[1]
-    length = float(np.linalg.norm(normal))
-    jacobian = np.zeros((4, 3))
-    jacobian[:3, 1], jacobian[:3, 2] = -u, -v
-    jacobian[3] = (1.0, -centre[0], -centre[1])
-    normal = normal / length
-    # Twice, because Plane accepts no length that is off by more than rounding.
-    plane = Plane(normal=normal / np.linalg.norm(normal), offset_m=offset_m / length)
-    return plane, jacobian
-
-
 def stated_covariance(fit: CellFit) -> tuple[NDArray[np.float64], float]:
     """State the covariance of a robust fit to cells, correlated and one-sided errors included.
 
     Returns:
         (p, p) of the unknowns, and how many cells without common errors would fix them as well.
     """
-    observed, design, weights = fit.observed, fit.observed.design, fit.weights()
+    design, weights = fit.design, fit.weights()
     scores, products, used = _scores(fit)
-    rows, columns = observed.rows[used], observed.columns[used]
+    rows, columns = fit.rows[used], fit.columns[used]
     factor = _flattening(fit, weights) ** -2
     largest = np.zeros((design.shape[1],) * 2)
     # Every cell a tile of its own.
@@ -415,7 +391,11 @@ def stated_covariance(fit: CellFit) -> tuple[NDArray[np.float64], float]:
             beyond = max(1.0, 2.0 - before / variance) if variance else 1.0
             largest, reach = beyond * covariance, variance
         before = variance
-    moved = _moved_by_more(fit)
+    # How far the unknowns move when cells twice as far away may take part.
+    wider = replace(fit, limit_m=_WIDER * fit.limit_m)
+    for _ in range(_WIDER_STEPS):
+        wider = wider.stepped() or wider
+    moved = wider.solution - fit.solution
     covariance = largest + np.outer(moved, moved)
     variance = _mean_variance(design, covariance)
     effective = float(weights.sum() ** 2 / np.sum(weights**2))
@@ -440,7 +420,7 @@ def _scores(
     """(m, p) scores and (m, p, p) products of the cells with weight, and (n,) which those are."""
     weights = fit.weights()
     used = weights > 0.0
-    design, weights = fit.observed.design[used], weights[used]
+    design, weights = fit.design[used], weights[used]
     scores = (weights * fit.residuals_m()[used])[:, None] * design
     products = (weights[:, None] * design)[:, :, None] * design[:, None, :]
     return scores, products, used
@@ -471,7 +451,7 @@ def _left_out(
 
 def _flattening(fit: CellFit, weights: NDArray[np.float64]) -> float:
     """Share of the weights that the derivative of the influence function leaves."""
-    design, faded = fit.observed.design, fit.faded()
+    design, faded = fit.design, fit.faded()
     inside = 1.0 - faded**2
     ratios = fit.residuals_m() / fit.limit_m
     falls = 4.0 * faded * np.abs(ratios) / (1.0 - _FULL_SHARE)
@@ -479,14 +459,3 @@ def _flattening(fit: CellFit, weights: NDArray[np.float64]) -> float:
     by_weights = float(np.trace(design.T @ (weights[:, None] * design)))
     by_slopes = float(np.trace(design.T @ (slopes[:, None] * design)))
     return max(_FLATTENING_LEAST, by_slopes / by_weights)
-
-
-def _moved_by_more(fit: CellFit) -> NDArray[np.float64]:
-    """How far the unknowns move when cells twice as far away may take part."""
-    wider = replace(fit, limit_m=_WIDER * fit.limit_m)
-    for _ in range(_WIDER_STEPS):
-        stepped = wider.stepped()
-        if stepped is None:
-            break
-        wider = stepped
-    return wider.solution - fit.solution

@@ -6,11 +6,10 @@ import math
 from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from orthoflow.errors import GeometryError, MethodError
-from orthoflow.geometry import Plane, basis_from_up, plane_through, wall_axes
+from orthoflow.geometry import Plane, plane_through, wall_axes
 from orthoflow.products import PointCloud, PointLabels
 from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, MetricSpec, StepContext
 from orthoflow_plugins.plane.detector import DetectorIn, DetectorOut
@@ -18,7 +17,6 @@ from orthoflow_plugins.plane.detector import DetectorIn, DetectorOut
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.cloud import PreparedCloud
     from orthoflow_plugins.plane.planes import FacedPlane
-    from orthoflow_plugins.plane.support import Support, SurfaceRaster
 
 Vector = tuple[float, float, float]
 
@@ -29,8 +27,8 @@ _STRAY_REPORTED: Final = 1e-3
 # The paper's buffer of three tolerances on either side of a wall.
 _BUFFER_TOLERANCES: Final = 3.0
 # Steps of the robust box; of so small a share of the points per side it does not depend.
-_PLAN_CELL_M: Final = 0.05
-_STRAY_SHARE: Final = 0.002
+_BOX_CELL_M: Final = 0.05
+_OUTSIDE_SHARE: Final = 0.0005
 _EVERYWHERE_M: Final = 1e9
 _NO_BOUNDS_M: Final = (-_EVERYWHERE_M, _EVERYWHERE_M, -_EVERYWHERE_M, _EVERYWHERE_M)
 
@@ -176,27 +174,18 @@ class GivenPlane(Method):
         from orthoflow_plugins.plane.support import slab_of
 
         cloud, tolerance_m = inputs.cloud, params.tolerance_m
-        if len(cloud) < 3:
-            cloud.require_points(3)
         ctx.progress(0.0, "placing the plane")
+        # With a part_min_share of 0 no point is stray.
+        outside_share = _OUTSIDE_SHARE if params.part_min_share else 0.0
         prepared = prepare(
-            cloud,
-            basis_from_up(cloud.up),
-            cell_m=_PLAN_CELL_M,
-            # With a part_min_share of 0 no point is stray.
-            least_share=_STRAY_SHARE if params.part_min_share else 0.0,
-            parts=ctx.cores,
+            cloud, parts=ctx.cores, box_cell_m=_BOX_CELL_M, outside_share=outside_share
         )
         laid = _laid(params, cloud, prepared, ctx)
         ctx.progress(0.4, "labelling points")
-        axes = [wall_axes(item.plane.normal, cloud.up) for item, _ in laid]
-        slabs = np.array(
-            [
-                slab_of(item.plane, own, np.zeros(2))
-                for (item, _), own in zip(laid, axes, strict=True)
-            ]
-        )
-        prepared.claim_in_turn(slabs, np.array([tolerance_m, *_NO_BOUNDS_M]))
+        planes = [item.plane for item, _ in laid]
+        slabs = np.array([slab_of(plane, wall_axes(plane.normal, cloud.up)) for plane in planes])
+        everywhere = np.tile(_NO_BOUNDS_M, (len(laid), 1))
+        prepared.assign(slabs, np.insert(everywhere, 0, tolerance_m, axis=1))
         counts = np.bincount(prepared.claims[prepared.claims >= 0], minlength=len(laid))
         order = np.argsort(-counts, kind="stable")
         # The plane with the most points first; the last entry is for points on none.
@@ -206,12 +195,12 @@ class GivenPlane(Method):
         deviations = measure_planes(
             prepared,
             slabs[order],
-            np.tile(_NO_BOUNDS_M, (len(laid), 1)),
+            everywhere,
             tolerance_m=tolerance_m,
             fit_tolerance_m=tolerance_m,
         )
         faced, viewpoints = zip(*(laid[k] for k in order), strict=True)
-        planes = planes_of(
+        found = planes_of(
             faced,
             deviations,
             cloud,
@@ -220,9 +209,9 @@ class GivenPlane(Method):
             viewpoint="guess" if "guess" in viewpoints else viewpoints[0],
         )
         report_planes(
-            ctx, planes, deviations, n_points=len(cloud), n_guessed=viewpoints.count("guess")
+            ctx, found, deviations, n_points=len(cloud), n_guessed=viewpoints.count("guess")
         )
-        return DetectorOut(planes=planes, labels=PointLabels(plane_index=labels))
+        return DetectorOut(planes=found, labels=PointLabels(plane_index=labels))
 
 
 def _laid(
@@ -255,6 +244,7 @@ def _placed(
         side_of_remaining,
         side_of_stations,
     )
+    from orthoflow_plugins.plane.support import SurfaceRaster, cell_for, measure_cells, support_of
 
     plane, is_settled = _plane_of(stated, cloud, prepared)
     members = prepared.sample.offsets_m
@@ -264,13 +254,26 @@ def _placed(
         buffer_m = _BUFFER_TOLERANCES * params.tolerance_m
     reach_m = _EVERYWHERE_M if buffer_m is None else buffer_m
     near = np.abs(distances_m) <= reach_m
-    raster, support, n_near = _support_of(
-        plane, members[near], reach_m, params.part_min_share, prepared
+    # Cells of the points near the plane that hang together. Not by the full range of these: three
+    # echoes far away would make the cells as large as the scene.
+    up = prepared.up
+    placed = members[near] @ wall_axes(plane.normal, up).T
+    low, high = np.quantile(placed, (0.01, 0.99), axis=0) if len(placed) else np.zeros((2, 2))
+    cell_m = cell_for(len(placed) * prepared.sample.n_represented, float(np.prod(high - low)))
+    raster = SurfaceRaster.over(plane, prepared.box_corners(), up, cell_m)
+    (sums,) = measure_cells(
+        prepared.points,
+        [raster],
+        tolerance_m=reach_m,
+        fit_tolerance_m=reach_m,
+        parts=prepared.parts,
     )
+    share = params.part_min_share
+    support = support_of(raster, sums.n_near > 0, sums, part_share=share)
     if support is None:
         low_m, high_m = float(distances_m.min()), float(distances_m.max())
         raise MethodError(_TOO_FAR.format(buffer=reach_m, low=low_m, high=high_m))
-    prepared.claim_in_turn(raster.slab()[None], np.concatenate([[reach_m], support.bounds_m]))
+    prepared.assign(raster.slab()[None], np.append(reach_m, support.bounds_m)[None])
     deviations = measure_planes(
         prepared,
         raster.slab()[None],
@@ -290,6 +293,7 @@ def _placed(
             nowhere = np.zeros(len(members), dtype=bool)
             clear_m = (buffer_m or 0.0) / _BUFFER_TOLERANCES
             side = side_of_remaining(plane, corners_m, members, nowhere, clear_m=clear_m)
+    n_near = int(sums.n_near.sum())
     n_beside = n_near - int(deviations.n_points[0]) if buffer_m is None else 0
     faced = face(raster, extent_m, support.parts_m, side, cloud.up, is_guessed=viewpoint == "guess")
     return faced, viewpoint, max(0, n_beside)
@@ -317,33 +321,3 @@ def _plane_of(
         return Plane(normal=up, offset_m=stated.height_m - float(up @ cloud.origin)), True
     ground_m = float(np.quantile(prepared.sample.offsets_m @ up, _GROUND_SHARE))
     return Plane(normal=up, offset_m=ground_m), True
-
-
-def _support_of(
-    plane: Plane,
-    near_m: NDArray[np.float64],
-    reach_m: float,
-    part_share: float,
-    prepared: PreparedCloud,
-) -> tuple[SurfaceRaster, Support | None, int]:
-    """Cells of the points near a plane that hang together, and how many points are near.
-
-    Args:
-        plane: the plane.
-        near_m: (m, 3) points of the sample that are near.
-        reach_m: what is near.
-        part_share: parts that cover a smaller share of what all cover do not count.
-        prepared: the cloud.
-    """
-    from orthoflow_plugins.plane.support import SurfaceRaster, cell_for, measure_cells, support_of
-
-    placed = near_m @ wall_axes(plane.normal, prepared.up).T
-    # Not the full range: three echoes far away would make the cells as large as the scene.
-    low, high = np.quantile(placed, (0.01, 0.99), axis=0) if len(near_m) else np.zeros((2, 2))
-    cell_m = cell_for(len(near_m) * prepared.sample.n_represented, float(np.prod(high - low)))
-    raster = SurfaceRaster.over(plane, prepared.box_corners(), prepared.up, cell_m)
-    sums = measure_cells(
-        prepared.points, raster, tolerance_m=reach_m, fit_tolerance_m=reach_m, parts=prepared.parts
-    )
-    support = support_of(raster, sums.n_near > 0, sums, part_share=part_share)
-    return raster, support, int(sums.n_near.sum())

@@ -12,6 +12,7 @@ share of a cell's points a plane took; where it is all of the cloud, it knows th
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Final, Literal, Self
 
@@ -32,7 +33,7 @@ from orthoflow_plugins.plane.detector import (
 )
 
 if TYPE_CHECKING:
-    from orthoflow_plugins.plane.cloud import Search
+    from orthoflow_plugins.plane.search import Search
 
 # Angles on either side of a candidate that was none that are not proposed again.
 _NOT_AGAIN_ANGLES: Final = 2
@@ -113,13 +114,12 @@ class Hough2d(Method):
         from orthoflow_plugins.plane.figures import draw_accumulator
         from orthoflow_plugins.plane.search import detect
 
-        cloud = inputs.cloud
-        proposer_of = partial(PlanProposer, params=params)
-        detection = detect(
+        cloud, proposer_of = inputs.cloud, partial(PlanProposer, params=params)
+        out, proposer = detect(
             cloud, params, ctx, proposer_of, method=self.id, plan_cell_m=params.cell_m
         )
-        draw_accumulator(ctx, detection.proposer, detection.out.planes, cloud)
-        return detection.out
+        draw_accumulator(ctx, proposer, out.planes, cloud)
+        return out
 
 
 class PlanProposer:
@@ -127,21 +127,19 @@ class PlanProposer:
 
     Attributes:
         grid: where the cells of the plan lie.
-        plan: (e1, e2) points per cell, and (storeys,) per height, of the untouched cloud.
+        plan: (e1, e2) points per cell of the untouched cloud.
         centre_m: (2,) centre of the plan in the (e1, e2) frame of the cloud's offsets.
         reach_m: distances of lines from there run from minus this to this.
-        first: (angles, bins) votes of the untouched cloud, in points; None for levels alone.
+        first: (angles, bins) votes of the untouched cloud, VOTE_SHARES each; None for levels alone.
         voters: who voted, to finish a sentence.
     """
 
     def __init__(self, search: Search, params: Hough2d.Params) -> None:
         """Get ready to propose; the points of the search's cloud were counted over its plan."""
         cloud = search.cloud
-        if cloud.plan is None:
-            raise ValueError("the points of the cloud were not counted over its plan")
         self._cloud, self._params = cloud, params
-        self._votes_walls = params.constraint != "horizontal"
         self._is_raw = params.coordinates == "raw"
+        self._is_plain = params.scoring == "votes"
         self.voters = _VOTERS["raw" if self._is_raw else params.accumulator]
         self.grid, self.plan = cloud.grid, cloud.plan
         rows, columns, storeys = self.grid.shape
@@ -150,56 +148,60 @@ class PlanProposer:
         self._least_points = params.min_share * len(cloud.claims)
         self._points_per_vote = cloud.sample.n_represented if self._is_raw else 1.0
         n_angles = round(180.0 / params.angle_step_deg)
-        self._angles_rad = np.arange(n_angles, dtype=np.float64) * (math.pi / n_angles)
+        self._step_rad = math.pi / n_angles
+        self._angles_rad = np.arange(n_angles, dtype=np.float64) * self._step_rad
         half_m = 0.5 * self._cell_m * math.hypot(rows, columns)
         self._reach_bins = math.ceil(half_m / self._cell_m) + 1
         self.reach_m = self._reach_bins * self._cell_m
         # Half an angle step off, a wall's ends lie in other bins than its middle.
-        self._smear_bins = max(1, round(0.3 * half_m * math.pi / n_angles / self._cell_m))
-        self._barred = np.zeros((n_angles, 2 * self._reach_bins), dtype=bool)
-        self._barred_heights = np.zeros(storeys, dtype=bool)
-        self._counted_for = -1
-        self._cells = np.zeros((rows, columns), dtype=np.int64)
-        self._heights = cloud.plan.heights
-        self._votes = np.zeros(self._barred.shape, dtype=np.int64)
-        self._scores = np.zeros((0, 0))
-        self._last = (-1, -1)
-        self.first: NDArray[np.int64] | None = None
+        self._smear_bins = max(1, round(0.3 * half_m * self._step_rad / self._cell_m))
+        self._barred = np.zeros((n_angles, 2 * self._reach_bins), dtype=np.uint8)
+        self._barred_heights = np.zeros((1, storeys), dtype=np.uint8)
+        self._votes = np.zeros(self._barred.shape, dtype=np.int32)
+        self._cells, self._heights = np.zeros((rows, columns), dtype=np.int64), cloud.heights
+        self._counted_for, self._last = -1, (-1, -1)
+        self.first: NDArray[np.int32] | None = None
 
     def propose(self, search: Search) -> Candidate | None:
         """Name the better of the best line and the best height."""
-        from orthoflow_plugins.plane.vote_kernels import VOTE_CAUTION
+        from orthoflow_plugins.plane.votes import VOTE_CAUTION, VOTE_SHARES, best_bin
 
         if self._counted_for != search.n_points:
             self._count(search)
             self._counted_for = search.n_points
-        line_score, angle, place = -math.inf, -1, -1
-        if self._votes_walls:
-            scores = np.where(self._barred, -np.inf, self._scores)
-            best = np.unravel_index(int(np.argmax(scores)), scores.shape)
-            angle, place = int(best[0]), int(best[1])
-            line_score = float(scores[angle, place])
-        height_score, storey = -math.inf, -1
+        line_score, height_score = -math.inf, -math.inf
+        if self._params.constraint != "horizontal":
+            half = 0 if self._is_plain else self._smear_bins
+            votes, angle, place = best_bin(self._votes, self._barred, half, is_plain=self._is_plain)
+            line_score = votes / VOTE_SHARES * self._points_per_vote
         if self._params.constraint != "vertical":
-            heights = self._scored(self._heights[None, :], 1)[0]
-            heights = np.where(self._barred_heights, -np.inf, heights)
-            storey = int(np.argmax(heights))
-            height_score = float(heights[storey])
+            half, heights = 0 if self._is_plain else 1, self._heights.astype(np.int32)[None]
+            height_score, _, storey = best_bin(
+                heights, self._barred_heights, half, is_plain=self._is_plain
+            )
         if max(line_score, height_score) < VOTE_CAUTION * self._least_points:
             return None
         if height_score > line_score:
             self._last = (-1, storey)
             height_m = float(self.grid.low_m[2] + (storey + 0.5) * self._cell_m)
-            return _candidate(self.grid.basis[2], height_m, "horizontal", height_score)
+            plane = Plane(normal=self.grid.basis[2], offset_m=height_m)
+            return Candidate(plane=plane, constraint="horizontal", votes=height_score)
         self._last = (angle, place)
-        return self._wall(angle, place, line_score)
+        angle_rad, distance_m = self._angles_rad[angle], (place + 0.5) * self._cell_m - self.reach_m
+        if not self._is_plain:
+            angle_rad, distance_m = self._refined(angle_rad, distance_m)
+        direction = np.array([math.cos(angle_rad), math.sin(angle_rad)])
+        offset_m = distance_m + float(direction @ self.centre_m)
+        normal = direction @ self.grid.basis[:2]
+        plane = Plane(normal=normal / np.linalg.norm(normal), offset_m=offset_m)
+        return Candidate(plane=plane, constraint="vertical", votes=line_score)
 
     def reject(self, candidate: Candidate) -> None:
         """Bar the surroundings of the last maximum."""
         del candidate
         angle, place = self._last
         if angle < 0:
-            self._barred_heights[max(0, place - 2) : place + 3] = True
+            self._barred_heights[0, max(0, place - 2) : place + 3] = 1
             return
         reach = self._smear_bins + 1
         n_angles, n_bins = self._barred.shape
@@ -208,164 +210,107 @@ class PlanProposer:
             wrapped = not 0 <= angle + step < n_angles
             centre = n_bins - 1 - place if wrapped else place
             row = self._barred[(angle + step) % n_angles]
-            row[max(0, centre - reach) : centre + reach + 1] = True
-
-    def _scored(self, votes: NDArray[np.int64], half: int) -> NDArray[np.float64]:
-        """What the bins of (rows, bins) votes are worth, in windows of 2 half + 1 bins."""
-        from orthoflow_plugins.plane.vote_kernels import contrast
-
-        is_plain = self._params.scoring == "votes"
-        return votes.astype(np.float64) if is_plain else contrast(votes, half)
+            row[max(0, centre - reach) : centre + reach + 1] = 1
 
     def _count(self, search: Search) -> None:
         """See what is left, and let it vote."""
-        from orthoflow_plugins.plane.vote_kernels import VOTE_SHARES
+        from orthoflow_plugins.plane.votes import VOTE_SHARES, vote_image, vote_places
 
         before, accumulator = self._cells, self._params.accumulator
-        if search.n_points == len(search.claims):
-            self._cells, self._heights = self.plan.cells, self.plan.heights
-        else:
-            cells, heights = self._residuals
-            self._heights = heights.left(search.claims)
-            self._cells = cells.left(search.claims)
-        self.__dict__.pop("_voting_cells", None)
-        if not self._votes_walls:
+        self._cells = self._cloud.plan
+        if search.n_points < len(search.claims):
+            self._cells, self._heights = self._left(search.claims)
+        if self._params.constraint == "horizontal":
             return
-        if self._is_raw:
-            self._vote_raw(search)
-        elif accumulator == "counts":
-            # Votes are sums: what was taken away takes its votes back.
-            self._vote(self._cells - before)
-        else:
-            self._votes = np.zeros(self._votes.shape, dtype=np.int64)
-            self._vote(vote_counts(self._cells, accumulator))
-        if self.first is None:
-            points = self._votes / VOTE_SHARES * self._points_per_vote
-            self.first = np.rint(points).astype(np.int64)
-        scores = self._scored(self._votes, self._smear_bins) / VOTE_SHARES
-        self._scores = scores * self._points_per_vote
-
-    @cached_property
-    def _residuals(self) -> tuple[_Residual, _Residual]:
-        """What planes leave over of cells and of storeys; who looks for one only never asks."""
-        sample = self._cloud.sample
-        framed = sample.offsets_m @ self.grid.basis.T - self.grid.low_m
-        places = np.floor(framed / self._cell_m)
-        inside = (places >= 0) & (places < np.array(self.grid.shape))
-        over = inside[:, 0] & inside[:, 1]
-        places = np.where(over[:, None], places, 0.0).astype(np.int64)
-        rows, columns, storeys = self.grid.shape
-        # The last place is for points outside.
-        cell = np.where(over, places[:, 0] * columns + places[:, 1], rows * columns)
-        storey = np.where(over & inside[:, 2], places[:, 2], storeys)
-        # A sample has too few points per cell to ask one alone.
-        asks_around = sample.n_represented > 1.0
-        return (
-            _Residual(self.plan.cells, cell, asks_around=asks_around),
-            _Residual(self.plan.heights, storey, asks_around=asks_around),
-        )
-
-    @cached_property
-    def _voting_cells(self) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-        """(m, 2) centres of the cells that vote, from the plan's centre, and (m,) their votes."""
-        votes = vote_counts(self._cells, self._params.accumulator)
-        cells = np.column_stack(np.nonzero(votes))
-        places_m = (cells + 0.5 - 0.5 * np.array(votes.shape)) * self._cell_m
-        return places_m.astype(np.float32), votes[cells[:, 0], cells[:, 1]]
-
-    def _vote(self, votes: NDArray[np.int64]) -> None:
-        """Let the cells of the plan (e1, e2) vote for all lines through them."""
-        from orthoflow_plugins.plane.vote_kernels import vote_image
-
-        image = votes.astype(np.int32)
-        in_threads([partial(vote_image, image, angles, table) for angles, table in self._shares()])
-
-    def _vote_raw(self, search: Search) -> None:
-        """Let every free point of the sample vote for all lines through it."""
-        from orthoflow_plugins.plane.vote_kernels import VOTE_SHARES, vote_points
-
-        plan, points = np.column_stack([self.grid.basis[:2], self.centre_m]), search.free().points
-        self._votes = np.zeros(self._votes.shape, dtype=np.int64)
-        low_m, bin_m = -self.reach_m, self._cell_m
-        in_threads(
-            [
-                partial(vote_points, points, plan, angles, low_m, bin_m, table)
-                for angles, table in self._shares()
-            ]
-        )
-        self._votes *= VOTE_SHARES
-
-    def _shares(self) -> zip[tuple[NDArray[np.float64], NDArray[np.int64]]]:
-        """Angles and their rows of the votes, one share per thread."""
+        if self._is_raw or accumulator != "counts":
+            self._votes[:] = 0
         parts = self._cloud.parts
-        angles = np.array_split(self._angles_rad, parts)
-        return zip(angles, np.array_split(self._votes, parts), strict=True)
+        shares = [np.array_split(table, parts) for table in (self._angles_rad, self._votes)]
+        if self._is_raw:
+            places = np.zeros((3, search.n_points), dtype=np.float32)
+            places[:2] = self.grid.basis[:2] @ search.free()[0].T - self.centre_m[:, None]
+            ones = np.full(search.n_points, VOTE_SHARES, dtype=np.int32)
 
-    def _wall(self, angle: int, place: int, score: float) -> Candidate:
-        """Look around a maximum with finer angles and half-cell bins."""
-        from orthoflow_plugins.plane.vote_kernels import contrast, parabola, vote_lines
+            def vote(angles_rad: NDArray[np.float64], votes: NDArray[np.int32]) -> None:
+                normals = _normals(angles_rad)
+                vote_places(places, ones, normals, -self.reach_m, self._cell_m, votes)
 
-        bin_m = self._cell_m
-        distance_m = (place + 0.5 - self._reach_bins) * bin_m
-        if self._params.scoring == "votes":
-            return self._upright(self._angles_rad[angle], distance_m, score)
-        places_m, votes = self._voting_cells
-        step = math.pi / len(self._angles_rad)
-        reach_m = (self._smear_bins + 3) * bin_m
-        fine_step = max(step / 40.0, 0.5 / self._reach_bins)
-        n_fine = max(1, math.ceil(step / fine_step))
-        angles = self._angles_rad[angle] + np.arange(-n_fine, n_fine + 1) * (step / n_fine)
-        fine = np.zeros((len(angles), 4 * (self._smear_bins + 3)), dtype=np.int64)
-        # A point moves by up to half the plan times a step; cells further off cannot matter.
-        direction = np.array([math.cos(self._angles_rad[angle]), math.sin(self._angles_rad[angle])])
-        near_m = reach_m + step * self._reach_bins * bin_m
-        near = np.abs(places_m @ direction - distance_m) < near_m
-        low_m = distance_m - reach_m
-        vote_lines(places_m[near], votes[near], angles, low_m, 0.5 * bin_m, fine)
-        scores = contrast(fine, 1)
-        best, column = np.unravel_index(int(np.argmax(scores)), scores.shape)
-        shift = parabola(scores[best], int(column))
-        return self._upright(angles[best], low_m + (column + 0.5 + shift) * 0.5 * bin_m, score)
+        else:
+            # Votes are sums: what was taken away takes its votes back.
+            cells = vote_counts(self._cells, accumulator) - before * (accumulator == "counts")
+            vote = partial(vote_image, cells.astype(np.int32))
+        in_threads([partial(vote, *share) for share in zip(*shares, strict=True)])
+        if self.first is None:
+            self.first = self._votes.copy()
 
-    def _upright(self, angle_rad: float, distance_m: float, score: float) -> Candidate:
-        """The wall over a line of the plan, at a distance from the plan's centre."""
-        direction = np.array([math.cos(angle_rad), math.sin(angle_rad)])
-        offset_m = distance_m + float(direction @ self.centre_m)
-        return _candidate(direction @ self.grid.basis[:2], offset_m, "vertical", score)
-
-
-class _Residual:
-    """The points of a cloud per cell, or per storey, that no plane of the sample has taken."""
-
-    def __init__(
-        self, counts: NDArray[np.int64], place: NDArray[np.int64], *, asks_around: bool
-    ) -> None:
-        self._counts, self._place, self._asks_around = counts, place, asks_around
-        self._asked = self._sampled(np.ones(len(place), dtype=bool))
-
-    def left(self, claims: NDArray[np.int8]) -> NDArray[np.int64]:
-        """Points that are left, given the (m,) claims of the sample."""
-        left = self._asked - self._sampled(claims >= 0)
-        ones = np.ones(self._counts.shape)
-        share = np.divide(left, self._asked, out=ones, where=self._asked > 0)
-        return np.asarray(np.rint(self._counts * share).astype(np.int64))
-
-    def _sampled(self, chosen: NDArray[np.bool_]) -> NDArray[np.int64]:
+    @cached_property
+    def _left(self) -> Callable[[NDArray[np.int16]], tuple[NDArray[np.int64], NDArray[np.int64]]]:
+        """What planes leave over of cells and of storeys, given the claims (m,) of the sample."""
         from orthoflow_plugins.plane.support import summed_around
 
-        counts = np.bincount(self._place[chosen], minlength=self._counts.size + 1)
-        counts = counts[:-1].reshape(self._counts.shape)
-        return summed_around(counts) if self._asks_around else counts
+        sample, counts = self._cloud.sample, (self._cloud.plan, self._cloud.heights[None])
+        places = (sample.offsets_m @ self.grid.basis.T - self.grid.low_m) / self._cell_m
+        inside = (places >= 0) & (places < np.array(self.grid.shape))
+        over = inside[:, 0] & inside[:, 1]
+        rows, columns, storeys = np.where(over[:, None], places, 0.0).astype(np.int64).T
+        # The last place is for points outside.
+        cell = np.where(over, rows * self.grid.shape[1] + columns, counts[0].size)
+        storey = np.where(over & inside[:, 2], storeys, counts[1].size)
+
+        def sampled(chosen: NDArray[np.bool_], k: int) -> NDArray[np.int64]:
+            found = np.bincount((cell, storey)[k][chosen], minlength=counts[k].size + 1)[:-1]
+            found = found.reshape(counts[k].shape)
+            # A sample has too few points per cell to ask one alone.
+            return summed_around(found) if sample.n_represented > 1.0 else found
+
+        asked = [sampled(np.ones(len(cell), dtype=bool), k) for k in range(2)]
+
+        def left(claims: NDArray[np.int16]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+            free = [
+                np.divide(
+                    found - sampled(claims >= 0, k),
+                    found,
+                    out=np.ones(found.shape),
+                    where=found > 0,
+                )
+                for k, found in enumerate(asked)
+            ]
+            cells, heights = (
+                np.rint(own * share).astype(np.int64)
+                for own, share in zip(counts, free, strict=True)
+            )
+            return cells, heights[0]
+
+        return left
+
+    def _refined(self, angle_rad: float, distance_m: float) -> tuple[float, float]:
+        """Look around a maximum with finer angles and half-cell bins."""
+        from orthoflow_plugins.plane.votes import sharpest, vote_places
+
+        bin_m, step = self._cell_m, self._step_rad
+        cells = vote_counts(self._cells, self._params.accumulator)
+        rows, columns = np.nonzero(cells)
+        reach_m = (self._smear_bins + 3) * bin_m
+        n_fine = max(1, math.ceil(step / max(step / 40.0, 0.5 / self._reach_bins)))
+        angles = np.float64(angle_rad) + np.arange(-n_fine, n_fine + 1) * (step / n_fine)
+        fine = np.zeros((len(angles), 4 * (self._smear_bins + 3)), dtype=np.int32)
+        places = np.zeros((3, len(rows)), dtype=np.float32)
+        places[0] = (rows + 0.5 - 0.5 * cells.shape[0]) * bin_m
+        places[1] = (columns + 0.5 - 0.5 * cells.shape[1]) * bin_m
+        # A point moves by up to half the plan times a step; cells further off cannot matter.
+        direction = np.array([math.cos(angle_rad), math.sin(angle_rad)], dtype=np.float32)
+        apart_m = np.abs(direction @ places[:2] - np.float32(distance_m))
+        near = np.flatnonzero(apart_m < reach_m + step * self.reach_m)
+        weights = cells[rows[near], columns[near]].astype(np.int32)
+        low_m = distance_m - reach_m
+        vote_places(places.take(near, axis=1), weights, _normals(angles), low_m, 0.5 * bin_m, fine)
+        best, place = sharpest(fine)
+        return float(angles[best]), low_m + place * 0.5 * bin_m
 
 
-def _candidate(
-    normal: NDArray[np.float64],
-    offset_m: float,
-    constraint: Literal["vertical", "horizontal"],
-    votes: float,
-) -> Candidate:
-    plane = Plane(normal=normal / np.linalg.norm(normal), offset_m=offset_m)
-    return Candidate(plane=plane, constraint=constraint, votes=votes)
+def _normals(angles_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(a, 3) directions in the plan."""
+    return np.stack([np.cos(angles_rad), np.sin(angles_rad), np.zeros(len(angles_rad))], axis=1)
 
 
 def vote_counts(

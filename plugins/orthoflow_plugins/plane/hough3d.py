@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,12 +32,10 @@ from orthoflow_plugins.plane.detector import (
 )
 
 if TYPE_CHECKING:
-    from orthoflow_plugins.plane.cloud import Claim, PreparedCloud, Search
-    from orthoflow_plugins.plane.figures import SpacePicture
-    from orthoflow_plugins.plane.kernels import BlockedPoints
+    from orthoflow_plugins.plane.search import Claim, Search
 
 # What markiewicz2015 cuts its accumulator at, Figure 13; degrees.
-_SECTIONS_DEG: Final = (0.0, 45.0, 90.0)
+_CUTS_DEG: Final = (0.0, 45.0, 90.0)
 # A direction stands for another one that is nearer than this, in steps between directions.
 _STANDS_FOR_STEPS: Final = 1.5
 _NOT_AGAIN_STEPS: Final = 2.2
@@ -45,8 +43,10 @@ _NOT_AGAIN_STEPS: Final = 2.2
 _FINE_STEPS: Final = ((-1.0, -0.5, 0.0, 0.5, 1.0), (-0.4, -0.2, 0.0, 0.2, 0.4))
 # More entries than this of all tables together cost more memory than they show; bins grow instead.
 _TABLE_MOST: Final = 120_000_000
-# Rows that a table of voxels begins with.
-_ROWS_FIRST: Final = 2_048
+# Best scores, votes over omega and over phi by angle, and the reach of distances: `sections_of`.
+_Sections = tuple[
+    NDArray[np.float64], dict[float, NDArray[np.float64]], dict[float, NDArray[np.float64]], float
+]
 
 
 class Hough3d(Method):
@@ -104,59 +104,83 @@ class Hough3d(Method):
         from orthoflow_plugins.plane.figures import draw_sections, draw_space
         from orthoflow_plugins.plane.search import detect
 
-        proposer_of = partial(SpaceProposer, params=params)
-        detection = detect(inputs.cloud, params, ctx, proposer_of, method=self.id)
-        planes = detection.out.planes
-        draw_space(ctx, detection.proposer.picture(), planes)
-        draw_sections(ctx, planes, inputs.cloud, cell_m=params.cell_m)
-        return detection.out
+        cloud, proposer_of = inputs.cloud, partial(SpaceProposer, params=params)
+        out, proposer = detect(cloud, params, ctx, proposer_of, method=self.id)
+        draw_space(ctx, *proposer.sections(), out.planes)
+        draw_sections(ctx, out.planes, cloud, cell_m=params.cell_m)
+        return out
 
 
 class SpaceProposer:
     """Proposes planes from the maxima of a 3D accumulator.
 
     The accumulator is linear: when points are taken away, their voxels take their votes back,
-    instead of all others voting again.
+    instead of all others voting again. A plane takes a voxel whose middle is near enough, as a
+    whole: that is the paper's zeroing of counters, and costs no pass over the points.
+
+    Attributes:
+        middles_m: (3, m) float32 middles of the voxels with points, from the middle of the box, in
+            the (e1, e2, up) frame.
+        left: (m,) int32 points in them that no plane has taken.
     """
 
     def __init__(self, search: Search, params: Hough3d.Params) -> None:
         """Count the points of the search's cloud per voxel; none has voted yet."""
+        from orthoflow_plugins.plane.voxels import VoxelTable
+
         cloud, coarser = search.cloud, 1.0 if params.search == "full" else 2.0
         self._params, self._parts = params, cloud.parts
         self._is_raw, self._is_plain = params.coordinates == "raw", params.scoring == "votes"
         self._least_points = params.min_share * len(cloud.claims)
         self._points_per_vote = cloud.sample.n_represented if self._is_raw else 1.0
-        self._voxels = VoxelCounts(cloud, coarser * params.cell_m)
+        table = VoxelTable.over(cloud, coarser * params.cell_m, n_sums=1)
+        self._basis, self._voxel_m = cloud.grid.basis, table.grid.cell_m
+        self._middle_m = cloud.grid.low_m + 0.5 * cloud.grid.extent_m
+        self._extent_m = cloud.grid.extent_m
+        middles_m = (table.places + 0.5) * self._voxel_m - 0.5 * self._extent_m
+        self.middles_m = np.ascontiguousarray(middles_m.T, dtype=np.float32)
+        self.left = table.sums[:, 0].astype(np.int32)
         self._directions = directions_over(
             coarser * params.angle_step_deg, params.constraint, params.max_tilt_deg
         )
-        half_m = 0.5 * float(np.linalg.norm(self._voxels.extent_m))
+        self._half_m = 0.5 * float(np.linalg.norm(self._extent_m))
         n_rows = len(self._directions.normals)
-        self._bin_m = max(self._voxels.voxel_m, 2.0 * half_m * n_rows / _TABLE_MOST)
-        n_bins = 2 * (math.ceil(half_m / self._bin_m) + 1)
-        self._smear_bins = max(1, round(0.3 * half_m * self._directions.step_rad / self._bin_m))
+        self._bin_m = max(self._voxel_m, 2.0 * self._half_m * n_rows / _TABLE_MOST)
+        n_bins = 2 * (math.ceil(self._half_m / self._bin_m) + 1)
+        self._smear_bins = max(
+            1, round(0.3 * self._half_m * self._directions.step_rad / self._bin_m)
+        )
         self._votes = np.zeros((n_rows, n_bins), dtype=np.int32)
         self._barred = np.zeros((n_rows, n_bins), dtype=np.uint8)
-        self._scores = np.zeros(n_rows, dtype=np.int64)
-        self._places = np.zeros(n_rows, dtype=np.int64)
-        self._voted_for = -1
+        self._scores, self._places = np.zeros((2, n_rows), dtype=np.int64)
         self._unscored = np.arange(n_rows)
-        self._last = (0, 0)
-        self._picture: SpacePicture | None = None
+        self._voted_for, self._n_taken, self._last = -1, 0, (0, 0)
+        self._first: _Sections | None = None
 
     def propose(self, search: Search) -> Candidate | None:
         """Name the plane whose votes stand out most."""
-        from orthoflow_plugins.plane.vote_kernels import VOTE_CAUTION, VOTE_SHARES
+        from orthoflow_plugins.plane.votes import VOTE_CAUTION, VOTE_SHARES
 
         if self._voted_for != search.n_points:
             self._vote(search)
+            self._voted_for = search.n_points
         self._score()
         direction = int(np.argmax(self._scores))
         score = float(self._scores[direction]) / VOTE_SHARES * self._points_per_vote
         if score < VOTE_CAUTION * self._least_points:
             return None
-        self._last = (direction, int(self._places[direction]))
-        return self._refined(direction, score)
+        place = int(self._places[direction])
+        self._last = (direction, place)
+        normal = self._directions.normals[direction]
+        point = (place + 0.5 - 0.5 * self._votes.shape[1]) * self._bin_m * normal
+        if not self._is_plain:
+            normal, point = self._refined(normal, float(normal @ point))
+        # From the middle of the box in its frame to offsets.
+        world = normal / np.linalg.norm(normal) @ self._basis
+        world = world / np.linalg.norm(world)
+        on_plane = (point + self._middle_m) @ self._basis
+        plane = Plane(normal=world, offset_m=float(world @ on_plane))
+        return Candidate(plane=plane, constraint=self._params.constraint, votes=score)
 
     def reject(self, candidate: Candidate) -> None:
         """Bar the surroundings of the last maximum."""
@@ -172,34 +196,40 @@ class SpaceProposer:
             middle = place if cosines[row] > 0.0 else n_bins - 1 - place
             self._barred[row, max(0, middle - reach) : middle + reach + 1] = 1
 
-    def picture(self) -> SpacePicture:
+    def sections(self) -> _Sections:
         """Return the cut accumulator of the untouched cloud; the first proposal makes it."""
-        if self._picture is None:
+        if self._first is None:
             raise ValueError("no plane was proposed yet")
-        return self._picture
+        return self._first
 
     def _vote(self, search: Search) -> None:
-        changes = self._voxels.take(search.taken)
+        """Let what changed vote: voxels that planes took since then take their votes back."""
+        from orthoflow_plugins.plane.votes import vote_planes
+
+        taken = np.zeros(len(self.left), dtype=bool)
+        for claim in search.taken[self._n_taken :]:
+            taken |= self._is_within(claim)
+        self._n_taken = len(search.taken)
+        index = np.flatnonzero(taken & (self.left > 0))
+        # In rows as all voxels are, not in columns: voting would be compiled once more.
+        places_m, weights = np.take(self.middles_m, index, axis=1), -self.left[index]
+        self.left[index] = 0
         if self._is_raw:
             self._votes[:] = 0
-            changes = self._voxels.raw_places(search.free().points)
+            framed = self._basis @ search.free()[0].T - self._middle_m[:, None]
+            places_m = framed.astype(np.float32, order="C")
+            weights = np.ones(places_m.shape[1], dtype=np.int32)
         elif self._voted_for < 0:
-            changes = Places(self._voxels.middles_m, self._voxels.left)
-        self._add(changes)
-        self._voted_for = search.n_points
-        self._unscored = np.arange(len(self._votes))
-
-    def _add(self, places: Places) -> None:
-        from orthoflow_plugins.plane.vote_kernels import vote_planes
-
-        extent = self._voxels.extent_m / self._bin_m
+            places_m, weights = self.middles_m, self.left
+        extent = self._extent_m / self._bin_m
         shape = (math.ceil(extent[2]) + 2, math.ceil(math.hypot(extent[0], extent[1])) + 2)
         starts = self._directions.starts
 
         def vote(turns: NDArray[np.int64]) -> None:
             first, last = int(starts[turns[0]]), int(starts[turns[-1] + 1])
             vote_planes(
-                *places,
+                places_m,
+                weights,
                 self._directions.angles_rad[first:last],
                 starts[turns[0] : turns[-1] + 2] - first,
                 np.zeros(shape, dtype=np.int32),
@@ -208,72 +238,72 @@ class SpaceProposer:
             )
 
         _in_shares(vote, np.array_split(np.arange(len(starts) - 1), self._parts))
+        self._unscored = np.arange(len(self._votes))
 
     def _score(self) -> None:
         """Find the best bin of each direction whose votes or bars changed."""
-        from orthoflow_plugins.plane.vote_kernels import VOTE_SHARES, best_bins
+        from orthoflow_plugins.plane.votes import VOTE_SHARES, best_bins
 
-        rows, half = self._unscored, 0 if self._is_plain else self._smear_bins
-        edges = np.linspace(0, len(rows), self._parts + 1).astype(int)
+        half, tables = 0 if self._is_plain else self._smear_bins, (self._scores, self._places)
 
-        def score(span: tuple[int, int]) -> None:
-            some = rows[span[0] : span[1]]
-            tables = (self._barred, self._scores, self._places)
-            best_bins(self._votes, some, half, self._is_plain, *tables)
+        def score(rows: NDArray[np.int64]) -> None:
+            best_bins(self._votes, rows, half, self._is_plain, self._barred, *tables)
 
-        _in_shares(score, list(itertools.pairwise(edges)))
-        self._unscored = rows[:0]
-        if self._picture is None:
+        _in_shares(score, np.array_split(self._unscored, self._parts))
+        self._unscored = self._unscored[:0]
+        if self._first is None:
             scores = self._scores / VOTE_SHARES
-            self._picture = pictured(self._directions, self._votes, scores, bin_m=self._bin_m)
+            self._first = sections_of(self._directions, self._votes, scores, bin_m=self._bin_m)
 
-    def _refined(self, direction: int, score: float) -> Candidate:
-        """Look around a maximum with finer slopes and half bins, with the voxels near it."""
-        from orthoflow_plugins.plane.vote_kernels import contrast, parabola, vote_tilts
+    def _refined(
+        self, normal: NDArray[np.float64], distance_m: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Look around a maximum with finer slopes and half bins, with the voxels near it.
 
-        place = int(self._places[direction])
-        normal = self._directions.normals[direction]
-        distance_m = (place + 0.5 - 0.5 * self._votes.shape[1]) * self._bin_m
-        if self._is_plain:
-            return self._candidate(normal, distance_m * normal, score)
+        Gives a normal, not of length one, and a point, in the box's frame from its middle.
+        """
+        from orthoflow_plugins.plane.votes import sharpest, vote_places
+
         axes = wall_axes(normal, np.array([0.0, 0.0, 1.0]))
-        reach_m = (self._smear_bins + 3) * self._bin_m
-        half_m = 0.5 * float(np.linalg.norm(self._voxels.extent_m))
-        near = self._voxels.near(normal, distance_m, reach_m + self._directions.step_rad * half_m)
-        local = np.vstack([axes, normal]).astype(np.float32) @ near.places_m
+        reach_m, step_rad = (self._smear_bins + 3) * self._bin_m, self._directions.step_rad
+        heights_m = normal.astype(np.float32) @ self.middles_m - np.float32(distance_m)
+        near = (np.abs(heights_m) < reach_m + step_rad * self._half_m) & (self.left > 0)
+        near_m, weights = self.middles_m[:, near], self.left[near]
+        local = np.vstack([axes, normal]).astype(np.float32) @ near_m
         local[2] -= np.float32(distance_m)
         middle = np.median(local[:2], axis=1) if local.size else np.zeros(2)
         local[:2] -= middle[:, None].astype(np.float32)
-        bin_m, best = 0.5 * self._bin_m, np.zeros(2)
+        bin_m, best, place = 0.5 * self._bin_m, np.zeros(2), 0.0
 
-        def vote(share: tuple[NDArray[np.float64], NDArray[np.int64]]) -> None:
-            vote_tilts(local, near.weights, share[0], -reach_m, bin_m, share[1])
+        def vote(share: tuple[NDArray[np.float64], NDArray[np.int32]]) -> None:
+            vote_places(local, weights, share[0], -reach_m, bin_m, share[1])
 
         for steps in _FINE_STEPS:
-            tilts = np.array(list(itertools.product(steps, steps)))
-            slopes = best + self._directions.step_rad * tilts
-            fine = np.zeros((len(slopes), 4 * (self._smear_bins + 3)), dtype=np.int64)
-            shares = (np.array_split(table, self._parts) for table in (slopes, fine))
+            slopes = best + step_rad * np.array(list(itertools.product(steps, steps)))
+            normals = np.column_stack([-slopes, np.ones(len(slopes))])
+            fine = np.zeros((len(slopes), 4 * (self._smear_bins + 3)), dtype=np.int32)
+            shares = (np.array_split(table, self._parts) for table in (normals, fine))
             _in_shares(vote, list(zip(*shares, strict=True)))
-            scores = contrast(fine, 1)
-            row, column = np.unravel_index(int(np.argmax(scores)), scores.shape)
+            row, place = sharpest(fine)
             best = slopes[row]
-        height_m = -reach_m + (column + 0.5 + parabola(scores[row], int(column))) * bin_m
-        point = (distance_m + height_m) * normal + middle @ axes
-        return self._candidate(normal - best @ axes, point, score)
+        height_m = place * bin_m - reach_m
+        return normal - best @ axes, (distance_m + height_m) * normal + middle @ axes
 
-    def _candidate(
-        self, normal: NDArray[np.float64], point: NDArray[np.float64], score: float
-    ) -> Candidate:
-        """The plane through a point, both from the middle of the box in its frame."""
-        world = normal / np.linalg.norm(normal) @ self._voxels.basis
-        world = world / np.linalg.norm(world)
-        on_plane = (point + self._voxels.middle_m) @ self._voxels.basis
-        return Candidate(
-            plane=Plane(normal=world, offset_m=float(world @ on_plane)),
-            constraint=self._params.constraint,
-            votes=score,
-        )
+    def _is_within(self, claim: Claim) -> NDArray[np.bool_]:
+        """(m,) whether the occupied voxels are within a plane's tolerance and rectangle."""
+        slab, bounds = claim
+        within = np.ones(len(self.left), dtype=bool)
+        for row in range(3):
+            axis = self._basis @ slab[4 * row : 4 * row + 3]
+            shift = slab[4 * row + 3] - float(axis @ self._middle_m)
+            along_m = axis.astype(np.float32) @ self.middles_m
+            # A voxel that the plane runs through holds points of it, however large it is.
+            half_m = 0.5 * self._voxel_m * float(np.abs(axis).sum())
+            reach_m = max(bounds[0], half_m)
+            low_m = -reach_m if row == 0 else bounds[2 * row - 1] - half_m
+            high_m = reach_m if row == 0 else bounds[2 * row] + half_m
+            within &= (along_m >= shift + low_m) & (along_m <= shift + high_m)
+        return within
 
 
 # Any: what a share of the work is differs from pass to pass.
@@ -331,13 +361,13 @@ def _normals(omega: NDArray[np.float64], phi: NDArray[np.float64]) -> NDArray[np
     return np.stack([np.cos(phi) * np.cos(omega), np.cos(phi) * np.sin(omega), np.sin(phi)])
 
 
-def pictured(
+def sections_of(
     directions: Directions,
     votes: NDArray[np.int32],
     scores: NDArray[np.float64],
     *,
     bin_m: float,
-) -> SpacePicture:
+) -> _Sections:
     """Cut an accumulator.
 
     Args:
@@ -345,9 +375,13 @@ def pictured(
         votes: (d, b) votes per direction and distance.
         scores: (d,) best score of each direction.
         bin_m: width of a bin of distances.
-    """
-    from orthoflow_plugins.plane.figures import SpacePicture
 
+    Returns:
+        (o, p) best score of any distance over omega 0..180 and phi -90..90 degrees, NaN where no
+        direction of that phi was asked about; by angle in degrees the votes over omega and
+        distance at that phi, and those over phi and distance at that omega, NaN where no direction
+        was asked about; and the reach of the distances, minus this to this.
+    """
     n_turns = len(directions.starts) - 1
     best = np.full((n_turns, n_turns + 1), np.nan)
     column = np.rint((directions.angles_rad[:, 1] + 0.5 * math.pi) / directions.step_rad)
@@ -358,19 +392,14 @@ def pictured(
     best = np.take_along_axis(best, np.maximum.accumulate(last_asked, axis=0), axis=0)
     omegas = directions.step_rad * np.arange(n_turns, dtype=np.float64)
     phis = directions.step_rad * np.arange(n_turns + 1, dtype=np.float64) - 0.5 * math.pi
-    cuts = np.radians(_SECTIONS_DEG)
     # Distances beyond all points say nothing.
     n_bins = votes.shape[1]
     used = np.flatnonzero(votes.any(axis=0))
     beyond = int(min(used[0], n_bins - 1 - used[-1])) if len(used) else 0
     votes = votes[:, beyond : n_bins - beyond]
-    return SpacePicture(
-        best=best,
-        over_omega=np.stack([_section(directions, votes, omegas, phi) for phi in cuts]),
-        over_phi=np.stack([_section(directions, votes, omega, phis) for omega in cuts]),
-        sections_deg=_SECTIONS_DEG,
-        reach_m=0.5 * votes.shape[1] * bin_m,
-    )
+    over_omega = {cut: _section(directions, votes, omegas, math.radians(cut)) for cut in _CUTS_DEG}
+    over_phi = {cut: _section(directions, votes, math.radians(cut), phis) for cut in _CUTS_DEG}
+    return best, over_omega, over_phi, 0.5 * votes.shape[1] * bin_m
 
 
 def _section(
@@ -386,131 +415,3 @@ def _section(
     section[cosine < 0.0] = section[cosine < 0.0, ::-1]
     section[np.abs(cosine) < math.cos(_STANDS_FOR_STEPS * directions.step_rad)] = np.nan
     return section
-
-
-class Places(NamedTuple):
-    """Where votes come from.
-
-    Attributes:
-        places_m: (3, m) float32 e1, e2 and height from the middle of the box.
-        weights: (m,) int32 votes of each.
-    """
-
-    places_m: NDArray[np.float32]
-    weights: NDArray[np.int32]
-
-
-class VoxelCounts:
-    """Counts the points of a cloud per voxel, in one pass.
-
-    Attributes:
-        voxel_m: side of a voxel.
-        middle_m: (3,) middle of the box in the (e1, e2, up) frame of the cloud's offsets.
-        extent_m: (3,) size of the box.
-        basis: (3, 3) rows e1, e2, up.
-        middles_m: (3, m) float32 middles of the voxels with points, from the middle of the box.
-        left: (m,) int32 points in them that no plane has taken.
-    """
-
-    def __init__(self, cloud: PreparedCloud, voxel_m: float) -> None:
-        """Count all points; voxels grow where a scene would have too many."""
-        from orthoflow_plugins.plane.kernels import PlanGrid, each_part, piece_of, plan_frame
-        from orthoflow_plugins.plane.voxel_kernels import (
-            BRICK_SIDE,
-            VOXELS,
-            coarsened,
-            voxel_places,
-        )
-
-        grid = cloud.grid
-        self.basis = grid.basis
-        self.extent_m = np.array(grid.shape) * grid.cell_m
-        self.voxel_m = coarsened(voxel_m, self.extent_m)
-        self.middle_m = grid.low_m + 0.5 * self.extent_m
-        a, b, c = np.ceil(self.extent_m / (BRICK_SIDE * self.voxel_m)).astype(int).tolist()
-        shape = (a, b, c)
-        frame = plan_frame(
-            PlanGrid(basis=grid.basis, low_m=grid.low_m, cell_m=self.voxel_m, shape=shape)
-        )
-        tables: list[tuple[NDArray[np.int32], NDArray[np.int32]]] = [_NO_TABLE] * cloud.parts
-
-        def count(part: int, piece: slice) -> None:
-            tables[part] = _counted(piece_of(cloud.points, piece), frame, shape)
-
-        each_part(len(cloud.claims), cloud.parts, count)
-        has_points = np.max([bricks for bricks, _ in tables], axis=0) >= 0
-        counts = np.zeros((np.count_nonzero(has_points), VOXELS), dtype=np.int32)
-        for bricks, own in tables:
-            rows = bricks[has_points]
-            counts[rows >= 0] += own[rows[rows >= 0]]
-        occupied = counts != 0
-        self.left = counts[occupied]
-        places = voxel_places(has_points.reshape(shape), occupied)
-        shift_m = (grid.low_m - self.middle_m)[:, None]
-        self.middles_m = ((places.T + 0.5) * self.voxel_m + shift_m).astype(np.float32, order="C")
-        self._n_taken = 0
-
-    def take(self, claims: list[Claim]) -> Places:
-        """Take points away for the planes that are new, and give what they took, negative.
-
-        A plane takes a voxel whose middle is near enough, as a whole: that is the paper's zeroing
-        of counters, and costs no pass over the points.
-        """
-        taken = np.zeros(len(self.left), dtype=bool)
-        for claim in claims[self._n_taken :]:
-            taken |= self._is_within(claim)
-        self._n_taken = len(claims)
-        index = np.flatnonzero(taken & (self.left > 0))
-        weights = -self.left[index]
-        self.left[index] = 0
-        # In rows as all voxels are, not in columns: voting would be compiled once more.
-        return Places(np.take(self.middles_m, index, axis=1), weights)
-
-    def near(self, axis: NDArray[np.float64], distance_m: float, reach_m: float) -> Places:
-        """Voxels with points left whose middle is near a plane of the box's frame."""
-        heights = axis.astype(np.float32) @ self.middles_m - np.float32(distance_m)
-        index = np.flatnonzero((np.abs(heights) < reach_m) & (self.left > 0))
-        return Places(self.middles_m[:, index], self.left[index])
-
-    def raw_places(self, points: BlockedPoints) -> Places:
-        """Points with their own coordinates, and one vote each."""
-        places_m = np.empty((3, len(points.x)), dtype=np.float32)
-        for row, (axis, middle) in enumerate(zip(self.basis, self.middle_m, strict=True)):
-            a, b, c = axis.astype(np.float32)
-            places_m[row] = a * points.x + b * points.y + c * points.z - np.float32(middle)
-        return Places(places_m, np.ones(len(points.x), dtype=np.int32))
-
-    def _is_within(self, claim: Claim) -> NDArray[np.bool_]:
-        """(m,) whether the occupied voxels are within a plane's tolerance and rectangle."""
-        slab, bounds = claim
-        within = np.ones(len(self.left), dtype=bool)
-        for row in range(3):
-            axis = self.basis @ slab[4 * row : 4 * row + 3]
-            shift = slab[4 * row + 3] - float(axis @ self.middle_m)
-            along_m = axis.astype(np.float32) @ self.middles_m
-            # A voxel that the plane runs through holds points of it, however large it is.
-            half_m = 0.5 * self.voxel_m * float(np.abs(axis).sum())
-            reach_m = max(bounds[0], half_m)
-            low_m = -reach_m if row == 0 else bounds[2 * row - 1] - half_m
-            high_m = reach_m if row == 0 else bounds[2 * row] + half_m
-            within &= (along_m >= shift + low_m) & (along_m <= shift + high_m)
-        return within
-
-
-_NO_TABLE: Final = (np.zeros(0, dtype=np.int32), np.zeros((0, 0), dtype=np.int32))
-
-
-def _counted(
-    points: BlockedPoints, frame: NDArray[np.float32], shape: tuple[int, int, int]
-) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Row of each brick, -1 for none, and (rows, voxels) points, of one part of the pass."""
-    from orthoflow_plugins.plane.kernels import BLOCK_POINTS
-    from orthoflow_plugins.plane.voxel_kernels import VOXELS, count_voxels, with_room
-
-    bricks = np.full(math.prod(shape), -1, dtype=np.int32)
-    counts = np.zeros((_ROWS_FIRST, VOXELS), dtype=np.int32)
-    n_used, start = np.zeros(1, dtype=np.int64), 0
-    while start < len(points.x):
-        counts = with_room(counts, int(n_used[0]), BLOCK_POINTS)
-        start = count_voxels(points, start, frame, shape, bricks, counts, n_used)
-    return bricks, counts

@@ -1,8 +1,15 @@
-"""Compiled passes over points: blocks of them, the robust fit of a plane, the scoring of many.
+"""Compiled passes over points: blocks, plan, slabs, the robust fit of a plane, scores of many.
 
 Kernels read float32 offsets as three contiguous arrays, in `BLOCK_POINTS` blocks with a box each.
 Work is split into parts, one per thread, each with tables of its own; everything summed across
-parts is an integer, so the result has the same bits for any number of threads.
+parts is an integer (distances as multiples of a fixed step), so the result has the same bits for
+any number of threads.
+
+A slab is a row of 12 float64: normal (3) and offset in the cloud's own offsets, then the in-plane
+axes u (3) with its origin and v (3) with its origin; its bounds are a row of 5: the distance from
+the plane within which it holds points, then its smallest and largest u and v. Passes try blocks
+only against the slabs that their box meets, mostly one or two, so that sixteen planes cost little
+more than one.
 """
 
 from __future__ import annotations
@@ -23,6 +30,11 @@ from orthoflow.geometry.threads import even_parts, in_threads
 # Small enough that a block of a scan column is a short piece of one surface, so that its box tells
 # most planes apart; large enough that boxes of 48 million points fit into the processor's cache.
 BLOCK_POINTS: Final = 256
+# Distances are summed in steps of the fit tolerance over this: half a micrometre at 15 mm, and the
+# squares of 48 million points still fit into 64 bits.
+STEPS_PER_TOLERANCE: Final = 32768
+# Bins that the deviations of a plane's points are counted in.
+HISTOGRAM_BINS: Final = 200
 
 
 def each_part(n_items: int, parts: int, task: Callable[[int, slice], None]) -> None:
@@ -38,10 +50,10 @@ def each_part(n_items: int, parts: int, task: Callable[[int, slice], None]) -> N
 
 
 class BlockedPoints(NamedTuple):
-    """Points as the passes that skip blocks take them; built by `blocked`.
+    """Points as the passes that skip blocks take them.
 
     Attributes:
-        x: (n,) float32 metres from the cloud's origin; y and z alike.
+        x: (n,) float32 metres from the cloud's origin; y and z likewise.
         boxes: (blocks, 6) float32, smallest and largest x, y, z of each block.
     """
 
@@ -49,11 +61,6 @@ class BlockedPoints(NamedTuple):
     y: NDArray[np.float32]
     z: NDArray[np.float32]
     boxes: NDArray[np.float32]
-
-
-def blocked(offsets: Offsets, boxes: NDArray[np.float32]) -> BlockedPoints:
-    """Join points and the boxes of their blocks."""
-    return BlockedPoints(offsets.x, offsets.y, offsets.z, boxes)
 
 
 def piece_of(points: BlockedPoints, piece: slice) -> BlockedPoints:
@@ -78,77 +85,48 @@ class PlanGrid:
     cell_m: float
     shape: tuple[int, int, int]
 
+    @property
+    def extent_m(self) -> NDArray[np.float64]:
+        """(3,) size of the box that the cells fill."""
+        return np.array(self.shape) * self.cell_m
 
-@dataclass(frozen=True, kw_only=True)
-class Boxes:
-    """Where the blocks of a cloud lie.
+    def frame(self) -> NDArray[np.float32]:
+        """(3, 4) that gives cell and storey of an offset: `f[:, :3] @ p - f[:, 3]`."""
+        frame = np.column_stack([self.basis, self.low_m]) / self.cell_m
+        return frame.astype(np.float32, order="C")
 
-    Attributes:
-        boxes: (blocks, 6) float32, smallest and largest x, y, z offsets of each block.
-        n_unusable: sides of boxes that are NaN or infinite.
+
+def count_points(
+    offsets: Offsets, grid: PlanGrid | None, *, parts: int
+) -> tuple[BlockedPoints, NDArray[np.int64], NDArray[np.int64], bool]:
+    """Find the box of each block, and count the points over a plan, in one pass.
+
+    Args:
+        offsets: the points.
+        grid: the plan; None counts none.
+        parts: parts of the pass, one per thread.
+
+    Returns:
+        The points in blocks, points per plan cell (cells along e1, cells along e2) and per storey
+        of those over the plan, and whether all coordinates are finite.
     """
-
-    boxes: NDArray[np.float32]
-    n_unusable: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class PlanCounts:
-    """How the points of a cloud spread over a plan.
-
-    Attributes:
-        cells: (cells along e1, cells along e2) int64, points per cell.
-        heights: (storeys,) int64, points per storey of those that lie over the plan.
-        boxed: where the blocks lie.
-    """
-
-    cells: NDArray[np.int64]
-    heights: NDArray[np.int64]
-    boxed: Boxes
-
-
-def box_blocks(offsets: Offsets, *, parts: int) -> Boxes:
-    """Find the box of each block of points, in one pass."""
+    shape = (0, 0, 0) if grid is None else grid.shape
+    frame = np.zeros((3, 4), dtype=np.float32) if grid is None else grid.frame()
+    cells = np.zeros((parts, *shape[:2]), dtype=np.int32)
+    heights = np.zeros((parts, shape[2]), dtype=np.int32)
     n_points = len(offsets.x)
     boxes = np.empty((-(-n_points // BLOCK_POINTS), 6), dtype=np.float32)
     unusable = np.zeros(parts, dtype=np.int64)
-
-    def find(part: int, piece: slice) -> None:
-        points = piece_of(blocked(offsets, boxes), piece)
-        unusable[part] = _set_boxes(points, points.boxes.view(np.int32))
-
-    each_part(n_points, parts, find)
-    return Boxes(boxes=boxes, n_unusable=int(unusable.sum()))
-
-
-def plan_frame(grid: PlanGrid) -> NDArray[np.float32]:
-    """(3, 4) that gives the cell along e1, along e2 and the storey of an offset: `f @ p - f3`."""
-    frame = np.empty((3, 4), dtype=np.float32)
-    frame[:, :3] = grid.basis / grid.cell_m
-    frame[:, 3] = grid.low_m / grid.cell_m
-    return frame
-
-
-def count_over_plan(offsets: Offsets, grid: PlanGrid, *, parts: int) -> PlanCounts:
-    """Count points per plan cell and per storey, and find the box of each block, in one pass."""
-    n_points = len(offsets.x)
-    cells = np.zeros((parts, *grid.shape[:2]), dtype=np.int32)
-    heights = np.zeros((parts, grid.shape[2]), dtype=np.int32)
-    boxes = np.empty((-(-n_points // BLOCK_POINTS), 6), dtype=np.float32)
-    unusable = np.zeros(parts, dtype=np.int64)
-    frame = plan_frame(grid)
+    points = BlockedPoints(*offsets, boxes)
 
     def count(part: int, piece: slice) -> None:
-        points = piece_of(blocked(offsets, boxes), piece)
-        sides = points.boxes.view(np.int32)
-        unusable[part] = _count_over_plan(points, sides, frame, cells[part], heights[part])
+        own = piece_of(points, piece)
+        sides = own.boxes.view(np.int32)
+        unusable[part] = _count_points(own, sides, frame, cells[part], heights[part])
 
     each_part(n_points, parts, count)
-    return PlanCounts(
-        cells=cells.sum(axis=0, dtype=np.int64),
-        heights=heights.sum(axis=0, dtype=np.int64),
-        boxed=Boxes(boxes=boxes, n_unusable=int(unusable.sum())),
-    )
+    totals = cells.sum(axis=0, dtype=np.int64), heights.sum(axis=0, dtype=np.int64)
+    return points, *totals, not unusable.any()
 
 
 @kernel_part
@@ -182,52 +160,6 @@ def _set_box(points: BlockedPoints, block: int, sides: NDArray[np.int32]) -> int
     return bad
 
 
-@compiled
-def _set_boxes(points: BlockedPoints, sides: NDArray[np.int32]) -> int:
-    """Set the boxes of all blocks, and give at how many sides values are unusable."""
-    bad = 0
-    for block in range(sides.shape[0]):
-        bad += _set_box(points, block, sides)
-    return bad
-
-
-@kernel_part
-def _place_block(
-    points: BlockedPoints,
-    block: int,
-    frame: NDArray[np.float32],
-    shape: tuple[int, int],
-    n_storeys: int,
-    cell: NDArray[np.int32],
-    storey: NDArray[np.int32],
-) -> None:
-    """Set cell and storey of a block's points, -1 outside.
-
-    Apart from the counting, and without branches, so that the processor takes several points at
-    once: the counts wait for each other, the places need not.
-    """
-    x, y, z = points.x, points.y, points.z
-    a0, a1, a2, a3 = frame[0, 0], frame[0, 1], frame[0, 2], frame[0, 3]
-    b0, b1, b2, b3 = frame[1, 0], frame[1, 1], frame[1, 2], frame[1, 3]
-    c0, c1, c2, c3 = frame[2, 0], frame[2, 1], frame[2, 2], frame[2, 3]
-    zero = np.float32(0.0)
-    top_first, top_second = np.float32(shape[0]), np.float32(shape[1])
-    top_storey = np.float32(n_storeys)
-    width, nowhere = np.int32(shape[1]), np.int32(-1)
-    start = block * BLOCK_POINTS
-    for i in range(start, min(start + BLOCK_POINTS, x.size)):
-        first = a0 * x[i] + a1 * y[i] + a2 * z[i] - a3
-        second = b0 * x[i] + b1 * y[i] + b2 * z[i] - b3
-        height = c0 * x[i] + c1 * y[i] + c2 * z[i] - c3
-        over = (first >= zero) & (first < top_first) & (second >= zero) & (second < top_second)
-        within = over & (height >= zero) & (height < top_storey)
-        row = np.int32(first if over else zero)
-        column = np.int32(second if over else zero)
-        level = np.int32(height if within else zero)
-        cell[i - start] = row * width + column if over else nowhere
-        storey[i - start] = level if within else nowhere
-
-
 @kernel_part
 def _add_runs(places: NDArray[np.int32], count: int, table: NDArray[np.int32]) -> None:
     """Count places into a table, none of them negative; a scan's neighbours share one."""
@@ -242,27 +174,278 @@ def _add_runs(places: NDArray[np.int32], count: int, table: NDArray[np.int32]) -
 
 
 @compiled
-def _count_over_plan(
+def _count_points(
     points: BlockedPoints,
     sides: NDArray[np.int32],
     frame: NDArray[np.float32],
     cells: NDArray[np.int32],
     heights: NDArray[np.int32],
 ) -> int:
-    """Add to cells and heights, set the boxes, and give at how many sides values are unusable."""
+    """Set the boxes, add to cells and heights, and give at how many sides values are unusable.
+
+    Places are set apart from the counting, and without branches, so that the processor takes
+    several points at once: the counts wait for each other, the places need not.
+    """
     flat = cells.reshape(cells.size)
     cell = np.empty(BLOCK_POINTS, dtype=np.int32)
     storey = np.empty(BLOCK_POINTS, dtype=np.int32)
+    a0, a1, a2, a3 = frame[0, 0], frame[0, 1], frame[0, 2], frame[0, 3]
+    b0, b1, b2, b3 = frame[1, 0], frame[1, 1], frame[1, 2], frame[1, 3]
+    c0, c1, c2, c3 = frame[2, 0], frame[2, 1], frame[2, 2], frame[2, 3]
+    zero, top_storey = np.float32(0.0), np.float32(heights.size)
+    top_first, top_second = np.float32(cells.shape[0]), np.float32(cells.shape[1])
+    width, nowhere = np.int32(cells.shape[1]), np.int32(-1)
     bad = 0
     for block in range(sides.shape[0]):
+        bad += _set_box(points, block, sides)
+        if cells.size == 0:
+            continue
         start = block * BLOCK_POINTS
         stop = min(start + BLOCK_POINTS, points.x.size)
-        bad += _set_box(points, block, sides)
-        _place_block(points, block, frame, cells.shape, heights.size, cell, storey)
-        _add_runs(cell, stop - start, flat)
-        _add_runs(storey, stop - start, heights)
+        xs, ys, zs = points.x[start:stop], points.y[start:stop], points.z[start:stop]
+        for i in range(xs.size):
+            first = a0 * xs[i] + a1 * ys[i] + a2 * zs[i] - a3
+            second = b0 * xs[i] + b1 * ys[i] + b2 * zs[i] - b3
+            height = c0 * xs[i] + c1 * ys[i] + c2 * zs[i] - c3
+            over = (first >= zero) & (first < top_first) & (second >= zero) & (second < top_second)
+            within = over & (height >= zero) & (height < top_storey)
+            row = np.int32(first if over else zero)
+            column = np.int32(second if over else zero)
+            level = np.int32(height if within else zero)
+            cell[i] = row * width + column if over else nowhere
+            storey[i] = level if within else nowhere
+        _add_runs(cell, xs.size, flat)
+        _add_runs(storey, xs.size, heights)
     return bad
 
+
+# --- points against slabs ---
+
+
+@kernel_part
+def _meet(box: NDArray[np.float32], slab: NDArray[np.float64], bounds: NDArray[np.float64]) -> int:
+    """Whether a slab misses a block's box, 0, holds it, 2, or cuts it, 1."""
+    verdict = 2
+    for row in range(3):
+        centre, half = -slab[4 * row + 3], 0.0
+        for axis in range(3):
+            low, high = np.float64(box[2 * axis]), np.float64(box[2 * axis + 1])
+            centre += slab[4 * row + axis] * 0.5 * (low + high)
+            half += abs(slab[4 * row + axis]) * 0.5 * (high - low)
+        least = -bounds[0] if row == 0 else bounds[2 * row - 1]
+        most = bounds[0] if row == 0 else bounds[2 * row]
+        if centre + half < least or centre - half > most:
+            return 0
+        if centre - half < least or centre + half > most:
+            verdict = 1
+    return verdict
+
+
+@kernel_part
+def _list_active(
+    box: NDArray[np.float32],
+    slabs: NDArray[np.float64],
+    bounds: NDArray[np.float64],
+    active: NDArray[np.int64],
+) -> tuple[int, int]:
+    """List the slabs that a block meets; gives how many, and the holder.
+
+    The holder is the slab that holds the entire block and is all it meets, -1 for none.
+    """
+    n_active, last = 0, 0
+    for k in range(slabs.shape[0]):
+        verdict = _meet(box, slabs[k], bounds[k])
+        if verdict > 0:
+            active[n_active] = k
+            n_active += 1
+            last = verdict
+    return n_active, int(active[0]) if n_active == 1 and last == 2 else -1
+
+
+@kernel_part
+def _own_block(
+    points: BlockedPoints,
+    start: int,
+    slabs: NDArray[np.float64],
+    bounds: NDArray[np.float64],
+    active: NDArray[np.int64],
+    owner: NDArray[np.int32],
+    nearest: NDArray[np.float64],
+) -> int:
+    """Set the slab that holds each point of a block and is nearest, -1 for none, and its distance.
+
+    Without branches, so that the processor takes several points at once. Gives how many there are.
+    """
+    stop = min(start + BLOCK_POINTS, points.x.size)
+    xs, ys, zs = points.x[start:stop], points.y[start:stop], points.z[start:stop]
+    owner[:] = -1
+    nearest[:] = np.inf
+    for k in active:
+        slab, new = slabs[k], np.int32(k)
+        n0, n1, n2, n3 = slab[0], slab[1], slab[2], slab[3]
+        u0, u1, u2, u3 = slab[4], slab[5], slab[6], slab[7]
+        v0, v1, v2, v3 = slab[8], slab[9], slab[10], slab[11]
+        reach, left, right = bounds[k, 0], bounds[k, 1], bounds[k, 2]
+        top, bottom = bounds[k, 3], bounds[k, 4]
+        for i in range(xs.size):
+            x, y, z = np.float64(xs[i]), np.float64(ys[i]), np.float64(zs[i])
+            here, before, earlier = n0 * x + n1 * y + n2 * z - n3, nearest[i], owner[i]
+            u = u0 * x + u1 * y + u2 * z - u3
+            v = v0 * x + v1 * y + v2 * z - v3
+            holds = (abs(here) <= reach) & (abs(here) < abs(before))
+            holds = holds & (u >= left) & (u <= right) & (v >= top) & (v <= bottom)
+            owner[i] = new if holds else earlier
+            nearest[i] = here if holds else before
+    return xs.size
+
+
+@compiled
+def assign_points(
+    points: BlockedPoints,
+    claims: NDArray[np.int8],
+    slabs: NDArray[np.float64],
+    bounds: NDArray[np.float64],
+) -> None:
+    """Assign each point to the nearest slab that holds it, the first of equals.
+
+    Args:
+        points: (n,) offsets in blocks.
+        claims: (n,) set to the slab of each point, -1 for none.
+        slabs: (k, 12) see module.
+        bounds: (k, 5) see module.
+    """
+    listed = np.empty(slabs.shape[0], dtype=np.int64)
+    owner = np.empty(BLOCK_POINTS, dtype=np.int32)
+    nearest = np.empty(BLOCK_POINTS)
+    for block in range(points.boxes.shape[0]):
+        n_active, holder = _list_active(points.boxes[block], slabs, bounds, listed)
+        start = block * BLOCK_POINTS
+        taken = claims[start : min(start + BLOCK_POINTS, claims.size)]
+        if n_active == 0 or holder >= 0:
+            # Most blocks of a scan are a short piece of one wall: no point has to be asked.
+            taken[:] = np.int8(holder)
+            continue
+        _own_block(points, start, slabs, bounds, listed[:n_active], owner, nearest)
+        for i in range(taken.size):
+            taken[i] = np.int8(owner[i])
+
+
+@compiled
+def sum_assigned(
+    points: BlockedPoints,
+    slabs: NDArray[np.float64],
+    bounds: NDArray[np.float64],
+    rasters: NDArray[np.float64],
+    drawn: NDArray[np.bool_],
+    counts: NDArray[np.int32],
+    sums: NDArray[np.int64],
+) -> None:
+    """Sum the distances of each point in the cells of the nearest slab that holds it.
+
+    Args:
+        points: (n,) offsets in blocks.
+        slabs: (k, 12) see module.
+        bounds: (k, 5) see module.
+        rasters: (k, 8) smallest u and v, cells per metre, rows, columns, first cell in the tables,
+            fit tolerance, inner tolerance. Slabs without rows are not summed.
+        drawn: (blocks,) which blocks are summed.
+        counts: (cells, 3) points within the find, inner and fit tolerance; added to.
+        sums: (cells, 2) distances and squared distances of those within the fit tolerance, in
+            steps and squared steps; added to.
+    """
+    listed = np.empty(slabs.shape[0], dtype=np.int64)
+    owner = np.empty(BLOCK_POINTS, dtype=np.int32)
+    nearest = np.empty(BLOCK_POINTS)
+    for block in range(points.boxes.shape[0]):
+        if not drawn[block]:
+            continue
+        n_active, _ = _list_active(points.boxes[block], slabs, bounds, listed)
+        n_summed, start = 0, block * BLOCK_POINTS
+        for k in listed[:n_active]:
+            n_summed += int(rasters[k, 3] > 0.0)
+        if n_summed == 0:
+            continue
+        count = _own_block(points, start, slabs, bounds, listed[:n_active], owner, nearest)
+        for i in range(count):
+            k = owner[i]
+            if k < 0 or rasters[k, 3] == 0.0:
+                continue
+            x, y, z = points.x[start + i], points.y[start + i], points.z[start + i]
+            per_m = rasters[k, 2]
+            u = slabs[k, 4] * x + slabs[k, 5] * y + slabs[k, 6] * z - slabs[k, 7] - rasters[k, 0]
+            v = slabs[k, 8] * x + slabs[k, 9] * y + slabs[k, 10] * z - slabs[k, 11] - rasters[k, 1]
+            column = min(max(u * per_m, 0.0), rasters[k, 4] - 1.0)
+            row = min(max(v * per_m, 0.0), rasters[k, 3] - 1.0)
+            cell = int(rasters[k, 5]) + int(row) * int(rasters[k, 4]) + int(column)
+            distance = nearest[i]
+            counts[cell, 0] += 1
+            counts[cell, 1] += abs(distance) <= rasters[k, 7]
+            if abs(distance) <= rasters[k, 6]:
+                steps = math.floor(distance * (STEPS_PER_TOLERANCE / rasters[k, 6]) + 0.5)
+                counts[cell, 2] += 1
+                sums[cell, 0] += steps
+                sums[cell, 1] += steps * steps
+
+
+@compiled
+def name_labels(
+    claims: NDArray[np.int8], names: NDArray[np.int16], labels: NDArray[np.int16]
+) -> None:
+    """Set (n,) labels to the (k + 1,) names of (n,) claims; the last is for a claim of -1."""
+    for i in range(claims.size):
+        labels[i] = names[claims[i]]
+
+
+@compiled
+def measure_deviations(
+    points: BlockedPoints,
+    claims: NDArray[np.int8],
+    slabs: NDArray[np.float64],
+    limits: NDArray[np.float64],
+    sums: NDArray[np.int64],
+    histogram: NDArray[np.int64],
+    extents: NDArray[np.float64],
+) -> None:
+    """Sum and bin the distances of claimed points to their plane, and see how far they reach.
+
+    Args:
+        points: (n,) offsets in blocks.
+        claims: (n,) plane of each point, negative for none.
+        slabs: (k, 12) the planes.
+        limits: (k, 6) find tolerance, fit tolerance, smallest and largest u, smallest and largest
+            v of the plane's rectangle; metres.
+        sums: (k, 6) of points within the find tolerance: number, steps, squared steps, then
+            the same within the fit tolerance; added to.
+        histogram: (k, HISTOGRAM_BINS) points per bin of -find tolerance..find tolerance.
+        extents: (k, 4) smallest and largest u, smallest and largest v of the points within the fit
+            tolerance and the rectangle; widened.
+    """
+    half = 0.5 * HISTOGRAM_BINS
+    for i in range(claims.size):
+        k = claims[i]
+        if k < 0:
+            continue
+        x, y, z = np.float64(points.x[i]), np.float64(points.y[i]), np.float64(points.z[i])
+        distance = slabs[k, 0] * x + slabs[k, 1] * y + slabs[k, 2] * z - slabs[k, 3]
+        place = min(max(distance / limits[k, 0] * half + half, 0.0), HISTOGRAM_BINS - 1.0)
+        histogram[k, int(place)] += 1
+        steps = math.floor(distance * (STEPS_PER_TOLERANCE / limits[k, 1]) + 0.5)
+        sums[k, 0] += 1
+        sums[k, 1] += steps
+        sums[k, 2] += steps * steps
+        if abs(distance) > limits[k, 1]:
+            continue
+        sums[k, 3] += 1
+        sums[k, 4] += steps
+        sums[k, 5] += steps * steps
+        u = slabs[k, 4] * x + slabs[k, 5] * y + slabs[k, 6] * z - slabs[k, 7]
+        v = slabs[k, 8] * x + slabs[k, 9] * y + slabs[k, 10] * z - slabs[k, 11]
+        if limits[k, 2] <= u <= limits[k, 3] and limits[k, 4] <= v <= limits[k, 5]:
+            extents[k, 0], extents[k, 1] = min(extents[k, 0], u), max(extents[k, 1], u)
+            extents[k, 2], extents[k, 3] = min(extents[k, 2], v), max(extents[k, 3], v)
+
+
+# --- the plane of points ---
 
 # What a fit may change: everything, a normal kept across up, or one kept along up.
 FREE: Final = 0
@@ -270,8 +453,6 @@ VERTICAL: Final = 1
 LEVEL: Final = 2
 
 _STEPS_MOST: Final = 20
-# Points within so many tolerances of a plane are kept while it is fitted to some of them.
-_REACH: Final = 2.0
 # A fit has settled when a point ten metres away moves by less than this share of the tolerance.
 _SETTLED_SHARE: Final = 5e-4
 # Points nearer to a line than this (root mean square) do not say how the plane lies about it.
@@ -298,8 +479,8 @@ def flattest(sums: NDArray[np.float64], plane: NDArray[np.float64]) -> None:
     off = ab * ab + ac * ac + bc * bc
     size = math.sqrt((da * da + db * db + dc * dc + 2.0 * off) / 6.0)
     plane[3], plane[4], plane[5] = ma, mb, mc
+    plane[0], plane[1], plane[2] = 0.0, 0.0, 1.0
     if size < 1e-12:
-        plane[0], plane[1], plane[2] = 0.0, 0.0, 1.0
         plane[6], plane[7], plane[8] = mean, mean, mean
         return
     determinant = (
@@ -311,161 +492,74 @@ def flattest(sums: NDArray[np.float64], plane: NDArray[np.float64]) -> None:
     plane[6], plane[7], plane[8] = max(least, 0.0), 3.0 * mean - most - least, most
     # Rows of (matrix - least) are across the normal: the longest cross product of two is the best.
     ra, rb, rc = aa - least, bb - least, cc - least
-    u0, u1, u2 = ab * bc - ac * rb, ac * ab - ra * bc, ra * rb - ab * ab
-    v0, v1, v2 = ab * rc - ac * bc, ac * ac - ra * rc, ra * bc - ab * ac
-    w0, w1, w2 = rb * rc - bc * bc, bc * ac - ab * rc, ab * bc - rb * ac
-    u, v, w = u0 * u0 + u1 * u1 + u2 * u2, v0 * v0 + v1 * v1 + v2 * v2, w0 * w0 + w1 * w1 + w2 * w2
-    if v > u:
-        u, u0, u1, u2 = v, v0, v1, v2
-    if w > u:
-        u, u0, u1, u2 = w, w0, w1, w2
-    length = math.sqrt(u)
-    if length > 0.0:
-        plane[0], plane[1], plane[2] = u0 / length, u1 / length, u2 / length
-    else:
-        plane[0], plane[1], plane[2] = 0.0, 0.0, 1.0
-
-
-@kernel_part
-def robust_moments(
-    points: NDArray[np.float64], plane: NDArray[np.float64], tolerance_m: float
-) -> NDArray[np.float64]:
-    """Weighted sums of the points near a plane, Tukey's weights with a cut at the tolerance.
-
-    Args:
-        points: (m, 3) offsets, metres.
-        plane: (4,) normal and offset.
-        tolerance_m: distance at which a point's weight has fallen to zero.
-
-    Returns:
-        (10,) sum of weights, of w x, w y, w z, and of w times xx, xy, xz, yy, yz, zz.
-    """
-    sums = np.zeros(10)
-    for i in range(points.shape[0]):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        distance_m = plane[0] * x + plane[1] * y + plane[2] * z - plane[3]
-        if abs(distance_m) >= tolerance_m:
-            continue
-        ratio = distance_m / tolerance_m
-        weight = (1.0 - ratio * ratio) ** 2
-        sums[0] += weight
-        sums[1] += weight * x
-        sums[2] += weight * y
-        sums[3] += weight * z
-        sums[4] += weight * x * x
-        sums[5] += weight * x * y
-        sums[6] += weight * x * z
-        sums[7] += weight * y * y
-        sums[8] += weight * y * z
-        sums[9] += weight * z * z
-    return sums
-
-
-@kernel_part
-def _nearby(
-    points: NDArray[np.float64], plane: NDArray[np.float64], reach_m: float
-) -> NDArray[np.float64]:
-    """(k, 3) the points within reach of a plane, in their order."""
-    near = np.empty_like(points)
-    count = 0
-    for i in range(points.shape[0]):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        near[count, 0], near[count, 1], near[count, 2] = x, y, z
-        distance_m = plane[0] * x + plane[1] * y + plane[2] * z - plane[3]
-        # Without a branch: which points are near cannot be foretold.
-        count += 1 if abs(distance_m) < reach_m else 0
-    return near[:count]
-
-
-@kernel_part
-def _furthest_m(points: NDArray[np.float64]) -> float:
-    """The largest distance of a point from the origin."""
-    largest = 0.0
-    for i in range(points.shape[0]):
-        largest = max(largest, points[i, 0] ** 2 + points[i, 1] ** 2 + points[i, 2] ** 2)
-    return float(np.sqrt(largest))
-
-
-@kernel_part
-def _without_rise(sums: NDArray[np.float64], up: NDArray[np.float64]) -> None:
-    """Replace moments by those that have up as their widest direction, so that no normal leans."""
-    mean, second, across = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
-    order = ((4, 5, 6), (5, 7, 8), (6, 8, 9))
-    for i in range(3):
-        mean[i] = sums[1 + i] / sums[0]
-    trace = 0.0
-    for i in range(3):
-        for j in range(3):
-            second[i, j] = sums[order[i][j]] / sums[0] - mean[i] * mean[j]
-            across[i, j] = (1.0 if i == j else 0.0) - up[i] * up[j]
-        trace += second[i, i]
-    for i in range(3):
-        for j in range(i, 3):
-            total = up[i] * up[j] * trace
-            for k in range(3):
-                for m in range(3):
-                    total += across[i, k] * second[k, m] * across[m, j]
-            sums[order[i][j]] = total + mean[i] * mean[j]
-    sums[0] = 1.0
-    for i in range(3):
-        sums[1 + i] = mean[i]
+    longest = 0.0
+    for p0, p1, p2 in (
+        (ab * bc - ac * rb, ac * ab - ra * bc, ra * rb - ab * ab),
+        (ab * rc - ac * bc, ac * ac - ra * rc, ra * bc - ab * ac),
+        (rb * rc - bc * bc, bc * ac - ab * rc, ab * bc - rb * ac),
+    ):
+        length = math.sqrt(p0 * p0 + p1 * p1 + p2 * p2)
+        if length > longest:
+            longest = length
+            plane[0], plane[1], plane[2] = p0 / length, p1 / length, p2 / length
 
 
 @compiled
 def refine_robustly(
-    points: NDArray[np.float64],
-    plane: NDArray[np.float64],
-    tolerance_m: float,
-    freedom: int,
-    up: NDArray[np.float64],
+    points: NDArray[np.float64], plane: NDArray[np.float64], tolerance_m: float, freedom: int
 ) -> bool:
     """Move a plane to the densest layer of points near it: total least squares, reweighted.
 
     Args:
-        points: (m, 3) offsets, metres.
+        points: (m, 3) metres; unless the fit is free, with up as their third axis.
         plane: (4,) normal and offset to start from; changed.
         tolerance_m: points further away have no weight (Tukey's weights).
         freedom: FREE, VERTICAL or LEVEL.
-        up: (3,) unit vector.
 
     Returns:
         Whether more than a line of points supports it; if not, the plane means nothing.
     """
-    fitted = np.empty(9)
-    furthest_m = _furthest_m(points)
-    # Only points near the plane matter, and mostly it moves little: those near it are asked again
-    # only when it may have come within the tolerance of others.
-    near, asked, reach_m = points, plane.copy(), np.inf
-    for step in range(_STEPS_MOST):
-        turned = np.sqrt(
-            (plane[0] - asked[0]) ** 2 + (plane[1] - asked[1]) ** 2 + (plane[2] - asked[2]) ** 2
-        )
-        may_have_moved_m = turned * furthest_m + abs(plane[3] - asked[3])
-        if step == 1 or may_have_moved_m + tolerance_m > reach_m:
-            reach_m = _REACH * tolerance_m
-            near, asked = _nearby(points, plane, reach_m), plane.copy()
-        sums = robust_moments(near, plane, tolerance_m)
+    sums, fitted = np.empty(10), np.empty(9)
+    for _ in range(_STEPS_MOST):
+        sums[:] = 0.0
+        for i in range(points.shape[0]):
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            distance_m = plane[0] * x + plane[1] * y + plane[2] * z - plane[3]
+            if abs(distance_m) >= tolerance_m:
+                continue
+            weight = (1.0 - (distance_m / tolerance_m) ** 2) ** 2
+            sums[0] += weight
+            sums[1] += weight * x
+            sums[2] += weight * y
+            sums[3] += weight * z
+            sums[4] += weight * x * x
+            sums[5] += weight * x * y
+            sums[6] += weight * x * z
+            sums[7] += weight * y * y
+            sums[8] += weight * y * z
+            sums[9] += weight * z * z
         if sums[0] <= 0.0:
             return False
         if freedom == VERTICAL:
-            _without_rise(sums, up)
+            # Moments whose widest direction is up, so that no normal leans.
+            x, y, z = sums[1] / sums[0], sums[2] / sums[0], sums[3] / sums[0]
+            sums[6], sums[8] = sums[1] * z, sums[2] * z
+            sums[9] += sums[4] - sums[1] * x + sums[7] - sums[2] * y
+        flattest(sums, fitted)
         if freedom == LEVEL:
-            fitted[0], fitted[1], fitted[2] = up[0], up[1], up[2]
-        else:
-            flattest(sums, fitted)
-            if fitted[7] < max(_LINE_WIDTH_M**2, 1e-8 * fitted[8]):
-                return False
-        turn, offset_m, sign = 0.0, 0.0, 0.0
-        for i in range(3):
-            sign += fitted[i] * plane[i]
+            fitted[0], fitted[1], fitted[2] = 0.0, 0.0, 1.0
+        elif fitted[7] < max(_LINE_WIDTH_M**2, 1e-8 * fitted[8]):
+            return False
+        sign = fitted[0] * plane[0] + fitted[1] * plane[1] + fitted[2] * plane[2]
         sign = -1.0 if sign < 0.0 else 1.0
+        turn, offset_m = 0.0, 0.0
         for i in range(3):
-            offset_m += sign * fitted[i] * sums[1 + i] / sums[0]
+            offset_m += sign * fitted[i] * fitted[3 + i]
             turn += (sign * fitted[i] - plane[i]) ** 2
             plane[i] = sign * fitted[i]
         moved_m = abs(offset_m - plane[3])
         plane[3] = offset_m
-        if max(10.0 * np.sqrt(turn), moved_m) < _SETTLED_SHARE * tolerance_m:
+        if max(10.0 * math.sqrt(turn), moved_m) < _SETTLED_SHARE * tolerance_m:
             break
     return True
 
@@ -508,35 +602,3 @@ def consensus_sums(
                 worth = np.int32(worth + (here if is_near else nothing))
             sums[h, 0] += count
             sums[h, 1] += worth
-
-
-@compiled
-def distance_histograms(
-    points: NDArray[np.float32],
-    planes: NDArray[np.float32],
-    reach_m: float,
-    histograms: NDArray[np.int32],
-) -> None:
-    """Bin the distances of points to each of many planes.
-
-    The running sum of a row is the number of points within any smaller tolerance.
-
-    Args:
-        points: (3, m) metres.
-        planes: (h, 4) normal and offset.
-        reach_m: distances up to here are counted.
-        histograms: (h, bins) points per bin of 0..reach; added to.
-    """
-    n_bins = histograms.shape[1]
-    per_m, top = np.float32(n_bins / reach_m), np.float32(n_bins)
-    xs, ys, zs = points[0], points[1], points[2]
-    bins = np.empty(points.shape[1], dtype=np.int32)
-    for h in range(planes.shape[0]):
-        a, b, c = planes[h, 0] * per_m, planes[h, 1] * per_m, planes[h, 2] * per_m
-        d = planes[h, 3] * per_m
-        # Apart from the counting, so that the processor takes several points at once.
-        for i in range(bins.size):
-            bins[i] = np.int32(min(abs(a * xs[i] + b * ys[i] + c * zs[i] - d), top))
-        for i in range(bins.size):
-            if bins[i] < n_bins:
-                histograms[h, bins[i]] += 1

@@ -15,26 +15,29 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry import Plane, omega_phi_deg, wall_axes
+from orthoflow.geometry import Plane, angle_between_deg, omega_phi_deg, wall_axes
 from orthoflow.geometry.frames import LEVEL_LIMIT_DEG
 from orthoflow.geometry.rows import Rows
 from orthoflow.products import JsonValue, Planes, PointCloud, SideSource, plane_name
 from orthoflow.products.planes import PlaneKind
 from orthoflow.sdk import DiagnosticSpec, StepContext
-from orthoflow_plugins.plane.candidates import FoundPlane
 from orthoflow_plugins.plane.cloud import PreparedCloud
-from orthoflow_plugins.plane.kernels import each_part, piece_of
-from orthoflow_plugins.plane.slab_kernels import (
+from orthoflow_plugins.plane.kernels import (
     HISTOGRAM_BINS,
     STEPS_PER_TOLERANCE,
+    each_part,
     measure_deviations,
+    piece_of,
 )
 from orthoflow_plugins.plane.support import SurfaceRaster
+
+if TYPE_CHECKING:
+    from orthoflow_plugins.plane.search import FoundPlane
 
 Viewpoint = Literal["stations", "view_from", "guess"]
 
@@ -130,30 +133,6 @@ class Normality:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RawPlane:
-    """What a detector itself gave for a plane, before the common fit; world.
-
-    Attributes:
-        plane: its normal to the same side as that of the fit.
-        votes: the points that speak for it, by the detector's own count.
-        own_tolerance_m: the tolerance that the detector found itself, or None.
-    """
-
-    plane: Plane
-    votes: float
-    own_tolerance_m: float | None
-
-    def to_json(self) -> dict[str, JsonValue]:
-        """Numbers for the planes' details."""
-        return {
-            "normal": [float(value) for value in self.plane.normal],
-            "offset_m": self.plane.offset_m,
-            "support": self.votes,
-            "own_tolerance_m": self.own_tolerance_m,
-        }
-
-
-@dataclass(frozen=True, kw_only=True)
 class FacedPlane:
     """A plane with its normal towards the viewer and its rectangles, in the cloud's offsets.
 
@@ -170,37 +149,19 @@ class FacedPlane:
     is_guessed: bool
 
 
-@dataclass(frozen=True, kw_only=True)
-class Assembly:
-    """The products of a detector, and what else is known about them.
-
-    Attributes:
-        planes: ordered by support.
-        labels_from_claims: (k + 1,) int16 label of each claim; the last entry is for -1.
-        deviations: of the planes in their final order.
-        n_guessed: planes whose side was guessed.
-        raw: of each plane what its detector itself gave.
-        normalities: of each plane how normal its deviations are, None where it has too few points.
-        n_independent: of each plane, how many cells without common errors would fix it as well.
-    """
-
-    planes: Planes
-    labels_from_claims: NDArray[np.int16]
-    deviations: Deviations
-    n_guessed: int
-    raw: tuple[RawPlane, ...]
-    normalities: tuple[Normality | None, ...]
-    n_independent: tuple[float, ...]
-
-
 def assemble(
     found: list[FoundPlane],
     prepared: PreparedCloud,
     cloud: PointCloud,
     tolerance_m: float,
     fit_tolerance_m: float,
-) -> Assembly:
-    """Measure planes on their claimed points, and give them their side, order and names."""
+) -> tuple[Planes, Deviations, list[Normality | None], NDArray[np.int16]]:
+    """Measure planes on their claimed points, and give them their side, order and names.
+
+    Returns:
+        The planes, the largest first; their deviations, and how normal those are, None where there
+        are too few points; and (k + 1,) the label of each claim, the last for -1.
+    """
     deviations = measure_planes(
         prepared,
         np.array([item.raster.slab() for item in found]),
@@ -210,24 +171,31 @@ def assemble(
     )
     order = np.argsort(-deviations.n_points, kind="stable")
     ordered = deviations.take(order)
-    items = [found[k] for k in order]
     faced = [_faced(found, int(k), deviations, prepared, cloud) for k in order]
-    flips = np.array(
-        [
-            float(side.plane.normal @ item.raster.plane.normal) < 0.0
-            for side, item in zip(faced, items, strict=True)
-        ]
-    )
-    # Histograms and means follow the normal when it was turned.
-    ordered.histogram[flips] = ordered.histogram[flips][:, ::-1]
-    ordered.mean_fit_m[flips] *= -1.0
-    normalities = tuple(
+    raw: list[JsonValue] = []
+    for place, (k, side) in enumerate(zip(order, faced, strict=True)):
+        candidate = found[k].candidate
+        if float(side.plane.normal @ found[k].raster.plane.normal) < 0.0:
+            # Histograms and means follow the normal when it was turned.
+            ordered.histogram[place] = ordered.histogram[place, ::-1].copy()
+            ordered.mean_fit_m[place] *= -1.0
+        own = candidate.plane
+        if float(own.normal @ side.plane.normal) < 0.0:
+            own = own.flipped()
+        raw.append(
+            {
+                "normal": own.normal.tolist(),
+                "offset_m": own.offset_m + float(own.normal @ cloud.origin),
+                "support": float(candidate.votes),
+                "own_tolerance_m": candidate.own_tolerance_m,
+            }
+        )
+    normalities = [
         normality(row, tolerance_m=tolerance_m, fit_tolerance_m=ordered.fit_tolerance_m)
         for row in ordered.histogram
-    )
-    raw = tuple(_raw(item, side.plane, cloud) for item, side in zip(items, faced, strict=True))
-    stated = [item.adjusted.stated() for item in items]
-    n_independent = tuple(n for _, n in stated)
+    ]
+    # Normal and offset change sign together, so that their covariance stays as it is.
+    covariances, n_independent = zip(*(found[k].adjusted.stated() for k in order), strict=True)
     is_guessed = [item.is_guessed for item in faced]
     viewpoint: Viewpoint = "guess" if all(is_guessed) else known_viewpoint(cloud)
     known: SideSource = "given" if viewpoint == "view_from" else "stations"
@@ -236,31 +204,21 @@ def assemble(
         faced,
         ordered,
         cloud,
-        # Normal and offset change sign together, so that their covariance stays as it is.
-        covariances=[covariance for covariance, _ in stated],
+        covariances=covariances,
         viewpoint=viewpoint,
         side_from=sides if len(set(is_guessed)) > 1 else (),
         details={
-            "fit_n_points": [int(n) for n in ordered.n_fit],
-            "fit_rms_m": [float(value) for value in ordered.rms_fit_m],
+            "fit_n_points": ordered.n_fit.tolist(),
+            "fit_rms_m": ordered.rms_fit_m.tolist(),
             "n_independent": list(n_independent),
             "normality": [None if item is None else item.to_json() for item in normalities],
             "fit_tolerance_m": ordered.fit_tolerance_m,
-            "raw": [item.to_json() for item in raw],
-            "guessed_sides": [int(k) for k in np.flatnonzero(is_guessed)],
+            "raw": raw,
+            "guessed_sides": list[JsonValue](np.flatnonzero(is_guessed).tolist()),
         },
     )
-    labels = np.full(len(found) + 1, -1, dtype=np.int16)
-    labels[order] = np.arange(len(found), dtype=np.int16)
-    return Assembly(
-        planes=planes,
-        labels_from_claims=labels,
-        deviations=ordered,
-        n_guessed=sum(is_guessed),
-        raw=raw,
-        normalities=normalities,
-        n_independent=n_independent,
-    )
+    labels = np.append(np.argsort(order), -1).astype(np.int16)
+    return planes, ordered, normalities, labels
 
 
 def planes_of(
@@ -277,11 +235,15 @@ def planes_of(
     normals = np.array([item.plane.normal for item in faced])
     heights_m = np.array([item.corners_m.mean(axis=0) @ cloud.up for item in faced])
     n_parts = [len(item.part_corners_m) for item in faced]
+    # The offset is counted from the world's origin.
+    shift = np.eye(4)
+    shift[3, :3] = cloud.origin
+    moved = shift @ np.array(covariances) @ shift.T
     return Planes(
         normal=normals,
-        offset=np.array([_world(item.plane, cloud).offset_m for item in faced]),
+        offset=np.array([item.plane.offset_m for item in faced]) + normals @ cloud.origin,
         corners=np.array([cloud.origin + item.corners_m for item in faced]),
-        covariance=np.array([_world_covariance(matrix, cloud) for matrix in covariances]),
+        covariance=0.5 * (moved + moved.transpose(0, 2, 1)),
         n_points=deviations.n_points,
         rms_m=deviations.rms_m,
         up=cloud.up.copy(),
@@ -296,16 +258,58 @@ def planes_of(
 
 
 def report_planes(
-    ctx: StepContext, planes: Planes, deviations: Deviations, *, n_points: int, n_guessed: int
+    ctx: StepContext,
+    planes: Planes,
+    deviations: Deviations,
+    *,
+    n_points: int,
+    n_guessed: int | None = None,
+    first: Normality | None = None,
 ) -> None:
-    """Report number and shares of planes, and where the first lies; warn of guessed sides."""
-    omega_deg, phi_deg = omega_phi_deg(planes.normal[0], planes.up)
+    """Report number and shares of planes, and the first of them; warn of guessed sides.
+
+    Args:
+        ctx: takes the metrics.
+        planes: the planes; of those that were found, what the detector itself gave is reported.
+        deviations: of their points.
+        n_points: points of the cloud.
+        n_guessed: planes whose side was guessed; by default as the details of the planes say.
+        first: how normal the deviations from the first plane are.
+    """
+
+    def lies(plane: Plane, prefix: str) -> None:
+        omega_deg, phi_deg = omega_phi_deg(plane.normal, planes.up)
+        ctx.metric(f"{prefix}omega_deg", omega_deg, "deg")
+        ctx.metric(f"{prefix}phi_deg", phi_deg, "deg")
+
+    plane = planes.plane(0)
     ctx.metric("n_planes", len(planes), "1")
     ctx.metric("labelled_share", float(deviations.n_points.sum()) / n_points, "1")
     ctx.metric("rms_mm", 1000.0 * float(planes.rms_m[0]), "mm")
-    ctx.metric("omega_deg", omega_deg, "deg")
-    ctx.metric("phi_deg", phi_deg, "deg")
-    ctx.metric("offset_m", float(planes.offset[0]), "m")
+    ctx.metric("offset_m", plane.offset_m, "m")
+    lies(plane, "")
+    if n_guessed is None:
+        details: Any = planes.details
+        n_guessed = len(details["guessed_sides"])
+        raw = Plane(
+            normal=np.array(details["raw"][0]["normal"]), offset_m=details["raw"][0]["offset_m"]
+        )
+        ctx.metric("first_share", float(planes.n_points[0]) / n_points, "1")
+        ctx.metric("fit_rms_mm", 1000.0 * float(deviations.rms_fit_m[0]), "mm")
+        ctx.metric("r_m", abs(plane.offset_m), "m")
+        ctx.metric("sigma_angle_deg", planes.sigma_angle_deg(0), "deg")
+        ctx.metric("sigma_offset_mm", 1000.0 * planes.sigma_offset_m(0), "mm")
+        ctx.metric("n_independent", details["n_independent"][0], "1")
+        if first is not None:
+            ctx.metric("skewness", first.skewness, "1")
+            ctx.metric("excess_kurtosis", first.excess_kurtosis, "1")
+            for reach, share in enumerate(first.within, start=1):
+                ctx.metric(f"within_{reach}_sigma", share, "1")
+        lies(raw, "raw_")
+        miss_m = raw.offset_m - float(raw.normal @ planes.corners[0].mean(axis=0))
+        ctx.metric("raw_r_m", abs(raw.offset_m), "m")
+        ctx.metric("raw_angle_deg", angle_between_deg(raw.normal, plane.normal), "deg")
+        ctx.metric("raw_offset_mm", 1000.0 * miss_m, "mm")
     if n_guessed:
         ctx.report(SIDES_GUESSED, n=n_guessed, n_planes=len(planes))
 
@@ -593,28 +597,3 @@ def _faced(
         )
     parts_m = found[claim].support.parts_m
     return face(raster, extent_m, parts_m, side, cloud.up, is_guessed=is_guessed)
-
-
-def _raw(item: FoundPlane, plane: Plane, cloud: PointCloud) -> RawPlane:
-    candidate = item.candidate
-    own = candidate.plane
-    if float(own.normal @ plane.normal) < 0.0:
-        own = own.flipped()
-    return RawPlane(
-        plane=_world(own, cloud),
-        votes=float(candidate.votes),
-        own_tolerance_m=candidate.own_tolerance_m,
-    )
-
-
-def _world(plane: Plane, cloud: PointCloud) -> Plane:
-    offset_m = plane.offset_m + float(plane.normal @ cloud.origin)
-    return Plane(normal=plane.normal, offset_m=offset_m)
-
-
-def _world_covariance(covariance: NDArray[np.float64], cloud: PointCloud) -> NDArray[np.float64]:
-    """Covariance of (normal, offset) with the offset counted from the world's origin."""
-    shift = np.eye(4)
-    shift[3, :3] = cloud.origin
-    moved: NDArray[np.float64] = shift @ covariance @ shift.T
-    return 0.5 * (moved + moved.T)

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final, Literal, Self
+from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +40,7 @@ from orthoflow_plugins.plane.detector import (
 )
 
 if TYPE_CHECKING:
-    from orthoflow_plugins.plane.cloud import Search
+    from orthoflow_plugins.plane.search import Search
 
 Model = Literal["3d", "2d"]
 Scoring = Literal["count", "msac", "a-contrario"]
@@ -141,11 +141,11 @@ class Ransac(Method):
         from orthoflow_plugins.plane.search import detect
 
         proposer_of = partial(ConsensusProposer, params=params, rng=ctx.rng)
-        detection = detect(inputs.cloud, params, ctx, proposer_of, method=self.id)
-        own_m = detection.raw[0].own_tolerance_m
-        if own_m is not None:
-            ctx.metric("own_tolerance_mm", 1000.0 * own_m, "mm")
-        return detection.out
+        out, _ = detect(inputs.cloud, params, ctx, proposer_of, method=self.id)
+        if params.scoring == "a-contrario":
+            details: Any = out.planes.details
+            ctx.metric("own_tolerance_mm", 1000.0 * details["raw"][0]["own_tolerance_m"], "mm")
+        return out
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -310,22 +310,24 @@ class ConsensusProposer:
         self._hypotheses, self._scores = hypotheses.take(ranked), scores.take(ranked)
 
     def _scored(self, hypotheses: Hypotheses, points_m: NDArray[np.float64]) -> Scores:
-        from orthoflow_plugins.plane.kernels import consensus_sums, distance_histograms
+        from orthoflow_plugins.plane.kernels import consensus_sums
 
         columns = np.ascontiguousarray(points_m.T, dtype=np.float32)
         rows = np.column_stack([hypotheses.normals, hypotheses.offsets_m]).astype(np.float32)
-        reach_m, parts = self._search.tolerance_m, self._search.cloud.parts
-
-        shares = even_parts(len(rows), parts)
+        reach_m = self._search.tolerance_m
         if self._params.scoring == "a-contrario":
-            histograms = np.zeros((len(rows), _BINS), dtype=np.int32)
-            count = partial(distance_histograms, columns)
-            in_threads([partial(count, rows[k], reach_m, histograms[k]) for k in shares])
+            places = ((np.abs(row[:3] @ columns - row[3]) / reach_m) * _BINS for row in rows)
+            histograms = np.array(
+                [np.bincount(np.minimum(p, _BINS).astype(int), minlength=_BINS + 1) for p in places]
+            )
             extents_m = np.abs(hypotheses.normals) @ self._box_m
             n_corners = 3 if self._params.model == "3d" else 2
-            return fewest_false_alarms(histograms, reach_m, len(points_m), extents_m, n_corners)
+            return fewest_false_alarms(
+                histograms[:, :_BINS], reach_m, len(points_m), extents_m, n_corners
+            )
         sums = np.zeros((len(rows), 2), dtype=np.int64)
         add = partial(consensus_sums, columns)
+        shares = even_parts(len(rows), self._search.cloud.parts)
         in_threads([partial(add, rows[k], reach_m, _BINS, sums[k]) for k in shares])
         n_points = sums[:, 0].copy()
         is_msac = self._params.scoring == "msac"
@@ -462,7 +464,7 @@ def curve_order(points_m: NDArray[np.float64]) -> NDArray[np.intp]:
 
 
 def fewest_false_alarms(
-    histograms: NDArray[np.int32],
+    histograms: NDArray[np.int64],
     reach_m: float,
     n_points: int,
     extents_m: NDArray[np.float64],

@@ -7,7 +7,6 @@ points comes first. A point may also be labelled by its region.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
@@ -28,9 +27,8 @@ from orthoflow_plugins.plane.detector import (
 )
 
 if TYPE_CHECKING:
-    from orthoflow_plugins.plane.candidates import FoundPlane
-    from orthoflow_plugins.plane.cloud import PreparedCloud, Search
-    from orthoflow_plugins.plane.kernels import BlockedPoints
+    from orthoflow_plugins.plane.cloud import PreparedCloud
+    from orthoflow_plugins.plane.search import FoundPlane, Search
     from orthoflow_plugins.plane.voxels import Neighbourhood, SurfaceVoxels
 
 # What `preset: paper` sets where nothing else is set: markiewicz2015, 4.1.2.
@@ -166,13 +164,6 @@ class Region(Method):
                 voxel_m=share * size_m if self.cell_m is None else self.cell_m,
             )
 
-        def growth_distance_m(self, fit_tolerance_m: float) -> float | None:
-            """Return how far a cell may lie from its region; None where the normal alone counts."""
-            if self.criterion == "normal":
-                return None
-            auto_m = max(0.015, 0.5 * fit_tolerance_m)
-            return auto_m if self.distance_m == "auto" else self.distance_m
-
     In = DetectorIn
     Out = DetectorOut
 
@@ -190,15 +181,13 @@ class Region(Method):
             return region_proposer(search, params, viewer_m=viewer_m)
 
         relabel = RegionProposer.relabel if params.labels == "region" else None
-        detection = detect(cloud, params, ctx, proposer_of, method=self.id, relabel=relabel)
-        regions = detection.proposer.regions
-        draw_normals(ctx, regions.voxels, len(regions.planes), detection.out.planes, cloud)
-        return detection.out
+        out, proposer = detect(cloud, params, ctx, proposer_of, method=self.id, relabel=relabel)
+        draw_normals(ctx, proposer.voxels, len(proposer.planes), out.planes, cloud)
+        return out
 
 
-@dataclass(frozen=True, kw_only=True)
-class Regions:
-    """Regions of voxels.
+class RegionProposer:
+    """Proposes the planes of regions, which were grown on all points.
 
     Attributes:
         voxels: the voxels.
@@ -209,42 +198,52 @@ class Regions:
         starts: the planes that most points of a region are near; the same where it is one layer.
     """
 
-    voxels: SurfaceVoxels
-    region_of_voxel: NDArray[np.int32]
-    n_points: NDArray[np.int64]
-    planes: dict[int, Plane]
-    starts: dict[int, Plane]
-
-    def region_of(self, points: BlockedPoints) -> NDArray[np.int32]:
-        """(n,) region of each point, -1 for none."""
-        voxel_of = self.voxels.voxel_of(points)
-        return np.where(voxel_of >= 0, self.region_of_voxel[voxel_of], np.int32(_NONE))
-
-
-class RegionProposer:
-    """Proposes the planes of regions, which were grown on all points.
-
-    Attributes:
-        regions: the regions.
-    """
-
-    def __init__(self, search: Search, params: Region.Params, regions: Regions) -> None:
-        """Get ready to propose."""
-        self.regions, self._params = regions, params
-        self._region_of_sample = regions.region_of(search.cloud.sample.points)
+    def __init__(
+        self,
+        search: Search,
+        params: Region.Params,
+        voxels: SurfaceVoxels,
+        region_of_voxel: NDArray[np.int32],
+        n_regions: int,
+    ) -> None:
+        """Get ready to propose the planes of regions of voxels."""
+        self._params, self.voxels, self.region_of_voxel = params, voxels, region_of_voxel
+        sums = voxels.table.sums_of(region_of_voxel, n_regions)
+        self.n_points = sums[:, 0].astype(np.int64)
+        least_points = _PART_SHARE * params.min_share * len(search.cloud.claims)
+        self.planes = {
+            int(region): plane
+            for region in np.flatnonzero(self.n_points >= least_points)
+            if (plane := _plane(sums[region], voxels)) is not None
+        }
+        self.starts = self.planes
+        if params.criterion == "normal":
+            self.starts = {
+                region: _densest(voxels, region_of_voxel == region, plane)
+                for region, plane in self.planes.items()
+            }
+        self._region_of_sample = self._region_of(search.cloud)
         self._barred: set[int] = set()
         self._last = -1
+
+    def _region_of(self, cloud: PreparedCloud) -> NDArray[np.int32]:
+        """(s,) region of each point of a cloud's sample, -1 for none."""
+        from orthoflow_plugins.plane.cloud import blocked
+
+        # The last entry is for points in no voxel.
+        regions = np.append(self.region_of_voxel, np.int32(_NONE))
+        return regions[self.voxels.table.voxel_of(blocked(cloud.sample.offsets_m))]
 
     def propose(self, search: Search) -> Candidate | None:
         """Name the plane of the region with most free points."""
         free = self._region_of_sample[(search.claims < 0) & (self._region_of_sample >= 0)]
-        counts = np.bincount(free, minlength=len(self.regions.n_points))
+        counts = np.bincount(free, minlength=len(self.n_points))
         constraint = self._params.constraint
         limit_deg = self._params.max_tilt_deg + _LEAN_CAUTION_DEG
         for region in np.argsort(-counts, kind="stable").tolist():
             if counts[region] < _PART_SHARE * search.least_points:
                 return None
-            plane = self.regions.planes.get(region)
+            plane = self.planes.get(region)
             if plane is None or region in self._barred:
                 continue
             leans = leans_as_asked(plane.normal[None], search.cloud.up, constraint, limit_deg)
@@ -257,8 +256,8 @@ class RegionProposer:
             return Candidate(
                 plane=plane,
                 constraint=constraint,
-                votes=float(self.regions.n_points[region]),
-                start=self.regions.starts[region],
+                votes=float(self.n_points[region]),
+                start=self.starts[region],
             )
         return None
 
@@ -273,82 +272,49 @@ class RegionProposer:
         A region belongs to the plane that most of its points are near, if more than half of them
         are near any; the claims of the cloud say which those are.
         """
-        claims, n_regions = cloud.sample_claims, len(self.regions.n_points)
-        region_of_sample = self.regions.region_of(cloud.sample.points)
+        from orthoflow_plugins.plane.kernels import each_part, piece_of
+
+        claims, n_regions = cloud.sample_claims, len(self.n_points)
+        region_of_sample = self._region_of(cloud)
         near = (region_of_sample >= 0) & (claims >= 0)
         joint = np.zeros((n_regions, len(found)), dtype=np.int64)
         np.add.at(joint, (region_of_sample[near], claims[near]), 1)
         n_sampled = np.bincount(region_of_sample[region_of_sample >= 0], minlength=n_regions)
         owner = np.where(joint.sum(axis=1) * 2 > n_sampled, joint.argmax(axis=1), -1)
-        # The last entry stands for voxels in no region: a region of -1 picks it.
-        owners = np.append(owner, -1).astype(np.int8)[self.regions.region_of_voxel]
-        self.regions.voxels.claim(cloud, owners)
+        # The last entries stand for voxels in no region, and for points in no voxel.
+        owners = np.append(np.append(owner, -1)[self.region_of_voxel], -1).astype(np.int8)
+
+        def claim(_part: int, piece: slice) -> None:
+            cloud.claims[piece] = owners[self.voxels.table.voxel_of(piece_of(cloud.points, piece))]
+
+        each_part(len(cloud.claims), cloud.parts, claim)
 
 
 def region_proposer(
     search: Search, params: Region.Params, *, viewer_m: NDArray[np.float64]
 ) -> RegionProposer:
-    """Grow regions on all points of a search's cloud; `viewer_m` as `grow` takes it."""
-    from orthoflow_plugins.plane.voxels import surface_voxels
-
-    fit_tolerance_m = search.fit_tolerance_m
-    regions = grow(
-        surface_voxels(search.cloud, params.neighbourhood_of(fit_tolerance_m)),
-        angle_deg=params.angle_deg,
-        distance_m=params.growth_distance_m(fit_tolerance_m),
-        least_points=_PART_SHARE * params.min_share * len(search.cloud.claims),
-        viewer_m=viewer_m,
-    )
-    return RegionProposer(search, params, regions)
-
-
-def grow(
-    voxels: SurfaceVoxels,
-    *,
-    angle_deg: float,
-    distance_m: float | None,
-    least_points: float,
-    viewer_m: NDArray[np.float64],
-) -> Regions:
-    """Join voxels to regions.
+    """Grow regions on all points of a search's cloud.
 
     Args:
-        voxels: the voxels with their normals.
-        angle_deg: largest angle between the normal of a voxel and its region's.
-        distance_m: largest distance of its middle from the region's plane; None asks for the
-            normal alone, wherever the voxel lies.
-        least_points: groups by normal smaller than this are not looked for.
+        search: the search.
+        params: how regions grow.
         viewer_m: (3,) from where normals are told from their opposites when the normal alone
             counts, in the cloud's offsets.
     """
-    from orthoflow_plugins.plane.voxel_kernels import sum_regions
+    from orthoflow_plugins.plane.voxels import surface_voxels
 
-    if distance_m is None:
-        region_of_voxel, n_regions = _grouped(voxels, angle_deg, least_points, viewer_m)
+    fit_tolerance_m = search.fit_tolerance_m
+    voxels = surface_voxels(search.cloud, params.neighbourhood_of(fit_tolerance_m))
+    # Groups smaller than this are not looked for.
+    least_points = _PART_SHARE * params.min_share * len(search.cloud.claims)
+    if params.criterion == "normal":
+        regions = _grouped(voxels, params.angle_deg, least_points, viewer_m)
     else:
-        once = partial(_grown_once, angle_deg=angle_deg, distance_m=distance_m)
-        region_of_voxel, n_regions = _grown(voxels, once, least_points)
-    sums = np.zeros((n_regions, 10))
-    sum_regions(voxels.places, voxels.sums, region_of_voxel, sums)
-    n_points = sums[:, 0].astype(np.int64)
-    planes = {
-        int(region): plane
-        for region in np.flatnonzero(n_points >= least_points)
-        if (plane := _plane(sums[region], voxels)) is not None
-    }
-    starts = planes
-    if distance_m is None:
-        starts = {
-            region: _densest(voxels, region_of_voxel == region, plane)
-            for region, plane in planes.items()
-        }
-    return Regions(
-        voxels=voxels,
-        region_of_voxel=region_of_voxel,
-        n_points=n_points,
-        planes=planes,
-        starts=starts,
-    )
+        auto_m = max(0.015, 0.5 * fit_tolerance_m)
+        distance_m = auto_m if params.distance_m == "auto" else params.distance_m
+        once = partial(_grown_once, angle_deg=params.angle_deg, distance_m=distance_m)
+        regions = _grown(voxels, once, least_points)
+    return RegionProposer(search, params, voxels, *regions)
 
 
 def _grown(
@@ -357,7 +323,7 @@ def _grown(
     least_points: float,
 ) -> tuple[NDArray[np.int32], int]:
     """Grow regions; where the cloud is thin, those of wider voxels among what they leave."""
-    from orthoflow_plugins.plane.voxels import POINTS_LEAST, coarser
+    from orthoflow_plugins.plane.voxels import POINTS_LEAST, SurfaceVoxels
 
     def crumbs_of(some: SurfaceVoxels, own: NDArray[np.int32]) -> NDArray[np.bool_]:
         """Voxels in no region, or in one with too few points to be looked at."""
@@ -375,7 +341,8 @@ def _grown(
         in_neighbourhood = float(n_left.mean()) * left.neighbourhood.width_voxels() ** 2
         if in_neighbourhood >= _THIN * POINTS_LEAST:
             break
-        wider, of_crumb = coarser(left, crumbs)
+        table, of_crumb = left.table.coarser(crumbs)
+        wider = SurfaceVoxels.of(table, left.neighbourhood, parts=1)
         found, n_found = once(wider)
         of_left = np.full(len(left.counts), -1)
         of_left[crumbs] = of_crumb
@@ -391,9 +358,10 @@ def _grown(
 def _grown_once(
     voxels: SurfaceVoxels, *, angle_deg: float, distance_m: float
 ) -> tuple[NDArray[np.int32], int]:
-    from orthoflow_plugins.plane.voxel_kernels import grow_regions
+    from orthoflow_plugins.plane.voxels import grow_regions
 
-    reach = distance_m / voxels.grid.cell_m
+    table = voxels.table
+    reach = distance_m / table.grid.cell_m
     deviation, width = voxels.spreads[:, 0], voxels.spreads[:, 1]
     may_join = (deviation <= reach) & (deviation <= _ROUNDEST * width) & (width > _NARROWEST)
     regions = np.where(may_join, np.int32(_FREE), np.int32(_NONE))
@@ -401,10 +369,10 @@ def _grown_once(
     # Sixteen bits, so that the sort takes no comparisons.
     flatness = np.minimum(deviation[seeds] / _FLATNESS_STEP, 65535.0).astype(np.uint16)
     n_regions = grow_regions(
-        voxels.places,
-        voxels.bricks,
-        voxels.numbers,
-        voxels.sums,
+        table.places,
+        table.bricks,
+        table.numbers,
+        table.sums,
         voxels.normals,
         seeds[np.argsort(flatness, kind="stable")],
         np.array([math.cos(math.radians(angle_deg)), reach]),
@@ -421,7 +389,7 @@ def _grouped(
     usable &= voxels.spreads[:, 1] > _NARROWEST
     # Each towards the viewer.
     normals: NDArray[np.float64] = voxels.normals.astype(np.float64)
-    to_viewer = voxels.grid.basis @ viewer_m - voxels.centroids()
+    to_viewer = voxels.table.grid.basis @ viewer_m - voxels.table.centroids()
     normals *= np.where(np.einsum("ij,ij->i", normals, to_viewer) < 0.0, -1.0, 1.0)[:, None]
     regions = np.full(len(normals), _NONE, dtype=np.int32)
     free = np.flatnonzero(usable)
@@ -471,9 +439,8 @@ def _plane(sums: NDArray[np.float64], voxels: SurfaceVoxels) -> Plane | None:
     variances, directions = np.linalg.eigh(second / sums[0] - np.outer(mean, mean))
     if variances[1] <= 0.0:
         return None
-    basis, side_m = voxels.grid.basis, voxels.grid.cell_m
-    # Sums count from the middle of the first voxel.
-    middle_m = (voxels.grid.low_m + side_m * (mean + 0.5)) @ basis
+    basis, side_m = voxels.table.grid.basis, voxels.table.grid.cell_m
+    middle_m = (voxels.table.grid.low_m + side_m * mean) @ basis
     normal = directions[:, 0] @ basis
     normal /= np.linalg.norm(normal)
     return Plane(normal=normal, offset_m=float(normal @ middle_m))
@@ -481,13 +448,13 @@ def _plane(sums: NDArray[np.float64], voxels: SurfaceVoxels) -> Plane | None:
 
 def _densest(voxels: SurfaceVoxels, member: NDArray[np.bool_], plane: Plane) -> Plane:
     """The plane in the mean direction of a group that most of its points are near."""
-    basis, side_m = voxels.grid.basis, voxels.grid.cell_m
+    basis, side_m = voxels.table.grid.basis, voxels.table.grid.cell_m
     weights = voxels.counts[member].astype(np.float64)
     normals = voxels.normals[member].astype(np.float64)
     best = int(np.argmax(np.abs(normals @ (basis @ plane.normal))))
     signs = np.where(normals @ normals[best] < 0.0, -1.0, 1.0)
     direction = _unit_mean(normals, weights * signs) @ basis
-    along_m = voxels.centroids()[member] @ basis @ direction
+    along_m = voxels.table.centroids()[member] @ basis @ direction
     bins = ((along_m - float(along_m.min())) / side_m).astype(np.int64)
     inside = bins == int(np.argmax(np.bincount(bins, weights)))
     offset_m = float(np.average(along_m[inside], weights=weights[inside]))

@@ -1,51 +1,104 @@
-"""The road that all detectors share: prepare, search, fit, label, measure, report.
+"""The one search of all detectors: candidates moved to a surface, verified, fitted, labelled.
 
-The search is greedy: the best plane first, its points taken away, then the best of what remains. A
-`Proposer` names candidates (an accumulator's maximum, a consensus set); what follows is the same
-for each. All planes are found in the sample; one pass over all points fits them, one labels.
+The same for every detector, so that methods differ in how they look, not in how they fit. A
+candidate is refined on the free points of the sample with a shrinking tolerance, must hold crowded
+cells of enough of them, and is fitted to those cells. Then all points take part, one pass for all
+planes; or of more than 24 million every so many'th block of neighbours, drawn over the whole cloud:
+neighbours share their errors, so that those left out say the same.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from typing import Final, Generic, Protocol, TypeVar
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Final, Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry import angle_between_deg, basis_from_up, omega_phi_deg
+from orthoflow.geometry import Plane, wall_axes
+from orthoflow.geometry.threads import in_order
 from orthoflow.products import PointCloud, PointLabels
 from orthoflow.sdk import DiagnosticSpec, StepContext
-from orthoflow_plugins.plane.candidates import (
-    FoundPlane,
-    fit_to_all,
-    label,
-    name_points,
-    verify,
-)
 from orthoflow_plugins.plane.cloud import (
-    Criterion,
     PreparedCloud,
-    Search,
+    blocked,
     measure_noise,
     prepare,
     thinned,
 )
-from orthoflow_plugins.plane.detector import Candidate, DetectorOut, DetectorParams
+from orthoflow_plugins.plane.detector import (
+    Candidate,
+    DetectorOut,
+    DetectorParams,
+    leans_as_asked,
+)
 from orthoflow_plugins.plane.figures import draw_deviations, draw_planes, draw_thickness
-from orthoflow_plugins.plane.planes import Assembly, RawPlane, assemble, report_planes
-from orthoflow_plugins.plane.support import CELL_LEAST_M
+from orthoflow_plugins.plane.fit import (
+    SETTLED_M,
+    AdjustedPlane,
+    Freedom,
+    adjust_plane,
+    refine_plane,
+    shrinking_tolerances,
+)
+from orthoflow_plugins.plane.kernels import BlockedPoints
+from orthoflow_plugins.plane.planes import assemble, report_planes
+from orthoflow_plugins.plane.support import (
+    CELL_LEAST_M,
+    CellSums,
+    Support,
+    SurfaceRaster,
+    cell_for,
+    covering_rectangles,
+    crowded_cells,
+    grown,
+    measure_cells,
+    support_of,
+)
 from orthoflow_plugins.plane.thickness import measure_thickness, report_thickness, row_points
 
-# Steps of the robust box of detectors that do not look at the plan.
-_PLAN_CELL_M: Final = 0.5
-# Four times the share of the points that may lie outside the box on each side. Mirror ghosts and
-# stray points, 0.4 % in simulated rooms, would else make it several times as large as the scene.
-_STRAY_SHARE: Final = 0.005
+# Share of the points in a plane's slab and rectangle that must lie in crowded cells.
+_CROWDED_LEAST: Final = 0.5
+# Cells that form a line, about which a plane may turn as it likes, are narrower than this.
+_STRIP_CELLS: Final = 2.5
+# Surfaces rounder than this radius are no planes, when the rounding is what shows in their cells.
+_RADIUS_LEAST_M: Final = 5.0
+_BENT_SHARE: Final = 0.5
+# Passes over the points that one plane may take, and the share of the fit tolerance by which a fit
+# may move without asking for another.
+_PASSES_MOST: Final = 3
+_SETTLED_SHARE: Final = 0.1
+# Planes of a sample are fitted to all points later.
+_SETTLED_ON_SAMPLE_M: Final = 2e-5
+# A candidate may miss a plane's share by this much before its cells are fitted.
+_SAMPLE_CAUTION: Final = 0.7
+# Parts are of one plane when the common fit lies not much worse in the largest than its own.
+_ASKEW: Final = 1.5
+_SAME_M: Final = 2e-4
+# Points that are enough to move a candidate to the surface near it; the fits that follow, to the
+# cells of the sample and then of all points, have all.
+_FIT_POINTS: Final = 20_000
+# Points that are enough to see how far a candidate's points spread.
+_SPREAD_POINTS: Final = 5_000
+# Points that fix every plane better than its surface is plane; of larger clouds a part is fitted.
+_FITTED_MOST: Final = 12_000_000
+# In a small cloud a plane need not show more than this share of the largest side of its box.
+_SIDE_SHARE: Final = 0.02
+# Rectangles that one plane is cut into at most: a frame has four sides. Claims are bytes.
+_RECTANGLES_MOST: Final = 8
+_SLABS_MOST: Final = 127
 # Candidates in a row that turned out to be none, after which the search gives up.
 _REJECTED_MOST: Final = 60
+
+# What may refuse a candidate: too few points, too little surface, none that crowd about it, a strip
+# as narrow as a line, points that only pass through, a rounded surface, or a tilt not asked for.
+Criterion = Literal["few", "small", "scattered", "strip", "smear", "bent", "tilt"]
+# No plane of the size asked for lies in the cells of candidates that were refused so.
+_SET_ASIDE: Final[frozenset[Criterion]] = frozenset({"small", "strip", "bent"})
 
 _NO_PLANE: Final = (
     "no plane was found in {count} points ({size}) with tolerance_m {tolerance:.3g} and min_share "
@@ -81,6 +134,113 @@ _NO_INTENSITY: Final = (
     "materials are told apart by the intensity of the points, which the cloud has not: leave "
     "materials out, or read a scan with intensity ({method})"
 )
+UNEXPLAINED: Final = DiagnosticSpec(
+    code="points-on-no-plane",
+    severity="warning",
+    text="{share:.0%} of the points lie on no plane, more than on the largest one ({largest:.0%}): "
+    "walls may be missing, unless these are vegetation, furniture or curved surfaces",
+    remedy="{step}.min_share={min_share:.2g} finds smaller planes, "
+    "{step}.tolerance_m={tolerance_m:.2g} rougher ones",
+    rank_by="share",
+)
+
+
+class Claim(NamedTuple):
+    """A plane that takes points: (12,) its slab and (5,) its bounds, see `kernels`."""
+
+    slab: NDArray[np.float64]
+    bounds_m: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, raster: SurfaceRaster, support: Support, tolerance_m: float) -> Claim:
+        """What a plane takes: points within the tolerance of it and of its rectangle."""
+        return cls(raster.slab(), grown(support.bounds_m, tolerance_m))
+
+
+@dataclass(kw_only=True)
+class Search:
+    """A greedy search for planes: the sample while they are taken from it, and what counts as one.
+
+    Attributes:
+        cloud: the cloud.
+        params: what is looked for, and when the search ends.
+        tolerance_m: `params.tolerance_m`, measured where that is `auto`.
+        fit_tolerance_m: `params.fit_tolerance_m`, likewise.
+        claims: (m,) int16, plane of each point of the sample, -1 for none yet.
+        taken: the planes that took points, in their order.
+        n_points: points of the sample that no plane holds.
+        refusals: what refused candidates, and the share of all points that each held.
+    """
+
+    cloud: PreparedCloud
+    params: DetectorParams
+    tolerance_m: float
+    fit_tolerance_m: float
+    claims: NDArray[np.int16] = field(init=False)
+    taken: list[Claim] = field(init=False, default_factory=list)
+    n_points: int = field(init=False)
+    refusals: list[tuple[Criterion, float]] = field(init=False, default_factory=list)
+    _free: tuple[NDArray[np.float64], BlockedPoints] | None = field(init=False, default=None)
+
+    def __post_init__(self) -> None:
+        self.n_points = len(self.cloud.sample.index)
+        self.claims = np.full(self.n_points, -1, dtype=np.int16)
+        self._away_m = np.full(self.n_points, np.inf)
+        self.box_corners_m = self.cloud.box_corners()
+
+    @property
+    def min_area_m2(self) -> float:
+        """Surface that a plane must show."""
+        _, middle, high = np.sort(self.cloud.grid.extent_m)
+        return min(self.params.min_area_m2, _SIDE_SHARE * float(middle * high))
+
+    @property
+    def least_points(self) -> float:
+        """Points of the sample that a plane must hold."""
+        return self.params.min_share * len(self.claims)
+
+    def free(self) -> tuple[NDArray[np.float64], BlockedPoints]:
+        """The points that no plane has: (m, 3) offsets, and in blocks."""
+        if self._free is None:
+            offsets_m = self.cloud.sample.offsets_m.take(np.flatnonzero(self.claims < 0), axis=0)
+            self._free = offsets_m, blocked(offsets_m)
+        return self._free
+
+    def claim(self, claim: Claim) -> None:
+        """Give a plane its points, but for those that an earlier one has and is nearer to."""
+        rows, bounds = claim.slab.reshape(3, 4), claim.bounds_m
+        away_m, u, v = rows[:, :3] @ self.cloud.sample.offsets_m.T - rows[:, 3:]
+        away_m = np.abs(away_m)
+        held = (away_m <= bounds[0]) & (away_m < self._away_m)
+        held &= (u >= bounds[1]) & (u <= bounds[2]) & (v >= bounds[3]) & (v <= bounds[4])
+        self.claims[held] = len(self.taken)
+        self._away_m[held] = away_m[held]
+        self.taken.append(claim)
+        self.n_points = int(np.count_nonzero(self.claims < 0))
+        self._free = None
+
+    def refuse(self, criterion: Criterion, n_points: float = 0.0) -> None:
+        """Note what refused a candidate that holds so many points of the sample."""
+        self.refusals.append((criterion, n_points / max(1, len(self.claims))))
+
+
+@dataclass(frozen=True)
+class FoundPlane:
+    """A plane that holds its share of the points.
+
+    Attributes:
+        raster: its cells; `raster.plane` is the plane, in the cloud's offsets.
+        support: which cells belong, parts, rectangle.
+        adjusted: the fit.
+        candidate: what the detector proposed.
+        freedom: what the fit could change.
+    """
+
+    raster: SurfaceRaster
+    support: Support
+    adjusted: AdjustedPlane
+    candidate: Candidate
+    freedom: Freedom
 
 
 class Proposer(Protocol):
@@ -94,34 +254,10 @@ class Proposer(Protocol):
 
 
 P = TypeVar("P", bound=Proposer)
+# The criterion that refuses a plane, the cells that belong to it, and how it fits them.
+_Verdict = tuple[Criterion | None, Support | None, AdjustedPlane | None]
 # Makes what proposes planes in a search that has taken none yet.
 ProposerOf = Callable[[Search], P]
-UNEXPLAINED: Final = DiagnosticSpec(
-    code="points-on-no-plane",
-    severity="warning",
-    text="{share:.0%} of the points lie on no plane, more than on the largest one ({largest:.0%}): "
-    "walls may be missing, unless these are vegetation, furniture or curved surfaces",
-    remedy="{step}.min_share={min_share:.2g} finds smaller planes, "
-    "{step}.tolerance_m={tolerance_m:.2g} rougher ones",
-    rank_by="share",
-)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Detection(Generic[P]):
-    """What a detector gives back.
-
-    Attributes:
-        out: planes and labels.
-        proposer: what proposed the planes.
-        raw: of each plane what its detector itself gave.
-        cloud: the cloud as the passes take it.
-    """
-
-    out: DetectorOut
-    proposer: P
-    raw: tuple[RawPlane, ...]
-    cloud: PreparedCloud
 
 
 def detect(
@@ -133,7 +269,7 @@ def detect(
     method: str,
     plan_cell_m: float | None = None,
     relabel: Callable[[P, list[FoundPlane], PreparedCloud], None] | None = None,
-) -> Detection[P]:
+) -> tuple[DetectorOut, P]:
     """Find the planes of a cloud and turn them into products.
 
     Args:
@@ -145,6 +281,9 @@ def detect(
         plan_cell_m: side of the plan's cells; None for detectors that do not look at the plan.
         relabel: changes the claims of the whole cloud once all points have theirs.
 
+    Returns:
+        Planes and labels, and what proposed the planes.
+
     Raises:
         ProductError: the cloud has fewer than three points, or coordinates that are not finite.
         MethodError: the points fix no plane, or none has enough of them; or materials are asked for
@@ -152,41 +291,79 @@ def detect(
     """
     if params.materials and cloud.intensity is None:
         raise MethodError(_NO_INTENSITY.format(method=method))
-    moments_s = [_now(ctx)]
+    moments_s = [(ctx.clock_s(), ctx.processor_s())]
     ctx.progress(0.0, "preparing the points")
-    cell_m = _PLAN_CELL_M if plan_cell_m is None else plan_cell_m
-
-    def prepared(points: PointCloud) -> PreparedCloud:
-        return prepare(
-            points,
-            basis_from_up(cloud.up),
-            cell_m=cell_m,
-            least_share=_STRAY_SHARE,
-            parts=ctx.cores,
-            counts_plan=plan_cell_m is not None,
-        )
-
-    search = _search_in(prepared(thinned(cloud, params.thinning)), params, ctx)
+    prepared = partial(prepare, parts=ctx.cores, plan_cell_m=plan_cell_m)
+    whole = prepared(thinned(cloud, params.thinning))
+    noise = measure_noise(whole.sample.offsets_m)
+    tolerance_m, fit_tolerance_m = params.tolerances_m(*(noise or (0.0, 0.0)))
+    search = Search(
+        cloud=whole, params=params, tolerance_m=tolerance_m, fit_tolerance_m=fit_tolerance_m
+    )
     proposer = proposer_of(search)
 
     def on_found(n_found: int) -> None:
-        moments_s.append(_now(ctx))
-        ctx.progress(0.1 + 0.7 * n_found / params.n_planes_max, f"plane {n_found}")
+        moments_s.append((ctx.clock_s(), ctx.processor_s()))
+        ctx.progress(0.8 - 0.7 * 0.9**n_found, f"plane {n_found}")
 
     found = find_planes(search, proposer, on_found)
     if not found:
         raise MethodError(_why_none(cloud, search, proposer_of, method))
-    whole = search.cloud
     if params.thinning > 1:
         whole = prepared(cloud)
-        label(found, whole, search.tolerance_m)
     if not params.refit:
-        found = [item.as_proposed(whole.up) for item in found]
-        label(found, whole, search.tolerance_m)
+        found = [_as_proposed(item, whole.up) for item in found]
+    if params.thinning > 1 or not params.refit:
+        label(found, whole, tolerance_m)
     if relabel is not None:
         relabel(proposer, found, whole)
-    _report_times(ctx, np.diff([*moments_s, _now(ctx)], axis=0))
-    return _products(cloud, whole, found, search, proposer, ctx)
+    _report_times(ctx, np.diff([*moments_s, (ctx.clock_s(), ctx.processor_s())], axis=0))
+    if noise is not None:
+        ctx.metric("noise_mm", 1000.0 * noise[0], "mm")
+    ctx.metric("tolerance_m", tolerance_m, "m")
+    ctx.metric("fit_tolerance_m", fit_tolerance_m, "m")
+    ctx.metric("thinning", params.thinning, "1")
+    return _products(cloud, whole, found, search, ctx), proposer
+
+
+def _products(
+    cloud: PointCloud,
+    whole: PreparedCloud,
+    found: list[FoundPlane],
+    search: Search,
+    ctx: StepContext,
+) -> DetectorOut:
+    """Measure, assemble, report and draw the planes that were found."""
+    ctx.progress(0.8, "measuring deviations")
+    planes, deviations, normalities, names = assemble(
+        found, whole, cloud, search.tolerance_m, search.fit_tolerance_m
+    )
+    labels = ctx.allocate("labels", "plane_index", (len(cloud),), np.int16).view(np.int16)
+    whole.write_labels(names, labels)
+    report_planes(ctx, planes, deviations, n_points=len(cloud), first=normalities[0])
+    n_left = len(cloud) - int(deviations.n_points.sum())
+    largest = int(deviations.n_points.max())
+    if n_left > largest:
+        ctx.report(
+            UNEXPLAINED,
+            share=n_left / len(cloud),
+            largest=largest / len(cloud),
+            min_share=search.params.min_share / 2.0,
+            tolerance_m=2.0 * search.tolerance_m,
+        )
+    ctx.progress(0.9, "drawing")
+    draw_deviations(ctx, planes, deviations, normalities)
+    # The last of the names is for points on no plane: a claim of -1 picks it.
+    plane_of_sample = names[whole.sample_claims].astype(np.int64)
+    draw_planes(ctx, planes, whole.sample.offsets_m, plane_of_sample, cloud)
+    materials, reach_m = search.params.materials, search.fit_tolerance_m
+    thickness = measure_thickness(planes, plane_of_sample, whole, cloud, reach_m, materials)
+    row = row_points(planes, plane_of_sample, whole, cloud)
+    report_thickness(ctx, thickness)
+    draw_thickness(ctx, planes, thickness, row, materials)
+    scan_row = None if row is None else row.measured(materials)
+    planes = replace(planes, thickness=thickness, scan_row=scan_row)
+    return DetectorOut(planes=planes, labels=PointLabels(plane_index=labels))
 
 
 def find_planes(
@@ -207,11 +384,7 @@ def find_planes(
 def greedy_search(
     search: Search, proposer: Proposer, on_found: Callable[[int], None] = lambda _: None
 ) -> list[FoundPlane]:
-    """Find planes in the sample one after the other until a stop rule holds; see `find_planes`.
-
-    Returns:
-        The planes in the order they were found; `search.claims` refers to that order.
-    """
+    """Find planes in the sample one after the other until a stop rule holds; see `find_planes`."""
     params, found, n_rejected = search.params, list[FoundPlane](), 0
     least_left = params.stop_unclassified_share * len(search.claims)
     while len(found) < params.n_planes_max and n_rejected < _REJECTED_MOST:
@@ -229,80 +402,253 @@ def greedy_search(
             break
         found.append(plane)
         n_rejected = 0
-        search.claim(plane.claim(search.tolerance_m))
+        search.claim(Claim.of(plane.raster, plane.support, search.tolerance_m))
         on_found(len(found))
     return found
 
 
-def _search_in(cloud: PreparedCloud, params: DetectorParams, ctx: StepContext) -> Search:
-    """Begin a search with the tolerances that the noise of the cloud asks for."""
-    noise = measure_noise(cloud.sample.offsets_m)
-    tolerance_m, fit_tolerance_m = params.tolerances_m(*(noise or (0.0, 0.0)))
-    if noise is not None:
-        ctx.metric("noise_mm", 1000.0 * noise.single_m, "mm")
-    ctx.metric("tolerance_m", tolerance_m, "m")
-    ctx.metric("fit_tolerance_m", fit_tolerance_m, "m")
-    ctx.metric("thinning", params.thinning, "1")
-    return Search(
-        cloud=cloud, params=params, tolerance_m=tolerance_m, fit_tolerance_m=fit_tolerance_m
-    )
+def verify(candidate: Candidate, search: Search) -> FoundPlane | None:
+    """Refine a candidate and see whether it is a plane of points that no other has.
 
-
-def _products(
-    cloud: PointCloud,
-    whole: PreparedCloud,
-    found: list[FoundPlane],
-    search: Search,
-    proposer: P,
-    ctx: StepContext,
-) -> Detection[P]:
-    """Measure, assemble, report and draw the planes that were found."""
-    ctx.progress(0.8, "measuring deviations")
-    assembly = assemble(found, whole, cloud, search.tolerance_m, search.fit_tolerance_m)
-    labels = ctx.allocate("labels", "plane_index", (len(cloud),), np.int16).view(np.int16)
-    name_points(whole, assembly.labels_from_claims, labels)
-    report_planes(
-        ctx,
-        assembly.planes,
-        assembly.deviations,
-        n_points=len(cloud),
-        n_guessed=assembly.n_guessed,
-    )
-    n_on_planes = assembly.deviations.n_points
-    n_left = len(cloud) - int(n_on_planes.sum())
-    if n_left > n_on_planes.max():
-        ctx.report(
-            UNEXPLAINED,
-            share=n_left / len(cloud),
-            largest=float(n_on_planes.max()) / len(cloud),
-            min_share=search.params.min_share / 2.0,
-            tolerance_m=2.0 * search.tolerance_m,
+    None when it is not; `search.refusals` then says by which criterion. Clutter near the scanner
+    holds more points than a wall far away: its candidates, a little different each time, would hide
+    that wall, so the points of those refused for their size or shape propose no other. Points that
+    lie on a plane are given to it in the end, when all points are labelled.
+    """
+    up, params = search.cloud.up, search.params
+    leans = partial(leans_as_asked, up=up, max_tilt_deg=params.max_tilt_deg)
+    freedom: Freedom = "free"
+    if params.exact:
+        normal = candidate.plane.normal[None]
+        if candidate.constraint == "vertical" or leans(normal, constraint="vertical").all():
+            freedom = "vertical"
+        elif leans(normal, constraint="horizontal").all():
+            freedom = "horizontal"
+    refined = _refined(candidate, search, freedom)
+    if refined is None:
+        return None
+    plane, cell_m = refined
+    if not leans(plane.normal[None], constraint=candidate.constraint).all():
+        search.refuse("tilt")
+        return None
+    for nth in range(_PASSES_MOST):
+        raster = SurfaceRaster.over(plane, search.box_corners_m, up, cell_m)
+        sums = _cells_of(search, raster, search.cloud.parts)
+        criterion, support, adjusted = _judged(
+            raster, sums, search, freedom, search.least_points, settled_m=_SETTLED_ON_SAMPLE_M
         )
-    _report_fit(ctx, assembly, n_points=len(cloud))
-    ctx.progress(0.9, "drawing")
-    draw_deviations(ctx, assembly)
-    # The last of the labels is for points on no plane: a claim of -1 picks it.
-    plane_of_sample = assembly.labels_from_claims[whole.sample_claims].astype(np.int64)
-    draw_planes(ctx, assembly.planes, whole.sample.offsets_m, plane_of_sample, cloud)
-    materials = search.params.materials
-    thickness = measure_thickness(
-        assembly.planes,
-        plane_of_sample,
-        whole,
-        cloud,
-        reach_m=search.fit_tolerance_m,
-        materials=materials,
-    )
-    row = row_points(assembly.planes, plane_of_sample, whole, cloud)
-    report_thickness(ctx, thickness)
-    draw_thickness(ctx, assembly.planes, thickness, row, materials)
-    planes = replace(
-        assembly.planes,
-        thickness=thickness,
-        scan_row=None if row is None else row.measured(materials),
-    )
-    out = DetectorOut(planes=planes, labels=PointLabels(plane_index=labels))
-    return Detection(out=out, proposer=proposer, raw=assembly.raw, cloud=whole)
+        if adjusted is None or support is None:
+            if support is not None and criterion in _SET_ASIDE:
+                search.claim(Claim.of(raster, support, search.tolerance_m))
+            return None
+        plane, cell_m = adjusted.plane, raster.cell_m
+        # A plane that moved saw its points through a tolerance that lay askew: look again.
+        is_settled = adjusted.moved_m < _SETTLED_SHARE * search.fit_tolerance_m
+        if is_settled or nth == _PASSES_MOST - 1:
+            raster = raster.moved_to(plane, up)
+            return FoundPlane(raster, support, adjusted, candidate, freedom)
+    return None
+
+
+def _refined(candidate: Candidate, search: Search, freedom: Freedom) -> tuple[Plane, float] | None:
+    """Move a candidate to the surface near it; gives the side of the cells that suit it, too.
+
+    None where too few points of the sample crowd there.
+    """
+    free_points, up = search.free()[0], search.cloud.up
+    fit = partial(refine_plane, freedom=freedom, up=up)
+    first, *rest = shrinking_tolerances(search.tolerance_m, search.fit_tolerance_m)
+    start = candidate.plane if candidate.start is None else candidate.start
+    plane = fit(_some(free_points, _FIT_POINTS), start, first)
+    if plane is None:
+        search.refuse("scattered")
+        return None
+    near = np.abs(free_points @ plane.normal - plane.offset_m) <= search.tolerance_m
+    near_m = free_points.take(np.flatnonzero(near), axis=0)
+    # The side of cells follows from the spread of the points.
+    placed = _some(near_m @ wall_axes(plane.normal, up).T, _SPREAD_POINTS)
+    low, high = np.quantile(placed, (0.02, 0.98), axis=0) if len(near_m) else np.zeros((2, 2))
+    cell_m = max(search.tolerance_m, cell_for(len(near_m), float(np.prod(high - low))))
+    raster = SurfaceRaster.over(plane, search.box_corners_m, up, cell_m)
+    sums = _cells_of(search, raster, 1)
+    support = support_of(raster, crowded_cells(sums), sums, join_parts=search.params.join_parts)
+    if support is None or support.n_points < _SAMPLE_CAUTION * search.least_points:
+        search.refuse("scattered" if support is None else "few", support.n_points if support else 0)
+        return None
+    # A door and a niche in one wall, at different depths, both lie near one plane that leans by
+    # some degrees and runs through them askew; fitted alone, the largest shows that it does not.
+    near_m = _some(near_m, _FIT_POINTS)
+    together = fit(near_m[raster.covers(near_m, support.cells)], plane, first, *rest)
+    if len(support.parts_m) > 1:
+        largest_m = near_m[raster.covers(near_m, support.part_of_cell == 0)]
+        alone = fit(largest_m, plane, first, *rest)
+        if together is not None and alone is not None:
+            joint_m, own_m = (
+                float(np.median(np.abs(fitted.distances_m(largest_m))))
+                for fitted in (together, alone)
+            )
+            if joint_m > _ASKEW * own_m + _SAME_M:
+                together = alone
+        else:
+            together = alone
+    if together is None:
+        search.refuse("scattered")
+        return None
+    area_m2 = float(support.cells.sum()) * raster.cell_m**2
+    return together, cell_for(float(sums.n_near[support.cells].sum()), area_m2)
+
+
+def _some(points: NDArray[np.float64], most: int) -> NDArray[np.float64]:
+    """Some of the points (m, 3), about so many if there are more."""
+    return points[:: max(1, len(points) // most)]
+
+
+def _cells_of(search: Search, raster: SurfaceRaster, parts: int) -> CellSums:
+    """Sums of the free points of the sample in the cells on a plane."""
+    return measure_cells(
+        search.free()[1],
+        [raster],
+        tolerance_m=search.tolerance_m,
+        fit_tolerance_m=search.fit_tolerance_m,
+        parts=parts,
+    )[0]
+
+
+def _judged(
+    raster: SurfaceRaster,
+    sums: CellSums,
+    search: Search,
+    freedom: Freedom,
+    least_points: float,
+    *,
+    settled_m: float = SETTLED_M,
+) -> _Verdict:
+    """The criterion that refuses a plane, the cells that belong to it and how it fits them."""
+    support = support_of(raster, crowded_cells(sums), sums, join_parts=search.params.join_parts)
+    if support is None:
+        search.refuse("scattered")
+        return "scattered", None, None
+    adjusted: AdjustedPlane | None = None
+    criterion: Criterion | None = None
+    u, v = raster.centres_m()
+    left, right, top, bottom = support.bounds_m
+    near_it = sums.n_near[(u > left) & (u < right) & (v > top) & (v < bottom)]
+    if support.n_points < least_points:
+        criterion = "few"
+    elif min(right - left, bottom - top) < _STRIP_CELLS * raster.cell_m:
+        criterion = "strip"
+    elif support.area_m2 < search.min_area_m2:
+        criterion = "small"
+    elif support.n_points < _CROWDED_LEAST * int(near_it.sum()):
+        criterion = "smear"
+    else:
+        adjusted = adjust_plane(
+            raster,
+            sums,
+            support.cells,
+            fit_tolerance_m=search.fit_tolerance_m,
+            freedom=freedom,
+            settled_m=settled_m,
+        )
+        # On a column or barrel that the plane only touches.
+        if adjusted is None or (
+            adjusted.bend_per_m > 1.0 / _RADIUS_LEAST_M and adjusted.bend_share > _BENT_SHARE
+        ):
+            criterion, adjusted = "bent", None
+    if criterion is not None:
+        # As a share of all points, however many of them were asked.
+        share = support.n_points / max(least_points, 1e-9)
+        search.refuse(criterion, share * search.least_points)
+    return criterion, support, adjusted
+
+
+def fit_to_all(found: list[FoundPlane], search: Search) -> list[FoundPlane]:
+    """Fit planes of the sample to all points; those that these do not bear out are left out."""
+    cloud = search.cloud
+    every = max(1, len(cloud.claims) // _FITTED_MOST)
+    least_points = search.params.min_share * len(cloud.claims) / every
+    # At a fixed step, blocks would fall in step with the columns of a scan and leave stripes out.
+    drawn = np.random.default_rng(0).permutation(len(cloud.points.boxes)) % every == 0
+    is_open = [True] * len(found)
+
+    def judged(asked: tuple[SurfaceRaster, CellSums, Freedom]) -> _Verdict:
+        raster, sums, freedom = asked
+        return _judged(raster, sums, search, freedom, least_points)
+
+    for _ in range(_PASSES_MOST):
+        rasters = [
+            _fine_raster(item, search, every) if wanted else replace(item.raster, shape=(0, 0))
+            for item, wanted in zip(found, is_open, strict=True)
+        ]
+        sums = measure_cells(
+            cloud.points,
+            rasters,
+            tolerance_m=search.tolerance_m,
+            fit_tolerance_m=search.fit_tolerance_m,
+            parts=cloud.parts,
+            bounds_m=_bounds(found, search.tolerance_m),
+            drawn=drawn,
+        )
+        asked = [k for k in range(len(found)) if is_open[k]]
+        verdicts = in_order(
+            judged, [(rasters[k], sums[k], found[k].freedom) for k in asked], threads=cloud.parts
+        )
+        fitted = dict(zip(asked, verdicts, strict=True))
+        kept, moves = [], []
+        for k, before in enumerate(found):
+            item = before
+            _, support, adjusted = fitted.get(k, (None, item.support, item.adjusted))
+            if support is None or adjusted is None:
+                continue
+            moves.append(is_open[k] and adjusted.moved_m > _SETTLED_SHARE * search.fit_tolerance_m)
+            if is_open[k]:
+                raster = rasters[k].moved_to(adjusted.plane, cloud.up)
+                item = replace(item, raster=raster, support=support, adjusted=adjusted)
+            kept.append(item)
+        found, is_open = kept, moves
+        if not any(is_open):
+            break
+    return found
+
+
+def _fine_raster(item: FoundPlane, search: Search, every: int) -> SurfaceRaster:
+    """Cells over the plane's rectangle alone, as fine as the points that are summed allow."""
+    area_m2 = float(item.support.cells.sum()) * item.raster.cell_m**2
+    share = search.cloud.sample.n_represented / every
+    cell_m = min(item.raster.cell_m, cell_for(item.support.n_points * share, area_m2))
+    left, right, top, bottom = grown(item.support.bounds_m, search.tolerance_m)[1:]
+    rows, columns = math.ceil((bottom - top) / cell_m), math.ceil((right - left) / cell_m)
+    shape = (max(1, rows), max(1, columns))
+    return replace(item.raster, low_m=np.array([left, top]), cell_m=cell_m, shape=shape)
+
+
+def _bounds(found: list[FoundPlane], tolerance_m: float) -> list[NDArray[np.float64]]:
+    """Bounds (r, 5) of each plane: its rectangle, or several where its cells cover little of it."""
+    bounds, n_spare = [], _SLABS_MOST - len(found)
+    for item in found:
+        most = min(_RECTANGLES_MOST, n_spare + 1)
+        own = covering_rectangles(item.raster, item.support.cells, most)
+        n_spare -= len(own) - 1
+        bounds.append(grown(own if len(own) > 1 else item.support.bounds_m[None], tolerance_m))
+    return bounds
+
+
+def label(found: list[FoundPlane], cloud: PreparedCloud, tolerance_m: float) -> None:
+    """Claim all points for the nearest plane in whose rectangles they lie."""
+    bounds = _bounds(found, tolerance_m)
+    plane_of_slab = np.repeat(np.arange(len(found)), [len(own) for own in bounds])
+    slabs = np.array([item.raster.slab() for item in found]).reshape(-1, 12)[plane_of_slab]
+    # The last entry is for a claim of -1.
+    names = np.append(plane_of_slab, -1).astype(np.int8) if len(slabs) > len(found) else None
+    cloud.assign(slabs, np.concatenate([np.zeros((0, 5)), *bounds]), names)
+
+
+def _as_proposed(item: FoundPlane, up: NDArray[np.float64]) -> FoundPlane:
+    """Return a plane as its detector proposed it, with the rectangle that was found for it."""
+    plane = item.candidate.plane
+    if float(plane.normal @ item.raster.plane.normal) < 0.0:
+        plane = plane.flipped()
+    return replace(item, raster=item.raster.moved_to(plane, up))
 
 
 def _why_none(cloud: PointCloud, search: Search, proposer_of: ProposerOf[P], method: str) -> str:
@@ -335,11 +681,6 @@ def _why_none(cloud: PointCloud, search: Search, proposer_of: ProposerOf[P], met
     )
 
 
-def _now(ctx: StepContext) -> tuple[float, float]:
-    """Return seconds by the clock, and by the processor."""
-    return ctx.clock_s(), ctx.processor_s()
-
-
 def _report_times(ctx: StepContext, passed_s: NDArray[np.float64]) -> None:
     """Report the seconds of a detection, loading apart, as Table 1 of markiewicz2015 does.
 
@@ -348,36 +689,9 @@ def _report_times(ctx: StepContext, passed_s: NDArray[np.float64]) -> None:
         passed_s: (n, 2) seconds up to each plane, and from the last one to the labels of all
             points; by the clock and by the processor.
     """
-    whole_s, first_s = passed_s.sum(axis=0), passed_s[0]
-    ctx.metric("detection_s", whole_s[0], "s")
-    ctx.metric("detection_cpu_s", whole_s[1], "s")
-    ctx.metric("first_plane_s", first_s[0], "s")
-    ctx.metric("first_plane_cpu_s", first_s[1], "s")
+    times_s = {"detection": passed_s.sum(axis=0), "first_plane": passed_s[0]}
     if len(passed_s) > 2:
-        next_s = passed_s[1:-1].mean(axis=0)
-        ctx.metric("next_plane_s", next_s[0], "s")
-        ctx.metric("next_plane_cpu_s", next_s[1], "s")
-
-
-def _report_fit(ctx: StepContext, assembly: Assembly, *, n_points: int) -> None:
-    """Report how the first plane fits, and how far the fit moved what the detector itself gave."""
-    planes, raw = assembly.planes, assembly.raw[0].plane
-    ctx.metric("first_share", float(planes.n_points[0]) / n_points, "1")
-    ctx.metric("fit_rms_mm", 1000.0 * float(assembly.deviations.rms_fit_m[0]), "mm")
-    ctx.metric("r_m", abs(float(planes.offset[0])), "m")
-    ctx.metric("sigma_angle_deg", planes.sigma_angle_deg(0), "deg")
-    ctx.metric("sigma_offset_mm", 1000.0 * planes.sigma_offset_m(0), "mm")
-    ctx.metric("n_independent", assembly.n_independent[0], "1")
-    shape = assembly.normalities[0]
-    if shape is not None:
-        ctx.metric("skewness", shape.skewness, "1")
-        ctx.metric("excess_kurtosis", shape.excess_kurtosis, "1")
-        for reach, share in enumerate(shape.within, start=1):
-            ctx.metric(f"within_{reach}_sigma", share, "1")
-    omega_deg, phi_deg = omega_phi_deg(raw.normal, planes.up)
-    miss_m = raw.offset_m - float(raw.normal @ planes.corners[0].mean(axis=0))
-    ctx.metric("raw_omega_deg", omega_deg, "deg")
-    ctx.metric("raw_phi_deg", phi_deg, "deg")
-    ctx.metric("raw_r_m", abs(raw.offset_m), "m")
-    ctx.metric("raw_angle_deg", angle_between_deg(raw.normal, planes.normal[0]), "deg")
-    ctx.metric("raw_offset_mm", 1000.0 * miss_m, "mm")
+        times_s["next_plane"] = passed_s[1:-1].mean(axis=0)
+    for name, (clock_s, processor_s) in times_s.items():
+        ctx.metric(f"{name}_s", clock_s, "s")
+        ctx.metric(f"{name}_cpu_s", processor_s, "s")

@@ -8,15 +8,21 @@ floors and ceilings leave in an accumulator.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane, wall_axes
-from orthoflow_plugins.plane.kernels import BlockedPoints, each_part, piece_of
-from orthoflow_plugins.plane.slab_kernels import sum_cells
+from orthoflow_plugins.plane.kernels import (
+    BLOCK_POINTS,
+    BlockedPoints,
+    each_part,
+    piece_of,
+    sum_assigned,
+)
 
 CELL_LEAST_M: Final = 0.05
 _CELLS_MOST: Final = 1_000_000
@@ -27,6 +33,8 @@ INNER_SHARE: Final = 0.4
 _CROWDED_SHARE: Final = 0.6
 # A part smaller than this share of the plane's cells is a chance meeting, not a piece of wall.
 PART_SHARE: Final = 0.03
+# Parts are connected over gaps of twice as many cells.
+_GAP_CELLS: Final = 2
 # A plane whose cells cover less of its rectangle is a frame or scattered parts.
 _FILLED_SHARE: Final = 0.5
 # Cells along a side that cuts are looked for between.
@@ -68,9 +76,17 @@ class SurfaceRaster:
         """Return the same cells on the plane after a small correction."""
         return replace(self, plane=plane, axes=wall_axes(plane.normal, up))
 
-    def slab(self, *, from_low: bool = False) -> NDArray[np.float64]:
-        """Row of 12 numbers that the compiled passes take; u and v count from 0 or from `low_m`."""
-        return slab_of(self.plane, self.axes, self.low_m if from_low else np.zeros(2))
+    def slab(self) -> NDArray[np.float64]:
+        """Row of 12 numbers that the compiled passes take, see `kernels`; u and v count from 0."""
+        return slab_of(self.plane, self.axes)
+
+    def bounds_m(self, cells: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
+        """(4,) smallest and largest u, smallest and largest v of some of the cells, or of all."""
+        edges = np.array([0, self.shape[1], 0, self.shape[0]], dtype=np.float64)
+        if cells is not None:
+            rows, columns = (np.flatnonzero(cells.any(axis=axis)) for axis in (1, 0))
+            edges[:] = columns[0], columns[-1] + 1, rows[0], rows[-1] + 1
+        return np.repeat(self.low_m, 2) + edges * self.cell_m
 
     def centres_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(rows, columns) u and v of the cell centres, metres."""
@@ -87,16 +103,15 @@ class SurfaceRaster:
         return cells[row, np.clip(placed[:, 0], 0, self.shape[1] - 1)]
 
 
-@dataclass(frozen=True, kw_only=True)
-class CellSums:
-    """What points in each cell of a surface raster add up to.
+class CellSums(NamedTuple):
+    """What points in each cell of a surface raster add up to, (rows, columns) int64 each.
 
     Attributes:
-        n_near: (rows, columns) int64 points within the tolerance.
+        n_near: points within the tolerance.
         n_inner: the same within `INNER_SHARE` of it.
         n_fit: the same within the tolerance of the fit.
-        steps: (rows, columns) int64 sum of distances of those, in steps.
-        squared_steps: (rows, columns) int64 sum of squared distances, in squared steps.
+        steps: sum of distances of those, in steps.
+        squared_steps: sum of squared distances, in squared steps.
     """
 
     n_near: NDArray[np.int64]
@@ -104,14 +119,6 @@ class CellSums:
     n_fit: NDArray[np.int64]
     steps: NDArray[np.int64]
     squared_steps: NDArray[np.int64]
-
-    @classmethod
-    def of(cls, counts: NDArray[np.int64], sums: NDArray[np.int64]) -> CellSums:
-        """Name the tables (rows, columns, 3) and (rows, columns, 2) of the compiled passes."""
-        near, inner, fit = np.moveaxis(counts, -1, 0)
-        return cls(
-            n_near=near, n_inner=inner, n_fit=fit, steps=sums[..., 0], squared_steps=sums[..., 1]
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,12 +147,15 @@ class Support:
         return float(np.prod(sides_m, axis=1).sum())
 
 
-def slab_of(
-    plane: Plane, axes: NDArray[np.float64], low_m: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Row of 12 numbers that the compiled passes take for a plane, see `slab_kernels`."""
-    u, v = axes
-    return np.concatenate([plane.normal, [plane.offset_m], u, low_m[:1], v, low_m[1:]])
+def slab_of(plane: Plane, axes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Row of 12 numbers that the compiled passes take for a plane, see `kernels`."""
+    return np.concatenate([plane.normal, [plane.offset_m], axes[0], [0.0], axes[1], [0.0]])
+
+
+def grown(bounds_m: NDArray[np.float64], tolerance_m: float) -> NDArray[np.float64]:
+    """Bounds (..., 5) of slabs: a tolerance, and (..., 4) rectangles widened by it."""
+    wider = bounds_m + tolerance_m * np.array([-1.0, 1.0, -1.0, 1.0])
+    return np.concatenate([np.full((*wider.shape[:-1], 1), tolerance_m), wider], axis=-1)
 
 
 def cell_for(n_points: float, area_m2: float) -> float:
@@ -157,24 +167,58 @@ def cell_for(n_points: float, area_m2: float) -> float:
 
 def measure_cells(
     points: BlockedPoints,
-    raster: SurfaceRaster,
+    rasters: Sequence[SurfaceRaster],
     *,
     tolerance_m: float,
     fit_tolerance_m: float,
     parts: int,
-) -> CellSums:
-    """Sum the points near a plane per cell, in one pass split into parts, one per thread."""
-    counts = np.zeros((parts, *raster.shape, 3), dtype=np.int32)
-    sums = np.zeros((parts, *raster.shape, 2), dtype=np.int64)
+    bounds_m: Sequence[NDArray[np.float64]] | None = None,
+    drawn: NDArray[np.bool_] | None = None,
+) -> list[CellSums]:
+    """Sum the points near planes per cell, each on the nearest, in one pass.
+
+    Args:
+        points: the points.
+        rasters: cells on each plane; planes without rows take part, but are not summed.
+        tolerance_m: of belonging.
+        fit_tolerance_m: of the fit.
+        parts: parts of the pass, one per thread.
+        bounds_m: (r, 5) rectangles of each plane that hold its points; by default its raster.
+        drawn: (blocks,) which blocks are summed; None for all.
+    """
+    if bounds_m is None:
+        bounds_m = [np.append(tolerance_m, raster.bounds_m())[None] for raster in rasters]
+    if drawn is None:
+        drawn = np.ones(len(points.boxes), dtype=bool)
+    starts = np.cumsum([0, *(math.prod(raster.shape) for raster in rasters)])
     fit_tolerance_m = min(fit_tolerance_m, tolerance_m)
-    limits = np.array([raster.cell_m, tolerance_m, INNER_SHARE * tolerance_m, fit_tolerance_m])
-    slab = raster.slab(from_low=True)
+    limits = (fit_tolerance_m, INNER_SHARE * tolerance_m)
+    tables = np.array(
+        [
+            (*r.low_m, 1.0 / r.cell_m, *r.shape, start, *limits)
+            for r, start in zip(rasters, starts, strict=False)
+        ]
+    ).reshape(-1, 8)
+    repeats = [len(own) for own in bounds_m]
+    slabs = np.array([raster.slab() for raster in rasters]).reshape(-1, 12)
+    rows = [np.repeat(table, repeats, axis=0) for table in (slabs, tables)]
+    slabs, tables, bounds = *rows, np.concatenate([np.zeros((0, 5)), *bounds_m])
+    counts = np.zeros((parts, int(starts[-1]), 3), dtype=np.int32)
+    sums = np.zeros((parts, int(starts[-1]), 2), dtype=np.int64)
 
     def add(part: int, piece: slice) -> None:
-        sum_cells(piece_of(points, piece), slab, limits, counts[part], sums[part])
+        blocks = drawn[piece.start // BLOCK_POINTS :]
+        own = (blocks, counts[part], sums[part])
+        sum_assigned(piece_of(points, piece), slabs, bounds, tables, *own)
 
     each_part(len(points.x), parts, add)
-    return CellSums.of(counts.sum(axis=0, dtype=np.int64), sums.sum(axis=0))
+    columns = [*counts.sum(axis=0, dtype=np.int64).T, *sums.sum(axis=0).T]
+    return [
+        CellSums(
+            *(column[start : start + math.prod(r.shape)].reshape(r.shape) for column in columns)
+        )
+        for r, start in zip(rasters, starts, strict=False)
+    ]
 
 
 def crowded_cells(sums: CellSums) -> NDArray[np.bool_]:
@@ -189,7 +233,16 @@ def crowded_cells(sums: CellSums) -> NDArray[np.bool_]:
         # Far below the usual density a cell is a stray echo beside the wall, not the wall.
         crowded &= sums.n_near >= 0.02 * np.median(sums.n_near[crowded])
     # The cell itself is one of those around it.
-    return crowded & (summed_around(crowded.astype(np.int64)) >= 4)
+    return crowded & (summed_around(crowded) >= 4)
+
+
+def summed_around(values: NDArray[np.int64] | NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Sum each value of a (rows, columns) array with its eight neighbours."""
+    import cv2
+
+    zero = cv2.BORDER_CONSTANT
+    sums = cv2.boxFilter(values.astype(np.float64), -1, (3, 3), normalize=False, borderType=zero)
+    return np.rint(np.asarray(sums)).astype(np.int64)
 
 
 def support_of(
@@ -209,11 +262,16 @@ def support_of(
     Returns:
         The support, or None where no cell belongs, or all lie scattered: no part is large enough.
     """
+    import cv2
     from scipy import ndimage
 
     if not belongs.any():
         return None
-    names, n_parts = ndimage.label(closed(belongs, 2) | belongs, np.ones((3, 3), dtype=int))
+    reach, margin = 2 * _GAP_CELLS + 1, 2 * _GAP_CELLS
+    wide = np.pad(belongs.astype(np.uint8), margin)
+    closed = cv2.morphologyEx(wide, cv2.MORPH_CLOSE, np.ones((reach, reach), dtype=np.uint8))
+    closed = closed[margin:-margin, margin:-margin]
+    names, n_parts = ndimage.label(closed, np.ones((3, 3), dtype=int))
     sizes = np.bincount(names[belongs], minlength=n_parts + 1)
     kept = np.flatnonzero(sizes >= max(part_share * belongs.sum(), 1.0))
     if not len(kept):
@@ -227,8 +285,8 @@ def support_of(
     return Support(
         cells=cells,
         part_of_cell=part_of_cell,
-        parts_m=np.array([_bounds_m(raster, part_of_cell == part) for part in range(len(kept))]),
-        bounds_m=_bounds_m(raster, cells),
+        parts_m=np.array([raster.bounds_m(part_of_cell == part) for part in range(len(kept))]),
+        bounds_m=raster.bounds_m(cells),
         n_points=int(sums.n_near[cells].sum()),
     )
 
@@ -275,55 +333,12 @@ def _best_cut(cells: NDArray[np.bool_], rectangle: _Rectangle) -> list[_Rectangl
 def _tight(cells: NDArray[np.bool_], rectangle: _Rectangle) -> _Rectangle:
     """Shrink a rectangle to the cells in it; without any it has no area."""
     top, bottom, left, right = rectangle
-    within = cells[top:bottom, left:right]
-    rows, columns = np.flatnonzero(within.any(axis=1)), np.flatnonzero(within.any(axis=0))
+    rows, columns = np.nonzero(cells[top:bottom, left:right])
     if not len(rows):
         return (top, top, left, left)
-    low, high = int(rows[0]), int(rows[-1]) + 1
-    return (top + low, top + high, left + int(columns[0]), left + int(columns[-1]) + 1)
+    low, high = int(rows.min()), int(rows.max()) + 1
+    return (top + low, top + high, left + int(columns.min()), left + int(columns.max()) + 1)
 
 
 def _area(rectangles: list[_Rectangle]) -> int:
     return sum((bottom - top) * (right - left) for top, bottom, left, right in rectangles)
-
-
-def _bounds_m(raster: SurfaceRaster, cells: NDArray[np.bool_]) -> NDArray[np.float64]:
-    rows = np.flatnonzero(cells.any(axis=1))
-    columns = np.flatnonzero(cells.any(axis=0))
-    edges = np.array([columns[0], columns[-1] + 1, rows[0], rows[-1] + 1], dtype=np.float64)
-    return np.repeat(raster.low_m, 2) + edges * raster.cell_m
-
-
-# As shifted additions of whole arrays: the filters of libraries ask each cell by itself, which on
-# the small rasters of hundreds of candidates costs more than all else.
-def summed_around(values: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Sum each value of an array of any dimension with those beside it, also across corners."""
-    for axis in range(values.ndim):
-        along = np.moveaxis(values, axis, 0)
-        total = values.copy()
-        sums = np.moveaxis(total, axis, 0)
-        sums[1:] += along[:-1]
-        sums[:-1] += along[1:]
-        values = total
-    return values
-
-
-def closed(cells: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
-    """Close gaps of up to twice a reach between cells (rows, columns)."""
-    rows, columns = cells.shape
-    wide = np.zeros((rows + 4 * reach, columns + 4 * reach), dtype=bool)
-    wide[2 * reach : 2 * reach + rows, 2 * reach : 2 * reach + columns] = cells
-    return ~_any_in_windows(~_any_in_windows(wide, reach), reach)
-
-
-def _any_in_windows(cells: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
-    """Whether any cell is set in each square window that lies within the raster."""
-    rows, columns = (size - 2 * reach for size in cells.shape)
-    shifts = range(1, 2 * reach + 1)
-    down = cells[:rows].copy()
-    for shift in shifts:
-        down |= cells[shift : shift + rows]
-    across = down[:, :columns].copy()
-    for shift in shifts:
-        across |= down[:, shift : shift + columns]
-    return across

@@ -74,7 +74,6 @@ def measure_thickness(
     plane_of_sample: NDArray[np.int64],
     prepared: PreparedCloud,
     cloud: PointCloud,
-    *,
     reach_m: float,
     materials: Materials,
 ) -> tuple[Thickness | None, ...]:

@@ -1,8 +1,14 @@
-"""Voxels that hold the points of a cloud as moments, and the plane of each one's neighbourhood.
+"""Voxels of a cloud as moments of their points, the planes of their neighbourhoods, regions.
 
 Region growing asks for the neighbours of every point. Voxels make that cheap: one pass adds each
 point to ten sums of its voxel, and the sums of neighbouring voxels give the plane through all their
-points exactly, without the points.
+points exactly, without the points. A room has half a million voxels where it has fifty million
+points. Where votes alone are counted, the first of the sums is enough.
+
+Voxels live in bricks of 8 x 8 x 8, of which only those with points have memory: a scan is surfaces,
+and a full table of two-centimetre voxels would be larger than the scan. Moments are those of whole
+steps from the middle of a voxel, so that neither threads nor the order of points show in the sums.
+Lengths of kernels are in sides of a voxel, so that they need not know how large one is.
 
 A cloud that is dense on one wall may have a point per decimetre on another: voxels that suit the
 one leave crumbs on the other. Moments add up, so what is left is summed into wider voxels without
@@ -13,46 +19,47 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.compiling import compiled, kernel_part
 from orthoflow_plugins.plane.cloud import PreparedCloud
 from orthoflow_plugins.plane.kernels import (
     BLOCK_POINTS,
     BlockedPoints,
     PlanGrid,
     each_part,
+    flattest,
     piece_of,
-    plan_frame,
-)
-from orthoflow_plugins.plane.voxel_kernels import (
-    BRICK_SIDE,
-    N_SUMS,
-    STEPS_PER_VOXEL,
-    VOXELS,
-    claim_voxels,
-    coarsened,
-    find_voxels,
-    fit_neighbourhoods,
-    gather_moments,
-    merge_moments,
-    voxel_places,
-    with_room,
 )
 
+BRICK_SIDE: Final = 8
+VOXELS: Final = BRICK_SIDE**3
+# Half steps from the middle of a voxel to its sides: a step is 20 micrometres in voxels of two
+# centimetres, and a point in its middle an odd number of halves away.
+HALF_STEPS: Final = 1024
+# Sums of a voxel: points, half steps along a, b, c, then their products aa, ab, ac, bb, bc, cc.
+N_SUMS: Final = 10
+# The products that moments hold, as pairs of axes.
+_PAIRS: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+# More bricks than this in the table of a scene cost more than they show; the voxels grow instead.
+_BRICKS_MOST: Final = 8_000_000
 # Points a neighbourhood should hold where the cloud is thin, so that its normal means something.
 POINTS_LEAST: Final = 16.0
 # A voxel is no larger than this share of the scene.
 _VOXEL_SHARE_MOST: Final = 0.05
 # Rows and voxels that tables begin with.
-_ROWS_FIRST: Final = 4_096
+_ROWS_FIRST: Final = 2_048
 _VOXELS_FIRST: Final = 131_072
 # A neighbourhood reaches this many voxels each way at most: 9 x 9 x 9.
 _REACH_MOST: Final = 4
-# The products that moments hold, as pairs of axes.
-_PAIRS: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+# A region's plane is fitted anew whenever it has grown by this share.
+_REFIT_SHARE: Final = 0.2
+# How often the voxels of a region ask their neighbours.
+_SWEEPS_MOST: Final = 3
+T = TypeVar("T", bound=np.generic)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,92 +109,195 @@ class Neighbourhood:
 
 
 @dataclass(frozen=True, kw_only=True)
+class VoxelTable:
+    """The voxels of a cloud that have points, numbered by place.
+
+    Attributes:
+        grid: axes, corner and side of the voxels.
+        bricks: (a, b, c) int32 row of each brick in `numbers`, -1 without points.
+        numbers: (rows, VOXELS) int32 number of each voxel, -1 without points.
+        places: (m, 3) int32 where voxels lie along e1, e2, up.
+        sums: (m, N_SUMS) int64 moments, or (m, 1) points alone.
+    """
+
+    grid: PlanGrid
+    bricks: NDArray[np.int32]
+    numbers: NDArray[np.int32]
+    places: NDArray[np.int32]
+    sums: NDArray[np.int64]
+
+    @classmethod
+    def over(cls, cloud: PreparedCloud, voxel_m: float, *, n_sums: int = N_SUMS) -> VoxelTable:
+        """Sum all points of a cloud into voxels over its box; they grow where they would be many.
+
+        Each part of the pass has tables of its own, which are then joined.
+        """
+        extent_m = cloud.grid.extent_m
+        brick_m3 = float(np.prod(extent_m + BRICK_SIDE * voxel_m)) / _BRICKS_MOST
+        voxel_m = max(voxel_m, math.cbrt(brick_m3) / BRICK_SIDE)
+        a, b, c = np.maximum(1, np.ceil(extent_m / voxel_m)).astype(int).tolist()
+        grid = replace(cloud.grid, cell_m=voxel_m, shape=(a, b, c))
+        frame, shape = grid.frame(), (-(-a // BRICK_SIDE), -(-b // BRICK_SIDE), -(-c // BRICK_SIDE))
+        n_bricks = math.prod(shape)
+        tables = [
+            (
+                np.full(n_bricks, -1, dtype=np.int32),
+                np.zeros((_ROWS_FIRST, VOXELS), dtype=np.int32),
+                np.zeros((_VOXELS_FIRST, n_sums), dtype=np.int64),
+                np.zeros(2, dtype=np.int64),
+            )
+            for _ in range(cloud.parts)
+        ]
+
+        def gather(part: int, piece: slice) -> None:
+            points, start = piece_of(cloud.points, piece), 0
+            bricks, numbers, sums, n_used = tables[part]
+            while start < len(points.x):
+                numbers = _with_room(numbers, int(n_used[0]), BLOCK_POINTS)
+                sums = _with_room(sums, int(n_used[1]), BLOCK_POINTS)
+                start = gather_moments(points, start, frame, shape, bricks, numbers, sums, n_used)
+            tables[part] = (bricks, numbers, sums, n_used)
+
+        each_part(len(cloud.claims), cloud.parts, gather)
+        # Numbered by place, so that neither threads nor the order of points show.
+        occupied = np.flatnonzero(np.max([table[0] for table in tables], axis=0) >= 0)
+        bricks = np.full(n_bricks, -1, dtype=np.int32)
+        bricks[occupied] = np.arange(len(occupied), dtype=np.int32)
+        held = np.zeros((len(occupied), VOXELS), dtype=bool)
+        for own_bricks, own_numbers, _, _ in tables:
+            rows = own_bricks[occupied]
+            held[rows >= 0] |= own_numbers[rows[rows >= 0]] >= 0
+        numbers = np.full(held.shape, -1, dtype=np.int32)
+        numbers[held] = np.arange(np.count_nonzero(held), dtype=np.int32)
+        sums = np.zeros((np.count_nonzero(held), n_sums), dtype=np.int64)
+        for own_bricks, own_numbers, own_sums, _ in tables:
+            rows = own_bricks[occupied]
+            own = own_numbers[rows[rows >= 0]]
+            sums[numbers[rows >= 0][own >= 0]] += own_sums[own[own >= 0]]
+        row, voxel = np.divmod(np.flatnonzero(held), VOXELS)
+        corners = np.stack(np.unravel_index(occupied, shape), axis=1) * BRICK_SIDE
+        within = np.stack(np.unravel_index(voxel, (BRICK_SIDE,) * 3), axis=1)
+        return cls(
+            grid=grid,
+            bricks=bricks.reshape(shape),
+            numbers=numbers,
+            places=(corners[row] + within).astype(np.int32),
+            sums=sums,
+        )
+
+    def coarser(self, member: NDArray[np.int64]) -> tuple[VoxelTable, NDArray[np.int64]]:
+        """Sum voxels (k,) into voxels twice as wide; gives those, and which one each is in."""
+        places, odd = np.divmod(self.places[member].astype(np.int64), 2)
+        a, b, c = (math.ceil(size / 2) for size in self.grid.shape)
+        shape = tuple(-(-size // BRICK_SIDE) for size in (a, b, c))
+        brick, within = np.divmod(places, BRICK_SIDE)
+        brick_key = np.ravel_multi_index(tuple(brick.T), shape)
+        voxel = np.ravel_multi_index(tuple(within.T), (BRICK_SIDE,) * 3)
+        keys, first, of_member = np.unique(
+            brick_key * VOXELS + voxel, return_index=True, return_inverse=True
+        )
+        occupied, rows = np.unique(keys // VOXELS, return_inverse=True)
+        bricks = np.full(math.prod(shape), -1, dtype=np.int32)
+        bricks[occupied] = np.arange(len(occupied), dtype=np.int32)
+        numbers = np.full((len(occupied), VOXELS), -1, dtype=np.int32)
+        numbers[rows, keys % VOXELS] = np.arange(len(keys), dtype=np.int32)
+        # Half steps are twice as long, and from the middle of the wider voxel.
+        moved = _moved(self.sums[member], (2 * odd - 1) * HALF_STEPS)
+        moved *= 0.5 ** np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2])
+        sums = np.rint(_totals(moved, of_member, len(keys))).astype(np.int64)
+        wider = VoxelTable(
+            grid=replace(self.grid, cell_m=2.0 * self.grid.cell_m, shape=(a, b, c)),
+            bricks=bricks.reshape(shape),
+            numbers=numbers,
+            places=places[first].astype(np.int32),
+            sums=sums,
+        )
+        return wider, of_member
+
+    def sums_of(self, regions: NDArray[np.int32], n_regions: int) -> NDArray[np.float64]:
+        """(r, N_SUMS) moments of regions (m,) of voxels, from the corner of the grid, in voxels."""
+        held = np.flatnonzero(regions >= 0)
+        unit = 1.0 / (2 * HALF_STEPS)
+        moved = _moved(self.sums[held], (2 * self.places[held] + 1) * HALF_STEPS)
+        moved *= unit ** np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2])
+        return _totals(moved, regions[held], n_regions)
+
+    def centroids(self) -> NDArray[np.float64]:
+        """(m, 3) mean of each voxel's points along e1, e2, up; metres in the offsets' frame."""
+        half_steps = self.sums[:, 1:4] / self.sums[:, :1]
+        middles = self.places + 0.5 + half_steps / (2 * HALF_STEPS)
+        return self.grid.low_m + self.grid.cell_m * middles
+
+    def voxel_of(self, points: BlockedPoints) -> NDArray[np.int32]:
+        """(n,) voxel of each point, -1 for none."""
+        found = np.empty(len(points.x), dtype=np.int32)
+        find_voxels(points, self.grid.frame(), self.bricks, self.numbers, found)
+        return found
+
+
+def _with_room(values: NDArray[T], n_used: int, n_free: int) -> NDArray[T]:
+    """Enlarge a table unless so many of its rows are free; what is in use stays."""
+    if n_used + n_free <= len(values):
+        return values
+    return np.concatenate([values, np.zeros_like(values)])
+
+
+def _moved(sums: NDArray[np.int64], shift: NDArray[np.integer[Any]]) -> NDArray[np.float64]:
+    """Moments (k, N_SUMS) counted from points that lie (k, 3) lower."""
+    number, linear, away = sums[:, 0], sums[:, 1:4], shift.astype(np.float64)
+    columns = [number, *(linear + number[:, None] * away).T]
+    for k, (i, j) in enumerate(_PAIRS):
+        mixed = away[:, i] * linear[:, j] + away[:, j] * linear[:, i]
+        columns.append(sums[:, 4 + k] + mixed + number * away[:, i] * away[:, j])
+    return np.stack(columns, axis=1)
+
+
+def _totals(
+    values: NDArray[np.float64], owner: NDArray[np.int64] | NDArray[np.int32], count: int
+) -> NDArray[np.float64]:
+    columns = [np.bincount(owner, column, minlength=count) for column in values.T]
+    return np.stack(columns, axis=1)
+
+
+@dataclass(frozen=True, kw_only=True)
 class SurfaceVoxels:
-    """The voxels of a cloud that have points.
+    """Voxels and the plane of each one's neighbourhood.
 
     Attributes:
         neighbourhood: which points make a normal; its voxels are those used, which may be larger
             than the ones asked for.
-        grid: axes, corner and side of the voxels.
-        bricks: (a, b, c) int32 row of each brick in `numbers`, -1 without points.
-        numbers: (rows, voxels) int32 number of each voxel, -1 without points.
-        places: (m, 3) int32 where voxels lie along e1, e2, up.
-        sums: (m, N_SUMS) int64 moments, see `voxel_kernels`.
+        table: the voxels.
         normals: (m, 3) float32 along e1, e2, up, of the neighbourhoods; either side.
         spreads: (m, 3) float32 deviation from the neighbourhood's plane and extents along it, in
             sides of a voxel.
     """
 
     neighbourhood: Neighbourhood
-    grid: PlanGrid
-    bricks: NDArray[np.int32]
-    numbers: NDArray[np.int32]
-    places: NDArray[np.int32]
-    sums: NDArray[np.int64]
+    table: VoxelTable
     normals: NDArray[np.float32]
     spreads: NDArray[np.float32]
 
     @classmethod
-    def of(
-        cls,
-        neighbourhood: Neighbourhood,
-        grid: PlanGrid,
-        bricks: NDArray[np.int32],
-        numbers: NDArray[np.int32],
-        places: NDArray[np.int32],
-        sums: NDArray[np.int64],
-        *,
-        parts: int,
-    ) -> SurfaceVoxels:
+    def of(cls, table: VoxelTable, wanted: Neighbourhood, *, parts: int) -> SurfaceVoxels:
         """Fit a plane to the neighbourhood of each voxel, in so many parts."""
-        normals = np.empty((len(places), 3), dtype=np.float32)
-        spreads = np.empty((len(places), 3), dtype=np.float32)
-        around = neighbourhood.around()
+        neighbourhood = wanted.with_voxels(table.grid.cell_m)
+        places, around = table.places, neighbourhood.around()
+        normals, spreads = np.empty((2, len(places), 3), dtype=np.float32)
         # Points with which a neighbourhood ends; the others take all their voxels.
         enough = neighbourhood.n_points if neighbourhood.shape == "knn" else 2**62
 
         def fit(_part: int, piece: slice) -> None:
-            own, start = (normals[piece], spreads[piece]), piece.start
-            fit_neighbourhoods(places[piece], start, bricks, numbers, sums, around, enough, *own)
+            tables = (table.bricks, table.numbers, table.sums)
+            own = (normals[piece], spreads[piece])
+            fit_neighbourhoods(places[piece], piece.start, *tables, around, enough, *own)
 
         each_part(len(places), parts, fit)
-        return cls(
-            neighbourhood=neighbourhood,
-            grid=grid,
-            bricks=bricks,
-            numbers=numbers,
-            places=places,
-            sums=sums,
-            normals=normals,
-            spreads=spreads,
-        )
+        return cls(neighbourhood=neighbourhood, table=table, normals=normals, spreads=spreads)
 
     @property
     def counts(self) -> NDArray[np.int64]:
         """(m,) points of each voxel."""
-        return self.sums[:, 0]
-
-    def centroids(self) -> NDArray[np.float64]:
-        """(m, 3) mean of each voxel's points along e1, e2, up; metres in the offsets' frame."""
-        steps = self.sums[:, 1:4] / self.counts[:, None]
-        middles = self.places + 0.5 + (steps + 0.5) / STEPS_PER_VOXEL
-        return self.grid.low_m + self.grid.cell_m * middles
-
-    def voxel_of(self, points: BlockedPoints) -> NDArray[np.int32]:
-        """(n,) voxel of each point, -1 for none."""
-        found = np.empty(len(points.x), dtype=np.int32)
-        find_voxels(points, plan_frame(self.grid), self.bricks, self.numbers, found)
-        return found
-
-    def claim(self, cloud: PreparedCloud, owners: NDArray[np.int8]) -> None:
-        """Return the points of a cloud to the planes that own (m,) their voxels."""
-        frame = plan_frame(self.grid)
-
-        def give(_part: int, piece: slice) -> None:
-            points = piece_of(cloud.points, piece)
-            claim_voxels(points, frame, self.bricks, self.numbers, owners, cloud.claims[piece])
-
-        each_part(len(cloud.claims), cloud.parts, give)
+        return self.table.sums[:, 0]
 
 
 def surface_voxels(cloud: PreparedCloud, wanted: Neighbourhood) -> SurfaceVoxels:
@@ -196,146 +306,344 @@ def surface_voxels(cloud: PreparedCloud, wanted: Neighbourhood) -> SurfaceVoxels
     Where the cloud is so thin that neighbourhoods would hold too few points, voxels and
     neighbourhoods are larger than what is wanted.
     """
-    grid = _voxel_grid(cloud, wanted)
-    table = _gathered(cloud, grid)
-    # Numbered by place, so that neither threads nor the order of points show.
-    occupied = np.flatnonzero(table.bricks >= 0)
-    numbers = table.numbers[table.bricks[occupied]]
-    bricks = np.full(len(table.bricks), -1, dtype=np.int32)
-    bricks[occupied] = np.arange(len(occupied), dtype=np.int32)
-    filled = numbers >= 0
-    met = numbers[filled]
-    numbers[filled] = np.arange(len(met), dtype=np.int32)
-    bricks = bricks.reshape(-(-np.array(grid.shape) // BRICK_SIDE))
-    return SurfaceVoxels.of(
-        wanted.with_voxels(grid.cell_m),
-        grid,
-        bricks,
-        numbers,
-        voxel_places(bricks >= 0, filled),
-        np.take(table.sums, met, axis=0),
-        parts=cloud.parts,
-    )
-
-
-def coarser(
-    voxels: SurfaceVoxels, member: NDArray[np.int64]
-) -> tuple[SurfaceVoxels, NDArray[np.int64]]:
-    """Sum voxels (k,) into voxels twice as wide; gives those, and which one each is in."""
-    places, odd = np.divmod(voxels.places[member].astype(np.int64), 2)
-    a, b, c = (math.ceil(size / 2) for size in voxels.grid.shape)
-    n_bricks = tuple(-(-size // BRICK_SIDE) for size in (a, b, c))
-    brick, within = np.divmod(places, BRICK_SIDE)
-    brick_key = np.ravel_multi_index(tuple(brick.T), n_bricks)
-    voxel = np.ravel_multi_index(tuple(within.T), (BRICK_SIDE,) * 3)
-    keys, first, of_member = np.unique(
-        brick_key * VOXELS + voxel, return_index=True, return_inverse=True
-    )
-    occupied, rows = np.unique(keys // VOXELS, return_inverse=True)
-    bricks = np.full(math.prod(n_bricks), -1, dtype=np.int32)
-    bricks[occupied] = np.arange(len(occupied), dtype=np.int32)
-    numbers = np.full((len(occupied), VOXELS), -1, dtype=np.int32)
-    numbers[rows, keys % VOXELS] = np.arange(len(keys), dtype=np.int32)
-    grid = replace(voxels.grid, cell_m=2.0 * voxels.grid.cell_m, shape=(a, b, c))
-    wider = SurfaceVoxels.of(
-        voxels.neighbourhood.with_voxels(grid.cell_m),
-        grid,
-        bricks.reshape(n_bricks),
-        numbers,
-        places[first].astype(np.int32),
-        _summed(voxels.sums[member], odd, of_member, len(keys)),
-        parts=1,
-    )
-    return wider, of_member
-
-
-@dataclass(kw_only=True)
-class _Table:
-    """Voxels as one part of the pass met them; arrays have room for more than is used."""
-
-    bricks: NDArray[np.int32]
-    numbers: NDArray[np.int32]
-    sums: NDArray[np.int64]
-    n_used: NDArray[np.int64]
-
-    def make_room(self, n_rows: int, n_voxels: int) -> None:
-        """Enlarge the tables if fewer rows and voxels than these are free."""
-        self.numbers = with_room(self.numbers, int(self.n_used[0]), n_rows)
-        self.sums = with_room(self.sums, int(self.n_used[1]), n_voxels)
-
-
-def _voxel_grid(cloud: PreparedCloud, wanted: Neighbourhood) -> PlanGrid:
-    """Lay voxels over the robust box of which a neighbourhood holds enough points."""
     grid, sample = cloud.grid, cloud.sample
-    extent_m = np.array(grid.shape) * grid.cell_m
     placed = np.floor((sample.offsets_m @ grid.basis.T - grid.low_m) / wanted.voxel_m)
-    inside = ((placed >= 0) & (placed * wanted.voxel_m < extent_m)).all(axis=1)
-    shape = np.ceil(extent_m / wanted.voxel_m).astype(np.int64) + 1
+    inside = ((placed >= 0) & (placed * wanted.voxel_m < grid.extent_m)).all(axis=1)
+    shape = np.ceil(grid.extent_m / wanted.voxel_m).astype(np.int64) + 1
     keys = np.sort(np.ravel_multi_index(tuple(placed[inside].astype(np.int64).T), tuple(shape)))
     counts = np.diff(np.flatnonzero(np.diff(keys, prepend=-1, append=-1)))
     # How many others of the sample share a point's voxel: chance alone shares none, however few.
     others = float((counts * (counts - 1)).sum()) / max(1, len(sample.index))
     in_neighbourhood = others * sample.n_represented * wanted.width_voxels() ** 2
-    scale = math.sqrt(POINTS_LEAST / max(in_neighbourhood, 1e-9))
-    cell_m = wanted.voxel_m * scale if scale > 1.0 else wanted.voxel_m
-    cell_m = min(cell_m, max(wanted.voxel_m, _VOXEL_SHARE_MOST * float(extent_m.max())))
-    cell_m = coarsened(cell_m, extent_m)
-    a, b, c = np.maximum(1, np.ceil(extent_m / cell_m)).astype(int).tolist()
-    return replace(grid, cell_m=cell_m, shape=(a, b, c))
+    voxel_m = wanted.voxel_m * max(1.0, math.sqrt(POINTS_LEAST / max(in_neighbourhood, 1e-9)))
+    most_m = max(wanted.voxel_m, _VOXEL_SHARE_MOST * float(grid.extent_m.max()))
+    table = VoxelTable.over(cloud, min(voxel_m, most_m))
+    return SurfaceVoxels.of(table, wanted, parts=cloud.parts)
 
 
-def _gathered(cloud: PreparedCloud, grid: PlanGrid) -> _Table:
-    """Sum all points into voxels, each part into tables of its own, which are then merged."""
-    frame = plan_frame(grid)
-    a, b, c = (-(-size // BRICK_SIDE) for size in grid.shape)
-    tables = [
-        _Table(
-            bricks=np.full(a * b * c, -1, dtype=np.int32),
-            numbers=np.zeros((_ROWS_FIRST, VOXELS), dtype=np.int32),
-            sums=np.zeros((_VOXELS_FIRST, N_SUMS), dtype=np.int64),
-            n_used=np.zeros(2, dtype=np.int64),
-        )
-        for _ in range(cloud.parts)
-    ]
+@kernel_part
+def _place_block(
+    points: BlockedPoints, start: int, frame: NDArray[np.float32], places: NDArray[np.float32]
+) -> int:
+    """Set (3, BLOCK_POINTS) places of a block's points, in voxels; gives their number.
 
-    def gather(part: int, piece: slice) -> None:
-        points, table, start = piece_of(cloud.points, piece), tables[part], 0
-        while start < len(points.x):
-            table.make_room(BLOCK_POINTS, BLOCK_POINTS)
-            own = (table.bricks, table.numbers, table.sums, table.n_used)
-            start = gather_moments(points, start, frame, (a, b, c), *own)
-
-    each_part(len(cloud.claims), cloud.parts, gather)
-    whole, *others = tables
-    for table in others:
-        whole.make_room(int(table.n_used[0]), int(table.n_used[1]))
-        own = (whole.bricks, whole.numbers, whole.sums, whole.n_used)
-        merge_moments(table.bricks, table.numbers, table.sums, *own)
-    return whole
+    Apart from what is done with them and without branches, so that the processor takes several
+    points at once; each of these loops writes one array: with more, the compiler gives up that.
+    """
+    stop = min(start + BLOCK_POINTS, points.x.size)
+    xs, ys, zs = points.x[start:stop], points.y[start:stop], points.z[start:stop]
+    for axis in range(3):
+        a, b, c, d = frame[axis, 0], frame[axis, 1], frame[axis, 2], frame[axis, 3]
+        own = places[axis]
+        for i in range(xs.size):
+            own[i] = a * xs[i] + b * ys[i] + c * zs[i] - d
+    return xs.size
 
 
-def _summed(
-    sums: NDArray[np.int64], odd: NDArray[np.int64], owner: NDArray[np.int64], count: int
-) -> NDArray[np.int64]:
-    """(count, N_SUMS) moments of wider voxels: steps are twice as long, from their middle.
+@kernel_part
+def _set_keys(
+    places: NDArray[np.float32], shape: tuple[int, int, int], keys: NDArray[np.int64]
+) -> None:
+    """Set (BLOCK_POINTS,) keys: brick times VOXELS plus the voxel within it, -1 outside."""
+    zero, low = np.float32(0.0), np.int32(BRICK_SIDE - 1)
+    top_a = np.float32(shape[0] * BRICK_SIDE)
+    top_b = np.float32(shape[1] * BRICK_SIDE)
+    top_c = np.float32(shape[2] * BRICK_SIDE)
+    n_b, n_c, side = np.int32(shape[1]), np.int32(shape[2]), np.int32(BRICK_SIDE)
+    voxels, nowhere = np.int64(VOXELS), np.int64(-1)
+    for i in range(keys.size):
+        a, b, c = places[0, i], places[1, i], places[2, i]
+        within = (a >= zero) & (a < top_a) & (b >= zero) & (b < top_b)
+        within = within & (c >= zero) & (c < top_c)
+        p = np.int32(a if within else zero)
+        q = np.int32(b if within else zero)
+        r = np.int32(c if within else zero)
+        # A side of eight: whole bricks are three bits further up.
+        brick = np.int32(((p >> np.int32(3)) * n_b + (q >> np.int32(3))) * n_c + (r >> np.int32(3)))
+        voxel = np.int32(((p & low) * side + (q & low)) * side + (r & low))
+        keys[i] = brick * voxels + voxel if within else nowhere
+
+
+@kernel_part
+def _voxel(
+    key: int, bricks: NDArray[np.int32], numbers: NDArray[np.int32], n_used: NDArray[np.int64]
+) -> int:
+    """Return the number of the voxel with a key, a new one if it had none."""
+    brick, voxel = key // VOXELS, key % VOXELS
+    row = bricks[brick]
+    if row < 0:
+        row = np.int32(n_used[0])
+        n_used[0] += 1
+        bricks[brick] = row
+        numbers[row, :] = -1
+    number = numbers[row, voxel]
+    if number < 0:
+        number = np.int32(n_used[1])
+        n_used[1] += 1
+        numbers[row, voxel] = number
+    return int(number)
+
+
+@compiled
+def gather_moments(  # noqa: PLR0913, PLR0917 - compiled code has no objects to bundle these in
+    points: BlockedPoints,
+    start: int,
+    frame: NDArray[np.float32],
+    shape: tuple[int, int, int],
+    bricks: NDArray[np.int32],
+    numbers: NDArray[np.int32],
+    sums: NDArray[np.int64],
+    n_used: NDArray[np.int64],
+) -> int:
+    """Add points to the moments of their voxels, which are made as they are met, until tables fill.
+
+    A scan comes column by column, so points that follow each other share a voxel: their sums are
+    added when the voxel changes.
 
     Args:
-        sums: (k, N_SUMS) moments of the voxels.
-        odd: (k, 3) 1 where a voxel is the upper half of its wider voxel.
-        owner: (k,) wider voxel of each.
-        count: wider voxels.
+        points: (n,) offsets in blocks.
+        start: first point, at the start of a block.
+        frame: (3, 4) voxel of a point: `frame[:, :3] @ p - frame[:, 3]`.
+        shape: bricks along a, b, c.
+        bricks: (a * b * c,) row of each brick in `numbers`, -1 for none yet.
+        numbers: (rows, VOXELS) number of each voxel, -1 for none yet.
+        sums: (voxels, N_SUMS) added to; (voxels, 1) takes the number of points alone.
+        n_used: rows and voxels in use.
+
+    Returns:
+        The first point that was not added: the number of points, unless the tables are full.
     """
-    number = sums[:, 0]
-    shift = (2 * odd - 1) * (STEPS_PER_VOXEL // 4)
-    linear = 0.5 * sums[:, 1:4]
-    moved = [number, *(linear + number[:, None] * shift).T]
-    for k, (i, j) in enumerate(_PAIRS):
-        moved.append(
-            0.25 * sums[:, 4 + k]
-            + shift[:, i] * linear[:, j]
-            + shift[:, j] * linear[:, i]
-            + number * shift[:, i] * shift[:, j]
-        )
-    # Sums of halves and quarters of whole numbers are exact in 53 bits: the order does not show.
-    totals = [np.bincount(owner, column, minlength=count) for column in moved]
-    return np.rint(np.column_stack(totals)).astype(np.int64)
+    keys = np.empty(BLOCK_POINTS, dtype=np.int64)
+    places = np.zeros((3, BLOCK_POINTS), dtype=np.float32)
+    has_moments = sums.shape[1] > 1
+    fine, one, middle = np.float32(HALF_STEPS), np.int64(1), np.int64(HALF_STEPS - 1)
+    while start < points.x.size:
+        if n_used[0] + BLOCK_POINTS > numbers.shape[0] or n_used[1] + BLOCK_POINTS > sums.shape[0]:
+            return start
+        count = _place_block(points, start, frame, places)
+        _set_keys(places, shape, keys)
+        first = 0
+        while first < count:
+            last, key = first + 1, keys[first]
+            while last < count and keys[last] == key:
+                last += 1
+            if key >= 0:
+                k = _voxel(key, bricks, numbers, n_used)
+                sums[k, 0] += last - first
+                if has_moments:
+                    sa = sb = sc = aa = ab = ac = bb = bc = cc = np.int64(0)
+                    for i in range(first, last):
+                        p, q, r = places[0, i], places[1, i], places[2, i]
+                        a = (np.int64((p - np.float32(np.int32(p))) * fine) << one) - middle
+                        b = (np.int64((q - np.float32(np.int32(q))) * fine) << one) - middle
+                        c = (np.int64((r - np.float32(np.int32(r))) * fine) << one) - middle
+                        sa, sb, sc = sa + a, sb + b, sc + c
+                        aa, ab, ac = aa + a * a, ab + a * b, ac + a * c
+                        bb, bc, cc = bb + b * b, bc + b * c, cc + c * c
+                    total = (sa, sb, sc, aa, ab, ac, bb, bc, cc)
+                    for place in range(9):
+                        sums[k, 1 + place] += total[place]
+            first = last
+        start += BLOCK_POINTS
+    return points.x.size
+
+
+@compiled
+def find_voxels(
+    points: BlockedPoints,
+    frame: NDArray[np.float32],
+    bricks: NDArray[np.int32],
+    numbers: NDArray[np.int32],
+    found: NDArray[np.int32],
+) -> None:
+    """Set (n,) found to the voxel of each point, -1 outside."""
+    keys = np.empty(BLOCK_POINTS, dtype=np.int64)
+    places = np.zeros((3, BLOCK_POINTS), dtype=np.float32)
+    flat = bricks.reshape(bricks.size)
+    for start in range(0, points.x.size, BLOCK_POINTS):
+        count = _place_block(points, start, frame, places)
+        _set_keys(places, bricks.shape, keys)
+        for i in range(count):
+            row = flat[keys[i] // VOXELS] if keys[i] >= 0 else -1
+            found[start + i] = numbers[row, keys[i] % VOXELS] if row >= 0 else -1
+
+
+@kernel_part
+def _voxel_at(a: int, b: int, c: int, bricks: NDArray[np.int32], numbers: NDArray[np.int32]) -> int:
+    """Return the number of the voxel at a place, -1 where none is."""
+    if a < 0 or b < 0 or c < 0:
+        return -1
+    p, q, r = a >> 3, b >> 3, c >> 3
+    if p >= bricks.shape[0] or q >= bricks.shape[1] or r >= bricks.shape[2]:
+        return -1
+    brick = bricks[p, q, r]
+    if brick < 0:
+        return -1
+    return int(numbers[brick, ((a & 7) * BRICK_SIDE + (b & 7)) * BRICK_SIDE + (c & 7)])
+
+
+@kernel_part
+def _add_moments(
+    total: NDArray[np.float64], sums: NDArray[np.int64], k: int, at: tuple[float, float, float]
+) -> None:
+    """Add voxel k to (10,) total, in voxels; its middle is `at` from where the total is counted."""
+    n, (a, b, c) = float(sums[k, 0]), at
+    unit = 1.0 / (2 * HALF_STEPS)
+    sa, sb, sc = sums[k, 1] * unit, sums[k, 2] * unit, sums[k, 3] * unit
+    square = unit * unit
+    total[0] += n
+    total[1] += n * a + sa
+    total[2] += n * b + sb
+    total[3] += n * c + sc
+    total[4] += n * a * a + 2.0 * a * sa + sums[k, 4] * square
+    total[5] += n * a * b + a * sb + b * sa + sums[k, 5] * square
+    total[6] += n * a * c + a * sc + c * sa + sums[k, 6] * square
+    total[7] += n * b * b + 2.0 * b * sb + sums[k, 7] * square
+    total[8] += n * b * c + b * sc + c * sb + sums[k, 8] * square
+    total[9] += n * c * c + 2.0 * c * sc + sums[k, 9] * square
+
+
+@compiled
+def fit_neighbourhoods(  # noqa: PLR0913, PLR0917 - compiled code has no objects to bundle these in
+    places: NDArray[np.int32],
+    first: int,
+    bricks: NDArray[np.int32],
+    numbers: NDArray[np.int32],
+    sums: NDArray[np.int64],
+    around: NDArray[np.int32],
+    enough: int,
+    normals: NDArray[np.float32],
+    spreads: NDArray[np.float32],
+) -> None:
+    """Fit a plane to the neighbourhood of each voxel.
+
+    Args:
+        places: (m, 3) voxels to fit, of which the first has the number `first`.
+        first: see above.
+        bricks: (a, b, c) number of each brick.
+        numbers: (bricks, VOXELS) number of each voxel.
+        sums: (n, N_SUMS) moments of all voxels.
+        around: (o, 4) steps to the voxels of a neighbourhood, near ones first, and the shell that
+            each is in.
+        enough: a neighbourhood ends with the shell in which it has so many points.
+        normals: (m, 3) set; either side.
+        spreads: (m, 3) set to the deviation from the plane and the two extents along it (standard
+            deviations), sides of a voxel; the first is infinite with fewer than three points.
+    """
+    total, plane = np.empty(10), np.empty(9)
+    for i in range(places.shape[0]):
+        a, b, c = places[i, 0], places[i, 1], places[i, 2]
+        total[:] = 0.0
+        _add_moments(total, sums, first + i, (0.0, 0.0, 0.0))
+        shell = 0
+        for j in range(around.shape[0]):
+            if around[j, 3] != shell:
+                if total[0] >= enough:
+                    break
+                shell = around[j, 3]
+            da, db, dc = around[j, 0], around[j, 1], around[j, 2]
+            k = _voxel_at(a + da, b + db, c + dc, bricks, numbers)
+            if k >= 0:
+                _add_moments(total, sums, k, (float(da), float(db), float(dc)))
+        if total[0] < 3.0:
+            normals[i, 0], normals[i, 1], normals[i, 2] = 0.0, 0.0, 1.0
+            spreads[i, 0], spreads[i, 1], spreads[i, 2] = np.inf, 0.0, 0.0
+            continue
+        flattest(total, plane)
+        for axis in range(3):
+            normals[i, axis] = plane[axis]
+            spreads[i, axis] = math.sqrt(max(plane[6 + axis], 0.0))
+
+
+@compiled
+def grow_regions(  # noqa: C901, PLR0912, PLR0913, PLR0917 - the loop that growing is
+    places: NDArray[np.int32],
+    bricks: NDArray[np.int32],
+    numbers: NDArray[np.int32],
+    sums: NDArray[np.int64],
+    normals: NDArray[np.float32],
+    seeds: NDArray[np.int64],
+    limits: NDArray[np.float64],
+    regions: NDArray[np.int32],
+) -> int:
+    """Grow regions over neighbouring voxels: like normal, and near the region's plane.
+
+    The plane is that of all points of the region so far; it is fitted anew as the region grows, and
+    when nothing more joins, the region's own voxels ask their neighbours again with the last one.
+
+    Args:
+        places: (n, 3) where voxels lie.
+        bricks: (a, b, c) number of each brick.
+        numbers: (bricks, VOXELS) number of each voxel.
+        sums: (n, N_SUMS) moments.
+        normals: (n, 3) of their neighbourhoods.
+        seeds: (s,) voxels that may belong to a region, those to start from first.
+        limits: smallest cosine between normals, largest distance in sides of a voxel.
+        regions: (n,) -2 where a voxel may join, others stay; set to the region.
+
+    Returns:
+        The number of regions.
+    """
+    cosine, distance = limits[0], limits[1]
+    queue = np.empty(seeds.size, dtype=np.int32)
+    total, plane = np.empty(10), np.empty(9)
+    n_regions = 0
+    unit = 1.0 / (2 * HALF_STEPS)
+    for s in range(seeds.size):
+        seed = seeds[s]
+        if regions[seed] != -2:
+            continue
+        regions[seed] = n_regions
+        queue[0] = seed
+        length = 1
+        # Counted from the seed's voxel, so that a region far from the box's corner loses nothing.
+        oa, ob, oc = places[seed, 0], places[seed, 1], places[seed, 2]
+        total[:] = 0.0
+        _add_moments(total, sums, seed, (0.0, 0.0, 0.0))
+        for axis in range(3):
+            plane[axis] = normals[seed, axis]
+            plane[3 + axis] = total[1 + axis] / total[0]
+        refit = 8
+        for _ in range(_SWEEPS_MOST):
+            before, head = length, 0
+            while head < length:
+                voxel = queue[head]
+                head += 1
+                for da in range(-1, 2):
+                    for db in range(-1, 2):
+                        for dc in range(-1, 2):
+                            pa, pb = places[voxel, 0] + da, places[voxel, 1] + db
+                            pc = places[voxel, 2] + dc
+                            k = _voxel_at(pa, pb, pc, bricks, numbers)
+                            if k < 0 or regions[k] != -2:
+                                continue
+                            turn = (
+                                plane[0] * normals[k, 0]
+                                + plane[1] * normals[k, 1]
+                                + plane[2] * normals[k, 2]
+                            )
+                            if abs(turn) < cosine:
+                                continue
+                            per = unit / sums[k, 0]
+                            away = (
+                                plane[0] * (pa - oa + sums[k, 1] * per - plane[3])
+                                + plane[1] * (pb - ob + sums[k, 2] * per - plane[4])
+                                + plane[2] * (pc - oc + sums[k, 3] * per - plane[5])
+                            )
+                            if abs(away) > distance:
+                                continue
+                            regions[k] = n_regions
+                            queue[length] = k
+                            length += 1
+                            at = (float(pa - oa), float(pb - ob), float(pc - oc))
+                            _add_moments(total, sums, k, at)
+                if length >= refit:
+                    flattest(total, plane)
+                    refit = int((1.0 + _REFIT_SHARE) * length) + 1
+            # While the plane still swayed it may have passed over voxels that it now holds.
+            if length == before:
+                break
+            if length >= 8:
+                flattest(total, plane)
+        n_regions += 1
+    return n_regions

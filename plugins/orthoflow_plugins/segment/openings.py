@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import ClassVar, Final
 
 import numpy as np
@@ -11,12 +12,13 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
+from orthoflow.files.images import encode_webp
 from orthoflow.geometry.levels import eight_bits
 from orthoflow.geometry.rings import signed_area
 from orthoflow.products import (
     Opening,
+    OpeningKind,
     Openings,
-    Orthoimage,
     Orthoimages,
     OutlineSource,
     PointCloud,
@@ -33,11 +35,8 @@ from orthoflow.sdk import (
     Ports,
     StepContext,
 )
-from orthoflow_plugins.segment.areas import Area, AreaRule, Relief, open_areas, relief_of
-from orthoflow_plugins.segment.figures import CAPTION, outline_map
-from orthoflow_plugins.segment.image_edges import moved_to_edges
-from orthoflow_plugins.segment.outlines import Outline, outline_of
-from orthoflow_plugins.segment.sight_lines import sight_lines
+from orthoflow_plugins.segment.areas import Area, Relief, open_areas, relief_of, sight_lines
+from orthoflow_plugins.segment.outlines import Outline, moved_to_edges, outline_of
 
 # Planes that lean more than this from upright are floors, ceilings and slopes.
 _UPRIGHT: Final = math.sin(math.radians(30.0))
@@ -45,6 +44,19 @@ _UPRIGHT: Final = math.sin(math.radians(30.0))
 _FACE_FARTHEST_M: Final = 0.3
 # Empty areas must fill this share of their rectangle, as round windows do. Shadows do not.
 _FILLED_LEAST: Final = 0.7
+_LONGEST_PX: Final = 1400
+_SMALLEST_PX: Final = 500
+_KIND_RGB: Final[Mapping[OpeningKind, tuple[int, int, int]]] = {
+    "through": (30, 110, 230),
+    "niche": (235, 120, 0),
+    "no data": (200, 30, 160),
+}
+_CAPTION: Final = (
+    "blue: rays passed through, orange: a back was measured, purple: no returns. Sides "
+    "should lie on "
+    "the edges of what is seen; a side that cuts across something, or an outline round nothing, "
+    "is wrong."
+)
 _COUNTED: Final = {"through": "n_through", "niche": "n_niche", "no data": "n_no_data"}
 NO_CLOUD: Final = DiagnosticSpec(
     code="openings-without-cloud",
@@ -126,11 +138,7 @@ class SegmentOpenings(Method):
             ge=0.0,
             le=1.0,
             description="Share of the outline along which the wall's face must be measured: "
-            "with less it is "
-            "the border of the "
-            ""
-            ""
-            "scan.",
+            "with less it is the border of the scan.",
         )
         level: bool = Field(default=False, description="Also search floors, ceilings and slopes.")
 
@@ -163,60 +171,47 @@ class SegmentOpenings(Method):
             inputs.cloud.require_points(2)
         else:
             ctx.report(NO_CLOUD)
-        rule = AreaRule(
-            behind_m=params.behind_m,
-            width_least_m=params.width_least_m,
-            area_least_m2=params.area_least_m2,
-            seen_least=params.seen_least_share,
-        )
-        found: list[_Found] = []
+        found: list[tuple[Wall, list[Opening], int]] = []
         for count, place in enumerate(chosen):
             ctx.progress(count / len(chosen), walls.walls[place].name)
-            found.append(_found_on(inputs, place, rule, ctx))
-        openings = tuple(opening for of_wall in found for opening in of_wall.openings)
+            found.append((walls.walls[place], *_found_on(inputs, place, params, ctx)))
+        openings = tuple(opening for _, of_wall, _ in found for opening in of_wall)
         _report(openings, found, ctx)
         crs = {wall.frame.map_crs for wall in walls.walls if wall.frame.map_crs is not None}
         return self.Out(
             openings=Openings(
                 openings=openings,
-                walls=tuple(of_wall.wall.plane_index for of_wall in found),
+                walls=tuple(wall.plane_index for wall, _, _ in found),
                 map_crs=crs.pop() if len(crs) == 1 else None,
             )
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Found:
+def _found_on(
+    inputs: SegmentOpenings.In, place: int, params: SegmentOpenings.Params, ctx: StepContext
+) -> tuple[list[Opening], int]:
     """Return the openings of one wall, and the number of areas rejected by border or by shape."""
-
-    wall: Wall
-    openings: tuple[Opening, ...]
-    n_unbounded: int
-
-
-def _found_on(inputs: SegmentOpenings.In, place: int, rule: AreaRule, ctx: StepContext) -> _Found:
     wall, slab = inputs.walls.walls[place], inputs.walls.slab(place)
     lines = None if inputs.cloud is None else sight_lines(inputs.cloud, slab)
-    relief = relief_of(wall, lines, rule)
+    relief = relief_of(wall, lines, params.behind_m)
     if relief.face_m:
         is_other = relief.face_m < -_FACE_FARTHEST_M
         what = "it is another surface, with no openings" if is_other else "openings begin there"
         ctx.report(OTHER_SURFACE, subject=wall.name, behind_m=-relief.face_m, what=what)
         if is_other:
-            return _Found(wall=wall, openings=(), n_unbounded=0)
+            return [], 0
     grey = _grey(inputs.orthoimages, wall, relief, ctx)
     spacing_m = replace(inputs.walls, walls=(wall,), buffers_m=(), included=()).spacing_m()
     openings: list[Opening] = []
     n_unbounded = 0
-    for area in open_areas(relief, rule):
+    for area in open_areas(relief, params.width_least_m, params.area_least_m2):
         outline = outline_of(area, relief, spacing_m)
-        if outline is None or outline.seen_of_all < rule.seen_least:
+        if outline is None or outline.seen_of_all < params.seen_least_share:
             n_unbounded += 1
             continue
         by_image = np.zeros(len(outline.corners), dtype=np.bool_)
         if grey is not None:
-            moved = moved_to_edges(outline, grey)
-            outline, by_image = moved.outline, moved.by_image
+            outline, by_image = moved_to_edges(outline, grey)
         opening = _opening(wall, relief, area, outline, by_image)
         if opening.kind == "no data" and opening.area_m2 < _FILLED_LEAST * (
             opening.width_m * opening.height_m
@@ -226,8 +221,20 @@ def _found_on(inputs: SegmentOpenings.In, place: int, rule: AreaRule, ctx: StepC
         openings.append(opening)
     openings.sort(key=lambda opening: float(opening.outline_m[:, 0].min()))
     if openings:
-        _draw(wall, relief, grey, openings, ctx)
-    return _Found(wall=wall, openings=tuple(openings), n_unbounded=n_unbounded)
+        frame, step = wall.frame, relief.step
+        # Over the orthoimage, or else over the intensity.
+        shown = np.where(relief.is_face, np.float32(0.8), np.float32(0.2))
+        if grey is not None:
+            shown = grey / 255.0
+        elif wall.intensity is not None:
+            shown = wall.intensity[::step, ::step]
+        drawn = [(each.kind, frame.wall_from_raster(each.outline_m) / step) for each in openings]
+        ctx.figure(
+            f"wall_{wall.plane_index}_openings",
+            outline_map(np.asarray(shown, dtype=np.float32), drawn),
+            f"{wall.name}: openings, from left to right; {_CAPTION}",
+        )
+    return openings, n_unbounded
 
 
 def _opening(
@@ -261,7 +268,8 @@ def _grey(
     images: Orthoimages | None, wall: Wall, relief: Relief, ctx: StepContext
 ) -> NDArray[np.float32] | None:
     """Return grey (rows, cols) 0..255 of the wall's orthoimage on the relief's cells, or None."""
-    image = _image_of(images, wall)
+    known = () if images is None else images.images
+    image = next((each for each in known if each.number == wall.plane_index), None)
     # An orthoimage painted from the cloud has the edges of its cells, not finer ones.
     if image is None or set(image.sources) <= {"cloud"}:
         return None
@@ -274,53 +282,18 @@ def _grey(
     return np.asarray(grey, dtype=np.float32)
 
 
-def _image_of(images: Orthoimages | None, wall: Wall) -> Orthoimage | None:
-    """Return its orthoimage, by the number of the plane."""
-    for image in () if images is None else images.images:
-        if image.number == wall.plane_index:
-            return image
-    return None
-
-
-def _draw(
-    wall: Wall,
-    relief: Relief,
-    grey: NDArray[np.float32] | None,
-    openings: list[Opening],
-    ctx: StepContext,
+def _report(
+    openings: tuple[Opening, ...], found: list[tuple[Wall, list[Opening], int]], ctx: StepContext
 ) -> None:
-    """Draw outlines over the orthoimage, or else over the intensity."""
-    frame, step = wall.frame, relief.step
-    if grey is not None:
-        shown = grey / 255.0
-    elif wall.intensity is not None:
-        shown = wall.intensity[::step, ::step]
-    else:
-        shown = np.where(relief.is_face, np.float32(0.8), np.float32(0.2))
-    outlines = [
-        (
-            opening.kind,
-            frame.wall_from_raster(opening.outline_m) / step,
-        )
-        for opening in openings
-    ]
-    ctx.figure(
-        f"wall_{wall.plane_index}_openings",
-        outline_map(np.asarray(shown, dtype=np.float32), outlines),
-        f"{wall.name}: openings, from left to right; {CAPTION}",
-    )
-
-
-def _report(openings: tuple[Opening, ...], found: list[_Found], ctx: StepContext) -> None:
     ctx.metric("n_openings", len(openings), "1")
     for kind, name in _COUNTED.items():
         ctx.metric(name, sum(opening.kind == kind for opening in openings), "1")
     area_m2 = sum(opening.area_m2 for opening in openings)
-    frames = [of_wall.wall.frame for of_wall in found]
+    frames = [wall.frame for wall, _, _ in found]
     whole_m2 = sum(frame.gsd_m**2 * frame.width * frame.height for frame in frames)
     ctx.metric("openings_area_m2", area_m2, "m2")
     ctx.metric("openings_share", area_m2 / whole_m2, "1")
-    ctx.metric("n_unbounded", sum(of_wall.n_unbounded for of_wall in found), "1")
+    ctx.metric("n_unbounded", sum(n_unbounded for _, _, n_unbounded in found), "1")
     sigma_m = np.concatenate([np.empty(0), *(opening.side_sigma_m for opening in openings)])
     sources = np.concatenate(
         [np.empty(0, dtype=np.uint8), *(opening.side_source for opening in openings)]
@@ -330,3 +303,46 @@ def _report(openings: tuple[Opening, ...], found: list[_Found], ctx: StepContext
         ctx.metric("side_sigma_mm", 1e3 * float(np.median(sigma_m[is_seen])), "mm")
         by_image = np.count_nonzero(sources == OutlineSource.IMAGE)
         ctx.metric("image_side_share", by_image / np.count_nonzero(is_seen), "1")
+
+
+def outline_map(
+    grey: NDArray[np.float32],
+    outlines: Sequence[tuple[OpeningKind, NDArray[np.float64]]],
+) -> bytes:
+    """Draw outlines with their numbers over a pale picture of the wall.
+
+    Args:
+        grey: (rows, cols) 0..1, NaN where nothing is shown.
+        outlines: kind and (n, 2) column and row of the corners, each.
+    """
+    import cv2
+
+    longest = max(grey.shape)
+    scale = float(np.clip(1.0, _SMALLEST_PX / longest, _LONGEST_PX / longest))
+    size = (max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale)))
+    way = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_NEAREST
+    pale = 70.0 + 180.0 * np.clip(np.nan_to_num(grey, nan=0.0), 0.0, 1.0)
+    small = np.asarray(cv2.resize(pale.astype(np.uint8), size, interpolation=way), dtype=np.uint8)
+    picture = np.repeat(small[:, :, None], 3, axis=2)
+    for number, (kind, corners) in enumerate(outlines):
+        places = np.rint(scale * corners).astype(np.int32)
+        cv2.polylines(
+            picture,
+            [places],
+            isClosed=True,
+            color=_KIND_RGB[kind],
+            thickness=2,
+            lineType=cv2.LINE_AA,
+        )
+        left, top = (int(value) for value in places.min(axis=0))
+        cv2.putText(
+            picture,
+            str(number),
+            (left + 6, top + 22),
+            cv2.FONT_HERSHEY_SIMPLEX,
+            0.7,
+            _KIND_RGB[kind],
+            2,
+            cv2.LINE_AA,
+        )
+    return encode_webp(picture)

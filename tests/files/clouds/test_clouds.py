@@ -403,7 +403,7 @@ def test_a_photo_colours_only_what_it_sees() -> None:
 
 @pytest.mark.usefixtures("_open3d")
 def test_open3d_reads_a_ply_with_colours_and_normals(tmp_path: Path) -> None:
-    from orthoflow_plugins.plane.open3d_library import load_open3d
+    from orthoflow_plugins.plane.comparators import load_open3d
 
     write_ply(tmp_path / "cloud.ply", dressed())
     open3d = load_open3d("this test")

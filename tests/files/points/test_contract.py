@@ -104,7 +104,7 @@ def by_pye57(path: Path, fields: Fields, *, is_posed: bool, has_grid: bool) -> F
 def by_open3d(
     path: Path, fields: Fields, *, is_ascii: bool, has_rgb: bool, is_packed: bool = False
 ) -> Fields:
-    from orthoflow_plugins.plane.open3d_library import load_open3d
+    from orthoflow_plugins.plane.comparators import load_open3d
 
     open3d = load_open3d("the test")
     cloud = open3d.geometry.PointCloud()

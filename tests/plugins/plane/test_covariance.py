@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.plane.fit import adjust_plane, independent_covariance
+from orthoflow_plugins.plane.kernels import STEPS_PER_TOLERANCE
 from orthoflow_plugins.plane.ransac import Ransac
-from orthoflow_plugins.plane.slab_kernels import STEPS_PER_TOLERANCE
 from orthoflow_plugins.plane.support import CellSums, SurfaceRaster
 from scipy import ndimage
 

@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Final
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.cloud import prepare
 from orthoflow_plugins.plane.figures import (
-    Margins,
-    SpacePicture,
     draw_accumulator,
     draw_deviations,
     draw_normals,
@@ -21,20 +19,16 @@ from orthoflow_plugins.plane.figures import (
     draw_sections,
     draw_space,
     draw_thickness,
-    space_out,
 )
-from orthoflow_plugins.plane.kernels import Boxes, PlanCounts, PlanGrid
-from orthoflow_plugins.plane.planes import Assembly, Deviations, normality
-from orthoflow_plugins.plane.region import grow
-from orthoflow_plugins.plane.slab_kernels import HISTOGRAM_BINS
+from orthoflow_plugins.plane.kernels import HISTOGRAM_BINS, PlanGrid
+from orthoflow_plugins.plane.planes import Deviations, Normality, normality
+from orthoflow_plugins.plane.region import Region, region_proposer
 from orthoflow_plugins.plane.thickness import RowPoints
-from orthoflow_plugins.plane.voxels import Neighbourhood, surface_voxels
 
 from orthoflow.geometry import wall_axes
 from orthoflow.products import Planes, Spread, Thickness
-from orthoflow.sdk import StepContext
 from tests import samples
-from tests.plane_scenes import Rectangle, cloud_of, context, sampled
+from tests.plane_scenes import Rectangle, cloud_of, context, prepared, sampled, search_in
 
 ORIGIN: Final = (100.0, 200.0, 50.0)
 UP: Final = np.array([0.0, 0.0, 1.0])
@@ -82,26 +76,10 @@ def image(axes: Any) -> tuple[NDArray[np.float64], tuple[float, ...]]:
     return np.ma.filled(shown.get_array().astype(float), np.nan), tuple(shown.get_extent())
 
 
-def test_panels_lie_within_their_margins() -> None:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8.0, 5.0))
-    margins = Margins(left=0.5, right=0.25, bottom=0.75, top=0.125, across=0.375, down=0.625)
-    space_out(figure, margins, n_rows=2, n_columns=3)
-    panels = figure.subplots(2, 3)
-    inches = [[axes.get_position().extents * (8.0, 5.0, 8.0, 5.0) for axes in r] for r in panels]
-    width, height = (8.0 - 0.75 - 2 * 0.375) / 3, (5.0 - 0.875 - 0.625) / 2
-    for row in range(2):
-        for column in range(3):
-            left, top = 0.5 + column * (width + 0.375), 5.0 - 0.125 - row * (height + 0.625)
-            expected = [left, top - height, left + width, top]
-            np.testing.assert_allclose(inches[row][column], expected, atol=1e-9)
-
-
 # --- deviations ---
 
 
-def assembly_of(count: int) -> Assembly:
+def deviations_of(count: int) -> tuple[Deviations, list[Normality | None]]:
     find_m, fit_m = 0.05, 0.015
     edges_m = np.linspace(-find_m, find_m, HISTOGRAM_BINS + 1)
     rng = np.random.default_rng(0)
@@ -120,64 +98,39 @@ def assembly_of(count: int) -> Assembly:
         fit_tolerance_m=fit_m,
     )
     shapes = [normality(row, tolerance_m=find_m, fit_tolerance_m=fit_m) for row in histogram]
-    return Assembly(
-        planes=planes_of(count=count),
-        labels_from_claims=np.arange(count + 1, dtype=np.int16),
-        deviations=deviations,
-        n_guessed=0,
-        raw=(),
-        normalities=(*shapes[:-1], None),
-        n_independent=np.ones(count),
-    )
+    return deviations, [*shapes[:-1], None]
 
 
 def test_deviations_are_drawn_with_the_gauss_curve_of_their_fit(
     drawings: dict[str, Any], tmp_path: Path
 ) -> None:
-    assembly = assembly_of(3)
-    draw_deviations(context(tmp_path), assembly)
-    panels = drawings["deviations"].axes
+    deviations, shapes = deviations_of(3)
+    draw_deviations(context(tmp_path), planes_of(), deviations, shapes)
+    panels = [axes for axes in drawings["deviations"].axes if axes.axison]
     # The last has no distribution, and its deviation is zero: bars alone.
     assert len(panels) == 5
     bars = [axes for axes in panels if axes.patches]
     for k, axes in enumerate(bars):
         (stairs,) = axes.patches
         values, edges_mm, _ = stairs.get_data()
-        np.testing.assert_array_equal(values, assembly.deviations.histogram[k])
+        np.testing.assert_array_equal(values, deviations.histogram[k])
         np.testing.assert_allclose(edges_mm, np.linspace(-50.0, 50.0, HISTOGRAM_BINS + 1))
         assert axes.get_title() == f"{NAMES[k]}: {3.0 if k < 2 else 0.0:.1f} mm"
         assert len(axes.lines) == (1 if k < 2 else 0)
         for x_mm, curve in lines(axes):
             # As many points below it as the fit had, about their mean.
-            assert curve.sum() == pytest.approx(assembly.deviations.n_fit[k], rel=1e-6)
+            assert curve.sum() == pytest.approx(deviations.n_fit[k], rel=1e-6)
             mean_mm = (x_mm @ curve) / curve.sum()
             assert mean_mm == pytest.approx(1.0 * k, abs=1e-6)
             sigma_mm = math.sqrt((x_mm - mean_mm) ** 2 @ curve / curve.sum())
             assert sigma_mm == pytest.approx(3.0, rel=1e-6)
     for k, axes in enumerate(axes for axes in panels if not axes.patches):
-        shape = assembly.normalities[k]
+        shape = shapes[k]
         assert shape is not None
         diagonal, quantiles = lines(axes)
         reach = shape.expected_sigmas[-1]
         np.testing.assert_array_equal(diagonal, [[-reach, reach], [-reach, reach]])
         np.testing.assert_array_equal(quantiles, [shape.expected_sigmas, shape.found_sigmas])
-
-
-def test_deviations_of_the_first_planes_alone_are_drawn(
-    drawings: dict[str, Any], tmp_path: Path
-) -> None:
-    draw_deviations(context(tmp_path), assembly_of(6))
-    figure = drawings["deviations"]
-    assert len([axes for axes in figure.axes if axes.patches]) == 4
-    assert len(figure.axes) == 8
-    np.testing.assert_allclose(figure.get_size_inches(), [12.8, 5.4])
-    boxes = np.array([axes.get_position().extents for axes in figure.axes])
-    # Histograms above, quantiles below, side by side in the order of the planes.
-    is_bar = np.array([bool(axes.patches) for axes in figure.axes])
-    for row in (is_bar, ~is_bar):
-        assert (np.diff(boxes[row, 0]) > 0.1).all()
-        assert np.ptp(boxes[row, 1]) == pytest.approx(0.0)
-    assert boxes[is_bar, 1].min() > boxes[~is_bar, 3].max()
 
 
 # --- planes in space ---
@@ -225,26 +178,6 @@ def test_planes_are_drawn_with_their_points_and_rectangles(
         for k, limits in enumerate((axes.get_xlim(), axes.get_ylim())):
             span = high[k] - low[k]
             np.testing.assert_allclose(limits, [low[k] - 0.04 * span, high[k] + 0.04 * span])
-
-
-def test_planes_seen_from_behind_hide_no_points_and_only_some_are_named(
-    drawings: dict[str, Any], tmp_path: Path
-) -> None:
-    planes = planes_of(count=14)
-    turned = replace(
-        planes, normal=planes.normal * np.where(np.arange(14) == 1, -1.0, 1.0)[:, None]
-    )
-    points_m = np.random.default_rng(0).uniform(-1.0, 1.0, (60_000, 3))
-    plane_of_point = np.arange(60_000) % 14
-    cloud = cloud_of(points_m, origin=ORIGIN)
-    draw_planes(context(tmp_path), turned, points_m, plane_of_point, cloud)
-    left, right = drawings["planes"].axes
-    # Half of 60 000 are shown; nothing is on no plane.
-    grey, *coloured = lines(left)
-    assert grey.shape == (2, 0)
-    assert len(coloured) == 13
-    assert lines(right)[0].shape == (2, 30_000)
-    assert len(right.get_legend_handles_labels()[1]) == 12
 
 
 # --- thickness ---
@@ -301,12 +234,7 @@ def test_thickness_is_drawn_by_plane_class_material_and_row(
     assert in_row.get_legend() is not None
     # Four panels above, the row below all of them.
     np.testing.assert_allclose(figure.get_size_inches(), [3.4 * 4, 2.9 * 2])
-    box, above = in_row.get_position(), sigmas.get_position()
-    assert box.x1 == pytest.approx(by_material.get_position().x1)
-    assert box.x0 == pytest.approx(above.x0)
-    assert box.y1 < above.y0
-    gap_in = 3.4 * 4 * (incidence.get_position().x0 - above.x1)
-    assert gap_in == pytest.approx(1.3)
+    assert in_row.get_position().y1 < sigmas.get_position().y0
 
 
 def test_thickness_without_classes_materials_or_row_is_one_panel(
@@ -324,62 +252,14 @@ def test_thickness_without_classes_materials_or_row_is_one_panel(
     assert len(drawings["thickness"].axes[-1].lines) == 1
 
 
-@pytest.mark.parametrize(
-    ("drawn", "has_row", "said"),
-    [
-        ({}, False, "beside the scan step there. A cloud"),
-        ({}, True, "there. Below, one row of the scan on the first plane. A cloud"),
-        ({"range_m": spreads(0.1)}, False, "there, and by range. A cloud"),
-        (
-            {"incidence_deg": spreads(0.1), "material": spreads(0.1, name="brick")},
-            False,
-            "there, and by angle of incidence and material. A cloud",
-        ),
-        (
-            {"incidence_deg": spreads(0.1), "range_m": spreads(0.1), "intensity": spreads(0.1)},
-            True,
-            "there, and by angle of incidence, range and intensity. Below, one row of the scan",
-        ),
-    ],
-    ids=["planes", "row", "range", "material", "classes and row"],
-)
-def test_the_caption_of_the_thickness_names_what_is_drawn(
-    drawn: dict[str, Any], has_row: bool, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    captions: list[str] = []
-    monkeypatch.setattr(StepContext, "figure", lambda *given: captions.append(given[-1]))
-    plain = Thickness(sigma_m=0.001, width_95_m=0.004, scan_step_m=0.005)
-    row = RowPoints(row=1, scan=0, along_m=np.ones(2), distance_m=np.ones(2), intensity=None)
-    # Of the fifth plane on only the bar is drawn.
-    fifth = replace(plain, material=spreads(0.1, name="wood"), intensity=spreads(0.1))
-    found = (replace(plain, **drawn), *[plain] * 3, fifth)
-    draw_thickness(context(tmp_path), planes_of(count=5), found, row if has_row else None, {})
-    (caption,) = captions
-    assert said in caption
-
-
 # --- how planes were looked for ---
 
 
-class PlanPicture:
+def plan_votes(grid: PlanGrid, plan: Any, votes: Any, centre_m: Any, reach_m: float) -> Any:
     """A plan and its votes, as a detector keeps them."""
-
-    voters = "cells vote"
-
-    def __init__(
-        self,
-        grid: PlanGrid,
-        plan: NDArray[np.int64],
-        votes: NDArray[np.int64],
-        *,
-        centre_m: NDArray[np.float64],
-        reach_m: float,
-    ) -> None:
-        boxes = Boxes(boxes=np.zeros((0, 6), dtype=np.float32), n_unusable=0)
-        self.grid = grid
-        self.plan = PlanCounts(cells=plan, heights=np.zeros(0, dtype=np.int64), boxed=boxes)
-        self.first: NDArray[np.int64] | None = votes
-        self.centre_m, self.reach_m = centre_m, reach_m
+    return SimpleNamespace(
+        grid=grid, plan=plan, first=votes, centre_m=centre_m, reach_m=reach_m, voters="cells vote"
+    )
 
 
 def test_the_accumulator_is_drawn_with_the_walls_as_lines_and_as_circles(
@@ -391,7 +271,7 @@ def test_the_accumulator_is_drawn_with_the_walls_as_lines_and_as_circles(
     )
     plan = rng.integers(0, 9, (16, 14))
     votes = rng.integers(0, 9, (12, 24))
-    picture = PlanPicture(grid, plan, votes, centre_m=np.array([0.0, 0.5]), reach_m=6.0)
+    picture = plan_votes(grid, plan, votes, np.array([0.0, 0.5]), 6.0)
     draw_accumulator(
         context(tmp_path), picture, planes_of(), cloud_of(np.zeros((3, 3)), origin=ORIGIN)
     )
@@ -412,28 +292,6 @@ def test_the_accumulator_is_drawn_with_the_walls_as_lines_and_as_circles(
     circles = np.array([line[:, 0] for line in lines(right)])
     np.testing.assert_allclose(circles, [[90.0, 1.5], [0.0, -3.0]], atol=1e-9)
     assert left.get_legend() is not None
-
-
-def test_large_plans_are_summed_until_they_are_small_enough_to_draw(
-    drawings: dict[str, Any], tmp_path: Path
-) -> None:
-    plan = np.random.default_rng(0).integers(0, 5, (2_001, 901))
-    grid = PlanGrid(basis=np.eye(3), low_m=np.zeros(3), cell_m=0.01, shape=(2_001, 901, 3))
-    planes = planes_of()
-    floor = replace(
-        planes, normal=planes.normal[[2]], offset=planes.offset[[2]], corners=planes.corners[[2]],
-        covariance=planes.covariance[:1], n_points=planes.n_points[:1], rms_m=planes.rms_m[:1],
-        names=("floor",),
-    )  # fmt: skip
-    picture = PlanPicture(grid, plan, plan[:4, :900], centre_m=np.zeros(2), reach_m=1.0)
-    draw_accumulator(context(tmp_path), picture, floor, cloud_of(np.zeros((3, 3))))
-    left, right = drawings["accumulator"].axes
-    shown = np.expm1(image(left)[0])
-    assert shown.shape == (451, 667)
-    assert shown.sum() == pytest.approx(plan.sum())
-    assert shown[0, 0] == pytest.approx(plan[:3, :2].sum())
-    assert image(right)[0].shape == (900, 4)
-    assert left.get_legend() is None
 
 
 def test_sections_count_the_points_of_one_layer_of_voxels(
@@ -468,11 +326,9 @@ def test_an_accumulator_of_directions_is_drawn_with_the_planes_it_found(
 ) -> None:
     rng = np.random.default_rng(0)
     best = rng.uniform(-1.0, 4.0, (12, 6))
-    over_omega, over_phi = rng.uniform(0.0, 9.0, (3, 12, 8)), rng.uniform(0.0, 9.0, (3, 6, 8))
-    picture = SpacePicture(
-        best=best, over_omega=over_omega, over_phi=over_phi,
-        sections_deg=(0.0, 30.0, 60.0), reach_m=2.5,
-    )  # fmt: skip
+    over_omega, over_phi = (
+        {30.0 * k: rng.uniform(0.0, 9.0, (count, 8)) for k in range(3)} for count in (12, 6)
+    )
     planes = planes_of()
     lean = math.radians(20.0)
     normal = planes.normal.copy()
@@ -482,7 +338,7 @@ def test_an_accumulator_of_directions_is_drawn_with_the_planes_it_found(
         math.cos(lean) * math.sin(math.radians(210.0)),
         math.sin(lean),
     ]
-    draw_space(context(tmp_path), picture, replace(planes, normal=normal))
+    draw_space(context(tmp_path), best, over_omega, over_phi, 2.5, replace(planes, normal=normal))
     (axes,) = drawings["accumulator"].axes
     shown, extent = image(axes)
     np.testing.assert_allclose(shown, np.sqrt(np.maximum(best.T, 0.0)))
@@ -494,10 +350,9 @@ def test_an_accumulator_of_directions_is_drawn_with_the_planes_it_found(
     for k in range(3):
         for row, votes, span in ((0, over_omega, (0.0, 180.0)), (1, over_phi, (-90.0, 90.0))):
             shown, extent = image(panels[row, k])
-            np.testing.assert_allclose(shown, np.sqrt(votes[k].T))
+            np.testing.assert_allclose(shown, np.sqrt(votes[30.0 * k].T))
             assert extent == (*span, -2.5, 2.5)
             assert panels[row, k].get_title().endswith(f"= {30.0 * k:.0f} deg")
-    assert [axes.get_ylabel() != "" for axes in panels[0]] == [True, False, False]
 
 
 def test_normals_are_drawn_by_points_and_over_the_first_plane(
@@ -512,18 +367,14 @@ def test_normals_are_drawn_by_points_and_over_the_first_plane(
     )  # fmt: skip
     points = sampled((wall, slope), noise_m=1e-3)
     cloud = cloud_of(points, origin=ORIGIN)
-    prepared = prepare(cloud, np.eye(3), cell_m=0.5, least_share=0.005, parts=1)
-    cube = Neighbourhood(shape="cube", size_m=0.15, n_points=30, voxel_m=0.05)
-    voxels = surface_voxels(prepared, cube)
-    regions = grow(
-        voxels, angle_deg=10.0, distance_m=0.015, least_points=100.0, viewer_m=np.zeros(3)
-    )
+    params = Region.Params(neighbourhood_m=0.15, min_share=0.005)
+    regions = region_proposer(search_in(prepared(points)), params, viewer_m=np.zeros(3))
     planes = planes_of()
     half = np.array([[-1.5, 0, 1.0], [-1.5, 0, -1.0], [1.5, 0, -1.0], [1.5, 0, 1.0]])
     corners = planes.corners.copy()
     corners[0] = half + np.array([0.0, 2.0, 0.0]) + np.array(ORIGIN)
     ctx = context(tmp_path)
-    draw_normals(ctx, voxels, len(regions.planes), replace(planes, corners=corners), cloud)
+    draw_normals(ctx, regions.voxels, len(regions.planes), replace(planes, corners=corners), cloud)
     metrics = {metric.name: metric.value for metric in ctx.metrics}
     assert metrics["n_regions"] == len(regions.planes) == 2
     assert metrics["neighbourhood_mm"] == pytest.approx(150.0)
@@ -553,35 +404,3 @@ def test_normals_are_drawn_by_points_and_over_the_first_plane(
     assert shown[20, 30] == pytest.approx(15.0)
     assert np.nanmedian(shown[:8]) < 0.2
     assert right.images[0].get_clim() == (0.0, 15.0)
-
-
-def edges_in(figure: Any) -> NDArray[np.float64]:
-    """(4,) margins of a figure's panels from its edges, inches: left, right, bottom, top."""
-    boxes = np.array([axes.get_position().extents for axes in figure.axes])
-    width, height = figure.get_size_inches()
-    low, high = boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)
-    return np.array(
-        [low[0] * width, (1.0 - high[0]) * width, low[1] * height, (1.0 - high[1]) * height]
-    )
-
-
-def test_labels_have_room_at_the_edges_and_between_panels(
-    drawings: dict[str, Any], tmp_path: Path
-) -> None:
-    draw_deviations(context(tmp_path), assembly_of(3))
-    figure = drawings["deviations"]
-    np.testing.assert_allclose(edges_in(figure), [0.3, 0.1, 0.45, 0.3], atol=1e-9)
-    first, second, below = (
-        axes.get_position() for axes in (*[a for a in figure.axes if a.patches][:2], figure.axes[1])
-    )
-    assert 9.6 * (second.x0 - first.x1) == pytest.approx(0.3)
-    assert 5.4 * (first.y0 - below.y1) == pytest.approx(0.75)
-    plain = Thickness(sigma_m=0.001, width_95_m=0.004, scan_step_m=0.005)
-    classes = replace(plain, incidence_deg=spreads(0.001))
-    row = RowPoints(row=1, scan=0, along_m=np.ones(2), distance_m=np.ones(2), intensity=None)
-    draw_thickness(context(tmp_path), planes_of(), (classes, None, None), row, {})
-    figure = drawings["thickness"]
-    np.testing.assert_allclose(edges_in(figure), [0.7, 0.1, 0.45, 0.1], atol=1e-9)
-    first, second, below = (axes.get_position() for axes in figure.axes)
-    assert 6.8 * (second.x0 - first.x1) == pytest.approx(0.45)
-    assert 5.8 * (first.y0 - below.y1) == pytest.approx(0.5)

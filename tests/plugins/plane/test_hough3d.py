@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.plane.hough3d import Hough3d, SpaceProposer, directions_over
-from orthoflow_plugins.plane.vote_kernels import VOTE_SHARES, vote_planes
+from orthoflow_plugins.plane.votes import VOTE_SHARES, vote_planes
 from scipy.spatial import KDTree
 
 from orthoflow.geometry import angle_between_deg
@@ -109,15 +109,6 @@ def test_every_place_votes_once_per_direction_and_takes_its_votes_back() -> None
     np.testing.assert_array_equal(rest, part)
 
 
-def test_votes_lie_at_the_distance_that_the_equation_gives() -> None:
-    places = np.array([[0.7], [-0.4], [0.9]], dtype=np.float32)
-    votes = votes_of(places, np.ones(1, dtype=np.int32))
-    normals = directions_over(5.0, "any", 10.0).normals
-    distances_m = (np.argmax(votes, axis=1) + 0.5 - 100.0) * 0.05
-    # Half a cell of the image along both of its axes, half a one when rows shift, and half a bin.
-    assert np.abs(distances_m - normals @ places[:, 0]).max() < 0.05 * (0.5 * np.sqrt(2.0) + 1.0)
-
-
 def test_the_number_of_threads_does_not_change_a_bit(tmp_path: Path) -> None:
     cloud = cloud_of(sampled())
     one, three = (detect(cloud, tmp_path / str(n), cores=n) for n in (1, 3))
@@ -130,6 +121,6 @@ def test_voxels_grow_where_a_scene_would_have_too_many() -> None:
     points = rng.uniform(-300.0, 300.0, (20_000, 3))
     search = search_in(prepared(points))
     proposer = SpaceProposer(search, Hough3d.Params(angle_step_deg=2.0, min_share=0.05))
-    assert proposer._voxels.voxel_m > 0.3
+    assert proposer._voxel_m > 0.3
     found = proposer.propose(search)
     assert found is None or proposer._votes.nbytes < 500_000_000

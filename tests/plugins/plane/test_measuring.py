@@ -87,7 +87,7 @@ def wall_of_rows() -> tuple[PointCloud, Any]:
 
 def test_the_row_with_most_points_on_the_first_plane_is_taken() -> None:
     known, planes = wall_of_rows()
-    prepared = prepare(known, np.eye(3), cell_m=0.1, least_share=0.005, parts=1)
+    prepared = prepare(known, parts=1)
     on_wall = np.abs(known.y.astype(float) - 2.0) < 0.1
     prepared.claims[on_wall] = 0
     of_sample = np.where(on_wall, 0, -1)
@@ -126,11 +126,11 @@ def test_thickness_needs_fifty_points_in_tiles_of_four() -> None:
             [x, 2.0 + rng.normal(0.0, 0.001, n_points), np.full(n_points, 0.05)]
         )
         known = cloud_of(np.vstack([points, [[0.0, 0.0, 9.0]]]))
-        prepared = prepare(known, np.eye(3), cell_m=0.5, least_share=0.0, parts=1)
+        prepared = prepare(known, parts=1)
         planes: Any = type("P", (), {"__len__": lambda _: 1})()
         planes.normal, planes.offset, planes.up = np.array([[0.0, -1.0, 0.0]]), [-2.0], UP
         of_sample = np.append(np.zeros(n_points, dtype=np.int64), -1)
-        (found,) = measure_thickness(planes, of_sample, prepared, known, reach_m=0.05, materials={})
+        (found,) = measure_thickness(planes, of_sample, prepared, known, 0.05, {})
         return found
 
     assert thickness(52, 4) is not None
@@ -172,7 +172,7 @@ def test_materials_may_touch() -> None:
 def test_planes_are_measured_on_all_points_that_they_have(parts: int) -> None:
     rng = np.random.default_rng(3)
     points = rng.uniform(-1.0, 1.0, (3_000, 3))
-    prepared = prepare(cloud_of(points), np.eye(3), cell_m=0.5, least_share=0.005, parts=parts)
+    prepared = prepare(cloud_of(points), parts=parts)
     seen = prepared.sample.offsets_m
     # Level planes at -0.5, 0 and 0.5; the last has no points.
     heights = np.array([-0.5, 0.0, 0.5])
@@ -207,16 +207,3 @@ def test_planes_are_measured_on_all_points_that_they_have(parts: int) -> None:
     for name in ("n_points", "rms_m", "n_fit", "rms_fit_m", "mean_fit_m", "histogram"):
         np.testing.assert_array_equal(getattr(turned, name), getattr(found, name)[order])
     assert (turned.tolerance_m, turned.fit_tolerance_m) == (find_m, fit_m)
-
-
-def test_a_plane_of_one_point_deviates_by_its_distance() -> None:
-    points = np.array([[0.0, 0.0, 0.03], [5.0, 5.0, 5.0], [5.0, -5.0, 3.0]])
-    prepared = prepare(cloud_of(points), np.eye(3), cell_m=0.5, least_share=0.005, parts=1)
-    prepared.claims[:] = [0, -1, -1]
-    slabs = np.array([[0, 0, 1.0, 0.0, 1.0, 0, 0, 0, 0, 1.0, 0, 0]])
-    found = measure_planes(
-        prepared, slabs, np.array([[-1.0, 1, -1, 1]]), tolerance_m=0.1, fit_tolerance_m=0.05
-    )
-    assert (found.n_points[0], found.n_fit[0]) == (1, 1)
-    for value in (found.rms_m[0], found.rms_fit_m[0], found.mean_fit_m[0]):
-        assert value == pytest.approx(0.03, rel=1e-3)

@@ -10,10 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from orthoflow_plugins.plane import open3d_library, open3d_ransac
-from orthoflow_plugins.plane.open3d_library import load_open3d
-from orthoflow_plugins.plane.open3d_patches import Open3dPatches
-from orthoflow_plugins.plane.open3d_ransac import Open3dRansac
+from orthoflow_plugins.plane import comparators
+from orthoflow_plugins.plane.comparators import Open3dPatches, Open3dRansac, load_open3d
 from orthoflow_plugins.plane.ransac import Ransac
 
 from orthoflow.errors import PluginError
@@ -81,7 +79,7 @@ def test_an_open3d_that_does_not_load_is_one_sentence(monkeypatch: pytest.Monkey
             raise OSError("libGL.so.1: cannot open shared object file\nmore")
         return SimpleNamespace(get_library_path=lambda: "nowhere.so")
 
-    monkeypatch.setattr(open3d_library, "import_module", fail)
+    monkeypatch.setattr(comparators, "import_module", fail)
     with pytest.raises(PluginError, match=r"does not load \(libGL\.so\.1: .* file\): install the"):
         load_open3d("plane.x")
 
@@ -95,6 +93,6 @@ def test_the_version_is_told_under_whichever_name_it_is_installed(
             raise PackageNotFoundError(name)
         return "0.19"
 
-    monkeypatch.setattr(open3d_ransac, "version", version)
+    monkeypatch.setattr(comparators, "version", version)
     expected = {"open3d": "0.19" if installed else "none"}
     assert Open3dRansac.tools() == Open3dPatches.tools() == expected

@@ -8,11 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.candidates import FoundPlane, label, verify
 from orthoflow_plugins.plane.cloud import PreparedCloud
 from orthoflow_plugins.plane.detector import Candidate
 from orthoflow_plugins.plane.planes import (
-    Assembly,
     Deviations,
     assemble,
     face,
@@ -24,10 +22,11 @@ from orthoflow_plugins.plane.planes import (
     side_of_remaining,
     side_of_stations,
 )
+from orthoflow_plugins.plane.search import Claim, FoundPlane, label, verify
 from orthoflow_plugins.plane.support import SurfaceRaster
 
 from orthoflow.geometry import Plane, wall_axes
-from orthoflow.products import PointCloud
+from orthoflow.products import Planes, PointCloud
 from tests.plane_scenes import FIT_TOLERANCE_M, TOLERANCE_M, cloud_of, prepared, search_in
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -215,7 +214,7 @@ def scene() -> Scene:
         )
         item = verify(rough, search)
         assert item is not None
-        search.claim(item.claim(TOLERANCE_M))
+        search.claim(Claim.of(item.raster, item.support, TOLERANCE_M))
         found.append(item)
     label(found, search.cloud, TOLERANCE_M)
     deviations = measure_planes(
@@ -228,21 +227,26 @@ def scene() -> Scene:
     return Scene(cloud=seen, prepared=search.cloud, found=found, deviations=deviations)
 
 
-def assembled(scene: Scene, *stations: tuple[float, float, float]) -> Assembly:
+def assembled(
+    scene: Scene, *stations: tuple[float, float, float]
+) -> tuple[Planes, Deviations, NDArray[np.int16]]:
     known = scene.cloud
     if stations:
         known = replace(known, stations=np.array(stations) + ORIGIN, stations_source="file")
-    return assemble(scene.found, scene.prepared, known, TOLERANCE_M, FIT_TOLERANCE_M)
+    planes, deviations, _, labels = assemble(
+        scene.found, scene.prepared, known, TOLERANCE_M, FIT_TOLERANCE_M
+    )
+    return planes, deviations, labels
 
 
 def test_planes_are_ordered_by_their_points_and_face_the_station(scene: Scene) -> None:
-    assembly = assembled(scene, (0.0, 0.0, 0.0))
-    planes = assembly.planes
+    planes, _, labels = assembled(scene, (0.0, 0.0, 0.0))
+    details: Any = planes.details
     assert planes.names == ("wall 0", "wall 1")
     assert planes.n_points.tolist() == sorted(planes.n_points, reverse=True)
-    np.testing.assert_array_equal(assembly.labels_from_claims, [1, 0, -1])
+    np.testing.assert_array_equal(labels, [1, 0, -1])
     np.testing.assert_allclose(planes.normal, [[0, -1, 0], [1, 0, 0]], atol=2e-3)
-    assert (planes.viewpoint, planes.side_from, assembly.n_guessed) == ("stations", (), 0)
+    assert (planes.viewpoint, planes.side_from) == ("stations", ())
     for k, item in enumerate(reversed(scene.found)):
         sign = -1.0 if k == 0 else 1.0
         own = item.raster.plane
@@ -255,18 +259,18 @@ def test_planes_are_ordered_by_their_points_and_face_the_station(scene: Scene) -
         np.testing.assert_allclose(
             planes.covariance[k], shift @ covariance @ shift.T, rtol=1e-6, atol=1e-15
         )
-        assert assembly.n_independent[k] == n_independent
-        raw = assembly.raw[k]
-        np.testing.assert_array_equal(raw.plane.normal, sign * item.candidate.plane.normal)
-        assert raw.plane.offset_m == pytest.approx(
-            sign * item.candidate.plane.offset_m + float(raw.plane.normal @ ORIGIN)
+        assert details["n_independent"][k] == n_independent
+        raw = details["raw"][k]
+        np.testing.assert_array_equal(raw["normal"], sign * item.candidate.plane.normal)
+        assert raw["offset_m"] == pytest.approx(
+            sign * item.candidate.plane.offset_m + float(np.array(raw["normal"]) @ ORIGIN)
         )
-        assert raw.votes == item.candidate.votes
+        assert raw["support"] == item.candidate.votes
     assert planes.tolerance_m == TOLERANCE_M
 
 
 def test_deviations_follow_a_normal_that_was_turned(scene: Scene) -> None:
-    before, after = scene.deviations, assembled(scene, (0.0, 0.0, 0.0)).deviations
+    before, after = scene.deviations, assembled(scene, (0.0, 0.0, 0.0))[1]
     assert not np.array_equal(before.histogram[1], before.histogram[1, ::-1])
     np.testing.assert_array_equal(after.histogram[0], before.histogram[1, ::-1])
     np.testing.assert_array_equal(after.histogram[1], before.histogram[0])
@@ -274,13 +278,13 @@ def test_deviations_follow_a_normal_that_was_turned(scene: Scene) -> None:
     np.testing.assert_array_equal(after.n_fit, before.n_fit[::-1])
     np.testing.assert_array_equal(after.rms_m, before.rms_m[::-1])
     # From behind it is the other way round.
-    after = assembled(scene, (-3.0, 3.0, 0.0)).deviations
+    after = assembled(scene, (-3.0, 3.0, 0.0))[1]
     np.testing.assert_array_equal(after.histogram, [before.histogram[1], before.histogram[0, ::-1]])
     np.testing.assert_array_equal(after.mean_fit_m, [before.mean_fit_m[1], -before.mean_fit_m[0]])
 
 
 def test_rectangles_end_with_the_points(scene: Scene) -> None:
-    planes = assembled(scene, (0.0, 0.0, 0.0)).planes
+    planes = assembled(scene, (0.0, 0.0, 0.0))[0]
     north, west = planes.corners - ORIGIN
     np.testing.assert_allclose(
         north[:, [0, 2]], [[-1.9, 1], [-1.9, -1], [2, -1], [2, 1]], atol=0.005
@@ -313,13 +317,8 @@ def test_sides_that_no_station_knows_are_guessed(
     side_from: tuple[str, ...],
     n_guessed: int,
 ) -> None:
-    assembly = assembled(scene, *stations)
-    planes = assembly.planes
-    assert (planes.viewpoint, planes.side_from, assembly.n_guessed) == (
-        viewpoint,
-        side_from,
-        n_guessed,
-    )
+    planes = assembled(scene, *stations)[0]
+    assert (planes.viewpoint, planes.side_from) == (viewpoint, side_from)
     # The other wall lies before each of them.
     np.testing.assert_allclose(planes.normal, [[0, -1, 0], [1, 0, 0]], atol=2e-3)
     given = planes.details["guessed_sides"]
@@ -330,17 +329,15 @@ def test_sides_that_were_stated_are_given(scene: Scene) -> None:
     known = replace(
         scene.cloud, stations=np.array([[0.0, 2.0, 0.0]]) + ORIGIN, stations_source="view_from"
     )
-    planes = assemble(scene.found, scene.prepared, known, TOLERANCE_M, FIT_TOLERANCE_M).planes
+    planes = assemble(scene.found, scene.prepared, known, TOLERANCE_M, FIT_TOLERANCE_M)[0]
     assert (planes.viewpoint, planes.side_from) == ("view_from", ("guess", "given"))
 
 
 def test_details_are_told_in_the_order_of_the_planes(scene: Scene) -> None:
-    assembly = assembled(scene, (0.0, 0.0, 0.0))
-    details = assembly.planes.details
+    details = assembled(scene, (0.0, 0.0, 0.0))[0].details
     assert details["fit_n_points"] == scene.deviations.n_fit[::-1].tolist()
     assert details["fit_rms_m"] == scene.deviations.rms_fit_m[::-1].tolist()
     assert details["fit_tolerance_m"] == FIT_TOLERANCE_M
-    assert details["n_independent"] == list(assembly.n_independent)
     first = details["raw"][0]  # type: ignore[index]
     assert first == {
         "normal": [0.0, -1.0, 0.0],

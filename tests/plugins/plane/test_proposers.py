@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from orthoflow_plugins.plane.cloud import Claim, Search
 from orthoflow_plugins.plane.detector import Candidate
 from orthoflow_plugins.plane.hough2d import Hough2d, PlanProposer
 from orthoflow_plugins.plane.hough3d import Hough3d, SpaceProposer
 from orthoflow_plugins.plane.ransac import ConsensusProposer, Ransac
 from orthoflow_plugins.plane.region import Region, region_proposer
+from orthoflow_plugins.plane.search import Claim, Search
 
 from orthoflow.geometry import angle_between_deg
 from tests.plane_scenes import ROOM, Rectangle, prepared, sampled, search_in, turned
@@ -32,7 +32,7 @@ def proposer_of(name: str, search: Search, /, **params: Any) -> Any:
 
 def room_search(angle_deg: float = 0.0) -> Search:
     points = sampled() @ turned(angle_deg).T
-    return search_in(prepared(points, cell_m=0.02, counts_plan=True), min_share=0.02)
+    return search_in(prepared(points, plan_cell_m=0.02), min_share=0.02)
 
 
 def errors(candidate: Candidate, truth: Rectangle, angle_deg: float) -> tuple[float, float]:
@@ -109,7 +109,7 @@ def test_with_one_vote_per_cell_the_plain_maximum_is_no_wall() -> None:
         Rectangle(r.name, r.centre, r.half_a, r.half_b, 5 * r.n_points) for r in ROOM[4:6]
     )
     points = sampled((*ROOM[:4], *floors)) @ turned(17.37).T
-    search = search_in(prepared(points, cell_m=0.05, counts_plan=True), min_share=0.02)
+    search = search_in(prepared(points, plan_cell_m=0.05), min_share=0.02)
     params = {"cell_m": 0.05, "constraint": "vertical", "scoring": "votes"}
     unit = proposer_of("hough2d", search, accumulator="unit", **params).propose(search)
     counts = proposer_of("hough2d", search, accumulator="counts", **params).propose(search)

@@ -8,18 +8,21 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.cloud import prepare
-from orthoflow_plugins.plane.region import Region, grow
-from orthoflow_plugins.plane.voxel_kernels import STEPS_PER_VOXEL
-from orthoflow_plugins.plane.voxels import Neighbourhood, SurfaceVoxels, coarser, surface_voxels
+from orthoflow_plugins.plane.region import Region, RegionProposer, region_proposer
+from orthoflow_plugins.plane.voxels import (
+    HALF_STEPS,
+    Neighbourhood,
+    SurfaceVoxels,
+    VoxelTable,
+    surface_voxels,
+)
 
-from orthoflow.geometry import angle_between_deg, basis_from_up
+from orthoflow.geometry import angle_between_deg
 from orthoflow.sdk import StepContext
-from tests.plane_scenes import Rectangle, cloud_of, context, sampled
+from tests.plane_scenes import Rectangle, cloud_of, context, prepared, sampled, search_in
 
 STATION = np.array([[0.0, -1.5, 0.0]])
 CUBE = Neighbourhood(shape="cube", size_m=0.15, n_points=30, voxel_m=0.05)
-GROWTH: dict[str, Any] = {"angle_deg": 10.0, "distance_m": 0.015, "viewer_m": np.zeros(3)}
 # A wall with a niche a quarter of a metre deep, and a floor before them.
 WALL = Rectangle("wall", (0, 2, 0), (1.5, 0, 0), (0, 0, 1.0), 120_000)
 NICHE = Rectangle("niche", (2.0, 2.25, 0), (0.4, 0, 0), (0, 0, 0.8), 26_000)
@@ -29,9 +32,14 @@ FLOOR = Rectangle("floor", (0, 1, -1.0), (1.5, 0, 0), (0, 1, 0), 40_000)
 def voxels_of(
     points: NDArray[np.float64], wanted: Neighbourhood, *, parts: int = 1
 ) -> SurfaceVoxels:
-    cloud = cloud_of(points)
-    prepared = prepare(cloud, basis_from_up(cloud.up), cell_m=0.5, least_share=0.005, parts=parts)
-    return surface_voxels(prepared, wanted)
+    return surface_voxels(prepared(points, parts=parts), wanted)
+
+
+def grown(points: NDArray[np.float64], min_share: float, **params: Any) -> RegionProposer:
+    """Regions of a cloud in cubes of 15 cm; a fifth of the share has to be in each."""
+    search = search_in(prepared(points))
+    settled = {"neighbourhood_m": 0.15, "min_share": min_share, **params}
+    return region_proposer(search, Region.Params(**settled), viewer_m=STATION[0])
 
 
 def detect(folder: Path, **params: Any) -> tuple[Any, StepContext]:
@@ -47,36 +55,20 @@ def named(ctx: StepContext) -> dict[str, float]:
 def test_cells_hold_the_moments_of_their_points() -> None:
     points = np.random.default_rng(0).uniform(-1.0, 1.0, (40_000, 3))
     voxels = voxels_of(points, CUBE)
-    voxel_of = voxels.voxel_of(prepared_points(points))
+    voxel_of = voxels.table.voxel_of(prepared_points(points))
     assert (voxel_of >= 0).mean() > 0.99  # the robust box may leave out a few at its edge
     kept, voxel_of = points[voxel_of >= 0], voxel_of[voxel_of >= 0]
     np.testing.assert_array_equal(np.bincount(voxel_of), voxels.counts)
     means = np.stack([np.bincount(voxel_of, axis) for axis in kept.T], axis=1)
     # Places within a voxel are kept in 1024 steps.
-    step_m = voxels.grid.cell_m / 1024
+    step_m = voxels.table.grid.cell_m / 1024
     np.testing.assert_allclose(
-        voxels.centroids(), means / voxels.counts[:, None], atol=0.6 * step_m
+        voxels.table.centroids(), means / voxels.counts[:, None], atol=0.6 * step_m
     )
 
 
 def prepared_points(points: NDArray[np.float64]) -> Any:
-    cloud = cloud_of(points)
-    basis = basis_from_up(cloud.up)
-    return prepare(cloud, basis, cell_m=0.5, least_share=0.005, parts=1).points
-
-
-def test_the_normal_of_a_neighbourhood_is_that_of_all_its_points() -> None:
-    points = sampled((WALL,), noise_m=0.003)
-    voxels = voxels_of(points, CUBE)
-    voxel_of = voxels.voxel_of(prepared_points(points))
-    for voxel in np.random.default_rng(0).choice(len(voxels.counts), 25, replace=False):
-        near = np.abs(voxels.places - voxels.places[voxel]).max(axis=1) <= 1
-        members = points[(voxel_of >= 0) & near[voxel_of]]
-        variances, directions = np.linalg.eigh(np.cov(members.T, bias=True))
-        normal = directions[:, 0]
-        assert abs(abs(normal @ voxels.normals[voxel]) - 1.0) < 1e-5
-        expected = np.sqrt(np.maximum(variances, 0.0)) / voxels.grid.cell_m
-        np.testing.assert_allclose(voxels.spreads[voxel], expected, rtol=0.01, atol=1e-3)
+    return prepared(points).points
 
 
 @pytest.mark.parametrize("parts", [2, 3])
@@ -86,8 +78,10 @@ def test_neither_threads_nor_the_order_of_points_show(parts: int) -> None:
     order = np.random.default_rng(1).permutation(len(points))
     found = voxels_of(points[order], CUBE, parts=parts)
     # The robust box comes from a sample, which for so few points is all of them.
-    for name in ("bricks", "numbers", "places", "sums", "normals", "spreads"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    for name in ("bricks", "numbers", "places", "sums"):
+        np.testing.assert_array_equal(getattr(found.table, name), getattr(expected.table, name))
+    np.testing.assert_array_equal(found.normals, expected.normals)
+    np.testing.assert_array_equal(found.spreads, expected.spreads)
 
 
 @pytest.mark.parametrize(
@@ -107,7 +101,7 @@ def test_nearest_cells_end_when_they_hold_enough_points() -> None:
     few = voxels_of(points, Neighbourhood(shape="knn", size_m=0.1, n_points=30, voxel_m=0.02))
     many = voxels_of(points, Neighbourhood(shape="knn", size_m=0.1, n_points=700, voxel_m=0.02))
     # 16 points in a voxel: 30 are there within one shell (6 cm), 700 within three (14 cm).
-    middle = (np.abs(few.centroids()[:, [0, 2]]) < 0.3).all(axis=1)
+    middle = (np.abs(few.table.centroids()[:, [0, 2]]) < 0.3).all(axis=1)
     assert np.median(few.spreads[middle, 2]) == pytest.approx(3 / np.sqrt(12), rel=0.05)
     assert np.median(many.spreads[middle, 2]) == pytest.approx(7 / np.sqrt(12), rel=0.1)
 
@@ -116,8 +110,7 @@ def test_a_region_is_fitted_by_total_least_squares_through_its_points() -> None:
     lean = np.radians(7.0)
     wall = Rectangle("lean", (1, 3, 2), (2, 0, 0), (0, np.sin(lean), np.cos(lean)), 80_000)
     points = sampled((wall,), noise_m=0.001)
-    growth = {**GROWTH, "least_points": 100.0}
-    regions = grow(voxels_of(points, CUBE), **growth)
+    regions = grown(points, 0.005)
     assert len(regions.planes) == 1
     (plane,) = regions.planes.values()
     centred = points - points.mean(axis=0)
@@ -130,32 +123,37 @@ def test_a_region_is_fitted_by_total_least_squares_through_its_points() -> None:
 def test_wider_cells_have_the_moments_of_their_points() -> None:
     points = sampled((WALL, NICHE))[::7]
     voxels = voxels_of(points, CUBE)
-    wide, of_member = coarser(voxels, np.arange(len(voxels.counts)))
-    assert wide.grid.cell_m == 2.0 * voxels.grid.cell_m
-    voxel_of = voxels.voxel_of(prepared_points(points))
+    wide, of_member = voxels.table.coarser(np.arange(len(voxels.counts)))
+    assert wide.grid.cell_m == 2.0 * voxels.table.grid.cell_m
+    voxel_of = voxels.table.voxel_of(prepared_points(points))
     inside = voxel_of >= 0
     wide_of = of_member[voxel_of[inside]]
     count = np.bincount(wide_of)
-    np.testing.assert_array_equal(wide.counts, count)
+    np.testing.assert_array_equal(wide.sums[:, 0], count)
     mean = (
         np.column_stack([np.bincount(wide_of, column) for column in points[inside].T])
         / count[:, None]
     )
-    step_m = wide.grid.cell_m / STEPS_PER_VOXEL
+    step_m = wide.grid.cell_m / HALF_STEPS
     centroids = wide.centroids() @ wide.grid.basis
     np.testing.assert_allclose(centroids, mean, atol=step_m)
     # The kernels find each wide voxel where its points are.
     np.testing.assert_array_equal(wide.voxel_of(prepared_points(points))[inside], wide_of)
 
 
+def test_counts_alone_are_the_first_of_the_moments() -> None:
+    cloud = prepared(np.random.default_rng(0).uniform(-1.0, 1.0, (9_000, 3)), parts=2)
+    moments, counts = (VoxelTable.over(cloud, 0.05, n_sums=n) for n in (10, 1))
+    np.testing.assert_array_equal(counts.sums[:, 0], moments.sums[:, 0])
+    np.testing.assert_array_equal(counts.places, moments.places)
+
+
 def test_a_thinly_scanned_wall_beside_a_dense_one_is_one_region() -> None:
     # A point per decimetre: neighbourhoods of 10 cm that suit the dense wall hold one of them.
     thin = Rectangle("thin", (3.0, 1.0, 0.0), (0, 3.0, 0), (0, 0, 2.0), 2_400)
     dense = Rectangle("dense", (0.0, 4.0, 0.0), (2.0, 0, 0), (0, 0, 2.0), 90_000)
-    wanted = Neighbourhood(shape="cube", size_m=0.1, n_points=30, voxel_m=0.1 / 3.0)
-    voxels = voxels_of(sampled((thin, dense), noise_m=0.002), wanted)
-    growth = {**GROWTH, "least_points": 400.0}
-    regions = grow(voxels, **growth)
+    points = sampled((thin, dense), noise_m=0.002)
+    regions = grown(points, 2_000.0 / len(points), neighbourhood_m=0.1)
     assert len(regions.planes) == 2
     of_thin = min(regions.planes, key=lambda region: regions.n_points[region])
     assert regions.n_points[of_thin] > 0.9 * 2_400
@@ -166,11 +164,9 @@ def test_a_thinly_scanned_wall_beside_a_dense_one_is_one_region() -> None:
 def test_a_step_of_three_centimetres_parts_regions() -> None:
     upper = Rectangle("upper", (0, 2, 0.5), (1, 0, 0), (0, 0, 0.5), 30_000)
     lower = Rectangle("lower", (0, 2.03, -0.5), (1, 0, 0), (0, 0, 0.5), 25_000)
-    growth = {**GROWTH, "least_points": 2_000.0}
-    voxels = voxels_of(sampled((upper, lower), noise_m=0.001), CUBE)
-    regions = grow(voxels, **growth)
-    assert len(regions.planes) == 2
-    either_depth = grow(voxels, **{**growth, "distance_m": None, "viewer_m": STATION[0]})
+    points = sampled((upper, lower), noise_m=0.001)
+    assert len(grown(points, 0.18).planes) == 2
+    either_depth = grown(points, 0.18, criterion="normal")
     # All but the voxels at the step itself, whose neighbourhoods lean.
     assert either_depth.n_points.max() > 0.85 * 55_000
 

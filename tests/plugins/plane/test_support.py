@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from orthoflow_plugins.plane.support import (
     CellSums,
     SurfaceRaster,
-    cell_for,
     crowded_cells,
     support_of,
 )
@@ -55,18 +54,12 @@ def test_a_raster_covers_the_box_with_cells_of_the_side_asked_for() -> None:
     assert flat.shape == (1, 50)
 
 
-def test_slabs_count_from_the_origin_or_from_the_low_corner() -> None:
+def test_slabs_and_bounds_count_from_the_origin() -> None:
     raster = raster_of((4, 5))
     rows = raster.slab().reshape(3, 4)
     np.testing.assert_array_equal(rows[:, :3], [PLANE.normal, *raster.axes])
     np.testing.assert_array_equal(rows[:, 3], [-2.0, 0.0, 0.0])
-    np.testing.assert_array_equal(raster.slab(from_low=True)[[3, 7, 11]], [-2.0, -1.0, 3.0])
-
-
-def test_cells_hold_a_dozen_points_and_are_no_smaller_than_five_centimetres() -> None:
-    assert cell_for(1_200.0, 4.0) == pytest.approx(0.2)
-    assert cell_for(1e9, 4.0) == 0.05
-    assert cell_for(0.0, 4.0) == cell_for(5.0, 0.0) == 0.05
+    np.testing.assert_allclose(raster.bounds_m(), [-1.0, -0.5, 3.0, 3.4])
 
 
 def test_crowded_cells_have_most_points_in_the_inner_slab_and_like_neighbours() -> None:
@@ -123,18 +116,6 @@ def test_parts_are_joined_over_gaps_of_four_cells_and_listed_by_points() -> None
     assert alone.n_points == 9 * 32
     np.testing.assert_allclose(alone.parts_m, support.parts_m[:1])
     np.testing.assert_allclose(alone.bounds_m, support.parts_m[0])
-
-
-def test_parts_with_a_fair_share_of_the_cells_count() -> None:
-    belongs = np.zeros((20, 40), dtype=bool)
-    belongs[:10, :10] = True
-    for n_cells, counts in ((3, False), (4, True)):
-        belongs[15, 30:] = False
-        belongs[15, 30 : 30 + n_cells] = True
-        support = support_of(raster_of((20, 40)), belongs, sums_of(belongs.astype(np.int64)))
-        assert support is not None
-        # Three of 103 are less than three in a hundred.
-        assert len(support.parts_m) == 1 + counts
 
 
 def test_cells_that_all_lie_scattered_support_nothing() -> None:

@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.segment import areas
-from orthoflow_plugins.segment.areas import Area, AreaRule, Relief, open_areas, relief_of
-from orthoflow_plugins.segment.sight_lines import SightLines
+from orthoflow_plugins.segment.areas import Area, Relief, SightLines, open_areas, relief_of
 
 from orthoflow.products import Wall
 from tests import samples
 
 GSD_M = 0.02
 SHAPE = (60, 80)
-RULE = AreaRule(behind_m=0.05, width_least_m=0.2, area_least_m2=0.05, seen_least=0.5)
+BEHIND_M, WIDTH_LEAST_M, AREA_LEAST_M2 = 0.05, 0.2, 0.05
 
 
 def wall(depth_m: NDArray[np.float32]) -> Wall:
@@ -66,7 +65,7 @@ def test_cells_farther_behind_the_face_than_asked_are_open(
 ) -> None:
     depth = flat()
     depth[10:30, 20:50] = -behind_m
-    found = relief_of(wall(depth), None, RULE)
+    found = relief_of(wall(depth), None, BEHIND_M)
     expected = block(10, 30, 20, 50) if is_behind else block(0, 0, 0, 0)
     # Its corners are rounded by the median of 5 x 5 cells, by three cells each.
     assert np.count_nonzero(found.is_open ^ expected) == (12 if is_behind else 0)
@@ -80,7 +79,7 @@ def test_single_cells_decide_nothing_and_holes_of_three_by_five_do() -> None:
     depth = flat()
     depth[10, 10] = depth[20, 20:24] = np.nan
     depth[30:33, 30:35] = -1.0
-    found = relief_of(wall(depth), None, RULE)
+    found = relief_of(wall(depth), None, BEHIND_M)
     assert found.is_open[31, 32]
     found.is_open[28:36, 28:38] = False
     assert not found.is_open.any()
@@ -91,13 +90,13 @@ def test_single_cells_decide_nothing_and_holes_of_three_by_five_do() -> None:
 def test_the_face_is_what_more_than_half_of_the_wall_is_on(n_deep_rows: int, face_m: float) -> None:
     depth = flat()
     depth[:n_deep_rows] = -0.2
-    found = relief_of(wall(depth), None, RULE)
+    found = relief_of(wall(depth), None, BEHIND_M)
     assert found.face_m == pytest.approx(face_m, abs=1e-6)
     # Open is what lies behind the face.
     assert found.is_open[5, 40] == (face_m == 0.0)
     # Cells without depth are of neither half.
     depth[-10:] = np.nan
-    assert relief_of(wall(depth), None, RULE).face_m == pytest.approx(-0.2, abs=1e-6)
+    assert relief_of(wall(depth), None, BEHIND_M).face_m == pytest.approx(-0.2, abs=1e-6)
 
 
 def test_empty_cells_are_open_unless_hidden_and_crossed_only_where_empty() -> None:
@@ -106,12 +105,12 @@ def test_empty_cells_are_open_unless_hidden_and_crossed_only_where_empty() -> No
     tiles = np.zeros((6, 8), dtype=np.bool_)
     tiles[1:3, 1:3] = True
     lines = SightLines(side=10, crossed=tiles, stopped=np.flip(tiles, axis=1))
-    found = relief_of(wall(depth), lines, RULE)
+    found = relief_of(wall(depth), lines, BEHIND_M)
     np.testing.assert_array_equal(found.is_crossed, block(10, 30, 10, 30))
     assert found.is_open[20, 20]
     assert not found.is_open[20, 60]
-    assert relief_of(wall(depth), None, RULE).is_open[20, 60]
-    assert not relief_of(wall(flat()), lines, RULE).is_crossed.any()
+    assert relief_of(wall(depth), None, BEHIND_M).is_open[20, 60]
+    assert not relief_of(wall(flat()), lines, BEHIND_M).is_crossed.any()
 
 
 def test_of_a_large_wall_every_nth_cell_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -119,16 +118,16 @@ def test_of_a_large_wall_every_nth_cell_is_taken(monkeypatch: pytest.MonkeyPatch
     depth[9:30, 21:51] = -0.25
     # 60 x 80 cells: a fourth of them is one too many, a ninth is not.
     monkeypatch.setattr(areas, "_CELLS_TOLD", 1199)
-    found = relief_of(wall(depth), None, RULE)
+    found = relief_of(wall(depth), None, BEHIND_M)
     assert (found.step, found.gsd_m) == (3, pytest.approx(3 * GSD_M))
     np.testing.assert_array_equal(found.depth_m, depth[::3, ::3])
     monkeypatch.setattr(areas, "_CELLS_TOLD", 1200)
-    assert relief_of(wall(depth), None, RULE).step == 2
+    assert relief_of(wall(depth), None, BEHIND_M).step == 2
 
 
 def test_areas_come_from_the_largest_with_a_rim_of_other_cells() -> None:
     small, large = block(5, 20, 60, 75), block(10, 50, 10, 40)
-    found = list(open_areas(relief(small | large), RULE))
+    found = list(open_areas(relief(small | large), WIDTH_LEAST_M, AREA_LEAST_M2))
     assert [np.count_nonzero(area.cells) for area in found] == [1200, 225]
     for area, cells in zip(found, (large, small), strict=True):
         np.testing.assert_array_equal(whole(area), cells)
@@ -142,17 +141,17 @@ def test_areas_come_from_the_largest_with_a_rim_of_other_cells() -> None:
 def test_bars_across_an_opening_are_part_of_it() -> None:
     cells = block(10, 50, 10, 40)
     cells[28:31, 20:30] = False
-    (area,) = open_areas(relief(cells), RULE)
+    (area,) = open_areas(relief(cells), WIDTH_LEAST_M, AREA_LEAST_M2)
     np.testing.assert_array_equal(whole(area), block(10, 50, 10, 40))
 
 
 @pytest.mark.parametrize(("neck", "n_areas"), [(2, 2), (3, 1), (4, 1)])
 def test_what_is_narrower_than_three_cells_joins_no_areas(neck: int, n_areas: int) -> None:
     cells = block(10, 50, 5, 30) | block(10, 50, 45, 70) | block(20, 20 + neck, 30, 45)
-    assert len(list(open_areas(relief(cells), RULE))) == n_areas
+    assert len(list(open_areas(relief(cells), WIDTH_LEAST_M, AREA_LEAST_M2))) == n_areas
     # Nor does a corner that two have in common.
     touching = block(5, 25, 5, 30) | block(25, 45, 30, 55)
-    assert len(list(open_areas(relief(touching), RULE))) == 2
+    assert len(list(open_areas(relief(touching), WIDTH_LEAST_M, AREA_LEAST_M2))) == 2
 
 
 @pytest.mark.parametrize("axis", [0, 1])
@@ -162,15 +161,15 @@ def test_a_square_of_the_least_width_fits_into_an_opening(
 ) -> None:
     # 0.2 m are ten cells; at the border of the raster, too.
     cells = block(0, width, 10, 50) if axis else block(10, 50, 0, width)
-    assert len(list(open_areas(relief(cells), RULE))) == is_opening
+    assert len(list(open_areas(relief(cells), WIDTH_LEAST_M, AREA_LEAST_M2))) == is_opening
 
 
 def test_the_least_area_is_that_of_an_opening() -> None:
     # 0.05 m2 are 125 cells.
-    assert len(list(open_areas(relief(block(10, 20, 10, 22)), RULE))) == 0
-    assert len(list(open_areas(relief(block(10, 20, 10, 23)), RULE))) == 1
-    exactly = replace(RULE, area_least_m2=120 * GSD_M**2)
-    assert len(list(open_areas(relief(block(10, 20, 10, 22)), exactly))) == 1
+    assert len(list(open_areas(relief(block(10, 20, 10, 22)), WIDTH_LEAST_M, AREA_LEAST_M2))) == 0
+    assert len(list(open_areas(relief(block(10, 20, 10, 23)), WIDTH_LEAST_M, AREA_LEAST_M2))) == 1
+    exactly_m2 = 120 * GSD_M**2
+    assert len(list(open_areas(relief(block(10, 20, 10, 22)), WIDTH_LEAST_M, exactly_m2))) == 1
 
 
 @pytest.mark.parametrize(
@@ -197,7 +196,7 @@ def test_the_kind_is_told_by_the_share_of_cells(n_crossed: int, n_empty: int, ki
     made = relief(
         cells, is_crossed=first(n_crossed), is_empty=first(n_empty), depth_m=depth, face_m=0.1
     )
-    (area,) = open_areas(made, RULE)
+    (area,) = open_areas(made, WIDTH_LEAST_M, AREA_LEAST_M2)
     assert area.kind == kind
     if n_empty == 400:
         assert area.depth_m is None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.segment.figures import outline_map
+from orthoflow_plugins.segment.openings import outline_map
 
 from orthoflow.files.images import decode_image
 
@@ -17,32 +17,6 @@ def drawn(shape: tuple[int, int], grey: float = 0.5, **outlines: NDArray[np.floa
     given = [(kinds[name], corners) for name, corners in outlines.items()]
     picture = np.full(shape, grey, dtype=np.float32)
     return decode_image(outline_map(picture, given), "a figure")  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("shape", "size"),
-    [
-        ((600, 900), (600, 900)),
-        ((1400, 700), (1400, 700)),
-        ((2800, 1400), (1400, 700)),
-        ((300, 4200), (100, 1400)),
-        ((250, 125), (500, 250)),
-        ((3, 5000), (1, 1400)),
-    ],
-)
-def test_a_picture_is_neither_too_large_nor_too_small(
-    shape: tuple[int, int], size: tuple[int, int]
-) -> None:
-    assert drawn(shape).shape == (*size, 3)
-
-
-def test_the_wall_is_pale_and_void_is_the_darkest() -> None:
-    levels = [int(np.median(drawn((600, 600), grey))) for grey in (np.nan, 0.0, 0.5, 1.0, 7.0)]
-    assert levels[0] == levels[1] < levels[2] < levels[3] == levels[4]
-    # Never black, nor quite white, so that outlines of any colour stand out.
-    assert levels[0] > 50
-    assert levels[3] < 255
-    assert levels[2] - levels[1] == pytest.approx(levels[3] - levels[2], abs=2)
 
 
 @pytest.mark.parametrize("factor", [1, 3])
@@ -70,15 +44,3 @@ def test_an_outline_lies_on_its_corners_in_the_colour_of_its_kind(
     # Its number stands inside, at the upper left.
     inside = changed[round(low[1]) + 5 : round(low[1]) + 30, round(low[0]) + 5 : round(low[0]) + 30]
     assert inside.sum() > 20
-
-
-def test_kinds_have_colours_of_their_own() -> None:
-    at = (slice(60, 150), slice(39, 42))
-    shown = {
-        kind: drawn((600, 700), **{kind: CORNERS})[at] for kind in ("through", "niche", "nothing")
-    }
-    means = {kind: part.reshape(-1, 3).astype(float).mean(axis=0) for kind, part in shown.items()}
-    assert means["through"].argmax() == 2
-    assert means["niche"].argmax() == 0
-    assert means["niche"].argmin() == 2
-    assert means["nothing"].argmin() == 1

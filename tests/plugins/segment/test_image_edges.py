@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.segment.image_edges import Moved, moved_to_edges
-from orthoflow_plugins.segment.outlines import Outline
+from orthoflow_plugins.segment.outlines import Outline, moved_to_edges
 
 SHAPE = (100, 120)
 # The left side of the outline; its edge is painted so many cells beside it.
@@ -41,12 +40,12 @@ def picture(*rows: NDArray[np.float64], grey: float = 60.0) -> NDArray[np.float3
     return np.tile(grey + np.sum(rows, axis=0), (SHAPE[0], 1)).astype(np.float32)
 
 
-def left_side(moved: Moved) -> float | None:
+def left_side(moved: tuple[Outline, NDArray[np.bool_]]) -> float | None:
     """How far outwards, to the left, the left side has moved; None where it stayed."""
-    if not moved.by_image[0]:
-        np.testing.assert_array_equal(moved.outline.corners[:2], CORNERS[:2])
+    if not moved[1][0]:
+        np.testing.assert_array_equal(moved[0].corners[:2], CORNERS[:2])
         return None
-    shifts = LEFT - moved.outline.corners[:2, 0]
+    shifts = LEFT - moved[0].corners[:2, 0]
     assert shifts[0] == pytest.approx(shifts[1], abs=1e-9)
     return float(shifts[0])
 
@@ -58,10 +57,10 @@ def test_a_side_moves_to_where_the_edge_was_painted(place: float, way: str) -> N
     moved = moved_to_edges(outline(), picture(sign * step_at(LEFT + place), grey=120.0))
     # A tenth of a cell: of cells that are covered in part a share is lost.
     assert left_side(moved) == pytest.approx(-place, abs=0.1)
-    assert moved.by_image.tolist() == [True, False, False, False]
-    assert moved.outline.sigma[0] == pytest.approx(SIGMA, abs=1e-9)
-    np.testing.assert_array_equal(moved.outline.sigma[1:], 1.0)
-    np.testing.assert_allclose(moved.outline.corners[2:], CORNERS[2:], atol=1e-9)
+    assert moved[1].tolist() == [True, False, False, False]
+    assert moved[0].sigma[0] == pytest.approx(SIGMA, abs=1e-9)
+    np.testing.assert_array_equal(moved[0].sigma[1:], 1.0)
+    np.testing.assert_allclose(moved[0].corners[2:], CORNERS[2:], atol=1e-9)
 
 
 def test_a_blurred_edge_is_found_in_its_middle() -> None:
@@ -81,13 +80,13 @@ def test_every_side_moves_outwards_alike() -> None:
     square = (50.0 + 100.0 * np.outer(rows, columns)).astype(np.float32)
     corners = np.array([[30.0, 20.0], [30.0, 70.0], [80.0, 70.0], [80.0, 20.0]])
     moved = moved_to_edges(outline(corners), square)
-    assert moved.by_image.all()
+    assert moved[1].all()
     expected = np.array([[left, top], [left, bottom], [right, bottom], [right, top]])
-    np.testing.assert_allclose(moved.outline.corners, expected, atol=0.1)
+    np.testing.assert_allclose(moved[0].corners, expected, atol=0.1)
     for turns in range(1, 4):
         corners, expected = quarter(corners), quarter(expected)
         turned = moved_to_edges(outline(corners), np.rot90(square, turns).copy())
-        np.testing.assert_allclose(turned.outline.corners, expected, atol=0.1)
+        np.testing.assert_allclose(turned[0].corners, expected, atol=0.1)
 
 
 def quarter(places: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -100,7 +99,7 @@ def test_sides_of_twenty_cells_and_more_are_long_enough(length: float, is_moved:
     corners = CORNERS.copy()
     corners[1:3, 1] = TOP + length
     moved = moved_to_edges(outline(corners), picture(step_at(LEFT)))
-    assert bool(moved.by_image[0]) == is_moved
+    assert bool(moved[1][0]) == is_moved
 
 
 def test_sides_that_were_not_seen_stay() -> None:
@@ -174,7 +173,7 @@ def test_the_ends_of_a_side_and_what_lies_beyond_do_not_count() -> None:
     moved = moved_to_edges(outline(), grey)
     assert left_side(moved) == pytest.approx(-0.3, abs=0.03)
     # All profiles are whole: nothing of the void has come into one.
-    assert moved.outline.sigma[0] == pytest.approx(SIGMA, abs=1e-9)
+    assert moved[0].sigma[0] == pytest.approx(SIGMA, abs=1e-9)
 
 
 def test_an_edge_that_wanders_is_as_exact_as_the_mean_of_its_pieces() -> None:
@@ -186,7 +185,7 @@ def test_an_edge_that_wanders_is_as_exact_as_the_mean_of_its_pieces() -> None:
     # Middles of five pieces, 10.4 rows from one to the next.
     off = slope * 10.4 * np.arange(-2.0, 3.0)
     expected = np.hypot(SIGMA, np.std(off, ddof=1) / np.sqrt(5.0))
-    assert moved.outline.sigma[0] == pytest.approx(expected, abs=0.004)
+    assert moved[0].sigma[0] == pytest.approx(expected, abs=0.004)
 
 
 @pytest.mark.parametrize(("turn_deg", "is_met"), [(12.0, False), (18.0, True), (-18.0, True)])
@@ -198,12 +197,12 @@ def test_corners_lie_on_the_moved_sides_unless_these_run_on_in_one_line(
     second = np.array([LEFT, 70.0]) + 10.0 * np.array([np.sin(turn), np.cos(turn)])
     corners = np.array([[LEFT, TOP], [LEFT, 70.0], second, [100.0, 70.0], [100.0, TOP]])
     moved = moved_to_edges(outline(corners), picture(step_at(LEFT + 0.3)))
-    assert moved.by_image.tolist() == [True, False, False, False, False]
-    shift = moved.outline.corners[1] - corners[1]
+    assert moved[1].tolist() == [True, False, False, False, False]
+    shift = moved[0].corners[1] - corners[1]
     if is_met:
         # On the moved side, and on the next one, which stayed.
         assert shift[0] == pytest.approx(0.3, abs=0.05)
         assert shift[0] * np.cos(turn) == pytest.approx(shift[1] * np.sin(turn), abs=1e-9)
     else:
         np.testing.assert_allclose(shift, [0.15, 0.0], atol=0.02)
-    np.testing.assert_array_equal(moved.outline.corners[2:4], corners[2:4])
+    np.testing.assert_array_equal(moved[0].corners[2:4], corners[2:4])

@@ -109,24 +109,6 @@ def test_turned_sides_lie_where_they_are_to_a_fraction_of_a_cell(degrees: float)
     assert np.all(found.sigma <= UNIFORM * np.hypot(2.0, 1.0) + 0.01)
 
 
-def test_a_triangle_keeps_its_three_corners() -> None:
-    corners = np.array([[30.0, 20.0], [30.0, 90.0], [130.0, 90.0]])
-    assert_corners(outline(within(corners)), corners, within_cells=1.0)
-
-
-def test_mirrored_cells_have_the_mirrored_outline() -> None:
-    cells = block()
-    cells[TOP : TOP + 25, LEFT : LEFT + 40] = False
-    cells[80:, 60:75] = False
-    there = outline(cells)
-    for axis, size in ((1, SHAPE[1]), (0, SHAPE[0])):
-        mirrored = outline(np.flip(cells, axis=axis))
-        expected = there.corners[::-1].copy()
-        expected[:, 1 - axis] = size - expected[:, 1 - axis]
-        assert_corners(mirrored, expected)
-    assert len(there.corners) == 10
-
-
 @pytest.mark.parametrize("at_row", [TOP, BOTTOM], ids=["above", "below"])
 @pytest.mark.parametrize(
     ("height", "is_corner"), [(1, False), (2, False), (3, True), (-2, False), (-3, True)]
@@ -164,11 +146,6 @@ def test_a_corner_cut_short_is_put_back_and_a_long_cut_is_a_side(cut: int, is_co
         assert_corners(found, np.vstack([cut_off, CORNERS[1:]]), within_cells=1.0)
 
 
-def test_a_short_side_stays_where_its_neighbours_meet_far_off() -> None:
-    corners = np.array([[77.0, 30.0], [60.0, 90.0], [100.0, 90.0], [83.0, 30.0]])
-    assert_corners(outline(within(corners)), corners, within_cells=3.0)
-
-
 def test_a_side_is_the_less_exact_the_more_it_scatters_and_the_fewer_points_it_has() -> None:
     # Every other cell sticks out by one: middles lie at 0, 1/2, 1 and 1/2 of it.
     cells = block()
@@ -193,22 +170,6 @@ def test_what_is_far_off_even_for_a_rough_side_does_not_move_it() -> None:
     np.testing.assert_allclose(ends, TOP - 0.5, atol=0.06)
 
 
-@pytest.mark.parametrize(("side", "is_short"), [(7, True), (20, False)])
-def test_short_sides_are_left_where_their_cells_end(side: int, is_short: bool) -> None:
-    found = outline(block(50, 50, 50 + side, 90))
-    assert len(found.corners) == 4
-    assert_corners(
-        found,
-        np.array([[50, 50], [50, 90], [50 + side, 90], [50 + side, 50]], dtype=np.float64),
-        within_cells=0.8 if is_short else 1e-6,
-    )
-    # Two cells: what corners are told by.
-    ends = found.sigma > UNIFORM * np.hypot(2.0, 1.0) + 0.1
-    assert np.count_nonzero(ends) == (2 if is_short else 0)
-    if is_short:
-        np.testing.assert_allclose(found.sigma[ends] ** 2, 5.0 / 12.0 + 4.0, rtol=1e-9)
-
-
 def test_of_a_single_cell_nothing_is_left() -> None:
     assert drawn(block(50, 50, 51, 51)) is None
 
@@ -218,28 +179,6 @@ def test_cells_that_do_not_hang_together_are_no_area() -> None:
     cells[:, 70:80] = False
     with pytest.raises(MethodError, match="must be connected, got 2 parts"):
         outline(cells)
-
-
-def test_an_outline_ends_with_the_raster() -> None:
-    cells = np.zeros(SHAPE, dtype=np.bool_)
-    cells[:60, 100:] = True
-    found = outline(cells)
-    assert_corners(found, np.array([[100.0, 0.0], [100.0, 60.0], [160.0, 60.0], [160.0, 0.0]]))
-    begin = int(np.linalg.norm(found.corners - [100.0, 0.0], axis=1).argmin())
-    # Left and below there is face, beyond the raster nothing.
-    np.testing.assert_array_equal(np.roll(found.seen_share, -begin), [1.0, 1.0, 0.0, 0.0])
-    assert found.seen_of_all == pytest.approx((60.0 + 60.0) / 240.0)
-
-
-@pytest.mark.parametrize("left_cells", [2, 3, 4])
-def test_of_what_lies_beside_a_side_the_raster_holds_some(left_cells: int) -> None:
-    right, bottom = SHAPE[1] - left_cells, SHAPE[0] - left_cells
-    found = outline(block(right=right, bottom=bottom))
-    corners = np.array([[LEFT, TOP], [LEFT, bottom], [right, bottom], [right, TOP]])
-    begin = int(np.linalg.norm(found.corners - corners[0], axis=1).argmin())
-    # The third cell to the right of a side and below it is the first that is asked.
-    is_seen = [1.0, float(left_cells > 2), float(left_cells > 2), 1.0]
-    np.testing.assert_array_equal(np.roll(found.seen_share, -begin), is_seen)
 
 
 @pytest.mark.parametrize("cells_off", range(1, 8))
@@ -255,18 +194,6 @@ def test_a_side_is_seen_where_there_is_face_two_to_four_cells_beside_it(cells_of
     # Borders lie between cells: the cell on one is the one below or right of it.
     assert {left, top} == {1.0 if 1 <= cells_off <= 3 else 0.0}
     assert {right, bottom} == {1.0 if 2 <= cells_off <= 4 else 0.0}
-
-
-@pytest.mark.parametrize(("n_cells", "is_seen"), [(34, False), (35, True), (36, True)])
-def test_a_side_half_of_which_has_face_beside_it_is_seen(n_cells: int, is_seen: bool) -> None:
-    face = np.zeros(SHAPE, dtype=np.bool_)
-    face[TOP : TOP + n_cells, :LEFT] = True
-    found = outline(block(), is_face=face)
-    begin = int(np.linalg.norm(found.corners - CORNERS[0], axis=1).argmin())
-    shares = np.roll(found.seen_share, -begin)
-    np.testing.assert_allclose(shares, [n_cells / 70.0, 0.0, 0.0, 0.0], atol=1e-9)
-    assert np.roll(found.is_seen, -begin).tolist() == [is_seen, False, False, False]
-    assert found.seen_of_all == pytest.approx(n_cells / 340.0)
 
 
 def side_at(degrees: float, middle: tuple[float, float]) -> module._Side:
@@ -369,16 +296,3 @@ def test_the_line_of_a_side_goes_through_what_lies_between_its_ends() -> None:
     assert side.middle is not None
     np.testing.assert_allclose([side.middle, [0.0, 0.7]], [[25.0, 0.0], [0.0, 0.7]], atol=1e-9)
     np.testing.assert_array_equal([side.begin, side.end], [[20.0, 0.7], [30.0, 0.7]])
-
-
-def test_a_side_is_placed_by_as_many_points_as_fit_on_it() -> None:
-    ends = {"begin": np.array([90.0, 40.0]), "end": np.array([90.0, 20.0])}
-    known = {"middle": np.array([90.0, 30.0]), "direction": np.array([0.0, -1.0])}
-    places = {"first": 0, "last": 20, "scatter": 3.0}
-    for spacing, scatter in ((5.0, 1.5), (40.0, 3.0)):
-        border = (2.0**2 + spacing**2) / 12.0
-        side = module._Side(**places, **ends, **known)
-        assert module._sigma(side, spacing) ** 2 == pytest.approx(border + scatter**2)
-        # A side without a line of its own has its corners alone.
-        side = module._Side(**places, **ends)
-        assert module._sigma(side, spacing) ** 2 == pytest.approx(border + 9.0)

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.segment import sight_lines as module
-from orthoflow_plugins.segment.sight_lines import SightLines, sight_lines
+from orthoflow_plugins.segment import areas as module
+from orthoflow_plugins.segment.areas import SightLines, sight_lines
 
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud

@@ -8,18 +8,14 @@ from typing import Final
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.kernels import blocked, box_blocks
-from orthoflow_plugins.plane.vote_kernels import (
+from orthoflow_plugins.plane.votes import (
     VOTE_SHARES,
     best_bins,
+    sharpest,
     vote_image,
-    vote_lines,
+    vote_places,
     vote_planes,
-    vote_points,
-    vote_tilts,
 )
-
-from orthoflow.geometry.point_kernels import read_only
 
 SEEDS: Final = range(3)
 
@@ -65,7 +61,7 @@ def test_cells_of_an_image_vote_for_the_lines_through_them(
 ) -> None:
     image = random_image(np.random.default_rng(0), shape)
     angles = np.radians(np.arange(0.0, 180.0, 7.2))
-    votes = np.ones((len(angles), n_bins), dtype=np.int64)
+    votes = np.ones((len(angles), n_bins), dtype=np.int32)
     vote_image(image, angles, votes)
     expected = [voted(image, math.cos(angle), math.sin(angle), n_bins) for angle in angles]
     np.testing.assert_array_equal(votes - 1, expected)
@@ -97,64 +93,28 @@ def test_places_vote_for_the_planes_through_them(seed: int) -> None:
         np.testing.assert_array_equal(found, voted(upright, math.sin(phi), math.cos(phi), n_bins))
 
 
-@pytest.mark.parametrize("axis", [0, 2])
-def test_places_on_the_first_edge_of_the_image_count_and_those_on_the_last_do_not(
-    axis: int,
-) -> None:
-    # Four cells of 1 m about the middle; every second place lies on an edge of a cell.
-    along = np.arange(-2.5, 2.75, 0.25, dtype=np.float32)
-    places = np.full((3, len(along)), 0.5, dtype=np.float32)
-    places[axis] = along
-    weights = np.ones(len(along), dtype=np.int32)
-    angles = np.array([[0.0, 0.0 if axis == 0 else math.pi / 2]])
-    image, votes = np.zeros((4, 4), dtype=np.int32), np.zeros((1, 8), dtype=np.int32)
-    vote_planes(places, weights, angles, np.array([0, 1]), image, 1.0, votes)
-    expected = [0, 0, *[4 * VOTE_SHARES] * 4, 0, 0]
-    np.testing.assert_array_equal(votes[0], expected)
-    assert not image.any()
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_lines_and_points_vote_at_their_distance(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    angles = np.radians([0.0, 20.0, 75.0, 90.0, 160.0])
-    low_m, bin_m, n_bins = -0.7, 0.13, 12
-    cells = rng.uniform(-1.0, 1.0, (80, 2)).astype(np.float32)
-    weights = rng.integers(-3, 9, 80)
-    votes = np.ones((5, n_bins), dtype=np.int64)
-    vote_lines(cells, weights, angles, low_m, bin_m, votes)
-    points_m = rng.uniform(-1.0, 1.0, (300, 3)).astype(np.float32)
-    offsets = read_only(*np.ascontiguousarray(points_m.T))
-    points = blocked(offsets, box_blocks(offsets, parts=1).boxes)
-    basis = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    plan = np.column_stack([basis[:2], rng.uniform(-0.4, 0.4, 2)])
-    of_points = np.ones((5, n_bins), dtype=np.int64)
-    vote_points(points, plan, angles, low_m, bin_m, of_points)
-    in_plan = points_m @ plan[:, :3].T - plan[:, 3]
-    edges = low_m + bin_m * np.arange(n_bins + 1)
-    for angle, found, found_of_points in zip(angles, votes, of_points, strict=True):
-        direction = np.array([math.cos(angle), math.sin(angle)])
-        expected = np.histogram(cells @ direction, edges, weights=weights)[0]
-        np.testing.assert_array_equal(found - 1, expected)
-        expected = np.histogram(in_plan @ direction, edges)[0]
-        assert 0 < expected.sum() < 300
-        np.testing.assert_array_equal(found_of_points - 1, expected)
-
-
-def test_tilts_are_voted_for_at_the_height_above_the_tilted_plane() -> None:
+def test_places_vote_one_by_one_at_their_distance() -> None:
     rng = np.random.default_rng(0)
     places = rng.uniform(-1.0, 1.0, (3, 300)).astype(np.float32)
-    weights = rng.integers(1, 9, 300).astype(np.int32)
-    slopes = np.array([[0.0, 0.0], [0.2, 0.0], [0.0, -0.3], [0.1, 0.15]])
+    weights = rng.integers(-3, 9, 300).astype(np.int32)
+    normals = np.array([[0.0, 0.0, 1.0], [-0.2, 0.0, 1.0], [0.6, 0.8, 0.0], [-0.1, -0.15, 1.0]])
     low_m, bin_m, n_bins = -0.6, 0.1, 12
-    votes = np.ones((4, n_bins), dtype=np.int64)
-    vote_tilts(places, weights, slopes, low_m, bin_m, votes)
+    votes = np.ones((4, n_bins), dtype=np.int32)
+    vote_places(places, weights, normals, low_m, bin_m, votes)
     edges = low_m + bin_m * np.arange(n_bins + 1)
-    for slope, found in zip(slopes, votes, strict=True):
-        heights = places[2] - slope @ places[:2]
-        expected = np.histogram(heights, edges, weights=weights)[0]
-        assert 0 < expected.sum() < weights.sum()
+    for normal, found in zip(normals, votes, strict=True):
+        expected = np.histogram(normal @ places, edges, weights=weights)[0]
+        assert 0 < np.abs(expected).sum() < np.abs(weights).sum()
         np.testing.assert_array_equal(found - 1, expected)
+
+
+def test_a_maximum_lies_at_the_top_of_a_parabola_through_its_neighbours() -> None:
+    votes = np.zeros((2, 30), dtype=np.int32)
+    votes[1, 14:17] = (40, 100, 70)
+    row, place = sharpest(votes)
+    assert row == 1
+    # Windows of three bins hold 140, 210, 170 about the middle, and nothing beside them.
+    assert place == pytest.approx(15.5 + 0.5 * (140 - 170) / (140 - 420 + 170), abs=1e-9)
 
 
 @pytest.mark.parametrize(("half", "is_plain"), [(0, False), (1, False), (3, False), (0, True)])

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.compiling import compiled, kernel_part
-from orthoflow_plugins.plane.kernels import BlockedPoints
 
 # A vote is counted in quarters, so that it can be shared between two bins without a rounding that
 # would not cancel when it is taken back.
@@ -28,7 +27,7 @@ _TILE: Final = 16
 
 @compiled
 def vote_image(
-    image: NDArray[np.int32], angles_rad: NDArray[np.float64], votes: NDArray[np.int64]
+    image: NDArray[np.int32], angles_rad: NDArray[np.float64], votes: NDArray[np.int32]
 ) -> None:
     """Let the cells of an image vote for all lines through them.
 
@@ -54,70 +53,6 @@ def vote_image(
         else:
             piece = add_sheared(turned, turned_spans, sine / cosine, line)
             share_out(line, piece, (n_columns, n_rows), cosine, votes[a])
-
-
-@compiled
-def vote_lines(
-    cells: NDArray[np.float32],
-    weights: NDArray[np.int64],
-    angles_rad: NDArray[np.float64],
-    low_m: float,
-    bin_m: float,
-    votes: NDArray[np.int64],
-) -> None:
-    """Let each plan cell vote for all lines through it.
-
-    Args:
-        cells: (m, 2) centres in the plan, metres.
-        weights: (m,) votes a cell has.
-        angles_rad: (a,) directions of the lines' normals.
-        low_m: distance of the first bin's lower edge; bins that miss the table are dropped.
-        bin_m: width of a bin.
-        votes: (a, bins) table, added to. Equation 4 of markiewicz2015: r = x cos + y sin.
-    """
-    n_bins = votes.shape[1]
-    for angle in range(angles_rad.size):
-        cosine = math.cos(angles_rad[angle]) / bin_m
-        sine = math.sin(angles_rad[angle]) / bin_m
-        start = low_m / bin_m
-        for i in range(cells.shape[0]):
-            position = cells[i, 0] * cosine + cells[i, 1] * sine - start
-            if 0.0 <= position < n_bins:
-                votes[angle, int(position)] += weights[i]
-
-
-@compiled
-def vote_points(
-    points: BlockedPoints,
-    plan: NDArray[np.float64],
-    angles_rad: NDArray[np.float64],
-    low_m: float,
-    bin_m: float,
-    votes: NDArray[np.int64],
-) -> None:
-    """Let each point vote with its own coordinates; otherwise as `vote_lines`.
-
-    Args:
-        points: (n,) offsets in blocks.
-        plan: (2, 4) e1 and e2, each with the position of the plan's centre along it.
-        angles_rad: (a,) directions of the lines' normals.
-        low_m: distance of the first bin's lower edge.
-        bin_m: width of a bin.
-        votes: (a, bins) table, added to.
-    """
-    x, y, z = points.x, points.y, points.z
-    n_bins = votes.shape[1]
-    for angle in range(angles_rad.size):
-        cosine = math.cos(angles_rad[angle]) / bin_m
-        sine = math.sin(angles_rad[angle]) / bin_m
-        a = cosine * plan[0, 0] + sine * plan[1, 0]
-        b = cosine * plan[0, 1] + sine * plan[1, 1]
-        c = cosine * plan[0, 2] + sine * plan[1, 2]
-        start = low_m / bin_m + cosine * plan[0, 3] + sine * plan[1, 3]
-        for i in range(x.size):
-            position = a * x[i] + b * y[i] + c * z[i] - start
-            if 0.0 <= position < n_bins:
-                votes[angle, int(position)] += 1
 
 
 @kernel_part
@@ -265,21 +200,21 @@ def best_bins(
 
 
 @compiled
-def vote_tilts(
+def vote_places(
     places: NDArray[np.float32],
     weights: NDArray[np.int32],
-    slopes: NDArray[np.float64],
+    normals: NDArray[np.float64],
     low_m: float,
     bin_m: float,
-    votes: NDArray[np.int64],
+    votes: NDArray[np.int32],
 ) -> None:
-    """Let places near a plane vote for planes that lean a little from it.
+    """Let places vote one by one, for the planes, or lines of a plan, through them.
 
     Args:
-        places: (3, m) u and v on the plane and the distance from it, metres.
+        places: (3, m) metres; a plan's have no third coordinate, 0.
         weights: (m,) votes of each.
-        slopes: (t, 2) rise per metre along u and v.
-        low_m: lower edge of the first bin.
+        normals: (t, 3) directions that distances are counted along. Equation 4 of markiewicz2015.
+        low_m: lower edge of the first bin; what misses the table is dropped.
         bin_m: width of a bin.
         votes: (t, bins) added to.
     """
@@ -287,9 +222,10 @@ def vote_tilts(
     bins = np.empty(places.shape[1], dtype=np.int32)
     us, vs, heights = places[0], places[1], places[2]
     zero, none, top = np.float32(0.0), np.int32(-1), np.float32(n_bins)
-    for t in range(slopes.shape[0]):
-        a, b = np.float32(-slopes[t, 0] / bin_m), np.float32(-slopes[t, 1] / bin_m)
-        c, d = np.float32(1.0 / bin_m), np.float32(-low_m / bin_m)
+    d = np.float32(-low_m / bin_m)
+    for t in range(normals.shape[0]):
+        a, b = np.float32(normals[t, 0] / bin_m), np.float32(normals[t, 1] / bin_m)
+        c = np.float32(normals[t, 2] / bin_m)
         for i in range(bins.size):
             place = c * heights[i] + a * us[i] + b * vs[i] + d
             within = (place >= zero) & (place < top)
@@ -388,12 +324,22 @@ def turn_image(
                     turned[column, row] = image[row, column]
 
 
-def contrast(votes: NDArray[np.int64], half: int) -> NDArray[np.float64]:
+def best_bin(
+    votes: NDArray[np.int32], barred: NDArray[np.uint8], half: int, *, is_plain: bool
+) -> tuple[int, int, int]:
+    """Score, row and bin of the best window in a table; see `best_bins`."""
+    scores, places = np.zeros((2, len(votes)), dtype=np.int64)
+    best_bins(votes, np.arange(len(votes)), half, is_plain, barred, scores, places)
+    row = int(np.argmax(scores))
+    return int(scores[row]), row, int(places[row])
+
+
+def contrast(votes: NDArray[np.int32], half: int) -> NDArray[np.float64]:
     """Votes in a window of 2 half + 1 bins above those of the emptier neighbouring window."""
     width = 2 * half + 1
     gap = width + 1
     padded = np.pad(votes, ((0, 0), (half + gap + 1, half + gap)))
-    running = np.cumsum(padded, axis=1)
+    running = np.cumsum(padded, axis=1, dtype=np.int64)
     window = (running[:, width:] - running[:, :-width]).astype(np.float64)
     n_bins = votes.shape[1]
     middle = window[:, gap : gap + n_bins]
@@ -401,10 +347,15 @@ def contrast(votes: NDArray[np.int64], half: int) -> NDArray[np.float64]:
     return middle - np.minimum(left, right)
 
 
-def parabola(values: NDArray[np.float64], place: int) -> float:
-    """Return where between bins a maximum lies, -0.5..0.5."""
-    if not 0 < place < len(values) - 1:
-        return 0.0
-    before, here, after = values[place - 1 : place + 2]
-    bend = before - 2.0 * here + after
-    return 0.0 if bend >= 0.0 else float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5))
+def sharpest(votes: NDArray[np.int32]) -> tuple[int, float]:
+    """Row of (rows, bins) votes with the best maximum, and its place in bins from the start."""
+    scores = contrast(votes, 1)
+    row, column = np.unravel_index(int(np.argmax(scores)), scores.shape)
+    values, place = scores[row], int(column)
+    shift = 0.0
+    if 0 < place < len(values) - 1:
+        before, here, after = values[place - 1 : place + 2]
+        bend = before - 2.0 * here + after
+        # The top of a parabola through the three.
+        shift = 0.0 if bend >= 0.0 else float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5))
+    return int(row), place + 0.5 + shift

@@ -1,4 +1,4 @@
-"""What becomes of a candidate: refined, refused by a criterion, fitted to all points, labelled."""
+"""What becomes of candidates: refined, refused by a criterion, claimed, fitted, labelled."""
 
 from __future__ import annotations
 
@@ -8,10 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.candidates import FoundPlane, fit_to_all, label, name_points, verify
-from orthoflow_plugins.plane.cloud import Search
 from orthoflow_plugins.plane.detector import Candidate, Constraint
-from orthoflow_plugins.plane.search import find_planes, greedy_search
+from orthoflow_plugins.plane.search import (
+    Claim,
+    FoundPlane,
+    Search,
+    find_planes,
+    fit_to_all,
+    greedy_search,
+    label,
+    verify,
+)
 
 from orthoflow.geometry import Plane, angle_between_deg
 from tests.plane_scenes import (
@@ -50,7 +57,7 @@ def test_a_candidate_is_moved_to_the_surface_near_it(miss_m: float, lean: float)
     sizes = np.diff(found.support.bounds_m.reshape(2, 2), axis=1)[:, 0]
     np.testing.assert_allclose(sizes, [4.0, 2.0], atol=0.25)
     # What is taken is the wall, and within the tolerance.
-    search.claim(found.claim(TOLERANCE_M))
+    search.claim(Claim.of(found.raster, found.support, TOLERANCE_M))
     assert (search.claims[:8_000] == 0).mean() > 0.99
     assert (search.claims[8_000:] == -1).all()
 
@@ -213,7 +220,7 @@ def test_points_belong_to_the_nearest_plane_whose_rectangle_holds_them() -> None
     assert corner.sum() > 30
     np.testing.assert_array_equal(claims[corner], away_m[corner].argmin(axis=1))
     names, labels = np.array([7, 3, -1], dtype=np.int16), np.empty(len(points), dtype=np.int16)
-    name_points(search.cloud, names, labels)
+    search.cloud.write_labels(names, labels)
     np.testing.assert_array_equal(labels, names[claims])
 
 

@@ -1,0 +1,240 @@
+"""Plane detectors of open3d, as comparators: segment_plane, and detect_planar_patches."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping
+from functools import partial
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from pydantic import Field
+
+from orthoflow.errors import MethodError, PluginError
+from orthoflow.geometry import Plane
+from orthoflow.sdk import Method, StepContext
+from orthoflow_plugins.plane.detector import (
+    DETECTOR_METRICS,
+    Candidate,
+    DetectorIn,
+    DetectorOut,
+    DetectorParams,
+)
+
+if TYPE_CHECKING:
+    from orthoflow_plugins.plane.search import Search
+
+# Points of a candidate, as a share of those that a plane needs.
+PART_SHARE: Final = 0.2
+
+
+# Any: the library has no types.
+def load_open3d(purpose: str) -> Any:
+    """Import open3d.
+
+    Its wheel needs libusb-1.0.so.0, which fresh machines lack; the package libusb-package carries
+    it, and once loaded globally it is found.
+
+    Args:
+        purpose: what needs it, for the message.
+
+    Raises:
+        PluginError: it is not installed or does not load.
+    """
+    try:
+        usb = import_module("libusb_package")
+        ctypes.CDLL(str(usb.get_library_path()), mode=ctypes.RTLD_GLOBAL)
+    except (ImportError, OSError):
+        # The system may have libusb itself; if not, open3d says so below.
+        pass
+    try:
+        return import_module("open3d")
+    except ModuleNotFoundError as error:
+        raise PluginError(
+            f"{purpose} needs open3d, which is not installed: install it with "
+            "`python -m pip install open3d-cpu libusb-package`, or take a method without it"
+        ) from error
+    except (ImportError, OSError) as error:
+        raise PluginError(
+            f"{purpose} needs open3d, which does not load ({str(error).splitlines()[0]}): install "
+            "the system library that it names (Debian: apt-get install libgl1 libx11-6 "
+            "libusb-1.0-0), or take a method without it"
+        ) from error
+
+
+class _Open3dMethod(Method):
+    """What the methods of open3d have in common."""
+
+    determinism = "loose"
+    metrics = DETECTOR_METRICS
+    In = DetectorIn
+    Out = DetectorOut
+
+    @classmethod
+    def tools(cls) -> Mapping[str, str]:
+        """Version of open3d, which decides about results, under whichever name it is installed."""
+        for name in ("open3d-cpu", "open3d"):
+            try:
+                return {"open3d": version(name)}
+            except PackageNotFoundError:
+                continue
+        return {"open3d": "none"}
+
+
+class Open3dRansac(_Open3dMethod):
+    """Find planes with open3d's `segment_plane` on the points that remain, plane after plane.
+
+    For comparison: it looks at the same sample of the cloud as the other detectors, takes longer
+    than plane.ransac, and does not repeat itself exactly, whatever the seed. `refit: false` shows
+    what it finds by itself; with the common refit its planes are as good as those of any other
+    detector, where it finds them.
+    """
+
+    id = "plane.open3d-ransac"
+    citations = (
+        "Zhou, Park, Koltun 2018: Open3D, a modern library for 3D data, arXiv:1801.09847",
+        "Fischler, Bolles 1981: Random sample consensus, doi:10.1145/358669.358692",
+    )
+
+    class Params(DetectorParams):
+        """What may be set."""
+
+        n_iterations: int = Field(1000, ge=1, le=1_000_000, description="Hypotheses per plane.")
+
+    def run(self, inputs: DetectorIn, params: Params, ctx: StepContext) -> DetectorOut:
+        """Detect the planes of a cloud."""
+        from orthoflow_plugins.plane.search import detect
+
+        open3d = load_open3d(self.id)
+        open3d.utility.random.seed(int(ctx.rng.integers(2**31)))
+        proposer_of = partial(SegmentProposer, params=params, open3d=open3d)
+        return detect(inputs.cloud, params, ctx, proposer_of, method=self.id)[0]
+
+
+class SegmentProposer:
+    """Proposes the plane of `segment_plane` among the points that remain, again and again."""
+
+    # Any: the library has no types.
+    def __init__(self, search: Search, params: Open3dRansac.Params, open3d: Any) -> None:
+        """Get ready to propose; open3d takes no constraint, so other planes are passed over."""
+        self._params, self._open3d = params, open3d
+        self._passed_over = np.zeros(len(search.claims), dtype=bool)
+        self._last = np.zeros(0, dtype=np.int64)
+
+    def propose(self, search: Search) -> Candidate | None:
+        """Name the plane with most inliers, or None when it has too few."""
+        free = np.flatnonzero((search.claims < 0) & ~self._passed_over)
+        if len(free) < max(3.0, search.least_points):
+            return None
+        cloud = self._open3d.geometry.PointCloud()
+        cloud.points = self._open3d.utility.Vector3dVector(search.cloud.sample.offsets_m[free])
+        model, inliers = cloud.segment_plane(search.tolerance_m, 3, self._params.n_iterations)
+        normal = np.array(model[:3], dtype=np.float64)
+        length = float(np.linalg.norm(normal))
+        if len(inliers) < PART_SHARE * search.least_points or not length > 0.0:
+            return None
+        self._last = free[np.asarray(inliers, dtype=np.int64)]
+        return Candidate(
+            plane=Plane(normal=normal / length, offset_m=-float(model[3]) / length),
+            constraint=self._params.constraint,
+            votes=float(len(inliers)),
+        )
+
+    def reject(self, candidate: Candidate) -> None:
+        """Leave the inliers of what was no plane out of the next search."""
+        del candidate
+        self._passed_over[self._last] = True
+
+
+class Open3dPatches(_Open3dMethod):
+    """Find planes with open3d's `detect_planar_patches`, which grows patches by robust statistics.
+
+    For comparison: it looks at the same sample of the cloud as the other detectors, with normals of
+    nearest neighbours there. `refit: false` shows what it finds by itself: the middle of the box
+    about a patch, which mouldings pull off the wall.
+    """
+
+    id = "plane.open3d-patches"
+    citations = (
+        "Zhou, Park, Koltun 2018: Open3D, a modern library for 3D data, arXiv:1801.09847",
+        (
+            "Araujo, Oliveira 2020: A robust statistics approach for plane detection in "
+            "unorganized point clouds, doi:10.1016/j.patcog.2019.107115"
+        ),
+    )
+
+    class Params(DetectorParams):
+        """What may be set; the last three bear the meaning that open3d gives them."""
+
+        n_neighbours: int = Field(
+            30, ge=3, le=1000, description="Points of a neighbourhood, for normals and growing."
+        )
+        normal_variance_deg: float = Field(
+            60.0, gt=0.0, lt=90.0, description="Largest spread of the normals in a patch."
+        )
+        coplanarity_deg: float = Field(
+            75.0, gt=0.0, lt=90.0, description="How flat a patch must be; 90 is perfectly flat."
+        )
+        outlier_share: float = Field(
+            0.75, gt=0.0, lt=1.0, description="Share of points off the plane that a patch may have."
+        )
+
+    def run(self, inputs: DetectorIn, params: Params, ctx: StepContext) -> DetectorOut:
+        """Detect the planes of a cloud."""
+        from orthoflow_plugins.plane.search import detect
+
+        proposer_of = partial(PatchProposer, params=params, open3d=load_open3d(self.id))
+        return detect(inputs.cloud, params, ctx, proposer_of, method=self.id)[0]
+
+
+class PatchProposer:
+    """Proposes the patches of `detect_planar_patches`, that with most points in its box first."""
+
+    # Any: the library has no types.
+    def __init__(self, search: Search, params: Open3dPatches.Params, open3d: Any) -> None:
+        """Find all patches at once.
+
+        Raises:
+            MethodError: open3d gave up.
+        """
+        points_m = search.cloud.sample.offsets_m
+        cloud = open3d.geometry.PointCloud()
+        cloud.points = open3d.utility.Vector3dVector(points_m)
+        neighbours = open3d.geometry.KDTreeSearchParamKNN(knn=params.n_neighbours)
+        try:
+            cloud.estimate_normals(neighbours)
+            boxes = cloud.detect_planar_patches(
+                normal_variance_threshold_deg=params.normal_variance_deg,
+                coplanarity_deg=params.coplanarity_deg,
+                outlier_ratio=params.outlier_share,
+                min_num_points=max(10, int(PART_SHARE * search.least_points)),
+                search_param=neighbours,
+            )
+        except RuntimeError as error:
+            raise MethodError(
+                f"open3d's detect_planar_patches gave up on the {len(points_m)} points "
+                f"({str(error).splitlines()[0]}): try another n_neighbours or thinning"
+            ) from error
+        self._candidates = []
+        for box in boxes:
+            normal = np.asarray(box.R, dtype=np.float64)[:, 2]
+            offset_m = float(normal @ np.asarray(box.center, dtype=np.float64))
+            inside = len(box.get_point_indices_within_bounding_box(cloud.points))
+            self._candidates.append(
+                Candidate(
+                    plane=Plane(normal=normal, offset_m=offset_m),
+                    constraint=params.constraint,
+                    votes=float(inside),
+                )
+            )
+        self._candidates.sort(key=lambda candidate: -candidate.votes)
+
+    def propose(self, search: Search) -> Candidate | None:
+        """Name the next patch."""
+        del search
+        return self._candidates.pop(0) if self._candidates else None
+
+    def reject(self, candidate: Candidate) -> None:
+        """Do nothing: patches are named once in any case."""
