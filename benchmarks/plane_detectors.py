@@ -27,12 +27,13 @@ from great_room import FULL_POINTS, great_room
 from numpy.typing import NDArray
 from orthoflow_plugins.plane.cloud import PreparedCloud, prepare
 from orthoflow_plugins.plane.detector import DetectorParams
+from orthoflow_plugins.plane.fit import FoundPlane
 from orthoflow_plugins.plane.hough2d import Hough2d, PlanProposer
 from orthoflow_plugins.plane.hough3d import Hough3d, SpaceProposer
 from orthoflow_plugins.plane.planes import measure_planes
 from orthoflow_plugins.plane.ransac import ConsensusProposer, Ransac
 from orthoflow_plugins.plane.region import Region, region_proposer
-from orthoflow_plugins.plane.search import FoundPlane, Proposer, Search, find_planes
+from orthoflow_plugins.plane.search import Proposer, Search, find_planes
 from plane_peers import PEERS, measured
 
 from orthoflow.products import PointCloud

@@ -59,7 +59,12 @@ _METHODS: Final = {
     "residuals, outliers, classes",
 }
 # Modules that are not called as their method is.
-_IDS: Final = {"match.sides": "face.photos", "orient.bundle": "orient.colmap-bundle"}
+_IDS: Final = {
+    "match.sides": "face.photos",
+    "orient.bundle": "orient.colmap-bundle",
+    "plane.comparators:Open3dRansac": "plane.open3d-ransac",
+    "plane.comparators:Open3dPatches": "plane.open3d-patches",
+}
 
 
 @hookimpl
@@ -208,7 +213,8 @@ def orthoflow_methods() -> list[MethodSpec]:
     """Give the built-in methods."""
     return [
         MethodSpec(
-            id=_IDS.get(module := where.partition(":")[0], module.replace("_", "-")),
+            id=_IDS.get(where)
+            or _IDS.get(module := where.partition(":")[0], module.replace("_", "-")),
             target=f"orthoflow_plugins.{where}",
             summary=summary,
         )

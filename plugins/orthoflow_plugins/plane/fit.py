@@ -34,6 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane, basis_from_up
+from orthoflow_plugins.plane.detector import Candidate
 from orthoflow_plugins.plane.kernels import (
     FREE,
     LEVEL,
@@ -41,7 +42,7 @@ from orthoflow_plugins.plane.kernels import (
     VERTICAL,
     refine_robustly,
 )
-from orthoflow_plugins.plane.support import CellSums, SurfaceRaster
+from orthoflow_plugins.plane.support import CellSums, Support, SurfaceRaster
 
 # What a fit may change: everything, or a normal kept exactly horizontal, or kept along up; that of
 # the compiled fit, and which of height, slope along u and slope along v are unknowns.
@@ -200,6 +201,25 @@ class AdjustedPlane:
         """
         covariance, n_independent = stated_covariance(self.fit)
         return self.jacobian @ covariance @ self.jacobian.T, n_independent
+
+
+@dataclass(frozen=True)
+class FoundPlane:
+    """A plane that holds its share of the points.
+
+    Attributes:
+        raster: its cells; `raster.plane` is the plane, in the cloud's offsets.
+        support: which cells belong, parts, rectangle.
+        adjusted: the fit.
+        candidate: what the detector proposed.
+        freedom: what the fit could change.
+    """
+
+    raster: SurfaceRaster
+    support: Support
+    adjusted: AdjustedPlane
+    candidate: Candidate
+    freedom: Freedom
 
 
 def adjust_plane(

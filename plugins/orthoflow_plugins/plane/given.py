@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
@@ -10,7 +11,7 @@ from pydantic import Field, model_validator
 
 from orthoflow.errors import GeometryError, MethodError
 from orthoflow.geometry import Plane, plane_through, wall_axes
-from orthoflow.products import PointCloud, PointLabels
+from orthoflow.products import PointCloud, PointLabels, SideSource
 from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, MetricSpec, StepContext
 from orthoflow_plugins.plane.detector import DetectorIn, DetectorOut
 
@@ -32,6 +33,13 @@ _OUTSIDE_SHARE: Final = 0.0005
 _EVERYWHERE_M: Final = 1e9
 _NO_BOUNDS_M: Final = (-_EVERYWHERE_M, _EVERYWHERE_M, -_EVERYWHERE_M, _EVERYWHERE_M)
 
+# A view point that the user stated is given, as a normal is.
+_SIDES: Final[Mapping[str, SideSource]] = {
+    "given": "given",
+    "view_from": "given",
+    "stations": "stations",
+    "guess": "guess",
+}
 _TOO_FAR: Final = (
     "no point of the cloud lies within {buffer:g} m of the plane; along its normal the "
     "points lie between {low:.3f} m and {high:.3f} m of it: check normal and offset_m, points "
@@ -200,6 +208,7 @@ class GivenPlane(Method):
             fit_tolerance_m=tolerance_m,
         )
         faced, viewpoints = zip(*(laid[k] for k in order), strict=True)
+        sides = tuple(_SIDES[viewpoint] for viewpoint in viewpoints)
         found = planes_of(
             faced,
             deviations,
@@ -207,10 +216,9 @@ class GivenPlane(Method):
             covariances=[np.zeros((4, 4))] * len(laid),
             # One word for all of them: the least certain.
             viewpoint="guess" if "guess" in viewpoints else viewpoints[0],
+            side_from=sides if len(set(sides)) > 1 else (),
         )
-        report_planes(
-            ctx, found, deviations, n_points=len(cloud), n_guessed=viewpoints.count("guess")
-        )
+        report_planes(ctx, found, deviations, n_points=len(cloud))
         return DetectorOut(planes=found, labels=PointLabels(plane_index=labels))
 
 

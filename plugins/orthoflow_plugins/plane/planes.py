@@ -15,7 +15,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ from orthoflow.products import JsonValue, Planes, PointCloud, SideSource, plane_
 from orthoflow.products.planes import PlaneKind
 from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.plane.cloud import PreparedCloud
+from orthoflow_plugins.plane.fit import FoundPlane
 from orthoflow_plugins.plane.kernels import (
     HISTOGRAM_BINS,
     STEPS_PER_TOLERANCE,
@@ -35,9 +36,6 @@ from orthoflow_plugins.plane.kernels import (
     piece_of,
 )
 from orthoflow_plugins.plane.support import SurfaceRaster
-
-if TYPE_CHECKING:
-    from orthoflow_plugins.plane.search import FoundPlane
 
 Viewpoint = Literal["stations", "view_from", "guess"]
 
@@ -155,12 +153,12 @@ def assemble(
     cloud: PointCloud,
     tolerance_m: float,
     fit_tolerance_m: float,
-) -> tuple[Planes, Deviations, list[Normality | None], NDArray[np.int16]]:
+) -> tuple[Planes, Deviations, list[Normality | None], NDArray[np.intp]]:
     """Measure planes on their claimed points, and give them their side, order and names.
 
     Returns:
         The planes, the largest first; their deviations, and how normal those are, None where there
-        are too few points; and (k + 1,) the label of each claim, the last for -1.
+        are too few points; and (k,) which of those that were found each one is.
     """
     deviations = measure_planes(
         prepared,
@@ -174,18 +172,15 @@ def assemble(
     faced = [_faced(found, int(k), deviations, prepared, cloud) for k in order]
     raw: list[JsonValue] = []
     for place, (k, side) in enumerate(zip(order, faced, strict=True)):
-        candidate = found[k].candidate
+        candidate, own = found[k].candidate, _raw(found[k], side.plane, cloud)
         if float(side.plane.normal @ found[k].raster.plane.normal) < 0.0:
             # Histograms and means follow the normal when it was turned.
             ordered.histogram[place] = ordered.histogram[place, ::-1].copy()
             ordered.mean_fit_m[place] *= -1.0
-        own = candidate.plane
-        if float(own.normal @ side.plane.normal) < 0.0:
-            own = own.flipped()
         raw.append(
             {
                 "normal": own.normal.tolist(),
-                "offset_m": own.offset_m + float(own.normal @ cloud.origin),
+                "offset_m": own.offset_m,
                 "support": float(candidate.votes),
                 "own_tolerance_m": candidate.own_tolerance_m,
             }
@@ -217,8 +212,7 @@ def assemble(
             "guessed_sides": list[JsonValue](np.flatnonzero(is_guessed).tolist()),
         },
     )
-    labels = np.append(np.argsort(order), -1).astype(np.int16)
-    return planes, ordered, normalities, labels
+    return planes, ordered, normalities, order
 
 
 def planes_of(
@@ -257,61 +251,60 @@ def planes_of(
     )
 
 
+def _raw(item: FoundPlane, plane: Plane, cloud: PointCloud) -> Plane:
+    """What a detector itself gave for a plane, before the common fit; world, to the same side."""
+    own = item.candidate.plane
+    if float(own.normal @ plane.normal) < 0.0:
+        own = own.flipped()
+    return Plane(normal=own.normal, offset_m=own.offset_m + float(own.normal @ cloud.origin))
+
+
 def report_planes(
-    ctx: StepContext,
-    planes: Planes,
-    deviations: Deviations,
-    *,
-    n_points: int,
-    n_guessed: int | None = None,
-    first: Normality | None = None,
+    ctx: StepContext, planes: Planes, deviations: Deviations, *, n_points: int
 ) -> None:
-    """Report number and shares of planes, and the first of them; warn of guessed sides.
-
-    Args:
-        ctx: takes the metrics.
-        planes: the planes; of those that were found, what the detector itself gave is reported.
-        deviations: of their points.
-        n_points: points of the cloud.
-        n_guessed: planes whose side was guessed; by default as the details of the planes say.
-        first: how normal the deviations from the first plane are.
-    """
-
-    def lies(plane: Plane, prefix: str) -> None:
-        omega_deg, phi_deg = omega_phi_deg(plane.normal, planes.up)
-        ctx.metric(f"{prefix}omega_deg", omega_deg, "deg")
-        ctx.metric(f"{prefix}phi_deg", phi_deg, "deg")
-
-    plane = planes.plane(0)
+    """Report number and shares of planes, and where the first lies; warn of guessed sides."""
+    omega_deg, phi_deg = omega_phi_deg(planes.normal[0], planes.up)
     ctx.metric("n_planes", len(planes), "1")
     ctx.metric("labelled_share", float(deviations.n_points.sum()) / n_points, "1")
     ctx.metric("rms_mm", 1000.0 * float(planes.rms_m[0]), "mm")
-    ctx.metric("offset_m", plane.offset_m, "m")
-    lies(plane, "")
-    if n_guessed is None:
-        details: Any = planes.details
-        n_guessed = len(details["guessed_sides"])
-        raw = Plane(
-            normal=np.array(details["raw"][0]["normal"]), offset_m=details["raw"][0]["offset_m"]
-        )
-        ctx.metric("first_share", float(planes.n_points[0]) / n_points, "1")
-        ctx.metric("fit_rms_mm", 1000.0 * float(deviations.rms_fit_m[0]), "mm")
-        ctx.metric("r_m", abs(plane.offset_m), "m")
-        ctx.metric("sigma_angle_deg", planes.sigma_angle_deg(0), "deg")
-        ctx.metric("sigma_offset_mm", 1000.0 * planes.sigma_offset_m(0), "mm")
-        ctx.metric("n_independent", details["n_independent"][0], "1")
-        if first is not None:
-            ctx.metric("skewness", first.skewness, "1")
-            ctx.metric("excess_kurtosis", first.excess_kurtosis, "1")
-            for reach, share in enumerate(first.within, start=1):
-                ctx.metric(f"within_{reach}_sigma", share, "1")
-        lies(raw, "raw_")
-        miss_m = raw.offset_m - float(raw.normal @ planes.corners[0].mean(axis=0))
-        ctx.metric("raw_r_m", abs(raw.offset_m), "m")
-        ctx.metric("raw_angle_deg", angle_between_deg(raw.normal, plane.normal), "deg")
-        ctx.metric("raw_offset_mm", 1000.0 * miss_m, "mm")
+    ctx.metric("omega_deg", omega_deg, "deg")
+    ctx.metric("phi_deg", phi_deg, "deg")
+    ctx.metric("offset_m", float(planes.offset[0]), "m")
+    n_guessed = sum(planes.side_source(k) == "guess" for k in range(len(planes)))
     if n_guessed:
         ctx.report(SIDES_GUESSED, n=n_guessed, n_planes=len(planes))
+
+
+def report_first(
+    ctx: StepContext,
+    planes: Planes,
+    deviations: Deviations,
+    shape: Normality | None,
+    found: FoundPlane,
+    cloud: PointCloud,
+) -> None:
+    """Report how the first plane fits, and how far the fit moved what the detector itself gave."""
+    raw = _raw(found, planes.plane(0), cloud)
+    ctx.metric("first_share", float(planes.n_points[0]) / len(cloud), "1")
+    ctx.metric("fit_rms_mm", 1000.0 * float(deviations.rms_fit_m[0]), "mm")
+    ctx.metric("r_m", abs(float(planes.offset[0])), "m")
+    ctx.metric("sigma_angle_deg", planes.sigma_angle_deg(0), "deg")
+    ctx.metric("sigma_offset_mm", 1000.0 * planes.sigma_offset_m(0), "mm")
+    ctx.metric("n_independent", found.adjusted.stated()[1], "1")
+    if shape is not None:
+        ctx.metric("skewness", shape.skewness, "1")
+        ctx.metric("excess_kurtosis", shape.excess_kurtosis, "1")
+        for reach, share in enumerate(shape.within, start=1):
+            ctx.metric(f"within_{reach}_sigma", share, "1")
+    omega_deg, phi_deg = omega_phi_deg(raw.normal, planes.up)
+    miss_m = raw.offset_m - float(raw.normal @ planes.corners[0].mean(axis=0))
+    ctx.metric("raw_omega_deg", omega_deg, "deg")
+    ctx.metric("raw_phi_deg", phi_deg, "deg")
+    ctx.metric("raw_r_m", abs(raw.offset_m), "m")
+    ctx.metric("raw_angle_deg", angle_between_deg(raw.normal, planes.normal[0]), "deg")
+    ctx.metric("raw_offset_mm", 1000.0 * miss_m, "mm")
+    if found.candidate.own_tolerance_m is not None:
+        ctx.metric("own_tolerance_mm", 1000.0 * found.candidate.own_tolerance_m, "mm")
 
 
 def plane_names(

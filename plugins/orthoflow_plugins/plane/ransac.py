@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Literal, Self
+from typing import TYPE_CHECKING, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,11 +141,7 @@ class Ransac(Method):
         from orthoflow_plugins.plane.search import detect
 
         proposer_of = partial(ConsensusProposer, params=params, rng=ctx.rng)
-        out, _ = detect(inputs.cloud, params, ctx, proposer_of, method=self.id)
-        if params.scoring == "a-contrario":
-            details: Any = out.planes.details
-            ctx.metric("own_tolerance_mm", 1000.0 * details["raw"][0]["own_tolerance_m"], "mm")
-        return out
+        return detect(inputs.cloud, params, ctx, proposer_of, method=self.id)[0]
 
 
 @dataclass(frozen=True, kw_only=True)

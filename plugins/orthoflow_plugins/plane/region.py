@@ -28,7 +28,8 @@ from orthoflow_plugins.plane.detector import (
 
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.cloud import PreparedCloud
-    from orthoflow_plugins.plane.search import FoundPlane, Search
+    from orthoflow_plugins.plane.fit import FoundPlane
+    from orthoflow_plugins.plane.search import Search
     from orthoflow_plugins.plane.voxels import Neighbourhood, SurfaceVoxels
 
 # What `preset: paper` sets where nothing else is set: markiewicz2015, 4.1.2.

@@ -40,13 +40,14 @@ from orthoflow_plugins.plane.figures import draw_deviations, draw_planes, draw_t
 from orthoflow_plugins.plane.fit import (
     SETTLED_M,
     AdjustedPlane,
+    FoundPlane,
     Freedom,
     adjust_plane,
     refine_plane,
     shrinking_tolerances,
 )
 from orthoflow_plugins.plane.kernels import BlockedPoints
-from orthoflow_plugins.plane.planes import assemble, report_planes
+from orthoflow_plugins.plane.planes import assemble, report_first, report_planes
 from orthoflow_plugins.plane.support import (
     CELL_LEAST_M,
     CellSums,
@@ -224,25 +225,6 @@ class Search:
         self.refusals.append((criterion, n_points / max(1, len(self.claims))))
 
 
-@dataclass(frozen=True)
-class FoundPlane:
-    """A plane that holds its share of the points.
-
-    Attributes:
-        raster: its cells; `raster.plane` is the plane, in the cloud's offsets.
-        support: which cells belong, parts, rectangle.
-        adjusted: the fit.
-        candidate: what the detector proposed.
-        freedom: what the fit could change.
-    """
-
-    raster: SurfaceRaster
-    support: Support
-    adjusted: AdjustedPlane
-    candidate: Candidate
-    freedom: Freedom
-
-
 class Proposer(Protocol):
     """What a detector must do to take part."""
 
@@ -335,12 +317,15 @@ def _products(
 ) -> DetectorOut:
     """Measure, assemble, report and draw the planes that were found."""
     ctx.progress(0.8, "measuring deviations")
-    planes, deviations, normalities, names = assemble(
+    planes, deviations, normalities, order = assemble(
         found, whole, cloud, search.tolerance_m, search.fit_tolerance_m
     )
+    # The last of the names is for points on no plane: a claim of -1 picks it.
+    names = np.append(np.argsort(order), -1).astype(np.int16)
     labels = ctx.allocate("labels", "plane_index", (len(cloud),), np.int16).view(np.int16)
     whole.write_labels(names, labels)
-    report_planes(ctx, planes, deviations, n_points=len(cloud), first=normalities[0])
+    report_planes(ctx, planes, deviations, n_points=len(cloud))
+    report_first(ctx, planes, deviations, normalities[0], found[order[0]], cloud)
     n_left = len(cloud) - int(deviations.n_points.sum())
     largest = int(deviations.n_points.max())
     if n_left > largest:
@@ -353,7 +338,6 @@ def _products(
         )
     ctx.progress(0.9, "drawing")
     draw_deviations(ctx, planes, deviations, normalities)
-    # The last of the names is for points on no plane: a claim of -1 picks it.
     plane_of_sample = names[whole.sample_claims].astype(np.int64)
     draw_planes(ctx, planes, whole.sample.offsets_m, plane_of_sample, cloud)
     materials, reach_m = search.params.materials, search.fit_tolerance_m

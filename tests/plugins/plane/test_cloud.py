@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.plane import cloud as clouds
-from orthoflow_plugins.plane.cloud import PreparedCloud, draw_sample, plan_grid, prepare, thinned
+from orthoflow_plugins.plane.cloud import PreparedCloud, draw_sample, plan_grid, prepare
 from orthoflow_plugins.plane.kernels import PlanGrid
 from orthoflow_plugins.plane.search import Claim
 from orthoflow_plugins.plane.support import SurfaceRaster
@@ -100,28 +99,6 @@ def test_one_point_of_each_of_200000_stretches_is_drawn_at_places_of_the_golden_
     np.testing.assert_array_equal(sample.offsets_m, points[sample.index].astype(np.float32))
 
 
-@pytest.mark.parametrize(
-    ("n_points", "every", "n_kept"),
-    [(12, 1, 12), (12, 2, 6), (12, 4, 3), (12, 5, 3), (2, 2, 2), (0, 3, 0)],
-)
-def test_thinning_keeps_every_nth_point_and_three_at_least(
-    n_points: int, every: int, n_kept: int
-) -> None:
-    points = np.arange(3.0 * n_points).reshape(-1, 3)
-    bare = replace(
-        cloud_of(points),
-        intensity=np.zeros(n_points, dtype=np.float32),
-        scan=np.arange(n_points, dtype=np.uint16),
-    )
-    kept = thinned(bare, every)
-    assert len(kept) == n_kept
-    assert kept.scan is not None
-    np.testing.assert_array_equal(kept.scan, kept.x / 3.0)
-    assert (kept.intensity is None) == (every > 1)
-    stretch = n_points / max(n_kept, 1)
-    np.testing.assert_array_equal(kept.scan // max(stretch, 1.0), np.arange(n_kept))
-
-
 def boxed_scene(
     low: tuple[float, float, float], high: tuple[float, float, float], *, n: int = 4_000
 ) -> NDArray[np.float64]:
@@ -169,15 +146,6 @@ def test_what_is_farther_off_than_the_scene_is_long_does_not_widen_the_plan() ->
     # 26 and 10 m with their margins, to a cell.
     assert beside.shape[0] == pytest.approx(281, abs=1)
     assert stray.shape[0] == pytest.approx(114, abs=1)
-
-
-def test_some_points_may_lie_outside_the_plan_on_each_side() -> None:
-    points = boxed_scene((0.0, 0.0, 0.0), (10.0, 4.0, 2.0), n=10_001)
-    points[:, 0] = np.linspace(0.0, 10.0, 10_001)
-    # A hundredth at either end, and a fiftieth of the rest and a cell's worth besides.
-    grid = grid_of(points, outside_share=0.01)
-    assert grid.low_m[0] == pytest.approx(0.1 - 0.5 - 0.02 * 9.8, abs=1e-5)
-    assert grid.shape[0] == math.ceil((9.8 * 1.04 + 1.0) / 0.1)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from orthoflow_plugins.plane.ransac import Ransac
 from orthoflow_plugins.plane.support import CellSums, SurfaceRaster
 from scipy import ndimage
 
-from orthoflow.geometry import Plane, angle_between_deg, wall_axes
+from orthoflow.geometry import Plane, wall_axes
 from orthoflow.products import Planes
 from tests.long_loops import IS_LONG
 from tests.plane_scenes import context
@@ -134,35 +134,6 @@ def test_cells_that_fade_state_what_their_plane_scatters_by(tails: str) -> None:
         covariance = independent_covariance(found.fit)
         squares.append(found.fit.solution**2 / np.diag(covariance))
     assert math.sqrt(np.mean(squares)) == pytest.approx(1.0, abs=0.1)
-
-
-def test_waves_leave_few_independent_cells() -> None:
-    counts = []
-    for reach_cells in (0.0, 2.0):
-        raster, sums = wall_of_cells(1, reach_cells=reach_cells, relief_m=0.002)
-        fit = adjust_plane(raster, sums, sums.n_fit > 0, fit_tolerance_m=FIT_M, freedom="free")
-        assert fit is not None
-        counts.append(fit.stated()[1])
-    assert 500 < counts[0] <= 30 * 45
-    # The integral of a Gaussian wave's correlation: 4 pi reach**2 = 50 cells go together.
-    assert 30 * 45 / 50 / 2.5 < counts[1] < 30 * 45 / 50 * 2.5
-
-
-def test_a_panel_over_a_third_of_a_wall_does_not_move_it() -> None:
-    raster, sums = wall_of_cells(2, reach_cells=0.0, relief_m=0.0005)
-    panel = np.zeros(raster.shape, dtype=np.int64)
-    panel[:, :15] = round(0.005 * STEPS_PER_TOLERANCE / FIT_M)
-    raised = CellSums(
-        n_near=sums.n_near,
-        n_inner=sums.n_inner,
-        n_fit=sums.n_fit,
-        steps=sums.steps + panel * sums.n_fit,
-        squared_steps=sums.squared_steps + 2 * panel * sums.steps + panel**2 * sums.n_fit,
-    )
-    fit = adjust_plane(raster, raised, sums.n_fit > 0, fit_tolerance_m=FIT_M, freedom="free")
-    assert fit is not None
-    assert angle_between_deg(fit.plane.normal, raster.plane.normal) < 0.01
-    assert abs(fit.plane.offset_m - raster.plane.offset_m) < 3e-4
 
 
 def room_ratios(seed: int, folder: Path, *, step_deg: float) -> list[list[float]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from pathlib import Path
 from typing import Any
@@ -163,26 +162,6 @@ def test_a_turned_room_gives_the_turned_planes(
 
 
 @every_detector
-def test_half_of_the_points_give_the_same_planes_within_three_sigma(
-    detector: str, rooms: dict[str, Any], halves: dict[str, Any]
-) -> None:
-    expected = rooms[detector].planes
-    out = halves[detector]
-    for truth in ROOM:
-        k = nearest(expected, truth.normal, np.array(truth.centre))
-        j = nearest(out.planes, truth.normal, np.array(truth.centre))
-        at_centre = np.append(truth.centre, -1.0)
-        sides = np.sign(out.planes.normal[j] @ expected.normal[k])
-        apart_m = (
-            out.planes.normal[j] @ np.array(truth.centre)
-            - out.planes.offset[j]
-            - sides * (expected.normal[k] @ np.array(truth.centre) - expected.offset[k])
-        )
-        variance = at_centre @ out.planes.covariance[j] @ at_centre
-        assert abs(apart_m) < 3.0 * np.sqrt(variance)
-
-
-@every_detector
 def test_five_percent_of_gross_outliers_neither_hide_nor_move_a_wall(
     detector: str, rooms: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -315,19 +294,6 @@ def test_thinning_finds_the_same_planes_and_labels_every_point(
 
 
 @every_detector
-def test_the_raw_detection_is_kept_beside_the_common_fit(
-    detector: str, rooms: dict[str, Any]
-) -> None:
-    planes = rooms[detector].planes
-    raw = planes.details["raw"]
-    assert len(raw) == len(planes)
-    for k, item in enumerate(raw):
-        assert angle_between_deg(np.array(item["normal"]), planes.normal[k]) < 4.0
-        middle = planes.corners[k].mean(axis=0)
-        assert abs(np.array(item["normal"]) @ middle - item["offset_m"]) < 0.06
-
-
-@every_detector
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_too_few_points_are_refused(detector: str, count: int, tmp_path: Path) -> None:
     with pytest.raises(ProductError, match=f"the cloud has {count} points, at least 3"):
@@ -376,14 +342,6 @@ def test_a_tolerance_below_the_noise_is_answered_with_one_that_does(
     advice = re.search(r"with tolerance_m ([\d.]+) one is found", str(refusal.value))
     assert advice is not None, refusal.value
     assert detect(detector, cloud, tmp_path, tolerance_m=float(advice[1]))[0].planes
-
-
-@every_detector
-def test_an_unknown_scan_of_a_point_does_not_matter(detector: str, tmp_path: Path) -> None:
-    cloud = cloud_of(sampled(ROOM[:1]), stations=np.array([[0.0, -4.0, 0.0]]))
-    cloud = dataclasses.replace(cloud, scan=np.zeros(len(cloud), dtype=np.uint16))
-    planes = detect(detector, cloud, tmp_path, thinning=2)[0].planes
-    assert planes.normal[0] @ (0.0, 1.0, 0.0) < -0.99
 
 
 @every_detector

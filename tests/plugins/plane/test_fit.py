@@ -102,21 +102,3 @@ def test_three_cells_or_a_row_of_them_fix_no_plane() -> None:
             raster(), cell_sums(heights), cells, fit_tolerance_m=0.015, freedom="free"
         )
         assert (fitted is not None) is is_fixed
-
-
-def test_points_on_a_line_refine_no_plane() -> None:
-    line = np.column_stack([np.linspace(0, 1, 50), np.zeros(50), np.full(50, 1.001)])
-    assert fit.refine_plane(line, FLOOR, 0.01, freedom="free", up=UP) is None
-    square = np.vstack([line, line[:, [1, 0, 2]]])
-    refined = fit.refine_plane(square, FLOOR, 0.01, freedom="free", up=UP)
-    assert refined is not None
-    assert refined.offset_m == pytest.approx(1.001, abs=1e-9)
-    np.testing.assert_allclose(refined.normal, UP, atol=1e-9)
-
-
-def test_a_cell_varies_by_the_noise_of_its_points_and_by_the_surface_and_no_more() -> None:
-    heights = np.random.default_rng(9).normal(0.0, 0.0006, (20, 30))
-    fitted = adjusted(heights)
-    assert fitted is not None
-    # What cells scatter by holds the noise of their sixteen points of a millimetre each.
-    np.testing.assert_allclose(np.sqrt(fitted.fit.variance_m2), 0.0006, rtol=0.2)

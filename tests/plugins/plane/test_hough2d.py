@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.hough2d import Hough2d, PlanProposer
+from orthoflow_plugins.plane.hough2d import Hough2d
 from pydantic import ValidationError
 
 from orthoflow.errors import MethodError
@@ -18,9 +18,7 @@ from tests.plane_scenes import (
     ROOM,
     cloud_of,
     context,
-    prepared,
     sampled,
-    search_in,
 )
 
 STATION = np.array([[0.3, -0.2, 0.1]])
@@ -106,19 +104,6 @@ def test_other_accumulators_find_the_densest_wall(
         assert len(planes) == 7  # "identical result, considerably longer" (markiewicz2015)
 
 
-def test_the_unit_accumulator_has_the_weaker_maximum(tmp_path: Path) -> None:
-    # Half of the floor's cells lie along any line through the room: a wall hardly stands out.
-    search = search_in(prepared(sampled(ROOM[:5]), plan_cell_m=0.02))
-    shares = []
-    for accumulator in ("counts", "unit"):
-        proposer = PlanProposer(search, Hough2d.Params(accumulator=accumulator))
-        proposer.propose(search)
-        votes = proposer.first
-        assert votes is not None
-        shares.append(votes.max() / votes.sum(axis=1).max())
-    assert shares[0] > 2.0 * shares[1]
-
-
 def test_raw_coordinates_with_one_vote_per_cell_are_refused() -> None:
     with pytest.raises(ValidationError, match="coordinates: raw goes with accumulator: counts"):
         Hough2d.Params(coordinates="raw", accumulator="unit")
@@ -166,27 +151,6 @@ def test_scan_numbers_of_the_points_outvote_a_nearer_station(tmp_path: Path) -> 
     )
     planes = detect(cloud, tmp_path).planes
     assert planes.normal[0] @ (0.0, 1.0, 0.0) < -0.99
-
-
-@pytest.mark.usefixtures("charts")
-def test_metrics_and_figures_tell_of_the_first_plane(tmp_path: Path) -> None:
-    ctx = context(tmp_path)
-    out = Hough2d().run(
-        Hough2d.In(cloud=cloud_of(sampled(), stations=STATION)), Hough2d.Params(), ctx
-    )
-    metrics = {metric.name: metric.value for metric in ctx.metrics}
-    assert metrics["n_planes"] == len(out.planes)
-    assert metrics["omega_deg"] == pytest.approx(270.0, abs=0.02)
-    assert metrics["phi_deg"] == pytest.approx(0.4, abs=0.02)
-    assert metrics["fit_rms_mm"] == pytest.approx(2.0, rel=0.05)
-    assert 0.9 < metrics["labelled_share"] <= 1.0
-    assert [figure.name for figure in ctx.figures] == [
-        "deviations",
-        "planes",
-        "thickness",
-        "accumulator",
-    ]
-    assert all(figure.path.stat().st_size > 5_000 for figure in ctx.figures)
 
 
 def test_a_perfectly_flat_wall_is_found(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.plane.cloud import PreparedCloud
 from orthoflow_plugins.plane.detector import Candidate
+from orthoflow_plugins.plane.fit import FoundPlane
 from orthoflow_plugins.plane.planes import (
     Deviations,
     assemble,
@@ -22,7 +23,7 @@ from orthoflow_plugins.plane.planes import (
     side_of_remaining,
     side_of_stations,
 )
-from orthoflow_plugins.plane.search import Claim, FoundPlane, label, verify
+from orthoflow_plugins.plane.search import Claim, label, verify
 from orthoflow_plugins.plane.support import SurfaceRaster
 
 from orthoflow.geometry import Plane, wall_axes
@@ -229,22 +230,22 @@ def scene() -> Scene:
 
 def assembled(
     scene: Scene, *stations: tuple[float, float, float]
-) -> tuple[Planes, Deviations, NDArray[np.int16]]:
+) -> tuple[Planes, Deviations, NDArray[np.intp]]:
     known = scene.cloud
     if stations:
         known = replace(known, stations=np.array(stations) + ORIGIN, stations_source="file")
-    planes, deviations, _, labels = assemble(
+    planes, deviations, _, order = assemble(
         scene.found, scene.prepared, known, TOLERANCE_M, FIT_TOLERANCE_M
     )
-    return planes, deviations, labels
+    return planes, deviations, order
 
 
 def test_planes_are_ordered_by_their_points_and_face_the_station(scene: Scene) -> None:
-    planes, _, labels = assembled(scene, (0.0, 0.0, 0.0))
+    planes, _, order = assembled(scene, (0.0, 0.0, 0.0))
     details: Any = planes.details
     assert planes.names == ("wall 0", "wall 1")
     assert planes.n_points.tolist() == sorted(planes.n_points, reverse=True)
-    np.testing.assert_array_equal(labels, [1, 0, -1])
+    np.testing.assert_array_equal(order, [1, 0])
     np.testing.assert_allclose(planes.normal, [[0, -1, 0], [1, 0, 0]], atol=2e-3)
     assert (planes.viewpoint, planes.side_from) == ("stations", ())
     for k, item in enumerate(reversed(scene.found)):
@@ -331,17 +332,3 @@ def test_sides_that_were_stated_are_given(scene: Scene) -> None:
     )
     planes = assemble(scene.found, scene.prepared, known, TOLERANCE_M, FIT_TOLERANCE_M)[0]
     assert (planes.viewpoint, planes.side_from) == ("view_from", ("guess", "given"))
-
-
-def test_details_are_told_in_the_order_of_the_planes(scene: Scene) -> None:
-    details = assembled(scene, (0.0, 0.0, 0.0))[0].details
-    assert details["fit_n_points"] == scene.deviations.n_fit[::-1].tolist()
-    assert details["fit_rms_m"] == scene.deviations.rms_fit_m[::-1].tolist()
-    assert details["fit_tolerance_m"] == FIT_TOLERANCE_M
-    first = details["raw"][0]  # type: ignore[index]
-    assert first == {
-        "normal": [0.0, -1.0, 0.0],
-        "offset_m": pytest.approx(-2.0 + 200.0),
-        "support": 99.0,
-        "own_tolerance_m": None,
-    }

@@ -96,16 +96,6 @@ def test_neighbourhoods_have_the_cells_of_their_shape(
     assert (np.diff(around[:, 3]) >= 0).all()
 
 
-def test_nearest_cells_end_when_they_hold_enough_points() -> None:
-    points = sampled((Rectangle("dense", (0, 0, 0), (0.5, 0, 0), (0, 0, 0.5), 40_000),))
-    few = voxels_of(points, Neighbourhood(shape="knn", size_m=0.1, n_points=30, voxel_m=0.02))
-    many = voxels_of(points, Neighbourhood(shape="knn", size_m=0.1, n_points=700, voxel_m=0.02))
-    # 16 points in a voxel: 30 are there within one shell (6 cm), 700 within three (14 cm).
-    middle = (np.abs(few.table.centroids()[:, [0, 2]]) < 0.3).all(axis=1)
-    assert np.median(few.spreads[middle, 2]) == pytest.approx(3 / np.sqrt(12), rel=0.05)
-    assert np.median(many.spreads[middle, 2]) == pytest.approx(7 / np.sqrt(12), rel=0.1)
-
-
 def test_a_region_is_fitted_by_total_least_squares_through_its_points() -> None:
     lean = np.radians(7.0)
     wall = Rectangle("lean", (1, 3, 2), (2, 0, 0), (0, np.sin(lean), np.cos(lean)), 80_000)

@@ -145,15 +145,6 @@ def test_bars_across_an_opening_are_part_of_it() -> None:
     np.testing.assert_array_equal(whole(area), block(10, 50, 10, 40))
 
 
-@pytest.mark.parametrize(("neck", "n_areas"), [(2, 2), (3, 1), (4, 1)])
-def test_what_is_narrower_than_three_cells_joins_no_areas(neck: int, n_areas: int) -> None:
-    cells = block(10, 50, 5, 30) | block(10, 50, 45, 70) | block(20, 20 + neck, 30, 45)
-    assert len(list(open_areas(relief(cells), WIDTH_LEAST_M, AREA_LEAST_M2))) == n_areas
-    # Nor does a corner that two have in common.
-    touching = block(5, 25, 5, 30) | block(25, 45, 30, 55)
-    assert len(list(open_areas(relief(touching), WIDTH_LEAST_M, AREA_LEAST_M2))) == 2
-
-
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize(("width", "is_opening"), [(9, False), (10, True)])
 def test_a_square_of_the_least_width_fits_into_an_opening(
@@ -162,14 +153,6 @@ def test_a_square_of_the_least_width_fits_into_an_opening(
     # 0.2 m are ten cells; at the border of the raster, too.
     cells = block(0, width, 10, 50) if axis else block(10, 50, 0, width)
     assert len(list(open_areas(relief(cells), WIDTH_LEAST_M, AREA_LEAST_M2))) == is_opening
-
-
-def test_the_least_area_is_that_of_an_opening() -> None:
-    # 0.05 m2 are 125 cells.
-    assert len(list(open_areas(relief(block(10, 20, 10, 22)), WIDTH_LEAST_M, AREA_LEAST_M2))) == 0
-    assert len(list(open_areas(relief(block(10, 20, 10, 23)), WIDTH_LEAST_M, AREA_LEAST_M2))) == 1
-    exactly_m2 = 120 * GSD_M**2
-    assert len(list(open_areas(relief(block(10, 20, 10, 22)), WIDTH_LEAST_M, exactly_m2))) == 1
 
 
 @pytest.mark.parametrize(

@@ -94,14 +94,6 @@ def quarter(places: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.column_stack([places[:, 1], 100.0 - places[:, 0]])
 
 
-@pytest.mark.parametrize(("length", "is_moved"), [(19.5, False), (20.5, True)])
-def test_sides_of_twenty_cells_and_more_are_long_enough(length: float, is_moved: bool) -> None:
-    corners = CORNERS.copy()
-    corners[1:3, 1] = TOP + length
-    moved = moved_to_edges(outline(corners), picture(step_at(LEFT)))
-    assert bool(moved[1][0]) == is_moved
-
-
 def test_sides_that_were_not_seen_stay() -> None:
     grey = picture(step_at(LEFT + 0.3))
     assert left_side(moved_to_edges(outline(seen=np.array([0.4, 1, 1, 1])), grey)) is None

@@ -87,43 +87,6 @@ def test_the_figure_shows_the_face_pale_where_the_laser_saw_no_intensity(tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("place", "corners"),
-    [(0, scenes.NICHE), (1, scenes.WINDOW), (2, scenes.MIRROR)],
-    ids=["turned niche", "window", "mirror"],
-)
-def test_corners_lie_where_the_borders_meet(
-    tmp_path: Path, place: int, corners: np.ndarray
-) -> None:
-    openings, _ = found(tmp_path, cloud=scenes.cloud())
-    opening = openings.openings[place]
-    cells = cells_of(opening)
-    assert len(cells) == 4
-    begin = int(np.linalg.norm(cells - corners[0], axis=1).argmin())
-    apart = np.abs(np.roll(cells, -begin, axis=0) - corners)
-    # Upright sides lie on borders of cells, half of one off at most; turned ones are told by many.
-    assert apart.max() <= (0.25 if place == 0 else 0.55)
-    size_m = scenes.GSD_M * (corners.max(axis=0) - corners.min(axis=0))
-    assert (opening.width_m, opening.height_m) == pytest.approx(tuple(size_m), abs=0.011)
-    assert opening.sill_m == pytest.approx(2.4 - scenes.GSD_M * corners[:, 1].max(), abs=0.006)
-    assert opening.seen_share > 0.9
-    sigma = opening.side_sigma_m / scenes.GSD_M
-    assert np.all((sigma >= (4.0 / 12.0) ** 0.5) & (sigma <= 0.7))
-
-
-def test_world_coordinates_are_those_of_the_wall(tmp_path: Path) -> None:
-    openings, _ = found(tmp_path, cloud=scenes.cloud())
-    where = scenes.frame()
-    for opening in openings.openings:
-        on_wall = where.wall_from_world(opening.outline_world)
-        np.testing.assert_allclose(on_wall[:, :2], cells_of(opening), atol=1e-6)
-        np.testing.assert_allclose(on_wall[:, 2], 0.0, atol=1e-8)
-        x, y = opening.outline_m.T
-        area_m2 = 0.5 * float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum())
-        # Counter-clockwise where Y points upwards.
-        assert area_m2 == pytest.approx(opening.area_m2, abs=1e-9)
-
-
-@pytest.mark.parametrize(
     ("systems", "told"),
     [
         ((None, None), None),

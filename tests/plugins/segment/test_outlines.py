@@ -269,30 +269,3 @@ def test_a_short_side_that_cuts_a_corner_goes_unless_only_three_are_left(
         far = [side_at(30.0, (99.0, 50.0))] * n_others
         sides = [side_at(0.0, (-20.0, 0.0)), short, side_at(90.0, (0.0, 20.0)), *far]
         assert (short not in module._without_short_cuts(sides)) == is_cut
-
-
-def test_the_line_of_a_side_goes_through_what_lies_between_its_ends() -> None:
-    def lifted(*columns: int) -> NDArray[np.float64]:
-        ring = np.column_stack([np.arange(60.0), np.zeros(60)])
-        ring[list(columns), 1] = 0.7
-        return ring
-
-    # Three cells at either end belong to the corners.
-    ends = lifted(10, 11, 12, 48, 49, 50)
-    side = module._side(ends, 10, 50)
-    np.testing.assert_array_equal([side.begin, side.end], ends[[10, 50]])
-    assert side.middle is not None
-    assert side.direction is not None
-    np.testing.assert_allclose([side.scatter, side.middle[1], side.direction[1]], 0.0, atol=1e-9)
-    assert side.middle[0] == pytest.approx(30.0)
-    # Six inner middles of 35 that lie 0.7 higher.
-    side = module._side(lifted(13, 14, 15, 45, 46, 47), 10, 50)
-    share = 6 / 35
-    assert side.middle is not None
-    assert side.middle[1] == pytest.approx(0.7 * share)
-    assert side.scatter == pytest.approx(0.7 * np.sqrt(share * (1.0 - share)), rel=1e-6)
-    # A quarter of a short side, and a side over the place where the ring begins.
-    side = module._side(np.roll(lifted(20, 22, 28, 30), -25, axis=0), 55, 5)
-    assert side.middle is not None
-    np.testing.assert_allclose([side.middle, [0.0, 0.7]], [[25.0, 0.0], [0.0, 0.7]], atol=1e-9)
-    np.testing.assert_array_equal([side.begin, side.end], [[20.0, 0.7], [30.0, 0.7]])

@@ -164,15 +164,6 @@ def test_so_many_rays_must_agree(depth_m: float, n_other: int, n_met: int, is_to
     assert np.count_nonzero(found.crossed | found.stopped) == is_told
 
 
-def test_a_tile_is_of_five_centimetres_and_no_larger_than_the_wall() -> None:
-    ends = np.zeros((2, 3))
-    assert sight_lines(cloud(ends), slab(gsd_m=0.004)).side == 12
-    assert sight_lines(cloud(ends), slab(gsd_m=0.2)).side == 1
-    small = sight_lines(cloud(ends), slab(rows=3, columns=61))
-    assert small.side == 3
-    assert small.crossed.shape == (1, 21)
-
-
 def test_tiles_are_told_by_the_cells_in_them() -> None:
     tiles = np.array([[True, False, True], [False, True, False]])
     lines = SightLines(side=4, crossed=tiles, stopped=~tiles)
