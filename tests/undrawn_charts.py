@@ -51,7 +51,7 @@ def build_plane_charts_once(
     from orthoflow_plugins.plane import figures, search
 
     common = ("draw_deviations", "draw_planes", "draw_thickness")
-    own = ("draw_accumulator", "draw_space", "draw_sections", "draw_normals")
+    own = ("draw_accumulator", "draw_space", "draw_sections", "_draw_normals")
     _build_charts_once(request, patch, (search, common, figures), test)
     _build_charts_once(request, patch, (figures, own, figures), test)
 

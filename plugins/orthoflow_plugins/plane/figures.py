@@ -442,6 +442,16 @@ def draw_normals(
     across_deg = np.degrees(np.arcsin(np.clip(normals @ basis_from_up(planes.up)[1], -1.0, 1.0)))
     angles_deg = {f"angle between normal and {planes.names[0]}": away_deg, "Ny": across_deg}
     counts = voxels.counts.astype(np.float64)
+    _draw_normals(ctx, angles_deg, counts, picture, size_m)
+
+
+def _draw_normals(
+    ctx: StepContext,
+    angles_deg: Mapping[str, NDArray[np.float64]],
+    counts: NDArray[np.float64],
+    picture: NDArray[np.float64],
+    size_m: NDArray[np.float64],
+) -> None:
     figure = Figure(figsize=(14.0, 4.0), layout="constrained")
     *histograms, right = figure.subplots(1, 3, width_ratios=(2.0, 2.0, 3.0))
     for axes, (name, values_deg) in zip(histograms, angles_deg.items(), strict=True):

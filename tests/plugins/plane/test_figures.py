@@ -367,7 +367,7 @@ def test_normals_are_drawn_by_points_and_over_the_first_plane(
     )  # fmt: skip
     points = sampled((wall, slope), noise_m=1e-3)
     cloud = cloud_of(points, origin=ORIGIN)
-    params = Region.Params(neighbourhood_m=0.15, min_share=0.005)
+    params = Region.Params(neighbourhood_m=0.15, cell_m=0.05, min_share=0.005)
     regions = region_proposer(search_in(prepared(points)), params, viewer_m=np.zeros(3))
     planes = planes_of()
     half = np.array([[-1.5, 0, 1.0], [-1.5, 0, -1.0], [1.5, 0, -1.0], [1.5, 0, 1.0]])
