@@ -51,6 +51,7 @@ _CHUNK_BYTES: Final = 1 << 20
 # Smaller arrays gain nothing from compression or mapping.
 _SMALL_BYTES: Final = 4096
 _EXACT: Final = 0.0
+_ALONE: Final = "only one of the products has it"
 # Of numbers in the metadata, which say something about a product and are not the product itself:
 # other versions of numerical libraries round their last digits in another way.
 _STATED_SHARE: Final = 1e-6
@@ -58,21 +59,6 @@ _UNITS: Final = ("mm", "m", "px", "deg")
 
 Index: TypeAlias = tuple[int | slice, ...]
 Tolerances: TypeAlias = Mapping[str, tuple[float, str]]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ArrayFingerprint:
-    """An array without its values.
-
-    Attributes:
-        dtype: numpy's code of the little-endian type, e.g. `<f4`, `|u1`, `|b1`.
-        shape: length of every axis.
-        sha256: digest of the bytes, little-endian and in C order; 64 hexadecimal digits.
-    """
-
-    dtype: str
-    shape: tuple[int, ...]
-    sha256: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,18 +129,18 @@ def block_indices(shape: tuple[int, ...], itemsize: int) -> Iterator[Index]:
         yield (slice(start, min(start + step, shape[0])),)
 
 
-def little_endian(dtype: np.dtype[np.generic]) -> np.dtype[np.generic]:
+def _little_endian(dtype: np.dtype[np.generic]) -> np.dtype[np.generic]:
     """Return the dtype with its bytes in little-endian order."""
     return dtype.newbyteorder("<")
 
 
-def byte_blocks(array: NDArray[np.generic]) -> Iterator[NDArray[np.uint8]]:
+def _byte_blocks(array: NDArray[np.generic]) -> Iterator[NDArray[np.uint8]]:
     """Return the array's bytes: little-endian, C order, flat.
 
     A contiguous little-endian array is given whole and not copied, memory-mapped or not; any other
     is copied block by block.
     """
-    wanted = little_endian(array.dtype)
+    wanted = _little_endian(array.dtype)
     if array.size == 0:
         return
     if array.flags.c_contiguous and array.dtype == wanted:
@@ -162,21 +148,6 @@ def byte_blocks(array: NDArray[np.generic]) -> Iterator[NDArray[np.uint8]]:
         return
     for index in block_indices(array.shape, array.dtype.itemsize):
         yield _as_bytes(np.ascontiguousarray(array[index], dtype=wanted))
-
-
-def array_fingerprint(array: NDArray[np.generic]) -> ArrayFingerprint:
-    """Digest one array without copying it when it is contiguous.
-
-    Raises:
-        RecordFormatError: the type is none that can be stored.
-    """
-    check_storable(array.dtype)
-    digest = hashlib.sha256()
-    for block in byte_blocks(array):
-        digest.update(block.data)
-    return ArrayFingerprint(
-        dtype=little_endian(array.dtype).str, shape=array.shape, sha256=digest.hexdigest()
-    )
 
 
 def payload_digest(payload: PayloadLike) -> str:
@@ -190,33 +161,26 @@ def payload_digest(payload: PayloadLike) -> str:
     Raises:
         RecordFormatError: the metadata are not JSON or an array's type cannot be stored.
     """
+
+    def fingerprint(name: str) -> list[JsonValue]:
+        array = payload.arrays[name]
+        check_storable(array.dtype)
+        digest = hashlib.sha256()
+        for block in _byte_blocks(array):
+            digest.update(block.data)
+        return [_little_endian(array.dtype).str, [*array.shape], digest.hexdigest()]
+
     # Largest first, so that no thread is left alone with a long tail.
     names = sorted(payload.arrays, key=lambda name: -payload.arrays[name].nbytes)
-    with ThreadPoolExecutor(max_workers=usable_cores()) as threads:
-        prints = threads.map(lambda name: array_fingerprint(payload.arrays[name]), names)
-        fingerprints = dict(zip(names, prints, strict=True))
-    return digest_of_parts(
-        payload.type_name, payload.encoding_version, payload.metadata, fingerprints
-    )
-
-
-def digest_of_parts(
-    type_name: str,
-    encoding_version: int,
-    metadata: Mapping[str, JsonValue],
-    arrays: Mapping[str, ArrayFingerprint],
-) -> str:
-    """Digest a product whose arrays have been digested before; see `payload_digest`."""
+    with ThreadPoolExecutor(max_workers=_usable_cores()) as threads:
+        fingerprints = dict(zip(names, threads.map(fingerprint, names), strict=True))
     content = {
         "what": "orthoflow/product",
         "v": 1,
-        "type": type_name,
-        "encoding_version": encoding_version,
-        "metadata": metadata,
-        "arrays": {
-            name: [print_.dtype, list(print_.shape), print_.sha256]
-            for name, print_ in arrays.items()
-        },
+        "type": payload.type_name,
+        "encoding_version": payload.encoding_version,
+        "metadata": payload.metadata,
+        "arrays": fingerprints,
     }
     return DIGEST_PREFIX + sha256_text(canonical_json(content))
 
@@ -236,7 +200,7 @@ def check_storable(dtype: np.dtype[np.generic]) -> None:
         )
 
 
-def usable_cores() -> int:
+def _usable_cores() -> int:
     """Count the processors this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
@@ -329,17 +293,17 @@ def measure_payloads(
     Returns:
         All differences, also those within the limits, by name; empty when the products are equal.
     """
-    differences: list[ArrayDifference] = []
     if (left.type_name, left.encoding_version) != (right.type_name, right.encoding_version):
         problem = (
             f"the products are {left.type_name} version {left.encoding_version} and "
             f"{right.type_name} version {right.encoding_version}"
         )
         return (_unlike("type", (_EXACT, "1"), problem),)
+    differences: list[ArrayDifference] = []
     for name in sorted(left.arrays.keys() | right.arrays.keys()):
         tolerance = _tolerance(name, tolerances)
         if name not in left.arrays or name not in right.arrays:
-            differences.append(_unlike(name, tolerance, "only one of the products has it"))
+            differences.append(_unlike(name, tolerance, _ALONE))
         else:
             differences += _array_differences(
                 name, left.arrays[name], right.arrays[name], tolerance
@@ -393,7 +357,7 @@ def _write_content(group: h5py.Group, payload: PayloadLike) -> None:
 def _write_array(
     group: h5py.Group, name: str, array: NDArray[np.generic], *, is_mapped: bool
 ) -> None:
-    dtype = little_endian(array.dtype)
+    dtype = _little_endian(array.dtype)
     if is_mapped or array.nbytes < _SMALL_BYTES or array.ndim == 0:
         dataset = _create_contiguous(group, name, array.shape, dtype)
     else:
@@ -536,33 +500,28 @@ def _json_differences(
         for key in sorted(left.keys() | right.keys()):
             place = f"{name}/{key}".lstrip("/")
             if key not in left or key not in right:
-                yield _unlike(place, tolerance, "only one of the products has it")
+                yield _unlike(place, tolerance, _ALONE)
             else:
                 yield from _json_differences(place, left[key], right[key], tolerances)
     elif isinstance(left, list) and isinstance(right, list) and len(left) == len(right):
         for index, (a, b) in enumerate(zip(left, right, strict=True)):
             yield from _json_differences(f"{name}/{index}", a, b, tolerances)
     elif _is_number(left) and _is_number(right):
-        stated = _stated_tolerance(name, left, right, tolerances)
-        yield from _number_differences(name, float(str(left)), float(str(right)), stated)
+        one, other = float(str(left)), float(str(right))
+        limit, unit = tolerance
+        if _field(name) not in tolerances and float in (type(left), type(right)):
+            limit = _STATED_SHARE * max(1.0, abs(one), abs(other))
+        if one != other:
+            yield ArrayDifference(
+                name=name,
+                largest=abs(one - other),
+                limit=limit,
+                unit=unit,
+                n_values=int(abs(one - other) > limit),
+                problem=f"{one:g} against {other:g}, {_amount(limit, unit)} are allowed",
+            )
     elif left != right or type(left) is not type(right):
         yield _unlike(name, tolerance, f"{left!r:.60} against {right!r:.60}")
-
-
-def _number_differences(
-    name: str, left: float, right: float, tolerance: tuple[float, str]
-) -> Iterator[ArrayDifference]:
-    limit, unit = tolerance
-    distance = abs(left - right)
-    if distance:
-        yield ArrayDifference(
-            name=name,
-            largest=distance,
-            limit=limit,
-            unit=unit,
-            n_values=int(distance > limit),
-            problem=f"{left:g} against {right:g}, {_amount(limit, unit)} are allowed",
-        )
 
 
 def _is_number(value: JsonValue) -> bool:
@@ -571,29 +530,14 @@ def _is_number(value: JsonValue) -> bool:
 
 def _tolerance(name: str, tolerances: Tolerances) -> tuple[float, str]:
     field = _field(name)
-    return tolerances.get(field, (_EXACT, _unit(field)))
-
-
-def _stated_tolerance(
-    name: str, left: JsonValue, right: JsonValue, tolerances: Tolerances
-) -> tuple[float, str]:
-    limit, unit = _tolerance(name, tolerances)
-    values = [value for value in (left, right) if isinstance(value, float)]
-    if _field(name) in tolerances or not values:
-        return limit, unit
-    return _STATED_SHARE * max(1.0, *(abs(value) for value in values)), unit
+    suffix = field.rpartition("_")[2]
+    return tolerances.get(field, (_EXACT, suffix if suffix in _UNITS else "1"))
 
 
 def _field(name: str) -> str:
     """The last part of a name that is not a number."""
     parts = (part for part in reversed(name.split("/")) if not part.isdigit())
     return next(parts, "")
-
-
-def _unit(field: str) -> str:
-    """The unit that the name of a field ends in, 1 when it ends in none."""
-    suffix = field.rpartition("_")[2]
-    return suffix if suffix in _UNITS else "1"
 
 
 def _amount(value: float, unit: str) -> str:

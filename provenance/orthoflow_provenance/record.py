@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Final, TypeAlias
+from typing import Final, TypeAlias
 
 import h5py
 import numpy as np
@@ -181,7 +181,7 @@ def write_record(
         for entry in written.inputs:
             for given in entry.files if entry.embedded else ():
                 if given.sha256 not in files:
-                    _embed_file(files, entry.name, given, input_file or _no_file)
+                    _embed_file(files, entry.name, given, input_file and input_file(given.sha256))
         offset = write_array(file, SEAL, fixed_text(_UNSEALED)).id.get_offset()
     _seal_file(part, offset)
     part.replace(path)
@@ -261,7 +261,11 @@ def expected_nodes(record: RunRecord, text: str) -> dict[str, Node]:
         nodes[f"/inputs/{entry.name}"] = _node(data=_table(entry.files, columns))
     for environment in record.environments:
         nodes[f"/environments/{environment.id}"] = _node(
-            _attributes(environment), _pairs(environment.packages, "name", "version")
+            _attributes(environment),
+            _table(
+                [{"name": name, "version": one} for name, one in environment.packages.items()],
+                ("name", "version"),
+            ),
         )
     for cell in record.cells:
         place = f"/{CELLS}/{cell.address}"
@@ -295,12 +299,14 @@ def file_sha256(path: Path, offset: int) -> str:
         path: the file.
         offset: of the 64 bytes of the seal.
     """
-    digest = hashlib.sha256()
+    digest, position = hashlib.sha256(), 0
     with path.open("rb") as stream:
-        _digest_bytes(digest.update, stream, offset)
-        digest.update(_UNSEALED.encode())
-        stream.seek(64, os.SEEK_CUR)
-        _digest_bytes(digest.update, stream, None)
+        while block := bytearray(stream.read(_BLOCK_BYTES)):
+            start = min(max(offset - position, 0), len(block))
+            stop = min(max(offset + len(_UNSEALED) - position, 0), len(block))
+            block[start:stop] = b"0" * (stop - start)
+            digest.update(block)
+            position += len(block)
     return digest.hexdigest()
 
 
@@ -458,10 +464,6 @@ def _metrics_table(record: RunRecord) -> NDArray[np.generic]:
     return _table(rows, columns, reals=("value",))
 
 
-def _pairs(pairs: Mapping[str, str], key: str, value: str) -> NDArray[np.generic]:
-    return _table([{key: one, value: other} for one, other in pairs.items()], (key, value))
-
-
 def _table(
     rows: Sequence[object],
     columns: Sequence[str],
@@ -523,15 +525,7 @@ def _copy_product(products: h5py.Group, digest: str, source: h5py.Group) -> None
     source.file.copy(source, products, name=digest.removeprefix(DIGEST_PREFIX))
 
 
-def _no_file(sha256: str) -> Path | None:
-    del sha256
-    return None
-
-
-def _embed_file(
-    files: h5py.Group, input_name: str, file: RecordedFile, input_file: InputFile
-) -> None:
-    path = input_file(file.sha256)
+def _embed_file(files: h5py.Group, input_name: str, file: RecordedFile, path: Path | None) -> None:
     if path is None:
         raise InputFileError(
             f"the file {file.name} of the input {input_name} is to be embedded, but there is none "
@@ -567,17 +561,6 @@ def _seal_file(path: Path, offset: int) -> None:
         stream.write(seal.encode())
         stream.flush()
         os.fsync(stream.fileno())
-
-
-def _digest_bytes(update: Callable[[bytes], object], stream: BinaryIO, n_bytes: int | None) -> None:
-    """Digest so many bytes of a stream, all that are left without a number."""
-    left = n_bytes
-    while left is None or left > 0:
-        block = stream.read(_BLOCK_BYTES if left is None else min(left, _BLOCK_BYTES))
-        if not block:
-            return
-        update(block)
-        left = None if left is None else left - len(block)
 
 
 def _sync_folder(folder: Path) -> None:

@@ -15,28 +15,6 @@ from orthoflow.engine.measuring import is_for_want_of_memory
 WHO = "method plane.mine of mine 1.0"
 
 
-@pytest.mark.parametrize(
-    ("code", "tail", "sentence"),
-    [
-        (1, "", f"{WHO} ended its process without a result (exit status 1)"),
-        (0, "", f"{WHO} ended its process without a result (exit status 0)"),
-        (
-            3,
-            "no.",
-            f"{WHO} ended its process without a result (exit status 3); its log ends with: no.",
-        ),
-        (
-            -signal.SIGTERM,
-            "no licence",
-            f"{WHO} was killed from outside (SIGTERM) while it held 1.5 GiB of memory",
-        ),
-    ],
-    ids=["without a word", "as if all were well", "with a last word", "from outside"],
-)
-def test_an_exit_is_told_with_what_is_known_of_it(code: int, tail: str, sentence: str) -> None:
-    assert describe_exit(WHO, code, 3 << 29, tail) == sentence
-
-
 @pytest.mark.parametrize("number", [signal.SIGSEGV, signal.SIGABRT, signal.SIGFPE])
 def test_a_crash_is_named_by_its_signal(number: signal.Signals) -> None:
     told = describe_exit(WHO, -number, 0, "")

@@ -37,25 +37,6 @@ def test_loading_shows_in_compile_s_only_and_stops_no_clock_from_a_daemon(world:
     assert again.results["b"].compile_s is not None
 
 
-def test_no_search_for_garbage_looks_at_what_a_step_has_loaded(world: World) -> None:
-    """Else what a method states of its speed hangs on who has loaded its libraries."""
-    package = world.site / "toy_plugin"
-    (package / "aside.py").write_text("")
-    (package / "heavy.py").write_text(
-        "import time\n"
-        "class Loaded: pass\n"
-        "objects = [Loaded() for _ in range(1000)]\n"
-        "end_s = time.thread_time() + 0.5\n"
-        "while time.thread_time() < end_s: pass\n"
-    )
-    result = world.run(STEPS.format("loads", "")).results["b"]
-    assert metric(result, "n_searched") == 0
-    # A program that orthoflow is a part of keeps its garbage collected.
-    into = {"into": "inline", "executor": "inline", "force": ("b",)}
-    here = world.run(STEPS.format("loads", ""), **into).results["b"]
-    assert metric(here, "n_searched") == 1000
-
-
 def test_a_deterministic_method_is_repeated_to_be_timed(world: World) -> None:
     steps = STEPS.format("slow", ", params: {steps: 2}, repeat: 3")
     first = world.run(steps)

@@ -21,7 +21,6 @@ from orthoflow.errors import (
     DiskSpaceError,
     InputError,
     MethodError,
-    PluginError,
     StepFailedError,
     StoreError,
 )
@@ -41,45 +40,6 @@ def a_task(**more: Any) -> Task:
         "environment": environment(),
     }  # fmt: skip
     return bare_task(**(plain | more))
-
-
-def read_only_error() -> ValueError:
-    array = np.zeros(2)
-    array.flags.writeable = False
-    try:
-        array[0] = 1.0
-    except ValueError as error:
-        return error
-    raise AssertionError
-
-
-WHO = "method work.add of toys 1.0"
-
-
-@pytest.mark.parametrize(
-    ("error", "kind", "said"),
-    [
-        (MemoryError(), StepFailedError, f"{WHO} needed more memory than it could get: an alloc"),
-        (MemoryError("8 GiB"), StepFailedError, f"{WHO} needed more memory than it could get: 8"),
-        (ModuleNotFoundError("No module named 'x'", name="x"), PluginError, f"{WHO} needs x, whi"),
-        (ImportError("bad wheel"), PluginError, f"{WHO} needs a library, which is missing or f"),
-        (read_only_error(), MethodError, f"{WHO} writes to an array that is read-only, as all"),
-        (ValueError("no number"), MethodError, f"{WHO} failed unexpectedly: ValueError: no number"),
-        (ValueError(), MethodError, f"{WHO} failed unexpectedly: ValueError"),
-        (SystemExit(3), MethodError, f"{WHO} tried to end the program (3)"),
-        (OSError(errno.ENOENT, "No such file"), MethodError, f"{WHO} failed unexpectedly: FileN"),
-    ],
-    ids=lambda value: value if isinstance(value, str) else type(value).__name__,
-)
-def test_whatever_a_method_raises_is_told_by_one_of_our_errors(
-    error: BaseException, kind: type[Exception], said: str
-) -> None:
-    told = worker.explain_failure(a_task(), error)
-    assert type(told) is kind
-    assert str(told).startswith(said)
-    assert not str(told).endswith(": ")
-    ours = StoreError("full")
-    assert worker.explain_failure(a_task(), ours) is ours
 
 
 @pytest.mark.parametrize(

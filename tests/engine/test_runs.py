@@ -15,7 +15,7 @@ from orthoflow.engine.journal import (
     CellStarted,
 )
 from orthoflow.engine.scheduler import execute
-from orthoflow.errors import ArgumentError, InputError, StoreError
+from orthoflow.errors import InputError
 from tests.engine_world import World, digests
 
 CHAIN = """
@@ -131,15 +131,6 @@ def test_threads_are_fixed_before_any_library_loads(world: World, jobs: int, cor
     assert not Path(scratch).exists()
 
 
-def test_products_that_got_lost_are_computed_again(world: World) -> None:
-    outcome = world.run(CHAIN, executor="inline")
-    digest = outcome.results["second"].outputs["numbers"].digest.removeprefix("sha256:")
-    (world.store.objects / digest / "product.h5").write_bytes(b"\x89HDF\r\n\x1a\n broken")
-    again = world.run(CHAIN, into="again", executor="inline")
-    assert digests(again) == digests(outcome)
-    assert set(again.cached) == {"first", "third"}
-
-
 def test_a_bad_input_file_ends_with_exit_code_two(world: World) -> None:
     (world.folder / "data.txt").write_text("one two")
     steps = """
@@ -193,40 +184,10 @@ def test_results_of_code_that_changed_during_the_run_are_not_kept(world: World) 
 # Run folders --------------------------------------------------------------------------------------
 
 
-def test_a_finished_run_folder_is_refused(world: World) -> None:
-    world.run(CHAIN, executor="inline")
-    (world.folder / "run" / "run.h5").write_bytes(b"")
-    with pytest.raises(ArgumentError, match=r"holds a finished run \(run.h5\); choose another"):
-        world.run(CHAIN, executor="inline")
-
-
-def test_a_folder_with_other_files_is_refused(world: World) -> None:
-    (world.folder / "mine").mkdir()
-    (world.folder / "mine" / "thesis.txt").write_text("dear")
-    with pytest.raises(ArgumentError, match="is not empty and holds no unfinished run"):
-        world.run(CHAIN, into="mine", executor="inline")
-    assert [path.name for path in (world.folder / "mine").iterdir()] == ["thesis.txt"]
-
-
-def test_an_unfinished_run_of_another_workflow_is_refused(world: World) -> None:
-    world.run(CHAIN, executor="inline")
-    path = world.folder / "run" / "journal.jsonl"
-    path.write_text(path.read_text().replace('"toy"', '"other"'))
-    with pytest.raises(ArgumentError, match="holds an unfinished run of other, not of toy"):
-        world.run(CHAIN, executor="inline")
-
-
 def test_a_forced_step_that_this_run_has_computed_is_not_computed_twice(world: World) -> None:
     first = world.run(CHAIN, executor="inline", force=("second",))
     second = world.run(CHAIN, executor="inline", force=("second",))
     assert second.results == first.results
-
-
-def test_a_damaged_journal_is_named(world: World) -> None:
-    world.run(CHAIN, executor="inline")
-    (world.folder / "run" / "journal.jsonl").write_text("nonsense\n")
-    with pytest.raises(StoreError, match=r"journal.jsonl is damaged; remove"):
-        world.run(CHAIN, executor="inline")
 
 
 def test_left_overs_of_killed_runs_are_removed(world: World) -> None:
