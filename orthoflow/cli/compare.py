@@ -34,7 +34,7 @@ if TYPE_CHECKING:
         ParameterValue,
         RunComparison,
     )
-    from orthoflow.report.moved import Alike
+    from orthoflow.report.differences import Alike
 
 Value = TypeVar("Value")
 _NOTHING: Final = "-"
@@ -100,7 +100,7 @@ def _row_json(row: Pair[Any]) -> dict[str, object]:
 
 
 def _print(comparison: RunComparison, *, most: int | None = None) -> None:
-    from orthoflow.report.moved import without_seeds
+    from orthoflow.report.differences import without_seeds
 
     for mark, record in (("A", comparison.left), ("B", comparison.right)):
         echo(
@@ -157,7 +157,7 @@ def _print_pairs(
         step_of: the step of each cell.
         whose: of which steps the rows are, if not of all.
     """
-    from orthoflow.report.moved import alike_rows, alike_texts
+    from orthoflow.report.differences import alike_rows, alike_texts
 
     different = [row for row in rows if not row.is_same]
     if not different:
@@ -225,7 +225,7 @@ def _parameter_text(parameter: ParameterValue) -> str:
 
 def _print_metrics(comparison: RunComparison, most: int | None) -> None:
     """Print metrics that differ by more than rounding; times and memory apart and last."""
-    from orthoflow.report.moved import alike_rows, moved_first, repeats_as_one
+    from orthoflow.report.differences import alike_rows, moved_first, repeats_as_one
 
     measured, step_of = comparison.measured, comparison.step_of
     echo("", f"metrics: {_counts(measured)}{comparison.of_shared_steps}")
@@ -244,7 +244,7 @@ def _print_metrics(comparison: RunComparison, most: int | None) -> None:
 
 
 def _print_numbers(rows: Sequence[Alike[ComparedMetric]]) -> None:
-    from orthoflow.report.moved import metric_label
+    from orthoflow.report.differences import metric_label
 
     echo_table(
         ("metric", "A", "B", "B - A", "unit"),

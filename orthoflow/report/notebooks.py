@@ -32,7 +32,7 @@ from orthoflow.records.tables import RunSet, join_runs
 from orthoflow.records.unfinished import open_run as open_plain_run
 from orthoflow.records.verification import Verification, broken_seal, verify_run
 from orthoflow.report.combinations import baseline_cells, combinations_of, unequal_walls
-from orthoflow.report.moved import moved_first
+from orthoflow.report.differences import moved_first
 from orthoflow.report.pictures import embedded_products, thumbnail
 from orthoflow.report.summaries import answers
 from orthoflow.report.tidy_tables import Varied

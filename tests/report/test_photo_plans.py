@@ -18,7 +18,7 @@ from orthoflow.report.pages import write_page
 from orthoflow.report.photo_plans import photo_plan
 from orthoflow.report.pictures import wall_pictures
 from tests import samples
-from tests.report_runs import HeldRun, camera, cell, compared_run, given
+from tests.report_runs import HeldRun, camera, compared_run
 
 
 def oriented(run: HeldRun, **changes: Any) -> HeldRun:
@@ -77,23 +77,6 @@ def test_without_an_oriented_photo_there_is_no_plan(tmp_path: Path) -> None:
 # --- the plan by itself ---
 
 UP = np.array([0.0, 0.0, 1.0])
-
-
-def test_up_is_that_of_the_planes(tmp_path: Path) -> None:
-    run = compared_run(tmp_path)
-    np.testing.assert_array_equal(module._up(run), UP)
-    up = np.array([0.6, 0.0, 0.8])
-    scene = samples.planes(
-        normal=np.array([[0.0, 1.0, 0.0]]),
-        offset=np.zeros(1),
-        corners=np.zeros((1, 4, 3)),
-        up=up,
-        names=("wall 0",),
-    )
-    cells = [*run.record.cells, cell("plane", outputs={"planes": given("", "9", "planes")})]
-    products = {**run.products, ("plane", "planes"): scene}
-    told = replace(run, record=replace(run.record, cells=tuple(cells)), products=products)
-    np.testing.assert_array_equal(module._up(told), up)
 
 
 # Walls of 12 m from west to east and of 4 m from south to north.

@@ -22,9 +22,7 @@ from orthoflow.report.summaries import answers, citations, limits, results
 from tests.report_runs import (
     HeldRun,
     cell,
-    compared_resolved,
     compared_run,
-    environment,
     given,
     metrics,
     record,
@@ -411,38 +409,6 @@ def test_what_a_run_was_broken_off_before_has_no_time_and_is_not_counted(
     assert "None of the 2 combinations was computed to its end" in page
     assert "not computed: wall@plane=coarse and 3 more" in page
     assert "found no plane" not in page
-
-
-def test_values_of_different_environments_carry_letters_and_are_ranked_apart() -> None:
-    cells = [
-        cell(
-            f"plane@plane={name}{repeat}",
-            metrics=metrics(rms_mm=value + 0.01 * len(repeat)),
-            environment=place,
-        )
-        for name, value, place in (("fine", 1.0, "e1"), ("b", 2.0, "e1"), ("c", 9.0, "e2"))
-        for repeat in ("", "#1")
-    ]
-    mixed = run(
-        *cells,
-        environments=(environment(), environment("e2", threads=1)),
-        workflow_resolved=compared_resolved("plane.rms_mm"),
-    )
-    table = comparison_table([mixed])
-    assert table is not None
-    values = [row.values[0] for row in table.rows]
-    assert [(value.group, value.mark) for value in values] == [
-        ("A", Mark.BEST),
-        ("A", Mark.WORST),
-        ("B", Mark.NONE),
-    ]
-    assert list(table.groups) == ["A", "B"]
-    assert [(one.groups, one.is_unranked) for one in table.glance] == [
-        (("A",), False),
-        (("B",), True),
-        (("A",), False),
-    ]
-    assert table.forced == "--force plane"
 
 
 def test_runs_on_different_data_are_not_ranked_together() -> None:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
 from orthoflow_provenance.document import RecordedFile
 
 from orthoflow.records.comparison import CellFacts, Distance, Pair, ParameterValue, RunComparison
-from orthoflow.report import numbers
 from orthoflow.report.combinations import (
     baseline_cells,
     baseline_of,
@@ -33,54 +31,6 @@ def run(*cells: object, **more: object) -> HeldRun:
 
 
 # --- numbers ---
-
-
-@pytest.mark.parametrize(
-    ("value", "printed"),
-    [
-        (0.0, "0"),
-        (-7.0, "-7"),
-        (999_999_999_999_999.0, "999999999999999"),
-        (1e15, "1000000000000000"),
-        (1e16, "10000000000000000"),
-        (123456.7, "123457"),
-        (1230.4, "1230"),
-        (-999.96, "-1000"),
-        (999.96, "1000"),
-        (1234.5678, "1235"),
-        (123.45678, "123.5"),
-        (1.23456, "1.235"),
-        (1.5, "1.5"),
-        (0.1, "0.1"),
-        (-0.000123456, "-0.0001235"),
-        (1.23456e-6, "0.000001235"),
-        (1.23456e-7, "1.23e-07"),
-    ],
-)
-def test_a_number_has_four_digits(value: float, printed: str) -> None:
-    assert numbers.number(value) == printed
-
-
-@pytest.mark.parametrize(
-    ("value", "spread", "printed"),
-    [
-        (12.3456, 0.0, "12.35"),
-        (12.3456, 1.0, "12.3 ± 1.0"),
-        (12.3456, 9.96, "12.3 ± 10.0"),
-        (123.4, 10.0, "123 ± 10"),
-        (1234.0, 100.0, "1234 ± 100"),
-        (1234.56, 123.456, "1235 ± 123.5"),
-        (0.01234, 0.00056, "0.01234 ± 0.00056"),
-        (0.0, 0.25, "0.00 ± 0.25"),
-        (12.3456, 0.0012, "12.3456 ± 0.0012"),
-        (12.3456, 0.00012, "12.35 ± 0.0001"),
-        (-1.5, 0.25, "-1.50 ± 0.25"),
-    ],
-)
-def test_a_mean_is_printed_to_the_second_digit_of_its_spread(
-    value: float, spread: float, printed: str
-) -> None:
-    assert numbers.number_with_spread(value, spread) == printed
 
 
 # --- ranks ---
