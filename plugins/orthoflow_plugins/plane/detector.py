@@ -128,7 +128,7 @@ class DetectorParams(MethodParams):
         description="Keep walls exactly vertical and levels exactly level instead of letting each "
         "plane lean as its points say.",
     )
-    n_planes_max: int = Field(16, ge=1, le=100, description="Stop after so many planes.")
+    n_planes_max: int = Field(100, ge=1, le=100, description="Stop after so many planes.")
     min_area_m2: float = Field(
         1.0,
         ge=0.0,

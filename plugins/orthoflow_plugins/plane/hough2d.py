@@ -217,6 +217,7 @@ class PlanProposer:
         from orthoflow_plugins.plane.votes import VOTE_SHARES, vote_image, vote_places
 
         before, accumulator = self._cells, self._params.accumulator
+        self.__dict__.pop("_voting_cells", None)
         self._cells = self._cloud.plan
         if search.n_points < len(search.claims):
             self._cells, self._heights = self._left(search.claims)
@@ -283,27 +284,32 @@ class PlanProposer:
 
         return left
 
+    @cached_property
+    def _voting_cells(self) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+        """(3, m) middles of the cells that vote, from the plan's centre, and (m,) their votes."""
+        votes = vote_counts(self._cells, self._params.accumulator)
+        cells = np.nonzero(votes)
+        places = np.zeros((3, len(cells[0])), dtype=np.float32)
+        for axis in range(2):
+            places[axis] = (cells[axis] + 0.5 - 0.5 * votes.shape[axis]) * self._cell_m
+        return places, votes[cells].astype(np.int32)
+
     def _refined(self, angle_rad: float, distance_m: float) -> tuple[float, float]:
         """Look around a maximum with finer angles and half-cell bins."""
         from orthoflow_plugins.plane.votes import sharpest, vote_places
 
         bin_m, step = self._cell_m, self._step_rad
-        cells = vote_counts(self._cells, self._params.accumulator)
-        rows, columns = np.nonzero(cells)
+        places, weights = self._voting_cells
         reach_m = (self._smear_bins + 3) * bin_m
         n_fine = max(1, math.ceil(step / max(step / 40.0, 0.5 / self._reach_bins)))
         angles = np.float64(angle_rad) + np.arange(-n_fine, n_fine + 1) * (step / n_fine)
         fine = np.zeros((len(angles), 4 * (self._smear_bins + 3)), dtype=np.int32)
-        places = np.zeros((3, len(rows)), dtype=np.float32)
-        places[0] = (rows + 0.5 - 0.5 * cells.shape[0]) * bin_m
-        places[1] = (columns + 0.5 - 0.5 * cells.shape[1]) * bin_m
         # A point moves by up to half the plan times a step; cells further off cannot matter.
         direction = np.array([math.cos(angle_rad), math.sin(angle_rad)], dtype=np.float32)
         apart_m = np.abs(direction @ places[:2] - np.float32(distance_m))
         near = np.flatnonzero(apart_m < reach_m + step * self.reach_m)
-        weights = cells[rows[near], columns[near]].astype(np.int32)
-        low_m = distance_m - reach_m
-        vote_places(places.take(near, axis=1), weights, _normals(angles), low_m, 0.5 * bin_m, fine)
+        low_m, near_by = distance_m - reach_m, places.take(near, axis=1)
+        vote_places(near_by, weights[near], _normals(angles), low_m, 0.5 * bin_m, fine)
         best, place = sharpest(fine)
         return float(angles[best]), low_m + place * 0.5 * bin_m
 

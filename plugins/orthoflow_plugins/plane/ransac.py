@@ -251,20 +251,49 @@ class ConsensusProposer:
         return np.asarray(np.sum(apart_m <= self._search.tolerance_m, axis=0, dtype=np.int64))
 
     def _best(self) -> Candidate | None:
-        hypotheses = self._hypotheses
+        """The best hypothesis with enough points, of which those near it crowd about its plane.
+
+        A plane through mouldings and clutter holds many points too, but spread over its slab. One
+        is barred: the full verification would cost ten times as much.
+        """
+        from orthoflow_plugins.plane.fit import refine_plane
+        from orthoflow_plugins.plane.support import INNER_SHARE
+
+        hypotheses, search, params = self._hypotheses, self._search, self._params
         if hypotheses is None:
             return None
-        is_barred = self._is_barred(hypotheses)
+        is_own = params.scoring == "a-contrario"
+        asked = max(1, min(_SECOND_POINTS, search.n_points))
+        n_points = self._scores.n_points / asked * search.n_points
+        is_open = n_points >= _SUPPORT_CAUTION * search.least_points
+        is_open &= (self._scores.value > 0.0) | (not is_own)
+        is_open &= ~self._is_barred(hypotheses)
+        reach_m = search.tolerance_m
         for place in range(len(hypotheses)):
-            if is_barred[place] or not self._is_worth_it(place):
+            if not is_open[place]:
                 continue
             hypothesis = hypotheses.take(np.array([place]))
-            layer = self._crowded_layer(hypothesis)
+            start, up = hypothesis.plane(0), search.cloud.up
+            layer = refine_plane(self._asked_m, start, reach_m, freedom="free", up=up)
             if layer is not None:
-                return self._candidate(hypothesis, place, layer)
-            # Not asked about again; the full verification would cost ten times as much.
-            self._bar(hypothesis)
-            is_barred |= hypotheses.are_near(hypothesis, self._search.tolerance_m)[:, 0]
+                sizes_m = np.abs(layer.distances_m(self._asked_m))
+                n_inner = np.count_nonzero(sizes_m <= INNER_SHARE * reach_m)
+                if n_inner < _CROWDED_SHARE * np.count_nonzero(sizes_m <= reach_m):
+                    layer = None
+            if layer is None:
+                self._bar(hypothesis)
+                is_open &= ~hypotheses.are_near(hypothesis, reach_m)[:, 0]
+                continue
+            own_m = None
+            if is_own:
+                hypothesis, own_m = self._polished(hypothesis)
+            return Candidate(
+                plane=self._in_offsets(hypothesis.plane(0)),
+                constraint="vertical" if params.model == "2d" else params.constraint,
+                votes=float(self._scores.value[place]),
+                own_tolerance_m=own_m,
+                start=self._in_offsets(layer),
+            )
         return None
 
     def _draw(self) -> None:
@@ -351,42 +380,6 @@ class ConsensusProposer:
             if len(kept) == n_most:
                 break
         return asked[kept]
-
-    def _is_worth_it(self, place: int) -> bool:
-        if self._params.scoring == "a-contrario" and self._scores.value[place] <= 0.0:
-            return False
-        asked = min(_SECOND_POINTS, self._search.n_points)
-        n_points = self._scores.n_points[place] / max(1, asked) * self._search.n_points
-        return bool(n_points >= _SUPPORT_CAUTION * self._search.least_points)
-
-    def _crowded_layer(self, hypothesis: Hypotheses) -> Plane | None:
-        """The densest layer near a hypothesis, about the centre, if points crowd about it.
-
-        A plane through mouldings and clutter holds many points too, but spread over its slab.
-        """
-        from orthoflow_plugins.plane.fit import refine_plane
-        from orthoflow_plugins.plane.support import INNER_SHARE
-
-        reach_m, start = self._search.tolerance_m, hypothesis.plane(0)
-        up = self._search.cloud.up
-        moved = refine_plane(self._asked_m, start, reach_m, freedom="free", up=up)
-        if moved is None:
-            return None
-        sizes_m = np.abs(moved.distances_m(self._asked_m))
-        inner = np.count_nonzero(sizes_m <= INNER_SHARE * reach_m)
-        return moved if inner >= _CROWDED_SHARE * np.count_nonzero(sizes_m <= reach_m) else None
-
-    def _candidate(self, hypothesis: Hypotheses, place: int, layer: Plane) -> Candidate:
-        own_m = None
-        if self._params.scoring == "a-contrario":
-            hypothesis, own_m = self._polished(hypothesis)
-        return Candidate(
-            plane=self._in_offsets(hypothesis.plane(0)),
-            constraint="vertical" if self._params.model == "2d" else self._params.constraint,
-            votes=float(self._scores.value[place]),
-            own_tolerance_m=own_m,
-            start=self._in_offsets(layer),
-        )
 
     def _in_offsets(self, plane: Plane) -> Plane:
         offset_m = plane.offset_m + float(plane.normal @ self._centre_m)

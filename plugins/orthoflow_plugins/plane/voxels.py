@@ -163,25 +163,30 @@ class VoxelTable:
         occupied = np.flatnonzero(np.max([table[0] for table in tables], axis=0) >= 0)
         bricks = np.full(n_bricks, -1, dtype=np.int32)
         bricks[occupied] = np.arange(len(occupied), dtype=np.int32)
-        held = np.zeros((len(occupied), VOXELS), dtype=bool)
-        for own_bricks, own_numbers, _, _ in tables:
-            rows = own_bricks[occupied]
-            held[rows >= 0] |= own_numbers[rows[rows >= 0]] >= 0
-        numbers = np.full(held.shape, -1, dtype=np.int32)
-        numbers[held] = np.arange(np.count_nonzero(held), dtype=np.int32)
-        sums = np.zeros((np.count_nonzero(held), n_sums), dtype=np.int64)
-        for own_bricks, own_numbers, own_sums, _ in tables:
-            rows = own_bricks[occupied]
-            own = own_numbers[rows[rows >= 0]]
-            sums[numbers[rows >= 0][own >= 0]] += own_sums[own[own >= 0]]
-        row, voxel = np.divmod(np.flatnonzero(held), VOXELS)
+        held = np.zeros(len(occupied) * VOXELS, dtype=bool)
+        met = []
+        for own_bricks, own_numbers, own_sums, n_used in tables:
+            known = np.flatnonzero(own_bricks >= 0)
+            rows = np.empty(len(known), dtype=np.int64)
+            rows[own_bricks[known]] = bricks[known]
+            own = own_numbers[: n_used[0]].ravel()
+            used = np.flatnonzero(own >= 0)
+            keys = rows[used // VOXELS] * VOXELS + used % VOXELS
+            held[keys] = True
+            met.append((keys, own_sums[own[used]]))
+        filled = np.flatnonzero(held)
+        numbers = np.full(len(held), -1, dtype=np.int32)
+        numbers[filled] = np.arange(len(filled), dtype=np.int32)
+        sums = np.zeros((len(filled), n_sums), dtype=np.int64)
+        for keys, own_sums in met:
+            sums[numbers[keys]] += own_sums
         corners = np.stack(np.unravel_index(occupied, shape), axis=1) * BRICK_SIDE
-        within = np.stack(np.unravel_index(voxel, (BRICK_SIDE,) * 3), axis=1)
+        within = np.stack(np.unravel_index(filled % VOXELS, (BRICK_SIDE,) * 3), axis=1)
         return cls(
             grid=grid,
             bricks=bricks.reshape(shape),
-            numbers=numbers,
-            places=(corners[row] + within).astype(np.int32),
+            numbers=numbers.reshape(-1, VOXELS),
+            places=(corners[filled // VOXELS] + within).astype(np.int32),
             sums=sums,
         )
 
