@@ -669,14 +669,9 @@ def _homography(
 ) -> NDArray[np.float64] | None:
     import cv2
 
-    params: Any = cv2.UsacParams()
-    params.threshold = loose_px
-    params.maxIterations = 10_000
+    params = sampling(loose_px, trials=10_000)
     params.confidence = 0.9999
-    params.randomGeneratorState = _SEED
     params.sampler = cv2.SAMPLING_PROSAC  # takes the matches in the order of their quality
-    params.score = cv2.SCORE_METHOD_MSAC
-    params.loMethod = cv2.LOCAL_OPTIM_INNER_LO
     order = np.argsort(ratio, kind="stable")
     try:
         found: Any = cv2.findHomography(source[order], target[order], params)[0]
@@ -684,6 +679,19 @@ def _homography(
         return None
     matrix: NDArray[np.float64] | None = found
     return matrix
+
+
+def sampling(threshold_px: float, *, trials: int) -> Any:
+    """Return how OpenCV samples robustly: MSAC, improved locally, the same each time."""
+    import cv2
+
+    params: Any = cv2.UsacParams()
+    params.threshold = threshold_px
+    params.maxIterations = trials
+    params.randomGeneratorState = _SEED
+    params.score = cv2.SCORE_METHOD_MSAC
+    params.loMethod = cv2.LOCAL_OPTIM_INNER_LO
+    return params
 
 
 def mapped(homography: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -461,6 +461,11 @@ class _Laid:
     apart_cells: float
     placed: Placed | None
 
+    @property
+    def shown(self) -> NDArray[np.bool_]:
+        """Coarse cells (rows, cols) of the wall that the photo shows."""
+        return np.isfinite(self.pixels[:, :, 0])
+
 
 def confirmed(
     photos: Photos,
@@ -499,7 +504,8 @@ def confirmed(
         for a, b in combinations(range(len(laid)), 2)
         if laid[a].photo != laid[b].photo
         and (laid[a].placed is not None or laid[b].placed is not None)
-        and _overlap(laid[a], laid[b])
+        and laid[a].wall == laid[b].wall
+        and (laid[a].shown & laid[b].shown).sum() >= _OVERLAP_CELLS
     ]
     wanted = sorted({(laid[a].photo, laid[b].photo) for a, b in near})
     shared = _shared(photos, wanted, cores)
@@ -562,13 +568,6 @@ def _laid_by_homography(
     return laid
 
 
-def _overlap(one: _Laid, other: _Laid) -> bool:
-    if one.wall != other.wall:
-        return False
-    both = np.isfinite(one.pixels[:, :, 0]) & np.isfinite(other.pixels[:, :, 0])
-    return int(both.sum()) >= _OVERLAP_CELLS
-
-
 def _shared(
     photos: Photos, wanted: Sequence[tuple[int, int]], cores: int
 ) -> dict[tuple[int, int], NDArray[np.float64]]:
@@ -602,7 +601,7 @@ def _agree(one: _Laid, other: _Laid, shared: NDArray[np.float64]) -> bool:
     """Whether two photos show the same where both lie on one spot of the wall."""
     from scipy.spatial import cKDTree
 
-    both = np.isfinite(one.pixels[:, :, 0]) & np.isfinite(other.pixels[:, :, 0])
+    both = one.shown & other.shown
     here, there = one.pixels[both], other.pixels[both]
     distance, nearest = (np.asarray(found) for found in cKDTree(here).query(shared[:, 0]))
     is_shown = distance <= one.cell_px
@@ -628,8 +627,16 @@ def _chosen(laid: Sequence[_Laid], agreeing: Sequence[tuple[int, int]]) -> dict[
     groups: list[list[int]] = [
         np.flatnonzero(group == label).tolist() for label in np.unique(group[pairs])
     ]
-    for members in sorted(groups, key=lambda some: (-_weight(laid, some), some[0])):
-        if not _is_enough(laid, members):
+
+    def weight(members: list[int]) -> float:
+        """How much speaks for a group: photos that key points recognised, then shares."""
+        is_anchored = any(laid[member].placed is None for member in members)
+        return 1e3 * is_anchored + sum(one.share for m in members if (one := laid[m].placed))
+
+    for members in sorted(groups, key=lambda some: (-weight(some), some[0])):
+        some = [laid[member] for member in members]
+        is_clear = any(each.placed is None or each.placed.is_clear for each in some)
+        if not is_clear and len({each.photo for each in some}) < _MANY:
             continue
         by_photo: dict[int, Placed] = {}
         recognised = {laid[member].photo for member in members if laid[member].placed is None}
@@ -645,18 +652,3 @@ def _chosen(laid: Sequence[_Laid], agreeing: Sequence[tuple[int, int]]) -> dict[
         if not any(photo in chosen for photo in by_photo):
             chosen.update(by_photo)
     return chosen
-
-
-def _weight(laid: Sequence[_Laid], members: Sequence[int]) -> float:
-    """How much speaks for a group: photos that key points recognised, then patches that agree."""
-    is_anchored = any(laid[member].placed is None for member in members)
-    shares = [placed.share for member in members if (placed := laid[member].placed) is not None]
-    return 1e3 * is_anchored + sum(shares)
-
-
-def _is_enough(laid: Sequence[_Laid], members: Sequence[int]) -> bool:
-    some = [laid[member] for member in members]
-    return (
-        any(each.placed is None or each.placed.is_clear for each in some)
-        or len({each.photo for each in some}) >= _MANY
-    )

@@ -105,7 +105,13 @@ class FaceByPhotos(Method):
         require_photos(inputs.photos)
         cloud.require_points(_MIN_POINTS)
         ctx.progress(0.0, "planes whose side was guessed")
-        asked = [index for index in range(len(planes)) if _is_asked(planes, index)]
+        level = math.cos(math.radians(LEVEL_LIMIT_DEG))
+        is_level = np.abs(planes.normal @ planes.up) > level
+        asked = [
+            index
+            for index in range(len(planes))
+            if planes.side_source(index) == "guess" and not is_level[index]
+        ]
         ctx.metric("n_planes_guessed", len(asked), "1")
         shown = cloud.intensity is not None or cloud.rgb is not None
         if not asked or not shown:
@@ -146,10 +152,16 @@ class FaceByPhotos(Method):
         as a laser that sees red dark may show it.
         """
         counts = np.zeros((len(pictures), 2), dtype=np.intp)
+
+        def look(photo: Photo, mixture: str) -> NDArray[np.intp]:
+            picture = photo_grey(photo) if mixture == "grey" else mixed(photo_rgb(photo), mixture)
+            if picture is None:
+                return np.zeros_like(counts)
+            return side_matches(picture, pictures, PairingParams())
+
         for name in ("grey", *MIXTURES):
-            look = partial(_seen_sides, pictures=pictures, mixture=name)
             tried = np.zeros_like(counts)
-            found = one_by_one(look, photos.photos, ctx.cores)
+            found = one_by_one(partial(look, mixture=name), photos.photos, ctx.cores)
             for nth, matches in enumerate(found):
                 ctx.progress((nth + 1) / (len(photos.photos) + 1), f"photos on both sides, {name}")
                 tried += matches
@@ -171,29 +183,12 @@ def _is_told(front: int, behind: int) -> bool:
     return max(front, behind) >= least
 
 
-def _seen_sides(
-    photo: Photo, *, pictures: Sequence[Features | None], mixture: str
-) -> NDArray[np.intp]:
-    """What a photo says of both sides of each plane, in grey or a mixture of its colours."""
-    picture = photo_grey(photo) if mixture == "grey" else mixed(photo_rgb(photo), mixture)
-    if picture is None:
-        return np.zeros((len(pictures), 2), dtype=np.intp)
-    return side_matches(picture, pictures, PairingParams())
-
-
 def _warn_of_guesses(planes: Planes, sources: Sequence[SideSource], ctx: StepContext) -> None:
     """State of which planes the side stays a guess, as the detector said of more of them."""
     named = sources or [planes.side_source(index) for index in range(len(planes))]
     guessed = [name for name, source in zip(planes.names, named, strict=True) if source == "guess"]
     if guessed:
         ctx.report(SIDES_GUESSED, n=len(guessed), n_planes=len(planes), planes=", ".join(guessed))
-
-
-def _is_asked(planes: Planes, index: int) -> bool:
-    is_level = abs(float(planes.normal[index] @ planes.up)) > math.cos(
-        math.radians(LEVEL_LIMIT_DEG)
-    )
-    return planes.side_source(index) == "guess" and not is_level
 
 
 def _features(planes: Planes, index: int, cloud: PointCloud, cores: int) -> Features | None:
@@ -223,7 +218,9 @@ def _features(planes: Planes, index: int, cloud: PointCloud, cores: int) -> Feat
 def _grey_on(
     frame: WallFrame, tolerance_m: float, cloud: PointCloud, cores: int
 ) -> NDArray[np.float32]:
-    """Grey 0..1 (rows, cols) of the cloud's topmost points; NaN where there is none."""
+    """Grey 0..1 (rows, cols) of the cloud's topmost points and between; NaN where none is near."""
+    import cv2
+
     from orthoflow.geometry.rastering import topmost_points
 
     slab = Slab(frame=frame, front_m=tolerance_m, behind_m=tolerance_m)
@@ -236,15 +233,10 @@ def _grey_on(
     elif cloud.rgb is not None:
         weights = REC_601.astype(np.float32)
         grey[has_point] = cloud.rgb[points].astype(np.float32) @ weights / np.float32(255.0)
-    return _filled_between(grey.reshape(frame.shape))
-
-
-def _filled_between(grey: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Fill the cells between points; NaN stays where none is near."""
-    import cv2
-
+    grey = grey.reshape(frame.shape)
+    filled = filled_smoothly(grey)
+    # Where no point is near nothing is known.
     side = 2 * _FILLED_CELLS + 1
     near = cv2.dilate(np.isfinite(grey).astype(np.uint8), np.ones((side, side), np.uint8))
-    filled = filled_smoothly(grey)
     filled[np.asarray(near) == 0] = np.nan
     return filled

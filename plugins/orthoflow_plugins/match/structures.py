@@ -129,7 +129,11 @@ def wall_structure(wall: Wall) -> WallStructure | None:
     levels = [(channels, coarse.frame.gsd_m)]
     intensity, depth_m = coarse.intensity, coarse.depth_m
     for _ in range(1, _LEVELS):
-        intensity, depth_m = _halved(intensity), _halved_depth(depth_m)
+        # Means of intensity; of depth one of four, where most of them are known.
+        known = _halved(np.isfinite(depth_m)) >= _MIN_KNOWN
+        rows, columns = known.shape
+        depth_m = np.where(known, depth_m[: 2 * rows : 2, : 2 * columns : 2], np.float32(np.nan))
+        intensity = _halved(intensity)
         levels.append((_wall_channels(intensity, depth_m), 2.0 * levels[-1][1]))
     return WallStructure(
         wall=coarse,
@@ -155,14 +159,6 @@ def _halved(values: NDArray[np.floating]) -> NDArray[np.float32]:
     return np.asarray(
         cv2.resize(even, (columns, rows), interpolation=cv2.INTER_AREA), dtype=np.float32
     )
-
-
-def _halved_depth(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-    """One of each 2 x 2 depths, NaN where fewer than most of them are known."""
-    known = _halved(np.isfinite(depth_m)) >= _MIN_KNOWN
-    rows, columns = known.shape
-    one = depth_m[: 2 * rows : 2, : 2 * columns : 2]
-    return np.where(known, one, np.float32(np.nan)).astype(np.float32)
 
 
 def _spectra(channels: Channels, cell_m: float, photo_cells: int) -> Spectra:
@@ -298,6 +294,7 @@ def _widths_cells(photo: Sequence[int], wall: tuple[int, ...]) -> list[int]:
 def _best_at(rgb: NDArray[np.uint8], width_cells: float, wall: Spectra) -> Place:
     """Best place of a photo whose width is so many cells."""
     import cv2
+    from scipy import fft
 
     # Whole samples.
     width, height = (
@@ -315,8 +312,9 @@ def _best_at(rgb: NDArray[np.uint8], width_cells: float, wall: Spectra) -> Place
         for top in (0, (height - side[0]) // 2, height - side[0])
         for left in (0, (width - side[1]) // 2, width - side[1])
     ]
-    # Of all parts alike.
-    under = _energy_under(side, wall)
+    # Energy of the wall under a part, at every place of its corner (wrapped): of all parts alike.
+    box = _spectrum(np.ones((1, *side), dtype=np.float32), wall.padded)[0]
+    under = np.asarray(fft.irfft2(wall.energy * np.conj(box), wall.padded), dtype=np.float32)
     maps = [
         _part_map(channels[:, top : top + side[0], left : left + side[1]], under, wall)
         for top, left in corners
@@ -349,14 +347,6 @@ def _best_at(rgb: NDArray[np.uint8], width_cells: float, wall: Spectra) -> Place
         parts_photo=middles / [width, height],
         parts_m=wall.sample_m * found,
     )
-
-
-def _energy_under(side: tuple[int, int], wall: Spectra) -> NDArray[np.float32]:
-    """Energy of the wall under a part of a size, at every place of its corner (wrapped)."""
-    from scipy import fft
-
-    box = _spectrum(np.ones((1, *side), dtype=np.float32), wall.padded)[0]
-    return np.asarray(fft.irfft2(wall.energy * np.conj(box), wall.padded), dtype=np.float32)
 
 
 def _part_map(

@@ -31,7 +31,13 @@ from orthoflow_plugins.match.channels import (
     textured_places,
 )
 from orthoflow_plugins.match.displacements import CORRELATION_AREA_CELLS, Displacements, measure
-from orthoflow_plugins.match.key_points import Features, PairingParams, pair_photo, wall_features
+from orthoflow_plugins.match.key_points import (
+    Features,
+    PairingParams,
+    pair_photo,
+    sampling,
+    wall_features,
+)
 from orthoflow_plugins.match.pictures import photo_grey
 from orthoflow_plugins.match.ties import (
     TiePiece,
@@ -72,7 +78,6 @@ _FEW_SHARE: Final = 0.25
 _MIN_AGREEING: Final = 24
 _POSE_LIMIT_SHARE: Final = 0.002
 _POSE_TRIALS: Final = 2000
-_SEED: Final = 1
 _PARAMS: Final = PairingParams()
 # Lenses of one camera: a focal length is that near to what EXIF states.
 _NEAR_FOCAL: Final = 0.1
@@ -187,8 +192,15 @@ def trace_photo(
         # What one content found out about the pose is the next one's start.
         start = (view, _FIRST_RADIUS_CELLS) if found is None else (found[1], _MIN_RADIUS)
         tried = _traced(start, desk, content, lens)
-        if found is None or _is_better(tried[0], found[0]):
-            found = tried
+        if found is not None:
+            new, old = tried[0], found[0]
+            if new.held_out_px and old.held_out_px:
+                is_better = _promised(new) < _promised(old)
+            else:
+                is_better = new.n_ties > old.n_ties
+            if not is_better:
+                continue
+        found = tried
     assert found is not None  # noqa: S101 - there is at least one content
     return replace(found[0], camera=camera)
 
@@ -217,13 +229,6 @@ def lens_by_ties(trace: Trace, lens: LensFreedom) -> tuple[ViewingCamera, float]
     except GeometryError:
         return trace.settled, math.inf
     return found.camera, math.sqrt(found.covariance[POSE_PARAMETERS, POSE_PARAMETERS])
-
-
-def _is_better(tried: Trace, found: Trace) -> bool:
-    """Whether another content promises a better pose."""
-    if not (tried.held_out_px and found.held_out_px):
-        return tried.n_ties > found.n_ties
-    return _promised(tried) < _promised(found)
 
 
 def _promised(trace: Trace) -> float:
@@ -609,12 +614,7 @@ def pose_of_most(
     """Pose that most points agree with, good enough to trace the photo from."""
     import cv2
 
-    params: Any = cv2.UsacParams()
-    params.threshold = limit_px
-    params.maxIterations = _POSE_TRIALS
-    params.randomGeneratorState = _SEED
-    params.score = cv2.SCORE_METHOD_MSAC
-    params.loMethod = cv2.LOCAL_OPTIM_INNER_LO
+    params = sampling(limit_px, trials=_POSE_TRIALS)
     middle = points.mean(axis=0)
     matrix = opencv_matrix(lens)
     observed = to_opencv(pixels)[:, None]

@@ -204,8 +204,7 @@ def estimate_dlt(tied: TiedPhoto, params: OrientDlt.Params) -> Estimate | str:
         return no_pose(tied.seen)
     control = tied.control(robust.agreeing)
     least = _LEAST[params.distortion] + params.skew
-    reason = _too_few(len(control), params.distortion, least) or _too_flat(control)
-    if reason:
+    if reason := _too_poor(control, params.distortion, least):
         return reason
     size_px = (tied.photo.width, tied.photo.height)
     try:
@@ -280,17 +279,13 @@ def _freedom(distortion: Distortion, size_px: tuple[int, int], *, keeps_skew: bo
     )
 
 
-def _too_few(n_control: int, distortion: Distortion, least: int) -> str:
-    if n_control >= least:
-        return ""
-    return (
-        f"only {n_control} control ties agree with one pose, a DLT with distortion "
-        f'"{distortion}" needs {least}'
-    )
-
-
-def _too_flat(control: SeenPoints) -> str:
-    """State that control lies too near a plane for eleven parameters; empty when it does not."""
+def _too_poor(control: SeenPoints, distortion: Distortion, least: int) -> str:
+    """State why control does not suffice for eleven parameters and more; empty when it does."""
+    if len(control) < least:
+        return (
+            f"only {len(control)} control ties agree with one pose, a DLT with distortion "
+            f'"{distortion}" needs {least}'
+        )
     rms_m, extent_m = relief(control.points_world)
     sigma_m = float(np.sqrt(np.mean(control.sigma_m**2)))
     if rms_m < _RELIEF_SIGMAS * sigma_m:
@@ -299,9 +294,7 @@ def _too_flat(control: SeenPoints) -> str:
             f"its points are known to {1000 * sigma_m:.1f} mm, and a DLT needs "
             f"{_RELIEF_SIGMAS:g} times as much relief",
         )
-    if rms_m < extent_m / _MAX_CONDITION:
-        return _flat(control, "a DLT needs relief")
-    return ""
+    return _flat(control, "a DLT needs relief") if rms_m < extent_m / _MAX_CONDITION else ""
 
 
 def _with_what_is_missing(
@@ -333,9 +326,9 @@ def _with_what_is_missing(
     except GeometryError:
         return estimate
     points = control.points_world
-    missing = _mean_square(_moved_px(model.camera, full.camera, points)) - _variance_px2(
-        full, points
-    )
+    # Mean square of a coordinate.
+    moved_px = _moved_px(model.camera, full.camera, points)
+    missing = 0.5 * float((moved_px**2).sum(axis=1).mean()) - _variance_px2(full, points)
     if missing <= 0.0:
         return estimate
     bias = _bias(model.camera, full, control)
@@ -344,7 +337,11 @@ def _with_what_is_missing(
     wider = replace(wider, variance_factor=factor * model.variance_factor)
     # A misfit of the lens bends neighbouring ties alike, and has widened the poorer model already.
     beyond_noise = factor * model.variance_factor / model.sigma0**2
-    return replace(estimate, resection=wider, notes=_misfit_notes(estimate, missing, beyond_noise))
+    notes: tuple[Note, ...] = ()
+    if model.sigma0 > _MAX_SIGMA0 or beyond_noise > _MAX_SIGMA0**2:
+        values = {"moved_px": math.sqrt(missing), "factor": math.sqrt(beyond_noise)}
+        notes = ((DLT_MISFIT, {"sigma0": model.sigma0, **values}),)
+    return replace(estimate, resection=wider, notes=notes)
 
 
 def _flat(control: SeenPoints, why: str) -> str:
@@ -395,20 +392,7 @@ def _moved_px(
     return other.project(points)[:, :2] - camera.project(points)[:, :2]
 
 
-def _mean_square(moved_px: NDArray[np.float64]) -> float:
-    """Mean square of a coordinate of moves (n, 2)."""
-    return 0.5 * float((moved_px**2).sum(axis=1).mean())
-
-
 def _variance_px2(resection: Resection, points: NDArray[np.float64]) -> float:
     """Mean predicted variance of a coordinate of the pixels of points (n, 3)."""
     covariances = predicted_covariances(resection, points)
     return 0.5 * float(np.trace(covariances, axis1=1, axis2=2).mean())
-
-
-def _misfit_notes(estimate: Estimate, missing_px2: float, factor: float) -> tuple[Note, ...]:
-    sigma0 = estimate.resection.sigma0
-    if sigma0 <= _MAX_SIGMA0 and factor <= _MAX_SIGMA0**2:
-        return ()
-    moved_px, wider = math.sqrt(missing_px2), math.sqrt(factor)
-    return ((DLT_MISFIT, {"sigma0": sigma0, "moved_px": moved_px, "factor": wider}),)

@@ -107,16 +107,17 @@ def known_walls(ties: Ties, chosen: NDArray[np.bool_]) -> list[KnownWall]:
 
 def wall_error(resection: Resection, walls: Sequence[KnownWall]) -> WallError | None:
     """Predict the error on the walls from the covariance; None when the photo shows no wall."""
-    parts = [_on_one_wall(resection, wall) for wall in walls]
+    parts = [_variances(resection, wall, _grid(wall, (_GRID_SIDE, _GRID_SIDE))) for wall in walls]
     variances = np.concatenate([np.empty(0), *(part[0] for part in parts)])
-    if not variances.size:
+    shown = np.isfinite(variances)
+    if not shown.any():
         return None
-    corners = _at_corners(resection, walls)
+    variances, corners = variances[shown], _at_corners(resection, walls)
     return WallError(
         rms_m=float(np.sqrt(variances.mean())),
         worst_m=float(np.sqrt(np.fmax.reduce(corners, initial=variances.max()))),
         corners_m=np.sqrt(corners),
-        footprint_px=np.vstack([part[1] for part in parts]),
+        footprint_px=np.vstack([part[1] for part in parts])[shown],
         sigmas_m=np.sqrt(variances),
     )
 
@@ -131,15 +132,6 @@ def sigmas_on_wall(
     """
     variances, _ = _variances(resection, wall, _grid(wall, shape))
     return np.sqrt(variances).reshape(shape)
-
-
-def _on_one_wall(
-    resection: Resection, wall: KnownWall
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Variances (n,) in metres squared per coordinate, and pixels (n, 2), over the footprint."""
-    variances, pixels = _variances(resection, wall, _grid(wall, (_GRID_SIDE, _GRID_SIDE)))
-    shown = np.isfinite(variances)
-    return variances[shown], pixels[shown]
 
 
 def _at_corners(resection: Resection, walls: Sequence[KnownWall]) -> NDArray[np.float64]:

@@ -142,26 +142,3 @@ def test_places_are_the_strongest_five_cells_around() -> None:
     assert channels.textured_places(strength, usable, 1).tolist() == [[12, 10]]
     nothing = channels.textured_places(np.zeros((5, 5), np.float32), np.ones((5, 5), bool), 10)
     assert nothing.shape == (0, 2)
-
-
-@pytest.mark.parametrize("n_most", [1, 40, 256, 300, 900])
-def test_the_strongest_of_each_part_come_before_the_second_strongest_of_any(n_most: int) -> None:
-    # Places every six cells over 16 x 16 parts of 17 x 15 cells; many parts hold six of them.
-    rng = np.random.default_rng(8)
-    strength = np.zeros((16 * 17, 16 * 15), dtype=np.float32)
-    rows, columns = (part.ravel() for part in np.mgrid[0:272:6, 0:240:6])
-    rows[-1], columns[-1] = 271, 239
-    strength[rows, columns] = rng.permutation(len(rows)) + 1.0
-    height, width = (int(np.ptp(part)) + 1 for part in (rows, columns))
-    part_of = (16 * rows // height) * 16 + 16 * columns // width
-    turn = np.array(
-        [
-            np.count_nonzero(
-                (part_of == part_of[k]) & (strength[rows, columns] > strength[rows[k], columns[k]])
-            )
-            for k in range(len(rows))
-        ]
-    )
-    order = np.lexsort((-strength[rows, columns], turn))[:n_most]
-    found = channels.textured_places(strength, np.ones(strength.shape, dtype=np.bool_), n_most)
-    assert found.tolist() == np.column_stack([columns, rows])[order].tolist()

@@ -33,17 +33,6 @@ def moved(layer: NDArray[np.float64], right: float, down: float) -> NDArray[np.f
 PLACES = np.array([[column, row] for row in (25, 40, 55) for column in (20, 40, 60)], dtype=np.intp)
 
 
-@pytest.mark.parametrize("apart", [(0.0, 0.0), (1.3, -0.6), (-2.75, 3.25)])
-def test_a_displacement_is_measured_to_hundredths_of_a_cell(apart: tuple[float, float]) -> None:
-    first = texture()
-    found = measure(channels(first), channels(moved(first, *apart)), PLACES)
-    assert len(found.places) == 9
-    np.testing.assert_array_equal(found.places, PLACES)
-    np.testing.assert_allclose(found.shift_cells, np.tile(apart, (9, 1)), atol=0.05)
-    assert (found.score > 0.95).all()
-    assert (found.sigma_cells < 0.1).all()
-
-
 def test_noise_is_told_by_the_standard_deviation() -> None:
     first = texture()
     other = moved(first, 1.0, 0.0)

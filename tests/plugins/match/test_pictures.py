@@ -138,17 +138,6 @@ def test_a_wall_becomes_a_picture_of_its_inner_percentiles() -> None:
     assert usable[:38].all()
 
 
-@pytest.mark.parametrize("factor", [0.5, 0.37, 0.9])
-def test_a_shrunk_picture_keeps_positions_and_its_mean(factor: float) -> None:
-    columns = np.tile(np.arange(200.0), (100, 1)).astype(np.uint8)
-    small = pictures.shrunk(columns, factor)
-    assert small.shape == (int(100 * factor), int(200 * factor))
-    # A ramp: pixel i shows what is at (i + 0.5) / factor, less half a pixel.
-    inner = np.arange(5, small.shape[1] - 5)
-    np.testing.assert_allclose(small[10, inner], (inner + 0.5) / factor - 0.5, atol=1.0)
-    assert pictures.shrunk(columns, 1.0) is columns
-
-
 def photo(width: int = 20) -> Photo:
     red = np.zeros((10, 20, 3), dtype=np.uint8)
     red[..., 0] = 200

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.match.structures import (
     WallStructure,
-    _energy_under,
-    _part_map,
     closer,
     likely_places,
     structure_of,
@@ -19,8 +15,6 @@ from orthoflow_plugins.match.structures import (
 
 from orthoflow.products import Wall
 from orthoflow.testing import photographed as ms
-
-RNG = np.random.default_rng(4)
 
 
 def picture(height: int, width: int) -> NDArray[np.float32]:
@@ -65,37 +59,6 @@ def test_what_is_not_known_and_its_border_has_no_structure() -> None:
     np.testing.assert_array_equal(found.known == 0.0, void)
     assert not found.values[void].any()
     assert (np.linalg.norm(found.values[~void], axis=1) > 0.0).mean() > 0.99
-
-
-@pytest.mark.parametrize("level", [0, 1])
-def test_a_part_is_compared_with_what_lies_under_it_everywhere(
-    structure: WallStructure, level: int
-) -> None:
-    spectra = structure.fine[level]
-    channels = np.fft.irfft2(np.conj(spectra.layers), spectra.padded)
-    height, width = spectra.shape
-    # Beside the wall there is nothing.
-    assert np.abs(channels[:, height:]).max() < 1e-5
-    assert np.abs(channels[:, :, width:]).max() < 1e-5
-    channels = channels[:, :height, :width]
-    rows, columns = min(35, height // 3), min(40, width // 3)
-    inner = (slice(None), slice(9, 9 + rows), slice(15, 15 + columns))
-    part = channels[inner] + RNG.normal(0.0, 0.2, (5, rows, columns))
-    under_it = _energy_under((rows, columns), spectra)
-    found = _part_map(part.astype(np.float32), under_it, spectra)
-    # So large that the largest part meets the wall at no two places at once.
-    assert np.all(np.array(found.shape) > np.array([height, width]) + 40)
-    own = float((part**2).sum())
-    places = [(9, 15), (0, 0), (11, 7), (height - rows, width - columns), (height - 9, 5)]
-    # Beside the wall, too.
-    around = np.pad(channels, ((0, 0), (rows, rows), (columns, columns)))
-    for row, column in [*places, (-8, 3), (-rows, -columns), (-7, width), (height, 12)]:
-        under = around[:, row + rows : row + 2 * rows, column + columns : column + 2 * columns]
-        # What lies beside the wall counts as a quarter of the part itself, at least.
-        energy = max(float((under**2).sum()), 0.25 * own)
-        expected = float((part * under).sum()) / math.sqrt(own * energy)
-        assert found[row, column] == pytest.approx(expected, abs=1e-4)
-    assert np.unravel_index(found.argmax(), found.shape) == (9, 15)
 
 
 def test_a_piece_of_the_wall_lies_where_it_was_taken_from(

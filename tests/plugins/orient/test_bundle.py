@@ -107,24 +107,6 @@ def test_ties_between_photos_make_them_more_exact(
     assert photo_ties["n_points"] > 200
 
 
-def test_a_lens_known_from_exif_is_found(exif: Cameras) -> None:
-    lenses = exif.details["lenses"]
-    assert isinstance(lenses, list)
-    assert len(lenses) == 1
-    true, found = bs.viewers()[0], exif.cameras[0].intrinsics
-    assert found is not None
-    assert found.source == "estimated"
-    sigmas = lenses[0]["sigmas"]
-    assert found.fx == pytest.approx(true.fx, abs=4.0 * sigmas["focal"])
-    assert sigmas["focal"] < 2.0
-    assert found.cx == pytest.approx(true.cx, abs=4.0 * sigmas["cx"])
-    # Its pixels are wider than high by 0.36 %, which a lens of square ones would bend the poses by.
-    assert found.fy / found.fx == pytest.approx(true.fy / true.fx, abs=4.0 * sigmas["aspect"])
-    assert sigmas["aspect"] < 5e-4
-    assert found.distortion[0] == pytest.approx(true.distortion[0], abs=0.005)
-    assert {camera.intrinsics for camera in exif.cameras} == {found}
-
-
 def test_stated_errors_are_those_of_repeated_orientations(tmp_path: Path) -> None:
     ratios = []
     for seed in range(8):

@@ -125,20 +125,6 @@ def test_corners_of_the_photo_count_where_they_show_a_wall(half_m: tuple[float, 
     assert found.worst_m > found.sigmas_m.max()
 
 
-def test_of_several_walls_all_count_and_at_a_corner_the_worse_one() -> None:
-    near, far = wall((2.5, 2.0)), wall((4.0, 3.5), index=1, y_m=3.0)
-    resection = posed((0.0, 0.0, 0.006))
-    one, other, both = (wall_error(resection, walls) for walls in ([near], [far], [near, far]))
-    assert one is not None
-    assert other is not None
-    assert both is not None
-    assert len(both.sigmas_m) == len(one.sigmas_m) + len(other.sigmas_m)
-    np.testing.assert_allclose(both.corners_m, np.maximum(one.corners_m, other.corners_m))
-    assert both.worst_m == max(one.worst_m, other.worst_m)
-    pooled = np.concatenate([one.sigmas_m, other.sigmas_m])
-    assert both.rms_m == pytest.approx(float(np.sqrt(np.mean(pooled**2))))
-
-
 def test_a_photo_that_shows_no_wall_has_no_error() -> None:
     resection = posed((0.001, 0.001, 0.001), camera(turn_deg=180.0))
     assert wall_error(resection, [wall()]) is None
