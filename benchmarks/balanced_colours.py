@@ -29,7 +29,6 @@ import numpy as np
 from numpy.typing import NDArray
 from orthoflow_plugins.mosaic.balance import Balance, balance_of, with_seams
 from orthoflow_plugins.mosaic.joining import coloured
-from orthoflow_plugins.mosaic.light import light_of_levels
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
 from orthoflow_plugins.raster.grid import RasterGrid
@@ -37,6 +36,7 @@ from orthoflow_plugins.simulate.room import SimulateRoom
 
 from orthoflow.engine.store import Store
 from orthoflow.geometry.bands import in_memory
+from orthoflow.geometry.levels import light_of_levels
 from orthoflow.products import (
     Cameras,
     Layer,

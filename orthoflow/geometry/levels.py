@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Final, TypeAlias
 
 import numpy as np
@@ -19,6 +20,8 @@ Level: TypeAlias = type[np.uint8] | type[np.uint16]
 REC_601: Final = np.array([0.299, 0.587, 0.114])
 # 16-bit levels per 8-bit level.
 DEEPER: Final = 257
+# Steps of the table from light to levels; between them it is nearly linear.
+_STEPS: Final = 1 << 16
 # A picture has a single tone if this share of it is within a level of 256 of its median, or darker
 # than this share of white, or brighter than white less this share.
 _PLAIN_SHARE: Final = 0.98
@@ -51,6 +54,44 @@ def in_levels(colours: Colours, level: Level) -> Colours:
 def level_of(colours: Colours) -> Level:
     """Return the number of bits of colours."""
     return np.uint16 if colours.dtype == np.uint16 else np.uint8
+
+
+@cache
+def light_of_levels(highest: int) -> NDArray[np.float32]:
+    """Return light, 0 to 1, of the levels 0 to `highest` of sRGB (IEC 61966-2-1)."""
+    level = np.arange(highest + 1) / float(highest)
+    light = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
+    return light.astype(np.float32)
+
+
+@cache
+def _share_of_light() -> NDArray[np.float32]:
+    """Levels, 0 to 1, of light in equal steps; with one more, so that there is always a next."""
+    light = np.minimum(np.arange(_STEPS + 1) / (_STEPS - 1.0), 1.0)
+    level = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
+    return level.astype(np.float32)
+
+
+def lit_shares(
+    levels: NDArray[np.floating], log_gains: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """Multiply the light of levels (n, 3), 0 to 1, by the exponentials of (n, 3)."""
+    light = np.interp(levels, np.linspace(0.0, 1.0, _STEPS), light_of_levels(_STEPS - 1))
+    # Interpolation ends with the table: clipped light is white.
+    gained = light * np.exp(log_gains)
+    levels = np.interp(gained, np.linspace(0.0, 1.0, _STEPS), _share_of_light()[:_STEPS])
+    return np.asarray(levels, dtype=np.float64)
+
+
+def lit(colours: Colours, log_gains: NDArray[np.float32]) -> Colours:
+    """Multiply the light of colours (n, 3) by the exponentials of (n, 3)."""
+    highest = int(np.iinfo(colours.dtype).max)
+    light = light_of_levels(highest)[colours] * np.exp(log_gains)
+    place = np.clip(light, 0.0, 1.0) * np.float32(_STEPS - 1)
+    before = place.astype(np.int32)
+    table = _share_of_light()
+    level = table[before] + (place - before) * (table[before + 1] - table[before])
+    return np.asarray(np.rint(np.float32(highest) * level), dtype=colours.dtype)
 
 
 def plain_tone(

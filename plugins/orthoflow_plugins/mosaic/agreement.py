@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from orthoflow.geometry.bands import row_bands
 from orthoflow.geometry.levels import REC_601, eight_bits
 from orthoflow.products import Layer, LayerMask
-from orthoflow_plugins.mosaic.depth_edges import depth_edges
+from orthoflow_plugins.mosaic.blocks import depth_edges
 
 if TYPE_CHECKING:
     from orthoflow_plugins.mosaic.balance import Balance
@@ -106,28 +106,19 @@ def _grey(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
     return np.ascontiguousarray(rgb.mean(axis=2, dtype=np.float32))
 
 
-@dataclass(frozen=True, kw_only=True)
-class SeamSteps:
-    """Colour differences where one source follows another.
-
-    Attributes:
-        grey: (n,) float64 difference in luminance of both sources in a cell at a seam.
-        delta_e: (n,) float64 distance of both colours in CIE L*a*b* (1976).
-    """
-
-    grey: NDArray[np.float64]
-    delta_e: NDArray[np.float64]
-
-
 def seam_steps(
     source: NDArray[np.int16], layers: Sequence[Layer], balance: Balance | None = None
-) -> SeamSteps:
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Compare both sources in the cells on the left of or above seams that both paint.
 
     Args:
         source: (rows, cols) index of the layer that paints each cell, -1 for none.
         layers: the layers to which the index refers.
         balance: the colour balance, or None.
+
+    Returns:
+        (n,) differences in luminance of both sources in cells at seams, and the distances of their
+        colours in CIE L*a*b* (1976).
     """
 
     def shown(index: int, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.uint8]:
@@ -152,9 +143,7 @@ def seam_steps(
             firsts.append(first)
     one, another = np.concatenate(firsts), np.concatenate(seconds)
     grey = (one.astype(np.float64) - another) @ REC_601
-    return SeamSteps(
-        grey=grey, delta_e=np.linalg.norm(_lab(one) - _lab(another), axis=1).astype(np.float64)
-    )
+    return grey, np.linalg.norm(_lab(one) - _lab(another), axis=1).astype(np.float64)
 
 
 def _before_seams(
@@ -188,13 +177,12 @@ def count_seams(source: NDArray[np.int16], depth_m: NDArray[np.float32] | None) 
 def is_seam(source: NDArray[np.int16]) -> NDArray[np.bool_]:
     """Return cells whose right or lower neighbour comes from another source."""
     seam = np.zeros(source.shape, dtype=np.bool_)
-    seam[:, :-1] |= _differ(source[:, :-1], source[:, 1:])
-    seam[:-1] |= _differ(source[:-1], source[1:])
+    for into, one, other in (
+        (seam[:, :-1], source[:, :-1], source[:, 1:]),
+        (seam[:-1], source[:-1], source[1:]),
+    ):
+        np.logical_or(into, (one != other) & (one >= 0) & (other >= 0), out=into)
     return seam
-
-
-def _differ(one: NDArray[np.int16], other: NDArray[np.int16]) -> NDArray[np.bool_]:
-    return np.asarray((one != other) & (one >= 0) & (other >= 0), dtype=np.bool_)
 
 
 def _lab(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -20,12 +20,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import WallFrame
-from orthoflow.geometry.levels import Colours
+from orthoflow.geometry.levels import Colours, lit
 from orthoflow.geometry.robust import median_deviation
 from orthoflow.products import Camera, Layer, Wall
-from orthoflow_plugins.mosaic.blocks import Blocks, Box, block_means
-from orthoflow_plugins.mosaic.depth_edges import depth_edges_in
-from orthoflow_plugins.mosaic.light import BlockLight, block_light, common, inside, lit, pairs
+from orthoflow_plugins.mosaic.blocks import (
+    BlockLight,
+    Blocks,
+    Box,
+    block_light,
+    block_means,
+    common,
+    depth_edges_in,
+    inside,
+    pairs,
+)
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array

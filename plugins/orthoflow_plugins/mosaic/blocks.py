@@ -1,16 +1,25 @@
-"""Blocks of cells over which colours and depths are averaged, for seams and balances."""
+"""Blocks of cells over which colours, light and depths are averaged, for seams and balances."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from functools import partial
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.bands import row_bands
-from orthoflow.geometry.levels import Colours
+from orthoflow.geometry.levels import Colours, light_of_levels
+from orthoflow.products import Layer, LayerMask
+
+# Clipped and almost black pixels are useless for exposure; this share of a block may be so.
+_DARKEST: Final = 10.0 / 255.0
+_BRIGHTEST: Final = 245.0 / 255.0
+_SAYING_LEAST: Final = 0.95
+# Photos differ by parallax at depth edges of a wall.
+_DEPTH_EDGE_M: Final = 0.03
 
 # Rows and columns of blocks.
 Box: TypeAlias = tuple[slice, slice]
@@ -89,3 +98,98 @@ def block_means(
         means[some] = np.add.reduceat(sums, columns[:-1], axis=1)
     means /= np.outer(np.diff(rows), np.diff(columns))
     return means
+
+
+def depth_edges(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return cells whose right or lower neighbour is 3 cm nearer or farther."""
+    edges = np.zeros(depth_m.shape, dtype=np.bool_)
+    edges[:, :-1] |= np.abs(np.diff(depth_m, axis=1)) > _DEPTH_EDGE_M
+    edges[:-1] |= np.abs(np.diff(depth_m, axis=0)) > _DEPTH_EDGE_M
+    return edges
+
+
+def depth_edges_in(depth_m: NDArray[np.float32], rows: slice) -> NDArray[np.bool_]:
+    """Return cells of some rows on either side of a depth edge; neighbouring rows are included."""
+    first = max(0, rows.start - 1)
+    around = depth_m[first : rows.stop + 1]
+    beside = depth_edges(around) | depth_edges(around[::-1, ::-1])[::-1, ::-1]
+    return beside[rows.start - first :][: rows.stop - rows.start]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BlockLight:
+    """Mean light of the blocks that a layer paints completely, in the box around its painted cells.
+
+    Attributes:
+        box: rows and columns of blocks.
+        log_light: (rows, cols, 3) float32 natural logarithm of the mean light; NaN where the layer
+            does not paint all of a block, or much of it is black or white.
+    """
+
+    box: Box
+    log_light: NDArray[np.float32]
+
+    @property
+    def is_known(self) -> NDArray[np.bool_]:
+        """Return blocks (rows, cols) whose light is known."""
+        return ~np.isnan(self.log_light[..., 0])
+
+
+def block_light(layer: Layer, blocks: Blocks) -> BlockLight:
+    """Measure the light over blocks of a layer with painted cells."""
+    painted = block_means(lambda rows: layer.mask[rows] == LayerMask.PAINTED, blocks)
+    down, right = (np.flatnonzero((painted > 0.0).any(axis=axis)) for axis in (1, 0))
+    box = slice(int(down[0]), int(down[-1]) + 1), slice(int(right[0]), int(right[-1]) + 1)
+    rows, columns = blocks.cells(box)
+    rgb = layer.rgb[rows, columns]
+    highest = int(np.iinfo(rgb.dtype).max)
+    low, high = _DARKEST * highest, _BRIGHTEST * highest
+    inner = blocks.within(box)
+    light = light_of_levels(highest)
+    sums = np.stack(
+        [block_means(partial(_light_in, light, rgb[..., c]), inner) for c in range(3)], axis=-1
+    )
+    saying = block_means(
+        lambda band: (rgb[band].min(axis=2) >= low) & (rgb[band].max(axis=2) <= high), inner
+    )
+    is_known = (painted[box] == 1.0) & (saying >= _SAYING_LEAST)
+    with np.errstate(divide="ignore"):
+        logs = np.log(sums)
+    logs[~is_known] = np.nan
+    return BlockLight(box=box, log_light=logs.astype(np.float32))
+
+
+def _light_in(
+    light: NDArray[np.float32], levels: NDArray[np.uint8 | np.uint16], rows: slice
+) -> NDArray[np.float32]:
+    return np.asarray(light[levels[rows]], dtype=np.float32)
+
+
+def common(one: Box, other: Box) -> Box | None:
+    """Return the blocks in both boxes; None if they share none."""
+    parts = [
+        slice(max(a.start, b.start), min(a.stop, b.stop)) for a, b in zip(one, other, strict=True)
+    ]
+    return (parts[0], parts[1]) if all(part.start < part.stop for part in parts) else None
+
+
+def inside(part: Box, box: Box) -> Box:
+    """Return where a part of a box is in arrays of that box."""
+    rows, columns = (
+        slice(inner.start - outer.start, inner.stop - outer.start)
+        for inner, outer in zip(part, box, strict=True)
+    )
+    return rows, columns
+
+
+def pairs(
+    lights: Sequence[BlockLight],
+) -> list[tuple[int, int, Box]]:
+    """Return pairs of layers whose boxes overlap, and where, by index, the lower first."""
+    found = []
+    for i, one in enumerate(lights):
+        for j in range(i + 1, len(lights)):
+            shared = common(one.box, lights[j].box)
+            if shared is not None:
+                found.append((i, j, shared))
+    return found

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.bands import Allocate, row_bands
+from orthoflow.geometry.levels import light_of_levels
 from orthoflow.geometry.robust import NMAD_FACTOR
 from orthoflow.products import Layer, LayerMask, Wall
-from orthoflow_plugins.mosaic.blocks import Blocks, Box, block_means
-from orthoflow_plugins.mosaic.light import common, inside, light_of_levels
+from orthoflow_plugins.mosaic.blocks import Blocks, Box, block_means, common, inside
 
 if TYPE_CHECKING:
     from orthoflow.geometry.levels import Colours
@@ -50,22 +50,6 @@ _LEAST_BLOCKS: Final = 100
 
 
 @dataclass(frozen=True, kw_only=True)
-class Consensus:
-    """The layers without the parts that others contradict.
-
-    Attributes:
-        layers: the layers; cells that they must not paint are marked as hidden.
-        n_outvoted: cells that a photo shows differently from the one that paints them now.
-        contradicted: (rows, cols) cells that a single photo shows, and the scan differently; None
-            without colours of the scan.
-    """
-
-    layers: tuple[Layer, ...]
-    n_outvoted: int
-    contradicted: NDArray[np.bool_] | None
-
-
-@dataclass(frozen=True, kw_only=True)
 class _Witness:
     """Logarithm of the light (r, c, 3) of the blocks in a box, NaN without an observation."""
 
@@ -74,13 +58,20 @@ class _Witness:
     is_grey: bool = False
 
 
-def consensus(layers: Sequence[Layer], wall: Wall | None, *, allocate: Allocate) -> Consensus:
+def consensus(
+    layers: Sequence[Layer], wall: Wall | None, *, allocate: Allocate
+) -> tuple[list[Layer], int, NDArray[np.bool_] | None]:
     """Remove from each photo the regions in which better confirmed photos contradict it.
 
     Args:
         layers: photos of one wall, unmodified, each with painted cells.
         wall: the wall as scanned; None if unknown.
         allocate: returns the masks of changed layers, by name.
+
+    Returns:
+        The layers, in which cells that they must not paint are marked as hidden; the number of
+        cells that a photo shows differently from the one that paints them now; and (rows, cols)
+        cells that a single photo shows, and the scan differently, None without colours of the scan.
     """
     shape, gsd_m = layers[0].frame.shape, layers[0].frame.gsd_m
     side = int(np.clip(math.ceil(_BLOCK_M / gsd_m), *_BLOCK_CELLS))
@@ -100,7 +91,7 @@ def consensus(layers: Sequence[Layer], wall: Wall | None, *, allocate: Allocate)
     contradicted = None
     if scan is not None:
         contradicted = _of_cells(_alone(witnesses, apart, blocks), blocks)
-    return Consensus(layers=kept, n_outvoted=n_outvoted, contradicted=contradicted)
+    return kept, n_outvoted, contradicted
 
 
 def _compared(
@@ -336,11 +327,11 @@ def _without(
     outvoted: Sequence[NDArray[np.bool_]],
     blocks: Blocks,
     allocate: Allocate,
-) -> tuple[tuple[Layer, ...], int]:
+) -> tuple[list[Layer], int]:
     """Layers without their outvoted blocks where another paints, and their cell count."""
     changed = [index for index, region in enumerate(outvoted) if region.any()]
     if not changed:
-        return tuple(layers), 0
+        return list(layers), 0
     shape = layers[0].frame.shape
     grown = [_grown(region) for region in outvoted]
     masks = {
@@ -362,10 +353,8 @@ def _without(
             loses = is_out[index] & stays
             masks[index][rows] = np.where(loses, LayerMask.OCCLUDED, layers[index].mask[rows])
             n_outvoted += int(np.count_nonzero(loses))
-    return (
-        tuple(
-            replace(layer, mask=masks[index]) if index in masks else layer
-            for index, layer in enumerate(layers)
-        ),
-        n_outvoted,
-    )
+    kept = [
+        replace(layer, mask=masks[index]) if index in masks else layer
+        for index, layer in enumerate(layers)
+    ]
+    return kept, n_outvoted

@@ -9,7 +9,6 @@ that see a place from different sides are displaced by its depth, all others by 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -106,10 +105,10 @@ def expected_errors_m(
     )
     noise_m, patchy_m = _depth_noises_m(wall)
     excess = _excess_of_overlaps(wall, cameras, overlaps)
-    if excess is not None and excess.depth_m is not None:
+    position_m, depth_m = (0.0, None) if excess is None else excess
+    if depth_m is not None:
         # Relief of five centimetres looks like errors of that size; overlaps distinguish them.
-        patchy_m = excess.depth_m
-    unexplained = np.float64(0.0 if excess is None else excess.position_m**2)
+        patchy_m = depth_m
     for index, name in enumerate(sources):
         camera = cameras.get(name)
         if camera is None or camera.covariance is None:
@@ -126,7 +125,7 @@ def expected_errors_m(
             down = down + rows.start
             variances = _between(of_pose, down, across, step)
             variances += _depth_variances(wall, down, across, centre, (noise_m, patchy_m))
-            errors_m[down, across] = np.sqrt(variances + unexplained)
+            errors_m[down, across] = np.sqrt(variances + position_m**2)
     return errors_m
 
 
@@ -224,27 +223,18 @@ def _depth_variances(
     return np.asarray(0.5 * squares * (sigma_m**2 + patchy_m**2), dtype=np.float64)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Excess:
-    """Errors in overlaps beyond those of the stated poses.
-
-    Attributes:
-        position_m: standard deviation of a coordinate of one photo.
-        depth_m: standard deviation of depths over a patch; None if views differ too little.
-    """
-
-    position_m: float
-    depth_m: float | None
-
-
 def _excess_of_overlaps(
     wall: Wall, cameras: Mapping[str, Camera], overlaps: Overlaps
-) -> _Excess | None:
+) -> tuple[float, float | None] | None:
     """Split displacements into those of poses and of depths; None if there are too few.
 
     Squares of displacements are sums of the variances of both poses, of twice the unstated variance
     of poses, and of the variance of the depth times the squared difference of the tangents of both
     views: a weighted least squares fit, without negative variances and outliers.
+
+    Returns:
+        Standard deviation of a coordinate of one photo, and that of depths over a patch, None if
+        views differ too little.
     """
     from scipy.optimize import nnls
 
@@ -284,10 +274,8 @@ def _excess_of_overlaps(
         weights = 1.0 / predicted[kept]
         found, _ = nnls(matrix[kept] * weights[:, None], (wanted - known_part)[kept] * weights)
         predicted = np.maximum(known_part + matrix @ found, 1e-12)
-    return _Excess(
-        position_m=float(np.sqrt(found[0])),
-        depth_m=float(np.sqrt(found[1])) if len(found) > 1 else None,
-    )
+    position_m, *depth_m = np.sqrt(found).tolist()
+    return position_m, depth_m[0] if depth_m else None
 
 
 def _views_of(

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.levels import lit_shares
 from orthoflow.products import Layer, LayerMask, Wall
-from orthoflow_plugins.mosaic.blocks import Blocks, block_means, raster_means
-from orthoflow_plugins.mosaic.depth_edges import depth_edges_in
-from orthoflow_plugins.mosaic.light import lit_shares
+from orthoflow_plugins.mosaic.blocks import Blocks, block_means, depth_edges_in, raster_means
 
 if TYPE_CHECKING:
     from orthoflow_plugins.mosaic.balance import Balance

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry.bands import Allocate, bands_with_reach, in_memory
+from orthoflow.geometry.bands import Allocate, bands_with_reach
 from orthoflow.geometry.levels import Colours, Level, in_levels
 from orthoflow.products import Layer, LayerMask, OrthoMask, Wall
 from orthoflow_plugins.mosaic.graph_cut import CutLabels, cut_labels
@@ -20,8 +20,7 @@ from orthoflow_plugins.mosaic.graph_cut import CutLabels, cut_labels
 if TYPE_CHECKING:
     from orthoflow_plugins.mosaic.balance import Balance
     from orthoflow_plugins.mosaic.drawn_seams import DrawnSeams
-
-SeamRule = Literal["best-view", "voronoi", "graph-cut", "priority"]
+    from orthoflow_plugins.mosaic.seams import MosaicSeams
 
 # Preference (rows, cols) of a layer in some rows of its wall, computed during joining: those of a
 # large wall would not fit into memory.
@@ -48,45 +47,12 @@ _RANK_OF_LAYER_MASK: Final = np.array(
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class SeamOptions:
-    """Where seams are preferred.
-
-    Attributes:
-        rule: decides which layer paints a cell that several show.
-        priority: names of photos, for that rule.
-        island_cells_min: smaller patches from one source are painted from the source around them,
-            if that one sees them too.
-        drawn: areas that a person assigns to photos, which precede all rules where those photos
-            paint them.
-    """
-
-    rule: SeamRule
-    priority: tuple[str, ...] = ()
-    island_cells_min: int = 1
-    drawn: DrawnSeams | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Choice:
-    """The state of each cell, before colours are taken.
-
-    Attributes:
-        rank: (rows, cols) uint8 position of its state in the order of states.
-        source: (rows, cols) int16 layer that paints it, `NOBODY` without one.
-    """
-
-    rank: NDArray[np.uint8]
-    source: NDArray[np.int16]
-
-
 def preferences(
     layers: Sequence[Layer],
-    options: SeamOptions,
+    params: MosaicSeams.Params,
     *,
     wall: Wall | None = None,
     balance: Balance | None = None,
-    allocate: Allocate = in_memory,
 ) -> list[Preference]:
     """Return by a rule how much each layer is preferred in rows of the wall; larger is better.
 
@@ -94,21 +60,59 @@ def preferences(
     `voronoi` prefers the layer whose painted area ends farthest away, so that seams are in the
     middle of overlaps. `priority` takes photos in the given order, the others by their quality.
     `graph-cut` puts seams where the layers look similar and away from depth edges of the wall.
-
-    Raises:
-        MethodError: `priority` names something that is not a layer of any wall.
     """
-    if options.rule == "voronoi":
-        return [_by_depth_inside(layer, index, allocate) for index, layer in enumerate(layers)]
-    if options.rule == "priority":
-        return _by_order(layers, options.priority)
-    if options.rule == "graph-cut" and len(layers) > 1:
+    if params.seams == "voronoi":
+        return [_depth_inside(layer) for layer in layers]
+    best = np.float32(max(1e-6, *(float(layer.quality.max()) for layer in layers)))
+    if params.seams == "priority":
+        names = params.priority
+        places = {name: len(names) - place for place, name in enumerate(names)}
+        raised = [np.float32(2 * places.get(layer.source, 0)) * best for layer in layers]
+        return [partial(_raised, layer, bonus) for layer, bonus in zip(layers, raised, strict=True)]
+    if params.seams == "graph-cut" and len(layers) > 1:
         cut = cut_labels(layers, wall, balance)
-        return [
-            partial(_cut_off, layer, index, cut, _best(layers))
-            for index, layer in enumerate(layers)
-        ]
-    return [partial(_rows_of, layer.quality) for layer in layers]
+        return [partial(_cut_off, layer, k, cut, best) for k, layer in enumerate(layers)]
+    return [partial(_raised, layer, np.float32(0.0)) for layer in layers]
+
+
+def _raised(layer: Layer, bonus: np.float32, rows: slice) -> NDArray[np.float32]:
+    return layer.quality[rows] + bonus
+
+
+def _cut_off(
+    layer: Layer, index: int, cut: CutLabels, best: np.float32, rows: slice
+) -> NDArray[np.float32]:
+    is_mine = cut.in_rows(rows) == index
+    return layer.quality[rows] + np.where(is_mine, np.float32(2.0) * best, np.float32(0.0))
+
+
+def _depth_inside(layer: Layer) -> Preference:
+    """Return the distance in cells to the nearest unpainted cell, or to the border.
+
+    On a large wall only every so many cells are looked at, and distances are linear between them.
+    """
+    import cv2
+
+    shape = layer.mask.shape
+    step = math.ceil(math.sqrt(layer.mask.size / _BAND_CELLS))
+    painted = np.pad((layer.mask[step // 2 :: step, step // 2 :: step] == LayerMask.PAINTED), 1)
+    distance = cv2.distanceTransform(painted.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    inside = np.float32(step) * np.asarray(distance, dtype=np.float32)
+    if step == 1:
+        return lambda rows: inside[1:-1, 1:-1][rows]
+
+    def preference(rows: slice) -> NDArray[np.float32]:
+        # The first cell that was looked at is the second of the padded picture.
+        row, column = (
+            (np.arange(*part.indices(size)) - step // 2) / step + 1.0
+            for part, size in zip((rows, slice(None)), shape, strict=True)
+        )
+        at = np.stack(np.meshgrid(column, row), axis=-1).astype(np.float32)
+        border = cv2.BORDER_REPLICATE
+        found = cv2.remap(inside, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=border)
+        return np.asarray(found, dtype=np.float32)
+
+    return preference
 
 
 def require_sources(layers: Sequence[Layer], priority: Sequence[str]) -> None:
@@ -144,8 +148,9 @@ def require_one_raster(layers: Sequence[Layer], name: str) -> None:
 def joined(
     painters: Sequence[Layer],
     others: Sequence[Layer],
-    options: SeamOptions,
+    params: MosaicSeams.Params,
     *,
+    drawn: DrawnSeams | None,
     wall: Wall | None,
     balance: Balance | None,
     allocate: Allocate,
@@ -155,7 +160,9 @@ def joined(
     Args:
         painters: layers of the wall that paint something.
         others: layers that paint nothing, but state what is hidden.
-        options: where seams are preferred.
+        params: where seams are preferred.
+        drawn: areas that a person assigns to photos, which precede all rules where those photos
+            paint them.
         wall: its surface, for seams off its depth edges, or None.
         balance: the colour balance of the painters, or None.
         allocate: returns the arrays of the orthoimage, by name.
@@ -163,20 +170,33 @@ def joined(
     Returns:
         (rows, cols) `OrthoMask`, and the index of the painter of each cell, `NOBODY` without one.
     """
-    preferred = (
-        preferences(painters, options, wall=wall, balance=balance, allocate=allocate)
-        if painters
-        else []
-    )
+    preferred: list[Preference] = []
+    if painters:
+        preferred = preferences(painters, params, wall=wall, balance=balance)
     shape = [*painters, *others][0].frame.shape
     mask = np.asarray(allocate("mask", shape, np.uint8), np.uint8)
     source = np.asarray(allocate("source", shape, np.int16), np.int16)
-    reach = _island_reach(options.island_cells_min)
+    # How many rows away a cell may influence who paints another.
+    cells_min = params.island_cells_min
+    reach = cells_min + math.ceil(math.sqrt(cells_min)) + 1 if cells_min > 1 else 0
     for band in bands_with_reach(shape, cells_most=_BAND_CELLS, reach_rows=reach):
-        rows = band.rows
-        choice = _choice_in(band.around, painters, others, preferred, options)
-        mask[rows] = _MASK_OF_RANK[choice.rank[band.inner]]
-        source[rows] = choice.source[band.inner]
+        rows = band.around
+        parts = [_part(layer, rows) for layer in painters]
+        values = [preference(rows) for preference in preferred]
+        if drawn is not None:
+            chosen = drawn.chosen(rows)
+            values = [
+                np.where(chosen == index, np.float32(np.inf), value)
+                for index, value in enumerate(values)
+            ]
+        rank, owner = best_views(
+            [*parts, *(_part(layer, rows) for layer in others)],
+            [*values, *(layer.quality[rows] for layer in others)],
+        )
+        if cells_min > 1 and len(painters) > 1:
+            owner = without_islands(rank, owner, parts, cells_min)
+        mask[band.rows] = _MASK_OF_RANK[rank[band.inner]]
+        source[band.rows] = owner[band.inner]
     return mask, source
 
 
@@ -211,36 +231,6 @@ def coloured(
     return rgb
 
 
-def _choice_in(
-    rows: slice,
-    painters: Sequence[Layer],
-    others: Sequence[Layer],
-    preferred: Sequence[Preference],
-    options: SeamOptions,
-) -> Choice:
-    """Return the state of the cells of some rows."""
-    parts = [_part(layer, rows) for layer in painters]
-    values = [preference(rows) for preference in preferred]
-    if options.drawn is not None:
-        chosen = options.drawn.chosen(rows)
-        values = [
-            np.where(chosen == index, np.float32(np.inf), value)
-            for index, value in enumerate(values)
-        ]
-    choice = best_views(
-        [*parts, *(_part(layer, rows) for layer in others)],
-        [*values, *(layer.quality[rows] for layer in others)],
-    )
-    if options.island_cells_min > 1 and len(painters) > 1:
-        return without_islands(choice, parts, options.island_cells_min)
-    return choice
-
-
-def _island_reach(cells_min: int) -> int:
-    """Return how many rows away a cell may influence who paints another."""
-    return cells_min + math.ceil(math.sqrt(cells_min)) + 1 if cells_min > 1 else 0
-
-
 def _part(layer: Layer, rows: slice) -> Layer:
     """Return some rows of a layer, without a copy."""
     return replace(
@@ -253,8 +243,15 @@ def _part(layer: Layer, rows: slice) -> Layer:
     )
 
 
-def best_views(layers: Sequence[Layer], preferences: Sequence[NDArray[np.float32]]) -> Choice:
-    """Assign each cell to the layer that is preferred there, the first of equals."""
+def best_views(
+    layers: Sequence[Layer], preferences: Sequence[NDArray[np.float32]]
+) -> tuple[NDArray[np.uint8], NDArray[np.int16]]:
+    """Assign each cell to the layer that is preferred there, the first of equals.
+
+    Returns:
+        (rows, cols) position of the cell's state in the order of states, and the layer that paints
+        it, `NOBODY` without one.
+    """
     shape = layers[0].frame.shape
     best = np.zeros(shape, dtype=np.float32)
     rank = np.zeros(shape, dtype=np.uint8)
@@ -266,10 +263,12 @@ def best_views(layers: Sequence[Layer], preferences: Sequence[NDArray[np.float32
         rank[wins] = states[wins]
         best[wins] = preference[wins]
         source[wins & is_painted] = index
-    return Choice(rank=rank, source=source)
+    return rank, source
 
 
-def without_islands(choice: Choice, layers: Sequence[Layer], cells_min: int) -> Choice:
+def without_islands(
+    rank: NDArray[np.uint8], owner: NDArray[np.int16], layers: Sequence[Layer], cells_min: int
+) -> NDArray[np.int16]:
     """Return small patches to the source that surrounds them, if it shows them as well.
 
     A patch is connected over sides of cells. The source with the most cells around a cell takes it;
@@ -277,32 +276,26 @@ def without_islands(choice: Choice, layers: Sequence[Layer], cells_min: int) -> 
     """
     import cv2
 
-    is_island = np.zeros(choice.source.shape, dtype=np.bool_)
+    is_island = np.zeros(owner.shape, dtype=np.bool_)
     for index in range(len(layers)):
-        is_island |= _small_patches(choice.source == index, cells_min)
+        is_mine = (owner == index).view(np.uint8)
+        _, labels, stats, _ = cv2.connectedComponentsWithStats(is_mine, connectivity=4)
+        is_small = stats[:, cv2.CC_STAT_AREA] < cells_min
+        is_small[0] = False
+        is_island |= is_small[labels]
     if not is_island.any():
-        return choice
-    source = choice.source.copy()
-    most = np.zeros(source.shape, dtype=np.float32)
+        return owner
+    source, most = owner.copy(), np.zeros(owner.shape, dtype=np.float32)
     side = 2 * math.ceil(math.sqrt(cells_min)) + 1
     for index, layer in enumerate(layers):
-        mainland = ((choice.source == index) & ~is_island).astype(np.float32)
+        mainland = ((owner == index) & ~is_island).astype(np.float32)
         about = cv2.boxFilter(
             mainland, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT
         )
-        takes = is_island & (_ranks(layer) == choice.rank) & (about > most)
+        takes = is_island & (_ranks(layer) == rank) & (about > most)
         source[takes] = index
         most[takes] = about[takes]
-    return replace(choice, source=source)
-
-
-def _small_patches(is_mine: NDArray[np.bool_], cells_min: int) -> NDArray[np.bool_]:
-    import cv2
-
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(is_mine.view(np.uint8), connectivity=4)
-    is_small = stats[:, cv2.CC_STAT_AREA] < cells_min
-    is_small[0] = False
-    return np.asarray(is_small[labels], dtype=np.bool_)
+    return source
 
 
 def _ranks(layer: Layer) -> NDArray[np.uint8]:
@@ -311,47 +304,3 @@ def _ranks(layer: Layer) -> NDArray[np.uint8]:
         is_filled = (layer.filled > 0) & (layer.mask == LayerMask.PAINTED)
         ranks[is_filled] = _RANKED.index(OrthoMask.FILLED)
     return ranks
-
-
-def _best(layers: Sequence[Layer]) -> np.float32:
-    return np.float32(max(1e-6, *(float(layer.quality.max()) for layer in layers)))
-
-
-def _by_depth_inside(layer: Layer, index: int, allocate: Allocate) -> Preference:
-    if layer.mask.size <= _BAND_CELLS:
-        return partial(_rows_of, _depth_inside(layer))
-    from orthoflow_plugins.mosaic.depths_inside import column_distances, depths_inside
-
-    return partial(depths_inside, column_distances(layer.mask, f"inside.{index}", allocate))
-
-
-def _depth_inside(layer: Layer) -> NDArray[np.float32]:
-    """Return the distance in cells to the nearest unpainted cell, or to the border."""
-    import cv2
-
-    painted = np.pad((layer.mask == LayerMask.PAINTED).astype(np.uint8), 1)
-    distance = cv2.distanceTransform(painted, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.asarray(distance[1:-1, 1:-1], dtype=np.float32)
-
-
-def _by_order(layers: Sequence[Layer], priority: Sequence[str]) -> list[Preference]:
-    places = {name: len(priority) - place for place, name in enumerate(priority)}
-    bonus = np.float32(2.0) * _best(layers)
-    return [
-        partial(_raised, layer, np.float32(places.get(layer.source, 0)) * bonus) for layer in layers
-    ]
-
-
-def _rows_of(values: NDArray[np.float32], rows: slice) -> NDArray[np.float32]:
-    return values[rows]
-
-
-def _raised(layer: Layer, bonus: np.float32, rows: slice) -> NDArray[np.float32]:
-    return layer.quality[rows] + bonus
-
-
-def _cut_off(
-    layer: Layer, index: int, cut: CutLabels, best: np.float32, rows: slice
-) -> NDArray[np.float32]:
-    is_mine = cut.in_rows(rows) == index
-    return layer.quality[rows] + np.where(is_mine, np.float32(2.0) * best, np.float32(0.0))

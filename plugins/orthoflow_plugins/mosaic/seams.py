@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
 from typing import ClassVar, Final, Literal
@@ -30,14 +30,11 @@ from orthoflow.products import (
     Orthoimage,
     Orthoimages,
     OrthoMask,
-    Wall,
     Walls,
 )
 from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.mosaic.agreement import (
-    Overlaps,
-    SeamSteps,
     count_seams,
     is_seam,
     overlaps_of,
@@ -49,8 +46,6 @@ from orthoflow_plugins.mosaic.drawn_seams import read_seams, seams_of
 from orthoflow_plugins.mosaic.expected_errors import expected_errors_m, ties_on
 from orthoflow_plugins.mosaic.joining import (
     NOBODY,
-    SeamOptions,
-    SeamRule,
     coloured,
     joined,
     require_one_raster,
@@ -202,7 +197,7 @@ class MosaicSeams(Method):
     class Params(MethodParams):
         """How the layer of a cell is chosen, and how specks are avoided."""
 
-        seams: SeamRule = Field(
+        seams: Literal["best-view", "voronoi", "graph-cut", "priority"] = Field(
             "best-view", description="Which layer paints what several of them show."
         )
         priority: tuple[str, ...] = Field(
@@ -224,10 +219,7 @@ class MosaicSeams(Method):
             ge=0,
             le=4096,
             description="Remaining differences at a seam are blended within this many cells "
-            "on either "
-            "side; only smooth differences, so that nothing is mixed. 0: a step may "
-            ""
-            ""
+            "on either side; only smooth differences, so that nothing is mixed. 0: a step may "
             "remain.",
         )
         island_cells_min: int = Field(
@@ -268,44 +260,31 @@ class MosaicSeams(Method):
                 "there is no layer to make an orthoimage from, at least one is needed"
             )
         require_sources(layers, params.priority)
-        cameras = {} if inputs.cameras is None else _oriented(inputs.cameras)
-        drawn = read_seams(inputs.seams, {layer.source for layer in layers})
+        polygons = read_seams(inputs.seams, {layer.source for layer in layers})
         verdicts: list[_Joined] = []
         for index, members in groupby(layers, key=lambda layer: layer.wall):
-            group: tuple[Layer, ...] = tuple(members)
-            name = inputs.layers.name(index)
-            ctx.progress(index / (layers[-1].wall + 1), name)
-            allocate = partial(_allocated, ctx, index)
-            surroundings = _Surroundings(
-                wall=_wall(inputs.walls, index),
-                cameras=cameras,
-                drawn=drawn,
-                number=inputs.layers.number(index),
-            )
-            verdict = _join(group, name, params, surroundings, allocate)
-            image = _with_errors(
-                replace(verdict.image, plane_index=inputs.layers.number(index)),
-                verdict.all_overlaps,
-                surroundings,
-                inputs.cameras,
-                ctx,
-                allocate,
-            )
-            verdicts.append(replace(verdict, image=image))
-            _show(ctx, image, inputs.cameras)
+            ctx.progress(index / (layers[-1].wall + 1), inputs.layers.name(index))
+            group, allocate = tuple(members), partial(_allocated, ctx, index)
+            verdicts.append(_join(inputs, group, params, polygons, ctx, allocate))
+            _show(ctx, verdicts[-1].image, inputs.cameras)
         _report(ctx, verdicts)
         gains: dict[str, JsonValue] = {
-            item.image.name: dict(item.gains) for item in verdicts if item.gains
+            item.image.name: dict(
+                zip(
+                    item.image.sources,
+                    np.exp(item.balance.exposures.exposures).round(4).tolist(),
+                    strict=True,
+                )
+            )
+            for item in verdicts
+            if item.balance is not None
         }
-        details: dict[str, JsonValue] = {"gains": gains} if gains else {}
-        images = tuple(item.image for item in verdicts)
-        profile = inputs.layers.icc_profile
         return self.Out(
             orthoimages=Orthoimages(
-                images=images,
-                icc_profile=profile,
+                images=tuple(item.image for item in verdicts),
+                icc_profile=inputs.layers.icc_profile,
                 layers=inputs.layers.layers if params.publish_layers else None,
-                details=details,
+                details={"gains": gains} if gains else {},
             )
         )
 
@@ -316,50 +295,23 @@ class _Joined:
 
     Attributes:
         image: the orthoimage.
-        overlaps: displacements between the two best photos of places.
-        all_overlaps: the same for every two photos.
-        steps: colour differences along seams.
+        shifts_cells: (n, 2) displacements between the two best photos of places.
+        steps: differences in luminance and in colour along seams.
         n_seam: cells of seams.
         n_edge_seam: cells of seams at depth edges, None if the surface is unknown.
-        untouched: the same for the unbalanced photos.
+        untouched: `steps` of the unbalanced photos.
         balance: the colour balance, None if colours are unchanged.
         n_outvoted: cells that another photo showed differently from the one that paints them.
     """
 
     image: Orthoimage
-    overlaps: Overlaps
-    all_overlaps: Overlaps
-    steps: SeamSteps
+    shifts_cells: NDArray[np.float64]
+    steps: tuple[NDArray[np.float64], NDArray[np.float64]]
     n_seam: int
     n_edge_seam: int | None
-    untouched: SeamSteps
+    untouched: tuple[NDArray[np.float64], NDArray[np.float64]]
     balance: Balance | None
     n_outvoted: int = 0
-
-    @property
-    def gains(self) -> dict[str, JsonValue]:
-        """Return factors on the light of each source, per channel; empty if none was changed."""
-        if self.balance is None:
-            return {}
-        factors = np.exp(self.balance.exposures.exposures).round(4).tolist()
-        return dict(zip(self.image.sources, factors, strict=True))
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Surroundings:
-    """What is known about the layers of a wall.
-
-    Attributes:
-        wall: its surface, or None.
-        cameras: of photos, by name.
-        drawn: areas that a person assigns to photos, of all walls.
-        number: of the wall.
-    """
-
-    wall: Wall | None
-    cameras: Mapping[str, Camera]
-    drawn: Sequence[NamedPolygon]
-    number: int
 
 
 def _allocated(
@@ -372,105 +324,96 @@ def _allocated(
 
 
 def _join(
+    inputs: MosaicSeams.In,
     group: tuple[Layer, ...],
-    name: str,
     params: MosaicSeams.Params,
-    surroundings: _Surroundings,
+    polygons: Sequence[NamedPolygon],
+    ctx: StepContext,
     allocate: Allocate,
 ) -> _Joined:
-    wall = surroundings.wall
+    """Join the layers of one wall.
+
+    Args:
+        inputs: of the step.
+        group: the layers.
+        params: how.
+        polygons: areas that a person assigns to photos, of all walls.
+        ctx: of the step.
+        allocate: returns the arrays of the orthoimage, by name.
+    """
+    frame, index = group[0].frame, group[0].wall
+    name, number = inputs.layers.name(index), inputs.layers.number(index)
+    walls = () if inputs.walls is None else inputs.walls.walls
+    wall = walls[index] if index < len(walls) else None
+    cameras = {} if inputs.cameras is None else _oriented(inputs.cameras)
     require_one_raster(group, name)
     # A layer that paints nothing is no source, but states what is hidden.
     painters = [layer for layer in group if holds_cells(layer.mask, LayerMask.PAINTED)]
     others = [layer for layer in group if all(layer is not painter for painter in painters)]
-    agreed = None
+    n_outvoted, contradicted = 0, None
     if params.robust and painters:
         # Before colours are balanced: passers-by are useless for light.
-        agreed = consensus(painters, wall, allocate=allocate)
-        painters = list(agreed.layers)
+        painters, n_outvoted, contradicted = consensus(painters, wall, allocate=allocate)
+    sources = [layer.source for layer in painters]
     balance = None
     if params.gains != "none" and len(painters) > 1:
-        cameras = [surroundings.cameras.get(layer.source) for layer in painters]
-        balance = balance_of(painters, wall, cameras, is_local=params.local_balance)
-    options = SeamOptions(
-        rule=params.seams,
-        priority=params.priority,
-        island_cells_min=params.island_cells_min,
-        drawn=seams_of(
-            surroundings.drawn,
-            surroundings.number,
-            group[0].frame,
-            [layer.source for layer in painters],
-        ),
+        seen = [cameras.get(source) for source in sources]
+        balance = balance_of(painters, wall, seen, is_local=params.local_balance)
+    mask, source = joined(
+        painters,
+        others,
+        params,
+        drawn=seams_of(polygons, number, frame, sources),
+        wall=wall,
+        balance=balance,
+        allocate=allocate,
     )
-    mask, source = joined(painters, others, options, wall=wall, balance=balance, allocate=allocate)
-    if agreed is not None and agreed.contradicted is not None:
+    if contradicted is not None:
         for rows in row_bands(mask.shape):
-            is_alone = agreed.contradicted[rows] & (mask[rows] == OrthoMask.PAINTED)
+            is_alone = contradicted[rows] & (mask[rows] == OrthoMask.PAINTED)
             mask[rows][is_alone] = OrthoMask.CONTRADICTED
-    untouched = seam_steps(source, painters)
-    steps = untouched
+    steps = untouched = seam_steps(source, painters)
     if balance is not None:
         if params.feather_cells:
             balance = with_seams(balance, source, wall, feather_cells=params.feather_cells)
         steps = seam_steps(source, painters, balance)
+    n_control, n_check = ties_on(inputs.cameras, number)
+    error_m: NDArray[np.float32] | None = None
+    if wall is not None and cameras and n_control + n_check:
+        overlaps = overlaps_of(group, of_all_pairs=True)
+        error_m = expected_errors_m(wall, source, sources, cameras, overlaps, allocate=allocate)
+    elif wall is not None and cameras:
+        # Without ties on the wall nothing is known of it.
+        error_m = np.asarray(allocate("error_m", frame.shape, np.float32), np.float32)
+        error_m[...] = np.nan
+        ctx.report(UNCHECKED, subject=name)
     image = Orthoimage(
-        frame=group[0].frame,
-        wall=group[0].wall,
+        frame=frame,
+        wall=index,
         name=name,
+        plane_index=number,
         rgb=coloured(painters, source, balance, allocate=allocate),
         mask=mask,
         source=source,
-        sources=tuple(layer.source for layer in painters),
+        sources=tuple(sources),
+        error_m=error_m,
+        n_check_points=n_check if wall is not None and cameras else 0,
     )
     n_seam, n_edge_seam = count_seams(source, None if wall is None else wall.depth_m)
     return _Joined(
         image=image,
-        overlaps=overlaps_of(group),
-        all_overlaps=overlaps_of(group, of_all_pairs=True),
+        shifts_cells=overlaps_of(group).shifts_cells,
         steps=steps,
-        untouched=untouched,
         n_seam=n_seam,
         n_edge_seam=None if wall is None else n_edge_seam,
+        untouched=untouched,
         balance=balance,
-        n_outvoted=0 if agreed is None else agreed.n_outvoted,
+        n_outvoted=n_outvoted,
     )
-
-
-def _with_errors(
-    image: Orthoimage,
-    overlaps: Overlaps,
-    surroundings: _Surroundings,
-    cameras: Cameras | None,
-    ctx: StepContext,
-    allocate: Allocate,
-) -> Orthoimage:
-    """Add the expected error of each cell, if ties on the wall determine it."""
-    n_control, n_check = ties_on(cameras, image.number)
-    if surroundings.wall is None or not surroundings.cameras:
-        return image
-    if n_control + n_check == 0:
-        unknown = np.asarray(allocate("error_m", image.frame.shape, np.float32), np.float32)
-        unknown[...] = np.nan
-        ctx.report(UNCHECKED, subject=image.name)
-        return replace(image, error_m=unknown)
-    errors_m = expected_errors_m(
-        surroundings.wall,
-        image.source,
-        image.sources,
-        surroundings.cameras,
-        overlaps,
-        allocate=allocate,
-    )
-    return replace(image, error_m=errors_m, n_check_points=n_check)
 
 
 def _oriented(cameras: Cameras) -> dict[str, Camera]:
     return {camera.photo: camera for camera in cameras.cameras if camera.status == "ok"}
-
-
-def _wall(walls: Walls | None, index: int) -> Wall | None:
-    return walls.walls[index] if walls is not None and index < len(walls.walls) else None
 
 
 def _show(ctx: StepContext, image: Orthoimage, cameras: Cameras | None) -> None:
@@ -555,7 +498,7 @@ def _report(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:
     edges = [item.n_edge_seam for item in verdicts if item.n_edge_seam is not None]
     if edges and n_seam:
         ctx.metric("seam_on_depth_edge_share", sum(edges) / n_seam, "1")
-    shifts_cells = np.concatenate([item.overlaps.shifts_cells for item in verdicts])
+    shifts_cells = np.concatenate([item.shifts_cells for item in verdicts])
     ctx.metric("n_overlap_patches", len(shifts_cells), "1")
     if len(shifts_cells):
         rms = np.sqrt(np.mean(shifts_cells**2, axis=0))
@@ -563,18 +506,18 @@ def _report(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:
         ctx.metric("overlap_v_rms_cells", rms[1], "cells")
         # Millimetres allow comparison of runs with different cell sizes.
         shifts_mm = np.concatenate(
-            [1e3 * item.image.frame.gsd_m * item.overlaps.shifts_cells for item in verdicts]
+            [1e3 * item.image.frame.gsd_m * item.shifts_cells for item in verdicts]
         )
         rms_mm = np.sqrt(np.mean(shifts_mm**2, axis=0))
         ctx.metric("overlap_u_rms_mm", rms_mm[0], "mm")
         ctx.metric("overlap_v_rms_mm", rms_mm[1], "mm")
-    grey = np.concatenate([item.steps.grey for item in verdicts])
+    grey = np.concatenate([item.steps[0] for item in verdicts])
     if len(grey):
-        delta_e = np.concatenate([item.steps.delta_e for item in verdicts])
+        delta_e = np.concatenate([item.steps[1] for item in verdicts])
         ctx.metric("seam_step_rms_grey", float(np.sqrt(np.mean(grey**2))), "grey")
         ctx.metric("seam_step_mean_delta_e", float(delta_e.mean()), "1")
         if any(item.balance is not None for item in verdicts):
-            untouched = np.concatenate([item.untouched.delta_e for item in verdicts])
+            untouched = np.concatenate([item.untouched[1] for item in verdicts])
             ctx.metric("seam_step_untouched_delta_e", float(untouched.mean()), "1")
     n_cells = sum(item.image.mask.size for item in verdicts)
     ctx.metric("outvoted_share", sum(item.n_outvoted for item in verdicts) / n_cells, "1")
@@ -582,11 +525,11 @@ def _report(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:
         share = count_cells(image.mask, OrthoMask.CONTRADICTED) / image.mask.size
         if share >= _CONTRADICTED_WORTH_WORDS:
             ctx.report(CONTRADICTED, subject=image.name, share=share)
-    _report_errors(ctx, [item.image for item in verdicts])
-    _report_gains(ctx, verdicts)
+    _report_errors_and_gains(ctx, verdicts)
 
 
-def _report_errors(ctx: StepContext, images: Sequence[Orthoimage]) -> None:
+def _report_errors_and_gains(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:
+    images = [item.image for item in verdicts]
     known = [
         image.error_m[np.isfinite(image.error_m)] for image in images if image.error_m is not None
     ]
@@ -595,15 +538,11 @@ def _report_errors(ctx: StepContext, images: Sequence[Orthoimage]) -> None:
         median, high = 1e3 * np.percentile(errors_m, (50.0, 95.0))
         ctx.metric("expected_mm_median", float(median), "mm")
         ctx.metric("expected_mm_p95", float(high), "mm")
-
-
-def _report_gains(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:
-    balances = [item.balance for item in verdicts if item.balance is not None]
-    if not balances:
-        return
-    exposures = np.exp(np.concatenate([item.exposures.exposures for item in balances]))
-    ctx.metric("gain_min", float(exposures.min()), "1")
-    ctx.metric("gain_max", float(exposures.max()), "1")
-    losses = [1.0 - math.exp(-bend.sum()) for item in balances for bend in item.exposures.lenses]
+    balances = [item.balance.exposures for item in verdicts if item.balance is not None]
+    if balances:
+        exposures = np.exp(np.concatenate([item.exposures for item in balances]))
+        ctx.metric("gain_min", float(exposures.min()), "1")
+        ctx.metric("gain_max", float(exposures.max()), "1")
+    losses = [1.0 - math.exp(-bend.sum()) for item in balances for bend in item.lenses]
     if losses:
         ctx.metric("lens_loss_share", max(losses), "1")

@@ -13,7 +13,7 @@ from orthoflow_plugins.mosaic.agreement import (
     overlaps_of,
     seam_steps,
 )
-from orthoflow_plugins.mosaic.depth_edges import depth_edges
+from orthoflow_plugins.mosaic.blocks import depth_edges
 
 from orthoflow.products import Layer, LayerMask
 from tests import samples
@@ -191,19 +191,19 @@ def test_steps_are_told_in_cells_that_both_sources_paint(balance: Brighter | Non
                 for k in (own, other)
             ]
             wanted.append(float((colours[0] - colours[1]) @ [0.299, 0.587, 0.114]))
-    found = seam_steps(source, layers, balance)  # type: ignore[arg-type]
+    grey, delta_e = seam_steps(source, layers, balance)  # type: ignore[arg-type]
     assert len(wanted) > 10
-    np.testing.assert_allclose(np.sort(found.grey), np.sort(wanted), atol=1e-9)
-    assert len(found.delta_e) == len(found.grey)
+    np.testing.assert_allclose(np.sort(grey), np.sort(wanted), atol=1e-9)
+    assert len(delta_e) == len(grey)
     alike = layer(rgb=np.full((*source.shape, 3), 9, np.uint8), shape=source.shape)
-    assert not seam_steps(source, [alike] * 3).delta_e.any()
+    assert not seam_steps(source, [alike] * 3)[1].any()
     nothing = seam_steps(np.zeros_like(source), layers)
-    assert (len(nothing.grey), len(nothing.delta_e)) == (0, 0)
+    assert [len(values) for values in nothing] == [0, 0]
 
 
 def test_black_and_white_are_a_hundred_apart() -> None:
     source = np.array([[0, 1]], dtype=np.int16)
     pair = [layer(rgb=np.full((1, 2, 3), value, np.uint8), shape=(1, 2)) for value in (0, 255)]
-    found = seam_steps(source, pair)
-    assert found.grey.tolist() == pytest.approx([-255.0])
-    assert found.delta_e.tolist() == pytest.approx([100.0], abs=1e-3)
+    grey, delta_e = seam_steps(source, pair)
+    assert grey.tolist() == pytest.approx([-255.0])
+    assert delta_e.tolist() == pytest.approx([100.0], abs=1e-3)

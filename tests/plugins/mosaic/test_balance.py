@@ -17,19 +17,12 @@ from orthoflow_plugins.mosaic.balance import (
     estimate,
     with_seams,
 )
-from orthoflow_plugins.mosaic.blocks import Blocks
-from orthoflow_plugins.mosaic.light import (
-    BlockLight,
-    block_light,
-    inside,
-    light_of_levels,
-    lit,
-    pairs,
-)
+from orthoflow_plugins.mosaic.blocks import BlockLight, Blocks, block_light, inside, pairs
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 from scipy.ndimage import map_coordinates
 
 from orthoflow.geometry.cameras import looking_at
+from orthoflow.geometry.levels import light_of_levels, lit
 from orthoflow.products import Camera, Intrinsics, Layer, Layers, Orthoimages, Walls
 from tests import inspect_scenes, samples
 from tests import raster_scenes as scenes

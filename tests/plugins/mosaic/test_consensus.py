@@ -79,8 +79,8 @@ def test_a_passer_by_yields_to_what_others_show(witness: str, place: int) -> Non
     photos = [photo(f"{k}.jpg", levels, seed=k) for k in range(3 if "photo" in witness else 2)]
     photos[place] = photo("passed.jpg", with_person(levels), seed=7)
     wall = scanned(levels if "photo" not in witness else None, intensity=witness == "laser")
-    found = consensus(photos, wall, allocate=in_memory)
-    for k, (before, after) in enumerate(zip(photos, found.layers, strict=True)):
+    kept, n_outvoted, _ = consensus(photos, wall, allocate=in_memory)
+    for k, (before, after) in enumerate(zip(photos, kept, strict=True)):
         lost = outvoted(before, after)
         if k != place:
             assert not lost.any()
@@ -90,15 +90,15 @@ def test_a_passer_by_yields_to_what_others_show(witness: str, place: int) -> Non
         # At most a cell in a thousand still shows him, and little beside him is lost.
         assert np.count_nonzero(person & ~lost) <= 1e-3 * person.size
         assert np.count_nonzero(lost & ~person) < 0.5 * np.count_nonzero(person)
-    assert found.n_outvoted == np.count_nonzero(outvoted(photos[place], found.layers[place]))
+    assert n_outvoted == np.count_nonzero(outvoted(photos[place], kept[place]))
 
 
 def test_two_photos_alone_cannot_say_who_is_right() -> None:
     levels = painted_wall()
     photos = [photo("a.jpg", levels, seed=1), photo("b.jpg", with_person(levels), seed=2)]
-    found = consensus(photos, None, allocate=in_memory)
-    assert found.n_outvoted == 0
-    assert all(one is other for one, other in zip(photos, found.layers, strict=True))
+    kept, n_outvoted, _ = consensus(photos, None, allocate=in_memory)
+    assert n_outvoted == 0
+    assert all(one is other for one, other in zip(photos, kept, strict=True))
 
 
 def test_what_one_photo_alone_shows_stays_in_a_class_of_its_own(tmp_path: Path) -> None:
@@ -107,14 +107,14 @@ def test_what_one_photo_alone_shows_stays_in_a_class_of_its_own(tmp_path: Path) 
         photo("a.jpg", with_person(levels), seed=1),
         photo("b.jpg", levels, seed=2, columns=slice(0, 150)),
     ]
-    found = consensus(photos, scanned(levels), allocate=in_memory)
-    assert found.n_outvoted == 0
+    _, n_outvoted, contradicted = consensus(photos, scanned(levels), allocate=in_memory)
+    assert n_outvoted == 0
     person = np.zeros(SHAPE, np.bool_)
     person[PERSON] = True
-    assert found.contradicted is not None
+    assert contradicted is not None
     # Regions are of whole blocks, so its border may be missing.
-    assert found.contradicted[person].mean() > 0.85
-    assert np.count_nonzero(found.contradicted & ~person) < 0.5 * np.count_nonzero(person)
+    assert contradicted[person].mean() > 0.85
+    assert np.count_nonzero(contradicted & ~person) < 0.5 * np.count_nonzero(person)
     # In the mask of the orthoimage they are a class of their own, and its share is reported.
     inputs = MosaicSeams.In(
         layers=Layers(layers=tuple(photos)), walls=samples.walls(scanned(levels))
@@ -122,7 +122,7 @@ def test_what_one_photo_alone_shows_stays_in_a_class_of_its_own(tmp_path: Path) 
     ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
     (image,) = MosaicSeams().run(inputs, MosaicSeams.Params(), ctx).orthoimages.images
     is_alone = image.mask == OrthoMask.CONTRADICTED
-    np.testing.assert_array_equal(is_alone, found.contradicted)
+    np.testing.assert_array_equal(is_alone, contradicted)
     assert (image.source[is_alone] == 0).all()
     assert is_shown(image.mask).all()
     metrics = {metric.name: metric.value for metric in ctx.metrics}
@@ -141,8 +141,8 @@ def test_light_that_changes_smoothly_is_no_contradiction() -> None:
         photo("b.jpg", levels * across[:, ::-1], seed=2),
         photo("c.jpg", 0.8 * levels, seed=3),
     ]
-    found = consensus(photos, scanned(levels), allocate=in_memory)
-    assert (found.n_outvoted, found.contradicted is None or found.contradicted.any()) == (0, False)
+    _, n_outvoted, contradicted = consensus(photos, scanned(levels), allocate=in_memory)
+    assert (n_outvoted, contradicted is None or contradicted.any()) == (0, False)
 
 
 def test_a_scan_that_sees_other_patterns_bears_no_witness() -> None:

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.mosaic import balance as module
 from orthoflow_plugins.mosaic.balance import Exposures, Radii, estimate
-from orthoflow_plugins.mosaic.light import BlockLight
+from orthoflow_plugins.mosaic.blocks import BlockLight
 
 
 def light(rows: slice, columns: slice, seed: int, unknown: float = 0.0) -> BlockLight:

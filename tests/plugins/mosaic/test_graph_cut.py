@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from orthoflow_plugins.mosaic import blocks, graph_cut
-from orthoflow_plugins.mosaic.blocks import Blocks
-from orthoflow_plugins.mosaic.depth_edges import depth_edges, depth_edges_in
+from orthoflow_plugins.mosaic.blocks import Blocks, depth_edges, depth_edges_in
 from orthoflow_plugins.mosaic.graph_cut import CutLabels
-from orthoflow_plugins.mosaic.light import lit_shares
 
+from orthoflow.geometry.levels import lit_shares
 from orthoflow.products import LayerMask
 
 

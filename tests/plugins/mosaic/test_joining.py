@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,12 +10,11 @@ from numpy.typing import NDArray
 from orthoflow_plugins.mosaic import joining as module
 from orthoflow_plugins.mosaic.joining import (
     NOBODY,
-    Choice,
-    SeamOptions,
     best_views,
     preferences,
     without_islands,
 )
+from orthoflow_plugins.mosaic.seams import MosaicSeams
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry.bands import in_memory
@@ -25,6 +22,7 @@ from orthoflow.products import Layer, LayerMask, OrthoMask
 from tests import samples
 
 SHAPE = (23, 17)
+PLAIN = MosaicSeams.Params(island_cells_min=1)
 # A cell takes the highest of these that any layer gives it.
 ORDER = [
     *(OrthoMask.NONE, OrthoMask.NO_SURFACE, OrthoMask.OCCLUDED),
@@ -70,11 +68,11 @@ LAYERS = [layer(1), layer(2, has_filled=False), layer(3), layer(4, painted=0.1)]
 
 
 def test_a_cell_is_painted_by_the_best_of_those_that_know_most_of_it() -> None:
-    choice = best_views(LAYERS, [one.quality for one in LAYERS])
+    rank, source = best_views(LAYERS, [one.quality for one in LAYERS])
     for cell in np.ndindex(SHAPE):
         states = [state(one, cell) for one in LAYERS]
         highest = max(states)
-        assert choice.rank[cell] == highest
+        assert rank[cell] == highest
         painters = [
             k
             for k, one in enumerate(LAYERS)
@@ -82,27 +80,28 @@ def test_a_cell_is_painted_by_the_best_of_those_that_know_most_of_it() -> None:
         ]
         # The first of equals.
         wanted = max(painters, key=lambda k: (LAYERS[k].quality[cell], -k), default=NOBODY)
-        assert choice.source[cell] == wanted
+        assert source[cell] == wanted
 
 
 def test_ranks_become_states_of_the_orthoimage() -> None:
     mask, source = module.joined(
         LAYERS[:3],
         LAYERS[3:],
-        SeamOptions(rule="best-view"),
+        PLAIN,
+        drawn=None,
         wall=None,
         balance=None,
         allocate=in_memory,
     )
-    choice = best_views(LAYERS, [one.quality for one in LAYERS])
-    np.testing.assert_array_equal(mask, np.array(ORDER, dtype=np.uint8)[choice.rank])
-    own = np.where(choice.source == 3, source, choice.source)
+    rank, owner = best_views(LAYERS, [one.quality for one in LAYERS])
+    np.testing.assert_array_equal(mask, np.array(ORDER, dtype=np.uint8)[rank])
+    own = np.where(owner == 3, source, owner)
     np.testing.assert_array_equal(source, own)
 
 
 @pytest.mark.parametrize("rule", ["best-view", "voronoi", "priority"])
 def test_preferences_are_the_same_row_by_row(rule: str) -> None:
-    options = SeamOptions(rule=rule, priority=("3.jpg", "1.jpg"))  # type: ignore[arg-type]
+    options = PLAIN.model_copy(update={"seams": rule, "priority": ("3.jpg", "1.jpg")})
     whole = slice(0, SHAPE[0])
     every = [preference(whole) for preference in preferences(LAYERS, options)]
     for preference, values in zip(preferences(LAYERS, options), every, strict=True):
@@ -120,7 +119,7 @@ def test_preferences_are_the_same_row_by_row(rule: str) -> None:
 
 
 def test_photos_in_the_given_order_go_before_all_qualities() -> None:
-    options = SeamOptions(rule="priority", priority=("3.jpg", "1.jpg"))
+    options = PLAIN.model_copy(update={"seams": "priority", "priority": ("3.jpg", "1.jpg")})
     found = {
         one.source: preference(slice(0, SHAPE[0]))
         for one, preference in zip(LAYERS, preferences(LAYERS, options), strict=True)
@@ -169,14 +168,14 @@ def test_small_patches_go_to_the_source_about_them_that_shows_them_too(
     painted = np.array([one.mask == LayerMask.PAINTED for one in layers])
     source = np.where(np.take_along_axis(painted, wanted[None], 0)[0], wanted, NOBODY)
     rank = np.where(source >= 0, ORDER.index(OrthoMask.PAINTED), 0).astype(np.uint8)
-    choice = Choice(rank=rank, source=source.astype(np.int16))
+    owner = source.astype(np.int16)
     island = np.zeros(SHAPE, dtype=bool)
     for index in range(3):
-        for patch in patches(choice.source, index):
+        for patch in patches(owner, index):
             if len(patch) < cells_min:
                 island[tuple(np.array(patch).T)] = True
     assert 5 < island.sum() < 0.5 * island.size
-    expected = choice.source.copy()
+    expected = owner.copy()
     reach = int(np.ceil(np.sqrt(cells_min)))
     for row, column in np.argwhere(island).tolist():
         about = (
@@ -184,7 +183,7 @@ def test_small_patches_go_to_the_source_about_them_that_shows_them_too(
             slice(max(0, column - reach), column + reach + 1),
         )
         counts = [
-            np.count_nonzero((choice.source[about] == k) & ~island[about])
+            np.count_nonzero((owner[about] == k) & ~island[about])
             if state(layers[k], (row, column)) == rank[row, column]
             else 0
             for k in range(3)
@@ -192,9 +191,7 @@ def test_small_patches_go_to_the_source_about_them_that_shows_them_too(
         if max(counts):
             # The first of equals.
             expected[row, column] = int(np.argmax(counts))
-    found = without_islands(choice, layers, cells_min)
-    np.testing.assert_array_equal(found.source, expected)
-    np.testing.assert_array_equal(found.rank, rank)
+    np.testing.assert_array_equal(without_islands(rank, owner, layers, cells_min), expected)
 
 
 def test_without_a_small_patch_nothing_changes() -> None:
@@ -202,10 +199,9 @@ def test_without_a_small_patch_nothing_changes() -> None:
     source = np.zeros(SHAPE, dtype=np.int16)
     source[:3, :3] = 1
     rank = np.full(SHAPE, ORDER.index(OrthoMask.PAINTED), dtype=np.uint8)
-    choice = Choice(rank=rank, source=source)
     # Nine cells are a patch of nine.
-    assert without_islands(choice, layers, 9) is choice
-    assert (without_islands(choice, layers, 10).source == 0).all()
+    assert without_islands(rank, source, layers, 9) is source
+    assert (without_islands(rank, source, layers, 10) == 0).all()
 
 
 @pytest.mark.parametrize("cells_min", [1, 2, 7, 30])
@@ -213,16 +209,16 @@ def test_bands_decide_islands_as_the_whole_does(
     monkeypatch: pytest.MonkeyPatch, cells_min: int
 ) -> None:
     layers = [layer(30 + k, painted=0.8, has_filled=False) for k in range(3)]
-    options = SeamOptions(rule="best-view", island_cells_min=cells_min)
-    given = {"wall": None, "balance": None, "allocate": in_memory}
+    options = PLAIN.model_copy(update={"island_cells_min": cells_min})
+    given = {"drawn": None, "wall": None, "balance": None, "allocate": in_memory}
     mask, source = module.joined(layers, [], options, **given)  # type: ignore[arg-type]
     monkeypatch.setattr(module, "_BAND_CELLS", SHAPE[1])
     banded = module.joined(layers, [], options, **given)  # type: ignore[arg-type]
     np.testing.assert_array_equal(banded[0], mask)
     np.testing.assert_array_equal(banded[1], source)
     if cells_min == 1:
-        best = best_views(layers, [one.quality for one in layers])
-        np.testing.assert_array_equal(source, best.source)
+        _, best = best_views(layers, [one.quality for one in layers])
+        np.testing.assert_array_equal(source, best)
 
 
 # --- colours ---
@@ -270,14 +266,26 @@ def test_layers_of_a_wall_share_its_raster() -> None:
     module.require_sources([other, one], ["b.jpg"])
 
 
-def test_a_cut_prefers_its_layer_by_more_than_any_quality() -> None:
-    labels = np.random.default_rng(8).integers(0, 2, SHAPE)
-    cut: Any = SimpleNamespace(in_rows=lambda rows: labels[rows])
-    best = module._best(LAYERS[:2])
-    assert best == max(float(one.quality.max()) for one in LAYERS[:2])
-    whole = slice(0, SHAPE[0])
-    values = [module._cut_off(one, k, cut, best, whole) for k, one in enumerate(LAYERS[:2])]
-    np.testing.assert_array_equal(np.argmax(values, axis=0), labels)
-    np.testing.assert_array_equal(
-        module._cut_off(LAYERS[0], 0, cut, best, slice(4, 9)), values[0][4:9]
+def test_distances_inside_a_large_layer_are_linear_between_every_so_many_cells(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    shape = (120, 150)
+    mask = np.full(shape, LayerMask.PAINTED, dtype=np.uint8)
+    mask[:, :30] = LayerMask.OUTSIDE
+    frame = samples.facing_south(0.01, shape[1], shape[0])
+    large = Layer(
+        frame=frame,
+        wall=0,
+        source="a.jpg",
+        rgb=np.zeros((*shape, 3), np.uint8),
+        mask=mask,
+        quality=np.ones(shape, np.float32),
     )
+    options = PLAIN.model_copy(update={"seams": "voronoi"})
+    (whole,) = preferences([large], options)
+    monkeypatch.setattr(module, "_BAND_CELLS", shape[0] * shape[1] // 8)
+    (reduced,) = preferences([large], options)
+    rows = slice(0, shape[0])
+    # Every third cell: what is painted may end two cells beside.
+    np.testing.assert_allclose(reduced(rows), whole(rows), atol=3.0)
+    np.testing.assert_array_equal(reduced(slice(31, 60)), reduced(rows)[31:60])

@@ -5,18 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.mosaic.blocks import Blocks
-from orthoflow_plugins.mosaic.light import (
-    BlockLight,
-    block_light,
-    common,
-    inside,
-    light_of_levels,
-    lit,
-    lit_shares,
-    pairs,
-)
+from orthoflow_plugins.mosaic.blocks import BlockLight, Blocks, block_light, common, inside, pairs
 
+from orthoflow.geometry.levels import light_of_levels, lit, lit_shares
 from orthoflow.products import Layer, LayerMask
 from tests import samples
 
