@@ -16,11 +16,11 @@ from orthoflow.geometry.bands import Allocate, bands_with_reach
 from orthoflow.geometry.levels import Colours, Level, in_levels
 from orthoflow.products import Layer, LayerMask, OrthoMask, Wall
 from orthoflow_plugins.mosaic.graph_cut import CutLabels, cut_labels
+from orthoflow_plugins.mosaic.parameters import SeamsParams
 
 if TYPE_CHECKING:
     from orthoflow_plugins.mosaic.balance import Balance
     from orthoflow_plugins.mosaic.drawn_seams import DrawnSeams
-    from orthoflow_plugins.mosaic.seams import MosaicSeams
 
 # Preference (rows, cols) of a layer in some rows of its wall, computed during joining: those of a
 # large wall would not fit into memory.
@@ -49,7 +49,7 @@ _RANK_OF_LAYER_MASK: Final = np.array(
 
 def preferences(
     layers: Sequence[Layer],
-    params: MosaicSeams.Params,
+    params: SeamsParams,
     *,
     wall: Wall | None = None,
     balance: Balance | None = None,
@@ -148,7 +148,7 @@ def require_one_raster(layers: Sequence[Layer], name: str) -> None:
 def joined(
     painters: Sequence[Layer],
     others: Sequence[Layer],
-    params: MosaicSeams.Params,
+    params: SeamsParams,
     *,
     drawn: DrawnSeams | None,
     wall: Wall | None,

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
-from typing import ClassVar, Final, Literal
+from typing import ClassVar, Final
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
-from pydantic import Field
 
 from orthoflow.errors import MethodError
 from orthoflow.files.images import encode_webp
@@ -32,7 +31,7 @@ from orthoflow.products import (
     OrthoMask,
     Walls,
 )
-from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, MetricSpec, Ports, StepContext
+from orthoflow.sdk import DiagnosticSpec, Method, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.mosaic.agreement import (
     count_seams,
@@ -51,6 +50,7 @@ from orthoflow_plugins.mosaic.joining import (
     require_one_raster,
     require_sources,
 )
+from orthoflow_plugins.mosaic.parameters import SeamsParams
 
 # Larger arrays are kept in files.
 _IN_MEMORY_MOST: Final = 1 << 24
@@ -194,50 +194,7 @@ class MosaicSeams(Method):
         "Kwatra et al. 2003, doi:10.1145/882262.882264 (graph-cut seams)",
     )
 
-    class Params(MethodParams):
-        """How the layer of a cell is chosen, and how specks are avoided."""
-
-        seams: Literal["best-view", "voronoi", "graph-cut", "priority"] = Field(
-            "best-view", description="Which layer paints what several of them show."
-        )
-        priority: tuple[str, ...] = Field(
-            (), description="Names of photos, highest priority first, for `seams: priority`."
-        )
-        gains: Literal["none", "global"] = Field(
-            "global",
-            description="none: colours stay as the photos have them, and nothing below changes "
-            "them; global: where photos differ, the light of each is multiplied by one number per "
-            "channel, so that overlaps agree.",
-        )
-        local_balance: bool = Field(
-            default=True,
-            description="Also balance vignetting and other differences that are "
-            "smooth over a photo, as measured in overlaps.",
-        )
-        feather_cells: int = Field(
-            64,
-            ge=0,
-            le=4096,
-            description="Remaining differences at a seam are blended within this many cells "
-            "on either side; only smooth differences, so that nothing is mixed. 0: a step may "
-            "remain.",
-        )
-        island_cells_min: int = Field(
-            default=100,
-            ge=1,
-            description="Smaller patches from one source are painted from the one around them, "
-            "where it sees them too; 1 keeps the best view of every cell.",
-        )
-
-        robust: bool = Field(
-            default=True,
-            description="Where photos contradict each other over a region, as with people and "
-            "vehicles that pass, one that most others and the scan confirm paints it.",
-        )
-        publish_layers: bool = Field(
-            default=False,
-            description="Also publish the layer of each photo as a GeoTIFF.",
-        )
+    Params = SeamsParams
 
     class In(Ports):
         """Layers of all walls; walls for depth edges, cameras for lenses, seams from a person."""
@@ -252,7 +209,7 @@ class MosaicSeams(Method):
 
         orthoimages: Orthoimages
 
-    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+    def run(self, inputs: In, params: SeamsParams, ctx: StepContext) -> Out:
         """Join wall by wall."""
         layers = sorted(inputs.layers.layers, key=lambda layer: layer.wall)
         if not layers:
@@ -326,7 +283,7 @@ def _allocated(
 def _join(
     inputs: MosaicSeams.In,
     group: tuple[Layer, ...],
-    params: MosaicSeams.Params,
+    params: SeamsParams,
     polygons: Sequence[NamedPolygon],
     ctx: StepContext,
     allocate: Allocate,
