@@ -482,11 +482,6 @@ def _report(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:
         share = count_cells(image.mask, OrthoMask.CONTRADICTED) / image.mask.size
         if share >= _CONTRADICTED_WORTH_WORDS:
             ctx.report(CONTRADICTED, subject=image.name, share=share)
-    _report_errors_and_gains(ctx, verdicts)
-
-
-def _report_errors_and_gains(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:
-    images = [item.image for item in verdicts]
     known = [
         image.error_m[np.isfinite(image.error_m)] for image in images if image.error_m is not None
     ]
@@ -495,6 +490,10 @@ def _report_errors_and_gains(ctx: StepContext, verdicts: Sequence[_Joined]) -> N
         median, high = 1e3 * np.percentile(errors_m, (50.0, 95.0))
         ctx.metric("expected_mm_median", float(median), "mm")
         ctx.metric("expected_mm_p95", float(high), "mm")
+    _report_gains(ctx, verdicts)
+
+
+def _report_gains(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:
     balances = [item.balance.exposures for item in verdicts if item.balance is not None]
     if balances:
         exposures = np.exp(np.concatenate([item.exposures for item in balances]))

@@ -94,6 +94,11 @@ class DirectParams(MethodParams):
         "black; 10: almost black ones, too; 0: none. Without it those of pure black, where "
         "these are specks: at most a tenth of all, and more than there are almost black ones.",
     )
+    balance_scans: bool = Field(
+        default=True,
+        description="Balance the colours of scans that differ in brightness or white balance "
+        "where they overlap on the walls.",
+    )
     layer_m: float = Field(
         default=0.02,
         gt=0,

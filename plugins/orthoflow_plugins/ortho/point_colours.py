@@ -6,14 +6,16 @@ from the centre of the cell; the other rules are that proposal, and two averages
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.levels import light_of_levels
 from orthoflow.geometry.raster_kernels import NO_POINT, Entries, keep_nearest
 from orthoflow.geometry.rastering import (
     empty_winners,
@@ -23,6 +25,7 @@ from orthoflow.geometry.rastering import (
     topmost_points,
     values_of_winners,
 )
+from orthoflow.geometry.robust import least_absolute
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
 from orthoflow_plugins.ortho.parameters import DirectParams
@@ -32,6 +35,15 @@ _SIGMA_CELLS: Final = 0.36
 _NO_COLOUR: Final = 999
 # Number of points that the median sorts at once.
 _POINTS_AT_ONCE: Final = 1 << 24
+# Places at which colours of scans are compared: side of a square, points of each scan, levels that
+# are neither clipped nor almost black, and number of places that judge a scan.
+_PLACE_M: Final = 0.05
+_POINTS_LEAST: Final = 4
+_DARKEST: Final = 10
+_BRIGHTEST: Final = 245
+_PLACES_LEAST: Final = 20
+# Share of the points of a place that may be clipped or almost black.
+_USELESS_MOST: Final = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,6 +132,68 @@ def colours_of(
         places=places,
         depth_m=np.where(has_point, winners["depth_m"], np.float32(np.nan)),
     )
+
+
+def scan_gains(painters: Painters, slabs: Sequence[Slab], *, threads: int) -> NDArray[np.float64]:
+    """Find the logarithms (scans, 3) of the factors on light that take casts of scans away.
+
+    Two scans that show a place show one surface: differences of their mean colours over places are
+    those of exposure and white balance, apart from edges of texture and objects, to which the L1
+    norm is robust. Of several scans that overlap, the median one keeps its colours.
+
+    Args:
+        painters: coloured points with numbers of scans.
+        slabs: of walls on which the scans overlap.
+        threads: number of threads.
+
+    Returns:
+        0 for scans that do not overlap with others.
+    """
+    scans, light = painters.cloud.scan, light_of_levels(255)
+    n_scans = 0 if scans is None or not len(scans) else int(scans.max()) + 1
+    if scans is None or n_scans < 2:
+        return np.zeros((n_scans, 3))
+    pairs, apart = [np.empty((0, 2), dtype=np.int64)], [np.empty((0, 3))]
+    for slab in slabs:
+        frame, scale = slab.frame, max(1.0, _PLACE_M / slab.frame.gsd_m)
+        width, height = (math.ceil(size / scale) for size in (frame.width, frame.height))
+        places = replace(frame, gsd_m=scale * frame.gsd_m, width=width, height=height)
+        near = Slab(
+            frame=places,
+            front_m=min(slab.front_m, _PLACE_M),
+            behind_m=min(slab.behind_m, _PLACE_M),
+        )
+        sums = np.zeros((near.n_cells * n_scans, 5))
+        for entries in entries_inside(
+            painters.cloud, near, threads=threads, is_left_out=painters.is_left_out
+        ):
+            values = painters.values[entries.points]
+            is_useless = (values.min(axis=1) < _DARKEST) | (values.max(axis=1) > _BRIGHTEST)
+            key = entries.cells.astype(np.int64) * n_scans + scans[entries.points]
+            shades = np.column_stack([light[values], is_useless, np.ones(len(values))])
+            for channel in range(5):
+                sums[:, channel] += np.bincount(key, shades[:, channel], len(sums))
+        # Places, not points: of two scans the darker one would lose more of them.
+        is_known = (sums[:, 4] >= _POINTS_LEAST) & (sums[:, 3] <= _USELESS_MOST * sums[:, 4])
+        known = np.flatnonzero(is_known)
+        logs = np.log(sums[known, :3] / sums[known, 4:])
+        # Scans of one place are adjacent.
+        first = np.flatnonzero(known[1:] // n_scans == known[:-1] // n_scans)
+        pairs.append(np.column_stack([known[first], known[first + 1]]) % n_scans)
+        apart.append(logs[first + 1] - logs[first])
+    scan_pairs, differences = np.concatenate(pairs), np.concatenate(apart)
+    # A scan with few places is not judged by them.
+    counts = np.bincount(scan_pairs.ravel(), minlength=n_scans)
+    is_kept = (counts[scan_pairs] >= _PLACES_LEAST).all(axis=1)
+    scan_pairs, differences = scan_pairs[is_kept], differences[is_kept]
+    design, rows = np.zeros((len(scan_pairs), n_scans)), np.arange(len(scan_pairs))
+    design[rows, scan_pairs[:, 0]], design[rows, scan_pairs[:, 1]] = 1.0, -1.0
+    overlap = np.unique(scan_pairs)
+    gains = np.zeros((n_scans, 3))
+    for channel in range(3) if len(overlap) else ():
+        found = least_absolute(design, differences[:, channel], np.full(n_scans, 1e-3))
+        gains[overlap, channel] = found[overlap] - np.median(found[overlap])
+    return gains
 
 
 def _on_top(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, ClassVar, Final
 
@@ -19,6 +20,8 @@ from orthoflow.geometry.bands import (
     holds_cells,
     in_memory,
 )
+from orthoflow.geometry.levels import lit
+from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Layer, LayerMask, Layers, PointCloud, Walls
 from orthoflow.sdk import DiagnosticSpec, Method, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
@@ -41,6 +44,8 @@ _POINTS_AT_ONCE: Final = 1 << 22
 _BLACK_WORTH_WORDS: Final = 0.001
 # Files with black points also have some that are almost black.
 _ALMOST_BLACK_GREY: Final = 10
+# Scans that differ by less are not balanced: a cast of 3 % is hardly seen.
+_CAST_LEAST: Final = 0.03
 # In clouds with more black points black is a colour.
 _MOST_SPECKS: Final = 0.1
 
@@ -50,6 +55,14 @@ SPECKS: Final = DiagnosticSpec(
     text="{n_points:,} points of {subject} ({share:.1%}) are pure black, as points without a "
     "colour are in many files: they paint no pixel",
     remedy="{step}.skip_below_grey=0 paints them, 10 leaves out almost black ones, too",
+)
+SCANS_BALANCED: Final = DiagnosticSpec(
+    code="scans-balanced",
+    severity="note",
+    text="{n} of {n_scans} scans differ in brightness or white balance from the others where they "
+    "overlap, by up to {share:.0%}: their colours are balanced",
+    remedy="{step}.balance_scans=false paints them as they are",
+    rank_by="share",
 )
 NO_COLOUR: Final = DiagnosticSpec(
     code="cloud-without-colour",
@@ -111,6 +124,9 @@ class PointcloudDirect(Method):
 
         inputs.cloud.require_points(3)
         painters = _painters(inputs.cloud, params, ctx)
+        slabs = [inputs.walls.slab(k) for k in range(len(inputs.walls.walls))]
+        if params.balance_scans and inputs.cloud.rgb is not None:
+            painters = _balanced(painters, slabs, ctx)
         layers: list[Layer] = []
         seconds = np.zeros(2)
         n_filled, preview = [0], b""
@@ -131,10 +147,9 @@ class PointcloudDirect(Method):
                 quality=np.asarray(new("quality", shape, np.float32), np.float32),
                 filled=filled,
             )
-            slab = inputs.walls.slab(k)
             for band in bands_with_reach(shape, cells_most=_BAND_CELLS, reach_rows=reach):
                 started = ctx.clock_s()
-                found = colours_of(painters, slab.over(band.around), params, threads=ctx.cores)
+                found = colours_of(painters, slabs[k].over(band.around), params, threads=ctx.cores)
                 projected = ctx.clock_s()
                 _fill(found, layer, band, params, threads=ctx.cores)
                 seconds += (projected - started, ctx.clock_s() - projected)
@@ -188,6 +203,25 @@ def _painters(cloud: PointCloud, params: DirectParams, ctx: StepContext) -> Pain
                 is_left_out = _mask(ctx, n_points)
             is_left_out[part] = is_unknown
     return Painters(cloud=cloud, values=grey, is_left_out=is_left_out)
+
+
+def _balanced(painters: Painters, slabs: list[Slab], ctx: StepContext) -> Painters:
+    """Return the points with the casts of single scans taken away, if there are any."""
+    from orthoflow_plugins.ortho.point_colours import scan_gains
+
+    gains, scans = scan_gains(painters, slabs, threads=ctx.cores), painters.cloud.scan
+    casts = np.expm1(np.abs(gains)).max(axis=1, initial=0.0)
+    if scans is None or casts.max(initial=0.0) < _CAST_LEAST:
+        return painters
+    n_cast = int(np.count_nonzero(casts >= _CAST_LEAST))
+    ctx.report(SCANS_BALANCED, n=n_cast, n_scans=len(casts), share=float(casts.max()))
+    values = np.asarray(
+        ctx.allocate("layers", "balanced", painters.values.shape, np.uint8), np.uint8
+    )
+    for first in range(0, len(values), _POINTS_AT_ONCE):
+        part = slice(first, first + _POINTS_AT_ONCE)
+        values[part] = lit(painters.values[part], gains[scans[part]].astype(np.float32))
+    return replace(painters, values=values)
 
 
 def _mask(ctx: StepContext, n_points: int) -> NDArray[np.bool_]:

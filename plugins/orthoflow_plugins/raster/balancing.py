@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.robust import least_absolute
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
 from orthoflow.sdk import DiagnosticSpec, StepContext
@@ -27,9 +28,6 @@ _COSINE_LEAST: Final = 0.05
 # At this range and perpendicular incidence, the first scan keeps its intensities.
 _RANGE_M: Final = 3.0
 _DARKEST: Final = 1.0e-4
-# Iterations of weights for the L1 norm, and the residual of log intensity with the largest weight.
-_ROUNDS: Final = 20
-_FLOOR: Final = 0.01
 _CHUNK: Final = 1 << 21
 NOT_BALANCED: Final = DiagnosticSpec(
     code="intensity-not-balanced",
@@ -156,16 +154,9 @@ def _trend(table: NDArray[np.float64], n_scans: int) -> _Trend | None:
     design[rows, second] -= 1.0
     design[:, n_scans:] = table[:, 3:]
     # The first scan defines the scale, and a scan without overlap keeps its own.
-    held = 1e-3 * np.eye(n_scans + 2)
-    held[0, 0] = 1e3
-    wanted, weights = table[:, 2], np.ones(len(table))
-    solution: NDArray[np.float64] = np.zeros(n_scans + 2)
-    for _ in range(_ROUNDS):
-        normal = design.T @ (design * weights[:, np.newaxis]) + held
-        solution = np.asarray(
-            np.linalg.solve(normal, design.T @ (weights * wanted)), dtype=np.float64
-        )
-        weights = 1.0 / np.maximum(np.abs(wanted - design @ solution), _FLOOR)
+    held = np.full(n_scans + 2, 1e-3)
+    held[0] += 1e3
+    solution = least_absolute(design, table[:, 2], held)
     return _Trend(
         scales=solution[:n_scans],
         range_power=float(solution[n_scans]),
