@@ -159,48 +159,6 @@ def test_seams_are_where_the_right_or_lower_neighbour_is_of_another(
     assert count_seams(source, None) == (seam.sum(), 0)
 
 
-class Brighter:
-    """A balance that adds ten levels per layer."""
-
-    def shown(
-        self, index: int, colours: NDArray[np.uint8], rows: object, columns: object
-    ) -> NDArray[np.uint8]:
-        del rows, columns
-        return (colours + 10 * index).astype(np.uint8)
-
-
-@pytest.mark.parametrize("balance", [None, Brighter()])
-def test_steps_are_told_in_cells_that_both_sources_paint(balance: Brighter | None) -> None:
-    rng = np.random.default_rng(5)
-    source = sources(4)
-    layers = []
-    for index in range(3):
-        mask = np.where(rng.random(source.shape) < 0.7, LayerMask.PAINTED, LayerMask.OCCLUDED)
-        mask[source == index] = LayerMask.PAINTED
-        rgb = rng.integers(0, 200, (*source.shape, 3)).astype(np.uint8)
-        layers.append(layer(rgb=rgb, mask=mask.astype(np.uint8), shape=source.shape))
-    wanted = []
-    for axis in (0, 1):
-        for row, column in zip(*module._before_seams(source, axis), strict=True):
-            other = int(source[row + (axis == 0), column + (axis == 1)])
-            if layers[other].mask[row, column] != LayerMask.PAINTED:
-                continue
-            own = int(source[row, column])
-            colours = [
-                layers[k].rgb[row, column].astype(int) + (0 if balance is None else 10 * k)
-                for k in (own, other)
-            ]
-            wanted.append(float((colours[0] - colours[1]) @ [0.299, 0.587, 0.114]))
-    grey, delta_e = seam_steps(source, layers, balance)  # type: ignore[arg-type]
-    assert len(wanted) > 10
-    np.testing.assert_allclose(np.sort(grey), np.sort(wanted), atol=1e-9)
-    assert len(delta_e) == len(grey)
-    alike = layer(rgb=np.full((*source.shape, 3), 9, np.uint8), shape=source.shape)
-    assert not seam_steps(source, [alike] * 3)[1].any()
-    nothing = seam_steps(np.zeros_like(source), layers)
-    assert [len(values) for values in nothing] == [0, 0]
-
-
 def test_black_and_white_are_a_hundred_apart() -> None:
     source = np.array([[0, 1]], dtype=np.int16)
     pair = [layer(rgb=np.full((1, 2, 3), value, np.uint8), shape=(1, 2)) for value in (0, 255)]

@@ -28,7 +28,6 @@ from tests import inspect_scenes, samples
 from tests import raster_scenes as scenes
 
 SHAPE = (120, 240)
-SPLIT = 120
 
 
 def texture(seed: int = 5) -> NDArray[np.float64]:
@@ -249,16 +248,6 @@ def test_what_is_added_is_straight_between_the_middles_of_blocks(box: tuple[slic
         np.testing.assert_allclose(found[:, channel], wanted, atol=1e-5)
     colours = np.random.default_rng(2).integers(0, 65536, (len(rows), 3)).astype(np.uint16)
     np.testing.assert_array_equal(balance.shown(0, colours, rows, columns), lit(colours, found))
-
-
-@pytest.mark.parametrize(
-    ("shape", "side"),
-    [((20, 30), 2), ((120, 300), 3), ((400, 1000), 10), ((990, 1000), 15), ((9_000, 9_000), 16)],
-)
-def test_small_walls_have_some_thousand_blocks_and_large_ones_blocks_of_sixteen_cells(
-    shape: tuple[int, int], side: int
-) -> None:
-    assert balancing._block_cells(shape) == side
 
 
 @pytest.mark.parametrize(("factor", "differs"), [(1.03, False), (1.05, True), (0.95, True)])

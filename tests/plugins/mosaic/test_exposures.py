@@ -44,15 +44,6 @@ def some_exposures(seed: int) -> Exposures:
     )
 
 
-@pytest.mark.parametrize("size", [1, 3, 7, 40])
-def test_fields_are_straight_between_four_nodes_over_a_side(size: int) -> None:
-    nodes = np.array([0.3, -1.0, 2.0, 0.7])
-    # The first node lies on the side's beginning, the last one on its end.
-    middles = (np.arange(size) + 0.5) / size
-    wanted = np.interp(middles, [0.0, 1 / 3, 2 / 3, 1.0], nodes)
-    np.testing.assert_allclose(module._hats(np.arange(size), size) @ nodes, wanted, atol=1e-12)
-
-
 @pytest.mark.parametrize("index", [0, 1])
 def test_light_gets_an_exposure_a_field_and_the_loss_of_a_lens(index: int) -> None:
     found = some_exposures(7)
@@ -71,22 +62,6 @@ def test_light_gets_an_exposure_a_field_and_the_loss_of_a_lens(index: int) -> No
             assert logs[row, column, channel] == pytest.approx(wanted, abs=1e-9)
 
 
-def test_overlaps_are_blocks_that_both_know_and_how_their_light_differs() -> None:
-    found = {item.layers: item for item in module._overlaps(LIGHTS)}
-    assert set(found) == {(0, 1), (0, 2), (1, 2)}
-    for (i, j), item in found.items():
-        logs = [np.full((50, 40, 3), np.nan) for _ in range(2)]
-        for k, whole in zip((i, j), logs, strict=True):
-            whole[LIGHTS[k].box] = LIGHTS[k].log_light
-        known = np.argwhere(np.isfinite(logs[0][..., 0]) & np.isfinite(logs[1][..., 0]))
-        assert len(known) == len(item.apart)
-        for k, places in zip((i, j), item.places, strict=True):
-            corner = [part.start for part in LIGHTS[k].box]
-            np.testing.assert_array_equal(places + corner, known)
-        rows, columns = known.T
-        np.testing.assert_allclose(item.apart, (logs[1] - logs[0])[rows, columns], atol=1e-6)
-
-
 @pytest.mark.parametrize(("n_shared", "n_taken"), [(3, 0), (4, 4), (200, 200), (300, 200)])
 def test_an_overlap_has_four_blocks_and_two_hundred_say_all(n_shared: int, n_taken: int) -> None:
     one = light(slice(0, 1), slice(0, n_shared), 1)
@@ -98,25 +73,6 @@ def test_an_overlap_has_four_blocks_and_two_hundred_say_all(n_shared: int, n_tak
         # Evenly, from end to end.
         assert (columns[0], columns[-1]) == (0, n_shared - 1)
         assert set(np.diff(columns)) <= {n_shared // n_taken, -(-n_shared // n_taken)}
-
-
-def test_the_equations_say_how_what_is_added_differs() -> None:
-    overlaps = module._overlaps(LIGHTS)
-    found = some_exposures(8)
-    left = (
-        module._exposure_columns(overlaps, 4) @ found.exposures
-        + (module._lens_columns(overlaps, RADII, 2) @ found.lenses.ravel())[:, None]
-        + module._field_columns(overlaps, LIGHTS) @ found.nodes.reshape(4 * 16, 3)
-    )
-    added = [found.logs(k, LIGHTS[k], RADII[k]) for k in range(4)]
-    right = np.concatenate(
-        [
-            added[item.layers[0]][tuple(item.places[0].T)]
-            - added[item.layers[1]][tuple(item.places[1].T)]
-            for item in overlaps
-        ]
-    )
-    np.testing.assert_allclose(left, right, atol=1e-9)
 
 
 def two(apart: NDArray[np.float64], n_columns: int = 40) -> list[BlockLight]:
@@ -206,32 +162,3 @@ def test_what_is_found_is_robust_least_squares(sizes: list[int], noise: float) -
     found = module._solved([csr_array(matrix)], apart, priors, blocks(sizes))
     # Of what the noise leaves unknown of them, a small part; it would be most of it otherwise.
     assert np.abs(pull(matrix, found, apart, priors, sizes)).max() < 0.02 * noise + 1e-4
-
-
-@pytest.mark.parametrize("is_local", [True, False])
-def test_exposures_lenses_and_fields_are_expected_near_nothing(
-    monkeypatch: pytest.MonkeyPatch, is_local: bool
-) -> None:
-    calls: list[Any] = []
-    solved = module._solved
-
-    def kept(columns: Any, apart: Any, priors: Any, overlaps: Any) -> NDArray[np.float64]:
-        found = solved(columns, apart, priors, overlaps)
-        calls.append((np.hstack([each.toarray() for each in columns]), apart, overlaps, found))
-        return found
-
-    monkeypatch.setattr(module, "_solved", kept)
-    found = estimate(LIGHTS, RADII, is_local=is_local)
-    (first, grey, overlaps, alike), (second, apart, _, rest) = calls
-    sizes = [len(item.apart) for item in overlaps]
-    field = 0.05 if is_local else 1e-9
-    # By e, by half of that and by a twentieth: exposures, the two terms of two lenses, nodes.
-    near = np.repeat([1.0, 0.5], [4, 4])
-    # Blocks of noise: nothing else tells, and what is expected beforehand counts.
-    assert np.abs(pull(first, alike, grey, near, sizes)).max() < 0.02
-    fields = np.repeat([1.0, field], [4, 4 * 16])
-    assert np.abs(pull(second, rest, apart, fields, sizes)).max() < 0.02
-    np.testing.assert_allclose(grey[:, 0], np.concatenate([o.apart for o in overlaps]).mean(axis=1))
-    np.testing.assert_array_equal(found.exposures, rest[:4])
-    np.testing.assert_array_equal(found.lenses.ravel(), alike[4:, 0])
-    np.testing.assert_array_equal(found.nodes.reshape(64, 3), rest[4:])

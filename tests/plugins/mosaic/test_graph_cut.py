@@ -16,22 +16,6 @@ from orthoflow.geometry.levels import lit_shares
 from orthoflow.products import LayerMask
 
 
-@pytest.mark.parametrize("length", range(1, 40))
-@pytest.mark.parametrize("part", [1, 2, 3, 7, 50])
-def test_blocks_are_the_same_from_either_end_and_about_as_large_as_wanted(
-    length: int, part: int
-) -> None:
-    edges = blocks._symmetric_edges(length, part)
-    sides = np.diff(edges)
-    assert (edges[0], edges[-1]) == (0, length)
-    np.testing.assert_array_equal(sides, sides[::-1])
-    assert sides.min() >= 1
-    # One more only where a middle block has to be odd or even as the side is.
-    assert sides.max() <= part + 1
-    # Not smaller than need be: one block more at most, for the middle.
-    assert len(sides) <= -(-length // part) + 1
-
-
 def test_blocks_have_rows_and_columns_of_their_own() -> None:
     blocks = Blocks.over((6, 4), 3)
     assert blocks.rows.tolist() == [0, 3, 6]
@@ -157,25 +141,6 @@ def two_layers(shape: tuple[int, int], greys: tuple[int, int]) -> list[Any]:
             )
         )
     return found
-
-
-def test_a_step_in_depth_costs_as_much_as_one_from_black_to_white() -> None:
-    depth_m = np.zeros((1, 12), dtype=np.float32)
-    depth_m[:, 8:] = 0.1
-    wall: Any = SimpleNamespace(depth_m=depth_m)
-    blocks_of = Blocks.over((1, 12), 1)
-    reduced = graph_cut._reduced(two_layers((1, 12), (0, 255)), wall, blocks_of, None)
-    plain, edge = (
-        float(graph_cut._seam_cost(reduced, *(np.array([k]) for k in (at, at + 1, 0, 1)))[0])
-        for at in (4, 7)
-    )
-    # Black beside white on either side of the seam.
-    assert plain == pytest.approx(2 * 1000, rel=0.01)
-    assert edge - plain == pytest.approx(plain, rel=0.01)
-    assert (reduced.views[0] == 0.0).all()
-    # A photo half as good costs as much as a difference of a twentieth between black and white.
-    np.testing.assert_allclose(reduced.views[1, 0, 2:], 0.05)
-    assert (reduced.views[1, 0, :2] >= 1000.0).all()
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.ortho import dsm_backward
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
 
 from orthoflow.errors import MethodError
@@ -443,22 +442,6 @@ def test_metrics_tell_what_was_painted_and_from_how_far(tmp_path: Path) -> None:
     # 2.1 m along the axis, a focal length of 1505 pixels; 0.7 m aside of 2 m before the wall.
     assert metrics["photo_gsd_mm"] == pytest.approx(1e3 * 2.1 / 1505, rel=0.02)
     assert metrics["obliquity_deg"] == pytest.approx(np.degrees(np.arctan2(0.7, 2.0)), abs=2.0)
-
-
-@pytest.mark.parametrize(
-    ("values", "weights", "median"),
-    [
-        ([3.0, 1.0, 2.0], [1, 1, 1], 2.0),
-        ([3.0, 1.0, 2.0], [5, 2, 2], 3.0),
-        ([3.0, 1.0, 2.0], [1, 1, 2], 2.0),
-        ([2.0, 1.0], [1, 1], 1.0),
-        ([2.0, 1.0], [3, 2], 2.0),
-    ],
-)
-def test_half_of_the_weight_lies_below_the_median(
-    values: list[float], weights: list[int], median: float
-) -> None:
-    assert dsm_backward._weighted_median(np.array(values), np.array(weights)) == median
 
 
 def refused(cameras: Cameras, folder: Path, **changes: object) -> str:

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.ortho import filling as module
 from orthoflow_plugins.ortho.filling import fillable_gaps, filling_preview, reach_rows, void_counts
 
 from orthoflow.products import Layer, LayerMask
@@ -103,26 +102,3 @@ def test_a_small_layer_is_shown_before_and_after_it_was_filled() -> None:
     # Without anything filled both are the same.
     plain = shown(layer((20, 30), None))
     np.testing.assert_array_equal(plain[:, : 30 * zoom], plain[:, -30 * zoom :])
-
-
-def test_of_a_large_layer_the_part_is_shown_in_which_most_was_filled() -> None:
-    filled = np.zeros((500, 800), dtype=np.uint8)
-    filled[10, 20] = 1
-    filled[300:303, 700] = 1
-    rows, columns = module._busiest_part(filled)
-    side = rows.stop - rows.start
-    assert side == columns.stop - columns.start
-    # A tile of some hundred cells, which shows all three.
-    assert 100 < side < 400
-    assert filled[rows, columns].sum() == 3
-    assert rows.start % side == columns.start % side == 0
-    # The first of equals.
-    filled[300:303, 700] = 0
-    filled[400, 700] = 1
-    rows, columns = module._busiest_part(filled)
-    assert (rows.start, columns.start) == (0, 0)
-    # At the rim it is as small as what is left there.
-    filled[:] = 0
-    filled[-1, -1] = 1
-    rows, columns = module._busiest_part(filled)
-    assert filled[rows, columns].sum() == 1

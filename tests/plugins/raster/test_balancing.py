@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from orthoflow_plugins.raster import balancing
 from orthoflow_plugins.raster.balancing import balanced
 
 from orthoflow.geometry.slabs import Slab
@@ -99,26 +98,3 @@ def test_scans_that_do_not_overlap_stay_as_they_are(tmp_path: Path) -> None:
     ctx = scenes.context(tmp_path)
     assert balanced(known, [slab()], ctx) is known
     assert any("no two scans overlap" in text for text in ctx.warnings)
-
-
-def test_twenty_places_tell_a_trend_and_nineteen_do_not() -> None:
-    rng = np.random.default_rng(3)
-    logs = rng.normal(size=(20, 2))
-    told = 0.4 - 0.8 * logs[:, 0] + 0.6 * logs[:, 1]
-    table = np.column_stack([np.ones(20), np.zeros(20), told, logs])
-    trend = balancing._trend(table, 2)
-    assert trend is not None
-    np.testing.assert_allclose(trend.scales, [0.0, 0.4], atol=1e-4)
-    assert (trend.range_power, trend.cosine_power) == pytest.approx((-0.8, 0.6), abs=1e-4)
-    assert balancing._trend(table[:19], 2) is None
-
-
-def test_places_compare_the_scans_that_saw_them_and_black_is_a_tenth_of_a_thousandth() -> None:
-    known, _ = cloud(n_scans=2, n_points=40_000)
-    assert known.scan is not None
-    grey = np.where(known.scan == 0, 0.0, 0.01).astype(np.float32)
-    table = balancing._places(replace(known, intensity=grey), slab())
-    # Squares of 5 cm on 4 x 3 m, nearly all of which both scans saw.
-    assert 3000 < len(table) <= 80 * 60
-    np.testing.assert_array_equal(table[:, :2], np.tile([0.0, 1.0], (len(table), 1)))
-    np.testing.assert_allclose(table[:, 2], np.log(1e-4 / 0.01), rtol=1e-6)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -64,27 +62,6 @@ def test_cells_two_rows_or_columns_off_are_around_and_three_are_not() -> None:
     assert specks(apart)[20, 20]
 
 
-def test_cells_are_sparse_where_far_fewer_are_known_than_beside() -> None:
-    is_known = np.ones((40, 60), dtype=np.bool_)
-    is_known[:, 30:] = False
-    is_known[::2, 30::2] = True  # a quarter: nine of 25, or six or four
-    sparse = surfaces._sparse(is_known)
-    assert not sparse[:, :30].any()
-    # Nine of 25 are more than 0.35 of them, six are less.
-    inner = sparse[5:35, 35:45]
-    counts = np.array(
-        [
-            [is_known[r - 2 : r + 3, c - 2 : c + 3].sum() for c in range(35, 45)]
-            for r in range(5, 35)
-        ]
-    )
-    np.testing.assert_array_equal(inner, is_known[5:35, 35:45] & (counts < 0.35 * 25))
-    # Where nothing around is denser nothing is sparse.
-    alone = np.zeros((60, 80), dtype=np.bool_)
-    alone[::2, ::2] = True
-    assert not surfaces._sparse(alone)[20:40, 20:60].any()
-
-
 def shadow(*, agree: int, n: int = 6) -> NDArray[np.float32]:
     """A dense wall, a shadow 10 columns wide, and in it a cell with some around it."""
     depth_m = flat(40, 60)
@@ -141,17 +118,6 @@ def test_depths_of_no_noise_or_no_radius_are_left_as_they_are() -> None:
     assert denoised(noisy, 1) is not noisy
 
 
-def test_cells_are_sparse_for_what_lies_within_sixteen_of_a_dense_place() -> None:
-    # The last square of 5 x 5 cells with a known one stands about column 31.
-    for column, is_sparse in ((47, True), (48, False)):
-        is_known = np.ones((60, 80), dtype=np.bool_)
-        is_known[:, 30:] = False
-        is_known[::6, column::6] = True
-        sparse = surfaces._sparse(is_known)[18:42]
-        assert sparse[:, column].any() == is_sparse
-        assert not sparse[:, column + 1 :].any()
-
-
 @pytest.mark.parametrize(("sigmas", "is_speck"), [(3.2, False), (5.5, True)])
 def test_sparse_cells_agree_within_four_deviations_of_the_noise(
     sigmas: float, is_speck: bool
@@ -170,26 +136,6 @@ def test_noise_of_less_than_a_fiftieth_of_a_millimetre_is_left() -> None:
     quiet, noisy = flat(noise_m=1.6e-5), flat(noise_m=2.6e-5)
     assert denoised(quiet, 3) is quiet
     assert denoised(noisy, 3) is not noisy
-
-
-def test_cells_are_sparse_that_have_a_third_of_the_known_ones_that_others_around_have() -> None:
-    rng = np.random.default_rng(5)
-    # The denser the further to the right, and all of it known at one place.
-    is_known = rng.random((40, 60)) < np.linspace(0.05, 0.6, 60)
-    is_known[18:23, 28:33] = True
-    rows, columns = is_known.shape
-
-    def around(values: NDArray[np.generic], row: int, column: int, reach: int) -> Any:
-        part = values[max(0, row - reach) : row + reach + 1]
-        return part[:, max(0, column - reach) : column + reach + 1]
-
-    places = [(row, column) for row in range(rows) for column in range(columns)]
-    near = np.array([around(is_known, *place, 2).sum() for place in places])
-    counts = near.reshape(is_known.shape)
-    most = np.array([around(counts, *place, 16).max() for place in places])
-    expected = is_known & (counts < 0.35 * most.reshape(is_known.shape))
-    np.testing.assert_array_equal(surfaces._sparse(is_known), expected)
-    assert 0 < np.count_nonzero(expected) < np.count_nonzero(is_known)
 
 
 def weighed(depth_m: NDArray[np.float64], radius: int, reach_m: float) -> NDArray[np.float64]:

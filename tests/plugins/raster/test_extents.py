@@ -26,8 +26,6 @@ GSD_M = 0.01
 # Points beside a corner are left out by three sigmas of the adjoining surface, then whole cells.
 CORNER_M = 3.0 * NOISE_M + GSD_M
 
-Box = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
-
 
 def patch(x: tuple[float, float], depth: tuple[float, float], z: tuple[float, float]) -> NDArray:
     """Points (n, 3) of a rectangle along two axes; the third has both ends alike."""
@@ -529,42 +527,6 @@ def test_what_lies_well_before_or_behind_a_wall_and_no_farther_than_a_metre_stan
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
-@pytest.mark.parametrize("side", ["left", "top"])
-@pytest.mark.parametrize(
-    ("share", "before_m", "off_m", "stands"),
-    [
-        (0.32, 0.5, 0.0, True),
-        (0.3, 0.5, 0.0, True),
-        (0.28, 0.5, 0.0, False),
-        (0.32, -0.5, 0.0, True),
-        (0.32, 0.5, 0.0029, True),
-        (0.32, 0.5, 0.0031, False),
-    ],
-)
-def test_points_along_three_tenths_of_a_side_tell_that_something_stands_there(
-    side: str, share: float, before_m: float, off_m: float, stands: bool
-) -> None:
-    bound = bound_by(
-        upright(0.0, (0.0, 3.0), towards=1.0)
-        if side == "left"
-        else level(HEIGHT_M, (0.0, 3.0), towards=-1.0)
-    )
-    length_m = HEIGHT_M if side == "left" else WIDTH_M
-    # One point in each of so many steps of a tenth of a metre, and many beside the wall's ends.
-    along = 0.05 + 0.1 * np.arange(round(share * length_m / 0.1))
-    along = np.append(along, np.linspace(-0.9, -0.1, 50))
-    off = np.full(len(along), off_m)
-    places = [off, along] if side == "left" else [along, off]
-    places_m = np.stack([*places, np.full(len(along), before_m)])
-    around = extents._Around(places_m=places_m, own_m=places_m[:, :0])
-    assert extents._stands(bound, (WIDTH_M, HEIGHT_M), around) == stands
-    # Some before and some behind the plane do not add up.
-    mixed = around.places_m.copy()
-    mixed[2, ::2] *= -1.0
-    mixed_around = extents._Around(places_m=mixed, own_m=mixed[:, :0])
-    assert not extents._stands(bound, (WIDTH_M, HEIGHT_M), mixed_around)
-
-
 def test_a_plane_covers_its_parts_or_all_of_its_rectangle() -> None:
     planes = planes_of((0.0, WIDTH_M), (0.0, HEIGHT_M), ROOM[0])
 
@@ -582,39 +544,6 @@ def test_a_plane_covers_its_parts_or_all_of_its_rectangle() -> None:
     assert extents._covered_m2(parts(9.0, 8.0, 50.0), 0) == pytest.approx(12.0)
     assert extents._covered_m2(parts(50.0), 0) == pytest.approx(12.0)
     assert extents._covered_m2(parts(0.0, 50.0), 0) == pytest.approx(12.0)
-
-
-@pytest.mark.parametrize(("set_m", "searched_m"), [(None, 0.6), (0.2, 0.2), (0.5, 0.5), (0.9, 0.5)])
-def test_relief_is_looked_for_a_tenth_of_a_metre_farther_than_it_counts(
-    set_m: float | None, searched_m: float
-) -> None:
-    assert extents._searched_m(set_m, 0.5) == pytest.approx(searched_m)
-
-
-@pytest.mark.parametrize(
-    ("shape", "block", "relief_m"),
-    [
-        # Of 2000 cells one is enough, and of 8000 four: what is left of a block without its rim.
-        ((40, 50), (3, 3), 0.3),
-        ((40, 50), (2, 9), 0.0),
-        ((80, 100), (4, 4), 0.3),
-        ((80, 100), (3, 5), 0.0),
-        ((80, 100), (3, 6), 0.3),
-    ],
-)
-def test_relief_is_what_stands_out_over_more_than_a_rim(
-    shape: tuple[int, int], block: tuple[int, int], relief_m: float
-) -> None:
-    depth_m = np.zeros(shape)
-    depth_m[10 : 10 + block[0], 20 : 20 + block[1]] = 0.3
-    # Deeper than any relief, and not known.
-    depth_m[20:30, 2:12], depth_m[5:9, 5:9] = 0.61, np.inf
-    search: Any = SimpleNamespace(inside=(slice(0, shape[0]), slice(0, shape[1])))
-    found = extents._relief_m(depth_m, 0.6, search)
-    # Half a step in depth of 2.5 cm on top.
-    assert found == pytest.approx(relief_m + 0.0125)
-    nothing = np.full(shape, -np.inf)
-    assert extents._relief_m(nothing, 0.6, search) == 0.0
 
 
 @pytest.mark.parametrize(
