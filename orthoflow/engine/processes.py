@@ -12,7 +12,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -125,35 +125,50 @@ def start_step(task: Task) -> StepProcess:
     Raises:
         StepFailedError: this machine cannot start another process.
     """
+    ours, theirs = multiprocessing.Pipe(duplex=False)
+    with theirs:
+        try:
+            process = start_process(run_step, (task, theirs, _variables(task)), task.address)
+        except StepFailedError as error:
+            ours.close()
+            raise StepFailedError(f"no process could be started for {task.who}: {error}") from error
+    return StepProcess(
+        process=process, pipe=ours, scratch=task.scratch, server=_parent(process.pid)
+    )
+
+
+def start_process(
+    target: Callable[..., object], arguments: tuple[object, ...], name: str
+) -> BaseProcess:
+    """Start a process with the libraries of steps loaded, and nothing else of this process.
+
+    Raises:
+        StepFailedError: this machine cannot start another process.
+    """
     context = (
         multiprocessing.get_context("forkserver")
         if _HAS_SERVER
         else multiprocessing.get_context("spawn")
     )
-    ours, theirs = context.Pipe(duplex=False)
-    arguments = (task, theirs, _variables(task))
     failure: Exception | None = None
-    with theirs, _starting, _start_conditions():
+    with _starting, _start_conditions():
         context.set_forkserver_preload(PRELOADED)
         # A killed server is detected by its silence, and started again.
         for _ in range(2):
-            process = context.Process(target=run_step, args=arguments, name=task.address)
+            process = context.Process(target=target, args=arguments, name=name)
             try:
                 process.start()
             except (OSError, EOFError) as error:
                 failure = error
             else:
-                return StepProcess(
-                    process=process, pipe=ours, scratch=task.scratch, server=_parent(process.pid)
-                )
-    ours.close()
+                return process
     is_of_files = isinstance(failure, OSError) and failure.errno in (errno.EMFILE, errno.ENFILE)
     why = (
         "too many files are open: raise the limit (`ulimit -n`)"
         if is_of_files
         else "the machine has too little memory or allows too few processes"
     )
-    raise StepFailedError(f"no process could be started for {task.who}: {why}") from failure
+    raise StepFailedError(why) from failure
 
 
 def _parent(process_id: int | None) -> psutil.Process | None:
