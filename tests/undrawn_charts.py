@@ -37,13 +37,6 @@ def keep_dots_for_charts() -> None:
     StepContext.figure = keep_dot  # type: ignore[method-assign]
 
 
-def build_charts_on_blanks() -> None:
-    """Let what this process loads from now on put the values of its charts onto blanks."""
-    import matplotlib.figure
-
-    matplotlib.figure.Figure = Blank  # type: ignore[assignment,misc]
-
-
 def build_plane_charts_once(
     request: pytest.FixtureRequest, patch: pytest.MonkeyPatch, test: str = ""
 ) -> None:

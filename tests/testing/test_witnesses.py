@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import numpy as np
-import pytest
 
 from orthoflow.engine.store import digest_of
 from orthoflow.products import Planes, PointCloud
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
-from orthoflow.testing import isolation
 from orthoflow.testing.examples import example_room
 from orthoflow.testing.trials import Trial
 from orthoflow.testing.witnesses import Witness
@@ -67,18 +62,3 @@ def test_drawing_from_numpys_own_generator_is_seen() -> None:
     cloud, _ = example_room(n_points=1000)
     first = Witness(Trial(method=Dicing, inputs={"cloud": cloud})).first
     assert (first.changed_inputs, first.drew_globally) == ((), True)
-
-
-def test_a_new_process_computes_with_the_same_instructions(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in isolation.INSTRUCTION_SWITCHES:
-        monkeypatch.setenv(name, f"switched by {name}")
-    monkeypatch.setenv("ORTHOFLOW_SECRET", "not for methods")
-    environment = isolation._environment(tmp_path)
-    for name in isolation.INSTRUCTION_SWITCHES:
-        assert environment[name] == f"switched by {name}"
-    assert "ORTHOFLOW_SECRET" not in environment
-    monkeypatch.delenv("OPENBLAS_CORETYPE")
-    assert "OPENBLAS_CORETYPE" not in isolation._environment(tmp_path)
-    assert environment["PATH"] == os.environ["PATH"]
