@@ -9,8 +9,7 @@ new ones each time, of which the layer needs two and a half times as much (quali
 virtual machine that gives unused memory back to its host, new memory may take longer than painting.
 Each task runs twice in a row, and the second run counts.
 `layer` is one photo on one wall with everything: relief, cloud, erosion, anti-aliasing, quality.
-`cloud` is what looking at the cloud adds per photo. Goals for bilinear: at most 1.6 times the peer
-without visibility, 3 times with it, 200 MB besides the layer.
+`cloud` is what looking at the cloud adds per photo.
 """
 
 from __future__ import annotations
