@@ -294,7 +294,7 @@ _CALIBRATION: Final = """\
 cameras:
   "IMG_00*.jpg": &wide {width: 64, height: 48, fx: 60.5, fy: 61.2, cx: 31.1, cy: 23.7,
                         distortion: [-0.08, 0.05, 0.0002, -0.0001, 0.0]}
-  "b.jpg": {<<: *wide, fx: 62}
+  "b.jpg": *wide
   "fish*": {model: fisheye, width: 64, height: 48, fx: 20, fy: 20.5, cx: 31.5, cy: 23.5,
             distortion: [0.01, -0.02, 0.003, 0.0], field_of_view_deg: 170}
   "*": {width: 64, height: 48, fx: 60, fy: 60, cx: 31.5, cy: 23.5}
