@@ -263,7 +263,7 @@ def _list_active(
 
 
 @kernel_part
-def _own_block(
+def _own_block(  # noqa: PLR0913, PLR0917 - compiled code has no objects to bundle these in
     points: BlockedPoints,
     start: int,
     slabs: NDArray[np.float64],
@@ -271,31 +271,32 @@ def _own_block(
     active: NDArray[np.int64],
     owner: NDArray[np.int32],
     nearest: NDArray[np.float64],
+    distances: NDArray[np.float64],
 ) -> int:
     """Set the slab that holds each point of a block and is nearest, -1 for none, and its distance.
 
-    Without branches, so that the processor takes several points at once. Gives how many there are.
+    Distances are set apart from what is done with them, so that the processor takes several points
+    at once. Gives how many points there are.
     """
     stop = min(start + BLOCK_POINTS, points.x.size)
     xs, ys, zs = points.x[start:stop], points.y[start:stop], points.z[start:stop]
     owner[:] = -1
     nearest[:] = np.inf
     for k in active:
-        slab, new = slabs[k], np.int32(k)
+        slab = slabs[k]
         n0, n1, n2, n3 = slab[0], slab[1], slab[2], slab[3]
-        u0, u1, u2, u3 = slab[4], slab[5], slab[6], slab[7]
-        v0, v1, v2, v3 = slab[8], slab[9], slab[10], slab[11]
-        reach, left, right = bounds[k, 0], bounds[k, 1], bounds[k, 2]
-        top, bottom = bounds[k, 3], bounds[k, 4]
         for i in range(xs.size):
+            distances[i] = n0 * xs[i] + n1 * ys[i] + n2 * zs[i] - n3
+        for i in range(xs.size):
+            here = distances[i]
+            if abs(here) > bounds[k, 0] or abs(here) >= abs(nearest[i]):
+                continue
             x, y, z = np.float64(xs[i]), np.float64(ys[i]), np.float64(zs[i])
-            here, before, earlier = n0 * x + n1 * y + n2 * z - n3, nearest[i], owner[i]
-            u = u0 * x + u1 * y + u2 * z - u3
-            v = v0 * x + v1 * y + v2 * z - v3
-            holds = (abs(here) <= reach) & (abs(here) < abs(before))
-            holds = holds & (u >= left) & (u <= right) & (v >= top) & (v <= bottom)
-            owner[i] = new if holds else earlier
-            nearest[i] = here if holds else before
+            u = slab[4] * x + slab[5] * y + slab[6] * z - slab[7]
+            v = slab[8] * x + slab[9] * y + slab[10] * z - slab[11]
+            if bounds[k, 1] <= u <= bounds[k, 2] and bounds[k, 3] <= v <= bounds[k, 4]:
+                owner[i] = k
+                nearest[i] = here
     return xs.size
 
 
@@ -316,7 +317,7 @@ def assign_points(
     """
     listed = np.empty(slabs.shape[0], dtype=np.int64)
     owner = np.empty(BLOCK_POINTS, dtype=np.int32)
-    nearest = np.empty(BLOCK_POINTS)
+    nearest, distances = np.empty(BLOCK_POINTS), np.empty(BLOCK_POINTS)
     for block in range(points.boxes.shape[0]):
         n_active, holder = _list_active(points.boxes[block], slabs, bounds, listed)
         start = block * BLOCK_POINTS
@@ -325,7 +326,7 @@ def assign_points(
             # Most blocks of a scan are a short piece of one wall: no point has to be asked.
             taken[:] = np.int8(holder)
             continue
-        _own_block(points, start, slabs, bounds, listed[:n_active], owner, nearest)
+        _own_block(points, start, slabs, bounds, listed[:n_active], owner, nearest, distances)
         for i in range(taken.size):
             taken[i] = np.int8(owner[i])
 
@@ -355,7 +356,7 @@ def sum_assigned(
     """
     listed = np.empty(slabs.shape[0], dtype=np.int64)
     owner = np.empty(BLOCK_POINTS, dtype=np.int32)
-    nearest = np.empty(BLOCK_POINTS)
+    nearest, distances = np.empty(BLOCK_POINTS), np.empty(BLOCK_POINTS)
     for block in range(points.boxes.shape[0]):
         if not drawn[block]:
             continue
@@ -365,7 +366,8 @@ def sum_assigned(
             n_summed += int(rasters[k, 3] > 0.0)
         if n_summed == 0:
             continue
-        count = _own_block(points, start, slabs, bounds, listed[:n_active], owner, nearest)
+        active = listed[:n_active]
+        count = _own_block(points, start, slabs, bounds, active, owner, nearest, distances)
         for i in range(count):
             k = owner[i]
             if k < 0 or rasters[k, 3] == 0.0:

@@ -210,12 +210,13 @@ class Search:
     def claim(self, claim: Claim) -> None:
         """Give a plane its points, but for those that an earlier one has and is nearer to."""
         rows, bounds = claim.slab.reshape(3, 4), claim.bounds_m
-        away_m, u, v = rows[:, :3] @ self.cloud.sample.offsets_m.T - rows[:, 3:]
-        away_m = np.abs(away_m)
-        held = (away_m <= bounds[0]) & (away_m < self._away_m)
-        held &= (u >= bounds[1]) & (u <= bounds[2]) & (v >= bounds[3]) & (v <= bounds[4])
-        self.claims[held] = len(self.taken)
-        self._away_m[held] = away_m[held]
+        points_m = self.cloud.sample.offsets_m
+        away_m = np.abs(points_m @ rows[0, :3] - rows[0, 3])
+        near = np.flatnonzero((away_m <= bounds[0]) & (away_m < self._away_m))
+        u, v = (points_m[near] @ rows[1:, :3].T - rows[1:, 3]).T
+        held = (u >= bounds[1]) & (u <= bounds[2]) & (v >= bounds[3]) & (v <= bounds[4])
+        self.claims[near[held]] = len(self.taken)
+        self._away_m[near[held]] = away_m[near[held]]
         self.taken.append(claim)
         self.n_points = int(np.count_nonzero(self.claims < 0))
         self._free = None
