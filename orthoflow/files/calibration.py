@@ -226,7 +226,17 @@ class _File(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
-    cameras: Annotated[dict[str, _Lens], Field(min_length=1, max_length=MOST_CAMERAS)]
+    cameras: Annotated[dict[str, _Lens], Field(min_length=1)]
+
+    @field_validator("cameras", mode="before")
+    @classmethod
+    def _are_not_many(cls, values: object) -> object:
+        if isinstance(values, dict) and len(values) > MOST_CAMERAS:
+            raise ValueError(
+                f"expected at most {MOST_CAMERAS} entries, got {len(values)}; give photos of one "
+                "camera one entry, by a pattern"
+            )
+        return values
 
 
 _TERMS: Final = ("k1", "k2", "p1", "p2", "k3")

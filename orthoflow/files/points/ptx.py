@@ -157,7 +157,7 @@ def _find_headers(path: Path) -> list[tuple[int, int, int]]:
             if not is_last:
                 cut = text.rfind(b"\n", 0, len(text) - _MOST_HEADER_BYTES) + 1
             if not cut and len(text) > MOST_LINE_BYTES:
-                raise long_line(path, line)
+                raise long_line(path, line) if found else _bad_header(path, line)
             begins = [match.start() for match in _HEADER.finditer(text) if match.start() < cut]
             counted = 0
             for place in [*begins, cut]:
