@@ -300,6 +300,81 @@ def _own_block(  # noqa: PLR0913, PLR0917 - compiled code has no objects to bund
     return xs.size
 
 
+@kernel_part
+def _hold_block(
+    points: BlockedPoints, start: int, slab: NDArray[np.float64], nearest: NDArray[np.float64]
+) -> int:
+    """Set the distance of each point of a block that one slab holds; gives how many there are."""
+    stop = min(start + BLOCK_POINTS, points.x.size)
+    xs, ys, zs = points.x[start:stop], points.y[start:stop], points.z[start:stop]
+    n0, n1, n2, n3 = slab[0], slab[1], slab[2], slab[3]
+    for i in range(xs.size):
+        nearest[i] = n0 * xs[i] + n1 * ys[i] + n2 * zs[i] - n3
+    return xs.size
+
+
+@kernel_part
+def _find_cells(
+    points: BlockedPoints,
+    start: int,
+    slab: NDArray[np.float64],
+    raster: NDArray[np.float64],
+    slab_index: np.int32,
+    owner: NDArray[np.int32],
+    cells: NDArray[np.int32],
+) -> None:
+    """Set the cell in the tables of each point of a block that a slab owns.
+
+    Without branches, so that the processor takes several points at once.
+    """
+    stop = min(start + BLOCK_POINTS, points.x.size)
+    xs, ys, zs = points.x[start:stop], points.y[start:stop], points.z[start:stop]
+    per_m, width, first = raster[2], np.int32(raster[4]), np.int32(raster[5])
+    u0, u1, u2, u3 = slab[4] * per_m, slab[5] * per_m, slab[6] * per_m, slab[7] * per_m
+    v0, v1, v2, v3 = slab[8] * per_m, slab[9] * per_m, slab[10] * per_m, slab[11] * per_m
+    u3 += raster[0] * per_m
+    v3 += raster[1] * per_m
+    last_row, last_column, zero = raster[3] - 1.0, raster[4] - 1.0, 0.0
+    for i in range(xs.size):
+        column = min(max(u0 * xs[i] + u1 * ys[i] + u2 * zs[i] - u3, zero), last_column)
+        row = min(max(v0 * xs[i] + v1 * ys[i] + v2 * zs[i] - v3, zero), last_row)
+        cell = first + np.int32(row) * width + np.int32(column)
+        cells[i] = cell if owner[i] == slab_index else cells[i]
+
+
+@kernel_part
+def _sum_runs(
+    cells: NDArray[np.int32],
+    distances: NDArray[np.float64],
+    fit_tolerance_m: float,
+    inner_tolerance_m: float,
+    counts: NDArray[np.int32],
+    sums: NDArray[np.int64],
+) -> None:
+    """Add points to their cells, -1 for none, a run of points in one cell at once."""
+    per_step = STEPS_PER_TOLERANCE / fit_tolerance_m
+    n_find = n_inner = n_fit = total = squares = 0
+    for i in range(cells.size):
+        cell = cells[i]
+        if cell >= 0:
+            away_m = abs(distances[i])
+            n_find += 1
+            n_inner += int(away_m <= inner_tolerance_m)
+            if away_m <= fit_tolerance_m:
+                steps = math.floor(distances[i] * per_step + 0.5)
+                n_fit += 1
+                total += steps
+                squares += steps * steps
+        if i + 1 == cells.size or cells[i + 1] != cell:
+            if cell >= 0:
+                counts[cell, 0] += n_find
+                counts[cell, 1] += n_inner
+                counts[cell, 2] += n_fit
+                sums[cell, 0] += total
+                sums[cell, 1] += squares
+            n_find = n_inner = n_fit = total = squares = 0
+
+
 @compiled
 def assign_points(
     points: BlockedPoints,
@@ -348,7 +423,8 @@ def sum_assigned(
         slabs: (k, 12) see module.
         bounds: (k, 5) see module.
         rasters: (k, 8) smallest u and v, cells per metre, rows, columns, first cell in the tables,
-            fit tolerance, inner tolerance. Slabs without rows are not summed.
+            fit tolerance, inner tolerance; the last two are the same for all. Slabs without rows
+            are not summed.
         drawn: (blocks,) which blocks are summed.
         counts: (cells, 3) points within the find, inner and fit tolerance; added to.
         sums: (cells, 2) distances and squared distances of those within the fit tolerance, in
@@ -356,37 +432,30 @@ def sum_assigned(
     """
     listed = np.empty(slabs.shape[0], dtype=np.int64)
     owner = np.empty(BLOCK_POINTS, dtype=np.int32)
+    cells = np.empty(BLOCK_POINTS, dtype=np.int32)
     nearest, distances = np.empty(BLOCK_POINTS), np.empty(BLOCK_POINTS)
     for block in range(points.boxes.shape[0]):
         if not drawn[block]:
             continue
-        n_active, _ = _list_active(points.boxes[block], slabs, bounds, listed)
+        n_active, holder = _list_active(points.boxes[block], slabs, bounds, listed)
         n_summed, start = 0, block * BLOCK_POINTS
         for k in listed[:n_active]:
             n_summed += int(rasters[k, 3] > 0.0)
         if n_summed == 0:
             continue
         active = listed[:n_active]
-        count = _own_block(points, start, slabs, bounds, active, owner, nearest, distances)
-        for i in range(count):
-            k = owner[i]
-            if k < 0 or rasters[k, 3] == 0.0:
-                continue
-            x, y, z = points.x[start + i], points.y[start + i], points.z[start + i]
-            per_m = rasters[k, 2]
-            u = slabs[k, 4] * x + slabs[k, 5] * y + slabs[k, 6] * z - slabs[k, 7] - rasters[k, 0]
-            v = slabs[k, 8] * x + slabs[k, 9] * y + slabs[k, 10] * z - slabs[k, 11] - rasters[k, 1]
-            column = min(max(u * per_m, 0.0), rasters[k, 4] - 1.0)
-            row = min(max(v * per_m, 0.0), rasters[k, 3] - 1.0)
-            cell = int(rasters[k, 5]) + int(row) * int(rasters[k, 4]) + int(column)
-            distance = nearest[i]
-            counts[cell, 0] += 1
-            counts[cell, 1] += abs(distance) <= rasters[k, 7]
-            if abs(distance) <= rasters[k, 6]:
-                steps = math.floor(distance * (STEPS_PER_TOLERANCE / rasters[k, 6]) + 0.5)
-                counts[cell, 2] += 1
-                sums[cell, 0] += steps
-                sums[cell, 1] += steps * steps
+        if holder >= 0:
+            count = _hold_block(points, start, slabs[holder], nearest)
+            owner[:] = holder
+        else:
+            count = _own_block(points, start, slabs, bounds, active, owner, nearest, distances)
+        cells[:] = -1
+        for k in active:
+            if rasters[k, 3] > 0.0:
+                _find_cells(points, start, slabs[k], rasters[k], np.int32(k), owner, cells)
+        _sum_runs(
+            cells[:count], nearest, rasters[active[0], 6], rasters[active[0], 7], counts, sums
+        )
 
 
 @compiled

@@ -211,7 +211,8 @@ class Search:
         """Give a plane its points, but for those that an earlier one has and is nearer to."""
         rows, bounds = claim.slab.reshape(3, 4), claim.bounds_m
         points_m = self.cloud.sample.offsets_m
-        away_m = np.abs(points_m @ rows[0, :3] - rows[0, 3])
+        x, y, z = points_m.T
+        away_m = np.abs(rows[0, 0] * x + rows[0, 1] * y + rows[0, 2] * z - rows[0, 3])
         near = np.flatnonzero((away_m <= bounds[0]) & (away_m < self._away_m))
         u, v = (points_m[near] @ rows[1:, :3].T - rows[1:, 3]).T
         held = (u >= bounds[1]) & (u <= bounds[2]) & (v >= bounds[3]) & (v <= bounds[4])
