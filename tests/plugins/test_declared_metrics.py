@@ -25,6 +25,8 @@ _PARTS = {"axis": "x", "reach": "1", "unit": "mm", "kind": "iou", "score": "iou"
 _PUT_TOGETHER = {
     *(
         "{prefix}{name}",
+        "{name}_s",
+        "{name}_cpu_s",
         "{name}_median",
         "{name}_worst",
         "{name}_max_{unit}",

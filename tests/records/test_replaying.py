@@ -81,6 +81,7 @@ def test_another_code_of_a_method_is_noted_and_not_refused(world: World) -> None
     )
 
 
+@pytest.mark.filterwarnings("ignore:Pydantic serializer warnings")  # of what is hostile
 @pytest.mark.parametrize(
     ("field", "value", "reason"),
     [

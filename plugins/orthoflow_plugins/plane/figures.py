@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
 from orthoflow.geometry import omega_phi_deg, wall_axes
@@ -37,6 +40,12 @@ _PLANES_MOST: Final = 12
 _CLASSED_MOST: Final = 4
 
 
+def colour_of(plane: int) -> tuple[float, float, float]:
+    """Return the colour of a plane in every figure of a run; the first twenty differ."""
+    red, green, blue = colormaps["tab20"](2 * plane % 20 + plane // 10 % 2)[:3]
+    return red, green, blue
+
+
 def draw_deviations(
     ctx: StepContext,
     planes: Planes,
@@ -50,18 +59,20 @@ def draw_deviations(
     tolerance_mm = 1000.0 * deviations.tolerance_m
     edges_mm = np.linspace(-tolerance_mm, tolerance_mm, HISTOGRAM_BINS + 1)
     middles_mm = 0.5 * (edges_mm[1:] + edges_mm[:-1])
+    width_mm = edges_mm[1] - edges_mm[0]
     for index, (axes, below) in enumerate(panels.T):
-        axes.stairs(deviations.histogram[index], edges_mm, fill=True, color=_BLUE)
+        # Per cent of the points in a millimetre, so that planes of any size compare.
+        share = 100.0 / (max(1.0, float(deviations.histogram[index].sum())) * width_mm)
+        axes.stairs(share * deviations.histogram[index], edges_mm, fill=True, color=_BLUE)
         sigma_mm = 1000.0 * float(deviations.rms_fit_m[index])
         if sigma_mm > 0.0:
             offset_mm = middles_mm - 1000.0 * float(deviations.mean_fit_m[index])
-            scale = float(deviations.n_fit[index]) * (edges_mm[1] - edges_mm[0])
+            scale = share * float(deviations.n_fit[index]) * width_mm
             curve = np.exp(-0.5 * (offset_mm / sigma_mm) ** 2)
             curve *= scale / (sigma_mm * math.sqrt(2.0 * math.pi))
             axes.plot(middles_mm, curve, color=_RED, linewidth=1.0)
         axes.set_title(f"{planes.names[index]}: {sigma_mm:.1f} mm", fontsize=9)
-        _label(axes, "distance to the plane [mm]")
-        axes.set_yticks([])
+        _label(axes, "distance to the plane [mm]", "" if index else "points [% per mm]")
         shape = normalities[index]
         if shape is None:
             below.set_axis_off()
@@ -71,7 +82,7 @@ def draw_deviations(
         below.plot(shape.expected_sigmas, shape.found_sigmas, ".", markersize=4, color="#33658a")
         skewness, kurtosis = shape.skewness, shape.excess_kurtosis
         below.set_title(f"skewness {skewness:+.2f}, kurtosis {kurtosis:+.2f}", fontsize=8)
-        _label(below, "normal quantile [sigma]")
+        _label(below, "normal quantile [sigma]", "" if index else "quantile [sigma]")
     ctx.figure(
         "deviations",
         figure,
@@ -119,7 +130,7 @@ def draw_planes(
     from_the_front = planes.normal @ np.cross(*view) > 0.0
     # The smallest last, so that the floor does not hide what stands on it.
     for k in range(len(planes)):
-        colour = f"C{k % 10}"
+        colour = colour_of(k)
         if from_the_front[k]:
             left.plot(*flat[index == k].T, ".", markersize=1.5, color=colour)
         parts = planes.corners[k][None]
@@ -182,9 +193,10 @@ def draw_thickness(
             spreads = getattr(item, _CLASSES[label])
             middles = [0.5 * (spread.low + spread.high) for spread in spreads]
             sigmas_mm = [1000.0 * spread.sigma_m for spread in spreads]
-            axes.plot(middles, sigmas_mm, "o-", markersize=3, label=planes.names[k])
+            colour, name = colour_of(k), planes.names[k]
+            axes.plot(middles, sigmas_mm, "o-", markersize=3, color=colour, label=name)
         axes.set_ylim(bottom=0.0)
-        _label(axes, label)
+        _label(axes, label, "" if place else "thickness [mm]")
         if place == 0:
             axes.legend(fontsize=7)
     if bars:
@@ -280,28 +292,41 @@ def draw_accumulator(ctx: StepContext, votes: PlanVotes, planes: Planes, cloud: 
     high = low + grid.cell_m * np.array(grid.shape[:2])
     image = np.log1p(_thinned_sum(votes.plan))
     left.imshow(image.T, origin="lower", cmap="gray_r", extent=(low[0], high[0], low[1], high[1]))
-    _show_votes(right, _thinned_sum(votes.first), (0.0, 180.0, -reach_m, reach_m))
+    shown = _show_votes(right, _thinned_sum(votes.first), (0.0, 180.0, -reach_m, reach_m))
+    figure.colorbar(shown, ax=right, label="votes")
+    # The one maximum, as a line of the plan and as a place of the parameter space.
+    n_angles, n_bins = votes.first.shape
+    row, column = np.unravel_index(int(votes.first.argmax()), votes.first.shape)
+    angle, distance_m = math.pi * row / n_angles, reach_m * (2.0 * (column + 0.5) / n_bins - 1.0)
+    across = np.array([math.cos(angle), math.sin(angle)])
+    foot = votes.centre_m + distance_m * across
+    ends = foot + np.outer([-2.0 * reach_m, 2.0 * reach_m], [-across[1], across[0]])
+    left.plot(*ends.T, color="k", linestyle=":", linewidth=1.0, label="maximum")
+    right.plot(math.degrees(angle), distance_m, "x", color="white", markersize=9)
     for index in np.flatnonzero(np.abs(planes.normal @ planes.up) < 0.5):
         corners = (planes.corners[index] - cloud.origin) @ basis.T
-        left.plot(corners[[1, 2], 0], corners[[1, 2], 1], linewidth=1.2, label=planes.names[index])
+        colour, name = colour_of(int(index)), planes.names[index]
+        left.plot(*corners[[1, 2], :2].T, linewidth=1.2, color=colour, label=name)
         # Where the wall lies in the parameter space.
         normal = basis @ planes.normal[index]
         angle = math.atan2(normal[1], normal[0]) % math.pi
         direction = np.array([math.cos(angle), math.sin(angle)])
         distance_m = float(direction @ (corners.mean(axis=0)[:2] - votes.centre_m))
-        right.plot(math.degrees(angle), distance_m, "o", fillstyle="none", markersize=9)
+        ring = dict[str, Any](color=colour, fillstyle="none", markersize=9)
+        right.plot(math.degrees(angle), distance_m, "o", **ring)
+    left.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     left.set_xlabel("e1 [m from the cloud's origin]")
     left.set_ylabel("e2 [m]")
     right.set_xlabel("direction of the normal [deg]")
     right.set_ylabel("distance from the middle of the plan [m]")
-    if left.lines:
-        # Beside the plan: one of a single long wall is too narrow to hold it.
-        left.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.02, 1.0))
+    # Beside the plan: one of a single long wall is too narrow to hold it.
+    left.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.02, 1.0))
     ctx.figure(
         "accumulator",
         figure,
         "Left: points per plan cell with the walls found. Right: the parameter space, in which "
-        f"{votes.voters}; circles mark the walls. A wall stands out as a sharp bright spot; a "
+        f"{votes.voters}; circles mark the walls, the cross and the dotted line the "
+        "fullest bin. A wall stands out as a sharp bright spot; a "
         "bright spot without a circle is a wall that was missed, a circle on grey ground a chance.",
     )
 
@@ -326,28 +351,34 @@ def draw_space(
     """
     figure = Figure(figsize=(7.0, 4.6), layout="constrained")
     axes = figure.subplots()
-    _show_votes(axes, np.maximum(best, 0.0), (0.0, 180.0, -90.0, 90.0))
-    for normal in planes.normal:
+    shown = _show_votes(axes, np.maximum(best, 0.0), (0.0, 180.0, -90.0, 90.0))
+    figure.colorbar(shown, ax=axes, label="score [votes]")
+    for index, normal in enumerate(planes.normal):
         omega_deg, phi_deg = omega_phi_deg(normal, planes.up)
         if omega_deg >= 180.0:
             omega_deg, phi_deg = omega_deg - 180.0, -phi_deg
-        axes.plot(omega_deg, phi_deg, "o", fillstyle="none", markersize=9)
+        ring = dict[str, Any](color=colour_of(index), fillstyle="none", markersize=9)
+        axes.plot(omega_deg, phi_deg, "o", **ring)
     _label(axes, "omega [deg]", "phi [deg]")
     ctx.figure(
         "accumulator",
         figure,
-        "The best votes of any distance over the direction of the normal; circles mark the planes. "
+        "The best score of any distance over the direction of the normal; circles mark the planes. "
         "Directions are even over the hemisphere: towards the poles one stands for several. A "
         "bright spot without a circle is a direction whose plane was missed.",
     )
     figure = Figure(figsize=(10.0, 6.4), layout="constrained")
-    for column, above, below in zip(figure.subplots(2, 3).T, over_omega, over_phi, strict=True):
-        _show_votes(column[0], over_omega[above], (0.0, 180.0, -reach_m, reach_m))
-        _show_votes(column[1], over_phi[below], (-90.0, 90.0, -reach_m, reach_m))
+    panels = figure.subplots(2, 3)
+    # One scale for all, so that sections compare.
+    most = max(float(votes.max()) for votes in (*over_omega.values(), *over_phi.values()))
+    for column, above, below in zip(panels.T, over_omega, over_phi, strict=True):
+        shown = _show_votes(column[0], over_omega[above], (0.0, 180.0, -reach_m, reach_m), most)
+        _show_votes(column[1], over_phi[below], (-90.0, 90.0, -reach_m, reach_m), most)
         column[0].set_title(f"phi = {above:.0f} deg", fontsize=9)
         column[1].set_title(f"omega = {below:.0f} deg", fontsize=9)
         _label(column[0], "omega [deg]", "distance from the middle [m]")
         _label(column[1], "phi [deg]", "distance from the middle [m]")
+    figure.colorbar(shown, ax=panels, label="votes", shrink=0.6)
     ctx.figure(
         "accumulator-sections",
         figure,
@@ -358,10 +389,16 @@ def draw_space(
 
 
 def _show_votes(
-    axes: Axes, votes: NDArray[np.float64], extent: tuple[float, float, float, float]
-) -> None:
-    """Show (across, up) votes, the brighter the more, by the square root."""
-    axes.imshow(np.sqrt(votes.T), origin="lower", aspect="auto", cmap="gray", extent=extent)
+    axes: Axes,
+    votes: NDArray[np.float64],
+    extent: tuple[float, float, float, float],
+    most: float | None = None,
+) -> AxesImage:
+    """Show (across, up) votes, the brighter the more, by the square root; white for the most."""
+    norm = PowerNorm(0.5, vmin=0.0, vmax=most)
+    return axes.imshow(
+        votes.T, origin="lower", aspect="auto", cmap="gray", norm=norm, extent=extent
+    )
 
 
 def draw_sections(ctx: StepContext, planes: Planes, cloud: PointCloud, *, cell_m: float) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.plane.figures import (
+    colour_of,
     draw_accumulator,
     draw_deviations,
     draw_normals,
@@ -113,13 +114,15 @@ def test_deviations_are_drawn_with_the_gauss_curve_of_their_fit(
     for k, axes in enumerate(bars):
         (stairs,) = axes.patches
         values, edges_mm, _ = stairs.get_data()
-        np.testing.assert_array_equal(values, deviations.histogram[k])
+        counts, width_mm = deviations.histogram[k], 100.0 / HISTOGRAM_BINS
+        per_point = 100.0 / max(1.0, counts.sum()) / width_mm
+        np.testing.assert_allclose(values, counts * per_point)
         np.testing.assert_allclose(edges_mm, np.linspace(-50.0, 50.0, HISTOGRAM_BINS + 1))
         assert axes.get_title() == f"{NAMES[k]}: {3.0 if k < 2 else 0.0:.1f} mm"
         assert len(axes.lines) == (1 if k < 2 else 0)
         for x_mm, curve in lines(axes):
             # As many points below it as the fit had, about their mean.
-            assert curve.sum() == pytest.approx(deviations.n_fit[k], rel=1e-6)
+            assert curve.sum() == pytest.approx(per_point * deviations.n_fit[k], rel=1e-6)
             mean_mm = (x_mm @ curve) / curve.sum()
             assert mean_mm == pytest.approx(1.0 * k, abs=1e-6)
             sigma_mm = math.sqrt((x_mm - mean_mm) ** 2 @ curve / curve.sum())
@@ -275,22 +278,32 @@ def test_the_accumulator_is_drawn_with_the_walls_as_lines_and_as_circles(
     draw_accumulator(
         context(tmp_path), picture, planes_of(), cloud_of(np.zeros((3, 3)), origin=ORIGIN)
     )
-    left, right = drawings["accumulator"].axes
+    left, right, bar = drawings["accumulator"].axes
+    assert bar.get_ylabel() == "votes"
     shown, extent = image(left)
     np.testing.assert_allclose(shown, np.log1p(plan.T))
     assert extent == (-4.0, 4.0, -3.0, 4.0)
     shown, extent = image(right)
-    np.testing.assert_allclose(shown, np.sqrt(votes.T))
+    np.testing.assert_allclose(shown, votes.T)
     assert extent == (0.0, 180.0, -6.0, 6.0)
     # The floor is no line of the plan.
-    front, side = lines(left)
+    maximum, front, side = lines(left)
+    row, column = np.unravel_index(votes.argmax(), votes.shape)
+    fullest = [15.0 * row, -6.0 + 0.5 * (column + 0.5)]
+    across = np.array([np.cos(np.radians(fullest[0])), np.sin(np.radians(fullest[0]))])
+    np.testing.assert_allclose((maximum.T - [0.0, 0.5]) @ across, fullest[1], atol=1e-9)
     np.testing.assert_allclose(np.sort(front[0]), [-3.0, 3.0])
     np.testing.assert_allclose(front[1], 2.0)
     np.testing.assert_allclose(side[0], -3.0)
     np.testing.assert_allclose(np.sort(side[1]), [-2.0, 2.0])
     # r = x cos + y sin from the centre of the plan: y = 2 at 90 degrees, x = -3 at 0.
-    circles = np.array([line[:, 0] for line in lines(right)])
-    np.testing.assert_allclose(circles, [[90.0, 1.5], [0.0, -3.0]], atol=1e-9)
+    marks = np.array([line[:, 0] for line in lines(right)])
+    np.testing.assert_allclose(marks, [fullest, [90.0, 1.5], [0.0, -3.0]], atol=1e-9)
+    # A plane has one colour in all figures.
+    colours = [line.get_color() for line in left.lines[1:]]
+    assert colours == [line.get_color() for line in right.lines[1:]]
+    assert colours == [colour_of(k) for k in (0, 1)]
+    assert len({colour_of(k) for k in range(20)}) == 20
     assert left.get_legend() is not None
 
 
@@ -339,18 +352,19 @@ def test_an_accumulator_of_directions_is_drawn_with_the_planes_it_found(
         math.sin(lean),
     ]
     draw_space(context(tmp_path), best, over_omega, over_phi, 2.5, replace(planes, normal=normal))
-    (axes,) = drawings["accumulator"].axes
+    axes, _ = drawings["accumulator"].axes
     shown, extent = image(axes)
-    np.testing.assert_allclose(shown, np.sqrt(np.maximum(best.T, 0.0)))
+    np.testing.assert_allclose(shown, np.maximum(best.T, 0.0))
     assert extent == (0.0, 180.0, -90.0, 90.0)
     circles = np.array([line[:, 0] for line in lines(axes)])
     np.testing.assert_allclose(circles[:2], [[30.0, -20.0], [0.0, 0.0]], atol=1e-9)
     assert circles[2, 1] == pytest.approx(90.0)
-    panels = np.array(drawings["accumulator-sections"].axes).reshape(2, 3)
+    panels = np.array(drawings["accumulator-sections"].axes[:6]).reshape(2, 3)
+    assert len({panel.images[0].get_clim() for panel in panels.flat}) == 1
     for k in range(3):
         for row, votes, span in ((0, over_omega, (0.0, 180.0)), (1, over_phi, (-90.0, 90.0))):
             shown, extent = image(panels[row, k])
-            np.testing.assert_allclose(shown, np.sqrt(votes[30.0 * k].T))
+            np.testing.assert_allclose(shown, votes[30.0 * k].T)
             assert extent == (*span, -2.5, 2.5)
             assert panels[row, k].get_title().endswith(f"= {30.0 * k:.0f} deg")
 
