@@ -16,7 +16,7 @@ from typing import Any, Final, Literal, Protocol
 from orthoflow_provenance.document import RecordedDiagnostic as Diagnostic
 
 from orthoflow.errors import ProductError
-from orthoflow.foreign_text import first_few, shown
+from orthoflow.untrusted_text import first_few, shown
 
 __all__ = [
     "FIRST_SHOWN",

@@ -23,7 +23,7 @@ from orthoflow.cli.tables import (
     number,
     verify_hint,
 )
-from orthoflow.foreign_text import first_few
+from orthoflow.untrusted_text import first_few
 
 if TYPE_CHECKING:
     from orthoflow.records import RecordedFile

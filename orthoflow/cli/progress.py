@@ -23,8 +23,8 @@ from orthoflow.engine.journal import (
     RunEvent,
     RunStarted,
 )
-from orthoflow.foreign_text import shown
 from orthoflow.geometry.threads import start_beside
+from orthoflow.untrusted_text import shown
 
 if TYPE_CHECKING:
     from rich.console import Console, Group, RenderableType

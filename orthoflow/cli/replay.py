@@ -27,7 +27,7 @@ from orthoflow.cli.commands import (
 from orthoflow.cli.run import executed
 from orthoflow.cli.tables import echo, echo_distances, echo_json, number
 from orthoflow.errors import CancelledStepError, ClusterError
-from orthoflow.foreign_text import first_few
+from orthoflow.untrusted_text import first_few
 
 if TYPE_CHECKING:
     from orthoflow.engine.store import Store

@@ -34,7 +34,7 @@ from orthoflow.cli.tables import (
     echo_table,
 )
 from orthoflow.errors import ArgumentError, DamageError, DiskSpaceError, StoreError
-from orthoflow.foreign_text import shown_json
+from orthoflow.untrusted_text import shown_json
 
 if TYPE_CHECKING:
     from orthoflow.engine.journal import RunEvent, RunListener

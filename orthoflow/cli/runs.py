@@ -14,7 +14,7 @@ import click
 
 from orthoflow.cli.commands import EXIT_GOOD, Command, json_option
 from orthoflow.cli.tables import counted, echo, echo_folded, echo_json, echo_table, medians, number
-from orthoflow.foreign_text import first_few
+from orthoflow.untrusted_text import first_few
 
 if TYPE_CHECKING:
     from orthoflow.report.browsing import RunSummary

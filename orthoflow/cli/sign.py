@@ -10,7 +10,7 @@ import click
 from orthoflow.cli.commands import EXIT_GOOD, Command
 from orthoflow.cli.tables import echo
 from orthoflow.errors import ArgumentError, RecordError
-from orthoflow.foreign_text import shown
+from orthoflow.untrusted_text import shown
 
 
 @click.command(cls=Command)

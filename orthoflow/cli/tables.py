@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 import click
 
-from orthoflow.foreign_text import shown, shown_json
+from orthoflow.untrusted_text import shown, shown_json
 
 if TYPE_CHECKING:
     from orthoflow.records import RecordedCell

@@ -19,9 +19,9 @@ from typing import Final
 from orthoflow.engine.durability import is_checked, with_digest, write_whole
 from orthoflow.engine.results import RecordedFile, name_problem
 from orthoflow.errors import InputError
-from orthoflow.foreign_text import parse_json
 from orthoflow.geometry.threads import in_order
 from orthoflow.sdk.lines import one_line, text_of_path
+from orthoflow.untrusted_text import parse_json
 
 # A file changed this shortly before hashing may change again within the same time stamp.
 _SETTLED_NS: Final = 2_000_000_000

@@ -22,8 +22,8 @@ from orthoflow.engine.durability import sync_folder, writing_to
 from orthoflow.engine.environment import now, time_in_a_name
 from orthoflow.engine.results import CellResult, CellStatus
 from orthoflow.errors import ArgumentError, DiskSpaceError, RecordError, StoreError
-from orthoflow.foreign_text import open_file
 from orthoflow.system import file_lock, flags
+from orthoflow.untrusted_text import open_file
 
 
 @dataclass(frozen=True, kw_only=True)

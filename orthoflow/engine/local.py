@@ -25,10 +25,10 @@ from orthoflow.engine.processes import StepProcess, start_step
 from orthoflow.engine.results import CellResult, result_from_json
 from orthoflow.engine.worker import EVENT, RESULT, Task, failed_result, run_task
 from orthoflow.errors import CancelledStepError, OrthoflowError, StepFailedError, StoreError
-from orthoflow.foreign_text import shown
 from orthoflow.sdk.context import StepEvent
 from orthoflow.sdk.lines import one_line
 from orthoflow.system import address_space, flags, read_at
+from orthoflow.untrusted_text import shown
 
 Tell = Callable[[str, StepEvent], None]
 _GRACE_S: Final = 5.0

@@ -26,7 +26,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from orthoflow.engine.durability import is_checked, with_digest
 from orthoflow.errors import StoreError
-from orthoflow.foreign_text import parse_json
+from orthoflow.untrusted_text import parse_json
 
 # The words of a record, for the rest of the engine.
 __all__ = [

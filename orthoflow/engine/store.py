@@ -62,9 +62,9 @@ from orthoflow.engine.results import (
     result_to_json,
 )
 from orthoflow.errors import ArgumentError, DamageError, ProductError, StoreError
-from orthoflow.foreign_text import open_file, parse_json
 from orthoflow.products.product import Payload, Product
 from orthoflow.sdk.lines import one_line
+from orthoflow.untrusted_text import open_file, parse_json
 
 # Created together when a store is first used. The last one identifies a store: a git repository has
 # `objects`, and any folder may have `results`.

@@ -58,7 +58,6 @@ from orthoflow.errors import (
     ProductError,
     StepFailedError,
 )
-from orthoflow.foreign_text import shown
 from orthoflow.geometry.kernel_news import heard_by
 from orthoflow.products.input_files import InputFiles
 from orthoflow.products.product import Product
@@ -66,6 +65,7 @@ from orthoflow.sdk.context import Drawing, StepContext, StepEvent
 from orthoflow.sdk.lines import one_line
 from orthoflow.sdk.methods import Method, labelled
 from orthoflow.system import adopt_orphans, children_processor_s, flags
+from orthoflow.untrusted_text import shown
 
 # Inputs up to this size are digested again after the run: they must not have changed.
 _CHECKED_BYTES: Final = 16 << 20

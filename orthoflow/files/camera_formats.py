@@ -33,9 +33,9 @@ from orthoflow.files.given_cameras import (
 )
 from orthoflow.files.images import PHOTO_SUFFIXES
 from orthoflow.files.metashape import read_metashape_xml
-from orthoflow.foreign_text import first_few, parse_json
 from orthoflow.geometry.opencv_border import HALF_PIXEL
 from orthoflow.products import Intrinsics
+from orthoflow.untrusted_text import first_few, parse_json
 
 _FULL_FRAME_MM: Final = 36.0
 # OpenGL axes, as in Bundler and RealityCapture: x right, y up, z backwards.

@@ -32,8 +32,8 @@ from orthoflow.files.given_cameras import (
     rotation_of,
 )
 from orthoflow.files.photo_files import MOST_PIXELS
-from orthoflow.foreign_text import open_file, reading
 from orthoflow.products import Camera, Cameras, Intrinsics, TieRole, Ties
+from orthoflow.untrusted_text import open_file, reading
 
 # Our names of the parameters of models that OpenCV's include; COLMAP uses another one for one of
 # them.

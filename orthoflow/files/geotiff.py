@@ -587,7 +587,7 @@ def quiet() -> Iterator[None]:
     """
     import rasterio
 
-    let_go_of_foreign_text()
+    let_go_of_untrusted_text()
     alone = rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True, GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR")
     with warnings.catch_warnings(), alone:
         warnings.simplefilter("ignore")
@@ -595,7 +595,7 @@ def quiet() -> Iterator[None]:
 
 
 @cache
-def let_go_of_foreign_text() -> None:
+def let_go_of_untrusted_text() -> None:
     """Print no traceback if rasterio cannot decode a part of a file that GDAL quotes.
 
     It tries this in a callback, which cannot raise, and so prints the error in both of Python's

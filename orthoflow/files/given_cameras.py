@@ -26,8 +26,8 @@ from orthoflow.files.cube_faces import (
     problem_of,
 )
 from orthoflow.files.photo_files import MOST_PIXELS
-from orthoflow.foreign_text import open_text, reading, text_of_file
 from orthoflow.products import Intrinsics
+from orthoflow.untrusted_text import open_text, reading, text_of_file
 
 # Limits for models with the observations of each photo, which are read line by line, and for other
 # files.

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.geotiff import let_go_of_foreign_text
+from orthoflow.files.geotiff import let_go_of_untrusted_text
 from orthoflow.geometry.levels import Colours
 
 if TYPE_CHECKING:
@@ -213,7 +213,7 @@ def _tiff_page(encoded: bytes, start: int) -> Iterator[DatasetReader]:
     from rasterio.errors import RasterioError, RasterioIOError
     from rasterio.io import MemoryFile
 
-    let_go_of_foreign_text()
+    let_go_of_untrusted_text()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:

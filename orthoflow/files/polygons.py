@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError
 from orthoflow.files.geotiff import SITE_CRS, SITE_CRS_WKT, epsg_of, local_crs_wkt
 from orthoflow.files.sidecars import write_bytes
-from orthoflow.foreign_text import json_bytes, open_file, parse_json
 from orthoflow.geometry.frames import FARTHEST_M
 from orthoflow.products.product import JsonValue
+from orthoflow.untrusted_text import json_bytes, open_file, parse_json
 
 Feature: TypeAlias = dict[str, JsonValue]
 

@@ -43,7 +43,6 @@ from orthoflow.files.sidecars import (
     write_json,
     write_text,
 )
-from orthoflow.foreign_text import Value, csv_text
 from orthoflow.geometry import WallFrame, omega_phi_deg
 from orthoflow.geometry.bands import row_bands
 from orthoflow.geometry.levels import eight_bits
@@ -69,6 +68,7 @@ from orthoflow.products import (
     is_shown,
     plane_name,
 )
+from orthoflow.untrusted_text import Value, csv_text
 
 # Letters of a source that its file is called after.
 _LONGEST_SOURCE: Final = 100

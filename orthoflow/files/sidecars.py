@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from orthoflow.errors import GeometryError, InputError, StoreError
 from orthoflow.files.drawings.words import accuracy_phrase
 from orthoflow.files.geotiff import GridPlace, RasterParts, local_crs_name
-from orthoflow.foreign_text import json_bytes, parse_json, text_of_file
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.frames import FARTHEST_M, RasterAxes
 from orthoflow.geometry.levels import eight_bits
 from orthoflow.products import JsonValue, LayerMask, OrthoMask, SurfaceMask
+from orthoflow.untrusted_text import json_bytes, parse_json, text_of_file
 
 #: bytes of the JSON file beside it
 MOST_SIDECAR_BYTES: Final = 1 << 20

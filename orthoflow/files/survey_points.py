@@ -13,7 +13,7 @@ from typing import Final
 
 from orthoflow.errors import InputError
 from orthoflow.files.sidecars import MOST_WALLS
-from orthoflow.foreign_text import text_of_file
+from orthoflow.untrusted_text import text_of_file
 
 _POSITION: Final = ("x", "y", "z")
 _IN_IMAGE: Final = ("u_px", "v_px")

@@ -29,8 +29,8 @@ from ruamel.yaml.resolver import VersionedResolver
 from ruamel.yaml.scanner import Scanner
 from ruamel.yaml.tag import Tag
 
-from orthoflow.foreign_text import first_few
 from orthoflow.products.product import JsonValue
+from orthoflow.untrusted_text import first_few
 
 #: levels of a workflow or calibration file
 DEEPEST: Final = 60

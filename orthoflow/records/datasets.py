@@ -22,11 +22,11 @@ from orthoflow.engine.durability import writing_to
 from orthoflow.engine.journal import RECORD_FILE, cell_file_name
 from orthoflow.engine.store import Store
 from orthoflow.errors import StoreError
-from orthoflow.foreign_text import parse_json
 from orthoflow.products.product import JsonValue
 from orthoflow.records.input_files import embedded_inputs
 from orthoflow.records.published import PRODUCTS_FOLDER
 from orthoflow.records.runs import PAGES_FOLDER, Run, copy_files, read_run
+from orthoflow.untrusted_text import parse_json
 from orthoflow.workflow.model import (
     DATA,
 )

@@ -14,8 +14,8 @@ from orthoflow_provenance.document import RecordedCell
 from orthoflow.engine.journal import cell_file_name
 from orthoflow.errors import InputError
 from orthoflow.files.sidecars import read_sidecar, write_json
-from orthoflow.foreign_text import parse_json
 from orthoflow.products import PAINTED_STATES, JsonValue
+from orthoflow.untrusted_text import parse_json
 
 WALLS_FILE: Final = "walls.json"
 _WALLS_LARGEST_BYTES: Final = 1 << 22

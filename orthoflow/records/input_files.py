@@ -29,8 +29,8 @@ from orthoflow.errors import (
     InputError,
     RecordError,
 )
-from orthoflow.foreign_text import first_few
 from orthoflow.records.runs import Run, record_errors
+from orthoflow.untrusted_text import first_few
 from orthoflow.workflow.inputs import (
     InputOption,
     override_inputs,

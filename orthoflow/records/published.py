@@ -20,9 +20,9 @@ from orthoflow.engine.file_digests import file_sha256
 from orthoflow.engine.journal import cell_file_name
 from orthoflow.errors import StoreError
 from orthoflow.files.geotiff import name_run
-from orthoflow.foreign_text import csv_text
 from orthoflow.geometry.threads import in_order
 from orthoflow.records.deliverables import write_walls_json
+from orthoflow.untrusted_text import csv_text
 
 # As for fractions in the metadata of products (SPEC 11.3): libraries round their last digits.
 _ROUNDING: Final = 1e-6

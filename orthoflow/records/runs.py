@@ -47,11 +47,11 @@ from orthoflow.errors import (
     RecordError,
     StoreError,
 )
-from orthoflow.foreign_text import first_few, shown
 from orthoflow.geometry.threads import in_order
 from orthoflow.products.product import Payload, Product
 from orthoflow.records.published import PRODUCTS_FOLDER, MetricRow, cell_metrics, published_files
 from orthoflow.sdk.lines import one_line
+from orthoflow.untrusted_text import first_few, shown
 
 REPORT_FILE: Final = "report.html"
 _DAMAGED: Final = "the file is damaged"

@@ -17,11 +17,11 @@ import numpy as np
 from orthoflow_provenance.document import COSTS, CellOutcome, RecordedCell, RunRecord, sha256_text
 
 from orthoflow.errors import ArgumentError
-from orthoflow.foreign_text import Value, csv_text
 from orthoflow.products import Inspection
 from orthoflow.products.product import JsonValue
 from orthoflow.records.published import METRICS_FILE, MetricRow, cell_metrics, write_metrics_csv
 from orthoflow.records.runs import Run
+from orthoflow.untrusted_text import Value, csv_text
 from orthoflow.workflow.model import DATA, SEED
 
 if TYPE_CHECKING:

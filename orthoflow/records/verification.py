@@ -28,7 +28,6 @@ from orthoflow_provenance.verify import verify_record
 
 from orthoflow.engine.journal import JOURNAL, LOGS
 from orthoflow.errors import ArgumentError, InputError, PluginError, RecordError
-from orthoflow.foreign_text import first_few
 from orthoflow.geometry.threads import in_order
 from orthoflow.products import Inspection
 from orthoflow.products.product import Payload
@@ -42,6 +41,7 @@ from orthoflow.records.runs import (
     find_record,
     record_errors,
 )
+from orthoflow.untrusted_text import first_few
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import (

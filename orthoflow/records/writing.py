@@ -27,7 +27,6 @@ from orthoflow.engine.file_digests import FileDigests
 from orthoflow.engine.journal import RECORD_FILE, kept_from_others
 from orthoflow.engine.results import CellResult
 from orthoflow.errors import ArgumentError, DamageError, InputError, OrthoflowError, StoreError
-from orthoflow.foreign_text import first_few
 from orthoflow.records.input_files import ChangedInputsError, embedded_inputs, find_inputs
 from orthoflow.records.published import publish_products
 from orthoflow.records.runs import Run, read_run
@@ -37,6 +36,7 @@ from orthoflow.records.unfinished import (
     recorded_environments,
     write_outline,
 )
+from orthoflow.untrusted_text import first_few
 from orthoflow.version import __version__
 from orthoflow.workflow.inputs import MissingInputsError
 from orthoflow.workflow.resolved import (

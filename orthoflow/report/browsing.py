@@ -14,7 +14,6 @@ import numpy as np
 
 from orthoflow.engine.journal import JOURNAL, RECORD_FILE, is_running
 from orthoflow.errors import ArgumentError, OrthoflowError
-from orthoflow.foreign_text import open_file, parse_json
 from orthoflow.products import JsonValue
 from orthoflow.records import RecordedCell
 from orthoflow.records.datasets import parts_of
@@ -26,6 +25,7 @@ from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.paired import middle_of
 from orthoflow.report.rankings import FLAG, Sense, is_flag, sense_of
 from orthoflow.report.summaries import headline_keys
+from orthoflow.untrusted_text import open_file, parse_json
 from orthoflow.workflow.model import DATA
 
 RunState: TypeAlias = Literal["ok", "failed", "running", "unfinished", "damaged"]

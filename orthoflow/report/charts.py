@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.foreign_text import shown
+from orthoflow.untrusted_text import shown
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,7 +11,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.foreign_text import first_few, parse_json
 from orthoflow.geometry import angle_between_deg
 from orthoflow.products import Inspection, Walls
 from orthoflow.records import RecordedCell
@@ -19,6 +18,7 @@ from orthoflow.records.published import cell_metrics
 from orthoflow.records.runs import Run
 from orthoflow.records.writing import NOT_YET
 from orthoflow.report.rankings import Sense, sense_of
+from orthoflow.untrusted_text import first_few, parse_json
 from orthoflow.workflow.expand import variants_text
 from orthoflow.workflow.model import (
     DATA,

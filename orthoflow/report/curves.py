@@ -11,7 +11,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from orthoflow.foreign_text import first_few
 from orthoflow.records import RecordedCell
 from orthoflow.records.datasets import parts_of
 from orthoflow.records.runs import Run
@@ -28,6 +27,7 @@ from orthoflow.report.numbers import number
 from orthoflow.report.paired import middle_of, spread_of
 from orthoflow.report.pictures import Picture
 from orthoflow.report.rankings import Sense, cost_share, is_flag
+from orthoflow.untrusted_text import first_few
 from orthoflow.workflow.expand import variants_text
 from orthoflow.workflow.model import DATA
 

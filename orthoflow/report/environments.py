@@ -6,9 +6,9 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from orthoflow.catalog.distributions import canonical_name, required_distributions
-from orthoflow.foreign_text import first_few
 from orthoflow.records import RecordedEnvironment
 from orthoflow.records.runs import Run
+from orthoflow.untrusted_text import first_few
 from orthoflow.version import DISTRIBUTION
 
 

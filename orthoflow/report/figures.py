@@ -10,13 +10,13 @@ from typing import Final
 
 from orthoflow.errors import InputError
 from orthoflow.files.images import decode_image, encode_pdf, encode_png, shrunk_webp
-from orthoflow.foreign_text import is_plain_svg
 from orthoflow.geometry.threads import in_order
 from orthoflow.records import RecordedFigure
 from orthoflow.records.runs import FIGURES_FOLDER, GRAPH_FILE, Run, figure_files, write_files
 from orthoflow.report.combinations import baseline_addresses
 from orthoflow.report.pictures import Picture, data_uri
 from orthoflow.report.rendering import graph_file
+from orthoflow.untrusted_text import is_plain_svg
 
 _BYTES_MOST: Final = 3_900_000  # of all figures on a page; a third more in base64
 # What the baseline may take of it as it is, before the others share the rest.

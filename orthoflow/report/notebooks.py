@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from orthoflow.catalog.wording import did_you_mean
 from orthoflow.errors import ArgumentError, PluginError, RecordError
 from orthoflow.files.images import cells_webp
-from orthoflow.foreign_text import first_few, shown
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.levels import Colours, eight_bits
 from orthoflow.products import Orthoimage, Orthoimages, Product, is_shown
@@ -36,6 +35,7 @@ from orthoflow.report.differences import moved_first
 from orthoflow.report.pictures import embedded_products, thumbnail
 from orthoflow.report.summaries import answers
 from orthoflow.report.tidy_tables import Varied
+from orthoflow.untrusted_text import first_few, shown
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -11,7 +11,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.foreign_text import first_few
 from orthoflow.geometry.robust import median_deviation
 from orthoflow.records import RecordedCell
 from orthoflow.records.published import is_rounding
@@ -20,6 +19,7 @@ from orthoflow.report.combinations import Combination, Measured, combinations_of
 from orthoflow.report.comparisons import Column, comparison_columns
 from orthoflow.report.environments import AlikeEnvironments, alike_environments
 from orthoflow.report.rankings import Sense, badness, is_flag
+from orthoflow.untrusted_text import first_few
 from orthoflow.workflow.expand import variants_text
 from orthoflow.workflow.model import (
     DATA,

@@ -7,7 +7,6 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
-from orthoflow.foreign_text import Value, csv_text, shown
 from orthoflow.records.datasets import parts_of
 from orthoflow.records.runs import Run
 from orthoflow.report.combinations import Combination, Measured, combinations_of
@@ -16,6 +15,7 @@ from orthoflow.report.numbers import number, number_with_spread
 from orthoflow.report.paired import MetricOverDatasets, over_datasets
 from orthoflow.report.summaries import citations
 from orthoflow.report.tables import Table, escaped_latex
+from orthoflow.untrusted_text import Value, csv_text, shown
 from orthoflow.workflow.model import DATA
 
 # More stand below each other.

@@ -10,7 +10,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.foreign_text import first_few
 from orthoflow.geometry import WallFrame
 from orthoflow.products import Camera, Cameras, Planes, TieRole, Ties
 from orthoflow.records.runs import Run
@@ -19,6 +18,7 @@ from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.numbers import number
 from orthoflow.report.pictures import Picture, embedded_products
 from orthoflow.report.tables import Table
+from orthoflow.untrusted_text import first_few
 
 _LEVEL: Final = 1.0 - 1e-6
 

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.images import Part, cells_webp, grey_cells, sampled_rows
-from orthoflow.foreign_text import shown
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.bands import count_cells
 from orthoflow.geometry.levels import eight_bits
@@ -28,6 +27,7 @@ from orthoflow.products import (
 )
 from orthoflow.records.runs import Run
 from orthoflow.report.combinations import baseline_cells
+from orthoflow.untrusted_text import shown
 
 LONGEST_SIDE_PX: Final = 1000
 SHORTEST_SIDE_PX: Final = 320

@@ -18,13 +18,13 @@ import jinja2
 from markupsafe import Markup, escape
 
 from orthoflow.errors import StoreError
-from orthoflow.foreign_text import shown
 from orthoflow.records import COSTS
 from orthoflow.records.runs import Run
 from orthoflow.report.diagrams import BOX, run_diagram
 from orthoflow.report.environments import told_apart
 from orthoflow.report.numbers import number, number_with_unit
 from orthoflow.report.pictures import DIVERGING
+from orthoflow.untrusted_text import shown
 from orthoflow.version import __version__
 
 # Parentheses in a DOI come in pairs, as in doi:10.1007/3DRes.02(2011)3.

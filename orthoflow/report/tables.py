@@ -9,11 +9,11 @@ from typing import Final
 
 import numpy as np
 
-from orthoflow.foreign_text import shown
 from orthoflow.geometry import omega_phi_deg
 from orthoflow.products import Planes
 from orthoflow.records.runs import Run
 from orthoflow.report.pictures import embedded_products
+from orthoflow.untrusted_text import shown
 
 _LATEX: Final = {
     **{sign: f"\\{sign}" for sign in "&%$#_{}"},

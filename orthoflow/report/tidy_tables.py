@@ -6,7 +6,6 @@ import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from orthoflow.foreign_text import Value
 from orthoflow.records import RecordedCell
 from orthoflow.records.datasets import parts_of
 from orthoflow.records.published import cell_metrics
@@ -14,6 +13,7 @@ from orthoflow.records.runs import Run
 from orthoflow.report.combinations import Combination, combinations_of
 from orthoflow.report.curves import sweeps
 from orthoflow.report.paired import over_datasets
+from orthoflow.untrusted_text import Value
 
 
 @dataclass(frozen=True, kw_only=True)

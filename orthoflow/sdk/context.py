@@ -25,9 +25,9 @@ from orthoflow.diagnostics import (
     warning_texts,
 )
 from orthoflow.errors import CancelledStepError, ProductError
-from orthoflow.foreign_text import MOST_SVG_BYTES, is_plain_svg
 from orthoflow.sdk.lines import is_name, one_line
 from orthoflow.system import take_room
+from orthoflow.untrusted_text import MOST_SVG_BYTES, is_plain_svg
 
 __all__ = ["Drawing", "DrawnFigure", "Metric", "StepContext", "StepEvent"]
 

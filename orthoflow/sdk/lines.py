@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-from orthoflow.foreign_text import shown
+from orthoflow.untrusted_text import shown
 
 _LONGEST: Final = 2000
 _LONGEST_NAME_BYTES: Final = 200

@@ -13,9 +13,9 @@ from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import NAME_PATTERN
 from orthoflow.errors import PluginError, WorkflowError
 from orthoflow.files.yaml_positions import Table, describe
-from orthoflow.foreign_text import first_few
 from orthoflow.products.product import JsonValue
 from orthoflow.sdk.methods import Method
+from orthoflow.untrusted_text import first_few
 from orthoflow.workflow.checks import check_comparison, check_wiring, first_variants
 from orthoflow.workflow.inputs import (
     DatasetReader,

@@ -26,9 +26,9 @@ from orthoflow.files.points import FORMATS, ScanFile, open_scan
 from orthoflow.files.points.formats import TEXT
 from orthoflow.files.points.units import refuse_degrees
 from orthoflow.files.survey_points import read_measured_ties, read_survey_points
-from orthoflow.foreign_text import first_few
 from orthoflow.geometry.cloud_quality import judge_quality
 from orthoflow.sdk.lines import text_of_path
+from orthoflow.untrusted_text import first_few
 from orthoflow.workflow.source import shipped_workflow
 
 FileKind: TypeAlias = Literal[

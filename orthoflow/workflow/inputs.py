@@ -27,9 +27,9 @@ from orthoflow.files.yaml_positions import (
     describe,
     plain,
 )
-from orthoflow.foreign_text import first_few
 from orthoflow.products.input_files import InputFiles
 from orthoflow.products.product import JsonValue
+from orthoflow.untrusted_text import first_few
 from orthoflow.workflow.model import (
     DATA,
     SEED,

@@ -7,7 +7,7 @@ from typing import Final
 
 from orthoflow.catalog.wording import did_you_mean
 from orthoflow.errors import WorkflowError
-from orthoflow.foreign_text import open_file
+from orthoflow.untrusted_text import open_file
 
 #: bytes of a workflow file
 MOST_BYTES: Final = 400_000

@@ -233,7 +233,7 @@ def test_only_the_standard_library_click_and_pluggy_load_for_help(tmp_path: Path
     code = (
         "import sys\n"
         "import orthoflow.cli\n"
-        "floors = ('cli', 'errors', 'foreign_text', 'system', 'version')\n"
+        "floors = ('cli', 'errors', 'untrusted_text', 'system', 'version')\n"
         "print([m for m in sys.modules if m.startswith('orthoflow.') "
         "and m.split('.')[1] not in floors])"
     )

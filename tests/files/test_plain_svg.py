@@ -7,7 +7,7 @@ import io
 import matplotlib.pyplot as plt
 import pytest
 
-from orthoflow.foreign_text import is_plain_svg
+from orthoflow.untrusted_text import is_plain_svg
 
 LINKS = 'xmlns:xlink="http://www.w3.org/1999/xlink"'
 

@@ -15,7 +15,7 @@ import pytest
 
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.errors import InputError
-from orthoflow.foreign_text import shown
+from orthoflow.untrusted_text import shown
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.draft import Recognised, draft_workflow, recognised
 from orthoflow.workflow.inputs import resolve_input_files

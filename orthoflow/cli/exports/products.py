@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from orthoflow.cli.commands import echo_error
 from orthoflow.errors import ArgumentError, StoreError
-from orthoflow.foreign_text import first_few
+from orthoflow.untrusted_text import first_few
 
 if TYPE_CHECKING:
     from orthoflow.products import Product

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from orthoflow.cli.exports.products import make_empty, output_of, product_of
 from orthoflow.cli.tables import counted
-from orthoflow.foreign_text import csv_text
+from orthoflow.untrusted_text import csv_text
 
 if TYPE_CHECKING:
     from orthoflow.cli.exports.choices import Choices

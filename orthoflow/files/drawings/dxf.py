@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import StoreError
 from orthoflow.files.drawings.regular_openings import regular_opening
 from orthoflow.files.drawings.room_lines import DrawnWall, RoomLines, edges_of
-from orthoflow.foreign_text import shown
+from orthoflow.untrusted_text import shown
 
 if TYPE_CHECKING:
     from ezdxf.document import Drawing

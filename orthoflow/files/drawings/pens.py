@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.foreign_text import shown
+from orthoflow.untrusted_text import shown
 
 if TYPE_CHECKING:
     from reportlab.pdfgen.canvas import Canvas

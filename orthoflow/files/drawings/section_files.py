@@ -26,8 +26,8 @@ from orthoflow.files.drawings.sheet_contents import (
     up_words,
 )
 from orthoflow.files.drawings.words import Language, Phrase, label
-from orthoflow.foreign_text import shown
 from orthoflow.products import Planes
+from orthoflow.untrusted_text import shown
 
 if TYPE_CHECKING:
     from ezdxf.document import Drawing as Document

@@ -35,7 +35,7 @@ from orthoflow.files.drawings.pens import (
 from orthoflow.files.drawings.sheet_blocks import Furniture
 from orthoflow.files.drawings.sheet_contents import Drawing, Placed, Sheet
 from orthoflow.files.drawings.words import label
-from orthoflow.foreign_text import shown
+from orthoflow.untrusted_text import shown
 
 _TICK_MM: Final = 1.5
 # Minimum distance between adjacent items.

@@ -22,7 +22,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from orthoflow.errors import InputError
 from orthoflow.files.images import decode_image
 from orthoflow.files.yaml_positions import read_model
-from orthoflow.foreign_text import open_file, reading, text_of_file
+from orthoflow.untrusted_text import open_file, reading, text_of_file
 
 #: bytes of the title block of sheets
 MOST_BYTES: Final = 100_000

@@ -35,7 +35,7 @@ from orthoflow.files.drawings.printed_pictures import (
 )
 from orthoflow.files.drawings.sheet_contents import LegendRow, Picture, Placed
 from orthoflow.files.drawings.words import Language, label
-from orthoflow.foreign_text import shown
+from orthoflow.untrusted_text import shown
 
 if TYPE_CHECKING:
     from reportlab.pdfgen.canvas import Canvas

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from orthoflow.errors import MethodError
 from orthoflow.files.images import before_masks, decode_image, decode_levels
 from orthoflow.files.photo_files import icc_profile, stated_bits
-from orthoflow.foreign_text import first_few
 from orthoflow.geometry.levels import Colours, Level, in_levels
 from orthoflow.products import Camera, Cameras, Layers, Photo, Photos, PointCloud, Walls
 from orthoflow.sdk import DiagnosticSpec, Ports, StepContext
+from orthoflow.untrusted_text import first_few
 from orthoflow_plugins.ortho.layers import LayerStack
 from orthoflow_plugins.ortho.parameters import VisibilityParams
 

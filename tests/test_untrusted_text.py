@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthoflow.foreign_text import csv_text, shown, shown_json
+from orthoflow.untrusted_text import csv_text, shown, shown_json
 
 ANY = st.text(
     st.characters() | st.sampled_from("\x1b\x9b\u202e\u2066\u200f\u2028\ud800=+-@\t\r\n'")
