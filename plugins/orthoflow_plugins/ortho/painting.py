@@ -112,8 +112,12 @@ def paint(
         if not is_painted.any():
             painting.mask[tile] = visible.mask[inner]
             return
-        u, v = visible.u[is_painted], visible.v[is_painted]
-        bounds = tuple(math.floor(value) for value in (u.min(), u.max(), v.min(), v.max()))
+        # Positions are 0 where nothing is painted.
+        bounds = tuple(
+            math.floor(value)
+            for places in (visible.u, visible.v)
+            for value in (np.where(is_painted, places, np.float32(np.inf)).min(), places.max())
+        )
         is_wide = max(bounds[1] - bounds[0], bounds[3] - bounds[2]) > _CROP_MOST_PX
         if is_wide and visible.mask[inner].size > 1:
             for quarter in _quarters(tile):
@@ -127,7 +131,7 @@ def paint(
                 painting.quality = np.asarray(allocate("quality", shape, np.float32), np.float32)
         if erosion_cells:
             is_near = near_patches(visible.mask == OCCLUDED, erosion_cells)
-            visible.mask[is_painted & is_near] = OCCLUDED
+            np.putmask(visible.mask, is_painted & is_near, OCCLUDED)
         rgb = sample(
             photo,
             visible.u[inner],
@@ -139,10 +143,12 @@ def paint(
         )
         is_bare = visible.mask[inner] != PAINTED
         rgb[is_bare] = 0
-        quality = (visible.quality[inner].view(np.uint32) & _QUALITY_BITS).view(np.float32)
-        quality[is_bare] = 0.0
         painting.mask[tile], painting.rgb[tile] = visible.mask[inner], rgb
-        painting.quality[tile] = quality
+        np.bitwise_and(
+            visible.quality[inner].view(np.uint32),
+            np.where(is_bare, np.uint32(0), _QUALITY_BITS),
+            out=painting.quality[tile].view(np.uint32),
+        )
         painting.footprints[tile[0].start, tile[1].start] = footprint
 
     tiles = [
@@ -217,11 +223,10 @@ def footprint_of(
         tile: its rows and columns on the wall.
         inner: the same within `is_painted`.
     """
-    rows, columns = np.nonzero(is_painted)
-    rows += tile[0].start - inner[0].start
-    columns += tile[1].start - inner[1].start
-    row, column = float(rows.mean()), float(columns.mean())
-    depth = float(surface.relief.depth[rows, columns].mean(dtype=np.float64))
+    first_row, first_column = (tile[k].start - inner[k].start for k in range(2))
+    around = surface.relief.depth[first_row:, first_column:]
+    n_cells, row, column, depth = _middle(is_painted, around)
+    row, column = row + first_row, column + first_column
     centre, beside, below = (
         _project(view.camera, (column + a + 0.5) * view.gsd_m, (row + b + 0.5) * view.gsd_m, depth)
         for a, b in ((0.0, 0.0), (_BASE_CELLS, 0.0), (0.0, _BASE_CELLS))
@@ -236,8 +241,27 @@ def footprint_of(
         pixels_down=down if math.isfinite(down) else 1.0,
         photo_gsd_m=centre[2] / math.sqrt(view.camera[12] * view.camera[13]),
         obliquity_deg=math.degrees(math.atan2(aside, view.height_m - depth)),
-        n_cells=len(rows),
+        n_cells=n_cells,
     )
+
+
+@compiled
+def _middle(
+    is_painted: NDArray[np.bool_], depths: NDArray[np.float32]
+) -> tuple[int, float, float, float]:
+    """Return the number of painted cells and the means of their rows, columns and depths."""
+    n_cells, rows, columns, total = 0, 0, 0, 0.0
+    for row in range(is_painted.shape[0]):
+        n_in_row, in_row = 0, 0.0
+        for column in range(is_painted.shape[1]):
+            if is_painted[row, column]:
+                n_in_row += 1
+                columns += column
+                in_row += float(depths[row, column])
+        n_cells += n_in_row
+        rows += n_in_row * row
+        total += in_row
+    return n_cells, rows / n_cells, columns / n_cells, total / n_cells
 
 
 def sample(
@@ -310,17 +334,21 @@ def sample_bilinear(
         v: see `u`.
         colours: overwritten. `cv2.remap` knows positions to a 32nd of a pixel only.
     """
-    last_u, last_v = photo.shape[1] - 1, photo.shape[0] - 1
-    for row in range(u.shape[0]):
-        for j in range(u.shape[1]):
-            across = min(max(float(u[row, j]), 0.0), float(last_u))
-            down = min(max(float(v[row, j]), 0.0), float(last_v))
-            left, upper = int(across), int(down)
-            right, lower = min(left + 1, last_u), min(upper + 1, last_v)
-            across -= left
-            down -= upper
-            for channel in range(3):
-                first, last = float(photo[upper, left, channel]), float(photo[lower, left, channel])
-                above = first + (float(photo[upper, right, channel]) - first) * across
-                below = last + (float(photo[lower, right, channel]) - last) * across
-                colours[row, j, channel] = int(above + (below - above) * down + 0.5)
+    last_u, last_v, width = photo.shape[1] - 1, photo.shape[0] - 1, photo.shape[1]
+    # Flat arrays, and places of a type without sign: numba does not look whether they are negative.
+    us, vs, pixels, into = u.reshape(-1), v.reshape(-1), photo.reshape(-1), colours.reshape(-1)
+    for cell in range(us.size):
+        across = min(max(float(us[cell]), 0.0), float(last_u))
+        down = min(max(float(vs[cell]), 0.0), float(last_v))
+        left, upper = int(across), int(down)
+        across -= left
+        down -= upper
+        at = 3 * (upper * width + left)
+        right = 3 if left < last_u else 0
+        lower = 3 * width if upper < last_v else 0
+        for channel in range(3):
+            first = float(pixels[np.uintp(at + channel)])
+            last = float(pixels[np.uintp(at + lower + channel)])
+            above = first + (float(pixels[np.uintp(at + right + channel)]) - first) * across
+            below = last + (float(pixels[np.uintp(at + lower + right + channel)]) - last) * across
+            into[3 * cell + channel] = int(above + (below - above) * down + 0.5)

@@ -21,7 +21,7 @@ from orthoflow_plugins.ortho.visibility_kernels import BLOCK_CELLS, Relief, Wall
 
 # Surfaces of walls with more cells are kept in files, and computed in bands of so many.
 _IN_MEMORY_MOST: Final = 1 << 26
-_BAND_CELLS: Final = 1 << 24
+_BAND_CELLS: Final = 1 << 19
 # A cell influences what hides others as far as this.
 _REACH_ROWS: Final = 4
 # Cells this much lower than a neighbour, in cells, are at an edge: steeper than 79 degrees.
@@ -145,6 +145,8 @@ def _hiding(depth: NDArray[np.float32], edge_m: float) -> NDArray[np.float32]:
 
 def _of_blocks(values: NDArray[np.float32], reduce: np.ufunc) -> NDArray[np.float32]:
     """Return the extreme of each block of cells; the last ones may be smaller."""
-    rows, columns = (np.arange(0, size, BLOCK_CELLS) for size in values.shape)
-    reduced = reduce.reduceat(reduce.reduceat(values, rows, axis=0), columns, axis=1)
+    rows, columns = (range(0, size, BLOCK_CELLS) for size in values.shape)
+    # Bands of rows: `reduceat` along the first axis goes through the whole array cell by cell.
+    bands = [reduce.reduce(values[row : row + BLOCK_CELLS], axis=0) for row in rows]
+    reduced = reduce.reduceat(np.array(bands), columns, axis=1)
     return np.asarray(reduced, dtype=np.float32)

@@ -109,20 +109,60 @@ def look_at_cells(
         first_row: row of the wall where the tile begins.
         first_column: column likewise.
     """
-    end_row, end_column = first_row + visible.mask.shape[0], first_column + visible.mask.shape[1]
-    for block_row in range(first_row // BLOCK_CELLS, (end_row - 1) // BLOCK_CELLS + 1):
-        for block in range(first_column // BLOCK_CELLS, (end_column - 1) // BLOCK_CELLS + 1):
-            top = _highest_in_the_way(view, relief, block_row, block)
-            begin, start = max(first_row, block_row * BLOCK_CELLS), block * BLOCK_CELLS
-            start, end = max(first_column, start), min(end_column, start + BLOCK_CELLS)
-            for row in range(begin, min(end_row, (block_row + 1) * BLOCK_CELLS)):
-                part = TileVisibility(
-                    visible.u[row - first_row, start - first_column : end - first_column],
-                    visible.v[row - first_row, start - first_column : end - first_column],
-                    visible.mask[row - first_row, start - first_column : end - first_column],
-                    visible.quality[row - first_row, start - first_column : end - first_column],
-                )
-                _look_at_row(view, relief, buffer, (row, start, top), part)
+    n_rows, n_columns = visible.mask.shape
+    first_block, last_block = (
+        first_column // BLOCK_CELLS,
+        (first_column + n_columns - 1) // BLOCK_CELLS,
+    )
+    tops, projected = np.empty(last_block - first_block + 1), np.empty((6, n_columns))
+    for i in range(n_rows):
+        row = first_row + i
+        if i == 0 or row % BLOCK_CELLS == 0:
+            for k in range(tops.size):
+                tops[k] = _highest_in_the_way(view, relief, row // BLOCK_CELLS, first_block + k)
+        part = TileVisibility(visible.u[i], visible.v[i], visible.mask[i], visible.quality[i])
+        depths = relief.depth[row, first_column : first_column + n_columns]
+        _project_row(view, depths, (row, first_column), projected)
+        _look_at_row(view, relief, buffer, (row, first_column), tops, projected, part)
+
+
+@kernel_part
+def _project_row(
+    view: WallView,
+    depths: NDArray[np.float32],
+    place: tuple[int, int],
+    projected: NDArray[np.float64],
+) -> None:
+    """Project cells of a row, void or not, in loops without branches: several cells at once.
+
+    Args:
+        view: the camera in front of the wall.
+        depths: (n,) of the cells.
+        place: row of the cells, column of the first one.
+        projected: (6, n or more) overwritten with u, v, distance along the axis, cosine of
+            incidence, the least distance at which nothing is in the way, and quality.
+    """
+    row, first_column = place
+    camera, gsd_m, height_m = view.camera, view.gsd_m, view.height_m
+    us, vs, alongs = projected[0], projected[1], projected[2]
+    cosines, leaves_m, qualities = projected[3], projected[4], projected[5]
+    y = (row + 0.5) * gsd_m
+    for j in range(depths.size):
+        x = (first_column + j + 0.5) * gsd_m
+        us[j], vs[j], alongs[j] = project_point(camera, x, y, float(depths[j]))
+    width, height, border_px = camera[21], camera[22], view.border_px
+    tolerance_m, free_m = view.tolerance_m, height_m - view.front_m
+    down, view_column = (view.row - row) * gsd_m, view.column
+    area_m2 = camera[12] * camera[13] * gsd_m * gsd_m
+    for j in range(depths.size):
+        u, v, along = us[j], vs[j], alongs[j]
+        lift = height_m - float(depths[j])
+        across = (view_column - (first_column + j)) * gsd_m
+        cosine = lift / math.sqrt(lift * lift + across * across + down * down)
+        inside = min(width - u, u, height - v, v) / border_px
+        cosines[j] = cosine
+        leaves_m[j] = along * free_m / lift - tolerance_m
+        qualities[j] = cosine * area_m2 / (along * along) * min(1.0, inside)
 
 
 @kernel_part
@@ -130,50 +170,47 @@ def _look_at_row(
     view: WallView,
     relief: Relief,
     buffer: DepthBuffer,
-    place: tuple[int, int, float],
+    place: tuple[int, int],
+    tops: NDArray[np.float64],
+    projected: NDArray[np.float64],
     visible: TileVisibility,
 ) -> None:
-    """Determine which cells of a row of a block a photo sees.
+    """Determine which cells of a row a photo sees.
 
     Args:
         view: the camera in front of the wall.
         relief: the whole wall.
         buffer: depth buffer of other objects.
-        place: row of the cells, column of the first one, and the height up to which rays have to
-            be followed.
+        place: row of the cells, column of the first one.
+        tops: height up to which rays have to be followed, of each block that has some of the cells.
+        projected: from `_project_row`.
         visible: (n,) arrays of the cells, output.
     """
-    row, first_column, top = place
-    camera, gsd_m, height_m = view.camera, view.gsd_m, view.height_m
-    width, height, border_px = camera[21], camera[22], view.border_px
-    cosine_least, tolerance_m, free_m = view.cosine_least, view.tolerance_m, height_m - view.front_m
-    depths, nearest, per_pixel = relief.depth[row], buffer.nearest, 1.0 / buffer.reduction
-    us, vs, mask, quality = visible.u, visible.v, visible.mask, visible.quality
-    y, down = (row + 0.5) * gsd_m, (view.row - row) * gsd_m
-    area_m2 = camera[12] * camera[13] * gsd_m * gsd_m
-    for j in range(mask.size):
-        column = first_column + j
-        us[j], vs[j], quality[j] = 0.0, 0.0, 0.0
-        depth = float(depths[column])
+    row, first_column = place
+    before = first_column % BLOCK_CELLS
+    width, height = view.camera[21], view.camera[22]
+    cosine_least, tolerance_m = view.cosine_least, view.tolerance_m
+    nearest, per_pixel = buffer.nearest, 1.0 / buffer.reduction
+    us, vs, cosines, leaves_m = projected[0], projected[1], projected[3], projected[4]
+    depths = relief.depth[row, first_column : first_column + visible.mask.size]
+    for j in range(visible.mask.size):
+        u, v, depth, top = us[j], vs[j], float(depths[j]), tops[(before + j) // BLOCK_CELLS]
+        state = PAINTED
         if math.isnan(depth):
-            mask[j] = NO_SURFACE
-            continue
-        u, v, along = project_point(camera, (column + 0.5) * gsd_m, y, depth)
-        if not (0.0 <= u < width and 0.0 <= v < height):
-            mask[j] = OUTSIDE
-            continue
-        lift, across = height_m - depth, (view.column - column) * gsd_m
-        cosine = lift / math.sqrt(lift * lift + across * across + down * down)
-        leaves_m = along * free_m / lift - tolerance_m
-        mask[j] = OCCLUDED
-        if cosine <= cosine_least or nearest[int(v * per_pixel), int(u * per_pixel)] < leaves_m:
-            continue
-        if depth + tolerance_m < top and _is_hidden(view, relief, row, column, top):
-            continue
-        mask[j] = PAINTED
-        us[j], vs[j] = u, v
-        inside = min(width - u, u, height - v, v) / border_px
-        quality[j] = cosine * area_m2 / (along * along) * min(1.0, inside)
+            state = NO_SURFACE
+        elif not (0.0 <= u < width and 0.0 <= v < height):
+            state = OUTSIDE
+        elif (
+            cosines[j] <= cosine_least
+            or nearest[np.uintp(v * per_pixel), np.uintp(u * per_pixel)] < leaves_m[j]
+            or (depth + tolerance_m < top and _is_hidden(view, relief, row, first_column + j, top))
+        ):
+            state = OCCLUDED
+        is_painted = state == PAINTED
+        visible.mask[j] = state
+        visible.u[j] = u if is_painted else 0.0
+        visible.v[j] = v if is_painted else 0.0
+        visible.quality[j] = projected[5, j] if is_painted else 0.0
 
 
 @kernel_part
