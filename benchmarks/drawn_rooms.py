@@ -4,7 +4,7 @@
     python benchmarks/drawn_rooms.py FOLDER --part surfaces --rooms 5
 
 Directions, leans and distances of all planes, decoration, scanner stations, photos and lens are
-drawn from a room's seed: ten rooms from 1 on, and ten others from 101 on, by which rankings are
+drawn from a room's seed: ten rooms from 1 on, and five others from 101 on, by which rankings are
 checked. Each room is measured four times: `planes` (plane-methods.yaml, paper_planes.yaml),
 `orient` (orient-methods.yaml), `ortho` (ortho-methods.yaml) and `surfaces`, where orthoimages are
 made from photos on a surface (backward) and from points (direct), on the scan and on points that
@@ -14,7 +14,7 @@ ones there. Check points are compared over those that all orthoimages of a room 
 Every room goes to `FOLDER/<part>-<seed>.json` as soon as it is measured, and is not measured again.
 From these files and the pages of benchmarks/pages docs/papers.md and docs/choosing.md are written:
 a place `{{part: cell metric}}` becomes mean ± standard deviation (largest) of the first ten rooms,
-`{{part: cell metric < cell metric}}` in how many rooms of each ten that holds.
+`{{part: cell metric < cell metric}}` in how many rooms of each set that holds.
 """
 
 from __future__ import annotations
@@ -56,7 +56,8 @@ from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import CellOutput, expand_cells
 
 ROOT: Final = Path(__file__).resolve().parents[1]
-TENS: Final = (range(1, 11), range(101, 111))
+# The rooms that are summed up, and others by which rankings are checked.
+SETS: Final = (range(1, 11), range(101, 106))
 DRAWN: Final = {"geometry": "drawn", "decoration": "drawn"}
 COARSE: Final = {
     **DRAWN,
@@ -121,6 +122,9 @@ def recipes(part: str, seed: int) -> Iterator[tuple[str, float]]:
         for cell in cells:
             sources = cell.inputs.items()
             if cell.skip_reason or not all(str(source) in given for _, source in sources):
+                continue
+            if part == "orient" and cell.step == "surf" and not cell.address.endswith("=dlt"):
+                # Of orientations only the DLT is compared with the intensity (Figure 25).
                 continue
             method = catalog.method(cell.method).load()
             inputs = method.In(**{port: given[str(source)] for port, source in sources})
@@ -299,31 +303,32 @@ def measured(folder: Path, part: str, seed: int) -> dict[str, float]:
     return dict(json.loads(path.read_text()))
 
 
-Tens = Mapping[str, Sequence[Sequence[Mapping[str, float]]]]
+Sets = Mapping[str, Sequence[Sequence[Mapping[str, float]]]]
 
 
-def filled_in(text: str, tens: Tens) -> str:
+def filled_in(text: str, sets: Sets) -> str:
     """Put the numbers of rooms into the places of a text.
 
     Args:
         text: with places `{{part: cell metric}}`, `{{part: cell metric : share}}` for per cent,
             `: mean` without scatter, `: median`, and `{{part: cell metric < cell metric}}`.
-        tens: part -> tens -> rooms -> numbers by `cell metric`.
+        sets: part -> sets -> rooms -> numbers by `cell metric`.
     """
-    return PLACE.sub(lambda place: _text_of(place[2].strip(), tens[place[1]]), text)
+    return PLACE.sub(lambda place: _text_of(place[2].strip(), sets[place[1]]), text)
 
 
-def _text_of(place: str, tens: Sequence[Sequence[Mapping[str, float]]]) -> str:
+def _text_of(place: str, sets: Sequence[Sequence[Mapping[str, float]]]) -> str:
     if " < " in place:
         first, second = place.split(" < ")
-        return " and ".join(_how_often(first, second, rooms) for rooms in tens if rooms)
+        counts = [_how_often(first, second, rooms) for rooms in sets if rooms]
+        return " and ".join(counts) or "not yet measured"
     key, _, form = place.partition(" : ")
     if form == "n":
-        return str(sum(key in room for room in tens[0]))
+        return str(sum(key in room for room in sets[0]))
     factor = 100.0 if form == "share" else 1.0
-    values = factor * np.abs([room[key] for room in tens[0] if key in room])
+    values = factor * np.abs([room[key] for room in sets[0] if key in room])
     if not len(values):
-        raise ValueError(f"no room has {key}")
+        return "no value in these rooms" if any(sets[0]) else "not yet measured"
     if form in ("mean", "median"):
         return _number(float(getattr(np, form)(values)))
     spread = f" ± {_number(float(values.std(ddof=1)), 2)}" if len(values) > 1 else ""
@@ -346,21 +351,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--part", action="append", choices=[*RECIPES, "surfaces"])
-    parser.add_argument("--rooms", type=int, default=10, help="of each ten")
+    parser.add_argument("--rooms", type=int, default=10, help="of each set, at most")
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
     parts = [*RECIPES, "surfaces"]
     for n_rooms in range(options.rooms):
-        for seeds in TENS:
+        for seeds in SETS:
             for part in options.part or parts:
-                measured(options.folder, part, seeds[n_rooms])
-    tens = {
-        part: [[_read(options.folder, part, seed) for seed in seeds] for seeds in TENS]
+                if n_rooms < len(seeds):
+                    measured(options.folder, part, seeds[n_rooms])
+    sets = {
+        part: [[_read(options.folder, part, seed) for seed in seeds] for seeds in SETS]
         for part in parts
     }
-    rooms = {part: [[room for room in ten if room] for ten in both] for part, both in tens.items()}
-    if not all(both[0] for both in rooms.values()):
-        return
+    rooms = {
+        part: [[room for room in seeds if room] for seeds in both] for part, both in sets.items()
+    }
     newest_s = max(path.stat().st_mtime for path in options.folder.glob("*.json"))
     made = (
         f"{datetime.fromtimestamp(newest_s, UTC):%Y-%m-%d} on {platform.machine()}, "
