@@ -12,7 +12,6 @@ from orthoflow_provenance.record import write_record
 
 from orthoflow.engine.file_digests import file_sha256
 from orthoflow.engine.store import digest_of
-from orthoflow.files.drawings.room_lines import DrawnWall
 from orthoflow.files.publishing import (
     publish_openings,
     publish_orthoimages,
@@ -94,17 +93,6 @@ def wall_frame(planes: Planes) -> WallFrame:
     frame = frame_over(planes.corners[WALL], planes.normal[WALL], gsd_m=GSD_M)
     east, north, top = planes.up.tolist()
     return replace(frame, up=(east, north, top), name=planes.names[WALL])
-
-
-def drawn_wall(planes: Planes, *, is_known: bool) -> DrawnWall:
-    """The photographed wall without openings, whose plane is known or not."""
-    return DrawnWall(
-        number=WALL,
-        name="the wall",
-        plane_index=WALL if is_known else None,
-        frame=wall_frame(planes),
-        openings=(),
-    )
 
 
 def box_products(image: Orthoimage | None = None) -> dict[str, Product]:

@@ -184,7 +184,7 @@ def plan_chart(
     """
     from matplotlib.figure import Figure  # noqa: PLC0415 - pages without charts need none
 
-    from orthoflow.files.clouds.dressing import plane_colour  # noqa: PLC0415 - likewise
+    from orthoflow.files.clouds.dressing import plane_ink  # noqa: PLC0415 - likewise
 
     feet, looks = (np.array([photo[k] for photo in photos]).reshape(-1, 2) for k in (1, 2))
     span = float(np.ptp(np.vstack([*(wall[2] for wall in walls), feet]), axis=0).max()) or 1.0
@@ -192,8 +192,7 @@ def plan_chart(
         figure = Figure(figsize=(1.5 * COLUMN_INCHES, 1.2 * COLUMN_INCHES), layout="constrained")
         axes = figure.subplots()
         for index, (name, number, corners_m) in enumerate(walls):
-            # Of a colour for clouds on black a darker one for paper.
-            colour = tuple(0.7 / 255.0 * part for part in plane_colour(number))
+            colour = plane_ink(number)
             ring = np.vstack([corners_m, corners_m[:1]])
             axes.plot(*ring.T, color=colour, linewidth=1.6)
             _name(axes, name, corners_m.mean(axis=0), colour=colour, above=bool(index % 2))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry.bands import Allocate, row_bands
+from orthoflow.geometry.bands import Allocate, count_known, row_bands
 from orthoflow.geometry.levels import Level
 from orthoflow.products import Layer, LayerMask, Layers, Walls
 from orthoflow.sdk import DiagnosticSpec, StepContext
@@ -122,10 +122,10 @@ def count_shown(walls: Walls, layers: Layers) -> tuple[int, int, int]:
     n_surface = n_painted = n_hidden = 0
     for place, wall in enumerate(walls.walls):
         masks = [layer.mask for layer in layers.layers if layer.wall == place]
+        n_surface += count_known(wall.depth_m)
         for rows in row_bands(wall.frame.shape):
             is_painted = np.logical_or.reduce([m[rows] == LayerMask.PAINTED for m in masks])
             is_hidden = np.logical_or.reduce([m[rows] == LayerMask.OCCLUDED for m in masks])
-            n_surface += int(np.count_nonzero(~np.isnan(wall.depth_m[rows])))
             n_painted += int(np.count_nonzero(is_painted))
             n_hidden += int(np.count_nonzero(is_hidden & ~is_painted))
     return n_surface, n_painted, n_hidden

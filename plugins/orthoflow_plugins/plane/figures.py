@@ -7,13 +7,13 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
+from orthoflow.files.clouds.dressing import plane_ink
 from orthoflow.geometry import omega_phi_deg, wall_axes
 from orthoflow.geometry.directions import basis_from_up
 from orthoflow.products import Planes, PointCloud, Thickness
@@ -38,12 +38,6 @@ _BLUE: Final = "#9db8d2"
 _RED: Final = "#b03a2e"
 _PLANES_MOST: Final = 12
 _CLASSED_MOST: Final = 4
-
-
-def colour_of(plane: int) -> tuple[float, float, float]:
-    """Return the colour of a plane in every figure of a run; the first twenty differ."""
-    red, green, blue = colormaps["tab20"](2 * plane % 20 + plane // 10 % 2)[:3]
-    return red, green, blue
 
 
 def draw_deviations(
@@ -130,7 +124,7 @@ def draw_planes(
     from_the_front = planes.normal @ np.cross(*view) > 0.0
     # The smallest last, so that the floor does not hide what stands on it.
     for k in range(len(planes)):
-        colour = colour_of(k)
+        colour = plane_ink(k)
         if from_the_front[k]:
             left.plot(*flat[index == k].T, ".", markersize=1.5, color=colour)
         parts = planes.corners[k][None]
@@ -193,7 +187,7 @@ def draw_thickness(
             spreads = getattr(item, _CLASSES[label])
             middles = [0.5 * (spread.low + spread.high) for spread in spreads]
             sigmas_mm = [1000.0 * spread.sigma_m for spread in spreads]
-            colour, name = colour_of(k), planes.names[k]
+            colour, name = plane_ink(k), planes.names[k]
             axes.plot(middles, sigmas_mm, "o-", markersize=3, color=colour, label=name)
         axes.set_ylim(bottom=0.0)
         _label(axes, label, "" if place else "thickness [mm]")
@@ -305,7 +299,7 @@ def draw_accumulator(ctx: StepContext, votes: PlanVotes, planes: Planes, cloud: 
     right.plot(math.degrees(angle), distance_m, "x", color="white", markersize=9)
     for index in np.flatnonzero(np.abs(planes.normal @ planes.up) < 0.5):
         corners = (planes.corners[index] - cloud.origin) @ basis.T
-        colour, name = colour_of(int(index)), planes.names[index]
+        colour, name = plane_ink(int(index)), planes.names[index]
         left.plot(*corners[[1, 2], :2].T, linewidth=1.2, color=colour, label=name)
         # Where the wall lies in the parameter space.
         normal = basis @ planes.normal[index]
@@ -357,7 +351,7 @@ def draw_space(
         omega_deg, phi_deg = omega_phi_deg(normal, planes.up)
         if omega_deg >= 180.0:
             omega_deg, phi_deg = omega_deg - 180.0, -phi_deg
-        ring = dict[str, Any](color=colour_of(index), fillstyle="none", markersize=9)
+        ring = dict[str, Any](color=plane_ink(index), fillstyle="none", markersize=9)
         axes.plot(omega_deg, phi_deg, "o", **ring)
     _label(axes, "omega [deg]", "phi [deg]")
     ctx.figure(

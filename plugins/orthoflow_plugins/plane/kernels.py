@@ -263,6 +263,22 @@ def _list_active(
 
 
 @kernel_part
+def _measure_block(
+    points: BlockedPoints, start: int, slab: NDArray[np.float64], distances: NDArray[np.float64]
+) -> int:
+    """Set the distance from a slab's plane of each point of a block; gives how many there are.
+
+    Apart from what is done with them, so that the processor takes several points at once.
+    """
+    stop = min(start + BLOCK_POINTS, points.x.size)
+    xs, ys, zs = points.x[start:stop], points.y[start:stop], points.z[start:stop]
+    n0, n1, n2, n3 = slab[0], slab[1], slab[2], slab[3]
+    for i in range(xs.size):
+        distances[i] = n0 * xs[i] + n1 * ys[i] + n2 * zs[i] - n3
+    return xs.size
+
+
+@kernel_part
 def _own_block(  # noqa: PLR0913, PLR0917 - compiled code has no objects to bundle these in
     points: BlockedPoints,
     start: int,
@@ -275,8 +291,7 @@ def _own_block(  # noqa: PLR0913, PLR0917 - compiled code has no objects to bund
 ) -> int:
     """Set the slab that holds each point of a block and is nearest, -1 for none, and its distance.
 
-    Distances are set apart from what is done with them, so that the processor takes several points
-    at once. Gives how many points there are.
+    Gives how many points there are.
     """
     stop = min(start + BLOCK_POINTS, points.x.size)
     xs, ys, zs = points.x[start:stop], points.y[start:stop], points.z[start:stop]
@@ -284,9 +299,7 @@ def _own_block(  # noqa: PLR0913, PLR0917 - compiled code has no objects to bund
     nearest[:] = np.inf
     for k in active:
         slab = slabs[k]
-        n0, n1, n2, n3 = slab[0], slab[1], slab[2], slab[3]
-        for i in range(xs.size):
-            distances[i] = n0 * xs[i] + n1 * ys[i] + n2 * zs[i] - n3
+        _measure_block(points, start, slab, distances)
         for i in range(xs.size):
             here = distances[i]
             if abs(here) > bounds[k, 0] or abs(here) >= abs(nearest[i]):
@@ -297,19 +310,6 @@ def _own_block(  # noqa: PLR0913, PLR0917 - compiled code has no objects to bund
             if bounds[k, 1] <= u <= bounds[k, 2] and bounds[k, 3] <= v <= bounds[k, 4]:
                 owner[i] = k
                 nearest[i] = here
-    return xs.size
-
-
-@kernel_part
-def _hold_block(
-    points: BlockedPoints, start: int, slab: NDArray[np.float64], nearest: NDArray[np.float64]
-) -> int:
-    """Set the distance of each point of a block that one slab holds; gives how many there are."""
-    stop = min(start + BLOCK_POINTS, points.x.size)
-    xs, ys, zs = points.x[start:stop], points.y[start:stop], points.z[start:stop]
-    n0, n1, n2, n3 = slab[0], slab[1], slab[2], slab[3]
-    for i in range(xs.size):
-        nearest[i] = n0 * xs[i] + n1 * ys[i] + n2 * zs[i] - n3
     return xs.size
 
 
@@ -445,7 +445,7 @@ def sum_assigned(
             continue
         active = listed[:n_active]
         if holder >= 0:
-            count = _hold_block(points, start, slabs[holder], nearest)
+            count = _measure_block(points, start, slabs[holder], nearest)
             owner[:] = holder
         else:
             count = _own_block(points, start, slabs, bounds, active, owner, nearest, distances)

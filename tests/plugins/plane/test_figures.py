@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.plane.figures import (
-    colour_of,
     draw_accumulator,
     draw_deviations,
     draw_normals,
@@ -26,6 +25,7 @@ from orthoflow_plugins.plane.planes import Deviations, Normality, normality
 from orthoflow_plugins.plane.region import Region, region_proposer
 from orthoflow_plugins.plane.thickness import RowPoints
 
+from orthoflow.files.clouds.dressing import plane_ink
 from orthoflow.geometry import wall_axes
 from orthoflow.products import Planes, Spread, Thickness
 from tests import samples
@@ -302,8 +302,8 @@ def test_the_accumulator_is_drawn_with_the_walls_as_lines_and_as_circles(
     # A plane has one colour in all figures.
     colours = [line.get_color() for line in left.lines[1:]]
     assert colours == [line.get_color() for line in right.lines[1:]]
-    assert colours == [colour_of(k) for k in (0, 1)]
-    assert len({colour_of(k) for k in range(20)}) == 20
+    assert colours == [plane_ink(k) for k in (0, 1)]
+    assert len({plane_ink(k) for k in range(20)}) == 20
     assert left.get_legend() is not None
 
 
