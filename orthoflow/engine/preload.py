@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import gc
 import importlib
-import warnings
 from contextlib import suppress
 from typing import Final
 
-from orthoflow.system import address_space, adopt_orphans
+from orthoflow.system import address_space
 
 _LIBRARIES: Final = (
     "numba",
@@ -62,7 +61,4 @@ def _register_compiler() -> None:
         entrypoints._already_initialized = False  # noqa: SLF001
 
 
-# A step that crashes leaves what it started to the server, which hears of children not its own.
-adopt_orphans()
-warnings.filterwarnings("ignore", message="forkserver: waitpid returned unexpected pid")
 load_libraries()

@@ -61,13 +61,11 @@ class StepProcess:
         process: of the step.
         pipe: what it sends, as in `worker.run_step`.
         scratch: what it starts knows this folder as `TMPDIR`, or works there.
-        server: what it was forked from; None where that is unknown.
     """
 
     process: BaseProcess
     pipe: Connection
     scratch: Path
-    server: psutil.Process | None
 
     @property
     def pid(self) -> int:
@@ -86,10 +84,9 @@ class StepProcess:
         if hasattr(os, "killpg"):
             with suppress(ProcessLookupError, PermissionError):
                 os.killpg(self.pid, signal.SIGKILL)
-        if self.server is not None and self.process.exitcode:
-            # What a step that crashed had started is the server's now.
-            left = _with_descendants(self.server.pid)
-            _kill(one for one in left if one != self.server and _is_at_work_in(one, self.scratch))
+        if self.process.exitcode:
+            # What a step that crashed had started has another parent now.
+            _kill(one for one in psutil.process_iter() if _is_at_work_in(one, self.scratch))
 
     def close(self) -> None:
         """Let go of it."""
@@ -115,7 +112,8 @@ def _is_at_work_in(process: psutil.Process, scratch: Path) -> bool:
     with suppress(psutil.Error):
         if process.environ().get("TMPDIR") == str(scratch):
             return True
-        return Path(process.cwd()).is_relative_to(scratch)
+        # A user's shell that looks at the folder has a terminal; a step has none.
+        return process.terminal() is None and Path(process.cwd()).is_relative_to(scratch)
     return False
 
 
@@ -132,9 +130,7 @@ def start_step(task: Task) -> StepProcess:
         except StepFailedError as error:
             ours.close()
             raise StepFailedError(f"no process could be started for {task.who}: {error}") from error
-    return StepProcess(
-        process=process, pipe=ours, scratch=task.scratch, server=_parent(process.pid)
-    )
+    return StepProcess(process=process, pipe=ours, scratch=task.scratch)
 
 
 def start_process(
@@ -169,13 +165,6 @@ def start_process(
         else "the machine has too little memory or allows too few processes"
     )
     raise StepFailedError(why) from failure
-
-
-def _parent(process_id: int | None) -> psutil.Process | None:
-    with suppress(psutil.Error):
-        parent = psutil.Process(process_id).parent()
-        return parent if parent is not None and parent.pid != os.getpid() else None
-    return None
 
 
 @contextmanager

@@ -10,7 +10,7 @@ import pytest
 
 from orthoflow.engine.results import CellResult
 from orthoflow.engine.scheduler import RunOutcome
-from tests.engine_world import World, has_ended
+from tests.engine_world import World, has_ended, start_fork_server
 
 WHO = "method work.{} of toy-plugin 1.0"
 
@@ -46,6 +46,8 @@ def test_what_a_step_started_ends_with_it(world: World) -> None:
 def test_what_was_started_in_another_session_by_a_process_that_is_gone_ends_too(
     world: World, name: str
 ) -> None:
+    # As in a program that had started the server of steps for purposes of its own.
+    start_fork_server()
     log = result_of(all_of(world, name), name).log
     found = re.search(r"hidden (\d+)", log)
     assert found, log
