@@ -32,9 +32,8 @@ from orthoflow_plugins.simulate.building import (
 )
 from orthoflow_plugins.simulate.scanning import SPOILT, Errors, Scanned, Scanner, Sweep
 
-from orthoflow.geometry.hashed_numbers import cell_states, uniforms
 from orthoflow.geometry.scene_rays import RAYS_AT_ONCE, SceneRays
-from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
+from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind, cell_states, uniforms
 from orthoflow.geometry.threads import in_runs
 
 SEED = 20150807

@@ -28,8 +28,8 @@ from orthoflow_plugins.ortho.surfaces import Surface, relief_of, view_of
 from orthoflow.files.geotiff import GridPlace, read_raster, write_orthoimage
 from orthoflow.files.images import cells_png
 from orthoflow.geometry import WallFrame
-from orthoflow.geometry.depth_noise import depth_noise_m
 from orthoflow.geometry.occluders import nothing_in_the_way
+from orthoflow.geometry.robust import depth_noise_m
 from orthoflow.products import LayerMask, Wall
 
 BAND_ROWS = 256

@@ -29,13 +29,13 @@ from orthoflow_plugins.ortho.surfaces import Surface, relief_of, view_of
 
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
-from orthoflow.geometry.depth_noise import depth_noise_m
 from orthoflow.geometry.occluders import (
     Occluders,
     depth_buffer,
     nothing_in_the_way,
     occluders_before,
 )
+from orthoflow.geometry.robust import depth_noise_m
 from orthoflow.products import PointCloud, Wall, Walls
 
 GSD_M = 0.003

@@ -30,8 +30,7 @@ from scan_targets import paper_plane
 
 from orthoflow.errors import MethodError
 from orthoflow.files.images import encode_png
-from orthoflow.geometry.cameras import ViewingCamera, looking_at
-from orthoflow.geometry.opencv_border import to_opencv
+from orthoflow.geometry.cameras import ViewingCamera, looking_at, to_opencv
 from orthoflow.products import Camera, InputFiles, Photo, Photos, Planes, PointCloud, Wall, Walls
 
 _SIZE_PX = (1200, 900)

@@ -28,8 +28,7 @@ from numpy.typing import NDArray
 from orthoflow_plugins.orient import pose
 from orthoflow_plugins.orient.pose import OrientParams
 
-from orthoflow.geometry.cameras import ViewingCamera, looking_at
-from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
+from orthoflow.geometry.cameras import ViewingCamera, looking_at, opencv_matrix, to_opencv
 from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Intrinsics, Photo
 

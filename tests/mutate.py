@@ -111,7 +111,7 @@ def annotation_lines(path: Path) -> Iterator[int]:
 def test_command(module: Path, *, golden: bool) -> list[str]:
     """Return the command that tests a module: its folder's tests, and conformance for a kind.
 
-    >>> test_command(Path("orthoflow/geometry/planes.py"), golden=True)[-1]
+    >>> test_command(Path("orthoflow/geometry/frames.py"), golden=True)[-1]
     'tests/geometry'
     """
     parts = module.parts

@@ -37,7 +37,7 @@ from orthoflow.errors import GeometryError, InputError
 from orthoflow.files.cube_faces import WIDEST_DEG, FisheyeLens, problem_of
 from orthoflow.files.sidecars import write_text
 from orthoflow.files.yaml_positions import read_model
-from orthoflow.geometry.opencv_border import HALF_PIXEL
+from orthoflow.geometry.cameras import HALF_PIXEL
 from orthoflow.products import Calibration, Intrinsics
 from orthoflow.untrusted_text import text_of_file
 

@@ -33,7 +33,7 @@ from orthoflow.files.given_cameras import (
 )
 from orthoflow.files.images import PHOTO_SUFFIXES
 from orthoflow.files.metashape import read_metashape_xml
-from orthoflow.geometry.opencv_border import HALF_PIXEL
+from orthoflow.geometry.cameras import HALF_PIXEL
 from orthoflow.products import Intrinsics
 from orthoflow.untrusted_text import first_few, parse_json
 

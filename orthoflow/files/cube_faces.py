@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError
 from orthoflow.files.images import decode_levels, encode_png
 from orthoflow.files.photo_files import MOST_PIXELS
+from orthoflow.geometry.cameras import HALF_PIXEL
 from orthoflow.geometry.levels import Colours
-from orthoflow.geometry.opencv_border import HALF_PIXEL
 from orthoflow.products import Intrinsics
 
 # Rows: right, down and forwards of each face, in the directions of the panorama.

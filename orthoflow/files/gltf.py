@@ -18,7 +18,7 @@ from orthoflow.files.geotiff import RasterParts
 from orthoflow.files.images import encode_jpeg, encode_png
 from orthoflow.files.sidecars import OrthoFile, numbers, write_bytes
 from orthoflow.geometry import WallFrame
-from orthoflow.geometry.directions import basis_from_up
+from orthoflow.geometry.frames import basis_from_up
 from orthoflow.products import JsonValue
 from orthoflow.untrusted_text import json_bytes
 from orthoflow.version import __version__

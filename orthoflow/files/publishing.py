@@ -45,8 +45,8 @@ from orthoflow.files.sidecars import (
 )
 from orthoflow.geometry import WallFrame, omega_phi_deg
 from orthoflow.geometry.bands import row_bands
+from orthoflow.geometry.cameras import opencv_matrix, to_opencv
 from orthoflow.geometry.levels import eight_bits
-from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
 from orthoflow.products import (
     Calibration,
     Camera,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.camera_kernels import project_point
 from orthoflow.geometry.compiling import compiled
-from orthoflow.geometry.point_kernels import Offsets
+from orthoflow.geometry.slabs import Offsets
 
 # Counts stay below this, so that sums over 3 x 3 x 3 voxels fit into 16 bits.
 COUNT_MOST: Final = 2000

@@ -1,4 +1,7 @@
-"""The wall frame: transforms between the cells of a wall's raster and the world."""
+"""Directions, planes and wall frames in the world.
+
+A wall frame transforms between the cells of a wall's raster and the world.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +14,159 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
-from orthoflow.geometry.directions import across, basis_from_up
-from orthoflow.geometry.planes import Plane
+
+UpDirection = Literal["z", "x", "-x", "y", "-y", "-z"]
+
+UP_VECTORS: Final[dict[UpDirection, tuple[float, float, float]]] = {
+    "x": (1.0, 0.0, 0.0),
+    "-x": (-1.0, 0.0, 0.0),
+    "y": (0.0, 1.0, 0.0),
+    "-y": (0.0, -1.0, 0.0),
+    "z": (0.0, 0.0, 1.0),
+    "-z": (0.0, 0.0, -1.0),
+}
+
+# e1 for each up axis; e2 = up x e1 completes the right-handed frame. With up = z this is (x, y, z).
+_FIRST_AXES: Final[dict[int, tuple[float, float, float]]] = {
+    0: (0.0, 1.0, 0.0),
+    1: (0.0, 0.0, 1.0),
+    2: (1.0, 0.0, 0.0),
+}
+
+
+def up_vector(direction: UpDirection) -> NDArray[np.float64]:
+    """Return the unit vector (3,) of an up direction in world axes."""
+    return np.array(UP_VECTORS[direction])
+
+
+def basis_from_up(up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the right-handed frame to which "horizontal", "2D" and the angles omega and phi refer.
+
+    Args:
+        up: (3,) unit vector in world axes, any direction.
+
+    Returns:
+        (3, 3) rows e1, e2, up: `basis @ point_world` gives (first, second, height). For up = z it
+        is the identity. e1 is the world axis that follows the one nearest to up (x after z, y
+        after x, z after y), made perpendicular to up.
+    """
+    axis = int(np.argmax(np.abs(up)))
+    first = np.array(_FIRST_AXES[axis])
+    first = first - (first @ up) * up
+    first /= np.linalg.norm(first)
+    return np.array([first, across(up, first), up])
+
+
+def across(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Cross product (3,); `np.cross` takes twenty times as long for two single vectors."""
+    a, b, c = first.tolist()
+    d, e, f = second.tolist()
+    return np.array([b * f - c * e, c * d - a * f, a * e - b * d])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plane:
+    """The points x with `normal . x = offset_m`.
+
+    Attributes:
+        normal: (3,) float64 unit vector in world axes, towards the viewer.
+        offset_m: distance of the plane from the world origin along the normal, metres, signed.
+    """
+
+    normal: NDArray[np.float64]
+    offset_m: float
+
+    def __post_init__(self) -> None:
+        if self.normal.shape != (3,) or abs(float(np.linalg.norm(self.normal)) - 1.0) > 1e-9:
+            raise GeometryError(f"a plane needs a unit normal of shape (3,), got {self.normal!r}")
+
+    def distances_m(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return signed distances (n,) of points (n, 3), metres, positive on the viewer's side."""
+        return points_world @ self.normal - self.offset_m
+
+    def flipped(self) -> Plane:
+        """Return the same plane seen from the other side."""
+        return Plane(normal=-self.normal, offset_m=-self.offset_m)
+
+    def towards(self, viewpoint_world: NDArray[np.float64]) -> Plane:
+        """Return the same plane with its normal on the side of a viewpoint (3,)."""
+        signed_m = float(viewpoint_world @ self.normal) - self.offset_m
+        return self if signed_m >= 0.0 else self.flipped()
+
+
+def plane_through(points_world: NDArray[np.float64]) -> Plane:
+    """Return the plane through three points (3, 3); its normal follows the right-hand rule.
+
+    Raises:
+        GeometryError: the points coincide or lie on one line.
+    """
+    first, second, third = points_world
+    normal = np.cross(second - first, third - first)
+    length = float(np.linalg.norm(normal))
+    extent = float(np.linalg.norm(points_world - first, axis=1).max())
+    if not math.isfinite(length) or length <= 1e-9 * extent * extent or length == 0.0:
+        raise GeometryError(
+            f"three points must span a plane, got {points_world.tolist()}, which lie on one line"
+        )
+    normal = normal / length
+    return Plane(normal=normal, offset_m=float(normal @ points_world.mean(axis=0)))
+
+
+def angle_between_deg(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
+    """Return the angle of two unit vectors in degrees, 0..180, accurate if small too."""
+    cross = float(np.linalg.norm(np.cross(first, second)))
+    return math.degrees(math.atan2(cross, float(first @ second)))
+
+
+def omega_phi_deg(normal: NDArray[np.float64], up: NDArray[np.float64]) -> tuple[float, float]:
+    """Direction (omega 0..360) and inclination (phi -90..90) of a normal, in degrees.
+
+    markiewicz2015 equation 3: n = (cos phi cos omega, cos phi sin omega, sin phi), in the (e1, e2,
+    up) frame of `basis_from_up`.
+    """
+    first, second, height = basis_from_up(up) @ normal
+    omega = math.degrees(math.atan2(second, first)) % 360.0
+    return omega, math.degrees(math.asin(max(-1.0, min(1.0, height))))
+
+
+def rotation_from_vector(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotation matrix (3, 3) of a rotation vector (3,) in radians (Rodrigues)."""
+    angle = float(np.linalg.norm(vector))
+    cross = cross_matrix(vector)
+    if angle < 1e-8:
+        return np.eye(3) + cross + 0.5 * cross @ cross
+    first, second = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
+    return np.eye(3) + first * cross + second * cross @ cross
+
+
+def cross_matrix(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Matrix (3, 3) that multiplies like the cross product from the left with a vector (3,)."""
+    matrix: NDArray[np.float64] = cross_matrices(vector[None])[0]
+    return matrix
+
+
+def cross_matrices(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Matrices (n, 3, 3) that multiply like the cross product with vectors (n, 3)."""
+    matrices = np.zeros((len(vectors), 3, 3))
+    x, y, z = vectors.T
+    matrices[:, 0, 1], matrices[:, 0, 2] = -z, y
+    matrices[:, 1, 0], matrices[:, 1, 2] = z, -x
+    matrices[:, 2, 0], matrices[:, 2, 1] = -y, x
+    return matrices
+
+
+def signed_area(ring: NDArray[np.float64]) -> float:
+    """Return the area enclosed by an open ring (n, 2) by Gauss's formula, in its units squared.
+
+    Positive if it turns from the first axis to the second. Digits are lost far from the origin:
+    pass coordinates relative to one of its points.
+
+    >>> signed_area(np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [0.0, 1.0]]))
+    2.0
+    """
+    x, y = ring.T
+    return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
+
 
 # If the angle between normal and up is smaller, a plane counts as a floor or ceiling: "right for
 # the viewer" would depend on the noise of a nearly vertical normal.

@@ -18,8 +18,7 @@ from orthoflow.geometry.depth_buffer_kernels import (
     count_in_voxels,
     splat_points,
 )
-from orthoflow.geometry.point_kernels import Offsets, read_only
-from orthoflow.geometry.slabs import OffsetPoints, Slab
+from orthoflow.geometry.slabs import OffsetPoints, Offsets, Slab, read_only
 from orthoflow.geometry.threads import even_parts, in_threads
 
 _LONGEST_SIDE_PX: Final = 2048

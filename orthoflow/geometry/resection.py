@@ -15,22 +15,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
-from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.cameras import (
+    POSE_PARAMETERS,
+    LensFreedom,
+    Linear,
+    ViewingCamera,
+    lens_values,
+    linearised,
+    stepped,
+)
 from orthoflow.geometry.covariances import (
     AdjustedPoints,
     honest_covariance,
     outwards,
     with_common_error,
 )
-from orthoflow.geometry.lenses import (
-    POSE_PARAMETERS,
-    LensFreedom,
-    Linear,
-    lens_values,
-    linearised,
-    stepped,
-)
-from orthoflow.geometry.rotations import cross_matrix
+from orthoflow.geometry.frames import cross_matrix
 from orthoflow.geometry.rows import Rows
 
 _ITERATIONS: Final = 40

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.cameras import ViewingCamera, undistorted
 from orthoflow.geometry.frames import WallFrame
-from orthoflow.geometry.hashed_numbers import cell_states, uniforms
 from orthoflow.geometry.scene_rays import RAYS_AT_ONCE, Hits, SceneRays, points_on
-from orthoflow.geometry.scenes import Scene, Viewers
+from orthoflow.geometry.scenes import Scene, Viewers, cell_states, uniforms
 from orthoflow.geometry.threads import in_runs
 
 # A viewer sees a point if the first hit is at most this far in front of it, metres.

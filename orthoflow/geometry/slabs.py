@@ -3,13 +3,30 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Final, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.frames import WallFrame
 from orthoflow.geometry.threads import in_parts
+
+
+class Offsets(NamedTuple):
+    """Offsets of points from their cloud's origin, (n,) float32 metres each."""
+
+    x: NDArray[np.float32]
+    y: NDArray[np.float32]
+    z: NDArray[np.float32]
+
+
+def read_only(x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32]) -> Offsets:
+    """Return arrays, including mapped files, in the form for which kernels are compiled."""
+    views = [np.asarray(values).view(np.ndarray) for values in (x, y, z)]
+    for view in views:
+        view.flags.writeable = False
+    return Offsets(*views)
+
 
 # Coordinates are read at the speed of memory or of the disk, which two threads saturate.
 _BOXING_THREADS: Final = 2

@@ -19,7 +19,7 @@ from scipy.ndimage import map_coordinates
 from orthoflow.files.images import encode_png
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
-from orthoflow.geometry.rotations import rotation_from_vector
+from orthoflow.geometry.frames import rotation_from_vector
 from orthoflow.products import (
     Calibration,
     Camera,

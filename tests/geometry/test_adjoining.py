@@ -11,15 +11,15 @@ import pytest
 
 from orthoflow.errors import InputError
 from orthoflow.files.drawings.key_plans import outline_of, surfaces_of
-from orthoflow.geometry.adjoining import (
+from orthoflow.geometry.frames import Plane
+from orthoflow.geometry.outlines import (
     Edge,
     Surface,
     corners_between,
     edges_between,
     line_of,
+    room_outline,
 )
-from orthoflow.geometry.outlines import room_outline
-from orthoflow.geometry.planes import Plane
 from orthoflow.products import Planes
 from tests import samples
 from tests.drawing_runs import CORNER, GAP_M, SIZE_M, box_planes, box_points

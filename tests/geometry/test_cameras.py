@@ -10,9 +10,8 @@ import pytest
 
 from orthoflow.errors import GeometryError
 from orthoflow.geometry.camera_kernels import largest_radius, project_point
-from orthoflow.geometry.cameras import ViewingCamera, looking_at
+from orthoflow.geometry.cameras import LensFreedom, ViewingCamera, linearised, looking_at, stepped
 from orthoflow.geometry.compiling import interpreted
-from orthoflow.geometry.lenses import LensFreedom, linearised, stepped
 from tests import samples
 
 UP = np.array([0.0, 0.0, 1.0])

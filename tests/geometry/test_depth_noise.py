@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthoflow.geometry.depth_noise import depth_noise_m
+from orthoflow.geometry.robust import depth_noise_m
 
 
 @pytest.mark.parametrize("sigma_m", [0.001, 0.004])

@@ -20,7 +20,7 @@ from orthoflow.geometry import (
     up_vector,
     wall_axes,
 )
-from orthoflow.geometry.directions import UP_VECTORS, UpDirection
+from orthoflow.geometry.frames import UP_VECTORS, UpDirection
 
 Z_UP = np.array([0.0, 0.0, 1.0])
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.lenses import LensFreedom, lens_values, linearised, stepped
-from orthoflow.geometry.rotations import rotation_from_vector
+from orthoflow.geometry.cameras import LensFreedom, ViewingCamera, lens_values, linearised, stepped
+from orthoflow.geometry.frames import rotation_from_vector
 from tests import scenes
 
 ALL = LensFreedom(

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from orthoflow.geometry.opencv_border import HALF_PIXEL, from_opencv, opencv_matrix, to_opencv
+from orthoflow.geometry.cameras import HALF_PIXEL, from_opencv, opencv_matrix, to_opencv
 from orthoflow.products import Intrinsics
 
 LENS = Intrinsics(width=900, height=640, fx=840.0, fy=843.0, cx=455.2, cy=316.4)

@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from orthoflow.geometry.frames import Plane
 from orthoflow.geometry.outlines import RoomOutline, room_outline
-from orthoflow.geometry.planes import Plane
 
 UP = np.array([0.0, 0.0, 1.0])
 # 8 x 6 m, 3 m high; walls are seen from inside.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from orthoflow.errors import GeometryError
-from orthoflow.geometry.planes import Plane, angle_between_deg, omega_phi_deg, plane_through
+from orthoflow.geometry.frames import Plane, angle_between_deg, omega_phi_deg, plane_through
 from tests import scenes
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -11,17 +11,16 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.geometry import frame_over, rastering
-from orthoflow.geometry import raster_kernels as kernels
+from orthoflow.geometry import rastering as kernels
 from orthoflow.geometry.narrow_gaps import narrow_gaps
-from orthoflow.geometry.point_kernels import Offsets
-from orthoflow.geometry.raster_kernels import NO_POINT
 from orthoflow.geometry.rastering import (
+    NO_POINT,
     places_of_winners,
     topmost_points,
     values_of_winners,
     wall_from_offset,
 )
-from orthoflow.geometry.slabs import Slab
+from orthoflow.geometry.slabs import Offsets, Slab
 from orthoflow.products import PointCloud
 from tests import raster_scenes as scenes
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from orthoflow.geometry.rotations import (
+from orthoflow.geometry.frames import (
     cross_matrices,
     cross_matrix,
     rotation_from_vector,

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.geometry import scan_steps
-from orthoflow.geometry.scan_steps import scan_step_m
+from orthoflow.geometry.cloud_quality import scan_step_m
 
 GSD_M = 0.01
 

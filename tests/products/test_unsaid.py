@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from orthoflow import products
-from orthoflow.geometry.lenses import LensFreedom
+from orthoflow.geometry.cameras import LensFreedom
 from orthoflow.geometry.scenes import Viewers
 
 # Numbers and words that stand for what is left out; what is absent is None or empty.

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from orthoflow.geometry.rotations import rotation_from_vector
+from orthoflow.geometry.frames import rotation_from_vector
 from tests.road.conftest import Shell, metrics_of
 from tests.scan_files import write_las
 

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.images import before_masks, decode_image
-from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.opencv_border import to_opencv
+from orthoflow.geometry.cameras import ViewingCamera, to_opencv
 from orthoflow.products import Photo, PointCloud
 
 if TYPE_CHECKING:

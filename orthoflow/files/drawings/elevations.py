@@ -30,7 +30,7 @@ from orthoflow.files.drawings.sheet_contents import (
 from orthoflow.files.drawings.wall_drawings import draw_raster
 from orthoflow.files.drawings.words import Language, Phrase, label
 from orthoflow.geometry import WallFrame
-from orthoflow.geometry.directions import basis_from_up
+from orthoflow.geometry.frames import basis_from_up
 
 _GAP_MM: Final = 8.0
 # Below the walls, for their names.

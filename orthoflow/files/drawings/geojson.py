@@ -14,7 +14,7 @@ from orthoflow.files.drawings.room_lines import DrawnWall, RoomLines, edges_of, 
 from orthoflow.files.geotiff import SITE_CRS
 from orthoflow.files.polygons import Feature, outlines, write_features
 from orthoflow.files.sidecars import numbers
-from orthoflow.geometry.adjoining import Edge
+from orthoflow.geometry.outlines import Edge
 from orthoflow.products import JsonValue, Opening, Orthoimage, OutlineSource
 
 _DIGITS: Final = 6

@@ -10,10 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.geometry.adjoining import Surface
-from orthoflow.geometry.directions import basis_from_up
-from orthoflow.geometry.frames import LEVEL_LIMIT_DEG, WallFrame
-from orthoflow.geometry.outlines import RoomOutline, room_outline
+from orthoflow.geometry.frames import LEVEL_LIMIT_DEG, WallFrame, basis_from_up
+from orthoflow.geometry.outlines import RoomOutline, Surface, room_outline
 from orthoflow.products import Planes
 
 # Every pair and some triples are compared, and a record may state any number.

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 from orthoflow.files.drawings.key_plans import outline_of, surfaces_of
 from orthoflow.geometry import WallFrame
-from orthoflow.geometry.adjoining import (
+from orthoflow.geometry.outlines import (
     REACH_M,
     Corner,
     Edge,
+    RoomOutline,
     Surface,
     corners_between,
     edges_between,
 )
-from orthoflow.geometry.outlines import RoomOutline
 from orthoflow.products import CheckPoints, Opening, Planes
 
 

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from orthoflow.errors import ArgumentError
 from orthoflow.files.drawings.key_plans import surfaces_of
 from orthoflow.files.drawings.words import Language, label
-from orthoflow.geometry.adjoining import edges_between
-from orthoflow.geometry.directions import basis_from_up
+from orthoflow.geometry.frames import basis_from_up
+from orthoflow.geometry.outlines import edges_between
 from orthoflow.products import Opening, Planes, PointCloud, PointLabels
 
 # Planes that the cut meets at a smaller angle have no sharp line in it.

@@ -17,7 +17,7 @@ from orthoflow.files.drawings.pens import POINTS_PER_MM
 from orthoflow.files.drawings.title_blocks import TitleBlock
 from orthoflow.files.drawings.words import Language, Phrase
 from orthoflow.geometry import WallFrame
-from orthoflow.geometry.directions import basis_from_up
+from orthoflow.geometry.frames import basis_from_up
 
 if TYPE_CHECKING:
     from reportlab.pdfgen.canvas import Canvas

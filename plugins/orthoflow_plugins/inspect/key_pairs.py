@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.opencv_border import from_opencv
+from orthoflow.geometry.cameras import from_opencv
 from orthoflow.geometry.threads import in_order
 from orthoflow_plugins.inspect.patches import (
     PATCH_CELLS,

@@ -11,7 +11,7 @@ from numpy.typing import DTypeLike, NDArray
 from orthoflow.errors import MethodError
 from orthoflow.geometry import angle_between_deg
 from orthoflow.geometry.bands import IN_MEMORY_CELLS, Allocate, in_memory
-from orthoflow.geometry.opencv_border import to_opencv
+from orthoflow.geometry.cameras import to_opencv
 from orthoflow.products import Orthoimage, Orthoimages, SurfaceMask, Wall, Walls
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.opencv_border import to_opencv
+from orthoflow.geometry.cameras import to_opencv
 from orthoflow_plugins.inspect.patches import GreyCells, GreyImage
 
 _ROUNDS: Final = 20

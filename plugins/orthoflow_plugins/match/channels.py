@@ -18,10 +18,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.cloud_quality import scan_step_m
 from orthoflow.geometry.interpolation import Surroundings, cell_values, interpolate
 from orthoflow.geometry.key_points import in_turns
 from orthoflow.geometry.narrow_gaps import narrow_gaps
-from orthoflow.geometry.scan_steps import scan_step_m
 from orthoflow.products import SurfaceMask, Wall
 from orthoflow_plugins.match.pictures import filled_smoothly, usual_spread_m
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from orthoflow.geometry.cameras import HALF_PIXEL
 from orthoflow.geometry.key_points import (
     Matches,
     Window,
@@ -24,7 +25,6 @@ from orthoflow.geometry.key_points import (
     mutual_matches_within,
     root_sift,
 )
-from orthoflow.geometry.opencv_border import HALF_PIXEL
 from orthoflow.geometry.rows import Rows
 from orthoflow.products import Photo, Wall
 from orthoflow.sdk import MethodParams

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
 from orthoflow.files.images import decode_image
-from orthoflow.geometry.opencv_border import HALF_PIXEL
+from orthoflow.geometry.cameras import HALF_PIXEL
 from orthoflow.geometry.threads import in_order
 from orthoflow.products import Photo, Photos, Wall, Walls
 

@@ -22,8 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
-from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.lenses import LensFreedom
+from orthoflow.geometry.cameras import LensFreedom, ViewingCamera
 from orthoflow.geometry.resection import SeenPoints, adjust
 from orthoflow.geometry.threads import in_order
 from orthoflow.products import Photo, Photos, Wall

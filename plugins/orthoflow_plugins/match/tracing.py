@@ -18,9 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
-from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.lenses import POSE_PARAMETERS, LensFreedom, unmeasured
-from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
+from orthoflow.geometry.cameras import (
+    POSE_PARAMETERS,
+    LensFreedom,
+    ViewingCamera,
+    opencv_matrix,
+    to_opencv,
+    unmeasured,
+)
 from orthoflow.geometry.resection import SeenPoints, adjust, misfit
 from orthoflow.geometry.robust import MEDIAN_LENGTH, NMAD_FACTOR
 from orthoflow.products import Camera, Intrinsics, JsonValue, Photo, Photos, Wall

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.opencv_border import to_opencv
+from orthoflow.geometry.cameras import ViewingCamera, to_opencv
 from orthoflow.products import Photo, Wall
 from orthoflow_plugins.match.pictures import photo_grey, photo_rgb, shrunk
 

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.bands import Allocate, row_bands
-from orthoflow.geometry.depth_noise import depth_noise_m
-from orthoflow.geometry.robust import NMAD_FACTOR
+from orthoflow.geometry.robust import NMAD_FACTOR, depth_noise_m
 from orthoflow.products import Camera, Cameras, SurfaceMask, TieRole, Wall
 from orthoflow_plugins.mosaic.agreement import Overlaps
 
@@ -139,7 +138,7 @@ def _pose_variances(
     camera: Camera, frame: WallFrame, nodes: NDArray[np.float64], depths_m: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
     """Variances (r, c) of a coordinate on the wall by a photo's orientation, metres squared."""
-    from orthoflow.geometry.lenses import LensFreedom, linearised
+    from orthoflow.geometry.cameras import LensFreedom, linearised
     from orthoflow.geometry.resection import moved_origin, pixels_by_point
 
     if camera.covariance is None:

@@ -15,14 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError, MethodError
-from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.cameras import (
+    POSE_PARAMETERS,
+    LensFreedom,
+    ViewingCamera,
+    lens_values,
+    linearised,
+)
 from orthoflow.geometry.covariances import (
     AdjustedPoints,
     outwards,
     widened_by_moves,
     with_common_error,
 )
-from orthoflow.geometry.lenses import POSE_PARAMETERS, LensFreedom, lens_values, linearised
 from orthoflow.geometry.resection import whiten
 from orthoflow.geometry.rows import Rows
 from orthoflow.products import JsonValue, Photo

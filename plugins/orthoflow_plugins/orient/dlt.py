@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.errors import GeometryError
-from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.lenses import LensFreedom, linearised
+from orthoflow.geometry.cameras import LensFreedom, ViewingCamera, linearised
 from orthoflow.geometry.resection import (
     Resection,
     SeenPoints,

@@ -15,8 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.opencv_border import to_opencv
+from orthoflow.geometry.cameras import ViewingCamera, to_opencv
 from orthoflow.geometry.resection import (
     Resection,
     SeenPoints,

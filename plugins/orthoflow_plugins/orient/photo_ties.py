@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.images import decode_image
-from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.cameras import ViewingCamera, from_opencv
+from orthoflow.geometry.frames import cross_matrix
 from orthoflow.geometry.key_points import in_turns, mutual_matches, root_sift
-from orthoflow.geometry.opencv_border import from_opencv
-from orthoflow.geometry.rotations import cross_matrix
 from orthoflow.products import Photo
 from orthoflow_plugins.orient.pose import camera_rays
 

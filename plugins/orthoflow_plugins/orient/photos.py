@@ -12,9 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError, MethodError
-from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.lenses import POSE_PARAMETERS
-from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
+from orthoflow.geometry.cameras import POSE_PARAMETERS, ViewingCamera, opencv_matrix, to_opencv
 from orthoflow.geometry.resection import Resection, SeenPoints, adjust, misfit, stated
 from orthoflow.products import Camera, Photo, Photos, TieRole, Ties
 from orthoflow.sdk import DiagnosticSpec, StepContext

@@ -10,8 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from orthoflow.errors import GeometryError
-from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
+from orthoflow.geometry.cameras import ViewingCamera, opencv_matrix, to_opencv
 from orthoflow.geometry.resection import SeenPoints, misfit, stated
 from orthoflow.sdk import Method, MetricSpec, StepContext
 from orthoflow.sdk.methods import Determinism

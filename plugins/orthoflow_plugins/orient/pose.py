@@ -12,9 +12,15 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.errors import GeometryError
-from orthoflow.geometry.cameras import ViewingCamera, undistorted
-from orthoflow.geometry.lenses import POSE_PARAMETERS, LensFreedom, unmeasured
-from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
+from orthoflow.geometry.cameras import (
+    POSE_PARAMETERS,
+    LensFreedom,
+    ViewingCamera,
+    opencv_matrix,
+    to_opencv,
+    undistorted,
+    unmeasured,
+)
 from orthoflow.geometry.resection import (
     Misfit,
     Resection,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.images import decode_image, encode_webp
-from orthoflow.geometry.opencv_border import to_opencv
+from orthoflow.geometry.cameras import to_opencv
 from orthoflow.geometry.resection import pixels_by_point
 from orthoflow.geometry.robust import median_deviation
 from orthoflow.products import Camera, Cameras, JsonValue, Photo, ResidualRow, TieRole, Ties

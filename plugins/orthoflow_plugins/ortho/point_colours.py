@@ -16,10 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.levels import light_of_levels
-from orthoflow.geometry.raster_kernels import NO_POINT, Entries, keep_nearest
 from orthoflow.geometry.rastering import (
+    NO_POINT,
+    Entries,
     empty_winners,
     entries_inside,
+    keep_nearest,
     places_of_winners,
     share_cells,
     topmost_points,

@@ -13,7 +13,7 @@ from numpy.typing import DTypeLike, NDArray
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.bands import Allocate, bands_with_reach, in_memory
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.depth_noise import depth_noise_m
+from orthoflow.geometry.robust import depth_noise_m
 from orthoflow.products import Wall, Walls
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.ortho.parameters import VisibilityParams

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry import basis_from_up
-from orthoflow.geometry.point_kernels import read_only
+from orthoflow.geometry.slabs import read_only
 from orthoflow.products import PointCloud
 from orthoflow_plugins.plane.kernels import (
     BlockedPoints,

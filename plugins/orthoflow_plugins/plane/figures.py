@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from orthoflow.files.clouds.dressing import plane_ink
 from orthoflow.geometry import omega_phi_deg, wall_axes
-from orthoflow.geometry.directions import basis_from_up
+from orthoflow.geometry.frames import basis_from_up
 from orthoflow.products import Planes, PointCloud, Thickness
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.plane.detector import Materials

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.compiling import compiled, kernel_part
-from orthoflow.geometry.point_kernels import Offsets
+from orthoflow.geometry.slabs import Offsets
 from orthoflow.geometry.threads import even_parts, in_threads
 
 # Small enough that a block of a scan column is a short piece of one surface, so that its box tells
@@ -74,7 +74,7 @@ class PlanGrid:
     """Where the cells of a plan (a map of the cloud seen from above) and its storeys lie.
 
     Attributes:
-        basis: (3, 3) rows e1, e2, up (see `geometry.directions.basis_from_up`).
+        basis: (3, 3) rows e1, e2, up (see `geometry.basis_from_up`).
         low_m: (3,) lower corner in the (e1, e2, up) frame of the cloud's offsets, metres.
         cell_m: side of a cell, and height of a storey of the height histogram.
         shape: cells along e1, cells along e2, storeys along up.

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError, MethodError
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.bands import row_bands
-from orthoflow.geometry.frames import LEVEL_LIMIT_DEG
-from orthoflow.geometry.rings import signed_area
+from orthoflow.geometry.frames import LEVEL_LIMIT_DEG, signed_area
 from orthoflow.products import Planes, SurfaceMask, Wall
 from orthoflow.sdk import DiagnosticSpec, StepContext
 

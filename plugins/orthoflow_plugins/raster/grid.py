@@ -133,7 +133,7 @@ class RasterGrid(Method):
 
     def run(self, inputs: In, params: RasterParams, ctx: StepContext) -> Out:
         """Raster the chosen planes, with one or a few passes over the cloud for each."""
-        from orthoflow.geometry.scan_steps import scan_step_m
+        from orthoflow.geometry.cloud_quality import scan_step_m
 
         cloud, planes = inputs.cloud, inputs.planes
         cloud.require_points(3)

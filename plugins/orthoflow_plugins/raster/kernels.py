@@ -1,6 +1,6 @@
 """Compiled passes that compute the surface of a wall from points, and close gaps between these.
 
-Those over the entries of `raster_kernels` run in each thread on the cells it owns.
+Those over the entries of `geometry.rastering` run in each thread on the cells it owns.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.compiling import compiled
-from orthoflow.geometry.point_kernels import Offsets
-from orthoflow.geometry.raster_kernels import Entries, is_own
+from orthoflow.geometry.rastering import Entries, is_own
+from orthoflow.geometry.slabs import Offsets
 
 # With more points the mean is near the centre of the cell. With few it may be off, and over many
 # cells in the same way: by up to half a point spacing if the cell is a multiple of it.

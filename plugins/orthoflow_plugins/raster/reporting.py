@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import omega_phi_deg
 from orthoflow.geometry.bands import count_cells
-from orthoflow.geometry.depth_noise import depth_noise_m
 from orthoflow.geometry.levels import plain_tone
+from orthoflow.geometry.robust import depth_noise_m
 from orthoflow.products import PointCloud, SurfaceMask, Wall
 from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.raster.emptiness import Emptiness

@@ -12,20 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.compiling import compiled
-from orthoflow.geometry.depth_noise import depth_noise_m
 from orthoflow.geometry.interpolation import Surroundings, cell_values, interpolate
 from orthoflow.geometry.narrow_gaps import narrow_gaps
-from orthoflow.geometry.point_kernels import read_only
-from orthoflow.geometry.raster_kernels import Entries, keep_nearest, keep_topmost
 from orthoflow.geometry.rastering import (
+    Entries,
     empty_winners,
     entries_inside,
+    keep_nearest,
+    keep_topmost,
     places_of_winners,
     share_cells,
     values_of_winners,
     wall_from_offset,
 )
-from orthoflow.geometry.slabs import Slab
+from orthoflow.geometry.robust import depth_noise_m
+from orthoflow.geometry.slabs import Slab, read_only
 from orthoflow.geometry.threads import in_parts
 from orthoflow.products import PointCloud, SurfaceMask
 from orthoflow_plugins.raster import kernels

@@ -12,7 +12,7 @@ from pydantic import Field
 from orthoflow.errors import InputError
 from orthoflow.files.points.units import UNITS_M
 from orthoflow.files.survey_points import MeasuredTie, read_measured_ties
-from orthoflow.geometry.opencv_border import from_opencv
+from orthoflow.geometry.cameras import from_opencv
 from orthoflow.products import InputFiles, Photo, Photos, TieRole, Ties
 from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow_plugins.read.scan import Unit

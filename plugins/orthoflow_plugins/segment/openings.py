@@ -13,8 +13,8 @@ from pydantic import Field
 
 from orthoflow.errors import MethodError
 from orthoflow.files.images import encode_webp
+from orthoflow.geometry.frames import signed_area
 from orthoflow.geometry.levels import eight_bits
-from orthoflow.geometry.rings import signed_area
 from orthoflow.products import (
     Opening,
     OpeningKind,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry.rings import signed_area
+from orthoflow.geometry.frames import signed_area
 from orthoflow.geometry.robust import median_deviation
 from orthoflow_plugins.segment.areas import Area, Relief
 

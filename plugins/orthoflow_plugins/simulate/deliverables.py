@@ -34,7 +34,7 @@ _TILE_M = 0.1
 _THUMB_PX = 300
 _FLAT: Final = "flat"
 _VERTICAL_EDGE: Final = "vertical edge"
-# The lattice of painted lines of a fresco, in periods (see `texture_kernels`).
+# The lattice of painted lines of a fresco, in periods (see `geometry.scene_rays`).
 _LATTICE: Final = 0.9
 _CLEAR_M: Final = 0.04
 # Number of its plane in `scene.plane_index`: it is built first.

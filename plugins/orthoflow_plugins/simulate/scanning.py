@@ -19,10 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane
-from orthoflow.geometry.hashed_numbers import cell_states, normals, uniforms
 from orthoflow.geometry.rows import Rows
 from orthoflow.geometry.scene_rays import RAYS_AT_ONCE, SceneRays, points_on
-from orthoflow.geometry.scenes import Scene, TextureKind
+from orthoflow.geometry.scenes import Scene, TextureKind, cell_states, normals, uniforms
 from orthoflow.geometry.threads import in_runs
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.simulate.room_model import main_wall_axes

@@ -13,7 +13,7 @@ from orthoflow_plugins.mosaic.expected_errors import expected_errors_m, ties_on
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.bands import in_memory
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.rotations import cross_matrix, rotation_from_vector
+from orthoflow.geometry.frames import cross_matrix, rotation_from_vector
 from orthoflow.products import Camera, Cameras, Intrinsics, SurfaceMask, TieRole, Wall
 from tests import samples
 

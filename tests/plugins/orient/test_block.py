@@ -22,7 +22,7 @@ from orthoflow_plugins.orient.pose import Lens
 from scipy.optimize import least_squares
 
 from orthoflow.errors import GeometryError
-from orthoflow.geometry.lenses import LensFreedom, stepped
+from orthoflow.geometry.cameras import LensFreedom, stepped
 from orthoflow.products import Photo
 from tests import block_scenes as bs
 

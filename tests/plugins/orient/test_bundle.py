@@ -20,7 +20,7 @@ from orthoflow_plugins.orient.photos import Trusted, by_itself, tied_photo
 from orthoflow_plugins.orient.pnp import OrientPnp
 from orthoflow_plugins.orient.pose import Lens, estimate_pose, lens_groups
 
-from orthoflow.geometry.lenses import LensFreedom
+from orthoflow.geometry.cameras import LensFreedom
 from orthoflow.geometry.resection import SeenPoints, adjust
 from orthoflow.products import Cameras, Photo, Photos, Ties
 from orthoflow.sdk import StepContext

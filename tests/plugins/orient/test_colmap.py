@@ -10,8 +10,7 @@ from orthoflow_plugins.orient.block import Block, Observations, Points, solve
 from orthoflow_plugins.orient.pose import Lens
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.lenses import LensFreedom
+from orthoflow.geometry.cameras import LensFreedom, ViewingCamera
 from orthoflow.testing import photographed as ms
 from tests import block_scenes as bs
 

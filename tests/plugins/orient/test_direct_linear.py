@@ -18,8 +18,8 @@ from orthoflow_plugins.orient.pose import Estimate, TiedPhoto
 
 from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
+from orthoflow.geometry.frames import rotation_from_vector
 from orthoflow.geometry.resection import SeenPoints
-from orthoflow.geometry.rotations import rotation_from_vector
 from orthoflow.products import Intrinsics, Photo
 from tests import samples
 

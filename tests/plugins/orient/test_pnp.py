@@ -11,8 +11,7 @@ from orthoflow_plugins.orient.gates import known_walls, wall_error
 from orthoflow_plugins.orient.pnp import OrientPnp
 
 from orthoflow.files.images import encode_png
-from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.lenses import LensFreedom, stepped
+from orthoflow.geometry.cameras import LensFreedom, ViewingCamera, stepped
 from orthoflow.geometry.resection import SeenPoints, adjust
 from orthoflow.products import Cameras, Intrinsics, Photo, Photos, TieRole, Ties, TieWall
 from orthoflow.sdk import StepContext

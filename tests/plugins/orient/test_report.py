@@ -14,7 +14,7 @@ from orthoflow_plugins.orient.report import (
     residual_table,
 )
 
-from orthoflow.geometry.lenses import LensFreedom
+from orthoflow.geometry.cameras import LensFreedom
 from orthoflow.geometry.resection import Resection, SeenPoints
 from orthoflow.testing import photographed as ms
 

@@ -14,8 +14,7 @@ from orthoflow_plugins.orient.gates import (
     wall_error,
 )
 
-from orthoflow.geometry.cameras import ViewingCamera, looking_at
-from orthoflow.geometry.lenses import LensFreedom
+from orthoflow.geometry.cameras import LensFreedom, ViewingCamera, looking_at
 from orthoflow.geometry.resection import Resection
 from orthoflow.products import TieWall
 from tests import samples

@@ -12,7 +12,7 @@ from orthoflow_plugins.ortho.dsm_forward import DsmForward
 from orthoflow_plugins.ortho.photos_on_walls import warn_of_heads
 
 from orthoflow.diagnostics import Diagnostic
-from orthoflow.geometry.rotations import rotation_from_vector
+from orthoflow.geometry.frames import rotation_from_vector
 from orthoflow.products import Camera, Photo, Photos
 from orthoflow.sdk import StepContext
 from tests import ortho_scenes as scenes

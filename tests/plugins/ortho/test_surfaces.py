@@ -21,7 +21,7 @@ from orthoflow_plugins.ortho.surfaces import (
 )
 from orthoflow_plugins.ortho.visibility_kernels import BLOCK_CELLS
 
-from orthoflow.geometry.depth_noise import depth_noise_m
+from orthoflow.geometry.robust import depth_noise_m
 from orthoflow.products import Wall
 from tests import ortho_scenes as scenes
 from tests import samples

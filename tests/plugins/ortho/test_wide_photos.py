@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from orthoflow.files.cube_faces import FisheyeLens
 from orthoflow.files.images import encode_png
-from orthoflow.geometry.rotations import rotation_from_vector
+from orthoflow.geometry.frames import rotation_from_vector
 from orthoflow.products import InputFiles, Layer, LayerMask
 from tests import scan_files
 from tests.box_rooms import BoxRoom

@@ -27,7 +27,7 @@ from orthoflow_plugins.plane.support import summed_around
 from scipy import ndimage
 
 from orthoflow.geometry import wall_axes
-from orthoflow.geometry.point_kernels import Offsets, read_only
+from orthoflow.geometry.slabs import Offsets, read_only
 from tests import scenes
 
 UP: Final = np.array([0.0, 0.0, 1.0])

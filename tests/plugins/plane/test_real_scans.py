@@ -14,7 +14,7 @@ from orthoflow_plugins.plane.ransac import Ransac
 from orthoflow_plugins.plane.region import Region
 
 from orthoflow.geometry import angle_between_deg
-from orthoflow.geometry.point_kernels import read_only
+from orthoflow.geometry.slabs import read_only
 from orthoflow.products import Planes, PointCloud
 from orthoflow.sdk import Method
 from tests.plane_scenes import cloud_of, context

@@ -16,8 +16,7 @@ from orthoflow.errors import MethodError
 from orthoflow.files.geotiff import GridPlace, read_raster
 from orthoflow.files.publishing import publish_walls
 from orthoflow.files.sidecars import frame_json, frame_of_raster
-from orthoflow.geometry.frames import WallFrame, frame_over
-from orthoflow.geometry.rotations import rotation_from_vector
+from orthoflow.geometry.frames import WallFrame, frame_over, rotation_from_vector
 from orthoflow.products import Planes
 from tests import raster_scenes as scenes
 from tests import samples

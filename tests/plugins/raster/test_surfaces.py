@@ -13,7 +13,7 @@ from orthoflow_plugins.raster.surfaces import denoised
 from scipy.spatial import cKDTree
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry.depth_noise import depth_noise_m
+from orthoflow.geometry.robust import depth_noise_m
 from orthoflow.products import PointCloud, SurfaceMask, Walls
 from orthoflow.sdk import StepContext
 from tests import raster_scenes as scenes

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthoflow.geometry.hashed_numbers import cell_states, mixed_bits, normals, uniforms
+from orthoflow.geometry.scenes import cell_states, mixed_bits, normals, uniforms
 
 GOLDEN = 0x9E3779B97F4A7C15
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from orthoflow.geometry import texture_kernels
+from orthoflow.geometry import scene_rays
 from orthoflow.geometry.scenes import TextureKind
 
 SEED = 7
@@ -21,7 +21,7 @@ REFERENCE = (0xE220A8397B1DCDAF, 0x6E789E6AA1B965F4, 0x06C45D188009454F)
 
 def callable_from_python(name: str) -> Callable[..., Any]:
     """Parts of kernels have no way in from Python: give one that has."""
-    part = getattr(texture_kernels, name)
+    part = getattr(scene_rays, name)
 
     @numba.njit
     def call(*arguments: Any) -> Any:
