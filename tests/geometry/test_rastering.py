@@ -11,7 +11,6 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.geometry import frame_over, rastering
-from orthoflow.geometry import rastering as kernels
 from orthoflow.geometry.narrow_gaps import narrow_gaps
 from orthoflow.geometry.rastering import (
     NO_POINT,
@@ -152,10 +151,11 @@ def test_blocks_beside_a_wall_are_not_read_and_nothing_else_changes(
     frame = slab_of(wall).frame
     part = Slab(frame=replace(frame, width=8), front_m=0.15, behind_m=0.15)
     read = {}
+    project = rastering.project_points
 
     def project_points(offsets: Offsets, *rest: Any) -> None:
         read[offsets.x.ctypes.data] = offsets.x.size
-        kernels.project_points(offsets, *rest)
+        project(offsets, *rest)
 
     monkeypatch.setattr(rastering, "project_points", project_points)
     assert cloud.boxes_m is not None

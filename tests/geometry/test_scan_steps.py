@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from orthoflow.geometry import scan_steps
+from orthoflow.geometry import cloud_quality
 from orthoflow.geometry.cloud_quality import scan_step_m
 
 GSD_M = 0.01
@@ -67,7 +67,7 @@ def test_a_wall_without_points_has_no_step_and_one_point_has_the_wall() -> None:
 @pytest.mark.parametrize("shape", [(6, 8), (7, 8), (6, 9), (7, 9), (1, 1), (1, 5)])
 def test_joined_blocks_hold_the_points_of_two_by_two(shape: tuple[int, int]) -> None:
     blocks = np.random.default_rng(1).integers(0, 9, shape).astype(np.uint32)
-    joined = scan_steps._joined(blocks)
+    joined = cloud_quality._joined(blocks)
     assert joined.shape == (-(-shape[0] // 2), -(-shape[1] // 2))
     for row in range(joined.shape[0]):
         for column in range(joined.shape[1]):
