@@ -47,8 +47,8 @@ from orthoflow.products import (
     Wall,
     Walls,
 )
+from orthoflow.records.open import open_run
 from orthoflow.records.runs import Run
-from orthoflow.records.unfinished import open_run
 from orthoflow.sdk import StepContext
 
 STRETCH = 24

@@ -17,7 +17,7 @@ import heapq
 from collections import defaultdict
 from dataclasses import dataclass, field
 
-from orthoflow.records.unfinished import open_run
+from orthoflow.records.open import open_run
 
 # What a task costs besides its work: `benchmarks/many_cells.py`.
 _TASK_S = 0.25

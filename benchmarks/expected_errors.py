@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import WallFrame
 from orthoflow.products import Camera, Cameras, Orthoimages, Walls
+from orthoflow.records.open import open_run
 from orthoflow.records.runs import Run
-from orthoflow.records.unfinished import open_run
 
 ROOT = Path(__file__).resolve().parents[1]
 FOUNTAIN = ROOT.parent / "shared" / "data" / "fountain-p11"

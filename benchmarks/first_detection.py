@@ -25,7 +25,7 @@ from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.engine.measuring import LoadingMeter
 from orthoflow.engine.store import Store
 from orthoflow.products import PointCloud
-from orthoflow.records.unfinished import open_run
+from orthoflow.records.open import open_run
 from orthoflow.sdk import StepContext
 
 METHODS = ("plane.hough2d", "plane.hough3d", "plane.ransac", "plane.region")

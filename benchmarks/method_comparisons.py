@@ -20,8 +20,8 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from orthoflow.records.open import open_run
 from orthoflow.records.runs import Run
-from orthoflow.records.unfinished import open_run
 from orthoflow.report import write_report
 from orthoflow.report.combinations import Combination, combinations_of
 from orthoflow.report.numbers import number, number_with_spread

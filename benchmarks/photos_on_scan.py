@@ -28,7 +28,7 @@ from scan_formats import write_e57
 
 from orthoflow.files.calibration import write_calibration
 from orthoflow.products import Calibration
-from orthoflow.records.unfinished import open_run
+from orthoflow.records.open import open_run
 
 RECIPE = "photos-on-scan.yaml"
 INPUTS = {"scan": "scan.e57", "photos": "photos", "calibration": "calibration.yaml"}

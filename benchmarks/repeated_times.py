@@ -24,7 +24,7 @@ from collections.abc import Mapping
 from itertools import combinations, pairwise
 from pathlib import Path
 
-from orthoflow.records.unfinished import open_run
+from orthoflow.records.open import open_run
 
 LEAST_S = 0.2
 FURTHEST = 1.3

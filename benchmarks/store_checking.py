@@ -23,9 +23,9 @@ from orthoflow.engine.durability import folder_size
 from orthoflow.engine.plan import RunOptions, plan_run
 from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.engine.store import Store
-from orthoflow.records import writing
+from orthoflow.records import write as record_writing
 from orthoflow.records.runs import Run
-from orthoflow.records.writing import executed_and_written, write_run
+from orthoflow.records.write import executed_and_written, write_run
 from orthoflow.report import write_page
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import expand_cells
@@ -34,7 +34,7 @@ from orthoflow.workflow.model import (
 )
 
 CHECKING = ((Store, "damage"), (Store, "take"), (Store, "blob"), (store, "describe_product"))
-SYNCING = ((writing, "sync_tree"),)
+SYNCING = ((record_writing, "sync_tree"),)
 
 
 class Clock:

@@ -4,13 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from orthoflow.records.comparison import (
-    CellFacts,
-    ComparedMetric,
-    Pair,
-    ParameterValue,
-    RunComparison,
-)
+from orthoflow.records.compare import CellFacts, ComparedMetric, Pair, ParameterValue, RunComparison
 from tests.report_runs import distance, record
 
 

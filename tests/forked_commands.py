@@ -104,9 +104,9 @@ def _close(server: subprocess.Popen[str]) -> None:
 
 def _serve() -> None:
     import orthoflow.cli
-    import orthoflow.records.comparison
-    import orthoflow.records.verification
-    import orthoflow.records.writing
+    import orthoflow.records.compare
+    import orthoflow.records.verify
+    import orthoflow.records.write
     import orthoflow.workflow.document
     import orthoflow.workflow.views
     from orthoflow.engine.environment import cpu_name, git_commit

@@ -35,7 +35,7 @@ from orthoflow.products import (
     Walls,
 )
 from orthoflow.products.product import Payload, Product
-from orthoflow.records.comparison import ComparedMetric, Distance, ProductDistance
+from orthoflow.records.compare import ComparedMetric, Distance, ProductDistance
 from orthoflow.records.runs import Run
 from orthoflow.sdk import Method, MetricSpec
 from orthoflow.sdk.methods import labelled

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from orthoflow.records.unfinished import open_run
-from orthoflow.records.verification import verify_run
+from orthoflow.records.open import open_run
+from orthoflow.records.verify import verify_run
 from tests.engine_world import install_toys
 from tests.killed_runs import Answer, RunServer, run_server
 

@@ -13,8 +13,8 @@ import pytest
 from click.testing import CliRunner, Result
 
 from orthoflow.cli.program import program
+from orthoflow.records.open import open_run
 from orthoflow.records.runs import Run
-from orthoflow.records.unfinished import open_run
 from tests.workshop_runs import WORKSHOP, write_studio
 
 

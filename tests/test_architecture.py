@@ -139,7 +139,7 @@ def test_loading_every_method_loads_no_heavy_or_slow_library() -> None:
 def test_no_run_loads_a_library_for_the_mistakes_of_a_workflow() -> None:
     loaded = run_python(
         "import orthoflow.engine.scheduler\n"
-        "from orthoflow.records import comparison, verification, writing\n"
+        "from orthoflow.records import compare, verify, write\n"
         f"print([name for name in {('networkx', *HEAVY, *SLOW)!r} if name in sys.modules])"
     )
     assert loaded.strip() == "[]"

@@ -116,7 +116,7 @@ class RecordCommand(Command):
         except (OrthoflowError, OSError, click.ClickException, click.Abort, click.exceptions.Exit):
             raise
         except Exception as error:
-            from orthoflow.records.verification import verify_run
+            from orthoflow.records.verify import verify_run
 
             for path in self._runs(ctx):
                 if findings := verify_run(path, also_published=False).findings:

@@ -27,7 +27,7 @@ from orthoflow.untrusted_text import first_few
 
 if TYPE_CHECKING:
     from orthoflow.records import RecordedFile
-    from orthoflow.records.comparison import (
+    from orthoflow.records.compare import (
         CellFacts,
         ComparedMetric,
         Pair,
@@ -62,9 +62,9 @@ def compare(first: Path, second: Path, store: Path, *, is_whole: bool, as_json: 
     digests are equal, are checked by `orthoflow verify`.
     """
     from orthoflow.engine.store import stores_at
-    from orthoflow.records.comparison import compare_runs
-    from orthoflow.records.unfinished import open_run
-    from orthoflow.records.verification import broken_seal
+    from orthoflow.records.compare import compare_runs
+    from orthoflow.records.open import open_run
+    from orthoflow.records.verify import broken_seal
 
     runs = (open_run(first), open_run(second))
     comparison = compare_runs(*runs, stores=stores_at(store))
@@ -186,7 +186,7 @@ def _print_pairs(
 # Any: rows of all kinds.
 def _counts(rows: Sequence[Pair[Any]]) -> str:
     """Count the rows in which the runs differ, and in how many by rounding."""
-    from orthoflow.records.comparison import Difference
+    from orthoflow.records.compare import Difference
 
     found = Difference.of(rows)
     counts = [f"{found.n_different} of {found.n_shared} differ"] if found.n_shared else []

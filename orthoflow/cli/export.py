@@ -222,8 +222,8 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     """Write the results of a run for other programs; 3 where the record's seal does not hold."""
     from orthoflow.cli.progress import working_on
     from orthoflow.engine.durability import whole_folder
-    from orthoflow.records.unfinished import open_run
-    from orthoflow.records.verification import broken_seal
+    from orthoflow.records.open import open_run
+    from orthoflow.records.verify import broken_seal
 
     chosen = Choices(**choices)
     check_choices(chosen, target)
@@ -247,7 +247,7 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
 
 def _export_to(target: Format, run: Run, folder: Path, chosen: Choices) -> str:
     from orthoflow.files.geotiff import name_run
-    from orthoflow.records.wall_results import with_files
+    from orthoflow.records.write import with_files
 
     if target.takes_rasters:
         with with_files(run, lambda note: echo_error(f"note: {note}")) as whole:
@@ -279,8 +279,8 @@ def _export_embedded(run: Run, folder: Path, chosen: Choices) -> str:
 
 def _export_split(run: Run, folder: Path, chosen: Choices) -> str:
     from orthoflow.engine.store import Store
-    from orthoflow.records.datasets import parts_of, write_part
-    from orthoflow.records.runs import REPORT_FILE, path_inside
+    from orthoflow.records.runs import REPORT_FILE, parts_of, path_inside
+    from orthoflow.records.write import write_part
     from orthoflow.report import write_page
 
     parts = parts_of(run)

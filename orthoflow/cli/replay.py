@@ -31,8 +31,8 @@ from orthoflow.untrusted_text import first_few
 
 if TYPE_CHECKING:
     from orthoflow.engine.store import Store
-    from orthoflow.records.comparison import ProductDistance
-    from orthoflow.records.replaying import Replay, ReplayedMetric
+    from orthoflow.records.compare import ProductDistance
+    from orthoflow.records.replay import Replay, ReplayedMetric
     from orthoflow.records.runs import Run
 
 _METRICS_MOST: Final = 5
@@ -77,9 +77,9 @@ def replay(
     from orthoflow.engine.journal import new_run_folder, new_run_id
     from orthoflow.engine.plan import RunOptions
     from orthoflow.engine.store import Store
-    from orthoflow.records.input_files import embedded_inputs
-    from orthoflow.records.replaying import plan_replay
-    from orthoflow.records.unfinished import open_run
+    from orthoflow.records.inputs import embedded_inputs
+    from orthoflow.records.open import open_run
+    from orthoflow.records.replay import plan_replay
 
     options = RunOptions(**choices)
     original = open_run(run)
@@ -156,7 +156,7 @@ class _Call:
 
     def go(self) -> int:
         """Execute, record, report, compare, and print how far the products differ."""
-        from orthoflow.records.replaying import DIFFERING, replayed_metrics
+        from orthoflow.records.replay import DIFFERING, replayed_metrics
         from orthoflow.records.runs import REPORT_FILE
         from orthoflow.report import write_report
 
@@ -197,7 +197,7 @@ class _Call:
 
     def _distances(self, made: Run) -> tuple[ProductDistance, ...]:
         from orthoflow.catalog.discovery import discover_catalog
-        from orthoflow.records.comparison import RunProducts, product_distances
+        from orthoflow.records.compare import RunProducts, product_distances
 
         return product_distances(
             RunProducts(run=self.original, stores=_earlier_stores()),

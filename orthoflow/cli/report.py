@@ -30,9 +30,9 @@ def report(runs: tuple[str, ...], output: Path | None, store: Path) -> int:
     Where a record's seal does not hold, the page states it, and this ends with 3.
     """
     from orthoflow.engine.store import stores_at
+    from orthoflow.records.open import open_run
     from orthoflow.records.runs import REPORT_FILE
-    from orthoflow.records.unfinished import open_run
-    from orthoflow.records.verification import broken_seal
+    from orthoflow.records.verify import broken_seal
     from orthoflow.report import write_page, write_report
 
     opened = [open_run(run) for run in runs]

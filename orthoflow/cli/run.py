@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from orthoflow.engine.store import Store
     from orthoflow.records import RecordedCell
     from orthoflow.records.runs import Run
-    from orthoflow.records.writing import WrittenRun
+    from orthoflow.records.write import WrittenRun
     from orthoflow.workflow.model import (
         Workflow,
     )
@@ -161,7 +161,7 @@ class Call:
         """Execute, record and report."""
         from orthoflow.engine.journal import new_run_folder, new_run_id
         from orthoflow.records.runs import REPORT_FILE
-        from orthoflow.records.writing import begin_run
+        from orthoflow.records.write import begin_run
         from orthoflow.report import write_page
 
         run_id = new_run_id()
@@ -193,7 +193,7 @@ class Call:
     def _show_unfinished(self, folder: Path, outcome: RunOutcome) -> None:
         """Write the report of an interrupted run: what is there, and how to go on."""
         from orthoflow.records.runs import REPORT_FILE
-        from orthoflow.records.writing import show_unfinished
+        from orthoflow.records.write import show_unfinished
         from orthoflow.report import write_page
 
         report = folder / REPORT_FILE
@@ -221,7 +221,7 @@ def executed(  # noqa: PLR0913 - what a run is made of
     """Execute a plan, show how far it is, and write products, record and report."""
     from orthoflow.cli.progress import Progress, working_on
     from orthoflow.engine.scheduler import execute
-    from orthoflow.records.writing import executed_and_written, write_run
+    from orthoflow.records.write import executed_and_written, write_run
 
     current_session().resume_hint = (
         "interrupted; finished steps are kept, and "

@@ -121,8 +121,8 @@ def _write_table(folders: Sequence[Path], table: Path) -> int:
     from orthoflow.engine.durability import write_whole, writing_to
     from orthoflow.engine.journal import RECORD_FILE
     from orthoflow.errors import ArgumentError
+    from orthoflow.records.open import open_run
     from orthoflow.records.tables import join_runs, joined_csv
-    from orthoflow.records.unfinished import open_run
     from orthoflow.report.browsing import run_folders
 
     if not table.absolute().parent.is_dir():

@@ -56,8 +56,8 @@ def show(run: Path, *, is_whole: bool, as_json: bool) -> int:
     the record does not hold; large arrays, which are not read, are checked by `orthoflow verify`.
     """
     from orthoflow.engine.journal import RECORD_FILE
-    from orthoflow.records.unfinished import open_run
-    from orthoflow.records.verification import broken_seal
+    from orthoflow.records.open import open_run
+    from orthoflow.records.verify import broken_seal
 
     if run.is_dir() and not (run / RECORD_FILE).exists():
         found = list_runs([run])
@@ -136,7 +136,7 @@ def _print_comparison(run: Run) -> bool:
     """Print a row per combination of variants, and who leads; whether there are several."""
     if all(set(cell.assignment) <= {DATA} for cell in run.record.cells):
         return False
-    from orthoflow.records.datasets import parts_of
+    from orthoflow.records.runs import parts_of
     from orthoflow.report.comparisons import comparison_table
     from orthoflow.report.paired import over_datasets, who_leads
     from orthoflow.workflow.expand import variants_text

@@ -17,7 +17,7 @@ from orthoflow.untrusted_text import shown, shown_json
 
 if TYPE_CHECKING:
     from orthoflow.records import RecordedCell
-    from orthoflow.records.comparison import Distance, ProductDistance
+    from orthoflow.records.compare import Distance, ProductDistance
 
 Row = TypeVar("Row")
 _VERDICTS: Final = ("identical", "within tolerance", "different", "not measured")

@@ -11,7 +11,7 @@ from orthoflow.cli.commands import EXIT_GOOD, EXIT_RECORD_DIFFERS, Command, echo
 from orthoflow.cli.tables import counted, echo, echo_json
 
 if TYPE_CHECKING:
-    from orthoflow.records.verification import Verification
+    from orthoflow.records.verify import Verification
 
 
 @click.command(cls=Command)
@@ -40,7 +40,7 @@ def verify(run: Path, signer: Path | None, *, strict: bool, as_json: bool) -> in
     must be signed with that key.
     Ends with 3 when something differs, or RUN is not a record or has another version.
     """
-    from orthoflow.records.verification import verify_run
+    from orthoflow.records.verify import verify_run
 
     verification = verify_run(run, signer=signer)
     notes = verification.notes

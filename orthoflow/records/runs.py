@@ -1,10 +1,14 @@
-"""The read API: a finished run as Python objects, its files, and its inputs."""
+"""A run as a Python object: its cells, metrics, products, files and datasets."""
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import hashlib
+import json
+import math
 import os
+import re
 import shlex
 import shutil
 from collections import Counter
@@ -14,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import TYPE_CHECKING, BinaryIO, Final, Literal, TypeAlias
 
 from orthoflow_provenance.arrays import StoredPayload
 from orthoflow_provenance.document import (
@@ -25,11 +29,13 @@ from orthoflow_provenance.document import (
     RecordFormatError,
     RunRecord,
     UnsafeFileError,
+    cost_metrics,
     shared_fields,
 )
 from orthoflow_provenance.paths import (
     colliding,
     create_below,
+    files_below,
     name_problem,
     open_below,
     path_below,
@@ -37,6 +43,7 @@ from orthoflow_provenance.paths import (
 )
 from orthoflow_provenance.record import open_record
 
+from orthoflow.catalog.discovery import NAME_PATTERN
 from orthoflow.catalog.wording import did_you_mean
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.journal import RECORD_FILE, cell_file_name, is_running
@@ -48,10 +55,179 @@ from orthoflow.errors import (
     StoreError,
 )
 from orthoflow.geometry.threads import in_order
-from orthoflow.products.product import Payload, Product
-from orthoflow.records.published import PRODUCTS_FOLDER, MetricRow, cell_metrics, published_files
+from orthoflow.products.product import JsonValue, Payload, Product
 from orthoflow.sdk.lines import one_line
-from orthoflow.untrusted_text import first_few, shown
+from orthoflow.untrusted_text import csv_text, first_few, parse_json, shown
+from orthoflow.workflow.model import (
+    DATA,
+)
+
+if TYPE_CHECKING:
+    pass
+
+# As for fractions in the metadata of products (SPEC 11.3): libraries round their last digits.
+_ROUNDING: Final = 1e-6
+_UNITLESS: Final = ("1", "yes/no")
+_COLUMNS: Final = ("cell", "step", "method", "metric", "value", "unit")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetricRow:
+    """One number of one cell.
+
+    Attributes:
+        cell: address of the cell.
+        step: name of its step.
+        method: method id.
+        metric: name, ending in its unit if it has one.
+        value: finite number.
+        unit: `mm`, `px`, `s`, ...; `1` for counts and shares.
+        label: label declared by its method; empty without one.
+        better: which values are better, `lower`, `higher` or `one`; empty where none are.
+        description: further explanation.
+        headline: it is one of the numbers that state how good a result is.
+        counted_by: metric of the same step with the number of items it summarises.
+    """
+
+    cell: str
+    step: str
+    method: str
+    metric: str
+    value: float
+    unit: str
+    label: str = ""
+    better: str = ""
+    description: str = ""
+    headline: bool = False
+    counted_by: str = ""
+
+    @property
+    def title(self) -> str:
+        """Its label; its name if its method declares none."""
+        return self.label or self.metric
+
+    @property
+    def titled(self) -> str:
+        """Its title with the unit; counts, shares and yes/no have none."""
+        return self.title if self.unit in _UNITLESS else f"{self.title} / {self.unit}"
+
+
+def cell_metrics(cell: RecordedCell) -> tuple[MetricRow, ...]:
+    """Return what the method reported and then what the engine measured (time and memory).
+
+    Cells without a result have no rows: their cost is not comparable with that of a result.
+    """
+    if cell.status != "ok":
+        return ()
+    return tuple(
+        MetricRow(
+            cell=cell.address,
+            step=cell.step,
+            method=cell.method,
+            metric=metric.name,
+            value=metric.value,
+            unit=metric.unit,
+            label=metric.label,
+            better=metric.better,
+            description=metric.description,
+            headline=metric.headline,
+            counted_by=metric.counted_by,
+        )
+        for metric in (*cell.metrics, *cost_metrics(cell))
+    )
+
+
+def is_rounding(left: float, right: float) -> bool:
+    """Whether two values of a metric are equal or differ by rounding only.
+
+    That is by a millionth of the larger one, or by a millionth if it is below 1; counts are never
+    rounded.
+
+    >>> is_rounding(0.84536087, 0.84536104), is_rounding(1.0, 1.00001), is_rounding(3e7, 3e7 + 1)
+    (True, False, False)
+    """
+    is_counted = all(float(value).is_integer() for value in (left, right))
+    return left == right or (
+        not is_counted and math.isclose(left, right, rel_tol=_ROUNDING, abs_tol=_ROUNDING)
+    )
+
+
+def write_metrics_csv(path: Path, rows: Iterable[MetricRow]) -> None:
+    """Write rows with a header; numbers with all digits."""
+    text = csv_text([_COLUMNS, *([getattr(row, name) for name in _COLUMNS] for row in rows)])
+    path.write_text(text, encoding="utf-8", newline="")
+
+
+PRODUCTS_FOLDER: Final = "products"
+METRICS_FILE: Final = "metrics.csv"
+
+
+def published_files(run_folder: Path, address: str) -> tuple[Path, ...]:
+    """Return files of one cell below `products/`, wall 2 before wall 10; empty without any.
+
+    Links are ignored, whatever their target.
+    """
+    inside = f"{PRODUCTS_FOLDER}/{cell_file_name(address)}"
+    names = sorted(files_below(run_folder, inside), key=_by_number)
+    return tuple(path_below(run_folder, f"{inside}/{name}") for name in names)
+
+
+def _by_number(name: str) -> tuple[tuple[str, int], ...]:
+    """Return a sort key that treats numbers in a name as numbers."""
+    return tuple((text, int(digits or 0)) for text, digits in re.findall(r"(\D*)(\d*)", name))
+
+
+PublishedState: TypeAlias = Literal["same", "changed", "missing", "unreadable", "no file"]
+
+
+def published_state(folder: Path, file: PublishedFile) -> PublishedState:
+    """Compare a published file with the record; follows no link and opens no device.
+
+    Args:
+        folder: of the run.
+        file: its entry in the record.
+    """
+    try:
+        with open_below(folder, file.path) as stream:
+            # A sparse file of a terabyte is recognised by its size.
+            if os.fstat(stream.fileno()).st_size != file.size_bytes:
+                return "changed"
+            digest = hashlib.file_digest(stream, "sha256").hexdigest()
+    except (FileNotFoundError, NotADirectoryError):
+        return "missing"
+    except UnsafeFileError:
+        return "no file"
+    except OSError:
+        return "unreadable"
+    return "same" if digest == file.sha256 else "changed"
+
+
+def require_unchanged(run: Run, *paths: Path) -> None:
+    """Refuse published files that differ from the record: their derivatives would be wrong.
+
+    Args:
+        run: the run.
+        paths: below its folder.
+
+    Raises:
+        RecordError: one was changed, is a link or a device, or is not in the record.
+    """
+    known = {file.path: file for file in run.record.published}
+    for path in paths:
+        expected = known.get(path.relative_to(run.folder).as_posix())
+        if expected is None:
+            raise RecordError(
+                f"{path} is not named in the record of the run, so it cannot be checked"
+            )
+        state = published_state(run.folder, expected)
+        if state == "changed":
+            raise RecordError(
+                f"{path} was changed after the run: the record says that it has the digest "
+                f"{expected.sha256}"
+            )
+        if state != "same":
+            raise RecordError(f"{path} cannot be read: {state}")
+
 
 REPORT_FILE: Final = "report.html"
 _DAMAGED: Final = "the file is damaged"
@@ -493,3 +669,93 @@ def _suffix(run: Run, figure: RecordedFigure) -> str:
     # Format for papers and word processors.
     shown = "image/png" if figure.media_type == "image/webp" else figure.media_type
     return FIGURE_SUFFIXES[shown]
+
+
+_DATASETS = "datasets"
+
+
+def datasets_of(run: Run) -> tuple[str, ...]:
+    """Return the datasets of a run that has cells of them, in order; usually none.
+
+    Names that are invalid are left out, because folders and pages are named after them.
+    """
+    if not _resolved(run).get(_DATASETS):
+        return ()
+    named = (cell.assignment[DATA] for cell in run.record.cells if DATA in cell.assignment)
+    return tuple(name for name in dict.fromkeys(named) if re.fullmatch(NAME_PATTERN, name))
+
+
+def parts_of(run: Run) -> dict[str, Run]:
+    """Return the part of each dataset of a run, including common cells, as a run of its own.
+
+    Their products are read from the record of the whole run.
+    """
+    cells: dict[str, list[RecordedCell]] = {name: [] for name in datasets_of(run)}
+    for cell in run.record.cells:
+        for name in [cell.assignment[DATA]] if DATA in cell.assignment else cells:
+            if name in cells:
+                cells[name].append(cell)
+    published: dict[str, list[PublishedFile]] = {}
+    for file in run.record.published:
+        published.setdefault(file.path.rpartition("/")[0], []).append(file)
+    document = _resolved(run)
+    return {
+        name: dataclasses.replace(
+            run, record=_record_of(run.record, document, name, tuple(own), published)
+        )
+        for name, own in cells.items()
+    }
+
+
+def _record_of(
+    record: RunRecord,
+    document: Mapping[str, JsonValue],
+    name: str,
+    cells: tuple[RecordedCell, ...],
+    published: Mapping[str, Sequence[PublishedFile]],
+) -> RunRecord:
+    taken = {product.source for cell in cells for product in cell.inputs.values()}
+    environments = {cell.environment for cell in cells}
+    return dataclasses.replace(
+        record,
+        status="failed" if any(cell.status == "failed" for cell in cells) else "ok",
+        workflow_resolved=_resolved_of(document, name),
+        inputs=tuple(
+            entry
+            for entry in record.inputs
+            if f"inputs.{entry.name}" in taken or entry.name.partition("@")[2] in ("", name)
+        ),
+        environments=tuple(item for item in record.environments if item.id in environments),
+        cells=cells,
+        published=tuple(
+            file
+            for cell in cells
+            for file in published.get(f"{PRODUCTS_FOLDER}/{cell_file_name(cell.address)}", ())
+        ),
+    )
+
+
+def pages_of(run: Run) -> dict[str, str]:
+    """Return the page of each dataset: name -> path below the run folder, if several."""
+    names = datasets_of(run)
+    return {name: f"{PAGES_FOLDER}/{name}.html" for name in names} if len(names) > 1 else {}
+
+
+def _resolved(run: Run) -> Mapping[str, JsonValue]:
+    try:
+        document = parse_json(run.record.workflow_resolved)
+    except ValueError:
+        return {}
+    return document if isinstance(document, dict) else {}
+
+
+def _resolved_of(document: Mapping[str, JsonValue], name: str) -> str:
+    datasets = document[_DATASETS]
+    own = {name: datasets.get(name)} if isinstance(datasets, dict) else datasets
+    return json.dumps(
+        {**document, _DATASETS: own},
+        sort_keys=True,
+        separators=(",", ":"),
+        ensure_ascii=False,
+        allow_nan=False,
+    )

@@ -15,8 +15,7 @@ from orthoflow.errors import ArgumentError
 from orthoflow.files.geotiff import RasterPlace, place_of
 from orthoflow.files.sidecars import read_sidecar
 from orthoflow.products import JsonValue
-from orthoflow.records.published import PRODUCTS_FOLDER
-from orthoflow.records.runs import Run, copy_files, creating
+from orthoflow.records.runs import PRODUCTS_FOLDER, Run, copy_files, creating
 from orthoflow.untrusted_text import json_bytes, shown
 
 COLLECTION_FILE: Final = "collection.json"

@@ -19,8 +19,7 @@ from orthoflow_provenance.document import COSTS, CellOutcome, RecordedCell, RunR
 from orthoflow.errors import ArgumentError
 from orthoflow.products import Inspection
 from orthoflow.products.product import JsonValue
-from orthoflow.records.published import METRICS_FILE, MetricRow, cell_metrics, write_metrics_csv
-from orthoflow.records.runs import Run
+from orthoflow.records.runs import METRICS_FILE, MetricRow, Run, cell_metrics, write_metrics_csv
 from orthoflow.untrusted_text import Value, csv_text
 from orthoflow.workflow.model import DATA, SEED
 
@@ -211,7 +210,6 @@ def _environments(record: RunRecord) -> Iterator[Row]:
 
 # The call of a step: its method and, as JSON, the parameters.
 Choice: TypeAlias = tuple[str, str]
-
 _BEHIND: Final = ("unit", "better", "step", "cell", "repeat", "runs", "environments")
 _RANGE: Final = ("lowest", "highest")
 

@@ -16,11 +16,9 @@ from orthoflow.engine.journal import JOURNAL, RECORD_FILE, is_running
 from orthoflow.errors import ArgumentError, OrthoflowError
 from orthoflow.products import JsonValue
 from orthoflow.records import RecordedCell
-from orthoflow.records.datasets import parts_of
-from orthoflow.records.published import cell_metrics
-from orthoflow.records.runs import REPORT_FILE, Run
-from orthoflow.records.unfinished import open_run
-from orthoflow.records.verification import broken_seal
+from orthoflow.records.open import open_run
+from orthoflow.records.runs import REPORT_FILE, Run, cell_metrics, parts_of
+from orthoflow.records.verify import broken_seal
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.paired import middle_of
 from orthoflow.report.rankings import FLAG, Sense, is_flag, sense_of

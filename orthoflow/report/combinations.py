@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from orthoflow.geometry import angle_between_deg
 from orthoflow.products import Inspection, Walls
 from orthoflow.records import RecordedCell
-from orthoflow.records.published import cell_metrics
-from orthoflow.records.runs import Run
-from orthoflow.records.writing import NOT_YET
+from orthoflow.records.runs import Run, cell_metrics
+from orthoflow.records.write import NOT_YET
 from orthoflow.report.rankings import Sense, sense_of
 from orthoflow.untrusted_text import first_few, parse_json
 from orthoflow.workflow.expand import variants_text

@@ -10,8 +10,7 @@ from string import ascii_uppercase
 from typing import Final, TypeAlias
 
 from orthoflow.records import COSTS
-from orthoflow.records.published import MetricRow, cell_metrics, is_rounding
-from orthoflow.records.runs import Run
+from orthoflow.records.runs import MetricRow, Run, cell_metrics, is_rounding
 from orthoflow.report.combinations import (
     Combination,
     Measured,

@@ -12,8 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from orthoflow.records import RecordedCell
-from orthoflow.records.datasets import parts_of
-from orthoflow.records.runs import Run
+from orthoflow.records.runs import Run, parts_of
 from orthoflow.report.charts import ChartFormat, ChartPoint, as_image, line_chart
 from orthoflow.report.combinations import (
     Combination,

@@ -8,8 +8,7 @@ from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from typing import Final
 
-from orthoflow.records.published import MetricRow, cell_metrics
-from orthoflow.records.runs import Run
+from orthoflow.records.runs import MetricRow, Run, cell_metrics
 from orthoflow.report.combinations import baseline_cells, baseline_of, combinations_of, is_missing
 from orthoflow.report.comparisons import comparison_columns
 from orthoflow.report.numbers import number

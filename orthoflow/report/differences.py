@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Final, Generic, TypeVar
 
 from orthoflow.records import RecordedFile
-from orthoflow.records.comparison import (
+from orthoflow.records.compare import (
     CellFacts,
     ComparedMetric,
     Pair,
@@ -18,7 +18,7 @@ from orthoflow.records.comparison import (
     ProductDistance,
     RunComparison,
 )
-from orthoflow.records.comparison import Difference as DifferenceCounts
+from orthoflow.records.compare import Difference as DifferenceCounts
 from orthoflow.report.numbers import number, number_with_unit
 
 Side = TypeVar("Side")

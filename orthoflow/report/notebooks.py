@@ -23,13 +23,11 @@ from orthoflow.geometry import WallFrame
 from orthoflow.geometry.levels import Colours, eight_bits
 from orthoflow.products import Orthoimage, Orthoimages, Product, is_shown
 from orthoflow.records import RecordedFigure
-from orthoflow.records.comparison import Difference, RunComparison, compare_runs
-from orthoflow.records.datasets import parts_of
-from orthoflow.records.published import cell_metrics
-from orthoflow.records.runs import Run
+from orthoflow.records.compare import Difference, RunComparison, compare_runs
+from orthoflow.records.open import open_run as open_plain_run
+from orthoflow.records.runs import Run, cell_metrics, parts_of
 from orthoflow.records.tables import RunSet, join_runs
-from orthoflow.records.unfinished import open_run as open_plain_run
-from orthoflow.records.verification import Verification, broken_seal, verify_run
+from orthoflow.records.verify import Verification, broken_seal, verify_run
 from orthoflow.report.combinations import baseline_cells, combinations_of, unequal_walls
 from orthoflow.report.differences import moved_first
 from orthoflow.report.pictures import embedded_products, thumbnail

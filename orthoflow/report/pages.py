@@ -13,14 +13,19 @@ from typing import TYPE_CHECKING, Final
 from orthoflow.errors import StoreError
 from orthoflow.products import Cameras
 from orthoflow.records import RecordedCell
-from orthoflow.records.comparison import compare_runs
-from orthoflow.records.datasets import pages_of, parts_of
-from orthoflow.records.deliverables import delivered_walls
-from orthoflow.records.published import METRICS_FILE, PRODUCTS_FOLDER
-from orthoflow.records.runs import FIGURES_FOLDER, Run, figure_files
+from orthoflow.records.compare import compare_runs
+from orthoflow.records.runs import (
+    FIGURES_FOLDER,
+    METRICS_FILE,
+    PRODUCTS_FOLDER,
+    Run,
+    figure_files,
+    pages_of,
+    parts_of,
+)
 from orthoflow.records.tables import common_points
-from orthoflow.records.verification import sealed_page
-from orthoflow.records.wall_results import uncounted_points
+from orthoflow.records.verify import sealed_page
+from orthoflow.records.walls import delivered_walls, uncounted_points
 from orthoflow.report.combinations import (
     baseline_addresses,
     baseline_cells,

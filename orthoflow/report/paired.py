@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.robust import median_deviation
 from orthoflow.records import RecordedCell
-from orthoflow.records.published import is_rounding
-from orthoflow.records.runs import Run
+from orthoflow.records.runs import Run, is_rounding
 from orthoflow.report.combinations import Combination, Measured, combinations_of
 from orthoflow.report.comparisons import Column, comparison_columns
 from orthoflow.report.environments import AlikeEnvironments, alike_environments

@@ -7,8 +7,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
-from orthoflow.records.datasets import parts_of
-from orthoflow.records.runs import Run
+from orthoflow.records.runs import Run, parts_of
 from orthoflow.report.combinations import Combination, Measured, combinations_of
 from orthoflow.report.comparisons import Column, comparison_columns
 from orthoflow.report.numbers import number, number_with_spread

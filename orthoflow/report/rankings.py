@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Final
 
-from orthoflow.records.published import is_rounding
+from orthoflow.records.runs import is_rounding
 
 # Without repeats of both nobody knows how far values of the same method lie apart, nor where they
 # all give one value. What is nearer than this share of the best is no difference then; times and

@@ -10,8 +10,7 @@ from typing import Final
 from orthoflow.diagnostics import DiagnosticGroup, grouped, standing
 from orthoflow.products import Cameras, Orthoimages, Walls
 from orthoflow.records import RecordedCell
-from orthoflow.records.published import cell_metrics
-from orthoflow.records.runs import Run
+from orthoflow.records.runs import Run, cell_metrics
 from orthoflow.report.combinations import (
     baseline_cells,
     combinations_of,

@@ -7,9 +7,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from orthoflow.records import RecordedCell
-from orthoflow.records.datasets import parts_of
-from orthoflow.records.published import cell_metrics
-from orthoflow.records.runs import Run
+from orthoflow.records.runs import Run, cell_metrics, parts_of
 from orthoflow.report.combinations import Combination, combinations_of
 from orthoflow.report.curves import sweeps
 from orthoflow.report.paired import over_datasets

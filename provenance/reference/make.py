@@ -37,7 +37,7 @@ def make(name: str) -> Path:
     from orthoflow.engine.plan import RunOptions, plan_run
     from orthoflow.engine.scheduler import execute
     from orthoflow.engine.store import Store
-    from orthoflow.records.writing import build_record
+    from orthoflow.records.write import build_record
     from orthoflow.workflow.document import load_workflow
     from orthoflow.workflow.expand import expand_cells
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.records.unfinished import open_run
-from orthoflow.records.verification import verify_run
+from orthoflow.records.open import open_run
+from orthoflow.records.verify import verify_run
 from tests.workshop_runs import orthoflow
 
 ROOMS = """\

@@ -12,8 +12,8 @@ import pytest
 
 from orthoflow.engine.store import Store
 from orthoflow.errors import ArgumentError, RecordError
-from orthoflow.records.unfinished import open_run
-from orthoflow.records.writing import write_embedded
+from orthoflow.records.open import open_run
+from orthoflow.records.write import write_embedded
 from tests.studios import Studio, open_copy, open_finished_studio
 
 

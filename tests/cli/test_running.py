@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.records.unfinished import open_run
+from orthoflow.records.open import open_run
 from tests.laboratories import write_distribution
 from tests.workshop_runs import command, orthoflow, workshop_environment, write_studio
 

@@ -19,7 +19,7 @@ from orthoflow.cli.exports.formats import check_choices
 from orthoflow.cli.exports.products import make_empty
 from orthoflow.cli.program import program
 from orthoflow.errors import ArgumentError
-from orthoflow.records.comparison import CellFacts, Pair, ParameterValue, RunComparison
+from orthoflow.records.compare import CellFacts, Pair, ParameterValue, RunComparison
 from tests.laboratories import laboratory_catalog
 from tests.report_runs import cell, metric, record
 

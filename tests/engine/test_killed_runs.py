@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from orthoflow.engine.store import Store
-from orthoflow.records.unfinished import open_run
-from orthoflow.records.verification import verify_run
+from orthoflow.records.open import open_run
+from orthoflow.records.verify import verify_run
 from tests.killed_runs import Answer, RunServer, run_server
 from tests.long_loops import IS_LONG
 from tests.workshop_runs import workshop_environment, write_studio

@@ -18,8 +18,8 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.records.unfinished import open_run
-from orthoflow.records.verification import verify_run
+from orthoflow.records.open import open_run
+from orthoflow.records.verify import verify_run
 from tests.engine_world import install_toys, toy_world
 from tests.forked_commands import run_command
 from tests.killed_runs import ROOT, run_here

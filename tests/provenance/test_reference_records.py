@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.records.unfinished import open_run
+from orthoflow.records.open import open_run
 from tests.studios import Studio, open_studio
 
 REFERENCE = Path(__file__).resolve().parents[2] / "provenance" / "reference"

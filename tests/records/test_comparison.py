@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from orthoflow.engine.store import Store
-from orthoflow.records import comparison as module
-from orthoflow.records.comparison import Pair, compare_runs
+from orthoflow.records import compare as module
+from orthoflow.records.compare import Pair, compare_runs
+from orthoflow.records.open import open_run
 from orthoflow.records.runs import Run
-from orthoflow.records.unfinished import open_run
 from orthoflow.report.pages import write_report
 from tests.compared_runs import compared, number
 from tests.report_runs import HeldRun, cell, record
@@ -193,9 +193,7 @@ def test_arrays_beside_the_record_are_found_in_a_store_or_not_measured(studio: S
 def test_a_page_of_two_runs_looks_into_the_store_as_the_command_does(
     studio: Studio, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        "orthoflow.records.unfinished.open_run", lambda path: unembedded(open_run(path))
-    )
+    monkeypatch.setattr("orthoflow.records.open.open_run", lambda path: unembedded(open_run(path)))
     # Studios write empty pages.
     monkeypatch.setattr("orthoflow.report.write_report", write_report)
     told = "in no record and no store at hand"

@@ -21,8 +21,8 @@ from orthoflow_provenance.document import RecordedFigure
 
 from orthoflow.errors import RecordError
 from orthoflow.files.images import encode_png
-from orthoflow.records.crates import crate_metadata, write_crate
-from orthoflow.records.unfinished import open_run
+from orthoflow.records.archive import crate_metadata, write_crate
+from orthoflow.records.open import open_run
 from orthoflow.report import write_page, write_report
 from tests.crate_contexts import context_of
 from tests.studios import Studio, open_studio

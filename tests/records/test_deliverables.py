@@ -13,7 +13,7 @@ import pytest
 
 from orthoflow.files.publishing import publish_orthoimages, publish_walls
 from orthoflow.products import Orthoimage, Orthoimages, OrthoMask, Walls
-from orthoflow.records.deliverables import WALLS_FILE, write_walls_json
+from orthoflow.records.walls import WALLS_FILE, write_walls_json
 from tests import samples
 
 FRAME = samples.facing_south(0.1, 20, 10)

@@ -10,8 +10,8 @@ import pytest
 
 from orthoflow.errors import PluginError
 from orthoflow.products.product import Payload, Tolerance
-from orthoflow.records import comparison as module
-from orthoflow.records.comparison import RunProducts, product_distances
+from orthoflow.records import compare as module
+from orthoflow.records.compare import RunProducts, product_distances
 
 
 def payload(version: int = 1, metadata: dict[str, Any] | None = None, **arrays: Any) -> Payload:

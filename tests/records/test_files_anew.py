@@ -9,10 +9,9 @@ import pytest
 
 from orthoflow.files.geotiff import RasterParts
 from orthoflow.products import Orthoimages
-from orthoflow.records.runs import Run
-from orthoflow.records.unfinished import open_run
-from orthoflow.records.verification import published_state
-from orthoflow.records.wall_results import with_files
+from orthoflow.records.open import open_run
+from orthoflow.records.runs import Run, published_state
+from orthoflow.records.write import with_files
 from tests.drawing_runs import WALL, write_drawing_run
 
 

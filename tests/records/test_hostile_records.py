@@ -14,7 +14,7 @@ import h5py
 import pytest
 
 from orthoflow.diagnostics import PLAIN_WARNING
-from orthoflow.records.verification import verify_run
+from orthoflow.records.verify import verify_run
 from tests import hostile_records as hostile
 from tests.studios import Studio, open_studio
 

@@ -19,8 +19,8 @@ from prov.model import (
     ProvUsage,
 )
 
-from orthoflow.records.prov import prov_document
-from orthoflow.records.unfinished import open_run
+from orthoflow.records.archive import prov_document
+from orthoflow.records.open import open_run
 from tests.studios import Studio, open_finished_studio
 
 

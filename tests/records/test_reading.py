@@ -24,10 +24,10 @@ from orthoflow_provenance.record import write_record
 from orthoflow.engine.journal import cell_file_name
 from orthoflow.errors import ArgumentError, RecordError
 from orthoflow.products import Planes
-from orthoflow.records.published import publish_products
+from orthoflow.records.open import open_run
 from orthoflow.records.runs import Run
-from orthoflow.records.unfinished import open_run
-from orthoflow.records.verification import verify_run
+from orthoflow.records.verify import verify_run
+from orthoflow.records.write import publish_products
 from tests import samples
 from tests.report_runs import environment
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from orthoflow_provenance.document import Metric
 
-from orthoflow.records.comparison import ProductDistance, Verdict
-from orthoflow.records.replaying import ReplayedMetric, replayed_metrics
+from orthoflow.records.compare import ProductDistance, Verdict
+from orthoflow.records.replay import ReplayedMetric, replayed_metrics
 from orthoflow.records.runs import Run
 from tests.report_runs import cell, given, metrics, record
 

@@ -9,9 +9,9 @@ import pytest
 from orthoflow.engine.plan import RunOptions, plan_run
 from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.engine.store import Store
-from orthoflow.records.replaying import UnreplayableRunError, plan_replay
+from orthoflow.records.replay import UnreplayableRunError, plan_replay
 from orthoflow.records.runs import Run
-from orthoflow.records.writing import write_run
+from orthoflow.records.write import write_run
 from orthoflow.workflow import expand as cells
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import expand_cells

@@ -17,12 +17,9 @@ from orthoflow_provenance.record import write_record
 
 from orthoflow.errors import RecordError
 from orthoflow.products.inspections import Finding
-from orthoflow.records import verification as module
-from orthoflow.records.verification import (
-    published_state,
-    require_unchanged,
-    verify_run,
-)
+from orthoflow.records import verify as module
+from orthoflow.records.runs import published_state, require_unchanged
+from orthoflow.records.verify import verify_run
 from tests.provenance_records import ProductShelf, sample_record
 from tests.report_runs import inspection_product
 
@@ -67,7 +64,7 @@ def test_a_file_that_cannot_be_read_is_told(folder: Path, monkeypatch: pytest.Mo
     def refuses(*_: object) -> None:
         raise PermissionError(13, "denied")
 
-    monkeypatch.setattr(module, "open_below", refuses)
+    monkeypatch.setattr("orthoflow.records.runs.open_below", refuses)
     assert published_state(folder, published("products/same")) == "unreadable"
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from orthoflow.errors import ArgumentError, RecordError
 from orthoflow.products import CheckPoints, Finding, Inspection
-from orthoflow.records import wall_results as module
+from orthoflow.records import walls as module
 
 
 def output(type_name: str, digest: str = "", *, embedded: bool = True) -> Any:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.records.published import _by_number, publish_products, published_files
-from orthoflow.records.runs import Run
+from orthoflow.records.runs import Run, _by_number, published_files
+from orthoflow.records.write import publish_products
 from tests.provenance_records import sample_record
 
 CLOUD, WALLS, ENVIRONMENT = "sha256:" + "c" * 64, "sha256:" + "d" * 64, "sha256:" + "e" * 64

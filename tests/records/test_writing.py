@@ -24,11 +24,16 @@ from orthoflow.engine.results import FigureRef
 from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.engine.store import Store
 from orthoflow.errors import DamageError, StoreError
-from orthoflow.records.published import publish_products
+from orthoflow.records.open import open_run
 from orthoflow.records.runs import Run
-from orthoflow.records.unfinished import open_run
-from orthoflow.records.verification import verify_run
-from orthoflow.records.writing import begin_run, executed_and_written, show_unfinished, write_run
+from orthoflow.records.verify import verify_run
+from orthoflow.records.write import (
+    begin_run,
+    executed_and_written,
+    publish_products,
+    show_unfinished,
+    write_run,
+)
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import expand_cells
 from orthoflow.workflow.model import (

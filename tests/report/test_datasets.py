@@ -14,9 +14,8 @@ import pytest
 from orthoflow_provenance.document import RecordedCell
 
 from orthoflow.errors import StoreError
-from orthoflow.records.datasets import datasets_of, parts_of
-from orthoflow.records.runs import Run
-from orthoflow.records.writing import NOT_YET
+from orthoflow.records.runs import Run, datasets_of, parts_of
+from orthoflow.records.write import NOT_YET
 from orthoflow.report import write_page, write_report
 from orthoflow.report.dataset_tables import dataset_table
 from orthoflow.report.paired import (

@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
-from orthoflow.records.comparison import ComparedMetric, Pair
+from orthoflow.records.compare import ComparedMetric, Pair
 from orthoflow.report import differences
 from orthoflow.report.differences import Difference
 from tests.compared_runs import compared

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from orthoflow.records.comparison import ComparedMetric, Pair
+from orthoflow.records.compare import ComparedMetric, Pair
 from orthoflow.report.differences import alike_texts, moved_first, without_seeds
 from tests.compared_runs import compared
 

@@ -19,7 +19,7 @@ import orthoflow
 from orthoflow.engine.store import Store
 from orthoflow.errors import ArgumentError, OrthoflowError, RecordError, WorkflowError
 from orthoflow.products import Orthoimages, PointCloud
-from orthoflow.records.comparison import ComparedMetric, Pair
+from orthoflow.records.compare import ComparedMetric, Pair
 from orthoflow.report.notebooks import Figures, OpenedRun, ShownComparison
 from orthoflow.report.tidy_tables import combination_rows
 from tests.compared_runs import compared, number

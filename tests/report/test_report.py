@@ -11,7 +11,7 @@ from orthoflow_provenance.document import Metric, PublishedFile, RecordedCell
 
 from orthoflow.errors import StoreError
 from orthoflow.records.runs import Run
-from orthoflow.records.writing import NOT_YET
+from orthoflow.records.write import NOT_YET
 from orthoflow.report import comparisons, write_figures, write_page, write_report
 from orthoflow.report.combinations import Measured, combinations_of
 from orthoflow.report.comparisons import Column, comparison_columns, comparison_table

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from orthoflow_provenance.document import RecordedFile
 
-from orthoflow.records.comparison import CellFacts, Distance, Pair, ParameterValue, RunComparison
+from orthoflow.records.compare import CellFacts, Distance, Pair, ParameterValue, RunComparison
 from orthoflow.report.combinations import (
     baseline_cells,
     baseline_of,

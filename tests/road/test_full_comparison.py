@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from orthoflow.records.open import open_run
 from orthoflow.records.runs import Run
-from orthoflow.records.unfinished import open_run
-from orthoflow.records.verification import verify_run
+from orthoflow.records.verify import verify_run
 from tests.browser import Page
 from tests.long_loops import IS_LONG
 from tests.road.conftest import ROOT, Shell

@@ -28,7 +28,7 @@ from orthoflow.files.drawings.room_lines import DrawnWall, RoomLines, room_lines
 from orthoflow.files.sidecars import placed_raster
 from orthoflow.products import Orthoimage, Orthoimages
 from orthoflow.records.runs import Run
-from orthoflow.records.wall_results import RoomResults, WallResult, room_results
+from orthoflow.records.walls import RoomResults, WallResult, room_results
 
 
 def chosen_walls(results: RoomResults, chosen: Choices) -> Sequence[WallResult]:

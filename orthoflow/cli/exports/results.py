@@ -90,7 +90,7 @@ def export_tables(run: Run, folder: Path, _chosen: Choices) -> str:
 
 def export_crate(run: Run, folder: Path, chosen: Choices) -> str:
     """Write a crate, with an embedded record if wanted."""
-    from orthoflow.records.crates import NO_LICENSE, write_crate
+    from orthoflow.records.archive import NO_LICENSE, write_crate
     from orthoflow.records.runs import REPORT_FILE
     from orthoflow.report import write_page
 
@@ -128,7 +128,7 @@ def export_prov(run: Run, folder: Path, _chosen: Choices) -> str:
     """Write `prov.json`."""
     from prov.model import ProvActivity, ProvAgent, ProvEntity
 
-    from orthoflow.records.prov import prov_document
+    from orthoflow.records.archive import prov_document
     from orthoflow.records.runs import creating
 
     document = prov_document(run.record)
@@ -153,6 +153,6 @@ def embedded(run: Run, folder: Path, chosen: Choices) -> Run:
     """Write a record with every product and input file in it; gives it opened."""
     from orthoflow.engine.journal import RECORD_FILE
     from orthoflow.engine.store import Store
-    from orthoflow.records.writing import write_embedded
+    from orthoflow.records.write import write_embedded
 
     return write_embedded(run, folder / RECORD_FILE, Store(chosen.store), chosen.inputs)

@@ -17,7 +17,7 @@ from orthoflow.files.drawings.sections import Cut, plan_cut, section_cut, sectio
 from orthoflow.files.drawings.sheet_contents import Drawing
 from orthoflow.products import Planes, PointCloud, PointLabels
 from orthoflow.records.runs import Run
-from orthoflow.records.wall_results import RoomResults, room_results
+from orthoflow.records.walls import RoomResults, room_results
 
 _USUAL_HEIGHT_M = 1.2
 

@@ -30,7 +30,7 @@ from orthoflow.files.drawings.wall_drawings import Area, wall_picture
 from orthoflow.files.drawings.words import Phrase, label, surface_name
 from orthoflow.products import Opening
 from orthoflow.records.runs import Run
-from orthoflow.records.wall_results import RoomResults, WallResult, room_results
+from orthoflow.records.walls import RoomResults, WallResult, room_results
 
 _USUAL_PAPER: Final = "A3"
 _GRID_MM: Final = 20.0

@@ -23,9 +23,8 @@ from orthoflow.files.sidecars import OrthoFile, ortho_files, placed_raster
 from orthoflow.files.tiles.iiif import MANIFEST, Canvas, Layer, write_manifest
 from orthoflow.files.tiles.pyramid import PAGE, write_tiles, write_viewer
 from orthoflow.products import Planes
-from orthoflow.records.runs import Run
-from orthoflow.records.verification import require_unchanged
-from orthoflow.records.wall_results import WallResult, room_results
+from orthoflow.records.runs import Run, require_unchanged
+from orthoflow.records.walls import WallResult, room_results
 
 _LOCAL: Final = "http://localhost:8000"
 _LAYERS: Final = {

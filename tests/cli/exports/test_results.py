@@ -62,7 +62,7 @@ def test_a_crate_says_what_it_does_not_say(
         asked.update(known)
         return [folder / "ro-crate-metadata.json", folder / "run.h5"]
 
-    monkeypatch.setattr("orthoflow.records.crates.write_crate", write_crate)
+    monkeypatch.setattr("orthoflow.records.archive.write_crate", write_crate)
     monkeypatch.setattr(module, "embedded", lambda *_args: "the record")
     chosen = Choices(embed=embed, **choices)  # type: ignore[arg-type]
     said = module.export_crate(Cells(), tmp_path / "out", chosen)  # type: ignore[arg-type]

@@ -20,9 +20,9 @@ from PIL import Image
 from orthoflow.cli.export import export as command
 from orthoflow.cli.program import program
 from orthoflow.errors import RecordError
+from orthoflow.records.open import open_run
 from orthoflow.records.runs import Run
-from orthoflow.records.unfinished import open_run
-from orthoflow.records.wall_results import room_results
+from orthoflow.records.walls import room_results
 from tests.drawing_runs import (
     GAP_M,
     GSD_M,

@@ -35,7 +35,7 @@ from orthoflow.files.drawings.title_blocks import TitleBlock
 from orthoflow.files.drawings.words import LANGUAGES, _labels, label
 from orthoflow.files.geotiff import GridPlace, write_raster
 from orthoflow.geometry.frames import frame_over
-from orthoflow.records.unfinished import open_run
+from orthoflow.records.open import open_run
 from tests import samples
 from tests.drawing_runs import WALL, write_drawing_run
 

@@ -12,10 +12,9 @@ import shlex
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Final, Literal
 
 from orthoflow_provenance.document import (
-    PublishedFile,
     RecordedCell,
     RunRecord,
     UnsafeFileError,
@@ -31,14 +30,16 @@ from orthoflow.errors import ArgumentError, InputError, PluginError, RecordError
 from orthoflow.geometry.threads import in_order
 from orthoflow.products import Inspection
 from orthoflow.products.product import Payload
-from orthoflow.records.published import PRODUCTS_FOLDER
 from orthoflow.records.runs import (
     FIGURES_FOLDER,
     PAGES_FOLDER,
+    PRODUCTS_FOLDER,
     REPORT_FILE,
+    PublishedState,
     Run,
     creating,
     find_record,
+    published_state,
     record_errors,
 )
 from orthoflow.untrusted_text import first_few
@@ -48,7 +49,6 @@ if TYPE_CHECKING:
         Ed25519PrivateKey,
         Ed25519PublicKey,
     )
-
 
 SIGNATURE_SUFFIX: Final = ".sig"
 _FORMAT: Final = "orthoflow-signature"
@@ -287,7 +287,6 @@ def _need_library() -> None:
 
 # Pages that show the record; its digests would have to be in it.
 _VIEWS: Final = (REPORT_FILE, PAGES_FOLDER, FIGURES_FOLDER)
-
 # Contradictions within a record: it may have been written like that.
 _OWN_FAULTS: Final = frozenset({"field", "name", "key", "reference"})
 # A crate has its description, two files of the workflow and one per environment.
@@ -297,8 +296,6 @@ _OF_WALLS: Final = re.compile(r"(all|(wall|floor|ceiling)_\d+)_")
 # Before the digests at the end of a page.
 _PAGE_MARK: Final = "orthoflow report of"
 _LARGEST_PAGE_BYTES: Final = 1 << 30
-
-PublishedState: TypeAlias = Literal["same", "changed", "missing", "unreadable", "no file"]
 _WRONG: Final[dict[PublishedState, str]] = {
     "changed": "changed since it was published",
     "unreadable": "unreadable since it was published",
@@ -554,55 +551,6 @@ def _check_published(path: Path, record: RunRecord) -> _PublishedCheck:
             text = f"not covered by the record: {first_few(others, most=_UNCOVERED_MOST)}"
             notes.append(Note(code="uncovered", text=text))
     return _PublishedCheck(changed=changed, notes=tuple(notes), n_same=states.count("same"))
-
-
-def published_state(folder: Path, file: PublishedFile) -> PublishedState:
-    """Compare a published file with the record; follows no link and opens no device.
-
-    Args:
-        folder: of the run.
-        file: its entry in the record.
-    """
-    try:
-        with open_below(folder, file.path) as stream:
-            # A sparse file of a terabyte is recognised by its size.
-            if os.fstat(stream.fileno()).st_size != file.size_bytes:
-                return "changed"
-            digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    except (FileNotFoundError, NotADirectoryError):
-        return "missing"
-    except UnsafeFileError:
-        return "no file"
-    except OSError:
-        return "unreadable"
-    return "same" if digest == file.sha256 else "changed"
-
-
-def require_unchanged(run: Run, *paths: Path) -> None:
-    """Refuse published files that differ from the record: their derivatives would be wrong.
-
-    Args:
-        run: the run.
-        paths: below its folder.
-
-    Raises:
-        RecordError: one was changed, is a link or a device, or is not in the record.
-    """
-    known = {file.path: file for file in run.record.published}
-    for path in paths:
-        expected = known.get(path.relative_to(run.folder).as_posix())
-        if expected is None:
-            raise RecordError(
-                f"{path} is not named in the record of the run, so it cannot be checked"
-            )
-        state = published_state(run.folder, expected)
-        if state == "changed":
-            raise RecordError(
-                f"{path} was changed after the run: the record says that it has the digest "
-                f"{expected.sha256}"
-            )
-        if state != "same":
-            raise RecordError(f"{path} cannot be read: {state}")
 
 
 def _unnamed(path: Path, record: RunRecord) -> tuple[list[str], list[str]]:

@@ -48,8 +48,6 @@ from orthoflow.workflow.problems import (
 
 # Maximum number of files of a folder that is searched by content; in a larger one only by name.
 _MOST_LISTED: Final = 10_000
-
-
 # By default a run is in runs/<name>/ below the folder of its workflow.
 _FOLDERS_ABOVE: Final = 3
 

@@ -1,41 +1,67 @@
-"""Writing a finished run: published products, then the record, whose name marks completion."""
+"""Writing a run: published products, then the record, whose name marks completion."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+import json
+import shutil
+import tempfile
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from itertools import chain, count
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Final
 
 from orthoflow_provenance.document import (
+    CellOutcome,
+    Figure,
     InputFileError,
     MethodIdentity,
+    ProductRef,
+    PublishedFile,
     RecordedCell,
+    RecordedEnvironment,
+    RecordedFigure,
     RecordedFile,
     RecordedInput,
+    RecordedProduct,
     RecordFormatError,
     RunRecord,
     shared_fields,
+    to_json,
 )
+from orthoflow_provenance.paths import colliding, path_below
 from orthoflow_provenance.record import write_record
 
-from orthoflow.engine.durability import sync_folder, sync_tree, writing_to
-from orthoflow.engine.file_digests import FileDigests
-from orthoflow.engine.journal import RECORD_FILE, kept_from_others
-from orthoflow.engine.results import CellResult
-from orthoflow.errors import ArgumentError, DamageError, InputError, OrthoflowError, StoreError
-from orthoflow.records.input_files import ChangedInputsError, embedded_inputs, find_inputs
-from orthoflow.records.published import publish_products
-from orthoflow.records.runs import Run, read_run
-from orthoflow.records.unfinished import (
-    OUTLINE_FILE,
-    recorded_cell,
-    recorded_environments,
-    write_outline,
+from orthoflow.engine.durability import sync_folder, sync_tree, write_whole, writing_to
+from orthoflow.engine.file_digests import FileDigests, file_sha256
+from orthoflow.engine.journal import (
+    RECORD_FILE,
+    cell_file_name,
+    kept_from_others,
 )
+from orthoflow.engine.results import CellResult
+from orthoflow.engine.store import Store, publish_into
+from orthoflow.errors import ArgumentError, DamageError, InputError, OrthoflowError, StoreError
+from orthoflow.files.geotiff import name_run
+from orthoflow.geometry.threads import in_order
+from orthoflow.products import (
+    Orthoimages,
+    Walls,
+)
+from orthoflow.records.inputs import ChangedInputsError, embedded_inputs, find_inputs
+from orthoflow.records.runs import (
+    METRICS_FILE,
+    PRODUCTS_FOLDER,
+    Run,
+    cell_metrics,
+    copy_files,
+    read_run,
+    write_metrics_csv,
+)
+from orthoflow.records.walls import write_walls_json
 from orthoflow.untrusted_text import first_few
 from orthoflow.version import __version__
 from orthoflow.workflow.inputs import MissingInputsError
@@ -46,12 +72,211 @@ from orthoflow.workflow.resolved import (
 
 if TYPE_CHECKING:
     from orthoflow.engine.plan import RunPlan
+    from orthoflow.engine.results import CellResult
     from orthoflow.engine.scheduler import RunOutcome
     from orthoflow.engine.store import Store
     from orthoflow.workflow.expand import Cell
     from orthoflow.workflow.model import (
         Workflow,
     )
+
+
+def publish_products(
+    run_folder: Path,
+    cells: Iterable[RecordedCell],
+    files_of: Mapping[str, Mapping[str, Mapping[Path, str]]],
+    run_id: str,
+) -> tuple[PublishedFile, ...]:
+    """Fill `products/` of a run folder; an older one of an interrupted run is replaced.
+
+    Args:
+        run_folder: existing folder.
+        cells: all cells of the run.
+        files_of: address -> output port -> files in the store, and the required SHA-256 of each.
+        run_id: is inserted into the names of the coordinate systems of walls.
+
+    Returns:
+        The present files, sorted by path.
+
+    Raises:
+        StoreError: a file cannot be copied, e.g. because the disk is full, or differs from its
+            digest.
+    """
+    target = run_folder / PRODUCTS_FOLDER
+    cells = tuple(cells)
+    with writing_to(target):
+        if target.is_symlink():
+            target.unlink()
+        # A file that cannot be removed would be published as part of this run.
+        with suppress(FileNotFoundError):
+            shutil.rmtree(target)
+        target.mkdir(parents=True, exist_ok=True)
+        replaced = _replaced(cells)
+        for cell in cells:
+            if cell.status == "ok":
+                folder = path_below(target, cell_file_name(cell.address))
+                ports = files_of.get(cell.address, {})
+                current = {
+                    port: files
+                    for port, files in ports.items()
+                    if f"{cell.address}.{port}" not in replaced
+                }
+                _publish_cell(folder, cell, current, run_id)
+        write_walls_json(target, cells)
+        rows = [row for cell in cells for row in cell_metrics(cell)]
+        write_metrics_csv(target / METRICS_FILE, rows)
+        return _digested(run_folder, target)
+
+
+def _digested(run_folder: Path, target: Path) -> tuple[PublishedFile, ...]:
+    paths = sorted(path for path in target.rglob("*") if path.is_file())
+    digests = list(in_order(file_sha256, paths))
+    return tuple(
+        PublishedFile(
+            path=path.relative_to(run_folder).as_posix(),
+            size_bytes=path.stat().st_size,
+            sha256=digest,
+        )
+        for path, digest in zip(paths, digests, strict=True)
+    )
+
+
+def _replaced(cells: Iterable[RecordedCell]) -> set[str]:
+    """Return outputs, `address.port`, that a later cell replaces by one of the same type.
+
+    Beside its successor, e.g. planes whose sides were found later, the first would contradict it.
+    Products read from files stay.
+    """
+    made = {
+        cell.address
+        for cell in cells
+        if any(not given.source.startswith("inputs.") for given in cell.inputs.values())
+    }
+    return {
+        given.source
+        for cell in cells
+        if cell.status == "ok"
+        for given in cell.inputs.values()
+        for output in cell.outputs.values()
+        if output.type_name == given.type_name
+        and output.digest != given.digest
+        and given.source.rpartition(".")[0] in made
+    }
+
+
+def _publish_cell(
+    folder: Path,
+    cell: RecordedCell,
+    files_of: Mapping[str, Mapping[Path, str]],
+    run_id: str,
+) -> None:
+    """Copy the files of a cell, by port, and insert the run's name."""
+    folder.mkdir()
+    taken = [METRICS_FILE]
+    for port, files in files_of.items():
+        for file, sha256 in files.items():
+            # Two outputs of one type publish equal names: the port tells them apart.
+            marks = chain(("", f"{port}_"), (f"{port}_{number}_" for number in count(2)))
+            names = (f"{mark}{file.name}" for mark in marks)
+            name = next(name for name in names if not colliding([*taken, name]))
+            taken.append(name)
+            # A copy, not a hard link: editing a product must not change the store.
+            copy = path_below(folder, name)
+            shutil.copyfile(file, copy)
+            if (found := file_sha256(copy)) != sha256:
+                raise StoreError(f"{copy} must have the digest {sha256}, got {found}")
+            name_run(copy, run_id)
+    write_metrics_csv(folder / METRICS_FILE, cell_metrics(cell))
+
+
+OUTLINE_FILE: Final = ".outline.json"
+
+
+def write_outline(
+    record: RunRecord,
+    run_folder: Path,
+    store: Store,
+    *,
+    sources: Mapping[str, Mapping[str, str]],
+    embedded: Collection[str],
+) -> None:
+    """Keep what a run is about to compute, so that it can be shown before it is finished.
+
+    Args:
+        record: of the run, with every cell skipped.
+        run_folder: existing folder.
+        store: where its results go.
+        sources: address -> input port -> its source.
+        embedded: product types whose arrays go into a record.
+
+    Raises:
+        StoreError: the disk cannot be written.
+    """
+    content = {
+        "store": str(store.folder.absolute()),
+        "record": to_json(record),
+        "sources": {address: dict(ports) for address, ports in sources.items()},
+        "embedded": sorted(embedded),
+    }
+    with writing_to(run_folder):
+        write_whole(run_folder / OUTLINE_FILE, json.dumps(content).encode("utf-8", "replace"))
+
+
+def recorded_environments(
+    results: Mapping[str, CellResult],
+) -> tuple[RecordedEnvironment, ...]:
+    """Return the environments of results, each once."""
+    given = (result.environment for result in results.values())
+    return tuple({one.id: one for one in given if one is not None}.values())
+
+
+def recorded_cell(
+    cell: RecordedCell,
+    result: CellResult,
+    store: Store,
+    *,
+    sources: Mapping[str, str],
+    embedded: Collection[str],
+    cached_from: str,
+) -> RecordedCell:
+    """Return a cell as recorded with its result.
+
+    Args:
+        cell: the cell without a result.
+        result: what the store keeps of it.
+        store: has the figures.
+        sources: source of each input port.
+        embedded: product types whose arrays go into the record.
+        cached_from: the earlier run that computed it, if any.
+
+    Raises:
+        DamageError: a figure is missing or damaged.
+    """
+    figures = []
+    for figure in result.figures:
+        try:
+            data = store.blob(figure.sha256)
+        except DamageError as error:
+            raise DamageError(f"the figure {figure.name} is damaged") from error
+        figures.append(RecordedFigure(data=data, **shared_fields(figure, Figure)))
+    return dataclasses.replace(
+        cell,
+        **shared_fields(result, CellOutcome),
+        environment=result.environment.id if result.environment else "",
+        cached_from=cached_from,
+        figures=tuple(figures),
+        inputs={
+            port: RecordedProduct(source=sources.get(port, ""), **shared_fields(ref, ProductRef))
+            for port, ref in result.inputs.items()
+        },
+        outputs={
+            port: RecordedProduct(
+                embedded=ref.type_name in embedded, **shared_fields(ref, ProductRef)
+            )
+            for port, ref in result.outputs.items()
+        },
+    )
+
 
 _UNFINISHED: Final = f".{RECORD_FILE}.unfinished"
 _MOST_ATTEMPTS: Final = 4
@@ -222,7 +447,7 @@ def show_unfinished(
 def begin_run(
     plan: RunPlan, workflow: Workflow, run_folder: Path, store: Store, run_id: str
 ) -> None:
-    """Keep the outline of a run that begins, see `records.unfinished`.
+    """Keep the outline of a run that begins, see `open.open_unfinished`.
 
     Raises:
         StoreError: the disk cannot be written.
@@ -470,3 +695,100 @@ def _input_files(
         for entry in record.inputs
         for file, place in zip(entry.files, search.paths[entry.name], strict=True)
     }
+
+
+def write_part(part: Run, folder: Path, store: Store) -> Run:
+    """Write one dataset of a run as a run folder, whose record can be verified and replayed alone.
+
+    Args:
+        part: from `parts_of`.
+        folder: a new folder for the record and the published files.
+        store: has the products that were embedded and are no longer in the run's record.
+
+    Raises:
+        RecordError: the run is damaged.
+        StoreError: the disk cannot be written.
+    """
+    with writing_to(folder):
+        folder.mkdir(parents=True)
+    published = part.record.published
+    copied = set(copy_files(part.folder, folder, [file.path for file in published], published))
+    record = dataclasses.replace(
+        part.record,
+        published=tuple(file for file in published if file.path in copied),
+    )
+    path = folder / RECORD_FILE
+    with embedded_inputs(part, folder) as laid_out:
+        files = {
+            file.sha256: place
+            for entry in record.inputs
+            for file, place in zip(
+                entry.files, laid_out.extracted.get(entry.name, ()), strict=False
+            )
+        }
+        try:
+            with writing_to(folder):
+                write_record(
+                    path, record, store.product_file, input_file=files.get, earlier=part.path
+                )
+        except (RecordFormatError, InputFileError) as error:
+            raise StoreError(f"{path} cannot be written: {error}") from error
+    return read_run(path)
+
+
+_TYPES: Final = frozenset((Orthoimages.type_name, Walls.type_name))
+
+
+@contextmanager
+def with_files(run: Run, tell: Callable[[str], None] = lambda _: None) -> Iterator[Run]:
+    """Return a run with the rasters that it published.
+
+    Those beside the record are used. If there are none, they are created from the walls and
+    orthoimages in the record, in a folder that exists as long as the block.
+
+    Args:
+        run: the run.
+        tell: called with a sentence if files are created.
+
+    Raises:
+        RecordError: the record is damaged.
+        StoreError: the disk cannot be written.
+    """
+    published = run.record.published
+    if not published or any((run.folder / file.path).exists() for file in published):
+        yield run
+        return
+    with tempfile.TemporaryDirectory(prefix="orthoflow-") as name, run.held_open() as opened:
+        scratch = Path(name)
+        if not (files_of := _made_again(opened, scratch / "made")):
+            yield run
+            return
+        folder = scratch / "run"
+        folder.mkdir()
+        made = publish_products(folder, run.record.cells, files_of, run.record.run_id)
+        tell(
+            f"{run.path} lies alone: its rasters are made anew of the products in it, and "
+            "other files that were published are left out"
+        )
+        record = replace(run.record, published=made)
+        yield replace(opened, record=record, files_folder=folder)
+
+
+def _made_again(run: Run, folder: Path) -> dict[str, dict[str, dict[Path, str]]]:
+    """Let the products of a record publish their files: address -> port -> file -> SHA-256."""
+    from orthoflow.catalog.discovery import discover_catalog  # noqa: PLC0415 - loads plugins
+
+    catalog = discover_catalog()
+    found: dict[str, dict[str, dict[Path, str]]] = {}
+    for address, cell in run.cells.items():
+        for port, output in cell.outputs.items():
+            if output.type_name not in _TYPES or not output.embedded:
+                continue
+            publish = catalog.publisher(output.type_name)
+            if publish is None:
+                continue
+            own = folder / str(len(found)) / port
+            publish_into(own, run.product(address, port), publish, output.digest)
+            files = sorted(path for path in own.rglob("*") if path.is_file())
+            found.setdefault(address, {})[port] = {path: file_sha256(path) for path in files}
+    return found

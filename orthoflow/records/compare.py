@@ -25,20 +25,14 @@ from orthoflow.engine.keys import read_preimage, stated_versions
 from orthoflow.errors import OrthoflowError
 from orthoflow.geometry.levels import DEEPER
 from orthoflow.products.product import JsonValue, Payload, Product, Tolerance
-from orthoflow.records.published import cell_metrics, is_rounding
-from orthoflow.records.runs import Run
+from orthoflow.records.runs import Run, cell_metrics, is_rounding
 from orthoflow.workflow.model import DATA, SEED
-
-if TYPE_CHECKING:
-    from orthoflow.catalog.catalog import Catalog
-    from orthoflow.engine.store import Store
-
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from orthoflow.catalog.catalog import Catalog
     from orthoflow.engine.store import Store
-
 
 Verdict = Literal["identical", "within tolerance", "different", "not measured"]
 

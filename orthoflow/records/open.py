@@ -1,52 +1,37 @@
-"""A running or interrupted run, as far as it has results: from its outline, journal and store.
-
-The outline is written when a run begins: the record of a run in which nothing was computed yet.
-Cells that ended since, according to the journal, come from the store.
-"""
+"""Opening a run, finished or not."""
 
 from __future__ import annotations
 
 import atexit
 import dataclasses
-import json
 import shutil
 import tempfile
-from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from orthoflow_provenance.document import (
-    CellOutcome,
-    Figure,
-    ProductRef,
-    RecordedCell,
-    RecordedEnvironment,
-    RecordedFigure,
-    RecordedProduct,
     RecordFormatError,
     RunRecord,
     from_json,
     parse_json,
-    shared_fields,
-    to_json,
 )
 from orthoflow_provenance.record import write_record
 
-from orthoflow.engine.durability import write_whole, writing_to
 from orthoflow.engine.journal import (
     RECORD_FILE,
     readable_lines,
 )
-from orthoflow.errors import ArgumentError, DamageError, StoreError
-from orthoflow.records.published import publish_products
-from orthoflow.records.runs import Run, find_record, read_run
-from orthoflow.records.verification import published_state
+from orthoflow.errors import ArgumentError, StoreError
+from orthoflow.records.runs import Run, find_record, published_state, read_run
+from orthoflow.records.write import (
+    OUTLINE_FILE,
+    publish_products,
+    recorded_cell,
+    recorded_environments,
+)
 
 if TYPE_CHECKING:
-    from orthoflow.engine.results import CellResult
-    from orthoflow.engine.store import Store
-
-OUTLINE_FILE: Final = ".outline.json"
+    pass
 
 
 def open_run(path: str | Path) -> Run:
@@ -62,36 +47,6 @@ def open_run(path: str | Path) -> Run:
     if has_outline(Path(path)):
         return open_unfinished(Path(path))
     return read_run(find_record(path))
-
-
-def write_outline(
-    record: RunRecord,
-    run_folder: Path,
-    store: Store,
-    *,
-    sources: Mapping[str, Mapping[str, str]],
-    embedded: Collection[str],
-) -> None:
-    """Keep what a run is about to compute, so that it can be shown before it is finished.
-
-    Args:
-        record: of the run, with every cell skipped.
-        run_folder: existing folder.
-        store: where its results go.
-        sources: address -> input port -> its source.
-        embedded: product types whose arrays go into a record.
-
-    Raises:
-        StoreError: the disk cannot be written.
-    """
-    content = {
-        "store": str(store.folder.absolute()),
-        "record": to_json(record),
-        "sources": {address: dict(ports) for address, ports in sources.items()},
-        "embedded": sorted(embedded),
-    }
-    with writing_to(run_folder):
-        write_whole(run_folder / OUTLINE_FILE, json.dumps(content).encode("utf-8", "replace"))
 
 
 def has_outline(folder: Path) -> bool:
@@ -165,60 +120,4 @@ def open_unfinished(folder: Path) -> Run:
     is_there = all(published_state(folder, file) == "same" for file in published)
     return dataclasses.replace(
         read_run(path), files_folder=folder if is_there else aside, home=folder
-    )
-
-
-def recorded_environments(
-    results: Mapping[str, CellResult],
-) -> tuple[RecordedEnvironment, ...]:
-    """Return the environments of results, each once."""
-    given = (result.environment for result in results.values())
-    return tuple({one.id: one for one in given if one is not None}.values())
-
-
-def recorded_cell(
-    cell: RecordedCell,
-    result: CellResult,
-    store: Store,
-    *,
-    sources: Mapping[str, str],
-    embedded: Collection[str],
-    cached_from: str,
-) -> RecordedCell:
-    """Return a cell as recorded with its result.
-
-    Args:
-        cell: the cell without a result.
-        result: what the store keeps of it.
-        store: has the figures.
-        sources: source of each input port.
-        embedded: product types whose arrays go into the record.
-        cached_from: the earlier run that computed it, if any.
-
-    Raises:
-        DamageError: a figure is missing or damaged.
-    """
-    figures = []
-    for figure in result.figures:
-        try:
-            data = store.blob(figure.sha256)
-        except DamageError as error:
-            raise DamageError(f"the figure {figure.name} is damaged") from error
-        figures.append(RecordedFigure(data=data, **shared_fields(figure, Figure)))
-    return dataclasses.replace(
-        cell,
-        **shared_fields(result, CellOutcome),
-        environment=result.environment.id if result.environment else "",
-        cached_from=cached_from,
-        figures=tuple(figures),
-        inputs={
-            port: RecordedProduct(source=sources.get(port, ""), **shared_fields(ref, ProductRef))
-            for port, ref in result.inputs.items()
-        },
-        outputs={
-            port: RecordedProduct(
-                embedded=ref.type_name in embedded, **shared_fields(ref, ProductRef)
-            )
-            for port, ref in result.outputs.items()
-        },
     )

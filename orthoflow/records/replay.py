@@ -18,10 +18,10 @@ from orthoflow.engine.keys import input_digest, read_preimage, stated_versions
 from orthoflow.engine.plan import RunOptions, RunPlan, plan_run
 from orthoflow.engine.store import Store
 from orthoflow.errors import PluginError, RecordError, WorkflowError
-from orthoflow.records.comparison import ComparedMetric, Pair, ProductDistance, compare_metrics
-from orthoflow.records.input_files import LaidOutInputs, find_inputs
+from orthoflow.records.compare import ComparedMetric, Pair, ProductDistance, compare_metrics
+from orthoflow.records.inputs import LaidOutInputs, find_inputs
 from orthoflow.records.runs import Run
-from orthoflow.records.verification import verify_run
+from orthoflow.records.verify import verify_run
 from orthoflow.workflow.expand import Cell, CellOutput, WorkflowInput
 from orthoflow.workflow.inputs import MissingInputsError
 from orthoflow.workflow.model import StepVariant, Workflow
@@ -334,8 +334,6 @@ def _method_notes(run: Run, plan: RunPlan, changed: frozenset[str]) -> Iterator[
 MetricVerdict = Literal[
     "same", "rounding", "products", "not in the record", "code changed", "different"
 ]
-
-
 # Verdicts that make a replay differ.
 DIFFERING: Final = frozenset({"code changed", "different"})
 
