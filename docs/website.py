@@ -310,7 +310,7 @@ def _limits() -> Iterator[str]:
         "before memory or time is spent on it, because a few kilobytes could otherwise demand "
         "gigabytes or hours. Numbers that files state are also compared with the size of the file. "
         "If a genuine file meets a limit, change the constant and report it; "
-        "`python -m tests.fuzz.campaign --cases 1000` tests them with damaged files.\n\n"
+        "`ORTHOFLOW_FUZZ_CASES=1000 python -m pytest tests/fuzz` tests them with damaged files.\n\n"
         "| at most | of | constant |\n|---:|---|---|"
     )
     for module, name, what in limits():

@@ -1,25 +1,26 @@
 """Fuzzing of readers: each case in a process that may die, watched for time, memory and writes.
 
-A reader may give something or refuse; anything else is a finding. Cases follow from (target, seed,
-number), so that one that failed can be had again:
+A reader may return something or refuse; anything else is a finding. Cases follow from (target,
+seed, number), so that one that failed can be repeated:
 
     ORTHOFLOW_FUZZ_SEED=3 ORTHOFLOW_FUZZ_CASE=1729 python -m pytest tests/fuzz -k las
 """
 
 from __future__ import annotations
 
-import atexit
-import json
+import multiprocessing
 import os
-import subprocess
+import re
+import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
 from pathlib import Path
 from random import Random
-from typing import Any, Final
+from typing import Final
 
 from orthoflow.errors import OrthoflowError
 from tests.fuzz.mutation import Mutate, mutate_bytes
@@ -33,13 +34,13 @@ SEED: Final = int(os.environ.get("ORTHOFLOW_FUZZ_SEED", "0"))
 # One case to repeat instead.
 CASE: Final = os.environ.get("ORTHOFLOW_FUZZ_CASE", "")
 
-MOST_CPU_S: Final = 5.0
-MOST_WALL_S: Final = 60.0
-MOST_MEMORY_MIB: Final = 1536.0
-_ROOT: Final = Path(__file__).resolve().parents[2]
-_MOST_FINDINGS: Final = 20
+MAX_CPU_S: Final = 5.0
+MAX_WALL_S: Final = 60.0
+MAX_MEMORY_MIB: Final = 1536.0
+_MAX_FINDINGS: Final = 20
 # Libraries leak where they fail: libE57 half a megabyte for each file.
-_MOST_PER_PROCESS: Final = 500
+_MAX_PER_PROCESS: Final = 500
+_OWN: Final = frozenset({"seeds", "case", "findings", "output"})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,21 +52,21 @@ class Target:
         read: reads one file; it may write into that file's folder and nowhere else.
         mutate: what damages the files.
         refusals: what the reader may raise.
-        most_cpu_s: processor time that a case may take.
-        most_mib: resident memory that the reading process may take, libraries included.
+        max_cpu_s: processor time that a case may take.
+        max_mib: resident memory that the reading process may take, libraries included.
     """
 
     seeds: Callable[[Path], object]
     read: Callable[[Path], object]
     mutate: Mutate = mutate_bytes
     refusals: tuple[type[BaseException], ...] = (OrthoflowError,)
-    most_cpu_s: float = MOST_CPU_S
-    most_mib: float = MOST_MEMORY_MIB
+    max_cpu_s: float = MAX_CPU_S
+    max_mib: float = MAX_MEMORY_MIB
 
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """A case that neither gave something nor was refused as it should.
+    """A case that neither returned something nor was refused as it should.
 
     Attributes:
         case: its number.
@@ -82,28 +83,16 @@ class Finding:
 
 @dataclass(kw_only=True)
 class Outcome:
-    """What came of fuzzing a target.
-
-    Attributes:
-        n_cases: cases that ran.
-        n_refused: those of them that the reader refused.
-        peak_mib: peak of the reading process's resident memory, libraries included.
-        slowest_s: processor time of the slowest case.
-        slowest_case: its number.
-        findings: what is to be mended.
-    """
+    """What came of fuzzing a target: cases that ran, those refused, and what is to be mended."""
 
     name: str
     seed: int
     n_cases: int = 0
     n_refused: int = 0
-    peak_mib: float = 0.0
-    slowest_s: float = 0.0
-    slowest_case: int = -1
     findings: list[Finding] = field(default_factory=list)
 
     def report(self) -> str:
-        """Say what was found, and how each case can be had again."""
+        """Return what was found, and how each case can be repeated."""
         lines = [f"{self.name}: {len(self.findings)} findings in {self.n_cases} cases"]
         for finding in self.findings:
             lines += [
@@ -118,7 +107,7 @@ class Outcome:
 
 
 def target_named(name: str) -> Target:
-    """Give the target of an import string such as `tests.fuzz.readers:LAS`."""
+    """Return the target of an import string such as `tests.fuzz.readers:LAS`."""
     module, _, attribute = name.partition(":")
     found: Target = getattr(import_module(module), attribute)
     return found
@@ -162,74 +151,73 @@ def fuzz(
     outcome = Outcome(name=name, seed=seed)
     first, most = (int(CASE), 1) if CASE else (0, most_cases or sys.maxsize)
     left_s = budget_s
-    while left_s > 0.0 and outcome.n_cases < most:
-        request = {
-            "name": name,
-            "folder": str(folder),
-            "seed": seed,
-            "first": first + outcome.n_cases,
-            "most": min(_MOST_PER_PROCESS, most - outcome.n_cases),
-            "budget_s": left_s,
-        }
-        for answer in _server().ask(request):
-            left_s -= _take(outcome, answer, folder)
-        if len(outcome.findings) >= _MOST_FINDINGS:
-            break
+    while left_s > 0.0 and outcome.n_cases < most and len(outcome.findings) < _MAX_FINDINGS:
+        count = min(_MAX_PER_PROCESS, most - outcome.n_cases)
+        left_s -= _fuzz_in_process(outcome, folder, first + outcome.n_cases, count, left_s)
     return outcome
 
 
-def _take(outcome: Outcome, answer: Mapping[str, Any], folder: Path) -> float:
-    """Put what the server said into the outcome; gives the seconds that went by."""
-    if answer["kind"] == "ended":
-        outcome.n_cases += answer["n_cases"]
-        outcome.n_refused += answer["n_refused"]
-        outcome.peak_mib = max(outcome.peak_mib, answer["peak_mib"])
-        if answer["slowest_s"] > outcome.slowest_s:
-            outcome.slowest_s, outcome.slowest_case = answer["slowest_s"], answer["slowest_case"]
-        return float(answer["seconds"])
-    case, kind, text = int(answer["case"]), str(answer["kind"]), str(answer["text"])
-    # The first of each kind and place: what differs is behind the colon.
+def _fuzz_in_process(
+    outcome: Outcome, folder: Path, first: int, count: int, budget_s: float
+) -> float:
+    """Run cases until the process ends, however it does; return the seconds that they took."""
+    from tests.fuzz.reading import read_cases
+
+    # A process of its own kind: pytest's has threads, and modules that a reader may change.
+    context = multiprocessing.get_context("spawn")
+    receiver, sender = context.Pipe(duplex=False)
+    arguments = (outcome.name, outcome.seed, first, count, folder, budget_s, sender)
+    process = context.Process(target=read_cases, args=arguments, daemon=True)
+    process.start()
+    sender.close()
+    case, began = first, 0.0
+    while True:
+        try:
+            kind, text = receiver.recv()
+        except EOFError:
+            break
+        if kind == "case":
+            case, began = int(text), began or time.monotonic()
+            outcome.n_cases += 1
+        elif kind == "refused":
+            outcome.n_refused += 1
+        else:
+            _add(outcome, folder, case, kind, text)
+    process.join()
+    output = (folder / "output").read_text(errors="replace") if process.exitcode else ""
+    # A broken harness must not look like a reader that is never asked.
+    assert began, f"no case was read: {output}"
+    if process.exitcode:
+        kind, text = _death(-process.exitcode)
+        _add(outcome, folder, case, kind, f"{text}{_place(output)}: {output[:3000]}")
+    strays = {item.name for item in folder.iterdir()} - _OWN
+    if strays:
+        _add(outcome, folder, case, "write", f"left outside its folder: {strays}")
+    return time.monotonic() - began
+
+
+def _add(outcome: Outcome, folder: Path, case: int, kind: str, text: str) -> None:
+    """Keep the first finding of each kind and place: what differs is behind the colon."""
     known = {(finding.kind, finding.text.partition(": ")[0]) for finding in outcome.findings}
     if (kind, text.partition(": ")[0]) not in known:
         kept = folder / "findings" / f"{outcome.seed}-{case}"
         kept.mkdir(exist_ok=True)
         file = write_case(outcome.name, outcome.seed, case, folder / "seeds", kept)
         outcome.findings.append(Finding(case=case, kind=kind, text=text, file=file))
-    return 0.0
 
 
-def _environment() -> dict[str, str]:
-    """What the process is told."""
-    return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+def _death(number: int) -> tuple[str, str]:
+    if number == signal.SIGPROF:
+        return "hang", "too much processor time"
+    if number == signal.SIGALRM:
+        return "hang", f"more than {MAX_WALL_S:g} s"
+    return (
+        "crash",
+        f"ended by {signal.Signals(number).name}" if number > 0 else "the harness failed",
+    )
 
 
-class _Server:
-    """The process that has everything loaded and forks one that reads."""
-
-    def __init__(self) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "tests.fuzz.server"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            cwd=_ROOT,
-            env=_environment(),
-            text=True,
-        )
-        atexit.register(self._process.kill)
-
-    def ask(self, request: Mapping[str, object]) -> Iterator[Mapping[str, Any]]:
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self._process.stdin.write(json.dumps(request) + "\n")
-        self._process.stdin.flush()
-        for line in self._process.stdout:
-            answer = json.loads(line)
-            yield answer
-            if answer["kind"] == "ended":
-                return
-        raise AssertionError("the process that reads damaged files did not start; see above")
-
-
-@cache
-def _server() -> _Server:
-    return _Server()
+def _place(output: str) -> str:
+    """Return where it happened, as the faulthandler printed it: innermost first."""
+    frames = re.findall(r'File "([^"]*)", line (\d+)', output)[:3]
+    return "".join(f" < {Path(path).name}:{line}" for path, line in frames)

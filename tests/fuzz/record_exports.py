@@ -40,13 +40,21 @@ from tests import hostile_records as hostile
 from tests.fuzz.harness import Target
 from tests.fuzz.hostile_files import changed_json
 from tests.fuzz.mutation import mutate_bytes
-from tests.fuzz.records import SECRET, Command, RefusedError, check_command, surroundings
+from tests.fuzz.records import (
+    MARK,
+    SECRET,
+    Command,
+    RefusedError,
+    check_command,
+    surroundings,
+    with_damage,
+)
 from tests.provenance_records import ProductShelf
 from tests.report_runs import cell, record
 from tests.studios import Studio
 
 Change = Callable[[Payload], Payload]
-MOST_CPU_S: Final = 10.0  # of a command that may be the first to compile a kernel
+MAX_CPU_S: Final = 10.0  # of a command that may be the first to compile a kernel
 
 _PICTURED: Final[Sequence[Command]] = tuple(
     ("export", "--to", target, "-o", f"out/{target}")
@@ -276,17 +284,10 @@ def _damage_file(run: Path, random: Random) -> None:
         hostile.publish_again(run)
 
 
-_MARK: Final = b"\ndamage "
-
-
-def _with_damage(content: bytes, random: Random, _: Sequence[bytes]) -> bytes:
-    return content + _MARK + str(random.getrandbits(64)).encode()
-
-
 def _read(path: Path) -> None:
     """Write a run, damaged, and make something of it; all of it of a sound one."""
     folder = path.parent
-    _, mark, number = path.read_bytes().rpartition(_MARK)
+    _, mark, number = path.read_bytes().rpartition(MARK)
     (folder / "secret.txt").write_text(SECRET)
     run, random = folder / "out" / "run", Random(number)
     commands: Sequence[Command] = tuple(dict.fromkeys(COMMANDS))
@@ -303,10 +304,8 @@ def _read(path: Path) -> None:
         if mark:
             _damage_file(run, random)
     before = surroundings(folder)
-    limit_s = MOST_CPU_S if mark else float("inf")
-    codes = [
-        check_command(Studio(folder), command, run, most_cpu_s=limit_s) for command in commands
-    ]
+    limit_s = MAX_CPU_S if mark else float("inf")
+    codes = [check_command(Studio(folder), command, run, max_cpu_s=limit_s) for command in commands]
     _check_made(folder / "out", run)
     assert surroundings(folder) == before
     if any(codes):
@@ -332,9 +331,9 @@ def _check_made(out: Path, run: Path) -> None:
 RECORD_EXPORTS = Target(
     seeds=lambda folder: (folder / "run").write_bytes(b""),
     read=_read,
-    mutate=_with_damage,
+    mutate=with_damage,
     refusals=(RefusedError,),
-    most_cpu_s=2 * MOST_CPU_S,
+    max_cpu_s=2 * MAX_CPU_S,
 )
 
 NAMES: Final = ("RECORD_EXPORTS",)

@@ -28,7 +28,7 @@ from tests.workshop_runs import WORKSHOP
 Damage = Callable[[Path, Random], None]
 Command = tuple[str, ...]
 
-MOST_CPU_S: Final = 5.0  # of a command
+MAX_CPU_S: Final = 5.0  # of a command
 RECORD_COMMANDS: Final[Sequence[Command]] = (
     ("show",),
     ("show", "--json"),
@@ -48,7 +48,7 @@ CRATE_COMMANDS: Final[Sequence[Command]] = (
     ("replay", "-o", "out/again"),
 )
 SECRET: Final = "what lies outside"
-_MARK: Final = b"\ndamage "
+MARK: Final = b"\ndamage "
 
 
 class RefusedError(Exception):
@@ -74,8 +74,8 @@ def _write_record(archive: Path, *, is_crate: bool) -> None:
         _pack(studio.folder / ("crate" if is_crate else "first"), archive)
 
 
-def _with_damage(content: bytes, random: Random, _: Sequence[bytes]) -> bytes:
-    return content + _MARK + str(random.getrandbits(64)).encode()
+def with_damage(content: bytes, random: Random, _: Sequence[bytes]) -> bytes:
+    return content + MARK + str(random.getrandbits(64)).encode()
 
 
 # Cases --------------------------------------------------------------------------------------------
@@ -85,7 +85,7 @@ def _read_damaged(damage: Damage, commands: Sequence[Command], path: Path) -> No
     """Unpack, damage, and run two commands; all of them on what is sound."""
     _install_workshop()
     folder = path.parent
-    _, mark, number = path.read_bytes().rpartition(_MARK)
+    _, mark, number = path.read_bytes().rpartition(MARK)
     run, original = folder / "out" / "run", folder / "first"
     for target in (run, original):
         with tarfile.open(path) as archive:
@@ -112,7 +112,7 @@ def _install_workshop() -> None:
 
 
 def check_command(
-    studio: Studio, command: Command, run: Path, *, most_cpu_s: float = MOST_CPU_S
+    studio: Studio, command: Command, run: Path, *, max_cpu_s: float = MAX_CPU_S
 ) -> int:
     """Run a command on a record, look at how it ends, give its exit code."""
     words = [str(studio.folder / "first") if word == "ORIGINAL" else word for word in command[1:]]
@@ -129,7 +129,7 @@ def check_command(
     if done.exit_code and "--json" not in command:
         assert "error: " in done.stderr, told
     assert not {"\x1b", "\x9b", "\u202e"} & set(done.output), told
-    assert took_s < most_cpu_s, f"{told}: {took_s} s"
+    assert took_s < max_cpu_s, f"{told}: {took_s} s"
     return done.exit_code
 
 
@@ -200,9 +200,9 @@ def _target(damage: Damage, commands: Sequence[Command], *, is_crate: bool = Fal
     return Target(
         seeds=lambda folder: _write_record(folder / "first.tar", is_crate=is_crate),
         read=partial(_read_damaged, damage, commands),
-        mutate=_with_damage,
+        mutate=with_damage,
         refusals=(RefusedError,),
-        most_cpu_s=3 * MOST_CPU_S,
+        max_cpu_s=3 * MAX_CPU_S,
     )
 
 

@@ -64,8 +64,8 @@ GOOD = Target(seeds=_seeds, read=Path.read_bytes)
 REFUSES = Target(seeds=_seeds, read=_unless_seed(_refuse))
 RAISES = Target(seeds=_seeds, read=_unless_seed(lambda path: {}[path]))
 CRASHES = Target(seeds=_seeds, read=_unless_seed(lambda path: ctypes.string_at(0)))
-HANGS = Target(seeds=_seeds, read=_unless_seed(_hang), most_cpu_s=0.2)
-EATS = Target(seeds=_seeds, read=_unless_seed(lambda path: np.ones(20_000_000)), most_mib=150.0)
+HANGS = Target(seeds=_seeds, read=_unless_seed(_hang), max_cpu_s=0.2)
+EATS = Target(seeds=_seeds, read=_unless_seed(lambda path: np.ones(20_000_000)), max_mib=150.0)
 STRAYS = Target(seeds=_seeds, read=_unless_seed(lambda path: (path.parents[1] / "s").mkdir()))
 
 
@@ -84,7 +84,6 @@ def test_reading_and_refusing_are_no_findings(name: str, n_refused: int, tmp_pat
     outcome = _fuzz(name, tmp_path)
     assert (outcome.n_cases, outcome.findings) == (4, [])
     assert outcome.n_refused == n_refused
-    assert 0.0 < outcome.peak_mib < 1000.0
 
 
 @pytest.mark.parametrize(
