@@ -25,6 +25,7 @@ from orthoflow.files.given_cameras import (
     GivenCamera,
     checked_lens,
     damaged,
+    lens_of_terms,
     lens_or_reason,
     nearest_lens,
     normalised_grid,
@@ -274,36 +275,19 @@ def _lens_of(camera: Any, path: Path) -> tuple[Intrinsics | FisheyeLens | str, s
         _NAMES.get(word, word): float(value)
         for word, value in zip(words, camera.params, strict=True)
     }
-    fx, fy = (values[name] if name in values else values["f"] for name in ("fx", "fy"))
-    terms = tuple(values.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3"))
-    model = str(camera.model_name)
+    values |= {name: values.get(name, values.get("f", 0.0)) for name in ("fx", "fy")}
+    model, size = str(camera.model_name), (int(camera.width), int(camera.height))
     is_rational = any(values.get(name, 0.0) for name in ("k4", "k5", "k6"))
-    if model in _FISHEYES:
-        radial = tuple(values.get(name, 0.0) for name in ("k1", "k2", "k3", "k4"))
-        return FisheyeLens(
-            width=int(camera.width),
-            height=int(camera.height),
-            fx=fx,
-            fy=fy,
-            cx=values["cx"],
-            cy=values["cy"],
-            radial=radial,
-        ), ""
-    is_exact = model in _BROWN and not is_rational
-    lens = Intrinsics(
-        width=int(camera.width),
-        height=int(camera.height),
-        fx=fx,
-        fy=fy,
-        cx=values["cx"],
-        cy=values["cy"],
-        distortion=terms if is_exact else (0.0,) * 5,
-        source="given",
-    )
-    lens = checked_lens(lens, path, f"a camera {model}")
+    is_exact = model in _FISHEYES or (model in _BROWN and not is_rational)
+    pinhole = {name: values[name] for name in ("fx", "fy", "cx", "cy")}
+    terms = values if is_exact else pinhole
+    lens, _ = lens_of_terms(terms, *size, is_fisheye=model in _FISHEYES)
+    if isinstance(lens, FisheyeLens):
+        return lens, ""
+    checked_lens(lens, path, f"a camera {model}")
     if is_exact:
         return lens, ""
-    pixels = normalised_grid(lens) * [fx, fy] + [lens.cx, lens.cy]
+    pixels = normalised_grid(lens) * [lens.fx, lens.fy] + [lens.cx, lens.cy]
     rays = np.asarray(camera.cam_ray_from_img(pixels), dtype=np.float64)
     nearest, worst_px = nearest_lens(lens, rays, pixels)
     return lens_or_reason(f"its camera of the model {model}", nearest, worst_px, _UNDISTORT)

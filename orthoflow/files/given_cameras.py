@@ -7,7 +7,8 @@ the world of the file. `camera_formats` chooses the reader.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Final
@@ -20,6 +21,7 @@ from orthoflow.files.cube_faces import (
     FACE_FROM_CAMERA,
     FACES,
     PANORAMA_FROM_CAMERA,
+    WIDEST_DEG,
     FisheyeLens,
     face_lenses,
     face_name,
@@ -50,6 +52,8 @@ MAX_LEFT_OUT_PX: Final = 0.5
 _FEWEST_DIRECTIONS: Final = 30
 _FAR_PX: Final = 1e4
 _WIDEST_FITTED_DEG: Final = 355.0
+# Of OpenCV's lenses: k1, k2, p1, p2, k3, and k1 to k4, p1, p2.
+_BROWN_TERMS, _FISHEYE_TERMS = 5, 6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,27 +78,15 @@ class CentredLens:
         """Lens for a photo of this size, and the largest omitted distortion in pixels."""
         longest = max(width, height)
         focal = self.focal_px or (self.focal_share or 0.0) * longest
-        k1, k2, k3, k4 = (*self.radial, 0.0, 0.0)[:4]
-        plain = Intrinsics(
-            width=width,
-            height=height,
-            fx=focal,
-            fy=focal,
-            cx=0.5 * width + self.off_middle[0] * longest,
-            cy=0.5 * height + self.off_middle[1] * longest,
-            distortion=(k1, k2, 0.0, 0.0, k3),
-            source="given",
+        terms = {f"k{n}": term for n, term in enumerate(self.radial, start=1)}
+        terms |= {"fx": focal, "fy": focal}
+        terms["cx"], terms["cy"] = (
+            0.5 * side + off * longest
+            for side, off in zip((width, height), self.off_middle, strict=True)
         )
+        lens, worst_px = lens_of_terms(terms, width, height)
         corner2 = (width * width + height * height) / (4.0 * focal * focal)
-        left_out_px = 3.0 * focal * corner2 * math.hypot(*self.tangential)
-        if not k4:
-            return plain, left_out_px
-        xy = normalised_grid(plain)
-        r2 = (xy * xy).sum(axis=1, keepdims=True)
-        bent = xy * (1.0 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4))))
-        rays = np.column_stack([xy, np.ones(len(xy))])
-        lens, worst_px = nearest_lens(plain, rays, focal * bent + [plain.cx, plain.cy])
-        return lens, worst_px + left_out_px
+        return lens, worst_px + 3.0 * focal * corner2 * math.hypot(*self.tangential)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,6 +182,68 @@ def normalised_grid(lens: Intrinsics) -> NDArray[np.float64]:
     return np.column_stack([(u.ravel() - lens.cx) / lens.fx, (v.ravel() - lens.cy) / lens.fy])
 
 
+def lens_of_terms(
+    terms: Mapping[str, float], width: int, height: int, *, is_fisheye: bool = False
+) -> tuple[Intrinsics | FisheyeLens, float]:
+    """Return the lens of another program's terms, the nearest of ours where we lack some of them.
+
+    Args:
+        terms: `fx`, `fy`, `cx`, `cy` and `skew` in pixels; `k1` to `k4`, `p1` and `p2` as OpenCV
+            has them; `p3` and `p4`: the tangential terms are multiplied by 1 + p3 r^2 + p4 r^4.
+            Missing ones are 0.
+        width: pixels.
+        height: pixels.
+        is_fisheye: they are terms of the angle off the axis.
+
+    Returns:
+        The lens, which may be invalid, and its largest deviation in pixels.
+    """
+    t = defaultdict(float, terms)
+    fx, fy, cx, cy = (t[name] for name in ("fx", "fy", "cx", "cy"))
+    start = Intrinsics(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, source="given")
+    radial = tuple(t[f"k{n}"] for n in range(1, 5))
+    lens: Intrinsics | FisheyeLens = replace(
+        start, distortion=(*radial[:2], t["p1"], t["p2"], radial[2]), skew=t["skew"] or None
+    )
+    if is_fisheye:
+        lens = _fisheye(start, (*radial, t["p1"], t["p2"]), WIDEST_DEG, skew=t["skew"])
+    is_exact = not (t["p3"] or t["p4"] or (radial[3] and not is_fisheye))
+    if is_exact or not (min(fx, fy) > 0.0 and all(map(math.isfinite, t.values()))):
+        return lens, 0.0
+    xy = normalised_grid(start)
+    rays = np.column_stack([xy, np.ones(len(xy))])
+    if is_fisheye:
+        # Here a position of the grid is an angle off the axis.
+        theta = np.hypot(*xy.T)[:, None]
+        rays = np.column_stack([xy * np.sinc(theta / np.pi), np.cos(theta)])
+    x, y = xy.T
+    r2 = x * x + y * y
+    growth = np.polynomial.polynomial.polyval(r2, [1.0, *radial])
+    further = 1.0 + t["p3"] * r2 + t["p4"] * r2 * r2
+    bent_x = x * growth + (t["p2"] * (r2 + 2.0 * x * x) + 2.0 * t["p1"] * x * y) * further
+    bent_y = y * growth + (t["p1"] * (r2 + 2.0 * y * y) + 2.0 * t["p2"] * x * y) * further
+    pixels = np.column_stack([cx + bent_x * fx + bent_y * t["skew"], cy + bent_y * fy])
+    return nearest_lens(start, rays, pixels)
+
+
+def _fisheye(
+    start: Intrinsics, terms: Sequence[float], field_of_view_deg: float, skew: float = 0.0
+) -> FisheyeLens:
+    """Return a fisheye of the size, focal length and principal point of another lens."""
+    return FisheyeLens(
+        width=start.width,
+        height=start.height,
+        fx=start.fx,
+        fy=start.fy,
+        cx=start.cx,
+        cy=start.cy,
+        radial=tuple(terms[:4]),
+        tangential=tuple(terms[4:]),
+        skew=skew,
+        field_of_view_deg=field_of_view_deg,
+    )
+
+
 def nearest_lens(
     start: Intrinsics, rays: NDArray[np.float64], pixels: NDArray[np.float64]
 ) -> tuple[Intrinsics | FisheyeLens, float]:
@@ -210,47 +264,30 @@ def nearest_lens(
     if len(pixels) < _FEWEST_DIRECTIONS:
         return start, math.inf
 
-    def brown(v: NDArray[np.float64]) -> Intrinsics:
+    def lens_of(v: NDArray[np.float64]) -> Intrinsics | FisheyeLens:
         fx, fy, cx, cy, *terms = v.tolist()
-        return replace(start, fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(terms))
+        lens = replace(start, fx=fx, fy=fy, cx=cx, cy=cy)
+        if len(terms) == _BROWN_TERMS:
+            return replace(lens, distortion=tuple(terms))
+        return _fisheye(lens, terms, _WIDEST_FITTED_DEG)
 
-    def fisheye(v: NDArray[np.float64]) -> FisheyeLens:
-        fx, fy, cx, cy, *terms = v.tolist()
-        return FisheyeLens(
-            width=start.width,
-            height=start.height,
-            fx=fx,
-            fy=fy,
-            cx=cx,
-            cy=cy,
-            radial=tuple(terms[:4]),
-            tangential=tuple(terms[4:]),
-            field_of_view_deg=_WIDEST_FITTED_DEG,
-        )
+    def residuals(v: NDArray[np.float64]) -> NDArray[np.float64]:
+        lens = lens_of(v)
+        viewing = lens if isinstance(lens, FisheyeLens) else lens.posed()
+        off_px = viewing.project(rays)[:, :2] - pixels
+        return np.nan_to_num(off_px, nan=_FAR_PX, posinf=_FAR_PX, neginf=-_FAR_PX).ravel()
 
-    def off_brown(v: NDArray[np.float64]) -> NDArray[np.float64]:
-        off = brown(v).posed().project(rays)[:, :2] - pixels
-        return np.nan_to_num(off, nan=_FAR_PX, posinf=_FAR_PX, neginf=-_FAR_PX).ravel()
-
-    def off_fisheye(v: NDArray[np.float64]) -> NDArray[np.float64]:
-        off = fisheye(v).project(rays) - pixels
-        return np.nan_to_num(off, nan=_FAR_PX, posinf=_FAR_PX, neginf=-_FAR_PX).ravel()
-
-    focal = [start.fx, start.fy, start.cx, start.cy]
-    fits: list[tuple[float, Intrinsics | FisheyeLens]] = []
+    is_before = bool((rays[:, 2] > 0.2 * np.linalg.norm(rays, axis=1)).all())
+    best: tuple[float, Intrinsics | FisheyeLens] = (math.inf, start)
     with np.errstate(all="ignore"):
-        if (rays[:, 2] > 0.2 * np.linalg.norm(rays, axis=1)).all():
-            found = least_squares(off_brown, [*focal, *[0.0] * 5], x_scale="jac")
-            fits.append((_worst_px(found.fun), brown(found.x)))
-        if not fits or fits[0][0] > MAX_LEFT_OUT_PX:
-            found = least_squares(off_fisheye, [*focal, *[0.0] * 6], x_scale="jac")
-            fits.append((_worst_px(found.fun), fisheye(found.x)))
-    worst_px, lens = min(fits, key=lambda fit: fit[0])
-    return lens, worst_px
-
-
-def _worst_px(residuals: NDArray[np.float64]) -> float:
-    return float(np.hypot(residuals[::2], residuals[1::2]).max())
+        for n_terms in (_BROWN_TERMS, _FISHEYE_TERMS) if is_before else (_FISHEYE_TERMS,):
+            begin = [start.fx, start.fy, start.cx, start.cy, *[0.0] * n_terms]
+            found = least_squares(residuals, begin, x_scale="jac")
+            worst_px = float(np.hypot(found.fun[::2], found.fun[1::2]).max())
+            best = min(best, (worst_px, lens_of(found.x)), key=lambda fit: fit[0])
+            if worst_px <= MAX_LEFT_OUT_PX:
+                break
+    return best[1], best[0]
 
 
 def lens_or_reason(

@@ -31,9 +31,8 @@ from orthoflow.files.given_cameras import (
     GivenCamera,
     checked_lens,
     damaged,
+    lens_of_terms,
     lens_or_reason,
-    nearest_lens,
-    normalised_grid,
     numbers_of,
     photo_path,
     rotation_of,
@@ -44,7 +43,7 @@ from orthoflow.products import Intrinsics
 
 #: tags of Metashape's XML
 MOST_TAGS: Final = 2_000_000
-_RADIAL: Final = ("k1", "k2", "k3", "k4")
+_TERMS: Final = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 _SINCE_EXPORT: Final = "optimise the cameras without k4, p3 and p4 and export again"
 # Half the step in metres by which the axes of a coordinate system are found at a position.
 _STEP_M: Final = 50.0
@@ -247,81 +246,47 @@ class _Sensor:
         self.is_panorama = element.get("type") == "spherical"
         self.lens, self.note = self._lens(element, path)
         self.rotation, self.location = np.eye(3), np.zeros(3)
+        whose = f"sensor {self.label}"
         rotation = element.findtext("rotation", "").split()
         location = (element.findtext("location") or element.findtext("translation") or "").split()
         if rotation:
-            numbers = _some(rotation, 9, path, "rotation", f"sensor {self.label}")
-            self.rotation = rotation_of(numbers, path, f"sensor {self.label}")
+            self.rotation = rotation_of(_some(rotation, 9, path, "rotation", whose), path, whose)
         if location:
-            whose = f"sensor {self.label}"
             self.location = np.array(_some(location, 3, path, "location", whose))
         shutter = element.findtext("rolling_shutter", "").strip().lower()
         self.has_rolling_shutter = shutter not in ("", "none", "disabled", *_OFF)
 
     def _lens(self, element: ET.Element, path: Path) -> tuple[Intrinsics | FisheyeLens | str, str]:
-        kind = element.get("type", "frame")
         if self.is_panorama:
             return face_lens(_size(element, self.label, path)[0]), ""
+        kind = element.get("type", "frame")
         if kind not in ("frame", "fisheye"):
             return (
                 f"its sensor {self.label} is of type {kind}; orthoflow takes frame, fisheye and "
                 "spherical"
             ), ""
         calibrations = element.findall("calibration")
-        adjusted = [each for each in calibrations if each.get("class") == "adjusted"]
         if not calibrations:
             return f"its sensor {self.label} has no calibration", ""
+        adjusted = [each for each in calibrations if each.get("class") == "adjusted"]
         calibration = (adjusted or calibrations)[-1]
-        values = {child.tag: child.text or "" for child in calibration}
-        if "f" not in values:
+        t = dict.fromkeys(_TERMS, 0.0) | {
+            child.tag: numbers_of([child.text or ""], path, f"{child.tag} of sensor {self.label}")[
+                0
+            ]
+            for child in calibration
+            if child.tag in _TERMS
+        }
+        if calibration.find("f") is None:
             return f"its sensor {self.label} has no focal length f ({_SINCE})", ""
         has_own_size = calibration.find("resolution") is not None
-        size = _size(calibration if has_own_size else element, self.label, path)
-        value = _Terms(values, path, self.label)
-        exact = (_fisheye if kind == "fisheye" else _intrinsics)(value, size)
-        if isinstance(exact, Intrinsics):
-            exact = checked_lens(exact, path, f"sensor {self.label}")
-        unknown = ("p3", "p4") if kind == "fisheye" else ("k4", "p3", "p4")
-        if not any(value(name) for name in unknown):
-            return exact, ""
-        return self._nearest(value, exact, is_fisheye=kind == "fisheye")
-
-    def _nearest(
-        self, value: _Terms, exact: Intrinsics | FisheyeLens, *, is_fisheye: bool
-    ) -> tuple[Intrinsics | FisheyeLens | str, str]:
-        """Return our lens nearest to one with terms that ours lacks."""
-        start = Intrinsics(
-            width=exact.width,
-            height=exact.height,
-            fx=exact.fx,
-            fy=exact.fy,
-            cx=exact.cx,
-            cy=exact.cy,
-            source="given",
-        )
-        xy = normalised_grid(start)
-        rays = np.column_stack([xy, np.ones(len(xy))])
-        if is_fisheye:
-            # Here a position of the grid is an angle off the axis.
-            theta = np.hypot(*xy.T)[:, None]
-            scale = np.sinc(theta / np.pi)
-            rays = np.column_stack([xy * scale, np.cos(theta)])
-        pixels = _projected(value, start, xy)
-        lens, worst_px = nearest_lens(start, rays, pixels)
+        width, height = _size(calibration if has_own_size else element, self.label, path)
+        t |= {"fx": t["f"] + t["b1"], "fy": t["f"], "skew": t["b2"], "p1": t["p2"], "p2": t["p1"]}
+        t |= {"cx": 0.5 * width + t["cx"], "cy": 0.5 * height + t["cy"]}
+        lens, worst_px = lens_of_terms(t, width, height, is_fisheye=kind == "fisheye")
+        if isinstance(lens, Intrinsics):
+            checked_lens(lens, path, f"sensor {self.label}")
         return lens_or_reason(f"the lens of sensor {self.label}", lens, worst_px, _SINCE_EXPORT)
-
-
-def _projected(value: _Terms, start: Intrinsics, xy: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return pixels of positions (n, 2) by the complete formula of Metashape's manual."""
-    x, y = xy.T
-    r2 = x * x + y * y
-    radial = np.polynomial.polynomial.polyval(r2, [1.0, *map(value, _RADIAL)])
-    p1, p2 = value("p1"), value("p2")
-    further = 1.0 + value("p3") * r2 + value("p4") * r2 * r2
-    bent_x = x * radial + (p1 * (r2 + 2.0 * x * x) + 2.0 * p2 * x * y) * further
-    bent_y = y * radial + (p2 * (r2 + 2.0 * y * y) + 2.0 * p1 * x * y) * further
-    u = start.cx + bent_x * start.fx + bent_y * value("b2")
-    return np.column_stack([u, start.cy + bent_y * start.fy])
 
 
 def _size(owner: ET.Element, label: str, path: Path) -> tuple[int, int]:
@@ -332,47 +297,6 @@ def _size(owner: ET.Element, label: str, path: Path) -> tuple[int, int]:
     if len(values) != 2 or min(values) < 1.0 or values[0] * values[1] > MOST_PIXELS:
         raise damaged(path, f"sensor {label} does not state its size in pixels")
     return round(values[0]), round(values[1])
-
-
-class _Terms:
-    """Return the numbers of a calibration by name; missing ones are zero."""
-
-    def __init__(self, values: Mapping[str, str], path: Path, label: str) -> None:
-        self._values, self._path, self._label = values, path, label
-
-    def __call__(self, name: str) -> float:
-        what = f"{name} of sensor {self._label}"
-        return numbers_of([self._values.get(name, "0")], self._path, what)[0]
-
-
-def _fisheye(value: _Terms, size: tuple[int, int]) -> FisheyeLens:
-    focal = value("f")
-    return FisheyeLens(
-        width=size[0],
-        height=size[1],
-        fx=focal + value("b1"),
-        fy=focal,
-        cx=0.5 * size[0] + value("cx"),
-        cy=0.5 * size[1] + value("cy"),
-        radial=tuple(map(value, _RADIAL)),
-        tangential=(value("p2"), value("p1")),
-        skew=value("b2"),
-    )
-
-
-def _intrinsics(value: _Terms, size: tuple[int, int]) -> Intrinsics:
-    focal = value("f")
-    return Intrinsics(
-        width=size[0],
-        height=size[1],
-        fx=focal + value("b1"),
-        fy=focal,
-        cx=0.5 * size[0] + value("cx"),
-        cy=0.5 * size[1] + value("cy"),
-        distortion=(value("k1"), value("k2"), value("p2"), value("p1"), value("k3")),
-        source="given",
-        skew=value("b2") or None,
-    )
 
 
 def _camera(
