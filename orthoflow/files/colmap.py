@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import ArgumentError, InputError, PluginError, StoreError
-from orthoflow.files.cube_faces import FisheyeLens, face_lens
+from orthoflow.files.cube_faces import FisheyeLens, PanoramaLens, WideLens
 from orthoflow.files.given_cameras import (
     MOST_CAMERAS,
     MOST_MODEL_BYTES,
@@ -200,9 +200,8 @@ def read_colmap_model(parts: Sequence[Path]) -> tuple[GivenCamera, ...]:
     except UnicodeDecodeError as error:
         raise damaged(images, "the name of an image is not UTF-8 text") from error
     return tuple(
-        given
+        _given(image, names[number], *lenses[image.camera_id], path=images)
         for number, image in by_number
-        for given in _given(image, names[number], *lenses[image.camera_id], path=images)
     )
 
 
@@ -242,34 +241,33 @@ def _whole_names(images: Path) -> dict[int, str]:
 
 
 def _given(
-    image: Any, whole_name: str, lens: Intrinsics | FisheyeLens | str, note: str, *, path: Path
-) -> list[GivenCamera]:
-    """Return the camera of an image; for a panorama those of its faces."""
+    image: Any, whole_name: str, lens: Intrinsics | WideLens | str, note: str, *, path: Path
+) -> GivenCamera:
+    """Return the camera of an image."""
     name = photo_path(whole_name)
     if isinstance(lens, str):
-        return [GivenCamera(name=name, reason=lens)]
+        return GivenCamera(name=name, reason=lens)
     if not image.has_pose:
-        return [GivenCamera(name=name, reason="COLMAP did not register it")]
+        return GivenCamera(name=name, reason="COLMAP did not register it")
     seen = image.cam_from_world()
     matrix = np.asarray(seen.matrix(), dtype=np.float64)
     if not np.isfinite(matrix).all() or not np.any(seen.rotation.quat):
         raise damaged(path, f"the pose of {name} must be finite numbers")
-    given = GivenCamera(
+    return GivenCamera(
         name=name,
         lens=lens,
         rotation=rotation_of(matrix[:, :3].ravel().tolist(), path, name),
         translation=matrix[:, 3],
         note=note,
     )
-    return given.panorama_faces() if image.camera.is_spherical() else [given]
 
 
-def _lens_of(camera: Any, path: Path) -> tuple[Intrinsics | FisheyeLens | str, str]:
+def _lens_of(camera: Any, path: Path) -> tuple[Intrinsics | WideLens | str, str]:
     """Return a camera's lens with the terms it omits, or the reason why there is none."""
     if min(camera.width, camera.height) < 1 or camera.width * camera.height > MOST_PIXELS:
         raise damaged(path, f"a camera has {camera.width} x {camera.height} pixels")
     if camera.is_spherical():
-        return face_lens(camera.width), ""
+        return PanoramaLens(width=int(camera.width), height=int(camera.height)), ""
     words = [word.strip() for word in camera.params_info.split(",")]
     values = {
         _NAMES.get(word, word): float(value)

@@ -2,9 +2,9 @@
 
 A fisheye is OpenCV's (`cv2.fisheye`; Kannala and Brandt 2006): a point theta off the axis is seen
 theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) focal lengths from the principal
-point. Metashape's also has tangential terms and a skew. Directions in a panorama are x forwards
-(the centre of the picture), y to the left and z up; columns count azimuth clockwise seen from
-above, rows elevation downwards, as in ASTM E2807.
+point. Metashape's also has tangential terms and a skew. The columns of a panorama count azimuth
+clockwise seen from above, its rows elevation downwards, as in ASTM E2807; its camera looks at the
+centre of the picture.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,114 +25,62 @@ from orthoflow.geometry.cameras import HALF_PIXEL
 from orthoflow.geometry.levels import Colours
 from orthoflow.products import Intrinsics
 
-# Rows: right, down and forwards of each face, in the directions of the panorama.
+# Rows: right, down and forwards of each face, in the camera's axes (x right, y down, z forward).
 FACES: Final[Mapping[str, NDArray[np.float64]]] = {
-    "front": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
-    "left": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
-    "back": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]]),
-    "right": np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]]),
-    "up": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
-    "down": np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
+    "front": np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
+    "left": np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]),
+    "back": np.array([[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]]),
+    "right": np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
+    "up": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+    "down": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
 }
-# From the axes of a camera that looks forwards: x right, y down, z forward.
-PANORAMA_FROM_CAMERA: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 # Limit of OpenCV's remap.
 #: columns of a panorama; columns and rows of a fisheye photo and its faces
 MOST_PX: Final = 32_766
-
-
-def face_lens(width: int) -> Intrinsics:
-    """Return the lens of the faces of a panorama, with equal resolution at the centre of a face."""
-    focal_px = width / (2.0 * math.pi)
-    side = max(1, round(2.0 * focal_px))
-    return Intrinsics(
-        width=side,
-        height=side,
-        fx=0.5 * side,
-        fy=0.5 * side,
-        cx=0.5 * side,
-        cy=0.5 * side,
-        source="given",
-    )
+WIDEST_DEG: Final = 180.0
+_FULL_TURN_DEG: Final = 360.0
+# Directions per side used to find the part of a face that the lens sees.
+_TRIED: Final = 65
+# A face that shows less than this share of the largest one is omitted.
+_LEAST_SHARE: Final = 0.02
+_ANGLES_TRIED: Final = 2000
 
 
 def face_rays(lens: Intrinsics) -> NDArray[np.float64]:
-    """Return directions (height, width, 3) of the pixels of a face, z = 1, in camera axes."""
+    """Return directions (height, width, 3) of the pixels of a face, z = 1, in its own axes."""
     right = (np.arange(lens.width) + 0.5 - lens.cx) / lens.fx
     down = (np.arange(lens.height) + 0.5 - lens.cy) / lens.fy
     across, along = np.meshgrid(right, down)
     return np.stack([across, along, np.ones_like(across)], axis=-1)
 
 
-def faces_of(
-    panorama: bytes, stem: str, width: int, used: NDArray[np.bool_] | None = None
-) -> tuple[CubeFace, ...]:
-    """Return the faces of a panorama as photos `<stem>_<face>.png`.
-
-    Args:
-        panorama: the file's bytes.
-        stem: stem of its name.
-        width: columns.
-        used: mask of the panorama (rows, columns), True where it may be used; None: all.
-
-    Raises:
-        InputError: it has too many columns.
-    """
-    if not 1 <= width <= MOST_PX:
-        raise InputError(f"panorama {stem} has {width} columns, at most {MOST_PX} can be read")
-    lens = face_lens(width)
-    return tuple(
-        CubeFace(name=face_name(stem, face), photo=panorama, face=face, lens=lens, used=used)
-        for face in FACES
-    )
-
-
-def face_name(stem: str, face: str) -> str:
-    """Return the name of the photo of a panorama's face."""
-    return f"{stem}_{face}.png"
-
-
 def face_in(name: str) -> tuple[str, str] | None:
-    """Return stem and face of the name of a photo that may be a face; None if it is not."""
+    """Return stem and face of the name of a photo that may be a face; None if it is not.
+
+    >>> face_in("hall_left.png"), face_in("left.png")
+    (('hall', 'left'), None)
+    """
     stem, _, face = name.removesuffix(".png").rpartition("_")
-    return (stem, face) if stem and face in FACES and name == face_name(stem, face) else None
+    return (stem, face) if stem and face in FACES and name.endswith(".png") else None
 
 
-def face_picture(panorama: Colours, name: str) -> Colours:
-    """Resample a face from a panorama (rows, columns[, 3]) by bilinear interpolation, as deep."""
-    import cv2
+@dataclass(frozen=True, kw_only=True)
+class PanoramaLens:
+    """The lens of a panorama over the whole sphere; pixels as ours."""
 
-    height, width = panorama.shape[:2]
-    lens = face_lens(width)
-    rays = face_rays(lens) @ FACES[name]
-    azimuth = np.arctan2(rays[..., 1], rays[..., 0])
-    elevation = np.arctan2(rays[..., 2], np.hypot(rays[..., 0], rays[..., 1]))
-    # OpenCV counts from the centre of the first pixel.
-    columns = width * (0.5 - azimuth / (2.0 * math.pi)) - HALF_PIXEL
-    rows = height * (0.5 - elevation / math.pi) - HALF_PIXEL
-    # The last column is left of the first; above the first row, that row is repeated.
-    framed = np.concatenate([panorama[:, -1:], panorama, panorama[:, :1]], axis=1)
-    looked_up = cv2.remap(
-        framed,
-        (columns + 1.0).astype(np.float32),
-        rows.astype(np.float32),
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
-    return np.asarray(looked_up, dtype=panorama.dtype)
+    width: int
+    height: int
 
+    def project(self, rays_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return pixels (..., 2) of directions (..., 3)."""
+        x, y, z = np.moveaxis(rays_camera, -1, 0)
+        u = self.width * (0.5 + np.arctan2(x, z) / (2.0 * math.pi))
+        v = self.height * (0.5 + np.arctan2(y, np.hypot(x, z)) / math.pi)
+        return np.stack([u, v], axis=-1)
 
-WIDEST_DEG: Final = 180.0
-_FULL_TURN_DEG: Final = 360.0
-# Rows: right, down and forwards of each face, in the axes of the camera.
-FACE_FROM_CAMERA: Final[Mapping[str, NDArray[np.float64]]] = {
-    face: axes @ PANORAMA_FROM_CAMERA for face, axes in FACES.items()
-}
-# Directions per side used to find the part of a face that the lens sees.
-_TRIED: Final = 65
-# A face that shows less than this share of the largest one is omitted.
-_LEAST_SHARE: Final = 0.02
-_ANGLES_TRIED: Final = 2000
+    def sees(self, pixels: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Report which pixels (..., 2) lie inside the image: all do."""
+        return np.asarray(np.isfinite(pixels).all(axis=-1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,8 +147,14 @@ class FisheyeLens:
         return max(self.fx, self.fy) * max(along, around)
 
 
-def problem_of(lens: FisheyeLens) -> str:
+WideLens: TypeAlias = FisheyeLens | PanoramaLens
+
+
+def problem_of(lens: WideLens) -> str:
     """Return why a lens is invalid, or "" if it is valid."""
+    if isinstance(lens, PanoramaLens):
+        is_valid = 1 <= lens.width <= MOST_PX
+        return "" if is_valid else f"it has {lens.width} columns, at most {MOST_PX} can be read"
     return _problem_of_numbers(lens) or _problem_of_faces(lens)
 
 
@@ -273,18 +227,38 @@ def _farthest(lens: FisheyeLens) -> float:
 
 
 @cache
-def face_lenses(lens: FisheyeLens) -> Mapping[str, Intrinsics]:
-    """Return lenses of the faces that a fisheye shows, each cropped to the visible part."""
+def face_lenses(lens: WideLens) -> Mapping[str, Intrinsics]:
+    """Return lenses of the faces that a lens shows, each cropped to the visible part.
+
+    Those of a panorama are as fine as it is at the centre of a face.
+    """
+    if isinstance(lens, PanoramaLens):
+        side = max(1, round(lens.width / math.pi))
+        return dict.fromkeys(FACES, _lens_of_face(side, (0, side, 0, side)))
     steps = np.linspace(-1.0, 1.0, _TRIED)
     right, down = np.meshgrid(steps, steps)
     rays = np.stack([right, down, np.ones_like(right)], axis=-1)
-    shown = {face: lens.sees(lens.project(rays @ axes)) for face, axes in FACE_FROM_CAMERA.items()}
+    shown = {face: lens.sees(lens.project(rays @ axes)) for face, axes in FACES.items()}
     most = max(float(seen.mean()) for seen in shown.values())
     return {
         face: _cut(lens, face, seen)
         for face, seen in shown.items()
         if seen.any() and seen.mean() >= _LEAST_SHARE * most
     }
+
+
+def _lens_of_face(side: int, ends: tuple[int, int, int, int]) -> Intrinsics:
+    """Return the lens of a part of a face: left, right, top and bottom in pixels of its side."""
+    left, right, top, bottom = ends
+    return Intrinsics(
+        width=right - left,
+        height=bottom - top,
+        fx=0.5 * side,
+        fy=0.5 * side,
+        cx=0.5 * side - left,
+        cy=0.5 * side - top,
+        source="given",
+    )
 
 
 def _cut(lens: FisheyeLens, face: str, seen: NDArray[np.bool_]) -> Intrinsics:
@@ -302,16 +276,7 @@ def _cut(lens: FisheyeLens, face: str, seen: NDArray[np.bool_]) -> Intrinsics:
             max(0, math.floor(side * first / (_TRIED - 1))),
             min(side, math.ceil(side * last / (_TRIED - 1))),
         ]
-    left, right, top, bottom = ends
-    return Intrinsics(
-        width=right - left,
-        height=bottom - top,
-        fx=0.5 * side,
-        fy=0.5 * side,
-        cx=0.5 * side - left,
-        cy=0.5 * side - top,
-        source="given",
-    )
+    return _lens_of_face(side, (ends[0], ends[1], ends[2], ends[3]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -323,7 +288,7 @@ class CubeFace:
         photo: the file of the whole, unmodified.
         face: which of `FACES`.
         lens: its lens, which is exact.
-        fisheye: lens of the whole; None for a panorama.
+        whole: lens of the whole.
         used: mask of the whole (rows, columns), True where it may be used; None: all.
     """
 
@@ -331,46 +296,47 @@ class CubeFace:
     photo: bytes
     face: str
     lens: Intrinsics
-    fisheye: FisheyeLens | None = None
+    whole: WideLens
     used: NDArray[np.bool_] | None = None
 
     def encoded(self) -> bytes:
         """Return the photo as a PNG file, black where the whole shows nothing."""
-        return encode_png(self._looked_up(decode_levels(self.photo, self.name)))
+        return encode_png(self.picture(decode_levels(self.photo, self.name)))
 
     def mask(self) -> NDArray[np.bool_] | None:
         """Return which pixels (height, width) may be used; None if all may."""
-        seen = np.ones((self.lens.height, self.lens.width), dtype=np.bool_)
-        if self.fisheye is not None:
-            seen = self.fisheye.sees(self._pixels(self.fisheye))
+        seen = self.whole.sees(self._pixels())
         if self.used is not None:
-            whole = self._looked_up(np.where(self.used, np.uint8(255), np.uint8(0)))
-            seen &= whole == np.uint8(255)
+            used = self.picture(np.where(self.used, np.uint8(255), np.uint8(0)))
+            seen &= used == np.uint8(255)
         return None if seen.all() else seen
 
-    def _pixels(self, fisheye: FisheyeLens) -> NDArray[np.float64]:
-        """Return pixels of the fisheye (height, width, 2) of those of the face."""
-        return fisheye.project(face_rays(self.lens) @ FACE_FROM_CAMERA[self.face])
-
-    def _looked_up(self, photo: Colours) -> Colours:
-        """Resample the face from the whole by bilinear interpolation."""
+    def picture(self, whole: Colours) -> Colours:
+        """Resample the face from the whole (rows, columns[, 3]) by bilinear interpolation."""
         import cv2
 
-        if self.fisheye is None:
-            return face_picture(photo, self.face)
-        pixels = self._pixels(self.fisheye)
-        pixels[~self.fisheye.sees(pixels)] = np.nan
-        # OpenCV counts from the centre of the first pixel; NaN would be sampled anywhere.
-        u, v = np.moveaxis(np.nan_to_num(pixels - HALF_PIXEL).astype(np.float32), -1, 0)
-        looked_up = cv2.remap(photo, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        looked_up[np.isnan(pixels[..., 0])] = 0
-        return np.asarray(looked_up, dtype=photo.dtype)
+        pixels = self._pixels()
+        seen = self.whole.sees(pixels)
+        if isinstance(self.whole, PanoramaLens):
+            # The last column is left of the first; above the first row, that row is repeated.
+            whole = np.concatenate([whole[:, -1:], whole, whole[:, :1]], axis=1)
+            pixels[..., 0] += 1.0
+        pixels[~seen] = 0.0
+        # OpenCV counts from the centre of the first pixel.
+        u, v = np.moveaxis((pixels - HALF_PIXEL).astype(np.float32), -1, 0)
+        found = cv2.remap(whole, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        found[~seen] = 0
+        return np.asarray(found, dtype=whole.dtype)
+
+    def _pixels(self) -> NDArray[np.float64]:
+        """Return pixels of the whole (height, width, 2) of those of the face."""
+        return self.whole.project(face_rays(self.lens) @ FACES[self.face])
 
 
-def fisheye_faces(
-    photo: bytes, stem: str, lens: FisheyeLens, used: NDArray[np.bool_] | None = None
+def faces_of(
+    photo: bytes, stem: str, lens: WideLens, used: NDArray[np.bool_] | None = None
 ) -> tuple[CubeFace, ...]:
-    """Return the visible parts of a fisheye photo as photos `<stem>_<face>.png`.
+    """Return the visible parts of a wide photo as photos `<stem>_<face>.png`.
 
     Args:
         photo: the file's bytes.
@@ -383,10 +349,8 @@ def fisheye_faces(
     """
     problem = problem_of(lens)
     if problem:
-        raise InputError(f"the fisheye lens of photo {stem} is none: {problem}")
+        raise InputError(f"the lens of photo {stem} is none: {problem}")
     return tuple(
-        CubeFace(
-            name=face_name(stem, face), photo=photo, face=face, lens=own, fisheye=lens, used=used
-        )
+        CubeFace(name=f"{stem}_{face}.png", photo=photo, face=face, lens=own, whole=lens, used=used)
         for face, own in face_lenses(lens).items()
     )

@@ -2,7 +2,7 @@
 
 The camera of a pinhole image has x to the right, y up and z backwards (ASTM E2807), in a frame
 whose pose transforms to the file's world. Principal points count from the outer corner of the first
-pixel, as ours do. A full spherical image becomes photos of the six faces of a cube.
+pixel, as ours do. The directions of a spherical image are x forwards, y to the left and z up.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.cube_faces import FACES, CubeFace, faces_of
+from orthoflow.files.cube_faces import PanoramaLens
 from orthoflow.files.given_cameras import GivenCamera
 from orthoflow.files.points.e57 import FORMAT, number_of, pose_of
 from orthoflow.files.points.scan_file import load_library, reading
@@ -26,6 +26,8 @@ from orthoflow.products import Intrinsics
 
 SUFFIX: Final = ".e57"
 _FROM_Y_UP: Final = np.diag([1.0, -1.0, -1.0])
+# From x forwards, y to the left, z up to a camera's axes.
+_FROM_PANORAMA: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 _REPRESENTATIONS: Final = ("pinhole", "spherical", "cylindrical", "visualReference")
 _CONTENTS: Final = {"jpegImage": ".jpg", "pngImage": ".png"}
 _UNUSUAL: Final = re.compile(r"[^\w.-]+")
@@ -37,17 +39,13 @@ class E57Image:
 
     Attributes:
         name: name of the photo: the file's, the image's, and the suffix of its content.
-        content: JPEG or PNG as in the file, or a face of the panorama.
+        content: JPEG or PNG as in the file.
         camera: its lens and pose, or why there is none.
     """
 
     name: str
-    content: bytes | CubeFace
+    content: bytes
     camera: GivenCamera
-
-    def encoded(self) -> bytes:
-        """Return the photo as a file: for a face a PNG, for others the content."""
-        return self.content if isinstance(self.content, bytes) else self.content.encoded()
 
 
 def read_e57_images(path: Path) -> tuple[E57Image, ...]:
@@ -65,7 +63,7 @@ def read_e57_images(path: Path) -> tuple[E57Image, ...]:
         images = tuple(
             image
             for index, node in enumerate(nodes)
-            for image in _images(path, index, pye57.libe57.StructureNode(node))
+            for image in _image(path, index, pye57.libe57.StructureNode(node))
         )
     if not images:
         raise InputError(f"{path.name} holds no photos (images2D as JPEG or PNG)")
@@ -105,33 +103,17 @@ def _children(vector: Any) -> Iterator[Any]:
     return (vector.get(index) for index in range(vector.childCount()))
 
 
-def _images(path: Path, index: int, node: Any) -> Iterator[E57Image]:
-    """Return one photo, six of a panorama, or none without a JPEG or PNG."""
+def _image(path: Path, index: int, node: Any) -> Iterator[E57Image]:
+    """Yield the photo of an image, or none without a JPEG or PNG."""
     for kind in _REPRESENTATIONS:
         field = f"{kind}Representation"
-        if not node.isDefined(field):
-            continue
-        shown = node[field]
+        shown = node[field] if node.isDefined(field) else None
         for content, suffix in _CONTENTS.items():
-            if shown.isDefined(content):
+            if shown is not None and shown.isDefined(content):
                 name = _name(path, index, node, suffix)
-                encoded = _content(path, shown[content])
                 camera = _camera(path, name, node, kind, shown)
-                if kind == "spherical" and not camera.reason:
-                    yield from _faces(node, shown, encoded, name.removesuffix(suffix))
-                else:
-                    yield E57Image(name=name, content=encoded, camera=camera)
+                yield E57Image(name=name, content=_content(path, shown[content]), camera=camera)
                 return
-
-
-def _faces(node: Any, shown: Any, content: bytes, stem: str) -> Iterator[E57Image]:
-    world_from_panorama, centre = pose_of(node)
-    for face in faces_of(content, stem, round(number_of(shown["imageWidth"]))):
-        rotation: NDArray[np.float64] = FACES[face.face] @ world_from_panorama.T
-        camera = GivenCamera(
-            name=face.name, lens=face.lens, rotation=rotation, translation=-rotation @ centre
-        )
-        yield E57Image(name=face.name, content=face, camera=camera)
 
 
 def _is_whole(shown: Any) -> bool:
@@ -167,9 +149,19 @@ def _camera(path: Path, name: str, node: Any, kind: str, shown: Any) -> GivenCam
         return GivenCamera(name=name, reason=f"it is a {kind} image, which cannot be painted from")
     if not node.isDefined("pose"):
         return GivenCamera(name=name, reason="the E57 file states no pose of it")
+    world_from_camera, centre = pose_of(node)
     if kind == "spherical":
-        part = "" if _is_whole(shown) else "it is a part of a panorama, only whole ones are taken"
-        return GivenCamera(name=name, reason=part)
+        if not _is_whole(shown):
+            reason = "it is a part of a panorama, only whole ones are taken"
+            return GivenCamera(name=name, reason=reason)
+        width, height = (round(number_of(shown[field])) for field in ("imageWidth", "imageHeight"))
+        rotation: NDArray[np.float64] = _FROM_PANORAMA @ world_from_camera.T
+        return GivenCamera(
+            name=name,
+            lens=PanoramaLens(width=width, height=height),
+            rotation=rotation,
+            translation=-rotation @ centre,
+        )
     values = {
         field: number_of(shown[field])
         for field in ("imageWidth", "imageHeight", "focalLength", "pixelWidth", "pixelHeight")
@@ -178,8 +170,7 @@ def _camera(path: Path, name: str, node: Any, kind: str, shown: Any) -> GivenCam
         values[field] > 0.0 for field in ("focalLength", "pixelWidth", "pixelHeight")
     ):
         raise InputError(f"{path.name}: the lens of photo {name} is none: {values}")
-    world_from_camera, centre = pose_of(node)
-    rotation: NDArray[np.float64] = _FROM_Y_UP @ world_from_camera.T
+    rotation = _FROM_Y_UP @ world_from_camera.T
     return GivenCamera(
         name=name,
         lens=Intrinsics(

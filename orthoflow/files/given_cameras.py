@@ -10,7 +10,7 @@ import math
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path, PureWindowsPath
 from typing import Final
 
 import numpy as np
@@ -18,13 +18,11 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
 from orthoflow.files.cube_faces import (
-    FACE_FROM_CAMERA,
     FACES,
-    PANORAMA_FROM_CAMERA,
     WIDEST_DEG,
     FisheyeLens,
+    WideLens,
     face_lenses,
-    face_name,
     problem_of,
 )
 from orthoflow.files.photo_files import MOST_PIXELS
@@ -105,7 +103,7 @@ class GivenCamera:
     """
 
     name: str
-    lens: Intrinsics | CentredLens | FisheyeLens | None = None
+    lens: Intrinsics | CentredLens | WideLens | None = None
     rotation: NDArray[np.float64] | None = None
     translation: NDArray[np.float64] | None = None
     sigma_wall_m: float | None = None
@@ -113,39 +111,22 @@ class GivenCamera:
     note: str = ""
 
     def of_face(self, face: str) -> GivenCamera:
-        """Return the camera of a face of the cube of a fisheye photo."""
-        if not isinstance(self.lens, FisheyeLens) or self.rotation is None:
+        """Return the camera of a face of the cube of a wide photo."""
+        if not isinstance(self.lens, WideLens) or self.rotation is None:
             return self
         problem = problem_of(self.lens)
         if problem or face not in face_lenses(self.lens):
-            return GivenCamera(
-                name=self.name,
-                reason=f"its fisheye lens is none: {problem}"
-                if problem
-                else "its fisheye lens does not show that face",
+            reason = (
+                f"its lens is none: {problem}" if problem else "its lens does not show that face"
             )
-        axes = FACE_FROM_CAMERA[face]
+            return GivenCamera(name=self.name, reason=reason)
+        axes = FACES[face]
         return replace(
             self,
             lens=face_lenses(self.lens)[face],
             rotation=axes @ self.rotation,
             translation=axes @ np.asarray(self.translation, dtype=np.float64),
         )
-
-    def panorama_faces(self) -> list[GivenCamera]:
-        """Return the cameras of a panorama's faces; itself without a pose."""
-        if self.rotation is None or self.translation is None:
-            return [self]
-        stem = str(PurePosixPath(self.name).with_suffix(""))
-        return [
-            replace(
-                self,
-                name=face_name(stem, face),
-                rotation=axes @ PANORAMA_FROM_CAMERA @ self.rotation,
-                translation=axes @ PANORAMA_FROM_CAMERA @ self.translation,
-            )
-            for face, axes in FACES.items()
-        ]
 
 
 def text_of(path: Path) -> str:

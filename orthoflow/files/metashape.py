@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.cube_faces import FisheyeLens, face_lens
+from orthoflow.files.cube_faces import PanoramaLens, WideLens
 from orthoflow.files.given_cameras import (
     MOST_CAMERAS,
     GivenCamera,
@@ -108,8 +108,7 @@ def _of_chunk(chunk: ET.Element, path: Path) -> Iterator[GivenCamera]:
         given = _camera(element, masters, sensor, world, path)
         if site is not None and world.is_placed and given.rotation is not None:
             given = site(given)
-        is_panorama = sensor is not None and sensor.is_panorama
-        yield from given.panorama_faces() if is_panorama else [given]
+        yield given
 
 
 _OFF: Final = ("false", "0")
@@ -243,7 +242,6 @@ class _Sensor:
 
     def __init__(self, element: ET.Element, path: Path) -> None:
         self.label = element.get("label", element.get("id", ""))
-        self.is_panorama = element.get("type") == "spherical"
         self.lens, self.note = self._lens(element, path)
         self.rotation, self.location = np.eye(3), np.zeros(3)
         whose = f"sensor {self.label}"
@@ -256,10 +254,11 @@ class _Sensor:
         shutter = element.findtext("rolling_shutter", "").strip().lower()
         self.has_rolling_shutter = shutter not in ("", "none", "disabled", *_OFF)
 
-    def _lens(self, element: ET.Element, path: Path) -> tuple[Intrinsics | FisheyeLens | str, str]:
-        if self.is_panorama:
-            return face_lens(_size(element, self.label, path)[0]), ""
+    def _lens(self, element: ET.Element, path: Path) -> tuple[Intrinsics | WideLens | str, str]:
         kind = element.get("type", "frame")
+        if kind == "spherical":
+            width, height = _size(element, self.label, path)
+            return PanoramaLens(width=width, height=height), ""
         if kind not in ("frame", "fisheye"):
             return (
                 f"its sensor {self.label} is of type {kind}; orthoflow takes frame, fisheye and "
@@ -349,7 +348,7 @@ def _rolling_shutter(element: ET.Element, sensor: _Sensor) -> str:
     if matrix.size in (12, 16) and np.isfinite(matrix).all() and sensor.lens is not None:
         turn = matrix.reshape(-1, 4)[:3, :3]
         cosine = float(np.clip(0.5 * (np.trace(turn) - 1.0), -1.0, 1.0))
-        focal = 0.0 if isinstance(sensor.lens, str) else sensor.lens.fx
+        focal = getattr(sensor.lens, "fx", 0.0)
         moved = f" by up to {0.5 * focal * math.acos(cosine):.2g} pixels"
     return (
         f"sensor {sensor.label} has a rolling shutter, for which Metashape compensates and "

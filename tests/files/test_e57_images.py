@@ -93,7 +93,7 @@ def test_images_without_a_pose_are_photos_with_the_reason(tmp_path: Path) -> Non
     assert "for reference only" in reasons[0]
     assert "states no pose of it" in reasons[1]
     assert reasons[2] == ""
-    assert images[0].encoded() == encode_png(PICTURE)
+    assert images[0].content == encode_png(PICTURE)
     photos, cameras = read(tmp_path / "room.e57")
     assert len(photos.photos) == 3
     assert [camera.status == "ok" for camera in cameras.cameras] == [False, False, True]
@@ -154,9 +154,9 @@ def test_a_panorama_becomes_six_photos_that_show_each_direction_where_it_is(
 
 
 def test_the_seam_of_a_panorama_does_not_show(tmp_path: Path) -> None:
-    images = read_e57_images(written(tmp_path, spherical()))
-    back = next(image for image in images if image.name.endswith("_back.png"))
-    middle = decode_image(back.encoded()).astype(int)
+    photos, _ = read(written(tmp_path, spherical()))
+    back = next(photo for photo in photos.photos if photo.name.endswith("_back.png"))
+    middle = decode_image(back.encoded).astype(int)
     column = middle.shape[1] // 2
     steps = np.abs(np.diff(middle[:, column - 3 : column + 3], axis=1)).max()
     assert steps <= 2

@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
 from orthoflow.files.cube_faces import (
-    FACE_FROM_CAMERA,
     FACES,
     FisheyeLens,
+    PanoramaLens,
     face_lenses,
     faces_of,
-    fisheye_faces,
     problem_of,
 )
 from orthoflow.files.images import decode_image, encode_png
@@ -86,12 +85,12 @@ def test_tangential_terms_and_skew_are_those_of_metashape() -> None:
 def test_each_direction_is_shown_once_and_where_it_is() -> None:
     rays = random_directions(600, 88.0)
     n_seen = np.zeros(len(rays), dtype=int)
-    faces = fisheye_faces(encode_png(picture(LENS)), "a", LENS)
+    faces = faces_of(encode_png(picture(LENS)), "a", LENS)
     assert [face.name for face in faces] == [
         f"a_{face}.png" for face in ("front", "left", "right", "up", "down")
     ]
     for face in faces:
-        camera = face.lens.posed(FACE_FROM_CAMERA[face.face])
+        camera = face.lens.posed(FACES[face.face])
         pixels = camera.project(rays)[:, :2]
         seen = camera.sees(pixels)
         mask = face.mask()
@@ -108,7 +107,7 @@ def test_each_direction_is_shown_once_and_where_it_is() -> None:
 def test_beyond_the_field_of_view_nothing_is_used() -> None:
     narrow = replace(LENS, field_of_view_deg=120.0)
     assert np.isnan(narrow.project(random_directions(50, 10.0) @ np.diag([1, 1, -1]))).all()
-    for face in fisheye_faces(encode_png(picture(LENS)), "a", narrow):
+    for face in faces_of(encode_png(picture(LENS)), "a", narrow):
         mask, lens = face.mask(), face.lens
         assert (mask is None) == (face.face == "front")
         if mask is None:
@@ -116,7 +115,7 @@ def test_beyond_the_field_of_view_nothing_is_used() -> None:
         rows, columns = np.nonzero(mask)
         rays = lens.posed().rays_camera(np.column_stack([columns + 0.5, rows + 0.5]))
         theta = np.degrees(
-            np.arccos((rays @ FACE_FROM_CAMERA[face.face])[:, 2] / np.linalg.norm(rays, axis=1))
+            np.arccos((rays @ FACES[face.face])[:, 2] / np.linalg.norm(rays, axis=1))
         )
         assert 59.0 < theta.max() <= 60.0
         # What the field leaves of a face is cut out, but for the steps by which it is found.
@@ -128,7 +127,7 @@ def test_masks_hold_for_the_faces() -> None:
     used = np.ones((LENS.height, LENS.width), dtype=bool)
     used[:, :260] = False
     names = {}
-    for face in fisheye_faces(encode_png(picture(LENS)), "a", LENS, used):
+    for face in faces_of(encode_png(picture(LENS)), "a", LENS, used):
         mask = face.mask()
         assert mask is not None
         names[face.face] = mask
@@ -136,7 +135,7 @@ def test_masks_hold_for_the_faces() -> None:
             continue
         rows, columns = np.nonzero(mask)
         rays = face.lens.posed().rays_camera(np.column_stack([columns + 0.5, rows + 0.5]))
-        assert LENS.project(rays @ FACE_FROM_CAMERA[face.face])[:, 0].min() > 260.0
+        assert LENS.project(rays @ FACES[face.face])[:, 0].min() > 260.0
     assert not names["left"].any()
     assert names["right"].mean() > 0.3
     columns = np.flatnonzero(names["front"].any(axis=0))
@@ -149,10 +148,11 @@ def test_masks_of_panoramas_hold_for_their_faces() -> None:
     used[:, :64] = False  # all that is to the left
     faces = {
         face.face: face
-        for face in faces_of(encode_png(np.zeros((64, 128), np.uint8)), "p", 128, used)
+        for face in faces_of(
+            encode_png(np.zeros((64, 128), np.uint8)), "p", PanoramaLens(width=128, height=64), used
+        )
     }
     assert set(faces) == set(FACES)
-    assert all(face.fisheye is None for face in faces.values())
     left, right, front = (faces[name].mask() for name in ("left", "right", "front"))
     assert left is not None
     assert not left.any()
@@ -180,5 +180,5 @@ def test_masks_of_panoramas_hold_for_their_faces() -> None:
 def test_a_lens_that_is_none_says_why(change: dict[str, float], problem: str) -> None:
     lens = replace(LENS, **change)  # type: ignore[arg-type]
     assert problem in problem_of(lens)
-    with pytest.raises(InputError, match="the fisheye lens of photo a is none: "):
-        fisheye_faces(b"", "a", lens)
+    with pytest.raises(InputError, match="the lens of photo a is none: "):
+        faces_of(b"", "a", lens)

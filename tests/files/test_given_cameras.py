@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
 from orthoflow.files.camera_formats import read_given_cameras
-from orthoflow.files.cube_faces import FACE_FROM_CAMERA, FisheyeLens, face_lenses, face_picture
+from orthoflow.files.cube_faces import FACES, FisheyeLens, PanoramaLens, face_lenses
 from orthoflow.files.given_cameras import (
     MAX_LEFT_OUT_PX,
     NEGLIGIBLE_PX,
@@ -163,11 +163,15 @@ def test_a_model_far_from_opencv_is_refused_with_its_size_in_pixels(tmp_path: Pa
     assert re.search(r"THIN_PRISM_FISHEYE differs from .* by up to [\d.e+]+ pixels", given.reason)
 
 
-def test_panoramas_of_colmap_become_the_cameras_of_their_faces(tmp_path: Path) -> None:
+def test_a_panorama_of_colmap_looks_where_its_front_does(tmp_path: Path) -> None:
     paths, written = colmap_model(tmp_path, "EQUIRECTANGULAR", [WIDTH, HEIGHT], "bin")
-    faces = {given.name: given for given in read_given_cameras(paths)}
-    assert len(faces) == 12
-    front = faces["walls/north face/a_front.png"]
+    _, given = read_given_cameras(paths)
+    assert given.lens == PanoramaLens(width=WIDTH, height=HEIGHT)
+    assert isinstance(given.lens, PanoramaLens)
+    np.testing.assert_allclose(
+        given.lens.project(POINTS), written.camera(7).img_from_cam(POINTS), atol=1e-8
+    )
+    front = given.of_face("front")
     np.testing.assert_allclose(
         np.column_stack([np.asarray(front.rotation), np.asarray(front.translation)]),
         written.image(2).cam_from_world().matrix(),
@@ -309,7 +313,7 @@ def test_metashape_cameras_project_as_its_manual_says(tmp_path: Path, where: str
     assert given["c.jpg"].reason == "its sensor Theta has no calibration"
 
 
-def test_metashape_panoramas_give_the_cameras_of_their_faces(tmp_path: Path) -> None:
+def test_a_panorama_of_metashape_projects_as_its_manual_says(tmp_path: Path) -> None:
     rotation, centre = pose(6)
     chunk_from_camera = np.eye(4)
     chunk_from_camera[:3, :3], chunk_from_camera[:3, 3] = rotation, centre
@@ -318,32 +322,16 @@ def test_metashape_panoramas_give_the_cameras_of_their_faces(tmp_path: Path) -> 
         f"{words(chunk_from_camera)}</transform></camera>"
     )
     paths = write(tmp_path, {"cameras.xml": metashape(np.eye(4), more=more)})
-    faces = {item.name: item for item in read_given_cameras(paths) if item.name.startswith("r_")}
-    assert len(faces) == 6
-    # Its manual: u = w / 2 + f atan2(x, z), v = h / 2 + f atan2(y, hypot(x, z)), f = w / 2 pi.
+    (given,) = [item for item in read_given_cameras(paths) if item.name == "r.jpg"]
+    assert isinstance(given.lens, PanoramaLens)
+    # u = w / 2 + f atan2(x, z), v = h / 2 + f atan2(y, hypot(x, z)), f = w / 2 pi.
     points = np.random.default_rng(8).normal(size=(300, 3))
     u = 360 + 720 / (2 * np.pi) * np.arctan2(points[:, 0], points[:, 2])
     v = 180 + 720 / (2 * np.pi) * np.arctan2(points[:, 1], np.hypot(points[:, 0], points[:, 2]))
-    # A picture whose two channels are the column and the row, from which faces are looked up.
-    columns, rows = np.meshgrid(np.arange(720), np.arange(360))
-    n_seen = np.zeros(len(points), dtype=int)
-    for face in ("front", "left", "back", "right", "up", "down"):
-        given = faces[f"r_{face}.png"]
-        assert isinstance(given.lens, Intrinsics)
-        viewing = given.lens.posed(given.rotation, given.translation)
-        at_face = viewing.project(points @ rotation.T + centre)[:, :2]
-        seen = viewing.sees(at_face)
-        n_seen += seen
-        pixel = np.floor(at_face[seen]).astype(int)
-        channels = [
-            face_picture((values // scale).astype(np.uint8), face)[pixel[:, 1], pixel[:, 0]]
-            for values, scale in ((columns, 4), (rows, 2))
-        ]
-        across = np.abs(channels[0] - u[seen] / 4)
-        level = np.abs(v[seen] - 180) < 120  # columns run together at the poles
-        assert np.minimum(across, 180 - across)[level].max() < 2.0
-        assert np.abs(channels[1] - v[seen] / 2).max() < 2.0
-    assert (n_seen == 1).all()
+    np.testing.assert_allclose(given.lens.project(points), np.column_stack([u, v]), atol=1e-9)
+    assert given.rotation is not None
+    np.testing.assert_allclose(given.rotation, rotation.T, atol=1e-12)
+    np.testing.assert_allclose(-given.rotation.T @ np.asarray(given.translation), centre)
 
 
 BOMB = '<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;">]><x>&b;</x>'
@@ -637,11 +625,11 @@ def test_the_faces_of_a_fisheye_have_its_place_and_their_own_directions(tmp_path
         own = camera.lens.posed().rays_world(places)
         # Through the axes of the fisheye on the one hand, through the world on the other.
         np.testing.assert_allclose(
-            viewing.rays_world(places) @ rotation, own @ FACE_FROM_CAMERA[face], atol=1e-9
+            viewing.rays_world(places) @ rotation, own @ FACES[face], atol=1e-9
         )
-    assert given.of_face("back").reason == "its fisheye lens does not show that face"
+    assert given.of_face("back").reason == "its lens does not show that face"
     folding = replace(given, lens=replace(given.lens, radial=(-0.9, 0.0, 0.0, 0.0)))
-    assert folding.of_face("front").reason.startswith("its fisheye lens is none: it folds back")
+    assert folding.of_face("front").reason.startswith("its lens is none: it folds back")
     # What has no orientation has none on any face, and keeps its reason.
     lost = replace(given, rotation=None, translation=None, reason="too few ties")
     assert lost.of_face("front") is lost

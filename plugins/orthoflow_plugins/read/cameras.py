@@ -12,7 +12,7 @@ from pydantic import Field
 
 from orthoflow.errors import InputError
 from orthoflow.files.camera_formats import read_given_cameras
-from orthoflow.files.cube_faces import FisheyeLens, face_in
+from orthoflow.files.cube_faces import WideLens, face_in
 from orthoflow.files.given_cameras import CentredLens, GivenCamera, lens_or_reason
 from orthoflow.files.points.units import UNITS_M
 from orthoflow.geometry.frames import FARTHEST_M
@@ -143,11 +143,11 @@ def _camera(photo: Photo, given: GivenByName, unit_m: float, notes: dict[str, li
         if isinstance(taken, str):
             return Camera(photo=photo.name, status=taken)
         lens = taken
-    if isinstance(lens, FisheyeLens):
+    if isinstance(lens, WideLens):
         return Camera(
             photo=photo.name,
-            status="its lens is a fisheye: wire the same files to read.photos as cameras, which "
-            "makes photos of it that can be painted from",
+            status="its lens is a fisheye or a panorama: wire the same files to read.photos as "
+            "cameras, which makes photos of it that can be painted from",
         )
     if note:
         notes.setdefault(note, []).append(photo.name)
@@ -195,14 +195,14 @@ class GivenByName:
     def of_photo(self, name: str, folder: str = "") -> GivenCamera | None:
         """Return the camera of a photo: of its name, or else of its name without suffix.
 
-        A photo NAME_front.png may be a face of NAME, whose lens is a fisheye. Of several cameras
-        the one counts whose folders are most like the photo's; where they are alike, the camera
-        that is returned only has the reason why it is none.
+        A photo NAME_front.png may be a face of NAME, whose lens is a fisheye or a panorama. Of
+        several cameras the one counts whose folders are most like the photo's; where these are
+        equally so, the camera that is returned only has the reason why it is none.
         """
         found, face = self._named(_file_name(name)), face_in(_file_name(name))
         if not found and face is not None:
             whole = [
-                camera for camera in self._of_stem(face[0]) if isinstance(camera.lens, FisheyeLens)
+                camera for camera in self._of_stem(face[0]) if isinstance(camera.lens, WideLens)
             ]
             nearest = _nearest(whole, folder, is_only=True)
             return nearest.of_face(face[1]) if nearest is not None else None

@@ -25,8 +25,9 @@ from orthoflow.files.camera_formats import read_given_cameras
 from orthoflow.files.cube_faces import (
     CubeFace,
     FisheyeLens,
+    PanoramaLens,
+    WideLens,
     faces_of,
-    fisheye_faces,
 )
 from orthoflow.files.e57_images import SUFFIX as E57_SUFFIX
 from orthoflow.files.e57_images import E57Image, read_e57_images
@@ -116,8 +117,9 @@ class ReadPhotos(Method):
     Photos of one file name in several folders are called by their paths within the input.
 
     A panorama, in an E57 file or named in `panoramas`, becomes six photos, the faces of a cube, as
-    PNG; their lenses are exact. So does a photo whose lens is a fisheye, as the calibration or the
-    given cameras say (OpenCV's fisheye model), but of faces only what it shows.
+    PNG; their lenses are exact. So does a photo whose lens is a fisheye (OpenCV's model), as the
+    calibration or the given cameras say, but of faces only what it shows; and what the given
+    cameras say is a panorama.
 
     The files' bytes are kept and never encoded again. Pixels are those of the stored array: the
     EXIF orientation is written down, not applied. Of a TIFF with several pages the largest that is
@@ -162,7 +164,7 @@ class ReadPhotos(Method):
     class In(Ports):
         """The photos, and a calibration file, masks and given cameras if there are any.
 
-        Of given cameras only those count here whose lenses are fisheyes.
+        Of given cameras only those count here whose lenses are fisheyes or panoramas.
         """
 
         files: InputFiles
@@ -232,24 +234,23 @@ class _Source:
 
     Attributes:
         name: of the photo.
-        content: a file of its own, or what makes one of an E57 file, a panorama or a fisheye's
-            photo.
+        content: a file, the bytes of one inside an E57 file, or a face of a cube.
         lens: what that file says of its lens.
         whole: name of the photo that it is a face of, whose lens nobody else knows; or "".
         folder: of the file, within the input.
     """
 
     name: str
-    content: Path | E57Image | CubeFace
+    content: Path | bytes | CubeFace
     lens: Intrinsics | None = None
     whole: str = ""
     folder: str = ""
 
     def encoded(self) -> bytes:
         """The bytes of the photo as they are."""
-        if isinstance(self.content, Path):
-            return _bytes_of(self.content)
-        return self.content.encoded()
+        if isinstance(self.content, bytes):
+            return self.content
+        return _bytes_of(self.content) if isinstance(self.content, Path) else self.content.encoded()
 
 
 def _bytes_of(path: Path) -> bytes:
@@ -276,16 +277,27 @@ class _Cubes:
     masks: Masks
 
     def sources(self, path: Path, folder: str) -> list[_Source]:
-        """A photo of a file of its own, or its faces."""
+        """Return a photo of a file of its own, or its faces; or the photos of an E57 file."""
+        if path.suffix.lower() == E57_SUFFIX:
+            return [source for image in read_e57_images(path) for source in self._of_e57(image)]
+        lens = self._lens(path.name, folder)
         if any(fnmatchcase(path.name, pattern) for pattern in self.panoramas):
-            return self._of_panorama(path)
-        lens = self._fisheye(path.name, folder)
-        return [_Source(name=path.name, content=path)] if lens is None else self._faces(path, lens)
+            lens = _PANORAMA
+        if lens is None:
+            return [_Source(name=path.name, content=path)]
+        return self._faces(path.name, _bytes_of(path), lens)
 
-    def _fisheye(self, name: str, folder: str) -> FisheyeLens | None:
-        """The lens of a photo where it is a fisheye: as the cameras say, else the calibration."""
+    def _of_e57(self, image: E57Image) -> list[_Source]:
+        lens = image.camera.lens
+        if isinstance(lens, PanoramaLens):
+            return self._faces(image.name, image.content, lens)
+        lens = lens if isinstance(lens, Intrinsics) else None
+        return [_Source(name=image.name, content=image.content, lens=lens)]
+
+    def _lens(self, name: str, folder: str) -> WideLens | None:
+        """Return the lens of a wide photo: as the cameras say, else the calibration."""
         camera = None if self.given is None else self.given.of_photo(name, folder)
-        if camera is not None and isinstance(camera.lens, FisheyeLens):
+        if camera is not None and isinstance(camera.lens, WideLens):
             return camera.lens
         if self.calibration is None:
             return None
@@ -295,31 +307,35 @@ class _Cubes:
         lens = self.calibration.lenses[self.calibration.patterns.index(pattern)]
         return lens if isinstance(lens, FisheyeLens) else None
 
-    def _of_panorama(self, path: Path) -> list[_Source]:
-        encoded, size = _whole_photo(path)
-        if size[0] != 2 * size[1]:
+    def _faces(self, name: str, encoded: bytes, lens: WideLens) -> list[_Source]:
+        """Return the faces of a wide photo of which masks leave something."""
+        _require_whole(name, encoded)
+        height, width = decode_image(encoded, f"photo {name}").shape[:2]
+        if lens == _PANORAMA and width != 2 * height:
             raise InputError(
-                f"photo {path.name} is named in panoramas, but has {size[0]} x {size[1]} pixels: a "
+                f"photo {name} is named in panoramas, but has {width} x {height} pixels: a "
                 "panorama over the whole sphere is twice as wide as high"
             )
-        used = self._used(path.name, size, encoded)
-        return _of_faces(faces_of(encoded, path.stem, size[0], used), path.name)
-
-    def _faces(self, path: Path, lens: FisheyeLens) -> list[_Source]:
-        encoded, size = _whole_photo(path)
-        if size != (lens.width, lens.height):
+        if lens == _PANORAMA:
+            lens = PanoramaLens(width=width, height=height)
+        if (width, height) != (lens.width, lens.height):
             raise InputError(
-                f"photo {path.name} has {size[0]} x {size[1]} pixels, but its fisheye lens is for "
+                f"photo {name} has {width} x {height} pixels, but its wide lens is for "
                 f"{lens.width} x {lens.height}: calibrate at the size of the photos as they are "
                 "stored, without the EXIF rotation"
             )
-        used = self._used(path.name, size, encoded)
-        return _of_faces(fisheye_faces(encoded, path.stem, lens, used), path.name)
-
-    def _used(self, name: str, size: tuple[int, int], encoded: bytes) -> NDArray[np.bool_] | None:
-        mask = self.masks.encoded(name, size)
+        mask = self.masks.encoded(name, (width, height))
         given = None if mask is None else decode_mask(mask, f"the mask of {name}")
-        return _both(given, opaque_pixels(encoded))
+        used = _both(given, opaque_pixels(encoded))
+        return [
+            _Source(name=face.name, content=face, lens=face.lens, whole=name)
+            for face in faces_of(encoded, Path(name).stem, lens, used)
+            if (own := face.mask()) is None or own.any()
+        ]
+
+
+# Of a photo that the user says is one, of any size.
+_PANORAMA: Final = PanoramaLens(width=0, height=0)
 
 
 def _both(
@@ -329,44 +345,12 @@ def _both(
     return other if one is None else one if other is None else one & other
 
 
-def _whole_photo(path: Path) -> tuple[bytes, tuple[int, int]]:
-    """Bytes of a photo, and its width and height."""
-    encoded = _bytes_of(path)
-    _require_whole(path.name, encoded)
-    height, width = decode_image(encoded, f"photo {path.name}").shape[:2]
-    return encoded, (width, height)
-
-
-def _of_faces(faces: Sequence[CubeFace], whole: str) -> list[_Source]:
-    """Faces of which masks leave something."""
-    return [
-        _Source(name=face.name, content=face, lens=face.lens, whole=whole)
-        for face in faces
-        if (mask := face.mask()) is None or mask.any()
-    ]
-
-
-def _inside_e57(path: Path) -> list[_Source]:
-    return [
-        _Source(
-            name=image.name,
-            content=image,
-            lens=image.camera.lens if isinstance(image.camera.lens, Intrinsics) else None,
-            whole=path.name if isinstance(image.content, CubeFace) else "",
-        )
-        for image in read_e57_images(path)
-    ]
-
-
 def _masked(read: _ReadPhoto, source: _Source, masks: Masks) -> _ReadPhoto:
     """Return a photo with its mask, where it has one."""
     photo = read.photo
     mask = masks.encoded(photo.name, (photo.width, photo.height))
-    own = (
-        opaque_pixels(photo.encoded)
-        if isinstance(source.content, Path | E57Image)
-        else source.content.mask()
-    )
+    face = source.content if isinstance(source.content, CubeFace) else None
+    own = opaque_pixels(photo.encoded) if face is None else face.mask()
     if own is not None:
         given = None if mask is None else decode_mask(mask, f"the mask of {photo.name}")
         used = _both(own, given)
@@ -386,14 +370,11 @@ def _sources(ctx: StepContext, files: InputFiles, masks: Set[Path], cubes: _Cube
     folders = _folders(photos)
     sources, others = [], []
     for path in photos:
-        if path.suffix.lower() in PHOTO_SUFFIXES:
+        if path.suffix.lower() in (*PHOTO_SUFFIXES, E57_SUFFIX):
             found = cubes.sources(path, folders[path])
-        elif path.suffix.lower() == E57_SUFFIX:
-            found = _inside_e57(path)
+            sources += [replace(source, folder=folders[path]) for source in found]
         else:
             others.append(path.name)
-            continue
-        sources += [replace(source, folder=folders[path]) for source in found]
     _refuse_raw(files.name, [source.name for source in sources], others)
     if not sources:
         raise InputError(
@@ -442,7 +423,7 @@ def _refuse_raw(input_name: str, photos: Sequence[str], others: Sequence[str]) -
 
 
 def _given(files: InputFiles | None) -> GivenByName | None:
-    """Cameras of other programs; an E57 file has panoramas, but no fisheyes."""
+    """Return cameras of other programs; those of E57 files belong to the photos in them."""
     if files is None or all(path.suffix.lower() == E57_SUFFIX for path in files.paths):
         return None
     return GivenByName(read_given_cameras(files.paths))

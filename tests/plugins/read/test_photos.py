@@ -163,12 +163,22 @@ def test_a_fisheye_becomes_the_faces_that_it_shows(tmp_path: Path, read: Reader)
     assert read.warnings == ""
 
 
-def test_a_fisheye_that_cameras_speak_of_needs_no_calibration(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("lens", "faces"),
+    [
+        (b"OPENCV_FISHEYE 64 48 20 20 32 24 0 0 0 0", ("down", "front", "left", "right", "up")),
+        (b"EQUIRECTANGULAR 64 48 64 48", ("back", "down", "front", "left", "right", "up")),
+    ],
+    ids=["fisheye", "panorama"],
+)
+def test_a_wide_photo_that_cameras_speak_of_needs_no_calibration(
+    tmp_path: Path, lens: bytes, faces: tuple[str, ...]
+) -> None:
     (path,) = made.write(tmp_path, {"a.jpg": encode_jpeg(made.picture())})
     model = made.write(
         tmp_path,
         {
-            "cameras.txt": b"1 OPENCV_FISHEYE 64 48 20 20 32 24 0 0 0 0\n",
+            "cameras.txt": b"1 " + lens + b"\n",
             "images.txt": b"1 1 0 0 0 0 0 0 1 a.jpg\n\n",
         },
     )
@@ -186,10 +196,9 @@ def test_a_fisheye_that_cameras_speak_of_needs_no_calibration(tmp_path: Path) ->
         )
         return tuple(f"{camera.photo}: {camera.status}" for camera in found.cameras.cameras)
 
-    faces = ("down", "front", "left", "right", "up")
     assert run(given) == tuple(f"a_{face}.png: ok" for face in faces)
     # Whoever wires the poses only is told what is missing.
-    with pytest.raises(InputError, match="its lens is a fisheye: wire the same files to read"):
+    with pytest.raises(InputError, match="its lens is a fisheye or a panorama: wire the same"):
         run(None)
 
 
