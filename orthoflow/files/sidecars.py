@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError, InputError, StoreError
-from orthoflow.files.drawings.words import accuracy_phrase
 from orthoflow.files.geotiff import GridPlace, RasterParts, local_crs_name
+from orthoflow.files.wall_descriptions import ORTHO_FILE, WallDescription, described
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.frames import FARTHEST_M, RasterAxes
 from orthoflow.geometry.levels import eight_bits
@@ -305,7 +304,6 @@ def _finite(value: object) -> JsonValue:
     return number(float(str(value)))
 
 
-_NAME: Final = re.compile(r"wall_(\d{1,5})_ortho\.tif")
 _COLOURS: Final = 3
 
 
@@ -315,19 +313,25 @@ class OrthoFile:
 
     Attributes:
         path: its GeoTIFF.
-        wall: number in its name.
-        name: what the run calls the wall.
+        about: its wall, size and accuracy.
         frame: where its cells lie.
         digest: of the product, empty where the sidecar does not say it.
-        accuracy: what is known of this image's, for people.
     """
 
     path: Path
-    wall: int
-    name: str
+    about: WallDescription
     frame: WallFrame
     digest: str
-    accuracy: str = ""
+
+    @property
+    def wall(self) -> int:
+        """Number of its wall."""
+        return self.about.number
+
+    @property
+    def name(self) -> str:
+        """What the run calls its wall."""
+        return self.about.name
 
     def shrunk(self, longest_px: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         """Colours (r, c, 3) and what is shown (r, c), averaged to at most so many pixels a side.
@@ -371,18 +375,17 @@ def ortho_files(paths: Iterable[Path]) -> tuple[OrthoFile, ...]:
     Raises:
         InputError: one of them, or the sidecar beside it, cannot be read.
     """
-    found = [_opened(path, int(name[1])) for path in paths if (name := _NAME.fullmatch(path.name))]
+    named = [path for path in paths if path.name.startswith("wall_")]
+    found = [_opened(path) for path in named if ORTHO_FILE.fullmatch(path.name)]
     return tuple(sorted(found, key=lambda ortho: ortho.wall))
 
 
-def _opened(path: Path, wall: int) -> OrthoFile:
+def _opened(path: Path) -> OrthoFile:
     frame, content = placed_raster(path)
-    name, digest = content.get("name"), content.get("product_digest")
+    digest = content.get("product_digest")
     return OrthoFile(
         path=path,
-        wall=wall,
-        name=name if isinstance(name, str) else f"wall {wall}",
+        about=described(path, content),
         frame=frame,
         digest=digest if isinstance(digest, str) else "",
-        accuracy=accuracy_phrase(content.get("accuracy")).text(),
     )

@@ -14,6 +14,7 @@ from typing import Final
 from orthoflow.errors import ArgumentError
 from orthoflow.files.geotiff import RasterPlace, place_of
 from orthoflow.files.sidecars import read_sidecar
+from orthoflow.files.wall_descriptions import described
 from orthoflow.products import JsonValue
 from orthoflow.records.runs import PRODUCTS_FOLDER, Run, copy_files, creating
 from orthoflow.untrusted_text import json_bytes, shown
@@ -30,7 +31,9 @@ _BESIDE: Final = {
     "_ortho_mask.tif": ("mask", "image/tiff; application=geotiff", ["metadata"]),
     "_ortho.png": ("preview", "image/png", ["thumbnail"]),
     "_ortho.json": ("placing", "application/json", ["metadata"]),
+    "_error.tif": ("error", "image/tiff; application=geotiff", ["metadata"]),
 }
+_DESCRIBED: Final = ("painted_share", "expected_mm_median", "expected_mm_p95", "recommended")
 _EVERYWHERE: Final = (-180.0, -90.0, 180.0, 90.0)
 # Prefix of sha2-256 in a multihash: its code and 32 bytes.
 _MULTIHASH: Final = "1220"
@@ -103,6 +106,7 @@ def _is_beside(path: PurePosixPath, ortho: _Ortho) -> bool:
 
 def _item(run: Run, folder: Path, ortho: _Ortho, beside: list[str]) -> dict[str, JsonValue]:
     place, sidecar = ortho.place, read_sidecar(folder / ortho.path.with_suffix(".json"))
+    about = described(folder / ortho.path, sidecar)
     outline: list[JsonValue] = [list(corner) for corner in ortho.place.outline_lonlat]
     geometry: JsonValue = {"type": "Polygon", "coordinates": [outline]} if outline else None
     digest = sidecar.get("product_digest")
@@ -118,7 +122,9 @@ def _item(run: Run, folder: Path, ortho: _Ortho, beside: list[str]) -> dict[str,
         "geometry": geometry,
         "properties": {
             "datetime": cell.ended or run.record.ended,
-            "title": f"{sidecar.get('name', 'wall')}, {ortho.address}",
+            "title": f"{about.name}, {ortho.address}",
+            "description": about.sentence,
+            **{f"orthoflow:{name}": getattr(about, name) for name in _DESCRIBED},
             "gsd": place.transform[0],
             "processing_digest": digest if isinstance(digest, str) else None,
             "proj:code": None if place.epsg is None else f"EPSG:{place.epsg}",

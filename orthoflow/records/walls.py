@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,86 +11,40 @@ from typing import Final
 
 import numpy as np
 from orthoflow_provenance.document import RecordedCell
+from pydantic import TypeAdapter, ValidationError
 
 from orthoflow.engine.journal import cell_file_name
 from orthoflow.errors import ArgumentError, InputError, RecordError
-from orthoflow.files.drawings.words import Phrase, accuracy_phrase
+from orthoflow.files.drawings.words import Phrase
 from orthoflow.files.geotiff import RasterParts
 from orthoflow.files.sidecars import placed_raster, read_sidecar, write_json
+from orthoflow.files.wall_descriptions import ORTHO_FILE, WallDescription, described
 from orthoflow.geometry import WallFrame
 from orthoflow.products import (
-    PAINTED_STATES,
     CheckPoints,
     Inspection,
-    JsonValue,
     Opening,
     Openings,
     Planes,
     Walls,
 )
 from orthoflow.records.runs import PRODUCTS_FOLDER, Run, published_files, require_unchanged
-from orthoflow.untrusted_text import parse_json
 
 WALLS_FILE: Final = "walls.json"
 _WALLS_LARGEST_BYTES: Final = 1 << 22
-_ORTHO: Final = re.compile(r"(?:[a-z]+_)?wall_(\d{1,5})_ortho\.json")
-_DEPTH: Final = re.compile(r"(?:[a-z]+_)?wall_(\d{1,5})_depth\.json")
-# An image with a smaller painted share is not a view of its wall.
-_LEAST_PAINTED_SHARE: Final = 0.5
+_DEPTH: Final = re.compile(r"(?:[a-z]+_)?wall_(\d{1,5})_depth\.tif")
+_WALLS: Final = TypeAdapter(dict[str, tuple[WallDescription, ...]])
 
 
-@dataclass(frozen=True, kw_only=True)
-class DeliveredWall:
-    """A wall, and whether its orthoimage should be delivered.
-
-    Attributes:
-        name: of the wall, with its number.
-        kind: `wall`, `floor`, `ceiling`, or its method's own name for it.
-        recommended: its orthoimage should be delivered.
-        reason: why, or why not, in words.
-        area_m2: of the image; None without one.
-        painted_share: of the cells of the image; None without one.
-        expected_mm: expected error of a point measured in the image, median; None if it was not
-            checked.
-    """
-
-    name: str
-    kind: str
-    recommended: bool
-    reason: str
-    area_m2: float | None
-    painted_share: float | None
-    expected_mm: float | None
-
-
-def delivered_walls(products: Path) -> tuple[DeliveredWall, ...]:
-    """Read `walls.json` of a run; empty if it is missing or unreadable."""
+def delivered_walls(products: Path) -> tuple[WallDescription, ...]:
+    """Read `walls.json` of a run; empty if it is missing, unreadable or not as one is written."""
     path = products / WALLS_FILE
     try:
         if path.is_symlink() or path.stat().st_size > _WALLS_LARGEST_BYTES:
             return ()
-        found = parse_json(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return _WALLS.validate_json(path.read_bytes()).get("walls", ())
+    except (OSError, ValidationError):
         return ()
-    rows = found.get("walls") if isinstance(found, dict) else None
-    return tuple(
-        DeliveredWall(
-            name=str(row.get("name", "")),
-            kind=str(row.get("kind", "")),
-            recommended=row.get("recommended") is True,
-            reason=str(row.get("reason", "")),
-            area_m2=_number(row.get("area_m2")),
-            painted_share=_number(row.get("painted_share")),
-            expected_mm=_number(row.get("expected_mm_median")),
-        )
-        for row in (rows if isinstance(rows, list) else ())
-        if isinstance(row, dict)
-    )
-
-
-def _number(value: object) -> float | None:
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return float(str(value)) if is_number and math.isfinite(float(str(value))) else None
 
 
 def write_walls_json(products: Path, cells: Sequence[RecordedCell]) -> None:
@@ -112,101 +65,48 @@ def write_walls_json(products: Path, cells: Sequence[RecordedCell]) -> None:
     ]
     if not pictured:
         return
-    folder = products / cell_file_name(pictured[-1].address)
-    images = {number: content for number, _, content in _sidecars(folder, _ORTHO)}
-    paths = {number: path for number, path, _ in _sidecars(folder, _ORTHO)}
-    walls: list[dict[str, JsonValue]] = []
-    for number, content in images.items():
-        image = paths[number].with_suffix(".tif").relative_to(products).as_posix()
-        error = paths[number].with_name(paths[number].name.replace("_ortho.json", "_error.tif"))
-        walls.append(_told(number, content, image, is_of_photos=error.exists()))
-    walls += _included(products, cells, images)
-    walls.sort(key=_rank)
-    write_json(products / WALLS_FILE, {"walls": list(walls)})
+    walls = {}
+    for number, path, sidecar in _with_sidecars(products, pictured[-1], ORTHO_FILE):
+        image = path.relative_to(products).as_posix()
+        walls[number] = described(path, sidecar).model_copy(update={"orthoimage": image})
+    included = {
+        int(other): number
+        for cell in cells
+        for number, _, sidecar in _with_sidecars(products, cell, _DEPTH)
+        if number in walls and isinstance(others := sidecar.get("includes_walls"), list)
+        for other in others
+    }
+    walls |= {
+        number: WallDescription(
+            number=number,
+            name=f"wall {number}",
+            kind="wall",
+            recommended=False,
+            reason=f"already included in wall {wall}",
+        )
+        for number, wall in included.items()
+        if number not in walls
+    }
+    ranked = sorted(walls.values(), key=_rank)
+    write_json(products / WALLS_FILE, {"walls": [wall.model_dump() for wall in ranked]})
 
 
-def _sidecars(
-    folder: Path, pattern: re.Pattern[str]
-) -> Iterator[tuple[int, Path, dict[str, object]]]:
-    for path in sorted(folder.glob("*.json")):
-        if found := pattern.fullmatch(path.name):
+def _with_sidecars(
+    products: Path, cell: RecordedCell, pattern: re.Pattern[str]
+) -> Iterator[tuple[int, Path, Mapping[str, object]]]:
+    """Return numbers of walls, published rasters and their sidecars of a cell."""
+    for path in sorted((products / cell_file_name(cell.address)).glob("*.json")):
+        raster = path.with_suffix(".tif")
+        if found := pattern.fullmatch(raster.name):
             try:
-                yield int(found[1]), path, read_sidecar(path)
+                yield int(found[1]), raster, read_sidecar(path)
             except InputError:
                 continue
 
 
-def _told(
-    number: int, content: Mapping[str, object], image: str, *, is_of_photos: bool
-) -> dict[str, JsonValue]:
-    """Return the entry of one orthoimage."""
-    counts = content.get("mask_counts")
-    counts = counts if isinstance(counts, dict) else {}
-    total = sum(counts.values()) or 1
-    painted = sum(float(counts.get(str(int(state)), 0)) for state in PAINTED_STATES) / total
-    accuracy = content.get("accuracy")
-    accuracy = accuracy if isinstance(accuracy, dict) else {}
-    median = accuracy.get("expected_mm_median")
-    reason = f"{painted:.0%} painted"
-    if painted < _LEAST_PAINTED_SHARE:
-        recommended, reason = False, f"only {reason}"
-    elif is_of_photos and not accuracy.get("assessed"):
-        recommended, reason = False, f"{reason}, accuracy not checked: no tie lies on this wall"
-    else:
-        recommended = True
-        if isinstance(median, float) and math.isfinite(median):
-            reason += f", expected error {median:.1f} mm"
-    size_m2 = float(str(content.get("gsd_m", 0.0))) ** 2 * total
-    return {
-        "number": number,
-        "name": str(content.get("name", f"wall {number}")),
-        "kind": _kind(str(content.get("name", "wall"))),
-        "recommended": recommended,
-        "reason": reason,
-        "area_m2": round(size_m2, 3),
-        "painted_share": round(painted, 4),
-        "expected_mm_median": median if isinstance(median, float) else None,
-        "n_check_points": accuracy.get("n_check_points", 0),
-        "orthoimage": image,
-    }
-
-
-def _included(
-    products: Path, cells: Sequence[RecordedCell], images: Mapping[int, object]
-) -> Iterator[dict[str, JsonValue]]:
-    """Return surfaces that a wall of these images already shows."""
-    found: dict[int, int] = {}
-    for cell in cells:
-        for number, _, content in _sidecars(products / cell_file_name(cell.address), _DEPTH):
-            included = content.get("includes_walls")
-            if number in images and isinstance(included, list):
-                found |= {int(other): number for other in included}
-    for number, wall in found.items():
-        if number not in images:
-            yield {
-                "number": number,
-                "name": f"wall {number}",
-                "kind": "wall",
-                "recommended": False,
-                "reason": f"already included in wall {wall}",
-                "area_m2": None,
-                "painted_share": None,
-                "expected_mm_median": None,
-                "n_check_points": 0,
-                "orthoimage": None,
-            }
-
-
-def _kind(name: str) -> str:
-    """Return the first word of a wall's name: wall, floor, ceiling, or its method's own."""
-    return name.split(" ", maxsplit=1)[0] or "wall"
-
-
-def _rank(wall: Mapping[str, JsonValue]) -> tuple[bool, float, int]:
+def _rank(wall: WallDescription) -> tuple[bool, float, int]:
     """Sort key: recommended ones first, of these the largest painted area."""
-    area, share = wall["area_m2"], wall["painted_share"]
-    painted = area * share if isinstance(area, float) and isinstance(share, float) else 0.0
-    return not wall["recommended"], -painted, int(str(wall["number"]))
+    return not wall.recommended, -(wall.area_m2 or 0.0) * (wall.painted_share or 0.0), wall.number
 
 
 _RASTER: Final = re.compile(r"(?:[a-z]+_)?wall_(\d{1,5})_(ortho|depth|intensity)\.tif")
@@ -233,6 +133,7 @@ class WallResult:
     Attributes:
         number: number of the wall, as in its files.
         name: name of the wall.
+        about: its orthoimage in numbers; None without one.
         plane_index: its plane's place in `planes.json`, or None if unknown.
         frame: frame of the largest of its rasters.
         rasters: `ortho`, `depth`, `intensity` -> GeoTIFF, if present.
@@ -244,6 +145,7 @@ class WallResult:
 
     number: int
     name: str
+    about: WallDescription | None
     plane_index: int | None
     frame: WallFrame
     rasters: dict[str, Path]
@@ -284,6 +186,11 @@ class RoomResults:
     checkpoints: CheckPoints | None
     inspections: dict[str, Inspection]
     openings: tuple[Opening, ...] = ()
+
+    @property
+    def crs(self) -> str | None:
+        """Coordinate system of the scan; None if it is in no map."""
+        return next((wall.frame.map_crs for wall in self.walls if wall.frame.map_crs), None)
 
     def openings_of(self, wall: WallResult) -> tuple[Opening, ...]:
         """Openings of one of the walls."""
@@ -490,7 +397,8 @@ def _wall_result(
     index = about.get("plane_index", number)
     known = planes is not None and isinstance(index, int) and 0 <= index < len(planes)
     plane_index = index if known and isinstance(index, int) else None
-    said = [accuracy_phrase(content.get("accuracy"))] if error.exists() else []
+    description = described(first, content) if "ortho" in rasters else None
+    said = [description.accuracy] if description and error.exists() else []
     if planes is not None and plane_index is not None:
         rms_mm = 1e3 * float(planes.rms_m[plane_index])
         count = f"{int(planes.n_points[plane_index]):,}"
@@ -498,6 +406,7 @@ def _wall_result(
     return WallResult(
         number=number,
         name=str(content.get("name") or f"wall {number}"),
+        about=description,
         plane_index=plane_index,
         frame=frame,
         rasters=rasters,

@@ -12,6 +12,7 @@ from orthoflow.errors import InputError
 from orthoflow.files import sidecars as module
 from orthoflow.files.geotiff import GridPlace, write_orthoimage, write_raster
 from orthoflow.files.sidecars import OrthoFile, ortho_files
+from orthoflow.files.wall_descriptions import described
 from orthoflow.geometry import WallFrame
 
 ROWS, COLUMNS = 6, 9
@@ -36,7 +37,7 @@ def ortho(folder: Path, rgb: NDArray[np.uint8 | np.uint16] = RGB) -> OrthoFile:
     path = folder / "wall_0_ortho.tif"
     shown = SHOWN[: len(rgb)]
     write_orthoimage(path, rgb, shown, place=GridPlace(gsd_m=0.5), tags={})
-    return OrthoFile(path=path, wall=0, name="wall 0", frame=frame(*rgb.shape[:2]), digest="")
+    return OrthoFile(path=path, about=described(path, {}), frame=frame(*rgb.shape[:2]), digest="")
 
 
 def test_orthoimages_are_known_by_their_names_and_come_in_the_order_of_their_walls(

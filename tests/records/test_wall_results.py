@@ -86,8 +86,8 @@ def test_an_inspection_says_how_exact_a_wall_is_by_findings_on_it() -> None:
     half = inspection(("rmse_x_mm", 1.0, 3), ("n_points", 5.0, 3))
     found = {"check": own, "truth": every, "half": half, "first": first}
     assert [said.text() for said in module._accuracy(found, 3)] == [
-        "check: RMSE sideways 1.2 mm, up and down 2.0 mm (check points: 6)",
-        "check: with depth RMS 3.0 mm, largest 9.0 mm",
+        "check: RMSE horizontal 1.2 mm, vertical 2.0 mm (check points: 6)",
+        "check, with depth: RMS 3.0 mm, largest 9.0 mm",
     ]
     # What was found of all walls together says nothing of one.
     (first_said,) = module._accuracy(found, 0)
@@ -116,7 +116,7 @@ def looking(status: str, message: str = "") -> Any:
         (3, looking("failed", "none was found: P0 (57 m left of wall 0)"),
          ", though 3 check points were given: none was found: P0 (57 m left of wall 0)"),
         (1, cell(), ", though 1 check point was given: no step has looked for them"),
-        (3, looking("ok"), ": surveyed check points would tell"),
+        (3, looking("ok"), ": surveyed check points would show"),
     ],
     ids=["none counted", "not looked for", "counted on another wall"],
 )  # fmt: skip
@@ -127,15 +127,15 @@ def test_given_check_points_are_not_asked_for_again(count: int, check: Any, said
     run: Any = ToyRun(room=room, survey=survey, check=check)
     assert module._unmeasured(run).text().startswith(f"accuracy not checked{said}")
     alone: Any = ToyRun(room=room)
-    assert "surveyed check points would tell" in module._unmeasured(alone).text()
+    assert "surveyed check points would show" in module._unmeasured(alone).text()
 
 
 @pytest.mark.parametrize(
     ("params", "metrics", "said"),
     [
-        ({}, (), "colours as mosaic.seams gave them"),
-        ({"gains": "none"}, (), "colours untouched: as photos or scan have them"),
-        ({"gains": "local"}, (), "colours untouched: the photos agree, or there is one only"),
+        ({}, (), "colours from mosaic.seams"),
+        ({"gains": "none"}, (), "original colours of the photos or the scan"),
+        ({"gains": "local"}, (), "original colours: the photos agree, or there is only one"),
         (
             {"gains": "local"},
             (SimpleNamespace(name="gain_max", value=1.5),),
@@ -148,7 +148,7 @@ def test_what_was_done_to_colours_is_said(params: Any, metrics: Any, said: str) 
     run: Any = ToyRun(photos=photos, mosaic=cell(params=params, metrics=metrics))
     assert module._colours(run, "mosaic").text() == said
     run = ToyRun(scan=cell(inputs={"cloud": output("cloud")}), mosaic=cell(params=params))
-    assert module._colours(run, "mosaic").text() == "colours as the scan has them"
+    assert module._colours(run, "mosaic").text() == "colours as scanned"
 
 
 @pytest.mark.parametrize(
@@ -157,7 +157,7 @@ def test_what_was_done_to_colours_is_said(params: Any, metrics: Any, said: str) 
 def test_points_that_paint_nothing_for_their_colour_are_said(least: int, said: str) -> None:
     ortho = cell(inputs={"cloud": output("cloud")}, params={"skip_below_grey": least})
     run: Any = ToyRun(ortho=ortho, mosaic=cell())
-    assert module._colours(run, "mosaic").text() == f"colours as the scan has them{said}"
+    assert module._colours(run, "mosaic").text() == f"colours as scanned{said}"
 
 
 def test_the_last_orthoimages_are_meant_or_else_the_last_walls() -> None:

@@ -71,8 +71,7 @@ def export_geojson(run: Run, folder: Path, chosen: Choices) -> str:
             write_seams_geojson(folder / f"wall_{image.number}_seams.geojson", image)
     if lines is None:
         return counted(len(walls), "wall")
-    crs = next((wall.frame.map_crs for wall in results.walls if wall.frame.map_crs), None)
-    write_room_geojson(folder / "room.geojson", lines, crs)
+    write_room_geojson(folder / "room.geojson", lines, results.crs)
     return f"{counted(len(walls), 'wall')}, and the room: {_said(lines)}"
 
 
@@ -124,6 +123,7 @@ def export_qgis(run: Run, folder: Path, chosen: Choices) -> str:
                 wall=wall.name,
                 kind=kind,
                 raster=wall.rasters[kind].resolve(),
+                about=wall.about.sentence if wall.about and kind == "ortho" else "",
                 is_shown=kind == kinds[0],
             )
             for kind in kinds

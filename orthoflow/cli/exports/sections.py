@@ -92,7 +92,14 @@ def _write(
 
     def drawn(scale: int) -> list[Drawing]:
         return [
-            section_sheet(f"{kind}_{number}", drawing, planes, text, grid_of(chosen, scale))
+            section_sheet(
+                f"{kind}_{number}",
+                drawing,
+                planes,
+                text,
+                grid=grid_of(chosen, scale),
+                crs=results.crs,
+            )
             for number, drawing in enumerate(at(scale), start=1)
         ]
 

@@ -102,7 +102,7 @@ def _canvas(wall: WallResult, scratch: Path) -> Canvas:
     same = [kind for kind in known if kind == "relief" or frames[kind].shape == shape]
     return Canvas(
         label=wall.name,
-        summary="; ".join(said.text() for said in wall.accuracy) or "accuracy not checked",
+        summary=wall.about.sentence if wall.about else "no orthoimage",
         layers=[
             Layer(label=_LAYERS[kind], raster=rasters[kind], stem=f"wall_{wall.number}_{kind}")
             for kind in same

@@ -19,6 +19,8 @@ from orthoflow.products import Planes
 MOST_PLANES: Final = 200
 #: connected parts of them
 MOST_PARTS: Final = 20_000
+# Label of the upwards direction of a plan in a map; other plans have an axis of the scan there.
+NORTH: Final = "N"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +87,7 @@ def _check_counts(planes: Planes) -> None:
 def key_plan(planes: Planes, frame: WallFrame, number: int = -1) -> KeyPlan:
     """Draw planes from above, and mark the position of a raster."""
     corners = frame.corners_world()
-    is_map = frame.map_crs is not None and frame.map_crs != "site"
+    is_map = is_map_crs(frame.map_crs)
     if abs(float(frame.normal_world @ planes.up)) > math.cos(math.radians(60.0)):
         return _marked_plan(planes, corners, None, number, is_map=is_map)
     ends = np.array([corners[:2].mean(axis=0), corners[2:].mean(axis=0)])
@@ -93,10 +95,24 @@ def key_plan(planes: Planes, frame: WallFrame, number: int = -1) -> KeyPlan:
 
 
 def cut_plan(
-    planes: Planes, ends_world: NDArray[np.float64], forward: NDArray[np.float64]
+    planes: Planes,
+    ends_world: NDArray[np.float64],
+    forward: NDArray[np.float64],
+    *,
+    is_map: bool = False,
 ) -> KeyPlan:
     """Draw planes from above, and mark a vertical cut: its ends (2, 3), and where it looks (3,)."""
-    return _marked_plan(planes, ends_world, -forward, -1, is_map=False)
+    return _marked_plan(planes, ends_world, -forward, -1, is_map=is_map)
+
+
+def is_map_crs(crs: str | None) -> bool:
+    """Return whether world x and y are the east and north of a map."""
+    return crs is not None and crs != "site"
+
+
+def up_label(up: NDArray[np.float64], *, is_map: bool) -> str:
+    """Return the label of the upwards direction of plans: `N`, or the axis of the scan."""
+    return NORTH if is_map else axis_words(basis_from_up(up)[1])
 
 
 def _marked_plan(
@@ -134,7 +150,7 @@ def _marked_plan(
         ),
         marked=seen(marked_world),
         arrow=arrow,
-        up_label="N" if is_map else axis_words(basis[1]),
+        up_label=up_label(planes.up, is_map=is_map),
         number=number,
     )
 

@@ -33,12 +33,14 @@ class ProjectLayer:
         wall: name of the wall.
         kind: content of the raster: `ortho`, `intensity`, `depth`, `error`.
         raster: its GeoTIFF.
+        about: one line on it, e.g. its accuracy.
         is_shown: it is visible when the project opens.
     """
 
     wall: str
     kind: str
     raster: Path
+    about: str
     is_shown: bool
 
 
@@ -82,6 +84,7 @@ def write_project(folder: Path, title: str, layers: Sequence[ProjectLayer]) -> N
             ("datasource", f"./{vrt.name}"),
             ("layername", f"{layer.wall}: {layer.kind}"),
             ("provider", "gdal"),
+            ("abstract", layer.about),
         ):
             ET.SubElement(described, name).text = text
     extent = np.array(boxes)

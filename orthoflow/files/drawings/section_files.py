@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.drawings.dxf import DIMENSION_STYLE, add_dimension_style, save_document
-from orthoflow.files.drawings.key_plans import axis_words, cut_plan
+from orthoflow.files.drawings.key_plans import cut_plan, is_map_crs, up_label
 from orthoflow.files.drawings.pens import FINE_MM, box, fill, line
 from orthoflow.files.drawings.sections import CutLine, Section
 from orthoflow.files.drawings.sheet_contents import (
@@ -100,9 +100,24 @@ class SectionDrawing:
 
 
 def section_sheet(
-    stem: str, drawing: SectionDrawing, planes: Planes, text: SheetText, grid: float
+    stem: str,
+    drawing: SectionDrawing,
+    planes: Planes,
+    text: SheetText,
+    *,
+    grid: float,
+    crs: str | None = None,
 ) -> Drawing:
-    """Return the sheet of a plan or section, with the text of its run."""
+    """Return the sheet of a plan or section, with the text of its run.
+
+    Args:
+        stem: of its files.
+        drawing: what is drawn.
+        planes: of the room, for the key plan.
+        text: of the run.
+        grid: distance of the crosses, 0 for none.
+        crs: coordinate system of the scan, None if it is in no map.
+    """
     left, bottom, right, top = drawing.bounds_m
     cut, language = drawing.section.cut, drawing.language
     is_plan = drawing.kind == "plan"
@@ -110,8 +125,10 @@ def section_sheet(
     if not is_plan:
         x_m = np.array([drawing.section.bounds_m[0], drawing.section.bounds_m[2]])
         ends_world = cut.origin_world + np.outer(x_m, cut.x_world)
-        plan = cut_plan(planes, ends_world, cut.forward_world)
+        plan = cut_plan(planes, ends_world, cut.forward_world, is_map=is_map_crs(crs))
     phrase = Phrase(key="axes_level")
+    if is_map_crs(crs):
+        phrase = Phrase(key="axes_map", values={"crs": crs})
     if not is_plan:
         phrase = Phrase(key="axes_section", values={"up": up_words(np.array(planes.up))})
     return Drawing(
@@ -125,7 +142,7 @@ def section_sheet(
         grid=grid,
         language=language,
         north=(0.0, 1.0) if is_plan else None,
-        up_label=axis_words(cut.y_world),
+        up_label=up_label(planes.up, is_map=is_map_crs(crs)),
     )
 
 

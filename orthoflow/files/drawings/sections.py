@@ -150,7 +150,7 @@ def section_cut(planes: Planes, through: Sequence[float], language: Language = "
     if length_m < 1e-6:
         raise ArgumentError("--through takes two different places, X,Y,X,Y, got one twice")
     right = (second - first) / length_m
-    words = ", ".join(f"{value:.2f}" for value in through)
+    words = ", ".join(f"({x:.2f}, {y:.2f})" for x, y in np.reshape(through, (2, 2)))
     return Cut(
         origin_world=first,
         x_world=right,

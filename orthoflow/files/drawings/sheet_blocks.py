@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from reportlab.lib.colors import Color
 from reportlab.platypus import Flowable, Image, Table
 
-from orthoflow.files.drawings.key_plans import KeyPlan
+from orthoflow.files.drawings.key_plans import NORTH, KeyPlan
 from orthoflow.files.drawings.papers import MARGIN_MM, Paper
 from orthoflow.files.drawings.pens import (
     BLACK,
@@ -284,7 +284,8 @@ def _legend(drawing: Drawing, sheet: Sheet) -> Iterator[Any]:
         )
     if drawing.north is not None:
         up = np.array([[7.0, -0.5], [7.0, 4.5]])
-        text = f"{drawing.up_label}: {label('legend_north', language)}"
+        meaning = "legend_north" if drawing.up_label == NORTH else "legend_axis"
+        text = f"{drawing.up_label}: {label(meaning, language)}"
         rows.append((lambda canvas: arrow(canvas, up), text))
     # What several pictures have in common once.
     own = {row[1]: row for view in sheet.views for row in drawing.pictures[view.kind].legend}
@@ -388,7 +389,10 @@ def _key_plan(drawing: Drawing, plan: KeyPlan) -> tuple[str, NDArray[np.float64]
                 numbered.append(middle)
                 write_on_white(canvas, str(number), (float(middle[0]), float(middle[1])))
 
-    return label("key_plan", drawing.language), np.vstack(lines), draw
+    heading = "key_plan"
+    if plan.arrow is None or plan.number < 0:
+        heading = "key_level" if plan.arrow is None else "key_section"
+    return label(heading, drawing.language), np.vstack(lines), draw
 
 
 def _length(ends: NDArray[np.float64]) -> float:

@@ -64,15 +64,3 @@ class Phrase:
         text = label(self.key, language, **self.values)
         more = ", ".join(item.text(language) for item in self.asides)
         return f"{text} ({more})" if more else text
-
-
-def accuracy_phrase(accuracy: object) -> Phrase:
-    """Return the statement of the `accuracy` of an orthoimage's sidecar."""
-    told = accuracy if isinstance(accuracy, dict) else {}
-    median, high = told.get("expected_mm_median"), told.get("expected_mm_p95")
-    if told.get("assessed") is not True or not (
-        isinstance(median, float) and isinstance(high, float)
-    ):
-        return Phrase(key="not_checked")
-    values = {"median": f"{median:.1f}", "high": f"{high:.1f}"}
-    return Phrase(key="expected_error", values={**values, "count": told.get("n_check_points")})

@@ -188,5 +188,5 @@ def _image(name: str, ortho: OrthoFile) -> JsonValue:
         "down": frame.raster_down,
         "axes": "E, N" if frame.map_crs else "X, H" if frame.raster_axes == "wall" else "X, Y",
         "crs": frame.map_crs or local_crs_name(frame.crs),
-        "accuracy": ortho.accuracy,
+        "about": ortho.about.sentence,
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -19,7 +20,9 @@ from orthoflow.files.drawings.relief import NOTHING, Light, shaded
 from orthoflow.files.drawings.sheet_contents import SheetText
 from orthoflow.files.drawings.title_blocks import TitleBlock
 from orthoflow.geometry.frames import frame_over
-from tests.drawing_runs import GSD_M, SIZE_M, WALL, box_planes, write_drawing_run
+from orthoflow.records.open import open_run
+from orthoflow.records.walls import delivered_walls, room_results, write_walls_json
+from tests.drawing_runs import GSD_M, SIZE_M, WALL, box_image, box_planes, write_drawing_run
 from tests.optional import skip
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -130,6 +133,40 @@ def test_a_qgis_project_shifts_x_alone(run: Path, tmp_path: Path) -> None:
             assert shifted.transform.a == pytest.approx(GSD_M)
             assert np.array_equal(shifted.read(), raster.read())
             assert np.array_equal(shifted.dataset_mask(), raster.dataset_mask())
+
+
+def test_every_export_states_the_same_of_a_wall(tmp_path: Path) -> None:
+    """GIS, tiles, manifest, catalogue and `walls.json`: size, share painted, expected error."""
+    image = box_image()
+    errors_m = np.full(image.frame.shape, 0.002, np.float32)
+    image = replace(image, error_m=errors_m, n_check_points=12)
+    run = write_drawing_run(tmp_path / "run", image=image)
+    (wall,) = room_results(open_run(run)).walls
+    assert wall.about is not None
+    assert wall.about.sentence == (
+        "3.80 x 2.30 m; 97% painted; expected error of a point measured in this image: median "
+        "2.0 mm, 95 % below 2.0 mm (one standard deviation, from orientation, depth and parallax; "
+        "check points on this wall: 12)"
+    )
+    for target, file in (
+        ("qgis", "walls.qgs"),
+        ("tiles", "index.html"),
+        ("iiif", "manifest.json"),
+        ("stac", f"products/mosaic/wall_{WALL}_ortho.item.json"),
+    ):
+        export(run, target, tmp_path / target)
+        assert wall.about.sentence in (tmp_path / target / file).read_text(), target
+    item = json.loads((tmp_path / "stac" / file).read_text())
+    assert item["properties"]["orthoflow:expected_mm_median"] == pytest.approx(2.0)
+    assert item["assets"]["error"]["href"] == f"./wall_{WALL}_error.tif"
+    cells = open_run(run).record.cells
+    write_walls_json(run / "products", cells)
+    assert delivered_walls(run / "products") == (
+        wall.about.model_copy(update={"orthoimage": f"mosaic/wall_{WALL}_ortho.tif"}),
+    )
+    assert delivered_walls(tmp_path) == ()
+    (tmp_path / "walls.json").write_text('{"walls": [{"number": "x"}]}')
+    assert delivered_walls(tmp_path) == ()
 
 
 @pytest.mark.filterwarnings("default")  # the validator's own models

@@ -117,9 +117,17 @@ def test_a_cut_that_meets_nothing_is_refused() -> None:
         section_cut(box_planes(), [1.0, 2.0, 1.0, 2.0])
 
 
-@pytest.mark.parametrize("kind", ["plan", "section"])
+@pytest.mark.parametrize(
+    ("kind", "crs", "direction"),
+    [
+        ("plan", None, "y: axis of the scan; north is not known"),
+        ("plan", "site", "y: axis of the scan; north is not known"),
+        ("plan", "EPSG:25832", "N: grid north"),
+        ("section", "EPSG:25832", "key plan: section line in red, seen along the arrow"),
+    ],
+)
 def test_a_sheet_of_it_has_title_block_coordinates_and_lines_in_scale(
-    tmp_path: Path, kind: Literal["plan", "section"]
+    tmp_path: Path, kind: Literal["plan", "section"], crs: str | None, direction: str
 ) -> None:
     planes = box_planes()
     ends = box_points(np.array([[-0.5, 1.0, 0.0], [SIZE_M[0] + 0.5, 1.0, 0.0]]))[:, :2]
@@ -129,10 +137,11 @@ def test_a_sheet_of_it_has_title_block_coordinates_and_lines_in_scale(
     section = section_of(cut, planes, (), box_cloud())
     drawing = SectionDrawing(kind=kind, section=section, scale=50, origin="a box")
     text = SheetText(name="", block=TitleBlock(), notes=(), digest="0" * 64, run="run")
-    ((sheet, furniture),) = lay_out(section_sheet("x", drawing, planes, text, 1.0)).sheets
-    write_sheet(
-        tmp_path / "x.pdf", section_sheet("x", drawing, planes, text, 1.0), sheet, furniture
-    )
+    drawn = section_sheet("x", drawing, planes, text, grid=1.0, crs=crs)
+    # The arrow of the sheet and that of its key plan have the same label.
+    assert drawn.plan is None or drawn.plan.up_label == drawn.up_label
+    ((sheet, furniture),) = lay_out(drawn).sheets
+    write_sheet(tmp_path / "x.pdf", drawn, sheet, furniture)
     with pdfplumber.open(tmp_path / "x.pdf") as pdf:
         (page,) = pdf.pages
         words = " ".join(page.extract_text().split())
@@ -144,8 +153,8 @@ def test_a_sheet_of_it_has_title_block_coordinates_and_lines_in_scale(
         lengths = [math.hypot(c["x1"] - c["x0"], c["y1"] - c["y0"]) for c in thick]
         longest_mm = 1000 * max(one.length_m for one in section.lines) / 50
         assert min(abs(one / POINTS_PER_MM - longest_mm) for one in lengths) < 0.01
-    slab = f"slab of {1e3 * section.slab_m:.0f} mm"
-    for said in ("1:50", kind.title(), slab, "sheet 1 of 1", "record sha256"):
+    slab = f"cut slice {1e3 * section.slab_m:.0f} mm thick"
+    for said in ("1:50", kind.title(), slab, "sheet 1 of 1", "record sha256", direction):
         assert said in words, said
 
 

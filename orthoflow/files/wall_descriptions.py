@@ -1,0 +1,138 @@
+"""The description of a wall's orthoimage that pages, sheets, tiles, tables and catalogues state."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+from pydantic import BaseModel, ConfigDict, NonNegativeFloat, NonNegativeInt
+
+from orthoflow.files.drawings.words import Phrase
+from orthoflow.products import PAINTED_STATES
+
+ORTHO_FILE: Final = re.compile(r"(?:[a-z]+_)?wall_(\d{1,5})_ortho\.tif")
+# An image with a smaller painted share is not a view of its wall.
+_MIN_PAINTED_SHARE: Final = 0.5
+
+
+class WallDescription(BaseModel):
+    """A wall and its orthoimage: size, share painted, expected error, whether to deliver it.
+
+    Attributes:
+        number: of the wall: the place of its plane in `planes.json`.
+        name: of the wall, with its number.
+        kind: `wall`, `floor`, `ceiling`, or its method's own name for it.
+        recommended: its orthoimage should be delivered.
+        reason: why, or why not.
+        width_m: of the image; None without one, like all that follows.
+        height_m: likewise.
+        area_m2: likewise.
+        painted_share: of the cells of the image.
+        height_of_top_m: height of its upper edge along the world's up; None for level surfaces.
+        expected_mm_median: expected error of a point measured in the image, one standard deviation,
+            median over the image; None if it was not checked.
+        expected_mm_p95: the same, exceeded by 5 % of the image.
+        n_check_points: on this wall.
+        orthoimage: its GeoTIFF, relative to where the description is written.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
+
+    number: NonNegativeInt
+    name: str
+    kind: str
+    recommended: bool
+    reason: str
+    width_m: NonNegativeFloat | None = None
+    height_m: NonNegativeFloat | None = None
+    area_m2: NonNegativeFloat | None = None
+    painted_share: NonNegativeFloat | None = None
+    height_of_top_m: float | None = None
+    expected_mm_median: NonNegativeFloat | None = None
+    expected_mm_p95: NonNegativeFloat | None = None
+    n_check_points: NonNegativeInt = 0
+    orthoimage: str | None = None
+
+    @property
+    def accuracy(self) -> Phrase:
+        """The expected error of its orthoimage as a phrase for drawings."""
+        if self.expected_mm_median is None or self.expected_mm_p95 is None:
+            return Phrase(key="not_checked")
+        errors = {"median": self.expected_mm_median, "high": self.expected_mm_p95}
+        texts: dict[str, object] = {name: f"{error_mm:.1f}" for name, error_mm in errors.items()}
+        return Phrase(key="expected_error", values=texts | {"count": self.n_check_points})
+
+    @property
+    def sentence(self) -> str:
+        """Size, share painted, expected error, and why it should not be delivered."""
+        parts = [self.accuracy.text()]
+        if self.painted_share is not None:
+            parts.insert(0, f"{self.width_m:.2f} x {self.height_m:.2f} m")
+            parts.insert(1, f"{self.painted_share:.0%} painted")
+        return "; ".join([*parts, *([] if self.recommended else [f"not advised: {self.reason}"])])
+
+
+def described(path: Path, sidecar: Mapping[str, object]) -> WallDescription:
+    """Describe the wall of a published orthoimage.
+
+    Args:
+        path: its GeoTIFF; beside those of photos lies the raster of their expected error.
+        sidecar: content of the JSON file beside it.
+
+    Raises:
+        ValueError: the sidecar states no number where one must be.
+    """
+    found = ORTHO_FILE.fullmatch(path.name)
+    number = int(found[1]) if found else 0
+    name = sidecar.get("name")
+    name = name if isinstance(name, str) else f"wall {number}"
+    counts = _table(sidecar.get("mask_counts"))
+    n_painted = sum(_number(counts.get(str(int(state)))) or 0.0 for state in PAINTED_STATES)
+    n_cells = sum(_number(count) or 0.0 for count in counts.values())
+    painted = n_painted / n_cells if n_cells else 0.0
+    accuracy = _table(sidecar.get("accuracy"))
+    is_assessed = accuracy.get("assessed") is True
+    median, high = (
+        _number(accuracy.get(f"expected_mm_{kind}")) if is_assessed else None
+        for kind in ("median", "p95")
+    )
+    is_of_photos = path.with_name(path.name.replace("_ortho.tif", "_error.tif")).exists()
+    reason = f"{painted:.0%} painted"
+    if painted < _MIN_PAINTED_SHARE:
+        is_recommended, reason = False, f"only {reason}"
+    elif is_of_photos and median is None:
+        is_recommended = False
+        reason += ", accuracy not checked: no tie point lies on this wall"
+    else:
+        is_recommended = True
+        reason += "" if median is None else f", expected error {median:.1f} mm"
+    gsd_m = _number(sidecar.get("gsd_m")) or 0.0
+    width, height = (_number(sidecar.get(key)) or 0.0 for key in ("width", "height"))
+    return WallDescription(
+        number=number,
+        name=name,
+        kind=name.split(" ", maxsplit=1)[0] or "wall",
+        recommended=is_recommended,
+        reason=reason,
+        width_m=round(gsd_m * width, 4),
+        height_m=round(gsd_m * height, 4),
+        area_m2=round(gsd_m**2 * width * height, 3),
+        painted_share=round(painted, 4),
+        height_of_top_m=_number(sidecar.get("height_of_top_m")),
+        expected_mm_median=median,
+        expected_mm_p95=high,
+        n_check_points=int(_number(accuracy.get("n_check_points")) or 0),
+        orthoimage=path.name,
+    )
+
+
+def _table(value: object) -> Mapping[str, object]:
+    return value if isinstance(value, dict) else {}
+
+
+def _number(value: object) -> float | None:
+    """Return a number of a sidecar; None where it holds none, or one that is not finite."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return float(str(value)) if is_number and abs(float(str(value))) < 1e15 else None
