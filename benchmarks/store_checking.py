@@ -29,9 +29,7 @@ from orthoflow.records.write import executed_and_written, write_run
 from orthoflow.report import write_page
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import expand_cells
-from orthoflow.workflow.model import (
-    Workflow,
-)
+from orthoflow.workflow.model import Workflow
 
 CHECKING = ((Store, "damage"), (Store, "take"), (Store, "blob"), (store, "describe_product"))
 SYNCING = ((record_writing, "sync_tree"),)

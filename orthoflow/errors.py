@@ -7,7 +7,8 @@ unless `--debug` is given.
 
 from __future__ import annotations
 
-from typing import ClassVar
+from collections.abc import Iterable
+from typing import ClassVar, Final
 
 
 class OrthoflowError(Exception):
@@ -86,3 +87,35 @@ class RecordError(OrthoflowError, ValueError):
     """A record is damaged, differs from its seal, or has a format this version cannot read."""
 
     exit_code = 3
+
+
+# Comparing takes some microseconds for each, for every name that is misspelt.
+_MOST_CANDIDATES: Final = 1000
+_LONGEST_NAME: Final = 200
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return the known name most like another, or nothing when none is near.
+
+    >>> nearest("hugh2d", ["hough2d", "ransac"])
+    'hough2d'
+    """
+    import difflib  # noqa: PLC0415 - for a mistake only
+
+    candidates = sorted(known)
+    if len(candidates) > _MOST_CANDIDATES or len(name) > _LONGEST_NAME:
+        return ""
+    matches = difflib.get_close_matches(name, candidates, n=1, cutoff=0.6)
+    return matches[0] if matches else ""
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return ` (did you mean X?)` for the nearest known name, or nothing when none is near.
+
+    >>> did_you_mean("gsd", ["gsd_m", "buffer_m"])
+    ' (did you mean gsd_m?)'
+    >>> did_you_mean("colour", ["gsd_m", "buffer_m"])
+    ''
+    """
+    near = nearest(name, known)
+    return f" (did you mean {near}?)" if near else ""

@@ -15,12 +15,8 @@ from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.sdk.hooks import ENTRY_POINT_GROUP
 from orthoflow.workflow.document import load_workflow
-from orthoflow.workflow.model import (
-    Workflow,
-)
-from orthoflow.workflow.problems import (
-    InvalidWorkflowError,
-)
+from orthoflow.workflow.model import Workflow
+from orthoflow.workflow.problems import InvalidWorkflowError
 
 LABORATORY = Path(__file__).parent / "laboratory"
 GOOD = """\

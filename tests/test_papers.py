@@ -10,10 +10,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from orthoflow.catalog.discovery import discover_catalog
-from orthoflow.workflow.source import (
-    shipped_workflow,
-    shipped_workflows,
-)
+from orthoflow.workflow.source import shipped_workflow, shipped_workflows
 
 ROOT = Path(__file__).resolve().parents[1]
 TEXT = (ROOT / "docs" / "papers.md").read_text()

@@ -13,8 +13,7 @@ from orthoflow.catalog.distributions import (
     package_path,
     source_files,
 )
-from orthoflow.catalog.wording import did_you_mean, nearest
-from orthoflow.errors import PluginError, WorkflowError
+from orthoflow.errors import PluginError, WorkflowError, did_you_mean, nearest
 from orthoflow.sdk.hooks import KindSpec, MethodSpec, ProductSpec
 from orthoflow.version import DISTRIBUTION
 

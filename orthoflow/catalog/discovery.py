@@ -29,7 +29,6 @@ from orthoflow.catalog.distributions import (
     describe_distribution,
 )
 from orthoflow.catalog.guarding import UserInterrupt, guarded
-from orthoflow.catalog.wording import describe_error
 from orthoflow.errors import PluginError
 from orthoflow.sdk.hooks import (
     ENTRY_POINT_GROUP,
@@ -40,6 +39,7 @@ from orthoflow.sdk.hooks import (
     PluginHooks,
     ProductSpec,
 )
+from orthoflow.sdk.lines import describe_error
 from orthoflow.version import DISTRIBUTION
 
 # Windows takes the first ones for devices; addresses and files are named after names.

@@ -9,10 +9,10 @@ from importlib import import_module
 
 from orthoflow.catalog.distributions import DistributionInfo
 from orthoflow.catalog.guarding import UserInterrupt, guarded
-from orthoflow.catalog.wording import describe_error, did_you_mean
-from orthoflow.errors import PluginError
+from orthoflow.errors import PluginError, did_you_mean
 from orthoflow.products.product import Product
 from orthoflow.sdk.hooks import FILES, KindSpec, MethodSpec
+from orthoflow.sdk.lines import describe_error
 from orthoflow.sdk.methods import (
     Determinism,
     Method,

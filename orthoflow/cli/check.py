@@ -12,9 +12,7 @@ from orthoflow.cli.tables import counted, echo, echo_json
 from orthoflow.errors import OrthoflowError
 
 if TYPE_CHECKING:
-    from orthoflow.workflow.model import (
-        Workflow,
-    )
+    from orthoflow.workflow.model import Workflow
 
 
 @click.command(cls=Command)

@@ -22,9 +22,7 @@ from orthoflow.errors import GeometryError, OrthoflowError, ProductError, Record
 if TYPE_CHECKING:
     from orthoflow.catalog.catalog import Catalog
     from orthoflow.products.product import JsonValue
-    from orthoflow.workflow.model import (
-        Workflow,
-    )
+    from orthoflow.workflow.model import Workflow
 
 
 DEBUG_HELP: Final = "Show tracebacks of errors."
@@ -176,7 +174,7 @@ class LazyGroup(click.Group):
         try:
             return super().resolve_command(ctx, args)
         except click.UsageError as error:
-            from orthoflow.catalog.wording import nearest
+            from orthoflow.errors import nearest
 
             near = nearest(args[0], self._lazy)
             if not near or "did you mean" in error.message.lower():

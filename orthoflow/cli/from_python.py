@@ -15,7 +15,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 from orthoflow.cli.commands import DEFAULT_STORE, Changes
 from orthoflow.cli.run import prepared
 from orthoflow.errors import ArgumentError
-from orthoflow.workflow.problems import ProblemLog, mistakes
+from orthoflow.files.documents import mistakes
+from orthoflow.files.yaml_positions import path_text
 
 if TYPE_CHECKING:
     from orthoflow.report.notebooks import OpenedRun
@@ -132,8 +133,7 @@ def run(
         known = _Arguments.model_validate(given)
     except ValidationError as error:
         loc, message, _ = next(mistakes(error, _Arguments, given))
-        place = ProblemLog(file="").path(loc)
-        raise ArgumentError(f"orthoflow.run: {place}: {message}") from error
+        raise ArgumentError(f"orthoflow.run: {path_text(loc)}: {message}") from error
     changes = Changes(
         sets=tuple(f"{name}={_spelt(value)}" for name, value in known.set.items()),
         set_files=known.set_files,

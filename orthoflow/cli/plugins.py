@@ -213,9 +213,9 @@ def _described(entry: MethodEntry) -> dict[str, Any]:
     Raises:
         PluginError: the method's class cannot be loaded.
     """
+    from orthoflow.files.documents import type_text
     from orthoflow.sdk import port_specs
     from orthoflow.sdk.units import unit_of
-    from orthoflow.workflow.problems import type_text
 
     method = entry.load()
     schema = method.Params.model_json_schema()

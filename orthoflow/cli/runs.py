@@ -257,7 +257,7 @@ def _require_known(names: Sequence[str], found: Sequence[RunSummary]) -> None:
         return
     for name in names:
         if name not in known:
-            from orthoflow.catalog.wording import nearest
+            from orthoflow.errors import nearest
 
             # Of a parameter people remember the end: its step and method stand before it.
             ends = sorted(one for one in known if one.endswith(f".{name}"))

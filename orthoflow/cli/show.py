@@ -28,9 +28,7 @@ from orthoflow.cli.tables import (
     size,
     verify_hint,
 )
-from orthoflow.workflow.model import (
-    DATA,
-)
+from orthoflow.workflow.model import DATA
 
 if TYPE_CHECKING:
     from orthoflow.records import RecordedCell

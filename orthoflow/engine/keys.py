@@ -26,10 +26,10 @@ from orthoflow.catalog.distributions import (
     source_files,
 )
 from orthoflow.catalog.guarding import UserInterrupt, guarded
-from orthoflow.catalog.wording import describe_error
 from orthoflow.engine.results import MethodIdentity, ProductRef, RecordedFile, canonical_json
 from orthoflow.errors import PluginError
 from orthoflow.products.product import JsonValue
+from orthoflow.sdk.lines import describe_error
 from orthoflow.sdk.methods import Method, port_specs
 from orthoflow.untrusted_text import parse_json
 from orthoflow.version import DISTRIBUTION

@@ -36,9 +36,7 @@ from orthoflow.workflow.expand import (
     select_cells,
 )
 from orthoflow.workflow.inputs import resolve_input_files
-from orthoflow.workflow.model import (
-    Workflow,
-)
+from orthoflow.workflow.model import Workflow
 
 ExecutorName = Literal["local", "inline", "dask"]
 CellPlan = Literal["cached", "will run", "unknown yet", "skipped"]

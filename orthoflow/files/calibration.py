@@ -35,8 +35,8 @@ from pydantic import (
 
 from orthoflow.errors import GeometryError, InputError
 from orthoflow.files.cube_faces import WIDEST_DEG, FisheyeLens, problem_of
+from orthoflow.files.documents import read_model
 from orthoflow.files.sidecars import write_text
-from orthoflow.files.yaml_positions import read_model
 from orthoflow.geometry.cameras import HALF_PIXEL
 from orthoflow.products import Calibration, Intrinsics
 from orthoflow.untrusted_text import text_of_file

@@ -6,15 +6,12 @@ tags and anchor bombs are problems among others instead of the first exception.
 
 from __future__ import annotations
 
-import difflib
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, Protocol, TypeAlias, TypeVar, get_args
+from typing import Any, Final, Protocol, TypeAlias
 
-from pydantic import BaseModel, ValidationError
-from pydantic_core import ErrorDetails
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.events import (
@@ -30,7 +27,6 @@ from ruamel.yaml.scanner import Scanner
 from ruamel.yaml.tag import Tag
 
 from orthoflow.products.product import JsonValue
-from orthoflow.untrusted_text import first_few
 
 #: levels of a workflow or calibration file
 DEEPEST: Final = 60
@@ -44,7 +40,8 @@ _LONGEST_KEY: Final = 1024
 _TAG: Final = "tag:yaml.org,2002:"
 
 Scalar: TypeAlias = bool | int | float | str | None
-Model = TypeVar("Model", bound=BaseModel)
+# Keys and indices that lead to a value: `("steps", "wall", "in", "cloud", 0)`.
+Location: TypeAlias = tuple[str | int, ...]
 
 
 @dataclass(frozen=True, kw_only=True, order=True)
@@ -59,46 +56,45 @@ _START: Final = Position(line=1, column=1)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Text:
-    """A single value: text, number, true, false or null."""
+class Document:
+    """A document as plain values, and where they are.
 
-    position: Position
-    value: Scalar
+    Attributes:
+        value: of the whole document.
+        places: location -> position of the value there; `()` is the whole document.
+        keys: location -> position of the key.
+    """
 
+    value: JsonValue
+    places: Mapping[Location, Position]
+    keys: Mapping[Location, Position] = field(default_factory=dict)
 
-@dataclass(frozen=True, kw_only=True)
-class Listing:
-    """A list."""
+    def resolve(self, location: Location) -> tuple[Location, Location]:
+        """Return a location without indices of single values, and as much of it as exists."""
+        value, stated, found = self.value, list[str | int](), Location()
+        is_found = True
+        for part in location:
+            # A single value in the place of a list has no index.
+            if is_found and isinstance(part, int) and not isinstance(value, list):
+                continue
+            stated.append(part)
+            is_found = is_found and (*found, part) in self.places
+            if is_found:
+                value, found = value[part], (*found, part)  # type: ignore[index]
+        return tuple(stated), found
 
-    position: Position
-    items: tuple[Value, ...]
+    def get(self, location: Location) -> JsonValue:
+        """Return the value at a location; None if there is none."""
+        stated, found = self.resolve(location)
+        value: Any = self.value
+        for part in found:
+            value = value[part]
+        return value if found == stated else None
 
-
-@dataclass(frozen=True, kw_only=True)
-class Entry:
-    """A key with its value."""
-
-    position: Position
-    key: str
-    value: Value
-
-
-@dataclass(frozen=True, kw_only=True)
-class Table:
-    """A mapping; every key occurs once."""
-
-    position: Position
-    entries: tuple[Entry, ...]
-
-    def get(self, key: str) -> Entry | None:
-        """The entry of a key."""
-        return next((entry for entry in self.entries if entry.key == key), None)
-
-    def __iter__(self) -> Iterator[Entry]:
-        return iter(self.entries)
-
-
-Value: TypeAlias = Text | Listing | Table
+    def position(self, location: Location, *, at_key: bool = False) -> Position:
+        """Return the position of a value, or of its key; of a missing one what is around it."""
+        _, found = self.resolve(location)
+        return (at_key and self.keys.get(found)) or self.places[found]
 
 
 class Problems(Protocol):
@@ -108,29 +104,21 @@ class Problems(Protocol):
         """Keep a problem: its place, the keys that lead to it joined by dots, and one sentence."""
 
 
-def plain(value: Value) -> JsonValue:
-    """Return a value without positions."""
-    if isinstance(value, Text):
-        return value.value
-    if isinstance(value, Listing):
-        return [plain(item) for item in value.items]
-    return {entry.key: plain(entry.value) for entry in value}
+def path_text(location: Location) -> str:
+    """Write a location.
+
+    >>> path_text(("steps", "wall", "in", "cloud", 1))
+    'steps.wall.in.cloud[1]'
+    """
+    parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
+    return "".join(parts).removeprefix(".")
 
 
-def describe(value: Value) -> str:
-    """State what a value is, for messages: `the text "a"`, `a list`, `a mapping`, `5`."""
-    if isinstance(value, Listing):
-        return "a list"
-    if isinstance(value, Table):
-        return "a mapping"
-    return describe_scalar(value.value)
+def describe(value: object) -> str:
+    """State what a value is, for messages.
 
-
-def describe_scalar(value: object) -> str:
-    """State what a plain value is, for messages.
-
-    >>> describe_scalar("0.003"), describe_scalar(0.003), describe_scalar(None)
-    ('the text "0.003"', '0.003', 'nothing')
+    >>> describe("0.003"), describe(0.003), describe(None), describe([1])
+    ('the text "0.003"', '0.003', 'nothing', 'a list')
     """
     if value is None:
         return "nothing"
@@ -138,6 +126,8 @@ def describe_scalar(value: object) -> str:
         return str(value).lower()
     if isinstance(value, str):
         return f'the text "{_cut(value)}"'
+    if isinstance(value, list | dict):
+        return "a list" if isinstance(value, list) else "a mapping"
     return str(value)
 
 
@@ -145,78 +135,15 @@ def _cut(text: str) -> str:
     return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."
 
 
-def read_yaml(text: str, log: Problems, most_values: int = MOST_VALUES) -> Value | None:
+def read_yaml(text: str, log: Problems, most_values: int = MOST_VALUES) -> Document | None:
     """Read a document; problems go to the log, None when nothing can be read."""
     try:
-        node = _compose(text, most_values)
-        return _Converter(log=log, most_values=most_values).convert(node, "", 0)
+        converter = _Converter(log=log, most_values=most_values)
+        value = converter.convert(_compose(text, most_values), ())
     except _UnreadableError as error:
         log.add(error.position, "", str(error))
         return None
-
-
-def read_model(
-    text: str, model: type[Model], most_values: int = MOST_VALUES
-) -> tuple[Model | None, list[tuple[Position, str]]]:
-    """Read a document as a pydantic model, or find out what is wrong with it and where.
-
-    Args:
-        text: the document.
-        model: that forbids other keys.
-        most_values: larger documents are refused, aliases expanded.
-
-    Returns:
-        None with one problem at least, in the order of the text.
-    """
-    log = _Collected()
-    content = read_yaml(text, log, most_values)
-    if isinstance(content, Table) and not log.found:
-        try:
-            return model.model_validate(plain(content)), []
-        except ValidationError as error:
-            for item in error.errors(include_url=False):
-                log.add(*_located(content, model, item))
-    elif content is not None and not log.found:
-        keys = first_few(list(model.model_fields))
-        log.add(content.position, "", f"expected the keys {keys}, got {describe(content)}")
-    return None, sorted(log.found)
-
-
-@dataclass
-class _Collected:
-    found: list[tuple[Position, str]] = field(default_factory=list)
-
-    def add(self, position: Position, path: str, message: str) -> None:
-        self.found.append((position, f"{path}: {message}" if path else message))
-
-
-def _located(
-    content: Table, model: type[BaseModel], item: ErrorDetails
-) -> tuple[Position, str, str]:
-    """Find the position of a mistake in the document, and describe it."""
-    place: Value = content
-    position, keys = content.position, [key for key in item["loc"] if key != "[key]"]
-    known = model
-    for key in keys:
-        entry = place.get(str(key)) if isinstance(place, Table) else None
-        if entry is not None:
-            position, place = entry.position, entry.value
-        elif isinstance(place, Listing) and isinstance(key, int):
-            place = place.items[key]
-            position = place.position
-        kind = known.model_fields[str(key)].annotation if str(key) in known.model_fields else None
-        inner = (arg for arg in get_args(kind) if isinstance(arg, type))
-        known = next((arg for arg in inner if issubclass(arg, BaseModel)), known)
-    path, message = ".".join(map(str, keys))[:_LONGEST_SHOWN], item["msg"]
-    if item["type"] == "extra_forbidden":
-        near = difflib.get_close_matches(str(keys[-1]), known.model_fields, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(known.model_fields)}"
-        return position, path, f"unknown key; {hint}"
-    if item["type"] == "string_type":
-        return position, path, f"expected a text, got {describe(place)}"
-    if item["type"] in ("value_error", "missing"):
-        return position, path, message.removeprefix("Value error, ").replace("Field", "field")
-    return position, path, f"{message[0].lower()}{message[1:]}, got {describe(place)}"
+    return Document(value=value, places=converter.places, keys=converter.keys)
 
 
 class _UnreadableError(Exception):
@@ -380,10 +307,12 @@ class _Converter:
 
     log: Problems
     most_values: int
+    places: dict[Location, Position] = field(default_factory=dict)
+    keys: dict[Location, Position] = field(default_factory=dict)
     n_nodes: int = 0
     open_nodes: set[int] = field(default_factory=set)
 
-    def convert(self, node: Node, path: str, depth: int) -> Value:
+    def convert(self, node: Node, at: Location) -> JsonValue:
         position = _mark_position(node.start_mark)
         self.n_nodes += 1
         if self.n_nodes > self.most_values:
@@ -393,56 +322,57 @@ class _Converter:
             )
         if id(node) in self.open_nodes:
             raise _UnreadableError(position, "the value contains itself through its anchor")
-        if depth > DEEPEST:
+        if len(at) > DEEPEST:
             raise _UnreadableError(position, f"the document is nested deeper than {DEEPEST} levels")
+        self.places[at] = position
         if isinstance(node, ScalarNode):
-            return Text(position=position, value=self._scalar(node, position, path))
+            return self._scalar(node, at)
         self.open_nodes.add(id(node))
-        value = self._collection(node, position, path, depth)
+        if str(node.tag) not in (_TAG + "map", _TAG + "seq"):
+            self._refuse_tag(node, at)
+        value: JsonValue
+        if isinstance(node, SequenceNode):
+            items = self._joined_items(node.value, at)
+            value = [self.convert(item, (*at, index)) for index, item in enumerate(items)]
+        else:
+            value = self._mapping(node, at)
         self.open_nodes.discard(id(node))
         return value
 
-    def _collection(self, node: Node, position: Position, path: str, depth: int) -> Value:
-        if str(node.tag) not in (_TAG + "map", _TAG + "seq"):
-            self._refuse_tag(node, position, path)
-        if isinstance(node, SequenceNode):
-            items = (
-                self.convert(item, f"{path}[{index}]", depth + 1)
-                for index, item in enumerate(self._joined_items(node.value, path))
-            )
-            return Listing(position=position, items=tuple(items))
-        entries: dict[str, Entry] = {}
-        for key_node, value_node in self._joined_entries(node.value, path):
-            key_position = _mark_position(key_node.start_mark)
-            key = self._key(key_node, key_position, path)
-            value = self.convert(value_node, join(path, key), depth + 1)
+    def _mapping(self, node: Node, at: Location) -> dict[str, JsonValue]:
+        entries: dict[str, JsonValue] = {}
+        for key_node, value_node in self._joined_entries(node.value, at):
+            position = _mark_position(key_node.start_mark)
+            key = self._key(key_node, at)
+            here = (*at, key)
             if key in entries:
-                first = entries[key].position.line
+                first = self.keys[here].line
                 message = f"the key is there already, in line {first}; remove one of them"
-                self.log.add(key_position, join(path, key), message)
-            else:
-                entries[key] = Entry(position=key_position, key=key, value=value)
-        return Table(position=position, entries=tuple(entries.values()))
+                self.log.add(position, path_text(here), message)
+                continue
+            self.keys[here] = position
+            entries[key] = self.convert(value_node, here)
+        return entries
 
-    def _joined_items(self, items: list[Node], path: str) -> list[Node]:
+    def _joined_items(self, items: list[Node], at: Location) -> list[Node]:
         """Join what a decimal comma leaves of numbers: `[0,02]` is 0 and 02."""
         joined = items[:1]
         for item in items[1:]:
             if self._is_split(joined[-1], item) and re.fullmatch(r"0\d+", str(item.value)):
-                joined[-1] = self._join(joined[-1], item, f"{path}[{len(joined) - 1}]")
+                joined[-1] = self._join(joined[-1], item, (*at, len(joined) - 1))
             else:
                 joined.append(item)
         return joined
 
     def _joined_entries(
-        self, entries: list[tuple[Node, Node]], path: str
+        self, entries: list[tuple[Node, Node]], at: Location
     ) -> list[tuple[Node, Node]]:
         """Join them between braces, where `{a: 0,003}` is the value 0 and a key without value."""
         joined = entries[:1]
         for key, value in entries[1:]:
             name, before = joined[-1]
             if self._is_split(before, key) and str(value.value) == "":
-                joined[-1] = (name, self._join(before, key, join(path, str(name.value))))
+                joined[-1] = (name, self._join(before, key, (*at, str(name.value))))
             else:
                 joined.append((key, value))
         return joined
@@ -456,41 +386,39 @@ class _Converter:
             and behind.start_mark.index == before.end_mark.index + 1
         )
 
-    def _join(self, before: Node, behind: Node, path: str) -> Node:
+    def _join(self, before: Node, behind: Node, at: Location) -> Node:
         """Refuse the comma and go on with the number that was meant."""
         meant = f"{before.value}.{behind.value}"
-        self.log.add(
-            _mark_position(before.start_mark),
-            path,
+        self._report(
+            before,
+            at,
             f"{before.value},{behind.value} is two numbers; decimals have a point: {meant}",
         )
         return ScalarNode(_TAG + "float", meant, before.start_mark, behind.end_mark)
 
-    def _key(self, node: Node, position: Position, path: str) -> str:
+    def _key(self, node: Node, at: Location) -> str:
         if not isinstance(node, ScalarNode):
-            self.log.add(position, path, "a key must be text, got a list or mapping")
+            self._report(node, at, "a key must be text, got a list or mapping")
             return "?"
         if str(node.tag) != _TAG + "str":
-            self.log.add(position, path, f"a key must be text, got {node.value or 'nothing'}")
+            self._report(node, at, f"a key must be text, got {node.value or 'nothing'}")
         return str(node.value)
 
-    def _scalar(self, node: ScalarNode, position: Position, path: str) -> Scalar:
+    def _scalar(self, node: ScalarNode, at: Location) -> Scalar:
         tag, text = str(node.tag), str(node.value)
         try:
             return _parse_scalar(tag.removeprefix(_TAG), text)
         except KeyError:
-            self._refuse_tag(node, position, path)
+            self._refuse_tag(node, at)
         except ValueError:
-            self.log.add(position, path, f"{_cut(text)!r} is not a valid {tag.removeprefix(_TAG)}")
+            self._report(node, at, f"{_cut(text)!r} is not a valid {tag.removeprefix(_TAG)}")
         return text
 
-    def _refuse_tag(self, node: Node, position: Position, path: str) -> None:
-        self.log.add(position, path, f"tags are not allowed, got {node.tag}")
+    def _refuse_tag(self, node: Node, at: Location) -> None:
+        self._report(node, at, f"tags are not allowed, got {node.tag}")
 
-
-def join(path: str, key: str) -> str:
-    """Append a key to a path."""
-    return f"{path}.{key}" if path else key
+    def _report(self, node: Node, at: Location, message: str) -> None:
+        self.log.add(_mark_position(node.start_mark), path_text(at), message)
 
 
 def _parse_scalar(kind: str, text: str) -> Scalar:

@@ -44,7 +44,6 @@ from orthoflow_provenance.paths import (
 from orthoflow_provenance.record import open_record
 
 from orthoflow.catalog.discovery import NAME_PATTERN
-from orthoflow.catalog.wording import did_you_mean
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.journal import RECORD_FILE, cell_file_name, is_running
 from orthoflow.errors import (
@@ -53,6 +52,7 @@ from orthoflow.errors import (
     PluginError,
     RecordError,
     StoreError,
+    did_you_mean,
 )
 from orthoflow.geometry.threads import in_order
 from orthoflow.products.product import JsonValue, Payload, Product

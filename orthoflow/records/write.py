@@ -65,10 +65,7 @@ from orthoflow.records.walls import write_walls_json
 from orthoflow.untrusted_text import first_few
 from orthoflow.version import __version__
 from orthoflow.workflow.inputs import MissingInputsError
-from orthoflow.workflow.resolved import (
-    resolved_json,
-    workflow_from_resolved,
-)
+from orthoflow.workflow.resolved import resolved_json, workflow_from_resolved
 
 if TYPE_CHECKING:
     from orthoflow.engine.plan import RunPlan
@@ -76,9 +73,7 @@ if TYPE_CHECKING:
     from orthoflow.engine.scheduler import RunOutcome
     from orthoflow.engine.store import Store
     from orthoflow.workflow.expand import Cell
-    from orthoflow.workflow.model import (
-        Workflow,
-    )
+    from orthoflow.workflow.model import Workflow
 
 
 def publish_products(

@@ -19,9 +19,7 @@ from orthoflow.records.write import NOT_YET
 from orthoflow.report.rankings import Sense, sense_of
 from orthoflow.untrusted_text import first_few, parse_json
 from orthoflow.workflow.expand import variants_text
-from orthoflow.workflow.model import (
-    DATA,
-)
+from orthoflow.workflow.model import DATA
 
 # Walls that differ by more are two.
 _TURNED_DEG: Final = 10.0

@@ -23,9 +23,7 @@ from orthoflow.report.numbers import number, number_with_spread
 from orthoflow.report.rankings import Mark, Sense, Value, cost_share, rank, sense_of
 from orthoflow.report.summaries import headline_keys
 from orthoflow.workflow.expand import NOT_ASKED_FOR, variants_text
-from orthoflow.workflow.model import (
-    DATA,
-)
+from orthoflow.workflow.model import DATA
 
 _NOTHING: Final = "-"
 # Seconds of loading and compiling in which a compiler was at work.

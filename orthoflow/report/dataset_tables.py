@@ -16,9 +16,7 @@ from orthoflow.report.pictures import thumbnail
 from orthoflow.report.rankings import Value
 from orthoflow.report.summaries import limits
 from orthoflow.workflow.expand import variants_text
-from orthoflow.workflow.model import (
-    DATA,
-)
+from orthoflow.workflow.model import DATA
 
 _ORIENTED: Final = "n_oriented"
 _MOST_COLUMNS: Final = 6

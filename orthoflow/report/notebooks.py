@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.catalog.wording import did_you_mean
-from orthoflow.errors import ArgumentError, PluginError, RecordError
+from orthoflow.errors import ArgumentError, PluginError, RecordError, did_you_mean
 from orthoflow.files.images import cells_webp
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.levels import Colours, eight_bits

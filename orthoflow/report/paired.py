@@ -20,9 +20,7 @@ from orthoflow.report.environments import AlikeEnvironments, alike_environments
 from orthoflow.report.rankings import Sense, badness, is_flag
 from orthoflow.untrusted_text import first_few
 from orthoflow.workflow.expand import variants_text
-from orthoflow.workflow.model import (
-    DATA,
-)
+from orthoflow.workflow.model import DATA
 
 # The datasets that decide make up at least this share of all differences.
 _DECIDING_SHARE: Final = 0.5

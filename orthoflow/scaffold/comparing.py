@@ -13,9 +13,7 @@ from orthoflow.errors import PluginError
 from orthoflow.scaffold.kinds import loadable_method
 from orthoflow.sdk import port_specs
 from orthoflow.sdk.hooks import FILES
-from orthoflow.workflow.source import (
-    shipped_workflow,
-)
+from orthoflow.workflow.source import shipped_workflow
 
 # The first recipe that has a step of the kind is taken; coarse cells of one wall let it run in
 # seconds, and without a warning.

@@ -16,8 +16,7 @@ import jinja2
 from orthoflow import products, sdk
 from orthoflow.catalog.catalog import Catalog, KindEntry, MethodEntry, ProductEntry
 from orthoflow.catalog.discovery import NAME_PATTERN
-from orthoflow.catalog.wording import did_you_mean
-from orthoflow.errors import ArgumentError
+from orthoflow.errors import ArgumentError, did_you_mean
 from orthoflow.scaffold.comparing import comparison_text, own_comparison_text
 from orthoflow.scaffold.kinds import KindPorts, kind_ports, new_kind_ports
 from orthoflow.version import __version__

@@ -8,6 +8,7 @@ from typing import Final
 from orthoflow.untrusted_text import shown
 
 _LONGEST: Final = 2000
+_LONGEST_ERROR: Final = 500
 _LONGEST_NAME_BYTES: Final = 200
 
 
@@ -23,6 +24,16 @@ def one_line(text: object, longest: int = _LONGEST) -> str:
     # Cut first: what is dropped need not be looked at.
     line = shown(" ".join(whole[: longest + 1].split()))
     return line if len(whole) <= longest else f"{line[:longest]}... ({len(whole)} characters)"
+
+
+def describe_error(error: BaseException) -> str:
+    r"""Return class and message of an error in one line.
+
+    >>> describe_error(ValueError("no such\n  plane"))
+    'ValueError: no such plane'
+    """
+    text = one_line(error, _LONGEST_ERROR)
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
 def is_name(name: object, *, also_of_file: bool = True) -> bool:

@@ -13,10 +13,10 @@ from pydantic import ValidationError
 
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.catalog.distributions import package_path
-from orthoflow.catalog.wording import describe_error
 from orthoflow.errors import ArgumentError, OrthoflowError, ProductError
 from orthoflow.products import InputFiles, Product
 from orthoflow.sdk import Method
+from orthoflow.sdk.lines import describe_error
 from orthoflow.testing.checks import CHECKS, Check
 from orthoflow.testing.examples import ExampleError, example_inputs
 from orthoflow.testing.trials import Trial

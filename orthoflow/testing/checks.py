@@ -20,11 +20,11 @@ from pydantic.fields import FieldInfo
 
 from orthoflow import products
 from orthoflow.catalog.discovery import discover_catalog
-from orthoflow.catalog.wording import describe_error
 from orthoflow.engine.store import digest_of, publish_into
 from orthoflow.errors import CancelledStepError, OrthoflowError, ProductError
 from orthoflow.products import Cameras, Planes, PointCloud, Product
 from orthoflow.sdk import Method, port_specs
+from orthoflow.sdk.lines import describe_error
 from orthoflow.sdk.units import UNITS
 from orthoflow.testing.examples import example_room, few_points
 from orthoflow.testing.golden import golden_problem

@@ -7,7 +7,8 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import Final
 
-from orthoflow.catalog.wording import did_you_mean
+from orthoflow.errors import did_you_mean
+from orthoflow.files.yaml_positions import Location
 from orthoflow.sdk.context import MEASURED_BY_THE_ENGINE
 from orthoflow.sdk.hooks import FILES
 from orthoflow.sdk.methods import port_specs
@@ -22,13 +23,8 @@ from orthoflow.workflow.model import (
     Workflow,
     is_acyclic,
 )
-from orthoflow.workflow.parameters import (
-    DraftStep,
-)
-from orthoflow.workflow.problems import (
-    Location,
-    ProblemLog,
-)
+from orthoflow.workflow.parameters import DraftStep
+from orthoflow.workflow.problems import ProblemLog
 
 _WILDCARDS: Final = frozenset("*?[")
 

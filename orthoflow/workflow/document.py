@@ -12,7 +12,7 @@ from typing import Final
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import NAME_PATTERN
 from orthoflow.errors import PluginError, WorkflowError
-from orthoflow.files.yaml_positions import Table, describe
+from orthoflow.files.yaml_positions import Location, describe
 from orthoflow.products.product import JsonValue
 from orthoflow.sdk.methods import Method
 from orthoflow.untrusted_text import first_few
@@ -48,7 +48,7 @@ from orthoflow.workflow.parameters import (
     overrides_of_settings,
     resolve_call,
 )
-from orthoflow.workflow.problems import Location, ProblemLog, validate
+from orthoflow.workflow.problems import ProblemLog, validate
 from orthoflow.workflow.source import find_workflow, read_text
 
 _STEPS: Final = "steps"
@@ -96,9 +96,9 @@ def load_workflow(  # noqa: PLR0913 - an argument for each option of the command
         ("orthoflow", "a workflow begins with orthoflow: 1"),
         (_STEPS, "a workflow needs the key steps"),
     ):
-        if log.value((key,)) is None:
+        if not log.has((key,)):
             log.report((key,), needed)
-    if log.value((_STEPS,)) is None:
+    if not log.has((_STEPS,)):
         # All others name steps: each of these names would be another problem.
         _sections(log)
         log.raise_any()
@@ -113,18 +113,18 @@ def load_workflow(  # noqa: PLR0913 - an argument for each option of the command
 
 
 def _is_mapping(log: ProblemLog, text: str) -> bool:
-    tree = log.parse(text)
-    if tree is not None and not isinstance(tree, Table):
-        log.report((), f"expected a mapping, got {describe(tree)}")
-    return isinstance(tree, Table)
+    found = log.parse(text)
+    if found and not isinstance(found.value, dict):
+        log.report((), f"expected a mapping, got {describe(found.value)}")
+    return isinstance(log.document.value, dict)
 
 
 def _sections(log: ProblemLog) -> WorkflowFile:
     """Validate the file; `datasets` may be replaced and is read apart."""
     data = log.get(())
-    assert isinstance(data, dict)  # noqa: S101 - a table is a mapping
-    data.pop("datasets", None)
-    return validate(WorkflowFile, data, log) or WorkflowFile()
+    assert isinstance(data, dict)  # noqa: S101 - checked before
+    sections = {key: value for key, value in data.items() if key != "datasets"}
+    return validate(WorkflowFile, sections, log) or WorkflowFile()
 
 
 def _read_profile(path: Path, log: ProblemLog) -> ProblemLog:
@@ -135,8 +135,7 @@ def _read_profile(path: Path, log: ProblemLog) -> ProblemLog:
         log.report_option(f"--set-file {path}", str(error))
         text = "{}"
     beside = log.beside(str(path), text)
-    if not _is_mapping(beside, text):
-        beside.tree = None
+    _is_mapping(beside, text)
     return beside
 
 
@@ -246,7 +245,7 @@ class _Reader:
         return workflow.with_input_specs(override_inputs(workflow.input_specs, own, log))
 
     def _name(self, file: WorkflowFile) -> str:
-        if self.log.value(("name",)) is None:
+        if not self.log.has(("name",)):
             if re.fullmatch(NAME_PATTERN, self.path.stem):
                 return self.path.stem
             message = f"{self.path.stem!r} cannot be a name: {NAME_RULE}"
@@ -277,7 +276,7 @@ class _Reader:
 
     def _variants(self, section: StepSection, location: Location) -> tuple[DraftCall, ...]:
         for key in _OF_CALLS:
-            if self.log.value((*location, key)) is not None:
+            if self.log.has((*location, key)):
                 message = f"with variants, {key} belongs in each of them"
                 self.log.report((*location, key), message, at_key=True)
         calls = [

@@ -16,8 +16,7 @@ from fnmatch import fnmatchcase
 from typing import Final, TypeAlias
 
 from orthoflow.catalog.catalog import Catalog
-from orthoflow.catalog.wording import did_you_mean
-from orthoflow.errors import ArgumentError, WorkflowError
+from orthoflow.errors import ArgumentError, WorkflowError, did_you_mean
 from orthoflow.products.product import JsonValue
 from orthoflow.sdk.methods import Method, PortSpec, port_specs
 from orthoflow.workflow.inputs import present_inputs

@@ -13,20 +13,10 @@ from fnmatch import fnmatchcase
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
-from orthoflow.catalog.wording import did_you_mean
-from orthoflow.errors import InputError, WorkflowError
-from orthoflow.files.yaml_positions import (
-    Entry,
-    Listing,
-    Position,
-    Table,
-    Text,
-    Value,
-    describe,
-    plain,
-)
+from orthoflow.errors import InputError, WorkflowError, did_you_mean
+from orthoflow.files.yaml_positions import Document, Location, Position, describe
 from orthoflow.products.input_files import InputFiles
 from orthoflow.products.product import JsonValue
 from orthoflow.untrusted_text import first_few
@@ -50,7 +40,7 @@ from orthoflow.workflow.parameters import (
     overrides_of_settings,
     resolve_call,
 )
-from orthoflow.workflow.problems import Location, ProblemLog, validate
+from orthoflow.workflow.problems import ProblemLog, validate
 from orthoflow.workflow.source import read_text
 
 # Files and folders that are examined for one input: `/**` would take hours.
@@ -63,6 +53,7 @@ MOST_DATASETS: Final = 10_000
 _MOST_LISTED: Final = 12
 _MOST_BESIDE: Final = 200
 _DATASETS: Final = "datasets"
+_NOWHERE: Final = Position(line=0, column=0)
 _NUMBER: Final = re.compile(r"-?(0|[1-9]\d{0,14})(\.\d{1,15})?")
 # The first of them in the header is used.
 _SEPARATORS: Final = (";", "\t", ",")
@@ -417,7 +408,9 @@ class DatasetReader:
         """
         if isinstance(table, Mapping):
             log = self.log.beside("datasets=", "")
-            log.tree, log.unnamed = _unplaced({_DATASETS: dict(table)}), _DATASETS
+            # It comes from no document.
+            log.document = Document(value={_DATASETS: dict(table)}, places={(): _NOWHERE})
+            log.unnamed = _DATASETS
             return self._named(_Origin(log=log, folder=Path.cwd(), is_given=True))
         if table:
             report = partial(self.log.report_option, f"--datasets {table}")
@@ -428,9 +421,9 @@ class DatasetReader:
             return self._from_table(self.folder / section, section, report)
         if isinstance(section, dict):
             return self._named(_Origin(log=self.log, folder=self.folder))
-        if (value := self.log.value((_DATASETS,))) is not None:
+        if self.log.has((_DATASETS,)):
             form = "a CSV file, or a mapping from names to datasets, as in {hall: {scan: hall.e57}}"
-            self.log.report((_DATASETS,), f"input should be {form}, got {describe(value)}")
+            self.log.report((_DATASETS,), f"input should be {form}, got {describe(section)}")
         return {}
 
     def _from_table(self, path: Path, name: str, report: Report) -> dict[str, Dataset]:
@@ -441,34 +434,29 @@ class DatasetReader:
             report(str(error) if os.path.lexists(path) else missing)
             return {}
         log = self.log.beside(name, text)
-        rows = read_rows(log)
-        if not rows.entries:
+        log.document, log.unnamed = read_rows(log), _DATASETS
+        if not log.get((_DATASETS,)):
             if not log.has_any:
                 report(f"the table {name} holds no dataset")
             return {}
-        start = Position(line=1, column=1)
-        entry = Entry(position=start, key=_DATASETS, value=rows)
-        log.tree, log.unnamed = Table(position=start, entries=(entry,)), _DATASETS
         return self._named(_Origin(log=log, folder=path.resolve().parent, table=name))
 
     def _named(self, origin: _Origin) -> dict[str, Dataset]:
         """Read the mapping under `datasets` in the origin's tree."""
         log = origin.log
         check_no_step(self.steps, DATA, log, (_DATASETS,))
-        value = log.value((_DATASETS,))
-        assert isinstance(value, Table)  # noqa: S101 - by the callers
-        if not value.entries:
+        written = log.get((_DATASETS,))
+        assert isinstance(written, dict)  # noqa: S101 - by the callers
+        if not written:
             log.report((_DATASETS,), "expected at least one dataset")
         # A key that names no input gets no second problem for its value.
         known = {"set", *self.inputs}
-        data: dict[str, JsonValue] = {}
-        for entry in value:
-            data[entry.key] = plain(entry.value)
-            if isinstance(entry.value, Table):
-                items = {item.key: item.value for item in entry.value}
+        data = dict(written)
+        for name, items in written.items():
+            if isinstance(items, dict):
                 for key in items.keys() - known:
-                    self._report_unknown(key, (_DATASETS, entry.key, key), origin)
-                data[entry.key] = {k: plain(v) for k, v in items.items() if k in known}
+                    self._report_unknown(key, (_DATASETS, name, key), origin)
+                data[name] = {key: value for key, value in items.items() if key in known}
         section = validate(DatasetsSection, {_DATASETS: data}, log)
         found = section.datasets if section else {}
         return {name: self._dataset(name, one, origin) for name, one in found.items()}
@@ -488,8 +476,7 @@ class DatasetReader:
             for key, files in (section.model_extra or {}).items()
         }
         for key, spec in self.inputs.items():
-            is_named = log.value((*here, key)) is not None
-            if not is_named and not spec.files and not spec.optional:
+            if not log.has((*here, key)) and not spec.files and not spec.optional:
                 log.report(
                     here,
                     f"the dataset names no files for the input {key}, and neither does the "
@@ -549,19 +536,6 @@ class DatasetReader:
         return calls
 
 
-def _unplaced(value: JsonValue) -> Value:
-    """Return the document form of a value that comes from no document."""
-    nowhere = Position(line=0, column=0)
-    if isinstance(value, dict):
-        entries = [
-            Entry(position=nowhere, key=key, value=_unplaced(item)) for key, item in value.items()
-        ]
-        return Table(position=nowhere, entries=tuple(entries))
-    if isinstance(value, list):
-        return Listing(position=nowhere, items=tuple(map(_unplaced, value)))
-    return Text(position=nowhere, value=value)
-
-
 def choose_data(
     texts: Sequence[str], datasets: Mapping[str, Dataset], log: ProblemLog
 ) -> tuple[str, ...]:
@@ -588,8 +562,8 @@ def choose_data(
 # Tables of datasets -------------------------------------------------------------------------------
 
 
-def read_rows(log: ProblemLog) -> Table:
-    """Read the lines of a table as a mapping from names to datasets, with their places.
+def read_rows(log: ProblemLog) -> Document:
+    """Read the lines of a table as the section `datasets`: a mapping from names to datasets.
 
     Columns are separated by semicolons, tabs or commas. A column with a dot in its name, or named
     `seed`, goes into the dataset's `set`, its values read as YAML; empty fields are omitted. Keys
@@ -601,28 +575,53 @@ def read_rows(log: ProblemLog) -> Table:
     if header is None:
         log.add(start, "", "a table of datasets begins with a line of column names, got none")
     columns = _columns(header, log) if header else []
-    entries: dict[str, Entry] = {}
+    datasets: dict[str, JsonValue] = {}
+    places: dict[Location, Position] = {(): start, (_DATASETS,): start}
+    keys: dict[Location, Position] = {}
     for row in rows if columns else ():
-        entry = _row(row, columns, log)
-        if entry is None:
+        name = _row_name(row, columns, log)
+        if name is None:
             continue
-        if entry.key in entries:
-            line = entries[entry.key].position.line
+        here = (_DATASETS, name.text)
+        if here in keys:
             log.add(
-                entry.position,
+                name.position,
                 "name",
-                f"the dataset {entry.key} is there already, in line {line}; give it another name",
+                f"the dataset {name.text} is there already, in line {keys[here].line}; give it "
+                "another name",
             )
-        elif len(entries) == MOST_DATASETS:
-            log.add(entry.position, "", f"a table has at most {MOST_DATASETS} datasets")
+            continue
+        if len(datasets) == MOST_DATASETS:
+            log.add(name.position, "", f"a table has at most {MOST_DATASETS} datasets")
             break
-        else:
-            entries[entry.key] = entry
-    return Table(position=start, entries=tuple(entries.values()))
+        keys[here], places[here] = name.position, row[0].position
+        dataset: dict[str, JsonValue] = {}
+        settings: dict[str, JsonValue] = {}
+        for column, field in zip(columns, row, strict=False):
+            key = column.text
+            if not field.text or key == "name":
+                continue
+            is_set = "." in key or key == SEED
+            values = _as_yaml(field, key, log) if is_set else [field.text]
+            for value in values:
+                at = (*here, "set", key) if is_set else (*here, key)
+                keys[at], places[at] = column.position, field.position
+                (settings if is_set else dataset)[key] = value
+        if settings:
+            dataset["set"], places[(*here, "set")] = settings, row[0].position
+        datasets[name.text] = dataset
+    return Document(value={_DATASETS: datasets}, places=places, keys=keys)
 
 
-def _rows(log: ProblemLog) -> Iterator[list[Text]]:
-    """Return the fields of every non-empty line, each a text with its place."""
+class _Field(NamedTuple):
+    """A field of a table."""
+
+    text: str
+    position: Position
+
+
+def _rows(log: ProblemLog) -> Iterator[list[_Field]]:
+    """Return the fields of every non-empty line."""
     separator = ""
     for number, line in enumerate(log.lines, start=1):
         if not line.strip() or line.lstrip()[0] == "#":
@@ -638,19 +637,18 @@ def _rows(log: ProblemLog) -> Iterator[list[Text]]:
         for field in fields:
             # A field with doubled quotes is not found as written; its place is approximate.
             at = max(at, line.find(field, at))
-            position = Position(line=number, column=at + 1)
-            placed.append(Text(position=position, value=field.strip()))
+            placed.append(_Field(field.strip(), Position(line=number, column=at + 1)))
             at += len(field)
         yield placed
 
 
-def _columns(header: Sequence[Text], log: ProblemLog) -> list[Text]:
+def _columns(header: Sequence[_Field], log: ProblemLog) -> list[_Field]:
     """Return the columns, some of them without a name; none if the table cannot be used."""
-    names = [str(field.value) for field in header]
-    for index, field in enumerate(header):
-        if names[index] and names[index] in names[:index]:
-            message = f"the column {field.value} is there twice; remove one of them"
-            log.add(field.position, names[index], message)
+    names = [field.text for field in header]
+    for index, (name, position) in enumerate(header):
+        if name and name in names[:index]:
+            message = f"the column {name} is there twice; remove one of them"
+            log.add(position, name, message)
     if "name" in names:
         return list(header)
     is_mapping = any(": " in name or name.endswith(":") for name in names)
@@ -661,46 +659,27 @@ def _columns(header: Sequence[Text], log: ProblemLog) -> list[Text]:
     return []
 
 
-def _row(row: Sequence[Text], columns: Sequence[Text], log: ProblemLog) -> Entry | None:
-    """Return the dataset of a line."""
-    start, name = row[0].position, None
-    entries: dict[bool, list[Entry]] = {False: [], True: []}
+def _row_name(row: Sequence[_Field], columns: Sequence[_Field], log: ProblemLog) -> _Field | None:
+    """Return the name of the dataset of a line; None if it is unusable, which is reported."""
+    names = [column.text for column in columns]
     for index, field in enumerate(row):
-        if not field.value:
-            continue
-        column = columns[index] if index < len(columns) else Text(position=start, value="")
-        key = str(column.value)
-        if not key:
-            text = f"{field.value} is in column {index + 1}, which has no name in the header"
+        if field.text and not "".join(names[index : index + 1]):
+            text = f"{field.text} is in column {index + 1}, which has no name in the header"
             log.add(field.position, "", text)
             return None
-        if key == "name":
-            name = field
-            continue
-        is_set = "." in key or key == SEED
-        value = _as_yaml(field, key, log) if is_set else field
-        if value is not None:
-            entries[is_set].append(Entry(position=column.position, key=key, value=value))
-    if name is None:
-        if any(field.value for field in row):
-            log.add(start, "name", "the dataset needs a name in the column name")
-        return None
-    if entries[True]:
-        table = Table(position=start, entries=tuple(entries[True]))
-        entries[False].append(Entry(position=start, key="set", value=table))
-    inner = Table(position=start, entries=tuple(entries[False]))
-    return Entry(position=name.position, key=str(name.value), value=inner)
+    found = [field for key, field in zip(names, row, strict=False) if key == "name" and field.text]
+    if not found and any(field.text for field in row):
+        log.add(row[0].position, "name", "the dataset needs a name in the column name")
+    return found[-1] if found else None
 
 
-def _as_yaml(field: Text, key: str, log: ProblemLog) -> Value | None:
-    """Read what stands in a column of parameters, as given with `--set`."""
-    text = str(field.value)
-    if _NUMBER.fullmatch(text):
+def _as_yaml(field: _Field, key: str, log: ProblemLog) -> list[JsonValue]:
+    """Read what stands in a column of parameters, as given with `--set`; nothing on an error."""
+    if _NUMBER.fullmatch(field.text):
         # A thousand rooms have a thousand numbers, and reading each as YAML takes milliseconds.
-        return replace(field, value=float(text) if "." in text else int(text))
+        return [float(field.text) if "." in field.text else int(field.text)]
     own = ProblemLog(file="")
-    value = own.parse(text)
-    if value is None or own.has_any:
+    if own.parse(field.text) is None or own.has_any:
         log.add(field.position, key, "the value cannot be read as YAML; quote it")
-        return None
-    return replace(value, position=field.position)
+        return []
+    return [own.get(())]

@@ -15,26 +15,15 @@ from pydantic import ValidationError
 
 from orthoflow.catalog.discovery import NAME_PATTERN
 from orthoflow.catalog.guarding import UserInterrupt, guarded
-from orthoflow.catalog.wording import describe_error, did_you_mean
-from orthoflow.errors import ArgumentError
+from orthoflow.errors import ArgumentError, did_you_mean
+from orthoflow.files.documents import meant_parameter, mistakes
+from orthoflow.files.yaml_positions import Location
 from orthoflow.products.product import JsonValue
 from orthoflow.sdk.hooks import KindSpec
+from orthoflow.sdk.lines import describe_error
 from orthoflow.sdk.methods import Method
-from orthoflow.workflow.model import (
-    MOST_SWEPT,
-    CallSection,
-    Reference,
-    StepVariant,
-    SweepSection,
-)
-from orthoflow.workflow.problems import (
-    InvalidWorkflowError,
-    Location,
-    ProblemLog,
-    meant_parameter,
-    mistakes,
-    validate,
-)
+from orthoflow.workflow.model import MOST_SWEPT, CallSection, Reference, StepVariant, SweepSection
+from orthoflow.workflow.problems import InvalidWorkflowError, ProblemLog, validate
 
 Report: TypeAlias = Callable[[str], None]
 
@@ -318,7 +307,7 @@ def _resolved(
                 inside = ProblemLog(file="").path(loc) or f"the parameters of {draft.id}"
                 is_named = name in reports and len(loc) == 1
                 report(message if is_named else f"{inside}: {message}")
-            elif log.value(params) is None:
+            elif not log.has(params):
                 log.report((*draft.location, "use"), message, shown=(*params, *loc))
             else:
                 log.report((*params, *loc), message, at_key=bool(loc))
@@ -390,7 +379,7 @@ def _sweeps_of(
     for name, value in draft.call.params.items():
         if _is_sweep(value):
             location = (*draft.location, "params", name)
-            swept = validate(SweepSection, deepcopy(value), log, location)
+            swept = validate(SweepSection, value, log, location)
             found[name] = [
                 (one, partial(log.report, (*location, SWEEP, index)))
                 for index, one in enumerate(swept.sweep if swept else ())

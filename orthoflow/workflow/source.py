@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-from orthoflow.catalog.wording import did_you_mean
-from orthoflow.errors import WorkflowError
+from orthoflow.errors import WorkflowError, did_you_mean
 from orthoflow.untrusted_text import open_file
 
 #: bytes of a workflow file

@@ -4,16 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from orthoflow.files.yaml_positions import (
-    MOST_VALUES,
-    Listing,
-    Position,
-    Table,
-    Text,
-    Value,
-    plain,
-    read_yaml,
-)
+from orthoflow.files.yaml_positions import MOST_VALUES, Document, Position, read_yaml
 
 
 class Problems:
@@ -24,7 +15,7 @@ class Problems:
         self.found.append((position.line, position.column, path, message))
 
 
-def read(text: str, most_values: int = MOST_VALUES) -> Value:
+def read(text: str, most_values: int = MOST_VALUES) -> Document:
     problems = Problems()
     value = read_yaml(text, problems, most_values)
     assert not problems.found
@@ -40,20 +31,21 @@ def problems_of(text: str, most_values: int = MOST_VALUES) -> list[tuple[int, in
 
 def test_every_value_knows_its_line_and_column() -> None:
     document = read("a: 1\nlist:\n  - x\n  - {deep: 2.5}\n")
-    assert isinstance(document, Table)
-    entry = document.get("list")
-    assert entry is not None
-    assert entry.position == Position(line=2, column=1)
-    assert isinstance(entry.value, Listing)
-    assert entry.value.position == Position(line=3, column=3)
-    first, second = entry.value.items
-    assert first == Text(position=Position(line=3, column=5), value="x")
-    assert isinstance(second, Table)
-    (deep,) = second
-    assert (deep.key, deep.position) == ("deep", Position(line=4, column=6))
-    assert deep.value == Text(position=Position(line=4, column=12), value=2.5)
-    assert document.get("b") is None
-    assert plain(document) == {"a": 1, "list": ["x", {"deep": 2.5}]}
+    assert document.value == {"a": 1, "list": ["x", {"deep": 2.5}]}
+    deep = ("list", 1, "deep")
+    assert document.position(("list",), at_key=True) == Position(line=2, column=1)
+    assert document.position(("list",)) == Position(line=3, column=3)
+    assert document.position(("list", 0)) == Position(line=3, column=5)
+    assert document.position(deep, at_key=True) == Position(line=4, column=6)
+    assert document.position(deep) == Position(line=4, column=12)
+    assert (document.get(deep), document.get(("b",)), document.get(("list", 7))) == (
+        2.5,
+        None,
+        None,
+    )
+    # What is missing stands where it would be written, and a single value has no index.
+    assert document.position(("list", 1, "b", "c")) == document.position(("list", 1))
+    assert document.resolve(("a", 0)) == (("a",), ("a",))
 
 
 @pytest.mark.parametrize(
@@ -84,12 +76,9 @@ def test_every_value_knows_its_line_and_column() -> None:
     ],
 )
 def test_plain_values_are_those_of_yaml_1_2(text: str, value: object) -> None:
-    found = read(f"a: {text}")
-    assert isinstance(found, Table)
-    (entry,) = found
-    assert isinstance(entry.value, Text)
-    assert entry.value.value == value
-    assert type(entry.value.value) is type(value)
+    found = read(f"a: {text}").get(("a",))
+    assert found == value
+    assert type(found) is type(value)
 
 
 @pytest.mark.parametrize(
@@ -122,13 +111,13 @@ def test_what_is_odd_is_told_with_its_place(text: str, problem: tuple[int, int, 
 
 
 def test_a_document_has_a_largest_number_of_values_aliases_expanded() -> None:
-    assert plain(read("[1, 2, 3, 4, 5, 6]", 7)) == [1, 2, 3, 4, 5, 6]
+    assert read("[1, 2, 3, 4, 5, 6]", 7).value == [1, 2, 3, 4, 5, 6]
     assert problems_of("[1, 2, 3, 4, 5, 6, 7]", 7)[0][3] == "the document has more than 7 values"
     assert problems_of("[&a [1, 2], *a, *a]", 7)[0][3] == (
         "the document has more than 7 values once aliases are expanded"
     )
     # A key that YAML 1.1 gave a meaning is one as any other.
-    assert plain(read("a: {<<: {x: 1}}")) == {"a": {"<<": {"x": 1}}}
+    assert read("a: {<<: {x: 1}}").value == {"a": {"<<": {"x": 1}}}
 
 
 @pytest.mark.parametrize("marks", ["[]", "{}"], ids=["lists", "mappings"])

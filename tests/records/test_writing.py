@@ -36,9 +36,7 @@ from orthoflow.records.write import (
 )
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import expand_cells
-from orthoflow.workflow.model import (
-    Workflow,
-)
+from orthoflow.workflow.model import Workflow
 from tests import photo_files
 from tests.engine_world import toy_world
 from tests.faulty_files import FaultyFiles

@@ -7,9 +7,7 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from orthoflow.workflow.source import (
-    shipped_workflow,
-)
+from orthoflow.workflow.source import shipped_workflow
 from tests.road.conftest import Shell, metrics_of
 
 ROOMS = ("usual", "one-station")

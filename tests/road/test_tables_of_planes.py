@@ -6,9 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.workflow.source import (
-    shipped_workflow,
-)
+from orthoflow.workflow.source import shipped_workflow
 from tests.long_loops import IS_LONG
 from tests.road.conftest import Shell, metrics_of
 

@@ -9,22 +9,13 @@ import pytest
 
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.errors import ArgumentError, InputError, OrthoflowError, WorkflowError
-from orthoflow.files.yaml_positions import Position, Table
 from orthoflow.workflow.checks import lint_workflow
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import Cell, derive_seed, expand_cells
 from orthoflow.workflow.inputs import read_rows, resolve_input_files
-from orthoflow.workflow.model import (
-    Workflow,
-)
-from orthoflow.workflow.problems import (
-    InvalidWorkflowError,
-    ProblemLog,
-)
-from orthoflow.workflow.resolved import (
-    resolved_json,
-    workflow_from_resolved,
-)
+from orthoflow.workflow.model import Workflow
+from orthoflow.workflow.problems import InvalidWorkflowError, ProblemLog
+from orthoflow.workflow.resolved import resolved_json, workflow_from_resolved
 
 ROOMS = """\
 orthoflow: 1
@@ -377,22 +368,6 @@ def test_datasets_that_can_hardly_be_meant_are_doubted(catalog: Catalog) -> None
 # --- tables ---
 
 
-def rows_of(text: str) -> tuple[Table, list[str]]:
-    log = ProblemLog(file="rooms.csv", lines=tuple(text.split("\n")))
-    table = read_rows(log)
-    return table, [f"{one.line}:{one.column} {one.message}" for _, one in log._found]
-
-
-def plain_of(table: Table) -> dict[str, object]:
-    """What a table says, without places."""
-    return {
-        entry.key: plain_of(entry.value)
-        if isinstance(entry.value, Table)
-        else getattr(entry.value, "value", entry.value)
-        for entry in table
-    }
-
-
 @pytest.mark.parametrize("mark", [",", ";", "\t"])
 def test_a_line_is_a_dataset_with_its_files_and_its_settings(mark: str) -> None:
     text = "\n".join(
@@ -405,25 +380,25 @@ def test_a_line_is_a_dataset_with_its_files_and_its_settings(mark: str) -> None:
             "cellar,,,",
         ]
     ).replace(",", mark)
-    table, problems = rows_of(text)
-    assert problems == []
-    assert plain_of(table) == {
+    log = ProblemLog(file="rooms.csv", lines=tuple(text.split("\n")))
+    rows = read_rows(log)
+    log.raise_any()
+    assert rows.get(("datasets",)) == {
         "hall": {"scan": "hall.e57", "set": {"plane.tolerance_m": 0.02, "plane.is_exact": True}},
         "attic": {"scan": "attic.laz", "set": {"plane.tolerance_m": 3}},
         "cellar": {},
     }
-    hall, attic, cellar = table
-    assert [one.position.line for one in (hall, attic, cellar)] == [3, 5, 6]
-    assert table.position == Position(line=1, column=1)
-    assert isinstance(attic.value, Table)
-    scan, settings = attic.value
+
+    def place(*location: str, at_key: bool = False) -> tuple[int, int]:
+        position = rows.position(("datasets", *location), at_key=at_key)
+        return position.line, position.column
+
+    lines = [place(name, at_key=True)[0] for name in ("hall", "attic", "cellar")]
+    assert lines == [3, 5, 6]
     # Keys have the place of their column in the header, values their own.
-    assert scan.position == Position(line=2, column=6)
-    assert scan.value.position == Position(line=5, column=7)
-    assert isinstance(settings.value, Table)
-    (tolerance,) = settings.value
-    assert tolerance.position == Position(line=2, column=11)
-    assert tolerance.value.position == Position(line=5, column=19)
+    assert (place("attic", "scan", at_key=True), place("attic", "scan")) == ((2, 6), (5, 7))
+    tolerance = ("attic", "set", "plane.tolerance_m")
+    assert (place(*tolerance, at_key=True), place(*tolerance)) == ((2, 11), (5, 19))
 
 
 # --- seeds ---

@@ -13,11 +13,7 @@ from orthoflow.errors import PluginError, WorkflowError
 from orthoflow.files.yaml_positions import Scalar
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.model import CallSection
-from orthoflow.workflow.problems import (
-    InvalidArgumentsError,
-    Problem,
-    UnusablePluginError,
-)
+from orthoflow.workflow.problems import InvalidArgumentsError, Problem, UnusablePluginError
 from tests.laboratories import (
     GOOD,
     laboratory_catalog,

@@ -12,10 +12,7 @@ import pytest
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.errors import InputError
 from orthoflow.workflow.document import load_workflow
-from orthoflow.workflow.inputs import (
-    present_inputs,
-    resolve_input_files,
-)
+from orthoflow.workflow.inputs import present_inputs, resolve_input_files
 
 
 @pytest.fixture

@@ -9,9 +9,7 @@ import pytest
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.sdk import MetricSpec
 from orthoflow.workflow.document import load_workflow
-from orthoflow.workflow.problems import (
-    InvalidWorkflowError,
-)
+from orthoflow.workflow.problems import InvalidWorkflowError
 from tests.laboratories import (
     GOOD,
     problems,

@@ -14,25 +14,15 @@ from pydantic import Field, field_validator
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import NAME_PATTERN
 from orthoflow.errors import ArgumentError, OrthoflowError
+from orthoflow.files.documents import meant_number, meant_parameter
 from orthoflow.products.product import JsonValue
 from orthoflow.sdk import MethodParams
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import swept_indices
-from orthoflow.workflow.model import (
-    Workflow,
-)
-from orthoflow.workflow.parameters import (
-    variant_names,
-)
-from orthoflow.workflow.problems import (
-    InvalidArgumentsError,
-    InvalidWorkflowError,
-    meant_number,
-    meant_parameter,
-)
-from orthoflow.workflow.resolved import (
-    resolved_json,
-)
+from orthoflow.workflow.model import Workflow
+from orthoflow.workflow.parameters import variant_names
+from orthoflow.workflow.problems import InvalidArgumentsError, InvalidWorkflowError
+from orthoflow.workflow.resolved import resolved_json
 from tests.laboratories import GOOD, load, with_steps
 
 SETS = {

@@ -12,16 +12,9 @@ from ruamel.yaml import YAML
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.workflow.document import load_workflow
-from orthoflow.workflow.problems import (
-    InvalidWorkflowError,
-)
-from orthoflow.workflow.resolved import (
-    resolved_json,
-)
-from orthoflow.workflow.source import (
-    shipped_workflow,
-    shipped_workflows,
-)
+from orthoflow.workflow.problems import InvalidWorkflowError
+from orthoflow.workflow.resolved import resolved_json
+from orthoflow.workflow.source import shipped_workflow, shipped_workflows
 from orthoflow.workflow.views import mermaid, workflow_schema
 from tests import workflow_format
 from tests.laboratories import (

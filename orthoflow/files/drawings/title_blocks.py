@@ -20,8 +20,8 @@ from typing import Annotated, Final, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from orthoflow.errors import InputError
+from orthoflow.files.documents import read_model
 from orthoflow.files.images import decode_image
-from orthoflow.files.yaml_positions import read_model
 from orthoflow.untrusted_text import open_file, reading, text_of_file
 
 #: bytes of the title block of sheets

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from orthoflow.catalog.wording import nearest
+from orthoflow.errors import nearest
 
 
 @pytest.mark.parametrize(("n_letters", "is_compared"), [(200, True), (201, False)])
