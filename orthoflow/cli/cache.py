@@ -12,7 +12,6 @@ from orthoflow.cli.commands import (
     EXIT_GOOD,
     EXIT_RECORD_DIFFERS,
     Command,
-    LazyCommand,
     LazyGroup,
     echo_error,
     json_option,
@@ -30,10 +29,8 @@ _SUMMARIES: Final = {
 cache: Final[click.Command] = LazyGroup(
     name="cache",
     help="List, check or clean the store of results.",
-    lazy={
-        name: LazyCommand(target=f"orthoflow.cli.cache:cache_{name}", summary=summary)
-        for name, summary in _SUMMARIES.items()
-    },
+    summaries=_SUMMARIES,
+    target="orthoflow.cli.cache:cache_{}",
 )
 
 

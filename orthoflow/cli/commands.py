@@ -128,44 +128,34 @@ class RecordCommand(Command):
                 yield from given if isinstance(given, tuple) else (given,)
 
 
-@dataclass(frozen=True, kw_only=True)
-class LazyCommand:
-    """Where a command is.
+class LazyGroup(click.Group):
+    """A group whose `--help` lists summaries without importing a single command.
 
-    Attributes:
-        target: import string `package.module:attribute`.
-        summary: one line for `--help`, so that listing loads nothing.
+    Args:
+        summaries: name of a command -> one line, in the order of work.
+        target: where the commands are, `package.module:attribute`; `{}` stands for the name.
     """
 
-    target: str
-    summary: str
-
-    def load(self) -> click.Command:
-        """Import the command's module and give the command."""
-        module_name, _, attribute = self.target.partition(":")
-        command = getattr(import_module(module_name), attribute)
-        if not isinstance(command, click.Command):
-            raise TypeError(f"{self.target} is a {type(command).__name__}, not a command")
-        return command
-
-
-class LazyGroup(click.Group):
-    """A group whose `--help` lists summaries without importing a single command."""
-
     # Any: click passes its own keyword arguments through.
-    def __init__(self, *args: Any, lazy: Mapping[str, LazyCommand], **kwargs: Any) -> None:
+    def __init__(
+        self, *args: Any, summaries: Mapping[str, str], target: str, **kwargs: Any
+    ) -> None:
         # Click wants a callback on a group, though nothing happens before its command.
         super().__init__(*args, **{"callback": lambda: None, **kwargs})
-        self._lazy = dict(lazy)
+        self._summaries = summaries
+        self._target = target
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names in the order of the table, which is the order of work."""
-        return list(self._lazy)
+        return list(self._summaries)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Load one command."""
-        found = self._lazy.get(cmd_name)
-        return found.load() if found is not None else None
+        """Import one command."""
+        if cmd_name not in self._summaries:
+            return None
+        module_name, _, attribute = self._target.replace("{}", cmd_name).partition(":")
+        command: click.Command = getattr(import_module(module_name), attribute)
+        return command
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -176,7 +166,7 @@ class LazyGroup(click.Group):
         except click.UsageError as error:
             from orthoflow.errors import nearest
 
-            near = nearest(args[0], self._lazy)
+            near = nearest(args[0], self._summaries)
             if not near or "did you mean" in error.message.lower():
                 raise
             sentence = f"{error.message.rstrip('.')}; did you mean {near!r}?"
@@ -185,7 +175,7 @@ class LazyGroup(click.Group):
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the list of commands from the table."""
         with formatter.section("Commands"):
-            formatter.write_dl([(name, entry.summary) for name, entry in self._lazy.items()])
+            formatter.write_dl(list(self._summaries.items()))
 
 
 def _keep_debug(ctx: click.Context, _param: click.Parameter, value: bool) -> None:  # noqa: FBT001

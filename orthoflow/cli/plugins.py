@@ -24,7 +24,6 @@ from orthoflow.cli.commands import (
     EXIT_GOOD,
     EXIT_PLUGIN_MISSING,
     Command,
-    LazyCommand,
     LazyGroup,
     json_option,
 )
@@ -59,10 +58,8 @@ _COLUMNS: Final = {
 plugins: Final[click.Command] = LazyGroup(
     name="plugins",
     help="List, show and check methods, and write a plugin of your own.",
-    lazy={
-        name: LazyCommand(target=f"orthoflow.cli.plugins:plugins_{name}", summary=summary)
-        for name, summary in _SUMMARIES.items()
-    },
+    summaries=_SUMMARIES,
+    target="orthoflow.cli.plugins:plugins_{}",
 )
 
 

@@ -14,7 +14,6 @@ import click
 
 from orthoflow.cli.commands import (
     EXIT_CELL_FAILED,
-    LazyCommand,
     LazyGroup,
     Session,
     debug_parameter,
@@ -100,10 +99,8 @@ def _print_version(ctx: click.Context, _param: click.Parameter, value: bool) -> 
 
 program: Final = Program(
     name="orthoflow",
-    lazy={
-        name: LazyCommand(target=f"orthoflow.cli.{name}:{name}", summary=summary)
-        for name, summary in _SUMMARIES.items()
-    },
+    summaries=_SUMMARIES,
+    target="orthoflow.cli.{}:{}",
     help=_HELP,
     params=[
         click.Option(

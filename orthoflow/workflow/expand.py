@@ -6,11 +6,11 @@ All of them first; `--only`, `--from` and `--until` then select among them.
 from __future__ import annotations
 
 import hashlib
-import heapq
 import itertools
 import json
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from typing import Final, TypeAlias
@@ -153,8 +153,8 @@ class StepGraph:
         users: step -> steps that take its products.
     """
 
-    sources: Mapping[str, Collection[str]]
-    users: Mapping[str, Collection[str]]
+    sources: Mapping[str, AbstractSet[str]]
+    users: Mapping[str, AbstractSet[str]]
 
     def before(self, name: str) -> set[str]:
         """Return all steps that a step needs, directly or not."""
@@ -188,17 +188,12 @@ def step_graph(steps: Mapping[str, WorkflowStep]) -> StepGraph:
 
 def topological_steps(steps: Mapping[str, WorkflowStep]) -> tuple[str, ...]:
     """Sort steps so that each follows all it needs, otherwise in the order of the file."""
-    graph, names = step_graph(steps), tuple(steps)
-    rank = {name: index for index, name in enumerate(names)}
-    n_missing = {name: len(sources) for name, sources in graph.sources.items()}
-    ready = [rank[name] for name in names if n_missing[name] == 0]
-    ordered: list[str] = []
-    while ready:
-        ordered.append(names[heapq.heappop(ready)])
-        for user in graph.users[ordered[-1]]:
-            n_missing[user] -= 1
-            if n_missing[user] == 0:
-                heapq.heappush(ready, rank[user])
+    sources, waiting = step_graph(steps).sources, list(steps)
+    ordered: dict[str, None] = {}
+    while waiting:
+        name = next(name for name in waiting if ordered.keys() >= sources[name])
+        waiting.remove(name)
+        ordered[name] = None
     return tuple(ordered)
 
 

@@ -11,7 +11,6 @@ import pytest
 from click.testing import CliRunner
 
 from orthoflow.cli.commands import (
-    LazyCommand,
     LazyGroup,
     RecordCommand,
     command_again,
@@ -45,11 +44,8 @@ def test_a_command_is_repeated_with_what_was_given_and_another_folder() -> None:
     [("bakee", "No such command 'bakee'; did you mean 'bake'?"), ("zzz", "No such command 'zzz'.")],
 )
 def test_a_group_says_which_of_its_commands_was_meant(name: str, said: str) -> None:
-    lazy = {
-        verb: LazyCommand(target=f"{__name__}:bake", summary=f"{verb} it")
-        for verb in ("wash", "bake")
-    }
-    group = LazyGroup("kitchen", lazy=lazy)
+    summaries = {verb: f"{verb} it" for verb in ("wash", "bake")}
+    group = LazyGroup("kitchen", summaries=summaries, target=f"{__name__}:{{}}")
     done = CliRunner().invoke(group, [name])
     assert done.exit_code == 2
     assert said in done.output

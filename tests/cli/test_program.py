@@ -15,7 +15,7 @@ from click.testing import CliRunner, Result
 
 from orthoflow import __version__
 from orthoflow.cli import program
-from orthoflow.cli.commands import LazyCommand, Session, current_session, explain
+from orthoflow.cli.commands import Session, current_session, explain
 from orthoflow.cli.program import Program
 from orthoflow.errors import (
     ArgumentError,
@@ -64,8 +64,7 @@ def invoke_failing(error: BaseException | Callable[[], int], *arguments: str) ->
             return error()
         raise error
 
-    broken = Program(name="orthoflow", callback=lambda: None, params=program.params, lazy={})
-    broken._lazy = {"fail": LazyCommand(target="unused:unused", summary="fails")}
+    broken = Program(name="orthoflow", params=program.params, summaries={}, target="")
     broken.get_command = lambda _ctx, _name: click.Command("fail", callback=fail)  # type: ignore[method-assign]
     return CliRunner().invoke(broken, [*arguments, "fail"])
 
