@@ -54,8 +54,8 @@ _HELP: Final = "\n\n".join(
 @click.option(
     "--embed",
     is_flag=True,
-    help="Write a self-contained record with every product and input file; "
-    "by itself, or instead of the record with --to ro-crate.",
+    help="Write a self-contained record with every product and input file; by itself, or instead "
+    "of the record with --to ro-crate.",
 )
 @click.option(
     "--split",
@@ -69,12 +69,10 @@ _HELP: Final = "\n\n".join(
     "--cell",
     "cell",
     metavar="ADDRESS",
-    help="colmap: the step with the orientations; by "
-    "default the last one that oriented photos. laz, copc, ply, e57: the step that found the "
-    "planes; "
-    "by default the last one that did. layers: the step that projected photos onto walls, "
-    "likewise. figures: only those "
-    "of this step. gltf, tiles, sheet, dxf, geojson: the step of the orthoimages, likewise.",
+    help="colmap: the step with the orientations; by default the last one that oriented photos. "
+    "laz, copc, ply, e57: the step that found the planes; by default the last one that did. "
+    "layers: the step that projected photos onto walls, likewise. figures: only those of this "
+    "step. gltf, tiles, sheet, dxf, geojson: the step of the orthoimages, likewise.",
 )
 @click.option(
     "--license",
@@ -91,14 +89,15 @@ _HELP: Final = "\n\n".join(
     "--scale",
     type=_Scale(min=1, max=100_000),
     metavar="N",
-    help="sheet: draw at 1:N (50 or 1:50); by default the largest usual scale at "
-    "which each wall fits onto one sheet.",
+    help="sheet: draw at 1:N (50 or 1:50); by default the largest usual scale at which each wall "
+    "fits onto one sheet.",
 )
 @click.option(
     "--paper",
     metavar="PAPER",
-    help="sheet: A0 to A4, a long one as A3.1 (297 x 841 mm), or width x height in mm as 700x500; "
-    "by default the smallest that takes each wall on one sheet (without --scale at most A3).",
+    help="sheet: A0 to A4, a long one as A3.1 (297 x 841 mm), or width x height in mm as "
+    "700x500; by default the smallest that takes each wall on one sheet (without --scale at most "
+    "A3).",
 )
 @click.option(
     "--grid",
@@ -110,26 +109,23 @@ _HELP: Final = "\n\n".join(
 @click.option(
     "--units",
     type=click.Choice(["m", "ft"]),
-    help="sheet: unit of coordinates, heights and the scale bar; m by default. With ft the "
-    "usual scales "
-    "are 1:48 (1/4 inch to the foot) and so "
-    ""
-    ""
-    "on.",
+    help="sheet: unit of coordinates, heights and the scale bar; m by default. With ft the usual "
+    "scales are 1:48 (1/4 inch to the foot) and so on.",
 )
 @click.option(
     "--title-block",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
     help="sheet: YAML file with any of project, title, site, client, organisation, author, "
-    "checked_by, date, drawing, revision, note, logo, fields, revisions, layout (column or strip).",
+    "checked_by, date, drawing, revision, note, logo, fields, revisions, layout (column or "
+    "strip).",
 )
 @click.option(
     "--beside",
     multiple=True,
     type=click.Choice(["depth", "intensity"]),
-    help="sheet: show depth as contours, or the laser intensity, beside the orthoimage; "
-    "can be given twice.",
+    help="sheet: show depth as contours, or the laser intensity, beside the orthoimage; can be "
+    "given twice.",
 )
 @click.option(
     "--height",
@@ -143,12 +139,8 @@ _HELP: Final = "\n\n".join(
     "--through",
     multiple=True,
     metavar="X,Y,X,Y",
-    help="section: two places of the plan, metres in the coordinates of the scan; the viewer "
-    "has the first on "
-    "the left; can be given several "
-    ""
-    ""
-    "times.",
+    help="section: two places of the plan, metres in the coordinates of the scan; the viewer has "
+    "the first on the left; can be given several times.",
 )
 @click.option("--dimensions", is_flag=True, help="plan, section: write lengths beside the lines.")
 @click.option(
@@ -159,8 +151,8 @@ _HELP: Final = "\n\n".join(
 @click.option(
     "--light",
     metavar="AZIMUTH,ALTITUDE",
-    help="relief: direction of the light in degrees: clockwise from the top on "
-    "the wall, and altitude above its plane; 315,25 (top left) by default.",
+    help="relief: direction of the light in degrees: clockwise from the top on the wall, and "
+    "altitude above its plane; 315,25 (top left) by default.",
 )
 @click.option(
     "--base-url",
@@ -173,19 +165,14 @@ _HELP: Final = "\n\n".join(
     "figure_format",
     type=click.Choice(["pdf", "svg", "png"]),
     help="figures: format of charts and drawings, png at 300 dpi; svg by default. Pictures "
-    "become pages "
-    "of a PDF, and stay PNG "
-    ""
-    ""
-    "otherwise.",
+    "become pages of a PDF, and stay PNG otherwise.",
 )
 @click.option(
     "--colour",
     type=click.Choice(["photos", "rgb", "intensity", "plane", "deviation"]),
     help="laz, copc, ply, e57: the colours are of the oriented photos (grey where none sees the "
-    "point), of the scan, its intensity, a colour per plane, or blue behind and red in front "
-    "of the "
-    "plane; by default the first of these that is available.",
+    "point), of the scan, its intensity, a colour per plane, or blue behind and red in front of "
+    "the plane; by default the first of these that is available.",
 )
 @click.option(
     "--wall",
@@ -215,8 +202,8 @@ _HELP: Final = "\n\n".join(
     "--output",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="FOLDER",
-    help="Where to write it, a new or empty folder; by default export/FORMAT in RUN (or embedded, "
-    "datasets).",
+    help="Where to write it, a new or empty folder; by default export/FORMAT in RUN (or "
+    "embedded, datasets).",
 )
 def export(run: Path, target: str | None, output: Path | None, **choices: Any) -> int:
     """Write the results of a run for other programs; 3 where the record's seal does not hold."""
