@@ -10,10 +10,11 @@ from pathlib import Path
 
 import pytest
 from pydantic import Field, field_validator
+from syrupy.assertion import SnapshotAssertion
 
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import NAME_PATTERN
-from orthoflow.errors import ArgumentError, OrthoflowError
+from orthoflow.errors import OrthoflowError
 from orthoflow.files.documents import meant_number, meant_parameter
 from orthoflow.products.product import JsonValue
 from orthoflow.sdk import MethodParams
@@ -86,87 +87,64 @@ class Params(MethodParams):
         return value
 
 
-def problems_of(catalog: Catalog, monkeypatch: pytest.MonkeyPatch, params: str) -> list[str]:
-    """What is wrong with parameters of a method that has those above."""
+@pytest.mark.parametrize(
+    "params",
+    [
+        "{}",
+        "{height_m: 1, near: [1, 2, 3]}",
+        "{height_m: 1, near: [[1, 2, a]]}",
+        "{height_m: 1, crop: [0, 0, 2]}",
+        "{height_m: 1, ink: {a: 1}}",
+        "{height_m: 13}",
+    ],
+)
+def test_what_is_wrong_with_a_parameter_is_one_problem(
+    params: str,
+    catalog: Catalog,
+    write: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    snapshot: SnapshotAssertion,
+) -> None:
     monkeypatch.setattr(catalog.method("plane.hough2d").load(), "Params", Params)
     text = with_steps(f"x: {{use: plane.hough2d, in: {{cloud: cloud.cloud}}, params: {params}}}")
     with pytest.raises(OrthoflowError) as caught:
-        load(text, Path("flow.yaml"), catalog)
-    return [f"{item.path}: {item.message}" for item in caught.value.problems]  # type: ignore[attr-defined]
+        load(text, write, catalog)
+    assert len(caught.value.problems) == 1  # type: ignore[attr-defined]
+    assert str(caught.value) == snapshot
 
 
-@pytest.mark.parametrize(
-    ("params", "said"),
-    [
-        ("{}", "params: plane.hough2d needs parameter height_m"),
-        (
-            "{near: [1, 2, 3]}",
-            "params.near: near is written [[number, number, number], ...], got [1, 2, 3]",
-        ),
-        (
-            "{near: [[1, 2, a]]}",
-            'params.near[0][2]: input should be a valid number, got the text "a"',
-        ),
-        (
-            "{crop: [0, 0, 2]}",
-            "crop is written [number, number, number, number] or [[number, number], ...] or null",
-        ),
-        ("{ink: {a: 1}}", "params.ink.a: input should be a list, got 1"),
-        (
-            "{height_m: 13}",
-            "checking the parameters of plane.hough2d failed: RuntimeError: the moon is full",
-        ),
-    ],
-)
-@pytest.mark.usefixtures("write")
-def test_what_is_wrong_with_a_parameter_is_one_problem(
-    params: str, said: str, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if params not in ("{}", "{height_m: 13}"):
-        params = params.replace("{", "{height_m: 1, ", 1)
-    (problem,) = problems_of(catalog, monkeypatch, params)
-    assert said.removeprefix("params: ") in problem
-
-
-BAD_SETS = {
-    "wal.gsd_m=1": "there is no step wal (did you mean wall?); steps: cloud",
-    "wall.gsd=1": "there is no parameter gsd in raster.grid (did you mean gsd_m?); known: gsd_m",
-    "plane.ransak.iterations=1": "step plane has no variant ransak (did you mean ransac?); it has",
-    "plane.depth=1": "no parameter depth in plane.hough2d or plane.ransac; known: cell_m, iter",
-    "wall.gsd_m": "expected step.parameter=value or step.variant.parameter=value",
-    "gsd_m=1": "expected step.parameter=value or step.variant.parameter=value",
-    "wall.gsd_m=": "expected a value after the equals sign",
-    "wall.gsd_m=[1": "the value cannot be read as YAML: this is not YAML",
-    "wall.gsd_m=-1": "input should be greater than 0, got -1",
-    'wall.gsd_m="1"': 'a valid number, got the text "1"; write it without quotes',
-    "plane.ransac.tolerance_m.x=1": "tolerance_m is not a mapping, so nothing in it can be set",
-}
+BAD_SETS = [
+    "wal.gsd_m=1",
+    "wall.gsd=1",
+    "plane.ransak.iterations=1",
+    "plane.depth=1",
+    "wall.gsd_m",
+    "gsd_m=1",
+    "wall.gsd_m=",
+    "wall.gsd_m=[1",
+    "wall.gsd_m=-1",
+    'wall.gsd_m="1"',
+    "plane.ransac.tolerance_m.x=1",
+]
 
 
 @pytest.mark.parametrize("text", BAD_SETS)
-def test_a_set_that_does_not_fit_is_refused(text: str, catalog: Catalog, write: Path) -> None:
-    with pytest.raises(ArgumentError) as caught:
-        load(GOOD, write, catalog, text)
-    assert isinstance(caught.value, InvalidArgumentsError)
-    assert str(caught.value).startswith(f"--set {text}: ")
-    assert BAD_SETS[text] in str(caught.value)
-
-
-def test_all_options_that_do_not_fit_are_named_together(catalog: Catalog, write: Path) -> None:
-    write.write_text(GOOD)
+def test_a_set_that_does_not_fit_is_refused(
+    text: str, catalog: Catalog, write: Path, snapshot: SnapshotAssertion
+) -> None:
     with pytest.raises(InvalidArgumentsError) as caught:
-        load_workflow(
-            write, catalog, sets=["wal.x=1", "wall.gsd=1"], inputs=["scam=a", "scan", "=b"]
-        )
-    assert [problem.file for problem in caught.value.problems] == [
-        "--input scan",
-        "--input =b",
-        "--input scam=a",
-        "--set wal.x=1",
-        "--set wall.gsd=1",
-    ]
-    assert "there is no input scam (did you mean scan?)" in str(caught.value)
-    assert "--input scan: expected NAME=PATH" in str(caught.value)
+        load(GOOD, write, catalog, text)
+    assert str(caught.value) == snapshot
+
+
+def test_all_options_that_do_not_fit_are_named_together(
+    catalog: Catalog, write: Path, snapshot: SnapshotAssertion
+) -> None:
+    write.write_text(GOOD)
+    sets, inputs = ["wal.x=1", "wall.gsd=1"], ["scam=a", "scan", "=b"]
+    with pytest.raises(InvalidArgumentsError) as caught:
+        load_workflow(write, catalog, sets=sets, inputs=inputs)
+    assert str(caught.value) == snapshot
 
 
 # --- sweeps ---
@@ -257,42 +235,42 @@ def test_a_value_takes_the_place_of_a_sweep_and_a_sweep_that_of_a_value(catalog:
 
 
 @pytest.mark.parametrize(
-    ("written", "said"),
+    "written",
     [
-        ("{sweep: [0.02]}", "tolerance_m.sweep: list should have at least 2"),
-        ("{sweep: 0.02}", "input should be a list, got 0.02"),
-        ("{sweep: [0.02, wide]}", "tolerance_m.sweep[1]: input should be a valid number, got the"),
-        ("{sweep: [0.02, 0.05], step: 1}", "unknown key step"),
-        ("{sweep: [1, 0.02, 1.0]}", "tolerance_m.sweep[2]: 1.0 is swept twice; leave one of them"),
-        ("[0.02, 0.05]", "number, got a list; to try each: {sweep: [0.02, 0.05]}"),
-        ("{sweep: [0.02, 0.001]}", "cell_m 0.01 must not exceed tolerance_m"),
+        "{sweep: [0.02]}",
+        "{sweep: 0.02}",
+        "{sweep: [0.02, wide]}",
+        "{sweep: [0.02, 0.05], step: 1}",
+        "{sweep: [1, 0.02, 1.0]}",
+        "[0.02, 0.05]",
+        "{sweep: [0.02, 0.001]}",
     ],
 )
-def test_what_is_wrong_with_a_sweep_is_told_once_at_its_place(
-    catalog: Catalog, written: str, said: str
+def test_what_is_wrong_with_a_sweep_is_reported_once_at_its_place(
+    catalog: Catalog, written: str, snapshot: SnapshotAssertion
 ) -> None:
     with pytest.raises(InvalidWorkflowError) as caught:
         load_swept(catalog, ROOM.replace("{sweep: [0.02, 0.05, 0.1]}", written))
-    [problem] = caught.value.problems
-    assert said in str(problem)
-    assert problem.line == 11
+    assert len(caught.value.problems) == 1
+    assert str(caught.value) == snapshot
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    "text",
     [
-        ("plane.tolerance_m={sweep: [1]}", "with 2 to 100 values and nothing beside it"),
-        ("plane.tolerance_m={sweep: [1, 2], to: 3}", "nothing beside it"),
-        ("plane.tolerance_m={sweep: [1, 2, 1]}", "1 is swept twice"),
-        ("plane.tolerance_m=[1, 2]", r"to try each: {sweep: \[1, 2\]}"),
-        ("cloud.up={sweep: [x, z]}", "sources take no variants, so nothing of it can be swept"),
+        "plane.tolerance_m={sweep: [1]}",
+        "plane.tolerance_m={sweep: [1, 2], to: 3}",
+        "plane.tolerance_m={sweep: [1, 2, 1]}",
+        "plane.tolerance_m=[1, 2]",
+        "cloud.up={sweep: [x, z]}",
     ],
 )
 def test_a_sweep_that_cannot_be_is_refused_on_the_command_line(
-    catalog: Catalog, text: str, said: str
+    catalog: Catalog, text: str, snapshot: SnapshotAssertion
 ) -> None:
-    with pytest.raises((InvalidArgumentsError, InvalidWorkflowError), match=said):
+    with pytest.raises((InvalidArgumentsError, InvalidWorkflowError)) as caught:
         load_swept(catalog, sets=[text])
+    assert str(caught.value) == snapshot
 
 
 def test_a_dataset_cannot_set_what_is_swept(catalog: Catalog) -> None:
@@ -366,21 +344,16 @@ def test_a_file_of_parameters_is_gone_before_by_what_is_set(
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("plane.celm: 1\n", "fine.yaml:1:1: plane.celm: there is no parameter celm"),
-        ("wall.gsd_m: fine\n", "fine.yaml:1:13: wall.gsd_m: input should be a valid number"),
-        ("wall: {gsd_m: 1}\n", "fine.yaml:1:1: wall: expected step.parameter"),
-        ("- 1\n", "fine.yaml:1:1: .*expected a mapping, got a list"),
-        ("wall.gsd_m: [1\n", "fine.yaml:1:13: this is not YAML: the bracket"),
-    ],
+    "text",
+    ["plane.celm: 1", "wall.gsd_m: fine", "wall: {gsd_m: 1}", "- 1", "wall.gsd_m: [1\n"],
 )
-def test_mistakes_in_a_file_of_parameters_are_told_at_their_place(
-    catalog: Catalog, tmp_path: Path, text: str, said: str
+def test_mistakes_in_a_file_of_parameters_are_reported_at_their_place(
+    catalog: Catalog, tmp_path: Path, text: str, snapshot: SnapshotAssertion
 ) -> None:
     (tmp_path / "fine.yaml").write_text(text)
-    with pytest.raises(InvalidWorkflowError, match=said):
+    with pytest.raises(InvalidWorkflowError) as caught:
         load_swept(catalog, set_files=["fine.yaml"])
+    assert str(caught.value) == snapshot
 
 
 def test_a_missing_file_of_parameters_is_an_argument_that_is_wrong(catalog: Catalog) -> None:
