@@ -73,40 +73,6 @@ _COG_OPTIONS: Final[dict[str, object]] = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class RasterFile:
-    """The content of a GeoTIFF.
-
-    Attributes:
-        values: (rows, cols) for one band, (rows, cols, bands) for more; stored type.
-        shown: (rows, cols) True where the dataset mask is valid.
-        gsd_m: side of a cell in metres.
-        corner_m: X and Y of the outer corner of the top-left cell.
-        down: change of Y per metre down the rows, -1 or 1.
-        tags: the dataset's tags.
-        crs_wkt: coordinate system, as GDAL gives it.
-        nodata: the value for no data, or None.
-        overviews: factors of the overviews.
-        layout: `COG` for a cloud-optimised file, else empty.
-    """
-
-    values: NDArray[np.generic]
-    shown: NDArray[np.bool_]
-    gsd_m: float
-    corner_m: tuple[float, float] = (0.0, 0.0)
-    down: float = -1.0
-    tags: dict[str, str] = field(default_factory=dict)
-    crs_wkt: str = ""
-    nodata: float | None = None
-    overviews: tuple[int, ...] = ()
-    layout: str = ""
-
-    @property
-    def place(self) -> GridPlace:
-        """Return its position; the coordinate system is not included."""
-        return GridPlace(gsd_m=self.gsd_m, corner_m=self.corner_m, down=self.down)
-
-
-@dataclass(frozen=True, kw_only=True)
 class GridPlace:
     """The position of a raster in its coordinate system.
 
@@ -131,6 +97,25 @@ class GridPlace:
             crs=frame.crs,
             down=frame.raster_down,
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RasterFile:
+    """The content of a GeoTIFF.
+
+    Attributes:
+        values: (rows, cols) for one band, (rows, cols, bands) for more; stored type.
+        shown: (rows, cols) True where the dataset mask is valid.
+        place: its position; the coordinate system is not included.
+        tags: the dataset's tags.
+        crs_wkt: coordinate system, as GDAL gives it.
+    """
+
+    values: NDArray[np.generic]
+    shown: NDArray[np.bool_]
+    place: GridPlace
+    tags: Mapping[str, str]
+    crs_wkt: str
 
 
 def local_crs_name(name: str) -> str:
@@ -349,33 +334,23 @@ def read_raster(path: Path) -> RasterFile:
     """Read a GeoTIFF that orthoflow or another program wrote.
 
     Raises:
-        InputError: GDAL cannot read the file, or its cells are not square and upright.
+        InputError: GDAL cannot read the file, it is too large, or its cells are not square and
+            upright.
     """
-    with _opened(path) as dataset:
-        _check_size(path, dataset)
-        values = dataset.read()
-        return RasterFile(
-            values=values[0] if len(values) == 1 else np.moveaxis(values, 0, 2),
-            shown=dataset.dataset_mask() > 0,
-            gsd_m=_gsd_m(path, dataset.transform),
-            corner_m=(float(dataset.transform.c), float(dataset.transform.f)),
-            down=math.copysign(1.0, dataset.transform.e),
-            tags=dict(dataset.tags()),
-            crs_wkt=dataset.crs.to_wkt() if dataset.crs else "",
-            nodata=dataset.nodata,
-            overviews=tuple(dataset.overviews(1)),
-            layout=dataset.tags(ns="IMAGE_STRUCTURE").get("LAYOUT", ""),
-        )
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[DatasetReader]:
-    """Open a GeoTIFF whose header is believed."""
-    import rasterio
-
-    with _reading(path), rasterio.open(path, driver="GTiff") as dataset:
-        check_header(path, dataset)
-        yield dataset
+    with RasterParts(path) as raster:
+        rows, columns = raster.shape
+        # What a small file can state and no orthoimage has, before memory is allocated.
+        if rows * columns > MOST_CELLS or raster.bands > MOST_BANDS:
+            raise InputError(
+                f"{path.name} is too large: {columns} x {rows} cells in {raster.bands} bands, at "
+                f"most {MOST_CELLS} cells and {MOST_BANDS} bands are read; export it with larger "
+                "cells or in parts"
+            )
+        values, shown = raster.read((0.0, 0.0, float(columns), float(rows)), raster.shape)
+        header = raster.header()
+    return RasterFile(
+        values=values, shown=shown, place=raster.place, tags=header.tags, crs_wkt=header.wkt
+    )
 
 
 @contextmanager
@@ -403,9 +378,7 @@ class RasterParts:
 
     Attributes:
         shape: rows and columns.
-        gsd_m: side of a cell in metres.
-        corner_m: X and Y of the outer corner of the top-left cell.
-        down: change of Y per metre down the rows, -1 or 1.
+        place: its position; the coordinate system is not included.
         bands: number of bands.
         dtype: numpy's name of the stored type.
     """
@@ -423,17 +396,25 @@ class RasterParts:
         with _reading(self._path):
             self._dataset: DatasetReader = rasterio.open(path, driver="GTiff")
             check_header(path, self._dataset)
+        transform = self._dataset.transform
         self.shape: tuple[int, int] = (self._dataset.height, self._dataset.width)
-        self.gsd_m = _gsd_m(path, self._dataset.transform)
-        self.corner_m = (float(self._dataset.transform.c), float(self._dataset.transform.f))
-        self.down = math.copysign(1.0, self._dataset.transform.e)
+        self.place = GridPlace(
+            gsd_m=_gsd_m(path, transform),
+            corner_m=(float(transform.c), float(transform.f)),
+            down=math.copysign(1.0, transform.e),
+        )
         self.bands: int = self._dataset.count
         self.dtype: str = self._dataset.dtypes[0]
 
     @property
-    def place(self) -> GridPlace:
-        """Return its position; the coordinate system is not included."""
-        return GridPlace(gsd_m=self.gsd_m, corner_m=self.corner_m, down=self.down)
+    def gsd_m(self) -> float:
+        """Return the side of a cell in metres."""
+        return self.place.gsd_m
+
+    @property
+    def corner_m(self) -> tuple[float, float]:
+        """Return X and Y of the outer corner of the top-left cell."""
+        return self.place.corner_m
 
     def __enter__(self) -> Self:
         return self
@@ -467,6 +448,32 @@ class RasterParts:
         values = read[0] if self.bands == 1 else np.moveaxis(read, 0, 2)
         return values, shown > 0
 
+    def header(self) -> RasterPlace:
+        """Return what the file states of itself."""
+        from rasterio.warp import transform
+
+        dataset = self._dataset
+        with _reading(self._path):
+            epsg = dataset.crs.to_epsg() if dataset.crs else None
+            left, first, right, last = dataset.bounds
+            bottom, top = sorted((first, last))
+            outline: tuple[tuple[float, float], ...] = ()
+            if epsg is not None:
+                x, y = (left, right, right, left, left), (bottom, bottom, top, top, bottom)
+                lon, lat = transform(dataset.crs, "EPSG:4326", x, y)
+                outline = tuple(zip(lon, lat, strict=True))
+            return RasterPlace(
+                shape=self.shape,
+                transform=tuple(dataset.transform)[:6],
+                epsg=epsg,
+                wkt=dataset.crs.to_wkt() if dataset.crs else "",
+                wkt2=dataset.crs.to_wkt(version="WKT2_2019") if dataset.crs else "",
+                bounds=(left, bottom, right, top),
+                outline_lonlat=outline,
+                bands=tuple(dataset.dtypes),
+                tags=dict(dataset.tags()),
+            )
+
 
 def check_header(path: Path, dataset: DatasetReader) -> None:
     """Refuse a file that references others, or states more than any file of its size can hold.
@@ -486,17 +493,6 @@ def check_header(path: Path, dataset: DatasetReader) -> None:
         raise InputError(
             f"{path.name} says it has {dataset.width} x {dataset.height} cells in "
             f"{dataset.count} bands, but {stored} bytes cannot hold as many: export it again"
-        )
-
-
-def _check_size(path: Path, dataset: DatasetReader) -> None:
-    """Refuse what a small file can state and no orthoimage has, before memory is allocated."""
-    cells = dataset.width * dataset.height
-    if cells > MOST_CELLS or dataset.count > MOST_BANDS:
-        raise InputError(
-            f"{path.name} is too large: {dataset.width} x {dataset.height} cells in "
-            f"{dataset.count} bands, at most {MOST_CELLS} cells and {MOST_BANDS} bands are read; "
-            "export it with larger cells or in parts"
         )
 
 
@@ -626,45 +622,32 @@ class RasterPlace:
         shape: rows and columns.
         transform: six numbers, X of the column, X of the row, X of the corner, and so for Y.
         epsg: code of the coordinate system, None for one without a code.
-        wkt2: coordinate system.
+        wkt: coordinate system, as GDAL gives it.
+        wkt2: the same as WKT 2.
         bounds: smallest X and Y, largest X and Y, in the coordinate system.
         outline_lonlat: corners on Earth, counter-clockwise and closed, longitude and latitude in
             degrees; empty if the coordinate system has no position on Earth.
         bands: type of each band.
+        tags: the dataset's tags.
     """
 
     shape: tuple[int, int]
     transform: tuple[float, ...]
     epsg: int | None
+    wkt: str = ""
     wkt2: str
     bounds: tuple[float, float, float, float]
     outline_lonlat: tuple[tuple[float, float], ...]
     bands: tuple[str, ...]
+    tags: Mapping[str, str] = field(default_factory=dict)
 
 
 def place_of(path: Path) -> RasterPlace:
     """Read the header of a GeoTIFF.
 
     Raises:
-        InputError: GDAL cannot read the file, or it states more than any file of its size can hold.
+        InputError: GDAL cannot read the file, its cells are not square and upright, or it states
+            more than any file of its size can hold.
     """
-    from rasterio.warp import transform
-
-    with _opened(path) as dataset:
-        epsg = dataset.crs.to_epsg() if dataset.crs else None
-        left, first, right, last = dataset.bounds
-        bottom, top = sorted((first, last))
-        outline: tuple[tuple[float, float], ...] = ()
-        if epsg is not None:
-            x, y = (left, right, right, left, left), (bottom, bottom, top, top, bottom)
-            lon, lat = transform(dataset.crs, "EPSG:4326", x, y)
-            outline = tuple(zip(lon, lat, strict=True))
-        return RasterPlace(
-            shape=(dataset.height, dataset.width),
-            transform=tuple(dataset.transform)[:6],
-            epsg=epsg,
-            wkt2=dataset.crs.to_wkt(version="WKT2_2019") if dataset.crs else "",
-            bounds=(left, bottom, right, top),
-            outline_lonlat=outline,
-            bands=tuple(dataset.dtypes),
-        )
+    with RasterParts(path) as raster:
+        return raster.header()

@@ -204,13 +204,11 @@ def test_orthoimages_are_told_completely(
     read = geotiff.read_raster(tmp_path / "wall_7_ortho.tif")
     np.testing.assert_array_equal(read.values, RGB)
     np.testing.assert_array_equal(read.shown, shown)
-    assert read.nodata is None
     tags = {**TAGS, "name": "north"}
     assert {key: read.tags[key] for key in [*tags, "content"]} == {**tags, "content": content}
     mask = geotiff.read_raster(tmp_path / "wall_7_ortho_mask.tif")
     np.testing.assert_array_equal(mask.values, MASK)
     assert mask.tags == {**tags, "content": of_mask}
-    assert mask.nodata is None
     for suffix in (".tfw", ".pgw"):
         assert (tmp_path / f"wall_7_ortho{suffix}").read_text() == WORLD_FILE
     preview = picture(tmp_path / "wall_7_ortho.png")

@@ -13,7 +13,7 @@ from orthoflow_plugins.raster.frames import mapped
 from orthoflow_plugins.raster.grid import RasterGrid
 
 from orthoflow.errors import MethodError
-from orthoflow.files.geotiff import GridPlace, read_raster
+from orthoflow.files.geotiff import read_raster
 from orthoflow.files.publishing import publish_walls
 from orthoflow.files.sidecars import frame_json, frame_of_raster
 from orthoflow.geometry.frames import WallFrame, frame_over, rotation_from_vector
@@ -117,10 +117,10 @@ def test_a_map_reads_back_to_where_it_lies(tmp_path: Path) -> None:
     publish_walls(walls, tmp_path, "digest")
     raster = read_raster(tmp_path / "wall_0_depth.tif")
     assert 'AUTHORITY["EPSG","2100"]' in raster.crs_wkt
-    assert raster.corner_m == pytest.approx(tuple(frame.origin_world[:2]), abs=1e-9)
+    assert raster.place.corner_m == pytest.approx(tuple(frame.origin_world[:2]), abs=1e-9)
     again = frame_of_raster(
         frame_json(walls.walls[0].frame),
-        raster=GridPlace(gsd_m=raster.gsd_m, corner_m=raster.corner_m),
+        raster=raster.place,
         shape=raster.values.shape,
         name="map",
     )
