@@ -18,8 +18,8 @@ import numpy as np
 
 from benchmarks.large_exports import own_mib, watch
 from benchmarks.tiled_orthoimage import largest_mib
+from orthoflow.files.clouds.attributes import AttributedCloud
 from orthoflow.files.clouds.copc import write_copc
-from orthoflow.files.clouds.dressing import DressedCloud
 from orthoflow.files.clouds.neighbourhoods import neighbourhoods_of
 from orthoflow.files.clouds.writers import write_e57, write_laz, write_ply
 from orthoflow.products import PointCloud
@@ -68,12 +68,12 @@ def export(name: str, folder: Path, n_points: int) -> None:
     watcher = threading.Thread(target=watch, args=(peaks, is_over))
     watcher.start()
     before, first = time.perf_counter(), time.process_time()
-    dressed = DressedCloud(
+    attributed = AttributedCloud(
         cloud=cloud, colouring="intensity", neighbourhoods=neighbourhoods_of(cloud)
     )
     looked = time.perf_counter() - before
     path = folder / f"cloud.{name}"
-    WRITERS[name](path, dressed)
+    WRITERS[name](path, attributed)
     is_over.set()
     watcher.join()
     print(

@@ -20,7 +20,7 @@ from orthoflow_plugins.read.scan import ReadScan
 from plane_streaming import fastest, measured
 
 from orthoflow.engine.store import digest_of
-from orthoflow.files.clouds.dressing import DressedCloud
+from orthoflow.files.clouds.attributes import AttributedCloud
 from orthoflow.files.clouds.neighbourhoods import neighbourhoods_of
 from orthoflow.files.clouds.writers import write_e57, write_ply
 from orthoflow.products import InputFiles
@@ -68,13 +68,13 @@ def main() -> None:
 def write(folder: Path, n_points: int, n_files: int) -> None:
     """Write a room, and links to it that stand for other files."""
     cloud = mapped_room(folder, n_points)
-    dressed = DressedCloud(
+    attributed = AttributedCloud(
         cloud=cloud, colouring="intensity", neighbourhoods=neighbourhoods_of(cloud)
     )
     for name, write_cloud in WRITERS.items():
         first = folder / f"room_0.{name}"
         if not first.exists():
-            write_cloud(first, dressed)
+            write_cloud(first, attributed)
         for k in range(1, n_files):
             other = folder / f"room_{k}.{name}"
             if not other.exists():

@@ -63,8 +63,8 @@ class DiagnosticSpec:
     """
 
     code: str
-    severity: Severity
     text: str
+    severity: Severity = "warning"
     remedy: str = ""
     rank_by: str = ""
     settled_by: tuple[str, ...] = ()

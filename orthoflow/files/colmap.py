@@ -186,8 +186,8 @@ def read_colmap_model(parts: Sequence[Path]) -> tuple[GivenCamera, ...]:
             model = pycolmap.Reconstruction(folder)
         except Exception as error:  # pycolmap raises what its checks in C++ become
             # In the order of its sources.
-            said = " ".join(str(error).rpartition("] ")[2].split())[:_MAX_SAID]
-            raise damaged(images, f"pycolmap cannot read the COLMAP model ({said})") from error
+            reason = " ".join(str(error).rpartition("] ")[2].split())[:_MAX_SAID]
+            raise damaged(images, f"pycolmap cannot read the COLMAP model ({reason})") from error
     if not model.images:
         raise damaged(images, "the model has no images")
     if len(model.images) > MOST_CAMERAS or len(model.cameras) > MOST_CAMERAS:

@@ -491,7 +491,7 @@ def check_header(path: Path, dataset: DatasetReader) -> None:
     stored = path.stat().st_size
     if declared > max(_ALWAYS_ALLOWED_VALUES, _LARGEST_RATIO * stored):
         raise InputError(
-            f"{path.name} says it has {dataset.width} x {dataset.height} cells in "
+            f"{path.name} states {dataset.width} x {dataset.height} cells in "
             f"{dataset.count} bands, but {stored} bytes cannot hold as many: export it again"
         )
 
@@ -597,21 +597,21 @@ def let_go_of_untrusted_text() -> None:
     It tries this in a callback, which cannot raise, and so prints the error in both of Python's
     ways. GDAL's own error about the file is raised afterwards.
     """
-    hear, show = sys.unraisablehook, sys.excepthook
+    log_unraisable, show_exception = sys.unraisablehook, sys.excepthook
 
-    def hear_rest(unraisable: sys.UnraisableHookArgs) -> None:
+    def log_others(unraisable: sys.UnraisableHookArgs) -> None:
         in_rasterio = "rasterio" in str(unraisable.object)
         if not (in_rasterio and isinstance(unraisable.exc_value, UnicodeDecodeError)):
-            hear(unraisable)
+            log_unraisable(unraisable)
 
-    def show_rest(
+    def show_others(
         kind: type[BaseException], error: BaseException, trace: TracebackType | None
     ) -> None:
         # An exception that ends a program has passed through a line of it.
         if not (trace is None and isinstance(error, UnicodeDecodeError)):
-            show(kind, error, trace)
+            show_exception(kind, error, trace)
 
-    sys.unraisablehook, sys.excepthook = hear_rest, show_rest
+    sys.unraisablehook, sys.excepthook = log_others, show_others
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -334,7 +334,7 @@ class OrthoFile:
         return self.about.name
 
     def shrunk(self, longest_px: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Colours (r, c, 3) and what is shown (r, c), averaged to at most so many pixels a side.
+        """Colours (r, c, 3) and what is shown (r, c), averaged to at most `longest_px` a side.
 
         Raises:
             InputError: the file cannot be read.
@@ -345,7 +345,7 @@ class OrthoFile:
         return self._read(slice(0, rows), shape)
 
     def bands(self, n_rows: int) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.bool_]]]:
-        """Return colours and what is shown, so many rows at a time from the top.
+        """Return colours and what is shown, `n_rows` at a time from the top.
 
         Raises:
             InputError: the file cannot be read.

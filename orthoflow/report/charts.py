@@ -184,7 +184,7 @@ def plan_chart(
     """
     from matplotlib.figure import Figure  # noqa: PLC0415 - pages without charts need none
 
-    from orthoflow.files.clouds.dressing import plane_ink  # noqa: PLC0415 - likewise
+    from orthoflow.files.clouds.attributes import plane_ink  # noqa: PLC0415 - likewise
 
     feet, looks = (np.array([photo[k] for photo in photos]).reshape(-1, 2) for k in (1, 2))
     span = float(np.ptp(np.vstack([*(wall[2] for wall in walls), feet]), axis=0).max()) or 1.0

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
-    from orthoflow.files.clouds.dressing import Colouring
+    from orthoflow.files.clouds.attributes import Colouring
     from orthoflow.files.drawings.words import Language
     from orthoflow.report.charts import ChartFormat
 

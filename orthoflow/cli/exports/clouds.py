@@ -23,8 +23,8 @@ from orthoflow.cli.exports.products import (
 )
 from orthoflow.cli.tables import counted
 from orthoflow.errors import ArgumentError
+from orthoflow.files.clouds.attributes import AttributedCloud, Colouring, describe_cloud
 from orthoflow.files.clouds.copc import write_copc
-from orthoflow.files.clouds.dressing import Colouring, DressedCloud, describe_cloud
 from orthoflow.files.clouds.neighbourhoods import neighbourhoods_of
 from orthoflow.files.clouds.photo_colours import UNSEEN_GREY, PointColours, colour_points
 from orthoflow.files.clouds.writers import write_e57, write_laz, write_ply
@@ -80,7 +80,7 @@ def _export(
     run: Run,
     folder: Path,
     chosen: Choices,
-    target: tuple[str, Callable[[Path, DressedCloud], int]],
+    target: tuple[str, Callable[[Path, AttributedCloud], int]],
 ) -> str:
     name, write = target
     found = _found(run, chosen)
@@ -92,7 +92,7 @@ def _export(
         )
     wall, wall_plane = _wall(found.walls, chosen.wall)
     box_world = _box(chosen.box)
-    dressed = DressedCloud(
+    attributed = AttributedCloud(
         cloud=found.cloud,
         colouring=colouring,
         neighbourhoods=neighbourhoods_of(found.cloud),
@@ -106,16 +106,16 @@ def _export(
         crs_wkt=_crs_wkt(found.walls),
         name=found.digest,
     )
-    if dressed.is_empty:
+    if attributed.is_empty:
         raise ArgumentError(
             f"no point of the cloud of {found.address} is left: choose another --wall or --box"
         )
     make_empty(folder)
     with tempfile.TemporaryDirectory(dir=folder) as scratch:
         if colouring == "photos":
-            dressed = replace(dressed, photo_colours=_photo_colours(found, Path(scratch)))
-        n_written = write(folder / name, dressed)
-        describe_cloud(folder / "cloud.json", dressed, name, n_written)
+            attributed = replace(attributed, photo_colours=_photo_colours(found, Path(scratch)))
+        n_written = write(folder / name, attributed)
+        describe_cloud(folder / "cloud.json", attributed, name, n_written)
     of_all = "" if n_written == len(found.cloud) else f" of {len(found.cloud)}"
     return f"{name}: {counted(n_written, 'point')}{of_all} by {colouring}, cloud of {found.address}"
 

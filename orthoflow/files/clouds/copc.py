@@ -20,7 +20,7 @@ from typing import Any, BinaryIO, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.clouds.dressing import BLOCK, DressedCloud
+from orthoflow.files.clouds.attributes import BLOCK, AttributedCloud
 from orthoflow.files.clouds.writers import las_header, las_record
 from orthoflow.files.points.scan_file import load_library
 
@@ -85,7 +85,7 @@ class _Nodes:
     count: NDArray[np.int64]
 
 
-def write_copc(path: Path, dressed: DressedCloud) -> int:
+def write_copc(path: Path, attributed: AttributedCloud) -> int:
     """Write the chosen points, and return their number.
 
     Raises:
@@ -93,9 +93,9 @@ def write_copc(path: Path, dressed: DressedCloud) -> int:
         OSError: the disk cannot be written.
     """
     laspy = load_library("laspy", path)
-    header = las_header(laspy, dressed)
+    header = las_header(laspy, attributed)
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        waiting = _waiting(laspy, header, dressed, Path(folder))
+        waiting = _waiting(laspy, header, attributed, Path(folder))
         if waiting is None:
             return 0
         with path.open("w+b") as file:
@@ -141,12 +141,12 @@ def _write(file: BinaryIO, laspy: Any, header: Any, waiting: _Waiting) -> None:
     header.write_to(file, ensure_same_size=True)
 
 
-def _waiting(laspy: Any, header: Any, dressed: DressedCloud, folder: Path) -> _Waiting | None:
+def _waiting(laspy: Any, header: Any, attributed: AttributedCloud, folder: Path) -> _Waiting | None:
     """Write the chosen points to files, with their positions on the curve, sorted into groups."""
     lowest, highest = [], []
     kind = None
     with (folder / "records").open("wb") as stream:
-        for points in dressed.blocks():
+        for points in attributed.blocks():
             array = las_record(laspy, header, points).array
             kind = array.dtype
             stream.write(array.tobytes())

@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.clouds.dressing import BLOCK, DressedCloud, Points
+from orthoflow.files.clouds.attributes import BLOCK, AttributedCloud, Points
 from orthoflow.files.points.scan_file import load_library
 from orthoflow.products import PointCloud
 from orthoflow.version import __version__
@@ -32,7 +32,7 @@ _LARGEST: Final = 2.0**30
 NORMAL_FIELDS: Final = ("NormalX", "NormalY", "NormalZ")
 
 
-def write_laz(path: Path, dressed: DressedCloud) -> int:
+def write_laz(path: Path, attributed: AttributedCloud) -> int:
     """Write the selected points, piece by piece; return their number.
 
     World coordinates are stored to a tenth of a millimetre, relative to the offset of the header.
@@ -41,10 +41,10 @@ def write_laz(path: Path, dressed: DressedCloud) -> int:
         PluginError: laspy does not load.
     """
     laspy = load_library("laspy", path)
-    header = las_header(laspy, dressed)
+    header = las_header(laspy, attributed)
     n_written = 0
     with laspy.open(path, mode="w", header=header) as writer:
-        for points in dressed.blocks():
+        for points in attributed.blocks():
             writer.write_points(las_record(laspy, header, points))
             n_written += len(points)
     return n_written
@@ -69,18 +69,19 @@ def las_record(laspy: Any, header: Any, points: Points) -> Any:
     return record
 
 
-def las_header(laspy: Any, dressed: DressedCloud) -> Any:
+def las_header(laspy: Any, attributed: AttributedCloud) -> Any:
     """Return the header of a cloud, without points."""
-    cloud = dressed.cloud
+    cloud = attributed.cloud
     header = laspy.LasHeader(point_format=_POINT_FORMAT, version=_VERSION)
     extra: list[tuple[str, type[np.generic], str]] = [
         (name, np.float32, "of the surface, 0 0 0 unknown") for name in NORMAL_FIELDS
     ]
-    if dressed.labels is not None:
+    if attributed.labels is not None:
         extra.append(("plane", np.int16, "plane, -1 for none"))
-    if dressed.wall is not None or (dressed.labels is not None and dressed.planes is not None):
+    has_planes = attributed.labels is not None and attributed.planes is not None
+    if attributed.wall is not None or has_planes:
         extra.append(("deviation", np.float32, "m from the plane, to viewer"))
-    if dressed.photo_colours is not None:
+    if attributed.photo_colours is not None:
         extra.append(("photo", np.int16, "photo of the colour, -1 none"))
     header.add_extra_dims(
         [
@@ -92,8 +93,8 @@ def las_header(laspy: Any, dressed: DressedCloud) -> Any:
     header.offsets = np.floor(cloud.origin)
     # LAS 1.4 requires it with this point format, with or without a known coordinate system.
     header.global_encoding.wkt = True
-    if dressed.crs_wkt:
-        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(dressed.crs_wkt))
+    if attributed.crs_wkt:
+        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(attributed.crs_wkt))
     # Independent of the date, so that the same cloud gives the same bytes.
     header.creation_date = _NO_DATE
     header.generating_software = "orthoflow"
@@ -112,7 +113,7 @@ _TYPES: Final = {"f8": "double", "f4": "float", "u1": "uchar", "u2": "ushort", "
 _DIGITS: Final = 12
 
 
-def write_ply(path: Path, dressed: DressedCloud) -> int:
+def write_ply(path: Path, attributed: AttributedCloud) -> int:
     """Write the selected points, piece by piece; return their number.
 
     Raises:
@@ -121,10 +122,10 @@ def write_ply(path: Path, dressed: DressedCloud) -> int:
     n_written = 0
     count_at = 0
     with path.open("wb") as stream:
-        for points in dressed.blocks():
+        for points in attributed.blocks():
             records = _records(points)
             if n_written == 0:
-                count_at = stream.write(_head(dressed))
+                count_at = stream.write(_head(attributed))
                 stream.write(_rest_of_head(records))
             stream.write(records.tobytes())
             n_written += len(points)
@@ -134,8 +135,8 @@ def write_ply(path: Path, dressed: DressedCloud) -> int:
     return n_written
 
 
-def _head(dressed: DressedCloud) -> bytes:
-    crs = " ".join(dressed.crs_wkt.split()) or "not known"
+def _head(attributed: AttributedCloud) -> bytes:
+    crs = " ".join(attributed.crs_wkt.split()) or "not known"
     lines = (
         *("ply", "format binary_little_endian 1.0", "comment orthoflow, metres"),
         f"comment coordinate system {crs}",
@@ -194,7 +195,7 @@ class _Writer:
         return self.libe57.StringNode(self.image, value)
 
 
-def write_e57(path: Path, dressed: DressedCloud) -> int:
+def write_e57(path: Path, attributed: AttributedCloud) -> int:
     """Write the selected points, scan by scan and piece by piece; return their number.
 
     A scan with a known station has it as its pose, and points relative to it, along the axes of the
@@ -207,24 +208,24 @@ def write_e57(path: Path, dressed: DressedCloud) -> int:
     libe57 = load_library("pye57", path).libe57
     writer = _Writer(libe57=libe57, image=libe57.ImageFile(str(path), "w"))
     try:
-        scans = _write_head(writer, dressed)
-        return sum(_write_scan(writer, scans, dressed, scan) for scan in dressed.scans)
+        scans = _write_head(writer, attributed)
+        return sum(_write_scan(writer, scans, attributed, scan) for scan in attributed.scans)
     finally:
         writer.image.close()
 
 
-def _write_head(writer: _Writer, dressed: DressedCloud) -> Any:
+def _write_head(writer: _Writer, attributed: AttributedCloud) -> Any:
     """Write what precedes the scans, independent of the date; return the list of scans."""
     libe57, image = writer.libe57, writer.image
     for prefix, uri in {"": libe57.E57_V1_0_URI, **EXTENSIONS}.items():
         image.extensionsAdd(prefix, uri)
     root = image.root()
-    unique = uuid.uuid5(uuid.NAMESPACE_URL, f"urn:orthoflow:{dressed.name}")
+    unique = uuid.uuid5(uuid.NAMESPACE_URL, f"urn:orthoflow:{attributed.name}")
     for name, text in (
         ("formatName", "ASTM E57 3D Imaging Data File"),
         ("guid", f"{{{unique}}}"),
         ("e57LibraryVersion", libe57.E57_LIBRARY_ID),
-        ("coordinateMetadata", dressed.crs_wkt),
+        ("coordinateMetadata", attributed.crs_wkt),
     ):
         root.set(name, writer.text(text))
     root.set("versionMajor", libe57.IntegerNode(image, libe57.E57_FORMAT_MAJOR))
@@ -236,17 +237,17 @@ def _write_head(writer: _Writer, dressed: DressedCloud) -> Any:
     return scans
 
 
-def _write_scan(writer: _Writer, scans: Any, dressed: DressedCloud, scan: int) -> int:
-    station = dressed.station(scan)
-    centre = dressed.cloud.origin if station is None else station
-    limits = dressed.bounds_world(scan)
+def _write_scan(writer: _Writer, scans: Any, attributed: AttributedCloud, scan: int) -> int:
+    station = attributed.station(scan)
+    centre = attributed.cloud.origin if station is None else station
+    limits = attributed.bounds_world(scan)
     if limits is None:
         return 0
     low, high = limits - centre
     node = writer.libe57.StructureNode(writer.image)
     name = f"scan {scan}" if station is not None else f"scan {scan}, station not known"
     # The same cloud gets the same name.
-    unique = uuid.uuid5(uuid.NAMESPACE_URL, f"urn:orthoflow:{dressed.name}:{scan}")
+    unique = uuid.uuid5(uuid.NAMESPACE_URL, f"urn:orthoflow:{attributed.name}:{scan}")
     node.set("guid", writer.text(f"{{{unique}}}"))
     node.set("name", writer.text(name))
     node.set("description", writer.text(f"orthoflow {__version__}"))
@@ -256,26 +257,26 @@ def _write_scan(writer: _Writer, scans: Any, dressed: DressedCloud, scan: int) -
     node.set("cartesianBounds", writer.group(**bounds))
     colours = {f"{name}{end}": v for name in _COLOURS for end, v in _ends(0, 255)}
     node.set("colorLimits", writer.group(**colours))
-    if dressed.cloud.intensity is not None:
+    if attributed.cloud.intensity is not None:
         node.set("intensityLimits", writer.group(intensityMinimum=0.0, intensityMaximum=1.0))
     pose = writer.libe57.StructureNode(writer.image)
     pose.set("rotation", writer.group(w=1.0, x=0.0, y=0.0, z=0.0))
     place = dict(zip("xyz", map(float, centre), strict=True))
     pose.set("translation", writer.group(**place))
     node.set("pose", pose)
-    return _write_points(writer, scans, node, dressed, (scan, centre))
+    return _write_points(writer, scans, node, attributed, (scan, centre))
 
 
 def _write_points(
     writer: _Writer,
     scans: Any,
     node: Any,
-    dressed: DressedCloud,
+    attributed: AttributedCloud,
     placed: tuple[int, NDArray[np.float64]],
 ) -> int:
     scan, centre = placed
     libe57, image = writer.libe57, writer.image
-    arrays = _columns(next(dressed.blocks(scan)), centre)
+    arrays = _columns(next(attributed.blocks(scan)), centre)
     prototype = libe57.StructureNode(image)
     buffers = libe57.VectorSourceDestBuffer()
     kept = {name: np.zeros(BLOCK, dtype=values.dtype.type) for name, values in arrays.items()}
@@ -291,7 +292,7 @@ def _write_points(
     scans.append(node)
     stream = points.writer(buffers)
     n_written = 0
-    for block in dressed.blocks(scan):
+    for block in attributed.blocks(scan):
         for name, values in _columns(block, centre).items():
             kept[name][: len(block)] = values
         stream.write(len(block))

@@ -1,6 +1,6 @@
 """Scans as files of other programs, read block by block: `open_scan` chooses the reader."""
 
 from orthoflow.files.points.formats import FORMATS, open_scan
-from orthoflow.files.points.scan_file import PointBlock, Scan, ScanFile, Wish
+from orthoflow.files.points.scan_file import PointBlock, PointQuery, Scan, ScanFile
 
-__all__ = ["FORMATS", "PointBlock", "Scan", "ScanFile", "Wish", "open_scan"]
+__all__ = ["FORMATS", "PointBlock", "PointQuery", "Scan", "ScanFile", "open_scan"]

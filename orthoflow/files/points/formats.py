@@ -11,7 +11,7 @@ from typing import Final
 
 from orthoflow.errors import InputError
 from orthoflow.files.points.fields import Columns
-from orthoflow.files.points.scan_file import ScanFile, Wish
+from orthoflow.files.points.scan_file import PointQuery, ScanFile
 
 # The densest encodings take a byte for eight points; a small file that states more is refused
 # before memory is allocated for them.
@@ -118,7 +118,7 @@ def open_scan(
     columns: Columns | None = None,
     *,
     classes: Collection[int] = (),
-    wish: Wish | None = None,
+    query: PointQuery | None = None,
     intensity_field: str | None = None,
 ) -> ScanFile:
     """Open a point file up to its header.
@@ -127,7 +127,7 @@ def open_scan(
         path: the file.
         columns: meaning of the columns of a text file, if the user states it.
         classes: of a LAS or LAZ file only points of these classes are read; all if empty.
-        wish: of a COPC file only parts with such points are read; others are read completely.
+        query: of a COPC file only parts with such points are read; others are read completely.
         intensity_field: name of the field to use as the intensity; None for the usual one.
 
     Raises:
@@ -139,7 +139,7 @@ def open_scan(
     if found is TEXT:
         choice["columns"] = columns
     if found is LAS:
-        choice |= {"classes": classes, "wish": wish}
+        choice |= {"classes": classes, "query": query}
     module, function = found.reader
     scan: ScanFile = getattr(import_module(f"{__package__}.{module}"), function)(path, **choice)
     n_bytes = path.stat().st_size

@@ -28,10 +28,10 @@ from orthoflow.files.points.fields import columns_of_names
 from orthoflow.files.points.scan_file import (
     BLOCK_POINTS,
     PointBlock,
+    PointQuery,
     Scan,
     ScanFile,
     Values,
-    Wish,
     cut_off,
     load_library,
     point_block,
@@ -81,7 +81,7 @@ def open_las(
     path: Path,
     *,
     classes: Collection[int] = (),
-    wish: Wish | None = None,
+    query: PointQuery | None = None,
     intensity_field: str | None = None,
 ) -> ScanFile:
     """Open a LAS, LAZ or COPC file.
@@ -89,7 +89,7 @@ def open_las(
     Args:
         path: the file.
         classes: only points of these classes are read; all if empty.
-        wish: of a COPC file only nodes with such points are read.
+        query: of a COPC file only nodes with such points are read.
         intensity_field: name of the field to use as the intensity; None for the usual one.
     """
     laspy = load_library("laspy", path)
@@ -101,7 +101,7 @@ def open_las(
         n_points = _count_points(path, header, notes)
         chunks = _checked_chunks(path, header) if n_points > 0 else []
         unit = _unit(path, header)
-    nodes = _chosen_nodes(path, chunks, wish) if wish and chunks else None
+    nodes = _chosen_nodes(path, chunks, query) if query and chunks else None
     if nodes is not None:
         n_points = sum(node.n_points for node in nodes)
     names = tuple(header.point_format.dimension_names)
@@ -451,7 +451,7 @@ def _records(
             yield record(points.view(row))
 
 
-def _chosen_nodes(path: Path, chunks: Sequence[_Chunk], wish: Wish) -> list[_Chunk] | None:
+def _chosen_nodes(path: Path, chunks: Sequence[_Chunk], query: PointQuery) -> list[_Chunk] | None:
     """Return the nodes of a COPC file with requested points, in the order of the file.
 
     The first level whose points are no farther apart than requested is the last one. If no node
@@ -480,20 +480,20 @@ def _chosen_nodes(path: Path, chunks: Sequence[_Chunk], wish: Wish) -> list[_Chu
     if not set(nodes.values()) <= set(chunks):
         raise _bad_octree(path, "it names chunks that the file does not have")
     last = _LEVELS_MOST
-    if wish.spacing is not None:
+    if query.spacing is not None:
         # One by one: a damaged file's spacing may be so large that the quotient is not finite.
-        levels = math.log2(spacing) - math.log2(wish.spacing)
+        levels = math.log2(spacing) - math.log2(query.spacing)
         last = max(0, math.ceil(levels - 1e-9))
     # Coordinates are rounded to steps of the file.
     slack = 2e-6 * half
 
     def is_wanted(level: int, *place: int) -> bool:
-        if wish.box is None or level > last:
+        if query.box is None or level > last:
             return level <= last
         side = 2.0 * half / 2.0**level
         low = np.array(middle) - half + side * np.array(place)
         return bool(
-            np.all(wish.box[0] <= low + side + slack) and np.all(wish.box[1] >= low - slack)
+            np.all(query.box[0] <= low + side + slack) and np.all(query.box[1] >= low - slack)
         )
 
     found = [chunk for key, chunk in nodes.items() if is_wanted(*key)]

@@ -64,7 +64,7 @@ class _Part:
         n_rows: rows of the grid; points come column by column.
         n_places: rows times columns.
         pose: rotation and translation, world from scan.
-        layout: how the numbers of a line are told apart.
+        layout: how the numbers of a line are separated.
     """
 
     start: int

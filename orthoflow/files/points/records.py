@@ -240,7 +240,7 @@ def _open_pcd(
 
 # Any: a partial function that yields values by meaning.
 def _blocks(read: Any, width: int = 0) -> Iterator[PointBlock]:
-    """Blocks of points; of an organised cloud with their places in a grid so many points wide."""
+    """Blocks of points; of an organised cloud with their places in a grid `width` points wide."""
     start = 0
     for values in read():
         if width:

@@ -134,7 +134,7 @@ class ScanFile:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Wish:
+class PointQuery:
     """The requested points of a file; a reader may return more.
 
     Attributes:

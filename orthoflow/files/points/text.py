@@ -66,7 +66,7 @@ _NO_WORD: Final = re.compile(
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    r"""How the numbers of a line are told apart.
+    r"""How the numbers of a line are separated.
 
     Attributes:
         separator: pattern for pandas: a character, or `\s+` for any white space.
@@ -91,7 +91,7 @@ def open_text(
 
     Args:
         path: the file.
-        columns: what the columns are, if the user says so.
+        columns: what the columns are, if the user states it.
         intensity_field: name of the column that is the intensity; None for the usual one.
 
     Raises:
@@ -303,7 +303,7 @@ def _numbers(line: str, layout: Layout) -> list[float]:
 
 
 def take_lines(file: BinaryIO, n_lines: int, *, first_line: int) -> list[bytes]:
-    """Read the next lines of a file, at most so many; never more of a line than it may have.
+    """Read the next lines of a file, up to a number; never more of a line than it may have.
 
     Raises:
         InputError: a line is longer than `MOST_LINE_BYTES`.
@@ -334,9 +334,9 @@ def read_table(
 
     Args:
         file: open at the start of a line.
-        layout: how numbers are told apart.
+        layout: how numbers are separated.
         columns: which columns are wanted, counted from 0.
-        n_lines: at most so many lines are read.
+        n_lines: maximum number of lines.
         first_line: number of the next line, counted from 1, for messages.
 
     Returns:

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
-from orthoflow.files.clouds.dressing import plane_ink
+from orthoflow.files.clouds.attributes import plane_ink
 from orthoflow.geometry import omega_phi_deg, wall_axes
 from orthoflow.geometry.frames import basis_from_up
 from orthoflow.products import Planes, PointCloud, Thickness

@@ -21,7 +21,7 @@ from orthoflow_plugins.read.scales import ColourScale
 
 # Coordinates rounded more coarsely than this limit what an orthoimage can show.
 COARSE_M: Final = 0.005
-# Offsets keep half a tenth of a millimetre; beyond, the user is told.
+# Offsets keep half a tenth of a millimetre; beyond, a warning is reported.
 FINE_M: Final = 5e-5
 _POINT_BYTES: Final = 40
 _MOST_SCANS: Final = 2**16
@@ -314,7 +314,7 @@ def rounding_m(points: NDArray[np.float64], unit_m: float) -> float:
 
     Returns:
         The largest step on which all values of an axis lie, the finest of the axes; 0 when that
-        is finer than `COARSE_M` or cannot be told.
+        is finer than `COARSE_M` or unknown.
     """
     sample = points[:: max(1, len(points) // _ROUNDING_SAMPLE)]
     found = []

@@ -24,13 +24,11 @@ _NAMED = 3
 _EXPORT_OTHERWISE = "align with the model Brown3, or export a COLMAP model"
 LIMITED: Final = DiagnosticSpec(
     code="cameras-limited",
-    severity="warning",
     text="{note} ({n} photos, such as {subject})",
     rank_by="n",
 )
 NOT_ORIENTED: Final = DiagnosticSpec(
     code="photo-not-oriented",
-    severity="warning",
     text="photo {subject} is not oriented: {status}",
 )
 

@@ -26,7 +26,7 @@ _WALL_STEP_DEG: Final = 2.0
 _WALL_FARTHEST_M: Final = 1000.0
 _WALL_CELL_M: Final = 0.05
 _WALL_REACH_M: Final = 0.15
-# Points of a line that lie farther apart than so many usual steps are not joined.
+# Points of a line that lie farther apart than this many usual steps are not joined.
 _BREAK_STEPS: Final = 6.0
 
 _SHEET_SIDE_PX: Final = 1200
@@ -92,11 +92,11 @@ def polar_view_png(cloud: PointCloud) -> bytes | None:
 
 
 def scan_lines_png(cloud: PointCloud) -> bytes | None:
-    """Give a PNG of a wall in rectangular coordinates, with rows and columns of the scan as lines.
+    """Return a PNG of a wall in rectangular coordinates, with lines along rows and columns.
 
     The wall is the vertical plane with most points of the scan with most points, seen squarely, up
-    is up; beside it lies what else of that scan is within 15 cm of the plane. Every so manieth row
-    is a yellow line, every so manieth column a blue one (markiewicz2015, Figure 2b): where they
+    is up; beside it lies what else of that scan is within 15 cm of the plane. Some
+    rows are yellow lines, some columns blue ones (markiewicz2015, Figure 2b): where they
     bend, something stands before the wall. None where the cloud has no grid.
     """
     import cv2
@@ -224,7 +224,7 @@ def _fullest_cell(distances_m: NDArray[np.float64]) -> tuple[int, float]:
 
 
 def _some_lines(lines: NDArray[np.int64], order: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
-    """Points (indices) of every so manieth line of a scan, one after the other."""
+    """Points (indices) of evenly chosen lines of a scan, one after the other."""
     numbers = np.unique(lines)
     for number in numbers[:: max(1, len(numbers) // _LINES)]:
         mine = np.flatnonzero(lines == number)
@@ -232,7 +232,7 @@ def _some_lines(lines: NDArray[np.int64], order: NDArray[np.int64]) -> Iterator[
 
 
 def _unbroken(pixels: NDArray[np.int64]) -> list[NDArray[np.int32]]:
-    """Pieces of a line of points (n, 2) in pixels whose steps are alike."""
+    """Pieces of a line of points (n, 2) in pixels, whose steps are similar."""
     steps = np.linalg.norm(np.diff(pixels, axis=0), axis=1)
     usual = max(1.0, float(np.median(steps))) if len(steps) else 1.0
     return np.split(pixels.astype(np.int32), np.flatnonzero(steps > _BREAK_STEPS * usual) + 1)

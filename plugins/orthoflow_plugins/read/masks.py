@@ -20,14 +20,12 @@ _POLYGONS: Final = (".geojson", ".json")
 _NAMED: Final = 3
 UNUSED: Final = DiagnosticSpec(
     code="masks-of-no-photo",
-    severity="warning",
     text="masks of no photo: {names}",
     remedy="photos are identified by their names",
     rank_by="n",
 )
 NO_MASKS: Final = DiagnosticSpec(
     code="files-are-no-masks",
-    severity="warning",
     text="left out of the masks, neither picture (PNG, JPEG, TIFF) nor polygons (GeoJSON): {names}",
     rank_by="n",
 )

@@ -100,10 +100,11 @@ class ReadOrthoimage(Method):
 def _read(path: Path, among: Sequence[Path], wall: int) -> Orthoimage:
     raster = read_raster(path)
     place = _place(path, among, raster)
-    said = place.get("wall", wall)
-    if isinstance(said, bool) or not isinstance(said, int) or not 0 <= said <= MOST_WALLS:
+    number = place.get("wall", wall)
+    if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number <= MOST_WALLS:
         raise InputError(
-            f"{path.stem}.json: wall must be the number of a wall, from 0, got {shown_value(said)}"
+            f"{path.stem}.json: wall must be the number of a wall, from 0, got "
+            f"{shown_value(number)}"
         )
     rgb = _rgb(path, raster)
     shown = raster.shown if raster.shown.ndim == 2 else raster.shown[..., 0]
@@ -115,13 +116,13 @@ def _read(path: Path, among: Sequence[Path], wall: int) -> Orthoimage:
     )
     return Orthoimage(
         frame=frame,
-        wall=said,
+        wall=number,
         name=str(place.get("name", path.stem)),
         rgb=np.where(shown[..., None], rgb, level_of(rgb)(0)),
         mask=np.where(shown, OrthoMask.PAINTED, OrthoMask.NONE).astype(np.uint8),
         source=np.where(shown, 0, -1).astype(np.int16),
         sources=(path.name,),
-        plane_index=said,
+        plane_index=number,
     )
 
 

@@ -64,32 +64,27 @@ _NAMED: Final = 3
 _MOST_PROBLEMS: Final = 20
 NO_PHOTOS: Final = DiagnosticSpec(
     code="files-are-no-photos",
-    severity="warning",
     text="{n} of {n_files} files of the input {subject} are not photos (JPEG, PNG, TIFF, WebP, "
     "HEIC) and were left out: {names}",
     rank_by="n",
 )
 EXIF_DAMAGED: Final = DiagnosticSpec(
     code="exif-damaged",
-    severity="warning",
     text="the EXIF data of {photos} are damaged; the readable part was used",
     rank_by="n",
 )
 REMARK: Final = DiagnosticSpec(
     code="photo-file-limited",
-    severity="warning",
     text="{photos}: {remark}",
     rank_by="n",
 )
 EXIF_IMPOSSIBLE: Final = DiagnosticSpec(
     code="exif-impossible",
-    severity="warning",
     text="{photos}: {doubt}: it is not used",
     rank_by="n",
 )
 FOCAL_UNKNOWN: Final = DiagnosticSpec(
     code="focal-length-unknown",
-    severity="warning",
     text="the focal length of {photos} is unknown ({reason}, and no calibration): the orientation "
     "has to find it, needs more ties for that and may refuse",
     remedy="a calibration file helps",
@@ -97,14 +92,12 @@ FOCAL_UNKNOWN: Final = DiagnosticSpec(
 )
 NOT_CALIBRATED: Final = DiagnosticSpec(
     code="calibration-without-photo",
-    severity="warning",
     text="the calibration has no entry for {photos}; the others are calibrated",
     remedy="add an entry",
     rank_by="n",
 )
 UNUSED_ENTRIES: Final = DiagnosticSpec(
     code="calibration-entries-unused",
-    severity="warning",
     text="calibration entries that match no photo: {names}",
     remedy="upper and lower case differ, and the first matching entry applies",
     rank_by="n",

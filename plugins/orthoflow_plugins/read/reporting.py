@@ -35,105 +35,88 @@ SUMMARY: Final = DiagnosticSpec(
 )
 NO_EFFECT: Final = DiagnosticSpec(
     code="scan-setting-without-effect",
-    severity="warning",
     text="{step}.{setting} has no effect: {why}",
 )
-FILE_NOTE: Final = DiagnosticSpec(code="scan-file-differs", severity="warning", text="{text}")
+FILE_NOTE: Final = DiagnosticSpec(code="scan-file-differs", text="{text}")
 COLOURS_ZERO: Final = DiagnosticSpec(
     code="scan-colours-zero",
-    severity="warning",
     text="{subject}: the colours of all points are zero: they are treated as missing, not as black",
 )
 COLOUR_LIMIT: Final = DiagnosticSpec(
     code="scan-colour-limit-misfit",
-    severity="warning",
     text="{subject}: it states that colours reach {limit:g}, but its colours reach {largest:g}: "
     "they are read as {scale}",
 )
 COLOURS_GREY: Final = DiagnosticSpec(
     code="scan-colours-grey",
-    severity="warning",
     text="the colours are all grey and follow the intensity: they do not come from photos",
 )
 INTENSITY_ZERO: Final = DiagnosticSpec(
     code="scan-intensity-zero",
-    severity="warning",
     text="{subject}: the intensity of all points is zero: it is treated as missing",
 )
 INTENSITY_LIMITS: Final = DiagnosticSpec(
     code="scan-intensity-limits-misfit",
-    severity="warning",
     text="{subject}: it states intensities from {stated_low:g} to {stated_high:g}, which its data "
     "do not fit: they are scaled from {low:g} to {high:g}",
     remedy="{step}.intensity_max=NUMBER sets the value of white",
 )
 INTENSITY_CLIPPED: Final = DiagnosticSpec(
     code="scan-intensity-clipped",
-    severity="warning",
     text="{subject}: {n_points} intensities lie beyond {low:g} to {high:g} ({rule}) and were "
     "clipped",
     rank_by="n_points",
 )
 INTENSITY_RANGES: Final = DiagnosticSpec(
     code="scan-intensity-ranges-differ",
-    severity="warning",
     text="the scans have intensities of different range and state none: {ranges}; each is scaled "
     "by its own, so equal surfaces may differ in brightness",
     remedy="{step}.intensity_max=NUMBER sets one for all",
 )
 INTENSITY_LUMINANCE: Final = DiagnosticSpec(
     code="scan-intensity-is-luminance",
-    severity="warning",
     text="the intensity is not the laser's but the luminance of the colours (correlation "
     "{correlation:.5f}): it is ignored, the colours contain it",
 )
 SCAN_WITHOUT: Final = DiagnosticSpec(
     code="scan-without-field",
-    severity="warning",
     text="{subject} has no {field}: its {n_points} points have a position only",
     rank_by="n_points",
 )
 POINTS_WITHOUT: Final = DiagnosticSpec(
     code="points-without-field",
-    severity="warning",
     text="{n_points} points have no valid {field}: they have a position only",
     rank_by="n_points",
 )
 NO_INTENSITY: Final = DiagnosticSpec(
     code="scan-intensity-not-chosen",
-    severity="warning",
     text="the scans have no intensity; fields not used: {names}",
     remedy="{step}.intensity_field={candidate} uses one as the intensity",
 )
 FEW_STATIONS: Final = DiagnosticSpec(
     code="scan-stations-missing",
-    severity="warning",
     text="only {n_stations} of {n_scans} scans state where the scanner stood; the nearest "
     "station determines the front of a wall",
 )
 COARSE_OFFSETS: Final = DiagnosticSpec(
     code="scan-offsets-coarse",
-    severity="warning",
     text="the points reach {farthest_m:.0f} m from the origin of the cloud, where coordinates are "
     "kept to {resolution_mm:.2f} mm only",
     remedy="check {step}.unit, or cut stray points off with {step}.box",
 )
 ROUNDED: Final = DiagnosticSpec(
     code="scan-coordinates-rounded",
-    severity="warning",
     text="the coordinates of {subject} are rounded to {rounding_mm:g} mm: planes and depths cannot "
     "be finer, and a grid may show",
     rank_by="rounding_mm",
 )
 SIZE: Final = DiagnosticSpec(
     code="scan-size-implausible",
-    severity="warning",
     text="the scan is {size} m ({unit}): is that right?",
     remedy="set {step}.unit={other} if it is in {other}, or to cm, ft, us-ft, in",
 )
 TOO_FAR: Final = DiagnosticSpec(
     code="points-too-far",
-    severity="warning",
     text="{subject}: {n_points} points lie farther than {farthest_m:g} m from the origin, the "
     "first at {place}, and were left out",
     remedy="check the file and {step}.unit",
@@ -141,26 +124,22 @@ TOO_FAR: Final = DiagnosticSpec(
 )
 NO_RETURN: Final = DiagnosticSpec(
     code="points-without-return",
-    severity="warning",
     text="{n_points} points at 0 0 0 are not returns of the scanner and were left out",
     rank_by="n_points",
 )
 NOT_FINITE: Final = DiagnosticSpec(
     code="points-not-finite",
-    severity="warning",
     text="{n_points} points with coordinates that are not finite were left out",
     rank_by="n_points",
 )
 OTHER_UP: Final = DiagnosticSpec(
     code="scan-up-doubtful",
-    severity="warning",
     text="{axis} looks like the axis that points up, not {up}: {share:.0%} of the surfaces are "
     "level or upright by it, {share_up:.0%} by {up}",
     remedy="{step}.up={axis}, or -{axis} where floors come out as ceilings",
 )
 THICK: Final = DiagnosticSpec(
     code="scan-thick",
-    severity="warning",
     text="the cloud is thicker than its point spacing: across surfaces, in pieces of about "
     "{side_cm:.0f} cm, its points scatter by {sigma_mm:.1f} mm (95 % within {width_mm:.1f} mm), "
     "and along them the nearest other point is {step_mm:.1f} mm away: planes and depths "
@@ -170,7 +149,6 @@ THICK: Final = DiagnosticSpec(
 )
 DISAGREE: Final = DiagnosticSpec(
     code="scans-disagree",
-    severity="warning",
     text="the scans disagree: where two show one surface they are {apart_mm:.1f} "
     "mm apart (median), while the scatter of each is {sigma_mm:.1f} mm",
     remedy="register them again, or use one at a time",
@@ -367,7 +345,7 @@ def report_summary(
 
 
 def warn_of_up(quality: CloudQuality | None, up: UpDirection, ctx: StepContext) -> None:
-    """Say so where surfaces are level and upright by another axis than the one that is up."""
+    """Warn where surfaces are level and upright by another axis than the one that is up."""
     axis = None if quality is None else quality.plainly_up(up_vector(up))
     if quality is None or axis is None:
         return

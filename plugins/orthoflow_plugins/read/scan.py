@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from orthoflow.errors import InputError
-from orthoflow.files.points import Scan, ScanFile, Wish, open_scan
+from orthoflow.files.points import PointQuery, Scan, ScanFile, open_scan
 from orthoflow.files.points.fields import Columns, columns_of_user, plain_name
 from orthoflow.files.points.formats import LAS, TEXT
 from orthoflow.files.points.units import UNITS_M, refuse_degrees
@@ -216,11 +216,11 @@ def _opened(
     if file.format_name != LAS.name or (box_m is None and params.gsd_m is None):
         return file
     unit_m = _unit_m(file.scans[0], params)
-    wish = Wish(
+    query = PointQuery(
         box=None if box_m is None else box_m / unit_m,
         spacing=None if params.gsd_m is None else params.gsd_m / float(unit_m[0]),
     )
-    return opened(wish=wish)
+    return opened(query=query)
 
 
 def _unit_m(scan: Scan, params: ReadScan.Params) -> NDArray[np.float64]:
@@ -362,7 +362,7 @@ def _judged_intensity(
     rgb: NDArray[np.uint8] | None,
     has_rgb: NDArray[np.bool_] | None,
 ) -> tuple[NDArray[np.float32] | None, str]:
-    """Leave out an intensity that only repeats the colours, and tell where it comes from."""
+    """Leave out an intensity that only repeats the colours, and return where it comes from."""
     if intensity is None:
         return None, "none"
     if rgb is None:

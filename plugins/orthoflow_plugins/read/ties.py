@@ -74,9 +74,9 @@ class ReadTies(Method):
         if wrong:
             left_out = len(wrong) - _MOST_PROBLEMS
             more = [f"... and {left_out} more problems"] if left_out > 0 else []
-            # To look for similar names takes long, so only those that are told are looked at.
-            told = [_problem(tie, photos) for tie in wrong[:_MOST_PROBLEMS]]
-            raise InputError("\n".join(told + more))
+            # Similar names take long to find: only for those that are shown.
+            shown = [_problem(tie, photos) for tie in wrong[:_MOST_PROBLEMS]]
+            raise InputError("\n".join(shown + more))
         ties = _ties(found, tuple(photos), params)
         per_photo = np.bincount(ties.photo, minlength=len(photos))
         ctx.metric("n_ties", len(found), "1")

@@ -15,7 +15,7 @@ from orthoflow.products import CheckPoints, Finding, Inspection, JsonValue, Poin
 from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 
 _AT_ONCE: Final = 1 << 20
-# Lists that fit so many times better as mirror images of each other are that.
+# Lists that fit this many times better as mirror images of each other are that.
 _MIRRORED_TIMES: Final = 10.0
 # Points whose second-largest spread is a smaller share of the largest lie on one line.
 _LINE_SHARE: Final = 1e-6

@@ -15,7 +15,7 @@ from rasterio.crs import CRS
 from orthoflow.cli.exports import clouds as module
 from orthoflow.cli.exports.choices import Choices
 from orthoflow.errors import ArgumentError
-from orthoflow.files.clouds.dressing import DressedCloud
+from orthoflow.files.clouds.attributes import AttributedCloud
 from orthoflow.products import (
     Camera,
     Cameras,
@@ -102,25 +102,25 @@ def labelled(of: PointCloud | None = None, marks: PointLabels | None = None) -> 
     )
 
 
-def exported(folder: Path, run: Any, **choices: Any) -> tuple[str, DressedCloud]:
+def exported(folder: Path, run: Any, **choices: Any) -> tuple[str, AttributedCloud]:
     """What is said, and what would be written."""
-    kept: list[DressedCloud] = []
+    kept: list[AttributedCloud] = []
 
-    def write(path: Path, dressed: DressedCloud) -> int:
-        kept.append(dressed)
+    def write(path: Path, attributed: AttributedCloud) -> int:
+        kept.append(attributed)
         path.touch()
-        return sum(len(block) for block in dressed.blocks())
+        return sum(len(block) for block in attributed.blocks())
 
     said = module._export(run, folder, Choices(**choices), ("cloud.toy", write))
-    (dressed,) = kept
-    return said, dressed
+    (attributed,) = kept
+    return said, attributed
 
 
 def test_a_box_leaves_points_out_and_says_so(tmp_path: Path) -> None:
     # Corners in any order.
-    said, dressed = exported(tmp_path, labelled(), box="0.5,1,1,0,0,-1")
+    said, attributed = exported(tmp_path, labelled(), box="0.5,1,1,0,0,-1")
     assert said == "cloud.toy: 72 points of 144 by intensity, cloud of plane"
-    np.testing.assert_array_equal(dressed.box_world, [[0.0, 0.0, -1.0], [0.5, 1.0, 1.0]])
+    np.testing.assert_array_equal(attributed.box_world, [[0.0, 0.0, -1.0], [0.5, 1.0, 1.0]])
     with pytest.raises(ArgumentError, match=r"^no point of the cloud of plane is left: choose"):
         exported(tmp_path, labelled(), box="5,5,5,6,6,6")
 
@@ -241,13 +241,13 @@ def test_photos_colour_a_cloud_where_any_is_oriented(
     monkeypatch.setattr("orthoflow.cli.exports.clouds.colour_points", colour_points)
     oriented = ((SimpleNamespace(name="a.jpg"), "its camera"),)
     monkeypatch.setattr(module, "_oriented", lambda *_args: oriented)
-    said, dressed = exported(tmp_path, labelled(), colour=colour)
+    said, attributed = exported(tmp_path, labelled(), colour=colour)
     if colour == "intensity":
-        assert (dressed.photo_colours, dressed.photo_names) == (None, ())
+        assert (attributed.photo_colours, attributed.photo_names) == (None, ())
         return
     assert said == "cloud.toy: 144 points by photos, cloud of plane"
-    assert dressed.colouring == "photos"
-    assert dressed.photo_names == ("a.jpg",)
+    assert attributed.colouring == "photos"
+    assert attributed.photo_names == ("a.jpg",)
     about = json.loads((tmp_path / "cloud.json").read_text())
     assert about["points_of_the_cloud_by_photo"] == [N_SIDE**2]
     assert about["points_of_the_cloud_unseen"] == 0

@@ -13,14 +13,14 @@ import pytest
 from laspy.copc import CopcReader
 from plyfile import PlyData
 
-from orthoflow.files.clouds import copc, dressing
+from orthoflow.files.clouds import attributes, copc
+from orthoflow.files.clouds.attributes import AttributedCloud, describe_cloud, plane_colour
 from orthoflow.files.clouds.copc import write_copc
-from orthoflow.files.clouds.dressing import DressedCloud, describe_cloud, plane_colour
 from orthoflow.files.clouds.neighbourhoods import neighbourhoods_of
 from orthoflow.files.clouds.photo_colours import PointColours, colour_points
 from orthoflow.files.clouds.writers import write_e57, write_laz, write_ply
 from orthoflow.files.images import encode_png
-from orthoflow.files.points import Wish, open_scan
+from orthoflow.files.points import PointQuery, open_scan
 from orthoflow.geometry.frames import frame_over
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Intrinsics, Photo, Planes, PointCloud, PointLabels
@@ -72,7 +72,7 @@ def labels(cloud: PointCloud) -> PointLabels:
     return PointLabels(plane_index=index)
 
 
-def dressed(**more: Any) -> DressedCloud:
+def with_attributes(**more: Any) -> AttributedCloud:
     cloud = more.pop("cloud", None) or corner()
     plain: dict[str, Any] = {
         "cloud": cloud,
@@ -81,7 +81,7 @@ def dressed(**more: Any) -> DressedCloud:
         "planes": planes(),
         "labels": labels(cloud) if len(cloud) == 2 * N_SIDE**2 else None,
     }
-    return DressedCloud(**(plain | more))
+    return AttributedCloud(**(plain | more))
 
 
 @dataclasses.dataclass
@@ -142,10 +142,10 @@ FORMATS = {
 def test_another_program_reads_every_point_as_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, block: int
 ) -> None:
-    monkeypatch.setattr(dressing, "BLOCK", block)
+    monkeypatch.setattr(attributes, "BLOCK", block)
     write, read = FORMATS[name]
     cloud = corner()
-    assert write(tmp_path / "a", dressed()) == len(cloud)
+    assert write(tmp_path / "a", with_attributes()) == len(cloud)
     found = read(tmp_path / "a")
     assert cloud.scan is not None
     assert cloud.rgb is not None
@@ -180,17 +180,17 @@ def test_copc_holds_the_points_of_laz_in_nodes_of_an_octree(
     cloud = PointCloud(
         origin=ORIGIN, x=x, y=y, z=z, up=np.array([0.0, 0.0, 1.0]), intensity=x / 2.0
     )
-    dress = dressed(cloud=cloud, colouring="intensity", planes=None)
+    attributed = with_attributes(cloud=cloud, colouring="intensity", planes=None)
     path = tmp_path / "a.copc.laz"
-    assert write_copc(path, dress) == len(cloud)
+    assert write_copc(path, attributed) == len(cloud)
     assert list(tmp_path.iterdir()) == [path]
     # In groups and blocks it gives the same bytes.
     monkeypatch.setattr(copc, "_IN_MEMORY_POINTS", 500)
     monkeypatch.setattr(copc, "BLOCK", 1000)
-    monkeypatch.setattr(dressing, "BLOCK", 1000)
-    write_copc(tmp_path / "b.copc.laz", dress)
+    monkeypatch.setattr(attributes, "BLOCK", 1000)
+    write_copc(tmp_path / "b.copc.laz", attributed)
     assert (tmp_path / "b.copc.laz").read_bytes() == path.read_bytes()
-    write_laz(tmp_path / "a.laz", dress)
+    write_laz(tmp_path / "a.laz", attributed)
     found, laz = laspy.read(path), laspy.read(tmp_path / "a.laz")
     rows = [sorted(row.tobytes() for row in read.points.array) for read in (found, laz)]
     assert rows[0] == rows[1]
@@ -220,7 +220,7 @@ def test_copc_holds_the_points_of_laz_in_nodes_of_an_octree(
     assert first == len(cloud)
     # And orthoflow reads as much of it as one asks for.
     root = [node.point_count for node in nodes if node.key.level == 0]
-    coarse = open_scan(path, wish=Wish(spacing=info.spacing))
+    coarse = open_scan(path, query=PointQuery(spacing=info.spacing))
     assert [sum(block.n_read for block in coarse.read())] == root
     assert info.spacing == pytest.approx(2.0 * info.halfsize / 128)
     # A step of the file about all points, and an odd number of steps; no times are known.
@@ -230,19 +230,19 @@ def test_copc_holds_the_points_of_laz_in_nodes_of_an_octree(
         info.center - info.halfsize, found.header.mins - 1e-4, rtol=0, atol=1e-7
     )
     assert struct.unpack_from("<2d", path.read_bytes(), 375 + 54 + 56) == (0.0, 0.0)
-    nothing = dataclasses.replace(dress, box_world=ORIGIN + 100.0 + np.eye(2, 3))
+    nothing = dataclasses.replace(attributed, box_world=ORIGIN + 100.0 + np.eye(2, 3))
     assert write_copc(tmp_path / "none", nothing) == 0
 
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_the_same_cloud_gives_the_same_bytes(tmp_path: Path, name: str) -> None:
     for path in (tmp_path / "a", tmp_path / "b"):
-        FORMATS[name][0](path, dressed())
+        FORMATS[name][0](path, with_attributes())
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
 def test_e57_keeps_a_pose_per_scan_and_fields_as_extensions(tmp_path: Path) -> None:
-    write_e57(tmp_path / "a.e57", dressed(crs_wkt="PROJCS[x]"))
+    write_e57(tmp_path / "a.e57", with_attributes(crs_wkt="PROJCS[x]"))
     with pye57.E57(str(tmp_path / "a.e57")) as file:
         assert file.root["coordinateMetadata"].value() == "PROJCS[x]"
         headers = [file.get_header(k) for k in range(file.scan_count)]
@@ -251,7 +251,7 @@ def test_e57_keeps_a_pose_per_scan_and_fields_as_extensions(tmp_path: Path) -> N
             headers[0].point_fields
         )
     without = dataclasses.replace(corner(), stations=None, stations_source=None)
-    write_e57(tmp_path / "b.e57", dressed(cloud=without))
+    write_e57(tmp_path / "b.e57", with_attributes(cloud=without))
     with pye57.E57(str(tmp_path / "b.e57")) as file:
         np.testing.assert_allclose(file.get_header(0).translation, ORIGIN)
 
@@ -259,7 +259,7 @@ def test_e57_keeps_a_pose_per_scan_and_fields_as_extensions(tmp_path: Path) -> N
 def test_an_e57_says_of_each_scan_what_it_holds(tmp_path: Path) -> None:
     cloud = corner()
     path = tmp_path / "a.e57"
-    write_e57(path, dressed())
+    write_e57(path, with_attributes())
     points = cloud.points_world()
     with pye57.E57(str(path)) as file:
         root = file.image_file.root()
@@ -299,12 +299,12 @@ def test_an_e57_says_of_each_scan_what_it_holds(tmp_path: Path) -> None:
 
 def test_colours_show_what_was_asked_for(tmp_path: Path) -> None:
     cloud = corner()
-    write_laz(tmp_path / "a.laz", dressed(colouring="intensity"))
+    write_laz(tmp_path / "a.laz", with_attributes(colouring="intensity"))
     grey = read_laz(tmp_path / "a.laz").rgb
     assert (grey[:, 0] == grey[:, 1]).all()
     assert (np.diff(grey[:, 0]) >= 0).all()
     assert (grey[0, 0], grey[-1, 0]) == (0, 255)
-    write_laz(tmp_path / "b.laz", dressed(colouring="plane"))
+    write_laz(tmp_path / "b.laz", with_attributes(colouring="plane"))
     by_plane = read_laz(tmp_path / "b.laz").rgb
     for plane in (-1, 0, 1):
         mine = by_plane[labels(cloud).plane_index == plane]
@@ -312,15 +312,15 @@ def test_colours_show_what_was_asked_for(tmp_path: Path) -> None:
         # Rounded to whole steps of 255.
         np.testing.assert_allclose(mine, shade[:, None] * plane_colour(plane), atol=1.0)
         assert shade.min() >= 0.39
-    dress = dressed(colouring="deviation")
-    assert dress.scale_m == 0.005
-    write_laz(tmp_path / "c.laz", dress)
+    attributed = with_attributes(colouring="deviation")
+    assert attributed.scale_m == 0.005
+    write_laz(tmp_path / "c.laz", attributed)
     by_distance = read_laz(tmp_path / "c.laz").rgb
     on_plane = labels(cloud).plane_index >= 0
     # 4 of 5 mm: four fifths of the way from white to red.
     assert set(map(tuple, np.rint(by_distance[on_plane]).tolist())) == {(192, 69, 84)}
     assert set(map(tuple, np.rint(by_distance[~on_plane]).tolist())) == {(128, 128, 128)}
-    describe_cloud(tmp_path / "c.json", dress, "c.laz", len(cloud))
+    describe_cloud(tmp_path / "c.json", attributed, "c.laz", len(cloud))
     said = json.loads((tmp_path / "c.json").read_text())
     assert said["colour_scale"]["+0.005"] == [178, 24, 43]
     assert said["scans"][1] == {"scan": 1, "station_world": STATIONS[1].tolist()}
@@ -330,21 +330,21 @@ def test_only_what_is_asked_for_is_written(tmp_path: Path) -> None:
     cloud = corner()
     frame = frame_over(planes().corners[0], planes().normal[0], gsd_m=0.01)
     slab = Slab(frame=frame, front_m=0.1, behind_m=0.05)
-    n_wall = write_laz(tmp_path / "a.laz", dressed(wall=slab, wall_plane=0))
+    n_wall = write_laz(tmp_path / "a.laz", with_attributes(wall=slab, wall_plane=0))
     found = read_laz(tmp_path / "a.laz")
     expected = (cloud.x <= 0.1) & (cloud.z > 0) & (cloud.y <= 2.0)
     assert n_wall == np.count_nonzero(expected)
     # The floor, up to 2 m from the plane of the wall, is not written and sets no scale.
-    assert dressed(wall=slab, wall_plane=0).scale_m == 0.1
+    assert with_attributes(wall=slab, wall_plane=0).scale_m == 0.1
     # Of points on no plane as well, and of those of the floor beside the wall.
     np.testing.assert_allclose(found.fields["deviation"], cloud.x[expected], atol=1e-6)
     box = ORIGIN + np.array([[0.5, 0.5, -1.0], [1.0, 1.5, 1.0]])
-    write_ply(tmp_path / "a.ply", dressed(box_world=box))
+    write_ply(tmp_path / "a.ply", with_attributes(box_world=box))
     inside = read_ply(tmp_path / "a.ply").world
     assert ((inside >= box[0]) & (inside <= box[1])).all()
     expected = np.all((cloud.points_world() >= box[0]) & (cloud.points_world() <= box[1]), axis=1)
     assert len(inside) == np.count_nonzero(expected)
-    assert write_laz(tmp_path / "none.laz", dressed(box_world=box + 100.0)) == 0
+    assert write_laz(tmp_path / "none.laz", with_attributes(box_world=box + 100.0)) == 0
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -361,7 +361,7 @@ def test_cleaning_takes_the_outliers_and_nothing_else(tmp_path: Path, seed: int)
         up=cloud.up,
         intensity=np.ones(len(cloud) + 12, np.float32),
     )
-    plain = dressed(cloud=spoilt, colouring="intensity", planes=None)
+    plain = with_attributes(cloud=spoilt, colouring="intensity", planes=None)
     assert write_laz(tmp_path / "a.laz", plain) == len(spoilt)
     clean = dataclasses.replace(plain, is_cleaned=True)
     assert write_laz(tmp_path / "b.laz", clean) == len(cloud)
@@ -405,7 +405,7 @@ def test_a_photo_colours_only_what_it_sees() -> None:
 def test_open3d_reads_a_ply_with_colours_and_normals(tmp_path: Path) -> None:
     from orthoflow_plugins.plane.comparators import load_open3d
 
-    write_ply(tmp_path / "cloud.ply", dressed())
+    write_ply(tmp_path / "cloud.ply", with_attributes())
     open3d = load_open3d("this test")
     found = open3d.io.read_point_cloud(str(tmp_path / "cloud.ply"))
     other = read_ply(tmp_path / "cloud.ply")

@@ -9,7 +9,7 @@ import laspy
 import numpy as np
 import pytest
 
-from orthoflow.files.clouds.dressing import DressedCloud
+from orthoflow.files.clouds.attributes import AttributedCloud
 from orthoflow.files.clouds.neighbourhoods import neighbourhoods_of
 from orthoflow.files.clouds.writers import write_laz
 from orthoflow.files.geotiff import epsg_wkt
@@ -23,12 +23,12 @@ def floor(size_m: float = 1.0) -> PointCloud:
     return PointCloud(origin=np.array([1e5, 2e5, 50.5]), x=x, y=y, z=np.zeros_like(x), up=up)
 
 
-def dressed(cloud: PointCloud) -> DressedCloud:
-    return DressedCloud(cloud=cloud, colouring="plane", neighbourhoods=neighbourhoods_of(cloud))
+def with_attributes(cloud: PointCloud) -> AttributedCloud:
+    return AttributedCloud(cloud=cloud, colouring="plane", neighbourhoods=neighbourhoods_of(cloud))
 
 
-def written(path: Path, dress: DressedCloud) -> laspy.LasData:
-    write_laz(path, dress)
+def written(path: Path, attributed: AttributedCloud) -> laspy.LasData:
+    write_laz(path, attributed)
     return laspy.read(path)
 
 
@@ -36,7 +36,7 @@ def written(path: Path, dress: DressedCloud) -> laspy.LasData:
 def test_a_header_has_a_coordinate_system_where_there_is_one_and_only_wkt_ever(
     tmp_path: Path, crs_wkt: str
 ) -> None:
-    found = written(tmp_path / "a.laz", replace(dressed(floor()), crs_wkt=crs_wkt))
+    found = written(tmp_path / "a.laz", replace(with_attributes(floor()), crs_wkt=crs_wkt))
     # LAS 1.4 has it for points of its formats from 6 on, whether there is one or not.
     assert found.header.global_encoding.wkt
     systems = [one.string for one in found.header.vlrs if one.record_id == 2112]
@@ -55,6 +55,6 @@ def test_coordinates_keep_a_tenth_of_a_millimetre_where_that_fits(
     cloud = floor(size_m)
     # Of a mirrored cloud the farthest point has a negative offset.
     for one in (cloud, replace(cloud, x=-cloud.x, y=np.zeros_like(cloud.y))):
-        found = written(tmp_path / "a.laz", dressed(one))
+        found = written(tmp_path / "a.laz", with_attributes(one))
         np.testing.assert_allclose(found.header.scales, scale_m, rtol=1e-9)
         np.testing.assert_allclose(found.xyz, one.points_world(), atol=0.51 * scale_m)

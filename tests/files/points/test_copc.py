@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.points import Wish, las, open_scan
+from orthoflow.files.points import PointQuery, las, open_scan
 from tests import scan_files
 
 # Root, its eight children, and two children of the last of these.
@@ -41,8 +41,8 @@ def sorted_points(points: NDArray[np.float64]) -> NDArray[np.float64]:
     return rounded[np.lexsort(rounded.T)]
 
 
-def read(path: Path, wish: Wish | None) -> NDArray[np.float64]:
-    scan = open_scan(path, wish=wish)
+def read(path: Path, query: PointQuery | None) -> NDArray[np.float64]:
+    scan = open_scan(path, query=query)
     blocks = list(scan.read())
     points = np.concatenate([block.points for block in blocks])
     assert scan.n_most == len(points) == sum(block.n_read for block in blocks)
@@ -54,9 +54,9 @@ def all_points(n_levels: int = 3) -> NDArray[np.float64]:
 
 
 def test_a_copc_file_is_read_whole_unless_somebody_asks_for_less(path: Path) -> None:
-    for wish in (None, Wish()):
-        np.testing.assert_array_equal(read(path, wish).round(4), all_points().round(4))
-        assert not open_scan(path, wish=wish).is_chosen
+    for query in (None, PointQuery()):
+        np.testing.assert_array_equal(read(path, query).round(4), all_points().round(4))
+        assert not open_scan(path, query=query).is_chosen
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_a_copc_file_is_read_whole_unless_somebody_asks_for_less(path: Path) -> 
 def test_levels_are_read_down_to_the_spacing_asked_for(
     path: Path, spacing: float, n_levels: int
 ) -> None:
-    found = read(path, Wish(spacing=spacing))
+    found = read(path, PointQuery(spacing=spacing))
     np.testing.assert_array_equal(sorted_points(found), sorted_points(all_points(n_levels)))
 
 
@@ -75,7 +75,7 @@ def test_only_nodes_that_meet_the_box_are_read_and_none_of_its_points_is_missing
 ) -> None:
     monkeypatch.setattr(las, "BLOCK_POINTS", block_points)
     box = np.array([[0.5, 4.5, 0.5], [3.5, 7.5, 3.5]])
-    found = read(path, Wish(box=box))
+    found = read(path, PointQuery(box=box))
     expected = np.concatenate([NODES[0][0, 0, 0], NODES[1][0, 1, 0]])
     np.testing.assert_array_equal(sorted_points(found), sorted_points(expected))
 
@@ -86,14 +86,14 @@ def test_only_nodes_that_meet_the_box_are_read_and_none_of_its_points_is_missing
 
 
 def test_a_box_beside_all_nodes_gives_the_root_which_tells_where_the_cloud_is(path: Path) -> None:
-    found = read(path, Wish(box=np.array([[90.0, 0.0, 0.0], [91.0, 1.0, 1.0]])))
+    found = read(path, PointQuery(box=np.array([[90.0, 0.0, 0.0], [91.0, 1.0, 1.0]])))
     np.testing.assert_array_equal(sorted_points(found), sorted_points(NODES[0][0, 0, 0]))
 
 
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
 def test_files_without_an_octree_are_read_whole(tmp_path: Path, suffix: str) -> None:
     plain = scan_files.write_las(tmp_path / f"a{suffix}", all_points())
-    assert len(read(plain, Wish(spacing=0.5))) == len(all_points())
+    assert len(read(plain, PointQuery(spacing=0.5))) == len(all_points())
 
 
 def hierarchy(content: bytes) -> tuple[int, int]:
@@ -130,7 +130,7 @@ def test_a_damaged_octree_is_told_before_anything_is_decoded(
     content[at : at + len(change)] = change
     path.write_bytes(bytes(content))
     with pytest.raises(InputError, match=rf"a\.copc\.laz cannot be read as COPC: .*{reason}"):
-        open_scan(path, wish=Wish(spacing=0.1))
+        open_scan(path, query=PointQuery(spacing=0.1))
     # Its points need no octree.
     assert len(read(path, None)) == len(all_points())
 
@@ -139,7 +139,7 @@ def test_a_spacing_beyond_all_numbers_asks_for_every_level(path: Path) -> None:
     content = bytearray(path.read_bytes())
     struct.pack_into("<d", content, 429 + 32, 1e308)
     path.write_bytes(bytes(content))
-    assert len(read(path, Wish(spacing=0.1))) == len(all_points())
+    assert len(read(path, PointQuery(spacing=0.1))) == len(all_points())
 
 
 def test_pages_that_name_each_other_end(path: Path) -> None:
@@ -148,4 +148,4 @@ def test_pages_that_name_each_other_end(path: Path) -> None:
     for at in range(page + 32, page + size, 32):
         struct.pack_into("<4iQii", content, at, 1, 0, 0, 0, page, size, -1)
     path.write_bytes(bytes(content))
-    assert len(read(path, Wish(spacing=0.1))) == len(NODES[0][0, 0, 0])
+    assert len(read(path, PointQuery(spacing=0.1))) == len(NODES[0][0, 0, 0])

@@ -25,7 +25,7 @@ from orthoflow_plugins.plane.planes import Deviations, Normality, normality
 from orthoflow_plugins.plane.region import Region, region_proposer
 from orthoflow_plugins.plane.thickness import RowPoints
 
-from orthoflow.files.clouds.dressing import plane_ink
+from orthoflow.files.clouds.attributes import plane_ink
 from orthoflow.geometry import wall_axes
 from orthoflow.products import Planes, Spread, Thickness
 from tests import samples

@@ -70,7 +70,7 @@ class Points:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DressedCloud:
+class AttributedCloud:
     """A cloud and the values added to its points.
 
     Attributes:
@@ -163,7 +163,7 @@ class DressedCloud:
         for part in self._parts():
             chosen = self._chosen(part, scan)
             if chosen.any():
-                yield self._dressed(part, chosen)
+                yield self._attributed(part, chosen)
 
     def _parts(self) -> Iterator[slice]:
         for first in range(0, len(self.cloud), BLOCK):
@@ -191,7 +191,7 @@ class DressedCloud:
             chosen &= ~near.alone[near.places(offsets_of(self.cloud, part))]
         return chosen
 
-    def _dressed(self, part: slice, chosen: NDArray[np.bool_]) -> Points:
+    def _attributed(self, part: slice, chosen: NDArray[np.bool_]) -> Points:
         cloud = self.cloud
         world = cloud.points_world(part)[chosen]
         plane = None if self.labels is None else np.asarray(self.labels.plane_index[part])
@@ -396,58 +396,58 @@ _MEANINGS: Final = {
 }
 
 
-def describe_cloud(path: Path, dressed: DressedCloud, name: str, n_points: int) -> None:
+def describe_cloud(path: Path, attributed: AttributedCloud, name: str, n_points: int) -> None:
     """Write the description of a cloud's file beside it.
 
     Raises:
         StoreError: the file cannot be written.
     """
-    cloud = dressed.cloud
+    cloud = attributed.cloud
     about: dict[str, JsonValue] = {
         "file": name,
         "points": n_points,
         "points_of_the_cloud": len(cloud),
-        "product_digest": dressed.name,
+        "product_digest": attributed.name,
         "coordinates": "metres, as the scan has them; z or another axis is up as `up` says",
         "up": numbers(cloud.up),
         "origin_world": numbers(cloud.origin),
-        "coordinate_system_wkt": dressed.crs_wkt or None,
-        "colour": dressed.colouring,
-        "colour_meaning": _MEANINGS[dressed.colouring],
+        "coordinate_system_wkt": attributed.crs_wkt or None,
+        "colour": attributed.colouring,
+        "colour_meaning": _MEANINGS[attributed.colouring],
         "normals": "least-squares planes of voxels with their neighbours, sides of "
-        f"{3.0 * dressed.neighbourhoods.side_m:.4g} m, towards the viewer; 0 0 0: no surface",
+        f"{3.0 * attributed.neighbourhoods.side_m:.4g} m, towards the viewer; 0 0 0: no surface",
         "cleaned": "points with fewer than 10 about them, in 3 x 3 x 3 cubes of "
-        f"{3.0 * dressed.neighbourhoods.side_m:.4g} m, are left out"
-        if dressed.is_cleaned
+        f"{3.0 * attributed.neighbourhoods.side_m:.4g} m, are left out"
+        if attributed.is_cleaned
         else None,
         "wall": None
-        if dressed.wall is None
-        else {"plane_index": dressed.wall_plane, "deviation": "from the plane of this wall"},
-        "box_world": None if dressed.box_world is None else numbers(dressed.box_world),
-        "scans": [_scan(dressed, scan) for scan in dressed.scans],
+        if attributed.wall is None
+        else {"plane_index": attributed.wall_plane, "deviation": "from the plane of this wall"},
+        "box_world": None if attributed.box_world is None else numbers(attributed.box_world),
+        "scans": [_scan(attributed, scan) for scan in attributed.scans],
     }
-    if dressed.colouring == "deviation":
+    if attributed.colouring == "deviation":
         about["colour_scale"] = {
             "unit": "m",
             **{
                 f"{place_m:+g}" if place_m else "0": list(colour)
                 for place_m, colour in (
-                    (-dressed.scale_m, BEHIND),
+                    (-attributed.scale_m, BEHIND),
                     (0.0, ON_PLANE),
-                    (dressed.scale_m, BEFORE),
+                    (attributed.scale_m, BEFORE),
                 )
             },
             "none": list(UNKNOWN),
         }
-    if dressed.photo_colours is not None and dressed.photo_colours.photo is not None:
-        photo = dressed.photo_colours.photo
-        counts = np.bincount(np.asarray(photo) + 1, minlength=len(dressed.photo_names) + 1)
-        about["photos"] = list(dressed.photo_names)
+    if attributed.photo_colours is not None and attributed.photo_colours.photo is not None:
+        photo = attributed.photo_colours.photo
+        counts = np.bincount(np.asarray(photo) + 1, minlength=len(attributed.photo_names) + 1)
+        about["photos"] = list(attributed.photo_names)
         about["points_of_the_cloud_by_photo"] = [int(count) for count in counts[1:]]
         about["points_of_the_cloud_unseen"] = int(counts[0])
     write_json(path, about)
 
 
-def _scan(dressed: DressedCloud, scan: int) -> JsonValue:
-    station = dressed.station(scan)
+def _scan(attributed: AttributedCloud, scan: int) -> JsonValue:
+    station = attributed.station(scan)
     return {"scan": scan, "station_world": None if station is None else numbers(station)}

@@ -1,4 +1,4 @@
-"""Points that are chosen and dressed: by scan, box and wall; signs of normals; deviations."""
+"""Points that are chosen and attributed: by scan, box and wall; signs of normals; deviations."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from orthoflow.files.clouds.dressing import DressedCloud
+from orthoflow.files.clouds.attributes import AttributedCloud
 from orthoflow.files.clouds.neighbourhoods import Neighbourhoods, neighbourhoods_of
 from orthoflow.products import Planes, PointCloud, PointLabels
 from tests import samples
@@ -46,14 +46,14 @@ def planes(sign: float = 1.0) -> Planes:
     )
 
 
-def dressed(
+def with_attributes(
     cloud: PointCloud = CORNER, *, near: Neighbourhoods = NEAR, **more: Any
-) -> DressedCloud:
-    return DressedCloud(cloud=cloud, colouring="intensity", neighbourhoods=near, **more)
+) -> AttributedCloud:
+    return AttributedCloud(cloud=cloud, colouring="intensity", neighbourhoods=near, **more)
 
 
-def normals(dress: DressedCloud, scan: int | None = None) -> NDArray[np.float32]:
-    return np.concatenate([block.normal for block in dress.blocks(scan)])
+def normals(attributed: AttributedCloud, scan: int | None = None) -> NDArray[np.float32]:
+    return np.concatenate([block.normal for block in attributed.blocks(scan)])
 
 
 def test_normals_look_at_the_scanner_of_their_scan() -> None:
@@ -62,10 +62,12 @@ def test_normals_look_at_the_scanner_of_their_scan() -> None:
     cloud = corner(stations=stations, stations_source="file")
     side = np.where(CORNER.scan == 0, 1.0, -1.0)
     expected = side[:, None] * NORMALS[IS_FLOOR.astype(int)]
-    np.testing.assert_allclose(normals(dressed(cloud)), expected, atol=1e-5)
-    np.testing.assert_allclose(normals(dressed(cloud), 1), expected[CORNER.scan == 1], atol=1e-5)
+    np.testing.assert_allclose(normals(with_attributes(cloud)), expected, atol=1e-5)
+    np.testing.assert_allclose(
+        normals(with_attributes(cloud), 1), expected[CORNER.scan == 1], atol=1e-5
+    )
     # Without a number per point, all are of the first.
-    one = normals(dressed(replace(cloud, scan=None)))
+    one = normals(with_attributes(replace(cloud, scan=None)))
     np.testing.assert_allclose(one, np.abs(expected), atol=1e-5)
 
 
@@ -75,38 +77,40 @@ def test_normals_look_where_those_of_their_planes_do_else_up(sign: float) -> Non
     cloud = corner(stations=ORIGIN + np.ones((2, 3)), stations_source="view_from")
     index = IS_FLOOR.astype(np.int16)
     index[-N_SIDE:] = -1
-    dress = dressed(cloud, planes=planes(sign), labels=PointLabels(plane_index=index))
+    attributed = with_attributes(cloud, planes=planes(sign), labels=PointLabels(plane_index=index))
     expected = sign * NORMALS[index]
     expected[-N_SIDE:] = NORMALS[1]
-    np.testing.assert_allclose(normals(dress), expected, atol=1e-5)
-    up = normals(dressed(cloud))[IS_FLOOR]
+    np.testing.assert_allclose(normals(attributed), expected, atol=1e-5)
+    up = normals(with_attributes(cloud))[IS_FLOOR]
     np.testing.assert_allclose(up, np.tile(NORMALS[1], (len(up), 1)), atol=1e-5)
 
 
 def test_a_station_is_known_where_the_files_say_one_for_every_scan() -> None:
     stations = ORIGIN + np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
-    told = dressed(corner(stations=stations, stations_source="file"))
+    told = with_attributes(corner(stations=stations, stations_source="file"))
     assert told.scans == (0, 1)
     np.testing.assert_array_equal([told.station(0), told.station(1)], stations)
-    assert dressed(corner(stations=stations, stations_source="view_from")).station(0) is None
-    assert dressed(corner(stations=stations[:1], stations_source="file")).station(0) is None
-    assert dressed().station(0) is None
-    single = dressed(corner(scan=None, stations=stations[:1], stations_source="file"))
+    assert (
+        with_attributes(corner(stations=stations, stations_source="view_from")).station(0) is None
+    )
+    assert with_attributes(corner(stations=stations[:1], stations_source="file")).station(0) is None
+    assert with_attributes().station(0) is None
+    single = with_attributes(corner(scan=None, stations=stations[:1], stations_source="file"))
     assert single.scans == (0,)
     np.testing.assert_array_equal(single.station(0), stations[0])
 
 
 def test_what_no_colour_is_known_for_is_grey() -> None:
     cloud = corner(intensity=np.linspace(0.0, 1.0, len(CORNER), dtype=np.float32))
-    (plain,) = replace(dressed(cloud), colouring="intensity").blocks()
+    (plain,) = replace(with_attributes(cloud), colouring="intensity").blocks()
     assert (plain.rgb == plain.rgb[:, :1]).all()
     assert len(np.unique(plain.rgb)) > 100
     # Without planes there is no deviation, without labels no plane to be told by its colour.
     for colouring in ("deviation", "plane", "rgb"):
-        (block,) = replace(dressed(cloud), colouring=colouring).blocks()
+        (block,) = replace(with_attributes(cloud), colouring=colouring).blocks()
         np.testing.assert_array_equal(block.rgb, plain.rgb)
     labels = PointLabels(plane_index=IS_FLOOR.astype(np.int16))
     for colouring in ("deviation", "plane"):
-        known = dressed(cloud, planes=planes(), labels=labels)
+        known = with_attributes(cloud, planes=planes(), labels=labels)
         (block,) = replace(known, colouring=colouring).blocks()
         assert (block.rgb != plain.rgb).any()
