@@ -1,12 +1,12 @@
-"""The one way to compile: what numba is told is told here.
+"""Compilation of kernels by numba, with the same options everywhere.
 
-Numba wraps every function for callers in Python and in C. Where a scene's tables are among the
-arguments, the wrappers take as long to compile as the function itself; what only kernels call
-needs neither.
+Numba wraps every function for callers in Python and in C. If a scene's tables are among the
+arguments, the wrappers take as long to compile as the function itself; functions that only kernels
+call need neither.
 
-Numba keeps kernels, but not its own functions: each process that compiles a kernel compiles those
-that it calls. An array put into a part of another (`part[2:] = array`) calls forty, for a sentence
-about shapes: kernels put numbers, one by one.
+Numba caches kernels, but not its own functions: each process that compiles a kernel compiles those
+that it calls. Assigning an array to a slice of another (`part[2:] = array`) calls forty of them for
+an error message about shapes, so kernels assign single numbers.
 """
 
 from __future__ import annotations
@@ -260,7 +260,7 @@ def _give_constants_no_version(kernel: Any) -> None:
 
 
 class _Compilation(event.Listener):
-    """Hears from numba which kernel is compiled; one that needs others waits for these.
+    """Reports which kernel is being compiled; one that needs others waits for these.
 
     The compiler's own lock lets one thread compile at a time.
     """
@@ -270,9 +270,9 @@ class _Compilation(event.Listener):
         self._n_begun = 0
 
     def on_start(self, event: event.Event) -> None:
-        """State what is compiled, and how many were in this process.
+        """Report what is compiled, and how many kernels were compiled in this process.
 
-        How many there will be nobody knows: what a step needs hangs on its data.
+        The total is unknown, because it depends on the data of a step.
         """
         kernel = event.data["dispatcher"]
         self._depth += 1
@@ -282,7 +282,7 @@ class _Compilation(event.Listener):
         tell(f"compiling {name} ({self._n_begun} so far)")
 
     def on_end(self, event: event.Event) -> None:
-        """State that it is there."""
+        """Report that all is compiled."""
         self._depth -= 1
         if self._depth == 0:
             tell("")

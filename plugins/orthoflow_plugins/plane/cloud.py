@@ -1,6 +1,6 @@
-"""A cloud made ready for detection: blocks, an even sample, the plan, and its noise.
+"""A cloud prepared for detection: blocks, a representative sample, the plan, and its noise.
 
-Detectors look for planes in the sample alone. Fits and labels then take all points.
+Detectors search the sample alone. Fits and labels then use all points.
 """
 
 from __future__ import annotations
@@ -28,42 +28,42 @@ from orthoflow_plugins.plane.kernels import (
 )
 
 SAMPLE_POINTS: Final = 200_000
-# More cells than this cost more than they show; the cell grows instead.
+# Maximum number of plan cells; larger plans have larger cells.
 PLAN_CELLS_MOST: Final = 8_000_000
-# Points that are enough to see where a scene ends.
+# Points used to find the extent of a scene.
 _BOX_POINTS: Final = 20_000
 _TAIL_SHARE: Final = 0.05
 _GOLDEN: Final = 0.6180339887498949
-# Steps of the robust box of detectors that do not look at the plan.
+# Cell size of the robust box for detectors that do not use the plan.
 _BOX_CELL_M: Final = 0.5
 # Share of the points that may lie outside the box on each side, well below what a plane must have:
 # mirror ghosts and stray points, 0.4 % in simulated rooms, would make it several times as large.
 _OUTSIDE_SHARE: Final = 0.00125
-# Thread-private plans and surface rasters must stay small beside the cloud.
+# Thread-private plans and surface rasters must stay small compared with the cloud.
 _PARTS_MOST: Final = 8
-# Clouds thinner than this in two directions are a line or a point.
+# A cloud thinner than this in two directions is a line or a point.
 _THINNEST_M: Final = 1e-4
 
-# Noise is measured at so many places, in neighbourhoods of these radii and so many points.
+# Number of places at which noise is measured; radii and numbers of points of neighbourhoods.
 _NOISE_SEEDS: Final = 600
 _RADII_M: Final = (0.05, 0.1, 0.2, 0.4, 0.8)
 _NEAR_LEAST: Final = 12
 _NEAR_MOST: Final = 400
-# A neighbourhood is flat where it spreads that many times as far along its plane as across it.
+# A neighbourhood is flat if it extends this many times farther along its plane than across it.
 _FLATNESS: Final = 5.0
-# Fewer flat places do not speak for a cloud.
+# Minimum number of flat places for an estimate.
 _FLAT_LEAST: Final = 20
 _QUARTER: Final = 0.25
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sample:
-    """A few hundred thousand points that stand for all.
+    """A few hundred thousand points that represent all.
 
     Attributes:
         index: (m,) int64 positions in the cloud, ascending.
         offsets_m: (m, 3) float64 metres from the cloud's origin.
-        n_represented: points of the cloud that one sample point stands for.
+        n_represented: points of the cloud per sample point.
     """
 
     index: NDArray[np.int64]
@@ -73,17 +73,17 @@ class Sample:
 
 @dataclass(frozen=True, kw_only=True)
 class PreparedCloud:
-    """A cloud as the passes take it, and the plane of each of its points.
+    """A cloud in the form that compiled passes take, and the plane of each of its points.
 
     Attributes:
         points: all points.
         sample: the sample of them.
-        grid: plan cells and storeys.
+        grid: cells of the plan and bins of height.
         up: (3,) unit vector.
         parts: parts of parallel passes.
         claims: (n,) int8, plane of each point, -1 for none yet; `search.label` fills them.
-        plan: (cells along e1, cells along e2) points per plan cell; empty where not counted.
-        heights: (storeys,) points per storey, of those over the plan.
+        plan: (cells along e1, cells along e2) points per cell of the plan; empty if not counted.
+        heights: (bins,) points per bin of height, of those inside the plan.
     """
 
     points: BlockedPoints
@@ -111,9 +111,9 @@ class PreparedCloud:
         bounds_m: NDArray[np.float64],
         names: NDArray[np.int8] | None = None,
     ) -> None:
-        """Claim each point for the nearest of some slabs (k, 12) in whose bounds (k, 5) it lies.
+        """Assign each point to the nearest of some slabs (k, 12) in whose bounds (k, 5) it lies.
 
-        Claims are the numbers of the slabs, or (k + 1,) their names, the last for -1.
+        Claims are the indices of the slabs, or their (k + 1,) names, the last for -1.
         """
 
         def claim(_part: int, piece: slice) -> None:
@@ -141,13 +141,13 @@ def prepare(
     box_cell_m: float = _BOX_CELL_M,
     outside_share: float = _OUTSIDE_SHARE,
 ) -> PreparedCloud:
-    """Sample a cloud and see where its blocks lie; nothing is claimed yet.
+    """Sample a cloud and find the boxes of its blocks; no point is assigned yet.
 
     Args:
         cloud: the cloud.
         parts: threads.
-        plan_cell_m: side of the cells that points are counted in, in the same pass; None for none.
-        box_cell_m: what the sides of the robust box are multiples of where there is no plan.
+        plan_cell_m: side of the cells of the plan, counted in the same pass; None for no plan.
+        box_cell_m: the sides of the robust box are multiples of this without a plan.
         outside_share: share of the points that may lie outside the box on each side.
 
     Raises:
@@ -159,7 +159,7 @@ def prepare(
     spread_m2 = np.linalg.eigvalsh(centred.T @ centred) / len(sample.index)
     if spread_m2[1] < _THINNEST_M**2:
         where = "coincide" if spread_m2[2] < _THINNEST_M**2 else "lie on one line"
-        raise MethodError(f"the {len(cloud)} points of the cloud {where}, which fixes no plane")
+        raise MethodError(f"the {len(cloud)} points of the cloud {where}, so they define no plane")
     basis, parts = basis_from_up(cloud.up), max(1, min(parts, _PARTS_MOST))
     cell_m = box_cell_m if plan_cell_m is None else plan_cell_m
     grid = plan_grid(sample, basis, cell_m=cell_m, outside_share=outside_share)
@@ -181,10 +181,10 @@ def prepare(
 
 
 def draw_sample(cloud: PointCloud) -> Sample:
-    """Take one point from each of `SAMPLE_POINTS` equal stretches of the cloud, all of a small one.
+    """Take one point from each of `SAMPLE_POINTS` equal parts of the cloud, all of a small one.
 
-    The place within a stretch follows the golden ratio: a fixed stride would fall in step with the
-    columns of a scan, and random places would need a seed.
+    The position within a part follows the golden ratio: a fixed stride would coincide with the
+    columns of a scan, and random positions would need a seed.
 
     Raises:
         ProductError: the cloud has fewer than three points, or coordinates that are not finite.
@@ -232,25 +232,25 @@ def blocked(offsets_m: NDArray[np.float64]) -> BlockedPoints:
 def plan_grid(
     sample: Sample, basis: NDArray[np.float64], *, cell_m: float, outside_share: float
 ) -> PlanGrid:
-    """Lay plan cells over the cloud without its gross outliers.
+    """Return plan cells over the cloud without its gross outliers.
 
     Args:
         sample: points of the cloud.
         basis: (3, 3) rows e1, e2, up.
-        cell_m: side of a cell wanted; grows when the plan would have too many.
+        cell_m: requested side of a cell; enlarged if the plan would have too many.
         outside_share: share of the points that may lie outside on each side.
     """
     framed = sample.offsets_m[:: max(1, len(sample.index) // _BOX_POINTS)] @ basis.T
     low, high = np.quantile(framed, (_TAIL_SHARE, 1.0 - _TAIL_SHARE), axis=0)
-    # The tails may be a side room or stray echoes; only what is far beyond the scene's own size
-    # can be told to be stray. A lone wall is thin one way, so the largest extent is the measure.
+    # The tails may be a side room or stray echoes; only points farther away than the size of the
+    # scene are certainly stray. A single wall is thin one way, so the largest extent counts.
     reach_m = float((high - low).max())
     framed = framed[((framed >= low - reach_m) & (framed <= high + reach_m)).all(axis=1)]
     low, high = np.quantile(framed, (outside_share, 1.0 - outside_share), axis=0)
     margin = 0.02 * (high - low) + 5.0 * cell_m
     low, high = low - margin, high + margin
     extent = high - low
-    # A long, thin plan, or a tall tower, must not ask for millions of storeys either.
+    # A long, thin plan, or a tall tower, must not need millions of bins of height either.
     fewest_m = math.sqrt(float(extent[0] * extent[1]) / PLAN_CELLS_MOST)
     cell_m = max(cell_m, fewest_m, float(extent.max()) / PLAN_CELLS_MOST)
     a, b, c = np.maximum(1, np.ceil(extent / cell_m)).astype(int).tolist()
@@ -258,13 +258,13 @@ def plan_grid(
 
 
 def measure_noise(points_m: NDArray[np.float64]) -> tuple[float, float] | None:
-    """Measure the noise of a cloud on a sample (n, 3) of its points; None where nothing is flat.
+    """Measure the noise of a cloud on a sample (n, 3) of its points; None if nothing is flat.
 
-    The points around a seed are fitted by a plane (principal components); their scatter across it
-    is noise where they are flat: spread at least five times as far along the plane as across it.
-    Small neighbourhoods show the noise of single points. Large ones show, too, errors that
-    neighbouring points share (a bent trajectory, stereo, scans that do not fit), but also relief:
-    of them the flatter quarter counts.
+    A plane is fitted to the points around a seed (principal components). Their scatter across it
+    is noise if they are flat: they extend at least five times farther along the plane than across
+    it. Small neighbourhoods give the noise of single points. Large ones also contain errors that
+    neighbouring points share (a bent trajectory, stereo, misregistered scans), but relief as well,
+    so the flatter quarter of them is used.
 
     Returns:
         Standard deviations across the surfaces, metres: of single points against their neighbours,
@@ -298,10 +298,10 @@ def measure_noise(points_m: NDArray[np.float64]) -> tuple[float, float] | None:
 
 
 def _flat_scatter_m(points_m: NDArray[np.float64]) -> float:
-    """Robust scatter across the plane of some points; NaN where they are not flat.
+    """Return the robust scatter of points across their plane; NaN if they are not flat.
 
-    The median deviation from the plane of principal components, 1.4826 times: a second surface or
-    an edge among them widens the components, so such places fall out by the flatness.
+    This is 1.4826 times the median deviation from the plane of principal components. A second
+    surface or an edge widens the components, so the test of flatness rejects such places.
     """
     relative = points_m - points_m.mean(axis=0)
     values, axes = np.linalg.eigh(relative.T @ relative / (len(points_m) - 3))

@@ -26,7 +26,7 @@ from orthoflow_plugins.plane.detector import (
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.search import Search
 
-# Points of a candidate, as a share of those that a plane needs.
+# Minimum number of points of a candidate as a share of those that a plane needs.
 PART_SHARE: Final = 0.2
 
 
@@ -34,8 +34,8 @@ PART_SHARE: Final = 0.2
 def load_open3d(purpose: str) -> Any:
     """Import open3d.
 
-    Its wheel needs libusb-1.0.so.0, which fresh machines lack; the package libusb-package carries
-    it, and once loaded globally it is found.
+    Its wheel needs libusb-1.0.so.0, which may be missing on a new machine; the package
+    libusb-package contains it, and open3d finds it once it is loaded globally.
 
     Args:
         purpose: what needs it, for the message.
@@ -54,18 +54,18 @@ def load_open3d(purpose: str) -> Any:
     except ModuleNotFoundError as error:
         raise PluginError(
             f"{purpose} needs open3d, which is not installed: install it with "
-            "`python -m pip install open3d-cpu libusb-package`, or take a method without it"
+            "`python -m pip install open3d-cpu libusb-package`, or use a method without it"
         ) from error
     except (ImportError, OSError) as error:
         raise PluginError(
             f"{purpose} needs open3d, which does not load ({str(error).splitlines()[0]}): install "
             "the system library that it names (Debian: apt-get install libgl1 libx11-6 "
-            "libusb-1.0-0), or take a method without it"
+            "libusb-1.0-0), or use a method without it"
         ) from error
 
 
 class _Open3dMethod(Method):
-    """What the methods of open3d have in common."""
+    """Common base of the methods of open3d."""
 
     determinism = "loose"
     metrics = DETECTOR_METRICS
@@ -74,7 +74,7 @@ class _Open3dMethod(Method):
 
     @classmethod
     def tools(cls) -> Mapping[str, str]:
-        """Version of open3d, which decides about results, under whichever name it is installed."""
+        """Return the version of open3d, which affects results, under its installed name."""
         for name in ("open3d-cpu", "open3d"):
             try:
                 return {"open3d": version(name)}
@@ -84,12 +84,12 @@ class _Open3dMethod(Method):
 
 
 class Open3dRansac(_Open3dMethod):
-    """Find planes with open3d's `segment_plane` on the points that remain, plane after plane.
+    """Find planes with open3d's `segment_plane` on the remaining points, plane after plane.
 
-    For comparison: it looks at the same sample of the cloud as the other detectors, takes longer
-    than plane.ransac, and does not repeat itself exactly, whatever the seed. `refit: false` shows
-    what it finds by itself; with the common refit its planes are as good as those of any other
-    detector, where it finds them.
+    For comparison: it uses the same sample of the cloud as the other detectors, takes longer than
+    plane.ransac, and is not exactly repeatable, whatever the seed. `refit: false` shows its own
+    planes; with the common refit, the planes that it finds are as accurate as those of any other
+    detector.
     """
 
     id = "plane.open3d-ransac"
@@ -99,7 +99,7 @@ class Open3dRansac(_Open3dMethod):
     )
 
     class Params(DetectorParams):
-        """What may be set."""
+        """Parameters."""
 
         n_iterations: int = Field(1000, ge=1, le=1_000_000, description="Hypotheses per plane.")
 
@@ -114,17 +114,17 @@ class Open3dRansac(_Open3dMethod):
 
 
 class SegmentProposer:
-    """Proposes the plane of `segment_plane` among the points that remain, again and again."""
+    """Proposes the plane of `segment_plane` among the remaining points, repeatedly."""
 
     # Any: the library has no types.
     def __init__(self, search: Search, params: Open3dRansac.Params, open3d: Any) -> None:
-        """Get ready to propose; open3d takes no constraint, so other planes are passed over."""
+        """Store the settings; open3d has no constraint, so unsuitable planes are skipped."""
         self._params, self._open3d = params, open3d
         self._passed_over = np.zeros(len(search.claims), dtype=bool)
         self._last = np.zeros(0, dtype=np.int64)
 
     def propose(self, search: Search) -> Candidate | None:
-        """Name the plane with most inliers, or None when it has too few."""
+        """Return the plane with most inliers, or None if it has too few."""
         free = np.flatnonzero((search.claims < 0) & ~self._passed_over)
         if len(free) < max(3.0, search.least_points):
             return None
@@ -143,7 +143,7 @@ class SegmentProposer:
         )
 
     def reject(self, candidate: Candidate) -> None:
-        """Leave the inliers of what was no plane out of the next search."""
+        """Exclude the inliers of the refused plane from the next search."""
         del candidate
         self._passed_over[self._last] = True
 
@@ -151,9 +151,9 @@ class SegmentProposer:
 class Open3dPatches(_Open3dMethod):
     """Find planes with open3d's `detect_planar_patches`, which grows patches by robust statistics.
 
-    For comparison: it looks at the same sample of the cloud as the other detectors, with normals of
-    nearest neighbours there. `refit: false` shows what it finds by itself: the middle of the box
-    about a patch, which mouldings pull off the wall.
+    For comparison: it uses the same sample of the cloud as the other detectors, with normals of
+    nearest neighbours there. `refit: false` shows its own planes, through the centre of the box
+    around a patch, which mouldings bias.
     """
 
     id = "plane.open3d-patches"
@@ -166,19 +166,19 @@ class Open3dPatches(_Open3dMethod):
     )
 
     class Params(DetectorParams):
-        """What may be set; the last three bear the meaning that open3d gives them."""
+        """Parameters; the last three have the meaning that open3d gives them."""
 
         n_neighbours: int = Field(
             30, ge=3, le=1000, description="Points of a neighbourhood, for normals and growing."
         )
         normal_variance_deg: float = Field(
-            60.0, gt=0.0, lt=90.0, description="Largest spread of the normals in a patch."
+            60.0, gt=0.0, lt=90.0, description="Maximum spread of the normals in a patch."
         )
         coplanarity_deg: float = Field(
             75.0, gt=0.0, lt=90.0, description="How flat a patch must be; 90 is perfectly flat."
         )
         outlier_share: float = Field(
-            0.75, gt=0.0, lt=1.0, description="Share of points off the plane that a patch may have."
+            0.75, gt=0.0, lt=1.0, description="Maximum share of points off the plane of a patch."
         )
 
     def run(self, inputs: DetectorIn, params: Params, ctx: StepContext) -> DetectorOut:
@@ -190,14 +190,14 @@ class Open3dPatches(_Open3dMethod):
 
 
 class PatchProposer:
-    """Proposes the patches of `detect_planar_patches`, that with most points in its box first."""
+    """Proposes the patches of `detect_planar_patches`, by the number of points in their boxes."""
 
     # Any: the library has no types.
     def __init__(self, search: Search, params: Open3dPatches.Params, open3d: Any) -> None:
         """Find all patches at once.
 
         Raises:
-            MethodError: open3d gave up.
+            MethodError: open3d failed.
         """
         points_m = search.cloud.sample.offsets_m
         cloud = open3d.geometry.PointCloud()
@@ -214,7 +214,7 @@ class PatchProposer:
             )
         except RuntimeError as error:
             raise MethodError(
-                f"open3d's detect_planar_patches gave up on the {len(points_m)} points "
+                f"open3d's detect_planar_patches failed on the {len(points_m)} points "
                 f"({str(error).splitlines()[0]}): try another n_neighbours or thinning"
             ) from error
         self._candidates = []
@@ -232,9 +232,9 @@ class PatchProposer:
         self._candidates.sort(key=lambda candidate: -candidate.votes)
 
     def propose(self, search: Search) -> Candidate | None:
-        """Name the next patch."""
+        """Return the next patch."""
         del search
         return self._candidates.pop(0) if self._candidates else None
 
     def reject(self, candidate: Candidate) -> None:
-        """Do nothing: patches are named once in any case."""
+        """Do nothing: each patch is proposed once."""

@@ -1,4 +1,4 @@
-"""What every detector takes, proposes and gives: ports, parameters, metrics, candidates."""
+"""What all detectors share: ports, parameters, metrics, candidates."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from orthoflow.geometry import Plane
 from orthoflow.products import Planes, PointCloud, PointLabels
 from orthoflow.sdk import MethodParams, MetricSpec, Ports
 
-# Which planes are looked for.
+# Which planes are searched for.
 Constraint = Literal["any", "vertical", "horizontal"]
 # Lowest and highest intensity of each material.
 Materials = Mapping[str, tuple[float, float]]
 
-# What every detector reports.
+# Metrics of every detector.
 DETECTOR_METRICS: Final = (
     MetricSpec("n_planes", label="planes found"),
-    MetricSpec("thinning", label="points per point that was looked at"),
+    MetricSpec("thinning", label="points per point used in the search"),
     MetricSpec("labelled_share", label="points that lie on a plane"),
     MetricSpec("first_share", label="points that lie on the first plane"),
     MetricSpec("tolerance_m", label="distance to a plane within which points belong to it"),
@@ -81,7 +81,7 @@ PAPER: Final = (
     "of Cultural Heritage Objects. Remote Sensing 7(12), doi:10.3390/rs71215869"
 )
 
-# Tolerances of a clean scan: that of markiewicz2015, and what mouldings of rooms stay outside of.
+# Tolerances of a clean scan: that of markiewicz2015, and one that excludes the mouldings of rooms.
 _TOLERANCE_M: Final = 0.05
 _FIT_TOLERANCE_M: Final = 0.015
 # Tolerances per standard deviation of the noise.
@@ -89,68 +89,70 @@ _NOISE_TIMES: Final = 4.0
 
 
 class DetectorIn(Ports):
-    """What planes are found in."""
+    """The cloud to search."""
 
     cloud: PointCloud
 
 
 class DetectorOut(Ports):
-    """Planes, and which of them has each point."""
+    """The planes, and the plane of each point."""
 
     planes: Planes
     labels: PointLabels
 
 
 class DetectorParams(MethodParams):
-    """What every detector takes; the defaults suit rooms and facades scanned at millimetres."""
+    """Parameters of every detector; the defaults suit rooms and facades scanned at millimetres."""
 
     tolerance_m: Annotated[float, Field(gt=0.0)] | Literal["auto"] = Field(
         "auto",
-        description="Points this near to a plane belong to it, metres. auto: 0.05, or four times "
-        "the noise that is measured on the cloud where that is more.",
+        description="Maximum distance from a plane of the points that belong to it, metres. auto: "
+        "0.05, or four times the measured noise of the cloud if that is more.",
     )
     fit_tolerance_m: Annotated[float, Field(gt=0.0)] | Literal["auto"] = Field(
         "auto",
-        description="Points this near to a plane take part in its final fit, metres; at most "
-        "`tolerance_m`. auto: 0.015, or four times the noise of single points where that is more.",
+        description="Maximum distance from a plane of the points used in its final fit, metres; "
+        "at most `tolerance_m`. auto: 0.015, or four times the noise of single points if that is "
+        "more.",
     )
     constraint: Constraint = Field(
-        "any", description="Which planes are looked for, within `max_tilt_deg`."
+        "any", description="Which planes are searched for, within `max_tilt_deg`."
     )
     max_tilt_deg: float = Field(
         10.0,
         gt=0.0,
         le=45.0,
-        description="Vertical planes may be off vertical, and horizontal ones off level, by this.",
+        description="Maximum deviation of vertical planes from vertical, and of horizontal ones "
+        "from level.",
     )
     exact: bool = Field(
         default=False,
-        description="Keep walls exactly vertical and levels exactly level instead of letting each "
-        "plane lean as its points say.",
+        description="Keep walls exactly vertical and floors exactly level instead of fitting their "
+        "tilt.",
     )
-    n_planes_max: int = Field(100, ge=1, le=100, description="Stop after so many planes.")
+    n_planes_max: int = Field(100, ge=1, le=100, description="Maximum number of planes.")
     min_area_m2: float = Field(
         1.0,
         ge=0.0,
-        description="Surface that a plane must show, square metres; the search ends where no "
-        "candidate has as much. Less in a cloud with no side of 50 times that.",
+        description="Minimum area of a plane, square metres; the search ends when no candidate has "
+        "as much. Less in a cloud none of whose faces has 50 times that.",
     )
     min_share: float = Field(
-        0.001, gt=0.0, lt=1.0, description="Share of all points that a plane must hold."
+        0.001, gt=0.0, lt=1.0, description="Minimum share of all points on a plane."
     )
     stop_unclassified_share: float = Field(
         0.0,
         ge=0.0,
         lt=1.0,
         description="Stop when a smaller share of the points is on no plane yet. markiewicz2015 "
-        "takes 0.1, at which walls far from the scanner are missed. 0 never stops.",
+        "uses 0.1, which misses walls far from the scanner. 0 never stops.",
     )
     stop_rest_share: float = Field(
         0.0,
         ge=0.0,
         lt=1.0,
-        description="Stop at a plane that holds a smaller share of the points that were left for "
-        "it: the other reading of the 10 % in markiewicz2015. 0 never stops.",
+        description="Stop at a plane that has a smaller share of the points not yet assigned: the "
+        "other reading of the 10 % in markiewicz2015. 0 never stops.",
     )
     thinning: int = Field(
         1,
@@ -160,17 +162,17 @@ class DetectorParams(MethodParams):
     )
     join_parts: bool = Field(
         default=True,
-        description="Parts of one plane that do not touch are one plane; else each is its own.",
+        description="Treat parts of a plane that do not touch as one plane instead of several.",
     )
     materials: dict[str, tuple[float, float]] = Field(
         default_factory=dict,
         description="Lowest and highest intensity (0..1) of each material, by its name, e.g. "
-        "{fabric: [0, 0.3], plaster: [0.3, 1]}: how thick the cloud is on each of them is told.",
+        "{fabric: [0, 0.3], plaster: [0.3, 1]}: the thickness of the cloud is reported for each.",
     )
     refit: bool = Field(
         default=True,
-        description="Fit planes to all their points, the same for every detector; else they stay "
-        "as the detector itself gave them.",
+        description="Fit planes to all their points, in the same way for every detector, instead "
+        "of keeping them as the detector proposed them.",
     )
 
     @field_validator("materials")
@@ -205,14 +207,15 @@ class DetectorParams(MethodParams):
     def tolerances_m(self, single_m: float, shared_m: float) -> tuple[float, float]:
         """Return `tolerance_m` and `fit_tolerance_m` of a cloud with a noise.
 
-        A plane is told from a filled slab by how its points crowd in the inner half of the
-        tolerance: within four standard deviations 95 % do (a normal distribution), within 2.5 no
-        more than 80 %, which is refused. Shared errors bend a surface by as much, so they count
-        for `tolerance_m`; for the fit half of that, since a bend is averaged over the whole plane.
+        A plane is distinguished from a filled slab by the concentration of its points in the inner
+        half of the tolerance: 95 % of them (normal distribution) if the tolerance is four standard
+        deviations, but only 80 %, which is refused, if it is 2.5. Errors that neighbouring points
+        share bend a surface, so they count for `tolerance_m`, and by half for the fit, which
+        averages bends over the whole plane.
 
         Args:
-            single_m: noise of single points, standard deviation; 0 where it is not known.
-            shared_m: the same with errors that neighbouring points share.
+            single_m: noise of single points, standard deviation; 0 if unknown.
+            shared_m: the same, including errors that neighbouring points share.
         """
         if self.fit_tolerance_m == "auto":
             fit_m = max(_FIT_TOLERANCE_M, _NOISE_TIMES * single_m, 0.5 * _NOISE_TIMES * shared_m)
@@ -228,11 +231,11 @@ class Candidate:
     """A plane that a detector proposes.
 
     Attributes:
-        plane: in the cloud's offsets, a few centimetres or a degree off.
-        constraint: what it may be.
-        votes: the points that speak for it, by the detector's own count.
-        own_tolerance_m: the tolerance that the detector found by itself, or None.
-        start: where the common fit starts, if not from the plane itself.
+        plane: in the cloud's offsets, accurate to a few centimetres or a degree.
+        constraint: which planes it may become.
+        votes: the detector's own score.
+        own_tolerance_m: the tolerance estimated by the detector, or None.
+        start: the plane from which the common fit starts; None for `plane`.
     """
 
     plane: Plane
@@ -248,7 +251,7 @@ def leans_as_asked(
     constraint: Constraint,
     max_tilt_deg: float,
 ) -> NDArray[np.bool_]:
-    """Report which planes with (n, 3) normals are vertical, or horizontal, within a tilt; (n,)."""
+    """Return which planes with (n, 3) normals are vertical, or horizontal, within a tilt; (n,)."""
     tilts_deg = np.degrees(np.arcsin(np.clip(np.abs(normals @ up), 0.0, 1.0)))
     if constraint == "any":
         return np.ones(len(normals), dtype=bool)

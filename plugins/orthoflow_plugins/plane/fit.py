@@ -1,27 +1,28 @@
 """Fits of a plane: to points of the sample, with a shrinking tolerance, and to the cells on it.
 
 All planes here are in the cloud's own offsets (metres from its origin), so that survey coordinates
-cost no digits; `planes` adds the origin once, at the end.
+lose no digits; `planes` adds the origin once, at the end.
 
 The fit to cells is robust total least squares, cell by cell. Neighbouring points of a scan share
-errors: relief, bow and plaster waves are larger than the scanner's noise. Here a cell is one
-observation with a variance of its own (surface) plus the noise of its points.
+errors: relief, bow and waves of the plaster exceed the scanner's noise. Each cell is therefore one
+observation, whose variance is that of the surface plus the noise of its points.
 
 Mouldings, edges and mixed distances put points beside the surface, nearly always on one side of it.
-Three things keep them out: the fit starts at the densest layer of cells instead of their median,
-cells far off lose their weight, and so do cells whose points scatter more than those of others.
+They are excluded in three ways: the fit starts at the densest layer of cells instead of their
+median, distant cells lose their weight, and so do cells whose points scatter more than usual.
 
-A covariance from single points would promise micrometres. Three things are done about it.
+A covariance from single points would be far too small. It is estimated in three steps.
 
-- Tiles of cells are the units that err independently: the covariance is that of leaving out one
-  tile after the other (the jackknife of clusters, CR3 in Cameron & Miller 2015, section VI.B),
-  which is still right with few tiles. Of several sizes of tile the one with the largest variance
-  holds: as long as tiles are smaller than the reach of the correlation, it grows with their size.
-- Cells that lose their weight as they move away tell less than their weights say: the covariance
-  grows by the derivative of the influence function (Huber & Ronchetti 2009, section 7.6).
-- Mouldings and mixed distances lie on one side and bias the fit, which no scatter shows. How far
-  the plane moves when cells twice as far away may take part shows it; that is added as a component
-  of its own (GUM, JCGM 100:2008, 4.3).
+- Tiles of cells are the independent units: the covariance is that of leaving out one tile at a
+  time (cluster jackknife, CR3 in Cameron & Miller 2015, section VI.B), which remains valid with
+  few tiles. Of several sizes of tile the one with the largest variance is used, because the
+  variance grows with the size as long as tiles are smaller than the correlation length.
+- Cells whose weight decreases with their residual carry less information than their weights
+  suggest: the covariance is enlarged by the derivative of the influence function (Huber &
+  Ronchetti 2009, section 7.6).
+- Mouldings and mixed distances lie on one side and bias the fit, which does not show in the
+  scatter. It shows in how far the plane moves if cells at twice the distance are used; this is
+  added as a separate component (GUM, JCGM 100:2008, 4.3).
 """
 
 from __future__ import annotations
@@ -55,26 +56,26 @@ _FREEDOMS: Final[dict[Freedom, tuple[int, list[int]]]] = {
 
 # In standard deviations of a cell: beyond, a cell has no weight (Beaton & Tukey 1974).
 _TUKEY: Final = 3.5
-# Cells nearer than this share of the limit have all their weight. Would it fade from the plane on,
-# as Tukey's does, each way to cut a wall into cells would weigh the same points differently: a
-# seventh of what they say would be lost, and a turned wall found elsewhere by half its sigma.
+# Cells nearer than this share of the limit have full weight. If it decreased from the plane on, as
+# Tukey's does, the same points would be weighted differently for each division into cells: a
+# seventh of the information would be lost, and a rotated wall would move by half its sigma.
 _FULL_SHARE: Final = 0.571
 # The densest layer holds this share of the cells; a normal distribution holds it within +-0.385.
 _LAYER_SHARE: Final = 0.3
 _LAYER_SIGMAS: Final = 0.7706
-# What is usual near a cell counts beside its own variance as if it had so many points.
+# The usual variance near a cell is combined with the cell's own as if it came from so many points.
 _USUAL_POINTS: Final = 40
-# What is usual is the median of blocks so wide, if they hold so many cells.
+# The usual variance is the median of blocks of this width, if they have this many cells.
 _BLOCK_CELLS: Final = 8
 _BLOCK_LEAST: Final = 12
 _CHANCE_SIGMAS: Final = 3.0
 _STEPS_MOST: Final = 30
 # A fit has settled when none of its cells moves by more than this.
 SETTLED_M: Final = 1e-7
-# What a surface is never flatter than, so that a perfectly flat simulation has weights too.
+# Lower limit of the roughness of a surface, so that a perfectly flat simulation has weights too.
 _FLATTEST_M: Final = 2e-5
 
-# Tiles that the covariance is estimated from, cells wide; fewer tiles do not show a spread.
+# Widths of tiles for the covariance, in cells; minimum number of tiles.
 _TILE_CELLS: Final = (2, 4, 8, 16)
 _TILES_LEAST: Final = 8
 # The derivative of the influence function is trusted down to this share of the weights.
@@ -85,10 +86,10 @@ _WIDER_STEPS: Final = 3
 
 
 def shrinking_tolerances(tolerance_m: float, fit_tolerance_m: float) -> tuple[float, ...]:
-    """Tolerances to fit with, one after the other: 5 cm, 2.7 cm and 1.5 cm for the defaults.
+    """Return the tolerances of successive fits: 5 cm, 2.7 cm and 1.5 cm for the defaults.
 
-    A fit at 5 cm finds the wall but is pulled by mouldings and the floor's edge; a fit at 1.5 cm is
-    exact but would not get there from a rough start.
+    A fit at 5 cm finds the wall but is biased by mouldings and the edge of the floor; a fit at
+    1.5 cm is exact but does not converge from a rough start.
     """
     if fit_tolerance_m >= tolerance_m:
         return (tolerance_m,)
@@ -107,15 +108,15 @@ def refine_plane(
     Args:
         points: (m, 3) offsets, metres.
         start: plane to start from.
-        tolerances_m: points further away have no weight (Tukey's weights); one after the other.
+        tolerances_m: of successive fits; points farther away have no weight (Tukey's weights).
         freedom: what may change.
         up: (3,) unit vector.
 
     Returns:
-        The plane, or None where fewer than three points or only a line of points support it.
+        The plane, or None if fewer than three points or only points on a line support it.
     """
     basis = np.eye(3) if freedom == "free" else basis_from_up(up)
-    # Every other point of an array, or all: one kernel for both.
+    # One memory layout, so that one kernel is compiled.
     packed = np.ascontiguousarray(points if freedom == "free" else points @ basis.T)
     row = np.append(basis @ start.normal, start.offset_m)
     for tolerance_m in tolerances_m:
@@ -129,14 +130,14 @@ def refine_plane(
 
 @dataclass(frozen=True, kw_only=True)
 class CellFit:
-    """A robust fit to cells, which are observations of the height over a plane nearly right.
+    """A robust fit to cells, which are observations of the height above an approximate plane.
 
     Attributes:
         design: (n, p) derivatives of a height by the unknowns.
         heights_m: (n,) mean height of the points of each cell.
-        rows: (n,) place of the cell on the plane.
+        rows: (n,) position of the cell on the plane.
         columns: see rows.
-        limit_m: (n,) residual at which a cell has no weight any more.
+        limit_m: (n,) residual beyond which a cell has no weight.
         variance_m2: (n,) variance of each cell.
         solution: (p,) the unknowns.
     """
@@ -150,20 +151,20 @@ class CellFit:
     solution: NDArray[np.float64]
 
     def residuals_m(self) -> NDArray[np.float64]:
-        """(n,) heights above the plane."""
+        """Return (n,) heights above the plane."""
         return np.asarray(self.heights_m - self.design @ self.solution)
 
     def faded(self) -> NDArray[np.float64]:
-        """(n,) how far residuals are from where weights begin to fade, 0, to the limit, 1."""
+        """Return (n,) positions of residuals between full weight, 0, and no weight, 1."""
         beyond = (np.abs(self.residuals_m() / self.limit_m) - _FULL_SHARE) / (1.0 - _FULL_SHARE)
         return np.clip(beyond, 0.0, 1.0)
 
     def weights(self) -> NDArray[np.float64]:
-        """(n,) robust weights over the variances: all, then Tukey's as residuals near the limit."""
+        """Return (n,) robust weights over variances: full, then Tukey's towards the limit."""
         return (1.0 - self.faded() ** 2) ** 2 / self.variance_m2
 
     def stepped(self) -> CellFit | None:
-        """Solve with the weights of this one; None where the cells do not fix a plane."""
+        """Solve with the current weights; None if the cells do not determine a plane."""
         weighted = self.weights() * self.design.T
         normal_matrix = weighted @ self.design
         extremes = np.abs(np.linalg.eigvalsh(normal_matrix))
@@ -179,9 +180,9 @@ class AdjustedPlane:
 
     Attributes:
         plane: in the cloud's offsets.
-        moved_m: how far the fit moved a corner of the cells at most.
-        bend_per_m: strongest curvature of the surface that the cells show, 1 over its radius.
-        bend_share: share of the cells' variance that this curvature explains.
+        moved_m: largest displacement of a cell by the fit.
+        bend_per_m: strongest curvature of the surface, 1 over its radius.
+        bend_share: share of the variance of the cells that this curvature explains.
         fit: the fit to the cells.
         jacobian: (4, p) of (normal, offset) by the unknowns of the fit.
     """
@@ -194,10 +195,10 @@ class AdjustedPlane:
     jacobian: NDArray[np.float64]
 
     def stated(self) -> tuple[NDArray[np.float64], float]:
-        """State the covariance (4, 4) of (normal, offset), in offsets.
+        """Return the covariance (4, 4) of (normal, offset), in offsets.
 
         Returns:
-            The covariance, and how many cells without common errors would fix the plane as well.
+            The covariance, and the number of independent cells that would give the same one.
         """
         covariance, n_independent = stated_covariance(self.fit)
         return self.jacobian @ covariance @ self.jacobian.T, n_independent
@@ -205,14 +206,14 @@ class AdjustedPlane:
 
 @dataclass(frozen=True)
 class FoundPlane:
-    """A plane that holds its share of the points.
+    """An accepted plane.
 
     Attributes:
         raster: its cells; `raster.plane` is the plane, in the cloud's offsets.
         support: which cells belong, parts, rectangle.
         adjusted: the fit.
-        candidate: what the detector proposed.
-        freedom: what the fit could change.
+        candidate: the detector's proposal.
+        freedom: the unknowns of the fit.
     """
 
     raster: SurfaceRaster
@@ -234,15 +235,15 @@ def adjust_plane(
     """Fit the plane to the mean distances of cells; to second order this is total least squares.
 
     Args:
-        raster: cells on a plane that is nearly right.
+        raster: cells on an approximate plane.
         sums: their sums.
         cells: (rows, columns) bool, which of them belong.
-        fit_tolerance_m: tolerance the sums were made with.
-        freedom: what may change.
-        settled_m: the fit ends when no cell moves by more.
+        fit_tolerance_m: tolerance of the sums.
+        freedom: the unknowns.
+        settled_m: the fit has converged if no cell moves by more.
 
     Returns:
-        The plane, or None where the cells do not fix it.
+        The plane, or None if the cells do not determine it.
     """
     rows, columns = np.nonzero(cells & (sums.n_fit > 0))
     if len(rows) < 4:
@@ -290,12 +291,12 @@ def _cell_variances(
     columns: NDArray[np.int64],
     fit_tolerance_m: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Variance of each cell's mean by the noise of its points, and by points that do not belong.
+    """Return the variance of each cell's mean from noise, and from points that do not belong.
 
-    A share of points spread evenly from the surface to the tolerance D, as mixed distances are,
-    adds share * D**2 / 3 to the variance of a cell and moves its mean by share * D / 2: the mean is
-    off by 1.5 / D times the variance in excess of what is usual thereabouts: the median of the
-    cells in its block, since noise differs with incidence and cloth.
+    A share of points spread evenly from the surface to the tolerance D, like mixed distances, adds
+    share * D**2 / 3 to the variance of a cell and moves its mean by share * D / 2. The error of the
+    mean is therefore 1.5 / D times the excess of the variance over the usual one nearby. That is
+    the median of the cells in the block, because noise depends on incidence and material.
     """
     free = np.maximum(number - 1, 0)
     own = np.maximum(spread_m2, 0.0) * number / np.maximum(free, 1)
@@ -329,7 +330,7 @@ def _solved(
     mixture_m2: NDArray[np.float64],
     settled_m: float,
 ) -> CellFit | None:
-    """Weighted least squares with the cells' own variance estimated along; outliers lose weight."""
+    """Solve by weighted least squares and estimate the variance of cells; outliers lose weight."""
     solution = np.zeros(design.shape[1])
     solution[0] = _densest_layer(heights_m)[0]
     usual_m2 = float(np.median(noise_m2 + mixture_m2))
@@ -355,10 +356,10 @@ def _solved(
 
 
 def _densest_layer(heights_m: NDArray[np.float64]) -> tuple[float, float]:
-    """Middle of the shortest interval that holds a share of the heights, and the spread it shows.
+    """Return the middle of the shortest interval with a share of the heights, and its sigma.
 
     The "shorth" of Rousseeuw & Leroy 1987 with a smaller share: a panel that covers half of a wall
-    does not move it.
+    does not affect it.
     """
     ordered = np.sort(heights_m)
     held = max(2, int(_LAYER_SHARE * len(ordered)))
@@ -369,7 +370,7 @@ def _densest_layer(heights_m: NDArray[np.float64]) -> tuple[float, float]:
 
 
 def _bend(design: NDArray[np.float64], heights_m: NDArray[np.float64]) -> tuple[float, float]:
-    """Curvature of the cells' heights, and the share of their variance that it explains."""
+    """Return the curvature of the cells' heights, and the share of their variance it explains."""
     reach_m = max(float(np.abs(design[:, 1:]).max()), _FLATTEST_M)
     # In units of the reach, so that the normal equations are well conditioned.
     u, v = design[:, 1] / reach_m, design[:, 2] / reach_m
@@ -387,17 +388,17 @@ def _bend(design: NDArray[np.float64], heights_m: NDArray[np.float64]) -> tuple[
 
 
 def stated_covariance(fit: CellFit) -> tuple[NDArray[np.float64], float]:
-    """State the covariance of a robust fit to cells, correlated and one-sided errors included.
+    """Return the covariance of a robust fit, including correlated and one-sided errors.
 
     Returns:
-        (p, p) of the unknowns, and how many cells without common errors would fix them as well.
+        (p, p) of the unknowns, and the number of independent cells that would give the same one.
     """
     design, weights = fit.design, fit.weights()
     scores, products, used = _scores(fit)
     rows, columns = fit.rows[used], fit.columns[used]
     factor = _flattening(fit, weights) ** -2
     largest = np.zeros((design.shape[1],) * 2)
-    # Every cell a tile of its own.
+    # Each cell is its own tile.
     alone = before = _mean_variance(design, independent_covariance(fit))
     reach = -math.inf
     for size in _TILE_CELLS:
@@ -407,11 +408,11 @@ def stated_covariance(fit: CellFit) -> tuple[NDArray[np.float64], float]:
         covariance = factor * _left_out(scores, products, tile)
         variance = _mean_variance(design, covariance)
         if variance > reach:
-            # Tiles twice as wide add as much again: what crosses their rims halves with each step.
+            # Extrapolated: the correlation across borders of tiles halves with each doubling.
             beyond = max(1.0, 2.0 - before / variance) if variance else 1.0
             largest, reach = beyond * covariance, variance
         before = variance
-    # How far the unknowns move when cells twice as far away may take part.
+    # How far the unknowns move if cells at twice the distance are used.
     wider = replace(fit, limit_m=_WIDER * fit.limit_m)
     for _ in range(_WIDER_STEPS):
         wider = wider.stepped() or wider
@@ -423,10 +424,10 @@ def stated_covariance(fit: CellFit) -> tuple[NDArray[np.float64], float]:
 
 
 def independent_covariance(fit: CellFit) -> NDArray[np.float64]:
-    """Covariance (p, p) of the unknowns where every cell errs by itself.
+    """Return the covariance (p, p) of the unknowns for independent cells.
 
-    The sandwich of M-estimates (Huber & Ronchetti 2009, section 7.6); what one of the cells has in
-    the solution is too little to matter.
+    The sandwich of M-estimates (Huber & Ronchetti 2009, section 7.6); the leverage of single cells
+    is negligible.
     """
     scores, products, _ = _scores(fit)
     inverse = np.linalg.inv(products.sum(axis=0))
@@ -437,7 +438,7 @@ def independent_covariance(fit: CellFit) -> NDArray[np.float64]:
 def _scores(
     fit: CellFit,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """(m, p) scores and (m, p, p) products of the cells with weight, and (n,) which those are."""
+    """Return (m, p) scores and (m, p, p) products of weighted cells, and (n,) which those are."""
     weights = fit.weights()
     used = weights > 0.0
     design, weights = fit.design[used], weights[used]
@@ -447,14 +448,14 @@ def _scores(
 
 
 def _mean_variance(design: NDArray[np.float64], covariance: NDArray[np.float64]) -> float:
-    """Mean variance of the plane's height over its cells: one number to compare covariances by."""
+    """Return the mean variance of the plane's height over its cells, to compare covariances."""
     return float(np.sum((design @ covariance) * design)) / len(design)
 
 
 def _left_out(
     scores: NDArray[np.float64], products: NDArray[np.float64], tile: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Covariance by how far the unknowns move when each tile in turn is left out."""
+    """Return the jackknife covariance of leaving out one tile at a time."""
     held = np.bincount(tile) > 0
     n_tiles, size = int(np.count_nonzero(held)), scores.shape[1]
     sums = np.column_stack([np.bincount(tile, column)[held] for column in scores.T])
@@ -463,14 +464,14 @@ def _left_out(
         for j in range(i, size):
             parts[:, i, j] = parts[:, j, i] = np.bincount(tile, products[:, i, j])[held]
     whole = parts.sum(axis=0)
-    # A tile without which the rest fixes no plane: its part is damped.
+    # Damped, in case the rest without a tile does not determine a plane.
     without = whole - parts + _STEADY * np.diag(np.diag(whole))
     moves = np.linalg.solve(without, sums[:, :, None])[:, :, 0]
     return (n_tiles - 1) / n_tiles * (moves.T @ moves)
 
 
 def _flattening(fit: CellFit, weights: NDArray[np.float64]) -> float:
-    """Share of the weights that the derivative of the influence function leaves."""
+    """Return the ratio of the derivative of the influence function to the weights."""
     design, faded = fit.design, fit.faded()
     inside = 1.0 - faded**2
     ratios = fit.residuals_m() / fit.limit_m

@@ -21,19 +21,19 @@ if TYPE_CHECKING:
 
 Vector = tuple[float, float, float]
 
-# The horizontal plane lies below this share of the points: below the scene, above stray echoes.
+# Share of the points below the horizontal plane: it lies below the scene and above stray echoes.
 _GROUND_SHARE: Final = 0.01
-# So many points beside the rectangle are no few echoes.
+# Share of points beside the rectangle that is reported.
 _STRAY_REPORTED: Final = 1e-3
-# The paper's buffer of three tolerances on either side of a wall.
+# The buffer of the paper, three tolerances on either side of a wall.
 _BUFFER_TOLERANCES: Final = 3.0
-# Steps of the robust box; of so small a share of the points per side it does not depend.
+# Cell size of the robust box, and the share of points outside it per side.
 _BOX_CELL_M: Final = 0.05
 _OUTSIDE_SHARE: Final = 0.0005
 _EVERYWHERE_M: Final = 1e9
 _NO_BOUNDS_M: Final = (-_EVERYWHERE_M, _EVERYWHERE_M, -_EVERYWHERE_M, _EVERYWHERE_M)
 
-# A view point that the user stated is given, as a normal is.
+# A viewpoint stated by the user counts as given, like a normal.
 _SIDES: Final[Mapping[str, SideSource]] = {
     "given": "given",
     "view_from": "given",
@@ -69,17 +69,17 @@ class StatedPlane(MethodParams):
     )
     horizontal: bool = Field(
         default=False,
-        description="The plane across `up`, seen from above; also what holds by default.",
+        description="The plane perpendicular to `up`, seen from above; the default.",
     )
     height_m: float | None = Field(
         None,
         description="Height of the horizontal plane along `up`, world metres; by default the "
-        "height that 1 % of the points are below.",
+        "first percentile of the heights of the points.",
     )
 
     @property
     def ways(self) -> tuple[str, ...]:
-        """In which of the three ways something is said."""
+        """Return which of the three ways are used."""
         ways = {
             "normal": self.normal is not None or self.offset_m is not None,
             "points": self.points is not None,
@@ -102,16 +102,16 @@ class StatedPlane(MethodParams):
 
 
 class GivenPlane(Method):
-    """Lay the reference plane, or several, where the user says.
+    """Use the reference plane, or several, that the user states.
 
-    Each in exactly one of three ways: `normal` with `offset_m` (the side of the normal is the
-    viewer's and is never turned), three `points` (world metres; the normal is turned towards the
+    Each is stated in exactly one of three ways: `normal` with `offset_m` (the normal points to the
+    viewer and is never reversed), three `points` (world metres; the normal is turned towards the
     viewer), or the `horizontal` plane seen from above, which is also the default, as in
-    skarlatos2012. Without `height_m` it lies at the height that 1 % of the points are below.
+    skarlatos2012. Without `height_m` it lies at the first percentile of the heights of the points.
     Several planes are listed in `planes`; a point near several belongs to the nearest.
 
-    The rectangle spans the points within `buffer_m` of the plane (every point for the horizontal
-    one), without parts too small to matter, such as stray echoes beside the scene.
+    The rectangle spans the points within `buffer_m` of the plane (all points for the horizontal
+    one), without insignificant parts such as stray echoes beside the scene.
     """
 
     id = "plane.given"
@@ -137,7 +137,7 @@ class GivenPlane(Method):
     )
 
     class Params(StatedPlane):
-        """Where the plane is, or the planes are."""
+        """The plane, or the planes."""
 
         planes: tuple[StatedPlane, ...] = Field(
             (),
@@ -146,21 +146,21 @@ class GivenPlane(Method):
             "points, or horizontal and height_m.",
         )
         tolerance_m: float = Field(
-            0.05, gt=0.0, description="Points this near to the plane are labelled with it."
+            0.05, gt=0.0, description="Maximum distance of points that are labelled with the plane."
         )
         buffer_m: float | None = Field(
             None,
             gt=0.0,
-            description="Points this near to the plane span its rectangle; by default three "
-            "times tolerance_m, and every point for the horizontal plane.",
+            description="Maximum distance of points that span the plane's rectangle; by default "
+            "three times tolerance_m, and unlimited for the horizontal plane.",
         )
         part_min_share: float = Field(
             0.03,
             ge=0.0,
             lt=1.0,
-            description="Points that hang together but cover a smaller share of what all of them "
-            "cover are taken for stray and left out of the rectangle; 0 keeps every part, but for "
-            "the few echoes that a sample of the cloud does not show.",
+            description="Connected parts that cover a smaller share of the area of all parts are "
+            "treated as stray and left out of the rectangle; 0 keeps every part except single "
+            "echoes.",
         )
 
         @model_validator(mode="after")
@@ -176,27 +176,27 @@ class GivenPlane(Method):
     Out = DetectorOut
 
     def run(self, inputs: DetectorIn, params: Params, ctx: StepContext) -> DetectorOut:
-        """Lay the planes and find which points are on them."""
+        """Place the planes and label the points on them."""
         from orthoflow_plugins.plane.cloud import prepare
         from orthoflow_plugins.plane.planes import measure_planes, planes_of, report_planes
         from orthoflow_plugins.plane.support import slab_of
 
         cloud, tolerance_m = inputs.cloud, params.tolerance_m
         ctx.progress(0.0, "placing the plane")
-        # With a part_min_share of 0 no point is stray.
+        # With part_min_share = 0 no point is stray.
         outside_share = _OUTSIDE_SHARE if params.part_min_share else 0.0
         prepared = prepare(
             cloud, parts=ctx.cores, box_cell_m=_BOX_CELL_M, outside_share=outside_share
         )
-        laid = _laid(params, cloud, prepared, ctx)
+        placed_planes = _all_placed(params, cloud, prepared, ctx)
         ctx.progress(0.4, "labelling points")
-        planes = [item.plane for item, _ in laid]
+        planes = [item.plane for item, _ in placed_planes]
         slabs = np.array([slab_of(plane, wall_axes(plane.normal, cloud.up)) for plane in planes])
-        everywhere = np.tile(_NO_BOUNDS_M, (len(laid), 1))
+        everywhere = np.tile(_NO_BOUNDS_M, (len(placed_planes), 1))
         prepared.assign(slabs, np.insert(everywhere, 0, tolerance_m, axis=1))
-        counts = np.bincount(prepared.claims[prepared.claims >= 0], minlength=len(laid))
+        counts = np.bincount(prepared.claims[prepared.claims >= 0], minlength=len(placed_planes))
         order = np.argsort(-counts, kind="stable")
-        # The plane with the most points first; the last entry is for points on none.
+        # The plane with most points first; the last entry is for points on none.
         prepared.claims[:] = np.append(np.argsort(order), -1).astype(np.int8)[prepared.claims]
         labels = ctx.allocate("labels", "plane_index", (len(cloud),), np.int16).view(np.int16)
         labels[:] = prepared.claims
@@ -207,14 +207,14 @@ class GivenPlane(Method):
             tolerance_m=tolerance_m,
             fit_tolerance_m=tolerance_m,
         )
-        faced, viewpoints = zip(*(laid[k] for k in order), strict=True)
+        faced, viewpoints = zip(*(placed_planes[k] for k in order), strict=True)
         sides = tuple(_SIDES[viewpoint] for viewpoint in viewpoints)
         found = planes_of(
             faced,
             deviations,
             cloud,
-            covariances=[np.zeros((4, 4))] * len(laid),
-            # One word for all of them: the least certain.
+            covariances=[np.zeros((4, 4))] * len(placed_planes),
+            # One value for all of them: the least certain.
             viewpoint="guess" if "guess" in viewpoints else viewpoints[0],
             side_from=sides if len(set(sides)) > 1 else (),
         )
@@ -222,28 +222,28 @@ class GivenPlane(Method):
         return DetectorOut(planes=found, labels=PointLabels(plane_index=labels))
 
 
-def _laid(
+def _all_placed(
     params: GivenPlane.Params, cloud: PointCloud, prepared: PreparedCloud, ctx: StepContext
 ) -> list[tuple[FacedPlane, str]]:
-    """Put a rectangle about the points near each plane; gives how its side was chosen, too."""
-    laid = []
+    """Return each plane with the rectangle of the points near it, and how its side was chosen."""
+    placed_planes = []
     for nth, stated in enumerate(params.planes or (params,)):
         try:
             faced, viewpoint, n_beside = _placed(stated, params, cloud, prepared)
         except MethodError as error:
             which = f"planes[{nth}]" if params.planes else "the given plane"
             raise MethodError(f"{which}: {error}") from error
-        laid.append((faced, viewpoint))
+        placed_planes.append((faced, viewpoint))
         if n_beside > _STRAY_REPORTED * len(cloud):
             share = n_beside / len(cloud)
             ctx.report(STRAY_PARTS, n=n_beside, share=share, part_share=params.part_min_share)
-    return laid
+    return placed_planes
 
 
 def _placed(
     stated: StatedPlane, params: GivenPlane.Params, cloud: PointCloud, prepared: PreparedCloud
 ) -> tuple[FacedPlane, str, int]:
-    """Turn a plane to the viewer; gives how the side was chosen, and the points beside it."""
+    """Turn a plane to the viewer; return it, how its side was chosen, and the points beside it."""
     from orthoflow_plugins.plane.planes import (
         face,
         known_viewpoint,
@@ -262,8 +262,8 @@ def _placed(
         buffer_m = _BUFFER_TOLERANCES * params.tolerance_m
     reach_m = _EVERYWHERE_M if buffer_m is None else buffer_m
     near = np.abs(distances_m) <= reach_m
-    # Cells of the points near the plane that hang together. Not by the full range of these: three
-    # echoes far away would make the cells as large as the scene.
+    # Cells of connected points near the plane. Their size follows from quantiles, because a few
+    # distant echoes would make the cells as large as the scene.
     up = prepared.up
     placed = members[near] @ wall_axes(plane.normal, up).T
     low, high = np.quantile(placed, (0.01, 0.99), axis=0) if len(placed) else np.zeros((2, 2))
@@ -310,7 +310,7 @@ def _placed(
 def _plane_of(
     stated: StatedPlane, cloud: PointCloud, prepared: PreparedCloud
 ) -> tuple[Plane, bool]:
-    """The plane in the cloud's offsets, and whether its side is settled."""
+    """Return the plane in the cloud's offsets, and whether its side is known."""
     if stated.normal is not None and stated.offset_m is not None:
         normal = np.array(stated.normal) / math.hypot(*stated.normal)
         normal = normal / np.linalg.norm(normal)

@@ -1,12 +1,12 @@
 """`plane.hough2d`: walls from the plan of the cloud, floors and ceilings from its heights.
 
-The plan (a map of the cloud, 2 cm cells) votes for lines; a cell has as many votes as points, since
-with one vote per cell floors and ceilings drown every wall (markiewicz2015, Figure 10). From each
-maximum the level of its surroundings at the same angle is subtracted: that level is what surfaces
-cut across leave, and with it goes the advantage of the longest diagonal through the room.
+The cells of the plan (a map of the cloud, 2 cm cells) vote for lines. A cell has as many votes as
+points, because with one vote per cell floors and ceilings hide every wall (markiewicz2015, Figure
+10). From each maximum the level of its surroundings at the same angle is subtracted. This level
+comes from surfaces that the line cuts and would favour the longest diagonal through the room.
 
-To count all points anew after each plane would cost a pass over the cloud. The sample knows which
-share of a cell's points a plane took; where it is all of the cloud, it knows that exactly.
+Counting all points again after each plane would cost a pass over the cloud. The sample gives the
+share of a cell's points that belong to a plane; for a small cloud the sample is the cloud.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from orthoflow_plugins.plane.detector import (
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.search import Search
 
-# Angles on either side of a candidate that was none that are not proposed again.
+# Angles on either side of a refused candidate that are excluded.
 _NOT_AGAIN_ANGLES: Final = 2
 # Thresholds of the edge detector on the density image of 8 bits.
 _EDGE_LOW: Final = 60
@@ -44,30 +44,30 @@ _VOTERS: Final = {
     "counts": "each cell votes with its number of points",
     "unit": "each cell with points has one vote",
     "canny": "each cell on an edge of the density has one vote",
-    "raw": "each point of the sample votes with its own coordinates",
+    "raw": "each point of the sample votes with its coordinates",
 }
 
 
 class Hough2d(Method):
     """Find walls, floors and ceilings by markiewicz2015's modified 2D Hough transform.
 
-    Points are counted in the cells of a plan; every occupied cell votes, with as many votes as it
-    has points, for all lines through it. The best line is refined on a sample of the points, with a
-    tolerance that shrinks from `tolerance_m` to `fit_tolerance_m`, given a rectangle, and its
-    points are taken away: the sample says which share of each cell those are. When all planes are
-    found, one pass over all points, of more than 24 million over a part drawn evenly, fits them
-    (total least squares of cell means), one labels all points.
+    Points are counted in the cells of a plan. Every occupied cell votes for all lines through it,
+    with as many votes as it has points. The best line is refined on a sample of the points with a
+    tolerance that shrinks from `tolerance_m` to `fit_tolerance_m`, bounded by a rectangle, and its
+    points are removed; the sample gives their share of each cell. When all planes are found, they
+    are fitted to all points in one pass (total least squares of cell means; of clouds above 24
+    million points a random part is used), and all points are labelled in another.
 
-    Floors, ceilings and other level planes come from the histogram of heights in the same race and
-    are refitted in 3D.
+    Floors, ceilings and other level planes come from the histogram of heights. They compete with
+    walls by their votes and are refitted in 3D.
 
-    The covariance of (normal, offset) respects that neighbouring points share errors; it is
+    The covariance of (normal, offset) accounts for errors that neighbouring points share; it is
     estimated from the scatter of tiles between 10 and 80 cm, the size with the largest variance.
 
-    For comparison: `accumulator: unit` gives every occupied cell one vote (no clear maximum, as the
-    paper says), `canny` only the cells on edges of the density image; `coordinates: raw` lets the
-    points of the sample vote with their own coordinates, which takes longer for the same planes.
-    `scoring: votes` proposes the plain maximum of the paper's own transform.
+    For comparison, `accumulator: unit` gives every occupied cell one vote (no clear maximum, as in
+    the paper) and `canny` only the cells on edges of the density image. With `coordinates: raw` the
+    points of the sample vote with their coordinates, which takes longer for the same planes.
+    `scoring: votes` proposes the plain maximum, as the transform of the paper does.
     """
 
     id = "plane.hough2d"
@@ -76,33 +76,33 @@ class Hough2d(Method):
     citations = (PAPER,)
 
     class Params(DetectorParams):
-        """What may be set; the defaults suit rooms and facades scanned at millimetres."""
+        """Parameters; the defaults suit rooms and facades scanned at millimetres."""
 
         cell_m: float = Field(
             0.02, gt=0.0, le=1.0, description="Side of a cell of the plan and of a distance bin."
         )
         angle_step_deg: float = Field(
-            1.0, ge=0.1, le=15.0, description="Step between the directions that are voted for."
+            1.0, ge=0.1, le=15.0, description="Step between the directions of lines."
         )
         accumulator: Literal["counts", "unit", "canny"] = Field(
             "counts",
-            description="Votes of a cell: its points, one, or one where the density has an edge.",
+            description="Votes of a cell: its points, one, or one on edges of the density.",
         )
         scoring: Literal["contrast", "votes"] = Field(
             "contrast",
-            description="What a line is worth: its votes above those of the emptier side, refined "
-            "with finer angles and bins, or the votes of its bin alone, as in markiewicz2015.",
+            description="Score of a line: its votes above those of the emptier side, refined with "
+            "finer angles and bins, or the votes of its bin alone, as in markiewicz2015.",
         )
         coordinates: Literal["cells", "raw"] = Field(
             "cells",
-            description="What votes: cells of the plan, or points of the sample by themselves.",
+            description="Which positions vote: cells of the plan, or single points of the sample.",
         )
 
         @model_validator(mode="after")
         def _points_have_one_vote(self) -> Self:
             if self.coordinates == "raw" and self.accumulator != "counts":
                 raise ValueError(
-                    f"coordinates: raw goes with accumulator: counts only, got {self.accumulator}"
+                    f"coordinates: raw needs accumulator: counts, got {self.accumulator}"
                 )
             return self
 
@@ -126,16 +126,16 @@ class PlanProposer:
     """Proposes walls from the maxima of the accumulator and levels from those of the heights.
 
     Attributes:
-        grid: where the cells of the plan lie.
-        plan: (e1, e2) points per cell of the untouched cloud.
+        grid: the cells of the plan.
+        plan: (e1, e2) points per cell of the whole cloud.
         centre_m: (2,) centre of the plan in the (e1, e2) frame of the cloud's offsets.
-        reach_m: distances of lines from there run from minus this to this.
-        first: (angles, bins) votes of the untouched cloud, VOTE_SHARES each; None for levels alone.
-        voters: who voted, to finish a sentence.
+        reach_m: maximum distance of lines from there, to either side.
+        first: (angles, bins) votes of the whole cloud, VOTE_SHARES each; None for levels alone.
+        voters: description of what votes.
     """
 
     def __init__(self, search: Search, params: Hough2d.Params) -> None:
-        """Get ready to propose; the points of the search's cloud were counted over its plan."""
+        """Prepare the accumulator; the search's cloud has the counts of its plan."""
         cloud = search.cloud
         self._cloud, self._params = cloud, params
         self._is_raw = params.coordinates == "raw"
@@ -153,7 +153,7 @@ class PlanProposer:
         half_m = 0.5 * self._cell_m * math.hypot(rows, columns)
         self._reach_bins = math.ceil(half_m / self._cell_m) + 1
         self.reach_m = self._reach_bins * self._cell_m
-        # Half an angle step off, a wall's ends lie in other bins than its middle.
+        # At half an angle step, the ends of a wall lie in other bins than its middle.
         self._smear_bins = max(1, round(0.3 * half_m * self._step_rad / self._cell_m))
         self._barred = np.zeros((n_angles, 2 * self._reach_bins), dtype=np.uint8)
         self._barred_heights = np.zeros((1, storeys), dtype=np.uint8)
@@ -163,7 +163,7 @@ class PlanProposer:
         self.first: NDArray[np.int32] | None = None
 
     def propose(self, search: Search) -> Candidate | None:
-        """Name the better of the best line and the best height."""
+        """Return the better of the best line and the best height."""
         from orthoflow_plugins.plane.votes import VOTE_CAUTION, VOTE_SHARES, best_bin
 
         if self._counted_for != search.n_points:
@@ -197,7 +197,7 @@ class PlanProposer:
         return Candidate(plane=plane, constraint="vertical", votes=line_score)
 
     def reject(self, candidate: Candidate) -> None:
-        """Bar the surroundings of the last maximum."""
+        """Exclude the surroundings of the last maximum."""
         del candidate
         angle, place = self._last
         if angle < 0:
@@ -206,14 +206,14 @@ class PlanProposer:
         reach = self._smear_bins + 1
         n_angles, n_bins = self._barred.shape
         for step in range(-_NOT_AGAIN_ANGLES, _NOT_AGAIN_ANGLES + 1):
-            # A line at 180 degrees is the line at 0 with its distance counted the other way.
+            # A line at 180 degrees is the line at 0 with the opposite sign of its distance.
             wrapped = not 0 <= angle + step < n_angles
             centre = n_bins - 1 - place if wrapped else place
             row = self._barred[(angle + step) % n_angles]
             row[max(0, centre - reach) : centre + reach + 1] = 1
 
     def _count(self, search: Search) -> None:
-        """See what is left, and let it vote."""
+        """Count the votes of the remaining points."""
         from orthoflow_plugins.plane.votes import VOTE_SHARES, vote_image, vote_places
 
         before, accumulator = self._cells, self._params.accumulator
@@ -237,7 +237,7 @@ class PlanProposer:
                 vote_places(places, ones, normals, -self.reach_m, self._cell_m, votes)
 
         else:
-            # Votes are sums: what was taken away takes its votes back.
+            # Votes are sums, so those of removed points are subtracted.
             cells = vote_counts(self._cells, accumulator) - before * (accumulator == "counts")
             vote = partial(vote_image, cells.astype(np.int32))
         in_threads([partial(vote, *share) for share in zip(*shares, strict=True)])
@@ -246,7 +246,7 @@ class PlanProposer:
 
     @cached_property
     def _left(self) -> Callable[[NDArray[np.int16]], tuple[NDArray[np.int64], NDArray[np.int64]]]:
-        """What planes leave over of cells and of storeys, given the claims (m,) of the sample."""
+        """Return a function of claims (m,) of the sample: remaining points per cell and height."""
         from orthoflow_plugins.plane.support import summed_around
 
         sample, counts = self._cloud.sample, (self._cloud.plan, self._cloud.heights[None])
@@ -261,7 +261,7 @@ class PlanProposer:
         def sampled(chosen: NDArray[np.bool_], k: int) -> NDArray[np.int64]:
             found = np.bincount((cell, storey)[k][chosen], minlength=counts[k].size + 1)[:-1]
             found = found.reshape(counts[k].shape)
-            # A sample has too few points per cell to ask one alone.
+            # A sample has too few points per cell, so neighbouring cells are summed.
             return summed_around(found) if sample.n_represented > 1.0 else found
 
         asked = [sampled(np.ones(len(cell), dtype=bool), k) for k in range(2)]
@@ -286,7 +286,7 @@ class PlanProposer:
 
     @cached_property
     def _voting_cells(self) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-        """(3, m) middles of the cells that vote, from the plan's centre, and (m,) their votes."""
+        """Return the centres (3, m) of voting cells from the plan's centre, and (m,) votes."""
         votes = vote_counts(self._cells, self._params.accumulator)
         cells = np.nonzero(votes)
         places = np.zeros((3, len(cells[0])), dtype=np.float32)
@@ -295,7 +295,7 @@ class PlanProposer:
         return places, votes[cells].astype(np.int32)
 
     def _refined(self, angle_rad: float, distance_m: float) -> tuple[float, float]:
-        """Look around a maximum with finer angles and half-cell bins."""
+        """Refine a maximum with finer angles and half-cell bins."""
         from orthoflow_plugins.plane.votes import sharpest, vote_places
 
         bin_m, step = self._cell_m, self._step_rad
@@ -304,7 +304,7 @@ class PlanProposer:
         n_fine = max(1, math.ceil(step / max(step / 40.0, 0.5 / self._reach_bins)))
         angles = np.float64(angle_rad) + np.arange(-n_fine, n_fine + 1) * (step / n_fine)
         fine = np.zeros((len(angles), 4 * (self._smear_bins + 3)), dtype=np.int32)
-        # A point moves by up to half the plan times a step; cells further off cannot matter.
+        # A step moves a point by up to half the plan times a step; cells beyond have no effect.
         direction = np.array([math.cos(angle_rad), math.sin(angle_rad)], dtype=np.float32)
         apart_m = np.abs(direction @ places[:2] - np.float32(distance_m))
         near = np.flatnonzero(apart_m < reach_m + step * self.reach_m)
@@ -322,10 +322,10 @@ def _normals(angles_rad: NDArray[np.float64]) -> NDArray[np.float64]:
 def vote_counts(
     counts: NDArray[np.int64], accumulator: Literal["counts", "unit", "canny"]
 ) -> NDArray[np.int64]:
-    """(e1, e2) votes of each cell of a plan, given (e1, e2) its points.
+    """Return the votes (e1, e2) of the cells of a plan with (e1, e2) points.
 
-    With one vote per cell, votes are multiplied by the points of a mean voter, so that they compare
-    with the heights, which are counted in points.
+    With one vote per cell, votes are multiplied by the mean number of points, to be comparable with
+    the heights, which are counted in points.
     """
     if accumulator == "counts":
         return counts
@@ -335,7 +335,7 @@ def vote_counts(
 
 
 def _edges(counts: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Occupied cells on edges of the density image, whose grey is the logarithm of the points."""
+    """Return occupied cells on edges of the density image, the logarithm of the counts."""
     import cv2
 
     grey = np.log1p(np.maximum(counts, 0))

@@ -1,8 +1,8 @@
 """`plane.hough3d`: planes in any direction from voxels that vote in a 3D accumulator.
 
-The directions asked about are even over the hemisphere. At phi = 90 degrees every omega is the same
-plane: a table of omega by phi counts a floor 180 times. Here each circle of one phi has as many
-directions as its length asks for, and the pole is there once.
+Directions are evenly distributed over the hemisphere. At phi = 90 degrees every omega is the same
+plane, so a table of omega by phi would count a floor 180 times. Here the number of directions of
+each phi is proportional to the length of its circle, and the pole occurs once.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from orthoflow_plugins.plane.detector import (
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.search import Claim, Search
 
-# What markiewicz2015 cuts its accumulator at, Figure 13; degrees.
+# Sections of the accumulator in markiewicz2015, Figure 13; degrees.
 _CUTS_DEG: Final = (0.0, 45.0, 90.0)
-# A direction stands for another one that is nearer than this, in steps between directions.
+# Directions nearer than this represent each other, in steps between directions.
 _STANDS_FOR_STEPS: Final = 1.5
 _NOT_AGAIN_STEPS: Final = 2.2
-# Slopes tried around a maximum, in steps between directions: first these, then closer ones.
+# Slopes around a maximum, in steps between directions: first these, then closer ones.
 _FINE_STEPS: Final = ((-1.0, -0.5, 0.0, 0.5, 1.0), (-0.4, -0.2, 0.0, 0.2, 0.4))
-# More entries than this of all tables together cost more memory than they show; bins grow instead.
+# Maximum number of entries of all tables together; larger scenes have larger bins.
 _TABLE_MOST: Final = 120_000_000
 # Best scores, votes over omega and over phi by angle, and the reach of distances: `sections_of`.
 _Sections = tuple[
@@ -53,13 +53,13 @@ class Hough3d(Method):
     """Find planes by the 3D Hough transform of markiewicz2015: voxels vote with their points.
 
     r = x cos(phi) cos(omega) + y cos(phi) sin(omega) + z sin(phi). For each omega the voxels are
-    first counted in an upright image, whose occupied cells then vote over phi. Directions are even
-    over the hemisphere, so that a floor is counted once and not for every omega.
+    first counted in an upright image, whose occupied cells then vote over phi. Directions are
+    evenly distributed over the hemisphere, so that a floor is counted once and not for every omega.
 
-    `search: coarse-to-fine` votes with twice `cell_m` and twice `angle_step_deg` and looks finer
-    around each maximum only; `full` votes with both as they are. What follows is common to all
-    detectors: refined on a sample, fitted to all points, points taken away. `scoring: votes`
-    proposes the plain maximum of the paper's own transform.
+    `search: coarse-to-fine` votes with twice `cell_m` and twice `angle_step_deg` and refines each
+    maximum; `full` votes with both as given. The rest is common to all detectors: planes are
+    refined on a sample and fitted to all points, and their points are removed. `scoring: votes`
+    proposes the plain maximum, as the transform of the paper does.
     """
 
     id = "plane.hough3d"
@@ -74,26 +74,26 @@ class Hough3d(Method):
     )
 
     class Params(DetectorParams):
-        """What may be set; the defaults suit rooms and facades scanned at millimetres."""
+        """Parameters; the defaults suit rooms and facades scanned at millimetres."""
 
         cell_m: float = Field(
             0.02, gt=0.0, le=1.0, description="Side of a voxel and of a distance bin."
         )
         angle_step_deg: float = Field(
-            1.0, ge=0.25, le=15.0, description="Step between the directions that are voted for."
+            1.0, ge=0.25, le=15.0, description="Step between the directions of normals."
         )
         search: Literal["coarse-to-fine", "full"] = Field(
             "coarse-to-fine",
-            description="Vote with doubled cells and steps and look finer around maxima, or vote "
-            "with all of them.",
+            description="Vote with doubled cells and steps and refine maxima, or vote with the "
+            "given ones.",
         )
         scoring: Literal["contrast", "votes"] = Field(
             "contrast",
-            description="What a plane is worth: its votes above those of the emptier side, refined "
-            "with finer angles and bins, or the votes of its bin alone, as in markiewicz2015.",
+            description="Score of a plane: its votes above those of the emptier side, refined with "
+            "finer angles and bins, or the votes of its bin alone, as in markiewicz2015.",
         )
         coordinates: Literal["cells", "raw"] = Field(
-            "cells", description="What votes: voxels, or points of the sample by themselves."
+            "cells", description="Which positions vote: voxels, or single points of the sample."
         )
 
     In = DetectorIn
@@ -114,18 +114,18 @@ class Hough3d(Method):
 class SpaceProposer:
     """Proposes planes from the maxima of a 3D accumulator.
 
-    The accumulator is linear: when points are taken away, their voxels take their votes back,
-    instead of all others voting again. A plane takes a voxel whose middle is near enough, as a
-    whole: that is the paper's zeroing of counters, and costs no pass over the points.
+    The accumulator is linear: when points are removed, the votes of their voxels are subtracted,
+    instead of all others voting again. A voxel whose centre is near enough to a plane is removed as
+    a whole: that is the paper's zeroing of counters, and needs no pass over the points.
 
     Attributes:
-        middles_m: (3, m) float32 middles of the voxels with points, from the middle of the box, in
+        middles_m: (3, m) float32 centres of the voxels with points, from the centre of the box, in
             the (e1, e2, up) frame.
-        left: (m,) int32 points in them that no plane has taken.
+        left: (m,) int32 number of their points that belong to no plane.
     """
 
     def __init__(self, search: Search, params: Hough3d.Params) -> None:
-        """Count the points of the search's cloud per voxel; none has voted yet."""
+        """Count the points of the search's cloud per voxel; nothing has voted yet."""
         from orthoflow_plugins.plane.voxels import VoxelTable
 
         cloud, coarser = search.cloud, 1.0 if params.search == "full" else 2.0
@@ -158,7 +158,7 @@ class SpaceProposer:
         self._first: _Sections | None = None
 
     def propose(self, search: Search) -> Candidate | None:
-        """Name the plane whose votes stand out most."""
+        """Return the plane with the best score."""
         from orthoflow_plugins.plane.votes import VOTE_CAUTION, VOTE_SHARES
 
         if self._voted_for != search.n_points:
@@ -175,7 +175,7 @@ class SpaceProposer:
         point = (place + 0.5 - 0.5 * self._votes.shape[1]) * self._bin_m * normal
         if not self._is_plain:
             normal, point = self._refined(normal, float(normal @ point))
-        # From the middle of the box in its frame to offsets.
+        # From the frame of the box to offsets.
         world = normal / np.linalg.norm(normal) @ self._basis
         world = world / np.linalg.norm(world)
         on_plane = (point + self._middle_m) @ self._basis
@@ -183,7 +183,7 @@ class SpaceProposer:
         return Candidate(plane=plane, constraint=self._params.constraint, votes=score)
 
     def reject(self, candidate: Candidate) -> None:
-        """Bar the surroundings of the last maximum."""
+        """Exclude the surroundings of the last maximum."""
         del candidate
         direction, place = self._last
         n_bins = self._votes.shape[1]
@@ -192,18 +192,18 @@ class SpaceProposer:
         near = np.cos(_NOT_AGAIN_STEPS * self._directions.step_rad)
         self._unscored = np.flatnonzero(np.abs(cosines) > near)
         for row in self._unscored:
-            # On the other side of the hemisphere distances count the other way.
+            # On the other side of the hemisphere distances change sign.
             middle = place if cosines[row] > 0.0 else n_bins - 1 - place
             self._barred[row, max(0, middle - reach) : middle + reach + 1] = 1
 
     def sections(self) -> _Sections:
-        """Return the cut accumulator of the untouched cloud; the first proposal makes it."""
+        """Return sections of the accumulator of the whole cloud, made by the first proposal."""
         if self._first is None:
             raise ValueError("no plane was proposed yet")
         return self._first
 
     def _vote(self, search: Search) -> None:
-        """Let what changed vote: voxels that planes took since then take their votes back."""
+        """Update the votes: subtract those of voxels that were assigned to planes since."""
         from orthoflow_plugins.plane.votes import vote_planes
 
         taken = np.zeros(len(self.left), dtype=bool)
@@ -211,7 +211,7 @@ class SpaceProposer:
             taken |= self._is_within(claim)
         self._n_taken = len(search.taken)
         index = np.flatnonzero(taken & (self.left > 0))
-        # In rows as all voxels are, not in columns: voting would be compiled once more.
+        # In the memory layout of all voxels, so that the kernel is compiled only once.
         places_m, weights = np.take(self.middles_m, index, axis=1), -self.left[index]
         self.left[index] = 0
         if self._is_raw:
@@ -241,7 +241,7 @@ class SpaceProposer:
         self._unscored = np.arange(len(self._votes))
 
     def _score(self) -> None:
-        """Find the best bin of each direction whose votes or bars changed."""
+        """Find the best bin of each direction whose votes or excluded bins changed."""
         from orthoflow_plugins.plane.votes import VOTE_SHARES, best_bins
 
         half, tables = 0 if self._is_plain else self._smear_bins, (self._scores, self._places)
@@ -258,9 +258,9 @@ class SpaceProposer:
     def _refined(
         self, normal: NDArray[np.float64], distance_m: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Look around a maximum with finer slopes and half bins, with the voxels near it.
+        """Refine a maximum with finer slopes and half bins, using the voxels near it.
 
-        Gives a normal, not of length one, and a point, in the box's frame from its middle.
+        Returns a normal, not of unit length, and a point, relative to the centre of the box.
         """
         from orthoflow_plugins.plane.votes import sharpest, vote_places
 
@@ -290,14 +290,14 @@ class SpaceProposer:
         return normal - best @ axes, (distance_m + height_m) * normal + middle @ axes
 
     def _is_within(self, claim: Claim) -> NDArray[np.bool_]:
-        """(m,) whether the occupied voxels are within a plane's tolerance and rectangle."""
+        """Return (m,) whether occupied voxels are within a plane's tolerance and rectangle."""
         slab, bounds = claim
         within = np.ones(len(self.left), dtype=bool)
         for row in range(3):
             axis = self._basis @ slab[4 * row : 4 * row + 3]
             shift = slab[4 * row + 3] - float(axis @ self._middle_m)
             along_m = axis.astype(np.float32) @ self.middles_m
-            # A voxel that the plane runs through holds points of it, however large it is.
+            # A voxel that the plane cuts contains points of it, however large it is.
             half_m = 0.5 * self._voxel_m * float(np.abs(axis).sum())
             reach_m = max(bounds[0], half_m)
             low_m = -reach_m if row == 0 else bounds[2 * row - 1] - half_m
@@ -306,14 +306,14 @@ class SpaceProposer:
         return within
 
 
-# Any: what a share of the work is differs from pass to pass.
+# Any: the type of a share of work differs between passes.
 def _in_shares(task: Callable[..., None], shares: Sequence[object]) -> None:
     in_threads([partial(task, share) for share in shares])
 
 
 @dataclass(frozen=True, kw_only=True)
 class Directions:
-    """Directions of normals in the (e1, e2, up) frame, those of one omega together.
+    """Directions of normals in the (e1, e2, up) frame, grouped by omega.
 
     Attributes:
         angles_rad: (d, 2) omega 0..pi and phi -pi/2..pi/2.
@@ -329,7 +329,7 @@ class Directions:
 
 
 def directions_over(step_deg: float, constraint: Constraint, max_tilt_deg: float) -> Directions:
-    """Cover the hemisphere, or the part of it that a constraint needs."""
+    """Return directions over the hemisphere, or the part of it that a constraint needs."""
     n_turns = round(180.0 / step_deg)
     step_rad = math.pi / n_turns
     phis = -0.5 * math.pi + step_rad * np.arange(1, n_turns + 1)
@@ -338,7 +338,7 @@ def directions_over(step_deg: float, constraint: Constraint, max_tilt_deg: float
         phis = phis[np.abs(phis) <= limit_rad]
     elif constraint == "horizontal":
         phis = phis[0.5 * math.pi - np.abs(phis) <= limit_rad]
-    # The pole is the last phi; its cosine is zero but for rounding, so it has one omega.
+    # The pole is the last phi; its cosine is zero except for rounding, so it has one omega.
     n_around = np.maximum(1, np.ceil(n_turns * np.cos(phis) - 1e-9)).astype(np.int64)
     rows = []
     starts = [0]
@@ -357,7 +357,7 @@ def directions_over(step_deg: float, constraint: Constraint, max_tilt_deg: float
 
 
 def _normals(omega: NDArray[np.float64], phi: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, n) unit vectors by Equation 3 of markiewicz2015."""
+    """Return unit vectors (3, n) by Equation 3 of markiewicz2015."""
     return np.stack([np.cos(phi) * np.cos(omega), np.cos(phi) * np.sin(omega), np.sin(phi)])
 
 
@@ -368,31 +368,31 @@ def sections_of(
     *,
     bin_m: float,
 ) -> _Sections:
-    """Cut an accumulator.
+    """Return sections of an accumulator.
 
     Args:
-        directions: that it asks about.
+        directions: of the accumulator.
         votes: (d, b) votes per direction and distance.
         scores: (d,) best score of each direction.
         bin_m: width of a bin of distances.
 
     Returns:
-        (o, p) best score of any distance over omega 0..180 and phi -90..90 degrees, NaN where no
-        direction of that phi was asked about; by angle in degrees the votes over omega and
-        distance at that phi, and those over phi and distance at that omega, NaN where no direction
-        was asked about; and the reach of the distances, minus this to this.
+        (o, p) best score of any distance over omega 0..180 and phi -90..90 degrees, NaN without a
+        direction of that phi; by angle in degrees the votes over omega and distance at that phi,
+        and those over phi and distance at that omega, NaN without a direction; and the maximum
+        distance, to either side.
     """
     n_turns = len(directions.starts) - 1
     best = np.full((n_turns, n_turns + 1), np.nan)
     column = np.rint((directions.angles_rad[:, 1] + 0.5 * math.pi) / directions.step_rad)
     row = np.rint(directions.angles_rad[:, 0] / directions.step_rad)
     best[row.astype(int), column.astype(int)] = scores
-    # Each direction stands for those of the same phi up to the next one.
+    # Each direction represents those of the same phi up to the next one.
     last_asked = np.where(np.isnan(best), 0, np.arange(n_turns)[:, None])
     best = np.take_along_axis(best, np.maximum.accumulate(last_asked, axis=0), axis=0)
     omegas = directions.step_rad * np.arange(n_turns, dtype=np.float64)
     phis = directions.step_rad * np.arange(n_turns + 1, dtype=np.float64) - 0.5 * math.pi
-    # Distances beyond all points say nothing.
+    # Distances beyond all points are left out.
     n_bins = votes.shape[1]
     used = np.flatnonzero(votes.any(axis=0))
     beyond = int(min(used[0], n_bins - 1 - used[-1])) if len(used) else 0
@@ -405,13 +405,13 @@ def sections_of(
 def _section(
     directions: Directions, votes: NDArray[np.int32], omega: ArrayLike, phi: ArrayLike
 ) -> NDArray[np.float64]:
-    """(n, b) votes for each of n directions, those of the nearest one that was asked about."""
+    """Return votes (n, b) for n directions, those of the nearest direction of the accumulator."""
     omegas, phis = np.broadcast_arrays(np.asarray(omega, dtype=float), np.asarray(phi, dtype=float))
     cosines = directions.normals @ _normals(omegas, phis)
     nearest = np.abs(cosines).argmax(axis=0)
     cosine = cosines[nearest, np.arange(len(nearest))]
     section: NDArray[np.float64] = votes[nearest].astype(np.float64)
-    # On the other side of the hemisphere distances count the other way.
+    # On the other side of the hemisphere distances change sign.
     section[cosine < 0.0] = section[cosine < 0.0, ::-1]
     section[np.abs(cosine) < math.cos(_STANDS_FOR_STEPS * directions.step_rad)] = np.nan
     return section

@@ -1,15 +1,15 @@
 """Compiled passes over points: blocks, plan, slabs, the robust fit of a plane, scores of many.
 
-Kernels read float32 offsets as three contiguous arrays, in `BLOCK_POINTS` blocks with a box each.
-Work is split into parts, one per thread, each with tables of its own; everything summed across
+Kernels read float32 offsets as three contiguous arrays, in blocks of `BLOCK_POINTS` with a box
+each. Work is split into parts, one per thread, each with its own tables. Everything summed across
 parts is an integer (distances as multiples of a fixed step), so the result has the same bits for
 any number of threads.
 
 A slab is a row of 12 float64: normal (3) and offset in the cloud's own offsets, then the in-plane
-axes u (3) with its origin and v (3) with its origin; its bounds are a row of 5: the distance from
-the plane within which it holds points, then its smallest and largest u and v. Passes try blocks
-only against the slabs that their box meets, mostly one or two, so that sixteen planes cost little
-more than one.
+axes u (3) with its origin and v (3) with its origin. Its bounds are a row of 5: the maximum
+distance of points from the plane, then the smallest and largest u and v. Passes compare blocks only
+with the slabs that their box intersects, mostly one or two, so sixteen planes cost little more than
+one.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from orthoflow.geometry.compiling import compiled, kernel_part
 from orthoflow.geometry.slabs import Offsets
 from orthoflow.geometry.threads import even_parts, in_threads
 
-# Small enough that a block of a scan column is a short piece of one surface, so that its box tells
-# most planes apart; large enough that boxes of 48 million points fit into the processor's cache.
+# Small enough that a block of a scan column is a short piece of one surface, so that its box
+# excludes most planes; large enough that boxes of 48 million points fit into the processor's cache.
 BLOCK_POINTS: Final = 256
-# Distances are summed in steps of the fit tolerance over this: half a micrometre at 15 mm, and the
-# squares of 48 million points still fit into 64 bits.
+# Distances are summed in steps of the fit tolerance divided by this: half a micrometre at 15 mm;
+# the squares of 48 million points still fit into 64 bits.
 STEPS_PER_TOLERANCE: Final = 32768
-# Bins that the deviations of a plane's points are counted in.
+# Number of bins for the deviations of a plane's points.
 HISTOGRAM_BINS: Final = 200
 
 
@@ -42,15 +42,15 @@ def each_part(n_items: int, parts: int, task: Callable[[int, slice], None]) -> N
 
     Args:
         n_items: length of the range.
-        parts: into how many parts; some may be empty.
-        task: gets the number of the part and its piece of the range.
+        parts: number of parts; some may be empty.
+        task: called with the index of the part and its slice of the range.
     """
     pieces = even_parts(n_items, parts, multiple=BLOCK_POINTS)
     in_threads([partial(task, part, piece) for part, piece in enumerate(pieces)])
 
 
 class BlockedPoints(NamedTuple):
-    """Points as the passes that skip blocks take them.
+    """Points in the form that block-wise passes take.
 
     Attributes:
         x: (n,) float32 metres from the cloud's origin; y and z likewise.
@@ -64,20 +64,20 @@ class BlockedPoints(NamedTuple):
 
 
 def piece_of(points: BlockedPoints, piece: slice) -> BlockedPoints:
-    """Return a piece of the points that starts at a block."""
+    """Return a slice of the points that starts at a block."""
     blocks = slice(piece.start // BLOCK_POINTS, -(-piece.stop // BLOCK_POINTS))
     return BlockedPoints(points.x[piece], points.y[piece], points.z[piece], points.boxes[blocks])
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlanGrid:
-    """Where the cells of a plan (a map of the cloud seen from above) and its storeys lie.
+    """The cells of a plan (a map of the cloud seen from above) and bins of height.
 
     Attributes:
         basis: (3, 3) rows e1, e2, up (see `geometry.basis_from_up`).
         low_m: (3,) lower corner in the (e1, e2, up) frame of the cloud's offsets, metres.
-        cell_m: side of a cell, and height of a storey of the height histogram.
-        shape: cells along e1, cells along e2, storeys along up.
+        cell_m: side of a cell, and height of a bin of the height histogram.
+        shape: cells along e1, cells along e2, bins along up.
     """
 
     basis: NDArray[np.float64]
@@ -87,11 +87,11 @@ class PlanGrid:
 
     @property
     def extent_m(self) -> NDArray[np.float64]:
-        """(3,) size of the box that the cells fill."""
+        """Return the size (3,) of the box of all cells."""
         return np.array(self.shape) * self.cell_m
 
     def frame(self) -> NDArray[np.float32]:
-        """(3, 4) that gives cell and storey of an offset: `f[:, :3] @ p - f[:, 3]`."""
+        """Return F (3, 4), with cell and height bin of an offset p: `F[:, :3] @ p - F[:, 3]`."""
         frame = np.column_stack([self.basis, self.low_m]) / self.cell_m
         return frame.astype(np.float32, order="C")
 
@@ -99,16 +99,16 @@ class PlanGrid:
 def count_points(
     offsets: Offsets, grid: PlanGrid | None, *, parts: int
 ) -> tuple[BlockedPoints, NDArray[np.int64], NDArray[np.int64], bool]:
-    """Find the box of each block, and count the points over a plan, in one pass.
+    """Find the box of each block and count the points in a plan, in one pass.
 
     Args:
         offsets: the points.
-        grid: the plan; None counts none.
+        grid: the plan; None for boxes only.
         parts: parts of the pass, one per thread.
 
     Returns:
-        The points in blocks, points per plan cell (cells along e1, cells along e2) and per storey
-        of those over the plan, and whether all coordinates are finite.
+        The points in blocks; points per plan cell (cells along e1, cells along e2); points in the
+        plan per bin of height; and whether all coordinates are finite.
     """
     shape = (0, 0, 0) if grid is None else grid.shape
     frame = np.zeros((3, 4), dtype=np.float32) if grid is None else grid.frame()
@@ -131,11 +131,11 @@ def count_points(
 
 @kernel_part
 def _set_box(points: BlockedPoints, block: int, sides: NDArray[np.int32]) -> int:
-    """Set the box of a block, and give at how many of its sides values are NaN or infinite.
+    """Set the box of a block; return at how many of its sides values are NaN or infinite.
 
-    Bits of floats, those of negative ones turned over, are in the order of their values: whole
-    numbers are compared several at once, which floats with their NaN are not. What is not finite
-    lies at the ends of that order.
+    The bits of floats, inverted for negative ones, have the order of the values. Integers are
+    compared several at a time, which floats with NaN are not. Values that are not finite are at
+    the ends of that order.
 
     Args:
         points: (n,) offsets in blocks.
@@ -162,7 +162,7 @@ def _set_box(points: BlockedPoints, block: int, sides: NDArray[np.int32]) -> int
 
 @kernel_part
 def _add_runs(places: NDArray[np.int32], count: int, table: NDArray[np.int32]) -> None:
-    """Count places into a table, none of them negative; a scan's neighbours share one."""
+    """Count places in a table, ignoring negative ones; neighbours in a scan share a place."""
     first, place = 0, places[0]
     for i in range(1, count):
         if places[i] != place:
@@ -181,10 +181,10 @@ def _count_points(
     cells: NDArray[np.int32],
     heights: NDArray[np.int32],
 ) -> int:
-    """Set the boxes, add to cells and heights, and give at how many sides values are unusable.
+    """Set the boxes, count cells and heights; return at how many sides values are unusable.
 
-    Places are set apart from the counting, and without branches, so that the processor takes
-    several points at once: the counts wait for each other, the places need not.
+    Places are computed in a loop of their own without branches, which the compiler vectorises;
+    counting depends on earlier counts.
     """
     flat = cells.reshape(cells.size)
     cell = np.empty(BLOCK_POINTS, dtype=np.int32)
@@ -224,7 +224,7 @@ def _count_points(
 
 @kernel_part
 def _meet(box: NDArray[np.float32], slab: NDArray[np.float64], bounds: NDArray[np.float64]) -> int:
-    """Whether a slab misses a block's box, 0, holds it, 2, or cuts it, 1."""
+    """Return 0 if a slab misses a block's box, 1 if it cuts it, 2 if it contains it."""
     verdict = 2
     for row in range(3):
         centre, half = -slab[4 * row + 3], 0.0
@@ -248,9 +248,9 @@ def _list_active(
     bounds: NDArray[np.float64],
     active: NDArray[np.int64],
 ) -> tuple[int, int]:
-    """List the slabs that a block meets; gives how many, and the holder.
+    """List the slabs that intersect a block; return their number, and the holder.
 
-    The holder is the slab that holds the entire block and is all it meets, -1 for none.
+    The holder is the only such slab if it contains the entire block, else -1.
     """
     n_active, last = 0, 0
     for k in range(slabs.shape[0]):
@@ -266,9 +266,9 @@ def _list_active(
 def _measure_block(
     points: BlockedPoints, start: int, slab: NDArray[np.float64], distances: NDArray[np.float64]
 ) -> int:
-    """Set the distance from a slab's plane of each point of a block; gives how many there are.
+    """Set the distance from a slab's plane of each point of a block; return their number.
 
-    Apart from what is done with them, so that the processor takes several points at once.
+    A loop of its own, which the compiler vectorises.
     """
     stop = min(start + BLOCK_POINTS, points.x.size)
     xs, ys, zs = points.x[start:stop], points.y[start:stop], points.z[start:stop]
@@ -289,9 +289,9 @@ def _own_block(  # noqa: PLR0913, PLR0917 - compiled code has no objects to bund
     nearest: NDArray[np.float64],
     distances: NDArray[np.float64],
 ) -> int:
-    """Set the slab that holds each point of a block and is nearest, -1 for none, and its distance.
+    """Set the nearest slab that contains each point of a block, -1 for none, and its distance.
 
-    Gives how many points there are.
+    Returns the number of points.
     """
     stop = min(start + BLOCK_POINTS, points.x.size)
     xs, ys, zs = points.x[start:stop], points.y[start:stop], points.z[start:stop]
@@ -323,9 +323,9 @@ def _find_cells(
     owner: NDArray[np.int32],
     cells: NDArray[np.int32],
 ) -> None:
-    """Set the cell in the tables of each point of a block that a slab owns.
+    """Set the cell in the tables of each point of a block that belongs to a slab.
 
-    Without branches, so that the processor takes several points at once.
+    Without branches, so that the compiler vectorises the loop.
     """
     stop = min(start + BLOCK_POINTS, points.x.size)
     xs, ys, zs = points.x[start:stop], points.y[start:stop], points.z[start:stop]
@@ -351,7 +351,7 @@ def _sum_runs(
     counts: NDArray[np.int32],
     sums: NDArray[np.int64],
 ) -> None:
-    """Add points to their cells, -1 for none, a run of points in one cell at once."""
+    """Add points to their cells, -1 for none, one run of points in the same cell at a time."""
     per_step = STEPS_PER_TOLERANCE / fit_tolerance_m
     n_find = n_inner = n_fit = total = squares = 0
     for i in range(cells.size):
@@ -382,7 +382,7 @@ def assign_points(
     slabs: NDArray[np.float64],
     bounds: NDArray[np.float64],
 ) -> None:
-    """Assign each point to the nearest slab that holds it, the first of equals.
+    """Assign each point to the nearest slab that contains it, the first among equals.
 
     Args:
         points: (n,) offsets in blocks.
@@ -398,7 +398,7 @@ def assign_points(
         start = block * BLOCK_POINTS
         taken = claims[start : min(start + BLOCK_POINTS, claims.size)]
         if n_active == 0 or holder >= 0:
-            # Most blocks of a scan are a short piece of one wall: no point has to be asked.
+            # Most blocks of a scan are a short piece of one wall and need no test of points.
             taken[:] = np.int8(holder)
             continue
         _own_block(points, start, slabs, bounds, listed[:n_active], owner, nearest, distances)
@@ -416,14 +416,14 @@ def sum_assigned(
     counts: NDArray[np.int32],
     sums: NDArray[np.int64],
 ) -> None:
-    """Sum the distances of each point in the cells of the nearest slab that holds it.
+    """Sum the distances of points in the cells of the nearest slab that contains them.
 
     Args:
         points: (n,) offsets in blocks.
         slabs: (k, 12) see module.
         bounds: (k, 5) see module.
         rasters: (k, 8) smallest u and v, cells per metre, rows, columns, first cell in the tables,
-            fit tolerance, inner tolerance; the last two are the same for all. Slabs without rows
+            fit tolerance, inner tolerance; the last two are equal for all. Slabs without rows
             are not summed.
         drawn: (blocks,) which blocks are summed.
         counts: (cells, 3) points within the find, inner and fit tolerance; added to.
@@ -462,7 +462,7 @@ def sum_assigned(
 def name_labels(
     claims: NDArray[np.int8], names: NDArray[np.int16], labels: NDArray[np.int16]
 ) -> None:
-    """Set (n,) labels to the (k + 1,) names of (n,) claims; the last is for a claim of -1."""
+    """Set (n,) labels to the (k + 1,) names of (n,) claims; the last name is for a claim of -1."""
     for i in range(claims.size):
         labels[i] = names[claims[i]]
 
@@ -477,7 +477,7 @@ def measure_deviations(
     histogram: NDArray[np.int64],
     extents: NDArray[np.float64],
 ) -> None:
-    """Sum and bin the distances of claimed points to their plane, and see how far they reach.
+    """Sum and bin the distances of points to their plane, and find their extent.
 
     Args:
         points: (n,) offsets in blocks.
@@ -518,7 +518,7 @@ def measure_deviations(
 
 # --- the plane of points ---
 
-# What a fit may change: everything, a normal kept across up, or one kept along up.
+# The unknowns of a fit: all, with the normal perpendicular to up, or along up.
 FREE: Final = 0
 VERTICAL: Final = 1
 LEVEL: Final = 2
@@ -526,16 +526,16 @@ LEVEL: Final = 2
 _STEPS_MOST: Final = 20
 # A fit has settled when a point ten metres away moves by less than this share of the tolerance.
 _SETTLED_SHARE: Final = 5e-4
-# Points nearer to a line than this (root mean square) do not say how the plane lies about it.
+# Points nearer to a line than this (root mean square) do not determine a rotation about it.
 _LINE_WIDTH_M: Final = 1e-4
 
 
 @compiled
 def flattest(sums: NDArray[np.float64], plane: NDArray[np.float64]) -> None:
-    """Set (9,) plane to normal, middle, and the variances along the three principal axes.
+    """Set (9,) plane to normal, centroid, and the variances along the three principal axes.
 
-    The eigenvalues of a symmetric 3 x 3 matrix in closed form, because the library's solver takes
-    a hundred times as long for so small a one.
+    The eigenvalues of a symmetric 3 x 3 matrix in closed form: LAPACK takes a hundred times as
+    long for so small a matrix.
 
     Args:
         sums: (10,) number of points, sums of a, b, c, and of aa, ab, ac, bb, bc, cc.
@@ -561,7 +561,7 @@ def flattest(sums: NDArray[np.float64], plane: NDArray[np.float64]) -> None:
     most = mean + 2.0 * size * math.cos(angle)
     least = mean + 2.0 * size * math.cos(angle + 2.0 * math.pi / 3.0)
     plane[6], plane[7], plane[8] = max(least, 0.0), 3.0 * mean - most - least, most
-    # Rows of (matrix - least) are across the normal: the longest cross product of two is the best.
+    # Rows of (matrix - least) are perpendicular to the normal: take their longest cross product.
     ra, rb, rc = aa - least, bb - least, cc - least
     longest = 0.0
     for p0, p1, p2 in (
@@ -583,12 +583,12 @@ def refine_robustly(
 
     Args:
         points: (m, 3) metres; unless the fit is free, with up as their third axis.
-        plane: (4,) normal and offset to start from; changed.
-        tolerance_m: points further away have no weight (Tukey's weights).
+        plane: (4,) initial normal and offset; changed.
+        tolerance_m: points farther away have no weight (Tukey's weights).
         freedom: FREE, VERTICAL or LEVEL.
 
     Returns:
-        Whether more than a line of points supports it; if not, the plane means nothing.
+        Whether more than points on a line support the plane; if not, it is meaningless.
     """
     sums, fitted = np.empty(10), np.empty(9)
     for _ in range(_STEPS_MOST):
@@ -612,7 +612,7 @@ def refine_robustly(
         if sums[0] <= 0.0:
             return False
         if freedom == VERTICAL:
-            # Moments whose widest direction is up, so that no normal leans.
+            # Moments whose largest axis is up, so that the normal is horizontal.
             x, y, z = sums[1] / sums[0], sums[2] / sums[0], sums[3] / sums[0]
             sums[6], sums[8] = sums[1] * z, sums[2] * z
             sums[9] += sums[4] - sums[1] * x + sums[7] - sums[2] * y
@@ -643,12 +643,12 @@ def consensus_sums(
     n_bins: int,
     sums: NDArray[np.int64],
 ) -> None:
-    """Count the points near each of many planes, and how near they are, in bins of distance.
+    """Score many planes by the points near each, in bins of distance.
 
     Args:
         points: (3, m) metres.
         planes: (h, 4) normal and offset.
-        reach_m: distances up to here are counted.
+        reach_m: maximum distance.
         n_bins: bins of 0..reach.
         sums: (h, 2) added to: points within reach, and 4 n^2 - (2 b + 1)^2 of the bin b of each,
             which is 4 n^2 (1 - d^2) with the distance d of its middle as a share of the reach.
@@ -662,7 +662,7 @@ def consensus_sums(
         for start in range(0, points.shape[1], BLOCK_POINTS):
             stop = min(start + BLOCK_POINTS, points.shape[1])
             xs, ys, zs = points[0, start:stop], points[1, start:stop], points[2, start:stop]
-            # Whole numbers of 32 bits, so that the processor takes several points at once.
+            # Integers of 32 bits, so that the compiler vectorises the loop.
             count, worth = nothing, nothing
             for i in range(xs.size):
                 place = np.int32(min(abs(a * xs[i] + b * ys[i] + c * zs[i] - d), top))

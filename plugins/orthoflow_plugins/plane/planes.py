@@ -1,12 +1,12 @@
 """Found planes turned into products: deviations, sides, order, names, rectangles in the world.
 
-Deviations are of all points, in one pass. markiewicz2015 takes a plane as correct when they look
-normal (Figures 6c to 14c). With a million points every formal test rejects, so the departure itself
-is stated: skewness, excess kurtosis, shares within one, two and three standard deviations, and
-quantile against quantile.
+Deviations are those of all points, in one pass. markiewicz2015 regards a plane as correct if they
+look normal (Figures 6c to 14c). With a million points every formal test rejects, so the departure
+itself is stated: skewness, excess kurtosis, shares within one, two and three standard deviations,
+and a quantile-quantile plot.
 
-Which side of a plane the viewer is on is asked of the scanner stations, else guessed from points.
-The wrong side mirrors every image of the wall, so a guess is always reported as one.
+The viewer's side of a plane follows from the scanner stations, or is guessed from the points. The
+wrong side mirrors every image of the wall, so a guess is always reported.
 """
 
 from __future__ import annotations
@@ -39,29 +39,29 @@ from orthoflow_plugins.plane.support import SurfaceRaster
 
 Viewpoint = Literal["stations", "view_from", "guess"]
 
-# Points that are too few to speak of a distribution.
+# Minimum number of points of a distribution.
 _DISTRIBUTION_LEAST: Final = 100
 _PROBABILITIES: Final = (
     0.001, 0.0025, 0.005, 0.01, 0.025, *(0.05 * step for step in range(1, 20)),
     0.975, 0.99, 0.995, 0.9975, 0.999,
 )  # fmt: skip
-# Points of a plane, and of all, that are asked for its side.
+# Points of a plane, and of the cloud, that are used to find its side.
 _MEMBERS_MOST: Final = 5000
 _WITNESSES_MOST: Final = 40_000
 # Cosine of 20 degrees.
 _PARALLEL: Final = 0.94
-# A station nearer to the plane than this stands in it, and says nothing about its side.
+# A station nearer to the plane than this lies in it and does not determine its side.
 _CLEAR_M: Final = 0.05
-# Beyond this distance a point counts no more for the side of the room than a nearer one.
+# The vote of a point for the side of the room does not grow beyond this distance.
 _FULL_VOTE_M: Final = 1.0
-# Points may project this far outside the rectangle: floor and ceiling lie at its edges.
+# Points may project this far outside the rectangle, because floor and ceiling lie at its edges.
 _BESIDE_M: Final = 0.3
-# A verdict below this share of all points, each just clear of the plane, is none.
+# Minimum majority, as a share of all points, each just clear of the plane.
 _DOUBT: Final = 0.01
 SIDES_GUESSED: Final = DiagnosticSpec(
     code="plane-sides-unknown",
     severity="warning",
-    text="no scanner station says from which side {n} of {n_planes} planes were seen; the side "
+    text="no scanner station shows from which side {n} of {n_planes} planes were seen; the side "
     "with more of the other points was taken, unless photos decide later (face.photos)",
     remedy="if an image comes out mirrored, set view_from of read.scan",
     rank_by="n",
@@ -71,7 +71,7 @@ SIDES_GUESSED: Final = DiagnosticSpec(
 
 @dataclass(frozen=True, kw_only=True)
 class Deviations(Rows):
-    """How far the points of each plane lie from it.
+    """Deviations of the points of each plane from it.
 
     Attributes:
         n_points: (k,) int64 points that belong to the plane.
@@ -82,8 +82,8 @@ class Deviations(Rows):
         histogram: (k, bins) points per bin of -tolerance_m..tolerance_m.
         extents_m: (k, 4) smallest and largest u, smallest and largest v of the points within the
             tolerance of the fit in the plane's rectangle.
-        tolerance_m: of belonging.
-        fit_tolerance_m: of the fit.
+        tolerance_m: maximum distance of points that belong to a plane.
+        fit_tolerance_m: maximum distance of points used in the fit.
     """
 
     n_points: NDArray[np.int64]
@@ -138,7 +138,7 @@ class FacedPlane:
         plane: the plane.
         corners_m: (4, 3) top-left first, counter-clockwise for the viewer.
         part_corners_m: (p, 4, 3) the same of each connected part.
-        is_guessed: no station decided about the side.
+        is_guessed: whether no station determined the side.
     """
 
     plane: Plane
@@ -154,11 +154,11 @@ def assemble(
     tolerance_m: float,
     fit_tolerance_m: float,
 ) -> tuple[Planes, Deviations, list[Normality | None], NDArray[np.intp]]:
-    """Measure planes on their claimed points, and give them their side, order and names.
+    """Measure planes on their points, and determine their sides, order and names.
 
     Returns:
-        The planes, the largest first; their deviations, and how normal those are, None where there
-        are too few points; and (k,) which of those that were found each one is.
+        The planes, the largest first; their deviations; the normality of these, None for a plane
+        with too few points; and the (k,) index of each plane among those found.
     """
     deviations = measure_planes(
         prepared,
@@ -174,7 +174,7 @@ def assemble(
     for place, (k, side) in enumerate(zip(order, faced, strict=True)):
         candidate, own = found[k].candidate, _raw(found[k], side.plane, cloud)
         if float(side.plane.normal @ found[k].raster.plane.normal) < 0.0:
-            # Histograms and means follow the normal when it was turned.
+            # Histograms and means follow a normal that was reversed.
             ordered.histogram[place] = ordered.histogram[place, ::-1].copy()
             ordered.mean_fit_m[place] *= -1.0
         raw.append(
@@ -189,7 +189,7 @@ def assemble(
         normality(row, tolerance_m=tolerance_m, fit_tolerance_m=ordered.fit_tolerance_m)
         for row in ordered.histogram
     ]
-    # Normal and offset change sign together, so that their covariance stays as it is.
+    # Normal and offset change sign together, which leaves their covariance unchanged.
     covariances, n_independent = zip(*(found[k].adjusted.stated() for k in order), strict=True)
     is_guessed = [item.is_guessed for item in faced]
     viewpoint: Viewpoint = "guess" if all(is_guessed) else known_viewpoint(cloud)
@@ -225,11 +225,11 @@ def planes_of(
     side_from: tuple[SideSource, ...] = (),
     details: dict[str, JsonValue] | None = None,
 ) -> Planes:
-    """Make the product of planes in their order; covariances (4, 4) are of (normal, offset)."""
+    """Return the product of planes in their order; covariances (4, 4) are of (normal, offset)."""
     normals = np.array([item.plane.normal for item in faced])
     heights_m = np.array([item.corners_m.mean(axis=0) @ cloud.up for item in faced])
     n_parts = [len(item.part_corners_m) for item in faced]
-    # The offset is counted from the world's origin.
+    # The offset refers to the world's origin.
     shift = np.eye(4)
     shift[3, :3] = cloud.origin
     moved = shift @ np.array(covariances) @ shift.T
@@ -252,7 +252,7 @@ def planes_of(
 
 
 def _raw(item: FoundPlane, plane: Plane, cloud: PointCloud) -> Plane:
-    """What a detector itself gave for a plane, before the common fit; world, to the same side."""
+    """Return a plane as its detector proposed it, in the world, facing the same side."""
     own = item.candidate.plane
     if float(own.normal @ plane.normal) < 0.0:
         own = own.flipped()
@@ -262,7 +262,7 @@ def _raw(item: FoundPlane, plane: Plane, cloud: PointCloud) -> Plane:
 def report_planes(
     ctx: StepContext, planes: Planes, deviations: Deviations, *, n_points: int
 ) -> None:
-    """Report number and shares of planes, and where the first lies; warn of guessed sides."""
+    """Report the number and shares of planes, and the first plane; warn of guessed sides."""
     omega_deg, phi_deg = omega_phi_deg(planes.normal[0], planes.up)
     ctx.metric("n_planes", len(planes), "1")
     ctx.metric("labelled_share", float(deviations.n_points.sum()) / n_points, "1")
@@ -283,7 +283,7 @@ def report_first(
     found: FoundPlane,
     cloud: PointCloud,
 ) -> None:
-    """Report how the first plane fits, and how far the fit moved what the detector itself gave."""
+    """Report the fit of the first plane, and how far it moved the detector's proposal."""
     raw = _raw(found, planes.plane(0), cloud)
     ctx.metric("first_share", float(planes.n_points[0]) / len(cloud), "1")
     ctx.metric("fit_rms_mm", 1000.0 * float(deviations.rms_fit_m[0]), "mm")
@@ -310,10 +310,10 @@ def report_first(
 def plane_names(
     normals: NDArray[np.float64], heights_m: NDArray[np.float64], up: NDArray[np.float64]
 ) -> tuple[str, ...]:
-    """Name planes by what they are: `wall 0`, `floor 1`, `ceiling 2`, `level 4`, `slope 5`.
+    """Name planes by kind: `wall 0`, `floor 1`, `ceiling 2`, `level 4`, `slope 5`.
 
     The number is the plane's position in the product, as in the files wall_<k>_*.tif. The floor is
-    the lowest level plane that is seen from above, the ceiling the highest that is seen from below.
+    the lowest level plane seen from above, the ceiling the highest seen from below.
 
     Args:
         normals: (k, 3) towards the viewer.
@@ -343,7 +343,7 @@ def measure_planes(
     tolerance_m: float,
     fit_tolerance_m: float,
 ) -> Deviations:
-    """Measure the deviations of all claimed points in one pass.
+    """Measure the deviations of all points on planes in one pass.
 
     Args:
         cloud: the cloud with its claims.
@@ -387,10 +387,10 @@ def measure_planes(
 def normality(
     histogram: NDArray[np.int64], *, tolerance_m: float, fit_tolerance_m: float
 ) -> Normality | None:
-    """Judge the distances that a histogram over +-tolerance_m holds within the fit's tolerance.
+    """Describe the distances within the fit tolerance in a histogram over +-tolerance_m.
 
     Returns:
-        Their shape, or None where there are too few, or all in one bin.
+        The shape of the distribution, or None for too few distances or a single bin.
     """
     edges_m = np.linspace(-tolerance_m, tolerance_m, len(histogram) + 1)
     middles_m = 0.5 * (edges_m[1:] + edges_m[:-1])
@@ -429,14 +429,14 @@ def normality(
 
 
 def known_viewpoint(cloud: PointCloud) -> Viewpoint:
-    """Return what is known about where the cloud was seen from."""
+    """Return how the positions from which the cloud was seen are known."""
     if cloud.stations is None or len(cloud.stations) == 0:
         return "guess"
     return "view_from" if cloud.stations_source == "view_from" else "stations"
 
 
 def middle_viewpoint_m(cloud: PointCloud, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3,) middle of the stations, of some points of the cloud where none is known; offsets."""
+    """Return the middle (3,) of the stations, or of points if none is known; offsets."""
     if cloud.stations is None or len(cloud.stations) == 0:
         return np.asarray(np.median(points_m, axis=0))
     return np.asarray(cloud.stations.mean(axis=0) - cloud.origin)
@@ -445,7 +445,7 @@ def middle_viewpoint_m(cloud: PointCloud, points_m: NDArray[np.float64]) -> NDAr
 def rectangle_m(
     plane: Plane, axes: NDArray[np.float64], bounds_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Corners (4, 3) on a plane: top-left first, counter-clockwise for the viewer.
+    """Return corners (4, 3) on a plane: top-left first, counter-clockwise for the viewer.
 
     Args:
         plane: the plane, normal towards the viewer.
@@ -466,9 +466,9 @@ def face(
     *,
     is_guessed: bool,
 ) -> FacedPlane:
-    """Turn a plane with the (4,) extent of its points and of its parts (p, 4) to a side.
+    """Return a plane facing a side, with the (4,) extent of its points and its parts (p, 4).
 
-    Parts are known to a cell; none reaches beyond the points that are there.
+    Parts are known to a cell; they are clipped to the extent of the points.
     """
     parts_m = np.clip(parts_m, extent_m[[0, 0, 2, 2]], extent_m[[1, 1, 3, 3]])
     corners = [rectangle_m(raster.plane, raster.axes, bounds) for bounds in (extent_m, *parts_m)]
@@ -491,10 +491,10 @@ def face(
 def side_of_stations(
     plane: Plane, centre_m: NDArray[np.float64], cloud: PointCloud, index: NDArray[np.int64]
 ) -> int:
-    """Side of a plane on which its points were seen from.
+    """Return the side of a plane from which its points were seen.
 
-    The scans of the plane's own points decide, each point with one vote; without that knowledge
-    the station nearest to the middle of the plane does.
+    The scans of the plane's points decide, each point with one vote; if these are unknown, the
+    station nearest to the middle of the plane decides.
 
     Args:
         plane: in the cloud's offsets.
@@ -503,7 +503,7 @@ def side_of_stations(
         index: (m,) some of the plane's points.
 
     Returns:
-        1 for the side of the normal, -1 for the other, 0 when no station decides.
+        1 for the side of the normal, -1 for the other, 0 if no station decides.
     """
     if cloud.stations is None or len(cloud.stations) == 0:
         return 0
@@ -528,12 +528,12 @@ def side_of_remaining(
     *,
     clear_m: float,
 ) -> int:
-    """Side of a plane on which more of the other points lie: a room, or furniture and floor.
+    """Return the side of a plane with more of the other points, which is that of the room.
 
-    Points on planes parallel to this one do not count at first: behind the front of a pilaster
-    lies the whole wall, yet the room is on the other side, as floor, side walls and furniture know.
-    Of the rest only points before or behind the plane's rectangle have a vote, and a point next to
-    the plane has less than one a metre away: relief and recesses are near, the room is far.
+    Points on planes parallel to this one do not count at first: the whole wall lies behind the
+    front of a pilaster, but the room, with its floor, side walls and furniture, on the other side.
+    Of the rest, only points in front of or behind the plane's rectangle have a vote. It grows with
+    the distance up to a metre, because relief and recesses are near and the room is far.
 
     Args:
         plane: in the cloud's offsets.
@@ -543,7 +543,7 @@ def side_of_remaining(
         clear_m: points nearer than this belong to the plane itself.
 
     Returns:
-        1 for the side of the normal, -1 for the other, 0 when the points do not decide.
+        1 for the side of the normal, -1 for the other, 0 if the points do not decide.
     """
     relative = points_m - corners_m[0]
     within = np.ones(len(points_m), dtype=bool)
@@ -555,7 +555,7 @@ def side_of_remaining(
     clear = np.abs(distances_m) > clear_m
     for chosen in (within & ~is_parallel, within, ~is_parallel, np.ones_like(within)):
         verdict = float(np.clip(distances_m[chosen & clear], -_FULL_VOTE_M, _FULL_VOTE_M).sum())
-        # Gross outliers on both sides of a bare wall leave a small difference that means nothing.
+        # Gross outliers on both sides of a bare wall leave a small, meaningless difference.
         if abs(verdict) > _DOUBT * len(points_m) * clear_m:
             return 1 if verdict > 0.0 else -1
     return 0
@@ -578,7 +578,7 @@ def _faced(
     side = side_of_stations(plane, corners_m.mean(axis=0), cloud, members)
     is_guessed = side == 0
     if is_guessed:
-        # The last entry stands for points on no plane: a claim of -1 picks it.
+        # The last entry is for points on no plane, which have a claim of -1.
         turns = [abs(float(item.raster.plane.normal @ plane.normal)) for item in found]
         every = max(1, len(claims) // _WITNESSES_MOST)
         side = side_of_remaining(

@@ -1,17 +1,18 @@
-"""`plane.ransac`: the planes that most points of a sample agree on, fitted to all points.
+"""`plane.ransac`: the planes with the largest consensus in a sample, fitted to all points.
 
-Three points drawn from all of a room are on one small wall once in a million draws. The sample is
-put along a space-filling curve, and the points of a hypothesis come from one stretch of it, of a
-length that is drawn too: short stretches find small planes, long ones fix large planes well.
+Three points drawn from a whole room lie on the same small wall once in a million draws. The sample
+is therefore ordered along a space-filling curve, and the points of a hypothesis are drawn from one
+section of it. The length of the section is random too: short ones find small planes, long ones
+determine large planes well.
 
-What a hypothesis is worth follows from the distances of points to it.
+The score of a hypothesis follows from the distances of points to it.
 
 - count (Max-Consensus): the points within the tolerance.
 - msac: a point within the tolerance counts 1 - (distance / tolerance)^2 (Torr and Zisserman 2000).
-- a-contrario (AC-RANSAC): minus the logarithm of the number of false alarms that the tolerance with
-  the fewest gives; the tolerance is an outcome (Moisan and Stival 2004; Moisan, Moulon, Monasse
-  2012). The chance that a point of the background lies within a distance of the plane is the share
-  of the scene's box that the slab fills.
+- a-contrario (AC-RANSAC): minus the logarithm of the number of false alarms at the tolerance with
+  the fewest, which is a result (Moisan and Stival 2004; Moisan, Moulon, Monasse 2012). The
+  probability that a point of the background lies within a distance of the plane is the share of the
+  scene's box inside the slab.
 """
 
 from __future__ import annotations
@@ -45,59 +46,60 @@ if TYPE_CHECKING:
 Model = Literal["3d", "2d"]
 Scoring = Literal["count", "msac", "a-contrario"]
 
-# Bins of 0..tolerance that distances are counted in.
+# Number of bins for distances from 0 to the tolerance.
 _BINS: Final = 100
-# Points of the sample that hypotheses are drawn from, and that they are scored on, at most.
+# Maximum number of points from which hypotheses are drawn, and on which they are scored.
 _DRAWN_MOST: Final = 50_000
 _ASKED_MOST: Final = 150_000
-# Points that all hypotheses are scored on, and those that the better ones are scored on again.
+# Points on which all hypotheses are scored, and points on which the better ones are scored again.
 _FIRST_POINTS: Final = 2_000
 _SECOND_POINTS: Final = 20_000
 _SECOND_SHARE: Final = 0.1
 _SECOND_LEAST: Final = 50
-# Few points fix a plane badly: it may lean by this much more than what is looked for.
+# Planes from few points are inaccurate: they may be tilted by this much more than requested.
 _LEAN_CAUTION_DEG: Final = 5.0
-# Points within the tolerance may fall short of what a plane needs: the hypothesis is rough.
+# Share of the required points that suffices, because hypotheses are rough.
 _SUPPORT_CAUTION: Final = 0.4
 _POLISHED: Final = 4
-# So many hypotheses near each other are scored again; the best of them fits better than any one.
-_ALIKE_MOST: Final = 5
-# Of the points within the tolerance so many must lie in its inner part; chance puts 0.4 there.
+# Number of similar hypotheses that are scored again, to find the best of them.
+_SIMILAR_MOST: Final = 5
+# Minimum share, among points within the tolerance, of those in its inner part; 0.4 by chance.
 _CROWDED_SHARE: Final = 0.5
-# Fresh draws after all hypotheses turned out to be none.
+# Number of new draws after all hypotheses were refused.
 _REDRAWS: Final = 2
-# Stretches hold at least so many points, and each length is half of the one before.
+# Minimum number of points of a section; each length is half of the one before.
 _STRETCH_LEAST: Final = 32
-# Triangles flatter than this (height over longest side) fix no plane.
+# Minimum ratio of height to longest side of a triangle.
 _FLATTEST: Final = 0.02
 _CURVE_BITS: Final = 10
-# Bits of a number spread to every third place, step by step.
+# Steps that spread the bits of a number to every third position.
 _SPREADS: Final = ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249))
-# A hypothesis this near, within a tolerance, to one that turned out to be none is not proposed
-# again; unless so many of the points near it are gone since then.
-_ALIKE_DEG: Final = 2.0
+# A hypothesis within this angle, and within the tolerance, of a refused one is not proposed again
+# unless this share of the points near it was removed since.
+_SIMILAR_DEG: Final = 2.0
 _LOST_SHARE: Final = 0.05
 
 
 class Ransac(Method):
     """Find planes by random sample consensus: Max-Consensus, MSAC or AC-RANSAC, in 3D or the plan.
 
-    Planes through random points are scored on a sample of the cloud; the best is refined on the
-    sample with a tolerance that shrinks from `tolerance_m` to `fit_tolerance_m`, and must hold
-    crowded cells of enough points. When all planes are found on the sample, one pass over all
-    points (of more than 24 million, over a part drawn evenly) fits them, and one labels the points.
+    Planes through random points are scored on a sample of the cloud. The best is refined on the
+    sample with a tolerance that shrinks from `tolerance_m` to `fit_tolerance_m`, and must have
+    enough points that concentrate on it. When all planes are found on the sample, they are fitted
+    to all points in one pass (of clouds above 24 million points a random part is used), and all
+    points are labelled in another.
 
     `model: 2d` draws upright planes through two points of the plan, as in markiewicz2015; it finds
-    walls only. `scoring: a-contrario` finds its own tolerance, up to `tolerance_m`: the one at
-    which the points least look like chance. It is reported as `own_tolerance_mm` for the first
-    plane and with each plane; the common fit with `fit_tolerance_m` follows all the same.
+    walls only. `scoring: a-contrario` estimates its own tolerance, up to `tolerance_m`: the one at
+    which the points are least likely by chance. It is reported as `own_tolerance_mm` for the first
+    plane and with each plane; the common fit with `fit_tolerance_m` follows in any case.
     """
 
     id = "plane.ransac"
     determinism = "seeded"
     metrics = (
         *DETECTOR_METRICS,
-        MetricSpec("own_tolerance_mm", label="tolerance taken from the cloud"),
+        MetricSpec("own_tolerance_mm", label="tolerance estimated from the cloud"),
     )
     citations = (
         "Fischler, Bolles 1981: Random sample consensus, doi:10.1145/358669.358692",
@@ -110,15 +112,15 @@ class Ransac(Method):
     )
 
     class Params(DetectorParams):
-        """What may be set; the defaults suit rooms and facades scanned at millimetres."""
+        """Parameters; the defaults suit rooms and facades scanned at millimetres."""
 
         model: Model = Field(
             "3d", description="Planes through three points, or upright ones through two."
         )
         scoring: Scoring = Field(
             "msac",
-            description="What a hypothesis is worth: its points, its points the more the nearer "
-            "they are, or how little they look like chance at its own tolerance.",
+            description="Score of a hypothesis: its points, its points weighted by distance, or "
+            "how unlikely they are by chance at its own tolerance.",
         )
         n_hypotheses: int = Field(
             1000,
@@ -146,7 +148,7 @@ class Ransac(Method):
 
 @dataclass(frozen=True, kw_only=True)
 class Hypotheses(Rows):
-    """Planes in the frame of the points they were drawn from.
+    """Planes in the frame of the points from which they were drawn.
 
     Attributes:
         normals: (h, 3) unit vectors.
@@ -157,10 +159,10 @@ class Hypotheses(Rows):
     offsets_m: NDArray[np.float64]
 
     def are_near(self, others: Hypotheses, tolerance_m: float) -> NDArray[np.bool_]:
-        """(h, o) whether hypotheses are much the same as others."""
+        """Return (h, o) whether hypotheses are similar to others."""
         cosines = self.normals @ others.normals.T
         apart_m = np.abs(self.offsets_m[:, None] - np.copysign(1.0, cosines) * others.offsets_m)
-        limit = math.cos(math.radians(_ALIKE_DEG))
+        limit = math.cos(math.radians(_SIMILAR_DEG))
         return (np.abs(cosines) > limit) & (apart_m < tolerance_m)
 
     def plane(self, place: int) -> Plane:
@@ -171,12 +173,12 @@ class Hypotheses(Rows):
 
 @dataclass(frozen=True, kw_only=True)
 class Scores(Rows):
-    """What hypotheses are worth.
+    """Scores of hypotheses.
 
     Attributes:
-        value: (h,) the larger the better; for a-contrario positive when meaningful.
-        tolerance_m: (h,) tolerance within which the points speak for it.
-        n_points: (h,) points within that.
+        value: (h,) higher is better; for a-contrario positive if meaningful.
+        tolerance_m: (h,) maximum distance of the points that count.
+        n_points: (h,) number of these.
     """
 
     value: NDArray[np.float64]
@@ -185,19 +187,19 @@ class Scores(Rows):
 
 
 class ConsensusProposer:
-    """Proposes planes that many points of a sample lie on.
+    """Proposes planes with many points of a sample.
 
-    Hypotheses that were good stay for the next plane and are scored anew on what remains. Those
-    that turned out to be no planes stay out until points near them are taken: a verification asks
-    those points, so that until then it would end as before.
+    Good hypotheses are kept for the next plane and scored again on the remaining points. Refused
+    ones are excluded until points near them are removed, because the verification depends on those
+    points alone.
     """
 
     def __init__(self, search: Search, params: Ransac.Params, rng: np.random.Generator) -> None:
-        """Get ready to propose; `rng` is the source of chance."""
+        """Order the sample along a curve; `rng` draws the hypotheses."""
         self._params, self._rng, self._search = params, rng, search
         points_m = search.cloud.sample.offsets_m
         self._centre_m = np.median(points_m, axis=0)
-        # Shuffled once, so that any first part of the free points is an even choice of them.
+        # Shuffled once, so that any first part of the free points represents all of them.
         self._shuffled = rng.permutation(len(points_m))[:_ASKED_MOST]
         drawn = self._shuffled[:_DRAWN_MOST]
         self._order = drawn[curve_order(points_m[drawn])]
@@ -206,7 +208,7 @@ class ConsensusProposer:
         self._box_m = corners.max(axis=0) - corners.min(axis=0)
         self._drawn_for = -1
         self._hypotheses: Hypotheses | None = None
-        # Of those, in the same order, the best first; on the points that were asked.
+        # Of the hypotheses, the best first, on the points that were used.
         self._scores = Scores(value=np.zeros(0), tolerance_m=np.zeros(0), n_points=np.zeros(0, int))
         self._asked_m = points_m[:0]
         self._witnesses = self._shuffled[:_SECOND_POINTS]
@@ -216,7 +218,7 @@ class ConsensusProposer:
         self._n_near = np.zeros(0, dtype=np.int64)
 
     def propose(self, search: Search) -> Candidate | None:
-        """Name the best hypothesis about the points that remain."""
+        """Return the best hypothesis for the remaining points."""
         if self._drawn_for != search.n_points:
             self._free_m = self._witnesses_m[search.claims[self._witnesses] < 0]
             stays = self._count_near(self._rejected) >= (1.0 - _LOST_SHARE) * self._n_near
@@ -231,7 +233,7 @@ class ConsensusProposer:
         return self._best()
 
     def reject(self, candidate: Candidate) -> None:
-        """Bar the surroundings of a hypothesis that turned out to be no plane."""
+        """Exclude the surroundings of a refused hypothesis."""
         plane = candidate.plane
         offset_m = plane.offset_m - float(plane.normal @ self._centre_m)
         self._bar(Hypotheses(normals=plane.normal[None], offsets_m=np.array([offset_m])))
@@ -241,20 +243,20 @@ class ConsensusProposer:
         self._n_near = np.append(self._n_near, self._count_near(hypothesis))
 
     def _is_barred(self, hypotheses: Hypotheses) -> NDArray[np.bool_]:
-        """(h,) whether hypotheses are much the same as a rejected one."""
+        """Return (h,) whether hypotheses are similar to a refused one."""
         near = hypotheses.are_near(self._rejected, self._search.tolerance_m)
         return np.asarray(np.logical_or.reduce(near, axis=1))
 
     def _count_near(self, hypotheses: Hypotheses) -> NDArray[np.int64]:
-        """(h,) free witnesses near each hypothesis."""
+        """Return (h,) the number of free test points near each hypothesis."""
         apart_m = np.abs(self._free_m @ hypotheses.normals.T - hypotheses.offsets_m)
         return np.asarray(np.sum(apart_m <= self._search.tolerance_m, axis=0, dtype=np.int64))
 
     def _best(self) -> Candidate | None:
-        """The best hypothesis with enough points, of which those near it crowd about its plane.
+        """Return the best hypothesis with enough points that concentrate on its plane.
 
-        A plane through mouldings and clutter holds many points too, but spread over its slab. One
-        is barred: the full verification would cost ten times as much.
+        A plane through mouldings and clutter has many points too, but spread over its slab. Such
+        planes are excluded here, because the full verification takes ten times as long.
         """
         from orthoflow_plugins.plane.fit import refine_plane
         from orthoflow_plugins.plane.support import INNER_SHARE
@@ -297,7 +299,7 @@ class ConsensusProposer:
         return None
 
     def _draw(self) -> None:
-        """Draw hypotheses, score them with the earlier ones on a few points, the best on more."""
+        """Draw hypotheses; score them and the earlier ones on few points, the best on more."""
         search, params = self._search, self._params
         points_m, claims = search.cloud.sample.offsets_m, search.claims
         free = np.flatnonzero(claims[self._order] < 0)
@@ -320,7 +322,7 @@ class ConsensusProposer:
         hypotheses = hypotheses.take(~self._is_barred(hypotheses))
         if len(hypotheses) == 0:
             return
-        # Among the first of them there nearly always are enough.
+        # The first of them nearly always contain enough.
         asked = self._shuffled[: 4 * _SECOND_POINTS]
         asked = asked[claims[asked] < 0]
         if len(asked) < _SECOND_POINTS:
@@ -365,18 +367,18 @@ class ConsensusProposer:
     def _distinct(
         self, hypotheses: Hypotheses, ranked: NDArray[np.intp], n_most: int
     ) -> NDArray[np.intp]:
-        """The best of some ranked hypotheses, no more than `_ALIKE_MOST` of them much the same."""
-        # The best ones nearly always hold enough that differ.
-        for n_asked in (min(len(ranked), _ALIKE_MOST * n_most), len(ranked)):
+        """Return the best of some ranked hypotheses, at most `_SIMILAR_MOST` similar ones."""
+        # The best ones nearly always include enough different ones.
+        for n_asked in (min(len(ranked), _SIMILAR_MOST * n_most), len(ranked)):
             asked = ranked[:n_asked]
             some = hypotheses.take(asked)
             near = some.are_near(some, self._search.tolerance_m)
             kept: list[int] = []
-            alike = np.zeros(n_asked, dtype=np.int64)
+            n_similar = np.zeros(n_asked, dtype=np.int64)
             for place in range(n_asked):
-                if alike[place] < _ALIKE_MOST and len(kept) < n_most:
+                if n_similar[place] < _SIMILAR_MOST and len(kept) < n_most:
                     kept.append(place)
-                    alike += near[place]
+                    n_similar += near[place]
             if len(kept) == n_most:
                 break
         return asked[kept]
@@ -386,7 +388,7 @@ class ConsensusProposer:
         return Plane(normal=plane.normal, offset_m=offset_m)
 
     def _polished(self, hypothesis: Hypotheses) -> tuple[Hypotheses, float]:
-        """Fit to the points within the own tolerance, find that anew, while it gets better."""
+        """Fit to the points within the own tolerance and estimate that again while it improves."""
         search = self._search
         relative_m = (search.cloud.sample.offsets_m - self._centre_m)[search.claims < 0]
         best = self._scored(hypothesis, relative_m)
@@ -414,10 +416,10 @@ def draw_hypotheses(
 
     Args:
         points_m: (m, 3) in curve order.
-        count: how many are drawn; those that fix no plane are left out.
+        count: number of draws; degenerate ones are left out.
         model: `3d` through three points, `2d` upright through two.
         up: (3,) unit vector.
-        rng: source of chance.
+        rng: random numbers.
     """
     n_points = len(points_m)
     n_lengths = max(1, int(np.log2(max(1.0, n_points / _STRETCH_LEAST))) + 1)
@@ -439,7 +441,7 @@ def draw_hypotheses(
 
 
 def curve_order(points_m: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Order points (m, 3) along a Morton curve, so that neighbours on it are near each other."""
+    """Return the order of points (m, 3) along a Morton curve, whose neighbours are close."""
     low, high = np.quantile(points_m, (0.01, 0.99), axis=0)
     scale = (2**_CURVE_BITS - 1) / max(float((high - low).max()), 1e-9)
     cells = np.clip((points_m - low) * scale, 0, 2**_CURVE_BITS - 1).astype(np.uint32)
@@ -459,14 +461,14 @@ def fewest_false_alarms(
     extents_m: NDArray[np.float64],
     n_corners: int,
 ) -> Scores:
-    """Score hypotheses by the tolerance at which their points least look like chance.
+    """Score hypotheses by the tolerance at which their points are least likely by chance.
 
     Args:
         histograms: (h, bins) points per bin of distance, 0..reach.
-        reach_m: the largest tolerance that is considered.
-        n_points: points that were asked.
+        reach_m: maximum tolerance.
+        n_points: total number of points.
         extents_m: (h,) extent of the scene's box along each normal.
-        n_corners: points that fix a hypothesis.
+        n_corners: number of points that determine a hypothesis.
     """
     within = np.cumsum(histograms, axis=1, dtype=np.int64)
     n_bins = within.shape[1]
@@ -501,7 +503,7 @@ def _log_choose(
 def _fitted(
     points_m: NDArray[np.float64], model: Model, up: NDArray[np.float64]
 ) -> Hypotheses | None:
-    """Plane of least squared distances, upright for the 2D model."""
+    """Return the total least squares plane, upright for the 2D model."""
     if len(points_m) < 4:
         return None
     mean = points_m.mean(axis=0)

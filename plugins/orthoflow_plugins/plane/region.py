@@ -1,7 +1,7 @@
-"""`plane.region`: regions grown over neighbouring points with like normals and a common plane.
+"""`plane.region`: regions grown over neighbouring points with similar normals on a common plane.
 
-Regions are of voxels: grown over neighbours, or grouped by normals alone. The region with most free
-points comes first. A point may also be labelled by its region.
+Regions consist of voxels, which are grown over neighbours or grouped by normals alone. The region
+with most free points is proposed first. Points may also be labelled by their region.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from orthoflow_plugins.plane.search import Search
     from orthoflow_plugins.plane.voxels import Neighbourhood, SurfaceVoxels
 
-# What `preset: paper` sets where nothing else is set: markiewicz2015, 4.1.2.
+# Values of `preset: paper` for parameters that are not set: markiewicz2015, 4.1.2.
 _PAPER_PRESET: Final[dict[str, object]] = {
     "criterion": "normal",
     "neighbourhood": "cube",
@@ -43,22 +43,22 @@ _PAPER_PRESET: Final[dict[str, object]] = {
     "labels": "region",
     "stop_unclassified_share": 0.1,
 }
-# Parts of a wall are regions of their own: together they may hold what each alone does not.
+# Parts of a wall are separate regions, which may have enough points only together.
 _PART_SHARE: Final = 0.2
-# A region's plane may lean by this much more than what is looked for; the fit decides.
+# A region's plane may be tilted by this much more than requested; the fit decides.
 _LEAN_CAUTION_DEG: Final = 3.0
-# What voxels hold that no region has: such as may join one, and such as may not.
+# Values of voxels in no region: those that may be added to one, and those that may not.
 _FREE: Final = -2
 _NONE: Final = -1
-# Voxels whose neighbourhood is rounder than this (deviation over the shorter extent) show no plane.
+# Maximum ratio of the deviation from a neighbourhood's plane to its shorter extent.
 _ROUNDEST: Final = 0.5
-# A neighbourhood must reach this far both ways, in sides of a voxel, lest it be a line.
+# Minimum extent of a neighbourhood in both directions, in sides of a voxel; else it is a line.
 _NARROWEST: Final = 0.2
-# Seeds are taken flattest first, in steps of this share of a voxel.
+# Seeds are ordered by flatness, in steps of this share of a voxel.
 _FLATNESS_STEP: Final = 1.0 / 2000.0
 _MEAN_SHIFTS: Final = 12
-# How often voxels become twice as wide where neighbourhoods hold less than so many times the points
-# that a normal needs.
+# Maximum number of times that voxels are doubled in width, and the limit, as a multiple of the
+# points that a normal needs, below which they are.
 _WIDENINGS: Final = 2
 _THIN: Final = 3.0
 
@@ -67,19 +67,19 @@ class Region(Method):
     """Find planes by region growing on the normals of neighbourhoods, on all points.
 
     The points are summed into cells once; the sums of neighbouring cells give the normal of each
-    neighbourhood. From the flattest cell on, neighbours join whose normal is like the region's and
-    whose middle is near its plane, which is fitted anew as the region grows. The planes of the
-    regions, largest first, then go the way of every detector: refined on a sample, fitted to all
-    points, parts of one plane joined, points labelled by the plane they are near.
+    neighbourhood. Starting from the flattest cell, neighbours are added whose normal is similar to
+    the region's and whose centroid is near its plane, which is refitted as the region grows. The
+    planes of the regions, largest first, are then processed as those of every detector: refined on
+    a sample, fitted to all points, parts of one plane joined, points labelled by the nearest plane.
 
-    `criterion: normal` asks for the normal alone, wherever a cell lies, as in markiewicz2015; with
+    `criterion: normal` uses the normal alone, wherever a cell lies, as in markiewicz2015; with
     `labels: region` a niche then belongs to its wall, whatever its depth. `preset: paper` sets both
     and the other values of that paper (a cube of 10 mm, 1 degree, every 10th point, an end at 10 %
-    unclassified), each of which can still be set otherwise.
+    unclassified), each of which can be overridden.
 
-    Where the cloud is so thin that a neighbourhood would hold too few points, it is enlarged;
-    `neighbourhood_mm` says to what. `normal_scatter_deg` says how far the normals of the first
-    plane lie apart: an `angle_deg` below it leaves crumbs.
+    If the cloud is so sparse that a neighbourhood would have too few points, it is enlarged;
+    `neighbourhood_mm` reports the size. `normal_scatter_deg` reports the scatter of the normals of
+    the first plane: an `angle_deg` below it leaves fragments.
     """
 
     id = "plane.region"
@@ -100,20 +100,20 @@ class Region(Method):
     )
 
     class Params(DetectorParams):
-        """What may be set; the defaults suit rooms and facades scanned at millimetres."""
+        """Parameters; the defaults suit rooms and facades scanned at millimetres."""
 
         preset: Literal["none", "paper"] = Field(
-            "none", description="Values to begin with: those above, or those of markiewicz2015."
+            "none", description="Default values: those of this table, or those of markiewicz2015."
         )
         neighbourhood: Literal["cube", "radius", "knn"] = Field(
             "cube",
-            description="From which points a normal is taken: a cube, a sphere, or the nearest "
-            "cells that hold `n_neighbours` points.",
+            description="The points from which a normal is computed: in a cube, in a sphere, or in "
+            "the nearest cells with `n_neighbours` points.",
         )
         neighbourhood_m: Annotated[float, Field(gt=0.0, le=2.0)] | Literal["auto"] = Field(
             "auto",
             description="Side of the cube, radius of the sphere, metres. auto: 0.1, or three times "
-            "the tolerance of the fit where that is more: normals need room beyond the noise.",
+            "the tolerance of the fit if that is more, because noise must not dominate normals.",
         )
         n_neighbours: int = Field(
             30, ge=3, le=100_000, description="Points of a neighbourhood for knn."
@@ -122,25 +122,25 @@ class Region(Method):
             None,
             gt=0.0,
             le=1.0,
-            description="Side of the cells that grow together; a third of the cube's side, half of "
-            "the sphere's radius, a third of `neighbourhood_m` for knn unless given.",
+            description="Side of the cells; by default a third of the cube's side, half of the "
+            "sphere's radius, a third of `neighbourhood_m` for knn.",
         )
         criterion: Literal["normal-and-distance", "normal"] = Field(
             "normal-and-distance",
-            description="What must be like the region's: the normal and the distance, or the "
+            description="What must agree with the region: the normal and the distance, or the "
             "normal alone, wherever the points lie.",
         )
         angle_deg: float = Field(
-            10.0, gt=0.0, le=45.0, description="Largest angle between a normal and the region's."
+            10.0, gt=0.0, le=45.0, description="Maximum angle between a normal and the region's."
         )
         distance_m: Annotated[float, Field(gt=0.0)] | Literal["auto"] = Field(
             "auto",
-            description="Largest distance of a cell's middle from the region, metres. auto: 0.015, "
-            "or half the tolerance of the fit where that is more.",
+            description="Maximum distance of a cell's centroid from the region's plane, metres. "
+            "auto: 0.015, or half the tolerance of the fit if that is more.",
         )
         labels: Literal["plane", "region"] = Field(
             "plane",
-            description="What labels a point: the plane it is near, or the region it is in.",
+            description="Label points by the nearest plane, or by the region that they are in.",
         )
 
         @model_validator(mode="before")
@@ -152,7 +152,7 @@ class Region(Method):
             return given
 
         def neighbourhood_of(self, fit_tolerance_m: float) -> Neighbourhood:
-            """Return the neighbourhood for a cloud that is fitted with a tolerance."""
+            """Return the neighbourhood for a cloud fitted with a tolerance."""
             from orthoflow_plugins.plane.voxels import Neighbourhood
 
             auto_m = min(2.0, max(0.1, 3.0 * fit_tolerance_m))
@@ -188,15 +188,15 @@ class Region(Method):
 
 
 class RegionProposer:
-    """Proposes the planes of regions, which were grown on all points.
+    """Proposes the planes of regions grown on all points.
 
     Attributes:
         voxels: the voxels.
         region_of_voxel: (m,) int32, -1 for none.
         n_points: (r,) int64 points of each region.
-        planes: of the regions with points enough, by region: total least squares through all
+        planes: of the regions with enough points, by region: total least squares through all
             their points, in the cloud's offsets.
-        starts: the planes that most points of a region are near; the same where it is one layer.
+        starts: the planes near most points of each region; equal to `planes` for a single layer.
     """
 
     def __init__(
@@ -207,7 +207,7 @@ class RegionProposer:
         region_of_voxel: NDArray[np.int32],
         n_regions: int,
     ) -> None:
-        """Get ready to propose the planes of regions of voxels."""
+        """Compute the planes of regions of voxels."""
         self._params, self.voxels, self.region_of_voxel = params, voxels, region_of_voxel
         sums = voxels.table.sums_of(region_of_voxel, n_regions)
         self.n_points = sums[:, 0].astype(np.int64)
@@ -228,7 +228,7 @@ class RegionProposer:
         self._last = -1
 
     def _region_of(self, cloud: PreparedCloud) -> NDArray[np.int32]:
-        """(s,) region of each point of a cloud's sample, -1 for none."""
+        """Return the region (s,) of each point of a cloud's sample, -1 for none."""
         from orthoflow_plugins.plane.cloud import blocked
 
         # The last entry is for points in no voxel.
@@ -236,7 +236,7 @@ class RegionProposer:
         return regions[self.voxels.table.voxel_of(blocked(cloud.sample.offsets_m))]
 
     def propose(self, search: Search) -> Candidate | None:
-        """Name the plane of the region with most free points."""
+        """Return the plane of the region with most free points."""
         free = self._region_of_sample[(search.claims < 0) & (self._region_of_sample >= 0)]
         counts = np.bincount(free, minlength=len(self.n_points))
         constraint = self._params.constraint
@@ -248,7 +248,7 @@ class RegionProposer:
             if plane is None or region in self._barred:
                 continue
             leans = leans_as_asked(plane.normal[None], search.cloud.up, constraint, limit_deg)
-            # By the normal alone a region has one plane, also where many of its points lie off it.
+            # By the normal alone a region has one plane, even if many of its points lie off it.
             if self._params.criterion == "normal" or not leans.all():
                 self._barred.add(region)
             if not leans.all():
@@ -263,15 +263,15 @@ class RegionProposer:
         return None
 
     def reject(self, candidate: Candidate) -> None:
-        """Do not name the last region again."""
+        """Exclude the last region."""
         del candidate
         self._barred.add(self._last)
 
     def relabel(self, found: list[FoundPlane], cloud: PreparedCloud) -> None:
-        """Assign each point to the plane of its region instead of the plane it is near.
+        """Assign each point to the plane of its region instead of the nearest plane.
 
-        A region belongs to the plane that most of its points are near, if more than half of them
-        are near any; the claims of the cloud say which those are.
+        A region belongs to the plane with most of its points according to the cloud's claims, if
+        more than half of its points are on any plane.
         """
         from orthoflow_plugins.plane.kernels import each_part, piece_of
 
@@ -282,7 +282,7 @@ class RegionProposer:
         np.add.at(joint, (region_of_sample[near], claims[near]), 1)
         n_sampled = np.bincount(region_of_sample[region_of_sample >= 0], minlength=n_regions)
         owner = np.where(joint.sum(axis=1) * 2 > n_sampled, joint.argmax(axis=1), -1)
-        # The last entries stand for voxels in no region, and for points in no voxel.
+        # The last entries are for voxels in no region, and for points in no voxel.
         owners = np.append(np.append(owner, -1)[self.region_of_voxel], -1).astype(np.int8)
 
         def claim(_part: int, piece: slice) -> None:
@@ -299,14 +299,14 @@ def region_proposer(
     Args:
         search: the search.
         params: how regions grow.
-        viewer_m: (3,) from where normals are told from their opposites when the normal alone
-            counts, in the cloud's offsets.
+        viewer_m: (3,) position that defines the sign of normals if the normal alone counts, in the
+            cloud's offsets.
     """
     from orthoflow_plugins.plane.voxels import surface_voxels
 
     fit_tolerance_m = search.fit_tolerance_m
     voxels = surface_voxels(search.cloud, params.neighbourhood_of(fit_tolerance_m))
-    # Groups smaller than this are not looked for.
+    # Minimum size of a group.
     least_points = _PART_SHARE * params.min_share * len(search.cloud.claims)
     if params.criterion == "normal":
         regions = _grouped(voxels, params.angle_deg, least_points, viewer_m)
@@ -323,11 +323,11 @@ def _grown(
     once: partial[tuple[NDArray[np.int32], int]],
     least_points: float,
 ) -> tuple[NDArray[np.int32], int]:
-    """Grow regions; where the cloud is thin, those of wider voxels among what they leave."""
+    """Grow regions; if the cloud is sparse, also regions of larger voxels among the rest."""
     from orthoflow_plugins.plane.voxels import POINTS_LEAST, SurfaceVoxels
 
     def crumbs_of(some: SurfaceVoxels, own: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """Voxels in no region, or in one with too few points to be looked at."""
+        """Return the voxels in no region, or in one with too few points."""
         too_few = np.bincount(own + 1, some.counts) < least_points
         too_few[0] = True
         return np.asarray(too_few[own + 1])
@@ -367,7 +367,7 @@ def _grown_once(
     may_join = (deviation <= reach) & (deviation <= _ROUNDEST * width) & (width > _NARROWEST)
     regions = np.where(may_join, np.int32(_FREE), np.int32(_NONE))
     seeds = np.flatnonzero(may_join)
-    # Sixteen bits, so that the sort takes no comparisons.
+    # Sixteen bits, for which numpy uses a radix sort.
     flatness = np.minimum(deviation[seeds] / _FLATNESS_STEP, 65535.0).astype(np.uint16)
     n_regions = grow_regions(
         table.places,
@@ -385,7 +385,7 @@ def _grown_once(
 def _grouped(
     voxels: SurfaceVoxels, angle_deg: float, least_points: float, viewer_m: NDArray[np.float64]
 ) -> tuple[NDArray[np.int32], int]:
-    """Take the direction that most points share, then that of the rest, and so on."""
+    """Group voxels by the direction that most points share, then that of the rest, and so on."""
     usable = (voxels.spreads[:, 0] <= _ROUNDEST * voxels.spreads[:, 1]) & (voxels.counts >= 1)
     usable &= voxels.spreads[:, 1] > _NARROWEST
     # Each towards the viewer.
@@ -411,7 +411,7 @@ def _grouped(
 def _common_direction(
     normals: NDArray[np.float64], weights: NDArray[np.float64], angle_deg: float
 ) -> NDArray[np.float64]:
-    """The fullest bin of directions, moved to the mean of those within the angle."""
+    """Return the fullest bin of directions, shifted to the mean of those within the angle."""
     step = 2.0 * math.sin(0.5 * math.radians(max(angle_deg, 0.5)))
     bins = np.round(normals / step).astype(np.int64) + 4096
     keys, bin_of = np.unique(
@@ -434,7 +434,7 @@ def _unit_mean(normals: NDArray[np.float64], weights: NDArray[np.float64]) -> ND
 
 
 def _plane(sums: NDArray[np.float64], voxels: SurfaceVoxels) -> Plane | None:
-    """Total least squares through the points of a region; in the cloud's offsets."""
+    """Return the total least squares plane of a region's points; in the cloud's offsets."""
     mean = sums[1:4] / sums[0]
     second = sums[[[4, 5, 6], [5, 7, 8], [6, 8, 9]]]
     variances, directions = np.linalg.eigh(second / sums[0] - np.outer(mean, mean))
@@ -448,7 +448,7 @@ def _plane(sums: NDArray[np.float64], voxels: SurfaceVoxels) -> Plane | None:
 
 
 def _densest(voxels: SurfaceVoxels, member: NDArray[np.bool_], plane: Plane) -> Plane:
-    """The plane in the mean direction of a group that most of its points are near."""
+    """Return the plane with the mean normal of a group at the distance of most of its points."""
     basis, side_m = voxels.table.grid.basis, voxels.table.grid.cell_m
     weights = voxels.counts[member].astype(np.float64)
     normals = voxels.normals[member].astype(np.float64)

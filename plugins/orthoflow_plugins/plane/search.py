@@ -1,10 +1,10 @@
-"""The one search of all detectors: candidates moved to a surface, verified, fitted, labelled.
+"""The search that all detectors share: candidates are refined, verified, fitted and labelled.
 
-The same for every detector, so that methods differ in how they look, not in how they fit. A
-candidate is refined on the free points of the sample with a shrinking tolerance, must hold crowded
-cells of enough of them, and is fitted to those cells. Then all points take part, one pass for all
-planes; or of more than 24 million every so many'th block of neighbours, drawn over the whole cloud:
-neighbours share their errors, so that those left out say the same.
+Detectors therefore differ in how they propose planes, not in how planes are fitted. A candidate is
+refined on the free points of the sample with a shrinking tolerance; it must have enough points in
+cells where they concentrate on the plane, and is fitted to those cells. All planes are then fitted
+to all points in one pass. Of clouds above 24 million points, randomly drawn blocks are used:
+neighbouring points share their errors, so the blocks left out would add no information.
 """
 
 from __future__ import annotations
@@ -75,30 +75,31 @@ _PASSES_MOST: Final = 3
 _SETTLED_SHARE: Final = 0.1
 # Planes of a sample are fitted to all points later.
 _SETTLED_ON_SAMPLE_M: Final = 2e-5
-# A candidate may miss a plane's share by this much before its cells are fitted.
+# Share of the required points that suffices before the cells of a candidate are fitted.
 _SAMPLE_CAUTION: Final = 0.7
-# Parts are of one plane when the common fit lies not much worse in the largest than its own.
+# Parts belong to one plane if the common fit is not much worse on the largest than its own.
 _ASKEW: Final = 1.5
 _SAME_M: Final = 2e-4
-# Points that are enough to move a candidate to the surface near it; the fits that follow, to the
-# cells of the sample and then of all points, have all.
+# Points used to move a candidate to the nearby surface; the later fits, to the cells of the sample
+# and then of all points, use all.
 _FIT_POINTS: Final = 20_000
-# Points that are enough to see how far a candidate's points spread.
+# Points used to estimate the extent of a candidate.
 _SPREAD_POINTS: Final = 5_000
-# Points that fix every plane better than its surface is plane; of larger clouds a part is fitted.
+# With this many points every plane is known better than its surface is flat; of larger clouds a
+# part is fitted.
 _FITTED_MOST: Final = 12_000_000
-# In a small cloud a plane need not show more than this share of the largest side of its box.
+# In small clouds the minimum area is limited to this share of the largest face of the box.
 _SIDE_SHARE: Final = 0.02
-# Rectangles that one plane is cut into at most: a frame has four sides. Claims are bytes.
+# Maximum number of rectangles per plane: a frame has four sides. Claims are bytes.
 _RECTANGLES_MOST: Final = 8
 _SLABS_MOST: Final = 127
-# Candidates in a row that turned out to be none, after which the search gives up.
+# Number of consecutive refused candidates after which the search ends.
 _REJECTED_MOST: Final = 60
 
 # What may refuse a candidate: too few points, too little surface, none that crowd about it, a strip
 # as narrow as a line, points that only pass through, a rounded surface, or a tilt not asked for.
 Criterion = Literal["few", "small", "scattered", "strip", "smear", "bent", "tilt"]
-# No plane of the size asked for lies in the cells of candidates that were refused so.
+# Candidates refused for these reasons contain no plane of the required size.
 _SET_ASIDE: Final[frozenset[Criterion]] = frozenset({"small", "strip", "bent"})
 
 _NO_PLANE: Final = (
@@ -106,34 +107,34 @@ _NO_PLANE: Final = (
     "{share:.2%}: {why}; {advice}{small} ({method})"
 )
 _CRITERIA: Final[Mapping[Criterion, str]] = {
-    "few": "the largest candidate holds {share:.2%} of the points",
-    "small": "the largest candidate, which holds {share:.2%} of the points, shows less than "
+    "few": "the largest candidate has {share:.2%} of the points",
+    "small": "the largest candidate, which has {share:.2%} of the points, covers less than "
     "{area:.2g} m2",
-    "scattered": "no points crowd about any candidate",
+    "scattered": "no points concentrate on any candidate",
     "strip": "the candidates are strips too narrow for a plane",
-    "smear": "most points near the largest candidate, which holds {share:.2%} of all, only pass "
+    "smear": "most points near the largest candidate, which has {share:.2%} of all, only pass "
     "through it, as on a rounded body or in a cloud noisier than the tolerance",
-    "bent": "the largest candidate, which holds {share:.2%} of the points, is a curved surface",
-    "tilt": "the candidates lean by more than max_tilt_deg",
+    "bent": "the largest candidate, which has {share:.2%} of the points, is a curved surface",
+    "tilt": "the candidates are tilted by more than max_tilt_deg",
 }
 _NO_CANDIDATE: Final = "no candidate was proposed"
 _ADVICE: Final = (
-    "wider tolerances up to {wider:.3g} m were tried and find none either: lower min_area_m2 for "
+    "wider tolerances up to {wider:.3g} m find none either: lower min_area_m2 for "
     "small planes, min_share for sparse ones, or raise max_tilt_deg"
 )
 _ADVICE_WIDER: Final = "with tolerance_m {wider:.3g} one is found"
-# Tolerances that are tried for the message, as multiples of the one that found nothing.
+# Tolerances tried for the message, as multiples of the one that found nothing.
 _WIDER: Final = (1.5, 2.0, 3.0, 4.0, 6.0)
-# Where two sides of a cloud are shorter, its unit may be wrong, and planes are hard to find.
+# If two sides of a cloud are shorter, its unit may be wrong, and planes are hard to find.
 _SMALL_M: Final = 1.0
 _SMALL: Final = (
-    ". It is small: is unit of read.scan right? A plane must be {least} m wide and high; points "
-    "beside its edges bend one that is little larger: lower fit_tolerance_m to 0.005, with "
-    "max_tilt_deg 45 where it leans, or state it (plane.given)"
+    ". The cloud is small: check unit of read.scan. A plane must be {least} m wide and high; "
+    "points beside its edges distort one that is not much larger: lower fit_tolerance_m to 0.005, "
+    "with max_tilt_deg 45 if it is tilted, or state the plane (plane.given)"
 )
 _NO_INTENSITY: Final = (
-    "materials are told apart by the intensity of the points, which the cloud has not: leave "
-    "materials out, or read a scan with intensity ({method})"
+    "materials are distinguished by the intensity of the points, which this cloud does not have: "
+    "leave out materials, or read a scan with intensity ({method})"
 )
 UNEXPLAINED: Final = DiagnosticSpec(
     code="points-on-no-plane",
@@ -147,30 +148,30 @@ UNEXPLAINED: Final = DiagnosticSpec(
 
 
 class Claim(NamedTuple):
-    """A plane that takes points: (12,) its slab and (5,) its bounds, see `kernels`."""
+    """A plane to which points are assigned: (12,) its slab and (5,) its bounds, see `kernels`."""
 
     slab: NDArray[np.float64]
     bounds_m: NDArray[np.float64]
 
     @classmethod
     def of(cls, raster: SurfaceRaster, support: Support, tolerance_m: float) -> Claim:
-        """What a plane takes: points within the tolerance of it and of its rectangle."""
+        """Return the region of a plane: within the tolerance of it and of its rectangle."""
         return cls(raster.slab(), grown(support.bounds_m, tolerance_m))
 
 
 @dataclass(kw_only=True)
 class Search:
-    """A greedy search for planes: the sample while they are taken from it, and what counts as one.
+    """The state of a greedy search: which points of the sample are still free.
 
     Attributes:
         cloud: the cloud.
-        params: what is looked for, and when the search ends.
+        params: which planes are accepted, and when the search ends.
         tolerance_m: `params.tolerance_m`, measured where that is `auto`.
         fit_tolerance_m: `params.fit_tolerance_m`, likewise.
         claims: (m,) int16, plane of each point of the sample, -1 for none yet.
-        taken: the planes that took points, in their order.
-        n_points: points of the sample that no plane holds.
-        refusals: what refused candidates, and the share of all points that each held.
+        taken: the regions from which points were removed, in order.
+        n_points: number of free points of the sample.
+        refusals: criterion that refused each candidate, and its share of all points.
     """
 
     cloud: PreparedCloud
@@ -191,24 +192,24 @@ class Search:
 
     @property
     def min_area_m2(self) -> float:
-        """Surface that a plane must show."""
+        """Minimum area of a plane."""
         _, middle, high = np.sort(self.cloud.grid.extent_m)
         return min(self.params.min_area_m2, _SIDE_SHARE * float(middle * high))
 
     @property
     def least_points(self) -> float:
-        """Points of the sample that a plane must hold."""
+        """Minimum number of points of the sample on a plane."""
         return self.params.min_share * len(self.claims)
 
     def free(self) -> tuple[NDArray[np.float64], BlockedPoints]:
-        """The points that no plane has: (m, 3) offsets, and in blocks."""
+        """Return the points that belong to no plane: (m, 3) offsets, and in blocks."""
         if self._free is None:
             offsets_m = self.cloud.sample.offsets_m.take(np.flatnonzero(self.claims < 0), axis=0)
             self._free = offsets_m, blocked(offsets_m)
         return self._free
 
     def claim(self, claim: Claim) -> None:
-        """Give a plane its points, but for those that an earlier one has and is nearer to."""
+        """Assign points to a plane, except those that are nearer to an earlier one."""
         rows, bounds = claim.slab.reshape(3, 4), claim.bounds_m
         points_m = self.cloud.sample.offsets_m
         x, y, z = points_m.T
@@ -223,24 +224,24 @@ class Search:
         self._free = None
 
     def refuse(self, criterion: Criterion, n_points: float = 0.0) -> None:
-        """Note what refused a candidate that holds so many points of the sample."""
+        """Record the criterion that refused a candidate with `n_points` of the sample."""
         self.refusals.append((criterion, n_points / max(1, len(self.claims))))
 
 
 class Proposer(Protocol):
-    """What a detector must do to take part."""
+    """Interface of a detector."""
 
     def propose(self, search: Search) -> Candidate | None:
-        """Name the best candidate among the points that remain, or None when there is none."""
+        """Return the best candidate among the free points, or None."""
 
     def reject(self, candidate: Candidate) -> None:
-        """Take note that the last candidate was none, so as not to name it again."""
+        """Exclude the last candidate from further proposals."""
 
 
 P = TypeVar("P", bound=Proposer)
 # The criterion that refuses a plane, the cells that belong to it, and how it fits them.
 _Verdict = tuple[Criterion | None, Support | None, AdjustedPlane | None]
-# Makes what proposes planes in a search that has taken none yet.
+# Creates the proposer of a search that has just begun.
 ProposerOf = Callable[[Search], P]
 
 
@@ -258,20 +259,20 @@ def detect(
 
     Args:
         cloud: the cloud.
-        params: what every detector takes.
+        params: parameters of every detector.
         ctx: the step's context.
-        proposer_of: makes what proposes planes.
+        proposer_of: creates the proposer.
         method: id of the method, for messages.
-        plan_cell_m: side of the plan's cells; None for detectors that do not look at the plan.
-        relabel: changes the claims of the whole cloud once all points have theirs.
+        plan_cell_m: side of the plan's cells; None for detectors that do not use the plan.
+        relabel: changes the claims of the whole cloud after all points were labelled.
 
     Returns:
-        Planes and labels, and what proposed the planes.
+        Planes and labels, and the proposer.
 
     Raises:
         ProductError: the cloud has fewer than three points, or coordinates that are not finite.
-        MethodError: the points fix no plane, or none has enough of them; or materials are asked for
-            of a cloud without intensity.
+        MethodError: the points determine no plane, or none has enough of them; or `materials` is
+            set for a cloud without intensity.
     """
     if params.materials and cloud.intensity is None:
         raise MethodError(_NO_INTENSITY.format(method=method))
@@ -322,7 +323,7 @@ def _products(
     planes, deviations, normalities, order = assemble(
         found, whole, cloud, search.tolerance_m, search.fit_tolerance_m
     )
-    # The last of the names is for points on no plane: a claim of -1 picks it.
+    # The last name is that of points on no plane, which have a claim of -1.
     names = np.append(np.argsort(order), -1).astype(np.int16)
     labels = ctx.allocate("labels", "plane_index", (len(cloud),), np.int16).view(np.int16)
     whole.write_labels(names, labels)
@@ -358,9 +359,9 @@ def find_planes(
     """Find all planes in the sample of a cloud, then fit them to all points and label those.
 
     Args:
-        search: what is looked for; its claims, and those of its cloud, are filled.
+        search: the search; its claims, and those of its cloud, are filled.
         proposer: the detector.
-        on_found: is called with the number of planes so far, after each of them.
+        on_found: called after each plane with the number of planes so far.
     """
     found = fit_to_all(greedy_search(search, proposer, on_found), search)
     label(found, search.cloud, search.tolerance_m)
@@ -370,7 +371,7 @@ def find_planes(
 def greedy_search(
     search: Search, proposer: Proposer, on_found: Callable[[int], None] = lambda _: None
 ) -> list[FoundPlane]:
-    """Find planes in the sample one after the other until a stop rule holds; see `find_planes`."""
+    """Find planes in the sample one by one until a stop rule applies; see `find_planes`."""
     params, found, n_rejected = search.params, list[FoundPlane](), 0
     least_left = params.stop_unclassified_share * len(search.claims)
     while len(found) < params.n_planes_max and n_rejected < _REJECTED_MOST:
@@ -394,12 +395,12 @@ def greedy_search(
 
 
 def verify(candidate: Candidate, search: Search) -> FoundPlane | None:
-    """Refine a candidate and see whether it is a plane of points that no other has.
+    """Refine a candidate and check whether the free points form a plane there.
 
-    None when it is not; `search.refusals` then says by which criterion. Clutter near the scanner
-    holds more points than a wall far away: its candidates, a little different each time, would hide
-    that wall, so the points of those refused for their size or shape propose no other. Points that
-    lie on a plane are given to it in the end, when all points are labelled.
+    Returns None if they do not; `search.refusals` then has the criterion. Clutter near the scanner
+    has more points than a distant wall, and its many slightly different candidates would hide that
+    wall. Points of candidates refused for their size or shape are therefore removed from the
+    search; those that lie on a plane are assigned to it when all points are labelled.
     """
     up, params = search.cloud.up, search.params
     leans = partial(leans_as_asked, up=up, max_tilt_deg=params.max_tilt_deg)
@@ -428,7 +429,7 @@ def verify(candidate: Candidate, search: Search) -> FoundPlane | None:
                 search.claim(Claim.of(raster, support, search.tolerance_m))
             return None
         plane, cell_m = adjusted.plane, raster.cell_m
-        # A plane that moved saw its points through a tolerance that lay askew: look again.
+        # The points of a plane that moved were selected by a tilted slab: repeat.
         is_settled = adjusted.moved_m < _SETTLED_SHARE * search.fit_tolerance_m
         if is_settled or nth == _PASSES_MOST - 1:
             raster = raster.moved_to(plane, up)
@@ -437,9 +438,9 @@ def verify(candidate: Candidate, search: Search) -> FoundPlane | None:
 
 
 def _refined(candidate: Candidate, search: Search, freedom: Freedom) -> tuple[Plane, float] | None:
-    """Move a candidate to the surface near it; gives the side of the cells that suit it, too.
+    """Move a candidate to the nearby surface; return the plane and a suitable cell size.
 
-    None where too few points of the sample crowd there.
+    Returns None if too few points of the sample concentrate there.
     """
     free_points, up = search.free()[0], search.cloud.up
     fit = partial(refine_plane, freedom=freedom, up=up)
@@ -451,7 +452,7 @@ def _refined(candidate: Candidate, search: Search, freedom: Freedom) -> tuple[Pl
         return None
     near = np.abs(free_points @ plane.normal - plane.offset_m) <= search.tolerance_m
     near_m = free_points.take(np.flatnonzero(near), axis=0)
-    # The side of cells follows from the spread of the points.
+    # The cell size follows from the extent of the points.
     placed = _some(near_m @ wall_axes(plane.normal, up).T, _SPREAD_POINTS)
     low, high = np.quantile(placed, (0.02, 0.98), axis=0) if len(near_m) else np.zeros((2, 2))
     cell_m = max(search.tolerance_m, cell_for(len(near_m), float(np.prod(high - low))))
@@ -461,8 +462,8 @@ def _refined(candidate: Candidate, search: Search, freedom: Freedom) -> tuple[Pl
     if support is None or support.n_points < _SAMPLE_CAUTION * search.least_points:
         search.refuse("scattered" if support is None else "few", support.n_points if support else 0)
         return None
-    # A door and a niche in one wall, at different depths, both lie near one plane that leans by
-    # some degrees and runs through them askew; fitted alone, the largest shows that it does not.
+    # A door and a niche in a wall, at different depths, both lie near a plane tilted by a few
+    # degrees that passes through both; a fit to the largest part alone reveals this.
     near_m = _some(near_m, _FIT_POINTS)
     together = fit(near_m[raster.covers(near_m, support.cells)], plane, first, *rest)
     if len(support.parts_m) > 1:
@@ -485,12 +486,12 @@ def _refined(candidate: Candidate, search: Search, freedom: Freedom) -> tuple[Pl
 
 
 def _some(points: NDArray[np.float64], most: int) -> NDArray[np.float64]:
-    """Some of the points (m, 3), about so many if there are more."""
+    """Return every n-th of the points (m, 3), about `most` of them."""
     return points[:: max(1, len(points) // most)]
 
 
 def _cells_of(search: Search, raster: SurfaceRaster, parts: int) -> CellSums:
-    """Sums of the free points of the sample in the cells on a plane."""
+    """Return sums of the free points of the sample in the cells on a plane."""
     return measure_cells(
         search.free()[1],
         [raster],
@@ -509,7 +510,7 @@ def _judged(
     *,
     settled_m: float = SETTLED_M,
 ) -> _Verdict:
-    """The criterion that refuses a plane, the cells that belong to it and how it fits them."""
+    """Return the criterion that refuses a plane, the cells that belong to it, and its fit."""
     support = support_of(raster, crowded_cells(sums), sums, join_parts=search.params.join_parts)
     if support is None:
         search.refuse("scattered")
@@ -536,24 +537,24 @@ def _judged(
             freedom=freedom,
             settled_m=settled_m,
         )
-        # On a column or barrel that the plane only touches.
+        # A column or barrel that the plane only touches.
         if adjusted is None or (
             adjusted.bend_per_m > 1.0 / _RADIUS_LEAST_M and adjusted.bend_share > _BENT_SHARE
         ):
             criterion, adjusted = "bent", None
     if criterion is not None:
-        # As a share of all points, however many of them were asked.
+        # As a share of all points, however many of them were used.
         share = support.n_points / max(least_points, 1e-9)
         search.refuse(criterion, share * search.least_points)
     return criterion, support, adjusted
 
 
 def fit_to_all(found: list[FoundPlane], search: Search) -> list[FoundPlane]:
-    """Fit planes of the sample to all points; those that these do not bear out are left out."""
+    """Fit planes of the sample to all points; drop those that all points do not confirm."""
     cloud = search.cloud
     every = max(1, len(cloud.claims) // _FITTED_MOST)
     least_points = search.params.min_share * len(cloud.claims) / every
-    # At a fixed step, blocks would fall in step with the columns of a scan and leave stripes out.
+    # A fixed step would coincide with the columns of a scan and leave out stripes.
     drawn = np.random.default_rng(0).permutation(len(cloud.points.boxes)) % every == 0
     is_open = [True] * len(found)
 
@@ -598,7 +599,7 @@ def fit_to_all(found: list[FoundPlane], search: Search) -> list[FoundPlane]:
 
 
 def _fine_raster(item: FoundPlane, search: Search, every: int) -> SurfaceRaster:
-    """Cells over the plane's rectangle alone, as fine as the points that are summed allow."""
+    """Return cells over the plane's rectangle alone, as fine as the number of points allows."""
     area_m2 = float(item.support.cells.sum()) * item.raster.cell_m**2
     share = search.cloud.sample.n_represented / every
     cell_m = min(item.raster.cell_m, cell_for(item.support.n_points * share, area_m2))
@@ -609,7 +610,7 @@ def _fine_raster(item: FoundPlane, search: Search, every: int) -> SurfaceRaster:
 
 
 def _bounds(found: list[FoundPlane], tolerance_m: float) -> list[NDArray[np.float64]]:
-    """Bounds (r, 5) of each plane: its rectangle, or several where its cells cover little of it."""
+    """Return bounds (r, 5) of each plane: one rectangle, or several if it is sparsely covered."""
     bounds, n_spare = [], _SLABS_MOST - len(found)
     for item in found:
         most = min(_RECTANGLES_MOST, n_spare + 1)
@@ -620,17 +621,17 @@ def _bounds(found: list[FoundPlane], tolerance_m: float) -> list[NDArray[np.floa
 
 
 def label(found: list[FoundPlane], cloud: PreparedCloud, tolerance_m: float) -> None:
-    """Claim all points for the nearest plane in whose rectangles they lie."""
+    """Assign all points to the nearest plane in whose rectangles they lie."""
     bounds = _bounds(found, tolerance_m)
     plane_of_slab = np.repeat(np.arange(len(found)), [len(own) for own in bounds])
     slabs = np.array([item.raster.slab() for item in found]).reshape(-1, 12)[plane_of_slab]
-    # The last entry is for a claim of -1.
+    # The last entry is that of a claim of -1.
     names = np.append(plane_of_slab, -1).astype(np.int8) if len(slabs) > len(found) else None
     cloud.assign(slabs, np.concatenate([np.zeros((0, 5)), *bounds]), names)
 
 
 def _as_proposed(item: FoundPlane, up: NDArray[np.float64]) -> FoundPlane:
-    """Return a plane as its detector proposed it, with the rectangle that was found for it."""
+    """Return a plane as its detector proposed it, with the rectangle found for it."""
     plane = item.candidate.plane
     if float(plane.normal @ item.raster.plane.normal) < 0.0:
         plane = plane.flipped()
@@ -638,7 +639,7 @@ def _as_proposed(item: FoundPlane, up: NDArray[np.float64]) -> FoundPlane:
 
 
 def _why_none(cloud: PointCloud, search: Search, proposer_of: ProposerOf[P], method: str) -> str:
-    """State which criterion refused the largest candidate, and what was tried and works."""
+    """Return the message for no plane: the criterion of the largest candidate, and what helps."""
     why = _NO_CANDIDATE
     if search.refusals:
         criterion, share = max(search.refusals, key=lambda refusal: refusal[1])
@@ -668,12 +669,12 @@ def _why_none(cloud: PointCloud, search: Search, proposer_of: ProposerOf[P], met
 
 
 def _report_times(ctx: StepContext, passed_s: NDArray[np.float64]) -> None:
-    """Report the seconds of a detection, loading apart, as Table 1 of markiewicz2015 does.
+    """Report the times of a detection, without loading, as Table 1 of markiewicz2015 does.
 
     Args:
         ctx: takes the metrics.
         passed_s: (n, 2) seconds up to each plane, and from the last one to the labels of all
-            points; by the clock and by the processor.
+            points; elapsed and processor seconds.
     """
     times_s = {"detection": passed_s.sum(axis=0), "first_plane": passed_s[0]}
     if len(passed_s) > 2:

@@ -1,8 +1,8 @@
 """What supports a plane: a coarse raster on it, the cells that belong, parts and rectangles.
 
-A cell belongs to the plane when its points crowd about it. A floor that a vertical plane cuts, or
-clutter, spreads evenly over the slab instead: that is what tells a wall from the mere smear that
-floors and ceilings leave in an accumulator.
+A cell belongs to the plane if its points concentrate near the plane. The points of clutter, or of a
+floor that a vertical plane cuts, are spread evenly over the slab instead. This distinguishes a wall
+from the smear that floors and ceilings leave in an accumulator.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from orthoflow_plugins.plane.kernels import (
 
 CELL_LEAST_M: Final = 0.05
 _CELLS_MOST: Final = 1_000_000
-# Points a cell should hold on average, so that the crowding test has something to count.
+# Average number of points per cell that the test of concentration needs.
 _POINTS_PER_CELL: Final = 12.0
-# The inner slab is this share of the tolerance; evenly spread points fill it by that share.
+# Thickness of the inner slab as a share of the tolerance, and its share of evenly spread points.
 INNER_SHARE: Final = 0.4
 _CROWDED_SHARE: Final = 0.6
-# A part smaller than this share of the plane's cells is a chance meeting, not a piece of wall.
+# A part with a smaller share of the plane's cells is there by chance and not a piece of the wall.
 PART_SHARE: Final = 0.03
 # Parts are connected over gaps of twice as many cells.
 _GAP_CELLS: Final = 2
 # A plane whose cells cover less of its rectangle is a frame or scattered parts.
 _FILLED_SHARE: Final = 0.5
-# Cells along a side that cuts are looked for between.
+# Maximum number of cells along a side when cuts are searched for.
 _CUT_CELLS: Final = 64
 
 
@@ -63,7 +63,7 @@ class SurfaceRaster:
     def over(
         cls, plane: Plane, box_corners: NDArray[np.float64], up: NDArray[np.float64], cell_m: float
     ) -> SurfaceRaster:
-        """Lay a raster on a plane that covers a box of (8, 3) corners; too many cells grow."""
+        """Return a raster on a plane that covers a box of (8, 3) corners; limits the cell count."""
         axes = wall_axes(plane.normal, up)
         placed = box_corners @ axes.T
         low, high = placed.min(axis=0), placed.max(axis=0)
@@ -77,11 +77,11 @@ class SurfaceRaster:
         return replace(self, plane=plane, axes=wall_axes(plane.normal, up))
 
     def slab(self) -> NDArray[np.float64]:
-        """Row of 12 numbers that the compiled passes take, see `kernels`; u and v count from 0."""
+        """Return the row of 12 numbers for compiled passes, see `kernels`; u and v count from 0."""
         return slab_of(self.plane, self.axes)
 
     def bounds_m(self, cells: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
-        """(4,) smallest and largest u, smallest and largest v of some of the cells, or of all."""
+        """Return (4,) smallest and largest u, smallest and largest v of some cells, or of all."""
         edges = np.array([0, self.shape[1], 0, self.shape[0]], dtype=np.float64)
         if cells is not None:
             rows, columns = (np.flatnonzero(cells.any(axis=axis)) for axis in (1, 0))
@@ -89,7 +89,7 @@ class SurfaceRaster:
         return np.repeat(self.low_m, 2) + edges * self.cell_m
 
     def centres_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(rows, columns) u and v of the cell centres, metres."""
+        """Return (rows, columns) u and v of the cell centres, metres."""
         rows, columns = np.indices(self.shape)
         return (
             self.low_m[0] + (columns + 0.5) * self.cell_m,
@@ -97,14 +97,14 @@ class SurfaceRaster:
         )
 
     def covers(self, points: NDArray[np.float64], cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """(m,) whether points project into cells (rows, columns) that belong."""
+        """Return (m,) whether points project into some cells (rows, columns)."""
         placed = np.floor((points @ self.axes.T - self.low_m) / self.cell_m).astype(np.int64)
         row = np.clip(placed[:, 1], 0, self.shape[0] - 1)
         return cells[row, np.clip(placed[:, 0], 0, self.shape[1] - 1)]
 
 
 class CellSums(NamedTuple):
-    """What points in each cell of a surface raster add up to, (rows, columns) int64 each.
+    """Sums over the points in each cell of a surface raster, (rows, columns) int64 each.
 
     Attributes:
         n_near: points within the tolerance.
@@ -142,24 +142,24 @@ class Support:
 
     @property
     def area_m2(self) -> float:
-        """Area of the rectangles about its parts: cells may be empty where points are sparse."""
+        """Return the area of the rectangles around its parts; sparse points leave cells empty."""
         sides_m = self.parts_m[:, 1::2] - self.parts_m[:, ::2]
         return float(np.prod(sides_m, axis=1).sum())
 
 
 def slab_of(plane: Plane, axes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Row of 12 numbers that the compiled passes take for a plane, see `kernels`."""
+    """Return the row of 12 numbers that stands for a plane in compiled passes, see `kernels`."""
     return np.concatenate([plane.normal, [plane.offset_m], axes[0], [0.0], axes[1], [0.0]])
 
 
 def grown(bounds_m: NDArray[np.float64], tolerance_m: float) -> NDArray[np.float64]:
-    """Bounds (..., 5) of slabs: a tolerance, and (..., 4) rectangles widened by it."""
+    """Return bounds (..., 5) of slabs: a tolerance, and (..., 4) rectangles widened by it."""
     wider = bounds_m + tolerance_m * np.array([-1.0, 1.0, -1.0, 1.0])
     return np.concatenate([np.full((*wider.shape[:-1], 1), tolerance_m), wider], axis=-1)
 
 
 def cell_for(n_points: float, area_m2: float) -> float:
-    """Side of a cell that holds enough of so many points spread over an area, metres."""
+    """Return the side of a cell, metres, that contains enough of the points spread over an area."""
     if n_points <= 0.0 or area_m2 <= 0.0:
         return CELL_LEAST_M
     return max(CELL_LEAST_M, math.sqrt(_POINTS_PER_CELL * area_m2 / n_points))
@@ -175,15 +175,15 @@ def measure_cells(
     bounds_m: Sequence[NDArray[np.float64]] | None = None,
     drawn: NDArray[np.bool_] | None = None,
 ) -> list[CellSums]:
-    """Sum the points near planes per cell, each on the nearest, in one pass.
+    """Sum the points near planes per cell, each point on its nearest plane, in one pass.
 
     Args:
         points: the points.
-        rasters: cells on each plane; planes without rows take part, but are not summed.
-        tolerance_m: of belonging.
-        fit_tolerance_m: of the fit.
+        rasters: cells on each plane; planes without rows attract points, but are not summed.
+        tolerance_m: maximum distance of points that belong to a plane.
+        fit_tolerance_m: maximum distance of points used in the fit.
         parts: parts of the pass, one per thread.
-        bounds_m: (r, 5) rectangles of each plane that hold its points; by default its raster.
+        bounds_m: (r, 5) rectangles of each plane that contain its points; by default its raster.
         drawn: (blocks,) which blocks are summed; None for all.
     """
     if bounds_m is None:
@@ -294,10 +294,10 @@ def support_of(
 def covering_rectangles(
     raster: SurfaceRaster, cells: NDArray[np.bool_], most: int
 ) -> NDArray[np.float64]:
-    """(r, 4) smallest and largest u, smallest and largest v of rectangles that cover cells.
+    """Return rectangles (r, 4) that cover cells: smallest and largest u, smallest and largest v.
 
-    One rectangle where it is covered well; else the cut that leaves the smallest area is made
-    again and again, until `_FILLED_SHARE` is reached: a frame must not compete for the points of
+    A well-covered rectangle stays whole. Otherwise the cut that leaves the smallest area is
+    repeated until `_FILLED_SHARE` is reached, so that a frame does not compete for the points of
     the wall that it surrounds.
     """
     every = max(1, math.ceil(max(cells.shape) / _CUT_CELLS))
@@ -322,7 +322,7 @@ _Rectangle = tuple[int, int, int, int]
 
 
 def _best_cut(cells: NDArray[np.bool_], rectangle: _Rectangle) -> list[_Rectangle]:
-    """Cut a rectangle in two that cover its cells with the smallest area; itself if none does."""
+    """Cut a rectangle into the two smallest that cover its cells, or return it if no cut helps."""
     top, bottom, left, right = rectangle
     pairs = [((top, k, left, right), (k, bottom, left, right)) for k in range(top + 1, bottom)]
     pairs += [((top, bottom, left, k), (top, bottom, k, right)) for k in range(left + 1, right)]
@@ -331,7 +331,7 @@ def _best_cut(cells: NDArray[np.bool_], rectangle: _Rectangle) -> list[_Rectangl
 
 
 def _tight(cells: NDArray[np.bool_], rectangle: _Rectangle) -> _Rectangle:
-    """Shrink a rectangle to the cells in it; without any it has no area."""
+    """Shrink a rectangle to the cells in it; without cells its area is zero."""
     top, bottom, left, right = rectangle
     rows, columns = np.nonzero(cells[top:bottom, left:right])
     if not len(rows):

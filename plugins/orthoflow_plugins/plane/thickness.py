@@ -1,10 +1,10 @@
 """Thickness of the cloud on each plane, and along one row of a scan.
 
-Thickness is the scanner's noise as the wall shows it; markiewicz2015 urges to look at this before
-anything else (3.1, Figure 3). Relief and bow are not thickness, so distances are taken from the
-mean of a small tile of the wall. It is measured on the sample. Along one row of a scan, which is
-read from the whole cloud, there is no footprint and no second station to blur the picture: what is
-left is the noise of single distances, on one material after the other.
+Thickness is the noise of the scanner on the wall, which markiewicz2015 recommends to inspect first
+(3.1, Figure 3). Relief and bow are not thickness, so distances refer to the mean of a small tile of
+the wall. It is measured on the sample. Along one row of a scan, read from the whole cloud, neither
+the footprint nor a second station contributes: what remains is the noise of single distances, on
+one material after the other.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from orthoflow.sdk import StepContext
 from orthoflow_plugins.plane.cloud import PreparedCloud
 from orthoflow_plugins.plane.detector import Materials
 
-# Side of a tile of a wall, and length of a piece of a row, from whose mean distances are taken.
+# Side of a tile of a wall, and length of a piece of a row, to whose mean distances refer.
 _TILE_M: Final = 0.1
 _TILE_LEAST: Final = 4
-# Fewer points do not show a spread.
+# Minimum number of points for a standard deviation.
 _SPREAD_LEAST: Final = 50
 _INCIDENCE_DEG: Final = tuple(float(edge) for edge in range(0, 91, 10))
 _CLASSES: Final = 6
-# Half the share of a normal distribution that lies outside the width reported.
+# Half the share of a normal distribution outside the reported width.
 _TAIL: Final = 0.025
-# Points a scan row needs on a plane to be worth drawing.
+# Minimum number of points of a scan row on a plane.
 _ROW_LEAST: Final = 20
 
 
@@ -40,11 +40,11 @@ class RowPoints:
     """The points of one row of one scan on the first plane.
 
     Attributes:
-        row: its number.
-        scan: the scan it is from.
-        along_m: (n,) place along the plane, to the viewer's right; ascending.
+        row: its index.
+        scan: the scan it belongs to.
+        along_m: (n,) position along the plane, to the viewer's right; ascending.
         distance_m: (n,) distance from the plane, positive towards the viewer.
-        intensity: (n,) 0..1, or None where the cloud has none.
+        intensity: (n,) 0..1, or None if the cloud has none.
     """
 
     row: int
@@ -54,7 +54,7 @@ class RowPoints:
     intensity: NDArray[np.float64] | None
 
     def measured(self, materials: Materials) -> ScanRow:
-        """Thickness of the row, and of each material on it."""
+        """Return the thickness of the row, and of each material on it."""
         piece = np.floor((self.along_m - self.along_m[0]) / _TILE_M).astype(np.int64)
         crowded, deviation_m, _ = _from_tiles(self.distance_m, piece, np.bincount(piece))
         material: tuple[Spread, ...] = ()
@@ -77,14 +77,14 @@ def measure_thickness(
     reach_m: float,
     materials: Materials,
 ) -> tuple[Thickness | None, ...]:
-    """Measure the thickness of each plane; None where too few points are on it.
+    """Measure the thickness of each plane; None for a plane with too few points.
 
     Args:
         planes: the planes, world.
         plane_of_sample: (s,) plane of each point of the sample, -1 for none.
-        prepared: the cloud as the passes take it, and its sample.
+        prepared: the prepared cloud with its sample.
         cloud: the cloud.
-        reach_m: points further than this from their plane are relief or belong to something else.
+        reach_m: points farther than this from their plane are relief or belong to other surfaces.
         materials: lowest and highest intensity of each material.
     """
     sample, found = prepared.sample, list[Thickness | None]()
@@ -96,7 +96,7 @@ def measure_thickness(
         members, distance_m = members[near], distance_m[near]
         axes = wall_axes(normal, planes.up)
         placed = np.floor(sample.offsets_m[members] @ axes.T / _TILE_M).astype(np.int64)
-        # One number per tile, since rows of two take many times as long to sort.
+        # One number per tile, since pairs take many times as long to sort.
         keys = placed[:, 0] * 2**31 + placed[:, 1]
         _, tile, count = np.unique(keys, return_inverse=True, return_counts=True)
         crowded, deviation_m, usual = _from_tiles(distance_m, tile, count)
@@ -127,7 +127,7 @@ def measure_thickness(
 def row_points(
     planes: Planes, plane_of_sample: NDArray[np.int64], prepared: PreparedCloud, cloud: PointCloud
 ) -> RowPoints | None:
-    """Return the scan row that most of the first plane's points are on, None without rows."""
+    """Return the scan row with most points of the first plane; None without rows."""
     members = prepared.sample.index[plane_of_sample == 0]
     if cloud.row is None or not len(members):
         return None
@@ -160,7 +160,7 @@ def row_points(
 
 
 def report_thickness(ctx: StepContext, found: tuple[Thickness | None, ...]) -> None:
-    """Report how thick the cloud is on the first plane, beside its scan step, and the worst."""
+    """Report the thickness and point spacing on the first plane, and the largest thickness."""
     known = [item for item in found if item is not None]
     if known:
         ctx.metric("thickest_mm", 1000.0 * max(item.sigma_m for item in known), "mm")
@@ -175,21 +175,21 @@ def report_thickness(ctx: StepContext, found: tuple[Thickness | None, ...]) -> N
 def _from_tiles(
     distance_m: NDArray[np.float64], tile: NDArray[np.int64], count: NDArray[np.int64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64], float]:
-    """Deviations of distances from the means of their tiles.
+    """Return the deviations of distances from the means of their tiles.
 
     Args:
         distance_m: (m,) distances.
-        tile: (m,) number of the tile of each.
+        tile: (m,) index of the tile of each.
         count: (t,) points of each tile.
 
     Returns:
-        (m,) which distances lie in tiles with points enough, their deviations, and how many points
-        such a tile usually has.
+        (m,) which distances lie in tiles with enough points, their deviations, and the median
+        number of points of such a tile.
     """
     mean_m = np.bincount(tile, distance_m) / np.maximum(count, 1)
     crowded = count[tile] >= _TILE_LEAST
     tile = tile[crowded]
-    # A mean of n follows its own points: deviations from it are too small by this.
+    # Deviations from a mean of n values are too small by this factor.
     deviation_m = (distance_m[crowded] - mean_m[tile]) / np.sqrt(1.0 - 1.0 / count[tile])
     usual = float(np.median(count[count >= _TILE_LEAST])) if len(tile) else 0.0
     return crowded, deviation_m, usual
@@ -204,7 +204,7 @@ def _by_class(
     cloud: PointCloud,
     materials: Materials,
 ) -> Thickness:
-    """Add to a thickness what is known of it by class; index is of the points in the cloud."""
+    """Add the thickness by class; `index` has the positions of the points in the cloud."""
     stations_m = _stations_of(index, cloud)
     if stations_m is not None:
         rays_m = points_m - stations_m
@@ -230,7 +230,7 @@ def _by_class(
 
 
 def _stations_of(index: NDArray[np.int64], cloud: PointCloud) -> NDArray[np.float64] | None:
-    """(m, 3) or (3,) offset of the station that saw each point, None where that is not known."""
+    """Return the offset (m, 3) or (3,) of the station of each point; None if unknown."""
     stations = cloud.stations
     if stations is None or len(stations) == 0 or cloud.stations_source == "view_from":
         return None
@@ -242,14 +242,14 @@ def _stations_of(index: NDArray[np.int64], cloud: PointCloud) -> NDArray[np.floa
 
 
 def _even_edges(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Edges of classes with equally many points."""
+    """Return the edges of classes with equal numbers of points."""
     return np.unique(np.quantile(values, np.linspace(0.0, 1.0, _CLASSES + 1)))
 
 
 def _spreads(
     values: NDArray[np.float64], edges: NDArray[np.float64], deviation_m: NDArray[np.float64]
 ) -> tuple[Spread, ...]:
-    """Spread of the points of each class; those with too few points are left out."""
+    """Return the spread of each class of points; classes with too few points are left out."""
     place = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(0, len(edges) - 2))
     classes = [
         _spread(None, float(edges[k]), float(edges[k + 1]), deviation_m[place == k])
@@ -261,7 +261,7 @@ def _spreads(
 def _by_material(
     intensity: NDArray[np.float64], materials: Materials, deviation_m: NDArray[np.float64]
 ) -> tuple[Spread, ...]:
-    """Spread of the points of each material; those with too few points are left out."""
+    """Return the spread on each material; those with too few points are left out."""
     classes = [
         _spread(name, low, high, deviation_m[(intensity >= low) & (intensity <= high)])
         for name, (low, high) in materials.items()

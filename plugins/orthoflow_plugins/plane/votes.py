@@ -1,8 +1,8 @@
 """Compiled votes of the Hough transforms: for lines of a plan, and for planes in space.
 
-What is many votes is an image whose rows, or columns, are shifted and added to one line for each
-direction: the sum is what lines of that slope meet. That is as exact as voting cell by cell up to
-rounding to cells, and many times faster, because whole rows are added and nothing is scattered.
+Votes are computed from an image. For each direction its rows, or columns, are shifted and added to
+one line: the sums over all lines of that slope. This equals voting cell by cell up to rounding to
+cells and is many times faster, because whole rows are added.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.compiling import compiled, kernel_part
 
-# A vote is counted in quarters, so that it can be shared between two bins without a rounding that
-# would not cancel when it is taken back.
+# Votes are counted in quarters, so that one can be shared between two bins without rounding errors
+# when it is subtracted.
 VOTE_SHARES: Final = 4
-# A candidate's votes may fall short of the share a plane needs by this much: it may be smeared over
-# several bins until it is refined.
+# Share of the required points that a candidate's votes must have, as it may be smeared over several
+# bins until it is refined.
 VOTE_CAUTION: Final = 0.25
-# Side of the tiles that an image is turned by.
+# Side of the tiles in which an image is transposed.
 _TILE: Final = 16
 
 
@@ -32,7 +32,7 @@ def vote_image(
     """Let the cells of an image vote for all lines through them.
 
     Args:
-        image: (rows, columns) votes of each cell; negative ones take votes back.
+        image: (rows, columns) votes of each cell; negative ones subtract votes.
         angles_rad: (a,) directions of the lines' normals, from the rows' axis to the columns'.
         votes: (a, bins) added to, VOTE_SHARES per vote; bins are as wide as cells, and the middle
             edge is the line through the middle of the image. Equation 4 of markiewicz2015.
@@ -64,9 +64,9 @@ def _count_upright(
     cells: NDArray[np.int32],
     image: NDArray[np.int32],
 ) -> tuple[int, int, int, int]:
-    """Count places in an upright image along a direction; (m,) cells is scratch.
+    """Count positions in an upright image along a direction; (m,) cells is scratch.
 
-    Gives the window that they lie in: first row, row behind the last, and the same for columns.
+    Returns the window that contains them: first row, row after the last, and likewise for columns.
     """
     n_rows, n_columns = image.shape
     cosine, sine = np.float32(math.cos(omega_rad) / bin_m), np.float32(math.sin(omega_rad) / bin_m)
@@ -76,7 +76,7 @@ def _count_upright(
     width = np.int32(n_columns)
     xs, ys, zs = places[0], places[1], places[2]
     left, right, bottom, top = top_columns, zero, top_rows, zero
-    # Without branches, so that the processor takes several places at once.
+    # Without branches, so that the compiler vectorises the loop.
     for i in range(cells.size):
         column = cosine * xs[i] + sine * ys[i] + half_columns
         row = zs[i] * per_m + half_rows
@@ -108,18 +108,18 @@ def vote_planes(
     bin_m: float,
     votes: NDArray[np.int32],
 ) -> None:
-    """Let places vote for all planes through them, in two stages.
+    """Let positions vote for all planes through them, in two stages.
 
-    For each direction in plan the places are counted in an upright image (distance along that
+    For each direction in plan the positions are counted in an upright image (distance along that
     direction, height). For each phi the rows of the image are shifted and added up, or its columns
     for planes that are more level than upright: a hundred times faster than voting one by one.
 
     Args:
-        places: (3, m) e1, e2 and height, metres from the middle of the box.
-        weights: (m,) votes of each; negative ones take votes back.
-        angles: (d, 2) omega and phi of each direction, those with one omega together; radians.
+        places: (3, m) e1, e2 and height, metres from the centre of the box.
+        weights: (m,) votes of each; negative ones subtract votes.
+        angles: (d, 2) omega and phi of each direction, grouped by omega; radians.
         starts: (o + 1,) where the directions of each omega start.
-        image: (rows, columns) scratch, zeros; its middle is the middle of the box.
+        image: (rows, columns) scratch, zeros; its centre is that of the box.
         bin_m: side of a cell of the image, width of a bin.
         votes: (d, bins) added to, VOTE_SHARES per vote; the middle edge is distance zero.
     """
@@ -157,15 +157,15 @@ def best_bins(
     scores: NDArray[np.int64],
     places: NDArray[np.int64],
 ) -> None:
-    """Find in each row the window whose votes stand out most from the emptier window beside it.
+    """Find in each row the window that exceeds the emptier window beside it by most votes.
 
     Args:
         votes: (d, bins).
-        rows: (m,) which of them are asked about.
-        half: a window has 2 half + 1 bins; the windows beside begin one bin further off.
-        is_plain: leave the windows beside out.
+        rows: (m,) rows to search.
+        half: a window has 2 half + 1 bins; the windows beside it begin one bin farther away.
+        is_plain: ignore the windows beside it.
         barred: (d, bins) 1 where no window may have its middle.
-        scores: (d,) set where asked.
+        scores: (d,) set for these rows.
         places: (d,) set to the middle bin.
     """
     n_bins = votes.shape[1]
@@ -175,7 +175,7 @@ def best_bins(
     windows = np.empty(n_bins + 2 * gap, dtype=np.int64)
     line = np.empty(n_bins, dtype=np.int64)
     before, middle, after = windows[:n_bins], windows[gap:], windows[2 * gap :]
-    # Loops of one step each, so that the processor takes several bins at once.
+    # Separate loops, which the compiler vectorises.
     for d in rows:
         row, is_barred = votes[d], barred[d]
         total = np.int64(0)
@@ -208,13 +208,13 @@ def vote_places(
     bin_m: float,
     votes: NDArray[np.int32],
 ) -> None:
-    """Let places vote one by one, for the planes, or lines of a plan, through them.
+    """Let positions vote one by one, for the planes, or lines of a plan, through them.
 
     Args:
-        places: (3, m) metres; a plan's have no third coordinate, 0.
+        places: (3, m) metres; the third coordinate is 0 in a plan.
         weights: (m,) votes of each.
-        normals: (t, 3) directions that distances are counted along. Equation 4 of markiewicz2015.
-        low_m: lower edge of the first bin; what misses the table is dropped.
+        normals: (t, 3) directions along which distances count. Equation 4 of markiewicz2015.
+        low_m: lower edge of the first bin; positions outside the bins do not vote.
         bin_m: width of a bin.
         votes: (t, bins) added to.
     """
@@ -242,10 +242,10 @@ def add_sheared(
     shear: float,
     line: NDArray[np.int32],
 ) -> tuple[int, int]:
-    """Add the rows of an image to a line, each shifted by its height over the middle times a shear.
+    """Add the rows of an image to a line, shifted by their height above the middle times a shear.
 
-    A row's first column lands at half its number of rows, and one more, with no shift. The line is
-    zero before; gives the piece of it that no longer is.
+    Without a shift the first column is added at half the number of rows plus one. The line is zero
+    before; returns the part that is changed.
     """
     n_rows = image.shape[0]
     low, high = line.size, 0
@@ -270,13 +270,13 @@ def share_out(
     scale: float,
     votes: NDArray[np.int32],
 ) -> None:
-    """Add a piece of a line to a row of votes whose bins are narrower, in quarters; clears it.
+    """Add part of a line to a row of votes with narrower bins, in quarters; clears the line.
 
     Args:
         line: see `add_sheared`.
-        piece: what of it is not zero.
-        shape: rows and columns of the image that was added up.
-        scale: width of a cell of the line, in bins; negative when it runs the other way.
+        piece: its part that is not zero.
+        shape: rows and columns of the image.
+        scale: width of a cell of the line, in bins; negative for the opposite direction.
         votes: (bins,) added to.
     """
     middle = 0.5 * votes.size
@@ -298,9 +298,9 @@ def share_out(
 def span_rows(
     image: NDArray[np.int32], window: tuple[int, int, int, int], spans: NDArray[np.int32]
 ) -> None:
-    """Set (rows, 2) spans to the first column with votes and the one behind the last.
+    """Set (rows, 2) spans to the first column with votes and the one after the last.
 
-    All votes lie in the window: first row, row behind the last, and the same for the columns.
+    All votes lie in the window: first row, row after the last, and likewise for columns.
     """
     spans[:] = 0
     for row in range(window[0], window[1]):
@@ -316,7 +316,7 @@ def span_rows(
 def turn_image(
     image: NDArray[np.int32], window: tuple[int, int, int, int], turned: NDArray[np.int32]
 ) -> None:
-    """Set turned to the image with rows and columns exchanged, tile by tile for the cache."""
+    """Set `turned` to the transposed image, tile by tile for the cache."""
     for top in range(window[0], window[1], _TILE):
         for left in range(window[2], window[3], _TILE):
             for column in range(left, min(left + _TILE, window[3])):
@@ -327,7 +327,7 @@ def turn_image(
 def best_bin(
     votes: NDArray[np.int32], barred: NDArray[np.uint8], half: int, *, is_plain: bool
 ) -> tuple[int, int, int]:
-    """Score, row and bin of the best window in a table; see `best_bins`."""
+    """Return score, row and bin of the best window in a table; see `best_bins`."""
     scores, places = np.zeros((2, len(votes)), dtype=np.int64)
     best_bins(votes, np.arange(len(votes)), half, is_plain, barred, scores, places)
     row = int(np.argmax(scores))
@@ -335,7 +335,7 @@ def best_bin(
 
 
 def contrast(votes: NDArray[np.int32], half: int) -> NDArray[np.float64]:
-    """Votes in a window of 2 half + 1 bins above those of the emptier neighbouring window."""
+    """Return the votes in windows of 2 half + 1 bins above those of the emptier window beside."""
     width = 2 * half + 1
     gap = width + 1
     padded = np.pad(votes, ((0, 0), (half + gap + 1, half + gap)))
@@ -348,7 +348,7 @@ def contrast(votes: NDArray[np.int32], half: int) -> NDArray[np.float64]:
 
 
 def sharpest(votes: NDArray[np.int32]) -> tuple[int, float]:
-    """Row of (rows, bins) votes with the best maximum, and its place in bins from the start."""
+    """Return the row of (rows, bins) votes with the best maximum, and its position in bins."""
     scores = contrast(votes, 1)
     row, column = np.unravel_index(int(np.argmax(scores)), scores.shape)
     values, place = scores[row], int(column)
@@ -356,6 +356,6 @@ def sharpest(votes: NDArray[np.int32]) -> tuple[int, float]:
     if 0 < place < len(values) - 1:
         before, here, after = values[place - 1 : place + 2]
         bend = before - 2.0 * here + after
-        # The top of a parabola through the three.
+        # The vertex of a parabola through the three.
         shift = 0.0 if bend >= 0.0 else float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5))
     return int(row), place + 0.5 + shift

@@ -1,18 +1,18 @@
 """Voxels of a cloud as moments of their points, the planes of their neighbourhoods, regions.
 
-Region growing asks for the neighbours of every point. Voxels make that cheap: one pass adds each
-point to ten sums of its voxel, and the sums of neighbouring voxels give the plane through all their
-points exactly, without the points. A room has half a million voxels where it has fifty million
-points. Where votes alone are counted, the first of the sums is enough.
+Region growing needs the neighbours of every point. Voxels make that cheap: one pass adds each point
+to ten sums of its voxel, and the sums of neighbouring voxels give the plane through all their
+points exactly. A room with fifty million points has half a million voxels. For votes alone the
+first of the sums, the number of points, suffices.
 
-Voxels live in bricks of 8 x 8 x 8, of which only those with points have memory: a scan is surfaces,
-and a full table of two-centimetre voxels would be larger than the scan. Moments are those of whole
-steps from the middle of a voxel, so that neither threads nor the order of points show in the sums.
-Lengths of kernels are in sides of a voxel, so that they need not know how large one is.
+Voxels are stored in bricks of 8 x 8 x 8, and only bricks with points have memory: a full table of
+two-centimetre voxels would be larger than the scan. Moments are sums of integer steps from the
+centre of a voxel, so they depend neither on threads nor on the order of points. Lengths in kernels
+are in sides of a voxel.
 
-A cloud that is dense on one wall may have a point per decimetre on another: voxels that suit the
-one leave crumbs on the other. Moments add up, so what is left is summed into wider voxels without
-asking the points again.
+A cloud that is dense on one wall may have a point per decimetre on another, where voxels that suit
+the first leave fragments. Moments are additive, so the fragments are summed into larger voxels
+without another pass over the points.
 """
 
 from __future__ import annotations
@@ -37,37 +37,37 @@ from orthoflow_plugins.plane.kernels import (
 
 BRICK_SIDE: Final = 8
 VOXELS: Final = BRICK_SIDE**3
-# Half steps from the middle of a voxel to its sides: a step is 20 micrometres in voxels of two
-# centimetres, and a point in its middle an odd number of halves away.
+# Half steps from the centre of a voxel to its sides: a step is 20 micrometres in voxels of two
+# centimetres, and its middle is an odd number of half steps away.
 HALF_STEPS: Final = 1024
 # Sums of a voxel: points, half steps along a, b, c, then their products aa, ab, ac, bb, bc, cc.
 N_SUMS: Final = 10
-# The products that moments hold, as pairs of axes.
+# The products among the moments, as pairs of axes.
 _PAIRS: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-# More bricks than this in the table of a scene cost more than they show; the voxels grow instead.
+# Maximum number of bricks of a scene; larger scenes have larger voxels.
 _BRICKS_MOST: Final = 8_000_000
-# Points a neighbourhood should hold where the cloud is thin, so that its normal means something.
+# Minimum number of points of a neighbourhood for a reliable normal.
 POINTS_LEAST: Final = 16.0
-# A voxel is no larger than this share of the scene.
+# Maximum side of a voxel as a share of the scene.
 _VOXEL_SHARE_MOST: Final = 0.05
-# Rows and voxels that tables begin with.
+# Initial numbers of rows and voxels of tables.
 _ROWS_FIRST: Final = 2_048
 _VOXELS_FIRST: Final = 131_072
-# A neighbourhood reaches this many voxels each way at most: 9 x 9 x 9.
+# Maximum reach of a neighbourhood in voxels each way: 9 x 9 x 9.
 _REACH_MOST: Final = 4
-# A region's plane is fitted anew whenever it has grown by this share.
+# A region's plane is refitted whenever the region has grown by this share.
 _REFIT_SHARE: Final = 0.2
-# How often the voxels of a region ask their neighbours.
+# Maximum number of passes over the voxels of a region.
 _SWEEPS_MOST: Final = 3
 T = TypeVar("T", bound=np.generic)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Neighbourhood:
-    """From which points the normal at a place is taken.
+    """The points from which a normal is computed.
 
     Attributes:
-        shape: a cube, a sphere, or the nearest voxels that hold `n_points`.
+        shape: a cube, a sphere, or the nearest voxels with `n_points`.
         size_m: side of the cube, radius of the sphere; not used by `knn`.
         n_points: see above.
         voxel_m: side of a voxel.
@@ -79,7 +79,7 @@ class Neighbourhood:
     voxel_m: float
 
     def around(self) -> NDArray[np.int32]:
-        """(o, 4) steps to the voxels of the neighbourhood, near ones first, and their shell."""
+        """Return (o, 4) steps to the voxels of the neighbourhood by distance, and their shells."""
         across = self.size_m / self.voxel_m
         reaches = {
             "cube": round(0.5 * (across - 1.0)),
@@ -98,25 +98,25 @@ class Neighbourhood:
         return np.column_stack([steps[order], shell[order]]).astype(np.int32)
 
     def width_voxels(self) -> float:
-        """Voxels across, of which the neighbourhood of a surface has the square."""
+        """Return the width in voxels; the neighbourhood of a surface has its square."""
         if self.shape == "knn":
             return 3.0
         return 2.0 * float(np.abs(self.around()[:, :3]).max(initial=0)) + 1.0
 
     def with_voxels(self, voxel_m: float) -> Neighbourhood:
-        """Return the same in voxels of another size."""
+        """Return the same neighbourhood in voxels of another size."""
         return replace(self, voxel_m=voxel_m, size_m=self.size_m * (voxel_m / self.voxel_m))
 
 
 @dataclass(frozen=True, kw_only=True)
 class VoxelTable:
-    """The voxels of a cloud that have points, numbered by place.
+    """The voxels of a cloud that have points, numbered by position.
 
     Attributes:
         grid: axes, corner and side of the voxels.
         bricks: (a, b, c) int32 row of each brick in `numbers`, -1 without points.
         numbers: (rows, VOXELS) int32 number of each voxel, -1 without points.
-        places: (m, 3) int32 where voxels lie along e1, e2, up.
+        places: (m, 3) int32 position of each voxel along e1, e2, up.
         sums: (m, N_SUMS) int64 moments, or (m, 1) points alone.
     """
 
@@ -128,9 +128,9 @@ class VoxelTable:
 
     @classmethod
     def over(cls, cloud: PreparedCloud, voxel_m: float, *, n_sums: int = N_SUMS) -> VoxelTable:
-        """Sum all points of a cloud into voxels over its box; they grow where they would be many.
+        """Sum all points of a cloud into voxels over its box, larger ones if these are too many.
 
-        Each part of the pass has tables of its own, which are then joined.
+        Each part of the pass has its own tables, which are then joined.
         """
         extent_m = cloud.grid.extent_m
         brick_m3 = float(np.prod(extent_m + BRICK_SIDE * voxel_m)) / _BRICKS_MOST
@@ -159,7 +159,7 @@ class VoxelTable:
             tables[part] = (bricks, numbers, sums, n_used)
 
         each_part(len(cloud.claims), cloud.parts, gather)
-        # Numbered by place, so that neither threads nor the order of points show.
+        # Numbered by position, independent of threads and of the order of points.
         occupied = np.flatnonzero(np.max([table[0] for table in tables], axis=0) >= 0)
         bricks = np.full(n_bricks, -1, dtype=np.int32)
         bricks[occupied] = np.arange(len(occupied), dtype=np.int32)
@@ -191,7 +191,7 @@ class VoxelTable:
         )
 
     def coarser(self, member: NDArray[np.int64]) -> tuple[VoxelTable, NDArray[np.int64]]:
-        """Sum voxels (k,) into voxels twice as wide; gives those, and which one each is in."""
+        """Sum voxels (k,) into voxels twice as wide; return these, and the one of each voxel."""
         places, odd = np.divmod(self.places[member].astype(np.int64), 2)
         a, b, c = (math.ceil(size / 2) for size in self.grid.shape)
         shape = tuple(-(-size // BRICK_SIDE) for size in (a, b, c))
@@ -206,7 +206,7 @@ class VoxelTable:
         bricks[occupied] = np.arange(len(occupied), dtype=np.int32)
         numbers = np.full((len(occupied), VOXELS), -1, dtype=np.int32)
         numbers[rows, keys % VOXELS] = np.arange(len(keys), dtype=np.int32)
-        # Half steps are twice as long, and from the middle of the wider voxel.
+        # Half steps are twice as long, and count from the centre of the larger voxel.
         moved = _moved(self.sums[member], (2 * odd - 1) * HALF_STEPS)
         moved *= 0.5 ** np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2])
         sums = np.rint(_totals(moved, of_member, len(keys))).astype(np.int64)
@@ -220,7 +220,7 @@ class VoxelTable:
         return wider, of_member
 
     def sums_of(self, regions: NDArray[np.int32], n_regions: int) -> NDArray[np.float64]:
-        """(r, N_SUMS) moments of regions (m,) of voxels, from the corner of the grid, in voxels."""
+        """Return moments (r, N_SUMS) of regions (m,), from the corner of the grid, in voxels."""
         held = np.flatnonzero(regions >= 0)
         unit = 1.0 / (2 * HALF_STEPS)
         moved = _moved(self.sums[held], (2 * self.places[held] + 1) * HALF_STEPS)
@@ -228,27 +228,27 @@ class VoxelTable:
         return _totals(moved, regions[held], n_regions)
 
     def centroids(self) -> NDArray[np.float64]:
-        """(m, 3) mean of each voxel's points along e1, e2, up; metres in the offsets' frame."""
+        """Return the centroids (m, 3) of voxels along e1, e2, up; metres, the cloud's offsets."""
         half_steps = self.sums[:, 1:4] / self.sums[:, :1]
         middles = self.places + 0.5 + half_steps / (2 * HALF_STEPS)
         return self.grid.low_m + self.grid.cell_m * middles
 
     def voxel_of(self, points: BlockedPoints) -> NDArray[np.int32]:
-        """(n,) voxel of each point, -1 for none."""
+        """Return the voxel (n,) of each point, -1 for none."""
         found = np.empty(len(points.x), dtype=np.int32)
         find_voxels(points, self.grid.frame(), self.bricks, self.numbers, found)
         return found
 
 
 def _with_room(values: NDArray[T], n_used: int, n_free: int) -> NDArray[T]:
-    """Enlarge a table unless so many of its rows are free; what is in use stays."""
+    """Enlarge a table unless it has `n_free` free rows."""
     if n_used + n_free <= len(values):
         return values
     return np.concatenate([values, np.zeros_like(values)])
 
 
 def _moved(sums: NDArray[np.int64], shift: NDArray[np.integer[Any]]) -> NDArray[np.float64]:
-    """Moments (k, N_SUMS) counted from points that lie (k, 3) lower."""
+    """Return moments (k, N_SUMS) about origins that are (k, 3) lower."""
     number, linear, away = sums[:, 0], sums[:, 1:4], shift.astype(np.float64)
     columns = [number, *(linear + number[:, None] * away).T]
     for k, (i, j) in enumerate(_PAIRS):
@@ -269,12 +269,11 @@ class SurfaceVoxels:
     """Voxels and the plane of each one's neighbourhood.
 
     Attributes:
-        neighbourhood: which points make a normal; its voxels are those used, which may be larger
-            than the ones asked for.
+        neighbourhood: the points of a normal; its voxels may be larger than requested.
         table: the voxels.
-        normals: (m, 3) float32 along e1, e2, up, of the neighbourhoods; either side.
-        spreads: (m, 3) float32 deviation from the neighbourhood's plane and extents along it, in
-            sides of a voxel.
+        normals: (m, 3) float32 along e1, e2, up, of the neighbourhoods; of either sign.
+        spreads: (m, 3) float32 standard deviations across the neighbourhood's plane and along it,
+            in sides of a voxel.
     """
 
     neighbourhood: Neighbourhood
@@ -284,11 +283,11 @@ class SurfaceVoxels:
 
     @classmethod
     def of(cls, table: VoxelTable, wanted: Neighbourhood, *, parts: int) -> SurfaceVoxels:
-        """Fit a plane to the neighbourhood of each voxel, in so many parts."""
+        """Fit a plane to the neighbourhood of each voxel."""
         neighbourhood = wanted.with_voxels(table.grid.cell_m)
         places, around = table.places, neighbourhood.around()
         normals, spreads = np.empty((2, len(places), 3), dtype=np.float32)
-        # Points with which a neighbourhood ends; the others take all their voxels.
+        # Number of points at which a knn neighbourhood ends; the others use all their voxels.
         enough = neighbourhood.n_points if neighbourhood.shape == "knn" else 2**62
 
         def fit(_part: int, piece: slice) -> None:
@@ -301,15 +300,15 @@ class SurfaceVoxels:
 
     @property
     def counts(self) -> NDArray[np.int64]:
-        """(m,) points of each voxel."""
+        """Return the number of points (m,) of each voxel."""
         return self.table.sums[:, 0]
 
 
 def surface_voxels(cloud: PreparedCloud, wanted: Neighbourhood) -> SurfaceVoxels:
     """Sum a cloud into voxels, and fit a plane to the neighbourhood of each.
 
-    Where the cloud is so thin that neighbourhoods would hold too few points, voxels and
-    neighbourhoods are larger than what is wanted.
+    If the cloud is so sparse that neighbourhoods would have too few points, voxels and
+    neighbourhoods are larger than requested.
     """
     grid, sample = cloud.grid, cloud.sample
     placed = np.floor((sample.offsets_m @ grid.basis.T - grid.low_m) / wanted.voxel_m)
@@ -317,7 +316,7 @@ def surface_voxels(cloud: PreparedCloud, wanted: Neighbourhood) -> SurfaceVoxels
     shape = np.ceil(grid.extent_m / wanted.voxel_m).astype(np.int64) + 1
     keys = np.sort(np.ravel_multi_index(tuple(placed[inside].astype(np.int64).T), tuple(shape)))
     counts = np.diff(np.flatnonzero(np.diff(keys, prepend=-1, append=-1)))
-    # How many others of the sample share a point's voxel: chance alone shares none, however few.
+    # Mean number of other points of the sample in a point's voxel.
     others = float((counts * (counts - 1)).sum()) / max(1, len(sample.index))
     in_neighbourhood = others * sample.n_represented * wanted.width_voxels() ** 2
     voxel_m = wanted.voxel_m * max(1.0, math.sqrt(POINTS_LEAST / max(in_neighbourhood, 1e-9)))
@@ -330,10 +329,9 @@ def surface_voxels(cloud: PreparedCloud, wanted: Neighbourhood) -> SurfaceVoxels
 def _place_block(
     points: BlockedPoints, start: int, frame: NDArray[np.float32], places: NDArray[np.float32]
 ) -> int:
-    """Set (3, BLOCK_POINTS) places of a block's points, in voxels; gives their number.
+    """Set (3, BLOCK_POINTS) places of a block's points, in voxels; return their number.
 
-    Apart from what is done with them and without branches, so that the processor takes several
-    points at once; each of these loops writes one array: with more, the compiler gives up that.
+    Loops of their own without branches, each writing one array, which the compiler vectorises.
     """
     stop = min(start + BLOCK_POINTS, points.x.size)
     xs, ys, zs = points.x[start:stop], points.y[start:stop], points.z[start:stop]
@@ -363,7 +361,7 @@ def _set_keys(
         p = np.int32(a if within else zero)
         q = np.int32(b if within else zero)
         r = np.int32(c if within else zero)
-        # A side of eight: whole bricks are three bits further up.
+        # A brick has eight voxels along each side, three bits.
         brick = np.int32(((p >> np.int32(3)) * n_b + (q >> np.int32(3))) * n_c + (r >> np.int32(3)))
         voxel = np.int32(((p & low) * side + (q & low)) * side + (r & low))
         keys[i] = brick * voxels + voxel if within else nowhere
@@ -373,7 +371,7 @@ def _set_keys(
 def _voxel(
     key: int, bricks: NDArray[np.int32], numbers: NDArray[np.int32], n_used: NDArray[np.int64]
 ) -> int:
-    """Return the number of the voxel with a key, a new one if it had none."""
+    """Return the number of the voxel with a key; assigns one if it had none."""
     brick, voxel = key // VOXELS, key % VOXELS
     row = bricks[brick]
     if row < 0:
@@ -400,10 +398,10 @@ def gather_moments(  # noqa: PLR0913, PLR0917 - compiled code has no objects to 
     sums: NDArray[np.int64],
     n_used: NDArray[np.int64],
 ) -> int:
-    """Add points to the moments of their voxels, which are made as they are met, until tables fill.
+    """Add points to the moments of their voxels, adding voxels as needed, until tables are full.
 
-    A scan comes column by column, so points that follow each other share a voxel: their sums are
-    added when the voxel changes.
+    A scan is ordered by column, so consecutive points share a voxel: their sums are added when the
+    voxel changes.
 
     Args:
         points: (n,) offsets in blocks.
@@ -412,11 +410,11 @@ def gather_moments(  # noqa: PLR0913, PLR0917 - compiled code has no objects to 
         shape: bricks along a, b, c.
         bricks: (a * b * c,) row of each brick in `numbers`, -1 for none yet.
         numbers: (rows, VOXELS) number of each voxel, -1 for none yet.
-        sums: (voxels, N_SUMS) added to; (voxels, 1) takes the number of points alone.
+        sums: (voxels, N_SUMS) added to; (voxels, 1) for the number of points alone.
         n_used: rows and voxels in use.
 
     Returns:
-        The first point that was not added: the number of points, unless the tables are full.
+        The first point that was not added, or the number of points.
     """
     keys = np.empty(BLOCK_POINTS, dtype=np.int64)
     places = np.zeros((3, BLOCK_POINTS), dtype=np.float32)
@@ -475,7 +473,7 @@ def find_voxels(
 
 @kernel_part
 def _voxel_at(a: int, b: int, c: int, bricks: NDArray[np.int32], numbers: NDArray[np.int32]) -> int:
-    """Return the number of the voxel at a place, -1 where none is."""
+    """Return the number of the voxel at a position, -1 for none."""
     if a < 0 or b < 0 or c < 0:
         return -1
     p, q, r = a >> 3, b >> 3, c >> 3
@@ -491,7 +489,7 @@ def _voxel_at(a: int, b: int, c: int, bricks: NDArray[np.int32], numbers: NDArra
 def _add_moments(
     total: NDArray[np.float64], sums: NDArray[np.int64], k: int, at: tuple[float, float, float]
 ) -> None:
-    """Add voxel k to (10,) total, in voxels; its middle is `at` from where the total is counted."""
+    """Add voxel k to (10,) total, in voxels; its centre is at `at` in the frame of the total."""
     n, (a, b, c) = float(sums[k, 0]), at
     unit = 1.0 / (2 * HALF_STEPS)
     sa, sb, sc = sums[k, 1] * unit, sums[k, 2] * unit, sums[k, 3] * unit
@@ -528,12 +526,11 @@ def fit_neighbourhoods(  # noqa: PLR0913, PLR0917 - compiled code has no objects
         bricks: (a, b, c) number of each brick.
         numbers: (bricks, VOXELS) number of each voxel.
         sums: (n, N_SUMS) moments of all voxels.
-        around: (o, 4) steps to the voxels of a neighbourhood, near ones first, and the shell that
-            each is in.
-        enough: a neighbourhood ends with the shell in which it has so many points.
-        normals: (m, 3) set; either side.
-        spreads: (m, 3) set to the deviation from the plane and the two extents along it (standard
-            deviations), sides of a voxel; the first is infinite with fewer than three points.
+        around: (o, 4) steps to the voxels of a neighbourhood by distance, and their shells.
+        enough: a neighbourhood ends with the shell in which it reaches this number of points.
+        normals: (m, 3) set; of either sign.
+        spreads: (m, 3) set to the standard deviations across the plane and along it, sides of a
+            voxel; the first is infinite with fewer than three points.
     """
     total, plane = np.empty(10), np.empty(9)
     for i in range(places.shape[0]):
@@ -571,20 +568,20 @@ def grow_regions(  # noqa: C901, PLR0912, PLR0913, PLR0917 - the loop that growi
     limits: NDArray[np.float64],
     regions: NDArray[np.int32],
 ) -> int:
-    """Grow regions over neighbouring voxels: like normal, and near the region's plane.
+    """Grow regions over neighbouring voxels with similar normals and near the region's plane.
 
-    The plane is that of all points of the region so far; it is fitted anew as the region grows, and
-    when nothing more joins, the region's own voxels ask their neighbours again with the last one.
+    The plane is that of all points of the region so far and is refitted as the region grows. When
+    no voxel is added any more, all neighbours of the region are tested again with the last plane.
 
     Args:
-        places: (n, 3) where voxels lie.
+        places: (n, 3) positions of voxels.
         bricks: (a, b, c) number of each brick.
         numbers: (bricks, VOXELS) number of each voxel.
         sums: (n, N_SUMS) moments.
         normals: (n, 3) of their neighbourhoods.
-        seeds: (s,) voxels that may belong to a region, those to start from first.
+        seeds: (s,) voxels that may belong to a region, in the order of seeds.
         limits: smallest cosine between normals, largest distance in sides of a voxel.
-        regions: (n,) -2 where a voxel may join, others stay; set to the region.
+        regions: (n,) -2 for voxels that may be added; set to the region.
 
     Returns:
         The number of regions.
@@ -601,7 +598,7 @@ def grow_regions(  # noqa: C901, PLR0912, PLR0913, PLR0917 - the loop that growi
         regions[seed] = n_regions
         queue[0] = seed
         length = 1
-        # Counted from the seed's voxel, so that a region far from the box's corner loses nothing.
+        # Relative to the seed, so that regions far from the corner of the box lose no precision.
         oa, ob, oc = places[seed, 0], places[seed, 1], places[seed, 2]
         total[:] = 0.0
         _add_moments(total, sums, seed, (0.0, 0.0, 0.0))
@@ -645,7 +642,7 @@ def grow_regions(  # noqa: C901, PLR0912, PLR0913, PLR0917 - the loop that growi
                 if length >= refit:
                     flattest(total, plane)
                     refit = int((1.0 + _REFIT_SHARE) * length) + 1
-            # While the plane still swayed it may have passed over voxels that it now holds.
+            # Earlier planes may have excluded voxels that the present one includes.
             if length == before:
                 break
             if length >= 8:

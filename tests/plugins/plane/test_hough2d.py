@@ -105,7 +105,7 @@ def test_other_accumulators_find_the_densest_wall(
 
 
 def test_raw_coordinates_with_one_vote_per_cell_are_refused() -> None:
-    with pytest.raises(ValidationError, match="coordinates: raw goes with accumulator: counts"):
+    with pytest.raises(ValidationError, match="accumulator: counts"):
         Hough2d.Params(coordinates="raw", accumulator="unit")
 
 
@@ -122,7 +122,7 @@ def test_a_rounded_body_is_no_wall(tmp_path: Path) -> None:
     )
     with pytest.raises(MethodError, match=r"\(1.2 x 1.2 x 2 m\) with tolerance_m"):
         detect(cloud_of(barrel), tmp_path)
-    with pytest.raises(MethodError, match=r"is small: is unit of read.scan right\? .* 0.1 m wide"):
+    with pytest.raises(MethodError, match=r"is small: .*unit of read.scan.* 0.1 m wide"):
         detect(cloud_of(0.1 * barrel), tmp_path)
 
 

@@ -113,7 +113,7 @@ def test_named_materials_have_a_thickness_each_on_the_plane_and_along_a_row(
 
 
 def test_materials_need_intensities(tmp_path: Path) -> None:
-    with pytest.raises(MethodError, match="intensity of the points, which the cloud has not"):
+    with pytest.raises(MethodError, match="leave out materials"):
         detect(cloud_of(wall(0.002)), tmp_path, materials={"fabric": (0.0, 0.5)})
 
 
