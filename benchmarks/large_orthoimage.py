@@ -20,17 +20,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
-from ortho_backward import GSD_M, camera
+from ortho_backward import GSD_M, UP, camera
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
 from orthoflow_plugins.ortho.painting import paint
-from orthoflow_plugins.ortho.surfaces import Surface, relief_of, view_of
+from orthoflow_plugins.ortho.surfaces import surface_of, view_of
 
 from orthoflow.files.geotiff import GridPlace, read_raster, write_orthoimage
 from orthoflow.files.images import cells_png
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.occluders import nothing_in_the_way
-from orthoflow.geometry.robust import depth_noise_m
-from orthoflow.products import LayerMask, Wall
+from orthoflow.products import LayerMask, Wall, Walls
 
 BAND_ROWS = 256
 
@@ -112,13 +111,15 @@ def main() -> None:
         photo = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
         print(f"{options.side} x {options.side} cells, photo of {options.megapixels:g} megapixels")
         with measured("relief"):
-            surface = Surface(
-                frame=raster.frame,
-                relief=relief_of(raster),
-                front_m=0.15,
-                tolerance_m=3.0 * depth_noise_m(raster.depth_m) + 0.5 * GSD_M,
+            walls = Walls(
+                walls=(raster,),
+                up=UP,
+                intensity_source="none",
+                buffer_front_m=0.15,
+                buffer_behind_m=0.15,
             )
-        params = DsmBackward.Params()
+            params = DsmBackward.Params()
+            surface = surface_of(walls, 0, params)
         with measured("painting"):
             painting = paint(
                 photo,

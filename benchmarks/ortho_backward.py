@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
 from orthoflow_plugins.ortho.painting import paint
-from orthoflow_plugins.ortho.surfaces import Surface, relief_of, view_of
+from orthoflow_plugins.ortho.surfaces import surface_of, view_of
 
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
@@ -35,7 +35,6 @@ from orthoflow.geometry.occluders import (
     nothing_in_the_way,
     occluders_before,
 )
-from orthoflow.geometry.robust import depth_noise_m
 from orthoflow.products import PointCloud, Wall, Walls
 
 GSD_M = 0.003
@@ -209,12 +208,8 @@ def main() -> None:
         allocate = allocate_anew if is_fresh else kept
 
         def task() -> object:
-            surface = Surface(
-                frame=raster.frame,
-                relief=relief_of(raster, hides=not is_seen_through, allocate=allocate),
-                front_m=walls.buffer_front_m,
-                tolerance_m=3.0 * depth_noise_m(raster.depth_m) + 0.5 * GSD_M,
-            )
+            hides = not is_seen_through
+            surface = surface_of(walls, 0, params, hides=hides, allocate=allocate)
             return paint(
                 photo,
                 view_of(viewer, surface, params),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
@@ -60,6 +61,13 @@ def depth_noise_m(depth_m: NDArray[np.float32]) -> float:
     rows, middle = depth_m[::step], depth_m[1:-1:step]
     across = rows[:, :-2] - 2.0 * rows[:, 1:-1] + rows[:, 2:]
     down = depth_m[:-2:step] - 2.0 * middle + depth_m[2::step]
-    bends = np.concatenate([across.ravel(), down.ravel()])
-    known = np.abs(bends[np.isfinite(bends)])
-    return float(np.median(known)) * NMAD_FACTOR / np.sqrt(6.0) if known.size else 0.0
+    bends = np.abs(np.concatenate([across.ravel(), down.ravel()]))
+    n_known = int(np.count_nonzero(np.isfinite(bends)))
+    if not n_known:
+        return 0.0
+    # The median; NaN is sorted to the end.
+    half = n_known // 2
+    bends = np.partition(bends, half)
+    upper = float(bends[half])
+    median = upper if n_known % 2 else (float(bends[:half].max()) + upper) / 2.0
+    return median * NMAD_FACTOR / math.sqrt(6.0)

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.bands import Allocate
 from orthoflow.geometry.camera_kernels import project_point
-from orthoflow.geometry.compiling import compiled, interpreted
+from orthoflow.geometry.compiling import compiled, inlined, interpreted
 from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 from orthoflow.geometry.levels import Colours, level_of
 from orthoflow.geometry.threads import in_threads
-from orthoflow_plugins.ortho.parameters import BackwardParams, Resampling
+from orthoflow_plugins.ortho.parameters import BackwardParams
 from orthoflow_plugins.ortho.surfaces import Surface
 from orthoflow_plugins.ortho.visibility_kernels import (
     OCCLUDED,
@@ -100,6 +100,8 @@ def paint(
             painted.
         threads: number of tiles painted at once; it does not change the result.
     """
+    import cv2
+
     shape, lock = surface.frame.shape, Lock()
     painting = Painting(mask=np.asarray(allocate("mask", shape, np.uint8), np.uint8))
     erosion_cells = params.erosion_cells if params.visibility == "full" else 0
@@ -112,11 +114,10 @@ def paint(
         if not is_painted.any():
             painting.mask[tile] = visible.mask[inner]
             return
-        # Positions are 0 where nothing is painted.
         bounds = tuple(
             math.floor(value)
             for places in (visible.u, visible.v)
-            for value in (np.where(is_painted, places, np.float32(np.inf)).min(), places.max())
+            for value in cv2.minMaxLoc(places, is_painted.view(np.uint8))[:2]
         )
         is_wide = max(bounds[1] - bounds[0], bounds[3] - bounds[2]) > _CROP_MOST_PX
         if is_wide and visible.mask[inner].size > 1:
@@ -131,22 +132,21 @@ def paint(
                 painting.quality = np.asarray(allocate("quality", shape, np.float32), np.float32)
         if erosion_cells:
             is_near = near_patches(visible.mask == OCCLUDED, erosion_cells)
-            np.putmask(visible.mask, is_painted & is_near, OCCLUDED)
-        rgb = sample(
+            np.copyto(visible.mask, np.uint8(OCCLUDED), where=is_painted & is_near)
+            np.copyto(visible.quality, np.float32(0.0), where=is_near)
+        painting.mask[tile] = visible.mask[inner]
+        sample(
             photo,
-            visible.u[inner],
-            visible.v[inner],
+            visible,
+            inner,
             bounds,
             footprint,
-            params.resampling,
-            antialias=params.antialias,
+            params,
+            into=painting.rgb[tile],
         )
-        is_bare = visible.mask[inner] != PAINTED
-        rgb[is_bare] = 0
-        painting.mask[tile], painting.rgb[tile] = visible.mask[inner], rgb
         np.bitwise_and(
             visible.quality[inner].view(np.uint32),
-            np.where(is_bare, np.uint32(0), _QUALITY_BITS),
+            _QUALITY_BITS,
             out=painting.quality[tile].view(np.uint32),
         )
         painting.footprints[tile[0].start, tile[1].start] = footprint
@@ -266,30 +266,31 @@ def _middle(
 
 def sample(
     photo: Colours,
-    u: NDArray[np.float32],
-    v: NDArray[np.float32],
+    visible: TileVisibility,
+    inner: Tile,
     bounds: tuple[int, ...],
     footprint: CellFootprint,
-    resampling: Resampling,
+    params: BackwardParams,
     *,
-    antialias: bool,
-) -> Colours:
-    """Return the colours (rows, cols, 3) of cells; those outside the bounds are undefined.
+    into: Colours,
+) -> None:
+    """Set the colours of cells; those that are not painted are black.
 
     Args:
         photo: (height, width, 3), 8 or 16 bits.
-        u: (rows, cols) positions in the photo, finite; v likewise.
-        v: see `u`.
-        bounds: first and last column, first and last row of the pixels that positions are in.
+        visible: cells of a tile and around it, with finite positions.
+        inner: rows and columns of the tile in it.
+        bounds: first and last column, first and last row of the pixels of painted cells.
         footprint: number of pixels that a cell covers.
-        resampling: `nearest` takes the pixel's own colour without a filter.
-        antialias: average over a cell where the photo is finer than the wall.
+        params: how colours are interpolated and averaged.
+        into: (rows, cols, 3) overwritten.
     """
     import cv2
 
-    is_nearest = resampling == "nearest"
+    resampling, is_nearest = params.resampling, params.resampling == "nearest"
+    is_averaged = params.antialias and not is_nearest
     sigmas = [
-        0.5 * math.sqrt(max(0.0, pixels * pixels - 1.0)) if antialias and not is_nearest else 0.0
+        0.5 * math.sqrt(max(0.0, pixels * pixels - 1.0)) if is_averaged else 0.0
         for pixels in (footprint.pixels_across, footprint.pixels_down)
     ]
     reach = 0 if is_nearest else _REACH_PX + math.ceil(4.0 * max(sigmas))
@@ -306,49 +307,123 @@ def sample(
             ),
             dtype=crop.dtype,
         )
-    if is_nearest:
-        rows = np.clip(np.floor(v).astype(np.intp) - first_row, 0, crop.shape[0] - 1)
-        columns = np.clip(np.floor(u).astype(np.intp) - first_column, 0, crop.shape[1] - 1)
-        return crop[rows, columns]
-    # From the centre of the first pixel.
-    u = u - np.float32(first_column + 0.5)
-    v = v - np.float32(first_row + 0.5)
     if resampling == "bilinear":
-        colours = np.empty((*u.shape, 3), dtype=crop.dtype)
-        sample_bilinear(np.ascontiguousarray(crop), u, v, colours)
-        return colours
-    flag = cv2.INTER_CUBIC if resampling == "cubic" else cv2.INTER_LANCZOS4
-    colours = cv2.remap(crop, u, v, flag, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(colours, dtype=crop.dtype)
+        sample_bilinear(crop, (first_column, first_row), visible, inner, into)
+        return
+    if is_nearest:
+        # Whole positions: the pixel that contains a cell's, so that OpenCV rounds nothing.
+        u, v = (np.floor(places[inner]) for places in (visible.u, visible.v))
+        u, v = u - np.float32(first_column), v - np.float32(first_row)
+    else:
+        # From the centre of the first pixel.
+        u = visible.u[inner] - np.float32(first_column + 0.5)
+        v = visible.v[inner] - np.float32(first_row + 0.5)
+    flags = {
+        "nearest": cv2.INTER_NEAREST,
+        "cubic": cv2.INTER_CUBIC,
+        "lanczos": cv2.INTER_LANCZOS4,
+    }
+    into[...] = cv2.remap(crop, u, v, flags[resampling], borderMode=cv2.BORDER_REPLICATE)
+    into[visible.mask[inner] != PAINTED] = 0
+
+
+def sample_bilinear(
+    photo: Colours,
+    corner: tuple[int, int],
+    visible: TileVisibility,
+    inner: Tile,
+    colours: Colours,
+) -> None:
+    """Set colours at positions of a photo, whose border is extended; others than painted are black.
+
+    `cv2.remap` knows positions to a 32nd of a pixel only, and takes twice as long.
+
+    Args:
+        photo: (height, width, 3), a part of the whole.
+        corner: column and row of its first pixel.
+        visible: cells of a tile and around it, with positions in the whole photo.
+        inner: rows and columns of the tile in it.
+        colours: (rows, cols, 3) of the tile, overwritten.
+    """
+    import cv2
+
+    # A pixel is one number, and has neighbours to the right and below.
+    if min(photo.shape[:2]) < 2:
+        photo = cv2.copyMakeBorder(photo, 0, 1, 0, 1, cv2.BORDER_REPLICATE)  # type: ignore[assignment]
+    four = np.asarray(cv2.cvtColor(photo, cv2.COLOR_RGB2RGBA), dtype=photo.dtype)
+    words = four.view(np.uint32) if photo.dtype == np.uint8 else four.view(np.uint64)
+    mixed = np.empty(colours.shape[:2], dtype=words.dtype)
+    centre = (np.float32(corner[0] + 0.5), np.float32(corner[1] + 0.5))
+    _mix_pixels(words[..., 0], centre, visible, (inner[0].start, inner[1].start), mixed)
+    channels = mixed.view(photo.dtype).reshape(*mixed.shape, 4)
+    cv2.cvtColor(channels, cv2.COLOR_RGBA2RGB, dst=colours)
 
 
 @compiled
-def sample_bilinear(
-    photo: Colours, u: NDArray[np.float32], v: NDArray[np.float32], colours: Colours
+def _mix_pixels(
+    pixels: NDArray[np.uint32 | np.uint64],
+    centre: tuple[np.float32, np.float32],
+    visible: TileVisibility,
+    first: tuple[int, int],
+    mixed: NDArray[np.uint32 | np.uint64],
 ) -> None:
-    """Set the colours (rows, cols, 3) at positions of a photo, whose border is extended.
+    """Interpolate between pixels of four channels in one number; the fourth is left out.
+
+    Each loop has no branches and writes one array only, so that compilers take many cells at once,
+    but for those that fetch pixels.
 
     Args:
-        photo: (height, width, 3).
-        u: (rows, cols) columns from the centre of the first pixel; v likewise rows.
-        v: see `u`.
-        colours: overwritten. `cv2.remap` knows positions to a 32nd of a pixel only.
+        pixels: (rows, cols) of a photo, at least two of each.
+        centre: of the first pixel, column and row in the photo.
+        visible: positions of cells.
+        first: row and column in it of the first cell.
+        mixed: (rows, cols) of the cells, overwritten.
     """
-    last_u, last_v, width = photo.shape[1] - 1, photo.shape[0] - 1, photo.shape[1]
-    # Flat arrays, and places of a type without sign: numba does not look whether they are negative.
-    us, vs, pixels, into = u.reshape(-1), v.reshape(-1), photo.reshape(-1), colours.reshape(-1)
-    for cell in range(us.size):
-        across = min(max(float(us[cell]), 0.0), float(last_u))
-        down = min(max(float(vs[cell]), 0.0), float(last_v))
-        left, upper = int(across), int(down)
-        across -= left
-        down -= upper
-        at = 3 * (upper * width + left)
-        right = 3 if left < last_u else 0
-        lower = 3 * width if upper < last_v else 0
-        for channel in range(3):
-            first = float(pixels[np.uintp(at + channel)])
-            last = float(pixels[np.uintp(at + lower + channel)])
-            above = first + (float(pixels[np.uintp(at + right + channel)]) - first) * across
-            below = last + (float(pixels[np.uintp(at + lower + right + channel)]) - last) * across
-            into[3 * cell + channel] = int(above + (below - above) * down + 0.5)
+    f, word, n_columns = np.float32, pixels.dtype.type, mixed.shape[1]
+    bits = word(2 * pixels.itemsize)
+    level = (word(1) << bits) - word(1)
+    u0, v0, zero, painted = centre[0], centre[1], f(0.0), np.uint8(PAINTED)
+    last_u, last_v = f(pixels.shape[1] - 1), f(pixels.shape[0] - 1)
+    last_left, last_upper = np.int32(pixels.shape[1] - 2), np.int32(pixels.shape[0] - 2)
+    width, flat = np.int32(pixels.shape[1]), pixels.reshape(-1)
+    shares, places = np.empty((2, n_columns), dtype=f), np.empty(n_columns, dtype=np.int32)
+    corners = np.empty((4, n_columns), dtype=pixels.dtype)
+    across, down = shares[0], shares[1]
+    ones, rights, belows, lasts = corners[0], corners[1], corners[2], corners[3]
+    begin, end = first[1], first[1] + n_columns
+    for i in range(mixed.shape[0]):
+        row, into = first[0] + i, mixed[i]
+        us, vs = visible.u[row, begin:end], visible.v[row, begin:end]
+        states = visible.mask[row, begin:end]
+        for j in range(n_columns):
+            at = min(max(us[j] - u0, zero), last_u)
+            across[j] = at - f(min(np.int32(at), last_left))
+        for j in range(n_columns):
+            at = min(max(vs[j] - v0, zero), last_v)
+            down[j] = at - f(min(np.int32(at), last_upper))
+        for j in range(n_columns):
+            left = min(np.int32(min(max(us[j] - u0, zero), last_u)), last_left)
+            upper = min(np.int32(min(max(vs[j] - v0, zero), last_v)), last_upper)
+            places[j] = upper * width + left
+        for j in range(n_columns):
+            place = np.uintp(places[j])
+            ones[j], rights[j] = flat[place], flat[place + np.uintp(1)]
+        for j in range(n_columns):
+            place = np.uintp(places[j] + width)
+            belows[j], lasts[j] = flat[place], flat[place + np.uintp(1)]
+        for j in range(n_columns):
+            four = (ones[j], rights[j], belows[j], lasts[j])
+            red = word(_mixed(four, across[j], down[j], word(0), level))
+            green = word(_mixed(four, across[j], down[j], bits, level)) << bits
+            blue = word(_mixed(four, across[j], down[j], bits + bits, level)) << (bits + bits)
+            into[j] = red | green | blue if states[j] == painted else word(0)
+
+
+@inlined
+def _mixed(four, across, down, shift, level):  # type: ignore[no-untyped-def]  # numba infers the types
+    """Interpolate one channel between four pixels."""
+    f = np.float32
+    above, below = f(four[0] >> shift & level), f(four[2] >> shift & level)
+    above += (f(four[1] >> shift & level) - above) * across
+    below += (f(four[3] >> shift & level) - below) * across
+    return np.int32(above + (below - above) * down + f(0.5))

@@ -21,7 +21,7 @@ from orthoflow_plugins.ortho.visibility_kernels import BLOCK_CELLS, Relief, Wall
 
 # Surfaces of walls with more cells are kept in files, and computed in bands of so many.
 _IN_MEMORY_MOST: Final = 1 << 26
-_BAND_CELLS: Final = 1 << 19
+_BAND_CELLS: Final = 1 << 17
 # A cell influences what hides others as far as this.
 _REACH_ROWS: Final = 4
 # Cells this much lower than a neighbour, in cells, are at an edge: steeper than 79 degrees.
@@ -50,15 +50,28 @@ def surfaces_of(
 ) -> list[Surface]:
     """Each wall as the surface that rays hit; with `hides` false its relief hides nothing."""
     return [
-        Surface(
-            frame=wall.frame,
-            relief=relief_of(wall, hides=hides, allocate=partial(_allocated, ctx, index)),
-            front_m=walls.slab(index).front_m,
-            tolerance_m=params.tolerance_sigma * depth_noise_m(wall.depth_m)
-            + params.tolerance_cells * wall.frame.gsd_m,
-        )
-        for index, wall in enumerate(walls.walls)
+        surface_of(walls, index, params, hides=hides, allocate=partial(_allocated, ctx, index))
+        for index in range(len(walls.walls))
     ]
+
+
+def surface_of(
+    walls: Walls,
+    index: int,
+    params: VisibilityParams,
+    *,
+    hides: bool = True,
+    allocate: Allocate = in_memory,
+) -> Surface:
+    """Prepare one wall; `allocate` returns the array of the heights that hide."""
+    wall = walls.walls[index]
+    noise_m = depth_noise_m(wall.depth_m) if hides else 0.0
+    return Surface(
+        frame=wall.frame,
+        relief=relief_of(wall, hides=hides, allocate=allocate),
+        front_m=walls.slab(index).front_m,
+        tolerance_m=params.tolerance_sigma * noise_m + params.tolerance_cells * wall.frame.gsd_m,
+    )
 
 
 def _allocated(
@@ -133,14 +146,18 @@ def _hiding(depth: NDArray[np.float32], edge_m: float) -> NDArray[np.float32]:
     import cv2
 
     square, pair = np.ones((3, 3), dtype=np.uint8), np.ones((2, 2), dtype=np.uint8)
-    border = cv2.BORDER_REPLICATE
-    known = np.where(np.isnan(depth), np.float32(-np.inf), depth)
-    closed = np.where(np.isnan(depth), cv2.dilate(known, square, borderType=border), known)
-    lowest = cv2.erode(closed, pair, anchor=(0, 0), borderType=border)
-    opened = np.asarray(cv2.dilate(lowest, pair, anchor=(1, 1), borderType=border), np.float32)
-    highest = np.asarray(cv2.dilate(opened, square, borderType=border), np.float32)
+    border, is_void = cv2.BORDER_REPLICATE, np.isnan(depth)
+    closed, spare = depth.copy(), np.empty_like(depth)
+    np.copyto(closed, np.float32(-np.inf), where=is_void)
+    cv2.dilate(closed, square, dst=spare, borderType=border)
+    np.copyto(closed, spare, where=is_void)
+    cv2.erode(closed, pair, dst=spare, anchor=(0, 0), borderType=border)
+    opened = np.asarray(cv2.dilate(spare, pair, anchor=(1, 1), borderType=border), np.float32)
+    highest = cv2.dilate(opened, square, dst=spare, borderType=border)
     with np.errstate(invalid="ignore"):
-        return np.where(highest - opened > np.float32(edge_m), highest, opened)
+        is_edge = np.subtract(highest, opened, out=closed) > np.float32(edge_m)
+    np.copyto(opened, highest, where=is_edge)
+    return opened
 
 
 def _of_blocks(values: NDArray[np.float32], reduce: np.ufunc) -> NDArray[np.float32]:

@@ -8,7 +8,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.camera_kernels import project_point
 from orthoflow.geometry.compiling import compiled, kernel_part
 from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 
@@ -18,6 +17,11 @@ BLOCK_CELLS: Final = 32
 # From the middle of a block to the centre of its last cell, in blocks; a ray is met by the cells on
 # either side of it, which are half a cell away at most.
 _HALF: Final = 0.5 - 0.5 / BLOCK_CELLS
+
+# Cells of a row that are projected together, from a multiple of this: in float32 from the first of
+# them, so that a cell has the same result in every tile.
+_RUN_CELLS: Final = 512
+_N_QUANTITIES: Final = 6
 
 # States of a cell, as in `LayerMask`.
 OUTSIDE: Final = 0
@@ -110,107 +114,218 @@ def look_at_cells(
         first_column: column likewise.
     """
     n_rows, n_columns = visible.mask.shape
-    first_block, last_block = (
-        first_column // BLOCK_CELLS,
-        (first_column + n_columns - 1) // BLOCK_CELLS,
-    )
-    tops, projected = np.empty(last_block - first_block + 1), np.empty((6, n_columns))
+    end_column, first_block = first_column + n_columns, first_column // BLOCK_CELLS
+    tops = np.empty((end_column - 1) // BLOCK_CELLS + 1 - first_block)
+    steps = np.arange(_RUN_CELLS).astype(np.float32)
+    projected = np.empty((_N_QUANTITIES, _RUN_CELLS), dtype=np.float32)
+    places = np.empty(_RUN_CELLS, dtype=np.int32)
+    occluding, tolerance_m = relief.occluding.reshape(-1), view.tolerance_m
+    eye = (view.row, view.column, view.height_m)
     for i in range(n_rows):
         row = first_row + i
         if i == 0 or row % BLOCK_CELLS == 0:
             for k in range(tops.size):
                 tops[k] = _highest_in_the_way(view, relief, row // BLOCK_CELLS, first_block + k)
-        part = TileVisibility(visible.u[i], visible.v[i], visible.mask[i], visible.quality[i])
-        depths = relief.depth[row, first_column : first_column + n_columns]
-        _project_row(view, depths, (row, first_column), projected)
-        _look_at_row(view, relief, buffer, (row, first_column), tops, projected, part)
+        start = first_column
+        while start < end_column:
+            run = start // _RUN_CELLS * _RUN_CELLS
+            end = min(end_column, run + _RUN_CELLS)
+            depths, in_tile = relief.depth[row, start:end], start - first_column
+            mask = visible.mask[i, in_tile : end - first_column]
+            _project_run(view, depths, (row, run), steps[start - run : end - run], projected)
+            _set_states(view, buffer, depths, projected, places, mask)
+            for k in range(start // BLOCK_CELLS, (end - 1) // BLOCK_CELLS + 1):
+                top = tops[k - first_block]
+                if float(relief.bottoms[row // BLOCK_CELLS, k]) + tolerance_m < top:
+                    first, last = max(start, k * BLOCK_CELLS), min(end, (k + 1) * BLOCK_CELLS)
+                    lows, cells = depths[first - start : last - start], mask[first - start :]
+                    place = (row, first, relief.depth.shape[0], relief.depth.shape[1])
+                    _hide_low_cells(occluding, eye, tolerance_m, top, place, lows, cells)
+            _keep_painted(mask, projected[0], visible.u[i, in_tile : end - first_column])
+            _keep_painted(mask, projected[1], visible.v[i, in_tile : end - first_column])
+            _keep_painted(mask, projected[5], visible.quality[i, in_tile : end - first_column])
+            start = end
 
 
 @kernel_part
-def _project_row(
+def _project_run(
     view: WallView,
     depths: NDArray[np.float32],
     place: tuple[int, int],
-    projected: NDArray[np.float64],
+    steps: NDArray[np.float32],
+    projected: NDArray[np.float32],
 ) -> None:
-    """Project cells of a row, void or not, in loops without branches: several cells at once.
+    """Project cells of a row, void or not: the formula of `camera_kernels.project_point`.
+
+    Each loop has no branches and writes one array only, so that compilers take many cells at once;
+    constants of another type would make them take fewer.
 
     Args:
         view: the camera in front of the wall.
         depths: (n,) of the cells.
-        place: row of the cells, column of the first one.
-        projected: (6, n or more) overwritten with u, v, distance along the axis, cosine of
-            incidence, the least distance at which nothing is in the way, and quality.
+        place: row of the cells, and the column from which they are counted.
+        steps: (n,) columns from there.
+        projected: (_N_QUANTITIES, n or more) overwritten with u, v, inverse distance along the
+            axis, cosine of incidence, the least distance at which nothing is in the way, and
+            quality; u is -1 behind the camera and beyond the lens model.
     """
     row, first_column = place
-    camera, gsd_m, height_m = view.camera, view.gsd_m, view.height_m
-    us, vs, alongs = projected[0], projected[1], projected[2]
-    cosines, leaves_m, qualities = projected[3], projected[4], projected[5]
-    y = (row + 0.5) * gsd_m
+    c, gsd_m, f = view.camera, view.gsd_m, np.float32
+    # The first cell in float64: survey coordinates and large walls lose nothing.
+    x, y = (first_column + 0.5) * gsd_m, (row + 0.5) * gsd_m
+    x0, y0 = f(c[0] * x + c[1] * y + c[9]), f(c[3] * x + c[4] * y + c[10])
+    z0 = f(c[6] * x + c[7] * y + c[11])
+    xu, yu, zu = f(c[0] * gsd_m), f(c[3] * gsd_m), f(c[6] * gsd_m)
+    xn, yn, zn = f(c[2]), f(c[5]), f(c[8])
+    fx, fy, cx, cy, skew = f(c[12]), f(c[13]), f(c[14]), f(c[15]), f(c[24])
+    k1, k2, k3, p1, p2 = f(c[16]), f(c[17]), f(c[20]), f(c[18]), f(c[19])
+    zero, one, two, farthest = f(0.0), f(1.0), f(2.0), f(c[23] * c[23])
+    us, vs, nears, qualities = projected[0], projected[1], projected[2], projected[5]
+    cosines, leaves_m = projected[3], projected[4]
     for j in range(depths.size):
-        x = (first_column + j + 0.5) * gsd_m
-        us[j], vs[j], alongs[j] = project_point(camera, x, y, float(depths[j]))
-    width, height, border_px = camera[21], camera[22], view.border_px
-    tolerance_m, free_m = view.tolerance_m, height_m - view.front_m
-    down, view_column = (view.row - row) * gsd_m, view.column
-    area_m2 = camera[12] * camera[13] * gsd_m * gsd_m
+        nears[j] = one / (z0 + zu * steps[j] + zn * depths[j])
     for j in range(depths.size):
-        u, v, along = us[j], vs[j], alongs[j]
-        lift = height_m - float(depths[j])
-        across = (view_column - (first_column + j)) * gsd_m
-        cosine = lift / math.sqrt(lift * lift + across * across + down * down)
-        inside = min(width - u, u, height - v, v) / border_px
-        cosines[j] = cosine
-        leaves_m[j] = along * free_m / lift - tolerance_m
-        qualities[j] = cosine * area_m2 / (along * along) * min(1.0, inside)
+        us[j] = (x0 + xu * steps[j] + xn * depths[j]) * nears[j]
+    # Rows of other quantities hold b and the distorted b until they are computed.
+    bs = cosines
+    for j in range(depths.size):
+        bs[j] = (y0 + yu * steps[j] + yn * depths[j]) * nears[j]
+    for j in range(depths.size):
+        a, b = us[j], bs[j]
+        r2 = a * a + b * b
+        radial = one + r2 * (k1 + r2 * (k2 + r2 * k3))
+        vs[j] = b * radial + p1 * (r2 + two * b * b) + two * p2 * a * b
+    for j in range(depths.size):
+        a, b = us[j], bs[j]
+        r2 = a * a + b * b
+        radial = one + r2 * (k1 + r2 * (k2 + r2 * k3))
+        u = fx * (a * radial + two * p1 * a * b + p2 * (r2 + two * a * a)) + cx + skew * vs[j]
+        us[j] = u if (r2 <= farthest) & (nears[j] > zero) else -one
+    for j in range(depths.size):
+        vs[j] = fy * vs[j] + cy
+    height_m, foot, side_m = f(view.height_m), f(view.column - first_column), f(gsd_m)
+    down_m = f((view.row - row) * gsd_m)
+    for j in range(depths.size):
+        lift, across = height_m - depths[j], (foot - steps[j]) * side_m
+        cosines[j] = lift / math.sqrt(lift * lift + across * across + down_m * down_m)
+    free_m, tolerance_m = f(view.height_m - view.front_m), f(view.tolerance_m)
+    for j in range(depths.size):
+        leaves_m[j] = free_m / (nears[j] * (height_m - depths[j])) - tolerance_m
+    width, height, per_border = f(c[21]), f(c[22]), f(1.0 / view.border_px)
+    area_m2 = f(c[12] * c[13] * gsd_m * gsd_m)
+    for j in range(depths.size):
+        inside = min(width - us[j], us[j], height - vs[j], vs[j]) * per_border
+        qualities[j] = cosines[j] * area_m2 * nears[j] * nears[j] * min(one, inside)
 
 
 @kernel_part
-def _look_at_row(
+def _set_states(
     view: WallView,
-    relief: Relief,
     buffer: DepthBuffer,
-    place: tuple[int, int],
-    tops: NDArray[np.float64],
-    projected: NDArray[np.float64],
-    visible: TileVisibility,
+    depths: NDArray[np.float32],
+    projected: NDArray[np.float32],
+    places: NDArray[np.int32],
+    mask: NDArray[np.uint8],
 ) -> None:
-    """Determine which cells of a row a photo sees.
+    """Determine which cells a photo sees if the relief hides none of them.
 
     Args:
         view: the camera in front of the wall.
-        relief: the whole wall.
         buffer: depth buffer of other objects.
-        place: row of the cells, column of the first one.
-        tops: height up to which rays have to be followed, of each block that has some of the cells.
-        projected: from `_project_row`.
-        visible: (n,) arrays of the cells, output.
+        depths: (n,) of the cells.
+        projected: from `_project_run`; the inverse distances are overwritten.
+        places: (n or more,) overwritten.
+        mask: (n,) states, output.
     """
-    row, first_column = place
-    before = first_column % BLOCK_CELLS
-    width, height = view.camera[21], view.camera[22]
-    cosine_least, tolerance_m = view.cosine_least, view.tolerance_m
-    nearest, per_pixel = buffer.nearest, 1.0 / buffer.reduction
-    us, vs, cosines, leaves_m = projected[0], projected[1], projected[3], projected[4]
-    depths = relief.depth[row, first_column : first_column + visible.mask.size]
-    for j in range(visible.mask.size):
-        u, v, depth, top = us[j], vs[j], float(depths[j]), tops[(before + j) // BLOCK_CELLS]
-        state = PAINTED
-        if math.isnan(depth):
-            state = NO_SURFACE
-        elif not (0.0 <= u < width and 0.0 <= v < height):
-            state = OUTSIDE
-        elif (
-            cosines[j] <= cosine_least
-            or nearest[np.uintp(v * per_pixel), np.uintp(u * per_pixel)] < leaves_m[j]
-            or (depth + tolerance_m < top and _is_hidden(view, relief, row, first_column + j, top))
-        ):
-            state = OCCLUDED
-        is_painted = state == PAINTED
-        visible.mask[j] = state
-        visible.u[j] = u if is_painted else 0.0
-        visible.v[j] = v if is_painted else 0.0
-        visible.quality[j] = projected[5, j] if is_painted else 0.0
+    f = np.float32
+    us, vs, nearests = projected[0], projected[1], projected[2]
+    cosines, leaves_m, nearest = projected[3], projected[4], buffer.nearest.reshape(-1)
+    width, height, zero = f(view.camera[21]), f(view.camera[22]), f(0.0)
+    per_pixel, stride = f(1.0 / buffer.reduction), np.int32(buffer.nearest.shape[1])
+    cosine_least = f(view.cosine_least)
+    for j in range(mask.size):
+        u, v = us[j], vs[j]
+        is_inside = (u >= zero) & (u < width) & (v >= zero) & (v < height)
+        at_row, at_column = v * per_pixel, u * per_pixel
+        place = np.int32(at_row if is_inside else zero) * stride
+        places[j] = place + np.int32(at_column if is_inside else zero)
+    for j in range(mask.size):
+        nearests[j] = nearest[np.uintp(places[j])]
+    outside, painted = np.uint8(OUTSIDE), np.uint8(PAINTED)
+    occluded, no_surface = np.uint8(OCCLUDED), np.uint8(NO_SURFACE)
+    for j in range(mask.size):
+        u, v = us[j], vs[j]
+        is_inside = (u >= zero) & (u < width) & (v >= zero) & (v < height)
+        is_hidden = (cosines[j] <= cosine_least) | (nearests[j] < leaves_m[j])
+        state = (occluded if is_hidden else painted) if is_inside else outside
+        mask[j] = no_surface if math.isnan(depths[j]) else state
+
+
+@kernel_part
+def _keep_painted(
+    mask: NDArray[np.uint8], values: NDArray[np.float32], kept: NDArray[np.float32]
+) -> None:
+    """Copy the values of painted cells, and 0 for others."""
+    painted, zero = np.uint8(PAINTED), np.float32(0.0)
+    for j in range(mask.size):
+        kept[j] = values[j] if mask[j] == painted else zero
+
+
+@kernel_part
+def _hide_low_cells(
+    surface: NDArray[np.float32],
+    eye: tuple[float, float, float],
+    tolerance_m: float,
+    top: float,
+    place: tuple[int, int, int, int],
+    depths: NDArray[np.float32],
+    mask: NDArray[np.uint8],
+) -> None:
+    """Follow the rays from painted cells of a row to the camera, up to a height.
+
+    A ray is followed one row or column at a time, whichever it crosses more of.
+
+    Args:
+        surface: (cells of the wall,) that hides.
+        eye: row, column and height of the projection centre.
+        tolerance_m: how far the surface must be above a ray.
+        top: nothing above this height hides any of the cells.
+        place: row and first column of the cells, rows and columns of the wall.
+        depths: (n,) of the cells.
+        mask: (n or more,) states, updated.
+    """
+    row, first_column, n_rows, n_columns = place
+    eye_row, eye_column, height_m = eye
+    down, zero = eye_row - row, np.float32(0.0)
+    for j in range(depths.size):
+        column = first_column + j
+        level = float(depths[j]) + tolerance_m
+        if not (mask[j] == PAINTED and level < top):
+            continue
+        across = eye_column - column
+        if abs(down) >= abs(across):
+            along, aside, here, at = down, across, row, float(column)
+            stride, side, n_here, n_beside = n_columns, 1, n_rows, n_columns
+        else:
+            along, aside, here, at = across, down, column, float(row)
+            stride, side, n_here, n_beside = 1, n_columns, n_columns, n_rows
+        per_cell, step = 1.0 / max(1.0, abs(along)), stride if along > 0.0 else -stride
+        rise, move = (height_m - float(depths[j])) * per_cell, aside * per_cell
+        n_left = n_here - 1 - here if along > 0.0 else here
+        n_steps, last = min(n_left, int(min(abs(along), (top - level) / rise))), n_beside - 1.0
+        if not 0.0 <= at + n_steps * move <= last:
+            n_steps = int((last - at if move > 0.0 else at) / abs(move))
+        start = here * stride
+        for _ in range(n_steps):
+            start, at, level = start + step, at + move, level + rise
+            # The surface is linear between the two cells beside the ray, which may be the same.
+            first = np.int64(at)
+            share, first = np.float32(at - first), start + first * side
+            one = surface[np.uintp(first)]
+            other = surface[np.uintp(first + (side if share > zero else 0))]
+            if one + share * (other - one) > level:
+                mask[j] = OCCLUDED
+                break
 
 
 @kernel_part
@@ -238,34 +353,3 @@ def _highest_in_the_way(view: WallView, relief: Relief, row: int, column: int) -
             for j in range(first, end):
                 top = max(top, float(tops[i, j]))
     return top
-
-
-@kernel_part
-def _is_hidden(view: WallView, relief: Relief, row: int, column: int, top: float) -> bool:
-    """Follow the ray from a cell to the camera, one row or column at a time, up to a height."""
-    surface, depth = relief.occluding, float(relief.depth[row, column])
-    down, across = view.row - row, view.column - column
-    is_steep = abs(down) >= abs(across)
-    # Steps are whole rows or columns; across them the ray moves by a fraction of a cell.
-    along, aside, place, beside = (
-        (down, across, row, column) if is_steep else (across, down, column, row)
-    )
-    per_cell, step = 1.0 / max(1.0, abs(along)), 1 if along > 0.0 else -1
-    level, rise = depth + view.tolerance_m, (view.height_m - depth) * per_cell
-    n_steps = int(min(abs(along), (top - level) / rise))
-    n_places, n_beside = surface.shape[0 if is_steep else 1], surface.shape[1 if is_steep else 0]
-    for k in range(1, n_steps + 1):
-        here, at = place + k * step, beside + k * aside * per_cell
-        if not (0 <= here < n_places and 0.0 <= at <= n_beside - 1.0):
-            break
-        # The surface is linear between the two cells beside the ray, which may be the same.
-        first = int(at)
-        share, second = at - first, min(first + 1, n_beside - 1)
-        if is_steep:
-            one, other = float(surface[here, first]), float(surface[here, second])
-        else:
-            one, other = float(surface[first, here]), float(surface[second, here])
-        height = one if share == 0.0 else one + share * (other - one)
-        if height > level + k * rise:
-            return True
-    return False

@@ -16,8 +16,9 @@ from orthoflow_plugins.ortho.painting import (
     sample,
     sample_bilinear,
 )
-from orthoflow_plugins.ortho.parameters import VisibilityParams
+from orthoflow_plugins.ortho.parameters import BackwardParams, VisibilityParams
 from orthoflow_plugins.ortho.surfaces import Surface, relief_of, view_of
+from orthoflow_plugins.ortho.visibility_kernels import TileVisibility
 
 from tests import ortho_scenes as scenes
 
@@ -76,7 +77,9 @@ def test_a_footprint_is_that_of_the_middle_of_what_is_painted(aside_m: float) ->
 def test_bilinear_colours_are_those_of_the_formula(depth: int, size: tuple[int, int]) -> None:
     rng = np.random.default_rng(5)
     photo = rng.integers(0, 2**depth, (*size, 3), dtype=np.uint8 if depth == 8 else np.uint16)
+    # From the centre of the first pixel of a part that begins at column 7 and row 3.
     u, v = rng.uniform(-4.0, 66.0, (2, 30, 40)).astype(np.float32)
+    is_painted = rng.random(u.shape) < 0.9
     last_u, last_v = size[1] - 1, size[0] - 1
     across, down = np.clip(u.astype(float), 0, last_u), np.clip(v.astype(float), 0, last_v)
     left, upper = np.floor(across).astype(int), np.floor(down).astype(int)
@@ -84,9 +87,13 @@ def test_bilinear_colours_are_those_of_the_formula(depth: int, size: tuple[int, 
     a, d = (across - left)[..., None], (down - upper)[..., None]
     above = photo[upper, left] * (1 - a) + photo[upper, right] * a
     below = photo[lower, left] * (1 - a) + photo[lower, right] * a
-    colours = np.empty((30, 40, 3), dtype=photo.dtype)
-    sample_bilinear(photo, u, v, colours)
-    assert np.abs(colours - (above * (1 - d) + below * d)).max() <= 0.5 + 1e-6
+    expected = np.where(is_painted[..., None], above * (1 - d) + below * d, 0.0)
+    visible = TileVisibility(u + 7.5, v + 3.5, is_painted.astype(np.uint8), np.ones_like(u))
+    inner, colours = (slice(2, 29), slice(3, 40)), np.empty((27, 37, 3), dtype=photo.dtype)
+    sample_bilinear(photo, (7, 3), visible, inner, colours)
+    # Positions are float32: a millionth of a pixel is a sixteenth of a level of 16 bits.
+    tolerance = 0.5 + (1e-3 if depth == 8 else 0.5)
+    assert np.abs(colours - expected[inner]).max() <= tolerance
 
 
 def places_of(rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -104,7 +111,11 @@ def sampled(photo: Any, pixels: tuple[float, float], resampling: Any, *, antiali
         pixels_across=across, pixels_down=down, photo_gsd_m=0.001, obliquity_deg=0.0, n_cells=9
     )
     bounds = tuple(math.floor(value) for value in (u.min(), u.max(), v.min(), v.max()))
-    return sample(photo, u, v, bounds, footprint, resampling, antialias=antialias)
+    visible = TileVisibility(u, v, np.ones(u.shape, dtype=np.uint8), np.ones_like(u))
+    inner, colours = (slice(0, u.shape[0]), slice(0, u.shape[1])), np.empty((*u.shape, 3), np.uint8)
+    params = BackwardParams(resampling=resampling, antialias=antialias)
+    sample(photo, visible, inner, bounds, footprint, params, into=colours)
+    return colours
 
 
 @pytest.mark.parametrize("resampling", ["nearest", "bilinear", "cubic", "lanczos"])

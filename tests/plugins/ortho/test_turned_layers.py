@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.ortho.painting import CellFootprint, Resampling, sample
+from orthoflow_plugins.ortho.painting import CellFootprint, sample
+from orthoflow_plugins.ortho.parameters import BackwardParams, Resampling
 from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
+from orthoflow_plugins.ortho.visibility_kernels import TileVisibility
 
-from orthoflow.geometry import eight_bits, frame_over
+from orthoflow.geometry import frame_over
 from orthoflow.products import Layer, LayerMask, Walls
 from tests import raster_scenes as scenes
 from tests import samples
@@ -88,9 +90,18 @@ def test_a_turned_photo_is_sampled_alike(resampling: Resampling, turn: Turn) -> 
             n_cells=400,
         )
         bounds = tuple(int(value) for value in (u.min(), u.max(), v.min(), v.max()))
-        return eight_bits(
-            sample(turn.raster(photo), u, v, bounds, footprint, resampling, antialias=True)
+        visible = TileVisibility(u, v, np.ones(u.shape, dtype=np.uint8), np.ones_like(u))
+        colours = np.empty((*u.shape, 3), dtype=np.uint8)
+        sample(
+            turn.raster(photo),
+            visible,
+            (slice(0, 20), slice(0, 20)),
+            bounds,
+            footprint,
+            BackwardParams(resampling=resampling),
+            into=colours,
         )
+        return colours
 
     # The same cells look at the same places, wherever these come to lie; blur and weights are
     # whole numbers, rounded on their way.
