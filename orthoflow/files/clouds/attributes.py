@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -28,45 +28,17 @@ _SCALE_PERCENT: Final = 99.0
 _NOTHING: Final = np.zeros(0, dtype=np.float32)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Points:
-    """Some points with all their values; None if unknown for this cloud.
-
-    Attributes:
-        world: (n, 3) float64 metres.
-        rgb: (n, 3) uint8.
-        normal: (n, 3) float32 unit vectors towards the viewer, 0 0 0 without a surface.
-        intensity: (n,) float32, 0..1.
-        scan: (n,) uint16.
-        plane: (n,) int16, -1 for none.
-        deviation_m: (n,) float32 distance from the plane, positive towards the viewer; NaN without
-            one.
-        photo: (n,) int16 photo that gave the colour, -1 for none.
-    """
-
-    world: NDArray[np.float64]
-    rgb: NDArray[np.uint8]
-    normal: NDArray[np.float32]
-    intensity: NDArray[np.float32] | None = None
-    scan: NDArray[np.uint16] | None = None
-    plane: NDArray[np.int16] | None = None
-    deviation_m: NDArray[np.float32] | None = None
-    photo: NDArray[np.int16] | None = None
-
-    def __len__(self) -> int:
-        return len(self.world)
-
-    # Any: each has a type of its own.
-    def fields(self) -> dict[str, NDArray[Any]]:
-        """Names of the values besides position, colour and normal, as in files."""
-        every = {
-            "intensity": self.intensity,
-            "scan": self.scan,
-            "plane": self.plane,
-            "deviation": self.deviation_m,
-            "photo": self.photo,
-        }
-        return {name: values for name, values in every.items() if values is not None}
+# Columns of a point, in the order of files.
+_COLUMNS: Final = {
+    **dict.fromkeys("xyz", "<f8"),
+    **dict.fromkeys(("nx", "ny", "nz"), "<f4"),
+    **dict.fromkeys(("red", "green", "blue"), "|u1"),
+    "intensity": "<f4",
+    "scan": "<u2",
+    "plane": "<i2",
+    "deviation": "<f4",
+    "photo": "<i2",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,8 +130,26 @@ class AttributedCloud:
             [np.min([low for low, _ in found], axis=0), np.max([high for _, high in found], axis=0)]
         )
 
-    def blocks(self, scan: int | None = None) -> Iterator[Points]:
-        """Yield the selected points in order, of all scans or of one."""
+    @cached_property
+    def columns(self) -> np.dtype[np.void]:
+        """Return the columns that are known of this cloud.
+
+        World coordinates in metres; unit normals towards the viewer, 0 0 0 without a surface;
+        colours; intensity 0..1; scan; plane, -1 for none; deviation from it in metres, positive
+        towards the viewer, NaN without one; photo that gave the colour, -1 for none.
+        """
+        photos, is_labelled = self.photo_colours, self.labels is not None
+        is_known = {
+            "intensity": self.cloud.intensity is not None,
+            "scan": self.cloud.scan is not None,
+            "plane": is_labelled,
+            "deviation": self.wall is not None or (is_labelled and self.planes is not None),
+            "photo": photos is not None and photos.photo is not None,
+        }
+        return np.dtype([item for item in _COLUMNS.items() if is_known.get(item[0], True)])
+
+    def blocks(self, scan: int | None = None) -> Iterator[NDArray[np.void]]:
+        """Yield the selected points (n,) with their `columns` in order, of all scans or of one."""
         for part in self._parts():
             chosen = self._chosen(part, scan)
             if chosen.any():
@@ -191,29 +181,34 @@ class AttributedCloud:
             chosen &= ~near.alone[near.places(offsets_of(self.cloud, part))]
         return chosen
 
-    def _attributed(self, part: slice, chosen: NDArray[np.bool_]) -> Points:
-        cloud = self.cloud
+    def _attributed(self, part: slice, chosen: NDArray[np.bool_]) -> NDArray[np.void]:
+        cloud, photos = self.cloud, self.photo_colours
+        found = np.empty(np.count_nonzero(chosen), dtype=self.columns)
+
+        def fill(names: Sequence[str], values: NDArray[Any] | None) -> None:
+            if values is not None:
+                for name, column in zip(names, values.reshape(len(values), -1).T, strict=True):
+                    found[name] = column
+
         world = cloud.points_world(part)[chosen]
-        plane = None if self.labels is None else np.asarray(self.labels.plane_index[part])
-        deviation_m = self._deviations(part)
-        photos = self.photo_colours
-        photo = None if photos is None or photos.photo is None else np.asarray(photos.photo[part])
+        fill(("x", "y", "z"), world)
+        fill(("red", "green", "blue"), self._colours(part)[chosen])
+        if cloud.intensity is not None:
+            intensity = np.asarray(cloud.intensity[part])[chosen]
+            found["intensity"] = np.clip(np.nan_to_num(intensity), 0.0, 1.0)
         scan = None if cloud.scan is None else np.asarray(cloud.scan[part])[chosen]
-        plane = None if plane is None else plane[chosen]
+        plane = None if self.labels is None else np.asarray(self.labels.plane_index[part])[chosen]
+        deviation_m = self._deviations(part)
+        fill(("scan",), scan)
+        fill(("plane",), plane)
+        fill(("deviation",), None if deviation_m is None else deviation_m[chosen])
+        if photos is not None and photos.photo is not None:
+            found["photo"] = np.asarray(photos.photo[part])[chosen]
         places = self.neighbourhoods.places(offsets_of(cloud, part)[chosen])
         normal = self.neighbourhoods.normals[places]
-        return Points(
-            world=world,
-            rgb=self._colours(part)[chosen],
-            normal=normal * self._signs(world, normal, scan, plane)[:, None],
-            intensity=None
-            if cloud.intensity is None
-            else np.clip(np.nan_to_num(cloud.intensity[part]), 0.0, 1.0)[chosen],
-            scan=scan,
-            plane=plane,
-            deviation_m=None if deviation_m is None else deviation_m[chosen],
-            photo=None if photo is None else photo[chosen],
-        )
+        signs = self._signs(world, normal, scan, plane)
+        fill(("nx", "ny", "nz"), normal * signs[:, None])
+        return found
 
     def _deviations(self, part: slice) -> NDArray[np.float32] | None:
         """Return signed distances (n,) from the wall's plane, else from each point's own plane."""

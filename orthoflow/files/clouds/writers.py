@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.clouds.attributes import BLOCK, AttributedCloud, Points
+from orthoflow.files.clouds.attributes import BLOCK, AttributedCloud
 from orthoflow.files.points.scan_file import load_library
 from orthoflow.products import PointCloud
 from orthoflow.version import __version__
@@ -29,7 +29,16 @@ _SCALE_M: Final = 1e-4
 _NO_DATE: Final = dt.date(1970, 1, 1)
 _LARGEST: Final = 2.0**30
 # Names as in CloudCompare and PDAL.
-NORMAL_FIELDS: Final = ("NormalX", "NormalY", "NormalZ")
+_LAS_NAMES: Final = {
+    **{f"n{axis}": f"Normal{axis.upper()}" for axis in "xyz"},
+    "scan": "point_source_id",
+}
+_EXTRA_BYTES: Final = {
+    **dict.fromkeys(("nx", "ny", "nz"), "of the surface, 0 0 0 unknown"),
+    "plane": "plane, -1 for none",
+    "deviation": "m from the plane, to viewer",
+    "photo": "photo of the colour, -1 none",
+}
 
 
 def write_laz(path: Path, attributed: AttributedCloud) -> int:
@@ -51,19 +60,17 @@ def write_laz(path: Path, attributed: AttributedCloud) -> int:
 
 
 # Any: laspy has no types.
-def las_record(laspy: Any, header: Any, points: Points) -> Any:
+def las_record(laspy: Any, header: Any, points: NDArray[np.void]) -> Any:
     """Return points as laspy writes them under a header."""
     record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
-    record.x, record.y, record.z = points.world.T
-    # LAS colours have 16 bits.
-    record.red, record.green, record.blue = 257 * points.rgb.astype(np.uint16).T
-    for axis, name in enumerate(NORMAL_FIELDS):
-        record[name] = points.normal[:, axis]
-    for name, values in points.fields().items():
-        if name == "intensity":
-            record.intensity = np.rint(65535.0 * values).astype(np.uint16)
-        else:
-            record["point_source_id" if name == "scan" else name] = values
+    for name in points.dtype.names or ():
+        values = points[name]
+        if name in ("red", "green", "blue"):
+            # LAS colours have 16 bits.
+            values = 257 * values.astype(np.uint16)
+        elif name == "intensity":
+            values = np.rint(65535.0 * values).astype(np.uint16)
+        record[_LAS_NAMES.get(name, name)] = values
     record.return_number[:] = 1
     record.number_of_returns[:] = 1
     return record
@@ -73,20 +80,14 @@ def las_header(laspy: Any, attributed: AttributedCloud) -> Any:
     """Return the header of a cloud, without points."""
     cloud = attributed.cloud
     header = laspy.LasHeader(point_format=_POINT_FORMAT, version=_VERSION)
-    extra: list[tuple[str, type[np.generic], str]] = [
-        (name, np.float32, "of the surface, 0 0 0 unknown") for name in NORMAL_FIELDS
-    ]
-    if attributed.labels is not None:
-        extra.append(("plane", np.int16, "plane, -1 for none"))
-    has_planes = attributed.labels is not None and attributed.planes is not None
-    if attributed.wall is not None or has_planes:
-        extra.append(("deviation", np.float32, "m from the plane, to viewer"))
-    if attributed.photo_colours is not None:
-        extra.append(("photo", np.int16, "photo of the colour, -1 none"))
+    columns = attributed.columns
     header.add_extra_dims(
         [
-            laspy.ExtraBytesParams(name=name, type=kind, description=text)
-            for name, kind, text in extra
+            laspy.ExtraBytesParams(
+                name=_LAS_NAMES.get(name, name), type=columns[name].type, description=text
+            )
+            for name, text in _EXTRA_BYTES.items()
+            if name in (columns.names or ())
         ]
     )
     header.scales = np.full(3, _scale_m(cloud))
@@ -119,50 +120,23 @@ def write_ply(path: Path, attributed: AttributedCloud) -> int:
     Raises:
         OSError: the disk cannot be written.
     """
-    n_written = 0
-    count_at = 0
-    with path.open("wb") as stream:
-        for points in attributed.blocks():
-            records = _records(points)
-            if n_written == 0:
-                count_at = stream.write(_head(attributed))
-                stream.write(_rest_of_head(records))
-            stream.write(records.tobytes())
-            n_written += len(points)
-        if n_written:
-            stream.seek(count_at - _DIGITS - 1)
-            stream.write(f"{n_written:0{_DIGITS}d}".encode())
-    return n_written
-
-
-def _head(attributed: AttributedCloud) -> bytes:
-    crs = " ".join(attributed.crs_wkt.split()) or "not known"
-    lines = (
+    head = [
         *("ply", "format binary_little_endian 1.0", "comment orthoflow, metres"),
-        f"comment coordinate system {crs}",
+        f"comment coordinate system {' '.join(attributed.crs_wkt.split()) or 'not known'}",
         f"element vertex {0:0{_DIGITS}d}",
-    )
-    return "".join(f"{line}\n" for line in lines).encode()
-
-
-def _rest_of_head(records: NDArray[np.void]) -> bytes:
-    names = records.dtype.names or ()
-    lines = [f"property {_TYPES[records.dtype[name].str[1:]]} {name}\n" for name in names]
-    return "".join([*lines, "end_header\n"]).encode()
-
-
-def _records(points: Points) -> NDArray[np.void]:
-    columns: dict[str, NDArray[Any]] = {
-        **dict(zip("xyz", points.world.T, strict=True)),
-        **dict(zip(("nx", "ny", "nz"), points.normal.T, strict=True)),
-        **dict(zip(("red", "green", "blue"), points.rgb.T, strict=True)),
-        **points.fields(),
-    }
-    kinds = [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()]
-    records = np.empty(len(points), dtype=kinds)
-    for name, values in columns.items():
-        records[name] = values
-    return records
+    ]
+    columns = attributed.columns
+    properties = [f"property {_TYPES[columns[k].str[1:]]} {k}" for k in columns.names or ()]
+    n_written = 0
+    with path.open("wb") as stream:
+        count_at = stream.write("\n".join(head).encode()) - _DIGITS
+        stream.write("\n".join(["", *properties, "end_header", ""]).encode())
+        for points in attributed.blocks():
+            stream.write(points.tobytes())
+            n_written += len(points)
+        stream.seek(count_at)
+        stream.write(f"{n_written:0{_DIGITS}d}".encode())
+    return n_written
 
 
 # Prefix -> URI of the extensions of the format.
@@ -170,10 +144,16 @@ EXTENSIONS: Final = {
     "nor": "http://www.libe57.org/E57_NOR_surface_normals.txt",
     "orthoflow": "urn:orthoflow:points:1",
 }
-_AXES: Final = ("cartesianX", "cartesianY", "cartesianZ")
 _COLOURS: Final = ("colorRed", "colorGreen", "colorBlue")
 _STATE: Final = "cartesianInvalidState"
-_NORMALS: Final = ("nor:normalX", "nor:normalY", "nor:normalZ")
+# The Data3D states the scan.
+_E57_NAMES: Final = {
+    **{axis: f"cartesian{axis.upper()}" for axis in "xyz"},
+    **dict(zip(("red", "green", "blue"), _COLOURS, strict=True)),
+    **{f"n{axis}": f"nor:normal{axis.upper()}" for axis in "xyz"},
+    "intensity": "intensity",
+    **{name: f"orthoflow:{name}" for name in ("plane", "deviation", "photo")},
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -275,11 +255,14 @@ def _write_points(
     placed: tuple[int, NDArray[np.float64]],
 ) -> int:
     scan, centre = placed
-    libe57, image = writer.libe57, writer.image
-    arrays = _columns(next(attributed.blocks(scan)), centre)
+    libe57, image, columns = writer.libe57, writer.image, attributed.columns
+    names = {name: _E57_NAMES[name] for name in columns.names or () if name in _E57_NAMES}
+    # Readers require a state, though all points are valid.
+    kept = {_STATE: np.zeros(BLOCK, dtype=np.int8)} | {
+        own: np.zeros(BLOCK, dtype=columns[name].type) for name, own in names.items()
+    }
     prototype = libe57.StructureNode(image)
     buffers = libe57.VectorSourceDestBuffer()
-    kept = {name: np.zeros(BLOCK, dtype=values.dtype.type) for name, values in arrays.items()}
     for name, values in kept.items():
         prototype.set(name, _field(libe57, image, name, values.dtype))
         buffers.append(
@@ -291,10 +274,11 @@ def _write_points(
     node.set("points", points)
     scans.append(node)
     stream = points.writer(buffers)
+    offsets = dict(zip("xyz", centre.tolist(), strict=True))
     n_written = 0
     for block in attributed.blocks(scan):
-        for name, values in _columns(block, centre).items():
-            kept[name][: len(block)] = values
+        for name, own in names.items():
+            kept[own][: len(block)] = block[name] - offsets.get(name, 0)
         stream.write(len(block))
         n_written += len(block)
     stream.close()
@@ -310,24 +294,8 @@ def _field(libe57: Any, image: Any, name: str, kind: np.dtype[Any]) -> Any:
         return libe57.IntegerNode(image, 0, -(1 << 15), (1 << 15) - 1)
     if name == "intensity":
         return libe57.FloatNode(image, 0.0, libe57.E57_SINGLE, 0.0, 1.0)
-    if name in _AXES:
-        return libe57.FloatNode(image, 0.0, libe57.E57_DOUBLE)
-    return libe57.FloatNode(image, 0.0, libe57.E57_SINGLE)
-
-
-def _columns(points: Points, centre: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
-    """Return fields of points in types that pye57 accepts."""
-    # The Data3D states the scan.
-    fields = {name: values for name, values in points.fields().items() if name != "scan"}
-    own = {"plane", "deviation", "photo"}
-    return {
-        # Readers require it, though all are valid.
-        _STATE: np.zeros(len(points), dtype=np.int8),
-        **dict(zip(_AXES, (points.world - centre).T, strict=True)),
-        **dict(zip(_COLOURS, points.rgb.T, strict=True)),
-        **dict(zip(_NORMALS, points.normal.T, strict=True)),
-        **{f"orthoflow:{name}" if name in own else name: fields[name] for name in fields},
-    }
+    precision = libe57.E57_DOUBLE if kind == np.float64 else libe57.E57_SINGLE
+    return libe57.FloatNode(image, 0.0, precision)
 
 
 def _ends(low: float, high: float) -> tuple[tuple[str, float], tuple[str, float]]:
