@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 from orthoflow.errors import InputError
 from orthoflow.files.e57_images import E57ImageCount, count_e57_images, read_e57_images
 from orthoflow.files.images import decode_image, encode_jpeg, encode_png
-from orthoflow.products import Cameras, InputFiles, Photos
-from orthoflow.sdk import StepContext
+from orthoflow.products import Cameras, Photos
 from tests import photo_files, scan_files, scenes
+from tests.method_runs import Reader
 from tests.wide_lenses import directions_of_panorama
 
 PICTURE = photo_files.picture(64, 48)
@@ -52,13 +52,8 @@ def written(folder: Path, *images: dict[str, Any]) -> Path:
 
 
 def read(path: Path) -> tuple[Photos, Cameras]:
-    first, second = (
-        StepContext(rng=np.random.default_rng(0), cores=1, scratch=path.parent) for _ in range(2)
-    )
-    files = InputFiles(name="photos", paths=(path,))
-    photos = ReadPhotos().run(ReadPhotos.In(files=files), ReadPhotos.Params(), first).photos
-    inputs = ReadCameras.In(files=files, photos=photos)
-    return photos, ReadCameras().run(inputs, ReadCameras.Params(), second).cameras
+    photos = Reader(ReadPhotos, path.parent).run((path,), {}).photos
+    return photos, Reader(ReadCameras, path.parent).run((path,), {}, photos=photos).cameras
 
 
 def e57_pixels(points_camera: NDArray[np.float64]) -> NDArray[np.float64]:

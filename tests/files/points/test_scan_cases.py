@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from orthoflow_plugins.read.scan import ReadScan
 
 from orthoflow.errors import InputError
-from orthoflow.products import InputFiles, PointCloud
-from orthoflow.sdk import StepContext
+from orthoflow.products import PointCloud
+from tests.method_runs import Reader
 from tests.scan_cases import CASES, Case, Draw
 
 SEEDS = range(6)
@@ -23,28 +23,23 @@ SEEDS = range(6)
 @pytest.mark.parametrize("name", CASES)
 def test_scans_of_other_programs_are_read_right(name: str, seed: int, tmp_path: Path) -> None:
     case = CASES[name](Draw(seed, tmp_path))
-    scratch = tmp_path / "scratch"
-    scratch.mkdir()
-    ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=scratch)
-    files = ReadScan.In(files=InputFiles(name="scan", paths=tuple(case.paths)))
-    params = ReadScan.Params(**case.params)
+    read = Reader(ReadScan, tmp_path)
     if case.refusal:
         with pytest.raises(InputError) as refused:
-            ReadScan().run(files, params, ctx)
+            read.run(tuple(case.paths), case.params)
         assert "\n" not in str(refused.value)
         for part in case.refusal:
             assert part in str(refused.value)
         return
-    cloud = ReadScan().run(files, params, ctx).cloud
-    said = "\n".join(ctx.warnings)
+    cloud = read.run(tuple(case.paths), case.params).cloud
     for part in case.warnings:
-        assert part in said
+        assert part in read.warnings
     np.testing.assert_allclose(
         cloud.points_world() - case.shift, case.scene.points, atol=case.atol_m, rtol=0.0
     )
     check_colours(cloud, case)
     check_intensity(cloud, case)
-    check_summary(cloud, case, {metric.name: metric.value for metric in ctx.metrics})
+    check_summary(cloud, case, read.metrics)
 
 
 def check_colours(cloud: PointCloud, case: Case) -> None:

@@ -10,8 +10,8 @@ from orthoflow_plugins.read.cameras import ReadCameras
 
 from orthoflow.errors import InputError
 from orthoflow.files.images import encode_png
-from orthoflow.products import Cameras, InputFiles, Photo, Photos
-from orthoflow.sdk import StepContext
+from orthoflow.products import Cameras, Photo, Photos
+from tests.method_runs import Reader
 
 HEAD = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n"
 PICTURE = encode_png(np.zeros((48, 64), np.uint8))
@@ -32,11 +32,9 @@ def read(
     )
     path = folder / "cameras.csv"
     path.write_text(text)
-    ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=folder)
-    inputs = ReadCameras.In(
-        files=InputFiles(name="cameras", paths=(path,)), photos=Photos(photos=tuple(photos))
-    )
-    return ReadCameras().run(inputs, ReadCameras.Params(), ctx).cameras, tuple(ctx.warnings)
+    reader = Reader(ReadCameras, folder)
+    found = reader.run((path,), {}, photos=Photos(photos=tuple(photos)))
+    return found.cameras, tuple(reader.ctx.warnings)
 
 
 def places(cameras: Cameras) -> list[float | None]:

@@ -9,35 +9,28 @@ import pytest
 from orthoflow_plugins.read.checkpoints import ReadCheckpoints
 
 from orthoflow.errors import InputError
-from orthoflow.products import CheckPoints, InputFiles
-from orthoflow.sdk import StepContext
+from orthoflow.products import CheckPoints
+from tests.method_runs import Reader
 
 
-class Reader:
-    """Writes texts to files, runs the method on them and keeps what it said."""
+class PointReader(Reader):
+    """Returns the check points of texts."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.ctx: StepContext
-
-    def __call__(self, *texts: str | bytes, unit: str = "m") -> CheckPoints:
-        paths = []
-        for index, text in enumerate(texts):
-            paths.append(self.folder / f"points{index}.csv")
-            paths[-1].write_bytes(text if isinstance(text, bytes) else text.encode())
-        self.ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=self.folder)
-        inputs = ReadCheckpoints.In(files=InputFiles(name="checkpoints", paths=tuple(paths)))
-        params = ReadCheckpoints.Params.model_validate({"unit": unit})
-        return ReadCheckpoints().run(inputs, params, self.ctx).checkpoints
+    def __call__(self, *texts: str) -> CheckPoints:
+        paths = tuple(self.folder / f"points{index}.csv" for index in range(len(texts)))
+        for path, text in zip(paths, texts, strict=True):
+            path.write_text(text)
+        points: CheckPoints = self.run(paths, {}).checkpoints
+        return points
 
 
 @pytest.fixture
-def read(tmp_path: Path) -> Reader:
-    return Reader(tmp_path)
+def read(tmp_path: Path) -> PointReader:
+    return PointReader(ReadCheckpoints, tmp_path)
 
 
 @pytest.mark.parametrize("mark", [",", ";", "\t"], ids=["comma", "semicolon", "tab"])
-def test_all_columns_come_out_whatever_separates_them(read: Reader, mark: str) -> None:
+def test_all_columns_come_out_whatever_separates_them(read: PointReader, mark: str) -> None:
     lines = [
         "# exported from the total station",
         "name,class,x,y,z,wall,v_px,u_px",
@@ -55,11 +48,11 @@ def test_all_columns_come_out_whatever_separates_them(read: Reader, mark: str) -
     assert points.wall.dtype == np.int32
 
 
-def test_files_are_joined_in_order(read: Reader) -> None:
+def test_files_are_joined_in_order(read: PointReader) -> None:
     points = read("P1,1,2,3\n", "name,x,y,z,class\nP2,4,5,7,edge\n")
     assert points.names == ("P1", "P2")
     assert points.classes == ("", "edge")
-    assert {metric.name: metric.value for metric in read.ctx.metrics} == {
+    assert read.metrics == {
         "n_points": 2,
         "n_measured": 0,
         "extent_x_m": 3,
@@ -68,15 +61,13 @@ def test_files_are_joined_in_order(read: Reader) -> None:
     }
 
 
-def test_one_name_in_two_files_is_refused(read: Reader) -> None:
+def test_one_name_in_two_files_is_refused(read: PointReader) -> None:
     with pytest.raises(InputError, match=r"P1 is in points0\.csv and again in points1\.csv"):
         read("P1,1,2,3\n", "P1,1,2,4\n")
 
 
-def test_no_files_are_refused(read: Reader, tmp_path: Path) -> None:
+def test_no_files_are_refused(read: PointReader, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="the input checkpoints names no files"):
         read()
-    ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
-    gone = InputFiles(name="checkpoints", paths=(tmp_path / "gone.csv",))
     with pytest.raises(InputError, match=r"gone\.csv cannot be read: No such file"):
-        ReadCheckpoints().run(ReadCheckpoints.In(files=gone), ReadCheckpoints.Params(), ctx)
+        read.run((tmp_path / "gone.csv",), {})

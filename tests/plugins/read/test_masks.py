@@ -14,7 +14,7 @@ from orthoflow.errors import InputError
 from orthoflow.files.images import encode_jpeg, encode_png, used_pixels
 from orthoflow.files.polygons import MOST_BYTES
 from orthoflow.products import InputFiles, Photo
-from tests import raster_scenes as scenes
+from tests.method_runs import Reader
 
 SIZE = (64, 48)
 INSIDE = np.s_[10:20, 30:50]
@@ -44,13 +44,10 @@ def file_in(folder: Path, name: str, content: bytes | str) -> Path:
 def read(
     folder: Path, photos: list[Path], masks: list[Path] | None = None
 ) -> tuple[tuple[Photo, ...], str]:
-    ctx = scenes.context(folder)
-    inputs = ReadPhotos.In(
-        files=InputFiles(name="photos", paths=tuple(photos)),
-        masks=None if masks is None else InputFiles(name="masks", paths=tuple(masks)),
-    )
-    read = ReadPhotos().run(inputs, ReadPhotos.Params(), ctx).photos.photos
-    return read, "\n".join(ctx.warnings)
+    reader = Reader(ReadPhotos, folder)
+    given = None if masks is None else InputFiles(name="masks", paths=tuple(masks))
+    read = reader.run(tuple(photos), {}, masks=given).photos.photos
+    return read, reader.warnings
 
 
 def masked(photo: Photo) -> NDArray[np.bool_]:

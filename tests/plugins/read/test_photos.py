@@ -23,47 +23,25 @@ from orthoflow.files.images import (
     used_pixels,
 )
 from orthoflow.products import InputFiles, Photo
-from orthoflow.sdk import StepContext
 from tests import photo_files as made
+from tests.method_runs import Reader
 
 CAMERA = "{width: 64, height: 48, fx: 60, fy: 61, cx: 31.5, cy: 23.5}"
 
 
-class Reader:
-    """Runs the method and keeps what it said."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.count = 0
-        self.ctx: StepContext
+class PhotoReader(Reader):
+    """Returns the photos of files."""
 
     def __call__(
         self, *paths: Path, calibration: str | None = None, **params: object
     ) -> tuple[Photo, ...]:
-        self.count += 1
-        scratch = self.folder / f"scratch-{self.count}"
-        scratch.mkdir()
-        self.ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=scratch)
-        inputs = ReadPhotos.In(
-            files=InputFiles(name="photos", paths=paths), calibration=self._calibration(calibration)
-        )
-        checked = ReadPhotos.Params.model_validate(params)
-        return ReadPhotos().run(inputs, checked, self.ctx).photos.photos
-
-    def _calibration(self, text: str | None) -> InputFiles | None:
-        if text is None:
-            return None
-        path = self.folder / "calibration.yaml"
-        path.write_text(text)
-        return InputFiles(name="calibration", paths=(path,))
-
-    @property
-    def warnings(self) -> str:
-        return "\n".join(self.ctx.warnings)
-
-    @property
-    def metrics(self) -> dict[str, float]:
-        return {metric.name: metric.value for metric in self.ctx.metrics}
+        given = None
+        if calibration is not None:
+            path = self.folder / "calibration.yaml"
+            path.write_text(calibration)
+            given = InputFiles(name="calibration", paths=(path,))
+        photos: tuple[Photo, ...] = self.run(paths, params, calibration=given).photos.photos
+        return photos
 
     @property
     def sheet(self) -> tuple[int, int]:
@@ -72,11 +50,11 @@ class Reader:
 
 
 @pytest.fixture
-def read(tmp_path: Path) -> Reader:
-    return Reader(tmp_path)
+def read(tmp_path: Path) -> PhotoReader:
+    return PhotoReader(ReadPhotos, tmp_path)
 
 
-def test_photos_come_by_name_with_their_bytes_untouched(tmp_path: Path, read: Reader) -> None:
+def test_photos_come_by_name_with_their_bytes_untouched(tmp_path: Path, read: PhotoReader) -> None:
     block = made.exif_block({made.ORIENTATION: 6}, {made.FOCAL_35MM: 28})
     files = {
         "b.JPG": made.jpeg(made.picture(48, 64), block),
@@ -101,7 +79,7 @@ def test_photos_come_by_name_with_their_bytes_untouched(tmp_path: Path, read: Re
 
 
 def test_a_focal_length_that_cannot_be_is_told_even_where_another_is_used(
-    tmp_path: Path, read: Reader
+    tmp_path: Path, read: PhotoReader
 ) -> None:
     pitch: dict[int, made.Value] = {
         made.FOCAL: (50, 1), made.RESOLUTION_X: (10, 1), made.RESOLUTION_UNIT: 4,
@@ -118,7 +96,7 @@ def test_a_focal_length_that_cannot_be_is_told_even_where_another_is_used(
     assert f"photo b.jpg: {told.format(1)}: it is not used" in read.warnings
 
 
-def test_a_panorama_becomes_six_photos_with_exact_lenses(tmp_path: Path, read: Reader) -> None:
+def test_a_panorama_becomes_six_photos_with_exact_lenses(tmp_path: Path, read: PhotoReader) -> None:
     files = {"360_a.jpg": encode_jpeg(made.picture(128, 64)), "b.jpg": encode_jpeg(made.picture())}
     photos = read(*made.write(tmp_path, files), panoramas=("360_*",))
     assert [photo.name for photo in photos] == [
@@ -138,7 +116,7 @@ FISHEYE = (
 )
 
 
-def test_a_fisheye_becomes_the_faces_that_it_shows(tmp_path: Path, read: Reader) -> None:
+def test_a_fisheye_becomes_the_faces_that_it_shows(tmp_path: Path, read: PhotoReader) -> None:
     files = {
         "a.jpg": encode_jpeg(made.picture()),
         "b.jpg": encode_jpeg(made.picture()),
@@ -182,18 +160,11 @@ def test_a_wide_photo_that_cameras_speak_of_needs_no_calibration(
             "images.txt": b"1 1 0 0 0 0 0 0 1 a.jpg\n\n",
         },
     )
-    photos, given = (InputFiles(name="x", paths=paths) for paths in ((path,), model))
+    given = InputFiles(name="cameras", paths=model)
 
     def run(cameras: InputFiles | None) -> tuple[str, ...]:
-        first, second = (
-            StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path) for _ in range(2)
-        )
-        read = ReadPhotos().run(
-            ReadPhotos.In(files=photos, cameras=cameras), ReadPhotos.Params(), first
-        )
-        found = ReadCameras().run(
-            ReadCameras.In(files=given, photos=read.photos), ReadCameras.Params(), second
-        )
+        read = Reader(ReadPhotos, tmp_path).run((path,), {}, cameras=cameras)
+        found = Reader(ReadCameras, tmp_path).run(model, {}, photos=read.photos)
         return tuple(f"{camera.photo}: {camera.status}" for camera in found.cameras.cameras)
 
     assert run(given) == tuple(f"a_{face}.png: ok" for face in faces)
@@ -205,7 +176,7 @@ def test_a_wide_photo_that_cameras_speak_of_needs_no_calibration(
 # Other files in the folder
 
 
-def test_other_files_are_left_out_and_counted(tmp_path: Path, read: Reader) -> None:
+def test_other_files_are_left_out_and_counted(tmp_path: Path, read: PhotoReader) -> None:
     photo = encode_jpeg(made.picture())
     files = {
         "a.jpg": photo,
@@ -221,7 +192,7 @@ def test_other_files_are_left_out_and_counted(tmp_path: Path, read: Reader) -> N
 @pytest.mark.parametrize("developed", [{}, {"a.jpg": encode_jpeg(made.picture())}])
 @pytest.mark.parametrize("suffix", [".CR2", ".nef", ".arw", ".DNG"])
 def test_raw_photos_that_nobody_developed_are_refused_with_the_way_out(
-    tmp_path: Path, read: Reader, developed: dict[str, bytes], suffix: str
+    tmp_path: Path, read: PhotoReader, developed: dict[str, bytes], suffix: str
 ) -> None:
     # Beside its own JPEG a raw photo does no harm.
     paths = made.write(tmp_path, {**developed, "A.CR2": b"II*\0", f"b{suffix}": b"MM\0*"})
@@ -236,7 +207,9 @@ def test_raw_photos_that_nobody_developed_are_refused_with_the_way_out(
 
 
 @pytest.mark.parametrize("layout", ["pixel", "band", "alpha", "tiles"])
-def test_sixteen_bits_are_read_in_every_layout(tmp_path: Path, read: Reader, layout: str) -> None:
+def test_sixteen_bits_are_read_in_every_layout(
+    tmp_path: Path, read: PhotoReader, layout: str
+) -> None:
     deep = np.random.default_rng(1).integers(0, 65536, (3, 40, 60)).astype(np.uint16)
     bands = np.concatenate([deep, deep[:1] | 0x8000]) if layout == "alpha" else deep
     options: dict[str, object] = {"interleave": "band" if layout == "band" else "pixel"}
@@ -260,7 +233,7 @@ def test_sixteen_bits_are_read_in_every_layout(tmp_path: Path, read: Reader, lay
     np.testing.assert_array_equal(decode_levels(photo.encoded), np.moveaxis(deep, 0, 2))
 
 
-def test_an_input_without_a_photo_is_refused(tmp_path: Path, read: Reader) -> None:
+def test_an_input_without_a_photo_is_refused(tmp_path: Path, read: PhotoReader) -> None:
     paths = made.write(tmp_path, {"a.doc": b"x", "b.txt": b"x"})
     with pytest.raises(InputError, match=r"holds no photo, only 2 other files: a\.doc, b\.txt"):
         read(*paths)
@@ -268,7 +241,9 @@ def test_an_input_without_a_photo_is_refused(tmp_path: Path, read: Reader) -> No
         read()
 
 
-def test_photos_of_one_name_live_together_under_their_paths(tmp_path: Path, read: Reader) -> None:
+def test_photos_of_one_name_live_together_under_their_paths(
+    tmp_path: Path, read: PhotoReader
+) -> None:
     pictures = [encode_jpeg(made.picture(seed=seed)) for seed in range(4)]
     names = ("x/one/a.jpg", "x/two/a.jpg", "x/two/b.jpg", "x/c.jpg")
     photos = read(*made.write(tmp_path, dict(zip(names, pictures, strict=True))), calibration=None)
@@ -285,7 +260,7 @@ def test_photos_of_one_name_live_together_under_their_paths(tmp_path: Path, read
 
 
 @pytest.mark.parametrize("kind", ["PNG", "TIFF", "WEBP"])
-def test_what_is_transparent_is_masked(tmp_path: Path, read: Reader, kind: str) -> None:
+def test_what_is_transparent_is_masked(tmp_path: Path, read: PhotoReader, kind: str) -> None:
     alpha = np.full((48, 64), 255, dtype=np.uint8)
     alpha[:, :21] = 0
     stream = io.BytesIO()
@@ -305,7 +280,7 @@ def test_what_is_transparent_is_masked(tmp_path: Path, read: Reader, kind: str) 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp"])
 @pytest.mark.parametrize("share", [0.2, 0.6, 0.95])
 def test_a_photo_that_is_cut_off_is_named(
-    tmp_path: Path, read: Reader, suffix: str, share: float
+    tmp_path: Path, read: PhotoReader, suffix: str, share: float
 ) -> None:
     image = made.picture(256, 192)
     writers = {"jpg": encode_jpeg, "png": encode_png, "tif": made.tiff, "webp": encode_webp}
@@ -317,7 +292,7 @@ def test_a_photo_that_is_cut_off_is_named(
         read(*made.write(tmp_path, {"0.jpg": encode_jpeg(image), f"a.{suffix}": content}))
 
 
-def test_bytes_that_a_decoder_passes_over_are_reported(tmp_path: Path, read: Reader) -> None:
+def test_bytes_that_a_decoder_passes_over_are_reported(tmp_path: Path, read: PhotoReader) -> None:
     whole = encode_jpeg(made.picture(256, 192))
     padded = whole[:-2] + b"\0" * 40 + whole[-2:]
     assert len(read(*made.write(tmp_path, {"a.jpg": padded, "b.jpg": whole}))) == 2
@@ -325,7 +300,7 @@ def test_bytes_that_a_decoder_passes_over_are_reported(tmp_path: Path, read: Rea
 
 
 def test_a_photo_whose_blocks_are_shifted_is_named_with_the_row(
-    tmp_path: Path, read: Reader
+    tmp_path: Path, read: PhotoReader
 ) -> None:
     image = made.picture(640, 480)
     shifted = image // 2
@@ -349,13 +324,15 @@ def test_a_photo_whose_blocks_are_shifted_is_named_with_the_row(
     ],
 )
 def test_a_file_that_only_has_the_name_of_a_photo_is_named(
-    tmp_path: Path, read: Reader, content: bytes, named: str
+    tmp_path: Path, read: PhotoReader, content: bytes, named: str
 ) -> None:
     with pytest.raises(InputError, match=rf"photo a\.jpg {named}"):
         read(*made.write(tmp_path, {"a.jpg": content}))
 
 
-def test_all_photos_that_cannot_be_read_are_named_at_once(tmp_path: Path, read: Reader) -> None:
+def test_all_photos_that_cannot_be_read_are_named_at_once(
+    tmp_path: Path, read: PhotoReader
+) -> None:
     whole = encode_jpeg(made.picture(256, 192))
     files = {"a.jpg": whole, "b.jpg": whole[:5000], "c.jpg": b"", "d.tif": b"%PDF-1.7"}
     with pytest.raises(InputError) as caught:
@@ -367,7 +344,7 @@ def test_all_photos_that_cannot_be_read_are_named_at_once(tmp_path: Path, read: 
 # Calibration
 
 
-def test_the_calibration_reaches_the_photos_it_names(tmp_path: Path, read: Reader) -> None:
+def test_the_calibration_reaches_the_photos_it_names(tmp_path: Path, read: PhotoReader) -> None:
     block = made.exif_block({}, {made.FOCAL_35MM: 28})
     files = {
         "a.jpg": made.jpeg(made.picture(), block),
@@ -393,7 +370,7 @@ def test_the_calibration_reaches_the_photos_it_names(tmp_path: Path, read: Reade
 
 
 def test_a_portrait_among_landscapes_needs_an_entry_of_its_own(
-    shared_data: Path, read: Reader
+    shared_data: Path, read: PhotoReader
 ) -> None:
     folder = shared_data / "cyprus-arch-photos/images"
     paths = [folder / f"DSC_{number}.JPG" for number in (6470, 6471, 6472)]

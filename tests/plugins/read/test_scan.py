@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Iterable
 from pathlib import Path
@@ -15,41 +14,22 @@ from numpy.typing import NDArray
 from orthoflow_plugins.read.scan import ReadScan
 
 from orthoflow.errors import InputError, StoreError
-from orthoflow.products import InputFiles, PointCloud
-from orthoflow.sdk import StepContext
+from orthoflow.products import PointCloud
 from tests import scan_files
+from tests.method_runs import Reader
 
 
-class Reader:
-    """Runs the method and keeps what it said."""
-
-    def __init__(self, scratch: Path) -> None:
-        self.scratch = scratch
-        self.ctx: StepContext
-        self.count = 0
+class ScanReader(Reader):
+    """Returns the cloud of files."""
 
     def __call__(self, *paths: Path, **params: object) -> PointCloud:
-        self.count += 1
-        scratch = self.scratch / f"scratch-{self.count}"
-        scratch.mkdir()
-        self.ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=scratch)
-        inputs = ReadScan.In(files=InputFiles(name="scan", paths=paths))
-        text = json.dumps(params)
-        checked = ReadScan.Params.model_validate_json(text, strict=True)
-        return ReadScan().run(inputs, checked, self.ctx).cloud
-
-    @property
-    def warnings(self) -> str:
-        return "\n".join(self.ctx.warnings)
-
-    @property
-    def metrics(self) -> dict[str, float]:
-        return {metric.name: metric.value for metric in self.ctx.metrics}
+        cloud: PointCloud = self.run(paths, params).cloud
+        return cloud
 
 
 @pytest.fixture
-def read(tmp_path: Path) -> Reader:
-    return Reader(tmp_path)
+def read(tmp_path: Path) -> ScanReader:
+    return ScanReader(ReadScan, tmp_path)
 
 
 @pytest.fixture
@@ -86,7 +66,7 @@ def cartesian(points: NDArray[np.float64], **more: object) -> dict[str, object]:
     [("m", 1.0), ("cm", 0.01), ("mm", 0.001), ("ft", 0.3048), ("us-ft", 1200 / 3937)],
 )
 def test_survey_coordinates_come_out_in_metres_to_a_hundredth_of_a_millimetre(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64], unit: str, factor: float
+    tmp_path: Path, read: ScanReader, points: NDArray[np.float64], unit: str, factor: float
 ) -> None:
     shift = np.array([634512.347, 486215.781, 112.193])
     world_m = points + shift
@@ -104,7 +84,7 @@ def test_survey_coordinates_come_out_in_metres_to_a_hundredth_of_a_millimetre(
 
 
 def test_a_box_keeps_the_points_in_it_and_on_its_faces(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
 ) -> None:
     world_m = points + np.array([634512.347, 486215.781, 112.193])
     # In feet: the box is in metres, as everything that follows.
@@ -121,7 +101,7 @@ def test_a_box_keeps_the_points_in_it_and_on_its_faces(
     assert scan_of(cloud)["left_out"] == {"outside_box": 400 - len(kept)}
 
 
-def test_a_box_beside_the_scan_says_where_the_scan_is(tmp_path: Path, read: Reader) -> None:
+def test_a_box_beside_the_scan_says_where_the_scan_is(tmp_path: Path, read: ScanReader) -> None:
     steps = np.stack(np.meshgrid(*[np.arange(5.0)] * 3), axis=-1).reshape(-1, 3) + 1.0
     path = write_text(tmp_path / "a.xyz", steps)
     with pytest.raises(InputError) as caught:
@@ -135,7 +115,7 @@ def test_a_box_beside_the_scan_says_where_the_scan_is(tmp_path: Path, read: Read
 
 
 def test_gsd_and_box_choose_nodes_of_a_copc_file_in_metres(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
 ) -> None:
     rng = np.random.default_rng(3)
     coarse, left, right = (
@@ -161,7 +141,7 @@ def test_a_box_without_an_inside_is_refused() -> None:
 
 
 def test_classes_choose_points_of_las_files(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
 ) -> None:
     classes = np.arange(400) % 3
     path = scan_files.write_las(tmp_path / "a.laz", points, classes=classes)
@@ -175,7 +155,7 @@ def test_classes_choose_points_of_las_files(
 
 
 def test_stray_points_do_not_cost_the_scan_its_precision(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
 ) -> None:
     world = points + np.array([634512.347, 486215.781, 112.193])
     world[:3] = 1.0
@@ -186,7 +166,7 @@ def test_stray_points_do_not_cost_the_scan_its_precision(
 
 @pytest.mark.parametrize("up", ["z", "x", "-x", "y", "-y", "-z"])
 def test_up_is_told_and_nothing_is_turned(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64], up: str
+    tmp_path: Path, read: ScanReader, points: NDArray[np.float64], up: str
 ) -> None:
     cloud = read(write_text(tmp_path / "a.xyz", points), up=up)
     expected = np.zeros(3)
@@ -196,7 +176,7 @@ def test_up_is_told_and_nothing_is_turned(
 
 
 def test_finite_points_beyond_any_survey_are_named(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
 ) -> None:
     points[5] = (0.5, 1e30, -2.0)
     points[9, 0] = -2e9
@@ -210,7 +190,7 @@ def test_finite_points_beyond_any_survey_are_named(
 
 
 def test_rounded_coordinates_are_warned_of_and_others_are_not(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
 ) -> None:
     read(write_text(tmp_path / "a.xyz", points))
     assert "rounded" not in read.warnings
@@ -219,7 +199,7 @@ def test_rounded_coordinates_are_warned_of_and_others_are_not(
 
 
 def test_a_scan_of_less_than_a_metre_asks_for_its_unit(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
 ) -> None:
     read(write_text(tmp_path / "a.xyz", points))
     assert "is that right?" not in read.warnings
@@ -231,7 +211,7 @@ def test_a_scan_of_less_than_a_metre_asks_for_its_unit(
 
 
 def test_several_files_become_one_cloud(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
 ) -> None:
     first = write_text(tmp_path / "a.xyz", points)
     second = scan_files.write_e57(
@@ -259,7 +239,7 @@ def test_several_files_become_one_cloud(
 
 
 def test_stations_belong_to_scans_in_their_order(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
 ) -> None:
     half = np.sqrt(0.5)
     scans = [
@@ -283,7 +263,7 @@ def test_stations_belong_to_scans_in_their_order(
 
 
 def test_view_from_is_in_metres_and_gives_way_to_the_scanner(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
 ) -> None:
     cloud = read(write_text(tmp_path / "a.xyz", points), view_from=[1.0, 2, 3.5], unit="ft")
     np.testing.assert_array_equal(cloud.stations, [[1.0, 2.0, 3.5]])
@@ -298,7 +278,7 @@ def test_view_from_is_in_metres_and_gives_way_to_the_scanner(
 
 
 def test_the_user_can_set_full_intensity(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
 ) -> None:
     table = np.column_stack([points, np.arange(400)])
     cloud = read(write_text(tmp_path / "a.xyz", table), intensity_max=200.0)
@@ -310,7 +290,7 @@ def test_the_user_can_set_full_intensity(
 
 
 def test_zero_intensity_and_zero_colours_are_absent_not_black(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
 ) -> None:
     zeros = np.zeros((400, 3), np.int64)
     path = scan_files.write_las(tmp_path / "a.laz", points, intensity=zeros[:, 0], rgb=zeros)
@@ -323,7 +303,7 @@ def test_zero_intensity_and_zero_colours_are_absent_not_black(
 
 
 def test_an_intensity_that_repeats_the_colours_is_no_laser_intensity(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
 ) -> None:
     rgb = np.random.default_rng(0).integers(0, 256, (400, 3))
     grey = np.rint(rgb @ [0.299, 0.587, 0.114] * 257).astype(np.int64)
@@ -335,7 +315,7 @@ def test_an_intensity_that_repeats_the_colours_is_no_laser_intensity(
 
 
 def test_grey_colours_made_from_the_intensity_leave_it_a_laser_intensity(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
 ) -> None:
     grey = np.random.default_rng(0).integers(0, 256, 400)
     rgb = np.repeat(grey[:, None], 3, axis=1)
@@ -351,7 +331,7 @@ def test_grey_colours_made_from_the_intensity_leave_it_a_laser_intensity(
 
 @pytest.mark.parametrize("factor", [1, 256, 257], ids=["low-byte", "times-256", "times-257"])
 def test_eight_bit_colours_in_las_come_back_however_they_were_stored(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64], factor: int
+    tmp_path: Path, read: ScanReader, points: NDArray[np.float64], factor: int
 ) -> None:
     rgb = np.random.default_rng(0).integers(0, 256, (400, 3))
     cloud = read(scan_files.write_las(tmp_path / "a.laz", points, rgb=rgb * factor))
@@ -362,7 +342,7 @@ def test_eight_bit_colours_in_las_come_back_however_they_were_stored(
 
 
 def test_a_picture_from_above_is_drawn(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
 ) -> None:
     read(write_text(tmp_path / "a.xyz", points))
     (figure,) = read.ctx.figures
@@ -375,7 +355,7 @@ def test_a_picture_from_above_is_drawn(
 
 
 def test_too_little_scratch_space_is_said_before_anything_is_written(
-    tmp_path: Path, read: Reader, points: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, read: ScanReader, points: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=1000))
     with pytest.raises(StoreError, match=r"400 points need 0\.00 GB of scratch space, but only"):
@@ -455,7 +435,7 @@ def test_too_little_scratch_space_is_said_before_anything_is_written(
 )
 def test_real_scans_come_out_whole(
     shared_data: Path,
-    read: Reader,
+    read: ScanReader,
     name: str,
     params: dict[str, object],
     n_points: int,
@@ -475,7 +455,7 @@ def test_real_scans_come_out_whole(
     assert ("luminance of the colours" in read.warnings) == ("lion" in name)
 
 
-def test_the_pump_is_seen_from_its_origin_on_its_grid(shared_data: Path, read: Reader) -> None:
+def test_the_pump_is_seen_from_its_origin_on_its_grid(shared_data: Path, read: ScanReader) -> None:
     cloud = read(shared_data / "pump-e57/pumpAVisualReferenceImage.e57")
     np.testing.assert_array_equal(cloud.stations, [[0.0, 0.0, 0.0]])
     assert cloud.stations_source == "file"
