@@ -321,51 +321,11 @@ def write_pcd(
         path.write_bytes(header + table.tobytes())
     else:
         plain = b"".join(array.tobytes() for array in arrays)
-        packed = compress_lzf(plain)
+        # LZF of literals only: their number less one before up to 32 of them.
+        parts = [plain[at : at + 32] for at in range(0, len(plain), 32)]
+        packed = b"".join(bytes([len(part) - 1]) + part for part in parts)
         path.write_bytes(header + struct.pack("<II", len(packed), len(plain)) + packed)
     return path
-
-
-def compress_lzf(plain: bytes) -> bytes:
-    """LZF by the book: literals, and back references of up to 264 bytes found greedily."""
-    packed = bytearray()
-    literals = bytearray()
-    seen: dict[bytes, int] = {}
-    position = 0
-
-    def flush() -> None:
-        while literals:
-            part = literals[:32]
-            packed.append(len(part) - 1)
-            packed.extend(part)
-            del literals[:32]
-
-    while position < len(plain):
-        key = plain[position : position + 3]
-        found = seen.get(key, -1)
-        seen[key] = position
-        if len(key) < 3 or found < 0 or position - found > 8191:
-            literals.append(plain[position])
-            position += 1
-            continue
-        length = 3
-        while (
-            length < 264
-            and position + length < len(plain)
-            and plain[found + length] == plain[position + length]
-        ):
-            length += 1
-        flush()
-        distance = position - found - 1
-        if length - 2 < 7:
-            packed.append(((length - 2) << 5) | (distance >> 8))
-        else:
-            packed.append((7 << 5) | (distance >> 8))
-            packed.append(length - 2 - 7)
-        packed.append(distance & 255)
-        position += length
-    flush()
-    return bytes(packed)
 
 
 def write_ptx(

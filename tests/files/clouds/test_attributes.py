@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,39 +12,15 @@ from numpy.typing import NDArray
 
 from orthoflow.files.clouds.attributes import AttributedCloud
 from orthoflow.files.clouds.neighbourhoods import Neighbourhoods, neighbourhoods_of
-from orthoflow.products import Planes, PointCloud, PointLabels
-from tests import samples
+from orthoflow.products import PointCloud, PointLabels
+from tests import cloud_scenes
+from tests.cloud_scenes import NORMALS, ORIGIN, planes
 
-ORIGIN = np.array([500_000.0, 4_000_000.0, 100.0])
-NORMALS = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 N_SIDE = 24
-
-
-def corner(**more: Any) -> PointCloud:
-    """The wall x = 0 and the floor z = 0, two metres each, of two scans that take turns."""
-    a, b = (axis.ravel() for axis in np.meshgrid(*[np.linspace(0.3, 2.0, N_SIDE)] * 2))
-    zero = np.zeros(len(a))
-    offsets = np.vstack([np.column_stack([zero, a, b]), np.column_stack([a, b, zero])])
-    x, y, z = (np.ascontiguousarray(axis) for axis in offsets.T.astype(np.float32))
-    scan = (np.arange(len(offsets)) % 2).astype(np.uint16)
-    plain: dict[str, Any] = {"scan": scan, "up": np.array([0.0, 0.0, 1.0])}
-    return PointCloud(origin=ORIGIN, x=x, y=y, z=z, **(plain | more))
-
-
+corner = partial(cloud_scenes.corner, N_SIDE, 0.3)
 CORNER = corner()
 IS_FLOOR = np.arange(len(CORNER)) >= N_SIDE**2
 NEAR = neighbourhoods_of(CORNER)
-
-
-def planes(sign: float = 1.0) -> Planes:
-    corners = np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 2.0, 2.0]])
-    return samples.planes(
-        normal=sign * NORMALS,
-        offset=sign * (NORMALS @ ORIGIN),
-        corners=ORIGIN + np.array([corners, corners[:, [2, 1, 0]]]),
-        n_points=np.array([1, 1]),
-        names=("wall 0", "floor"),
-    )
 
 
 def with_attributes(

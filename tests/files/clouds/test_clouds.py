@@ -19,50 +19,29 @@ from orthoflow.files.clouds.copc import write_copc
 from orthoflow.files.clouds.neighbourhoods import neighbourhoods_of
 from orthoflow.files.clouds.photo_colours import PointColours, colour_points
 from orthoflow.files.clouds.writers import write_e57, write_laz, write_ply
+from orthoflow.files.geotiff import epsg_wkt
 from orthoflow.files.images import encode_png
 from orthoflow.files.points import PointQuery, open_scan
 from orthoflow.geometry.frames import frame_over
 from orthoflow.geometry.slabs import Slab
-from orthoflow.products import Intrinsics, Photo, Planes, PointCloud, PointLabels
-from tests import samples
+from orthoflow.products import Intrinsics, Photo, PointCloud, PointLabels
+from tests import cloud_scenes
+from tests.cloud_scenes import ORIGIN, planes
 
-ORIGIN = np.array([500_000.0, 4_000_000.0, 100.0])
-# A corner: the wall x = 0, seen from x > 0, and the floor z = 0, seen from above; two scans.
 N_SIDE = 60
 STATIONS = ORIGIN + np.array([[2.0, 1.0, 1.5], [1.0, 2.0, 1.0]])
 DEVIATION_M = 0.004
 
 
-def corner() -> PointCloud:
-    a, b = (axis.ravel() for axis in np.meshgrid(*[np.linspace(0.05, 2.0, N_SIDE)] * 2))
-    zero = np.full(len(a), DEVIATION_M)
-    points = np.vstack([np.column_stack([zero, a, b]), np.column_stack([a, b, zero])])
-    n_points = len(points)
-    x, y, z = points.T.astype(np.float32)
-    return PointCloud(
-        origin=ORIGIN,
-        x=np.ascontiguousarray(x),
-        y=np.ascontiguousarray(y),
-        z=np.ascontiguousarray(z),
-        up=np.array([0.0, 0.0, 1.0]),
-        intensity=np.linspace(0.0, 1.0, n_points, dtype=np.float32),
-        rgb=(np.arange(3 * n_points) % 251).astype(np.uint8).reshape(-1, 3),
-        scan=(np.arange(n_points) % 2).astype(np.uint16),
-        stations=STATIONS,
-        stations_source="file",
-    )
-
-
-def planes() -> Planes:
-    normal = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    wall = np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 2.0, 2.0]])
-    return samples.planes(
-        normal=normal,
-        offset=normal @ ORIGIN,
-        corners=ORIGIN + np.array([wall, wall[:, [2, 1, 0]]]),
-        n_points=np.array([1, 1]),
-        names=("wall 0", "floor"),
-    )
+def corner(**more: Any) -> PointCloud:
+    n_points = 2 * N_SIDE**2
+    plain: dict[str, Any] = {
+        "intensity": np.linspace(0.0, 1.0, n_points, dtype=np.float32),
+        "rgb": (np.arange(3 * n_points) % 251).astype(np.uint8).reshape(-1, 3),
+        "stations": STATIONS,
+        "stations_source": "file",
+    }
+    return cloud_scenes.corner(N_SIDE, 0.05, deviation_m=DEVIATION_M, **(plain | more))
 
 
 def labels(cloud: PointCloud) -> PointLabels:
@@ -250,7 +229,7 @@ def test_e57_keeps_a_pose_per_scan_and_fields_as_extensions(tmp_path: Path) -> N
         assert {"nor:normalX", "orthoflow:plane", "orthoflow:deviation"} <= set(
             headers[0].point_fields
         )
-    without = dataclasses.replace(corner(), stations=None, stations_source=None)
+    without = corner(stations=None, stations_source=None)
     write_e57(tmp_path / "b.e57", with_attributes(cloud=without))
     with pye57.E57(str(tmp_path / "b.e57")) as file:
         np.testing.assert_allclose(file.get_header(0).translation, ORIGIN)
@@ -412,3 +391,46 @@ def test_open3d_reads_a_ply_with_colours_and_normals(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.asarray(found.points), other.world)
     np.testing.assert_array_equal(np.rint(255.0 * np.asarray(found.colors)), other.rgb)
     np.testing.assert_allclose(np.asarray(found.normals), other.normal, atol=1e-6)
+
+
+# The header of LAZ, and the scale of its coordinates
+
+
+def floor(size_m: float = 1.0) -> PointCloud:
+    a, b = (axis.ravel() for axis in np.meshgrid(*[np.linspace(0.0, size_m, 12)] * 2))
+    x, y = (np.ascontiguousarray(axis, np.float32) for axis in (a, b))
+    up = np.array([0.0, 0.0, 1.0])
+    return PointCloud(origin=np.array([1e5, 2e5, 50.5]), x=x, y=y, z=np.zeros_like(x), up=up)
+
+
+def written(path: Path, cloud: PointCloud, crs_wkt: str = "") -> laspy.LasData:
+    write_laz(path, with_attributes(cloud=cloud, planes=None, crs_wkt=crs_wkt))
+    return laspy.read(path)
+
+
+@pytest.mark.parametrize("crs_wkt", ["", epsg_wkt(25832)], ids=["unknown", "known"])
+def test_a_header_has_a_coordinate_system_where_there_is_one_and_only_wkt_ever(
+    tmp_path: Path, crs_wkt: str
+) -> None:
+    found = written(tmp_path / "a.laz", floor(), crs_wkt)
+    # LAS 1.4 has it for points of its formats from 6 on, whether there is one or not.
+    assert found.header.global_encoding.wkt
+    systems = [one.string for one in found.header.vlrs if one.record_id == 2112]
+    assert systems == ([crs_wkt] if crs_wkt else [])
+
+
+@pytest.mark.parametrize(
+    ("size_m", "scale_m"),
+    # 31 bits with a sign hold 214 km in steps of a tenth of a millimetre, and the origin may lie
+    # anywhere within.
+    [(1.0, 1e-4), (107_000.0, 1e-4), (108_000.0, 1e-3), (2_000_000.0, 1e-2)],
+)
+def test_coordinates_keep_a_tenth_of_a_millimetre_where_that_fits(
+    tmp_path: Path, size_m: float, scale_m: float
+) -> None:
+    cloud = floor(size_m)
+    # Of a mirrored cloud the farthest point has a negative offset.
+    for one in (cloud, dataclasses.replace(cloud, x=-cloud.x, y=np.zeros_like(cloud.y))):
+        found = written(tmp_path / "a.laz", one)
+        np.testing.assert_allclose(found.header.scales, scale_m, rtol=1e-9)
+        np.testing.assert_allclose(found.xyz, one.points_world(), atol=0.51 * scale_m)

@@ -285,6 +285,23 @@ def test_pcd_values_of_several_numbers_stand_between_those_of_one(
         np.testing.assert_array_equal(read_points(path), rows[:, [0, 1, -1]])
 
 
+@pytest.mark.parametrize(
+    ("reference", "plain"),
+    [
+        # Three bits of length less two, the distance less one; 7 takes a byte more of length.
+        (b"\x20\x02", b"abcabc"),
+        (b"\xc0\x01", b"abcbcbcbcbc"),
+        (b"\xe0\x05\x02", b"abc" + b"abcabcabcabcab"),
+        (b"\x21\x02", None),
+    ],
+    ids=["short", "overlapping", "long", "before the beginning"],
+)
+def test_lzf_repeats_what_it_refers_to(reference: bytes, plain: bytes | None) -> None:
+    found = np.zeros(64, np.uint8)
+    count = decompress_lzf(np.frombuffer(b"\x02abc" + reference, np.uint8), found)
+    assert (found[:count].tobytes() if count >= 0 else None) == plain
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_damaged_lzf_data_never_leave_their_array(seed: int) -> None:
     packed = np.random.default_rng(seed).integers(0, 256, 300).astype(np.uint8)
