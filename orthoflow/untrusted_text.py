@@ -16,7 +16,6 @@ from typing import Final, NoReturn, TypeAlias
 from xml.parsers import expat
 
 from orthoflow.errors import InputError
-from orthoflow.system import flags
 
 Value: TypeAlias = str | int | float | None
 
@@ -145,7 +144,7 @@ def open_file(path: Path) -> BufferedReader:
     Raises:
         OSError: it cannot be read, or is a folder, a pipe or a device.
     """
-    descriptor = os.open(path, flags("O_RDONLY", "O_NONBLOCK", "O_NOCTTY", "O_CLOEXEC"))
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     if stat.S_ISREG(os.fstat(descriptor).st_mode):
         return os.fdopen(descriptor, "rb")
     os.close(descriptor)

@@ -16,7 +16,6 @@ from types import FrameType
 from typing import Final, NoReturn
 
 from orthoflow.errors import PluginError
-from orthoflow.system import working_folder_kept
 
 _SLOW_S: Final = 3.0
 
@@ -46,7 +45,7 @@ def guarded(what: str) -> Iterator[None]:
     limit = sys.getrecursionlimit()
     try:
         with (
-            working_folder_kept(),
+            _working_folder_kept(),
             contextlib.redirect_stdout(sys.stderr),
             _exits_refused(),
             _interrupts_marked(),
@@ -61,6 +60,17 @@ def guarded(what: str) -> Iterator[None]:
         if left < limit:
             # Also in the place of the RecursionError that it leads to.
             raise PluginError(f"it lowers Python's recursion limit from {limit} to {left}")
+
+
+@contextmanager
+def _working_folder_kept() -> Iterator[None]:
+    """Return to the working folder, even if it has no name any more."""
+    folder = os.open(".", os.O_PATH if hasattr(os, "O_PATH") else os.O_RDONLY)
+    try:
+        yield
+    finally:
+        os.fchdir(folder)
+        os.close(folder)
 
 
 @contextmanager

@@ -25,7 +25,7 @@ from orthoflow.cli.commands import (
     store_option,
 )
 from orthoflow.cli.tables import counted, echo, echo_json, echo_table
-from orthoflow.system import usable_cores
+from orthoflow.geometry.threads import usable_cores
 from orthoflow.version import __version__
 
 _IMPORT_TIMEOUT_S: Final = 120

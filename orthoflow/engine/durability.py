@@ -10,12 +10,12 @@ import shutil
 import subprocess
 import uuid
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
 from orthoflow.errors import StoreError
-from orthoflow.system import file_lock, flags
+from orthoflow.untrusted_text import open_file
 
 _REASONS = {
     errno.ENOSPC: "No space left on the disk; free some, or choose another folder",
@@ -66,9 +66,7 @@ def writing_to(folder: Path) -> Iterator[None]:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make renames in a folder survive a power cut, if the system can sync folders."""
-    if not hasattr(os, "O_DIRECTORY"):
-        return
+    """Make renames in a folder survive a power cut."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -78,8 +76,7 @@ def sync_folder(folder: Path) -> None:
 
 def sync_file(path: Path) -> None:
     """Make the content of a closed file survive a power cut."""
-    # Windows only syncs files opened for writing.
-    descriptor = os.open(path, flags("O_RDWR" if os.name == "nt" else "O_RDONLY"))
+    descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:
@@ -211,55 +208,79 @@ def _sha256(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
+def lock_file(path: Path, descriptor: int, *, is_shared: bool = False, waits: bool = False) -> bool:
+    """Lock an open file until it is closed, or its process ends.
+
+    Args:
+        path: of the file, for the message.
+        descriptor: the same file, open.
+        is_shared: others may hold it too, if theirs is shared.
+        waits: until nobody else holds it.
+
+    Returns:
+        False if another one holds it.
+
+    Raises:
+        StoreError: the file system has no locks.
+    """
+    import fcntl  # noqa: PLC0415 - only of Unix, where runs run
+
+    mode = fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX
+    try:
+        fcntl.flock(descriptor, mode | (0 if waits else fcntl.LOCK_NB))
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        raise StoreError(
+            f"cannot lock {path}: {error.strerror or error}; it must lie on a file system with "
+            "locks"
+        ) from error
+    return True
+
+
 @contextmanager
 def shared_lock(path: Path) -> Iterator[None]:
-    """Hold a shared lock; waits while another process holds it exclusively.
+    """Hold a lock file together with others; waits while another process holds it alone.
 
     Raises:
         StoreError: the lock file cannot be created, or the file system has no locks.
     """
-    with _lock(path, is_shared=True, waits=True):
+    with _opened_lock(path) as descriptor:
+        lock_file(path, descriptor, is_shared=True, waits=True)
         yield
 
 
 @contextmanager
 def exclusive_lock(path: Path, busy: str) -> Iterator[None]:
-    """Hold an exclusive lock; never waits.
+    """Hold a lock file alone; never waits.
 
     Args:
         path: lock file, created if missing.
-        busy: the sentence in case another process holds it.
+        busy: the message if another process holds it.
 
     Raises:
-        StoreError: another process holds it, or it cannot be created.
+        StoreError: another process holds it, or as for `shared_lock`.
     """
-    with _lock(path, is_shared=False, waits=False) as is_held:
-        if not is_held:
+    with _opened_lock(path) as descriptor:
+        if not lock_file(path, descriptor):
             raise StoreError(busy)
         yield
 
 
 def is_locked(path: Path) -> bool:
-    """Whether a living process holds the lock file, shared or exclusively."""
-    if not path.exists():
-        return False
-    with _lock(path, is_shared=False, waits=False) as is_held:
-        return not is_held
+    """Whether a living process holds a lock file alone; False if there is none."""
+    with suppress(OSError, StoreError), open_file(path) as file:
+        # Shared, so that two such checks do not mistake each other for holders.
+        return not lock_file(path, file.fileno(), is_shared=True)
+    return False
 
 
 @contextmanager
-def _lock(path: Path, *, is_shared: bool, waits: bool) -> Iterator[bool]:
+def _opened_lock(path: Path) -> Iterator[int]:
     with writing_to(path.parent):
         path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(path, flags("O_RDWR", "O_CREAT"), 0o666)
-    with ExitStack() as stack:
-        stack.callback(os.close, descriptor)
-        lock = stack.enter_context(closing(file_lock(path, descriptor)))
-        try:
-            is_held = lock.take(is_shared=is_shared, waits=waits)
-        except OSError as error:
-            raise StoreError(
-                f"cannot lock {path}: {error.strerror or error}; the store must lie on a file "
-                "system with locks"
-            ) from error
-        yield is_held
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)

@@ -7,7 +7,7 @@ import json
 import os
 import uuid
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -18,12 +18,10 @@ from orthoflow_provenance.paths import path_below
 from pydantic import TypeAdapter
 
 from orthoflow.diagnostics import Diagnostic
-from orthoflow.engine.durability import sync_folder, writing_to
+from orthoflow.engine.durability import is_locked, lock_file, sync_folder, writing_to
 from orthoflow.engine.environment import now, time_in_a_name
 from orthoflow.engine.results import CellResult, CellStatus
 from orthoflow.errors import ArgumentError, DiskSpaceError, RecordError, StoreError
-from orthoflow.system import file_lock, flags
-from orthoflow.untrusted_text import open_file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,22 +172,17 @@ class Journal:
         _check_folder(folder)
         with writing_to(folder):
             folder.mkdir(parents=True, exist_ok=True)
-            self._descriptor = os.open(self._path, flags("O_RDWR", "O_CREAT"), 0o666)
-        self._lock = file_lock(self._path, self._descriptor)
+            self._descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o666)
         try:
             self._begin(name, run_id)
         except BaseException:
-            self._close()
+            os.close(self._descriptor)
             raise
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._close()
-
-    def _close(self) -> None:
-        self._lock.close()
         os.close(self._descriptor)
 
     def write(self, event: LineEvent, **facts: str | bool) -> None:
@@ -212,7 +205,7 @@ class Journal:
             os.fsync(self._descriptor)
 
     def _begin(self, name: str, run_id: str) -> None:
-        if not self._lock.take(is_shared=False, waits=False):
+        if not lock_file(self._path, self._descriptor):
             raise _is_in_use(self._folder)
         lines = self._read_lines()
         if (self._folder / RECORD_FILE).exists():
@@ -299,8 +292,8 @@ def kept_from_others(folder: Path) -> Iterator[None]:
     if not path.exists():
         yield
         return
-    with path.open("r+b") as journal, closing(file_lock(path, journal.fileno())) as lock:
-        if not lock.take(is_shared=False, waits=False):
+    with path.open("r+b") as journal:
+        if not lock_file(path, journal.fileno()):
             raise _is_in_use(folder)
         yield
 
@@ -359,13 +352,7 @@ def _check_folder(folder: Path) -> None:
 
 def is_running(folder: Path) -> bool:
     """Whether a living process works on the run in a folder."""
-    path = folder / JOURNAL
-    try:
-        with open_file(path) as journal, closing(file_lock(path, journal.fileno())) as lock:
-            # Shared, so that two such checks do not mistake each other for runs.
-            return not lock.take(is_shared=True, waits=False)
-    except OSError:
-        return False
+    return is_locked(folder / JOURNAL)
 
 
 def new_run_id() -> str:

@@ -85,8 +85,6 @@ def is_private(folder: Path) -> bool:
         OSError: it is not there.
     """
     state = folder.lstat()
-    if not hasattr(os, "getuid"):
-        return stat.S_ISDIR(state.st_mode)
     is_own = state.st_uid in (os.getuid(), 0)
     return stat.S_ISDIR(state.st_mode) and is_own and not state.st_mode & 0o022
 

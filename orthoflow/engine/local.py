@@ -25,9 +25,9 @@ from orthoflow.engine.processes import StepProcess, start_step
 from orthoflow.engine.results import CellResult, result_from_json
 from orthoflow.engine.worker import EVENT, RESULT, Task, failed_result, run_task
 from orthoflow.errors import CancelledStepError, OrthoflowError, StepFailedError, StoreError
+from orthoflow.geometry.threads import address_space
 from orthoflow.sdk.context import StepEvent
 from orthoflow.sdk.lines import one_line
-from orthoflow.system import address_space, flags, read_at
 from orthoflow.untrusted_text import shown
 
 Tell = Callable[[str, StepEvent], None]
@@ -180,7 +180,7 @@ class StepLog:
             StoreError: it cannot be written.
         """
         self.path = path
-        opened = flags("O_RDWR", "O_CREAT", "O_TRUNC", "O_APPEND", "O_NOFOLLOW")
+        opened = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_NOFOLLOW
         with writing_to(path.parent):
             self._descriptor = os.open(path, opened, 0o666)
         self._n_dropped = 0
@@ -218,7 +218,7 @@ class StepLog:
         os.close(self._descriptor)
 
     def _tail(self, size: int) -> bytes:
-        return read_at(self._descriptor, _KEPT_BYTES, max(0, size - _KEPT_BYTES))
+        return os.pread(self._descriptor, _KEPT_BYTES, max(0, size - _KEPT_BYTES))
 
 
 @dataclass(kw_only=True)

@@ -24,8 +24,8 @@ from orthoflow.engine.keys import (
 from orthoflow.engine.results import CellResult, ProductRef
 from orthoflow.engine.store import Preimage, Store
 from orthoflow.errors import ArgumentError, InputError, PluginError, StoreError
+from orthoflow.geometry.threads import usable_cores
 from orthoflow.products.input_files import InputFiles
-from orthoflow.system import usable_cores
 from orthoflow.untrusted_text import first_few
 from orthoflow.workflow.expand import (
     Cell,

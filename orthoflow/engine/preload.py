@@ -10,7 +10,7 @@ import importlib
 from contextlib import suppress
 from typing import Final
 
-from orthoflow.system import address_space
+from orthoflow.geometry.threads import address_space
 
 _LIBRARIES: Final = (
     "numba",

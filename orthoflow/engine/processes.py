@@ -81,9 +81,8 @@ class StepProcess:
     def end_tree(self) -> None:
         """Kill it with all that it started, also when it has ended by itself."""
         _kill(_with_descendants(self.pid))
-        if hasattr(os, "killpg"):
-            with suppress(ProcessLookupError, PermissionError):
-                os.killpg(self.pid, signal.SIGKILL)
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(self.pid, signal.SIGKILL)
         if self.process.exitcode:
             # What a step that crashed had started has another parent now.
             _kill(one for one in psutil.process_iter() if _is_at_work_in(one, self.scratch))

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import dataclasses
 import errno
 import faulthandler
@@ -12,6 +13,7 @@ import io
 import json
 import multiprocessing
 import os
+import resource
 import signal
 import sys
 import tempfile
@@ -64,7 +66,6 @@ from orthoflow.products.product import Product
 from orthoflow.sdk.context import Drawing, StepContext, StepEvent
 from orthoflow.sdk.lines import one_line
 from orthoflow.sdk.methods import Method, labelled
-from orthoflow.system import adopt_orphans, children_processor_s, flags
 from orthoflow.untrusted_text import shown
 
 # Inputs up to this size are digested again after the run: they must not have changed.
@@ -76,6 +77,7 @@ _LONGEST_ERROR: Final = 4000
 _LONGEST_TRACE: Final = 64 << 10
 _OOM_SCORE: Final = "900"
 _PROGRESS_EVERY_S: Final = 0.1
+_PR_SET_CHILD_SUBREAPER: Final = 36
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,10 +220,11 @@ def run_step(task: Task, pipe: Connection, variables: Mapping[str, str]) -> None
 
 def _move_to(task: Task, variables: Mapping[str, str]) -> None:
     """Set up the environment of a step in this process."""
-    if hasattr(os, "setsid"):
-        os.setsid()
-    adopt_orphans()
-    log = os.open(task.log, flags("O_WRONLY", "O_APPEND", "O_NOFOLLOW"))
+    os.setsid()
+    # What it starts in other sessions stays below it also when what started that has ended.
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+    log = os.open(task.log, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW)
     for descriptor in (1, 2):
         os.dup2(log, descriptor)
     os.close(log)
@@ -256,9 +259,7 @@ def _end_with_coordinator() -> None:
     if coordinator is not None:
         coordinator.join()
         _kill_children()
-        if hasattr(os, "killpg"):
-            os.killpg(0, signal.SIGKILL)
-        os._exit(1)
+        os.killpg(0, signal.SIGKILL)
 
 
 def _kill_children() -> None:
@@ -518,7 +519,8 @@ class _Call:
     def _cpu_s(self) -> float:
         """Processor seconds of this process and its children, without loading and samples."""
         others_s = self._meter.processor_s + self._sampler.processor_s
-        return time.process_time() + children_processor_s() - others_s
+        children = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return time.process_time() + children.ru_utime + children.ru_stime - others_s
 
     def _read(self, given: TaskInput) -> Product | InputFiles:
         if given.input_name:

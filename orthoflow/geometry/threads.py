@@ -14,11 +14,24 @@ from functools import partial
 from threading import Thread
 from typing import Final, TypeVar
 
-from orthoflow.system import address_space
-
 _ROOM_FOR_THREADS: Final = 2 << 30
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
+
+
+def usable_cores() -> int:
+    """Return the number of processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def address_space() -> int | None:
+    """Return the bytes of memory that this process may ask for (`ulimit -v`); None if unlimited."""
+    import resource  # noqa: PLC0415 - only of Unix, where steps run
+
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return None if limit == resource.RLIM_INFINITY else limit
 
 
 def has_room_for_threads() -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import os
 import re
 import time
 from collections.abc import Callable
@@ -26,7 +27,6 @@ from orthoflow.diagnostics import (
 )
 from orthoflow.errors import CancelledStepError, ProductError
 from orthoflow.sdk.lines import is_name, one_line
-from orthoflow.system import take_room
 from orthoflow.untrusted_text import MOST_SVG_BYTES, is_plain_svg
 
 __all__ = ["Drawing", "DrawnFigure", "Metric", "StepContext", "StepEvent"]
@@ -290,7 +290,7 @@ class StepContext:
         path.parent.mkdir(exist_ok=True)
         with path.open("wb") as file:
             # Writing into the hole of a sparse file on a full disk would kill the process.
-            take_room(file, size_bytes)
+            os.posix_fallocate(file.fileno(), 0, size_bytes)
         return np.memmap(path, dtype=np.dtype(dtype), mode="r+", shape=shape)
 
     def _take_name(self, name: object) -> None:

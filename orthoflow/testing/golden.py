@@ -27,12 +27,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
+from orthoflow.engine.durability import lock_file
 from orthoflow.engine.store import digest_of
 from orthoflow.errors import InputError
 from orthoflow.products import JsonValue, Product
 from orthoflow.products.product import Payload, Tolerance
 from orthoflow.sdk import Method
-from orthoflow.system import lock_where_possible
 from orthoflow.testing.isolation import INSTRUCTION_SWITCHES
 from orthoflow.testing.trials import Trial
 
@@ -197,14 +197,14 @@ def _read(file: Path) -> dict[str, Golden]:
     if not file.is_file():
         return {}
     with file.open(encoding="utf-8") as stream:
-        lock_where_possible(stream.fileno(), is_shared=True)
+        lock_file(file, stream.fileno(), is_shared=True, waits=True)
         return _parsed(stream.read(), file)
 
 
 def _record(file: Path, method_id: str, golden: Golden) -> None:
     """Write a result into the file, which processes that try other methods change meanwhile."""
     with file.open("a+", encoding="utf-8") as stream:
-        lock_where_possible(stream.fileno(), is_shared=False)
+        lock_file(file, stream.fileno(), waits=True)
         stream.seek(0)
         known = _parsed(stream.read(), file)
         stream.truncate(0)

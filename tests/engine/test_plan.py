@@ -16,7 +16,7 @@ from orthoflow.engine.plan import RunOptions, explain
 from orthoflow.engine.results import ProductRef
 from orthoflow.engine.store import Preimage
 from orthoflow.errors import ArgumentError
-from orthoflow.system import usable_cores
+from orthoflow.geometry.threads import usable_cores
 from orthoflow.workflow.expand import Cell
 from tests.engine_world import World, forget_toys
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import resource
+import subprocess
+import sys
 import threading
 from functools import partial
 
@@ -11,11 +15,13 @@ from hypothesis import strategies as st
 
 from orthoflow.geometry import threads
 from orthoflow.geometry.threads import (
+    address_space,
     even_parts,
     in_order,
     in_runs,
     in_threads,
     start_beside,
+    usable_cores,
 )
 
 WAIT_S = 20.0
@@ -142,3 +148,24 @@ def test_no_thread_is_started_where_memory_is_limited_to_little(
     monkeypatch.setattr(threads, "address_space", lambda: 8 << 30)
     with pytest.raises(AssertionError, match="a thread was started"):
         start_beside(done.clear)
+
+
+def test_processors_and_memory_are_those_that_the_process_may_use() -> None:
+    usable = sorted(os.sched_getaffinity(0))
+    limit = resource.getrlimit(resource.RLIMIT_AS)
+    program = "from orthoflow.geometry.threads import *; print(usable_cores(), address_space())"
+
+    def restrict() -> None:
+        os.sched_setaffinity(0, usable[:1])
+        resource.setrlimit(resource.RLIMIT_AS, (3 << 30, limit[1]))
+
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        preexec_fn=restrict,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout.split() == ["1", str(3 << 30)], done.stderr
+    assert usable_cores() == len(usable)
+    assert address_space() == (None if limit[0] == resource.RLIM_INFINITY else limit[0])

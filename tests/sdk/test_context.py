@@ -94,6 +94,8 @@ def test_an_allocated_array_is_zero_and_a_file_of_its_size(
     array = ctx.allocate("walls", "walls/0/rgb", (4, 5, 3), dtype)
     assert (array.shape, array.dtype, array.any()) == ((4, 5, 3), dtype, False)
     (path,) = (tmp_path / "allocated").iterdir()
+    # In blocks of 512 bytes: nothing of it is a hole.
+    assert 512 * path.stat().st_blocks >= path.stat().st_size
     assert path.name == "walls.walls.0.rgb"
     assert path.stat().st_size == 60 * np.dtype(dtype).itemsize
     array[1, 2, 2] = 7
