@@ -14,7 +14,7 @@ import time
 import uuid
 from collections.abc import Mapping
 from contextlib import closing, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -22,10 +22,9 @@ import dask
 from distributed import Client, Future, KilledWorker, LocalCluster, Worker, get_worker
 from distributed.worker import WORKER_ANY_RUNNING
 
-from orthoflow.diagnostics import Diagnostic
 from orthoflow.engine.durability import write_whole, writing_to
 from orthoflow.engine.environment import environment
-from orthoflow.engine.local import Capacity, LocalExecutor, TaskEnd, Tell
+from orthoflow.engine.local import EVENTS, Capacity, LocalExecutor, Tell
 from orthoflow.engine.method_versions import methods_text, misfit
 from orthoflow.engine.results import CellResult, result_from_json, result_to_json
 from orthoflow.engine.worker import Task, failed_result
@@ -51,11 +50,24 @@ _POLL_S: Final = 0.1
 _LOOK_S: Final = 1.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class Order:
-    """The instructions for a worker besides the task itself.
+def look_around(path: str, methods: str) -> tuple[str, float, str]:
+    """Return the surroundings of a worker: runs on each before it gets a task.
 
-    Attributes:
+    Returns:
+        Content of the file, or why it cannot be read; its time, seconds since 1970; how its methods
+        or libraries differ, empty if they are the same.
+    """
+    try:
+        seen = Path(path).read_text(encoding="utf-8")
+    except OSError as error:
+        seen = error.strerror or "it cannot be read"
+    return seen, time.time(), misfit(methods)
+
+
+def run_attempt(task: Task, name: str, topic: str, retries: int, methods: str) -> str:
+    """Run a task in a child process of this worker; return its result as JSON.
+
+    Args:
         task: what to run.
         name: the scheduler's name for it.
         topic: topic for progress messages.
@@ -63,42 +75,7 @@ class Order:
         methods: the plan's statement about its methods, see `methods_text`; empty for a worker in
             the process that made the plan.
     """
-
-    task: Task
-    name: str
-    topic: str
-    retries: int
-    methods: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class Surroundings:
-    """The surroundings of a worker.
-
-    Attributes:
-        seen: content of the file that it was asked to read, or why it cannot read it.
-        clock_s: its time, seconds since 1970.
-        misfit: how its methods or libraries differ; empty if they are the same.
-    """
-
-    seen: str
-    clock_s: float
-    misfit: str
-
-
-def look_around(path: str, methods: str) -> Surroundings:
-    """Return the surroundings of a worker: runs on each before it gets a task."""
-    try:
-        seen = Path(path).read_text(encoding="utf-8")
-    except OSError as error:
-        seen = error.strerror or "it cannot be read"
-    return Surroundings(seen=seen, clock_s=time.time(), misfit=misfit(methods))
-
-
-def run_attempt(order: Order) -> str:
-    """Run a task in a child process of this worker; return its result as JSON."""
     worker = get_worker()
-    task = order.task
     home = Path(task.folder)
     n_before = sum(1 for _ in home.glob(f"{_ATTEMPT}*"))
     folder = home / f"{_ATTEMPT}{uuid.uuid4().hex[:12]}"
@@ -107,18 +84,18 @@ def run_attempt(order: Order) -> str:
     own = replace(
         task, folder=str(folder), log=str(folder / "log"), environment=environment(task.cores)
     )
-    if n_before > order.retries:
+    if n_before > retries:
         return _refused(own, StepFailedError(describe_loss(task.who, n_before)))
-    if wrong := order.methods and misfit(order.methods):
+    if wrong := methods and misfit(methods):
         return _refused(own, PluginError(f"{task.who} cannot run on {worker.address}: {wrong}"))
 
     def tell(_: str, event: StepEvent) -> None:
-        worker.log_event(order.topic, {"address": task.address, **asdict(event)})
+        worker.log_event(topic, (task.address, EVENTS.dump_json(event)))
 
     executor = LocalExecutor(Capacity.of_jobs(1, task.cores), tell)
     with closing(executor):
         executor.start(own)
-        return result_to_json(_result(executor, home, worker, order.name))
+        return result_to_json(_result(executor, home, worker, name))
 
 
 def describe_loss(who: str, times: int) -> str:
@@ -130,8 +107,8 @@ def describe_loss(who: str, times: int) -> str:
 def _result(executor: LocalExecutor, home: Path, worker: Worker, name: str) -> CellResult:
     next_look_s, is_stopping = 0.0, False
     while True:
-        for end in executor.poll(_POLL_S):
-            return end.result
+        for result in executor.poll(_POLL_S).values():
+            return result
         if is_stopping or time.monotonic() < next_look_s:
             continue
         next_look_s = time.monotonic() + _LOOK_S
@@ -172,14 +149,6 @@ _QUIET: Final = {
 }
 
 
-@dataclass(kw_only=True)
-class _Running:
-    """A task, and its state in dask."""
-
-    task: Task
-    future: Future[str]
-
-
 class DaskExecutor:
     """Runs tasks on the workers of a cluster, or on workers of its own."""
 
@@ -201,7 +170,7 @@ class DaskExecutor:
         self._address = plan.options.scheduler
         # Its own workers have the code that made the plan.
         self._methods = methods_text(plan.methods) if self._address else ""
-        self._running: dict[str, _Running] = {}
+        self._running: dict[str, tuple[Task, Future[str]]] = {}
         self._news: queue.SimpleQueue[tuple[str, StepEvent | None]] = queue.SimpleQueue()
         self._topic = f"orthoflow-{uuid.uuid4().hex}"
         self._stop_at: float | None = None
@@ -209,7 +178,7 @@ class DaskExecutor:
         self._looked = self._with_workers = time.monotonic()
         self._client = _client(self._address, capacity)
         try:
-            self._client.subscribe_topic(self._topic, self._hear)
+            self._client.subscribe_topic(self._topic, self._receive)
             if self._address:
                 self._wait_for_workers()
                 self._look_at_workers(scratch)
@@ -231,20 +200,18 @@ class DaskExecutor:
         with writing_to(Path(task.folder).parent):
             Path(task.folder).mkdir(parents=True, exist_ok=True)
         name = f"{task.address}-{uuid.uuid4().hex[:12]}"
-        order = Order(
-            task=task,
-            name=name,
-            topic=self._topic,
-            retries=self._retries,
-            methods=self._methods,
-        )
         future = self._client.submit(
-            run_attempt, order, key=name, pure=False, retries=0, resources={CORES: task.cores}
+            run_attempt,
+            *(task, name, self._topic, self._retries, self._methods),
+            key=name,
+            pure=False,
+            retries=0,
+            resources={CORES: task.cores},
         )
-        self._running[task.address] = _Running(task=task, future=future)
+        self._running[task.address] = (task, future)
         future.add_done_callback(lambda _, address=task.address: self._news.put((address, None)))
 
-    def poll(self, timeout_s: float) -> tuple[TaskEnd, ...]:
+    def poll(self, timeout_s: float) -> dict[str, CellResult]:
         """Wait for tasks to end, up to a time; forwards messages of running tasks.
 
         Raises:
@@ -259,24 +226,24 @@ class DaskExecutor:
                     ended.append(address)
                 elif address in self._running:
                     self._tell(address, event)
-        ends = tuple(self._end(address) for address in ended if address in self._running)
+        ends = {address: self._end(address) for address in ended if address in self._running}
         self._watch()
         if self._stop_at is not None and time.monotonic() > self._stop_at:
-            ends += tuple(self._give_up(address) for address in tuple(self._running))
+            ends |= {address: self._give_up(address) for address in tuple(self._running)}
         return ends
 
     def cancel(self) -> None:
         """Ask all tasks to stop; those that do not answer for 20 s are given up."""
         self._stop_at = time.monotonic() + _STOPPING_S
-        for run in self._running.values():
+        for task, _ in self._running.values():
             with suppress(OSError):
-                (Path(run.task.folder) / CANCEL_FILE).touch()
+                (Path(task.folder) / CANCEL_FILE).touch()
 
     def close(self) -> None:
         """Release whatever still runs: workers stop obsolete tasks."""
-        for run in self._running.values():
+        for _, future in self._running.values():
             with suppress(Exception):
-                run.future.cancel()
+                future.cancel()
         cluster = self._client.cluster
         # Dask's messages about losses are of no use at this point.
         with suppress(Exception):
@@ -285,20 +252,19 @@ class DaskExecutor:
             with suppress(Exception):
                 cluster.close(timeout=_CLOSE_S)
 
-    def _end(self, address: str) -> TaskEnd:
-        run = self._running[address]
-        result = self._result(run)
+    def _end(self, address: str) -> CellResult:
+        task, future = self._running[address]
+        result = self._result(task, future)
         del self._running[address]
-        write_whole(Path(run.task.log), result.log.encode())
-        return TaskEnd(address=address, result=result)
+        write_whole(Path(task.log), result.log.encode())
+        return result
 
-    def _give_up(self, address: str) -> TaskEnd:
-        run = self._running.pop(address)
-        run.future.cancel()
-        return TaskEnd(address=address, result=failed_result(run.task, _cancelled(run.task)))
+    def _give_up(self, address: str) -> CellResult:
+        task, future = self._running.pop(address)
+        future.cancel()
+        return failed_result(task, _cancelled(task))
 
-    def _result(self, run: _Running) -> CellResult:
-        task, future = run.task, run.future
+    def _result(self, task: Task, future: Future[str]) -> CellResult:
         if future.status in ("cancelled", "lost"):
             if self._stop_at is not None:
                 return failed_result(task, _cancelled(task))
@@ -317,18 +283,11 @@ class DaskExecutor:
                 task, StepFailedError(f"{task.who} could not be run by its worker ({said})")
             )
 
-    # Any: a worker's own statement.
-    def _hear(self, event: tuple[float, Any]) -> None:
-        said = event[1]
-        with suppress(AttributeError, KeyError, TypeError, ValueError):
-            told = said.get("diagnostic")
-            heard = StepEvent(
-                kind=said["kind"],
-                text=str(said["text"]),
-                fraction=float(said["fraction"]),
-                diagnostic=told and Diagnostic(**{**told, "settled_by": tuple(told["settled_by"])}),
-            )
-            self._news.put((str(said["address"]), heard))
+    # Any: what a worker sent.
+    def _receive(self, event: tuple[float, Any]) -> None:
+        with suppress(TypeError, ValueError):
+            address, text = event[1]
+            self._news.put((str(address), EVENTS.validate_json(text, strict=True)))
 
     def _watch(self) -> None:
         """Check every two seconds which workers are present."""
@@ -375,7 +334,7 @@ class DaskExecutor:
     def _look_at_workers(self, scratch: Path) -> None:
         path, word = scratch / _PROOF_FILE, uuid.uuid4().hex
         write_whole(path, word.encode())
-        found: Mapping[str, Surroundings | Exception] = self._client.run(
+        found: Mapping[str, tuple[str, float, str] | Exception] = self._client.run(
             look_around, str(path), self._methods, workers=list(self._workers()), on_error="return"
         )
         for address, said in found.items():
@@ -384,21 +343,20 @@ class DaskExecutor:
                     f"worker {address} cannot run orthoflow ({type(said).__name__}: "
                     f"{one_line(said)}); install the same version there"
                 )
-            if said.seen != word:
+            seen, clock_s, wrong = said
+            if seen != word:
                 raise ArgumentError(
                     f"worker {address} does not see the store {scratch.parent.parent} "
-                    f"({one_line(said.seen)}): give a --store on a file system that all workers "
+                    f"({one_line(seen)}): give a --store on a file system that all workers "
                     f"have at the same place"
                 )
-            if abs(said.clock_s - time.time()) > _CLOCKS_APART_S:
+            if abs(clock_s - time.time()) > _CLOCKS_APART_S:
                 raise ArgumentError(
-                    f"the clock of worker {address} is {said.clock_s - time.time():+.0f} s off "
+                    f"the clock of worker {address} is {clock_s - time.time():+.0f} s off "
                     f"this one: set both, ages of results go by them"
                 )
-            if said.misfit:
-                raise PluginError(
-                    f"worker {address}: {said.misfit}; install there what the plan has"
-                )
+            if wrong:
+                raise PluginError(f"worker {address}: {wrong}; install there what the plan has")
 
 
 def _client(address: str, capacity: Capacity) -> Client:

@@ -32,9 +32,11 @@ class FileRef(RecordedFile):
     """An input file by name, content and path.
 
     Attributes:
+        path: where it is.
         identity: file system attributes, used only to notice a change while a step reads it.
     """
 
+    path: Path
     identity: str
 
 
@@ -88,6 +90,7 @@ class FileDigests:
             name=path.name,
             size_bytes=after.st_size,
             sha256=sha256,
+            path=path,
             identity=identity,
         )
 

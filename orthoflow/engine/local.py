@@ -10,7 +10,6 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cache
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Final, Protocol
@@ -31,6 +30,7 @@ from orthoflow.sdk.lines import one_line
 from orthoflow.untrusted_text import shown
 
 Tell = Callable[[str, StepEvent], None]
+EVENTS: Final = TypeAdapter(StepEvent)
 _GRACE_S: Final = 5.0
 # Maximum number of messages per poll: a step that never stops must not delay its timeout.
 _MOST_MESSAGES: Final = 256
@@ -48,19 +48,6 @@ _CRASHES: Final = {
     signal.SIGFPE: "arithmetic error",
     signal.SIGILL: "illegal instruction",
 }
-
-
-@dataclass(frozen=True, kw_only=True)
-class TaskEnd:
-    """A task that ended.
-
-    Attributes:
-        address: of its cell.
-        result: ok or failed, never skipped.
-    """
-
-    address: str
-    result: CellResult
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,8 +90,12 @@ class Executor(Protocol):
             StoreError: its files cannot be written.
         """
 
-    def poll(self, timeout_s: float) -> tuple[TaskEnd, ...]:
-        """Wait for tasks to end, up to a time; forwards messages of running tasks."""
+    def poll(self, timeout_s: float) -> dict[str, CellResult]:
+        """Wait for tasks to end, up to a time; forwards messages of running tasks.
+
+        Returns:
+            Address -> result of the tasks that ended: ok or failed, never skipped.
+        """
 
     def cancel(self) -> None:
         """Ask all tasks to stop; they still end through `poll`, after a grace period by force."""
@@ -134,14 +125,14 @@ class InlineExecutor:
         """Queue a task."""
         self._waiting.append(task)
 
-    def poll(self, timeout_s: float) -> tuple[TaskEnd, ...]:
+    def poll(self, timeout_s: float) -> dict[str, CellResult]:
         """Run the next task to its end; timeouts are ignored."""
         if not self._waiting:
-            return ()
+            return {}
         task = self._waiting.popleft()
         if self._is_cancelled:
             reason = CancelledStepError(f"step {task.address} was interrupted")
-            return (TaskEnd(address=task.address, result=failed_result(task, reason)),)
+            return {task.address: failed_result(task, reason)}
         log: deque[str] = deque(maxlen=_MOST_LINES)
 
         def listen(event: StepEvent) -> None:
@@ -153,7 +144,7 @@ class InlineExecutor:
             result = run_task(task, listen, self._is_interrupted)
         text = "".join(f"{line}\n" for line in log)
         write_whole(Path(task.log), text.encode())
-        return (TaskEnd(address=task.address, result=dataclasses.replace(result, log=text)),)
+        return {task.address: dataclasses.replace(result, log=text)}
 
     def cancel(self) -> None:
         """End the queued tasks without running them; none runs while this is called."""
@@ -264,7 +255,7 @@ class LocalExecutor:
     tell: Tell
     _running: dict[str, _Running] = field(default_factory=dict)
     _guard: MemoryGuard = field(default_factory=MemoryGuard)
-    _unstarted: list[TaskEnd] = field(default_factory=list)
+    _unstarted: dict[str, CellResult] = field(default_factory=dict)
 
     def start(self, task: Task) -> None:
         """Start the process of a task.
@@ -279,7 +270,7 @@ class LocalExecutor:
             step = start_step(task)
         except StepFailedError as error:
             log.close()
-            self._unstarted.append(TaskEnd(address=task.address, result=failed_result(task, error)))
+            self._unstarted[task.address] = failed_result(task, error)
             return
         run = _Running(
             task=task,
@@ -291,19 +282,19 @@ class LocalExecutor:
         )
         self._running[task.address] = _all_running[run.step.pid] = run
 
-    def poll(self, timeout_s: float) -> tuple[TaskEnd, ...]:
+    def poll(self, timeout_s: float) -> dict[str, CellResult]:
         """Wait for tasks to end, up to a time; forwards messages of running tasks."""
-        unstarted, self._unstarted = tuple(self._unstarted), []
+        ends, self._unstarted = self._unstarted, {}
         waited = [run.step.process.sentinel for run in self._running.values()]
         heard = [run.step.pipe for run in self._running.values() if not run.step.pipe.closed]
-        wait([*heard, *waited], 0.0 if unstarted else min(timeout_s, self._guard.interval_s))
+        wait([*heard, *waited], 0.0 if ends else min(timeout_s, self._guard.interval_s))
         # Checked before the last messages are read: nothing is sent after the end.
         ended = [run for run in self._running.values() if not run.step.process.is_alive()]
         for run in self._running.values():
             self._hear(run)
-        ends = tuple(self._end(run) for run in ended)
+        ends |= {run.task.address: self._end(run) for run in ended}
         self._watch()
-        return unstarted + ends
+        return ends
 
     def cancel(self) -> None:
         """Ask all tasks to stop: SIGTERM, and SIGKILL after 5 s."""
@@ -339,7 +330,7 @@ class LocalExecutor:
                 result = result_from_json(text, f"the result of {run.task.address}")
                 run.result = result if result.key == run.task.key else None
             elif message.startswith(EVENT):
-                event = _events().validate_json(message.removeprefix(EVENT), strict=True)
+                event = EVENTS.validate_json(message.removeprefix(EVENT), strict=True)
                 self.tell(run.task.address, event)
 
     def _watch(self) -> None:
@@ -377,12 +368,12 @@ class LocalExecutor:
             run.kill_at = time.monotonic() + _GRACE_S
             run.step.ask_to_end()
 
-    def _end(self, run: _Running) -> TaskEnd:
+    def _end(self, run: _Running) -> CellResult:
         run.step.end_tree()
         run.log.shorten()
         result = dataclasses.replace(_result(run), log=run.log.text())
         self._forget(run)
-        return TaskEnd(address=run.task.address, result=result)
+        return result
 
     def _forget(self, run: _Running) -> None:
         run.log.close()
@@ -403,11 +394,6 @@ def _result(run: _Running) -> CellResult:
         wall_s=round(time.monotonic() - run.clock, 4),
         peak_rss_mib=peak_mib,
     )
-
-
-@cache
-def _events() -> TypeAdapter[StepEvent]:
-    return TypeAdapter(StepEvent)
 
 
 def _reason_of_silence(run: _Running) -> OrthoflowError:

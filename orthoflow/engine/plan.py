@@ -21,7 +21,7 @@ from orthoflow.engine.keys import (
     publisher_tag,
     read_preimage,
 )
-from orthoflow.engine.results import CellResult, ProductRef
+from orthoflow.engine.results import CellResult, ProductRef, ProductTarget
 from orthoflow.engine.store import Preimage, Store
 from orthoflow.errors import ArgumentError, InputError, PluginError, StoreError
 from orthoflow.geometry.threads import usable_cores
@@ -133,28 +133,16 @@ class PlannedInput:
 
     Attributes:
         ref: its digest, as a product of type `files`.
-        paths: the files.
-        files: name, size and digest of each, in the same order.
+        files: its files, in order.
     """
 
     ref: ProductRef
-    paths: tuple[Path, ...]
     files: tuple[FileRef, ...]
 
-
-@dataclass(frozen=True, kw_only=True)
-class ProductTarget:
-    """Import strings of a product type: its class, and its publisher or nothing.
-
-    Attributes:
-        target: of the class.
-        publisher: of the publisher.
-        publisher_tag: version of the publisher.
-    """
-
-    target: str
-    publisher: str
-    publisher_tag: str
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """Return the paths of the files."""
+        return tuple(file.path for file in self.files)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -230,13 +218,13 @@ def _require_distinct(
             if cell.skip_reason or given is None or port in methods[cell.method].repeatable:
                 continue
             seen: dict[str, Path] = {}
-            for path, file in zip(given.paths, given.files, strict=True):
-                if path.suffix.lower() in _SIDECARS:
+            for file in given.files:
+                if file.path.suffix.lower() in _SIDECARS:
                     continue
-                first = seen.setdefault(file.sha256, path)
-                if first != path:
+                first = seen.setdefault(file.sha256, file.path)
+                if first != file.path:
                     raise InputError(
-                        f"the input of {cell.step}.{port}: {first} and {path} have the same "
+                        f"the input of {cell.step}.{port}: {first} and {file.path} have the same "
                         "content, which would count twice; leave one of them out"
                     )
 
@@ -358,8 +346,8 @@ def remember_places(inputs: Mapping[str, PlannedInput | None], store: Store) -> 
     """Note in the store where the files of a run are, for a replay or an export of it."""
     digests = store.file_digests()
     for given in inputs.values():
-        for file, path in zip(given.files, given.paths, strict=True) if given else ():
-            digests.note_place(file.sha256, path)
+        for file in given.files if given else ():
+            digests.note_place(file.sha256, file.path)
     with contextlib.suppress(StoreError):
         digests.save()
 
@@ -375,7 +363,7 @@ def _digest_inputs(
             continue
         refs = digests.digest_all(files.paths)
         ref = ProductRef(type_name="files", encoding_version=0, digest=input_digest(refs))
-        planned[name] = PlannedInput(ref=ref, paths=files.paths, files=refs)
+        planned[name] = PlannedInput(ref=ref, files=refs)
     if store.folder.is_dir():
         # Only a cache: a plan must also be possible on a full or read-only disk.
         with contextlib.suppress(StoreError):
@@ -399,6 +387,7 @@ def _product_targets(
                 entry.problem if entry else f"no installed plugin brings the product {type_name}"
             )
         targets[type_name] = ProductTarget(
+            type_name=type_name,
             target=entry.spec.target,
             publisher=entry.spec.publisher,
             publisher_tag=publisher_tag(entry),

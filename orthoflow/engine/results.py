@@ -39,6 +39,7 @@ __all__ = [
     "MethodIdentity",
     "Metric",
     "ProductRef",
+    "ProductTarget",
     "RecordedEnvironment",
     "RecordedFile",
     "canonical_json",
@@ -49,6 +50,23 @@ __all__ = [
 ]
 
 FORMAT: Final = "orthoflow/result/1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProductTarget:
+    """A product type by import strings.
+
+    Attributes:
+        type_name: its name.
+        target: its class.
+        publisher: writes its published files; empty without any.
+        publisher_tag: version of the publisher.
+    """
+
+    type_name: str
+    target: str
+    publisher: str = ""
+    publisher_tag: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

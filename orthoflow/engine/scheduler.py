@@ -29,18 +29,16 @@ from orthoflow.engine.journal import (
     cell_file_name,
     ignore,
 )
-from orthoflow.engine.keys import CellKey, MethodFacts, cell_key
+from orthoflow.engine.keys import CellKey, cell_key
 from orthoflow.engine.local import (
     Capacity,
     Executor,
     InlineExecutor,
     LocalExecutor,
-    TaskEnd,
     Tell,
 )
 from orthoflow.engine.plan import (
     PlannedInput,
-    ProductTarget,
     RunPlan,
     known_inputs,
     needed_addresses,
@@ -48,7 +46,7 @@ from orthoflow.engine.plan import (
 )
 from orthoflow.engine.results import CellResult, MethodIdentity, ProductRef, shared_fields
 from orthoflow.engine.store import Store
-from orthoflow.engine.worker import Task, TaskFile, TaskInput, TaskOutput
+from orthoflow.engine.worker import Task, TaskInput
 from orthoflow.errors import (
     ArgumentError,
     CancelledStepError,
@@ -167,17 +165,10 @@ def execute(
             )
         )
         with _scratch(store, journal.run_id) as scratch, _watching_interruptions() as interruption:
-            tasks = _TaskMaker(
-                plan=plan,
-                store=store,
-                scratch=scratch,
-                logs=folder / LOGS,
-                run_id=journal.run_id,
-            )
             executor = _executor_of(
                 plan, scratch, _passing_on(listen), lambda: interruption.is_asked
             )
-            run = _Run(tasks, journal, listen)
+            run = _Run(plan, store, journal, listen, scratch=scratch, logs=folder / LOGS)
             try:
                 with closing(executor):
                     run.go(executor, interruption)
@@ -188,26 +179,23 @@ def execute(
         return run.outcome()
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Ready:
-    """Key and inputs of a cell that waits for free cores."""
-
-    key: CellKey
-    refs: Mapping[str, ProductRef]
-
-
 class _Run:
     """The state of one run; used from one thread."""
 
     def __init__(
         self,
-        tasks: _TaskMaker,
+        plan: RunPlan,
+        store: Store,
         journal: Journal,
         listen: RunListener,
+        *,
+        scratch: Path,
+        logs: Path,
     ) -> None:
-        self._tasks = tasks
-        self._plan = tasks.plan
-        self._store = tasks.store
+        self._plan = plan
+        self._store = store
+        self._scratch = scratch
+        self._logs = logs
         self._journal = journal
         self._listen = listen
         self._results: dict[str, CellResult] = {}
@@ -216,7 +204,8 @@ class _Run:
         self._made: set[str] = set()
         self._repeats: dict[str, int] = {}
         self._waiting = {item.cell.address: item for item in self._plan.cells}
-        self._ready: dict[str, _Ready] = {}
+        # Keys and inputs of cells that wait for free cores.
+        self._ready: dict[str, tuple[CellKey, Mapping[str, ProductRef]]] = {}
         self._running: dict[str, Task] = {}
         self._step_of = step_names((item.cell.step, item.cell.method) for item in self._plan.cells)
 
@@ -230,8 +219,12 @@ class _Run:
             if interruption.is_asked:
                 self._break_off(executor)
             self._advance(executor)
-            for end in executor.poll(_POLL_S) if self._running else ():
-                self._take(end)
+            self._poll(executor)
+
+    def _poll(self, executor: Executor) -> None:
+        ends = executor.poll(_POLL_S) if self._running else {}
+        for address, result in ends.items():
+            self._take(self._running.pop(address), result)
 
     def outcome(self) -> RunOutcome:
         """Return the results of the run, in the order of the plan."""
@@ -263,12 +256,11 @@ class _Run:
     def _break_off(self, executor: Executor) -> None:
         executor.cancel()
         while self._running:
-            for end in executor.poll(_POLL_S):
-                self._take(end)
+            self._poll(executor)
         self._journal.write("interrupted")
         raise CancelledStepError(
             f"the run was interrupted; the same command "
-            f"continues it with -o {self._tasks.logs.parent.name}"
+            f"continues it with -o {self._logs.parent.name}"
         )
 
     def _advance(self, executor: Executor) -> None:
@@ -278,16 +270,17 @@ class _Run:
                 self._prepare(planned.cell)
         for address, planned in list(self._waiting.items()):
             ready = self._ready.get(address)
-            if ready is None or self._is_under_way(ready.key):
+            if ready is None or self._is_under_way(ready[0]):
                 continue
+            key, refs = ready
             # An equal cell of this run may have ended meanwhile.
-            known = self._known(planned.cell, ready.key) if ready.key.key in self._made else None
+            known = self._known(planned.cell, key) if key.key in self._made else None
             if known is not None:
                 self._settle(planned.cell, known, is_cached=True)
             elif self._has_room(planned.cell, executor.capacity) and not self._is_held_up(
-                planned.cell, ready.refs
+                planned.cell, refs
             ):
-                self._start(planned.cell, ready, executor)
+                self._start(planned.cell, key, refs, executor)
 
     def _prepare(self, cell: Cell) -> None:
         """Settle a cell from the store, or make it ready, as soon as its inputs are known."""
@@ -304,7 +297,7 @@ class _Run:
         if known is not None:
             self._settle(cell, known, is_cached=True)
         else:
-            self._ready[cell.address] = _Ready(key=key, refs=refs)
+            self._ready[cell.address] = (key, refs)
 
     def _missing(self, needed: tuple[str, ...]) -> str:
         for address in needed:
@@ -372,17 +365,49 @@ class _Run:
         is_fitting = taken + _cores(cell, capacity) <= capacity.n_cores
         return len(self._running) < capacity.n_tasks and is_fitting
 
-    def _start(self, cell: Cell, ready: _Ready, executor: Executor) -> None:
-        cores = _cores(cell, executor.capacity)
-        task = self._tasks.make(cell, ready.key, ready.refs, cores)
+    def _start(
+        self, cell: Cell, key: CellKey, refs: Mapping[str, ProductRef], executor: Executor
+    ) -> None:
+        task = self._task(cell, key, refs, _cores(cell, executor.capacity))
         del self._waiting[cell.address]
         self._journal.write("started", address=cell.address, key=task.key)
         self._listen(CellStarted(address=cell.address))
         self._running[task.address] = task
         executor.start(task)
 
-    def _take(self, end: TaskEnd) -> None:
-        task, result = self._running.pop(end.address), end.result
+    def _task(self, cell: Cell, key: CellKey, refs: Mapping[str, ProductRef], cores: int) -> Task:
+        facts, products = self._plan.methods[cell.method], self._plan.products
+
+        def given(port: str, ref: ProductRef) -> TaskInput:
+            source = cell.inputs[port]
+            if not isinstance(source, WorkflowInput):
+                return TaskInput(ref=ref, target=products[ref.type_name].target)
+            planned = self._plan.inputs[source.name]
+            return TaskInput(
+                ref=ref, input_name=source.name, files=planned.files if planned else ()
+            )
+
+        return Task(
+            address=cell.address,
+            run_id=self._journal.run_id,
+            target=facts.target,
+            key=key.key,
+            key_preimage=key.preimage,
+            params=cell.params,
+            seed=cell.seed,
+            inputs={port: given(port, ref) for port, ref in refs.items()},
+            outputs={port: products[type_name] for port, type_name in facts.outputs.items()},
+            cores=cores,
+            timeout_s=cell.timeout_s,
+            store=str(self._store.folder),
+            folder=str(self._scratch / uuid.uuid4().hex[:12]),
+            log=str(self._logs / f"{cell_file_name(cell.address)}.log"),
+            kernels=facts.kernels,
+            environment=environment(cores),
+            **shared_fields(facts, MethodIdentity),
+        )
+
+    def _take(self, task: Task, result: CellResult) -> None:
         remove_tree(Path(task.folder))
         planned = next(item for item in self._plan.cells if item.cell.address == task.address)
         cell = planned.cell
@@ -496,77 +521,6 @@ def _scratch(store: Store, run_id: str) -> Iterator[Path]:
 
 def _lock_of(folder: Path) -> Path:
     return folder.with_name(f"{folder.name}.lock")
-
-
-@dataclass(frozen=True, kw_only=True)
-class _TaskMaker:
-    """Creates the tasks of one run.
-
-    Attributes:
-        plan: of the run.
-        store: receives products and results.
-        scratch: folder of the run for work in progress, on the store's file system.
-        logs: folder for the logs of steps.
-        run_id: of the run.
-    """
-
-    plan: RunPlan
-    store: Store
-    scratch: Path
-    logs: Path
-    run_id: str
-
-    def make(self, cell: Cell, key: CellKey, refs: Mapping[str, ProductRef], cores: int) -> Task:
-        """Return the task of a cell.
-
-        Args:
-            cell: the cell.
-            key: its key.
-            refs: port -> product.
-            cores: threads it may use.
-        """
-        facts = self.plan.methods[cell.method]
-        return Task(
-            address=cell.address,
-            run_id=self.run_id,
-            target=facts.target,
-            key=key.key,
-            key_preimage=key.preimage,
-            params=cell.params,
-            seed=cell.seed,
-            inputs={port: self._input(cell, port, ref) for port, ref in refs.items()},
-            outputs=self._outputs(facts),
-            cores=cores,
-            timeout_s=cell.timeout_s,
-            store=str(self.store.folder),
-            folder=str(self.scratch / uuid.uuid4().hex[:12]),
-            log=str(self.logs / f"{cell_file_name(cell.address)}.log"),
-            kernels=facts.kernels,
-            environment=environment(cores),
-            **shared_fields(facts, MethodIdentity),
-        )
-
-    def _input(self, cell: Cell, port: str, ref: ProductRef) -> TaskInput:
-        source = cell.inputs[port]
-        if not isinstance(source, WorkflowInput):
-            return TaskInput(ref=ref, target=self.plan.products[ref.type_name].target)
-        given = self.plan.inputs[source.name]
-        return TaskInput(ref=ref, input_name=source.name, files=_task_files(given) if given else ())
-
-    def _outputs(self, facts: MethodFacts) -> dict[str, TaskOutput]:
-        return {
-            port: TaskOutput(
-                type_name=type_name, **shared_fields(self.plan.products[type_name], ProductTarget)
-            )
-            for port, type_name in facts.outputs.items()
-        }
-
-
-def _task_files(given: PlannedInput) -> tuple[TaskFile, ...]:
-    return tuple(
-        TaskFile(path=str(path.absolute()), identity=file.identity, sha256=file.sha256)
-        for path, file in zip(given.paths, given.files, strict=True)
-    )
 
 
 def _executor_of(

@@ -36,7 +36,7 @@ from pydantic import JsonValue, ValidationError
 from orthoflow.diagnostics import Diagnostic, warning_texts
 from orthoflow.engine.durability import is_broken, store_error, writing_to
 from orthoflow.engine.environment import now
-from orthoflow.engine.file_digests import file_identity, file_sha256
+from orthoflow.engine.file_digests import FileRef, file_identity, file_sha256
 from orthoflow.engine.kernels import reload_numba_config
 from orthoflow.engine.measuring import MIB, LoadingMeter, MemorySampler, is_for_want_of_memory
 from orthoflow.engine.results import (
@@ -46,6 +46,7 @@ from orthoflow.engine.results import (
     FigureRef,
     MethodIdentity,
     ProductRef,
+    ProductTarget,
     RecordedEnvironment,
     result_to_json,
     shared_fields,
@@ -81,21 +82,6 @@ _PR_SET_CHILD_SUBREAPER: Final = 36
 
 
 @dataclass(frozen=True, kw_only=True)
-class TaskFile:
-    """An input file of a task.
-
-    Attributes:
-        path: its path.
-        identity: file system attributes while it is unchanged.
-        sha256: digest of its content, hexadecimal.
-    """
-
-    path: str
-    identity: str
-    sha256: str
-
-
-@dataclass(frozen=True, kw_only=True)
 class TaskInput:
     """A product on an input port.
 
@@ -109,24 +95,7 @@ class TaskInput:
     ref: ProductRef
     target: str = ""
     input_name: str = ""
-    files: tuple[TaskFile, ...] = ()
-
-
-@dataclass(frozen=True, kw_only=True)
-class TaskOutput:
-    """What an output port must give: type, class and publisher by import string.
-
-    Attributes:
-        type_name: product type.
-        target: of its class.
-        publisher: of its published files; empty without any.
-        publisher_tag: version of the publisher.
-    """
-
-    type_name: str
-    target: str
-    publisher: str = ""
-    publisher_tag: str = ""
+    files: tuple[FileRef, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,7 +131,7 @@ class Task(MethodIdentity):
     params: Mapping[str, JsonValue]
     seed: int
     inputs: Mapping[str, TaskInput]
-    outputs: Mapping[str, TaskOutput]
+    outputs: Mapping[str, ProductTarget]
     cores: int
     timeout_s: float | None
     store: str
@@ -524,7 +493,7 @@ class _Call:
 
     def _read(self, given: TaskInput) -> Product | InputFiles:
         if given.input_name:
-            paths = tuple(Path(file.path) for file in given.files)
+            paths = tuple(file.path for file in given.files)
             return InputFiles(name=given.input_name, paths=paths)
         cls = cast("type[Product]", load_target(given.target))
         return self._store.get_product(given.ref.digest, cls, is_checked=True)
@@ -620,8 +589,8 @@ def load_target(target: str) -> object:
         ) from error
 
 
-def _check_file(file: TaskFile) -> None:
-    path = Path(file.path)
+def _check_file(file: FileRef) -> None:
+    path = file.path
     try:
         # Touching or renaming it changes nothing.
         is_same = file_identity(path) == file.identity or file_sha256(path) == file.sha256

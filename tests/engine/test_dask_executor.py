@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from orthoflow.engine import dask as engine_dask
-from orthoflow.engine.dask import CANCEL_FILE, CORES, DaskExecutor, Surroundings
+from orthoflow.engine.dask import CANCEL_FILE, CORES, DaskExecutor
 from orthoflow.engine.local import Capacity
 from orthoflow.engine.worker import Task
 from orthoflow.errors import ArgumentError, ClusterError, PluginError
@@ -67,10 +67,7 @@ def an_executor(folder: Path, *futures: Future, **more: Any) -> Any:
         "_retries": 2,
         "_address": "tcp://x:1",
         "_methods": "{}",
-        "_running": {
-            str(n): engine_dask._Running(task=a_task(folder, str(n)), future=future)  # type: ignore[arg-type]
-            for n, future in enumerate(futures)
-        },
+        "_running": {str(n): (a_task(folder, str(n)), future) for n, future in enumerate(futures)},
         "_news": queue.SimpleQueue(),
         "_stop_at": None,
         "_capacity": ONE,
@@ -91,10 +88,10 @@ def test_tasks_that_do_not_stop_are_given_up(tmp_path: Path) -> None:
     executor.cancel()
     assert all((tmp_path / name / CANCEL_FILE).exists() for name in "01")
     assert 15.0 < executor._stop_at - time.monotonic() <= 20.0
-    assert executor.poll(0.0) == ()
+    assert executor.poll(0.0) == {}
     executor._stop_at = time.monotonic() - 0.01
     ends = executor.poll(0.0)
-    assert [(end.address, end.result.error_message) for end in ends] == [
+    assert [(address, end.error_message) for address, end in ends.items()] == [
         *(("0", "step 0 was interrupted"), ("1", "step 1 was interrupted")),
     ]
     assert executor._running == {}
@@ -158,7 +155,7 @@ def test_workers_are_looked_at_before_they_get_a_task(
             return {"w1": said}
         seen = said.get("seen", Path(path).read_text())
         clock_s = time.time() + said.get("clock_s", 0.0)
-        return {"w1": Surroundings(seen=seen, clock_s=clock_s, misfit=said.get("misfit", ""))}
+        return {"w1": (seen, clock_s, said.get("misfit", ""))}
 
     executor = an_executor(tmp_path, _client=a_client(run=look))
     if error is None:

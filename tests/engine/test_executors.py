@@ -31,10 +31,8 @@ def test_what_is_in_line_ends_as_interrupted_once_it_is_cancelled(
     executor.start(task)
     executor.cancel()
     for _ in range(2):
-        (end,) = executor.poll(0.0)
-        assert end.address == "a"
-        assert end.result.status != "ok"
-        assert end.result.status == "failed"
-        assert end.result.error_message == "step a was interrupted"
+        (end,) = executor.poll(0.0).items()
+        assert (end[0], end[1].status) == ("a", "failed")
+        assert end[1].error_message == "step a was interrupted"
     executor.close()
-    assert executor.poll(0.0) == ()
+    assert executor.poll(0.0) == {}

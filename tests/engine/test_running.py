@@ -13,10 +13,10 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.engine import worker
-from orthoflow.engine.file_digests import file_identity, file_sha256
+from orthoflow.engine.file_digests import FileDigests
 from orthoflow.engine.results import ProductRef
 from orthoflow.engine.store import digest_of
-from orthoflow.engine.worker import Task, TaskFile, TaskInput
+from orthoflow.engine.worker import Task, TaskInput
 from orthoflow.errors import (
     DiskSpaceError,
     InputError,
@@ -77,7 +77,7 @@ def a_call(task: Task, **more: Any) -> Any:
 def test_an_input_file_may_be_touched_and_not_changed(tmp_path: Path) -> None:
     path = tmp_path / "scan.txt"
     path.write_text("points")
-    file = TaskFile(path=str(path), identity=file_identity(path), sha256=file_sha256(path))
+    file = FileDigests(tmp_path / "memo").digest(path)
     worker._check_file(file)
     os.utime(path, ns=(1, 1))
     worker._check_file(file)
