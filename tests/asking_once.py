@@ -12,14 +12,14 @@ from pathlib import Path
 import click
 from distributed import Worker
 
-from orthoflow.engine import method_versions
+from orthoflow.engine import keys
 
 
 @click.command()
 @click.argument("folder", type=click.Path(path_type=Path))
 def dask_setup(_: Worker, folder: Path) -> None:
     """Let this worker take the answer that another one got, where there is one."""
-    ask = method_versions._methods_here
+    ask = keys._methods_here
 
     def ask_once(names: tuple[str, ...]) -> str:
         name = hashlib.sha256(" ".join(names).encode()).hexdigest()
@@ -31,4 +31,4 @@ def dask_setup(_: Worker, folder: Path) -> None:
                 answer.write(said)
         return said
 
-    method_versions._methods_here = ask_once  # type: ignore[assignment]
+    keys._methods_here = ask_once  # type: ignore[assignment]

@@ -24,7 +24,7 @@ import pytest
 
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import discover_catalog
-from orthoflow.engine import processes
+from orthoflow.engine import local
 from orthoflow.engine.journal import RunEvent
 from orthoflow.engine.plan import RunOptions, RunPlan, plan_run
 from orthoflow.engine.scheduler import RunOutcome, execute
@@ -220,7 +220,7 @@ def _coordinate(folder: Path, steps: str, into: str, said: Any) -> None:
     """Run a workflow as a process of its own that has started in its own session."""
     os.setsid()
     # Toys need no compiler.
-    processes.PRELOADED[:] = ["orthoflow.engine.worker"]
+    local.PRELOADED[:] = ["orthoflow.engine.worker"]
     descriptor = said.detach()
     for stream in (1, 2):
         os.dup2(descriptor, stream)

@@ -134,7 +134,7 @@ def _serve() -> None:
 
 def _step_server(*, draws: bool) -> ForkServer:
     """A server of steps, which keep dots in the place of charts where they do not draw."""
-    from orthoflow.engine.processes import PRELOADED
+    from orthoflow.engine.local import PRELOADED
 
     server, path = ForkServer(), os.environ["PYTHONPATH"]
     server.set_forkserver_preload([*PRELOADED, *([] if draws else ["tests.keep_dots"])])

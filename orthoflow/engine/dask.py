@@ -24,8 +24,8 @@ from distributed.worker import WORKER_ANY_RUNNING
 
 from orthoflow.engine.durability import write_whole, writing_to
 from orthoflow.engine.environment import environment
+from orthoflow.engine.keys import methods_text, misfit
 from orthoflow.engine.local import EVENTS, Capacity, LocalExecutor, Tell
-from orthoflow.engine.method_versions import methods_text, misfit
 from orthoflow.engine.results import CellResult, result_from_json, result_to_json
 from orthoflow.engine.worker import Task, failed_result
 from orthoflow.errors import (

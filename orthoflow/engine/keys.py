@@ -2,13 +2,20 @@
 
 Paths, step names, cores, timeouts and time stamps are excluded on purpose. The code of a method and
 the versions of the libraries that it may use are included for every method automatically.
+
+    python -m orthoflow.engine.keys plane.hough2d ortho.dsm-backward
+
+prints what decides the results of methods here, as JSON behind a line break: so a worker of a
+cluster finds out whether it computes what a plan states.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import re
+import subprocess
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -16,9 +23,10 @@ from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from importlib import metadata
 from pathlib import Path
-from typing import Final, TypeAlias, cast
+from typing import Any, Final, TypeAlias, cast
 
 from orthoflow.catalog.catalog import Catalog, MethodEntry, ProductEntry
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.catalog.distributions import (
     canonical_name,
     direct_requirements,
@@ -26,8 +34,9 @@ from orthoflow.catalog.distributions import (
     source_files,
 )
 from orthoflow.catalog.guarding import UserInterrupt, guarded
+from orthoflow.engine.environment import python_path
 from orthoflow.engine.results import MethodIdentity, ProductRef, RecordedFile, canonical_json
-from orthoflow.errors import PluginError
+from orthoflow.errors import OrthoflowError, PluginError
 from orthoflow.products.product import JsonValue
 from orthoflow.sdk.lines import describe_error
 from orthoflow.sdk.methods import Method, port_specs
@@ -36,6 +45,8 @@ from orthoflow.version import DISTRIBUTION
 from orthoflow.workflow.expand import Cell
 
 _WHAT: Final = "orthoflow/cell"
+# For another process to load methods.
+_TIMEOUT_S: Final = 300.0
 _KEY_VERSION: Final = 1
 _ROOT: Final = Path(__file__).resolve().parents[1]
 # Parts of the framework on which a method's result can depend; engine and command line cannot
@@ -112,7 +123,8 @@ def method_facts(method_id: str, catalog: Catalog) -> MethodFacts:
     entry = catalog.method(method_id)
     cls: type[Method] = entry.load()
     distribution = entry.distribution
-    sources = _code_files(entry)
+    # Their content affects the results, whatever the version.
+    sources = {"plugin": plugin_files(entry), "framework": framework_files()}
     is_ours = entry.spec.target.startswith(f"{_BUILT_IN_PACKAGE}.")
     libraries = library_versions(distribution.name, () if is_ours else entry.source_files())
     unaffected = frozenset(map(canonical_name, cls.unaffected_by))
@@ -288,11 +300,6 @@ def plugin_files(entry: MethodEntry) -> tuple[Path, ...]:
     return tuple(sorted(found.union(files)))
 
 
-def _code_files(entry: MethodEntry) -> dict[str, tuple[Path, ...]]:
-    """Return files whose content affects a method's results, regardless of the version."""
-    return {"plugin": plugin_files(entry), "framework": framework_files()}
-
-
 def files_digest(files: Iterable[Path]) -> str:
     """Return the digest of files with their names; cached as long as they are unchanged."""
     return _digest(_states(files))
@@ -312,3 +319,75 @@ def _digest(files: _States) -> str:
         digest.update(f"{path.relative_to(root).as_posix()}\0{len(content)}\0".encode())
         digest.update(content)
     return digest.hexdigest()
+
+
+# Other installations ----------------------------------------------------------------------------
+
+
+def methods_text(methods: Mapping[str, MethodFacts]) -> str:
+    """What decides the results of methods, as text that can be compared."""
+    return json.dumps({name: _facts(facts) for name, facts in methods.items()}, sort_keys=True)
+
+
+def misfit(methods: str) -> str:
+    """State in what the methods installed here differ from those of a plan; empty if nowhere."""
+    planned = json.loads(methods)
+    try:
+        here = json.loads(_methods_here(tuple(planned)))
+    except (OSError, ValueError, subprocess.SubprocessError) as error:
+        return f"its methods cannot be loaded ({type(error).__name__})"
+    return next(
+        (said for name in planned if (said := _difference(name, planned[name], here[name]))), ""
+    )
+
+
+@cache
+def _methods_here(names: tuple[str, ...]) -> str:
+    """Ask another process, so that this one loads none of them."""
+    asked = subprocess.run(
+        [sys.executable, "-P", "-m", "orthoflow.engine.keys", *names],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=_TIMEOUT_S,
+        env={**os.environ, "PYTHONPATH": python_path()},
+    )
+    return asked.stdout.rpartition("\n")[2]
+
+
+def _facts(facts: MethodFacts) -> dict[str, JsonValue]:
+    return {
+        "distribution": f"{facts.distribution} {facts.distribution_version}",
+        "result version": facts.result_version,
+        "code": dict(facts.code),
+        "libraries": dict(facts.tools),
+    }
+
+
+# Any: JSON that `_facts` gave, here and in the process of a worker.
+def _difference(name: str, planned: dict[str, Any], here: dict[str, Any] | str) -> str:
+    if isinstance(here, str):
+        return here
+    for library in sorted(planned["libraries"].keys() | here["libraries"].keys()):
+        versions = [facts["libraries"].get(library, "none") for facts in (planned, here)]
+        if versions[0] != versions[1]:
+            return f"{name} has {library} {versions[1]} there, {versions[0]} in the plan"
+    for what in ("distribution", "result version"):
+        if planned[what] != here[what]:
+            return f"{name} has the {what} {here[what]} there, {planned[what]} in the plan"
+    return "" if planned["code"] == here["code"] else f"{name} has other code there"
+
+
+def _print_facts(names: Sequence[str]) -> None:
+    catalog = discover_catalog()
+    found: dict[str, JsonValue] = {}
+    for name in names:
+        try:
+            found[name] = _facts(method_facts(name, catalog))
+        except OrthoflowError as error:
+            found[name] = str(error)
+    sys.stdout.write("\n" + json.dumps(found))
+
+
+if __name__ == "__main__":
+    _print_facts(sys.argv[1:])

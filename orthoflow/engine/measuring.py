@@ -8,7 +8,7 @@ import importlib
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
@@ -126,14 +126,6 @@ def _reclaimable(folder: Path, name: str) -> int:
     return sum(int(line.split()[1]) for line in lines if line.split()[0] == name)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Victim:
-    """The step to stop, and its memory."""
-
-    address: str
-    n_bytes: int
-
-
 class MemoryGuard:
     """Watches the remaining memory while steps run.
 
@@ -144,23 +136,22 @@ class MemoryGuard:
     def __init__(self) -> None:
         self.interval_s = _LONGEST_S
 
-    def check(self, roots: Mapping[str, int]) -> Victim | None:
+    def check(self, roots: Iterable[int]) -> tuple[int, int] | None:
         """Choose a step to stop if too little memory is left.
 
         Args:
-            roots: name -> root process of every running step.
+            roots: root process of every running step.
+
+        Returns:
+            Root process of that step, and its memory in bytes.
         """
         memory = available_memory()
         margin = memory.available - memory.floor
         self.interval_s = min(max(margin / _FASTEST_BYTES_PER_S, _SHORTEST_S), _LONGEST_S)
-        if margin > 0 or not roots:
-            return None
-        held = {address: tree_memory(root) for address, root in roots.items()}
-        largest = max(held, key=lambda address: held[address])
+        held = {root: tree_memory(root) for root in roots} if margin <= 0 else {}
+        largest, n_bytes = max(held.items(), key=lambda item: item[1], default=(0, 0))
         # Another program may be the cause: stopping a small step would not help.
-        if held[largest] < memory.floor:
-            return None
-        return Victim(address=largest, n_bytes=held[largest])
+        return (largest, n_bytes) if held and n_bytes >= memory.floor else None
 
 
 def oom_kills() -> int:

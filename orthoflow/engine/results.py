@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Final
+from typing import Literal
 
 from orthoflow_provenance.document import (
     CellOutcome,
@@ -26,7 +25,6 @@ from pydantic import TypeAdapter, ValidationError
 
 from orthoflow.engine.durability import is_checked, with_digest
 from orthoflow.errors import StoreError
-from orthoflow.untrusted_text import parse_json
 
 # The words of a record, for the rest of the engine.
 __all__ = [
@@ -48,8 +46,6 @@ __all__ = [
     "result_to_json",
     "shared_fields",
 ]
-
-FORMAT: Final = "orthoflow/result/1"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,6 +81,7 @@ class CellResult(CellOutcome):
     """The outcome of one cell.
 
     Attributes:
+        format: name and version of its form in the store.
         run_id: the run that computed it.
         environment: where it was computed, None if it never was.
         inputs: port -> product.
@@ -94,6 +91,7 @@ class CellResult(CellOutcome):
         exit_code: of the error class, 0 when ok.
     """
 
+    format: Literal["orthoflow/result/1"] = "orthoflow/result/1"
     run_id: str = ""
     environment: RecordedEnvironment | None = None
     inputs: Mapping[str, ProductRef] = field(default_factory=dict)
@@ -111,9 +109,7 @@ class CellResult(CellOutcome):
 
 def result_to_json(result: CellResult) -> str:
     """Return a result as JSON text."""
-    content = _codec().dump_python(result, mode="json")
-    text = json.dumps({"format": FORMAT, **content}, allow_nan=False, ensure_ascii=False)
-    return with_digest(text)
+    return with_digest(_codec().dump_json(result).decode())
 
 
 def result_from_json(text: str, where: str) -> CellResult:
@@ -126,22 +122,14 @@ def result_from_json(text: str, where: str) -> CellResult:
     Raises:
         StoreError: the text is damaged or of another format.
     """
+    if not is_checked(text):
+        raise StoreError(f"{where} is damaged: its content does not match its digest")
     try:
-        content = parse_json(text)
-        form = content.get("format") if isinstance(content, dict) else None
-        if not isinstance(content, dict) or form != FORMAT:
-            raise StoreError(f"{where} has a result format that this orthoflow cannot read")
-        if not is_checked(text):
-            raise StoreError(f"{where} is damaged: its content does not match its digest")
         return _codec().validate_json(text, strict=True)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
-        raise StoreError(f"{where} is damaged: {place}: {first['msg']}") from error
-    except ValueError as error:
-        if isinstance(error, StoreError):
-            raise
-        raise StoreError(f"{where} is damaged: {error}") from error
+        raise StoreError(f"{where} is of another version: {place}: {first['msg']}") from error
 
 
 @cache

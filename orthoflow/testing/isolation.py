@@ -17,7 +17,7 @@ import threadpoolctl
 
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.engine.kernels import VARIABLE, reload_numba_config
-from orthoflow.engine.processes import start_process
+from orthoflow.engine.local import start_process
 from orthoflow.engine.store import Store
 from orthoflow.products import InputFiles, Product
 from orthoflow.testing.trials import Trial, run_trial

@@ -22,9 +22,9 @@ from orthoflow.engine.journal import (
     RunEvent,
     RunListener,
 )
+from orthoflow.engine.keys import methods_text, misfit
 from orthoflow.engine.local import Capacity
 from orthoflow.engine.measuring import AvailableMemory
-from orthoflow.engine.method_versions import methods_text, misfit
 from orthoflow.engine.plan import RunPlan
 from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.errors import ArgumentError, CancelledStepError, ClusterError, PluginError

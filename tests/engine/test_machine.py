@@ -114,11 +114,11 @@ def test_a_step_is_stopped_at_the_floor_and_not_above(
     left = AvailableMemory(available=here.floor + over, total=here.total)
     monkeypatch.setattr(measuring, "available_memory", lambda: left)
     monkeypatch.setattr(measuring, "tree_memory", {1: here.floor, 2: here.floor - 1}.__getitem__)
-    found = MemoryGuard().check({"small": 2, "large": 1})
+    found = MemoryGuard().check([2, 1])
     assert (found is not None) == is_stopped
     if found is not None:
-        assert (found.address, found.n_bytes) == ("large", here.floor)
-        assert MemoryGuard().check({"small": 2}) is None
+        assert found == (1, here.floor)
+        assert MemoryGuard().check([2]) is None
 
 
 # --- versions ---

@@ -9,12 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.engine import method_versions
-from orthoflow.engine.cleaning import collect_garbage
+from orthoflow.engine import keys
 from orthoflow.engine.keys import CellKey, MethodFacts, cell_key
 from orthoflow.engine.plan import RunOptions, explain
 from orthoflow.engine.results import ProductRef
-from orthoflow.engine.store import Preimage
+from orthoflow.engine.store import Preimage, collect_garbage
 from orthoflow.errors import ArgumentError
 from orthoflow.geometry.threads import usable_cores
 from orthoflow.workflow.expand import Cell
@@ -74,14 +73,14 @@ INPUTS = {"left": LEFT, "right": RIGHT}
 def test_a_machine_whose_methods_cannot_be_asked_does_not_fit(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    planned = method_versions.methods_text({"work.noise": FACTS})
+    planned = keys.methods_text({"work.noise": FACTS})
     here = dict.fromkeys(["work.noise"], "method work.noise is broken")
-    monkeypatch.setattr(method_versions, "_methods_here", lambda _: planned)
-    assert method_versions.misfit(planned) == ""
-    monkeypatch.setattr(method_versions, "_methods_here", lambda _: json.dumps(here))
-    assert method_versions.misfit(planned) == "method work.noise is broken"
-    monkeypatch.setattr(method_versions, "_methods_here", lambda _: "")
-    said = method_versions.misfit(planned)
+    monkeypatch.setattr(keys, "_methods_here", lambda _: planned)
+    assert keys.misfit(planned) == ""
+    monkeypatch.setattr(keys, "_methods_here", lambda _: json.dumps(here))
+    assert keys.misfit(planned) == "method work.noise is broken"
+    monkeypatch.setattr(keys, "_methods_here", lambda _: "")
+    said = keys.misfit(planned)
     assert said == "its methods cannot be loaded (JSONDecodeError)"
 
 

@@ -19,7 +19,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from orthoflow.engine.cleaning import collect_garbage
 from orthoflow.engine.durability import with_digest
 from orthoflow.engine.file_digests import FileDigests
 from orthoflow.engine.results import (
@@ -30,7 +29,7 @@ from orthoflow.engine.results import (
     result_from_json,
     result_to_json,
 )
-from orthoflow.engine.store import Publisher, Store, digest_of, list_results
+from orthoflow.engine.store import Publisher, Store, collect_garbage, digest_of, list_results
 from orthoflow.errors import ArgumentError, DamageError, InputError, ProductError, StoreError
 from orthoflow.products.product import Product
 from tests.optional import skip
@@ -179,7 +178,9 @@ def test_an_unreadable_result_is_a_miss(store: Store, text: str) -> None:
 def test_a_result_says_what_is_wrong_with_it() -> None:
     for field, value in (("status", "great"), ("wall_s", "long")):
         wrong = with_digest(json.dumps({"format": "orthoflow/result/1", field: value}))
-        with pytest.raises(StoreError, match=rf"^x\.json is damaged: {field}: Input should be "):
+        with pytest.raises(
+            StoreError, match=rf"^x\.json is of another version: {field}: Input should be "
+        ):
             result_from_json(wrong, "x.json")
 
 
