@@ -84,28 +84,8 @@ def kind_ports(catalog: Catalog, kind: str) -> KindPorts:
             name: PortSpec(name=name, type_name=type_name, required=True)
             for name, type_name in entry.spec.outputs.items()
         }
-    imports: dict[str, set[str]] = {}
-    for port in (*taken.values(), *given.values()):
-        module, name = _class_of(catalog, port.type_name)
-        imports.setdefault(module, set()).add(name)
-    handed = {port.type_name: port.name for port in taken.values() if port.required}
-    module, _, class_name = start.spec.target.partition(":") if start else ("", "", "")
-    return KindPorts(
-        inputs=tuple(_port(catalog, port, "") for port in taken.values()),
-        outputs=tuple(
-            _port(catalog, port, handed.get(port.type_name, "")) for port in given.values()
-        ),
-        imports={module: tuple(sorted(names)) for module, names in sorted(imports.items())},
-        needs=_needs(
-            catalog,
-            [port.type_name for port in (*taken.values(), *given.values())],
-            [entry.distribution, *([start.distribution] if start else [])],
-        ),
-        start_module=module,
-        start_class=class_name,
-        start_id=start.spec.id if start else "",
-        start_inputs=tuple(taken),
-    )
+    besides = [entry.distribution, *([start.distribution] if start else [])]
+    return _kind_ports(catalog, taken, given, start, besides)
 
 
 def loadable_method(catalog: Catalog, kind: str) -> MethodEntry | None:
@@ -132,14 +112,6 @@ def new_kind_ports(catalog: Catalog, takes: Sequence[str], gives: Sequence[str])
     Raises:
         ArgumentError: none does.
     """
-    imports: dict[str, set[str]] = {}
-    for name in (*takes, *gives):
-        module, class_name = _class_of(catalog, name)
-        imports.setdefault(module, set()).add(class_name)
-    outputs = tuple(
-        Port(name=name, class_name=_class_of(catalog, name)[1], same_as=name * (name in takes))
-        for name in gives
-    )
     made = [name for name in gives if name not in takes]
     start = _maker(catalog, takes, made) if made else None
     if made and not start:
@@ -147,16 +119,57 @@ def new_kind_ports(catalog: Catalog, takes: Sequence[str], gives: Sequence[str])
             f"no installed method makes {' and '.join(made)} of {' and '.join(takes)}, so there is "
             f"nothing to start from: name {' and '.join(made)} with --takes, too"
         )
+    taken, given = (
+        {name: PortSpec(name=name, type_name=name, required=True) for name in names}
+        for names in (takes, gives)
+    )
+    return _kind_ports(catalog, taken, given, start, [start.distribution] if start else [])
+
+
+def _kind_ports(
+    catalog: Catalog,
+    taken: Mapping[str, PortSpec],
+    given: Mapping[str, PortSpec],
+    start: MethodEntry | None,
+    besides: Sequence[DistributionInfo],
+) -> KindPorts:
+    """Return the ports of a new method.
+
+    Args:
+        catalog: what is installed.
+        taken: input ports by name.
+        given: output ports by name.
+        start: the method that does its work at first.
+        besides: distributions that it needs besides those of its product types.
+    """
+    types = dict.fromkeys(port.type_name for port in (*taken.values(), *given.values()))
+    classes = {type_name: _class_of(catalog, type_name) for type_name in types}
+    imports: dict[str, set[str]] = {}
+    for module, name in classes.values():
+        imports.setdefault(module, set()).add(name)
+    handed_on = {port.type_name: port.name for port in taken.values() if port.required}
     module, _, class_name = start.spec.target.partition(":") if start else ("", "", "")
+    start_takes = port_specs(start.load().In) if start else {}
     return KindPorts(
-        inputs=tuple(Port(name=name, class_name=_class_of(catalog, name)[1]) for name in takes),
-        outputs=outputs,
+        inputs=tuple(
+            Port(name=port.name, class_name=classes[port.type_name][1], required=port.required)
+            for port in taken.values()
+        ),
+        outputs=tuple(
+            Port(
+                name=port.name,
+                class_name=classes[port.type_name][1],
+                required=port.required,
+                same_as=handed_on.get(port.type_name, ""),
+            )
+            for port in given.values()
+        ),
         imports={module: tuple(sorted(names)) for module, names in sorted(imports.items())},
-        needs=_needs(catalog, (*takes, *gives), [start.distribution] if start else ()),
+        needs=_needs(catalog, types, besides),
         start_module=module,
         start_class=class_name,
         start_id=start.spec.id if start else "",
-        start_inputs=tuple(name for name in _declared(start)[0] if name in takes) if start else (),
+        start_inputs=tuple(name for name in taken if name in start_takes),
     )
 
 
@@ -195,11 +208,6 @@ def _needs(
 def _declared(start: MethodEntry) -> tuple[Mapping[str, PortSpec], Mapping[str, PortSpec]]:
     method = start.load()
     return port_specs(method.In), port_specs(method.Out)
-
-
-def _port(catalog: Catalog, port: PortSpec, same_as: str) -> Port:
-    name = _class_of(catalog, port.type_name)[1]
-    return Port(name=port.name, class_name=name, required=port.required, same_as=same_as)
 
 
 def _class_of(catalog: Catalog, type_name: str) -> tuple[str, str]:

@@ -39,25 +39,14 @@ __all__ = [
     "port_specs",
 ]
 
-# The hooks must load without numpy and pydantic, so that `plugins list` stays instant; these
+# The hooks must load without numpy and pydantic, so that `plugins list` stays instant; all other
 # names are looked up only when a method module asks for them.
-_HOMES = {
-    "Diagnostic": "orthoflow.diagnostics",
-    "DiagnosticSpec": "orthoflow.diagnostics",
-    "Determinism": "orthoflow.sdk.methods",
-    "Method": "orthoflow.sdk.methods",
-    "MethodParams": "orthoflow.sdk.methods",
-    "MetricSpec": "orthoflow.sdk.methods",
-    "PortSpec": "orthoflow.sdk.methods",
-    "Ports": "orthoflow.sdk.methods",
-    "port_specs": "orthoflow.sdk.methods",
-    "Metric": "orthoflow.sdk.context",
-    "StepContext": "orthoflow.sdk.context",
-    "StepEvent": "orthoflow.sdk.context",
-}
+_HOMES = ("orthoflow.sdk.methods", "orthoflow.sdk.context", "orthoflow.diagnostics")
 
 
 def __getattr__(name: str) -> object:
-    if name in _HOMES:
-        return getattr(import_module(_HOMES[name]), name)
+    if name in __all__:
+        for home in map(import_module, _HOMES):
+            if hasattr(home, name):
+                return getattr(home, name)
     raise AttributeError(f"module 'orthoflow.sdk' has no attribute {name!r}")

@@ -241,14 +241,6 @@ class Sample:
     values: Sequence[float | None]
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Limit:
-    """How far two numbers may lie apart: an amount, and a share of the larger one."""
-
-    amount: float
-    share: float = 0.0
-
-
 def sample_of(product: Product) -> dict[str, Sample]:
     """Return a sample of every array, and of the numbers in the metadata; bytes are left out.
 
@@ -287,8 +279,10 @@ def sample_problem(
             return f"{name} had {list(old.shape)} values, now {list(new.shape)}"
         if name == _METADATA and not numbers_stated:
             continue
-        limit = _limit(name, tolerances)
-        n_apart = sum(_is_apart(a, b, limit) for a, b in zip(old.values, new.values, strict=True))
+        amount, share = _limit(name, tolerances)
+        n_apart = sum(
+            _is_apart(a, b, amount, share) for a, b in zip(old.values, new.values, strict=True)
+        )
         if n_apart > _STRAY_SHARE * len(old.values):
             return f"{n_apart} of {len(old.values)} sampled values of {name} moved"
     return ""
@@ -296,33 +290,29 @@ def sample_problem(
 
 def _sample(array: NDArray[np.generic]) -> Sample:
     flat = array.reshape(-1)
-    n_values = min(flat.size, _AT_MOST)
-    places = range(flat.size) if flat.size <= _AT_MOST else _places(flat.size)
-    values = [float(flat[place]) for place in places][:n_values]
+    places: Sequence[int] = range(flat.size)
+    if flat.size > _AT_MOST:
+        places = [(index * _STRIDE) % flat.size for index in range(1, _AT_MOST + 1)]
+    values = [float(flat[place]) for place in places]
     return Sample(
         shape=list(array.shape),
         values=[float(f"{value:.{_DIGITS}g}") if np.isfinite(value) else None for value in values],
     )
 
 
-def _places(size: int) -> list[int]:
-    return [(index * _STRIDE) % size for index in range(1, _AT_MOST + 1)]
-
-
-def _limit(name: str, tolerances: Mapping[str, Tolerance]) -> _Limit:
+def _limit(name: str, tolerances: Mapping[str, Tolerance]) -> tuple[float, float]:
+    """How far two numbers may lie apart: an amount, and a share of the larger one."""
     if name == _METADATA:
-        return _Limit(amount=_UNSTATED, share=_METADATA_SHARE)
-    tolerance = tolerances.get(_field(name))
-    if tolerance is None:
-        return _Limit(amount=_UNSTATED, share=_UNSTATED)
-    return _Limit(amount=tolerance.limit)
+        return _UNSTATED, _METADATA_SHARE
+    tolerance = tolerances.get(name.rpartition("/")[2])
+    return (_UNSTATED, _UNSTATED) if tolerance is None else (tolerance.limit, 0.0)
 
 
-def _is_apart(before: float | None, after: float | None, limit: _Limit) -> bool:
+def _is_apart(before: float | None, after: float | None, amount: float, share: float) -> bool:
     if before is None or after is None:
         return before is not after
     largest = max(abs(before), abs(after))
-    return abs(after - before) > limit.amount + (limit.share + _ROUNDING) * largest
+    return abs(after - before) > amount + (share + _ROUNDING) * largest
 
 
 def _is_bytes(payload: Payload, name: str) -> bool:
@@ -344,7 +334,3 @@ def _numbers(node: JsonValue) -> Iterator[float]:
             yield from _numbers(value)
     elif isinstance(node, int | float) and not isinstance(node, bool):
         yield float(node)
-
-
-def _field(name: str) -> str:
-    return name.rpartition("/")[2]

@@ -50,7 +50,9 @@ class Witness:
     def first(self) -> WatchedRun:
         """The run, watched; inputs that it changed are as before afterwards."""
         inputs, state = _digests(self.trial.inputs), _global_state()
-        copies = {name: _copied(_arrays(self.trial.inputs[name])) for name in inputs}
+        copies = {
+            name: [array.copy() for array in _arrays(self.trial.inputs[name])] for name in inputs
+        }
         changed: tuple[str, ...] = ()
         try:
             run = _run(self.trial)
@@ -59,7 +61,10 @@ class Witness:
             changed = tuple(name for name in inputs if inputs[name] != after[name])
             # Other methods are tried on the same examples.
             for name in changed:
-                _put_back(_arrays(self.trial.inputs[name]), copies[name])
+                arrays = _arrays(self.trial.inputs[name])
+                for array, copy in zip(arrays, copies[name], strict=True):
+                    if array.flags.writeable:
+                        np.copyto(array, copy)
         return WatchedRun(run=run, changed_inputs=changed, drew_globally=state != _global_state())
 
     @cached_property
@@ -93,16 +98,6 @@ def _digests(inputs: Mapping[str, object]) -> dict[str, str]:
 
 def _arrays(given: object) -> list[Array]:
     return list(given.to_payload().arrays.values()) if isinstance(given, Product) else []
-
-
-def _copied(arrays: list[Array]) -> list[Array]:
-    return [array.copy() for array in arrays]
-
-
-def _put_back(arrays: list[Array], copies: list[Array]) -> None:
-    for array, copy in zip(arrays, copies, strict=True):
-        if array.flags.writeable:
-            np.copyto(array, copy)
 
 
 def _global_state() -> str:
