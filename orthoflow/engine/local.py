@@ -1,7 +1,6 @@
 """Executors of one machine: a guarded process per task, or none.
 
-Processes come from `multiprocessing`: forked from a server that has loaded `engine.preload` if the
-system supports it, otherwise spawned.
+Processes are forked from a server of `multiprocessing` that has loaded `engine.preload`.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import ModuleType
@@ -40,7 +39,6 @@ from orthoflow.sdk.lines import one_line
 from orthoflow.untrusted_text import shown
 
 PRELOADED: Final = ["orthoflow.engine.preload"]
-_HAS_SERVER: Final = "forkserver" in multiprocessing.get_all_start_methods()
 _THREAD_VARIABLES: Final = (
     "BLIS_NUM_THREADS",
     "GDAL_NUM_THREADS",
@@ -241,47 +239,6 @@ class StepLog:
         return os.pread(self._descriptor, _KEPT_BYTES, max(0, size - _KEPT_BYTES))
 
 
-@dataclass(frozen=True, kw_only=True)
-class StepProcess:
-    """The process of a step, in a session of its own.
-
-    Attributes:
-        process: of the step.
-        pipe: what it sends, as in `worker.run_step`.
-        scratch: what it starts knows this folder as `TMPDIR`, or works there.
-    """
-
-    process: BaseProcess
-    pipe: Connection
-    scratch: Path
-
-    @property
-    def pid(self) -> int:
-        """Its number."""
-        assert self.process.pid is not None  # noqa: S101 - it was started
-        return self.process.pid
-
-    def ask_to_end(self) -> None:
-        """Ask it to stop by itself."""
-        with suppress(OSError):
-            self.process.terminate()
-
-    def end_tree(self) -> None:
-        """Kill it with all that it started, also when it has ended by itself."""
-        _kill(_with_descendants(self.pid))
-        with suppress(ProcessLookupError, PermissionError):
-            os.killpg(self.pid, signal.SIGKILL)
-        if self.process.exitcode:
-            # What a step that crashed had started has another parent now.
-            _kill(one for one in psutil.process_iter() if _is_at_work_in(one, self.scratch))
-
-    def close(self) -> None:
-        """Let go of it."""
-        self.pipe.close()
-        if not self.process.is_alive():
-            self.process.close()
-
-
 def _with_descendants(process_id: int) -> list[psutil.Process]:
     with suppress(psutil.Error):
         root = psutil.Process(process_id)
@@ -304,22 +261,6 @@ def _is_at_work_in(process: psutil.Process, scratch: Path) -> bool:
     return False
 
 
-def start_step(task: Task) -> StepProcess:
-    """Start the process of a task; its log and its folder exist.
-
-    Raises:
-        StepFailedError: this machine cannot start another process.
-    """
-    ours, theirs = multiprocessing.Pipe(duplex=False)
-    with theirs:
-        try:
-            process = start_process(run_step, (task, theirs, _variables(task)), task.address)
-        except StepFailedError as error:
-            ours.close()
-            raise StepFailedError(f"no process could be started for {task.who}: {error}") from error
-    return StepProcess(process=process, pipe=ours, scratch=task.scratch)
-
-
 def start_process(
     target: Callable[..., object], arguments: tuple[object, ...], name: str
 ) -> BaseProcess:
@@ -328,11 +269,7 @@ def start_process(
     Raises:
         StepFailedError: this machine cannot start another process.
     """
-    context = (
-        multiprocessing.get_context("forkserver")
-        if _HAS_SERVER
-        else multiprocessing.get_context("spawn")
-    )
+    context = multiprocessing.get_context("forkserver")
     failure: Exception | None = None
     with _starting, _start_conditions():
         context.set_forkserver_preload(PRELOADED)
@@ -397,17 +334,15 @@ def _variables(task: Task) -> Mapping[str, str]:
     }
 
 
-@dataclass(kw_only=True)
-class _Running:
-    """A task and its process.
+class _Step:
+    """A task and its process, in a session of its own.
 
     Attributes:
         task: the task.
-        step: its process.
+        process: its process.
+        pipe: what it sends, as in `worker.run_step`.
         log: its output.
-        started: ISO 8601 UTC.
         clock: monotonic seconds at the start.
-        oom_kills: the kernel's counter at the start.
         reason: why we stopped it; None otherwise.
         is_victim: stopped because of lack of memory.
         kill_at: end of the grace period, monotonic seconds.
@@ -415,21 +350,93 @@ class _Running:
         result: the result that it sent.
     """
 
-    task: Task
-    step: StepProcess
-    log: StepLog
-    started: str
-    clock: float
-    oom_kills: int
-    reason: OrthoflowError | None = None
-    is_victim: bool = False
-    kill_at: float | None = None
-    peak_bytes: int = 0
-    result: CellResult | None = None
+    def __init__(self, task: Task) -> None:
+        """Start the process of a task.
+
+        Raises:
+            StepFailedError: this machine cannot start another process.
+            StoreError: its files cannot be written.
+        """
+        with writing_to(Path(task.folder).parent):
+            task.scratch.mkdir(parents=True, exist_ok=True)
+        self.task = task
+        self.log = StepLog(Path(task.log))
+        self._started, self._oom_kills = now(), oom_kills()
+        self.clock = time.monotonic()
+        self.reason: OrthoflowError | None = None
+        self.is_victim = False
+        self.kill_at: float | None = None
+        self.peak_bytes = 0
+        self.result: CellResult | None = None
+        self.pipe, theirs = multiprocessing.Pipe(duplex=False)
+        with theirs:
+            try:
+                arguments = (task, theirs, _variables(task))
+                self.process = start_process(run_step, arguments, task.address)
+            except StepFailedError as error:
+                self.pipe.close()
+                self.log.close()
+                raise StepFailedError(
+                    f"no process could be started for {task.who}: {error}"
+                ) from error
+
+    @property
+    def pid(self) -> int:
+        """Its number."""
+        assert self.process.pid is not None  # noqa: S101 - it was started
+        return self.process.pid
+
+    def stop(self, reason: OrthoflowError) -> None:
+        """Ask it to stop by itself, if nobody has; it is killed after a grace period."""
+        if self.reason is None:
+            self.reason = reason
+            self.kill_at = time.monotonic() + _GRACE_S
+            with suppress(OSError):
+                self.process.terminate()
+
+    def kill(self) -> None:
+        """Kill it with all that it started, also when it has ended by itself."""
+        self.kill_at = time.monotonic() + _GRACE_S
+        _kill(_with_descendants(self.pid))
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(self.pid, signal.SIGKILL)
+        if self.process.exitcode:
+            # What a step that crashed had started has another parent now.
+            scratch = self.task.scratch
+            _kill(one for one in psutil.process_iter() if _is_at_work_in(one, scratch))
+
+    def close(self) -> None:
+        """Close its files."""
+        self.log.close()
+        self.pipe.close()
+        if not self.process.is_alive():
+            self.process.close()
+
+    def outcome(self) -> CellResult:
+        """Return the result of the process, which has ended."""
+        peak_mib = round(self.peak_bytes / MIB, 1)
+        if self.reason is None and self.result is not None:
+            peak_mib = max(self.result.peak_rss_mib, peak_mib)
+            return dataclasses.replace(self.result, peak_rss_mib=peak_mib, log=self.log.text())
+        return dataclasses.replace(
+            failed_result(self.task, self.reason or self._reason_of_silence()),
+            started=self._started,
+            ended=now(),
+            wall_s=round(time.monotonic() - self.clock, 4),
+            peak_rss_mib=peak_mib,
+            log=self.log.text(),
+        )
+
+    def _reason_of_silence(self) -> OrthoflowError:
+        code = self.process.exitcode or 0
+        if code == -signal.SIGKILL and oom_kills() > self._oom_kills:
+            return describe_memory(self.task.who, self.peak_bytes)
+        tail = one_line(self.log.text().strip().rpartition("\n")[2], _LONGEST_LAST_LINE)
+        return StepFailedError(describe_exit(self.task.who, code, self.peak_bytes, tail))
 
 
 # By process, the tasks of all executors here: a cluster's workers in this process have one each.
-_all_running: Final[dict[int, _Running]] = {}
+_all_running: Final[dict[int, _Step]] = {}
 
 
 @dataclass
@@ -438,7 +445,7 @@ class LocalExecutor:
 
     capacity: Capacity
     tell: Tell
-    _running: dict[str, _Running] = field(default_factory=dict)
+    _running: dict[str, _Step] = field(default_factory=dict)
     _guard: MemoryGuard = field(default_factory=MemoryGuard)
     _unstarted: dict[str, CellResult] = field(default_factory=dict)
 
@@ -448,145 +455,103 @@ class LocalExecutor:
         Raises:
             StoreError: its files cannot be written.
         """
-        with writing_to(Path(task.folder).parent):
-            task.scratch.mkdir(parents=True, exist_ok=True)
-        log, kills = StepLog(Path(task.log)), oom_kills()
         try:
-            step = start_step(task)
+            step = _Step(task)
         except StepFailedError as error:
-            log.close()
             self._unstarted[task.address] = failed_result(task, error)
             return
-        run = _Running(
-            task=task,
-            step=step,
-            log=log,
-            started=now(),
-            clock=time.monotonic(),
-            oom_kills=kills,
-        )
-        self._running[task.address] = _all_running[run.step.pid] = run
+        self._running[task.address] = _all_running[step.pid] = step
 
     def poll(self, timeout_s: float) -> dict[str, CellResult]:
         """Wait for tasks to end, up to a time; forwards messages of running tasks."""
         ends, self._unstarted = self._unstarted, {}
-        waited = [run.step.process.sentinel for run in self._running.values()]
-        heard = [run.step.pipe for run in self._running.values() if not run.step.pipe.closed]
-        wait([*heard, *waited], 0.0 if ends else min(timeout_s, self._guard.interval_s))
+        steps = self._running.values()
+        pipes = [step.pipe for step in steps if not step.pipe.closed]
+        timeout_s = 0.0 if ends else min(timeout_s, self._guard.interval_s)
+        wait([*pipes, *(step.process.sentinel for step in steps)], timeout_s)
         # Checked before the last messages are read: nothing is sent after the end.
-        ended = [run for run in self._running.values() if not run.step.process.is_alive()]
-        for run in self._running.values():
-            self._hear(run)
-        ends |= {run.task.address: self._end(run) for run in ended}
+        ended = [step for step in steps if not step.process.is_alive()]
+        for step in steps:
+            self._read(step)
+        ends |= {step.task.address: self._end(step) for step in ended}
         self._watch()
         return ends
 
     def cancel(self) -> None:
         """Ask all tasks to stop: SIGTERM, and SIGKILL after 5 s."""
-        for run in self._running.values():
-            self._stop(run, CancelledStepError(f"step {run.task.address} was interrupted"))
+        for step in self._running.values():
+            step.stop(CancelledStepError(f"step {step.task.address} was interrupted"))
 
     def close(self) -> None:
         """Kill whatever still runs."""
-        for run in list(self._running.values()):
-            run.step.end_tree()
-            run.step.process.join(_GRACE_S)
-            self._forget(run)
+        for step in list(self._running.values()):
+            step.kill()
+            step.process.join(_GRACE_S)
+            self._forget(step)
 
-    def _hear(self, run: _Running) -> None:
+    def _read(self, step: _Step) -> None:
         for _ in range(_MOST_MESSAGES):
-            if run.step.pipe.closed:
+            if step.pipe.closed:
                 return
             try:
-                if not run.step.pipe.poll(0):
+                if not step.pipe.poll(0):
                     return
-                message = run.step.pipe.recv_bytes(_LARGEST_MESSAGE)
+                message = step.pipe.recv_bytes(_LARGEST_MESSAGE)
             except (EOFError, OSError):
                 # Ended, or sent an invalid message.
-                run.step.pipe.close()
+                step.pipe.close()
                 return
-            self._take(run, message)
+            self._take(step, message)
 
-    def _take(self, run: _Running, message: bytes) -> None:
+    def _take(self, step: _Step, message: bytes) -> None:
         # A method may write into the pipe by mistake: invalid messages are ignored.
         with suppress(ValueError, StoreError, RecursionError):
             if message.startswith(RESULT):
                 text = message.removeprefix(RESULT).decode()
-                result = result_from_json(text, f"the result of {run.task.address}")
-                run.result = result if result.key == run.task.key else None
+                result = result_from_json(text, f"the result of {step.task.address}")
+                step.result = result if result.key == step.task.key else None
             elif message.startswith(EVENT):
                 event = EVENTS.validate_json(message.removeprefix(EVENT), strict=True)
-                self.tell(run.task.address, event)
+                self.tell(step.task.address, event)
 
     def _watch(self) -> None:
         time_now = time.monotonic()
-        for run in self._running.values():
-            run.peak_bytes = max(run.peak_bytes, process_memory(run.step.pid))
-            run.log.shorten()
-            limit = run.task.timeout_s
-            if run.kill_at is not None and time_now > run.kill_at:
-                run.step.end_tree()
-                run.kill_at = time_now + _GRACE_S
-            elif limit is not None and run.reason is None and time_now - run.clock > limit:
-                self._stop(run, describe_timeout(run.task.who, limit))
+        for step in self._running.values():
+            step.peak_bytes = max(step.peak_bytes, process_memory(step.pid))
+            step.log.shorten()
+            limit = step.task.timeout_s
+            if step.kill_at is not None and time_now > step.kill_at:
+                step.kill()
+            elif limit is not None and time_now - step.clock > limit:
+                step.stop(describe_timeout(step.task.who, limit))
         self._guard_memory()
 
     def _guard_memory(self) -> None:
-        runs = _all_running.copy()
-        victim = self._guard.check(runs)
+        steps = _all_running.copy()
+        victim = self._guard.check(steps)
         # One at a time: the memory of a dying process is not released at once.
-        if victim is None or any(run.is_victim for run in runs.values()):
+        if victim is None or any(step.is_victim for step in steps.values()):
             return
-        run, n_bytes = runs[victim[0]], victim[1]
-        if self._running.get(run.task.address) is not run:
+        step, n_bytes = steps[victim[0]], victim[1]
+        if self._running.get(step.task.address) is not step:
             # Its own executor stops it.
             return
-        run.is_victim = True
-        run.reason = describe_memory(run.task.who, n_bytes)
-        run.peak_bytes = max(run.peak_bytes, n_bytes)
-        run.step.end_tree()
-        run.kill_at = time.monotonic() + _GRACE_S
+        step.is_victim = True
+        step.reason = describe_memory(step.task.who, n_bytes)
+        step.peak_bytes = max(step.peak_bytes, n_bytes)
+        step.kill()
 
-    def _stop(self, run: _Running, reason: OrthoflowError) -> None:
-        if run.reason is None:
-            run.reason = reason
-            run.kill_at = time.monotonic() + _GRACE_S
-            run.step.ask_to_end()
-
-    def _end(self, run: _Running) -> CellResult:
-        run.step.end_tree()
-        run.log.shorten()
-        result = dataclasses.replace(_result(run), log=run.log.text())
-        self._forget(run)
+    def _end(self, step: _Step) -> CellResult:
+        step.kill()
+        step.log.shorten()
+        result = step.outcome()
+        self._forget(step)
         return result
 
-    def _forget(self, run: _Running) -> None:
-        run.log.close()
-        del _all_running[run.step.pid]
-        del self._running[run.task.address]
-        run.step.close()
-
-
-def _result(run: _Running) -> CellResult:
-    peak_mib = round(run.peak_bytes / MIB, 1)
-    if run.reason is None and run.result is not None:
-        peak_mib = max(run.result.peak_rss_mib, peak_mib)
-        return dataclasses.replace(run.result, peak_rss_mib=peak_mib)
-    return dataclasses.replace(
-        failed_result(run.task, run.reason or _reason_of_silence(run)),
-        started=run.started,
-        ended=now(),
-        wall_s=round(time.monotonic() - run.clock, 4),
-        peak_rss_mib=peak_mib,
-    )
-
-
-def _reason_of_silence(run: _Running) -> OrthoflowError:
-    code = run.step.process.exitcode or 0
-    if code == -signal.SIGKILL and oom_kills() > run.oom_kills:
-        return describe_memory(run.task.who, run.peak_bytes)
-    tail = one_line(run.log.text().strip().rpartition("\n")[2], _LONGEST_LAST_LINE)
-    return StepFailedError(describe_exit(run.task.who, code, run.peak_bytes, tail))
+    def _forget(self, step: _Step) -> None:
+        del _all_running[step.pid]
+        del self._running[step.task.address]
+        step.close()
 
 
 def describe_exit(who: str, code: int, n_bytes: int, tail: str) -> str:
