@@ -233,4 +233,6 @@ def _coordinate(folder: Path, steps: str, into: str, said: Any) -> None:
         except OrthoflowError as error:
             sys.stdout.write(f"{type(error).__name__}: {error}\n")
             sys.exit(error.exit_code)
+        for address, result in outcome.failed.items():
+            sys.stdout.write(f"{address}: {result.error_message}\n{result.log}\n")
         sys.exit(outcome.exit_code)
