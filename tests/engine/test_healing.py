@@ -166,7 +166,7 @@ def test_a_result_file_that_is_damaged_is_made_again(world: World) -> None:
     path = world.store.results / f"{first.results['noise'].key}.json"
     text = path.read_text()
     # Still JSON, still of the right shape, and wrong.
-    path.write_text(text.replace('"wall_s": 0', '"wall_s": 9'))
+    path.write_text(text.replace('"wall_s":0', '"wall_s":9'))
     assert path.read_text() != text
     again = run(world, STEPS, into="again")
     assert (computed(again), again.damaged) == ({"noise"}, {"noise": "result file"})
