@@ -78,7 +78,8 @@ def cache_list(store: Path, *, as_json: bool) -> int:
 @json_option
 def cache_gc(store: Path, older_than: float | None, *, dry_run: bool, as_json: bool) -> int:
     """Remove incomplete results, products that no result needs, and what killed runs left."""
-    from orthoflow.engine.store import Store, collect_garbage
+    from orthoflow.engine.cleaning import collect_garbage
+    from orthoflow.engine.store import Store
 
     found = collect_garbage(Store(store), older_than_days=older_than, dry_run=dry_run)
     if as_json:
@@ -102,7 +103,8 @@ def cache_verify(store: Path, *, as_json: bool) -> int:
     What is damaged is removed: the next run that needs it computes it again. Ends with 3 when
     something was damaged. Runs may use the store meanwhile.
     """
-    from orthoflow.engine.store import Store, check_store
+    from orthoflow.engine.cleaning import check_store
+    from orthoflow.engine.store import Store
 
     found = check_store(Store(store))
     code = EXIT_RECORD_DIFFERS if found.damaged else EXIT_GOOD

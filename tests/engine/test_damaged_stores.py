@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.engine.store import Store, check_store
+from orthoflow.engine.cleaning import check_store
+from orthoflow.engine.store import Store
 from tests.long_loops import IS_LONG
 from tests.stored_runs import StoredRuns, stored_runs
 

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.engine.store import Store, check_store
+from orthoflow.engine.cleaning import check_store
+from orthoflow.engine.store import Store
 from tests.faulty_files import FAULTS
 from tests.long_loops import IS_LONG
 from tests.stored_runs import StoredRuns, stored_runs

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
+from orthoflow.engine.cleaning import check_store
 from orthoflow.engine.journal import CellStarted, RunEvent
 from orthoflow.engine.scheduler import RunOutcome, execute
-from orthoflow.engine.store import check_store
 from orthoflow.errors import StoreError
 from tests.engine_world import World, digests
 

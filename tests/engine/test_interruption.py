@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from orthoflow.engine.cleaning import collect_garbage
 from orthoflow.engine.journal import is_running
 from orthoflow.engine.scheduler import RunOutcome, execute
-from orthoflow.engine.store import collect_garbage
 from orthoflow.errors import ArgumentError, CancelledStepError, StoreError
 from orthoflow.records.runs import find_record
 from tests.engine_world import World, digests, start_coordinator, toy_world

@@ -10,10 +10,11 @@ from pathlib import Path
 import pytest
 
 from orthoflow.engine import keys
+from orthoflow.engine.cleaning import collect_garbage
 from orthoflow.engine.keys import CellKey, MethodFacts, cell_key
 from orthoflow.engine.plan import RunOptions, explain
 from orthoflow.engine.results import ProductRef
-from orthoflow.engine.store import Preimage, collect_garbage
+from orthoflow.engine.store import Preimage
 from orthoflow.errors import ArgumentError
 from orthoflow.geometry.threads import usable_cores
 from orthoflow.workflow.expand import Cell

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from orthoflow.engine.cleaning import Damage, Soundness, check_store
 from orthoflow.engine.results import CellResult, ProductRef
-from orthoflow.engine.store import Damage, Soundness, Store, check_store
+from orthoflow.engine.store import Store
 from orthoflow.products.product import Product
 
 

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from orthoflow.engine.cleaning import collect_garbage
 from orthoflow.engine.durability import with_digest
 from orthoflow.engine.file_digests import FileDigests
 from orthoflow.engine.results import (
@@ -29,7 +30,7 @@ from orthoflow.engine.results import (
     result_from_json,
     result_to_json,
 )
-from orthoflow.engine.store import Publisher, Store, collect_garbage, digest_of, list_results
+from orthoflow.engine.store import Publisher, Store, digest_of, list_results
 from orthoflow.errors import ArgumentError, DamageError, InputError, ProductError, StoreError
 from orthoflow.products.product import Product
 from tests.optional import skip

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.engine.store import Store, check_store, collect_garbage
+from orthoflow.engine.cleaning import check_store, collect_garbage
+from orthoflow.engine.store import Store
 from orthoflow.errors import ArgumentError
 
 

@@ -1,0 +1,153 @@
+"""Cleaning a store: what is damaged or needed no longer is removed."""
+
+from __future__ import annotations
+
+import re
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from orthoflow.engine.durability import exclusive_lock, remove_tree, shared_lock, size_of
+from orthoflow.engine.store import WHOLE, Store, is_store, require_store
+from orthoflow.errors import ArgumentError
+
+_DAY_S: Final = 86_400.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Damage:
+    """Something damaged that was removed.
+
+    Attributes:
+        name: its path below the store's folder.
+        what: the damaged part; for a result, why it is unusable.
+    """
+
+    name: str
+    what: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Soundness:
+    """The result of checking a store.
+
+    Attributes:
+        n_results: intact results.
+        n_objects: intact products and figures.
+        damaged: what was damaged, and is removed now.
+    """
+
+    n_results: int
+    n_objects: int
+    damaged: tuple[Damage, ...]
+
+
+def check_store(store: Store) -> Soundness:
+    """Check every object and every result; runs may use the store meanwhile.
+
+    What is damaged is removed, and results with missing products or figures are.
+
+    Raises:
+        ArgumentError: the folder has other content.
+        StoreError: the store cannot be read, or something damaged cannot be removed.
+    """
+    require_store(store.folder)
+    if not is_store(store.folder):
+        return Soundness(n_results=0, n_objects=0, damaged=())
+    with shared_lock(store.lock_file):
+        names = _named_by_digest(store.objects)
+        parts = {name: store.damage(name, with_published=True, again=True) for name in names}
+        keys = _named_by_digest(store.results)
+        reasons = {key: store.damage_of_result(key) for key in keys}
+    # A missing object was replaced by a run, or removed by somebody: results show it.
+    objects = [
+        Damage(name=f"objects/{n}", what=w) for n, w in parts.items() if w not in ("", WHOLE)
+    ]
+    results = [Damage(name=f"results/{key}.json", what=why) for key, why in reasons.items() if why]
+    return Soundness(
+        n_results=len(keys) - len(results),
+        n_objects=len(names) - len(objects),
+        damaged=(*objects, *results),
+    )
+
+
+def _named_by_digest(folder: Path) -> tuple[str, ...]:
+    """Return names, without suffix, of the store's own files; others are not ours."""
+    names = (path.name.removesuffix(".json") for path in folder.glob("*"))
+    return tuple(sorted(name for name in names if re.fullmatch("[0-9a-f]{64}", name)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class GarbageReport:
+    """What garbage collection removed, or would remove.
+
+    Attributes:
+        n_results: results.
+        n_objects: products and figures.
+        freed_bytes: bytes of everything removed.
+    """
+
+    n_results: int
+    n_objects: int
+    freed_bytes: int
+
+
+def collect_garbage(
+    store: Store, *, older_than_days: float | None = None, dry_run: bool = False
+) -> GarbageReport:
+    """Remove incomplete results, products without results, and leftovers.
+
+    Args:
+        store: the store; no run may use it meanwhile.
+        older_than_days: also remove results that no run used for this many days; 0 removes all.
+        dry_run: only report what would be removed.
+
+    Raises:
+        ArgumentError: the number of days is negative, or the folder has other content.
+        StoreError: a run uses the store.
+    """
+    if older_than_days is not None and older_than_days < 0:
+        raise ArgumentError(f"days must be 0 or more, got {older_than_days:g}")
+    require_store(store.folder)
+    if not is_store(store.folder):
+        return GarbageReport(n_results=0, n_objects=0, freed_bytes=0)
+    busy = f"the store {store.folder} is in use by a run; wait until it has ended"
+    with exclusive_lock(store.lock_file, busy):
+        return _collect(store, older_than_days, is_dry=dry_run)
+
+
+def _collect(store: Store, older_than_days: float | None, *, is_dry: bool) -> GarbageReport:
+    results: list[Path] = []
+    kept: set[str] = set()
+    for path in sorted(store.results.glob("*.json")):
+        age_days = (time.time() - path.lstat().st_mtime) / _DAY_S
+        result = store.result(path.stem)
+        if result is None or (older_than_days is not None and age_days >= older_than_days):
+            results.append(path)
+        else:
+            kept |= result.objects
+    gone = {path.stem for path in results}
+    objects = [path for path in _children(store.objects) if path.name not in kept]
+    preimages = [
+        path
+        for path in store.preimages.glob("*/*.json")
+        if path.stem in gone or not (store.results / path.name).exists()
+    ]
+    half_written = [
+        path
+        for folder in (store.results, store.preimages)
+        for path in folder.glob("**/.*-*")
+        if path.is_file()
+    ]
+    # Results first: after a kill in between, no result remains whose objects are gone.
+    unneeded = (*results, *preimages, *objects, *_children(store.failures))
+    unneeded = (*unneeded, *_children(store.scratch), *half_written)
+    freed_bytes = sum(size_of(path) for path in unneeded)
+    for path in () if is_dry else unneeded:
+        remove_tree(path)
+    return GarbageReport(n_results=len(results), n_objects=len(objects), freed_bytes=freed_bytes)
+
+
+def _children(folder: Path) -> tuple[Path, ...]:
+    return tuple(sorted(folder.iterdir())) if folder.is_dir() else ()
