@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from base64 import b64decode
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Final
@@ -41,12 +41,13 @@ def build_plane_charts_once(
     request: pytest.FixtureRequest, patch: pytest.MonkeyPatch, test: str = ""
 ) -> None:
     """Let a test set up the charts of its detections once; see `_build_charts_once`."""
+    import matplotlib.figure
     from orthoflow_plugins.plane import figures, search
 
     common = ("draw_deviations", "draw_planes", "draw_thickness")
     own = ("draw_accumulator", "draw_space", "draw_sections", "_draw_normals")
-    _build_charts_once(request, patch, (search, common, figures), test)
-    _build_charts_once(request, patch, (figures, own, figures), test)
+    _build_charts_once(request, patch, (search, common, matplotlib.figure), test)
+    _build_charts_once(request, patch, (figures, own, matplotlib.figure), test)
 
 
 def build_orient_charts_once(
@@ -133,6 +134,9 @@ class Blank:
 
     def __getitem__(self, _: object) -> Blank:
         return self
+
+    def __iter__(self) -> Iterator[Blank]:
+        return iter((self, self))
 
     def __call__(self, *_: object, **__: object) -> Blank:
         return self

@@ -5,14 +5,14 @@ from __future__ import annotations
 import base64
 import io
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.files.drawing import COLUMN_INCHES, plane_ink, styled
 from orthoflow.untrusted_text import shown
 
 if TYPE_CHECKING:
@@ -25,9 +25,6 @@ ChartFormat: TypeAlias = Literal["svg", "pdf", "png"]
 PlanWall: TypeAlias = tuple[str, int, NDArray[np.float64]]
 PlanPhoto: TypeAlias = tuple[str, NDArray[np.float64], NDArray[np.float64]]
 
-# Two columns of a journal are 85 mm wide each.
-COLUMN_INCHES: Final = 85.0 / 25.4
-_DPI: Final = 300
 # Distinguished by people who see few colours, and by their strokes where there are none
 # (Okabe and Ito 2008).
 COLOURS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#000000")
@@ -38,27 +35,7 @@ _NEAR_ZERO: Final = 0.6
 # Of a viewing direction, of the plan; and of how many photos names can be read.
 _ARROW_SHARE: Final = 0.06
 _NAMED_PHOTOS: Final = 60
-# Any: matplotlib's own types name every setting that it has.
-_STYLE: Final[Mapping[Any, Any]] = {
-    "font.size": 8.0,
-    "font.family": "DejaVu Sans",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#d4d9de",
-    "grid.linewidth": 0.5,
-    "lines.linewidth": 1.2,
-    "lines.markersize": 4.0,
-    "errorbar.capsize": 2.0,
-    "legend.frameon": False,
-    "legend.fontsize": 7.0,
-    "savefig.dpi": _DPI,
-    # The same numbers give the same bytes, and text stays text in PDF.
-    "svg.hashsalt": "orthoflow",
-    "pdf.fonttype": 42,
-    "text.parse_math": False,
-}
+_STYLE: Final = {"font.size": 8.0, "axes.grid": True}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,17 +55,6 @@ class ChartPoint:
     spread: float = math.nan
     is_filled: bool = False
     is_joined: bool = True
-
-
-@contextmanager
-def styled() -> Iterator[None]:
-    """Draw in the style of all charts, whatever the user's own settings of matplotlib are."""
-    import matplotlib as mpl  # noqa: PLC0415 - pages without charts need none
-
-    with mpl.rc_context():
-        mpl.rcdefaults()
-        mpl.rcParams.update(_STYLE)
-        yield
 
 
 def line_chart(
@@ -112,7 +78,7 @@ def line_chart(
 
     every = [point for points in lines.values() for point in points]
     xs = sorted({point.x for point in every})
-    with styled():
+    with styled(_STYLE):
         figure = Figure(figsize=(COLUMN_INCHES, 0.75 * COLUMN_INCHES), layout="constrained")
         axes = figure.subplots()
         is_logarithmic = xs[0] > 0 and xs[-1] / xs[0] >= _LOGARITHMIC_RATIO
@@ -184,11 +150,9 @@ def plan_chart(
     """
     from matplotlib.figure import Figure  # noqa: PLC0415 - pages without charts need none
 
-    from orthoflow.files.clouds.attributes import plane_ink  # noqa: PLC0415 - likewise
-
     feet, looks = (np.array([photo[k] for photo in photos]).reshape(-1, 2) for k in (1, 2))
     span = float(np.ptp(np.vstack([*(wall[2] for wall in walls), feet]), axis=0).max()) or 1.0
-    with styled():
+    with styled(_STYLE):
         figure = Figure(figsize=(1.5 * COLUMN_INCHES, 1.2 * COLUMN_INCHES), layout="constrained")
         axes = figure.subplots()
         for index, (name, number, corners_m) in enumerate(walls):

@@ -284,7 +284,6 @@ class AttributedCloud:
 # Hues by the golden ratio: planes with close numbers have different colours.
 _HUE_STEP: Final = 0.618033988749895
 _SATURATION: Final = 0.6
-_INK: Final = 0.7
 UNKNOWN: Final = (128, 128, 128)
 # The darkest intensity keeps this share of its plane's colour.
 _DARKEST: Final = 0.4
@@ -306,12 +305,6 @@ def plane_colour(index: int) -> tuple[int, int, int]:
         return UNKNOWN
     red, green, blue = colorsys.hsv_to_rgb((index * _HUE_STEP) % 1.0, _SATURATION, 1.0)
     return round(255 * red), round(255 * green), round(255 * blue)
-
-
-def plane_ink(index: int) -> tuple[float, float, float]:
-    """Return the colour of a plane in charts, 0..1: darker, as paper is white and viewers black."""
-    red, green, blue = plane_colour(index)
-    return _INK * red / 255.0, _INK * green / 255.0, _INK * blue / 255.0
 
 
 def plane_colours(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import ClassVar, Final
 
 import numpy as np
@@ -349,7 +350,7 @@ def _draw(
         times = enlargement(shifts, picture.image)
         ctx.figure(
             f"wall_{picture.image.number}_residuals",
-            vector_map(picture.image, places, shifts, [names[k] for k in own]),
+            partial(vector_map, picture.image, places, shifts, [names[k] for k in own]),
             f"{picture.image.name}: check points, shown - surveyed, {times:g} times enlarged; "
             "green up to the median, yellow beyond, red over twice the median. Short arrows to all "
             "sides are noise; neighbours that point the same way are a real shift of the image.",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import ClassVar, Final, Literal
 
 import numpy as np
@@ -202,7 +203,7 @@ class _Verdict:
         times = enlargement(self.pairs.shift, self.image)
         ctx.figure(
             f"wall_{self.image.number}_displacements",
-            vector_map(self.image, self.pairs.places, self.pairs.shift),
+            partial(vector_map, self.image, self.pairs.places, self.pairs.shift),
             f"{self.image.name}: orthoimage against intensity, displacements {times:g} times "
             "enlarged; yellow over the median, red over twice the median. Short arrows to all "
             "sides are noise; neighbours that point the same way are a real shift.",

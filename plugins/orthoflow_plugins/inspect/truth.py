@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
@@ -49,9 +50,6 @@ from orthoflow_plugins.inspect.cell_errors import (
     wall_errors,
 )
 from orthoflow_plugins.inspect.figures import (
-    COLOUR_SPAN_GREY,
-    DEPTH_SPAN_MM,
-    DISPLACEMENT_SPAN_CELLS,
     colour_error_map,
     depth_error_map,
     displacement_map,
@@ -606,23 +604,22 @@ class _Judge:
 def _draw(image: Orthoimage, verdict: _Verdict, ctx: StepContext) -> None:
     ctx.figure(
         f"wall_{image.number}_depth_error",
-        depth_error_map(verdict.depth_m),
-        f"{image.name}: measured - true depth, blue {-DEPTH_SPAN_MM:g} mm to red "
-        f"{DEPTH_SPAN_MM:g} mm. Fine grain is noise of the scanner; whole areas of one colour are "
-        "a plane or a surface in the wrong place.",
+        partial(depth_error_map, verdict.depth_m),
+        f"{image.name}: measured - true depth. Fine grain is noise of the scanner; whole areas of "
+        "one colour are a plane or a surface in the wrong place.",
     )
     ctx.figure(
         f"wall_{image.number}_colour_error",
-        colour_error_map(verdict.grey),
-        f"{image.name}: colour error, black 0 to yellow {COLOUR_SPAN_GREY:g} grey levels. Bright "
+        partial(colour_error_map, verdict.grey),
+        f"{image.name}: colour error. Bright "
         "outlines are displaced edges, bright areas wrong paint or light of another photo.",
     )
     if verdict.sources is not None:
         ctx.figure(
             f"wall_{image.number}_displacement",
-            displacement_map(verdict.length_m / image.frame.gsd_m),
-            f"{image.name}: true displacement of cells that photos painted, black 0 to yellow "
-            f"{DISPLACEMENT_SPAN_CELLS:g} cells of {1e3 * image.frame.gsd_m:g} mm. Dark is good; a "
+            partial(displacement_map, verdict.length_m / image.frame.gsd_m),
+            f"{image.name}: true displacement of cells of {1e3 * image.frame.gsd_m:g} mm that "
+            f"photos painted. Dark is good; a "
             "bright area with a sharp border is a photo oriented worse than its neighbours.",
         )
 

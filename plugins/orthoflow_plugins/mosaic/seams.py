@@ -13,7 +13,12 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from orthoflow.errors import MethodError
-from orthoflow.files.images import encode_webp
+from orthoflow.files.drawing import (
+    encode_chart,
+    in_column_style,
+    picture_figure,
+    plane_ink,
+)
 from orthoflow.files.polygons import NamedPolygon
 from orthoflow.geometry.bands import Allocate, count_cells, holds_cells, row_bands
 from orthoflow.geometry.levels import eight_bits, plain_tone
@@ -56,18 +61,9 @@ from orthoflow_plugins.mosaic.parameters import SeamsParams
 _IN_MEMORY_MOST: Final = 1 << 24
 # The map of sources: its longest side, its colours, and their share relative to the grey.
 _LONGEST_PX: Final = 900
-_NAMED_RGB: Final = {
-    "blue": (31, 119, 180),
-    "orange": (255, 127, 14),
-    "green": (44, 160, 44),
-    "red": (214, 39, 40),
-    "purple": (148, 103, 189),
-    "brown": (140, 86, 75),
-    "pink": (227, 119, 194),
-    "grey": (127, 127, 127),
-    "olive": (188, 189, 34),
-    "cyan": (23, 190, 207),
-}
+# Sources that the picture names, and letters of a name that leave no room for three abreast.
+_NAMED_MOST: Final = 24
+_LONG_NAME: Final = 16
 _TINT: Final = 0.45
 # Share of empty cells of a wall, and share of a cause in it, before a warning.
 _EMPTY_WORTH_WORDS: Final = 0.1
@@ -384,7 +380,7 @@ def _show(ctx: StepContext, image: Orthoimage, cameras: Cameras | None) -> None:
             tone, share = plain
             ctx.report(PLAIN, subject=image.name, tone=tone, share=share, sources=sources)
     if len(image.sources) > 1:
-        ctx.figure(f"wall_{image.number}_sources", _source_map(image), _caption(image))
+        ctx.figure(f"wall_{image.number}_sources", partial(_source_map, image), _caption(image))
 
 
 def _report_empty(ctx: StepContext, image: Orthoimage, cameras: Cameras | None) -> None:
@@ -414,30 +410,38 @@ def _way_to_a_photo(cameras: Cameras | None) -> str:
     return f"{n_refused} of {n_photos} photos are not oriented" if n_refused else "take one there"
 
 
+@in_column_style()
 def _source_map(image: Orthoimage) -> bytes:
     """Return a picture of an orthoimage tinted by source, seams in white, empty cells in black.
 
     After markiewicz2015, Figure 24.
     """
+    from matplotlib.patches import Patch
+
     step = max(1, -(-max(image.source.shape) // _LONGEST_PX))
     source = image.source[::step, ::step]
-    palette = np.array(list(_NAMED_RGB.values()), dtype=np.float64)
-    tint = palette[source % len(palette)]
+    colours = [plane_ink(k) for k in range(len(image.sources))]
+    tint = 255.0 * np.array([*colours, (0.0, 0.0, 0.0)])[source]
     grey = eight_bits(image.rgb[::step, ::step]).mean(axis=2, keepdims=True)
     picture = np.where(source[..., None] >= 0, _TINT * tint + (1.0 - _TINT) * grey, 0.0)
     picture[is_seam(source)] = 255.0
-    return encode_webp(np.rint(picture).astype(np.uint8))
+    # Of photos that paint anything, those with most cells.
+    counts = np.bincount(source[source >= 0], minlength=len(image.sources))
+    named = sorted(np.argsort(-counts, kind="stable")[:_NAMED_MOST].tolist())
+    handles = [Patch(color=colours[k], label=image.sources[k]) for k in named if counts[k]]
+    abreast = 3 if max((len(name) for name in image.sources), default=0) < _LONG_NAME else 2
+    legend_in = 0.1 + 0.13 * -(-len(handles) // abreast)
+    figure, _ = picture_figure(np.rint(picture).astype(np.uint8), extra_inches=legend_in)
+    figure.legend(handles=handles, loc="outside lower center", ncols=abreast)
+    return encode_chart(figure)
 
 
 def _caption(image: Orthoimage) -> str:
-    """Report which colour of `_source_map` represents which source."""
-    names = list(_NAMED_RGB)
-    legend = ", ".join(
-        f"{names[index % len(names)]} {name}" for index, name in enumerate(image.sources)
-    )
+    n_more = max(0, len(image.sources) - _NAMED_MOST)
+    more = f", of which {n_more} with few cells are not named" if n_more else ""
     return (
-        f"{image.name}, by source: {legend}; seams in white. Large even areas are good; crumbs of "
-        "many colours are places that no photo shows well, where edges may be doubled."
+        f"{image.name}, coloured by source{more}; seams in white. Large even areas are good; "
+        "crumbs of many colours are places that no photo shows well, where edges may be doubled."
     )
 
 

@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.images import decode_image, encode_webp
+from orthoflow.files.drawing import (
+    column_figure,
+    encode_chart,
+    in_column_style,
+    map_chart,
+    picture_figure,
+    plane_ink,
+    round_scale,
+)
+from orthoflow.files.images import decode_image
 from orthoflow.geometry.cameras import to_opencv
 from orthoflow.geometry.resection import pixels_by_point
 from orthoflow.geometry.robust import median_deviation
@@ -23,7 +32,6 @@ from orthoflow_plugins.orient.pose import NOT_ORIENTED, Note, ties_of_photo
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 # Of a normal distribution 4.55 % lie beyond; of any, at most a quarter can (Chebyshev).
 _BEYOND: Final = 2.0
@@ -36,10 +44,8 @@ _ROLE_RGB: Final = {
 }
 _MAX_FIGURES: Final = 24
 _SUB_PIXEL_BITS: Final = 4
-# Cells along the longer side of a map of predicted errors, and pixels per cell.
+# Cells along the longer side of a map of predicted errors.
 _MAP_CELLS: Final = 90
-_MAP_ZOOM: Final = 8
-_UNSEEN_BGR: Final = (60, 40, 20)
 # Histograms, with normal distributions: markiewicz2015, Figures 18, 20, 21 and 23.
 _BARS: Final = 40
 _BARS_OF_A_PHOTO: Final = 25
@@ -52,8 +58,9 @@ _CURVE_COLOUR: Final = "#b03a2e"
 _VIEW_M: Final = 0.4
 _MAX_CONTROL: Final = 300
 _PERCENTILE: Final = 99.5
-# Width of a letter of the names of photos, inches.
-_LETTER_IN: Final = 0.065
+# Letters of a photo's name for which there is room, and residuals of which densities are made.
+_NAME_LETTERS: Final = 14
+_MAX_KERNELS: Final = 5000
 _KINDS: Final = (TieRole.CONTROL, TieRole.CHECK)
 
 COLUMNS_SAID: Final[Mapping[str, JsonValue]] = {
@@ -333,13 +340,29 @@ def draw_ties(
         at = np.rint(to_opencv(pixels_photo[role == kind] * scale) * unit).astype(int)
         for u, v in at.tolist():
             cv2.circle(canvas, (u, v), 2 * unit, colour, -1, cv2.LINE_AA, _SUB_PIXEL_BITS)
+    counts = {kind: int(np.count_nonzero(role == kind)) for kind in _ROLE_RGB}
     ctx.figure(
         name,
-        encode_webp(canvas),
+        partial(_with_legend, canvas, counts),
         f"Ties of {photo.name}: control green, check yellow, rejected red. {status}. Green over "
         "the whole wall holds the photo; green in one corner alone, or red among it everywhere, "
         "does not.",
     )
+
+
+@in_column_style()
+def _with_legend(canvas: NDArray[np.uint8], counts: Mapping[TieRole, int]) -> bytes:
+    from matplotlib.lines import Line2D
+
+    figure, _ = picture_figure(canvas, extra_inches=0.2)
+    handles = []
+    for kind in (TieRole.CONTROL, TieRole.CHECK, TieRole.REJECTED):
+        red, green, blue = (value / 255.0 for value in _ROLE_RGB[kind])
+        mark = Line2D([], [], marker="o", linestyle="none", color=(red, green, blue))
+        mark.set_label(f"{counts[kind]} {kind.name.lower()}")
+        handles.append(mark)
+    figure.legend(handles=handles, loc="outside lower center", ncols=3)
+    return encode_chart(figure)
 
 
 def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
@@ -364,18 +387,22 @@ def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
         shown = np.isfinite(best)
         if not shown.any():
             continue
-        # A corner that photos hardly reach must not darken all the rest.
+        # A corner that photos hardly reach must not darken all the rest; of orientations that are
+        # compared the scale is mostly the same.
         median_m, high_m = np.percentile(best[shown], [50.0, 98.0])
+        error_mm = np.where(shown, 1e3 * best, np.nan)
+        label = "predicted error of a coordinate [mm]"
         ctx.figure(
             f"wall_{wall.number}_predicted_error",
-            partial(_error_map, best / high_m),
+            partial(map_chart, error_mm, label, low=0.0, high=round_scale(1e3 * high_m)),
             f"Predicted error of a coordinate on {wall.name}, of the photo that knows each place "
-            f"best: black 0 to yellow {1e3 * high_m:.2g} mm and more, median "
-            f"{1e3 * median_m:.2g} mm; blue where no oriented photo shows the wall. Bright places "
-            "far from ties are where the orthoimage may be off; more ties there would help.",
+            f"best, median {1e3 * median_m:.2g} mm; grey where no oriented photo shows the wall. "
+            "Bright places far from ties are where the orthoimage may be off; more ties there "
+            "would help.",
         )
 
 
+@in_column_style()
 def draw_positions(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
     """Draw where the photos were taken, and the control, along the first wall and facing it.
 
@@ -385,8 +412,6 @@ def draw_positions(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
         ctx: takes the picture.
         candidates: of the photos that are ok.
     """
-    from matplotlib.figure import Figure
-
     walls = {wall.index: wall for candidate in candidates for wall in candidate.known}
     if not walls:
         return
@@ -394,30 +419,34 @@ def draw_positions(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
     sides = first.corners_world[[3, 1]] - first.corners_world[0]
     axes_world = np.vstack([sides / np.linalg.norm(sides, axis=1)[:, None], first.normal])
     origin = first.corners_world[0]
-    figure = Figure(figsize=(11.0, 5.0))
-    panels = figure.subplots(1, 2)
-    _set_margins(figure, left_in=0.6)
+    feet = np.array([one.estimate.resection.camera.centre_world for one in candidates])
+    everything = np.vstack([feet, *(wall.corners_world for wall in walls.values())]) - origin
+    spans_m = np.ptp(everything @ axes_world.T, axis=0)
+    # To scale, with room for the names above, and for the labels.
+    heights = np.clip(2.9 * spans_m[[2, 1]] / spans_m[0], 0.5, 3.5) + np.array([0.6, 0.0])
+    figure = column_figure(float(heights.sum()) + 0.9)
+    panels = figure.subplots(2, 1, height_ratios=heights)
     for panel, axis, label in zip(panels, (2, 1), ("before it", "down it"), strict=True):
         shown = axes_world[[0, axis]].T
         for wall in walls.values():
             ring = (wall.corners_world[[0, 1, 2, 3, 0]] - origin) @ shown
-            panel.plot(*ring.T, color="#888888", linewidth=0.8)
+            panel.plot(*ring.T, color=plane_ink(wall.number), linewidth=1.2)
         for candidate in candidates:
-            _draw_position(panel, candidate, origin, shown)
+            _draw_position(panel, candidate, origin, shown, turn_deg=40.0 if axis == 2 else 0.0)
         panel.set_aspect("equal")
-        panel.set_xlabel("along the first wall [m]", fontsize=8)
-        panel.set_ylabel(f"{label} [m]", fontsize=8)
-        panel.tick_params(labelsize=7)
+        panel.set_xlabel("along the first wall [m]")
+        panel.set_ylabel(f"{label} [m]")
     panels[1].invert_yaxis()
     ctx.figure(
         "positions",
         figure,
         "Where the oriented photos were taken and which way they look, with their control: seen "
-        "along the first wall (left) and facing it (right); of a floor the right view is its plan. "
-        "A photo behind a wall or far from the others is oriented wrongly.",
+        "along the first wall (above) and facing it (below); of a floor the lower view is its "
+        "plan. A photo behind a wall or far from the others is oriented wrongly.",
     )
 
 
+@in_column_style()
 def draw_residuals(ctx: StepContext, photos: Sequence[Oriented]) -> None:
     """Draw histograms of the residuals of oriented photos, all together and each by itself."""
     pooled = {
@@ -431,55 +460,53 @@ def draw_residuals(ctx: StepContext, photos: Sequence[Oriented]) -> None:
 
 
 def _draw_position(
-    axes: Axes, candidate: Candidate, origin: NDArray[np.float64], shown: NDArray[np.float64]
+    axes: Axes,
+    candidate: Candidate,
+    origin: NDArray[np.float64],
+    shown: NDArray[np.float64],
+    *,
+    turn_deg: float,
 ) -> None:
     """Draw a photo's place, view and control onto two axes (3, 2) of the world."""
     camera = candidate.estimate.resection.camera
     control = (candidate.seen.points_world[candidate.control] - origin) @ shown
     step = max(1, len(control) // _MAX_CONTROL)
-    axes.plot(*control[::step].T, ".", markersize=1.0, color="#30a040")
+    axes.plot(*control[::step].T, ".", markersize=0.8, color="#30a040")
     x, y = ((camera.centre_world - origin) @ shown).tolist()
     across, down = (_VIEW_M * camera.rotation[2] @ shown).tolist()
     axes.arrow(x, y, across, down, head_width=0.2 * _VIEW_M, color=_CURVE_COLOUR, linewidth=0.8)
-    axes.annotate(candidate.photo.name, (x, y), fontsize=5.5)
-
-
-def _error_map(shares: NDArray[np.float64]) -> bytes:
-    import cv2
-
-    shown = np.isfinite(shares)
-    grey = np.rint(255.0 * np.clip(np.where(shown, shares, 0.0), 0.0, 1.0)).astype(np.uint8)
-    bgr = np.asarray(cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO), dtype=np.uint8)
-    bgr[~shown] = _UNSEEN_BGR
-    size = (_MAP_ZOOM * shares.shape[1], _MAP_ZOOM * shares.shape[0])
-    enlarged = cv2.resize(bgr, size, interpolation=cv2.INTER_NEAREST)
-    return encode_webp(np.asarray(enlarged, dtype=np.uint8)[:, :, ::-1])
+    axes.annotate(
+        candidate.photo.name,
+        (x, y),
+        xytext=(2, 2),
+        textcoords="offset points",
+        fontsize=6.0,
+        rotation=turn_deg,
+        rotation_mode="anchor",
+    )
 
 
 def _draw_pooled(ctx: StepContext, pooled: dict[TieRole, NDArray[np.float64]]) -> None:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.0, 2.6 * len(pooled)))
-    panels = figure.subplots(len(pooled), 2, squeeze=False)
-    _set_margins(figure, left_in=0.4)
+    figure = column_figure(0.4 + 1.35 * len(pooled))
+    panels = figure.subplots(len(pooled), 2, squeeze=False, sharex=True)
+    reach = _reach(np.vstack(list(pooled.values())))
     for (kind, values), row in zip(pooled.items(), panels, strict=True):
         for label, column, axes in zip("uv", values.T, row, strict=True):
             # One outline instead of forty bars, each of which takes its time to draw.
-            counts, edges = np.histogram(column, bins=_BARS)
+            counts, edges = np.histogram(column, bins=_BARS, range=(-reach, reach))
             axes.stairs(counts, edges, fill=True, color=_BAR_COLOUR)
-            grid = np.linspace(edges[0], edges[-1], 200)
-            axes.plot(grid, _normal(column, edges, grid), color=_CURVE_COLOUR, linewidth=1.0)
-            axes.set_title(
-                f"{kind.name.lower()} {label}: {len(column)} ties, SD {column.std():.2f} px",
-                fontsize=9,
-            )
-            axes.set_xlabel("observed - computed [px]", fontsize=8)
-            axes.tick_params(labelsize=7)
+            _draw_curves(axes, column, edges)
+            axes.set_title(f"{kind.name.lower()} {label}: {len(column)}, SD {column.std():.2f} px")
+        row[0].set_ylabel("ties per bar")
+    for axes in panels[-1]:
+        axes.set_xlabel("observed - computed [px]")
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     ctx.figure(
         "residuals",
         figure,
-        "Residuals of all oriented photos, with normal distributions: narrow hills about 0 are "
-        "good; one beside 0, or broader for check ties than for control, is a systematic error.",
+        "Residuals of all oriented photos: narrow peaks about 0 are good; one beside 0, a density "
+        "with lobes beside its peak, or one broader for check ties than for control, is a "
+        "systematic error or a group of wrong ties.",
     )
 
 
@@ -488,33 +515,31 @@ def _draw_each(
     photos: Sequence[Oriented],
     pooled: dict[TieRole, NDArray[np.float64]],
 ) -> None:
-    """Draw a row per photo, a column per role and coordinate, all bars up to its height."""
-    from matplotlib.figure import Figure
-
+    """Draw a row per photo, a panel per role and coordinate, all bars up to its height."""
     shown = photos[:_MAX_PHOTOS]
-    columns = [(kind, axis) for kind in pooled for axis in (0, 1)]
-    figure = Figure(figsize=(2.6 * len(columns), 1.0 + 0.45 * len(shown)))
-    panels = figure.subplots(1, len(columns), sharey=True, squeeze=False)[0]
-    longest = max(len(photo.camera.photo) for photo in shown)
-    _set_margins(figure, left_in=min(0.2 + _LETTER_IN * longest, 2.6))
-    for (kind, axis), axes in zip(columns, panels, strict=True):
-        reach = max(float(np.percentile(np.abs(pooled[kind][:, axis]), _PERCENTILE)), 1e-6)
-        for row, photo in enumerate(shown):
-            _draw_row(axes, photo.residuals_of(kind)[:, axis], -row, reach)
-        axes.axvline(0.0, color="#888888", linewidth=0.5)
-        axes.set_xlim(-reach, 1.6 * reach)
-        axes.set_ylim(0.9 - len(shown), 1.0)
-        axes.set_title(f"{kind.name.lower()} {'uv'[axis]}", fontsize=9)
-        axes.set_xlabel("observed - computed [px]", fontsize=8)
-        axes.tick_params(labelsize=7)
-    panels[0].set_yticks(
-        [-row for row in range(len(shown))], [photo.camera.photo for photo in shown]
+    figure = column_figure(len(pooled) * (0.45 + 0.22 * len(shown)))
+    panels = figure.subplots(len(pooled), 2, squeeze=False, sharex=True, sharey=True)
+    reach = _reach(np.vstack(list(pooled.values())))
+    for kind, row in zip(pooled, panels, strict=True):
+        for axis, axes in enumerate(row):
+            for place, photo in enumerate(shown):
+                _draw_row(axes, photo.residuals_of(kind)[:, axis], -place, reach)
+            axes.axvline(0.0, color="#888888", linewidth=0.5)
+            axes.set_title(f"{kind.name.lower()} {'uv'[axis]}; number, SD [px]")
+    panels[0, 0].set_xlim(-reach, 1.9 * reach)
+    panels[0, 0].set_ylim(0.9 - len(shown), 1.0)
+    panels[0, 0].set_yticks(
+        [-row for row in range(len(shown))],
+        [_end_of(photo.camera.photo) for photo in shown],
     )
+    for axes in panels[-1]:
+        axes.set_xlabel("observed - computed [px]")
     ctx.figure(
         "residuals_by_photo",
         figure,
-        "Residuals of each oriented photo, with the normal distribution of the same mean and SD: a "
-        "row that is broader than the others, or beside 0, is a photo to look at.",
+        "Residuals of each oriented photo, with their density and the normal distribution of the "
+        "same mean and SD: a row that is broader than the others, beside 0, or has lobes, is a "
+        "photo to look at.",
     )
 
 
@@ -523,25 +548,43 @@ def _draw_row(axes: Axes, values: NDArray[np.float64], base: float, reach: float
     if len(values) < 3:
         return
     counts, edges = np.histogram(values, bins=_BARS_OF_A_PHOTO, range=(-reach, reach))
-    grid = np.linspace(-reach, reach, 120)
-    curve = _normal(values, edges, grid)
-    scale = _ROW_SHARE / max(float(counts.max()), float(curve.max()), 1e-9)
+    peak = float(_normal(values, edges, np.array([values.mean()]))[0])
+    scale = _ROW_SHARE / max(float(counts.max()), peak, 1e-9)
     axes.stairs(scale * counts + base, edges, baseline=base, fill=True, color=_BAR_COLOUR)
-    axes.plot(grid, scale * curve + base, color=_CURVE_COLOUR, linewidth=0.8)
-    axes.text(1.55 * reach, base, f"{len(values)}\nSD {values.std():.2f}", fontsize=5.5, ha="right")
+    _draw_curves(axes, values, edges, scale=scale, base=base)
+    text = f"{len(values)}, {values.std():.2f}"
+    axes.text(1.88 * reach, base + 0.1, text, fontsize=6.0, ha="right")
 
 
-def _set_margins(figure: Figure, *, left_in: float) -> None:
-    """Leave room for labels and titles: a layout that measures them draws everything twice."""
-    width, height = figure.get_size_inches()
-    figure.subplots_adjust(
-        left=left_in / width,
-        right=1.0 - 0.15 / width,
-        bottom=0.5 / height,
-        top=1.0 - 0.3 / height,
-        wspace=0.2,
-        hspace=0.45,
-    )
+def _draw_curves(
+    axes: Axes,
+    values: NDArray[np.float64],
+    edges: NDArray[np.float64],
+    *,
+    scale: float = 1.0,
+    base: float = 0.0,
+) -> None:
+    """Draw the normal distribution of some values and their density, which shows their lobes."""
+    grid = np.linspace(edges[0], edges[-1], 161)
+    curve = scale * _normal(values, edges, grid) + base
+    axes.plot(grid, curve, color="black", linestyle="--", linewidth=0.6, label="normal")
+    # Silverman's rule of thumb, robust: an SD that outliers widen would smooth lobes away.
+    spread = min(float(values.std()), median_deviation(values, float(np.median(values))))
+    width = max(0.9 * spread * len(values) ** -0.2, 1e-9)
+    some = values[:: max(1, len(values) // _MAX_KERNELS)]
+    kernels = np.exp(-0.5 * ((grid[:, None] - some) / width) ** 2) / width / np.sqrt(2.0 * np.pi)
+    density = len(values) * (edges[1] - edges[0]) * kernels.mean(axis=1)
+    axes.plot(grid, scale * density + base, color=_CURVE_COLOUR, linewidth=0.8, label="density")
+
+
+def _end_of(name: str) -> str:
+    """Shorten a photo's name at its beginning: photos differ at the end of theirs."""
+    return name if len(name) <= _NAME_LETTERS else f"..{name[2 - _NAME_LETTERS :]}"
+
+
+def _reach(values: NDArray[np.float64]) -> float:
+    """Return the largest residual that is drawn, the same in all panels of figures that compare."""
+    return round_scale(max(float(np.percentile(np.abs(values), _PERCENTILE)), 1e-6))
 
 
 def _normal(

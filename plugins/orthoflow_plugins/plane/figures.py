@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import PowerNorm
-from matplotlib.figure import Figure
+from matplotlib.colors import PowerNorm, SymLogNorm
 from matplotlib.image import AxesImage
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from orthoflow.files.clouds.attributes import plane_ink
+from orthoflow.files.drawing import COLUMN_INCHES, column_figure, in_column_style, plane_ink
 from orthoflow.geometry import omega_phi_deg, wall_axes
 from orthoflow.geometry.frames import basis_from_up
 from orthoflow.products import Planes, PointCloud, Thickness
@@ -30,16 +30,17 @@ if TYPE_CHECKING:
 _PANELS_MOST: Final = 4
 _POINTS_MOST: Final = 25_000
 _NAMED_MOST: Final = 12
+_NAMES_ABREAST: Final = 3
 # The view is from above, a little aside, along parallel lines.
 _AZIMUTH_DEG: Final = -60.0
 _ELEVATION_DEG: Final = 35.0
 _GREY: Final = "#c8c8c8"
 _BLUE: Final = "#9db8d2"
-_RED: Final = "#b03a2e"
 _PLANES_MOST: Final = 12
 _CLASSED_MOST: Final = 4
 
 
+@in_column_style()
 def draw_deviations(
     ctx: StepContext,
     planes: Planes,
@@ -48,52 +49,59 @@ def draw_deviations(
 ) -> None:
     """Draw how the points of the first planes lie about them, with the Gauss curve of the fit."""
     count = min(_PANELS_MOST, len(planes))
-    figure = Figure(figsize=(3.2 * count, 5.4), layout="constrained")
-    panels = figure.subplots(2, count, squeeze=False)
+    figure = column_figure(0.3 + 1.15 * count)
+    # One scale for all planes, so that they compare.
+    panels = figure.subplots(count, 2, squeeze=False, sharex="col", sharey="col")
     tolerance_mm = 1000.0 * deviations.tolerance_m
     edges_mm = np.linspace(-tolerance_mm, tolerance_mm, HISTOGRAM_BINS + 1)
     middles_mm = 0.5 * (edges_mm[1:] + edges_mm[:-1])
     width_mm = edges_mm[1] - edges_mm[0]
-    for index, (axes, below) in enumerate(panels.T):
+    for index, (axes, beside) in enumerate(panels):
         # Per cent of the points in a millimetre, so that planes of any size compare.
         share = 100.0 / (max(1.0, float(deviations.histogram[index].sum())) * width_mm)
-        axes.stairs(share * deviations.histogram[index], edges_mm, fill=True, color=_BLUE)
+        axes.stairs(
+            share * deviations.histogram[index], edges_mm, fill=True, color=plane_ink(index)
+        )
         sigma_mm = 1000.0 * float(deviations.rms_fit_m[index])
         if sigma_mm > 0.0:
             offset_mm = middles_mm - 1000.0 * float(deviations.mean_fit_m[index])
             scale = share * float(deviations.n_fit[index]) * width_mm
             curve = np.exp(-0.5 * (offset_mm / sigma_mm) ** 2)
             curve *= scale / (sigma_mm * math.sqrt(2.0 * math.pi))
-            axes.plot(middles_mm, curve, color=_RED, linewidth=1.0)
-        axes.set_title(f"{planes.names[index]}: {sigma_mm:.1f} mm", fontsize=9)
-        _label(axes, "distance to the plane [mm]", "" if index else "points [% per mm]")
+            axes.plot(middles_mm, curve, color="black", linewidth=0.8)
+        axes.set_title(f"{planes.names[index]}: SD {sigma_mm:.1f} mm")
+        axes.set_ylabel("points [% per mm]")
         shape = normalities[index]
         if shape is None:
-            below.set_axis_off()
+            beside.set_axis_off()
             continue
         reach = float(shape.expected_sigmas[-1])
-        below.plot([-reach, reach], [-reach, reach], color=_RED, linewidth=1.0)
-        below.plot(shape.expected_sigmas, shape.found_sigmas, ".", markersize=4, color="#33658a")
+        beside.plot([-reach, reach], [-reach, reach], color="black", linewidth=0.8)
+        beside.plot(
+            shape.expected_sigmas,
+            shape.found_sigmas,
+            ".",
+            markersize=2.5,
+            color=plane_ink(index),
+        )
         skewness, kurtosis = shape.skewness, shape.excess_kurtosis
-        below.set_title(f"skewness {skewness:+.2f}, kurtosis {kurtosis:+.2f}", fontsize=8)
-        _label(below, "normal quantile [sigma]", "" if index else "quantile [sigma]")
+        moments = f"skewness {skewness:+.2f}\nkurtosis {kurtosis:+.2f}"
+        beside.text(0.04, 0.96, moments, va="top", transform=beside.transAxes)
+        beside.set_ylabel("measured [sigma]")
+    panels[-1, 0].set_xlabel("distance to the plane [mm]")
+    panels[-1, 1].set_xlabel("normal quantile [sigma]")
     ctx.figure(
         "deviations",
         figure,
         "Distances of the points to their plane, positive towards the viewer; the curve is the "
         f"normal distribution of those within {1000.0 * deviations.fit_tolerance_m:.0f} mm. "
-        "Below, their "
+        "Right, their "
         "quantiles against those of a normal distribution, which would lie on the line: a second "
-        "hill, or ends that leave the line early, are relief or another surface on the plane.",
+        "peak, or ends that leave the line early, are relief or another surface on the plane.",
     )
 
 
-def _label(axes: Axes, across: str, down: str = "") -> None:
-    axes.set_xlabel(across, fontsize=8)
-    axes.set_ylabel(down, fontsize=8)
-    axes.tick_params(labelsize=7)
-
-
+@in_column_style()
 def draw_planes(
     ctx: StepContext,
     planes: Planes,
@@ -101,7 +109,7 @@ def draw_planes(
     plane_of_point: NDArray[np.int64],
     cloud: PointCloud,
 ) -> None:
-    """Draw points coloured by their plane beside the rectangles of the planes' parts.
+    """Draw points coloured by their plane above the rectangles of the planes' parts.
 
     Args:
         ctx: takes the figure.
@@ -114,45 +122,52 @@ def draw_planes(
     shown = points_m[::every]
     view = _view(planes.up)
     flat, index = shown @ view.T, plane_of_point[::every]
+    corners = (planes.corners.reshape(-1, 3) - cloud.origin) @ view.T
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    margin = 0.04 * (high - low)
+    n_named = min(_NAMED_MOST, len(planes))
     # Not a constrained layout, which draws all the points once more to measure them.
-    figure = Figure(figsize=(11.0, 4.8))
-    edges = {"left": 0.01, "right": 0.99, "bottom": 0.01, "top": 0.99, "wspace": 0.02}
-    left, right = figure.subplots(1, 2, gridspec_kw=edges)
+    panel_in = COLUMN_INCHES * float(np.clip((high[1] - low[1]) / (high[0] - low[0]), 0.3, 1.0))
+    legend_in = 0.08 + 0.14 * -(-n_named // _NAMES_ABREAST)
+    figure = column_figure(2.0 * panel_in + legend_in)
+    figure.set_layout_engine("none")
+    edges = {"left": 0.0, "right": 1.0, "top": 1.0, "hspace": 0.02}
+    bottom = legend_in / (2.0 * panel_in + legend_in)
+    above, below = figure.subplots(2, 1, gridspec_kw={**edges, "bottom": bottom})
     on_none = index < 0
-    left.plot(*flat[on_none].T, ".", markersize=0.8, color=_GREY)
-    right.plot(*flat.T, ",", color="#e4e4e4")
+    above.plot(*flat[on_none].T, ".", markersize=1.0, markeredgewidth=0.0, color=_GREY)
+    below.plot(*flat.T, ",", color="#e4e4e4")
     from_the_front = planes.normal @ np.cross(*view) > 0.0
     # The smallest last, so that the floor does not hide what stands on it.
     for k in range(len(planes)):
         colour = plane_ink(k)
         if from_the_front[k]:
-            left.plot(*flat[index == k].T, ".", markersize=1.5, color=colour)
+            above.plot(*flat[index == k].T, ".", markersize=1.5, markeredgewidth=0.0, color=colour)
         parts = planes.corners[k][None]
         if planes.part_corners is not None and planes.part_plane is not None:
             parts = planes.part_corners[planes.part_plane == k]
         for place, part in enumerate(parts):
             around = (part[[0, 1, 2, 3, 0]] - cloud.origin) @ view.T
             name = planes.names[k] if k < _NAMED_MOST and place == 0 else None
-            right.plot(*around.T, color=colour, linewidth=1.3, label=name)
-    corners = (planes.corners.reshape(-1, 3) - cloud.origin) @ view.T
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    margin = 0.04 * (high - low)
-    for axes in (left, right):
+            below.plot(*around.T, color=colour, linewidth=1.3, label=name)
+    for axes in (above, below):
         axes.set_aspect("equal")
         axes.set_xlim(low[0] - margin[0], high[0] + margin[0])
         axes.set_ylim(low[1] - margin[1], high[1] + margin[1])
         axes.set_axis_off()
-    right.legend(fontsize=7, loc="upper left", ncols=2)
+    figure.legend(*below.get_legend_handles_labels(), loc="lower center", ncols=_NAMES_ABREAST)
     ctx.figure(
         "planes",
         figure,
-        "Left: a sample of the points, coloured by plane, without planes seen from behind; on none "
-        f"(grey) are {np.mean(on_none):.1%}. Right: the rectangles of the planes' connected parts. "
+        "Above: a sample of the points, coloured by plane, without planes seen from behind; on "
+        f"none (grey) are {np.mean(on_none):.1%}. Below: the rectangles of the planes' connected "
+        "parts. "
         "Each wall should have one colour: two side by side are one wall taken for two, and a grey "
         "one was missed.",
     )
 
 
+@in_column_style()
 def draw_thickness(
     ctx: StepContext,
     planes: Planes,
@@ -173,30 +188,35 @@ def draw_thickness(
         for k, item in first
         for spread in item.material
     ]
-    n_rows, n_columns = 1 if row is None else 2, 1 + len(classes) + bool(bars)
-    figure = Figure(figsize=(3.4 * n_columns, 2.9 * n_rows), layout="constrained")
-    grid = figure.add_gridspec(n_rows, n_columns)
+    n_panels = 1 + len(classes) + bool(bars)
+    n_rows = -(-n_panels // 2)
+    figure = column_figure(1.5 * n_rows + (0.0 if row is None else 1.3))
+    grid = figure.add_gridspec(n_rows + (row is not None), 2 if n_panels > 1 else 1)
+    places = iter([grid[k // 2, k % 2] for k in range(n_panels)])
     sigmas = [(planes.names[k], 1000.0 * item.sigma_m) for k, item in known]
-    axes = _draw_bars(figure.add_subplot(grid[0, 0]), sigmas, _BLUE, "thickness [mm]")
+    colours = [plane_ink(k) for k, _ in known]
+    axes = _draw_bars(figure.add_subplot(next(places)), sigmas, colours, "thickness [mm]")
     steps_mm = [1000.0 * item.scan_step_m for _, item in known]
-    axes.plot(steps_mm, range(len(known)), "|", color=_RED, label="scan step")
-    axes.legend(fontsize=7)
+    axes.plot(steps_mm, range(len(known)), "|", color="black", label="scan step")
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0))
     for place, label in enumerate(classes):
-        axes = figure.add_subplot(grid[0, 1 + place])
+        axes = figure.add_subplot(next(places))
         for k, item in first:
             spreads = getattr(item, _CLASSES[label])
             middles = [0.5 * (spread.low + spread.high) for spread in spreads]
             sigmas_mm = [1000.0 * spread.sigma_m for spread in spreads]
             colour, name = plane_ink(k), planes.names[k]
-            axes.plot(middles, sigmas_mm, "o-", markersize=3, color=colour, label=name)
+            axes.plot(middles, sigmas_mm, "o-", markersize=2, color=colour, label=name)
         axes.set_ylim(bottom=0.0)
-        _label(axes, label, "" if place else "thickness [mm]")
+        axes.set_xlabel(label)
+        axes.set_ylabel("thickness [mm]")
         if place == 0:
-            axes.legend(fontsize=7)
+            axes.legend()
     if bars:
-        _draw_bars(figure.add_subplot(grid[0, -1]), bars, "#d2b89d", "thickness by material [mm]")
+        colours = [plane_ink(k) for k, item in first for _ in item.material]
+        _draw_bars(figure.add_subplot(next(places)), bars, colours, "thickness by material [mm]")
     if row is not None:
-        _draw_row(figure.add_subplot(grid[1, :]), planes, row, materials)
+        _draw_row(figure.add_subplot(grid[-1, :]), planes, row, materials)
     drawn = [label.partition(" [")[0] for label in classes] + ["material"] * bool(bars)
     ctx.figure(
         "thickness",
@@ -225,26 +245,31 @@ _CLASSES: Final = {
 }
 
 
-def _draw_bars(axes: Axes, bars: Sequence[tuple[str, float]], colour: str, label: str) -> Axes:
-    axes.barh(range(len(bars)), [value for _, value in bars], color=colour)
+def _draw_bars(
+    axes: Axes,
+    bars: Sequence[tuple[str, float]],
+    colours: Sequence[tuple[float, float, float]],
+    label: str,
+) -> Axes:
+    axes.barh(range(len(bars)), [value for _, value in bars], color=colours)
     axes.set_yticks(range(len(bars)), [name for name, _ in bars])
     axes.invert_yaxis()
-    _label(axes, label)
+    axes.set_xlabel(label)
     return axes
 
 
 def _draw_row(axes: Axes, planes: Planes, row: RowPoints, materials: Materials) -> None:
     """Distances of the points of a scan row from the first plane, coloured by material."""
-    axes.plot(row.along_m, 1000.0 * row.distance_m, ".", markersize=2, color="#333333")
+    axes.plot(row.along_m, 1000.0 * row.distance_m, ".", markersize=1, color="#333333")
     if row.intensity is not None:
         for name, (low, high) in materials.items():
             mine = (row.intensity >= low) & (row.intensity <= high)
             distance_mm = 1000.0 * row.distance_m[mine]
-            axes.plot(row.along_m[mine], distance_mm, ".", markersize=2, label=name)
+            axes.plot(row.along_m[mine], distance_mm, ".", markersize=1, label=name)
         if materials:
-            axes.legend(fontsize=7, markerscale=3)
-    across = f"along {planes.names[0]} [m], row {row.row} of scan {row.scan}"
-    _label(axes, across, "distance [mm]")
+            axes.legend(markerscale=4)
+    axes.set_xlabel(f"along {planes.names[0]} [m], row {row.row} of scan {row.scan}")
+    axes.set_ylabel("distance [mm]")
 
 
 _PIXELS_MOST: Final = 900
@@ -268,6 +293,7 @@ class PlanVotes(Protocol):
     voters: str
 
 
+@in_column_style()
 def draw_accumulator(ctx: StepContext, votes: PlanVotes, planes: Planes, cloud: PointCloud) -> None:
     """Draw the plan with the walls found, and the parameter space with their maxima.
 
@@ -279,15 +305,23 @@ def draw_accumulator(ctx: StepContext, votes: PlanVotes, planes: Planes, cloud: 
     """
     if votes.first is None:
         return
-    figure = Figure(figsize=(11.0, 4.6), layout="constrained")
-    left, right = figure.subplots(1, 2)
     basis, grid, reach_m = basis_from_up(planes.up), votes.grid, votes.reach_m
     low = grid.low_m[:2]
     high = low + grid.cell_m * np.array(grid.shape[:2])
-    image = np.log1p(_thinned_sum(votes.plan))
-    left.imshow(image.T, origin="lower", cmap="gray_r", extent=(low[0], high[0], low[1], high[1]))
-    shown = _show_votes(right, _thinned_sum(votes.first), (0.0, 180.0, -reach_m, reach_m))
-    figure.colorbar(shown, ax=right, label="votes")
+    plan_in = float(np.clip(2.6 * (high[1] - low[1]) / (high[0] - low[0]), 1.0, 3.2))
+    figure = column_figure(plan_in + 2.6)
+    above, below = figure.subplots(2, 1, height_ratios=(plan_in, 2.2))
+    image = _thinned_sum(votes.plan)
+    plan = above.imshow(
+        image.T,
+        origin="lower",
+        cmap="gray_r",
+        extent=(low[0], high[0], low[1], high[1]),
+        norm=SymLogNorm(1.0, vmin=0.0, vmax=max(1.0, float(image.max()))),
+    )
+    figure.colorbar(plan, ax=above, label="points per cell", format="{x:g}")
+    shown = _show_votes(below, _thinned_sum(votes.first), (0.0, 180.0, -reach_m, reach_m))
+    figure.colorbar(shown, ax=below, label="votes")
     # The one maximum, as a line of the plan and as a place of the parameter space.
     n_angles, n_bins = votes.first.shape
     row, column = np.unravel_index(int(votes.first.argmax()), votes.first.shape)
@@ -295,36 +329,37 @@ def draw_accumulator(ctx: StepContext, votes: PlanVotes, planes: Planes, cloud: 
     across = np.array([math.cos(angle), math.sin(angle)])
     foot = votes.centre_m + distance_m * across
     ends = foot + np.outer([-2.0 * reach_m, 2.0 * reach_m], [-across[1], across[0]])
-    left.plot(*ends.T, color="k", linestyle=":", linewidth=1.0, label="maximum")
-    right.plot(math.degrees(angle), distance_m, "x", color="white", markersize=9)
+    above.plot(*ends.T, color="k", linestyle=":", label="maximum")
+    below.plot(math.degrees(angle), distance_m, "x", color="white", markersize=7)
     for index in np.flatnonzero(np.abs(planes.normal @ planes.up) < 0.5):
         corners = (planes.corners[index] - cloud.origin) @ basis.T
         colour, name = plane_ink(int(index)), planes.names[index]
-        left.plot(*corners[[1, 2], :2].T, linewidth=1.2, color=colour, label=name)
+        above.plot(*corners[[1, 2], :2].T, linewidth=1.2, color=colour, label=name)
         # Where the wall lies in the parameter space.
         normal = basis @ planes.normal[index]
         angle = math.atan2(normal[1], normal[0]) % math.pi
         direction = np.array([math.cos(angle), math.sin(angle)])
         distance_m = float(direction @ (corners.mean(axis=0)[:2] - votes.centre_m))
-        ring = dict[str, Any](color=colour, fillstyle="none", markersize=9)
-        right.plot(math.degrees(angle), distance_m, "o", **ring)
-    left.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    left.set_xlabel("e1 [m from the cloud's origin]")
-    left.set_ylabel("e2 [m]")
-    right.set_xlabel("direction of the normal [deg]")
-    right.set_ylabel("distance from the middle of the plan [m]")
-    # Beside the plan: one of a single long wall is too narrow to hold it.
-    left.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.02, 1.0))
+        ring = dict[str, Any](color=colour, fillstyle="none", markersize=6)
+        below.plot(math.degrees(angle), distance_m, "o", **ring)
+    above.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    above.set_xlabel("e1 [m from the cloud's origin]")
+    above.set_ylabel("e2 [m]")
+    below.set_xlabel("direction of the normal [deg]")
+    below.set_ylabel("distance from the centre [m]")
+    # Below the panels: the plan of a single long wall is too narrow to hold it.
+    figure.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     ctx.figure(
         "accumulator",
         figure,
-        "Left: points per plan cell with the walls found. Right: the parameter space, in which "
+        "Above: points per plan cell with the walls found. Below: the parameter space, in which "
         f"{votes.voters}; circles mark the walls, the cross and the dotted line the "
         "fullest bin. A wall stands out as a sharp bright spot; a "
         "bright spot without a circle is a wall that was missed, a circle on grey ground a chance.",
     )
 
 
+@in_column_style()
 def draw_space(
     ctx: StepContext,
     best: NDArray[np.float64],
@@ -343,7 +378,7 @@ def draw_space(
         reach_m: see best.
         planes: the planes, world.
     """
-    figure = Figure(figsize=(7.0, 4.6), layout="constrained")
+    figure = column_figure(2.4)
     axes = figure.subplots()
     shown = _show_votes(axes, np.maximum(best, 0.0), (0.0, 180.0, -90.0, 90.0))
     figure.colorbar(shown, ax=axes, label="score [votes]")
@@ -351,9 +386,10 @@ def draw_space(
         omega_deg, phi_deg = omega_phi_deg(normal, planes.up)
         if omega_deg >= 180.0:
             omega_deg, phi_deg = omega_deg - 180.0, -phi_deg
-        ring = dict[str, Any](color=plane_ink(index), fillstyle="none", markersize=9)
+        ring = dict[str, Any](color=plane_ink(index), fillstyle="none", markersize=6)
         axes.plot(omega_deg, phi_deg, "o", **ring)
-    _label(axes, "omega [deg]", "phi [deg]")
+    axes.set_xlabel("omega [deg]")
+    axes.set_ylabel("phi [deg]")
     ctx.figure(
         "accumulator",
         figure,
@@ -361,24 +397,26 @@ def draw_space(
         "Directions are even over the hemisphere: towards the poles one stands for several. A "
         "bright spot without a circle is a direction whose plane was missed.",
     )
-    figure = Figure(figsize=(10.0, 6.4), layout="constrained")
-    panels = figure.subplots(2, 3)
+    figure = column_figure(5.0)
+    panels = figure.subplots(3, 2, sharex="col", sharey=True)
     # One scale for all, so that sections compare.
     most = max(float(votes.max()) for votes in (*over_omega.values(), *over_phi.values()))
-    for column, above, below in zip(panels.T, over_omega, over_phi, strict=True):
-        shown = _show_votes(column[0], over_omega[above], (0.0, 180.0, -reach_m, reach_m), most)
-        _show_votes(column[1], over_phi[below], (-90.0, 90.0, -reach_m, reach_m), most)
-        column[0].set_title(f"phi = {above:.0f} deg", fontsize=9)
-        column[1].set_title(f"omega = {below:.0f} deg", fontsize=9)
-        _label(column[0], "omega [deg]", "distance from the middle [m]")
-        _label(column[1], "phi [deg]", "distance from the middle [m]")
-    figure.colorbar(shown, ax=panels, label="votes", shrink=0.6)
+    for (left, right), phi_deg, omega_deg in zip(panels, over_omega, over_phi, strict=True):
+        shown = _show_votes(left, over_omega[phi_deg], (0.0, 180.0, -reach_m, reach_m), most)
+        _show_votes(right, over_phi[omega_deg], (-90.0, 90.0, -reach_m, reach_m), most)
+        left.set_title(f"phi = {phi_deg:.0f} deg")
+        right.set_title(f"omega = {omega_deg:.0f} deg")
+        left.set_ylabel("distance [m]")
+    panels[-1, 0].set_xlabel("omega [deg]")
+    panels[-1, 1].set_xlabel("phi [deg]")
+    bar = figure.colorbar(shown, ax=panels, label="votes", location="bottom", aspect=40)
+    bar.locator = MaxNLocator(4)
     ctx.figure(
         "accumulator-sections",
         figure,
-        "Votes over direction and distance before any plane was taken, in sections of one phi "
-        "(above) and of one omega (below); the brighter the more, by the square root. Planes are "
-        "sharp spots where bands cross; without any, there is no plane to find.",
+        "Votes over direction and distance from the middle before any plane was taken, in sections "
+        "of one phi (left) and of one omega (right); the brighter the more, by the square root. "
+        "Planes are sharp spots where bands cross; without any, there is no plane to find.",
     )
 
 
@@ -395,6 +433,7 @@ def _show_votes(
     )
 
 
+@in_column_style()
 def draw_sections(ctx: StepContext, planes: Planes, cloud: PointCloud, *, cell_m: float) -> None:
     """Draw the points per voxel in three sections through the middle of the planes' parts.
 
@@ -414,20 +453,30 @@ def draw_sections(ctx: StepContext, planes: Planes, cloud: PointCloud, *, cell_m
     cell_m = max(cell_m, float((high - low).max()) / _SECTION_CELLS_MOST)
     low, high = low - 5.0 * cell_m, high + 5.0 * cell_m
     middle = 0.5 * (low + high)
-    figure = Figure(figsize=(12.0, 4.2), layout="constrained")
     names = ("e1", "e2", "up")
-    for axes, (first, second, across) in zip(
-        figure.subplots(1, 3), ((0, 1, 2), (0, 2, 1), (1, 2, 0)), strict=True
-    ):
+    views = ((0, 1, 2), (0, 2, 1), (1, 2, 0))
+    sides_m = high - low
+    # To one scale: each as high as its section is.
+    heights = [float(np.clip(sides_m[up] / sides_m[:2].max(), 0.25, 1.5)) for _, up, _ in views]
+    figure = column_figure(2.3 * sum(heights) + 0.5 * len(views))
+    panels = figure.subplots(len(views), 1, height_ratios=heights)
+    counted = []
+    for first, second, across in views:
         inside = np.abs(framed[:, across] - middle[across]) < 0.5 * cell_m
         edges = [np.arange(low[k], high[k] + cell_m, cell_m) for k in (first, second)]
         counts = np.histogram2d(framed[inside, first], framed[inside, second], edges)[0]
-        extent = (edges[0][0], edges[0][-1], edges[1][0], edges[1][-1])
-        axes.imshow(
-            np.log1p(counts.T), origin="lower", cmap="gray_r", extent=extent, aspect="equal"
+        counted.append((counts, (edges[0][0], edges[0][-1], edges[1][0], edges[1][-1])))
+    norm = SymLogNorm(1.0, vmin=0.0, vmax=max(1.0, *(float(one.max()) for one, _ in counted)))
+    for axes, (first, second, across), (counts, extent) in zip(panels, views, counted, strict=True):
+        shown = axes.imshow(
+            counts.T, origin="lower", cmap="gray_r", extent=extent, aspect="equal", norm=norm
         )
-        _label(axes, f"{names[first]} [m from the cloud's origin]", f"{names[second]} [m]")
-        axes.set_title(f"{names[across]} = {middle[across]:.2f} m", fontsize=9)
+        axes.set_xlabel(f"{names[first]} [m from the cloud's origin]")
+        axes.set_ylabel(f"{names[second]} [m]")
+        axes.set_title(f"{names[across]} = {middle[across]:.2f} m")
+    figure.colorbar(
+        shown, ax=panels, label="points per voxel", location="bottom", aspect=40, format="{x:g}"
+    )
     ctx.figure(
         "voxels",
         figure,
@@ -471,11 +520,12 @@ def draw_normals(
     columns, rows = (placed[order] / pixel_m).astype(np.int64).T
     picture[rows, columns] = away_deg[order]
     across_deg = np.degrees(np.arcsin(np.clip(normals @ basis_from_up(planes.up)[1], -1.0, 1.0)))
-    angles_deg = {f"angle between normal and {planes.names[0]}": away_deg, "Ny": across_deg}
+    angles_deg = {f"angle to {planes.names[0]}": away_deg, "Ny": across_deg}
     counts = voxels.counts.astype(np.float64)
     _draw_normals(ctx, angles_deg, counts, picture, size_m)
 
 
+@in_column_style()
 def _draw_normals(
     ctx: StepContext,
     angles_deg: Mapping[str, NDArray[np.float64]],
@@ -483,29 +533,35 @@ def _draw_normals(
     picture: NDArray[np.float64],
     size_m: NDArray[np.float64],
 ) -> None:
-    figure = Figure(figsize=(14.0, 4.0), layout="constrained")
-    *histograms, right = figure.subplots(1, 3, width_ratios=(2.0, 2.0, 3.0))
+    map_in = float(np.clip(2.6 * size_m[1] / size_m[0], 0.8, 4.0))
+    figure = column_figure(1.5 + map_in + 0.5)
+    grid = figure.add_gridspec(2, 2, height_ratios=(1.5, map_in + 0.5))
+    histograms = [figure.add_subplot(grid[0, column]) for column in range(2)]
+    below = figure.add_subplot(grid[1, :])
     for axes, (name, values_deg) in zip(histograms, angles_deg.items(), strict=True):
         edges_deg = np.arange(-90.0 if values_deg.min() < 0.0 else 0.0, 90.0 + _BIN_DEG, _BIN_DEG)
         histogram, _ = np.histogram(values_deg, edges_deg, weights=counts)
         shares = histogram / max(1.0, float(counts.sum()))
-        axes.stairs(shares, edges_deg, fill=True, color="#9db8d2")
-        axes.set_xlabel(f"{name} [deg]", fontsize=9)
-    histograms[0].set_ylabel("share of the points", fontsize=9)
-    image = right.imshow(
+        axes.stairs(shares, edges_deg, fill=True, color=_BLUE)
+        axes.set_xlabel(f"{name} [deg]")
+        axes.set_ylabel("points [share]")
+    image = below.imshow(
         np.minimum(picture, _MAP_MOST_DEG),
         cmap="viridis",
         extent=(0.0, float(size_m[0]), float(size_m[1]), 0.0),
         vmin=0.0,
         vmax=_MAP_MOST_DEG,
     )
-    figure.colorbar(image, ax=right, label="angle [deg]", shrink=0.8)
-    right.set_xlabel("along the plane [m]", fontsize=9)
+    figure.colorbar(
+        image, ax=below, label="angle [deg]", location="bottom", aspect=40, extend="max"
+    )
+    below.set_xlabel("along the plane [m]")
+    below.set_ylabel("down the plane [m]")
     ctx.figure(
         "normals",
         figure,
-        "Left: how the normals of the neighbourhoods lie to the first plane, by points. Middle: "
-        "how far they point along the second horizontal axis (markiewicz2015, Figure 8). Right: "
+        "Left: how the normals of the neighbourhoods lie to the first plane, by points. Right: "
+        "how far they point along the second horizontal axis (markiewicz2015, Figure 8). Below: "
         f"the first over the plane's rectangle, up to {1000.0 * _MAP_DEPTH_M:.0f} mm before and "
         "behind it; what has the wall's colour is told from it by its distance alone. Normals of a "
         "good wall gather near 0 degrees; a broad hill means noise or relief.",

@@ -29,10 +29,11 @@ _WALL_REACH_M: Final = 0.15
 # Points of a line that lie farther apart than this many usual steps are not joined.
 _BREAK_STEPS: Final = 6.0
 
-_SHEET_SIDE_PX: Final = 1200
-_CELL_PX: Final = 300
-_LABEL_PX: Final = 18
-_LETTER_PX: Final = 7
+# A column of a journal at 300 dpi, with letters of 6 points.
+_SHEET_SIDE_PX: Final = 1004
+_CELL_PX: Final = 251
+_LABEL_PX: Final = 30
+_LETTER_PX: Final = 15
 _GAP_PX: Final = 6
 _MOST: Final = 100
 _PAPER: Final = 245
@@ -165,13 +166,13 @@ class ContactSheet:
         cell[_GAP_PX : _GAP_PX + height, _GAP_PX : _GAP_PX + width] = cv2.resize(
             image, (width, height), interpolation=cv2.INTER_AREA
         )
-        place = (_GAP_PX, _GAP_PX + height + _LABEL_PX - 5)
+        place = (_GAP_PX, _GAP_PX + height + _LABEL_PX - 8)
         label = _shortened(name, room_px // _LETTER_PX)
-        cv2.putText(cell, label, place, cv2.FONT_HERSHEY_SIMPLEX, 0.38, _INK, 1, cv2.LINE_AA)
+        cv2.putText(cell, label, place, cv2.FONT_HERSHEY_SIMPLEX, 0.8, _INK, 1, cv2.LINE_AA)
         self._cells.append(cell)
 
     def encoded(self) -> bytes:
-        """Encode the sheet as WebP; no side is longer than 1200 pixels."""
+        """Encode the sheet as WebP; no side is longer than 1004 pixels."""
         starts = range(0, len(self._cells), self._columns)
         rows = [_in_a_row(self._cells[start : start + self._columns]) for start in starts]
         width = max(row.shape[1] for row in rows)

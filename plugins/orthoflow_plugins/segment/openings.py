@@ -44,7 +44,7 @@ _UPRIGHT: Final = math.sin(math.radians(30.0))
 _FACE_FARTHEST_M: Final = 0.3
 # Empty areas must fill this share of their rectangle, as round windows do. Shadows do not.
 _FILLED_LEAST: Final = 0.7
-_LONGEST_PX: Final = 1400
+_LONGEST_PX: Final = 1004
 _SMALLEST_PX: Final = 500
 _KIND_RGB: Final[Mapping[OpeningKind, tuple[int, int, int]]] = {
     "through": (30, 110, 230),
@@ -340,7 +340,7 @@ def outline_map(
             str(number),
             (left + 6, top + 22),
             cv2.FONT_HERSHEY_SIMPLEX,
-            0.7,
+            0.85,
             _KIND_RGB[kind],
             2,
             cv2.LINE_AA,

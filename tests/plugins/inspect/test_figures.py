@@ -1,68 +1,85 @@
-"""Pictures of an inspection: which colour an error has, and where arrows begin and end."""
+"""Pictures of an inspection: which scale an error has, and where arrows begin and end."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
-from orthoflow_plugins.inspect import figures
+from matplotlib.axes import Axes
 from orthoflow_plugins.inspect.figures import (
     colour_error_map,
+    depth_error_map,
     enlargement,
     vector_map,
 )
 
+from orthoflow.files.images import decode_image
 from tests.inspect_scenes import image_of
-
-
-@pytest.fixture(autouse=True)
-def _exact_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures as they are before WebP loses some of them."""
-    monkeypatch.setattr(figures, "encode_webp", np.array)
-
-
-def test_large_maps_are_shrunk_to_nine_hundred_pixels() -> None:
-    assert np.shape(colour_error_map(np.zeros((1_800, 450)))) == (900, 225, 3)
-    assert np.shape(colour_error_map(np.zeros((300, 900)))) == (300, 900, 3)
 
 
 def grey_image(rows: int, columns: int) -> Any:
     return image_of(np.full((rows, columns), 80.0))
 
 
-def test_arrows_run_from_where_things_should_be_to_where_they_are() -> None:
-    # Side 250: pixels are half a cell. The longest usual arrow has 40 pixels.
+@pytest.fixture
+def arrows(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
+    """Tails, components and colours of the arrows that are drawn, and the one of known length."""
+    kept: list[tuple[Any, ...]] = []
+    quiver, key = Axes.quiver, Axes.quiverkey
+
+    def draw(self: Axes, *args: Any, **settings: Any) -> Any:
+        kept.append((np.array(args[:2]).T, np.array(args[2:]).T, settings["color"]))
+        return quiver(self, *args, **settings)
+
+    def draw_key(self: Axes, *args: Any, **settings: Any) -> Any:
+        kept.append(args[3:])
+        return key(self, *args, **settings)
+
+    monkeypatch.setattr(Axes, "quiver", draw)
+    monkeypatch.setattr(Axes, "quiverkey", draw_key)
+    return kept
+
+
+def test_maps_have_the_width_of_a_column_and_a_colour_bar() -> None:
+    error = np.full((1_800, 450), 30.0)
+    error[:900] = np.nan
+    shown = decode_image(colour_error_map(error), "map").astype(int)
+    assert shown.shape[1] == 1003
+    middle = shown[:, 502]
+    # Unknown cells are grey, half of the span is the middle of the colours.
+    np.testing.assert_allclose(middle[200], (138, 148, 158), atol=12)
+    np.testing.assert_allclose(middle[1200], (188, 55, 84), atol=12)
+    red, _, blue = decode_image(depth_error_map(np.full((300, 300), 0.01)), "map")[300, 502]
+    assert red > blue
+
+
+def test_arrows_run_from_where_things_should_be_to_where_they_are(
+    arrows: list[tuple[Any, ...]],
+) -> None:
     image = grey_image(250, 250)
     places = np.array([[50.0, 60.0], [150.0, 100.0], [100.0, 200.0]])
     shift_cells = np.array([[2.0, 0.0], [0.0, 2.0], [-8.0, 0.0]])
     times = enlargement(shift_cells, image)
-    usual = np.percentile([2.0, 2.0, 8.0], 95.0)
-    assert times == np.floor(40.0 / (2.0 * usual)) == 2.0
-    drawn = np.array(vector_map(image, places, shift_cells))
-    expected = np.array(vector_map(image, np.empty((0, 2)), np.empty((0, 2))))
-    arrows = (
-        ((92, 120), (100, 120), (30, 160, 30), 0.3),
-        ((300, 192), (300, 200), (30, 160, 30), 0.3),
-        # Four times the median; heads are no longer than 8 pixels.
-        ((232, 400), (200, 400), (220, 30, 30), 0.25),
-    )
-    for tail, tip, colour, head in arrows:
-        cv2.arrowedLine(expected, tail, tip, colour, 1, cv2.LINE_AA, tipLength=head)
-    np.testing.assert_array_equal(drawn, expected)
+    # The longest usual arrow takes at most 6 % of the side: 15 cells of 7.4 give twice, not five.
+    assert times == 2.0
+    vector_map(image, places, shift_cells)
+    (tails, components, colours), (length, label) = arrows
+    np.testing.assert_allclose(components, times * shift_cells)
+    np.testing.assert_allclose(tails + components, places)
+    # Four times the median is red; the median and what equals it is green.
+    assert colours[0] == colours[1] != colours[2]
+    cell_mm = 1e3 * image.frame.gsd_m
+    assert label == f"{length / times * cell_mm:g} mm"
 
 
-def test_arrows_beyond_the_median_are_yellow_and_of_many_an_even_part_is_drawn() -> None:
+def test_arrows_beyond_the_median_are_yellow_and_of_many_an_even_part_is_drawn(
+    arrows: list[tuple[Any, ...]],
+) -> None:
     image = grey_image(500, 500)
     shift_cells = np.tile([[1.0, 0.0], [1.0, 0.0], [1.5, 0.0]], (1_100, 1))
-    # All at one place but the yellow ones, of which the first is 2 and every second is drawn.
-    places = np.tile([[100.0, 100.0], [100.0, 100.0], [100.0, 300.0]], (1_100, 1))
-    places[3::6] = (400.0, 400.0)
-    drawn = np.array(vector_map(image, places, shift_cells))
-    plain = np.array(vector_map(image, places[:0], shift_cells[:0]))
-    changed = (drawn != plain).any(axis=2)
-    assert changed[90:110].any()
-    assert not changed[395:405].any()
-    yellow = (drawn[290:310] == (230, 180, 0)).all(axis=2)
-    assert yellow.any()
+    places = np.tile([[100.0, 100.0]], (3_300, 1))
+    vector_map(image, places, shift_cells)
+    tails, components, colours = arrows[0]
+    assert len(tails) == len(components) == 1_650
+    assert len(set(colours)) == 2

@@ -19,7 +19,8 @@ from orthoflow_plugins.orient.report import (
     draw_wall_errors,
 )
 
-from orthoflow.files.images import encode_png
+from orthoflow.files.drawing import COLUMN_INCHES
+from orthoflow.files.images import decode_image, encode_png
 from orthoflow.products import Camera, Photo, TieRole
 from orthoflow.sdk import StepContext
 
@@ -44,26 +45,38 @@ def residuals(name: str, n: int, seed: int, *, shift_px: float = 0.0) -> Oriente
 
 
 @pytest.fixture
-def exact(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures as they are before WebP loses some of them."""
-    monkeypatch.setattr(report, "encode_webp", np.array)
+def pictures(monkeypatch: pytest.MonkeyPatch) -> list[NDArray[np.uint8]]:
+    """Pictures as they are before a frame is drawn around them."""
+    kept: list[NDArray[np.uint8]] = []
+    framed = report.picture_figure
+
+    def keep(picture: NDArray[np.uint8], **settings: Any) -> Any:
+        kept.append(picture)
+        return framed(picture, **settings)
+
+    monkeypatch.setattr(report, "picture_figure", keep)
+    return kept
 
 
 def photo_of(image: NDArray[np.uint8], name: str = "west/a b.jpg") -> Photo:
     return Photo(name=name, encoded=encode_png(image), width=image.shape[1], height=image.shape[0])
 
 
-@pytest.mark.usefixtures("exact")
 @pytest.mark.parametrize("scale", [1.0, 0.5])
 def test_ties_are_marked_on_a_dimmed_photo_in_the_colour_of_their_role(
-    scale: float, drawings: dict[str, Any], tmp_path: Path
+    scale: float,
+    drawings: dict[str, Any],
+    pictures: list[NDArray[np.uint8]],
+    tmp_path: Path,
 ) -> None:
     context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
     image = np.full((round(300 / scale), round(900 / scale), 3), 200, dtype=np.uint8)
     at = np.array([[100.5, 50.5], [400.5, 100.5], [700.5, 250.5]])
     role = np.array([TieRole.CONTROL, TieRole.CHECK, TieRole.REJECTED], dtype=np.uint8)
     draw_ties(context, photo_of(image), at / scale, role, "ok")
-    shown = np.array(drawings["ties_west-a-b"])
+    drawn = decode_image(drawings["ties_west-a-b"](), "ties")
+    assert drawn.shape[1] == 1003
+    (shown,) = pictures
     assert shown.shape == (300, 900, 3)
     colours = [(40, 200, 60), (250, 220, 40), (220, 40, 40)]
     expected = np.full((300, 900, 3), 140, dtype=np.uint8)
@@ -92,7 +105,6 @@ def test_photos_of_one_stem_have_figures_of_their_own_and_no_more_than_enough(
 # --- predicted errors ---
 
 
-@pytest.mark.usefixtures("exact")
 def test_the_map_of_a_wall_shows_the_photo_that_knows_each_place_best(
     drawings: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -121,11 +133,12 @@ def test_the_map_of_a_wall_shows_the_photo_that_knows_each_place_best(
     seen = np.isfinite(best)
     assert not seen.all()
     high = np.percentile(best[seen], 98.0)
-    grey = np.rint(255.0 * np.minimum(np.where(seen, best, 0.0) / high, 1.0)).astype(np.uint8)
-    rgb = cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO)[:, :, ::-1].copy()
-    rgb[~seen] = (20, 40, 60)
-    shown = np.array(drawings["wall_8_predicted_error"]())
-    np.testing.assert_array_equal(shown, rgb.repeat(8, axis=0).repeat(8, axis=1))
+    drawn = drawings["wall_8_predicted_error"]
+    np.testing.assert_array_equal(drawn.args[0], np.where(seen, 1e3 * best, np.nan))
+    # 1, 2 or 5 times a power of ten above it, so that maps that are compared have one scale.
+    assert drawn.keywords == {"low": 0.0, "high": 10.0}
+    assert 5.0 < 1e3 * high <= 10.0
+    assert decode_image(drawn(), "map").shape[1] == 1003
     # No more pictures than enough.
     drawings.clear()
     monkeypatch.setattr(report, "_MAX_FIGURES", 0)
@@ -141,7 +154,9 @@ def test_photos_stand_before_the_wall_and_look_at_it(
 ) -> None:
     context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
     corners = np.array([[1.0, 0.0, 2.0], [1.0, 0.0, 0.0], [9.0, 0.0, 0.0], [9.0, 0.0, 2.0]])
-    wall = SimpleNamespace(index=0, corners_world=corners, normal=np.array([0.0, -1.0, 0.0]))
+    wall = SimpleNamespace(
+        index=0, number=0, corners_world=corners, normal=np.array([0.0, -1.0, 0.0])
+    )
     looks = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     camera = SimpleNamespace(centre_world=np.array([4.0, -3.0, 1.5]), rotation=looks)
     points = np.array([[2.0, 0.0, 1.0], [3.0, -0.1, 0.5], [8.0, 0.0, 1.9]])
@@ -182,15 +197,18 @@ def test_residuals_of_all_photos_are_counted_by_role_and_coordinate(
     photos[0].residuals_px[1] = np.nan
     draw_residuals(context, photos)
     pooled = drawings["residuals"]
-    np.testing.assert_allclose(pooled.get_size_inches(), [7.0, 5.2])
+    assert pooled.get_size_inches()[0] == pytest.approx(COLUMN_INCHES)
     panels = np.array(pooled.axes).reshape(2, 2)
+    reach = panels[0, 0].patches[0].get_data()[1][-1]
     for row, kind in enumerate((TieRole.CONTROL, TieRole.CHECK)):
         values = np.vstack([photo.residuals_of(kind) for photo in photos])
         assert len(values) == (3 * 239 - 1 if row == 0 else 180)
+        assert panels[row, 0].get_ylabel() == "ties per bar"
         for column in range(2):
             axes = panels[row, column]
             counts, edges, _ = axes.patches[0].get_data()
-            expected = np.histogram(values[:, column], bins=40)
+            # One scale for all panels.
+            expected = np.histogram(values[:, column], bins=40, range=(-reach, reach))
             np.testing.assert_array_equal(counts, expected[0])
             np.testing.assert_allclose(edges, expected[1])
             x, curve = axes.lines[0].get_data()
@@ -199,3 +217,17 @@ def test_residuals_of_all_photos_are_counted_by_role_and_coordinate(
             share = np.exp(-0.5 * ((x - mean) / deviation) ** 2)
             peak = len(values) * (edges[1] - edges[0]) / (deviation * np.sqrt(2.0 * np.pi))
             np.testing.assert_allclose(curve, peak * share)
+
+
+def test_the_density_of_residuals_shows_lobes(drawings: dict[str, Any], tmp_path: Path) -> None:
+    context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
+    photos = [residuals(f"{k}.jpg", 400, k, shift_px=3.0 * k) for k in range(2)]
+    draw_residuals(context, photos)
+    normal, density = drawings["residuals"].axes[0].lines
+
+    def n_peaks(line: Any) -> int:
+        curve = np.asarray(line.get_ydata())
+        is_peak = (curve[1:-1] > curve[:-2]) & (curve[1:-1] > curve[2:])
+        return int(np.count_nonzero(is_peak & (curve[1:-1] > 0.2 * curve.max())))
+
+    assert (n_peaks(normal), n_peaks(density)) == (1, 2)

@@ -28,7 +28,7 @@ def test_an_outline_lies_on_its_corners_in_the_colour_of_its_kind(
 ) -> None:
     plain = drawn((600 * factor, 700 * factor)).astype(int)
     picture = drawn((600 * factor, 700 * factor), **{kind: CORNERS * factor}).astype(int)
-    shrink = min(1.0, 1400 / (700 * factor))
+    shrink = min(1.0, 1004 / (700 * factor))
     changed = np.abs(picture - plain).max(axis=2) > 60
     rows, columns = np.nonzero(changed)
     corners = CORNERS * factor * shrink

@@ -1,0 +1,188 @@
+"""Charts and pictures at the width of a journal's column, 85 mm, with text of 6 points or more."""
+
+from __future__ import annotations
+
+import colorsys
+import io
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.colors import Colormap
+    from matplotlib.figure import Figure
+
+# Two columns of a journal are 85 mm wide each.
+COLUMN_INCHES: Final = 85.0 / 25.4
+DPI: Final = 300
+# A picture higher than this would not leave room for its caption on a page.
+_MAX_HEIGHT_INCHES: Final = 6.0
+# More pixels along a picture's longer side than a column shows cost time only.
+_MAX_SIDE_PX: Final = 1000
+_MISSING: Final = "#8a949e"
+# Any: matplotlib's own types name every setting that it has.
+_STYLE: Final[Mapping[Any, Any]] = {
+    "font.family": "DejaVu Sans",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "grid.color": "#d4d9de",
+    "grid.linewidth": 0.5,
+    "lines.linewidth": 1.2,
+    "lines.markersize": 4.0,
+    "errorbar.capsize": 2.0,
+    "legend.frameon": False,
+    "legend.fontsize": 7.0,
+    "savefig.dpi": DPI,
+    # The same numbers give the same bytes, and text stays text in PDF.
+    "svg.hashsalt": "orthoflow",
+    "pdf.fonttype": 42,
+    "text.parse_math": False,
+}
+# Of figures with several panels, and of pictures with a frame.
+_PANELS: Final[Mapping[Any, Any]] = {
+    "figure.dpi": DPI,
+    "font.size": 7.0,
+    "axes.titlesize": 7.0,
+    "axes.linewidth": 0.6,
+    "axes.labelpad": 2.0,
+    "axes.titlepad": 3.0,
+    "xtick.labelsize": 6.5,
+    "ytick.labelsize": 6.5,
+    "xtick.major.size": 2.5,
+    "ytick.major.size": 2.5,
+    "legend.fontsize": 6.5,
+    "legend.handlelength": 1.2,
+    "legend.columnspacing": 1.0,
+    "legend.borderaxespad": 0.2,
+    "lines.linewidth": 1.0,
+}
+
+
+@contextmanager
+def styled(settings: Mapping[Any, Any]) -> Iterator[None]:
+    """Draw in the style of all charts, whatever the user's own settings of matplotlib are.
+
+    Args:
+        settings: of matplotlib, in addition to those of all charts.
+    """
+    import matplotlib as mpl
+
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        mpl.rcParams.update({**_STYLE, **settings})
+        yield
+
+
+@contextmanager
+def in_column_style() -> Iterator[None]:
+    """Draw figures of several panels and pictures with a frame: a context, or a decorator."""
+    with styled(_PANELS):
+        yield
+
+
+def column_figure(height_inches: float) -> Figure:
+    """Return an empty figure of a column's width; to be called `in_column_style`."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(COLUMN_INCHES, height_inches), layout="constrained")
+
+
+def picture_figure(
+    picture: NDArray[np.uint8], *, extra_inches: float = 0.0, size: tuple[int, int] | None = None
+) -> tuple[Figure, Axes]:
+    """Return a figure that shows a picture, and its axes, whose units are the picture's pixels.
+
+    Args:
+        picture: (rows, cols) grey or (rows, cols, 3) RGB.
+        extra_inches: height for a legend or a colour bar.
+        size: rows and columns that the axes count, of a picture drawn smaller.
+    """
+    rows, columns = size or picture.shape[:2]
+    height = min(COLUMN_INCHES * rows / columns, _MAX_HEIGHT_INCHES)
+    figure = column_figure(height + extra_inches)
+    axes = figure.add_subplot()
+    axes.set_axis_off()
+    axes.set_anchor("N")
+    extent = (0.0, float(columns), float(rows), 0.0)
+    axes.imshow(picture, cmap="gray", vmin=0, vmax=255, extent=extent)
+    return figure, axes
+
+
+def map_chart(
+    values: NDArray[np.floating], label: str, *, low: float, high: float, cmap: str = "inferno"
+) -> bytes:
+    """Return a map of values (rows, cols) with its colour bar, as WebP; NaN is grey."""
+    import matplotlib as mpl
+
+    with in_column_style():
+        small = _shrunk(values)
+        colours: Colormap = mpl.colormaps[cmap].with_extremes(bad=_MISSING)
+        scale = mpl.colors.Normalize(low, high)
+        rgb = colours(scale(np.ma.masked_invalid(small)), bytes=True)[..., :3]
+        figure, axes = picture_figure(rgb, extra_inches=0.45)
+        figure.colorbar(
+            mpl.cm.ScalarMappable(scale, colours),
+            ax=axes,
+            label=label,
+            location="bottom",
+            aspect=40,
+            extend="both" if low < 0.0 else "max",
+        )
+        return encode_chart(figure)
+
+
+def encode_chart(figure: Figure) -> bytes:
+    """Encode a figure as WebP, which takes a tenth of the bytes of PNG where it shows a photo."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format="webp", pil_kwargs={"quality": 90})
+    return stream.getvalue()
+
+
+def round_scale(value: float) -> float:
+    """Round up to 1, 2 or 5 times a power of ten: figures of similar runs have one scale.
+
+    >>> round_scale(0.34), round_scale(7.0)
+    (0.5, 10.0)
+    """
+    if not value > 0.0:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(value))
+    step = next(step for step in (1.0, 2.0, 5.0, 10.0) if value <= step * power * (1.0 + 1e-9))
+    return float(f"{step * power:.6g}")
+
+
+# Saturation and value of hues by the golden ratio, in turn: the first twenty colours differ most.
+_HUE_STEP: Final = 0.618033988749895
+_SHADES: Final = ((0.9, 0.8), (0.8, 0.55), (0.45, 0.9))
+
+
+def plane_ink(index: int) -> tuple[float, float, float]:
+    """Return the colour (red, green, blue), 0..1, of a plane, or of a photo, in all charts.
+
+    The hue is that of `plane_colour`, the colour of its points in clouds.
+
+    >>> tuple(round(value, 2) for value in plane_ink(0))
+    (0.8, 0.08, 0.08)
+    """
+    return colorsys.hsv_to_rgb(index * _HUE_STEP % 1.0, *_SHADES[index % len(_SHADES)])
+
+
+def _shrunk(values: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return means of what is known, no side longer than a column has pixels."""
+    import cv2
+
+    shown = np.asarray(values, dtype=np.float64)
+    scale = _MAX_SIDE_PX / max(shown.shape)
+    if scale >= 1.0:
+        return shown
+    size = (max(1, round(shown.shape[1] * scale)), max(1, round(shown.shape[0] * scale)))
+    known = np.isfinite(shown)
+    share = cv2.resize(known.astype(np.float64), size, interpolation=cv2.INTER_AREA)
+    total = cv2.resize(np.where(known, shown, 0.0), size, interpolation=cv2.INTER_AREA)
+    small = np.full(share.shape, np.nan)
+    return np.asarray(np.divide(total, share, out=small, where=share >= 0.5))

@@ -1,0 +1,68 @@
+"""Charts at the width of a column: sizes of letters, colours that differ, scales that compare."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import cv2
+import numpy as np
+import pytest
+from matplotlib.text import Text
+
+from orthoflow.files.drawing import (
+    COLUMN_INCHES,
+    column_figure,
+    in_column_style,
+    map_chart,
+    picture_figure,
+    plane_ink,
+    round_scale,
+)
+from orthoflow.files.images import decode_image
+
+
+def test_no_letter_is_smaller_than_six_points_at_the_width_of_a_column() -> None:
+    with in_column_style():
+        figure = column_figure(3.0)
+        axes = figure.subplots()
+        axes.plot([0.0, 1.0], label="a line")
+        axes.set(xlabel="x [m]", ylabel="y [m]", title="a title")
+        axes.legend()
+        figure.draw_without_rendering()
+    assert figure.get_size_inches()[0] * 25.4 == pytest.approx(85.0)
+    sizes = [text.get_fontsize() for text in figure.findobj(Text) if text.get_text()]
+    assert len(sizes) > 10
+    assert min(sizes) >= 6.0
+
+
+def test_colours_of_twenty_planes_differ() -> None:
+    inks = np.array([[plane_ink(k) for k in range(20)]], dtype=np.float32)
+    lab = cv2.cvtColor(inks, cv2.COLOR_RGB2Lab)[0]
+    # CIE76: a just noticeable difference is 2.3.
+    assert min(np.linalg.norm(a - b) for a, b in combinations(lab, 2)) > 20.0
+
+
+@pytest.mark.parametrize("shape", [(40, 90), (900, 300)])
+def test_a_picture_keeps_its_proportions_and_leaves_room(shape: tuple[int, int]) -> None:
+    with in_column_style():
+        figure, axes = picture_figure(np.zeros(shape, dtype=np.uint8), extra_inches=0.5)
+    width, height = figure.get_size_inches()
+    assert width == COLUMN_INCHES
+    assert height == pytest.approx(min(width * shape[0] / shape[1], 6.0) + 0.5)
+    assert axes.get_xlim() == (0.0, shape[1])
+
+
+def test_means_of_a_large_map_leave_out_what_is_unknown() -> None:
+    values = np.full((2_000, 2_000), np.nan)
+    values[::2] = 1.0
+    shown = decode_image(map_chart(values, "error [mm]", low=0.0, high=1.0), "map")
+    # Half known: the full colour, neither mixed with zeros nor missing.
+    np.testing.assert_allclose(shown[400, 500], (252, 255, 164), atol=10)
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [(0.0, 1.0), (0.1, 0.1), (0.11, 0.2), (2.0, 2.0), (2.1, 5.0), (51.0, 100.0), (1e-7, 1e-7)],
+)
+def test_scales_are_rounded_up(value: float, expected: float) -> None:
+    assert round_scale(value) == pytest.approx(expected)
