@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
+from dataclasses import asdict
 
 import click
 
 from orthoflow.cli.commands import EXIT_GOOD, Changes, Command, json_option, workflow_arguments
 from orthoflow.cli.tables import counted, echo, echo_json
 from orthoflow.errors import OrthoflowError
-
-if TYPE_CHECKING:
-    from orthoflow.workflow.model import Workflow
 
 
 @click.command(cls=Command)
@@ -25,33 +21,26 @@ def check(workflow: str, changes: Changes, *, as_json: bool) -> int:
     for as well. Warnings name what is allowed but hardly intended. Ends with 2 when something is
     wrong, with 4 when a plugin is missing.
     """
-    if not as_json:
-        verdict = _check(workflow, changes)
-        echo(verdict.summary, *(f"warning: {text}" for text in verdict.warnings))
-        return EXIT_GOOD
     try:
-        verdict = _check(workflow, changes)
+        summary, warnings = _check(workflow, changes)
     except OrthoflowError as error:
+        if not as_json:
+            raise
         problems = [asdict(problem) for problem in getattr(error, "problems", ())]
         echo_json({"ok": False, "message": str(error), "problems": problems, "warnings": []})
         return error.exit_code
-    warnings = list(verdict.warnings)
-    echo_json({"ok": True, "message": verdict.summary, "problems": [], "warnings": warnings})
+    if as_json:
+        echo_json({"ok": True, "message": summary, "problems": [], "warnings": list(warnings)})
+    else:
+        echo(summary, *(f"warning: {text}" for text in warnings))
     return EXIT_GOOD
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Verdict:
-    """A workflow without mistakes in a sentence, and what is doubtful about it."""
-
-    summary: str
-    warnings: tuple[str, ...]
-
-
-def _check(workflow: str, changes: Changes) -> _Verdict:
+def _check(workflow: str, changes: Changes) -> tuple[str, tuple[str, ...]]:
+    """Return a workflow without mistakes in a sentence, and what is probably a mistake in it."""
     from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.workflow.checks import lint_workflow
-    from orthoflow.workflow.expand import expand_cells, is_plain
+    from orthoflow.workflow.expand import expand_cells, is_plain, variants_text
     from orthoflow.workflow.inputs import resolve_input_files
 
     catalog = discover_catalog()
@@ -63,16 +52,10 @@ def _check(workflow: str, changes: Changes) -> _Verdict:
     n_data = len(loaded.chosen_data)
     datasets = f"{counted(n_data, 'dataset')}, " if n_data else ""
     n_runs = "" if is_plain(cells) else f", {datasets}run {counted(len(cells), 'time')} in all"
+    # The variants with which others are compared: in a sweep, the user chose none.
+    named = variants_text(loaded.baseline)
     summary = (
         f"{loaded.name} is fine: {counted(len(loaded.steps), 'step')}"
-        f"{n_runs}{without_data}{_baseline_text(loaded)}"
+        f"{n_runs}{without_data}{f'; baseline {named}' if named else ''}"
     )
-    return _Verdict(summary=summary, warnings=lint_workflow(loaded))
-
-
-def _baseline_text(workflow: Workflow) -> str:
-    """Which variants the others are compared with: of a sweep, nobody named it."""
-    from orthoflow.workflow.expand import variants_text
-
-    named = variants_text(workflow.baseline)
-    return f"; baseline {named}" if named else ""
+    return summary, lint_workflow(loaded)

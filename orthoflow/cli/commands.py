@@ -88,9 +88,10 @@ class Command(click.Command):
         except click.UsageError as error:
             broken = (one for one in given if one.count("[") > one.count("]"))
             found = next(broken, "")
-            # Behind a space, a negative number looks like an option.
+            # Behind a space, a negative number looks like an option, any other like an argument,
+            # of which click has no error of its own.
             is_number = isinstance(error, click.NoSuchOption) and error.option_name[1:2].isdigit()
-            if not found or not (is_number or "unexpected extra argument" in error.message):
+            if not found or not (is_number or type(error) is click.UsageError):
                 raise
             sentence = (
                 f"{error.message.rstrip('.')}; {found} was split at its "
@@ -161,16 +162,13 @@ class LazyGroup(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Find the command, and suggest which one was probably meant when there is none."""
-        try:
-            return super().resolve_command(ctx, args)
-        except click.UsageError as error:
+        if args and self.get_command(ctx, args[0]) is None:
             from orthoflow.errors import nearest
 
             near = nearest(args[0], self._summaries)
-            if not near or "did you mean" in error.message.lower():
-                raise
-            sentence = f"{error.message.rstrip('.')}; did you mean {near!r}?"
-            raise click.UsageError(sentence, ctx) from error
+            hint = f"; did you mean {near!r}?" if near else "."
+            raise click.UsageError(f"No such command {args[0]!r}{hint}", ctx)
+        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the list of commands from the table."""
@@ -216,64 +214,114 @@ def workflow_arguments(run: Callable[..., int]) -> Callable[..., int]:
         changes = Changes(**{item.name: given.pop(item.name) for item in fields(Changes)})
         return run(changes=changes, **given)
 
-    command = click.option(
-        "--only-data",
-        "only_data",
-        multiple=True,
-        metavar="NAMES",
-        help="Run on these of the datasets, with commas between their names.",
-    )(command)
-    command = click.option(
-        "--datasets",
-        default="",
-        metavar="FILE",
-        help="Run on each dataset of a CSV file: the column name, and a column per input.",
-    )(command)
-    command = input_option(command)
-    command = click.option(
-        "--set-file",
-        "set_files",
-        multiple=True,
-        metavar="FILE",
-        help="Change the parameters that a YAML file names: step.parameter: value.",
-    )(command)
-    command = click.option(
+    return _workflow_options(command)
+
+
+def _together(*options: Callable[[_Decorated], _Decorated]) -> Callable[[_Decorated], _Decorated]:
+    """Return a decorator that adds arguments and options in the order of the help."""
+
+    def add(command: _Decorated) -> _Decorated:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return add
+
+
+input_option = click.option(
+    "--input",
+    "inputs",
+    multiple=True,
+    metavar="NAME=PATH",
+    help="Give an input: a file, a folder or a quoted glob, relative to the current folder.",
+)
+store_option = click.option(
+    "--store",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=DEFAULT_STORE,
+    show_default=True,
+    metavar="DIR",
+    help="Folder of stored results.",
+)
+json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+_workflow_options = _together(
+    click.argument("workflow", metavar="WORKFLOW"),
+    click.option(
         "--set",
         "sets",
         multiple=True,
         metavar="STEP.PARAM=VALUE",
         help="Change a parameter, e.g. wall.gsd_m=0.002 or plane.ransac.tolerance_m=0.05.",
-    )(command)
-    return click.argument("workflow", metavar="WORKFLOW")(command)
-
-
-def input_option(command: _Decorated) -> _Decorated:
-    """Add `--input`."""
-    return click.option(
-        "--input",
-        "inputs",
+    ),
+    click.option(
+        "--set-file",
+        "set_files",
         multiple=True,
-        metavar="NAME=PATH",
-        help="Give an input: a file, a folder or a quoted glob, relative to the current folder.",
-    )(command)
-
-
-def selection_options(command: _Decorated) -> _Decorated:
-    """Add the options that choose steps: `--only --from --until --force`."""
-    for name, parameter, text in [
-        ("--force", "force", "Run this step although its result is stored."),
-        (
-            "--until",
-            "until",
-            "Run this step and what it needs; what is stored is not computed again.",
-        ),
-        ("--from", "from_", "Run this step, what follows, and what these need and is not stored."),
-        ("--only", "only", "Run this step, and what it needs and is not stored."),
-    ]:
-        command = click.option(
-            name, parameter, metavar="STEP", multiple=True, help=f"{text} Repeatable."
-        )(command)
-    return command
+        metavar="FILE",
+        help="Change the parameters that a YAML file names: step.parameter: value.",
+    ),
+    input_option,
+    click.option(
+        "--datasets",
+        default="",
+        metavar="FILE",
+        help="Run on each dataset of a CSV file: the column name, and a column per input.",
+    ),
+    click.option(
+        "--only-data",
+        "only_data",
+        multiple=True,
+        metavar="NAMES",
+        help="Run on these of the datasets, with commas between their names.",
+    ),
+)
+#: the options that choose steps
+selection_options = _together(
+    *(
+        click.option(option, name, metavar="STEP", multiple=True, help=f"{text} Repeatable.")
+        for option, name, text in (
+            ("--only", "only", "Run this step, and what it needs and is not stored."),
+            (
+                "--from",
+                "from_",
+                "Run this step, what follows, and what these need and is not stored.",
+            ),
+            (
+                "--until",
+                "until",
+                "Run this step and what it needs; what is stored is not computed again.",
+            ),
+            ("--force", "force", "Run this step although its result is stored."),
+        )
+    )
+)
+#: how steps run
+execution_options = _together(
+    click.option(
+        "--jobs", type=int, default=1, metavar="N", help="Steps that run at the same time."
+    ),
+    click.option(
+        "--executor",
+        type=click.Choice(["local", "inline", "dask"]),
+        default="local",
+        help="A process per step, all in this one (for debugging; a step's memory then "
+        "includes that of earlier ones), or on the workers of dask.",
+    ),
+    click.option(
+        "--scheduler",
+        default="",
+        metavar="ADDRESS",
+        help="With dask: the cluster's scheduler, tcp://HOST:PORT; without it, N workers here.",
+    ),
+    click.option(
+        "--retries",
+        type=int,
+        default=2,
+        show_default=True,
+        metavar="N",
+        help="With dask: how often a step is repeated after its worker was lost.",
+    ),
+)
 
 
 def output_option(name: str) -> Callable[[_Decorated], _Decorated]:
@@ -285,51 +333,6 @@ def output_option(name: str) -> Callable[[_Decorated], _Decorated]:
         metavar="RUNDIR",
         help=f"Folder of this run.  [default: runs/{name}]",
     )
-
-
-def execution_options(command: _Decorated) -> _Decorated:
-    """Add how steps run: `--jobs --executor --scheduler --retries`."""
-    command = click.option(
-        "--retries",
-        type=int,
-        default=2,
-        show_default=True,
-        metavar="N",
-        help="With dask: how often a step is repeated after its worker was lost.",
-    )(command)
-    command = click.option(
-        "--scheduler",
-        default="",
-        metavar="ADDRESS",
-        help="With dask: the cluster's scheduler, tcp://HOST:PORT; without it, N workers here.",
-    )(command)
-    command = click.option(
-        "--executor",
-        type=click.Choice(["local", "inline", "dask"]),
-        default="local",
-        help="A process per step, all in this one (for debugging; a step's memory then "
-        "includes that of earlier ones), or on the workers of dask.",
-    )(command)
-    return click.option(
-        "--jobs", type=int, default=1, metavar="N", help="Steps that run at the same time."
-    )(command)
-
-
-def store_option(command: _Decorated) -> _Decorated:
-    """Add `--store`."""
-    return click.option(
-        "--store",
-        type=click.Path(path_type=Path, file_okay=False),
-        default=DEFAULT_STORE,
-        show_default=True,
-        metavar="DIR",
-        help="Folder of stored results.",
-    )(command)
-
-
-def json_option(command: _Decorated) -> _Decorated:
-    """Add `--json`."""
-    return click.option("--json", "as_json", is_flag=True, help="Print JSON.")(command)
 
 
 EXIT_GOOD: Final = 0

@@ -68,19 +68,29 @@ class _Collected:
         self.found.append((position, f"{path}: {message}" if path else message))
 
 
-# In the words of a workflow file instead of Python's.
+# Code of pydantic's -> what was expected, in the words of a file instead of Python's. Validators of
+# ours raise custom errors with a `form`.
 _FORMS: Final[Mapping[str, str]] = {
     "bool_type": "true or false",
     "dict_type": "a mapping",
+    "finite_number": "a finite number",
+    "float_type": "a valid number",
+    "greater_than": "greater than {gt:g}",
+    "greater_than_equal": "greater than or equal to {ge:g}",
     "int_from_float": "a whole number",
     "int_type": "a whole number",
-    "model_type": "a mapping",
+    "less_than": "less than {lt:g}",
+    "less_than_equal": "less than or equal to {le:g}",
     "list_type": "a list",
-    "tuple_type": "a list",
+    "literal_error": "{expected}",
+    "model_type": "a mapping",
     "string_type": "a text",
+    "tuple_type": "a list",
 }
+_OF_NUMBERS: Final = frozenset(
+    ("finite_number", "float_type", "int_from_float", "int_type", "time")
+)
 _OF_LISTS: Final = frozenset(("tuple_type", "list_type", "missing", "too_long", "too_short"))
-_LEADING: Final = "Input should be "
 # Keys of a call that are often written among its parameters.
 _BESIDE: Final = ("use", "repeat", "resources", "timeout")
 
@@ -147,18 +157,19 @@ def _sentence(
         return f"{owner} needs parameter {name}" if owner else f"{name} is missing"
     if kind in {"value_error", "assertion_error"}:
         return str(details.get("ctx", {}).get("error", details["msg"]))
+    context = [one.get("ctx", {}) for one in alternatives]
     forms = [
-        _FORMS.get(one["type"], one["msg"].removeprefix(_LEADING))
-        for one in alternatives
-        if one["type"] in _FORMS or one["msg"].startswith(_LEADING)
+        _FORMS.get(one["type"], "{form}").format_map(values)
+        for one, values in zip(alternatives, context, strict=True)
+        if one["type"] in _FORMS or "form" in values
     ]
     if not forms:
         text = details["msg"].replace("Tuple", "list").replace("Dictionary", "mapping")
-        return text[:1].lower() + text[1:] if kind.startswith("too_") else text
+        return text[:1].lower() + text[1:] if kind in _OF_LISTS else text
     meant = ""
     if kind == "literal_error":
-        meant = did_you_mean(str(given), re.findall(r"'([^']*)'", details["msg"]))
-    elif any("number" in form for form in forms):
+        meant = did_you_mean(str(given), _literals_at(model, loc))
+    elif any(one["type"] in _OF_NUMBERS for one in alternatives):
         meant = meant_number(name, given)
     if owner and len(loc) == 1 and isinstance(given, list) and len(given) > 1:
         meant += f"; to try each: {{sweep: {_shown(given)}}}"
@@ -210,25 +221,40 @@ def _unknown_key(name: str, known: Sequence[str], value: JsonValue, owner: str) 
 
 def _keys_at(model: type[BaseModel], loc: Location) -> list[str]:
     """Return the keys that the model at a location has."""
-    models = [model]
-    for part in loc:
-        fields = [
-            info
-            for one in models
-            for name, info in one.model_fields.items()
-            if part == (info.alias or name)
-        ]
-        # Else it is a name in a mapping, or an index.
-        if fields:
-            models = [one for info in fields for one in _models_in(info.annotation)]
+    models = _models_in(_annotations_at(model, loc))
     return [info.alias or name for one in models for name, info in one.model_fields.items()]
 
 
-def _models_in(annotation: object) -> Iterator[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+def _literals_at(model: type[BaseModel], loc: Location) -> list[str]:
+    """Return the words that may stand at a location."""
+    parts = _parts_of(_annotations_at(model, loc))
+    literals = (part for part in parts if typing.get_origin(part) is typing.Literal)
+    return [str(word) for one in literals for word in typing.get_args(one)]
+
+
+def _annotations_at(model: type[BaseModel], loc: Location) -> list[object]:
+    """Return the types at a location, and those around what is a name in a mapping or an index."""
+    found: list[object] = [model]
+    for part in loc:
+        fields = [
+            info.annotation
+            for one in _models_in(found)
+            for name, info in one.model_fields.items()
+            if part == (info.alias or name)
+        ]
+        found = fields or found
+    return found
+
+
+def _models_in(annotations: Iterable[object]) -> list[type[BaseModel]]:
+    parts = _parts_of(annotations)
+    return [part for part in parts if isinstance(part, type) and issubclass(part, BaseModel)]
+
+
+def _parts_of(annotations: Iterable[object]) -> Iterator[object]:
+    for annotation in annotations:
         yield annotation
-    for part in typing.get_args(annotation):
-        yield from _models_in(part)
+        yield from _parts_of(typing.get_args(annotation))
 
 
 # Units and decimals ------------------------------------------------------------------------------

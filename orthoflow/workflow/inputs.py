@@ -197,7 +197,7 @@ def resolve_input_files(workflow: Workflow) -> Mapping[str, InputFiles | None]:
         try:
             found[spec.name] = _resolve(spec)
         except InputError as error:
-            missing.append(str(error))
+            missing.append(f"{_place(spec)}{error}")
     if len(missing) == 1:
         raise InputError(missing[0])
     if missing:
@@ -211,8 +211,7 @@ def add_missing_inputs(workflow: Workflow, log: ProblemLog) -> None:
         try:
             _resolve(spec)
         except InputError as error:
-            place = _place(spec)
-            log.report_input(spec.place if place else None, str(error).removeprefix(place))
+            log.report_input(None if spec.is_given else spec.place, str(error))
 
 
 def present_inputs(workflow: Workflow) -> frozenset[str]:
@@ -263,7 +262,7 @@ def _find(spec: WorkflowInputSpec, pattern: str) -> list[Path]:
     else:
         files, missing = [], f"there is no file {pattern}{where}{_meant(path)}"
     if not files:
-        raise InputError(f"{_place(spec)}input {spec.name}: {missing}")
+        raise InputError(f"input {spec.name}: {missing}")
     return [item.absolute() for item in files]
 
 

@@ -73,6 +73,10 @@ def check_name(name: str) -> str:
     return name
 
 
+def _refusal(code: str, form: str) -> PydanticCustomError:
+    return PydanticCustomError(code, "Input should be {form}", {"form": form})  # type: ignore[arg-type]
+
+
 def _seconds(raw: object) -> float:
     """Return a time in seconds: 1800 for `30min`."""
     seconds = 0.0
@@ -81,8 +85,7 @@ def _seconds(raw: object) -> float:
     elif isinstance(raw, str) and (match := _TIME.fullmatch(raw)):
         seconds = float(match[1]) * _SECONDS[match[2]]
     if not (math.isfinite(seconds) and seconds > 0):
-        form = "a time such as 90s, 30min, 2h or a number of seconds above 0"
-        raise PydanticCustomError("time", f"Input should be {form}")
+        raise _refusal("time", "a time such as 90s, 30min, 2h or a number of seconds above 0")
     return seconds
 
 
@@ -110,19 +113,19 @@ class Reference:
 def _reference(raw: object) -> Reference:
     match = _REFERENCE.fullmatch(raw) if isinstance(raw, str) else None
     if match is None:
-        raise PydanticCustomError("reference", "Input should be step.port or inputs.name")
+        raise _refusal("reference", "step.port or inputs.name")
     return Reference(source=match[1], name=match[2])
 
 
 def _input_reference(raw: object) -> Reference:
     if not (isinstance(raw, str) and raw.startswith(f"{INPUTS}.")):
-        raise PydanticCustomError("reference", "Input should be an input such as inputs.scan")
+        raise _refusal("reference", "an input such as inputs.scan")
     return _reference(raw)
 
 
 def _metric(pattern: str) -> str:
     if not re.fullmatch(_METRIC, pattern):
-        raise PydanticCustomError("metric", "Input should be step.metric, * allowed")
+        raise _refusal("metric", "step.metric, * allowed")
     return pattern
 
 
