@@ -72,7 +72,7 @@ LIBRARIES: Final[Mapping[str, tuple[str, str]]] = {
     "distributed": ("distributed", "clusters: --executor dask"),
 }
 _CORE: Final = frozenset(
-    ("click", "h5py", "jinja2", "networkx", "numpy", "pluggy", "pydantic", "rich", "ruamel.yaml")
+    (*(name for name, (_, use) in LIBRARIES.items() if use == _EVERYTHING), "jinja2", "rich")
 )
 # What a plain installation lacks, and how `pip install` names it.
 _EXTRAS: Final = {"cryptography": "cryptography[ssh]", "distributed": "distributed"}
@@ -132,16 +132,10 @@ def doctor(store: Path, *, as_json: bool) -> int:
     findings = [*_machine(), *_store(store), *libraries, *_plugins()]
     is_broken = any(item.is_core and item.verdict == "missing" for item in findings)
     if as_json:
+        # As the columns of the table are called.
+        keys = {"use": "for", "is_core": "core"}
         listed = [
-            {
-                "name": item.name,
-                "verdict": item.verdict,
-                "found": item.found,
-                "for": item.use,
-                "cost": item.cost,
-                "core": item.is_core,
-            }
-            for item in findings
+            {keys.get(name, name): value for name, value in vars(item).items()} for item in findings
         ]
         echo_json({"version": __version__, "ok": not is_broken, "findings": listed})
     else:
@@ -219,26 +213,26 @@ def _machine() -> Iterator[Finding]:
         # The engine does not load when a core library is missing, which is a finding of its own.
         yield Finding("memory", "limited", "unknown", "cannot be measured")
         return
-    yield _enough(
-        Finding("memory", "ok", f"{n_bytes / 1024**3:.1f} GiB available"),
-        "scans of many millions of points will not fit",
-        is_enough=n_bytes >= _COMFORTABLE_MEMORY_BYTES,
+    cost = "scans of many millions of points will not fit"
+    yield _enough("memory", n_bytes, _COMFORTABLE_MEMORY_BYTES, "available", cost)
+
+
+def _enough(name: str, n_bytes: int, comfortable_bytes: int, found: str, cost: str) -> Finding:
+    """Return whether there is enough of something."""
+    text = f"{n_bytes / 1024**3:.1f} GiB {found}"
+    return (
+        Finding(name, "ok", text)
+        if n_bytes >= comfortable_bytes
+        else Finding(name, "limited", text, cost)
     )
-
-
-def _enough(finding: Finding, cost: str, *, is_enough: bool) -> Finding:
-    return finding if is_enough else Finding(finding.name, "limited", finding.found, cost)
 
 
 def _store(store: Path) -> Iterator[Finding]:
     places = (store.absolute(), *store.absolute().parents)
     folder = next(place for place in places if place.is_dir())
     free = shutil.disk_usage(folder).free
-    yield _enough(
-        Finding("disk of the store", "ok", f"{free / 1024**3:.1f} GiB free"),
-        "long runs may fill it (orthoflow cache gc, or --store DIR)",
-        is_enough=free >= _COMFORTABLE_DISK_BYTES,
-    )
+    cost = "long runs may fill it (orthoflow cache gc, or --store DIR)"
+    yield _enough("disk of the store", free, _COMFORTABLE_DISK_BYTES, "free", cost)
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
             file.write(b"x")

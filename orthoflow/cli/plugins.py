@@ -9,7 +9,7 @@ import os
 import re
 import traceback
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -37,24 +37,6 @@ _SUMMARIES: Final = {
     "check": "Run the conformance suite on a method.",
 }
 
-# Header -> key of the JSON.
-_COLUMNS: Final = {
-    "methods": {
-        "method": "id",
-        "state": "state",
-        "distribution": "distribution",
-        "summary": "summary",
-    },
-    "kinds": {
-        "kind": "name",
-        "takes": "in",
-        "gives": "out",
-        "distribution": "distribution",
-        "summary": "summary",
-    },
-    "products": {"product": "name", "distribution": "distribution", "summary": "summary"},
-}
-
 plugins: Final[click.Command] = LazyGroup(
     name="plugins",
     help="List, show and check methods, and write a plugin of your own.",
@@ -74,10 +56,24 @@ def plugins_list(*, as_json: bool) -> int:
     if as_json:
         echo_json(found)
         return EXIT_GOOD
-    for section, columns in _COLUMNS.items():
+    for section, columns in (
+        ("methods", {"method": "id", "state": "state"}),
+        ("kinds", {"kind": "name", "takes": "in", "gives": "out"}),
+        ("products", {"product": "name"}),
+    ):
         if section != "methods":
             echo()
-        echo_table(tuple(columns), [_row(one, columns.values()) for one in found[section]])
+        echo_table(
+            (*columns, "distribution", "summary"),
+            [
+                (
+                    *(_cell(one, key) for key in columns.values()),
+                    f"{one['distribution']} {one['version']}",
+                    one["summary"],
+                )
+                for one in found[section]
+            ],
+        )
     problems = [one["problem"] for rows in found.values() for one in rows if one["problem"]]
     if problems:
         echo("", "what is wrong:", *(f"- {problem}" for problem in problems))
@@ -127,15 +123,10 @@ def _announced(entry: MethodEntry | KindEntry | ProductEntry) -> dict[str, objec
     }
 
 
-def _row(entry: Mapping[str, Any], columns: Iterable[str]) -> list[str]:
-    texts = {
-        name: ", ".join(value) if isinstance(value, dict) else str(value)
-        for name, value in entry.items()
-    }
-    texts["distribution"] += f" {entry['version']}"
-    if entry.get("is_source"):
-        texts["in"] = texts["out"] = "its methods' own"
-    return [texts[name] for name in columns]
+def _cell(entry: Mapping[str, Any], key: str) -> str:
+    if key in ("in", "out"):
+        return "its methods' own" if entry["is_source"] else ", ".join(entry[key])
+    return str(entry[key])
 
 
 @click.command("show", cls=Command)
@@ -163,29 +154,25 @@ def plugins_show(method_id: str, *, as_json: bool) -> int:
 
 
 def _failure(catalog: Catalog, name: str) -> dict[str, str]:
-    """Why a plugin or a method cannot be loaded; empty where it can."""
-    distribution: DistributionInfo
-    entry = catalog.methods.get(name)
-    if entry is None:
-        for broken in catalog.broken:
-            if name in (broken.entry_point, broken.distribution.name) or broken.mentions(name):
-                problem, target, trace = str(broken), broken.module, broken.traceback
-                distribution = broken.distribution
-                break
-        else:
-            return {}
-    else:
-        if entry.state != "fine":
-            return {}
+    """Return why a plugin or a method cannot be loaded; empty where it can."""
+    found: tuple[DistributionInfo, str, str, str] | None = None
+    if entry := catalog.methods.get(name):
         try:
-            entry.load()
+            if entry.state == "fine":
+                entry.load()
         except PluginError as error:
             cause = error.__cause__
-            problem, target, distribution = str(error), entry.spec.target, entry.distribution
             # A class that loads and breaks a rule has none.
             trace = "".join(traceback.format_exception(cause)) if cause else ""
-        else:
-            return {}
+            found = entry.distribution, str(error), entry.spec.target, trace
+    else:
+        for one in catalog.broken:
+            if name in (one.entry_point, one.distribution.name) or one.mentions(name):
+                found = one.distribution, str(one), one.module, one.traceback
+                break
+    if found is None:
+        return {}
+    distribution, problem, target, trace = found
     return {
         "state": "broken",
         "problem": problem,
@@ -272,20 +259,19 @@ def _print_method(method: Mapping[str, Any]) -> None:
             ],
         )
     echo(*([""] if method["params"] else ["", "no parameters"]))
-    names = ("type", "default", "unit", "description")
     echo_table(
-        ("parameter", *names),
+        ("parameter", "type", "default", "unit", "description"),
         [
-            (one["name"], *(_shown(one[name], is_json=name == "default") for name in names))
+            (
+                one["name"],
+                one["type"],
+                "" if one["default"] is None else json.dumps(one["default"]),
+                one["unit"],
+                one["description"],
+            )
             for one in method["params"]
         ],
     )
-
-
-def _shown(value: object, *, is_json: bool) -> str:
-    if value is None:
-        return ""
-    return json.dumps(value) if is_json else str(value)
 
 
 def _metric_text(spec: Mapping[str, str]) -> str:
@@ -423,11 +409,14 @@ def plugins_check(method_id: str, *, as_json: bool, golden: Path | None, quick: 
     if as_json:
         echo_json({"method": method_id, "checks": results, "unwritten": list(left)})
     else:
-        summed = [f"{method_id} keeps {counted(counts['kept'], 'rule')}"]
-        summed += [f"breaks {counts['broken']}"] if counts["broken"] else []
-        summed += [f"{counts['skipped']} skipped"] if counts["skipped"] else []
-        summed += [f"{counts['left out']} left out (--quick)"] if counts["left out"] else []
-        echo("", ", ".join(summed))
+        words = {
+            "kept": f"{method_id} keeps {counted(counts['kept'], 'rule')}",
+            "broken": f"breaks {counts['broken']}",
+            "skipped": f"{counts['skipped']} skipped",
+            "left out": f"{counts['left out']} left out (--quick)",
+        }
+        parts = [text for state, text in words.items() if state == "kept" or counts[state]]
+        echo("", ", ".join(parts))
         if left:
             echo(f"warning: as `plugins new` wrote it, write your own: {', '.join(left)}")
     return EXIT_CELL_FAILED if counts["broken"] else EXIT_GOOD

@@ -131,7 +131,7 @@ def test_looking_ends_where_there_is_too_much(
     place = re.escape(str(project / pattern))
     with pytest.raises(
         InputError,
-        match=f" inputs.photos.files: input photos: {re.escape(pattern)} beside the workflow \\({place}\\) has more "
+        match=f" input photos: {re.escape(pattern)} beside the workflow \\({place}\\) has more "
         "than 4 files and folders to look at; name a folder nearer to the files$",
     ):
         names(project, catalog, f"{{files: {json.dumps(pattern)}}}")
