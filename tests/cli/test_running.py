@@ -123,12 +123,6 @@ def test_until_leaves_out_what_follows_and_says_so(finished: tuple[Path, str, st
     assert "A part of the workflow was asked for: <code>--until survey</code>." in page
 
 
-def test_a_finished_folder_is_refused(finished: tuple[Path, str, str]) -> None:
-    done = orthoflow(finished[0], "run", "studio.yaml", "-o", "good")
-    assert done.returncode == 2
-    assert "holds a finished run (run.h5); choose another folder with -o" in done.stderr
-
-
 def test_an_input_from_the_command_line_is_recorded_by_content(tmp_path: Path) -> None:
     write_studio(tmp_path)
     (tmp_path / "n.txt").write_text("1.5", encoding="utf-8")
@@ -346,28 +340,6 @@ def test_a_truncated_record_ends_with_3_everywhere(
         assert "run.h5" in done.stdout + done.stderr
 
 
-@pytest.mark.parametrize("verb", ["show", "verify", "report"])
-def test_a_missing_run_ends_with_2(tmp_path: Path, verb: str) -> None:
-    done = orthoflow(tmp_path, verb, "nowhere")
-    assert done.returncode == 2
-    assert done.stderr == "error: nowhere does not exist; give a run folder or its run.h5\n"
-
-
-def test_plan_says_what_is_cached_and_what_changed(finished: tuple[Path, str, str]) -> None:
-    folder = finished[0]
-    same = orthoflow(folder, "plan", "studio.yaml", "--set", "survey.offset_m=-3")
-    assert same.stdout.splitlines()[-1] == "2 steps: 2 cached"
-    other = json.loads(
-        orthoflow(
-            folder,
-            *("plan", "studio.yaml", "--set", "survey.offset_m=-3", "--set", "paint.grey=9"),
-            "--json",
-        ).stdout
-    )
-    assert [item["status"] for item in other] == ["cached", "will run"]
-    assert "grey" in other[1]["reason"]
-
-
 def test_cache_lists_results_and_collects_garbage(tmp_path: Path) -> None:
     write_studio(tmp_path)
     assert orthoflow(tmp_path, "run", "studio.yaml", "-o", "r", *INLINE).returncode == 0
@@ -393,12 +365,6 @@ def test_the_store_may_lie_elsewhere(tmp_path: Path) -> None:
     assert not (tmp_path / ".orthoflow").exists()
 
 
-def test_check_is_content_with_a_good_workflow(tmp_path: Path) -> None:
-    write_studio(tmp_path)
-    done = orthoflow(tmp_path, "check", "studio.yaml")
-    assert (done.returncode, done.stdout) == (0, "studio is fine: 2 steps\n")
-
-
 def test_check_names_every_problem_with_its_place(tmp_path: Path) -> None:
     path = write_studio(tmp_path, "paint.plane")
     path.write_text(path.read_text(encoding="utf-8") + "colour: red\n", encoding="utf-8")
@@ -412,22 +378,6 @@ def test_check_names_every_problem_with_its_place(tmp_path: Path) -> None:
     assert answer["ok"] is False
     assert [problem["line"] for problem in answer["problems"]] == [8, 9]
     assert answer["warnings"] == []
-
-
-def test_check_looks_for_the_files(tmp_path: Path) -> None:
-    write_studio(tmp_path)
-    done = orthoflow(tmp_path, "check", "studio.yaml", "--input", "number=none.txt")
-    assert done.returncode == 2
-    assert "there is no file none.txt" in done.stderr
-
-
-def test_graph_and_schema_print_what_other_programs_read(tmp_path: Path) -> None:
-    write_studio(tmp_path)
-    graph = orthoflow(tmp_path, "graph", "studio.yaml")
-    assert graph.returncode == 0, graph.stderr
-    assert graph.stdout.splitlines()[0].startswith(("flowchart", "graph"))
-    schema = json.loads(orthoflow(tmp_path, "schema").stdout)
-    assert "paint.plain" in json.dumps(schema)
 
 
 PAINTS = """

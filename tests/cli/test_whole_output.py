@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import CliRunner
 from orthoflow_provenance.document import RunRecord
 
-from orthoflow.cli import plugins as plugins_commands
 from orthoflow.cli.compare import _print
 from orthoflow.cli.export import _refuse_filled
 from orthoflow.cli.exports.choices import Choices
 from orthoflow.cli.exports.formats import check_choices
 from orthoflow.cli.exports.products import make_empty
-from orthoflow.cli.program import program
 from orthoflow.errors import ArgumentError
 from orthoflow.records.compare import CellFacts, Pair, ParameterValue, RunComparison
-from tests.laboratories import laboratory_catalog
 from tests.report_runs import cell, metric, record
 
 
@@ -100,111 +95,6 @@ def test_a_short_comparison_counts_rounding_and_says_once_what_is_said_alike(
     ]
     _print(comparison)
     assert sum("tiny_mm" in line for line in printed(capsys)) == 3
-
-
-# --- methods ---
-
-
-@pytest.fixture
-def laboratory(monkeypatch: pytest.MonkeyPatch) -> None:
-    catalog = laboratory_catalog(monkeypatch)
-    monkeypatch.setattr(plugins_commands, "discover_catalog", lambda: catalog)
-
-
-def answer(*arguments: str, code: int = 0) -> str:
-    result = CliRunner().invoke(program, ["plugins", *arguments])
-    assert result.exit_code == code, result.output
-    return result.output
-
-
-@pytest.mark.usefixtures("laboratory")
-def test_a_method_is_shown_with_ports_and_parameters() -> None:
-    assert answer("show", "plane.ransac") == (
-        "plane.ransac: plane.ransac of the tests\n"
-        "\n"
-        "distribution  laboratory 1.0\n"
-        "state         fine\n"
-        "class         laboratory.methods:Ransac\n"
-        "determinism   seeded, result version 1\n"
-        "\n"
-        "port  name    product\n"
-        "in    cloud   cloud\n"
-        "out   planes  planes\n"
-        "out   labels  labels\n"
-        "\n"
-        "parameter    type                default  unit  description\n"
-        "tolerance_m  number > 0 or auto  0.05     m     Distance that counts as on the plane.\n"
-        "iterations   integer >= 1        2000           Trials.\n"
-    )
-    told = json.loads(answer("show", "plane.ransac", "--json"))
-    assert told == {
-        "id": "plane.ransac",
-        "summary": "plane.ransac of the tests",
-        "description": "",
-        "state": "fine",
-        "distribution": "laboratory",
-        "version": "1.0",
-        "target": "laboratory.methods:Ransac",
-        "result_version": 1,
-        "determinism": "seeded",
-        "citations": [],
-        "params": [
-            {
-                "name": "tolerance_m",
-                "type": "number > 0 or auto",
-                "default": 0.05,
-                "unit": "m",
-                "description": "Distance that counts as on the plane.",
-            },
-            {
-                "name": "iterations",
-                "type": "integer >= 1",
-                "default": 2000,
-                "unit": "",
-                "description": "Trials.",
-            },
-        ],
-        "in": [{"port": "cloud", "product": "cloud", "required": True}],
-        "out": [
-            {"port": "planes", "product": "planes"},
-            {"port": "labels", "product": "labels"},
-        ],
-        "metrics": [],
-    }
-    photos = answer("show", "read.photos")
-    assert "in    calibration  files    optional\n" in photos
-    assert photos.endswith("out   photos       photos\n\nno parameters\n")
-
-
-@pytest.mark.usefixtures("laboratory")
-def test_methods_kinds_and_products_are_listed() -> None:
-    blocks = [block.splitlines() for block in answer("list").split("\n\n")]
-    assert [block[0].split() for block in blocks] == [
-        ["method", "state", "distribution", "summary"],
-        ["kind", "takes", "gives", "distribution", "summary"],
-        ["product", "distribution", "summary"],
-    ]
-    assert "plane.ransac    fine   laboratory 1.0  plane.ransac of the tests" in blocks[0]
-    rows = {line.split()[0]: line for line in blocks[1]}
-    assert "planes, labels" in rows["plane"]
-    assert rows["read"].count("its methods' own") == 2
-    told = json.loads(answer("list", "--json"))
-    assert set(told) == {"methods", "kinds", "products", "broken"}
-    assert told["broken"] == []
-    assert next(item for item in told["methods"] if item["id"] == "plane.ransac") == {
-        "id": "plane.ransac",
-        "kind": "plane",
-        "state": "fine",
-        "problem": "",
-        "distribution": "laboratory",
-        "version": "1.0",
-        "summary": "plane.ransac of the tests",
-    }
-    kinds = {item["name"]: item for item in told["kinds"]}
-    assert kinds["plane"]["in"] == {"cloud": "cloud"}
-    assert kinds["plane"]["out"] == {"planes": "planes", "labels": "labels"}
-    assert (kinds["plane"]["is_source"], kinds["read"]["is_source"]) == (False, True)
-    assert {item["state"] for item in [*told["kinds"], *told["products"]]} == {"fine"}
 
 
 # --- options of exports ---

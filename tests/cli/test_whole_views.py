@@ -15,48 +15,6 @@ from tests.provenance_records import write_sample
 from tests.studios import said
 
 
-def test_a_run_is_shown_completely(tmp_path: Path) -> None:
-    path, record, _ = write_sample(tmp_path)
-    wall = "wall@plane=hough2d,orient=pnp#2"
-    sha256 = record.inputs[0].files[0].sha256[:12]
-    rows = [
-        ("step", "method", "status", "time   memory"),
-        ("cloud", "read.scan 0.1.0", "ok (cached from earlier-run)", "1.5 s  64 MiB"),
-        (wall, "raster.grid 0.1.0", "ok", "1.5 s  64 MiB"),
-        ("ortho", "ortho.pointcloud-direct", "failed", ""),
-    ]
-    assert said("show", path).splitlines() == [
-        "court-yard, run 20250102-abc: 3 steps, 2 ok, 1 failed",
-        "2025-01-02T03:04:05Z to 2025-01-02T03:05:05Z, orthoflow 0.1.0, seed 7",
-        "overrides: wall.gsd_m=0.01",
-        f"input scan: hall.laz, 1.0 TiB, sha256 {sha256}",
-        "input calibration: not given",
-        "",
-        *(f"{row[0]:31}  {row[1]:23}  {row[2]:28}  {row[3]}".rstrip() for row in rows),
-        "ortho failed: no cell has enough points",
-        "",
-        f"{'step':31}  metric  value  unit",
-        f"{wall}  rms_mm  1.25   mm",
-        f"{wall}  cells   5400",
-        "",
-        "environment: Python 3.11.7, Linux 6.1, A processor, 2 cores, 2 threads",
-        "numpy 2.4.0, h5py 3.16.0 and 0 others (--json names them)",
-        "",
-        f"products: {tmp_path / 'products'}, 0 files",
-        "",
-        f"`orthoflow verify {path}` checks that nothing changed since it was written",
-    ]
-    told = json.loads(said("show", path, "--json"))
-    assert [cell["address"] for cell in told["cells"]] == ["cloud", wall, "ortho"]
-    assert told["cells"][1]["figures"] == [
-        {"name": "residuals", "caption": "Résidus", "media_type": "image/png"}
-    ]
-    assert told["files"] == []
-    assert (told["run_id"], told["seed"], told["overrides"]) == (
-        *("20250102-abc", 7, ["wall.gsd_m=0.01"]),
-    )
-
-
 def test_a_whole_record_is_verified_and_a_changed_one_named(tmp_path: Path) -> None:
     path, _, _ = write_sample(tmp_path)
     with open_record(path) as opened:
