@@ -236,7 +236,7 @@ def _annotations_at(model: type[BaseModel], loc: Location) -> list[object]:
     """Return the types at a location, and those around what is a name in a mapping or an index."""
     found: list[object] = [model]
     for part in loc:
-        fields = [
+        fields: list[object] = [
             info.annotation
             for one in _models_in(found)
             for name, info in one.model_fields.items()

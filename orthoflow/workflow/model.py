@@ -74,7 +74,7 @@ def check_name(name: str) -> str:
 
 
 def _refusal(code: str, form: str) -> PydanticCustomError:
-    return PydanticCustomError(code, "Input should be {form}", {"form": form})  # type: ignore[arg-type]
+    return PydanticCustomError(code, "Input should be {form}", {"form": form})
 
 
 def _seconds(raw: object) -> float:
