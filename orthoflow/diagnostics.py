@@ -1,7 +1,7 @@
 """What deserves attention, as data: declared once by who reports it, grouped and ordered by code.
 
 A method declares a `DiagnosticSpec` and reports it with `ctx.report(SPEC, subject=..., **values)`.
-Terminal, report and record work on code, severity and values; nobody looks into the text.
+Terminal, report and record work on code, severity and values; no code reads the text.
 """
 
 from __future__ import annotations
@@ -253,7 +253,7 @@ def step_names(steps: Iterable[tuple[str, str]]) -> Callable[[str], str]:
     for step, method in steps:
         for name in (method, method.partition(".")[0]):
             found.setdefault(name, set()).add(step)
-    # Of two steps of a kind nobody can know which is meant.
+    # Of two steps of a kind it is ambiguous which is meant.
     return lambda name: min(found[name]) if len(found.get(name, ())) == 1 else name
 
 

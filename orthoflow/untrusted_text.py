@@ -38,7 +38,7 @@ _INNER_CELL: Final = re.compile(
 
 
 def shown(text: str, *, keep: str = "") -> str:
-    r"""Write what a terminal would obey, and what turns reading round, as what it is.
+    r"""Escape control characters, marks of text direction and other invisible letters.
 
     Args:
         text: any text, also with halves of surrogate pairs.

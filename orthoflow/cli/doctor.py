@@ -105,7 +105,7 @@ class Finding:
         name: what was looked at.
         verdict: ok, limited (works, with a restriction) or missing.
         found: version, size or setting.
-        cost: what does not work because of it, and the way out; empty when ok.
+        cost: what does not work because of it, and what to do; empty when ok.
         use: what needs it, where that is a library.
         is_core: orthoflow cannot work without it.
     """

@@ -22,7 +22,7 @@ _EXPORT_FOLDER: Final = "export"
 
 
 class _Scale(click.IntRange):
-    """The N of a scale 1:N, which people also write whole."""
+    """The N of a scale 1:N, given as N or as 1:N."""
 
     # Any: as click has it.
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
@@ -218,7 +218,7 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     name = target or ("datasets" if chosen.split else "embedded")
     folder = output or _folder_inside(opened, *((_EXPORT_FOLDER,) if target else ()), name)
     _refuse_filled(folder)
-    # These hand on the record itself, with arrays that nobody has read, or print its seal.
+    # These copy the record itself, with arrays that were not read, or print its seal.
     hands_on = chosen.embed or chosen.split or target in ("ro-crate", "sheet")
     finding = broken_seal(opened, of_all=hands_on)
     if finding and hands_on:
@@ -283,7 +283,7 @@ def _export_split(run: Run, folder: Path, chosen: Choices) -> str:
 
 
 def _folder_inside(run: Run, *names: str) -> Path:
-    """A folder of the run that nobody named; a link there would lead to where nobody wants it."""
+    """Return a default folder inside the run; refuse links, which lead out of it."""
     folder = run.home_folder
     for name in names:
         folder /= name

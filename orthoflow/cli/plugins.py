@@ -37,6 +37,9 @@ _SUMMARIES: Final = {
     "check": "Run the conformance suite on a method.",
 }
 
+# Parameters of a method that are shown apart from the others.
+_FIRST_SHOWN: Final = 5
+
 plugins: Final[click.Command] = LazyGroup(
     name="plugins",
     help="List, show and check methods, and write a plugin of your own.",
@@ -259,19 +262,24 @@ def _print_method(method: Mapping[str, Any]) -> None:
             ],
         )
     echo(*([""] if method["params"] else ["", "no parameters"]))
-    echo_table(
-        ("parameter", "type", "default", "unit", "description"),
-        [
-            (
-                one["name"],
-                one["type"],
-                "" if one["default"] is None else json.dumps(one["default"]),
-                one["unit"],
-                one["description"],
-            )
-            for one in method["params"]
-        ],
-    )
+    # Those that users set most come first, by the order in which their method declares them.
+    first, others = method["params"][:_FIRST_SHOWN], method["params"][_FIRST_SHOWN:]
+    for title, params in (("parameter", first), ("other parameters", others)):
+        if others and title != "parameter":
+            echo()
+        echo_table(
+            (title, "type", "default", "unit", "description"),
+            [
+                (
+                    one["name"],
+                    one["type"],
+                    "" if one["default"] is None else json.dumps(one["default"]),
+                    one["unit"],
+                    one["description"],
+                )
+                for one in params
+            ],
+        )
 
 
 def _metric_text(spec: Mapping[str, str]) -> str:

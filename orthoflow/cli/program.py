@@ -78,7 +78,7 @@ class Program(LazyGroup):
             code = error.exit_code
         except Exception as error:  # noqa: BLE001 - the last stop before the user
             code = explain(error, session)
-        # A command that does not say how it ended did not end well.
+        # A command that returns no code did not end well.
         sys.exit(code if isinstance(code, int) else EXIT_CELL_FAILED)
 
     def invoke(self, ctx: click.Context) -> object:

@@ -57,7 +57,7 @@ def replay(
     store: Path | None,
     *,
     as_json: bool,
-    # Any: those fields of RunOptions that say how steps run, whose types click has checked.
+    # Any: the fields of RunOptions about how steps run, whose types click has checked.
     **choices: Any,
 ) -> int:
     """Make RUN, a run folder or its run.h5, again from its record and its input files.

@@ -153,7 +153,7 @@ class Call:
         try:
             _print_summary(made, report)
         except BrokenPipeError:
-            # Nobody reads the summary any more; the exit code still says how the run went.
+            # The reader has closed the pipe; the exit code still states how the run ended.
             silence_stdout()
         return made.outcome.exit_code
 

@@ -25,7 +25,7 @@ _COLUMNS: Final = ("folder", "started", "workflow", "status")
 _METRICS_MOST: Final = 4
 _LONGEST_FACT: Final = 40
 _FACTS_MOST: Final = 4
-# What a record says may be of any length.
+# Texts of a record may have any length.
 _LONGEST_NAME: Final = 60
 _LONGEST_REASON: Final = 1000
 _CONDITION: Final = re.compile(
@@ -259,7 +259,7 @@ def _require_known(names: Sequence[str], found: Sequence[RunSummary]) -> None:
         if name not in known:
             from orthoflow.errors import nearest
 
-            # Of a parameter people remember the end: its step and method stand before it.
+            # Users often give the last part of a parameter's name, without its step and method.
             ends = sorted(one for one in known if one.endswith(f".{name}"))
             near = ends[0] if ends else nearest(name, known)
             hint = f"did you mean {near!r}?" if near else "--json has the names of all"

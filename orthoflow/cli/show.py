@@ -248,7 +248,7 @@ def _as_json(run: Run) -> dict[str, object]:
 
 def _cell_json(cell: RecordedCell) -> dict[str, object]:
     values = dataclasses.asdict(dataclasses.replace(cell, figures=()))
-    # What a method does not say of its metrics is left out, as in the record.
+    # Empty fields of metrics are left out, as in the record.
     values["metrics"] = [
         {
             name: value

@@ -23,12 +23,12 @@ Row = TypeVar("Row")
 _VERDICTS: Final = ("identical", "within tolerance", "different", "not measured")
 # Of longer tables the rest is printed when it is asked for.
 ROWS_MOST: Final = 20
-# How people say the units of tolerances; `1` stands for plain numbers.
+# Units of tolerances as they are printed; `1` stands for plain numbers.
 _UNITS: Final = {"grey": " grey levels", "1": ""}
 
 
 def echo(*lines: str, err: bool = False) -> None:
-    """Print lines, on standard error if asked to; what a terminal would obey is written out.
+    """Print lines, on standard error if asked to, with control characters escaped.
 
     All output of commands goes through here: names, messages and logs are untrusted.
     """
@@ -98,7 +98,7 @@ def table_lines(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[st
 def echo_json(value: object) -> None:
     """Print a value as JSON, readable and stable."""
     text = shown_json(json.dumps(value, indent=2, ensure_ascii=False))
-    click.echo(text)  # noqa: TID251 - what could be obeyed is written as JSON has it
+    click.echo(text)  # noqa: TID251 - control characters are escaped as in JSON
 
 
 def echo_distances(distances: Sequence[ProductDistance], most: int | None = None) -> None:
@@ -169,7 +169,7 @@ def verdict_counts(distances: Sequence[ProductDistance]) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Write a duration as people do.
+    """Write a duration in hours, minutes and seconds.
 
     >>> [duration(seconds) for seconds in (0.001, 0.042, 59.97, 75, 3700)]
     ['< 0.01 s', '0.04 s', '1 min 00 s', '1 min 15 s', '1 h 02 min']

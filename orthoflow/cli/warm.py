@@ -107,7 +107,7 @@ def _warm(workflow: str | None) -> Warmed:
 
 
 def _results(catalog: Catalog, wanted: Collection[str] | None) -> dict[str, CellResult]:
-    """Run the recipes in a store that goes away; give one result per method, a good one first.
+    """Run the recipes in a temporary store; return one result per method, preferably a good one.
 
     Args:
         catalog: the installed plugins.

@@ -58,6 +58,7 @@ COMMANDS = [
     "check studio.yaml",
     "plan studio.yaml --set survey.offset_m=-3 --set paint.grey=9",
     "plan studio.yaml --set survey.offset_m=-3 --set paint.grey=9 --json",
+    "plan studio.yaml --set survey.offset_m=7",
     "graph studio.yaml",
     "run studio.yaml -o second",
     "run studio.yaml -o third --set survey.offset_m=-3",

@@ -12,7 +12,6 @@ from orthoflow_provenance.document import RecordedFile, RecordedInput
 from orthoflow_provenance.record import write_record
 from syrupy.assertion import SnapshotAssertion
 
-from orthoflow.cli import runs as module
 from tests.hostile_records import reseal
 from tests.report_runs import cell, metrics, record
 from tests.studios import asked, said
@@ -191,24 +190,19 @@ def test_mistakes_get_a_sentence(runs: Path, words: list[str], snapshot: Snapsho
     assert result.output == snapshot
 
 
-# --- parts of a row ---
-
-
 @pytest.mark.parametrize(
-    ("text", "name", "holding"),
+    ("condition", "found"),
     [
-        ("rms_mm<2", "rms_mm", [1]),
-        (" rms_mm <= 2 ", "rms_mm", [1, 2]),
-        ("check.rms_mm > 2e0", "check.rms_mm", [3]),
-        ("plane.a >= 2.", "plane.a", [2, 3]),
-        ("seed = +2", "seed", [2]),
-        ("seed != .2e1", "seed", [1, 3]),
-        ("input scan = -2.5", "input scan", []),
+        ("rmse_u_mm<1.5", ["deep/er/c"]),
+        (" rmse_u_mm <= 1.5 ", ["runs/a", "deep/er/c"]),
+        ("check.rmse_u_mm > 25e-1", ["runs/other"]),
+        ("rmse_u_mm >= 2.5", ["runs/other", "runs/b"]),
+        ("plane.cell_m = +.05", ["runs/b"]),
+        ("plane.cell_m != 2e-2", ["runs/other", "runs/b"]),
+        ("rmse_u_mm = -1.5", []),
     ],
 )
 def test_a_condition_is_a_name_a_sign_and_a_number(
-    text: str, name: str, holding: list[int]
+    runs: Path, condition: str, found: list[str]
 ) -> None:
-    named, holds = module._condition(text)
-    assert named == name
-    assert [value for value in (1, 2, 3) if holds(value)] == holding
+    assert folders("--where", condition) == found

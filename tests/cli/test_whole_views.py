@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import h5py
 from orthoflow_provenance.record import open_record
 
-from orthoflow.cli.plan import _as_json, _summary
 from tests.provenance_records import write_sample
 from tests.studios import said
 
@@ -56,26 +53,3 @@ def test_who_shows_a_record_that_was_changed_says_so(tmp_path: Path) -> None:
     (row,) = json.loads(said("runs", tmp_path, "--json"))
     assert (row["status"], row["metrics"]) == ("damaged", {})
     assert row["reason"] == doubt.removesuffix("; ")
-
-
-def planned(status: str, *, key: object = None) -> Any:
-    cell = SimpleNamespace(address=f"a@b={status}", step="a", method="a.b", params={"n": 1})
-    return SimpleNamespace(status=status, reason="so", cell=cell, key=key)
-
-
-def test_a_plan_is_summed_up_by_status() -> None:
-    assert _summary([]) == "0 steps: "
-    statuses = ("skipped", "cached", "will run", "cached", "unknown yet")
-    assert _summary([planned(status) for status in statuses]) == (
-        "5 steps: 2 cached, 1 will run, 1 unknown yet, 1 skipped"
-    )
-    assert _as_json(planned("cached", key=SimpleNamespace(key="abc"))) == {
-        "cell": "a@b=cached",
-        "step": "a",
-        "method": "a.b",
-        "status": "cached",
-        "reason": "so",
-        "key": "abc",
-        "params": {"n": 1},
-    }
-    assert _as_json(planned("will run"))["key"] is None
