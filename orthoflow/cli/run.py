@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -297,7 +297,17 @@ def _print_summary(made: WrittenRun, report: Path) -> None:
     echo_table(
         ("step", "method", "status", "time", "remark"),
         [
-            (cell.address, cell.method, _status(cell, made.kept), _time(cell), _remark(cell))
+            (
+                cell.address,
+                cell.method,
+                "cached"
+                if cell.cached_from
+                else "kept"
+                if cell.address in made.kept
+                else cell.status,
+                duration(cell.wall_s) if cell.status != "skipped" and cell.started else "",
+                _remark(cell),
+            )
             for cell in cells
         ],
     )
@@ -306,7 +316,11 @@ def _print_summary(made: WrittenRun, report: Path) -> None:
     echo_diagnostics(cells, run.folder)
     echo("", _cached_text(cells, made.kept))
     if made.outcome.damaged:
-        echo(_damaged_text(made.outcome.damaged))
+        damaged = made.outcome.damaged
+        were = "were" if len(damaged) > 1 else "was"
+        named = ", ".join(f"{address} ({what})" for address, what in damaged.items())
+        count = counted(len(damaged), "result")
+        echo(f"{count} of the store {were} damaged and computed again: {named}")
     from orthoflow.report.combinations import baseline_of
     from orthoflow.workflow.expand import variants_text
 
@@ -333,22 +347,6 @@ def _cached_text(cells: Iterable[RecordedCell], kept: Collection[str]) -> str:
     n_kept = sum(cell.address in kept for cell in counted_cells)
     before = f", {n_kept} kept from before the interruption" if n_kept else ""
     return f"{n_cached} of {counted(n_cells, 'step')} cached{before}"
-
-
-def _damaged_text(damaged: Mapping[str, str]) -> str:
-    """List the cells whose results were damaged in the store."""
-    were = "were" if len(damaged) > 1 else "was"
-    named = ", ".join(f"{address} ({what})" for address, what in damaged.items())
-    count = counted(len(damaged), "result")
-    return f"{count} of the store {were} damaged and computed again: {named}"
-
-
-def _status(cell: RecordedCell, kept: Collection[str]) -> str:
-    return "cached" if cell.cached_from else "kept" if cell.address in kept else cell.status
-
-
-def _time(cell: RecordedCell) -> str:
-    return duration(cell.wall_s) if cell.status != "skipped" and cell.started else ""
 
 
 def _remark(cell: RecordedCell) -> str:

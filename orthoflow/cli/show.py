@@ -33,7 +33,6 @@ from orthoflow.workflow.model import DATA
 if TYPE_CHECKING:
     from orthoflow.records import RecordedCell
     from orthoflow.records.runs import Run
-    from orthoflow.report.comparisons import Row
     from orthoflow.report.paired import MethodOverDatasets
 
 # Of metrics beside each other, so that lines stay within a wide window.
@@ -113,7 +112,9 @@ def _print_cells(run: Run, *, is_whole: bool) -> None:
             (
                 cell.address,
                 f"{cell.method} {cell.distribution_version}".rstrip(),
-                _cell_status(cell),
+                f"{cell.status} (cached from {cell.cached_from})"
+                if cell.cached_from
+                else cell.status,
                 duration(cell.wall_s) if cell.started else "",
                 f"{cell.peak_rss_mib:.0f} MiB" if cell.started else "",
             )
@@ -124,10 +125,6 @@ def _print_cells(run: Run, *, is_whole: bool) -> None:
         if cell.error_message:
             echo(f"{cell.address} {cell.status}: {cell.error_message}")
     echo_diagnostics(run.record.cells, run.folder, is_whole=is_whole)
-
-
-def _cell_status(cell: RecordedCell) -> str:
-    return f"{cell.status} (cached from {cell.cached_from})" if cell.cached_from else cell.status
 
 
 def _print_comparison(run: Run) -> bool:
@@ -158,7 +155,10 @@ def _print_comparison(run: Run) -> bool:
     elif table := comparison_table([run]):
         names = [f"{one.step}.{one.metric}" for one in table.columns]
         rows = [
-            (variants_text(dict(zip(table.steps, row.variants, strict=True))), *_texts(row))
+            (
+                variants_text(dict(zip(table.steps, row.variants, strict=True))),
+                *(value.text or _NOTHING for value in row.values),
+            )
             for row in table.rows
         ]
         leaders, about = "", "means of the repeats ± their standard deviation, where there are some"
@@ -173,10 +173,6 @@ def _print_comparison(run: Run) -> bool:
     more = f"; {counted(n_more, 'more metric')} in the report" if n_more > 0 else ""
     echo(f"{about}{more}; --all prints every number", *([f"{leaders}."] if leaders else []))
     return True
-
-
-def _texts(row: Row) -> tuple[str, ...]:
-    return tuple(value.text or _NOTHING for value in row.values)
 
 
 def _median(one: MethodOverDatasets) -> str:

@@ -191,7 +191,12 @@ def check_comparison(
     """Check the section `compare` against steps, datasets and seeds; None without one."""
     if section is None:
         return None
-    names = {step.name: _variant_names(step) for step in steps if step.is_varied}
+    names = {
+        # A swept variant is still known by its own name.
+        step.name: list(dict.fromkeys((*(call.name for call in step.calls), *_families(step))))
+        for step in steps
+        if step.is_varied
+    }
     factors = dict(names)
     if datasets:
         factors[DATA] = list(datasets)
@@ -230,11 +235,6 @@ def _check_baseline(comparison: Comparison, log: ProblemLog) -> None:
                 at_key=True,
                 shown=("compare", "exclude"),
             )
-
-
-def _variant_names(step: DraftStep) -> list[str]:
-    # A swept variant is still known by its own name.
-    return list(dict.fromkeys((*(call.name for call in step.calls), *_families(step))))
 
 
 def _families(step: DraftStep) -> dict[str, list[str]]:
@@ -370,31 +370,19 @@ _MILLIMETRES: Final = 1000.0
 
 def lint_workflow(workflow: Workflow) -> tuple[str, ...]:
     """Return a sentence for each implausible setting."""
-    return (
-        *_unused_inputs(workflow),
-        *_idle_datasets(workflow),
-        *_cell_sizes(workflow),
-        *_cropped_matching(workflow),
-    )
+    return (*_idle_inputs(workflow), *_cell_sizes(workflow), *_cropped_matching(workflow))
 
 
-def _taken_inputs(workflow: Workflow) -> set[str]:
-    return {
+def _idle_inputs(workflow: Workflow) -> Iterator[str]:
+    taken = {
         name
         for step in workflow.steps.values()
         for name in (*(one.name for one in step.references if one.is_input), *step.conditions)
     }
-
-
-def _unused_inputs(workflow: Workflow) -> Iterator[str]:
-    taken = _taken_inputs(workflow)
     for name in workflow.inputs:
         if name not in taken:
             yield f"no step takes the input {name}: wire it as inputs.{name}, or remove it"
-
-
-def _idle_datasets(workflow: Workflow) -> Iterator[str]:
-    is_idle = not workflow.data_calls and workflow.data_inputs.isdisjoint(_taken_inputs(workflow))
+    is_idle = not workflow.data_calls and workflow.data_inputs.isdisjoint(taken)
     if workflow.datasets and is_idle and not workflow.has_data_seeds:
         yield "the datasets change nothing: they name no input that a step takes, and no parameter"
 

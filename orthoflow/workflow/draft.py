@@ -299,16 +299,16 @@ def _is_cloud(rows: Sequence[object]) -> bool:
 
 def _yaml(path: Path) -> Recognised:
     """Recognise a calibration; a workflow, e.g. an earlier one of `new`, is reported as one."""
-    found = _read("calibration", path, _calibration_summary)
+    found = _read(
+        "calibration",
+        path,
+        lambda _: f"a calibration of {', '.join(read_calibration(path).patterns)}",
+    )
     with path.open("rb") as file:
         is_workflow = re.search(rb"^steps:", file.read(_WORKFLOW_BYTES), re.MULTILINE)
     if found.kind == "unknown" and is_workflow:
         return _unknown(path, f"{path.name} is a workflow itself")
     return found
-
-
-def _calibration_summary(path: Path) -> str:
-    return f"a calibration of {', '.join(read_calibration(path).patterns)}"
 
 
 def _cameras_summary(paths: Sequence[Path]) -> str:
@@ -531,13 +531,11 @@ def _folders_of_photos(items: Sequence[Recognised]) -> list[Path]:
         inside = [p for p in path.parent.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES]
         whole = path.suffix.lower() in PHOTO_SUFFIXES and set(inside) <= set(paths)
         # A folder that also contains scans would include these.
-        whole = whole and len(inside) > 1 and _holds_photos_only(path.parent)
+        beside = (file for file in path.parent.iterdir() if file.is_file())
+        whole = whole and len(inside) > 1
+        whole = whole and all(file.suffix.lower() in PHOTO_SUFFIXES for file in beside)
         places[path.parent if whole else path] = None
     return list(places)
-
-
-def _holds_photos_only(folder: Path) -> bool:
-    return all(path.suffix.lower() in PHOTO_SUFFIXES for path in folder.iterdir() if path.is_file())
 
 
 def _described(items: Sequence[Recognised]) -> str:

@@ -455,7 +455,8 @@ class _Expansion:
     def _outer(self, steps: Iterable[str]) -> list[Assignment]:
         """Return the datasets and seeds on which a step runs, as far as they may influence it."""
         workflow = self.workflow
-        is_random = workflow.has_seeds and any(map(self._is_random, steps))
+        variants = [variant for name in steps for variant in workflow.steps[name].variants]
+        is_random = workflow.has_seeds and any(map(self._uses_seed, variants))
         by_data = any(map(self._takes_data, steps)) or (is_random and workflow.has_data_seeds)
         chosen: tuple[Dataset | None, ...] = workflow.chosen_data if by_data else (None,)
         return [
@@ -465,10 +466,6 @@ class _Expansion:
                 [{SEED: str(seed)} for seed in workflow.seeds_of(dataset)] if is_random else [{}]
             )
         ]
-
-    def _is_random(self, name: str) -> bool:
-        """Whether seeds change a step itself."""
-        return any(map(self._uses_seed, self.workflow.steps[name].variants))
 
     def _uses_seed(self, variant: StepVariant) -> bool:
         return self.methods[variant.method].determinism != "exact"
@@ -555,13 +552,17 @@ class _Expansion:
         if _is_excluded(workflow, assignment):
             raise _ExcludedError
         inputs = {port: source for port, (source, _, _) in choices.items() if source}
-        missing = next((port for port in choices if self._is_missing(variant, port, choices)), "")
+        ports = self._ports(variant)
+        missing = next(
+            (p for p, choice in choices.items() if not choice[0] and ports[p].required), ""
+        )
         if not missing:
             cell = self._cell(step, variant, assignment, inputs, "")
             return _Node(cell=cell, dependence=assignment)
         _, chosen_by, causes = choices[missing]
         dependence = dict(chosen_by) | always
-        if not self._all_require(step, missing):
+        takes = map(self._ports, step.variants)
+        if not all(missing in own_ports and own_ports[missing].required for own_ports in takes):
             dependence |= own
         cell = self._cell(step, variant, assignment, inputs, _reason(*causes))
         return _Node(cell=cell, dependence=dependence, causes=causes)
@@ -607,13 +608,6 @@ class _Expansion:
         if node is None:
             raise _ExcludedError
         return node
-
-    def _is_missing(self, variant: StepVariant, port: str, choices: Mapping[str, _Choice]) -> bool:
-        return choices[port][0] is None and self._ports(variant)[port].required
-
-    def _all_require(self, step: WorkflowStep, port: str) -> bool:
-        takes = map(self._ports, step.variants)
-        return all(port in ports and ports[port].required for ports in takes)
 
     def _cell(
         self,

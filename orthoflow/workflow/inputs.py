@@ -197,7 +197,8 @@ def resolve_input_files(workflow: Workflow) -> Mapping[str, InputFiles | None]:
         try:
             found[spec.name] = _resolve(spec)
         except InputError as error:
-            missing.append(f"{_place(spec)}{error}")
+            place = spec.place.place if spec.place and not spec.is_given else ""
+            missing.append(f"{place}{error}")
     if len(missing) == 1:
         raise InputError(missing[0])
     if missing:
@@ -264,10 +265,6 @@ def _find(spec: WorkflowInputSpec, pattern: str) -> list[Path]:
     if not files:
         raise InputError(f"input {spec.name}: {missing}")
     return [item.absolute() for item in files]
-
-
-def _place(spec: WorkflowInputSpec) -> str:
-    return spec.place.place if spec.place and not spec.is_given else ""
 
 
 def _meant(path: Path) -> str:

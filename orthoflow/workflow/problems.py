@@ -253,12 +253,12 @@ def validate(
         if () in unfit:
             return None
         # Later items of a list first.
-        for *outer, last in sorted(unfit, key=_depth, reverse=True):
+        for *outer, last in sorted(
+            unfit,
+            key=lambda loc: (len(loc), [part for part in loc if isinstance(part, int)]),
+            reverse=True,
+        ):
             place: Any = data
             for part in outer:
                 place = place[part]
             del place[last]
-
-
-def _depth(loc: Location) -> tuple[int, list[tuple[str, int]]]:
-    return len(loc), [("", part) if isinstance(part, int) else (part, 0) for part in loc]
