@@ -7,11 +7,19 @@ from pathlib import Path
 
 import jsonschema
 import pytest
+from pydantic import ValidationError
 from ruamel.yaml import YAML
 
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.workflow.document import load_workflow
+from orthoflow.workflow.model import (
+    CallSection,
+    FileSection,
+    ResourcesSection,
+    SeedSection,
+    WorkflowFile,
+)
 from orthoflow.workflow.problems import InvalidWorkflowError
 from orthoflow.workflow.resolved import resolved_json
 from orthoflow.workflow.source import shipped_workflow, shipped_workflows
@@ -126,6 +134,26 @@ def test_the_example_of_a_key_fits_its_model_and_its_schema(name: str) -> None:
     schema = section.model_json_schema()
     schema["required"] = []
     jsonschema.Draft202012Validator(schema).validate({key: example})
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "least"),
+    [
+        (ResourcesSection, "cores", 1),
+        (CallSection, "repeat", 1),
+        (SeedSection, "seed", 0),
+        (WorkflowFile, "orthoflow", 1),
+    ],
+)
+def test_the_schema_has_the_limits_of_its_model(
+    section: type[FileSection], key: str, least: int
+) -> None:
+    validator = jsonschema.Draft202012Validator(section.model_json_schema())
+    assert validator.is_valid({key: least})
+    assert section.model_validate({key: least})
+    assert not validator.is_valid({key: least - 1})
+    with pytest.raises(ValidationError):
+        section.model_validate({key: least - 1})
 
 
 def test_the_example_of_the_reference_is_a_workflow(tmp_path: Path) -> None:
