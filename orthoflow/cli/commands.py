@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 
 DEBUG_HELP: Final = "Show tracebacks of errors."
+# Of each command, as click keeps what the first call of a command has found.
+HELP_OPTIONS: Final = {"help_option_names": ["-h", "--help"]}
 
 
 @dataclass
@@ -77,7 +79,7 @@ class Command(click.Command):
 
     # Any: click passes its own keyword arguments through.
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
+        super().__init__(*args, **{"context_settings": HELP_OPTIONS, **kwargs})
         self.params.append(debug_parameter())
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -142,7 +144,9 @@ class LazyGroup(click.Group):
         self, *args: Any, summaries: Mapping[str, str], target: str, **kwargs: Any
     ) -> None:
         # Click wants a callback on a group, though nothing happens before its command.
-        super().__init__(*args, **{"callback": lambda: None, **kwargs})
+        super().__init__(
+            *args, **{"callback": lambda: None, "context_settings": HELP_OPTIONS, **kwargs}
+        )
         self._summaries = summaries
         self._target = target
 

@@ -14,6 +14,7 @@ import click
 
 from orthoflow.cli.commands import (
     EXIT_CELL_FAILED,
+    HELP_OPTIONS,
     LazyGroup,
     Session,
     debug_parameter,
@@ -113,7 +114,7 @@ program: Final = Program(
         ),
         debug_parameter(),
     ],
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    context_settings={**HELP_OPTIONS, "max_content_width": 100},
 )
 
 
