@@ -223,9 +223,18 @@ def footprint_of(
         tile: its rows and columns on the wall.
         inner: the same within `is_painted`.
     """
+    import cv2
+
     first_row, first_column = (tile[k].start - inner[k].start for k in range(2))
+    painted = is_painted.view(np.uint8)
+    in_columns, in_rows = (
+        cv2.reduce(painted, axis, cv2.REDUCE_SUM, dtype=cv2.CV_32S).ravel() for axis in range(2)
+    )
+    n_cells = int(in_rows.sum())
+    row, column = (float(n @ np.arange(n.size)) / n_cells for n in (in_rows, in_columns))
     around = surface.relief.depth[first_row:, first_column:]
-    n_cells, row, column, depth = _middle(is_painted, around)
+    around = around[: len(painted), : painted.shape[1]]
+    depth = cv2.sumElems(cv2.copyTo(around, painted))[0] / n_cells
     row, column = row + first_row, column + first_column
     centre, beside, below = (
         _project(view.camera, (column + a + 0.5) * view.gsd_m, (row + b + 0.5) * view.gsd_m, depth)
@@ -243,25 +252,6 @@ def footprint_of(
         obliquity_deg=math.degrees(math.atan2(aside, view.height_m - depth)),
         n_cells=n_cells,
     )
-
-
-@compiled
-def _middle(
-    is_painted: NDArray[np.bool_], depths: NDArray[np.float32]
-) -> tuple[int, float, float, float]:
-    """Return the number of painted cells and the means of their rows, columns and depths."""
-    n_cells, rows, columns, total = 0, 0, 0, 0.0
-    for row in range(is_painted.shape[0]):
-        n_in_row, in_row = 0, 0.0
-        for column in range(is_painted.shape[1]):
-            if is_painted[row, column]:
-                n_in_row += 1
-                columns += column
-                in_row += float(depths[row, column])
-        n_cells += n_in_row
-        rows += n_in_row * row
-        total += in_row
-    return n_cells, rows / n_cells, columns / n_cells, total / n_cells
 
 
 def sample(

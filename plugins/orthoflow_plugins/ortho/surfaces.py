@@ -17,7 +17,7 @@ from orthoflow.geometry.robust import depth_noise_m
 from orthoflow.products import Wall, Walls
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.ortho.parameters import VisibilityParams
-from orthoflow_plugins.ortho.visibility_kernels import BLOCK_CELLS, Relief, WallView
+from orthoflow_plugins.ortho.visibility_kernels import BLOCK_CELLS, FINE_CELLS, Relief, WallView
 
 # Surfaces of walls with more cells are kept in files, and computed in bands of so many.
 _IN_MEMORY_MOST: Final = 1 << 26
@@ -118,7 +118,8 @@ def relief_of(wall: Wall, *, hides: bool = True, allocate: Allocate = in_memory)
         allocate: returns the array of the heights that hide.
     """
     depth = np.asarray(wall.depth_m, dtype=np.float32).view(np.ndarray)[:]
-    bottoms = _of_blocks(depth, np.fmin)
+    side = FINE_CELLS if hides else BLOCK_CELLS
+    bottoms = _of_blocks(depth, np.fmin, side)
     bottoms[np.isnan(bottoms)] = np.inf
     occluding, tops = np.empty((0, 0), dtype=np.float32), np.full_like(bottoms, -np.inf)
     if hides:
@@ -126,12 +127,19 @@ def relief_of(wall: Wall, *, hides: bool = True, allocate: Allocate = in_memory)
         edge_m = _EDGE_CELLS * wall.frame.gsd_m
         for band in bands_with_reach(depth.shape, cells_most=_BAND_CELLS, reach_rows=_REACH_ROWS):
             occluding[band.rows] = _hiding(depth[band.around], edge_m)[band.inner]
-        tops = _of_blocks(occluding, np.maximum)
+        tops = _of_blocks(occluding, np.maximum, side)
     occluding = occluding.view(np.ndarray)
     # Kernels are compiled once, for read-only arrays.
     depth.flags.writeable = occluding.flags.writeable = False
-    highest_m = float(tops.max())
-    return Relief(depth, occluding, tops=tops, bottoms=bottoms, highest_m=highest_m)
+    return Relief(
+        depth,
+        occluding,
+        tops=_of_blocks(tops, np.maximum, BLOCK_CELLS // side),
+        bottoms=_of_blocks(bottoms, np.minimum, BLOCK_CELLS // side),
+        fine_tops=tops,
+        fine_bottoms=bottoms,
+        highest_m=float(tops.max()),
+    )
 
 
 def _hiding(depth: NDArray[np.float32], edge_m: float) -> NDArray[np.float32]:
@@ -160,10 +168,12 @@ def _hiding(depth: NDArray[np.float32], edge_m: float) -> NDArray[np.float32]:
     return opened
 
 
-def _of_blocks(values: NDArray[np.float32], reduce: np.ufunc) -> NDArray[np.float32]:
+def _of_blocks(
+    values: NDArray[np.float32], reduce: np.ufunc, side_cells: int
+) -> NDArray[np.float32]:
     """Return the extreme of each block of cells; the last ones may be smaller."""
-    rows, columns = (range(0, size, BLOCK_CELLS) for size in values.shape)
+    rows, columns = (range(0, size, side_cells) for size in values.shape)
     # Bands of rows: `reduceat` along the first axis goes through the whole array cell by cell.
-    bands = [reduce.reduce(values[row : row + BLOCK_CELLS], axis=0) for row in rows]
+    bands = [reduce.reduce(values[row : row + side_cells], axis=0) for row in rows]
     reduced = reduce.reduceat(np.array(bands), columns, axis=1)
     return np.asarray(reduced, dtype=np.float32)

@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 from orthoflow.geometry.compiling import compiled, kernel_part
 from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 
-# Side of the square blocks of cells that share one bound on the height up to which rays are
-# followed.
+# Sides of the square blocks of cells that share one bound on the height up to which rays are
+# followed: small ones are looked at where it matters within large ones.
 BLOCK_CELLS: Final = 32
-# From the middle of a block to the centre of its last cell, in blocks; a ray is met by the cells on
-# either side of it, which are half a cell away at most.
-_HALF: Final = 0.5 - 0.5 / BLOCK_CELLS
+FINE_CELLS: Final = 8
 
 # Cells of a row that are projected together, from a multiple of this: in float32 from the first of
 # them, so that a cell has the same result in every tile.
@@ -67,6 +65,8 @@ class Relief(NamedTuple):
             hides nothing, nor do interpolations with it. Empty if the surface hides nothing.
         tops: (blocks, blocks) float32, the highest `occluding` in a block, or minus infinity.
         bottoms: (blocks, blocks) float32, the lowest depth in a block, infinite in a void one.
+        fine_tops: the same for blocks of `FINE_CELLS` if the surface hides anything; fine_bottoms
+            likewise.
         highest_m: the highest of `tops`.
     """
 
@@ -74,6 +74,8 @@ class Relief(NamedTuple):
     occluding: NDArray[np.float32]
     tops: NDArray[np.float32]
     bottoms: NDArray[np.float32]
+    fine_tops: NDArray[np.float32]
+    fine_bottoms: NDArray[np.float32]
     highest_m: float
 
 
@@ -114,8 +116,8 @@ def look_at_cells(
         first_column: column likewise.
     """
     n_rows, n_columns = visible.mask.shape
-    end_column, first_block = first_column + n_columns, first_column // BLOCK_CELLS
-    tops = np.empty((end_column - 1) // BLOCK_CELLS + 1 - first_block)
+    end_column, first_block = first_column + n_columns, first_column // FINE_CELLS
+    tops = np.empty((end_column - 1) // FINE_CELLS + 1 - first_block)
     steps = np.arange(_RUN_CELLS).astype(np.float32)
     projected = np.empty((_N_QUANTITIES, _RUN_CELLS), dtype=np.float32)
     places = np.empty(_RUN_CELLS, dtype=np.int32)
@@ -123,9 +125,8 @@ def look_at_cells(
     eye = (view.row, view.column, view.height_m)
     for i in range(n_rows):
         row = first_row + i
-        if i == 0 or row % BLOCK_CELLS == 0:
-            for k in range(tops.size):
-                tops[k] = _highest_in_the_way(view, relief, row // BLOCK_CELLS, first_block + k)
+        if i == 0 or row % FINE_CELLS == 0:
+            _bound_rays(view, relief, row // FINE_CELLS, first_block, tops)
         start = first_column
         while start < end_column:
             run = start // _RUN_CELLS * _RUN_CELLS
@@ -134,10 +135,10 @@ def look_at_cells(
             mask = visible.mask[i, in_tile : end - first_column]
             _project_run(view, depths, (row, run), steps[start - run : end - run], projected)
             _set_states(view, buffer, depths, projected, places, mask)
-            for k in range(start // BLOCK_CELLS, (end - 1) // BLOCK_CELLS + 1):
+            for k in range(start // FINE_CELLS, (end - 1) // FINE_CELLS + 1):
                 top = tops[k - first_block]
-                if float(relief.bottoms[row // BLOCK_CELLS, k]) + tolerance_m < top:
-                    first, last = max(start, k * BLOCK_CELLS), min(end, (k + 1) * BLOCK_CELLS)
+                if top > -math.inf:
+                    first, last = max(start, k * FINE_CELLS), min(end, (k + 1) * FINE_CELLS)
                     lows, cells = depths[first - start : last - start], mask[first - start :]
                     place = (row, first, relief.depth.shape[0], relief.depth.shape[1])
                     _hide_low_cells(occluding, eye, tolerance_m, top, place, lows, cells)
@@ -329,25 +330,73 @@ def _hide_low_cells(
 
 
 @kernel_part
-def _highest_in_the_way(view: WallView, relief: Relief, row: int, column: int) -> float:
+def _bound_rays(
+    view: WallView, relief: Relief, row: int, first_column: int, highest: NDArray[np.float64]
+) -> None:
+    """Bound the height up to which rays from fine blocks must be followed; -inf without rays.
+
+    Args:
+        view: the camera in front of the wall.
+        relief: the wall.
+        row: of the blocks.
+        first_column: of the first block.
+        highest: (blocks,) output.
+    """
+    per_block, large, top = BLOCK_CELLS // FINE_CELLS, -1, -math.inf
+    for k in range(highest.size):
+        column = first_column + k
+        if column // per_block != large:
+            large = column // per_block
+            block = (row // per_block, large)
+            top = _highest_in_the_way(
+                view, relief.tops, relief.bottoms[block], BLOCK_CELLS, block, relief.highest_m
+            )
+        highest[k] = -math.inf
+        if top > -math.inf:
+            block = (row, column)
+            highest[k] = _highest_in_the_way(
+                view, relief.fine_tops, relief.fine_bottoms[block], FINE_CELLS, block, top
+            )
+
+
+@kernel_part
+def _highest_in_the_way(
+    view: WallView,
+    tops: NDArray[np.float32],
+    bottom: float,
+    side_cells: int,
+    block: tuple[int, int],
+    top: float,
+) -> float:
     """Bound the height up to which rays from the cells of a block must be followed.
 
     On the way to the camera a block shrinks towards the camera's foot, and no ray is lower than
     that of its lowest cell. So what hides any of it lies on the part of the way on which that ray
     is below the highest surface of all; the highest surface there bounds a shorter part.
+
+    Args:
+        view: the camera in front of the wall.
+        tops: (blocks, blocks) highest surface in each.
+        bottom: lowest depth in the block.
+        side_cells: of a block.
+        block: its row and column.
+        top: nothing higher hides any of its cells.
     """
-    tops, top = relief.tops, relief.highest_m
-    bottom = float(relief.bottoms[row, column]) + view.tolerance_m
-    down = (view.row + 0.5) / BLOCK_CELLS - row - 0.5
-    across = (view.column + 0.5) / BLOCK_CELLS - column - 0.5
+    row, column = block
+    # From the middle of a block to the centre of its last cell, in blocks; a ray is met by the
+    # cells on either side of it, which are half a cell away at most.
+    half = 0.5 - 0.5 / side_cells
+    bottom += view.tolerance_m
+    down = (view.row + 0.5) / side_cells - row - 0.5
+    across = (view.column + 0.5) / side_cells - column - 0.5
     for _ in range(2):
         if not bottom < min(top, view.height_m):
             return -math.inf
         share = min(1.0, (top - bottom) / (view.height_m - bottom))
-        first_row = max(0, math.floor(row + min(0.0, share * (down + _HALF))))
-        end_row = min(tops.shape[0], math.ceil(row + 1 + max(0.0, share * (down - _HALF))))
-        first = max(0, math.floor(column + min(0.0, share * (across + _HALF))))
-        end = min(tops.shape[1], math.ceil(column + 1 + max(0.0, share * (across - _HALF))))
+        first_row = max(0, math.floor(row + min(0.0, share * (down + half))))
+        end_row = min(tops.shape[0], math.ceil(row + 1 + max(0.0, share * (down - half))))
+        first = max(0, math.floor(column + min(0.0, share * (across + half))))
+        end = min(tops.shape[1], math.ceil(column + 1 + max(0.0, share * (across - half))))
         top = -math.inf
         for i in range(first_row, end_row):
             for j in range(first, end):

@@ -19,7 +19,7 @@ from orthoflow_plugins.ortho.surfaces import (
     surfaces_of,
     view_of,
 )
-from orthoflow_plugins.ortho.visibility_kernels import BLOCK_CELLS
+from orthoflow_plugins.ortho.visibility_kernels import BLOCK_CELLS, FINE_CELLS
 
 from orthoflow.geometry.robust import depth_noise_m
 from orthoflow.products import Wall
@@ -76,6 +76,9 @@ def test_bounds_of_blocks_are_those_of_their_cells(shape: tuple[int, int]) -> No
         assert not prepared.occluding.flags.writeable
     tops = of_blocks(relief.occluding, BLOCK_CELLS, np.max)
     np.testing.assert_array_equal(relief.tops, tops)
+    fine_tops = of_blocks(relief.occluding, FINE_CELLS, np.max)
+    np.testing.assert_array_equal(relief.fine_tops, fine_tops)
+    np.testing.assert_array_equal(relief.fine_bottoms, of_blocks(low, FINE_CELLS, np.min))
     assert relief.highest_m == tops.max()
     assert clear.occluding.size == 0
     assert clear.highest_m == clear.tops.max() == -np.inf
