@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
@@ -32,6 +31,7 @@ class ColourPhotos(Method):
     """
 
     id: ClassVar[str] = "colour.photos"
+    result_version: ClassVar[int] = 2
     determinism = "loose"
     metrics = (
         MetricSpec("coloured_share", label="points that got a colour"),
@@ -111,15 +111,4 @@ class ColourPhotos(Method):
                 "system (colour.photos)"
             )
         coloured = replace(cloud, rgb=colours.rgb, has_rgb=None)
-        return self.Out(cloud=_only(coloured, seen) if params.unseen == "drop" else coloured)
-
-
-def _only(cloud: PointCloud, chosen: NDArray[np.bool_]) -> PointCloud:
-    """Return the chosen points with all their values."""
-    per_point = {
-        field.name: np.ascontiguousarray(value[chosen])
-        for field in fields(PointCloud)
-        if isinstance(value := getattr(cloud, field.name), np.ndarray)
-        and field.name not in ("origin", "up", "stations")
-    }
-    return replace(cloud, **per_point)  # type: ignore[arg-type] # arrays only
+        return self.Out(cloud=coloured.selected(seen) if params.unseen == "drop" else coloured)

@@ -175,10 +175,12 @@ class WallErrors:
         patches: where displacements were measured.
         depth_m: (rows, cols) measured - true depth, NaN where either is missing.
         grey: (rows, cols) root mean square colour error, NaN where not compared.
+        steps: (rows, cols) cells within 2 cells of a true depth step.
     """
 
     samples: WallSamples
     patches: PatchShifts
+    steps: NDArray[np.bool_]
     depth_m: NDArray[np.float64]
     grey: NDArray[np.float64]
 
@@ -239,7 +241,9 @@ def wall_errors(
         n_gross=count_true(gross),
         n_ghost=count_true(gross & behind),
     )
-    return WallErrors(samples=samples, patches=patches, depth_m=depth, grey=np.sqrt(square))
+    return WallErrors(
+        samples=samples, patches=patches, steps=steps, depth_m=depth, grey=np.sqrt(square)
+    )
 
 
 def depth_step_band(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:

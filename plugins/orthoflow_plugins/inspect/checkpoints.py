@@ -53,10 +53,9 @@ from orthoflow_plugins.inspect.image_quality import (
     completeness,
     quality_findings,
 )
-from orthoflow_plugins.inspect.missed_points import missed_points, ways_to_count, with_reasons
 from orthoflow_plugins.inspect.patches import IntensityGrey
 from orthoflow_plugins.inspect.placing import in_files, on_walls, wall_of
-from orthoflow_plugins.inspect.point_doubts import doubts, is_own
+from orthoflow_plugins.inspect.point_doubts import doubts, is_own, missed_points, with_reasons
 from orthoflow_plugins.inspect.point_places import Picture, PointFinder, ShownPoint
 
 # Number of points whose residuals are logged.
@@ -178,12 +177,15 @@ class InspectCheckpoints(Method):
             ctx.report(doubt, subject=name, **values)
         # In a simulated room points are hidden on purpose.
         if missed and not is_simulated:
+            ways = ["measure them in an orthoimage"]
+            if any(point.is_beside for point in missed.values()):
+                ways.append("let {step[raster.grid]}.margin_m make walls larger")
             ctx.report(
                 MISSED,
                 n_missed=len(missed),
                 n_points=len(points),
                 reasons=with_reasons(missed),
-                ways=ways_to_count(missed),
+                ways=", or ".join(ways),
             )
         gsd_m = {picture.wall: picture.frame.gsd_m for picture in pictures}
         numbers = {picture.wall: picture.image.number for picture in pictures}
@@ -204,8 +206,8 @@ class InspectCheckpoints(Method):
         own_names = [inputs.checkpoints.names[k] for k in found]
         _draw(pictures, [points[k] for k in found], own_names, ctx)
         _tell(shift_m, own_names, ctx)
-        for name, reason in list(missed.items())[:_TOLD]:
-            ctx.log(f"check point {name}: not used, {reason}")
+        for name, point in list(missed.items())[:_TOLD]:
+            ctx.log(f"check point {name}: not used, {point.reason}")
         names = tuple(dict.fromkeys(classes))
         return self.Out(
             inspection=Inspection(

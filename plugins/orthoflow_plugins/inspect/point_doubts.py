@@ -1,14 +1,14 @@
-"""Signs that check points refer to another raster, unit or coordinate system."""
+"""Check points that no picture shows, or that refer to another raster, unit or system."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Any, Final, TypeAlias
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.products import CheckPoints
+from orthoflow.products import CheckPoints, Walls
 from orthoflow.sdk import DiagnosticSpec
 from orthoflow_plugins.inspect.findings import rms
 from orthoflow_plugins.inspect.point_places import Picture, ShownPoint
@@ -22,6 +22,9 @@ _SCALE_OFF: Final = 0.02
 # Share of the total error that all points have in common.
 _ALIKE_SHARE: Final = 0.9
 _ALIKE_LEAST: Final = 3
+# Unused points that a message names, and the distance from which it states metres.
+_NAMED: Final = 4
+_NEAR_M: Final = 1.0
 _ANY_CELLS: Final = (
     "measure them in this orthoimage, or give what holds for any cell size: shown_x,shown_y,"
     "shown_z as the report saves them, or map_x,map_y of a map"
@@ -123,3 +126,75 @@ def _doubts_of_places(points: Sequence[ShownPoint], picture: Picture) -> Iterato
         right_m, down_m = gsd_m * alike
         where = {"right_m": right_m, "down_m": down_m, "any_cells": _ANY_CELLS}
         yield SHIFTED_POINTS, name, {"n_points": len(points), **where}
+
+
+class Missed(NamedTuple):
+    """Why a point is not used; `is_beside` if a larger wall would include it."""
+
+    reason: str
+    is_beside: bool = False
+
+
+def missed_points(
+    points: Sequence[ShownPoint],
+    surveyed: CheckPoints,
+    pictures: Sequence[Picture],
+    walls: Walls,
+    *,
+    is_simulated: bool = False,
+) -> dict[str, Missed]:
+    """Return the points that are not used, by name, in the order of the survey.
+
+    Args:
+        points: expected and shown position of each.
+        surveyed: the points.
+        pictures: the pictures that were searched; at least one.
+        walls: those of the pictures.
+        is_simulated: points were searched with the scene's truth, not as targets.
+    """
+    sought = "nothing like it" if is_simulated else "no black and white quadrant target"
+    names = {picture.wall: picture.image.name for picture in pictures}
+    found: dict[str, Missed] = {}
+    for index, point in enumerate(points):
+        if np.isfinite(point.place).all():
+            continue
+        if point.how != "outside":
+            reason = f"{sought} was recognised on {names[point.wall]}"
+            found[surveyed.names[index]] = Missed(reason)
+            continue
+        number = int(surveyed.wall[index])
+        found[surveyed.names[index]] = (
+            Missed(f"there is no orthoimage of wall {number}")
+            if number >= 0
+            else min(_beside(surveyed, index, picture, walls) for picture in pictures)[1]
+        )
+    return found
+
+
+def with_reasons(missed: Mapping[str, Missed]) -> str:
+    """Name the first few results of `missed_points`, each with its reason."""
+    named = [f"{name} ({point.reason})" for name, point in list(missed.items())[:_NAMED]]
+    more = f" and {len(missed) - _NAMED} more, see the log" if len(missed) > _NAMED else ""
+    return f"{', '.join(named)}{more}"
+
+
+def _beside(
+    surveyed: CheckPoints, index: int, picture: Picture, walls: Walls
+) -> tuple[float, Missed]:
+    """Return how far a point is outside a picture in metres, and on which side."""
+    frame, slab = picture.frame, walls.slab(picture.wall)
+    column, row, depth_m = frame.wall_from_world(surveyed.points_world[index][None])[0]
+    off_m = {
+        "left of": -column * frame.gsd_m,
+        "right of": (column - frame.width) * frame.gsd_m,
+        "above": -row * frame.gsd_m,
+        "below": (row - frame.height) * frame.gsd_m,
+        "before": depth_m - slab.front_m,
+        "behind": -depth_m - slab.behind_m,
+    }
+    side = max(off_m, key=off_m.__getitem__)
+    far_m = float(np.linalg.norm([max(0.0, value) for value in off_m.values()]))
+    said = f"{1e3 * off_m[side]:.3g} mm" if off_m[side] < _NEAR_M else f"{off_m[side]:.3g} m"
+    is_beside = side not in {"before", "behind"}
+    limit = "" if is_beside else ", beyond its buffer"
+    return far_m, Missed(f"{said} {side} {picture.image.name}{limit}", is_beside)

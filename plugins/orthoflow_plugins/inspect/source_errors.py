@@ -12,7 +12,6 @@ from orthoflow.geometry import WallFrame
 from orthoflow.geometry.robust import median_deviation
 from orthoflow.geometry.scenes import SurfaceRole
 from orthoflow.products import Cameras, Finding, Orthoimage, Truth, Wall, is_painted
-from orthoflow_plugins.inspect.cell_errors import depth_step_band
 from orthoflow_plugins.inspect.findings import count_true, rms
 from orthoflow_plugins.inspect.orientation_errors import true_camera
 
@@ -33,7 +32,6 @@ class SourceErrors:
             oriented photo painted or the pixel has no target.
         traced: (rows, cols) bool, cells that an oriented photo painted.
         expected_m: (rows, cols) stated error of the orthoimage; None if it states none.
-        steps: (rows, cols) bool, within 2 cells of a true depth step.
         ghosts: (rows, cols) bool, the pixel shows a free-standing object.
         n_seen_by_both: of the cells whose visibility is tested, those whose true surface a station
             and a photo see.
@@ -43,16 +41,16 @@ class SourceErrors:
     frame: WallFrame
     displacement_m: NDArray[np.float64]
     traced: NDArray[np.bool_]
-    steps: NDArray[np.bool_]
     ghosts: NDArray[np.bool_]
     n_seen_by_both: int
     n_seen_painted: int
     expected_m: NDArray[np.float32] | None = None
 
-    def samples(self, error_step: int = 1) -> SourceSamples:
+    def samples(self, steps: NDArray[np.bool_], error_step: int = 1) -> SourceSamples:
         """Return the errors as numbers.
 
         Args:
+            steps: (rows, cols) within 2 cells of a true depth step.
             error_step: displacements are kept in steps of this.
         """
         known = self.traced & np.isfinite(self.displacement_m).all(axis=2)
@@ -61,11 +59,11 @@ class SourceErrors:
         is_far = self.traced & ~(length_m <= _FAR_CELLS * self.frame.gsd_m)
         sigmas = np.empty(0)
         if self.expected_m is not None:
-            stated = counted & ~self.steps & np.isfinite(self.expected_m)
+            stated = counted & ~steps & np.isfinite(self.expected_m)
             sigmas = np.abs(self.displacement_m[stated]) / self.expected_m[stated][:, None]
         return SourceSamples(
-            away_m=self.displacement_m[counted & ~self.steps][::error_step],
-            step_m=self.displacement_m[counted & self.steps][::error_step],
+            away_m=self.displacement_m[counted & ~steps][::error_step],
+            step_m=self.displacement_m[counted & steps][::error_step],
             n_traced=count_true(self.traced),
             n_far=count_true(is_far),
             n_ghosts=count_true(self.ghosts),
@@ -159,7 +157,6 @@ def trace_sources(
         frame=image.frame,
         displacement_m=displacement,
         traced=traced,
-        steps=depth_step_band(true.depth_m),
         ghosts=ghosts,
         n_seen_by_both=count_true(both),
         n_seen_painted=count_true(both & is_painted(image.mask)),

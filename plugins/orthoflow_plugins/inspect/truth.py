@@ -43,7 +43,6 @@ from orthoflow_plugins.inspect.cell_errors import (
     Sampling,
     SamplingRule,
     WallSamples,
-    depth_step_band,
     sample_findings,
     sampling,
     sampling_rule,
@@ -559,9 +558,7 @@ class _Judge:
                 self.inputs.truth,
                 self.views,
             )
-            # Steps at the border of a band depend on what is beyond it.
-            traced = replace(traced, steps=depth_step_band(true.depth_m)[band.inner])
-            sources = traced.samples(self.rule.error_step)
+            sources = traced.samples(errors.steps, self.rule.error_step)
             length_m = np.linalg.norm(traced.displacement_m[drawn], axis=2)
             is_known = np.isfinite(traced.displacement_m).all(axis=2)
             cells = np.argwhere(is_known)[::cell_step]

@@ -39,6 +39,10 @@ def test_points_take_the_colour_of_what_the_photo_sees_there(tmp_path: Path) -> 
     )
     assert cloud.rgb is not None
     points = cloud.points_world()
+    # Each point keeps its number in the given cloud, by which labels are compared with the truth.
+    assert cloud.point_id is not None
+    given = ortho_scenes.cloud(where)
+    np.testing.assert_array_equal(given.points_world()[cloud.point_id], points)
     truth = ortho_scenes.cast(
         where, np.broadcast_to(viewer.centre_world, points.shape), points - viewer.centre_world
     )

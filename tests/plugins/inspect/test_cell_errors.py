@@ -86,6 +86,7 @@ def test_cells_are_compared_away_from_steps_and_by_what_they_are() -> None:
     np.testing.assert_array_equal(steps[:11], expected[:11])
     errors = wall_errors(image_, wall, true, Sampling(coloured=every, lattice=lattice))
     samples = errors.samples
+    np.testing.assert_array_equal(errors.steps, steps)
     away = ~steps & (true.rectangle >= 0)
     n_away = np.count_nonzero(away[1:])
     np.testing.assert_allclose(samples.depth_m, 0.002, atol=1e-7)

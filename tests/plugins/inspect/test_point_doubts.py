@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.inspect import point_doubts
 from orthoflow_plugins.inspect.checkpoints import InspectCheckpoints
+from orthoflow_plugins.inspect.point_doubts import Missed, with_reasons
 
 from orthoflow.errors import MethodError
 from orthoflow.products import CheckPoints, Orthoimages
@@ -124,3 +125,10 @@ def test_points_are_far_beyond_the_length_of_their_wall(side: tuple[float, float
         expected = GSD_M * off if is_far else 0.0
         assert point_doubts._beyond_m(point, picture) == pytest.approx(expected)
     assert point_doubts._beyond_m(point, None) == 0.0
+
+
+def test_four_unused_points_are_named_and_the_others_counted() -> None:
+    missed = {f"P{k}": Missed("2 mm below wall") for k in range(6)}
+    named = "P0 (2 mm below wall), P1 (2 mm below wall), P2 (2 mm below wall), P3 (2 mm below wall)"
+    assert with_reasons(missed) == f"{named} and 2 more, see the log"
+    assert with_reasons(dict([*missed.items()][:4])) == named

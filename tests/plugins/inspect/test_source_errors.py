@@ -20,20 +20,21 @@ def source_errors() -> SourceErrors:
     displacement_m[0, 4:6] = [[0.01, 0.02], [-0.03, 0.02]]
     displacement_m[0, 6:8] = 0.001
     mask = np.zeros((1, 10), dtype=np.bool_)
-    traced, steps, ghosts = mask.copy(), mask.copy(), mask.copy()
+    traced, ghosts = mask.copy(), mask.copy()
     # The ninth looks at nothing.
     traced[0, :9] = True
-    steps[0, 4:6] = True
     ghosts[0, 6:8] = True
     return SourceErrors(
-        frame=where, displacement_m=displacement_m, traced=traced, steps=steps, ghosts=ghosts,
+        frame=where, displacement_m=displacement_m, traced=traced, ghosts=ghosts,
         n_seen_by_both=8, n_seen_painted=6,
     )  # fmt: skip
 
 
 def numbers_of(*errors: SourceErrors) -> dict[str, float]:
     """Findings of walls, or of bands of one, together."""
-    samples = pooled([item.samples() for item in errors])
+    steps = np.zeros((1, 10), dtype=np.bool_)
+    steps[0, 4:6] = True
+    samples = pooled([item.samples(steps) for item in errors])
     return {item.name: item.value for item in source_findings(samples, 0)}
 
 
