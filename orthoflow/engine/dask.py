@@ -25,7 +25,7 @@ from distributed.worker import WORKER_ANY_RUNNING
 from orthoflow.engine.durability import write_whole, writing_to
 from orthoflow.engine.environment import environment
 from orthoflow.engine.keys import methods_text, misfit
-from orthoflow.engine.local import EVENTS, Capacity, LocalExecutor, Tell
+from orthoflow.engine.local import EVENTS, Capacity, LocalExecutor, StepListener
 from orthoflow.engine.results import CellResult, result_from_json, result_to_json
 from orthoflow.engine.worker import Task, failed_result
 from orthoflow.errors import (
@@ -89,10 +89,10 @@ def run_attempt(task: Task, name: str, topic: str, retries: int, methods: str) -
     if wrong := methods and misfit(methods):
         return _refused(own, PluginError(f"{task.who} cannot run on {worker.address}: {wrong}"))
 
-    def tell(_: str, event: StepEvent) -> None:
+    def forward(_: str, event: StepEvent) -> None:
         worker.log_event(topic, (task.address, EVENTS.dump_json(event)))
 
-    executor = LocalExecutor(Capacity.of_jobs(1, task.cores), tell)
+    executor = LocalExecutor(Capacity.of_jobs(1, task.cores), forward)
     with closing(executor):
         executor.start(own)
         return result_to_json(_result(executor, home, worker, name))
@@ -152,20 +152,22 @@ _QUIET: Final = {
 class DaskExecutor:
     """Runs tasks on the workers of a cluster, or on workers of its own."""
 
-    def __init__(self, plan: RunPlan, scratch: Path, capacity: Capacity, tell: Tell) -> None:
+    def __init__(
+        self, plan: RunPlan, scratch: Path, capacity: Capacity, listen: StepListener
+    ) -> None:
         """Connect to the scheduler, and check that each worker can execute the plan.
 
         Args:
             plan: its options name the scheduler; its methods must be those of the workers.
             scratch: a folder of the run in the store.
             capacity: of the workers that it makes itself without a scheduler.
-            tell: called with the address of a task and its message.
+            listen: called with the address of a task and its message.
 
         Raises:
             ArgumentError: there is no such scheduler, no worker, or one does not see the store.
             PluginError: a worker has other versions than the plan, or no orthoflow.
         """
-        self._tell = tell
+        self._listen = listen
         self._retries = plan.options.retries
         self._address = plan.options.scheduler
         # Its own workers have the code that made the plan.
@@ -225,7 +227,7 @@ class DaskExecutor:
                 if event is None:
                     ended.append(address)
                 elif address in self._running:
-                    self._tell(address, event)
+                    self._listen(address, event)
         ends = {address: self._end(address) for address in ended if address in self._running}
         self._watch()
         if self._stop_at is not None and time.monotonic() > self._stop_at:
@@ -278,9 +280,9 @@ class DaskExecutor:
         except TimeoutError as error:
             raise self._lost() from error
         except Exception as error:  # noqa: BLE001 - whatever befell the worker
-            said = f"{type(error).__name__}: {one_line(error)}"
+            reason = f"{type(error).__name__}: {one_line(error)}"
             return failed_result(
-                task, StepFailedError(f"{task.who} could not be run by its worker ({said})")
+                task, StepFailedError(f"{task.who} could not be run by its worker ({reason})")
             )
 
     # Any: what a worker sent.
@@ -325,7 +327,7 @@ class DaskExecutor:
         while not (workers := self._workers()):
             if time.monotonic() - self._with_workers > _PATIENCE_S:
                 raise ArgumentError(
-                    f"--scheduler {self._address}: no worker there says how many cores it has; "
+                    f"--scheduler {self._address}: no worker there states how many cores it has; "
                     f"start workers with `dask worker {self._address} --resources {CORES}=N`"
                 )
             time.sleep(0.1)
@@ -337,13 +339,13 @@ class DaskExecutor:
         found: Mapping[str, tuple[str, float, str] | Exception] = self._client.run(
             look_around, str(path), self._methods, workers=list(self._workers()), on_error="return"
         )
-        for address, said in found.items():
-            if isinstance(said, Exception):
+        for address, answer in found.items():
+            if isinstance(answer, Exception):
                 raise PluginError(
-                    f"worker {address} cannot run orthoflow ({type(said).__name__}: "
-                    f"{one_line(said)}); install the same version there"
+                    f"worker {address} cannot run orthoflow ({type(answer).__name__}: "
+                    f"{one_line(answer)}); install the same version there"
                 )
-            seen, clock_s, wrong = said
+            seen, clock_s, wrong = answer
             if seen != word:
                 raise ArgumentError(
                     f"worker {address} does not see the store {scratch.parent.parent} "

@@ -213,7 +213,7 @@ def _tools(cls: type[Method]) -> dict[str, str]:
         raise
     except BaseException as error:
         raise PluginError(
-            f"method {cls.id} cannot tell the versions of its libraries: {describe_error(error)}"
+            f"method {cls.id} cannot state the versions of its libraries: {describe_error(error)}"
         ) from error
 
 
@@ -337,7 +337,7 @@ def misfit(methods: str) -> str:
     except (OSError, ValueError, subprocess.SubprocessError) as error:
         return f"its methods cannot be loaded ({type(error).__name__})"
     return next(
-        (said for name in planned if (said := _difference(name, planned[name], here[name]))), ""
+        (wrong for name in planned if (wrong := _difference(name, planned[name], here[name]))), ""
     )
 
 

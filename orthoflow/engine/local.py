@@ -62,7 +62,7 @@ _AT_START: Final = {
 }
 _starting: Final = threading.Lock()
 
-Tell = Callable[[str, StepEvent], None]
+StepListener = Callable[[str, StepEvent], None]
 EVENTS: Final = TypeAdapter(StepEvent)
 _GRACE_S: Final = 5.0
 # Maximum number of messages per poll: a step that never stops must not delay its timeout.
@@ -139,16 +139,18 @@ class Executor(Protocol):
 class InlineExecutor:
     """Runs tasks one by one in this process, for debugging: no timeout, no crash protection."""
 
-    def __init__(self, capacity: Capacity, tell: Tell, is_interrupted: Callable[[], bool]) -> None:
+    def __init__(
+        self, capacity: Capacity, listen: StepListener, is_interrupted: Callable[[], bool]
+    ) -> None:
         """Make one.
 
         Args:
             capacity: limits for a task.
-            tell: called with the address of a task and its message.
+            listen: called with the address of a task and its message.
             is_interrupted: whether the user asked to stop, even while a task runs.
         """
         self.capacity = capacity
-        self._tell = tell
+        self._listen = listen
         self._is_interrupted = is_interrupted
         self._waiting: deque[Task] = deque()
         self._is_cancelled = False
@@ -170,7 +172,7 @@ class InlineExecutor:
         def listen(event: StepEvent) -> None:
             if event.kind != "progress":
                 log.append(shown(event.text, keep="\n"))
-            self._tell(task.address, event)
+            self._listen(task.address, event)
 
         with kernels_in(kernel_folder(task.kernels)):
             result = run_task(task, listen, self._is_interrupted)
@@ -444,7 +446,7 @@ class LocalExecutor:
     """Runs each task in a process of its own."""
 
     capacity: Capacity
-    tell: Tell
+    listen: StepListener
     _running: dict[str, _Step] = field(default_factory=dict)
     _guard: MemoryGuard = field(default_factory=MemoryGuard)
     _unstarted: dict[str, CellResult] = field(default_factory=dict)
@@ -512,7 +514,7 @@ class LocalExecutor:
                 step.result = result if result.key == step.task.key else None
             elif message.startswith(EVENT):
                 event = EVENTS.validate_json(message.removeprefix(EVENT), strict=True)
-                self.tell(step.task.address, event)
+                self.listen(step.task.address, event)
 
     def _watch(self) -> None:
         time_now = time.monotonic()

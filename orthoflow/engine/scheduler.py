@@ -35,7 +35,7 @@ from orthoflow.engine.local import (
     Executor,
     InlineExecutor,
     LocalExecutor,
-    Tell,
+    StepListener,
 )
 from orthoflow.engine.plan import (
     PlannedInput,
@@ -487,8 +487,8 @@ def _cores(cell: Cell, capacity: Capacity) -> int:
     return min(cell.cores or capacity.share, capacity.cores_of_one)
 
 
-def _passing_on(listen: RunListener) -> Tell:
-    def tell(address: str, event: StepEvent) -> None:
+def _passing_on(listen: RunListener) -> StepListener:
+    def forward(address: str, event: StepEvent) -> None:
         if event.kind == "progress":
             listen(CellProgress(address=address, fraction=event.fraction, text=event.text))
         elif event.diagnostic is not None:
@@ -496,7 +496,7 @@ def _passing_on(listen: RunListener) -> Tell:
         else:
             listen(CellLogged(address=address, text=event.text))
 
-    return tell
+    return forward
 
 
 @contextmanager
@@ -524,14 +524,14 @@ def _lock_of(folder: Path) -> Path:
 
 
 def _executor_of(
-    plan: RunPlan, scratch: Path, tell: Tell, is_asked_to_stop: Callable[[], bool]
+    plan: RunPlan, scratch: Path, listen: StepListener, is_asked_to_stop: Callable[[], bool]
 ) -> Executor:
     """Return the executor that the options of a run name.
 
     Args:
         plan: of the run.
         scratch: its scratch folder.
-        tell: called with messages of steps.
+        listen: called with messages of steps.
         is_asked_to_stop: whether the run is interrupted.
 
     Raises:
@@ -546,10 +546,10 @@ def _executor_of(
             raise PluginError(
                 "--executor dask needs dask: pip install 'orthoflow-tls[dask]'"
             ) from error
-        return DaskExecutor(plan, scratch, capacity, tell)
+        return DaskExecutor(plan, scratch, capacity, listen)
     if options.executor == "inline":
-        return InlineExecutor(capacity, tell, is_asked_to_stop)
-    return LocalExecutor(capacity, tell)
+        return InlineExecutor(capacity, listen, is_asked_to_stop)
+    return LocalExecutor(capacity, listen)
 
 
 class Interruption:

@@ -13,8 +13,8 @@ Layout below the store's folder:
 
 Everything has the digest of its bytes and is checked when a run, or an export, uses it. What is
 damaged is removed and computed again. Figures name themselves, and keys their preimages; results
-and descriptions of objects begin with the digest of the rest. It says what is damaged, not who did
-it: whoever can write to the store can write digests, too.
+and descriptions of objects begin with the digest of the rest. They show what is damaged, not
+who did it: whoever can write to the store can write digests, too.
 """
 
 from __future__ import annotations

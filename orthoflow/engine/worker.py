@@ -315,12 +315,12 @@ def run_task(
 def failed_result(task: Task, error: OrthoflowError, trace: str = "") -> CellResult:
     """Return the result of a cell that failed."""
     # A file reports all problems at once, a line each.
-    said = "; ".join(str(error).splitlines()) if type(error) is InputError else error
+    message = "; ".join(str(error).splitlines()) if type(error) is InputError else error
     return dataclasses.replace(
         blank_result(task),
         status="failed",
         error_type=type(error).__name__,
-        error_message=one_line(said, _LONGEST_ERROR) or f"{task.who} failed without a message",
+        error_message=one_line(message, _LONGEST_ERROR) or f"{task.who} failed without a message",
         traceback=trace,
         exit_code=error.exit_code,
     )
@@ -361,10 +361,10 @@ def explain_failure(task: Task, error: BaseException) -> OrthoflowError:
             f"{task.who} writes to an array that is read-only, as all its inputs are ({error}); it "
             f"must work on a copy"
         )
-    said = f"failed unexpectedly: {type(error).__name__}: {one_line(error)}".removesuffix(": ")
+    reason = f"failed unexpectedly: {type(error).__name__}: {one_line(error)}".removesuffix(": ")
     if isinstance(error, SystemExit):
-        said = f"tried to end the program ({one_line(error.code)})"
-    return MethodError(f"{task.who} {said}")
+        reason = f"tried to end the program ({one_line(error.code)})"
+    return MethodError(f"{task.who} {reason}")
 
 
 def _disk_failure(error: OSError, store: Path) -> OrthoflowError | None:
@@ -502,10 +502,10 @@ class _Call:
         try:
             return cls.Params.model_validate_json(json.dumps(dict(self.task.params)), strict=True)
         except ValidationError as error:
-            said = "; ".join(
+            problems = "; ".join(
                 f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()
             )
-            raise MethodError(f"{self.task.who} refuses its parameters: {said}") from error
+            raise MethodError(f"{self.task.who} refuses its parameters: {problems}") from error
 
     def _check_inputs(self, inputs: Mapping[str, Product | InputFiles]) -> None:
         for port, given in self.task.inputs.items():
@@ -585,7 +585,7 @@ def load_target(target: str) -> object:
     except Exception as error:
         raise PluginError(
             f"{target} cannot be loaded: {type(error).__name__}: {one_line(error)}; "
-            f"`orthoflow doctor` says what is missing"
+            f"`orthoflow doctor` lists what is missing"
         ) from error
 
 
@@ -609,7 +609,7 @@ def _n_bytes(product: Product) -> int:
 def _trace(error: BaseException) -> str:
     try:
         text = "".join(traceback.format_exception(error))
-    except Exception:  # noqa: BLE001 - as above, it may fail at being told of
+    except Exception:  # noqa: BLE001 - its own text may raise one
         text = ""
     # The relevant part is at the end.
     return text[-_LONGEST_TRACE:].encode(errors="backslashreplace").decode()

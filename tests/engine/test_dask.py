@@ -310,5 +310,5 @@ def test_workers_that_do_not_say_their_cores_get_no_work(
     monkeypatch.setattr(engine_dask, "_PATIENCE_S", 1.0)
     with cluster(1) as silent:
         plan = office.world.plan(STEPS, executor="dask", scheduler=silent.scheduler_address)
-        with pytest.raises(ArgumentError, match="no worker there says how many cores it has"):
+        with pytest.raises(ArgumentError, match="no worker there states how many cores it has"):
             DaskExecutor(plan, tmp_path, Capacity.of_jobs(1, 1), lambda *_: None)

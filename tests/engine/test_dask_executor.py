@@ -76,7 +76,7 @@ def an_executor(folder: Path, *futures: Future, **more: Any) -> Any:
         "_client": a_client(),
     }
     executor.told = []
-    executor._tell = lambda address, event: executor.told.append((address, event))
+    executor._listen = lambda address, event: executor.told.append((address, event))
     for name, value in (plain | more).items():
         setattr(executor, name, value)
     return executor

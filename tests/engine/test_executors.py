@@ -24,7 +24,7 @@ def test_what_is_in_line_ends_as_interrupted_once_it_is_cancelled(
     monkeypatch.undo()
     (task,) = started
     executor = InlineExecutor(
-        Capacity.of_jobs(1, 1), tell=lambda address, event: None, is_interrupted=lambda: False
+        Capacity.of_jobs(1, 1), listen=lambda address, event: None, is_interrupted=lambda: False
     )
     executor.start(task)
     executor.start(task)
