@@ -45,6 +45,7 @@ from orthoflow.version import DISTRIBUTION
 from orthoflow.workflow.expand import Cell
 
 _WHAT: Final = "orthoflow/cell"
+_CODE: Final = "its code"
 # For another process to load methods.
 _TIMEOUT_S: Final = 300.0
 _KEY_VERSION: Final = 1
@@ -357,10 +358,10 @@ def _methods_here(names: tuple[str, ...]) -> str:
 
 def _facts(facts: MethodFacts) -> dict[str, JsonValue]:
     return {
-        "distribution": f"{facts.distribution} {facts.distribution_version}",
-        "result version": facts.result_version,
-        "code": dict(facts.code),
-        "libraries": dict(facts.tools),
+        **facts.tools,
+        "the distribution": f"{facts.distribution} {facts.distribution_version}",
+        "the result version": facts.result_version,
+        _CODE: dict(facts.code),
     }
 
 
@@ -368,14 +369,11 @@ def _facts(facts: MethodFacts) -> dict[str, JsonValue]:
 def _difference(name: str, planned: dict[str, Any], here: dict[str, Any] | str) -> str:
     if isinstance(here, str):
         return here
-    for library in sorted(planned["libraries"].keys() | here["libraries"].keys()):
-        versions = [facts["libraries"].get(library, "none") for facts in (planned, here)]
-        if versions[0] != versions[1]:
-            return f"{name} has {library} {versions[1]} there, {versions[0]} in the plan"
-    for what in ("distribution", "result version"):
-        if planned[what] != here[what]:
-            return f"{name} has the {what} {here[what]} there, {planned[what]} in the plan"
-    return "" if planned["code"] == here["code"] else f"{name} has other code there"
+    for what in sorted((planned.keys() | here.keys()) - {_CODE}):
+        before, now = planned.get(what, "none"), here.get(what, "none")
+        if before != now:
+            return f"{name} has {what} {now} there, {before} in the plan"
+    return "" if planned[_CODE] == here[_CODE] else f"{name} has other code there"
 
 
 def _print_facts(names: Sequence[str]) -> None:

@@ -193,9 +193,6 @@ class StepLog:
     """An open log that another process appends to, while this one limits its size.
 
     It stays open, because its name may refer to anything by the time that the step has ended.
-
-    Attributes:
-        path: path under which the other process opens it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -204,7 +201,6 @@ class StepLog:
         Raises:
             StoreError: it cannot be written.
         """
-        self.path = path
         opened = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_NOFOLLOW
         with writing_to(path.parent):
             self._descriptor = os.open(path, opened, 0o666)
