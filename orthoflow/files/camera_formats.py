@@ -6,7 +6,6 @@ Metashape, COLMAP and E57 have modules of their own.
 from __future__ import annotations
 
 import csv
-import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import islice
@@ -14,7 +13,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
 from orthoflow.files.colmap import COLMAP_PARTS, read_colmap_model
@@ -225,25 +223,24 @@ def read_bundler(path: Path, names: Sequence[str]) -> tuple[GivenCamera, ...]:
         InputError: it is damaged.
     """
     # Points follow the cameras, and may be many.
-    words = list(islice(_words_of(path), 2 + 15 * len(names)))
-    found = []
-    for index, name in enumerate(names):
-        values = numbers_of(words[2 + 15 * index : 17 + 15 * index], path, f"camera {index}")
-        if len(values) < 15:
-            raise damaged(path, f"it ends within camera {index}")
-        focal, k1, k2 = values[:3]
-        if not focal > 0.0:
-            found.append(GivenCamera(name=name, reason="Bundler did not orient it"))
-            continue
-        found.append(
-            GivenCamera(
-                name=name,
-                lens=CentredLens(focal_px=focal, radial=(k1, k2, 0.0)),
-                rotation=_FROM_OPENGL @ rotation_of(values[3:12], path, name),
-                translation=_FROM_OPENGL @ np.array(values[12:15]),
-            )
+    values = numbers_of(
+        list(islice(_words_of(path), 2, 2 + 15 * len(names))), path, "the parameters of cameras"
+    )
+    if len(values) < 15 * len(names):
+        raise damaged(path, f"it ends within camera {len(values) // 15}")
+    return tuple(
+        GivenCamera(
+            name=name,
+            lens=CentredLens(focal_px=focal, radial=(k1, k2, 0.0)),
+            rotation=_FROM_OPENGL @ rotation_of(pose[:9], path, name),
+            translation=_FROM_OPENGL @ np.array(pose[9:]),
         )
-    return tuple(found)
+        if focal > 0.0
+        else GivenCamera(name=name, reason="Bundler did not orient it")
+        for name, (focal, k1, k2, *pose) in zip(
+            names, np.reshape(values, (-1, 15)).tolist(), strict=True
+        )
+    )
 
 
 def _words_of(path: Path) -> Iterator[str]:
@@ -301,6 +298,8 @@ def read_realitycapture_list(path: Path) -> tuple[GivenCamera, ...]:
 
 
 def _of_row(row: Mapping[str, str], path: Path, line: int) -> GivenCamera:
+    from scipy.spatial.transform import Rotation
+
     name = photo_path(row["name"])
     pose = numbers_of([row.get(key, "") for key in _ANGLES], path, "the parameters", line)
     terms = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
@@ -315,7 +314,10 @@ def _of_row(row: Mapping[str, str], path: Path, line: int) -> GivenCamera:
     (focal,) = numbers_of([row["f"]], path, "the focal length", line)
     if not focal > 0.0:
         raise damaged(path, f"the focal length of {name} must be positive, got {focal:g}", line)
-    rotation = _FROM_OPENGL @ _world_from_angles(*pose[3:]).T
+    # The camera's OpenGL axes are turned about z by -heading, x by pitch and y by roll.
+    heading, pitch, roll = pose[3:]
+    world_from_axes = Rotation.from_euler("ZXY", [-heading, pitch, roll], degrees=True)
+    rotation = _FROM_OPENGL @ world_from_axes.as_matrix().T
     return GivenCamera(
         name=name,
         lens=CentredLens(
@@ -327,14 +329,3 @@ def _of_row(row: Mapping[str, str], path: Path, line: int) -> GivenCamera:
         rotation=rotation,
         translation=-rotation @ np.array(pose[:3]),
     )
-
-
-def _world_from_angles(
-    heading_deg: float, pitch_deg: float, roll_deg: float
-) -> NDArray[np.float64]:
-    """Return world from the camera's OpenGL axes: about z by -heading, x by pitch, y by roll."""
-    h, p, r = (math.radians(value) for value in (-heading_deg, pitch_deg, roll_deg))
-    about_z = [[math.cos(h), -math.sin(h), 0.0], [math.sin(h), math.cos(h), 0.0], [0.0, 0.0, 1.0]]
-    about_x = [[1.0, 0.0, 0.0], [0.0, math.cos(p), -math.sin(p)], [0.0, math.sin(p), math.cos(p)]]
-    about_y = [[math.cos(r), 0.0, math.sin(r)], [0.0, 1.0, 0.0], [-math.sin(r), 0.0, math.cos(r)]]
-    return np.asarray(np.array(about_z) @ np.array(about_x) @ np.array(about_y))

@@ -171,7 +171,11 @@ def _problem_of_numbers(lens: FisheyeLens) -> str:
 
 def _problem_of_faces(lens: FisheyeLens) -> str:
     fold = _fold_rad(lens.radial)
-    if fold < math.radians(0.5 * lens.field_of_view_deg) and _bent(lens, fold) < _farthest(lens):
+    # The farthest corner from the principal point, in focal lengths.
+    across = max(lens.cx, lens.width - lens.cx) / lens.fx
+    down = max(lens.cy, lens.height - lens.cy) / lens.fy
+    is_inside = _bent(lens, fold) < math.hypot(across, down)
+    if fold < math.radians(0.5 * lens.field_of_view_deg) and is_inside:
         return (
             f"it folds back {math.degrees(fold):.1f} degrees off the axis, inside the image, so "
             "that two directions share a pixel"
@@ -180,14 +184,14 @@ def _problem_of_faces(lens: FisheyeLens) -> str:
     if not finest < MOST_PX:
         return f"{finest:.0f} pixels per radian, at most {MOST_PX} are taken"
     faces = face_lenses(lens)
-    large = [face for face in faces.values() if not _is_small(face)]
+    large = [
+        face
+        for face in faces.values()
+        if max(face.width, face.height) > MOST_PX or face.width * face.height > MOST_PIXELS
+    ]
     if large:
         return f"its faces would have {large[0].width} x {large[0].height} pixels"
     return "" if faces else "it shows nothing inside the image"
-
-
-def _is_small(face: Intrinsics) -> bool:
-    return max(face.width, face.height) <= MOST_PX and face.width * face.height <= MOST_PIXELS
 
 
 def _radial(radial: tuple[float, ...], theta: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -217,13 +221,6 @@ def _fold_rad(radial: tuple[float, ...]) -> float:
 def _bent(lens: FisheyeLens, theta_rad: float) -> float:
     with np.errstate(all="ignore"):
         return theta_rad * float(_radial(lens.radial, np.array(theta_rad)))
-
-
-def _farthest(lens: FisheyeLens) -> float:
-    """Return the distance of the farthest corner from the principal point, in focal lengths."""
-    across = max(lens.cx, lens.width - lens.cx) / lens.fx
-    down = max(lens.cy, lens.height - lens.cy) / lens.fy
-    return math.hypot(across, down)
 
 
 @cache

@@ -181,7 +181,8 @@ class _Document:
     def _add_material(self, ortho: OrthoFile) -> int:
         rgb, shown = ortho.shrunk(LONGEST_TEXTURE_PX)
         is_whole = bool(shown.all())
-        encoded = encode_jpeg(rgb) if is_whole else _with_alpha(rgb, shown)
+        alpha = np.where(shown, np.uint8(255), np.uint8(0))
+        encoded = encode_jpeg(rgb) if is_whole else encode_png(np.dstack([rgb, alpha]))
         self.images.append(
             {
                 "name": f"wall_{ortho.wall}_ortho",
@@ -232,10 +233,6 @@ class _Document:
 def _columns(matrix: NDArray[np.float64]) -> JsonValue:
     """Return sixteen numbers column by column, as glTF requires for matrices."""
     return numbers(matrix.T.ravel())
-
-
-def _with_alpha(rgb: NDArray[np.uint8], shown: NDArray[np.bool_]) -> bytes:
-    return encode_png(np.dstack([rgb, np.where(shown, np.uint8(255), np.uint8(0))]))
 
 
 # Along the longest side of a wall; some 300,000 triangles, which phones can still display.

@@ -501,6 +501,8 @@ def shifted_row(encoded: bytes, rgb: NDArray[np.uint8]) -> int | None:
 FULL_FRAME_DIAGONAL_MM: Final = math.hypot(36.0, 24.0)
 
 _ORIENTATION: Final = 0x0112
+# They count from 1 to 8.
+_ORIENTATIONS: Final = 9.0
 _MAKE: Final = 0x010F
 _MODEL: Final = 0x0110
 _EXIF_DIRECTORY: Final = 0x8769
@@ -585,8 +587,9 @@ def read_exif(encoded: bytes) -> Exif:
         if image is None:
             return Exif()
         found, is_damaged = _tags(image)
+    orientation = _positive(found.get(_ORIENTATION)) or 1.0
     return Exif(
-        orientation=_orientation(_positive(found.get(_ORIENTATION))),
+        orientation=int(orientation) if 1.0 <= orientation < _ORIENTATIONS else 1,
         make=_text(found.get(_MAKE)),
         model=_text(found.get(_MODEL)),
         focal_mm=_positive(found.get(_FOCAL_LENGTH)),
@@ -690,7 +693,8 @@ def _believed_focal_length(exif: Exif, width: int, height: int) -> FocalLength:
         if exif.focal_35mm is None
         else exif.focal_35mm / FULL_FRAME_DIAGONAL_MM * math.hypot(width, height)
     )
-    if by_pitch is not None and not _contradict(by_pitch, by_equivalent):
+    ratio = 1.0 if by_pitch is None or by_equivalent is None else by_pitch / by_equivalent
+    if by_pitch is not None and max(ratio, 1.0 / ratio) <= _CONTRADICTION:
         return FocalLength(value_px=by_pitch, reason="pixel pitch of the focal plane")
     if by_equivalent is not None:
         return FocalLength(value_px=by_equivalent, reason="35 mm equivalent over the diagonal")
@@ -719,10 +723,6 @@ def _text(value: object) -> str:
     return plain.split("\0")[0].strip()
 
 
-def _orientation(number: float | None) -> int:
-    return int(number) if number is not None and 1.0 <= number < 9.0 else 1
-
-
 def _is_cropped(exif: Exif, width: int, height: int) -> bool:
     if exif.width is None or exif.height is None:
         return False
@@ -740,10 +740,6 @@ def _by_pitch(exif: Exif, longest_px: int) -> float | None:
     if not smallest <= taken_px / exif.resolution_px_per_mm <= largest:
         return None
     return exif.focal_mm * exif.resolution_px_per_mm * longest_px / taken_px
-
-
-def _contradict(one: float, other: float | None) -> bool:
-    return other is not None and max(one / other, other / one) > _CONTRADICTION
 
 
 def _whole(value: float | None) -> int | None:

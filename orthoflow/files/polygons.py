@@ -85,23 +85,12 @@ def _polygons_of(feature: Any, name: str) -> Iterator[NamedPolygon]:
     kinds = {"Polygon": [geometry["coordinates"]], "MultiPolygon": geometry["coordinates"]}
     for parts in kinds[geometry["type"]]:
         rings = tuple(np.array(ring, dtype=np.float64)[:, :2] for ring in parts)
-        yield NamedPolygon(
-            name=_text(properties[name]), rings=_finite(rings), properties=dict(properties)
-        )
-
-
-def _text(value: object) -> str:
-    if not isinstance(value, str):
-        raise TypeError
-    return value
-
-
-def _finite(rings: tuple[NDArray[np.float64], ...]) -> tuple[NDArray[np.float64], ...]:
-    if not rings or not all(
-        len(ring) >= _CORNERS_LEAST and (np.abs(ring) < FARTHEST_M).all() for ring in rings
-    ):
-        raise ValueError
-    return rings
+        is_valid = rings and isinstance(properties[name], str)
+        if not is_valid or not all(
+            len(ring) >= _CORNERS_LEAST and (np.abs(ring) < FARTHEST_M).all() for ring in rings
+        ):
+            raise ValueError
+        yield NamedPolygon(name=properties[name], rings=rings, properties=dict(properties))
 
 
 def filled(rings: tuple[NDArray[np.float64], ...], shape: tuple[int, int]) -> NDArray[np.bool_]:

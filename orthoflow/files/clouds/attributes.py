@@ -412,7 +412,10 @@ def describe_cloud(path: Path, attributed: AttributedCloud, name: str, n_points:
         if attributed.wall is None
         else {"plane_index": attributed.wall_plane, "deviation": "from the plane of this wall"},
         "box_world": None if attributed.box_world is None else numbers(attributed.box_world),
-        "scans": [_scan(attributed, scan) for scan in attributed.scans],
+        "scans": [
+            {"scan": scan, "station_world": None if place is None else numbers(place)}
+            for scan, place in ((scan, attributed.station(scan)) for scan in attributed.scans)
+        ],
     }
     if attributed.colouring == "deviation":
         about["colour_scale"] = {
@@ -434,8 +437,3 @@ def describe_cloud(path: Path, attributed: AttributedCloud, name: str, n_points:
         about["points_of_the_cloud_by_photo"] = [int(count) for count in counts[1:]]
         about["points_of_the_cloud_unseen"] = int(counts[0])
     write_json(path, about)
-
-
-def _scan(attributed: AttributedCloud, scan: int) -> JsonValue:
-    station = attributed.station(scan)
-    return {"scan": scan, "station_world": None if station is None else numbers(station)}

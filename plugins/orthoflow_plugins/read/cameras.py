@@ -18,9 +18,9 @@ from orthoflow.files.points.units import UNITS_M
 from orthoflow.geometry.frames import FARTHEST_M
 from orthoflow.products import Camera, Cameras, InputFiles, Photo, Photos
 from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, MetricSpec, Ports, StepContext
+from orthoflow.untrusted_text import first_few
 from orthoflow_plugins.read.scan import Unit
 
-_NAMED = 3
 _EXPORT_OTHERWISE = "align with the model Brown3, or export a COLMAP model"
 LIMITED: Final = DiagnosticSpec(
     code="cameras-limited",
@@ -105,11 +105,11 @@ class ReadCameras(Method):
         cameras = tuple(_camera(photo, by_name, UNITS_M[params.unit], notes) for photo in photos)
         n_oriented = sum(camera.status == "ok" for camera in cameras)
         if not n_oriented:
-            names = ", ".join(item.name for item in given[:_NAMED])
             raise InputError(
                 f"the input {inputs.files.name} orients none of the {len(photos)} photos, such as "
-                f"{photos[0].name if photos else 'none'}: it speaks of {names}"
-                f"{' ...' if len(given) > _NAMED else ''}; {cameras[0].status if cameras else ''}"
+                f"{photos[0].name if photos else 'none'}: it speaks of "
+                f"{first_few([item.name for item in given])}; "
+                f"{cameras[0].status if cameras else ''}"
                 "; without these files, photos are oriented by matching with the scan"
             )
         for note, of_photos in notes.items():
@@ -245,7 +245,7 @@ def _nearest(found: Sequence[GivenCamera], folder: str, *, is_only: bool) -> Giv
     best = [camera for camera, score in zip(posed, scores, strict=True) if score == max(scores)]
     if len(best) == 1 and (is_only or max(scores) > 0 or not own):
         return best[0]
-    names = ", ".join(camera.name for camera in best[:_NAMED])
+    names = first_few([camera.name for camera in best])
     count = f"{len(best)} cameras of its name ({names})" if len(best) > 1 else f"only {names}"
     return GivenCamera(
         name=found[0].name,

@@ -14,10 +14,10 @@ from orthoflow.errors import InputError
 from orthoflow.files.images import PHOTO_SUFFIXES, decode_mask, encode_png
 from orthoflow.files.polygons import NamedPolygon, filled, read_polygons
 from orthoflow.sdk import DiagnosticSpec, StepContext
+from orthoflow.untrusted_text import first_few
 
 _ENDING: Final = "_mask"
 _POLYGONS: Final = (".geojson", ".json")
-_NAMED: Final = 3
 UNUSED: Final = DiagnosticSpec(
     code="masks-of-no-photo",
     text="masks of no photo: {names}",
@@ -74,7 +74,7 @@ class Masks:
         if others and len(others) == len(given):
             raise InputError(
                 f"no file of the masks is a picture (PNG, JPEG, TIFF) or polygons (GeoJSON), only "
-                f"{_named(others)}"
+                f"{first_few(sorted(set(others)))}"
             )
         return cls(pictures, polygons, others)
 
@@ -107,9 +107,9 @@ class Masks:
             polygon.name for polygon in self._polygons if polygon.name not in self._taken
         ]
         if unused:
-            ctx.report(UNUSED, n=len(unused), names=_named(unused))
+            ctx.report(UNUSED, n=len(unused), names=first_few(sorted(set(unused))))
         if self._others:
-            ctx.report(NO_MASKS, n=len(self._others), names=_named(self._others))
+            ctx.report(NO_MASKS, n=len(self._others), names=first_few(sorted(set(self._others))))
 
     def _picture(self, path: Path, photo: str, size: tuple[int, int]) -> NDArray[np.bool_]:
         self._taken.add(path.name)
@@ -136,12 +136,6 @@ def beside_photos(paths: Sequence[Path]) -> frozenset[Path]:
         and path.suffix.lower() in PHOTO_SUFFIXES
         and _key(path.stem) in stems | {other.name for other in paths}
     )
-
-
-def _named(names: Sequence[str]) -> str:
-    """Some of the names."""
-    found = sorted(set(names))
-    return f"{', '.join(found[:_NAMED])}{' ...' if len(found) > _NAMED else ''}"
 
 
 def _key(stem: str) -> str:

@@ -55,12 +55,12 @@ from orthoflow.files.photo_files import (
 from orthoflow.geometry.levels import eight_bits
 from orthoflow.products import InputFiles, Intrinsics, Photo, Photos
 from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, MetricSpec, Ports, StepContext
+from orthoflow.untrusted_text import first_few
 from orthoflow_plugins.read.cameras import GivenByName
 from orthoflow_plugins.read.figures import ContactSheet
 from orthoflow_plugins.read.masks import Masks, beside_photos
 
 _PLAIN_BITS: Final = 8
-_NAMED: Final = 3
 _MOST_PROBLEMS: Final = 20
 NO_PHOTOS: Final = DiagnosticSpec(
     code="files-are-no-photos",
@@ -372,11 +372,11 @@ def _sources(ctx: StepContext, files: InputFiles, masks: Set[Path], cubes: _Cube
     if not sources:
         raise InputError(
             f"the input {files.name} holds no photo, only {len(others)} other files: "
-            f"{_names(others)}; expected JPEG, PNG, TIFF, WebP or HEIC (.jpg, .png, .tif ...)"
+            f"{first_few(others)}; expected JPEG, PNG, TIFF, WebP or HEIC (.jpg, .png, .tif ...)"
         )
     if others:
         counts = {"n": len(others), "n_files": len(files.paths)}
-        ctx.report(NO_PHOTOS, subject=files.name, names=_names(others), **counts)
+        ctx.report(NO_PHOTOS, subject=files.name, names=first_few(others), **counts)
     # Photos of one file name are called by their paths within the input.
     counts = Counter(source.name for source in sources)
     named = (
@@ -569,12 +569,8 @@ def _warn_of_matches(
     used = {matching_pattern(calibration.patterns, item.whole or item.photo.name) for item in read}
     unused = [pattern for pattern in calibration.patterns if pattern not in used]
     if unused:
-        ctx.report(UNUSED_ENTRIES, n=len(unused), names=_names(unused))
+        ctx.report(UNUSED_ENTRIES, n=len(unused), names=first_few(unused))
 
 
 def _counted(names: Sequence[str]) -> str:
-    return f"photo {names[0]}" if len(names) == 1 else f"{len(names)} photos ({_names(names)})"
-
-
-def _names(names: Sequence[str]) -> str:
-    return ", ".join(names[:_NAMED]) + (" ..." if len(names) > _NAMED else "")
+    return f"photo {names[0]}" if len(names) == 1 else f"{len(names)} photos ({first_few(names)})"

@@ -186,7 +186,7 @@ def test_other_files_are_left_out_and_counted(tmp_path: Path, read: PhotoReader)
         "K.txt": b"",
     }
     assert [item.name for item in read(*made.write(tmp_path, files))] == ["a.jpg"]
-    assert "and were left out: a.jpg.camera, Thumbs.db, a.CR2 ..." in read.warnings
+    assert "and were left out: a.jpg.camera, Thumbs.db, a.CR2 and 1 more" in read.warnings
 
 
 @pytest.mark.parametrize("developed", [{}, {"a.jpg": encode_jpeg(made.picture())}])
