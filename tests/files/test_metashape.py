@@ -1,12 +1,10 @@
-"""What an export of Metashape leaves out, or says twice, and what becomes of it.
-
-That cameras project as Metashape's manual says stands in test_given_cameras.
-"""
+"""What an export of Metashape leaves out, or says twice, and what becomes of it."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Mapping
 from pathlib import Path
 from xml.sax.saxutils import escape
 
@@ -17,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from orthoflow.errors import InputError
-from orthoflow.files.cube_faces import FisheyeLens
+from orthoflow.files.cube_faces import FisheyeLens, PanoramaLens
 from orthoflow.files.given_cameras import MAX_LEFT_OUT_PX, GivenCamera
 from orthoflow.files.metashape import read_metashape_xml
 from orthoflow.products import Intrinsics
@@ -36,9 +34,9 @@ def document(*, sensors: str = SENSOR, cameras: str = CAMERA, chunk: str = "") -
     )
 
 
-def read(folder: Path, text: str) -> tuple[GivenCamera, ...]:
+def read(folder: Path, text: str | bytes) -> tuple[GivenCamera, ...]:
     path = folder / "cameras.xml"
-    path.write_text(text, encoding="utf-8")
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
     return read_metashape_xml(path)
 
 
@@ -119,9 +117,34 @@ def test_cameras_of_all_chunks_are_read_wherever_the_chunks_stand(tmp_path: Path
     assert [given.name for given in read(tmp_path, nested)] == ["a.jpg", "b.jpg"]
 
 
+BOMB = '<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;">]><x>&b;</x>'
+OUTSIDE = '<!DOCTYPE x [<!ENTITY a SYSTEM "file:///etc/passwd">]><x>&a;</x>'
+
+
+def numbers(values: object) -> str:
+    return " ".join(map(repr, np.ravel(np.asarray(values, dtype=np.float64)).tolist()))
+
+
+def posed_by(matrix: object) -> str:
+    return document(cameras=CAMERA.replace(POSE, f"<transform>{numbers(matrix)}</transform>"))
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        (BOMB, "defines a document type"),
+        (OUTSIDE, "defines a document type"),
+        (BOMB.encode("utf-16"), "is not UTF-8 text"),
+        ("<document><chunk>", r"cameras.xml:1: it is not XML: no element found"),
+        ("<document/>", "holds no cameras of Metashape"),
+        (posed_by(np.eye(4)[:3]), "the transform of a.jpg must be 16 numbers, got 12"),
+        (posed_by(2.0 * np.eye(4)), "the rotation of a.jpg is not a rotation matrix"),
+        (
+            posed_by(np.diag([1.0, 1, 1, np.nan])),
+            "the transform of a.jpg must be numbers, got '1.0",
+        ),
+        (document().replace("<f>500</f>", "<f>-1</f>"), "the lens of sensor NIKON is none"),
+        (document().replace("<f>500</f>", "<f>5 px</f>"), "f of sensor NIKON must be numbers"),
         (
             document(chunk="<transform><rotation>1 0 0</rotation></transform>"),
             "the rotation of the chunk must be 9 numbers, got 3",
@@ -133,48 +156,99 @@ def test_cameras_of_all_chunks_are_read_wherever_the_chunks_stand(tmp_path: Path
         (document(sensors=SENSOR.replace(SIZE, "")), "NIKON does not state its size in pixels"),
     ],
 )
-def test_what_contradicts_itself_ends_in_one_sentence(
-    tmp_path: Path, text: str, message: str
+def test_a_damaged_file_ends_in_one_sentence(
+    tmp_path: Path, text: str | bytes, message: str
 ) -> None:
     with pytest.raises(InputError, match=message) as caught:
         read(tmp_path, text)
     assert "\n" not in str(caught.value)
 
 
-# Terms that OpenCV's lenses have not, against the formula of the manual.
+# The formulas of the manual, appendix "Camera models".
+
+MATRIX = np.eye(4)
+MATRIX[:3, :3] = Rotation.from_rotvec([0.3, -0.2, 0.1]).as_matrix()
+MATRIX[:3, 3] = [1.0, 2.0, 3.0]
+TERMS = {"f": 500.0, "cx": 1.5, "cy": -2.25, "b1": 0.75, "k1": -0.05, "k2": 0.02, "k3": 0.01}
+TERMS |= {"p1": 1e-3, "p2": -2e-3}
+POINTS = np.random.default_rng(2).uniform([-1, -1, 3], [1, 1, 6], (20, 3))
 
 
-def formula(
-    xy: NDArray[np.float64], f: float, k: Sequence[float], p: Sequence[float]
-) -> NDArray[np.float64]:
-    x, y = xy.T
+def sensor_of(terms: Mapping[str, float]) -> str:
+    return SENSOR.replace("<f>500</f>", "".join(f"<{k}>{v!r}</{k}>" for k, v in terms.items()))
+
+
+def formula(points: NDArray[np.float64], terms: Mapping[str, float]) -> NDArray[np.float64]:
+    t = defaultdict(float, terms)
+    x, y = (points[:, :2] / points[:, 2:]).T
     r2 = x * x + y * y
-    radial = 1 + r2 * (k[0] + r2 * (k[1] + r2 * (k[2] + r2 * k[3])))
-    further = 1 + p[2] * r2 + p[3] * r2 * r2
-    u = x * radial + (p[0] * (r2 + 2 * x * x) + 2 * p[1] * x * y) * further
-    v = y * radial + (p[1] * (r2 + 2 * y * y) + 2 * p[0] * x * y) * further
-    return np.asarray(f * np.column_stack([u, v]) + [320, 240])
+    radial = 1 + r2 * (t["k1"] + r2 * (t["k2"] + r2 * (t["k3"] + r2 * t["k4"])))
+    further = 1 + t["p3"] * r2 + t["p4"] * r2 * r2
+    u = x * radial + (t["p1"] * (r2 + 2 * x * x) + 2 * t["p2"] * x * y) * further
+    v = y * radial + (t["p2"] * (r2 + 2 * y * y) + 2 * t["p1"] * x * y) * further
+    return np.column_stack([320 + t["cx"] + u * (t["f"] + t["b1"]), 240 + t["cy"] + v * t["f"]])
+
+
+def project(given: GivenCamera, points_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return pixels of points in front of the camera at `MATRIX`."""
+    assert isinstance(given.lens, Intrinsics)
+    points_world = points_camera @ MATRIX[:3, :3].T + MATRIX[:3, 3]
+    return given.lens.posed(given.rotation, given.translation).project(points_world)[:, :2]
+
+
+@pytest.mark.parametrize("where", ["component", "chunk", "nowhere"])
+def test_cameras_project_as_the_manual_says(tmp_path: Path, where: str) -> None:
+    turn, shift, scale = Rotation.from_rotvec([1.0, -2.0, 0.5]).as_matrix(), [3.0, -2.0, 5.0], 2.5
+    if where == "nowhere":
+        turn, shift, scale = np.eye(3), [0.0, 0.0, 0.0], 1.0
+    # World = scale * turn * chunk + shift.
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn.T @ MATRIX[:3, :3]
+    matrix[:3, 3] = turn.T @ (MATRIX[:3, 3] - shift) / scale
+    transform = (
+        f"<transform><rotation>{numbers(turn)}</rotation><translation>{numbers(shift)}"
+        f"</translation><scale>{scale}</scale></transform>"
+    )
+    component = f'<components><component id="0">{transform}</component></components>'
+    chunk = {"component": component, "chunk": transform, "nowhere": ""}[where]
+    placed = posed("a", matrix, ' component_id="0"')
+    cameras = f'<camera id="1" sensor_id="0" label="b.jpg"/><group>{placed}</group>'
+    lost, given = read(tmp_path, document(sensors=sensor_of(TERMS), cameras=cameras, chunk=chunk))
+    assert (given.name, lost.reason) == ("a", "Metashape did not align it")
+    np.testing.assert_allclose(project(given, POINTS), formula(POINTS, TERMS), atol=1e-8)
+
+
+def test_a_panorama_projects_as_the_manual_says(tmp_path: Path) -> None:
+    size = '<resolution width="720" height="360"/>'
+    sensor = f'<sensor id="0" label="360" type="spherical">{size}</sensor>'
+    (given,) = read(tmp_path, document(sensors=sensor, cameras=posed("r.jpg")))
+    assert isinstance(given.lens, PanoramaLens)
+    # u = w / 2 + f atan2(x, z), v = h / 2 + f atan2(y, hypot(x, z)), f = w / 2 pi.
+    points = np.random.default_rng(8).normal(size=(300, 3))
+    u = 360 + 720 / (2 * np.pi) * np.arctan2(points[:, 0], points[:, 2])
+    v = 180 + 720 / (2 * np.pi) * np.arctan2(points[:, 1], np.hypot(points[:, 0], points[:, 2]))
+    np.testing.assert_allclose(given.lens.project(points), np.column_stack([u, v]), atol=1e-9)
+    assert given.rotation is not None
+    np.testing.assert_allclose(given.rotation, MATRIX[:3, :3].T, atol=1e-12)
 
 
 @pytest.mark.parametrize(
-    ("k", "p"),
+    "terms",
     [
-        ((-0.05, 0.02, -0.01, 0.03), (0, 0, 0, 0)),
-        ((-0.05, 0.02, 0, 0), (1e-3, -5e-4, 0.1, -0.05)),
-        ((-0.1, 0.05, -0.02, 0.2), (1e-3, -5e-4, 0.02, 0)),
+        {"k1": -0.05, "k2": 0.02, "k3": -0.01, "k4": 0.03},
+        {"k1": -0.05, "k2": 0.02, "p1": 1e-3, "p2": -5e-4, "p3": 0.1, "p4": -0.05},
+        {"k1": -0.1, "k2": 0.05, "k3": -0.02, "k4": 0.2, "p1": 1e-3, "p2": -5e-4, "p3": 0.02},
     ],
+    ids=["k4", "p3-p4", "k4-p3"],
 )
-def test_further_terms_are_taken_over_by_the_others(
-    tmp_path: Path, k: Sequence[float], p: Sequence[float]
+def test_terms_that_opencv_lacks_are_taken_over_by_the_others(
+    tmp_path: Path, terms: dict[str, float]
 ) -> None:
-    terms = {f"k{i}": value for i, value in enumerate(k, 1)} | {
-        f"p{i}": value for i, value in enumerate(p, 1)
-    }
-    text = "".join(f"<{name}>{value}</{name}>" for name, value in terms.items())
-    lens = lens_of(tmp_path, SENSOR.replace("</f>", f"</f>{text}"))
+    terms = {"f": 500.0, **terms}
+    (given,) = read(tmp_path, document(sensors=sensor_of(terms), cameras=posed("a.jpg")))
     xy = np.random.default_rng(1).uniform([-0.6, -0.45], [0.6, 0.45], (50, 2))
-    ours = lens.posed().project(np.column_stack([xy, np.ones(50)]))[:, :2]
-    assert np.abs(ours - formula(xy, 500.0, k, p)).max() < MAX_LEFT_OUT_PX
+    points = np.column_stack([xy, np.ones(50)])
+    assert np.abs(project(given, points) - formula(points, terms)).max() < MAX_LEFT_OUT_PX
 
 
 def test_what_cannot_be_taken_over_is_stated_in_pixels(tmp_path: Path) -> None:
@@ -185,10 +259,6 @@ def test_what_cannot_be_taken_over_is_stated_in_pixels(tmp_path: Path) -> None:
 
 
 # Rigs, disabled cameras, rolling shutters, coordinate systems.
-
-MATRIX = np.eye(4)
-MATRIX[:3, :3] = Rotation.from_rotvec([0.3, -0.2, 0.1]).as_matrix()
-MATRIX[:3, 3] = [1.0, 2.0, 3.0]
 
 
 def posed(label: str, matrix: NDArray[np.float64] = MATRIX, more: str = "") -> str:
