@@ -140,7 +140,7 @@ def _print_comparison(run: Run) -> bool:
     names: Sequence[str]
     rows: list[tuple[str, ...]]
     if over := over_datasets(parts):
-        names = [f"{one.step}.{one.metric}" for one in over]
+        names = [f"{one.column.step}.{one.column.metric}" for one in over]
         rows = [
             (methods[0].name, *(_median(one) for one in methods))
             for methods in zip(*(one.methods for one in over), strict=True)

@@ -21,7 +21,7 @@ from orthoflow.records.runs import REPORT_FILE, Run, cell_metrics, parts_of
 from orthoflow.records.verify import broken_seal
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.paired import middle_of
-from orthoflow.report.rankings import FLAG, Sense, is_flag, sense_of
+from orthoflow.report.rankings import FLAG, is_flag
 from orthoflow.report.summaries import headline_keys
 from orthoflow.untrusted_text import open_file, parse_json
 from orthoflow.workflow.model import DATA
@@ -299,7 +299,7 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
                 facts[f"{cell.step}.use"] = cell.method
             for row in cell_metrics(cell):
                 # Of several datasets errors with signs are given by their sizes.
-                is_size = len(parts) > 1 and sense_of(row.better) is Sense.LESS
+                is_size = len(parts) > 1 and row.better == "lower"
                 for name in (f"{row.step}.{row.metric}", row.metric):
                     own[name] = abs(row.value) if is_size else row.value
                     labels[name] = row.title

@@ -16,7 +16,6 @@ from orthoflow.products import Inspection, Walls
 from orthoflow.records import RecordedCell
 from orthoflow.records.runs import Run, cell_metrics
 from orthoflow.records.write import NOT_YET
-from orthoflow.report.rankings import Sense, sense_of
 from orthoflow.untrusted_text import first_few, parse_json
 from orthoflow.workflow.expand import variants_text
 from orthoflow.workflow.model import DATA
@@ -107,9 +106,7 @@ class Combination:
             return None
         values = np.array([row.value for row, _ in found])
         # Their mean would be small where the repeats lie far apart, on both sides of the truth.
-        is_of_sizes = (
-            bool(values.min() < 0.0 < values.max()) and sense_of(found[0][0].better) is Sense.LESS
-        )
+        is_of_sizes = bool(values.min() < 0.0 < values.max()) and found[0][0].better == "lower"
         if is_of_sizes:
             values = np.abs(values)
         return Measured(

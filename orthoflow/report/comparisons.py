@@ -20,7 +20,7 @@ from orthoflow.report.combinations import (
 )
 from orthoflow.report.environments import alike_environments
 from orthoflow.report.numbers import number, number_with_spread
-from orthoflow.report.rankings import Mark, Sense, Value, cost_share, rank, sense_of
+from orthoflow.report.rankings import BETTER, Mark, Value, cost_share, rank
 from orthoflow.report.summaries import headline_keys
 from orthoflow.workflow.expand import NOT_ASKED_FOR, variants_text
 from orthoflow.workflow.model import DATA
@@ -33,31 +33,6 @@ _TIMED_S: Final = 0.1
 _LEADS: Final = (Mark.BEST, Mark.NEAR)
 _DESCRIBED_MOST: Final = 12  # metrics that are shown where none of quality differs
 _NAMED: Final = 3  # numbers that a combination is best in
-
-
-@dataclass(frozen=True, kw_only=True)
-class Column:
-    """One metric of one step.
-
-    Attributes:
-        step: name of the step.
-        metric: name of the metric.
-        label: what the metric is, in words, with its unit.
-        sense: what makes a value good.
-        unit: of its values.
-        counted_by: metric of the step that says how many items it sums up; empty for none.
-        is_key: it says how good the products are, and stands in tables for a first look.
-        is_described: nothing of quality differs, so that what does is shown without a judgement.
-    """
-
-    step: str
-    metric: str
-    label: str
-    sense: Sense
-    unit: str = "1"
-    counted_by: str = ""
-    is_key: bool = False
-    is_described: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,7 +125,7 @@ class ComparisonTable:
     """
 
     steps: tuple[str, ...]
-    columns: tuple[Column, ...]
+    columns: tuple[MetricRow, ...]
     rows: tuple[Row, ...]
     shows_runs: bool
     groups: Mapping[str, str]
@@ -195,7 +170,7 @@ class ComparisonTable:
     @property
     def n_judged(self) -> int:
         """How many of the columns have a good side, time and memory included."""
-        return sum(column.sense is not Sense.NEITHER for column in self.columns) + 2
+        return sum(column.better in BETTER for column in self.columns) + 2
 
     @property
     def n_undecided(self) -> int:
@@ -206,7 +181,11 @@ class ComparisonTable:
     @property
     def glance(self) -> tuple[Standing, ...]:
         """How often each combination leads; who is best, then near the best most often first."""
-        labels = [*(f"{one.step}: {one.label}" for one in self.columns), "processor time", "memory"]
+        labels = [
+            *(f"{one.step}: {one.titled}" for one in self.columns),
+            "processor time",
+            "memory",
+        ]
         found = []
         groups = [row.groups for row in self.rows]
         for row, name, own in zip(self.rows, self._names, groups, strict=True):
@@ -256,7 +235,7 @@ def comparison_table(runs: Sequence[Run]) -> ComparisonTable | None:
     )
 
 
-def comparison_columns(combinations: Sequence[Combination]) -> tuple[Column, ...]:
+def comparison_columns(combinations: Sequence[Combination]) -> tuple[MetricRow, ...]:
     """Metrics that the workflows ask for, else those of quality; the cost has its own places.
 
     Where none of quality differs, what does is described behind them and not judged.
@@ -280,11 +259,10 @@ def comparison_columns(combinations: Sequence[Combination]) -> tuple[Column, ...
         if not any(_differs(key, combinations) for key in wanted):
             others = [key for key in last if key not in wanted and not cost_share(first[key].unit)]
             described = _described(others, combinations)
-    columns = [_column(first[key]) for key in dict.fromkeys(wanted)]
-    columns += [
-        replace(_column(first[key]), sense=Sense.NEITHER, is_described=True) for key in described
-    ]
-    return tuple(columns)
+    return (
+        *(first[key] for key in dict.fromkeys(wanted)),
+        *(replace(first[key], better="") for key in described),
+    )
 
 
 def _differs(key: tuple[str, str], combinations: Sequence[Combination]) -> bool:
@@ -305,18 +283,6 @@ def _described(
     return [key for own in reversed(by_step.values()) for key in own][:_DESCRIBED_MOST]
 
 
-def _column(row: MetricRow) -> Column:
-    return Column(
-        step=row.step,
-        metric=row.metric,
-        label=row.titled,
-        sense=sense_of(row.better),
-        unit=row.unit,
-        counted_by=row.counted_by,
-        is_key=row.headline,
-    )
-
-
 def _matching(patterns: Iterable[str], known: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
     found: dict[tuple[str, str], None] = {}
     for pattern in patterns:
@@ -331,7 +297,7 @@ def _matching(patterns: Iterable[str], known: Iterable[tuple[str, str]]) -> list
 def _row(
     one: Combination,
     steps: Sequence[str],
-    columns: Sequence[Column],
+    columns: Sequence[MetricRow],
     origins: Origins,
     label: str,
 ) -> Row:
@@ -400,7 +366,9 @@ def _run_labels(runs: Sequence[Run]) -> dict[tuple[Path, str], str]:
     }
 
 
-def _value(measured: Measured | None, one: Combination, origins: Origins, column: Column) -> Value:
+def _value(
+    measured: Measured | None, one: Combination, origins: Origins, column: MetricRow
+) -> Value:
     if measured is None:
         return _absent(one, origins, column)
     repeated = measured.n_repeats > 1
@@ -425,7 +393,7 @@ def _value(measured: Measured | None, one: Combination, origins: Origins, column
     )
 
 
-def _absent(one: Combination, origins: Origins, column: Column) -> Value:
+def _absent(one: Combination, origins: Origins, column: MetricRow) -> Value:
     """What stands where there is no number: nothing was found, or nobody asked."""
     own = [cell for cell in one.cells if cell.step == column.step]
     asked = [
@@ -463,15 +431,14 @@ def _remark(one: Combination) -> str:
     return "; ".join(parts)
 
 
-def _ranked(rows: Sequence[Row], columns: Sequence[Column]) -> tuple[Row, ...]:
+def _ranked(rows: Sequence[Row], columns: Sequence[MetricRow]) -> tuple[Row, ...]:
     by_column = [
-        rank([row.values[index] for row in rows], column.sense, column.unit)
+        rank([row.values[index] for row in rows], column.better, column.unit)
         for index, column in enumerate(columns)
     ]
-    times = rank([row.time for row in rows], Sense.LESS, "s")
+    times = rank([row.time for row in rows], "lower", "s")
     has_compiler = any(row.has_compiler for row in rows)
-    memory_sense = Sense.NEITHER if has_compiler else Sense.LESS
-    memories = rank([row.memory for row in rows], memory_sense, "MiB")
+    memories = rank([row.memory for row in rows], "" if has_compiler else "lower", "MiB")
     return tuple(
         replace(
             row,

@@ -12,20 +12,19 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from orthoflow.records import RecordedCell
-from orthoflow.records.runs import Run, parts_of
+from orthoflow.records.runs import MetricRow, Run, parts_of
 from orthoflow.report.charts import ChartFormat, ChartPoint, as_image, line_chart
 from orthoflow.report.combinations import (
     Combination,
     combinations_of,
     gives,
     unequal_walls,
-    wanted_metrics,
 )
-from orthoflow.report.comparisons import Column, comparison_columns
+from orthoflow.report.comparisons import comparison_columns
 from orthoflow.report.numbers import number
 from orthoflow.report.paired import middle_of, spread_of
 from orthoflow.report.pictures import Picture
-from orthoflow.report.rankings import Sense, cost_share, is_flag
+from orthoflow.report.rankings import BETTER, cost_share, is_flag
 from orthoflow.untrusted_text import first_few
 from orthoflow.workflow.expand import variants_text
 from orthoflow.workflow.model import DATA
@@ -209,7 +208,6 @@ _Line = dict[float | None, list[_Value]]
 def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
     combinations = [one for part in parts for one in combinations_of(part)]
     columns = comparison_columns(combinations)
-    is_asked = any(wanted_metrics(part) for part in parts)
     cells = [cell for part in parts for cell in part.record.cells]
     # What several methods sweep is one drawing: axes of their own would hide which is better.
     swept: dict[tuple[str, str], list[Sweep]] = {}
@@ -221,9 +219,8 @@ def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
         if unequal_walls(combinations)
         else set()
     )
-    for column in sorted(columns, key=lambda one: not one.is_key):
-        is_good = column.is_key or column.is_described or column.sense is not Sense.NEITHER
-        for (step, parameter), alike in swept.items() if is_asked or is_good else ():
+    for column in sorted(columns, key=lambda one: not one.headline):
+        for (step, parameter), alike in swept.items():
             # A parameter over itself says nothing.
             is_behind = any(cell.step == column.step and step in cell.assignment for cell in cells)
             if (column.step, column.metric) == (step, parameter) or not is_behind:
@@ -242,7 +239,7 @@ def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
                 yield _curve(f"{step}.{parameter}", column, first, len(parts), caveats)
 
 
-def _unequal_photos(combinations: Iterable[Combination], column: Column) -> str:
+def _unequal_photos(combinations: Iterable[Combination], column: MetricRow) -> str:
     """Return where combinations sum up unequal numbers of photos of a dataset; else empty."""
     counts: dict[str, set[float]] = {}
     for one in combinations:
@@ -254,7 +251,9 @@ def _unequal_photos(combinations: Iterable[Combination], column: Column) -> str:
     return " Not all sum up as many photos: without difficult ones errors are smaller."
 
 
-def _lines(combinations: Sequence[Combination], sweep: Sweep, column: Column) -> dict[str, _Line]:
+def _lines(
+    combinations: Sequence[Combination], sweep: Sweep, column: MetricRow
+) -> dict[str, _Line]:
     """One line per combination of the other variants."""
     lines: dict[str, _Line] = {}
     for one in combinations:
@@ -280,7 +279,7 @@ def _lines(combinations: Sequence[Combination], sweep: Sweep, column: Column) ->
 
 
 def _curve(
-    parameter: str, column: Column, lines: Mapping[str, _Line], n_datasets: int, caveats: str
+    parameter: str, column: MetricRow, lines: Mapping[str, _Line], n_datasets: int, caveats: str
 ) -> Curve:
     is_over = n_datasets > 1
     xs = [x for line in lines.values() for x in line if x is not None]
@@ -308,17 +307,17 @@ def _curve(
             ]
     every = [point for points in drawn.values() for point in points]
     # Sizes of errors are never below 0, and what is judged by more and lies in 0 to 1 is a share.
-    is_size = column.sense is Sense.LESS and all(point.y >= 0.0 for point in every)
-    is_share = column.sense is Sense.MORE and all(0.0 <= point.y <= 1.0 for point in every)
+    is_size = column.better == "lower" and all(point.y >= 0.0 for point in every)
+    is_share = column.better == "higher" and all(0.0 <= point.y <= 1.0 for point in every)
     said = _points_words(lines, column.unit, n_datasets)
     if is_broken:
         what = "datasets or repeats" if is_over else "numbers of repeats"
         said += f", no line between those of unlike {what}"
     if partly:
         said += f"; of only some repeats: {first_few(partly)}"
-    if column.sense is not Sense.NEITHER:
-        said += f"; {column.sense.value}"
-    if column.sense is Sense.LESS and not cost_share(column.unit):
+    if column.better in BETTER:
+        said += f"; {BETTER[column.better]}"
+    if column.better == "lower" and not cost_share(column.unit):
         said += ", of signed errors their sizes"
     if any(None in line for line in lines.values()):
         said += "; level lines are of what was not swept"
@@ -333,20 +332,20 @@ def _curve(
     )
     return Curve(
         name=f"{column.step}.{column.metric}_over_{parameter}",
-        title=f"{column.label} ({column.step}) over {parameter}",
+        title=f"{column.titled} ({column.step}) over {parameter}",
         caption=f"Points are {said}. {shape}{caveats}",
         lines=drawn,
         below=parameter,
-        beside=column.label,
+        beside=column.titled,
         bounds=(0.0 if is_size or is_share else -math.inf, 1.0 if is_share else math.inf),
     )
 
 
 def _point(
-    x: float, found: Sequence[_Value], column: Column, *, is_over: bool, is_joined: bool
+    x: float, found: Sequence[_Value], column: MetricRow, *, is_over: bool, is_joined: bool
 ) -> ChartPoint:
     numbers = np.array([one.value for one in found])
-    if column.sense is Sense.LESS:
+    if column.better == "lower":
         # Errors of both signs would make each other small, and the most negative look best.
         numbers = np.abs(numbers)
     spread = spread_of(numbers, column.unit)

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.robust import median_deviation
 from orthoflow.records import RecordedCell
-from orthoflow.records.runs import Run, is_rounding
+from orthoflow.records.runs import MetricRow, Run, is_rounding
 from orthoflow.report.combinations import Combination, Measured, combinations_of
-from orthoflow.report.comparisons import Column, comparison_columns
+from orthoflow.report.comparisons import comparison_columns
 from orthoflow.report.environments import AlikeEnvironments, alike_environments
-from orthoflow.report.rankings import Sense, badness, is_flag
+from orthoflow.report.rankings import BETTER, badness, is_flag
 from orthoflow.untrusted_text import first_few
 from orthoflow.workflow.expand import variants_text
 from orthoflow.workflow.model import DATA
@@ -138,27 +138,19 @@ class MetricOverDatasets:
     """One metric of one step over all datasets.
 
     Attributes:
-        step: name of the step.
-        metric: its name.
-        label: the metric with its unit.
-        sense: what makes a value good.
-        unit: of its values.
+        column: the metric, as one of its cells has it.
         methods: the combinations, the reference first where it is the workflow's.
         ranks: of all methods; None of fewer than three, or than five datasets.
     """
 
-    step: str
-    metric: str
-    label: str
-    sense: Sense
-    unit: str
+    column: MetricRow
     methods: tuple[MethodOverDatasets, ...]
     ranks: MeanRanks | None = None
 
     @property
     def middle(self) -> str:
         """What the medians are, which are shares where the metric is yes or no."""
-        return "share" if is_flag(self.unit) else "median"
+        return "share" if is_flag(self.column.unit) else "median"
 
     @property
     def reference(self) -> str:
@@ -229,11 +221,7 @@ def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
     )
     return _corrected(
         MetricOverDatasets(
-            step=column.step,
-            metric=column.metric,
-            label=column.label,
-            sense=column.sense,
-            unit=column.unit,
+            column=column,
             methods=_methods(found, names, partners, column, alike),
             ranks=_mean_ranks(found, names, column, alike),
         )
@@ -275,11 +263,11 @@ def holm(values: Sequence[float]) -> dict[float, float]:
 def _mean_ranks(
     found: Mapping[str, Mapping[str, Combination]],
     names: Sequence[str],
-    column: Column,
+    column: MetricRow,
     alike: AlikeEnvironments,
 ) -> MeanRanks | None:
     """Rank all methods on the datasets on which each has a value that may be compared."""
-    if column.sense is Sense.NEITHER:
+    if column.better not in BETTER:
         return None
     # Combinations of the same cells are one method.
     methods = {
@@ -296,7 +284,7 @@ def _mean_ranks(
             continue
         if any(_other_photos(ways[0], other, column) for other in ways[1:]):
             continue
-        rows.append([badness(value.value, column.sense) for value in known])
+        rows.append([badness(value.value, column.better) for value in known])
     if len(methods) < _FEWEST_RANKED or len(rows) < _FEWEST_TESTED or not np.isfinite(rows).all():
         return None
     return mean_ranks(tuple(methods), np.array(rows))
@@ -386,7 +374,7 @@ def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
         over: the metrics.
         n_datasets: how many the run has.
     """
-    judged = [metric for metric in over if metric.sense is not Sense.NEITHER]
+    judged = [metric for metric in over if metric.column.better in BETTER]
     rows = [one for metric in judged for one in metric.told if one.against]
     if not rows:
         return ""
@@ -407,7 +395,7 @@ def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
     for name, against in dict.fromkeys((one.name, one.against) for one in rows):
         n_both = sum((one.name, one.against) == (name, against) for one in rows)
         shown = [
-            (metric.label.partition(" / ")[0], one.paired.effect)
+            (metric.column.title, one.paired.effect)
             for metric in judged
             for one in metric.told
             if (one.name, one.against) == (name, against)
@@ -447,10 +435,10 @@ def _methods(
     found: Mapping[str, Mapping[str, Combination]],
     names: Sequence[str],
     partners: Mapping[str, str],
-    column: Column,
+    column: MetricRow,
     alike: AlikeEnvironments,
 ) -> tuple[MethodOverDatasets, ...]:
-    step, sense = column.step, column.sense
+    step, is_judged = column.step, column.better in BETTER
     measured = {
         method: {
             name: value
@@ -464,12 +452,11 @@ def _methods(
         values = measured[method]
         failed = tuple(name for name, one in by_name.items() if one.failure is not None)
         numbers = np.array([value.value for value in values.values()])
-        if sense is Sense.LESS:
+        if column.better == "lower":
             # Errors of both signs would make each other small.
             numbers = np.abs(numbers)
         against = partners[method]
-        is_compared = against != "" and sense is not Sense.NEITHER
-        theirs = measured[against] if is_compared else {}
+        theirs = measured[against] if against and is_judged else {}
         both = {name: value for name, value in values.items() if name in theirs}
         like = {
             name: value
@@ -505,7 +492,7 @@ def _methods(
     return tuple(rows)
 
 
-def _other_photos(one: Combination, other: Combination, column: Column) -> bool:
+def _other_photos(one: Combination, other: Combination, column: MetricRow) -> bool:
     """Whether one sums up more photos than the other, which makes its errors no worse ones."""
     ours, theirs = (each.n_items(column.step, column.counted_by) for each in (one, other))
     return abs(ours - theirs) > 0.0
@@ -519,11 +506,11 @@ def _own(ways: Iterable[Combination], step: str) -> str:
 
 
 def _paired(
-    ours: Mapping[str, Measured], theirs: Mapping[str, Measured], column: Column
+    ours: Mapping[str, Measured], theirs: Mapping[str, Measured], column: MetricRow
 ) -> Paired | None:
-    sense = column.sense
+    better = column.better
     pairs = {
-        name: (badness(ours[name].value, sense), badness(theirs[name].value, sense))
+        name: (badness(ours[name].value, better), badness(theirs[name].value, better))
         for name in ours
     }
     # A rank test would take the last digits of six datasets for a proof.
@@ -532,19 +519,19 @@ def _paired(
         for name, (own, other) in pairs.items()
         if math.isfinite(own - other)
     }
-    return paired_differences(worse, sense, column.unit) if worse else None
+    return paired_differences(worse, better, column.unit) if worse else None
 
 
-def paired_differences(worse: Mapping[str, float], sense: Sense, unit: str = "1") -> Paired:
+def paired_differences(worse: Mapping[str, float], better: str, unit: str = "1") -> Paired:
     """Judge differences of pairs.
 
     Args:
         worse: dataset -> how much worse than the reference the method is there, finite; at least
             one; zero where they are level.
-        sense: what makes a value good, for the sign of the differences that are told.
+        better: which values are, for the sign of the differences that are told.
         unit: of its values.
     """
-    sign = -1.0 if sense is Sense.MORE else 1.0
+    sign = -1.0 if better == "higher" else 1.0
     differences = np.array(list(worse.values()))
     largest = sorted(worse, key=lambda name: -abs(worse[name]))
     total = float(np.abs(differences).sum())

@@ -7,9 +7,9 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
-from orthoflow.records.runs import Run, parts_of
+from orthoflow.records.runs import MetricRow, Run, parts_of
 from orthoflow.report.combinations import Combination, Measured, combinations_of
-from orthoflow.report.comparisons import Column, comparison_columns
+from orthoflow.report.comparisons import comparison_columns
 from orthoflow.report.numbers import number, number_with_spread
 from orthoflow.report.paired import MetricOverDatasets, over_datasets
 from orthoflow.report.summaries import citations
@@ -19,7 +19,6 @@ from orthoflow.workflow.model import DATA
 
 # More stand below each other.
 _FEW_COMBINATIONS: Final = 4
-_BETTER: Final = {"LESS": "lower", "MORE": "higher", "ONE": "one", "NEITHER": ""}
 # `Hoehle and Hoehle 2009, title, doi:10.1016/...`: of which only authors and year are certain.
 _CITATION: Final = re.compile(
     r"(?P<authors>[^\d]+?),? (?P<year>(?:19|20)\d\d)\b[,:]?\s*(?P<rest>.*)"
@@ -60,8 +59,8 @@ def _tidy(run: Run) -> Iterator[Sequence[Value]]:
                 spread = None if math.isnan(measured.spread) else measured.spread
                 yield (
                     *(one.assignment.get(factor, "") for factor in factors),
-                    *(column.step, column.metric, column.label, column.unit),
-                    *(_BETTER[column.sense.name], measured.value, spread, measured.n_repeats),
+                    *(column.step, column.metric, column.titled, column.unit),
+                    *(column.better, measured.value, spread, measured.n_repeats),
                 )
 
 
@@ -83,7 +82,7 @@ def _results(run: Run) -> Table:
             caption=caption,
             head=("metric", "better", *names),
             rows=tuple(
-                (f"{column.step}: {column.label}", _BETTER[column.sense.name] or "--", *values)
+                (f"{column.step}: {column.titled}", column.better or "--", *values)
                 for column, *values in zip(columns, *texts, strict=True)
             ),
             numeric=frozenset(range(2, 2 + len(combinations))),
@@ -124,8 +123,17 @@ def _over(over: Sequence[MetricOverDatasets]) -> Table:
                 low, high = (text(edge, 3) for edge in paired.interval)
                 interval = "--" if "--" in (low, high) else f"{low} to {high}"
                 told = [text(paired.median, 3), interval, text(paired.p_holm, 2)]
-            name, better = f"{metric.step}: {metric.label}", _BETTER[metric.sense.name] or "--"
-            rows.append((name, better, one.name or "all", str(one.n), text(one.median), *told))
+            name = f"{metric.column.step}: {metric.column.titled}"
+            rows.append(
+                (
+                    name,
+                    metric.column.better or "--",
+                    one.name or "all",
+                    str(one.n),
+                    text(one.median),
+                    *told,
+                )
+            )
     return Table(
         name="datasets",
         caption="Medians over the datasets, median differences from the reference with their 95 % "
@@ -139,7 +147,7 @@ def _over(over: Sequence[MetricOverDatasets]) -> Table:
     )
 
 
-def _compared(run: Run) -> tuple[tuple[Combination, ...], tuple[Column, ...]]:
+def _compared(run: Run) -> tuple[tuple[Combination, ...], tuple[MetricRow, ...]]:
     combinations = combinations_of(run)
     return combinations, comparison_columns(combinations)
 
@@ -150,9 +158,9 @@ def _factors(combinations: Iterable[Combination]) -> tuple[str, ...]:
     return tuple(sorted(found, key=lambda factor: factor != DATA))
 
 
-def _heading(column: Column) -> str:
-    better = _BETTER[column.sense.name]
-    return f"{column.step}: {column.label}{f' ({better} is better)' if better else ''}"
+def _heading(column: MetricRow) -> str:
+    better = f" ({column.better} is better)" if column.better else ""
+    return f"{column.step}: {column.titled}{better}"
 
 
 def bibtex(cited: Mapping[str, Sequence[str]]) -> str:

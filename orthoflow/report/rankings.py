@@ -55,7 +55,7 @@ class Value:
     found_nothing: bool = False
 
 
-def rank(values: Sequence[Value], sense: Sense, unit: str = "1") -> list[Value]:
+def rank(values: Sequence[Value], better: str, unit: str = "1") -> list[Value]:
     """Mark the best and the worst of each group; a group whose values are all equal has neither.
 
     Groups with a value of a single run are not ranked: on another machine, or with another seed,
@@ -70,10 +70,10 @@ def rank(values: Sequence[Value], sense: Sense, unit: str = "1") -> list[Value]:
 
     Args:
         values: a column.
-        sense: what makes its values good.
+        better: which of its values are, a key of `BETTER`; those of others are not ranked.
         unit: of its values.
     """
-    if sense is Sense.NEITHER:
+    if better not in BETTER:
         return list(values)
     marked = list(values)
     for group in dict.fromkeys(value.group for value in values):
@@ -88,14 +88,14 @@ def rank(values: Sequence[Value], sense: Sense, unit: str = "1") -> list[Value]:
             marked[index] = replace(values[index], mark=Mark.FEWER)
         if not members or any(math.isnan(values[index].spread) for index in members):
             continue
-        scores = {index: badness(values[index].sort, sense) for index in members}
+        scores = {index: badness(values[index].sort, better) for index in members}
         best = values[min(members, key=scores.__getitem__)]
-        leading = {i for i in members if _are_alike(values[i], best, sense, unit)}
+        leading = {i for i in members if _are_alike(values[i], best, better, unit)}
         if len(leading) == len(members):
             continue
         worst = max(members, key=scores.__getitem__)
         is_worst = not (_has_found_nothing(values, group) and cost_share(unit) == 0.0) and not any(
-            _are_alike(values[worst], values[i], sense, unit) for i in members if i != worst
+            _are_alike(values[worst], values[i], better, unit) for i in members if i != worst
         )
         for index in members:
             mark = Mark.NONE
@@ -108,9 +108,9 @@ def rank(values: Sequence[Value], sense: Sense, unit: str = "1") -> list[Value]:
     return marked
 
 
-def _are_alike(one: Value, other: Value, sense: Sense, unit: str) -> bool:
+def _are_alike(one: Value, other: Value, better: str, unit: str) -> bool:
     """Whether nothing shows that a value differs from a better one."""
-    if is_rounding(badness(one.sort, sense), badness(other.sort, sense)):
+    if is_rounding(badness(one.sort, better), badness(other.sort, better)):
         return True
     known = [
         value.spread
@@ -119,8 +119,8 @@ def _are_alike(one: Value, other: Value, sense: Sense, unit: str) -> bool:
     ]
     share = max(cost_share(unit), 0.0 if len(known) == 2 else _ALIKE_SHARE)
     # Signed errors count by their size.
-    own, better = (abs(v.sort) if sense is Sense.LESS else v.sort for v in (one, other))
-    return abs(own - better) <= max(math.hypot(*known), share * abs(better))
+    own, leading = (abs(v.sort) if better == "lower" else v.sort for v in (one, other))
+    return abs(own - leading) <= max(math.hypot(*known), share * abs(leading))
 
 
 def cost_share(unit: str) -> float:
@@ -132,26 +132,8 @@ def _has_found_nothing(values: Sequence[Value], group: str) -> bool:
     return any(value.found_nothing and value.group == group for value in values)
 
 
-class Sense(Enum):
-    """What makes a value of a metric good."""
-
-    LESS = "less is better"
-    MORE = "more is better"
-    ONE = "1 is best"
-    NEITHER = "neither more nor less is better"
-
-
-_SENSES: Final = {"lower": Sense.LESS, "higher": Sense.MORE, "one": Sense.ONE}
-
-
-def sense_of(better: str) -> Sense:
-    """Return what makes a value good, from what the method of the metric declares.
-
-    >>> sense_of("lower").name, sense_of("").name
-    ('LESS', 'NEITHER')
-    """
-    # A record may hold anything.
-    return _SENSES.get(better, Sense.NEITHER)
+# What a method declares of a metric (`MetricSpec.better`), in words; others are not judged.
+BETTER: Final = {"lower": "less is better", "higher": "more is better", "one": "1 is best"}
 
 
 def is_flag(unit: str) -> bool:
@@ -159,16 +141,16 @@ def is_flag(unit: str) -> bool:
     return unit == FLAG
 
 
-def badness(value: float, sense: Sense) -> float:
+def badness(value: float, better: str) -> float:
     """Return a number that is smaller the better the value is; signed errors count by their size.
 
     Raises:
         ValueError: the metric has no good side.
     """
-    if sense is Sense.LESS:
+    if better == "lower":
         return abs(value)
-    if sense is Sense.MORE:
+    if better == "higher":
         return -value
-    if sense is Sense.ONE:
+    if better == "one":
         return abs(math.log(value)) if value > 0 else math.inf
     raise ValueError("a metric without a good side cannot be ranked")

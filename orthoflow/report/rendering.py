@@ -24,6 +24,7 @@ from orthoflow.report.diagrams import BOX, run_diagram
 from orthoflow.report.environments import told_apart
 from orthoflow.report.numbers import number, number_with_unit
 from orthoflow.report.pictures import DIVERGING
+from orthoflow.report.rankings import BETTER
 from orthoflow.untrusted_text import shown
 from orthoflow.version import __version__
 
@@ -59,6 +60,7 @@ def environment() -> jinja2.Environment:
         for name in ("page.css", "early.js", "page.js")
     )
     environment.globals |= {
+        "better": BETTER,
         "costs": COSTS,
         "version": __version__,
         "depth_colours": DIVERGING.tolist(),

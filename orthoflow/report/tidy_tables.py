@@ -105,7 +105,7 @@ def dataset_rows(run: Run) -> Iterator[Sequence[Value]]:
         for one in metric.methods:
             paired = one.paired
             yield (
-                *(metric.step, metric.metric, one.name, one.against),
+                *(metric.column.step, metric.column.metric, one.name, one.against),
                 *(one.n, len(one.failed), one.n_absent, ", ".join(one.partly)),
                 *map(_known, (one.median, one.spread if one.n > 1 else math.nan)),
                 *(

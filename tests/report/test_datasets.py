@@ -23,7 +23,6 @@ from orthoflow.report.paired import (
     over_datasets,
     who_leads,
 )
-from orthoflow.report.rankings import Sense
 from orthoflow.report.tidy_tables import _known, dataset_rows
 from tests.report_runs import (
     HeldRun,
@@ -87,10 +86,10 @@ def rooms(tmp_path: Path) -> HeldRun:
 
 def methods(run: Run) -> dict[str, MethodOverDatasets]:
     (metric,) = over_datasets(parts_of(run))
-    assert (metric.step, metric.label, metric.sense) == (
+    assert (metric.column.step, metric.column.titled, metric.column.better) == (
         "plane",
         "points to the first plane, RMS / mm",
-        Sense.LESS,
+        "lower",
     )
     return {method.name: method for method in metric.methods}
 

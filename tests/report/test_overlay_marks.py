@@ -16,7 +16,7 @@ from orthoflow.report.comparisons import Origins, comparison_table
 from orthoflow.report.environments import environment_words
 from orthoflow.report.overlays import magnification_for, overlays, residuals_on_wall
 from orthoflow.report.pictures import Picture, sliders
-from orthoflow.report.rankings import Mark, Sense
+from orthoflow.report.rankings import Mark
 from tests.report_runs import (
     CENTRE,
     FRAME,
@@ -171,20 +171,20 @@ def test_rows_of_a_comparison_stand_beside_each_other(tmp_path: Path) -> None:
     table = comparison_table([compared_run(tmp_path)])
     assert table is not None
     assert (table.steps, table.shows_runs, table.groups) == (("plane",), False, {})
-    assert [(one.step, one.metric, one.label, one.sense) for one in table.columns] == [
-        ("plane", "rms_mm", "points to the first plane, RMS / mm", Sense.LESS),
-        ("plane", "omega_deg", "direction of the first normal (omega) / deg", Sense.NEITHER),
-        ("check", "rmse_u_mm", "error along u, RMS / mm", Sense.LESS),
+    assert [(one.step, one.metric, one.titled, one.better) for one in table.columns] == [
+        ("plane", "rms_mm", "points to the first plane, RMS / mm", "lower"),
+        ("plane", "omega_deg", "direction of the first normal (omega) / deg", ""),
+        ("check", "rmse_u_mm", "error along u, RMS / mm", "lower"),
         (
             "check",
             "completeness",
             "painted, not filled, of the visible surface",
-            Sense.MORE,
+            "higher",
         ),
-        ("check", "wall_s", "time / s", Sense.LESS),
-        ("check", "cpu_s", "processor time / s", Sense.LESS),
-        ("check", "peak_rss_mib", "memory / MiB", Sense.LESS),
-        ("check", "compile_s", "loading and compiling / s", Sense.NEITHER),
+        ("check", "wall_s", "time / s", "lower"),
+        ("check", "cpu_s", "processor time / s", "lower"),
+        ("check", "peak_rss_mib", "memory / MiB", "lower"),
+        ("check", "compile_s", "loading and compiling / s", ""),
     ]
     fine, coarse, broken = table.rows
     here = tmp_path.name

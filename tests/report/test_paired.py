@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.stats import wilcoxon
 
+from orthoflow.records.runs import MetricRow
 from orthoflow.report import paired as module
-from orthoflow.report.comparisons import Column
 from orthoflow.report.environments import AlikeEnvironments
 from orthoflow.report.paired import (
     MethodOverDatasets,
@@ -19,7 +19,6 @@ from orthoflow.report.paired import (
     Paired,
     paired_differences,
 )
-from orthoflow.report.rankings import Sense
 
 ALIKE = AlikeEnvironments(first={}, words={})
 
@@ -29,14 +28,14 @@ def worse(*values: float) -> dict[str, float]:
 
 
 @pytest.mark.parametrize(
-    ("sense", "median", "deciding"),
-    [(Sense.LESS, -1.0, {"c": -4.0, "d": 2.0}), (Sense.MORE, 1.0, {"c": 4.0, "d": -2.0})],
+    ("better", "median", "deciding"),
+    [("lower", -1.0, {"c": -4.0, "d": 2.0}), ("higher", 1.0, {"c": 4.0, "d": -2.0})],
 )
 def test_what_less_or_more_of_a_number_is_worth_is_told_in_its_own_sign(
-    sense: Sense, median: float, deciding: dict[str, float]
+    better: str, median: float, deciding: dict[str, float]
 ) -> None:
     # Of eleven in all, four and two make up more than half.
-    found = paired_differences(worse(-1.0, -1.0, -4.0, 2.0, -1.5, 1.0, 0.0), sense)
+    found = paired_differences(worse(-1.0, -1.0, -4.0, 2.0, -1.5, 1.0, 0.0), better)
     assert (found.n, found.wins, found.losses) == (7, 4, 2)
     assert found.median == median
     assert found.deciding == deciding
@@ -57,19 +56,19 @@ def test_what_less_or_more_of_a_number_is_worth_is_told_in_its_own_sign(
 def test_the_largest_differences_that_make_up_half_decide(
     values: tuple[float, ...], names: list[str]
 ) -> None:
-    assert list(paired_differences(worse(*values), Sense.LESS).deciding) == names
+    assert list(paired_differences(worse(*values), "lower").deciding) == names
 
 
 def test_five_differences_are_tested_and_four_are_not() -> None:
-    few = paired_differences(worse(-1.0, -2.0, -3.0, -4.0, 0.0, 0.0), Sense.LESS)
+    few = paired_differences(worse(-1.0, -2.0, -3.0, -4.0, 0.0, 0.0), "lower")
     assert math.isnan(few.p)
     assert math.isnan(few.effect)
     values = (-1.0, -2.0, -3.0, -4.0, 2.5)
-    found = paired_differences(worse(*values, 0.0), Sense.LESS)
+    found = paired_differences(worse(*values, 0.0), "lower")
     # Ranks 1, 2, 4 and 5 for, 3 against: (12 - 3) / 15.
     assert found.effect == pytest.approx(0.6)
     assert found.p == wilcoxon(values).pvalue
-    every = paired_differences(worse(1.0, 2.0, 3.0, 4.0, 5.0), Sense.LESS)
+    every = paired_differences(worse(1.0, 2.0, 3.0, 4.0, 5.0), "lower")
     assert every.effect == -1.0
     assert every.p == pytest.approx(0.0625)
     assert every.wins == 0
@@ -116,11 +115,11 @@ def leading(n_methods: int, p: float) -> Any:
         )
         for k in range(n_methods + 1)
     ]
-    return SimpleNamespace(sense=Sense.LESS, told=methods, label="error / mm")
+    return SimpleNamespace(column=column("lower"), told=methods)
 
 
 def test_who_leads_is_said_of_six_at_most() -> None:
-    judged_not = SimpleNamespace(sense=Sense.NEITHER, told=leading(2, 0.01).told)
+    judged_not = SimpleNamespace(column=column(""), told=leading(2, 0.01).told)
     assert module.who_leads([judged_not], 9) == ""
     assert module.who_leads([leading(0, 0.01)], 9) == ""
     few = module.who_leads([leading(2, math.nan)], 5)
@@ -154,42 +153,40 @@ def test_values_of_no_size_are_not_paired() -> None:
         "d": measured(math.inf), "e": measured(-1.0),
     }  # fmt: skip
     theirs = {name: measured(1.5) for name in "ade"}
-    found = module._paired(ours, theirs, column(Sense.LESS))
+    found = module._paired(ours, theirs, column("lower"))
     assert found is not None
     # Of signed errors the sizes.
     assert (found.n, found.wins, found.losses) == (2, 1, 1)
     assert found.deciding == {"a": 0.5}
-    assert (
-        module._paired({"d": measured(1.0)}, {"d": measured(math.inf)}, column(Sense.LESS)) is None
-    )
+    assert module._paired({"d": measured(1.0)}, {"d": measured(math.inf)}, column("lower")) is None
 
 
-def pairs(sense: Sense, *values: tuple[float, float]) -> Paired:
+def pairs(better: str, *values: tuple[float, float]) -> Paired:
     ours, theirs = (
         {name: measured(pair[side]) for name, pair in zip("abcdefgh", values, strict=False)}
         for side in (0, 1)
     )
-    found = module._paired(ours, theirs, column(sense))
+    found = module._paired(ours, theirs, column(better))
     assert found is not None
     return found
 
 
 @pytest.mark.parametrize(
-    ("sense", "ours", "theirs"),
+    ("better", "ours", "theirs"),
     [
-        (Sense.LESS, 0.84536087, 0.84536104),
-        (Sense.MORE, 0.84536104, 0.84536087),
-        (Sense.LESS, 3.2e6 + 0.5, 3.2e6 + 2.5),
+        ("lower", 0.84536087, 0.84536104),
+        ("higher", 0.84536104, 0.84536087),
+        ("lower", 3.2e6 + 0.5, 3.2e6 + 2.5),
         # Angles of next to nothing, in degrees; errors of both signs; factors to 1.
-        (Sense.LESS, 1e-13, 4.5e-13),
-        (Sense.LESS, -0.84536087, 0.84536104),
-        (Sense.ONE, 0.5, 2.0000001),
+        ("lower", 1e-13, 4.5e-13),
+        ("lower", -0.84536087, 0.84536104),
+        ("one", 0.5, 2.0000001),
     ],
 )
 def test_what_differs_by_rounding_is_level_and_tests_nothing(
-    sense: Sense, ours: float, theirs: float
+    better: str, ours: float, theirs: float
 ) -> None:
-    found = pairs(sense, *[(ours, theirs)] * 8)
+    found = pairs(better, *[(ours, theirs)] * 8)
     assert (found.n, found.wins, found.losses, found.median) == (8, 0, 0, 0.0)
     assert math.isnan(found.p)
     assert math.isnan(found.effect)
@@ -197,12 +194,21 @@ def test_what_differs_by_rounding_is_level_and_tests_nothing(
 
 
 def test_more_than_rounding_and_every_count_is_a_difference() -> None:
-    found = pairs(Sense.LESS, (1.0, 1.000002), (3e7 + 1.0, 3e7), (0.0, 2e-6))
+    found = pairs("lower", (1.0, 1.000002), (3e7 + 1.0, 3e7), (0.0, 2e-6))
     assert (found.wins, found.losses) == (2, 1)
 
 
-def column(sense: Sense) -> Column:
-    return Column(step="check", metric="rms_mm", label="", sense=sense)
+def column(better: str, metric: str = "rms_mm", unit: str = "mm") -> MetricRow:
+    return MetricRow(
+        cell="check",
+        step="check",
+        method="inspect.truth",
+        metric=metric,
+        value=0.0,
+        unit=unit,
+        label="error",
+        better=better,
+    )
 
 
 def combination(
@@ -234,9 +240,7 @@ def test_a_method_is_summed_up_over_datasets() -> None:
         },
     }
     partners = {"plane=a": "", "plane=b": "plane=a"}
-    first, second = module._methods(
-        found, ("x", "y", "z", "w"), partners, column(Sense.LESS), ALIKE
-    )
+    first, second = module._methods(found, ("x", "y", "z", "w"), partners, column("lower"), ALIKE)
     assert (first.name, first.is_reference, first.n, first.failed, first.n_absent) == (
         "plane=a", True, 3, (), 1,
     )  # fmt: skip
@@ -251,7 +255,7 @@ def test_a_method_is_summed_up_over_datasets() -> None:
     )  # fmt: skip
     assert second.paired is not None
     assert (second.paired.n, second.paired.wins) == (1, 1)
-    first, second = module._methods(found, ("x", "y", "z"), partners, column(Sense.NEITHER), ALIKE)
+    first, second = module._methods(found, ("x", "y", "z"), partners, column(""), ALIKE)
     assert first.median == 3.0
     assert second.paired is None
 
@@ -262,7 +266,7 @@ def test_of_what_is_found_or_not_the_share_of_datasets_is_told() -> None:
         "plane=b": dict(zip("xyz", map(combination, (1.0, 0.0, 0.5)), strict=True)),
     }
     partners = {"plane=a": "", "plane=b": "plane=a"}
-    told = Column(step="check", metric="main_found", label="", sense=Sense.MORE, unit="yes/no")
+    told = column("higher", "main_found", "yes/no")
     first, second = module._methods(found, ("x", "y", "z"), partners, told, ALIKE)
     # Their medians would be 1 and 0.5.
     assert (first.median, second.median) == (1.0, 0.5)
@@ -277,7 +281,7 @@ def test_errors_of_unequal_numbers_of_photos_are_not_paired() -> None:
         "orient=b": {"x": combination(1.0, n_items=2), "y": combination(3.0, n_items=3)},
     }
     partners = {"orient=a": "", "orient=b": "orient=a"}
-    _, second = module._methods(found, ("x", "y"), partners, column(Sense.LESS), ALIKE)
+    _, second = module._methods(found, ("x", "y"), partners, column("lower"), ALIKE)
     assert second.paired is not None
     assert (second.paired.n, second.paired.wins, second.paired.losses) == (1, 0, 1)
     assert (second.n_other_photos, second.n_unlike) == (1, 0)
@@ -293,9 +297,7 @@ def test_what_does_not_hang_on_a_step_has_one_row_for_all_its_variants() -> None
         )  # fmt: skip
 
     def told(*rows: MethodOverDatasets) -> list[tuple[str, str]]:
-        metric = MetricOverDatasets(
-            step="check", metric="rms_mm", label="error", sense=Sense.LESS, unit="mm", methods=rows
-        )
+        metric = MetricOverDatasets(column=column("lower"), methods=rows)
         return [(one.name, one.against) for one in metric.told]
 
     every = [row(plane, corner) for plane in "ab" for corner in "yx"]
@@ -354,9 +356,9 @@ def test_the_interval_of_a_median_covers_it_as_often_as_it_says() -> None:
         for _ in range(1000):
             drawn = dict(enumerate(rng.standard_normal(n)))
             low, high = module.paired_differences(
-                {str(key): value for key, value in drawn.items()}, Sense.LESS
+                {str(key): value for key, value in drawn.items()}, "lower"
             ).interval
             covered += low <= 0.0 <= high
         assert covered / 1000 == pytest.approx(rate, abs=0.02)
-    few = module.paired_differences({str(k): float(k) for k in range(5)}, Sense.LESS)
+    few = module.paired_differences({str(k): float(k) for k in range(5)}, "lower")
     assert math.isnan(few.interval[0])

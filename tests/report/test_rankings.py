@@ -1,4 +1,4 @@
-"""Best and worst of a column: among its like, by the sense of its metric, within spreads."""
+"""Best and worst of a column: among its like, by what makes its values good, within spreads."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from dataclasses import replace
 import pytest
 from orthoflow_plugins.inspect.truth import InspectTruth
 
-from orthoflow.report.rankings import Sense, Value, badness, rank, sense_of
+from orthoflow.report.rankings import Value, badness, rank
 
 
-def marks(*values: Value, sense: Sense = Sense.LESS) -> list[str]:
-    return [value.mark.name for value in rank(values, sense)]
+def marks(*values: Value, better: str = "lower") -> list[str]:
+    return [value.mark.name for value in rank(values, better)]
 
 
 def of(sort: float, spread: float = 0.0, group: str = "") -> Value:
@@ -21,7 +21,7 @@ def of(sort: float, spread: float = 0.0, group: str = "") -> Value:
 
 def test_the_smallest_is_best_and_the_largest_is_worst() -> None:
     assert marks(of(3.0), of(1.0), of(2.0)) == ["WORST", "BEST", "NONE"]
-    assert marks(of(3.0), of(1.0), of(2.0), sense=Sense.MORE) == ["BEST", "WORST", "NONE"]
+    assert marks(of(3.0), of(1.0), of(2.0), better="higher") == ["BEST", "WORST", "NONE"]
     # Signed errors count by their size.
     assert marks(of(-3.0), of(1.0), of(-0.5)) == ["WORST", "NONE", "BEST"]
 
@@ -53,7 +53,7 @@ def test_single_runs_are_not_ranked() -> None:
 
 
 def test_a_ratio_is_best_at_one_and_as_bad_at_half_as_at_double() -> None:
-    found = marks(of(0.5), of(1.1), of(2.0), of(0.0), sense=Sense.ONE)
+    found = marks(of(0.5), of(1.1), of(2.0), of(0.0), better="one")
     assert found == ["NONE", "BEST", "NONE", "WORST"]
 
 
@@ -62,7 +62,7 @@ def test_what_is_alike_has_neither_and_nobody_leads_in_what_several_share() -> N
     assert marks(of(1.0), of(-1.0)) == ["NONE", "NONE"]
     assert marks(of(1.0), of(1.0), of(2.0)) == ["NEAR", "NEAR", "WORST"]
     assert marks(of(1.0)) == ["NONE"]
-    assert marks(of(1.0), of(2.0), sense=Sense.NEITHER) == ["NONE", "NONE"]
+    assert marks(of(1.0), of(2.0), better="") == ["NONE", "NONE"]
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,7 @@ def test_without_repeats_a_hundredth_is_no_difference_and_a_tenth_of_a_cost() ->
     assert marks(of(1.238), of(1.239)) == ["NONE", "NONE"]
     assert marks(of(1.238), of(1.239), of(2.0)) == ["NEAR", "NEAR", "WORST"]
     assert marks(of(1.0), of(1.011), of(2.0)) == ["BEST", "NONE", "WORST"]
-    costs = rank([of(10.0), of(10.9), of(11.1)], Sense.LESS, "MiB")
+    costs = rank([of(10.0), of(10.9), of(11.1)], "lower", "MiB")
     assert [value.mark.name for value in costs] == ["NEAR", "NEAR", "NONE"]
 
 
@@ -123,7 +123,7 @@ def test_rounding_is_no_difference_whatever_the_share() -> None:
     assert marks(of(1e-13), of(4.5e-13)) == ["NONE", "NONE"]
     assert marks(of(1e-13), of(4.5e-13), of(0.2)) == ["NEAR", "NEAR", "WORST"]
     assert marks(of(0.1), of(0.2), of(0.2 + 1e-9)) == ["BEST", "NONE", "NONE"]
-    halves = marks(of(0.5), of(2.0 + 1e-9), of(4.0), sense=Sense.ONE)
+    halves = marks(of(0.5), of(2.0 + 1e-9), of(4.0), better="one")
     assert halves == ["NEAR", "NEAR", "WORST"]
 
 
@@ -136,7 +136,7 @@ def test_errors_of_both_signs_are_as_far_apart_as_their_sizes() -> None:
 def test_times_that_another_run_could_turn_round_are_not_told_apart() -> None:
     for spread in (0.0, 0.01):
         times = [of(1.0, spread), of(1.29, spread), of(1.31, spread), of(2.0, spread)]
-        found = rank(times, Sense.LESS, "s")
+        found = rank(times, "lower", "s")
         assert [value.mark.name for value in found] == ["NEAR", "NEAR", "NONE", "WORST"]
 
 
@@ -156,24 +156,24 @@ def test_who_found_something_is_not_worst_where_another_found_nothing() -> None:
         "NONE",
     ]
     for cost in ("s", "MiB"):
-        found = rank([of(1.0), nothing, of(2.0)], Sense.LESS, cost)
+        found = rank([of(1.0), nothing, of(2.0)], "lower", cost)
         assert [value.mark.name for value in found] == ["BEST", "NONE", "WORST"]
 
 
 def test_methods_declare_what_is_good() -> None:
-    found = {spec.name: sense_of(spec.better) for spec in InspectTruth.metric_specs()}
-    assert found["pose_error_over_sigma"] is Sense.ONE
-    assert found["label_f1"] is Sense.MORE
-    assert found["wall_[0-9]*_rmse_[uv]_mm"] is found["rmse_[uv]_mm"] is Sense.LESS
-    assert found["n_photos"] is Sense.NEITHER
+    found = {spec.name: spec.better for spec in InspectTruth.metric_specs()}
+    assert found["pose_error_over_sigma"] == "one"
+    assert found["label_f1"] == "higher"
+    assert found["wall_[0-9]*_rmse_[uv]_mm"] is found["rmse_[uv]_mm"] == "lower"
+    assert found["n_photos"] == ""
     # A record may hold anything.
-    assert sense_of("sideways") is Sense.NEITHER
+    assert marks(of(1.0), of(2.0), better="sideways") == ["NONE", "NONE"]
 
 
 def test_badness_is_smaller_the_better_a_value_is() -> None:
-    assert badness(-2.0, Sense.LESS) == 2.0
-    assert badness(2.0, Sense.MORE) == -2.0
-    assert badness(2.0, Sense.ONE) == badness(0.5, Sense.ONE) == pytest.approx(math.log(2.0))
-    assert badness(0.0, Sense.ONE) == badness(-1.0, Sense.ONE) == math.inf
+    assert badness(-2.0, "lower") == 2.0
+    assert badness(2.0, "higher") == -2.0
+    assert badness(2.0, "one") == badness(0.5, "one") == pytest.approx(math.log(2.0))
+    assert badness(0.0, "one") == badness(-1.0, "one") == math.inf
     with pytest.raises(ValueError, match="cannot be ranked"):
-        badness(1.0, Sense.NEITHER)
+        badness(1.0, "")

@@ -10,13 +10,13 @@ import pytest
 from orthoflow_provenance.document import Metric, PublishedFile, RecordedCell
 
 from orthoflow.errors import StoreError
-from orthoflow.records.runs import Run
+from orthoflow.records.runs import MetricRow, Run
 from orthoflow.records.write import NOT_YET
 from orthoflow.report import comparisons, write_figures, write_page, write_report
 from orthoflow.report.combinations import Measured, combinations_of
-from orthoflow.report.comparisons import Column, comparison_columns, comparison_table
+from orthoflow.report.comparisons import comparison_columns, comparison_table
 from orthoflow.report.figures import figure_groups
-from orthoflow.report.rankings import Mark, Sense, Value
+from orthoflow.report.rankings import Mark, Value
 from orthoflow.report.rendering import cited
 from orthoflow.report.summaries import answers, citations, limits, results
 from tests.report_runs import (
@@ -265,7 +265,10 @@ def test_a_third_party_method_declares_its_headlines() -> None:
         ("points to the first plane, RMS", "1.6 mm", "plane"),
     ]
     columns = comparison_columns(combinations_of(run(*cells)))
-    assert [(one.metric, one.is_key) for one in columns] == [("dent_share", True), ("rms_mm", True)]
+    assert [(one.metric, one.headline) for one in columns] == [
+        ("dent_share", True),
+        ("rms_mm", True),
+    ]
 
 
 def test_what_a_cell_published_is_linked_in_its_place(tmp_path: Path) -> None:
@@ -322,6 +325,18 @@ def test_processor_times_are_ranked_whatever_the_clock_says() -> None:
     ]
 
 
+def offset_column(step: str) -> MetricRow:
+    return MetricRow(
+        cell=step,
+        step=step,
+        method="",
+        metric="plane_offset_mm",
+        value=0.0,
+        unit="mm",
+        better="lower",
+    )
+
+
 @pytest.mark.parametrize(
     ("n_repeats", "n_all", "text", "note"),
     [
@@ -338,7 +353,7 @@ def test_a_value_says_what_it_is_the_mean_of(
         value=2.0, spread=0.5, n_repeats=n_repeats, n_all=n_all, unit="", environment="e1"
     )
     (one,) = combinations_of(told)
-    column = Column(step="plane", metric="plane_offset_mm", label="", sense=Sense.LESS)
+    column = offset_column("plane")
     value = comparisons._value(measured, one, comparisons.Origins.of([told]), column)
     assert (value.text, value.note, value.sort, value.spread) == (text, note, 2.0, 0.5)
     nothing = comparisons._value(None, one, comparisons.Origins.of([told]), column)
@@ -380,7 +395,7 @@ def test_who_was_asked_for_a_number_and_has_none_found_nothing(
 ) -> None:
     told = run(*cells)
     (one,) = combinations_of(told)
-    column = Column(step="check", metric="plane_offset_mm", label="", sense=Sense.LESS)
+    column = offset_column("check")
     value = comparisons._value(None, one, comparisons.Origins.of([told]), column)
     assert value.found_nothing == found_nothing
 
