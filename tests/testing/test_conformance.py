@@ -18,7 +18,7 @@ from orthoflow.testing import ConformanceCase, conformance_cases
 from orthoflow.testing.examples import example
 from orthoflow.testing.photographed import settled_camera
 from tests import inspect_scenes, ortho_scenes, photo_files, recess_scenes
-from tests.undrawn_charts import build_orient_charts_once, build_plane_charts_once
+from tests.undrawn_charts import blank_charts
 
 # Parameters that make a method quick on the suite's small examples; results stay meaningful.
 QUICK: dict[str, dict[str, object]] = {
@@ -131,18 +131,19 @@ def cases() -> list[ConformanceCase]:
         ]
 
 
+CASES = cases()
+FIRST = {case.method_id: case for case in reversed(CASES)}
+
+
 @pytest.fixture(autouse=True)
-def _charts_of_a_method_built_once(
-    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    method_id = request.node.callspec.params["case"].method_id
-    kind = method_id.partition(".")[0]
-    if kind in ("plane", "orient"):
-        build = build_plane_charts_once if kind == "plane" else build_orient_charts_once
-        build(request, monkeypatch, test=method_id)
+def _blank_charts(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Build the charts of detectors and orientations in the first case of each method only."""
+    case = request.node.callspec.params["case"]
+    if case.method_id.startswith(("plane.", "orient.")) and case is not FIRST[case.method_id]:
+        blank_charts(request, monkeypatch)
 
 
-@pytest.mark.parametrize("case", cases(), ids=str)
+@pytest.mark.parametrize("case", CASES, ids=str)
 def test_our_methods_conform(case: ConformanceCase, request: pytest.FixtureRequest) -> None:
     if "open3d" in str(case):
         request.getfixturevalue("_open3d")

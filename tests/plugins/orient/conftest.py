@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from orthoflow_plugins.orient import report
 
-from tests.undrawn_charts import build_orient_charts_once
+from tests.undrawn_charts import blank_charts
 
 
 @pytest.fixture(autouse=True)
@@ -19,5 +19,5 @@ def _small_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPa
 
 
 @pytest.fixture(autouse=True)
-def _charts_built_once(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    build_orient_charts_once(request, monkeypatch)
+def _blank_charts(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    blank_charts(request, monkeypatch)

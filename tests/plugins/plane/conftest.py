@@ -1,12 +1,12 @@
-"""What the tests of detectors share."""
+"""Fixtures of the tests of detectors."""
 
 from __future__ import annotations
 
 import pytest
 
-from tests.undrawn_charts import build_plane_charts_once
+from tests.undrawn_charts import blank_charts
 
 
 @pytest.fixture(autouse=True)
-def _charts_built_once(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    build_plane_charts_once(request, monkeypatch)
+def _blank_charts(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    blank_charts(request, monkeypatch)
