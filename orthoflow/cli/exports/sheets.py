@@ -149,20 +149,16 @@ def export_elevations(run: Run, folder: Path, chosen: Choices) -> str:
         )
     up = results.planes.up
     order, is_inside = unfolded(walls, up)
-    # Each wall has its own evidence.
+    # Each wall has its own evidence; those of which the same is known share a note.
+    known: dict[str, list[str]] = {}
+    for wall in results.walls:
+        if wall.frame.raster_axes == "wall":
+            about = wall.about.accuracy if wall.about else Phrase(key="not_checked")
+            name = surface_name(wall.name, language)
+            known.setdefault(about.text(language), []).append(name)
     notes = tuple(
-        Phrase(
-            key="of_wall",
-            values={"wall": surface_name(wall.name, language), "text": said.text(language)},
-        )
-        for wall in results.walls
-        if wall.frame.raster_axes == "wall"
-        for said in (
-            next(
-                (one for one in wall.accuracy if one.key != "plane_noise"),
-                Phrase(key="not_checked"),
-            ),
-        )
+        Phrase(key="of_wall", values={"wall": ", ".join(names), "text": said})
+        for said, names in known.items()
     )
     text = text_of(run, ", ".join(wall.name for wall in order), chosen, notes)
 

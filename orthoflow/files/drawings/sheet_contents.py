@@ -66,7 +66,9 @@ class Placed:
     ) -> NDArray[np.float64]:
         """Return positions on the paper (n, 2), mm, of metres right and down from the corner."""
         part = self.view.part
-        offset = np.asarray(places_m, dtype=np.float64) - [part.left_m, part.bottom_m]
+        # No positions are an empty list, e.g. of a hatch too small for a line of its pattern.
+        places = np.asarray(places_m, dtype=np.float64).reshape(-1, 2)
+        offset = places - [part.left_m, part.bottom_m]
         return np.asarray(self.view.corner_mm + 1e3 / self.scale * offset * [1.0, -1.0])
 
 

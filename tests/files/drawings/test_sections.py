@@ -14,7 +14,7 @@ import pytest
 
 from orthoflow.errors import ArgumentError
 from orthoflow.files.drawings.section_files import SectionDrawing, section_sheet, write_section
-from orthoflow.files.drawings.sections import plan_cut, section_cut, section_of
+from orthoflow.files.drawings.sections import CutLine, Section, plan_cut, section_cut, section_of
 from orthoflow.files.drawings.sheet_contents import SheetText
 from orthoflow.files.drawings.sheet_layout import lay_out
 from orthoflow.files.drawings.sheets import write_sheet
@@ -156,6 +156,34 @@ def test_a_sheet_of_it_has_title_block_coordinates_and_lines_in_scale(
     slab = f"cut slice {1e3 * section.slab_m:.0f} mm thick"
     for said in ("1:50", kind.title(), slab, "sheet 1 of 1", "record sha256", direction):
         assert said in words, said
+
+
+def test_a_hatch_too_small_for_a_line_of_its_pattern_is_left_out(tmp_path: Path) -> None:
+    planes = box_planes()
+    stub = CutLine(
+        plane=2,
+        ends_m=np.array([[0.05, 0.0], [0.11, 0.0]]),
+        behind=np.array([0.0, 1.0]),
+        thickness_m=0.04,
+    )
+    nothing = np.empty((0, 2, 2))
+    section = Section(
+        cut=plan_cut(planes, 1.2),
+        lines=(stub,),
+        gaps_m=nothing,
+        beyond_m=nothing,
+        points_m=nothing[0:, 0],
+        slab_m=0.0,
+        n_points=0,
+    )
+    drawing = SectionDrawing(kind="plan", section=section, scale=100, origin="a box")
+    text = SheetText(name="", block=TitleBlock(), notes=(), digest="0" * 64, run="run")
+    drawn = section_sheet("x", drawing, planes, text, grid=0.0)
+    ((sheet, furniture),) = lay_out(drawn).sheets
+    write_sheet(tmp_path / "x.pdf", drawn, sheet, furniture)
+    with pdfplumber.open(tmp_path / "x.pdf") as pdf:
+        widths_mm = [line["linewidth"] / POINTS_PER_MM for line in pdf.pages[0].lines]
+    assert pytest.approx(min(widths_mm, key=lambda width: abs(width - 0.5))) == 0.5
 
 
 def test_the_files_of_a_plan_show_the_same_lines_in_scale(tmp_path: Path) -> None:
