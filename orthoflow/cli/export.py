@@ -213,7 +213,7 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     from orthoflow.records.verify import broken_seal
 
     chosen = Choices(**choices)
-    check_choices(chosen, target)
+    check_choices(chosen, target, flags())
     opened = open_run(run)
     name = target or ("datasets" if chosen.split else "embedded")
     folder = output or _folder_inside(opened, *((_EXPORT_FOLDER,) if target else ()), name)
@@ -230,6 +230,11 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
             summary = (_export_split if chosen.split else _export_embedded)(opened, aside, chosen)
     echo(f"{name}: {folder}: {summary}")
     return code_for([finding], f"do not use anything in {folder}")
+
+
+def flags() -> dict[str, str]:
+    """Return the options as users write them, by the name of their field."""
+    return {str(option.name): option.opts[0] for option in export.params}
 
 
 def _export_to(target: Format, run: Run, folder: Path, chosen: Choices) -> str:

@@ -12,6 +12,7 @@ from typing import Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
+from orthoflow.engine.durability import write_whole
 from orthoflow.engine.journal import JOURNAL, RECORD_FILE, is_running
 from orthoflow.errors import ArgumentError, OrthoflowError
 from orthoflow.products import JsonValue
@@ -379,7 +380,7 @@ def write_run_table(runs: Sequence[RunSummary], path: Path, *, among: Sequence[R
     Raises:
         StoreError: it cannot be written.
     """
-    from orthoflow.report.rendering import environment, write_whole  # noqa: PLC0415 - few ask
+    from orthoflow.report.rendering import environment  # noqa: PLC0415 - few ask
 
     facts = differing_facts(among)
     known = dict.fromkeys(name for run in runs for name in run.metrics if "." not in name)
@@ -408,7 +409,7 @@ def write_run_table(runs: Sequence[RunSummary], path: Path, *, among: Sequence[R
             reasons={str(run.folder): run.reason for run in runs if run.reason},
         )
     )
-    write_whole(path, page)
+    write_whole(path, page.encode("utf-8"))
 
 
 def _picture(folder: Path) -> str:

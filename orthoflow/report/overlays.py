@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.files.drawings.papers import round_below
 from orthoflow.geometry import WallFrame
 from orthoflow.products import Camera, Cameras, Inspection, TieRole
 from orthoflow.records.runs import Run
@@ -165,13 +166,7 @@ def magnification_for(frame: WallFrame, lengths_m: NDArray[np.float64]) -> float
     rms_m = float(np.sqrt(np.mean(np.sum(known**2, axis=1)))) if len(known) else 0.0
     if rms_m == 0.0:
         return 1.0
-    return max(1.0, _round_below(_RMS_SHARE * max(frame.width, frame.height) * frame.gsd_m / rms_m))
-
-
-def _round_below(most: float) -> float:
-    """Return the largest of 1, 2, 5, 10 ... that is no larger."""
-    power = 10.0 ** np.floor(np.log10(most))
-    return float(power * max(k for k in (1.0, 2.0, 5.0) if k * power <= most * (1 + 1e-9)))
+    return max(1.0, round_below(_RMS_SHARE * max(frame.width, frame.height) * frame.gsd_m / rms_m))
 
 
 def _overlay(
@@ -192,7 +187,7 @@ def _overlay(
     feet = frame.wall_from_world(points_world[chosen])[:, :2]
     ends = np.hstack([feet, feet + magnification * drawn_m / frame.gsd_m])
     reference_px = _REFERENCE_SHARE * max(frame.width, frame.height)
-    reference_mm = _round_below(1e3 * reference_px * frame.gsd_m / magnification)
+    reference_mm = round_below(1e3 * reference_px * frame.gsd_m / magnification)
     some = "" if len(chosen) == len(kinds) else f", {len(chosen)} of them shown"
     return Overlay(
         title=title,

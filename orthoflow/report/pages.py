@@ -10,6 +10,7 @@ from pathlib import Path
 from types import MappingProxyType, SimpleNamespace
 from typing import TYPE_CHECKING, Final
 
+from orthoflow.engine.durability import write_whole
 from orthoflow.errors import StoreError
 from orthoflow.products import Cameras
 from orthoflow.records import RecordedCell
@@ -50,7 +51,7 @@ from orthoflow.report.pictures import (
     sliders,
     wall_pictures,
 )
-from orthoflow.report.rendering import environment, write_whole
+from orthoflow.report.rendering import environment
 from orthoflow.report.summaries import answers, citations, limits, results, says_how_far_off
 from orthoflow.report.tables import PlaneTables, plane_tables
 
@@ -188,7 +189,7 @@ def _write(
             go_on=go_on,
         )
     )
-    write_whole(path, sealed_page(text, runs))
+    write_whole(path, sealed_page(text, runs).encode("utf-8"))
 
 
 def _overview(run: Run, prefix: str, folder: Path, pages: Mapping[str, str]) -> SimpleNamespace:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry import WallFrame
+from orthoflow.files.drawings.key_plans import axis_words
+from orthoflow.geometry import WallFrame, basis_from_up
 from orthoflow.products import Camera, Cameras, Planes, TieRole, Ties
 from orthoflow.records.runs import Run
 from orthoflow.report.charts import ChartFormat, PlanPhoto, PlanWall, as_image, plan_chart
@@ -19,8 +19,6 @@ from orthoflow.report.numbers import number
 from orthoflow.report.pictures import Picture, embedded_products
 from orthoflow.report.tables import Table
 from orthoflow.untrusted_text import first_few
-
-_LEVEL: Final = 1.0 - 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +31,7 @@ class PhotoPlan:
         caption: what it shows, and which photos are missing, in words.
         cell: address of the orientation.
         table: how well each photo is oriented; without rows where only poses are known.
-        is_map: the axes are the world's x and y.
+        axes: names of the axes of the scan to the right and upwards.
     """
 
     walls: tuple[PlanWall, ...]
@@ -41,7 +39,7 @@ class PhotoPlan:
     caption: str
     cell: str
     table: Table
-    is_map: bool = True
+    axes: tuple[str, str] = ("x", "y")
 
     @property
     def picture(self) -> Picture:
@@ -54,7 +52,8 @@ class PhotoPlan:
 
     def file(self, suffix: ChartFormat) -> bytes:
         """The drawing as a file."""
-        labels = ("x / m", "y / m") if self.is_map else ("along the first wall / m", "across / m")
+        right, upwards = self.axes
+        labels = (f"{right} / m", f"{upwards} / m")
         return plan_chart(self.walls, self.photos, labels=labels, suffix=suffix)
 
 
@@ -84,7 +83,7 @@ def photo_plan(run: Run, walls: Sequence[Picture]) -> PhotoPlan | None:
             return PhotoPlan(
                 walls=drawn_walls,
                 photos=photos,
-                is_map=bool(up[2] > _LEVEL),
+                axes=(axis_words(basis_from_up(up)[0]), axis_words(basis_from_up(up)[1])),
                 caption=_caption(address, cameras, oriented),
                 cell=address,
                 table=_table(orientation),
@@ -156,7 +155,7 @@ def _drawn(
     walls: Mapping[int, tuple[str, WallFrame]],
 ) -> tuple[tuple[PlanWall, ...], tuple[PlanPhoto, ...]]:
     """Lay walls, by number, and photos into the view from above."""
-    axes = _axes(up, [frame for _, frame in walls.values()])
+    axes = basis_from_up(up)[:2].T
     photos = []
     for camera in oriented:
         rotation, translation = (
@@ -173,15 +172,3 @@ def _drawn(
         ),
         tuple(photos),
     )
-
-
-def _axes(up: NDArray[np.float64], frames: Sequence[WallFrame]) -> NDArray[np.float64]:
-    """World x and y where z is up, as maps have them; else along the first wall."""
-    if up[2] > _LEVEL:
-        return np.eye(3)[:, :2]
-    along = frames[0].u_world if frames else np.array([1.0, 0.0, 0.0])
-    right = along - (along @ up) * up
-    if float(np.linalg.norm(right)) < 1e-6:
-        right = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
-    right = right / np.linalg.norm(right)
-    return np.column_stack([right, np.cross(up, right)])

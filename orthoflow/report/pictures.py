@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.files.drawings.papers import round_below
 from orthoflow.files.images import Part, cells_webp, grey_cells, sampled_rows
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.bands import count_cells
@@ -102,9 +103,7 @@ class Picture:
     @property
     def scale(self) -> tuple[str, float]:
         """A round length, 1, 2 or 5 times a power of ten, and its share of the width in percent."""
-        most_m = _BAR_SHARE * self.width_m
-        power = 10.0 ** math.floor(math.log10(most_m))
-        length_m = float(f"{power * max(k for k in (1, 2, 5) if k * power <= most_m):.1g}")
+        length_m = round_below(_BAR_SHARE * self.width_m)
         words = f"{length_m:g} m" if length_m >= 1.0 else f"{100.0 * length_m:g} cm"
         return words, 100.0 * length_m / self.width_m
 

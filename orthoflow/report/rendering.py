@@ -5,19 +5,15 @@ from __future__ import annotations
 import base64
 import hashlib
 import re
-import secrets
 import shlex
-from contextlib import suppress
 from functools import cache
 from importlib.resources import files
-from pathlib import Path
 from typing import Final
 from urllib.parse import quote
 
 import jinja2
 from markupsafe import Markup, escape
 
-from orthoflow.errors import StoreError
 from orthoflow.records import COSTS
 from orthoflow.records.runs import Run
 from orthoflow.report.diagrams import BOX, run_diagram
@@ -103,23 +99,3 @@ def graph_file(run: Run) -> bytes:
     """Return the graph of a run as an SVG file."""
     template = environment().get_template("graph.svg.j2")
     return template.render(diagram=run_diagram(run)).encode("utf-8")
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a page, as a whole or not at all.
-
-    Raises:
-        StoreError: it cannot be written.
-    """
-    aside = path.with_name(f".report-{secrets.token_hex(8)}")
-    try:
-        # A new file: through a link that lies there it would be another's.
-        with aside.open("x", encoding="utf-8") as stream:
-            stream.write(text)
-        aside.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            aside.unlink()
-        raise StoreError(
-            f"the report {path} cannot be written: {error.strerror}; choose another place with -o"
-        ) from error

@@ -126,7 +126,7 @@ def test_a_page_leads_to_the_report_of_each_run(runs: Path) -> None:
     assert "plane.cell_m=0.05" in page
     assert "&lt;b&gt;" in page
     assert "<b>/" not in page
-    assert "cannot be written" in asked("runs", "runs", "--html", "no/folder.html").output
+    assert "cannot write" in asked("runs", "runs", "--html", "no/folder.html").output
 
 
 def test_what_cannot_be_read_is_a_row_with_its_reason(runs: Path) -> None:

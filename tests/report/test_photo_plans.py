@@ -104,28 +104,6 @@ PHOTOS = [
 ]
 
 
-def test_maps_are_kept_where_z_is_up_and_walls_lie_across_elsewhere() -> None:
-    frame = WALLS[1][1]
-    np.testing.assert_array_equal(module._axes(UP, [frame]), np.eye(3)[:, :2])
-    # A tenth of a degree is no map.
-    tilted = np.array([np.sin(0.002), 0.0, np.cos(0.002)])
-    for up, frames in (
-        (tilted, [frame]),
-        (np.array([0.0, -1.0, 0.0]), [frame]),
-        (np.array([0.0, 1.0, 0.0]), []),
-        (frame.u_world, [frame]),
-        (-UP, [frame]),
-    ):
-        right, upwards = module._axes(up, frames).T
-        np.testing.assert_allclose([right @ right, upwards @ upwards], 1.0)
-        np.testing.assert_allclose([right @ up, upwards @ up, right @ upwards], 0.0, atol=1e-12)
-        # Seen from above.
-        np.testing.assert_allclose(np.cross(right, upwards), up, atol=1e-12)
-        along = frames[0].u_world if frames else np.array([1.0, 0.0, 0.0])
-        if abs(along @ up) < 0.999:
-            assert right @ along == pytest.approx(np.sqrt(1.0 - (along @ up) ** 2))
-
-
 def test_each_photo_has_a_row_with_its_error_on_the_wall(tmp_path: Path) -> None:
     one = replace(ours(compared_run(tmp_path)), sigma_wall_m=0.0012)
     refused = Camera(photo="gone.jpg", status="too few <ties>")

@@ -73,7 +73,7 @@ def test_a_citation_links_its_whole_doi(text: str, doi: str) -> None:
 def test_a_report_that_cannot_be_written_ends_with_a_sentence(
     compared: Run, tmp_path: Path
 ) -> None:
-    with pytest.raises(StoreError, match="cannot be written"):
+    with pytest.raises(StoreError, match="cannot write"):
         write_report([compared], tmp_path / "missing" / "report.html")
 
 

@@ -193,34 +193,14 @@ FORMATS: Final[Mapping[str, Format]] = {
     ),
 }
 
-# Of the options that belong to formats, how they are written. `embed` and `inputs` are apart.
-FLAGS: Final = {
-    "cell": "--step",
-    "license_text": "--license",
-    "author": "--author",
-    "colour": "--colour",
-    "wall": "--wall",
-    "box": "--box",
-    "clean": "--clean",
-    "relief": "--relief",
-    "scale": "--scale",
-    "paper": "--paper",
-    "grid": "--grid",
-    "units": "--units",
-    "title_block": "--title-block",
-    "beside": "--beside",
-    "heights_m": "--height",
-    "through": "--through",
-    "dimensions": "--dimensions",
-    "language": "--language",
-    "light": "--light",
-    "base_url": "--base-url",
-    "figure_format": "--format",
-}
 
-
-def check_choices(chosen: Choices, target: str | None) -> None:
+def check_choices(chosen: Choices, target: str | None, flags: Mapping[str, str]) -> None:
     """Refuse options that do not belong to the format.
+
+    Args:
+        chosen: the options.
+        target: the format.
+        flags: field of `Choices` -> the option as users write it, in the order of the help.
 
     Raises:
         ArgumentError: one does not, or no format is named.
@@ -237,9 +217,9 @@ def check_choices(chosen: Choices, target: str | None) -> None:
             f"orthoflow export RUN/datasets/NAME {f'--to {target}' if target else '--embed'}"
         )
     taken = FORMATS[target].options if target else ()
-    for name, flag in FLAGS.items():
-        if _is_given(getattr(chosen, name)) and name not in taken:
-            owners = [owner for owner, entry in FORMATS.items() if name in entry.options]
+    for name, flag in flags.items():
+        owners = [owner for owner, entry in FORMATS.items() if name in entry.options]
+        if owners and name not in taken and _is_given(getattr(chosen, name)):
             raise ArgumentError(f"{flag} belongs to --to {listed(owners)}, not to {said}")
     if chosen.embed and target not in {None, "ro-crate"}:
         raise ArgumentError(f"{said} writes no record, so nothing can be embedded with --embed")

@@ -254,6 +254,16 @@ def _with_labels(size_m: tuple[float, float], scale: int) -> tuple[float, float]
     return wide + LEFT_MM + RIGHT_MM, high + ABOVE_MM + BELOW_MM
 
 
+def round_below(most: float) -> float:
+    """Return the largest of 1, 2, 5 times a power of ten that is at most as large.
+
+    >>> round_below(0.3), round_below(2.0), round_below(60.0)
+    (0.2, 2.0, 50.0)
+    """
+    power = 10.0 ** math.floor(math.log10(most))
+    return power * max(factor for factor in (1, 2, 5) if factor * power <= most * (1 + 1e-9))
+
+
 def nice_step(least: float) -> float:
     """Return the smallest of 1, 2, 5 times a power of ten that is at least as large.
 

@@ -17,7 +17,7 @@ from reportlab.lib.colors import Color
 from reportlab.platypus import Flowable, Image, Table
 
 from orthoflow.files.drawings.key_plans import NORTH, KeyPlan
-from orthoflow.files.drawings.papers import MARGIN_MM, Paper
+from orthoflow.files.drawings.papers import MARGIN_MM, Paper, round_below
 from orthoflow.files.drawings.pens import (
     BLACK,
     FRAME_MM,
@@ -240,13 +240,8 @@ def _notes(drawing: Drawing, sheet: Sheet, *, is_brief: bool) -> list[Any]:
 
 def _scale_bar(drawing: Drawing) -> _Picture:
     """Draw segments of a round length, black and white, with the length at each end."""
-    unit_m = drawing.unit_m
-    least = 1e-3 * drawing.scale * _SEGMENT_MM / 2.5 / unit_m
-    # The largest round length that is at most 25 mm long.
-    power = 10.0 ** math.floor(math.log10(least))
-    mm_per_unit = 1e3 * unit_m / drawing.scale
-    lengths = [factor * power for factor in (1.0, 2.0, 5.0, 10.0, 20.0)]
-    length = max(one for one in lengths if one * mm_per_unit <= _SEGMENT_MM + 1e-6)
+    mm_per_unit = 1e3 * drawing.unit_m / drawing.scale
+    length = round_below(_SEGMENT_MM / mm_per_unit)
     segment = length * mm_per_unit
 
     def draw(canvas: Canvas, wide_mm: float) -> None:
