@@ -21,11 +21,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from orthoflow.records.open import open_run
-from orthoflow.records.runs import Run
+from orthoflow.records.runs import Run, cell_metrics
 from orthoflow.report import write_report
 from orthoflow.report.combinations import Combination, combinations_of
 from orthoflow.report.numbers import number, number_with_spread
-from orthoflow.report.rankings import Mark, Value, rank, sense_of
+from orthoflow.report.rankings import Mark, Value, rank
 
 RECIPES = ("plane-methods", "orient-methods", "ortho-methods")
 COARSE = {"room.scan_step_m": "0.004", "room.photo_gsd_m": "0.003", "wall.gsd_m": "0.006"}
@@ -132,9 +132,15 @@ def finished_run(folder: Path, recipe: str) -> Run:
 def markdown(combinations: Sequence[Combination], names: Mapping[str, str]) -> list[str]:
     """Print a table: a row per combination, a column per metric, the best and its like in bold."""
     steps = tuple(dict.fromkeys(step for one in combinations for step in one.assignment))
+    declared = {
+        f"{row.step}.{row.metric}": (row.better, row.unit)
+        for one in combinations
+        for cell in one.cells
+        for row in cell_metrics(cell)
+    }
     columns = [
-        rank([value_of(one, key) for one in combinations], sense_of(metric), metric)
-        for key, metric in ((key, key.partition(".")[2]) for key in names)
+        rank([value_of(one, key) for one in combinations], *declared.get(key, ("", "1")))
+        for key in names
     ]
     header = [*steps, *names.values()]
     lines = [line(header), line(["---"] * len(steps) + ["---:"] * len(names))]

@@ -35,7 +35,7 @@ from orthoflow.files.sidecars import (
 )
 from orthoflow.products import LayerMask, OrthoMask, SurfaceMask
 from orthoflow.records import COSTS
-from orthoflow.report.rankings import Sense, sense_of
+from orthoflow.report.rankings import BETTER
 from orthoflow.sdk import Method, MetricSpec, port_specs
 
 ROOT: Final = Path(__file__).resolve().parents[1]
@@ -269,8 +269,7 @@ def _metric(spec: MetricSpec, methods: list[str]) -> str:
 
 
 def _good(better: str) -> str:
-    sense = sense_of(better)
-    return "" if sense is Sense.NEITHER else sense.value
+    return BETTER.get(better, "")
 
 
 def _commands() -> Iterator[str]:

@@ -10,7 +10,7 @@ import pytest
 from orthoflow_provenance.document import RunRecord
 
 from orthoflow.cli.compare import _print
-from orthoflow.cli.export import _refuse_filled
+from orthoflow.cli.export import _refuse_filled, flags
 from orthoflow.cli.exports.choices import Choices
 from orthoflow.cli.exports.formats import check_choices
 from orthoflow.cli.exports.products import make_empty
@@ -102,7 +102,7 @@ def test_a_short_comparison_counts_rounding_and_says_once_what_is_said_alike(
 
 def test_whoever_splits_is_told_where_to_export_then() -> None:
     with pytest.raises(ArgumentError, match=r"as orthoflow export RUN/datasets/NAME --to csv$"):
-        check_choices(Choices(split=True), "csv")
+        check_choices(Choices(split=True), "csv", flags())
 
 
 def test_only_an_empty_folder_is_written_to(tmp_path: Path) -> None:
