@@ -6,6 +6,7 @@ import difflib
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Generic, Literal, TypeVar
 
 import numpy as np
@@ -102,11 +103,6 @@ class RunProducts:
         cell = self.run.cells.get(self.own.get(address, address))
         return {} if cell is None else cell.outputs
 
-    def digest(self, address: str, port: str) -> str:
-        """Return the digest of an output, empty if the run has no such output."""
-        output = self.outputs(address).get(port)
-        return "" if output is None else output.digest
-
     def payload(self, address: str, port: str, cls: type[Product]) -> Payload | None:
         """Return arrays and metadata of an output; None if they are not available."""
         output = self.outputs(address)[port]
@@ -129,64 +125,55 @@ def product_distances(
         addresses: the cells, each in both runs.
         catalog: has the product types and their tolerances.
     """
-    found = []
-    for address in addresses:
-        ours, theirs = left.outputs(address), right.outputs(address)
-        for port in dict.fromkeys((*ours, *theirs)):
-            type_name = (ours.get(port) or theirs[port]).type_name
-            found.append(_distance(left, right, (address, port, type_name), catalog))
-    return tuple(found)
+    return tuple(
+        _distance(left, right, address, port, catalog)
+        for address in addresses
+        for port in dict.fromkeys((*left.outputs(address), *right.outputs(address)))
+    )
 
 
 def _distance(
-    left: RunProducts, right: RunProducts, what: tuple[str, str, str], catalog: Catalog
+    left: RunProducts, right: RunProducts, address: str, port: str, catalog: Catalog
 ) -> ProductDistance:
-    address, port, type_name = what
-    digests = left.digest(address, port), right.digest(address, port)
-
-    def verdict(
-        said: Verdict, reason: str = "", distances: tuple[Distance, ...] = ()
-    ) -> ProductDistance:
-        return ProductDistance(
-            cell=address,
-            port=port,
-            type_name=type_name,
-            verdict=said,
-            left=digests[0],
-            right=digests[1],
-            distances=distances,
-            reason=reason,
-        )
-
+    outputs = [side.outputs(address).get(port) for side in (left, right)]
+    digests = ["" if output is None else output.digest for output in outputs]
+    type_name = next(output.type_name for output in outputs if output is not None)
+    distance = partial(
+        ProductDistance,
+        cell=address,
+        port=port,
+        type_name=type_name,
+        left=digests[0],
+        right=digests[1],
+    )
     if not all(digests):
-        return verdict("different", "only one of the runs has it")
+        return distance(verdict="different", reason="only one of the runs has it")
     if digests[0] == digests[1]:
-        return verdict("identical")
+        return distance(verdict="identical")
     try:
         cls = catalog.product_class(type_name)
-        payloads = [side.payload(address, port, cls) for side in (left, right)]
+        ours, theirs = (side.payload(address, port, cls) for side in (left, right))
     except OrthoflowError as error:
-        return verdict("not measured", f"the digests differ, and {error}")
-    ours, theirs = payloads
+        return distance(verdict="not measured", reason=f"the digests differ, and {error}")
     if ours is None or theirs is None:
-        return verdict(
-            "not measured",
+        reason = (
             "the digests differ, and its arrays are in no record and no store at hand; run with "
-            "--embed to keep them",
+            "--embed to keep them"
         )
+        return distance(verdict="not measured", reason=reason)
     limits = {
         name: (_limit(name, tolerance, ours), tolerance.unit)
         for name, tolerance in cls.tolerances.items()
     }
     differences = [_named(found, ours) for found in measure_payloads(ours, theirs, limits)]
+    distances = _by_unit(differences)
     beyond = [difference for difference in differences if difference.n_values]
     if not beyond:
-        return verdict(
-            "within tolerance" if differences else "identical", "", _by_unit(differences)
-        )
+        verdict: Verdict = "within tolerance" if differences else "identical"
+        return distance(verdict=verdict, distances=distances)
     others = f"; {len(beyond) - 1} more fields differ" if len(beyond) > 1 else ""
     reason = f"{beyond[0].name}: {beyond[0].problem}{others}"
-    return verdict("different", reason, _by_unit(differences))
+    return distance(verdict="different", reason=reason, distances=distances)
 
 
 def _named(difference: ArrayDifference, payload: Payload) -> ArrayDifference:
@@ -214,22 +201,23 @@ def _limit(name: str, tolerance: Tolerance, payload: Payload) -> float:
 
 
 def _by_unit(differences: Sequence[ArrayDifference]) -> tuple[Distance, ...]:
-    units = dict.fromkeys(difference.unit for difference in differences)
-    return tuple(
-        _farthest([difference for difference in differences if difference.unit == unit])
-        for unit in units
-    )
-
-
-def _farthest(differences: Sequence[ArrayDifference]) -> Distance:
-    worst = max(differences, key=lambda difference: difference.largest)
-    return Distance(
-        unit=worst.unit,
-        largest=worst.largest if math.isfinite(worst.largest) else None,
-        limit=worst.limit,
-        field=worst.name,
-        n_values=sum(difference.n_values for difference in differences),
-    )
+    """Return the largest difference of each unit."""
+    units: dict[str, list[ArrayDifference]] = {}
+    for difference in differences:
+        units.setdefault(difference.unit, []).append(difference)
+    found = []
+    for unit, same in units.items():
+        worst = max(same, key=lambda difference: difference.largest)
+        found.append(
+            Distance(
+                unit=unit,
+                largest=worst.largest if math.isfinite(worst.largest) else None,
+                limit=worst.limit,
+                field=worst.name,
+                n_values=sum(difference.n_values for difference in same),
+            )
+        )
+    return tuple(found)
 
 
 Side = TypeVar("Side")

@@ -7,10 +7,11 @@ import os
 import shutil
 import stat
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
-from itertools import chain, islice
+from dataclasses import dataclass
+from functools import cache
+from itertools import islice
 from pathlib import Path
 from typing import Final
 
@@ -101,21 +102,19 @@ def find_inputs(
     """
     places = _places(workflow, run_folder, given, extracted or {})
     paths: dict[str, tuple[Path, ...]] = {}
-    lost: list[_Lost] = []
+    problems: list[str] = []
+    is_changed = False
     for entry in recorded:
         found = []
         for file in entry.files:
-            where = _find(entry.name, file, places[entry.name], (digests, *noted))
-            if isinstance(where, Path):
-                found.append(where)
-            else:
-                lost.append(where)
+            path, rival = _find(file, places[entry.name], (digests, *noted))
+            if path is not None:
+                found.append(path)
+                continue
+            problems.append(_problem(entry.name, file, rival, places[entry.name].files))
+            is_changed |= rival is not None
         paths[entry.name] = tuple(found)
-    return InputSearch(
-        paths=paths,
-        problems=tuple(one.problem for one in lost),
-        is_changed=any(one.is_changed for one in lost),
-    )
+    return InputSearch(paths=paths, problems=tuple(problems), is_changed=is_changed)
 
 
 class LaidOutInputs:
@@ -156,17 +155,15 @@ class LaidOutInputs:
         # Files of one name are sorted by their folders.
         if [path.name for path in paths] == names and len(set(names)) == len(names):
             return paths
-        return tuple(self._link(path, name) for path, name in zip(paths, names, strict=True))
-
-    def _link(self, path: Path, name: str) -> Path:
-        link = self.folder() / name
-        try:
-            link.symlink_to(path)
-        except OSError:
-            # On Windows most users cannot create links.
-            with writing_to(link.parent):
-                shutil.copyfile(path, link)
-        return link
+        links = tuple(self.folder() / name for name in names)
+        for link, path in zip(links, paths, strict=True):
+            try:
+                link.symlink_to(path)
+            except OSError:
+                # On Windows most users cannot create links.
+                with writing_to(link.parent):
+                    shutil.copyfile(path, link)
+        return links
 
 
 @contextmanager
@@ -190,54 +187,46 @@ def embedded_inputs(run: Run, beside: Path) -> Iterator[LaidOutInputs]:
         yield laid_out
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Lost:
-    """A file that was not found: the sentence about it, and whether another has its place."""
-
-    problem: str
-    is_changed: bool = False
-
-
 def _find(
-    name: str, file: RecordedFile, places: _Places, memories: Sequence[FileDigests]
-) -> Path | _Lost:
-    """Return the file, or why there is none."""
-    same_name: list[Path] = []
+    file: RecordedFile, places: _Places, memories: Sequence[FileDigests]
+) -> tuple[Path | None, Path | None]:
+    """Return the file, and one of its name with other content; None for what there is not."""
+    rival = None
     seen: set[Path] = set()
-    expected = f"{file.size_bytes} bytes with the SHA-256 {file.sha256[:12]}..."
-    for path in chain(places.candidates(file.name), places.others(file, memories)):
+    for path in places.candidates(file, memories):
         size_bytes = _size_of_file(path)
         if path in seen or size_bytes is None:
             continue
         seen.add(path)
         try:
-            is_same = (
-                size_bytes == file.size_bytes and memories[0].digest(path).sha256 == file.sha256
-            )
+            if size_bytes == file.size_bytes and memories[0].digest(path).sha256 == file.sha256:
+                return path.absolute(), None
         except InputError:
             # Nobody named this file explicitly.
             if path.name == file.name or places.files:
                 raise
             continue
-        if is_same:
-            return path.absolute()
         if path.name == file.name:
-            same_name.append(path)
-    if same_name:
-        return _Lost(
-            problem=f"input {name}: {same_name[0]} is not the {file.name} of the record: it was "
-            f"changed (expected {expected})",
-            is_changed=True,
+            rival = rival or path
+    return None, rival
+
+
+def _problem(name: str, file: RecordedFile, rival: Path | None, given: tuple[Path, ...]) -> str:
+    digest = f"SHA-256 {file.sha256[:12]}..."
+    expected = f"{file.size_bytes} bytes with the {digest}"
+    if rival is not None:
+        return (
+            f"input {name}: {rival} is not the {file.name} of the record: it was changed "
+            f"(expected {expected})"
         )
-    if places.files:
-        given = first_few([str(path) for path in places.files])
-        return _Lost(
-            problem=f"input {name}: {file.name} of the record is not among what was given, {given} "
-            f"(expected {expected}, under any name)"
+    if given:
+        return (
+            f"input {name}: {file.name} of the record is not among what was given, "
+            f"{first_few([str(path) for path in given])} (expected {expected}, under any name)"
         )
-    return _Lost(
-        problem=f"input {name}: {file.name} ({file.size_bytes} bytes, SHA-256 "
-        f"{file.sha256[:12]}...) is not to be found; give it with --input {name}=PATH"
+    return (
+        f"input {name}: {file.name} ({file.size_bytes} bytes, {digest}) is not to be found; give it"
+        f" with --input {name}=PATH"
     )
 
 
@@ -252,23 +241,24 @@ def _size_of_file(path: Path) -> int | None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Places:
-    """Candidate positions of the files of one input: in folders, or only where a user said."""
+    """Candidate positions of the files of one input: in folders, or only where a user said.
+
+    Attributes:
+        folders: to search.
+        files: what a user gave, or the record itself; there are no folders then.
+        listed: files directly in a folder by size.
+    """
 
     folders: tuple[Path, ...] = ()
     files: tuple[Path, ...] = ()
-    listings: _Listings
+    listed: Callable[[Path], Mapping[int, list[Path]]]
 
-    def candidates(self, name: str) -> Iterator[Path]:
-        """Yield paths at which a file of that name may be, the likeliest first."""
-        if name_problem(name):
-            return
-        yield from (path for path in self.files if path.name == name)
-        yield from (folder / name for folder in self.folders)
-
-    def others(self, file: RecordedFile, memories: Sequence[FileDigests]) -> Iterator[Path]:
-        """Yield paths at which a file with another name or folder may be."""
+    def candidates(self, file: RecordedFile, memories: Sequence[FileDigests]) -> Iterator[Path]:
+        """Yield paths at which a file may be, the likeliest first: of its name, then others."""
         if name_problem(file.name):
             return
+        yield from (path for path in self.files if path.name == file.name)
+        yield from (folder / file.name for folder in self.folders)
         yield from self.files
         if self.files:
             return
@@ -276,32 +266,20 @@ class _Places:
         seen_last = [path for path in noted if path is not None]
         yield from seen_last
         for folder in dict.fromkeys((*self.folders, *(path.parent for path in seen_last))):
-            yield from self.listings.of_size(folder, file.size_bytes)
+            yield from self.listed(folder.absolute()).get(file.size_bytes, ())
 
 
-@dataclass(kw_only=True)
-class _Listings:
-    """Files directly in folders by size, each folder read once."""
-
-    _known: dict[Path, Mapping[int, list[Path]]] = field(default_factory=dict)
-
-    def of_size(self, folder: Path, size_bytes: int) -> Sequence[Path]:
-        """Return the files of a size, as far as the folder can be read."""
-        place = folder.absolute()
-        if place not in self._known:
-            self._known[place] = self._listed(folder)
-        return self._known[place].get(size_bytes, ())
-
-    def _listed(self, folder: Path) -> Mapping[int, list[Path]]:
-        found: dict[int, list[Path]] = {}
-        try:
-            with os.scandir(folder) as entries:
-                for entry in islice(entries, _MOST_LISTED):
-                    if entry.is_file() and not name_problem(entry.name):
-                        found.setdefault(entry.stat().st_size, []).append(folder / entry.name)
-        except OSError:
-            return {}
-        return {size: sorted(paths) for size, paths in found.items()}
+def _listed(folder: Path) -> Mapping[int, list[Path]]:
+    """Return the files directly in a folder by size, as far as it can be read."""
+    found: dict[int, list[Path]] = {}
+    try:
+        with os.scandir(folder) as entries:
+            for entry in islice(entries, _MOST_LISTED):
+                if entry.is_file() and not name_problem(entry.name):
+                    found.setdefault(entry.stat().st_size, []).append(folder / entry.name)
+    except OSError:
+        return {}
+    return {size: sorted(paths) for size, paths in found.items()}
 
 
 def _places(
@@ -323,12 +301,13 @@ def _places(
     # The resolved form has options instead of the file's own text, and no folders.
     written = written_files(workflow.source)
     places: dict[str, _Places] = {}
-    listings = _Listings()
+    # Each folder is read once.
+    listed = cache(_listed)
     for name, spec in specs.items():
         by_name = by_hand.get(name)
         files = by_name.paths if by_name is not None else extracted.get(name)
         if files is not None:
-            places[name] = _Places(files=files, listings=listings)
+            places[name] = _Places(files=files, listed=listed)
             continue
         texts = (*spec.files, *written.get(name, ()))
         named = [
@@ -338,7 +317,7 @@ def _places(
             for folder in (pattern.parent, pattern)
         ]
         folders = tuple(dict.fromkeys((*named, *roots)))
-        places[name] = _Places(folders=folders, listings=listings)
+        places[name] = _Places(folders=folders, listed=listed)
     return places
 
 

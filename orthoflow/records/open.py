@@ -7,31 +7,21 @@ import dataclasses
 import shutil
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from orthoflow_provenance.document import (
-    RecordFormatError,
-    RunRecord,
-    from_json,
-    parse_json,
-)
+from orthoflow_provenance.document import RecordFormatError, RunRecord, from_json, parse_json
 from orthoflow_provenance.record import write_record
 
-from orthoflow.engine.journal import (
-    RECORD_FILE,
-    readable_lines,
-)
+from orthoflow.engine.journal import RECORD_FILE, readable_lines
 from orthoflow.errors import ArgumentError, StoreError
 from orthoflow.records.runs import Run, find_record, published_state, read_run
 from orthoflow.records.write import (
     OUTLINE_FILE,
+    files_of_outputs,
     publish_products,
     recorded_cell,
     recorded_environments,
 )
-
-if TYPE_CHECKING:
-    pass
 
 
 def open_run(path: str | Path) -> Run:
@@ -106,10 +96,7 @@ def open_unfinished(folder: Path) -> Run:
     )
     aside = Path(tempfile.mkdtemp(prefix="orthoflow-"))
     atexit.register(shutil.rmtree, aside, ignore_errors=True)
-    files = {
-        address: {port: store.published_files(ref.digest) for port, ref in result.outputs.items()}
-        for address, result in results.items()
-    }
+    files = files_of_outputs(results, store)
     published = publish_products(aside, record.cells, files, record.run_id)
     path = aside / RECORD_FILE
     try:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import base64
 import binascii
 import hashlib
-import json
 import os
 import re
 import shlex
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
@@ -24,6 +24,7 @@ from orthoflow_provenance.document import (
 from orthoflow_provenance.paths import files_below, open_below
 from orthoflow_provenance.record import OpenRecord, open_record
 from orthoflow_provenance.verify import verify_record
+from pydantic import BaseModel, ValidationError
 
 from orthoflow.engine.journal import JOURNAL, LOGS
 from orthoflow.errors import ArgumentError, InputError, PluginError, RecordError
@@ -40,6 +41,7 @@ from orthoflow.records.runs import (
     creating,
     find_record,
     published_state,
+    read_run,
     record_errors,
 )
 from orthoflow.untrusted_text import first_few
@@ -51,25 +53,24 @@ if TYPE_CHECKING:
     )
 
 SIGNATURE_SUFFIX: Final = ".sig"
-_FORMAT: Final = "orthoflow-signature"
-_VERSION: Final = "1.0"
 # Keys and signatures are a few hundred bytes.
 _LARGEST_BYTES: Final = 64 << 10
 
 
-@dataclass(frozen=True, kw_only=True)
-class Signature:
+class Signature(BaseModel):
     """The content of a signature file, untrusted until it was checked.
 
     Attributes:
         content_sha256: content digest of the record that was signed.
         public_key: key of the signer in OpenSSH format: `ssh-ed25519 ...`.
-        signature: 64 bytes.
+        signature: base64 of 64 bytes.
     """
 
+    format: Literal["orthoflow-signature"] = "orthoflow-signature"
+    format_version: Literal["1.0"] = "1.0"
     content_sha256: str
     public_key: str
-    signature: bytes
+    signature: str
 
     @property
     def fingerprint(self) -> str:
@@ -100,21 +101,11 @@ def sign_record(path: Path, key_file: Path, password: Callable[[], str]) -> Sign
             f"beside {path} there is a signature already, said to be of the key "
             f"{earlier.fingerprint}: remove {path.name}{SIGNATURE_SUFFIX} to sign with another"
         )
-    content_sha256 = _content_sha256(path)
-    made = Signature(
-        content_sha256=content_sha256,
-        public_key=public_key,
-        signature=key.sign(_message(content_sha256)),
-    )
-    content = {
-        "format": _FORMAT,
-        "format_version": _VERSION,
-        "content_sha256": made.content_sha256,
-        "public_key": made.public_key,
-        "signature": base64.b64encode(made.signature).decode("ascii"),
-    }
+    content_sha256 = read_run(path).content_sha256
+    signature = base64.b64encode(key.sign(_message(content_sha256))).decode("ascii")
+    made = Signature(content_sha256=content_sha256, public_key=public_key, signature=signature)
     with creating(path.parent, f"{path.name}{SIGNATURE_SUFFIX}") as stream:
-        stream.write(f"{json.dumps(content, indent=1)}\n".encode())
+        stream.write(made.model_dump_json(indent=1).encode() + b"\n")
     return made
 
 
@@ -129,9 +120,10 @@ def read_signature(record: Path) -> Signature | None:
         return None
     try:
         with open_below(record.parent, name) as stream:
-            return _parsed(stream.read(_LARGEST_BYTES))
-    except (UnsafeFileError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise RecordError(f"{name} is not a signature, or is damaged: {error}") from error
+            return Signature.model_validate_json(stream.read(_LARGEST_BYTES), strict=True)
+    except (UnsafeFileError, OSError, ValidationError) as error:
+        reason = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
+        raise RecordError(f"{name} is not a signature, or is damaged: {reason}") from error
 
 
 def check_signature(record: Path, signer: Path) -> Signature:
@@ -161,8 +153,9 @@ def check_signature(record: Path, signer: Path) -> Signature:
     from cryptography.exceptions import InvalidSignature  # noqa: PLC0415 - only those who sign
 
     try:
-        key.verify(found.signature, _message(_content_sha256(record)))
-    except InvalidSignature as error:
+        message = _message(read_run(record).content_sha256)
+        key.verify(base64.b64decode(found.signature, validate=True), message)
+    except (InvalidSignature, binascii.Error) as error:
         raise RecordError(
             f"the signature beside {record.name} does not fit it: it is another record's, or "
             "was changed"
@@ -170,27 +163,9 @@ def check_signature(record: Path, signer: Path) -> Signature:
     return found
 
 
-def _parsed(text: bytes) -> Signature:
-    content = json.loads(text)
-    form, version = content["format"], content["format_version"]
-    if form != _FORMAT or str(version).partition(".")[0] != _VERSION.partition(".")[0]:
-        raise ValueError(f"this orthoflow reads {_FORMAT} {_VERSION}, got {form} {version}")
-    return Signature(
-        content_sha256=str(content["content_sha256"]),
-        public_key=str(content["public_key"]),
-        signature=base64.b64decode(content["signature"], validate=True),
-    )
-
-
 def _message(content_sha256: str) -> bytes:
     text = canonical_json({"what": "orthoflow/signature", "v": 1, "content_sha256": content_sha256})
     return text.encode("utf-8")
-
-
-def _content_sha256(record: Path) -> str:
-    path = find_record(record)
-    with record_errors(path), open_record(path) as opened:
-        return opened.content_sha256
 
 
 def _fingerprint(public_key: str) -> str:
@@ -202,80 +177,61 @@ def _fingerprint(public_key: str) -> str:
 
 
 def _openssh(key: Ed25519PublicKey) -> str:
-    from cryptography.hazmat.primitives.serialization import (  # noqa: PLC0415 - as above
-        Encoding,
-        PublicFormat,
-    )
+    from cryptography.hazmat.primitives import serialization  # noqa: PLC0415 - as above
 
-    return key.public_bytes(Encoding.OpenSSH, PublicFormat.OpenSSH).decode("ascii")
+    encoding, form = serialization.Encoding.OpenSSH, serialization.PublicFormat.OpenSSH
+    return key.public_bytes(encoding, form).decode("ascii")
 
 
 def _private_key(path: Path, password: Callable[[], str]) -> Ed25519PrivateKey:
-    _need_library()
-    from cryptography.exceptions import UnsupportedAlgorithm  # noqa: PLC0415 - as above
-    from cryptography.hazmat.primitives.asymmetric import ed25519  # noqa: PLC0415
-    from cryptography.hazmat.primitives.serialization import (  # noqa: PLC0415
-        load_pem_private_key,
-        load_ssh_private_key,
-    )
-
     data = _key_bytes(path)
+    from cryptography.hazmat.primitives import serialization  # noqa: PLC0415 - as above
+    from cryptography.hazmat.primitives.asymmetric import ed25519  # noqa: PLC0415
+
     if data.startswith((b"ssh-", b"-----BEGIN PUBLIC")):
         raise InputError(
             f"{path} is the public half of a key, by which others check: sign with the private one"
             f", {path.with_suffix('')}"
         )
-    load = load_ssh_private_key if b"OPENSSH PRIVATE KEY" in data else load_pem_private_key
-    try:
+    is_openssh = b"OPENSSH PRIVATE KEY" in data
+    load = serialization.load_ssh_private_key if is_openssh else serialization.load_pem_private_key
+    with _key_errors(path, "private", "or the password is wrong: {}"):
         try:
             key = load(data, password=None)
         except TypeError:
             # Protected; an empty password would count as none.
             key = load(data, password=password().encode("utf-8") or b"\0")
-    except (ValueError, TypeError, UnsupportedAlgorithm) as error:
-        raise InputError(
-            f"{path} is not a private key in OpenSSH or PEM format, or the password is wrong: "
-            f"{error}"
-        ) from error
     if not isinstance(key, ed25519.Ed25519PrivateKey):
         raise InputError(f"{path} must be an Ed25519 key; `ssh-keygen -t ed25519` makes one")
     return key
 
 
 def _public_key(path: Path) -> Ed25519PublicKey:
-    _need_library()
-    from cryptography.exceptions import UnsupportedAlgorithm  # noqa: PLC0415 - as above
-    from cryptography.hazmat.primitives.asymmetric import ed25519  # noqa: PLC0415
-    from cryptography.hazmat.primitives.serialization import (  # noqa: PLC0415
-        load_pem_public_key,
-        load_ssh_public_key,
-    )
-
     data = _key_bytes(path)
-    load = load_pem_public_key if data.lstrip().startswith(b"-----") else load_ssh_public_key
-    try:
+    from cryptography.hazmat.primitives import serialization  # noqa: PLC0415 - as above
+    from cryptography.hazmat.primitives.asymmetric import ed25519  # noqa: PLC0415
+
+    is_pem = data.lstrip().startswith(b"-----")
+    load = serialization.load_pem_public_key if is_pem else serialization.load_ssh_public_key
+    with _key_errors(path, "public", "{}; the signer's file ends with .pub"):
         key = load(data)
-    except (ValueError, UnsupportedAlgorithm) as error:
-        raise InputError(
-            f"{path} is not a public key in OpenSSH or PEM format: {error}; the signer's file ends "
-            "with .pub"
-        ) from error
     if not isinstance(key, ed25519.Ed25519PublicKey):
         raise InputError(f"{path} must be an Ed25519 key, as records are signed with these")
     return key
 
 
-def _key_bytes(path: Path) -> bytes:
+@contextmanager
+def _key_errors(path: Path, kind: str, reason: str) -> Iterator[None]:
+    from cryptography.exceptions import UnsupportedAlgorithm  # noqa: PLC0415 - as above
+
     try:
-        if not path.is_file():
-            raise InputError(f"there is no key file {path}")
-        with path.open("rb") as stream:
-            return stream.read(_LARGEST_BYTES)
-    except OSError as error:
-        raise InputError(f"the key file {path} cannot be read: {error.strerror}") from error
+        yield
+    except (ValueError, TypeError, UnsupportedAlgorithm) as error:
+        what = f"{path} is not a {kind} key in OpenSSH or PEM format, {reason.format(error)}"
+        raise InputError(what) from error
 
 
-def _need_library() -> None:
+def _key_bytes(path: Path) -> bytes:
     try:
         import cryptography  # noqa: F401, PLC0415 - asked for before anything is read
     except ImportError as error:
@@ -283,6 +239,13 @@ def _need_library() -> None:
             "signatures need the library cryptography, which is missing or fails to import: "
             "python -m pip install 'orthoflow-tls[sign]'"
         ) from error
+    try:
+        if not path.is_file():
+            raise InputError(f"there is no key file {path}")
+        with path.open("rb") as stream:
+            return stream.read(_LARGEST_BYTES)
+    except OSError as error:
+        raise InputError(f"the key file {path} cannot be read: {error.strerror}") from error
 
 
 # Pages that show the record; its digests would have to be in it.
@@ -373,37 +336,46 @@ def verify_run(
         PluginError: `signer` is given, and the library cryptography is missing.
     """
     record_path = find_record(path)
-    found = verify_record(record_path)
-    findings = tuple(f"{finding.place}: {finding.problem}" for finding in found)
-    if findings:
+    if found := verify_record(record_path):
         is_unchecked = found[0].code in ("foreign", "locked")
         wrong = "cannot be checked" if is_unchecked else "is not as it was written"
-        wrong = f"{record_path} {wrong}"
-        return Verification(path=record_path, findings=findings, wrong=wrong)
+        findings = tuple(f"{finding.place}: {finding.problem}" for finding in found)
+        return Verification(path=record_path, findings=findings, wrong=f"{record_path} {wrong}")
     with record_errors(record_path), open_record(record_path) as opened:
         record, seal = opened.record, opened.content_sha256
-        contradictions = tuple(
-            said for cell in record.cells for said in _contradictions(opened, cell)
+        contradictions = [said for cell in record.cells for said in _contradictions(opened, cell)]
+    signed_with, unsigned, notes = _check_signature(record_path, signer)
+    changed: list[str] = []
+    states: list[PublishedState] = []
+    pages: dict[str, bool] = {}
+    if also_published:
+        folder = record_path.parent
+        pages = _page_states(folder, seal)
+        notes += [_page_note(folder, name) for name, is_own in pages.items() if not is_own]
+        states = list(in_order(lambda file: published_state(folder, file), record.published))
+        checked = list(zip(record.published, states, strict=True))
+        changed = [f"{file.path}: {_WRONG[state]}" for file, state in checked if state in _WRONG]
+        notes += _published_notes(
+            record_path, record, [file.path for file, state in checked if state == "missing"]
         )
+    beside = [
+        *(["its signature is not the one asked for"] if unsigned else []),
+        *(["published files beside it are not as they were written"] if changed else []),
+    ]
+    wrong = f"the seal of {record_path} holds, but {' and '.join(beside)}" if beside else ""
     products = [product for cell in record.cells for product in cell.outputs.values()]
     n_products = sum(product.embedded for product in products)
-    check = _check_published(record_path, record) if also_published else _PublishedCheck()
-    pages = _page_states(record_path.parent, seal) if also_published else {}
-    signature = _check_signature(record_path, signer)
-    changed_pages = tuple(_page_note(record_path.parent, name) for name in pages if not pages[name])
     return Verification(
         path=record_path,
-        findings=(*contradictions, *signature.findings, *check.changed),
-        wrong=f"{record_path} contradicts itself"
-        if contradictions
-        else _wrong_beside(record_path, signature, check),
-        notes=(*signature.notes, *changed_pages, *check.notes),
+        findings=(*contradictions, *unsigned, *changed),
+        wrong=f"{record_path} contradicts itself" if contradictions else wrong,
+        notes=tuple(notes),
         seal=seal,
-        signed_with=signature.signed_with,
+        signed_with=signed_with,
         n_products=n_products,
         n_named=len(products) - n_products,
         n_inputs=sum(len(entry.files) for entry in record.inputs if entry.embedded),
-        n_published=check.n_same,
+        n_published=states.count("same"),
         n_pages=sum(pages.values()),
     )
 
@@ -420,8 +392,8 @@ def _contradictions(opened: OpenRecord, cell: RecordedCell) -> Iterator[str]:
     ]
     stated: dict[str, set[tuple[float, str]]] = {}
     for port in places:
-        found = Inspection.from_payload(_payload(opened, cell.address, port)).findings
-        for finding in found:
+        payload = Payload(**shared_fields(opened.payload(cell.address, port), Payload))
+        for finding in Inspection.from_payload(payload).findings:
             stated.setdefault(finding.name, set()).add((finding.value, finding.unit))
     for metric in cell.metrics:
         name = metric.name if metric.name in stated else _OF_WALLS.sub("", metric.name)
@@ -431,10 +403,6 @@ def _contradictions(opened: OpenRecord, cell: RecordedCell) -> Iterator[str]:
                 f"/cells/{cell.address}: the metric {metric.name} is {metric.value:g} "
                 f"{metric.unit}, its inspection has {values}"
             )
-
-
-def _payload(opened: OpenRecord, address: str, port: str) -> Payload:
-    return Payload(**shared_fields(opened.payload(address, port), Payload))
 
 
 def sealed_page(text: str, runs: Sequence[Run]) -> str:
@@ -496,61 +464,48 @@ def broken_seal(run: Run, *, of_all: bool = False) -> str:
     return f"{run.path} is not as it was written: its seal does not hold for {first_few(places)}"
 
 
-def _wrong_beside(record: Path, signature: Verification, check: _PublishedCheck) -> str:
-    """Report what differs beside an intact record."""
-    wrong = [
-        *(["its signature is not the one asked for"] if signature.findings else []),
-        *(["published files beside it are not as they were written"] if check.changed else []),
-    ]
-    return f"the seal of {record} holds, but {' and '.join(wrong)}" if wrong else ""
-
-
-def _check_signature(record: Path, signer: Path | None) -> Verification:
-    """Return notes about the signature alone."""
+def _check_signature(record: Path, signer: Path | None) -> tuple[str, list[str], list[Note]]:
+    """Return the fingerprint of a signature that holds, what is wrong with it, and notes."""
     try:
         if signer is not None:
-            found = check_signature(record, signer)
-            return Verification(path=record, findings=(), signed_with=found.fingerprint)
-        if (unchecked := read_signature(record)) is None:
-            return Verification(path=record, findings=())
+            return check_signature(record, signer).fingerprint, [], []
+        if (found := read_signature(record)) is None:
+            return "", [], []
+        text = (
+            f"there is a signature, said to be of the key {found.fingerprint}, that was not "
+            "checked: name the signer's public key with --signer"
+        )
     except RecordError as error:
         if signer is not None:
-            return Verification(path=record, findings=(str(error),))
-        note = Note(code="signature", text=str(error))
-        return Verification(path=record, findings=(), notes=(note,))
-    note = Note(
-        code="signature",
-        text=f"there is a signature, said to be of the key {unchecked.fingerprint}, that was not "
-        "checked: name the signer's public key with --signer",
-    )
-    return Verification(path=record, findings=(), notes=(note,))
+            return "", [str(error)], []
+        text = str(error)
+    return "", [], [Note(code="signature", text=text)]
 
 
-@dataclass(frozen=True, kw_only=True)
-class _PublishedCheck:
-    changed: tuple[str, ...] = ()
-    notes: tuple[Note, ...] = ()
-    n_same: int = 0
-
-
-def _check_published(path: Path, record: RunRecord) -> _PublishedCheck:
-    folder = path.parent
-    states = list(in_order(lambda file: published_state(folder, file), record.published))
-    checked = list(zip(record.published, states, strict=True))
-    missing = [file.path for file, state in checked if state == "missing"]
-    changed = tuple(f"{file.path}: {_WRONG[state]}" for file, state in checked if state in _WRONG)
-    notes = [Note(code="missing", text=_missing_note(missing, len(checked)))] if missing else []
-    # A record that is passed on alone is among unrelated files.
-    if len(missing) < len(checked) or not checked:
-        foreign, others = _unnamed(path, record)
-        if foreign:
-            rest = first_few(foreign, most=_UNCOVERED_MOST)
-            text = f"the record does not name {rest}, among its published files"
-            notes.append(Note(code="foreign", text=text))
-        if others:
-            text = f"not covered by the record: {first_few(others, most=_UNCOVERED_MOST)}"
-            notes.append(Note(code="uncovered", text=text))
-    return _PublishedCheck(changed=changed, notes=tuple(notes), n_same=states.count("same"))
+def _published_notes(path: Path, record: RunRecord, missing: list[str]) -> Iterator[Note]:
+    """Note published files that are gone, and files that the record does not name."""
+    n_published = len(record.published)
+    if missing:
+        text = (
+            f"{len(missing)} of {n_published} published files are not in {PRODUCTS_FOLDER}/: "
+            f"{first_few(missing)}"
+        )
+        if len(missing) == n_published:
+            text = f"the {n_published} published files of the record are not beside it, so they "
+            text += "were not checked"
+        yield Note(code="missing", text=text)
+        if len(missing) == n_published:
+            # A record that is passed on alone is among unrelated files.
+            return
+    foreign, others = _unnamed(path, record)
+    if foreign:
+        rest = first_few(foreign, most=_UNCOVERED_MOST)
+        yield Note(
+            code="foreign", text=f"the record does not name {rest}, among its published files"
+        )
+    if others:
+        rest = first_few(others, most=_UNCOVERED_MOST)
+        yield Note(code="uncovered", text=f"not covered by the record: {rest}")
 
 
 def _unnamed(path: Path, record: RunRecord) -> tuple[list[str], list[str]]:
@@ -562,15 +517,3 @@ def _unnamed(path: Path, record: RunRecord) -> tuple[list[str], list[str]]:
     for place, _, below in os.walk(path.parent / PRODUCTS_FOLDER):
         foreign |= {Path(place, name).relative_to(path.parent).as_posix() for name in below}
     return sorted(foreign - named), sorted({*folders, *files} - known)
-
-
-def _missing_note(missing: list[str], n_published: int) -> str:
-    if len(missing) == n_published:
-        return (
-            f"the {n_published} published files of the record are not beside it, so they were not "
-            "checked"
-        )
-    return (
-        f"{len(missing)} of {n_published} published files are not in {PRODUCTS_FOLDER}/: "
-        f"{first_few(missing)}"
-    )

@@ -187,36 +187,6 @@ def _publish_cell(
 OUTLINE_FILE: Final = ".outline.json"
 
 
-def write_outline(
-    record: RunRecord,
-    run_folder: Path,
-    store: Store,
-    *,
-    sources: Mapping[str, Mapping[str, str]],
-    embedded: Collection[str],
-) -> None:
-    """Keep what a run is about to compute, so that it can be shown before it is finished.
-
-    Args:
-        record: of the run, with every cell skipped.
-        run_folder: existing folder.
-        store: where its results go.
-        sources: address -> input port -> its source.
-        embedded: product types whose arrays go into a record.
-
-    Raises:
-        StoreError: the disk cannot be written.
-    """
-    content = {
-        "store": str(store.folder.absolute()),
-        "record": to_json(record),
-        "sources": {address: dict(ports) for address, ports in sources.items()},
-        "embedded": sorted(embedded),
-    }
-    with writing_to(run_folder):
-        write_whole(run_folder / OUTLINE_FILE, json.dumps(content).encode("utf-8", "replace"))
-
-
 def recorded_environments(
     results: Mapping[str, CellResult],
 ) -> tuple[RecordedEnvironment, ...]:
@@ -327,12 +297,25 @@ def write_run(
         InputError: an input file to embed was changed during the run.
         ArgumentError: another run uses the folder.
     """
-    _check_failures(outcome, run_folder)
+    for address, result in outcome.failed.items():
+        # Because of the disk, not of its method.
+        if result.error_type in (StoreError.__name__, DamageError.__name__):
+            raise StoreError(
+                f"{address} failed: {result.error_message}; finished steps are kept, and "
+                f"the same command with -o {run_folder} goes on from there"
+            )
     try:
         with kept_from_others(run_folder):
-            return _write_run(
-                outcome, plan, workflow, run_folder, store, embed=embed, before_finish=before_finish
-            )
+            unfinished = _publish(outcome, plan, workflow, run_folder, store, embed=embed)
+            with writing_to(run_folder):
+                if before_finish is not None:
+                    before_finish(read_run(unfinished, later_name=RECORD_FILE))
+                # Everything that the record names must exist before the record gets its name.
+                sync_tree(run_folder)
+                finished = unfinished.replace(run_folder / RECORD_FILE)
+                (run_folder / OUTLINE_FILE).unlink(missing_ok=True)
+                sync_folder(run_folder)
+            return read_run(finished)
     except StoreError as error:
         needed = [name for result in outcome.results.values() for name in result.objects]
         damaged = store.damaged_objects(needed)
@@ -342,38 +325,6 @@ def write_run(
             f"the store {store.folder} does not hold any more what the record needs ({error}); the "
             f"same command with -o {run_folder} computes it again"
         ) from error
-
-
-def _check_failures(outcome: RunOutcome, run_folder: Path) -> None:
-    """Refuse to finish a run in which a step failed because of the disk, not of its method."""
-    for address, result in outcome.failed.items():
-        if result.error_type in (StoreError.__name__, DamageError.__name__):
-            raise StoreError(
-                f"{address} failed: {result.error_message}; finished steps are kept, and "
-                f"the same command with -o {run_folder} goes on from there"
-            )
-
-
-def _write_run(
-    outcome: RunOutcome,
-    plan: RunPlan,
-    workflow: Workflow,
-    run_folder: Path,
-    store: Store,
-    *,
-    embed: bool,
-    before_finish: Callable[[Run], None] | None,
-) -> Run:
-    unfinished = _publish(outcome, plan, workflow, run_folder, store, embed=embed)
-    with writing_to(run_folder):
-        if before_finish is not None:
-            before_finish(_under_way(unfinished))
-        # Everything that the record names must exist before the record gets its name.
-        sync_tree(run_folder)
-        finished = unfinished.replace(run_folder / RECORD_FILE)
-        (run_folder / OUTLINE_FILE).unlink(missing_ok=True)
-        sync_folder(run_folder)
-    return read_run(finished)
 
 
 def _publish(
@@ -387,22 +338,39 @@ def _publish(
 ) -> Path:
     """Fill `products/` and write the record under its temporary name."""
     record = build_record(outcome, plan, workflow, store, embed=embed)
-    with writing_to(run_folder):
-        run_folder.mkdir(parents=True, exist_ok=True)
-    published = publish_products(
-        run_folder, record.cells, _published(outcome, store), record.run_id
-    )
-    record = dataclasses.replace(record, published=published)
+    given = {
+        file.sha256: place
+        for entry in plan.inputs.values()
+        if entry is not None
+        for file, place in zip(entry.files, entry.paths, strict=True)
+    }
     unfinished = run_folder / _UNFINISHED
     with writing_to(run_folder):
+        run_folder.mkdir(parents=True, exist_ok=True)
+        files = files_of_outputs(outcome.results, store)
+        published = publish_products(run_folder, record.cells, files, record.run_id)
+        record = dataclasses.replace(record, published=published)
         for leftover in run_folder.glob(f".*{RECORD_FILE}.*"):
             leftover.unlink()
-        _write_record(unfinished, record, store, plan, embed=embed)
+        try:
+            write_record(unfinished, record, store.product_file, embed=embed, input_file=given.get)
+        except InputFileError as error:
+            raise InputError(f"{error}: run again") from error
+        except RecordFormatError as error:
+            raise StoreError(
+                f"the record cannot be assembled from the store {store.folder}: {error}"
+            ) from error
     return unfinished
 
 
-def _under_way(unfinished: Path) -> Run:
-    return read_run(unfinished, later_name=RECORD_FILE)
+def files_of_outputs(
+    results: Mapping[str, CellResult], store: Store
+) -> dict[str, dict[str, Mapping[Path, str]]]:
+    """Return the published files of results in a store: address -> port -> file -> SHA-256."""
+    return {
+        address: {port: store.published_files(ref.digest) for port, ref in result.outputs.items()}
+        for address, result in results.items()
+    }
 
 
 def show_unfinished(
@@ -431,7 +399,7 @@ def show_unfinished(
     try:
         unfinished = _publish(whole, plan, workflow, run_folder, store, embed=False)
         try:
-            show(_under_way(unfinished))
+            show(read_run(unfinished, later_name=RECORD_FILE))
         finally:
             unfinished.unlink(missing_ok=True)
     except (OrthoflowError, OSError):
@@ -442,7 +410,9 @@ def show_unfinished(
 def begin_run(
     plan: RunPlan, workflow: Workflow, run_folder: Path, store: Store, run_id: str
 ) -> None:
-    """Keep the outline of a run that begins, see `open.open_unfinished`.
+    """Keep the outline of a run that begins: its record, with every cell skipped.
+
+    The run can be shown from it before it is finished, see `open.open_unfinished`.
 
     Raises:
         StoreError: the disk cannot be written.
@@ -452,13 +422,14 @@ def begin_run(
 
     began = now()
     outcome = RunOutcome(run_id=run_id, started=began, ended=began, results={})
-    write_outline(
-        build_record(_with_missing(outcome, plan), plan, workflow, store),
-        run_folder,
-        store,
-        sources={item.cell.address: _sources(item.cell) for item in plan.cells},
-        embedded=_embedded_types(plan),
-    )
+    content = {
+        "store": str(store.folder.absolute()),
+        "record": to_json(build_record(_with_missing(outcome, plan), plan, workflow, store)),
+        "sources": {item.cell.address: _sources(item.cell) for item in plan.cells},
+        "embedded": sorted(_embedded_types(plan)),
+    }
+    with writing_to(run_folder):
+        write_whole(run_folder / OUTLINE_FILE, json.dumps(content).encode("utf-8", "replace"))
 
 
 def _sources(cell: Cell) -> dict[str, str]:
@@ -510,25 +481,6 @@ def executed_and_written(
         # Results of the first attempt are cached in the second.
         kept &= outcome.resumed
     return WrittenRun(run=write(outcome), outcome=outcome, kept=kept)
-
-
-def _write_record(
-    path: Path, record: RunRecord, store: Store, plan: RunPlan, *, embed: bool
-) -> None:
-    files = {
-        file.sha256: place
-        for given in plan.inputs.values()
-        if given is not None
-        for file, place in zip(given.files, given.paths, strict=True)
-    }
-    try:
-        write_record(path, record, store.product_file, embed=embed, input_file=files.get)
-    except InputFileError as error:
-        raise InputError(f"{error}: run again") from error
-    except RecordFormatError as error:
-        raise StoreError(
-            f"the record cannot be assembled from the store {store.folder}: {error}"
-        ) from error
 
 
 def build_record(
@@ -605,34 +557,48 @@ def write_embedded(run: Run, path: Path, store: Store, inputs: Sequence[str] = (
         StoreError: the disk cannot be written.
         InvalidArgumentsError: `inputs` names no input of the workflow.
     """
-    _check_products(run, store)
+    missing = [
+        f"{address}.{port}"
+        for address, cell in run.cells.items()
+        for port, output in cell.outputs.items()
+        if not output.embedded and store.product_file(output.digest) is None
+    ]
+    if missing:
+        raise ArgumentError(
+            f"neither the record {run.path} nor the store {store.folder} has "
+            f"{first_few(missing)}: name the store of the run with --store, or replay the run"
+        )
+    whole = tuple(
+        dataclasses.replace(entry, embedded=bool(entry.files)) for entry in run.record.inputs
+    )
     with embedded_inputs(run, path.parent) as laid_out:
         files = _input_files(run, store.file_digests(), inputs, laid_out.extracted)
-        record = dataclasses.replace(
-            run.record,
-            inputs=tuple(
-                dataclasses.replace(entry, embedded=bool(entry.files))
-                for entry in run.record.inputs
-            ),
-            cells=tuple(
-                dataclasses.replace(
-                    cell,
-                    outputs={
-                        port: dataclasses.replace(output, embedded=True)
-                        for port, output in cell.outputs.items()
-                    },
-                )
-                for cell in run.record.cells
-            ),
-        )
-        try:
-            with writing_to(path.parent):
-                write_record(
-                    path, record, store.product_file, input_file=files.get, earlier=run.path
-                )
-        except RecordFormatError as error:
-            raise StoreError(f"{path} cannot be written: {error}") from error
+        _write_again(path, dataclasses.replace(run.record, inputs=whole), run, store, files)
     return read_run(path)
+
+
+def _write_again(
+    path: Path,
+    record: RunRecord,
+    run: Run,
+    store: Store,
+    files: Mapping[str, Path],
+    *,
+    embed: bool = True,
+) -> None:
+    """Write a record made from that of a run, with products from there or from a store."""
+    try:
+        with writing_to(path.parent):
+            write_record(
+                path,
+                record,
+                store.product_file,
+                embed=embed,
+                input_file=files.get,
+                earlier=run.path,
+            )
+    except (RecordFormatError, InputFileError) as error:
+        raise StoreError(f"{path} cannot be written: {error}") from error
 
 
 def _recorded_inputs(plan: RunPlan, *, embed: bool) -> tuple[RecordedInput, ...]:
@@ -647,27 +613,6 @@ def _recorded_inputs(plan: RunPlan, *, embed: bool) -> tuple[RecordedInput, ...]
         )
         for name, given in plan.inputs.items()
     )
-
-
-def _published(outcome: RunOutcome, store: Store) -> dict[str, dict[str, Mapping[Path, str]]]:
-    return {
-        address: {port: store.published_files(ref.digest) for port, ref in result.outputs.items()}
-        for address, result in outcome.results.items()
-    }
-
-
-def _check_products(run: Run, store: Store) -> None:
-    missing = [
-        f"{address}.{port}"
-        for address, cell in run.cells.items()
-        for port, output in cell.outputs.items()
-        if not output.embedded and store.product_file(output.digest) is None
-    ]
-    if missing:
-        raise ArgumentError(
-            f"neither the record {run.path} nor the store {store.folder} has "
-            f"{first_few(missing)}: name the store of the run with --store, or replay the run"
-        )
 
 
 def _input_files(
@@ -721,13 +666,7 @@ def write_part(part: Run, folder: Path, store: Store) -> Run:
                 entry.files, laid_out.extracted.get(entry.name, ()), strict=False
             )
         }
-        try:
-            with writing_to(folder):
-                write_record(
-                    path, record, store.product_file, input_file=files.get, earlier=part.path
-                )
-        except (RecordFormatError, InputFileError) as error:
-            raise StoreError(f"{path} cannot be written: {error}") from error
+        _write_again(path, record, part, store, files, embed=False)
     return read_run(path)
 
 

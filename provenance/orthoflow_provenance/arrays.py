@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -129,18 +128,13 @@ def block_indices(shape: tuple[int, ...], itemsize: int) -> Iterator[Index]:
         yield (slice(start, min(start + step, shape[0])),)
 
 
-def _little_endian(dtype: np.dtype[np.generic]) -> np.dtype[np.generic]:
-    """Return the dtype with its bytes in little-endian order."""
-    return dtype.newbyteorder("<")
-
-
 def _byte_blocks(array: NDArray[np.generic]) -> Iterator[NDArray[np.uint8]]:
     """Return the array's bytes: little-endian, C order, flat.
 
     A contiguous little-endian array is given whole and not copied, memory-mapped or not; any other
     is copied block by block.
     """
-    wanted = _little_endian(array.dtype)
+    wanted = array.dtype.newbyteorder("<")
     if array.size == 0:
         return
     if array.flags.c_contiguous and array.dtype == wanted:
@@ -168,11 +162,11 @@ def payload_digest(payload: PayloadLike) -> str:
         digest = hashlib.sha256()
         for block in _byte_blocks(array):
             digest.update(block.data)
-        return [_little_endian(array.dtype).str, [*array.shape], digest.hexdigest()]
+        return [array.dtype.newbyteorder("<").str, [*array.shape], digest.hexdigest()]
 
     # Largest first, so that no thread is left alone with a long tail.
     names = sorted(payload.arrays, key=lambda name: -payload.arrays[name].nbytes)
-    with ThreadPoolExecutor(max_workers=_usable_cores()) as threads:
+    with ThreadPoolExecutor() as threads:
         fingerprints = dict(zip(names, threads.map(fingerprint, names), strict=True))
     content = {
         "what": "orthoflow/product",
@@ -198,13 +192,6 @@ def check_storable(dtype: np.dtype[np.generic]) -> None:
             f"an array of type {dtype} cannot be stored, only bool, integers and floats of 2, 4 or "
             "8 bytes can"
         )
-
-
-def _usable_cores() -> int:
-    """Count the processors this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def write_product_file(path: Path, payload: PayloadLike) -> str:
@@ -273,7 +260,15 @@ def array_datasets(group: h5py.Group) -> Iterator[tuple[str, h5py.Dataset]]:
     Raises:
         RecordFormatError: the group is damaged.
     """
-    yield from _datasets_below(open_group(group, "arrays"), "")
+    pending = [("", open_group(group, "arrays"))]
+    while pending:
+        name, item = pending.pop()
+        if isinstance(item, h5py.Dataset):
+            yield name, item
+            continue
+        with reading(item.name):
+            children = [(f"{name}/{child}".lstrip("/"), item[child]) for child in sorted(item)]
+        pending += reversed(children)
 
 
 def measure_payloads(
@@ -357,7 +352,7 @@ def _write_content(group: h5py.Group, payload: PayloadLike) -> None:
 def _write_array(
     group: h5py.Group, name: str, array: NDArray[np.generic], *, is_mapped: bool
 ) -> None:
-    dtype = _little_endian(array.dtype)
+    dtype = array.dtype.newbyteorder("<")
     if is_mapped or array.nbytes < _SMALL_BYTES or array.ndim == 0:
         dataset = _create_contiguous(group, name, array.shape, dtype)
     else:
@@ -427,16 +422,6 @@ def _read_array(dataset: h5py.Dataset, *, is_mapping: bool) -> NDArray[np.generi
         dataset.read_direct(array)
     array.flags.writeable = False
     return array
-
-
-def _datasets_below(group: h5py.Group, prefix: str) -> Iterator[tuple[str, h5py.Dataset]]:
-    with reading(group.name):
-        children = [(name, group[name]) for name in sorted(group)]
-    for name, child in children:
-        if isinstance(child, h5py.Dataset):
-            yield prefix + name, child
-        elif isinstance(child, h5py.Group):
-            yield from _datasets_below(child, f"{prefix}{name}/")
 
 
 def _as_bytes(array: NDArray[np.generic]) -> NDArray[np.uint8]:

@@ -11,9 +11,9 @@ import errno
 import math
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import h5py
 import numpy as np
@@ -163,11 +163,7 @@ def open_group(parent: h5py.Group, name: str) -> h5py.Group:
     Raises:
         RecordFormatError: there is none of that name.
     """
-    with reading(f"{parent.name.rstrip('/')}/{name}"):
-        found = parent.get(name)
-    if not isinstance(found, h5py.Group):
-        raise RecordFormatError(f"{parent.name} lacks the group {name}")
-    return found
+    return _child(parent, name, h5py.Group, "group")
 
 
 def dataset_of(group: h5py.Group, name: str) -> h5py.Dataset:
@@ -176,10 +172,15 @@ def dataset_of(group: h5py.Group, name: str) -> h5py.Dataset:
     Raises:
         RecordFormatError: there is none of that name.
     """
-    with reading(f"{group.name}/{name}"):
-        found = group.get(name)
-    if not isinstance(found, h5py.Dataset):
-        raise RecordFormatError(f"{group.name} lacks the dataset {name}")
+    return _child(group, name, h5py.Dataset, "dataset")
+
+
+# Any: h5py has no types.
+def _child(parent: h5py.Group, name: str, kind: type, what: str) -> Any:
+    with reading(f"{parent.name.rstrip('/')}/{name}"):
+        found = parent.get(name)
+    if not isinstance(found, kind):
+        raise RecordFormatError(f"{parent.name} lacks the {what} {name}")
     return found
 
 
@@ -214,63 +215,57 @@ class FileSink:
         if not hasattr(os, "O_NOFOLLOW") and path.is_symlink():
             raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
         self._descriptor = os.open(path, flags, 0o666)
-        self._position = 0
+        # What could not be written since a failure, in order: offset and bytes.
         self._kept: list[tuple[int, bytes]] = []
-        self._kept_end = 0
         self.failure: OSError | None = None
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
         """Move the position; HDF5 uses it to ask for the size as well."""
         if whence == os.SEEK_END:
-            size = os.fstat(self._descriptor).st_size
-            self._position = max(size, self._kept_end) + offset
-        elif whence == os.SEEK_CUR:
-            self._position += offset
-        else:
-            self._position = offset
-        return self._position
+            ends = (start + len(data) for start, data in self._kept)
+            offset += max(os.fstat(self._descriptor).st_size, *ends, 0)
+            whence = os.SEEK_SET
+        return os.lseek(self._descriptor, offset, whence)
 
     def tell(self) -> int:
         """Return the position."""
-        return self._position
+        return self.seek(0, os.SEEK_CUR)
 
     def write(self, data: memoryview) -> int:
         """Write all of the data at the position."""
         view = memoryview(data).cast("B")
-        if self.failure is None:
-            try:
-                self._write_all(view)
-            except OSError as error:
-                self.failure = error
+        start, done = self.tell(), 0
+        try:
+            while self.failure is None and done < len(view):
+                done += os.write(self._descriptor, view[done:])
+        except OSError as error:
+            self.failure = error
         if self.failure is not None and len(view) <= _KEPT_AFTER_FAILURE_BYTES:
-            self._kept.append((self._position, bytes(view)))
-            self._kept_end = max(self._kept_end, self._position + len(view))
-        self._position += len(view)
+            self._kept.append((start, bytes(view)))
+        self.seek(start + len(view))
         return len(view)
 
     def readinto(self, buffer: memoryview) -> int:
         """Read at the position; what was never written is zeros."""
         view = memoryview(buffer).cast("B")
-        stored = _read_at(self._descriptor, len(view), self._position)
+        position = self.tell()
+        stored = os.read(self._descriptor, len(view))
         view[: len(stored)] = stored
         view[len(stored) :] = bytes(len(view) - len(stored))
         for offset, data in self._kept:
-            start = max(offset, self._position)
-            stop = min(offset + len(data), self._position + len(view))
+            start, stop = max(offset, position), min(offset + len(data), position + len(view))
             if start < stop:
-                view[start - self._position : stop - self._position] = data[
-                    start - offset : stop - offset
-                ]
-        self._position += len(view)
+                view[start - position : stop - position] = data[start - offset : stop - offset]
+        self.seek(position + len(view))
         return len(view)
 
     def truncate(self, size: int) -> int:
         """Set the length of the file."""
-        if self.failure is None:
-            try:
+        try:
+            if self.failure is None:
                 os.ftruncate(self._descriptor, size)
-            except OSError as error:
-                self.failure = error
+        except OSError as error:
+            self.failure = error
         return size
 
     def flush(self) -> None:
@@ -290,11 +285,6 @@ class FileSink:
         if self.failure is not None:
             raise self.failure
 
-    def _write_all(self, view: memoryview) -> None:
-        done = 0
-        while done < len(view):
-            done += _write_at(self._descriptor, view[done:], self._position + done)
-
 
 @contextmanager
 def create_file(path: Path) -> Iterator[h5py.File]:
@@ -307,22 +297,16 @@ def create_file(path: Path) -> Iterator[h5py.File]:
     """
     sink = FileSink(path)
     try:
-        file = _open_through(sink, path)
         try:
-            yield file
+            file = _open_through(sink, path)
+            try:
+                yield file
+            finally:
+                file.close()
         finally:
-            file.close()
-    except BaseException as error:
-        failure = sink.failure
-        with suppress(OSError):
+            # Whatever HDF5 made of it, what the disk said first is the reason.
             sink.close()
-        path.unlink(missing_ok=True)
-        if failure is not None and isinstance(error, Exception):
-            raise failure from error
-        raise
-    try:
-        sink.close()
-    except OSError:
+    except BaseException:
         path.unlink(missing_ok=True)
         raise
 
@@ -428,7 +412,11 @@ def _is_short_text(file: h5py.File, name: bytes) -> bool:
     if not h5py.h5a.exists(file.id, name):
         return False
     kind = h5py.h5a.open(file.id, name).get_type()
-    return _is_text(kind) and _is_plain(kind) and kind.get_size() <= _LONGEST_FORMAT_BYTES
+    return (
+        kind.get_class() == h5py.h5t.STRING
+        and _is_plain(kind)
+        and kind.get_size() <= _LONGEST_FORMAT_BYTES
+    )
 
 
 class _Inspection:
@@ -454,15 +442,14 @@ class _Inspection:
         self._visit_once(self._file.id, "/")
         while pending:
             group, path, depth = pending.pop()
-            if depth > _DEEPEST:
-                raise self._refusal(path, f"is nested more than {_DEEPEST} groups deep")
+            too_deep = f"is nested more than {_DEEPEST} groups deep"
+            self._refuse(path, depth > _DEEPEST, too_deep)
             with reading(f"{self._name}:{path}"):
                 self._check_attributes(group, path)
                 names = list(group)
             for name in names:
                 place = f"{path.rstrip('/')}/{name.decode('utf-8', 'backslashreplace')}"
                 with reading(f"{self._name}:{place}"):
-                    self._check_name(name, place)
                     child = self._open(group, name, place)
                     if isinstance(child, h5py.h5g.GroupID):
                         pending.append((child, place, depth + 1))
@@ -473,100 +460,79 @@ class _Inspection:
     def _open(
         self, group: h5py.h5g.GroupID, name: bytes, place: str
     ) -> h5py.h5g.GroupID | h5py.h5d.DatasetID:
-        link = group.links.get_info(name).type
-        if link == h5py.h5l.TYPE_EXTERNAL:
-            raise self._refusal(place, "is a link into another file")
-        if link != h5py.h5l.TYPE_HARD:
-            raise self._refusal(place, "is a soft link, only hard links are allowed")
-        child = h5py.h5o.open(group, name)
-        if not isinstance(child, h5py.h5g.GroupID | h5py.h5d.DatasetID):
-            raise self._refusal(place, "is neither a group nor a dataset")
-        self._visit_once(child, place)
-        return child
-
-    def _check_name(self, name: bytes, place: str) -> None:
-        # A way down is asked for with `/` between names: `..` would be one up for other programs.
         try:
+            # `..` between names would be one group up for other programs.
             check_name(name.decode("utf-8"), "the object")
         except RecordFormatError as error:
             raise self._refusal(place, f"is not a place in a record: {error}") from error
+        link = group.links.get_info(name).type
+        self._refuse(place, link == h5py.h5l.TYPE_EXTERNAL, "is a link into another file")
+        is_soft = link != h5py.h5l.TYPE_HARD
+        self._refuse(place, is_soft, "is a soft link, only hard links are allowed")
+        child = h5py.h5o.open(group, name)
+        is_known = isinstance(child, h5py.h5g.GroupID | h5py.h5d.DatasetID)
+        self._refuse(place, not is_known, "is neither a group nor a dataset")
+        self._visit_once(child, place)
+        return child
 
     def _visit_once(self, item: h5py.h5g.GroupID | h5py.h5d.DatasetID, place: str) -> None:
         # Two ways to one object make loops, and trees that grow without end from a few bytes.
         info = h5py.h5o.get_info(item)
         identity = (int(info.fileno), int(info.addr))
-        if identity in self._seen:
-            raise self._refusal(place, "leads to an object that has another place as well")
+        is_known = identity in self._seen
+        self._refuse(place, is_known, "leads to an object that has another place as well")
         self._seen.add(identity)
         self._count(1, place)
 
     def _count(self, n_objects: int, place: str) -> None:
         self._n_objects += n_objects
-        if self._n_objects > MAX_OBJECTS:
-            raise self._refusal(
-                place, f"and what lies before it are more than {MAX_OBJECTS} groups and attributes"
-            )
+        reason = f"and what lies before it are more than {MAX_OBJECTS} groups and attributes"
+        self._refuse(place, self._n_objects > MAX_OBJECTS, reason)
 
     def _check_dataset(self, dataset: h5py.h5d.DatasetID, place: str) -> None:
-        properties = dataset.get_create_plist()
-        if properties.get_external_count():
-            raise self._refusal(place, "keeps its data in another file")
+        properties, kind = dataset.get_create_plist(), dataset.get_type()
         layout = properties.get_layout()
-        if layout not in {h5py.h5d.COMPACT, h5py.h5d.CONTIGUOUS, h5py.h5d.CHUNKED}:
-            raise self._refusal(place, "is a virtual dataset")
+        is_chunked, itemsize = layout == h5py.h5d.CHUNKED, kind.get_size()
         used = [properties.get_filter(index)[0] for index in range(properties.get_nfilters())]
-        if not set(used) <= set(_FILTERS) or len(set(used)) != len(used):
-            raise self._refusal(
-                place, f"must use each of {', '.join(_FILTERS.values())} at most once and no other"
-            )
-        kind = dataset.get_type()
-        if not _is_allowed(kind):
-            raise self._refusal(place, "has a type outside the format")
-        if layout == h5py.h5d.CHUNKED and (
-            math.prod(properties.get_chunk()) * kind.get_size() > _LARGEST_CHUNK_BYTES
-        ):
-            raise self._refusal(place, "has chunks of more than 64 MiB")
-        self._check_size(dataset, kind.get_size(), place)
-
-    def _check_size(self, dataset: h5py.h5d.DatasetID, itemsize: int, place: str) -> None:
+        is_filtered = not set(used) <= set(_FILTERS) or len(set(used)) != len(used)
+        chunk = math.prod(properties.get_chunk()) * itemsize if is_chunked else 0
+        in_file = is_chunked or layout in {h5py.h5d.COMPACT, h5py.h5d.CONTIGUOUS}
+        filters = f"must use each of {', '.join(_FILTERS.values())} at most once and no other"
+        self._refuse(place, properties.get_external_count(), "keeps its data in another file")
+        self._refuse(place, not in_file, "is a virtual dataset")
+        self._refuse(place, is_filtered, filters)
+        self._refuse(place, not _is_allowed(kind), "has a type outside the format")
+        self._refuse(place, chunk > _LARGEST_CHUNK_BYTES, "has chunks of more than 64 MiB")
         declared = math.prod(dataset.shape or ()) * itemsize
         stored = dataset.get_storage_size()
-        if declared > max(_ALWAYS_ALLOWED_BYTES, _LARGEST_RATIO * stored):
-            raise self._refusal(
-                place, f"says it has {declared} bytes, but the file holds {stored} for it"
-            )
+        unfounded = declared > max(_ALWAYS_ALLOWED_BYTES, _LARGEST_RATIO * stored)
+        sizes = f"says it has {declared} bytes, but the file holds {stored} for it"
+        self._refuse(place, unfounded, sizes)
         # Many that each stay below what is always allowed would be a flood together.
         self._unfounded_bytes += max(0, declared - _LARGEST_RATIO * stored)
-        if self._unfounded_bytes > _ALWAYS_ALLOWED_BYTES:
-            raise self._refusal(
-                place,
-                "and those before it say they have more than 64 MiB that the file cannot hold",
-            )
         self._stored_bytes += stored
-        if self._stored_bytes > self._size_bytes:
-            raise self._refusal(place, "and the datasets before it say more than the file can hold")
+        together = "and those before it say they have more than 64 MiB that the file cannot hold"
+        self._refuse(place, self._unfounded_bytes > _ALWAYS_ALLOWED_BYTES, together)
+        together = "and the datasets before it say more than the file can hold"
+        self._refuse(place, self._stored_bytes > self._size_bytes, together)
 
     def _check_attributes(self, item: h5py.h5g.GroupID | h5py.h5d.DatasetID, place: str) -> None:
         n_attributes = h5py.h5a.get_num_attrs(item)
         self._count(n_attributes, place)
         for index in range(n_attributes):
             attribute = h5py.h5a.open(item, index=index)
-            kind = attribute.get_type()
-            problem = ""
-            if not _is_allowed(kind):
-                problem = "has a type outside the format"
-            elif math.prod(attribute.shape) * kind.get_size() > _LARGEST_ATTRIBUTE_BYTES:
-                problem = "is larger than 1 MiB"
-            if problem:
-                name = attribute.name.decode("utf-8", "backslashreplace")
-                raise self._refusal(f"{place}@{name}", problem)
+            kind, where = attribute.get_type(), place
+            where += "@" + attribute.name.decode("utf-8", "backslashreplace")
+            self._refuse(where, not _is_allowed(kind), "has a type outside the format")
+            n_bytes = math.prod(attribute.shape) * kind.get_size()
+            self._refuse(where, n_bytes > _LARGEST_ATTRIBUTE_BYTES, "is larger than 1 MiB")
+
+    def _refuse(self, place: str, is_wrong: object, reason: str) -> None:
+        if is_wrong:
+            raise self._refusal(place, reason)
 
     def _refusal(self, place: str, reason: str) -> RecordFormatError:
         return RecordFormatError(f"{self._name}:{place} {reason}: the file is not opened")
-
-
-def _is_text(kind: h5py.h5t.TypeID) -> bool:
-    return bool(kind.get_class() == h5py.h5t.STRING)
 
 
 def _is_allowed(kind: h5py.h5t.TypeID) -> bool:
@@ -582,21 +548,6 @@ def _is_plain(kind: h5py.h5t.TypeID) -> bool:
     if type_class == h5py.h5t.STRING:
         return not kind.is_variable_str()
     return type_class in _PLAIN_CLASSES or type_class == h5py.h5t.ENUM
-
-
-def _read_at(descriptor: int, n_bytes: int, position: int) -> bytes:
-    if hasattr(os, "pread"):
-        return os.pread(descriptor, n_bytes, position)
-    # Windows has no such call; a sink has one thread.
-    os.lseek(descriptor, position, os.SEEK_SET)
-    return os.read(descriptor, n_bytes)
-
-
-def _write_at(descriptor: int, data: memoryview, position: int) -> int:
-    if hasattr(os, "pwrite"):
-        return os.pwrite(descriptor, data, position)
-    os.lseek(descriptor, position, os.SEEK_SET)
-    return os.write(descriptor, data)
 
 
 def _open_through(sink: FileSink, path: Path) -> h5py.File:

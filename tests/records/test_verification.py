@@ -12,22 +12,21 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from orthoflow_provenance.document import Metric, RecordedProduct
+from orthoflow_provenance.document import Metric, PublishedFile, RecordedProduct
 from orthoflow_provenance.record import write_record
 
 from orthoflow.errors import RecordError
 from orthoflow.products.inspections import Finding
-from orthoflow.records import verify as module
 from orthoflow.records.runs import published_state, require_unchanged
-from orthoflow.records.verify import verify_run
+from orthoflow.records.verify import Verification, sealed_page, verify_run
 from tests.provenance_records import ProductShelf, sample_record
 from tests.report_runs import inspection_product
 
 CONTENT = b"a picture"
 
 
-def published(path: str, content: bytes = CONTENT) -> Any:
-    return SimpleNamespace(
+def published(path: str, content: bytes = CONTENT) -> PublishedFile:
+    return PublishedFile(
         path=path, size_bytes=len(content), sha256=hashlib.sha256(content).hexdigest()
     )
 
@@ -68,17 +67,24 @@ def test_a_file_that_cannot_be_read_is_told(folder: Path, monkeypatch: pytest.Mo
     assert published_state(folder, published("products/same")) == "unreadable"
 
 
-def checked(folder: Path, *names: str) -> Any:
-    record: Any = SimpleNamespace(published=[published(f"products/{name}") for name in names])
-    return module._check_published(folder / "run.h5", record)
+def checked(folder: Path, *names: str) -> Verification:
+    """Verify a record that names files of a folder; what it names is in `products/`."""
+    base = sample_record("sha256:" + "c" * 64, "sha256:" + "d" * 64)
+    record = replace(
+        base,
+        cells=(base.cells[0], base.cells[2]),
+        published=tuple(published(f"products/{name}") for name in names),
+    )
+    write_record(folder / "run.h5", record, lambda _: None)
+    return verify_run(folder)
 
 
 def test_files_beside_a_record_are_counted_and_named(folder: Path) -> None:
     for name in set(STATES) - {"same", "other", "link", "folder", "gone", "same/below"}:
         (folder / "products" / name).unlink()
     found = checked(folder, "same", "other", "link", "gone", "same/below")
-    assert found.n_same == 1
-    assert found.changed == (
+    assert found.n_published == 1
+    assert found.findings == (
         "products/other: changed since it was published",
         (
             "products/link: a link, a folder or a device stands where a file was published; "
@@ -99,20 +105,28 @@ def test_files_beside_a_record_are_counted_and_named(folder: Path) -> None:
 
 
 def test_a_page_is_of_one_record_and_as_it_was_written(tmp_path: Path) -> None:
-    run: Any = SimpleNamespace(content_sha256="a" * 64)
-    text = module.sealed_page(
-        "<html>1.25 mm</html>", [run, SimpleNamespace(content_sha256="b" * 64)]
-    )
+    own: Any = SimpleNamespace(content_sha256=checked(tmp_path).seal)
+    other: Any = SimpleNamespace(content_sha256="b" * 64)
     page = tmp_path / "report.html"
-    page.write_text(text)
-    for digest, is_own in (("a" * 64, True), ("b" * 64, True), ("c" * 64, False)):
-        assert module._page_states(tmp_path, digest) == {"report.html": is_own}
-    for changed in (text.replace("1.25", "0.25"), text + " ", text.replace("a" * 64, "c" * 64), ""):
+
+    def is_own() -> bool:
+        found = verify_run(tmp_path)
+        assert [note.code for note in found.notes] == ["page"] * (1 - found.n_pages)
+        return bool(found.n_pages)
+
+    text = sealed_page("<html>1.25 mm</html>", [own, other])
+    for shown, is_shown in (([own, other], True), ([other, own], True), ([other], False)):
+        page.write_text(sealed_page("<html>1.25 mm</html>", shown))
+        assert is_own() is is_shown
+    own_digest = own.content_sha256
+    for changed in (text.replace("1.25", "0.25"), text + " ", text.replace("b" * 64, own_digest)):
         page.write_text(changed)
-        assert module._page_states(tmp_path, "a" * 64) == {"report.html": False}
+        assert not is_own()
+    page.write_text("")
+    assert not is_own()
     page.unlink()
     page.symlink_to("/dev/zero")
-    assert module._page_states(tmp_path, "a" * 64) == {"report.html": False}
+    assert not is_own()
 
 
 def test_only_what_the_record_vouches_for_is_used(folder: Path) -> None:
