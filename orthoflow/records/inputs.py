@@ -26,10 +26,7 @@ from orthoflow_provenance.record import extract_files
 
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.file_digests import FileDigests
-from orthoflow.errors import (
-    InputError,
-    RecordError,
-)
+from orthoflow.errors import InputError
 from orthoflow.records.runs import Run, record_errors
 from orthoflow.untrusted_text import first_few
 from orthoflow.workflow.inputs import (
@@ -46,14 +43,6 @@ from orthoflow.workflow.problems import ProblemLog
 _MOST_LISTED: Final = 10_000
 # By default a run is in runs/<name>/ below the folder of its workflow.
 _FOLDERS_ABOVE: Final = 3
-
-
-class ChangedInputsError(RecordError):
-    """Input files differ from the record; `problems` names them, and missing ones."""
-
-    def __init__(self, problems: tuple[str, ...]) -> None:
-        self.problems = problems
-        super().__init__("\n".join(problems))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -30,22 +30,6 @@ from orthoflow.workflow.resolved import workflow_from_resolved
 _ENVIRONMENT: tuple[str, ...] = ("python", "os", "cpu")
 
 
-class UnreplayableRunError(RecordError):
-    """A run cannot be replayed unchanged; `problems` has the reasons, a sentence each."""
-
-    def __init__(self, problems: tuple[str, ...]) -> None:
-        self.problems = problems
-        super().__init__("\n".join(problems))
-
-
-class MissingMethodsError(PluginError):
-    """Methods or product types of a record are not installed; `problems` names them."""
-
-    def __init__(self, problems: tuple[str, ...]) -> None:
-        self.problems = problems
-        super().__init__("\n".join(problems))
-
-
 @dataclass(frozen=True, kw_only=True)
 class Replay:
     """A replay that is ready to start.
@@ -88,22 +72,27 @@ def plan_replay(
         earlier: stores that may have noted positions of input files.
 
     Raises:
-        UnreplayableRunError: the record was changed, a method has another result version or takes
+        RecordError: the record was changed, a method has another result version or takes
             other parameters, or an input file was changed.
         MissingInputsError: only input files are missing.
-        MissingMethodsError: only methods or product types are missing.
+        PluginError: only methods or product types are missing.
         InvalidArgumentsError: `inputs` names no input of the workflow.
         InputError: there is nothing at a given path.
     """
-    findings = verify_run(run.path, also_published=False).findings or (
-        *_inconsistencies(run),
-        *_loose_ends(run),
-    )
-    if findings:
-        raise UnreplayableRunError(
-            tuple(f"{run.path} is not as it was written: {finding}" for finding in findings)
+    findings = verify_run(run.path, also_published=False).findings
+    if problems := findings or (*_inconsistencies(run), *_loose_ends(run)):
+        raise RecordError(
+            "\n".join(f"{run.path} is not as it was written: {problem}" for problem in problems)
         )
-    workflow = _workflow(run)
+    try:
+        workflow = workflow_from_resolved(run.record.workflow_resolved, run.record.workflow_source)
+    except WorkflowError as error:
+        raise RecordError(f"{run.path}: {error}") from error
+    unknown = [cell.address for cell in run.record.cells if _variant(cell, workflow) is None]
+    if unknown:
+        raise RecordError(
+            "\n".join(f"{run.path}: its workflow has no step {address}" for address in unknown)
+        )
     missing, others = _method_problems(run, catalog)
     digests = store.file_digests()
     search = find_inputs(
@@ -116,52 +105,31 @@ def plan_replay(
         noted=[one.file_digests() for one in earlier],
     )
     if others or search.is_changed:
-        raise UnreplayableRunError((*others, *missing, *search.problems))
+        raise RecordError("\n".join((*others, *missing, *search.problems)))
     if search.problems:
         raise MissingInputsError((*missing, *search.problems))
     if missing:
-        raise MissingMethodsError(missing)
+        raise PluginError("\n".join(missing))
     if store.folder.is_dir():
         digests.save()
-    paths = {
-        entry.name: laid_out.named(entry, search.paths[entry.name])
-        if laid_out
-        else search.paths[entry.name]
-        for entry in run.record.inputs
-    }
+    paths = search.paths
+    if laid_out:
+        paths = {
+            entry.name: laid_out.named(entry, paths[entry.name]) for entry in run.record.inputs
+        }
     found = _with_files(workflow, paths)
     cells = [_cell(cell, workflow) for cell in run.record.cells]
     plan = plan_run(cells, found, catalog, store, options)
-    changed = _changed_methods(run, plan)
-    notes = (*_environment_notes(run), *_method_notes(run, plan, changed))
+    changed, notes = _changes(run, plan)
+    products = [output for cell in run.record.cells for output in cell.outputs.values()]
+    given = [entry for entry in run.record.inputs if entry.files]
     return Replay(
         workflow=workflow,
         plan=plan,
-        notes=tuple(dict.fromkeys(notes)),
+        notes=notes,
         changed_methods=changed,
-        is_embedded=_is_embedded(run),
+        is_embedded=all(one.embedded for one in products) and all(one.embedded for one in given),
     )
-
-
-def _is_embedded(run: Run) -> bool:
-    products = (output for cell in run.record.cells for output in cell.outputs.values())
-    inputs = (entry for entry in run.record.inputs if entry.files)
-    return all(item.embedded for item in products) and all(item.embedded for item in inputs)
-
-
-def _workflow(run: Run) -> Workflow:
-    try:
-        workflow = workflow_from_resolved(run.record.workflow_resolved, run.record.workflow_source)
-    except WorkflowError as error:
-        raise UnreplayableRunError((f"{run.path}: {error}",)) from error
-    strangers = tuple(
-        f"{run.path}: its workflow has no step {cell.address}"
-        for cell in run.record.cells
-        if _variant(cell, workflow) is None
-    )
-    if strangers:
-        raise UnreplayableRunError(strangers)
-    return workflow
 
 
 def _variant(cell: RecordedCell, workflow: Workflow) -> StepVariant | None:
@@ -210,18 +178,15 @@ def _inconsistencies(run: Run) -> Iterator[str]:
 
 def _loose_ends(run: Run) -> Iterator[str]:
     """Find inputs of cells that neither an input of the run nor an earlier cell gives."""
-    inputs = {entry.name for entry in run.record.inputs}
-    given: dict[str, set[str]] = {}
+    given = {"inputs": {entry.name for entry in run.record.inputs}}
     for cell in run.record.cells:
         for port, product in cell.inputs.items():
             owner, _, name = product.source.rpartition(".")
-            is_there = name in inputs if owner == "inputs" else owner in given
-            # This may be what a skipped cell lacks.
-            if is_there and owner != "inputs" and cell.status != "skipped":
-                is_there = name in given[owner]
-            if not is_there:
+            # Of a step before it a skipped cell may lack just this.
+            is_lacking = cell.status == "skipped" and owner != "inputs" and owner in given
+            if not is_lacking and name not in given.get(owner, ()):
                 yield f"{cell.address}: nothing before it gives {product.source!r}, its {port}"
-        given[cell.address] = set(cell.outputs)
+        given.setdefault(cell.address, set(cell.outputs))
 
 
 def _method_problems(run: Run, catalog: Catalog) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -295,40 +260,33 @@ def _source(text: str) -> CellOutput | WorkflowInput:
     return CellOutput(address=owner, port=name)
 
 
-def _environment_notes(run: Run) -> Iterator[str]:
+def _changes(run: Run, plan: RunPlan) -> tuple[frozenset[str], tuple[str, ...]]:
+    """Return methods with other code than in the record, and all that may affect results."""
     here = environment(1)
-    for recorded in run.record.environments:
-        for name in _ENVIRONMENT:
-            if getattr(recorded, name) != getattr(here, name):
-                yield f"{name}: {getattr(here, name)} here, {getattr(recorded, name)} in the record"
-
-
-def _changed_methods(run: Run, plan: RunPlan) -> frozenset[str]:
-    return frozenset(
-        cell.method
-        for cell in run.record.cells
-        if cell.method in plan.methods
-        and cell.key_preimage
-        and stated_versions(read_preimage(cell.key_preimage), "code")
-        != dict(plan.methods[cell.method].code)
-    )
-
-
-def _method_notes(run: Run, plan: RunPlan, changed: frozenset[str]) -> Iterator[str]:
+    notes = [
+        f"{name}: {getattr(here, name)} here, {getattr(recorded, name)} in the record"
+        for recorded in run.record.environments
+        for name in _ENVIRONMENT
+        if getattr(recorded, name) != getattr(here, name)
+    ]
+    changed: set[str] = set()
     for cell in run.record.cells:
         facts = plan.methods.get(cell.method)
         if facts is None or not cell.key_preimage:
             continue
-        if cell.method in changed:
-            yield (
+        preimage = read_preimage(cell.key_preimage)
+        if stated_versions(preimage, "code") != dict(facts.code):
+            changed.add(cell.method)
+            notes.append(
                 f"{cell.method}: its code is not that of the record, though both say result "
                 f"version {cell.result_version}"
             )
-        recorded = stated_versions(read_preimage(cell.key_preimage), "tools")
-        for tool in sorted(recorded.keys() | facts.tools.keys()):
-            versions = facts.tools.get(tool), recorded.get(tool)
-            if versions[0] != versions[1]:
-                yield f"{cell.method}: {tool} {versions[0]} here, {versions[1]} in the record"
+        recorded_tools = stated_versions(preimage, "tools")
+        for tool in sorted(recorded_tools.keys() | facts.tools.keys()):
+            ours, theirs = facts.tools.get(tool), recorded_tools.get(tool)
+            if ours != theirs:
+                notes.append(f"{cell.method}: {tool} {ours} here, {theirs} in the record")
+    return frozenset(changed), tuple(dict.fromkeys(notes))
 
 
 MetricVerdict = Literal[

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, BinaryIO, Final, Literal, TypeAlias
 from orthoflow_provenance.arrays import StoredPayload
 from orthoflow_provenance.document import (
     FIGURE_SUFFIXES,
+    Metric,
     PublishedFile,
     RecordedCell,
     RecordedFigure,
@@ -72,34 +73,23 @@ _COLUMNS: Final = ("cell", "step", "method", "metric", "value", "unit")
 
 
 @dataclass(frozen=True, kw_only=True)
-class MetricRow:
+class MetricRow(Metric):
     """One number of one cell.
 
     Attributes:
         cell: address of the cell.
         step: name of its step.
         method: method id.
-        metric: name, ending in its unit if it has one.
-        value: finite number.
-        unit: `mm`, `px`, `s`, ...; `1` for counts and shares.
-        label: label declared by its method; empty without one.
-        better: which values are better, `lower`, `higher` or `one`; empty where none are.
-        description: further explanation.
-        headline: it is one of the numbers that state how good a result is.
-        counted_by: metric of the same step with the number of items it summarises.
     """
 
     cell: str
     step: str
     method: str
-    metric: str
-    value: float
-    unit: str
-    label: str = ""
-    better: str = ""
-    description: str = ""
-    headline: bool = False
-    counted_by: str = ""
+
+    @property
+    def metric(self) -> str:
+        """Its name, as columns of tables are called."""
+        return self.name
 
     @property
     def title(self) -> str:
@@ -120,19 +110,7 @@ def cell_metrics(cell: RecordedCell) -> tuple[MetricRow, ...]:
     if cell.status != "ok":
         return ()
     return tuple(
-        MetricRow(
-            cell=cell.address,
-            step=cell.step,
-            method=cell.method,
-            metric=metric.name,
-            value=metric.value,
-            unit=metric.unit,
-            label=metric.label,
-            better=metric.better,
-            description=metric.description,
-            headline=metric.headline,
-            counted_by=metric.counted_by,
-        )
+        MetricRow(cell=cell.address, step=cell.step, method=cell.method, **vars(metric))
         for metric in (*cell.metrics, *cost_metrics(cell))
     )
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import re
-import statistics
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,7 +13,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
-from orthoflow_provenance.document import COSTS, CellOutcome, RecordedCell, RunRecord, sha256_text
+from orthoflow_provenance.document import (
+    COSTS,
+    CellOutcome,
+    RecordedCell,
+    RecordedDiagnostic,
+    RunRecord,
+    sha256_text,
+)
 
 from orthoflow.errors import ArgumentError
 from orthoflow.products import Inspection
@@ -305,20 +311,17 @@ class RunSet:
             A row per combination of variants, step, method and metric, with `n`, `median`, `mean`,
             `standard_deviation` (NaN for one value), `lowest` and `highest`.
         """
-        import pandas as pd  # noqa: PLC0415 - as above
-
-        header, *rows = self.rows()
-        keys = [*(f"variant.{step}" for step in self.steps), "step", "method", "metric", "unit"]
-        keys.append("better")
-        groups: dict[tuple[Value, ...], list[float]] = {}
-        for row in rows:
-            named = dict(zip(header, row, strict=True))
-            values = groups.setdefault(tuple(named[key] for key in keys), [])
-            values.append(float(named["value"] or 0.0))
-        columns = [*keys, "n", "median", "mean", "standard_deviation", *_RANGE]
-        return pd.DataFrame(
-            [(*key, *_summary(values)) for key, values in groups.items()], columns=columns
-        )
+        names = [f"variant.{step}" for step in self.steps]
+        keys = [*names, "step", "method", "metric", "unit", "better"]
+        values = self.metrics().astype({"value": float}).groupby(keys, sort=False)["value"]
+        return values.agg(
+            n="count",
+            median="median",
+            mean="mean",
+            standard_deviation="std",
+            lowest="min",
+            highest="max",
+        ).reset_index()
 
     def rows(self) -> Iterator[tuple[Value, ...]]:
         """Return the table of `metrics`, its header first."""
@@ -428,12 +431,6 @@ def _told_apart(choice: Choice, others: Sequence[Choice]) -> str:
     return f" ({', '.join(said)})"
 
 
-def _summary(values: Sequence[float]) -> tuple[float, ...]:
-    spread = statistics.stdev(values) if len(values) > 1 else float("nan")
-    middle = statistics.median(values), statistics.fmean(values)
-    return (len(values), *middle, spread, min(values), max(values))
-
-
 _WORD: Final = re.compile(r"(?<!^)(?=[A-Z])")
 
 
@@ -442,18 +439,14 @@ def diagnostics_of(cell: CellOutcome, step: str, address: str) -> Iterator[dict[
 
     The code of a failure is the class of its error in lower case: `InputError` is `input-error`.
     """
+    found = list(cell.diagnostics)
     if cell.status == "failed":
-        yield {
-            "code": _WORD.sub("-", cell.error_type).lower() or "failed",
-            "severity": "error",
-            "step": step,
-            "cell": address,
-            "subject": address,
-            "values": {},
-            "text": cell.error_message,
-            "remedy": "",
-        }
-    for one in cell.diagnostics:
+        code = _WORD.sub("-", cell.error_type).lower() or "failed"
+        failure = RecordedDiagnostic(
+            code=code, severity="error", subject=address, values={}, text=cell.error_message
+        )
+        found.insert(0, failure)
+    for one in found:
         yield {
             "code": one.code,
             "severity": one.severity,

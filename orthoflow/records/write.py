@@ -44,14 +44,21 @@ from orthoflow.engine.journal import (
 )
 from orthoflow.engine.results import CellResult
 from orthoflow.engine.store import Store, publish_into
-from orthoflow.errors import ArgumentError, DamageError, InputError, OrthoflowError, StoreError
+from orthoflow.errors import (
+    ArgumentError,
+    DamageError,
+    InputError,
+    OrthoflowError,
+    RecordError,
+    StoreError,
+)
 from orthoflow.files.geotiff import name_run
 from orthoflow.geometry.threads import in_order
 from orthoflow.products import (
     Orthoimages,
     Walls,
 )
-from orthoflow.records.inputs import ChangedInputsError, embedded_inputs, find_inputs
+from orthoflow.records.inputs import embedded_inputs, find_inputs
 from orthoflow.records.runs import (
     METRICS_FILE,
     PRODUCTS_FOLDER,
@@ -552,7 +559,7 @@ def write_embedded(run: Run, path: Path, store: Store, inputs: Sequence[str] = (
 
     Raises:
         InputError: an input file is missing.
-        ChangedInputsError: an input file was changed.
+        RecordError: an input file was changed.
         ArgumentError: a product is in neither record nor store.
         StoreError: the disk cannot be written.
         InvalidArgumentsError: `inputs` names no input of the workflow.
@@ -627,7 +634,7 @@ def _input_files(
         workflow, record.inputs, run.folder, digests, given=given, extracted=extracted
     )
     if search.is_changed:
-        raise ChangedInputsError(search.problems)
+        raise RecordError("\n".join(search.problems))
     if search.problems:
         raise MissingInputsError(search.problems)
     return {

@@ -9,7 +9,8 @@ import pytest
 from orthoflow.engine.plan import RunOptions, plan_run
 from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.engine.store import Store
-from orthoflow.records.replay import UnreplayableRunError, plan_replay
+from orthoflow.errors import RecordError
+from orthoflow.records.replay import plan_replay
 from orthoflow.records.runs import Run
 from orthoflow.records.write import write_run
 from orthoflow.workflow import expand as cells
@@ -108,5 +109,5 @@ def test_a_record_whose_workflow_asks_for_the_impossible_is_refused(
     hostile = dataclasses.replace(workflow, steps=steps)
     run = write_run(outcome, plan, hostile, world.folder / "run", world.store)
     said = rf"the resolved workflow cannot be read: steps\.last\.variants\.0\.{field}: .*{reason}"
-    with pytest.raises(UnreplayableRunError, match=said):
+    with pytest.raises(RecordError, match=said):
         plan_replay(run, catalog, Store(world.folder / "fresh"), INLINE)
