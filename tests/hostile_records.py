@@ -15,7 +15,6 @@ import numpy as np
 from orthoflow_provenance import record as module
 from orthoflow_provenance.document import (
     RecordFormatError,
-    RunRecord,
     canonical_json,
     from_json,
     sha256_text,
@@ -97,9 +96,7 @@ def reseal(path: Path, change: Callable[[Record], object]) -> None:
 def rewrite(file: h5py.File, text: str) -> None:
     """Give a record another document, with what repeats it where it can be, and a new seal."""
     try:
-        read = from_json(
-            RunRecord, json.loads(text), lambda sha256: file[f"files/{sha256}"][()].tobytes()
-        )
+        read = from_json(text, lambda sha256: file[f"files/{sha256}"][()].tobytes())
         nodes = module.expected_nodes(read, text)
         for name in set(file) - {"products", "files"}:
             del file[name]

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import atexit
 import dataclasses
+import json
 import shutil
 import tempfile
 from pathlib import Path
 from typing import Any
 
-from orthoflow_provenance.document import RecordFormatError, RunRecord, from_json, parse_json
+from orthoflow_provenance.document import RecordFormatError, from_json, parse_json
 from orthoflow_provenance.record import write_record
 
 from orthoflow.engine.journal import RECORD_FILE, readable_lines
@@ -58,7 +59,7 @@ def open_unfinished(folder: Path) -> Run:
 
     try:
         content: Any = parse_json((folder / OUTLINE_FILE).read_text("utf-8"), OUTLINE_FILE)
-        record = from_json(RunRecord, content["record"], lambda _: b"")
+        record = from_json(json.dumps(content["record"]), lambda _: b"")
         store = Store(Path(content["store"]))
         sources, embedded = content["sources"], frozenset(content["embedded"])
     except (OSError, RecordFormatError, KeyError, TypeError) as error:

@@ -1,1 +1,1 @@
-"""The record format of orthoflow: h5py and numpy only, readable without the program itself."""
+"""The record format of orthoflow, readable without the program: h5py, numpy, pydantic."""

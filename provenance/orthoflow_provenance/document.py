@@ -1,8 +1,8 @@
-"""What a run says, as dataclasses and as one JSON document.
+"""The content of a record, as dataclasses and as one JSON document.
 
 The only declaration of metric, figure, cell and record: methods, store and record use these types,
-or add to them what only they know. Reading and writing go through the fields, so a field that is
-added here is recorded, and those of `Costs` are shown wherever the others are.
+or add to them what only they know. Pydantic reads and writes the document by the fields, so a field
+that is added here is recorded, and those of `Costs` are shown wherever the others are.
 """
 
 from __future__ import annotations
@@ -10,16 +10,16 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import types
 import typing
-from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Protocol, TypeAlias
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+    from pydantic import TypeAdapter
 
 RUN_FORMAT: Final = "orthoflow-run"
 PRODUCT_FORMAT: Final = "orthoflow-product"
@@ -34,9 +34,14 @@ FIGURE_SUFFIXES: Final[Mapping[str, str]] = {
     "image/jpeg": ".jpg",
 }
 
-JsonValue: TypeAlias = bool | int | float | str | list["JsonValue"] | dict[str, "JsonValue"] | None
+if TYPE_CHECKING:
+    JsonValue: TypeAlias = (
+        bool | int | float | str | list["JsonValue"] | dict[str, "JsonValue"] | None
+    )
+else:
+    # Pydantic cannot resolve an alias that contains itself; the document is JSON already.
+    JsonValue = Any
 CellStatus = Literal["ok", "failed", "skipped"]
-Entry = TypeVar("Entry")
 
 
 class RecordFormatError(ValueError):
@@ -465,85 +470,77 @@ def shared_fields(source: object, part: type) -> dict[str, Any]:
     return {item.name: getattr(source, item.name) for item in fields(part)}
 
 
-def to_json(value: object) -> JsonValue:
-    """Write dataclasses as JSON: an object per dataclass, the SHA-256 in the place of bytes."""
-    if is_dataclass(value):
-        return {item.name: to_json(getattr(value, item.name)) for item in fields(value)}
-    if isinstance(value, Mapping):
-        return {str(key): to_json(item) for key, item in value.items()}
-    if isinstance(value, bytes):
-        return hashlib.sha256(value).hexdigest()
-    if isinstance(value, tuple):
-        return [to_json(item) for item in value]
-    return plain_json(value)
-
-
-def from_json(
-    kind: type[Entry], value: object, contents: Callable[[str], bytes], place: str = ""
-) -> Entry:
-    """Read what `to_json` wrote.
-
-    Args:
-        kind: the dataclass.
-        value: JSON.
-        contents: SHA-256 -> bytes, for what was written as digest.
-        place: of the value in the document, for the message.
+def to_json(record: RunRecord) -> dict[str, Any]:
+    """Return the document of a record: an object per dataclass, digests in the place of bytes.
 
     Raises:
-        RecordFormatError: a field is missing, unknown, or has another type.
+        RecordFormatError: it holds what cannot be JSON.
     """
-    if not isinstance(value, dict):
-        raise _misfit(place, "an object", value)
-    hints = _hints(typing.cast("Hashable", kind))
-    for name in hints.keys() ^ value.keys():
-        said = "lacks" if name in hints else "has the unknown field"
-        raise RecordFormatError(f"the document{f' at {place}' if place else ''} {said} {name!r}")
-    return kind(
-        **{
-            name: _from_json(hint, value[name], contents, f"{place}/{name}")
-            for name, hint in hints.items()
-        }
-    )
+
+    def digested(figure: RecordedFigure) -> RecordedFigure:
+        return replace(figure, data=hashlib.sha256(figure.data).hexdigest().encode())
+
+    try:
+        document: dict[str, Any] = _codec().dump_python(
+            _with_figures(record, digested), mode="json"
+        )
+    except ValueError as error:
+        raise RecordFormatError(f"the record cannot be written as JSON: {error}") from error
+    plain_json(document)
+    return document
 
 
-# Any: a type as annotations state it, and what it constructs.
-def _from_json(hint: Any, value: object, contents: Callable[[str], bytes], place: str) -> Any:
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+def from_json(text: str, contents: Callable[[str], bytes]) -> RunRecord:
+    """Read a document.
 
-    def inner(kind: object, item: object, name: object) -> Any:
-        return _from_json(kind, item, contents, f"{place}/{name}")
+    Args:
+        text: JSON of what `to_json` returned.
+        contents: SHA-256 -> bytes, for what was written as digest.
 
-    read: Any = value
-    if origin in (typing.Union, types.UnionType):
-        # Of two the other is None; of more it is JSON of any form.
-        if len(arguments) == 2 and value is not None:
-            read = _from_json(arguments[0], value, contents, place)
-    elif origin is tuple and isinstance(value, list):
-        read = tuple(inner(arguments[0], item, index) for index, item in enumerate(value))
-    elif origin is Mapping and isinstance(value, dict):
-        read = {key: inner(arguments[1], item, key) for key, item in value.items()}
-    elif is_dataclass(hint):
-        read = from_json(typing.cast("type", hint), value, contents, place)
-    elif hint is bytes and isinstance(value, str):
-        read = contents(value)
-    elif hint is float and type(value) is int:
-        read = float(value)
-    elif value not in arguments if origin is Literal else type(value) is not hint:
-        expected = " or ".join(map(repr, arguments)) if origin is Literal else f"a {hint}"
-        raise _misfit(place, expected, value)
-    return read
+    Raises:
+        RecordFormatError: the text is not JSON, or a field is missing, unknown, or has another
+            type.
+    """
+    document = parse_json(text, "the document")
+    codec = _codec()
+    from pydantic import ValidationError  # noqa: PLC0415 - as above
+
+    try:
+        record = codec.validate_json(text, strict=True)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        place = "/".join(map(str, first["loc"]))
+        raise RecordFormatError(f"the document at /{place}: {first['msg']}") from error
+    if (written := codec.dump_python(record, mode="json")) != document:
+        odd = min({*_paths(document)} ^ {*_paths(written)}, default="/")
+        raise RecordFormatError(f"the document lacks {odd}, or has it where no such field is known")
+    return _with_figures(record, lambda one: replace(one, data=contents(one.data.decode())))
 
 
-def _misfit(place: str, expected: str, value: object) -> RecordFormatError:
-    found = f"{value!r:.40}" if isinstance(value, str | int | float) else type(value).__name__
-    return RecordFormatError(f"the document must have {expected} at {place or '/'}, got {found}")
+def _with_figures(
+    record: RunRecord, change: Callable[[RecordedFigure], RecordedFigure]
+) -> RunRecord:
+    cells = (replace(cell, figures=tuple(map(change, cell.figures))) for cell in record.cells)
+    return replace(record, cells=tuple(cells))
+
+
+def _paths(value: JsonValue, place: str = "") -> Iterator[str]:
+    """Yield the paths of all values in a document."""
+    below: Iterable[tuple[object, JsonValue]] = ()
+    if isinstance(value, dict):
+        below = value.items()
+    elif isinstance(value, list):
+        below = enumerate(value)
+    for name, item in below:
+        yield f"{place}/{name}"
+        yield from _paths(item, f"{place}/{name}")
 
 
 @cache
-# Any: a dataclass, which mypy does not let be a key of the cache.
-def _hints(kind: Any) -> Mapping[str, Any]:
-    hints = typing.get_type_hints(kind)
-    return {item.name: hints[item.name] for item in fields(kind)}
+def _codec() -> TypeAdapter[RunRecord]:
+    from pydantic import TypeAdapter  # noqa: PLC0415 - `orthoflow --help` needs none
+
+    return TypeAdapter(RunRecord)
 
 
 def parse_json(text: str, place: str) -> JsonValue:

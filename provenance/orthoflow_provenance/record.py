@@ -39,7 +39,6 @@ from orthoflow_provenance.document import (
     RunRecord,
     cost_metrics,
     from_json,
-    parse_json,
     sha256_text,
     to_json,
 )
@@ -226,8 +225,7 @@ def record_of(file: h5py.File) -> RunRecord:
         check_name(sha256, "the file")
         return np.asarray(read_whole(dataset_of(open_group(file, FILES), sha256))).tobytes()
 
-    value = parse_json(read_text(file, DOCUMENT), f"/{DOCUMENT}")
-    return from_json(RunRecord, value, contents)
+    return from_json(read_text(file, DOCUMENT), contents)
 
 
 def document_text(record: RunRecord) -> str:
