@@ -323,16 +323,16 @@ def test_tables_for_spreadsheets_hold_no_formulas(finished: Studio, folder: Path
     assert '"paint","paint","paint.plain","plain",2.0,"1"\n' in text
 
 
-def test_halves_of_letters_are_written_as_json_has_them(finished: Studio, folder: Path) -> None:
+def test_a_document_with_halves_of_letters_is_refused(finished: Studio, folder: Path) -> None:
     def write(record: hostile.Record) -> None:
         record.cell("paint")["params"] = {"odd": "a\ud800"}
 
     run = hostile.changed(finished.folder / "first", folder / "run", write)
-    for target in ("csv", "prov", "ro-crate"):
-        done = finished("export", run, "--to", target, "-o", target)
-        assert done.exit_code == 0, done.output
-    assert "a\\ud800" in Path("csv/parameters.csv").read_text()
-    assert "a\\ud800" in Path("prov/prov.json").read_text()
+    assert {finding.partition(":")[0] for finding in verify_run(run).findings} == {"/document"}
+    for command in COMMANDS:
+        done = finished(command[0], run, *command[1:])
+        assert done.exit_code == 3, (command, done.output)
+        assert "\ud800" not in done.output
 
 
 def test_pictures_that_cannot_be_decoded_are_not_counted(finished: Studio, folder: Path) -> None:
