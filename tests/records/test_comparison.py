@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from orthoflow.engine.store import Store
-from orthoflow.records import compare as module
 from orthoflow.records.compare import Pair, compare_runs
 from orthoflow.records.open import open_run
 from orthoflow.records.runs import Run
@@ -207,10 +206,16 @@ def test_what_was_skipped_has_no_versions_to_differ_in() -> None:
     # Its method was loaded only where another dataset needed it.
     skipped = replace(cell("cloud", status="skipped", error_message="no scan"), seed=None)
     loaded = replace(skipped, result_version=1, determinism="exact", distribution="toys")
-    facts = [module._facts(one) for one in (skipped, loaded)]
-    assert facts[0] == facts[1]
-    assert str(facts[1]) == "skipped, cloud.toy, no scan"
-    assert module._facts(replace(loaded, status="ok")).result_version == 1
+    runs = [HeldRun(path=Path("run.h5"), record=record([one])) for one in (skipped, loaded)]
+    (row,) = compare_runs(*runs).cells
+    assert row.is_same
+    assert str(row.right) == "skipped, cloud.toy, no scan"
+    runs = [
+        HeldRun(path=Path("run.h5"), record=record([replace(one, status="ok")]))
+        for one in (skipped, loaded)
+    ]
+    (row,) = compare_runs(*runs).cells
+    assert not row.is_same
 
 
 def _swept(**values: float) -> HeldRun:
@@ -237,8 +242,8 @@ def _swept(**values: float) -> HeldRun:
 def test_rows_are_paired_by_parameters_and_not_by_names_of_variants(
     left: dict[str, float], right: dict[str, float], pairs: dict[str, str]
 ) -> None:
-    one, two = _swept(**left), _swept(**right)
-    found = module._readdressed(one, two)
-    assert found == {f"plane@plane={b}": f"plane@plane={a}" for b, a in pairs.items()}
-    own = {module._label(two, address, found): address for address in two.cells}
-    assert sorted(own.values()) == sorted(two.cells)
+    found = compare_runs(_swept(**left), _swept(**right))
+    assert found.readdressed == {f"plane@plane={b}": f"plane@plane={a}" for b, a in pairs.items()}
+    # No row of the second run is lost or counted twice.
+    assert sum(row.right is not None for row in found.cells) == len(right)
+    assert len({row.cell for row in found.cells}) == len(found.cells)

@@ -10,7 +10,6 @@ import pytest
 
 from orthoflow.errors import PluginError
 from orthoflow.products.product import Payload, Tolerance
-from orthoflow.records import compare as module
 from orthoflow.records.compare import RunProducts, product_distances
 
 
@@ -101,9 +100,8 @@ def test_what_cannot_be_had_is_not_measured() -> None:
     ("dtype", "limit"), [(np.uint8, 2.0), (np.uint16, 2.0 * 257), (np.int32, 2.0)]
 )
 def test_grey_of_sixteen_bits_counts_in_steps_of_257(dtype: Any, limit: float) -> None:
-    grey, metres = Tolerance(limit=2.0, unit="grey"), Tolerance(limit=2.0, unit="m")
-    one = payload(**{"walls/0/rgb": np.zeros(3, dtype=dtype)})
-    assert module._limit("rgb", grey, one) == limit
-    assert module._limit("rgb", metres, one) == 2.0
-    assert module._limit("gb", grey, one) == 2.0
-    assert module._limit("rgb", grey, payload(rgb=np.zeros(3, dtype=dtype))) == limit
+    for field, allowed in (("rgb", limit), ("n", 0.0)):
+        for place in (field, f"walls/0/{field}"):
+            before, after = (payload(**{place: np.array([v], dtype=dtype)}) for v in (0, 200))
+            (distance,) = compared(before, after).distances
+            assert distance.limit == allowed
