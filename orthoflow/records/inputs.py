@@ -7,7 +7,7 @@ import os
 import shutil
 import stat
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -26,7 +26,7 @@ from orthoflow_provenance.record import extract_files
 
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.file_digests import FileDigests
-from orthoflow.errors import InputError
+from orthoflow.errors import InputError, OrthoflowError, PluginError, RecordError
 from orthoflow.records.runs import Run, record_errors
 from orthoflow.untrusted_text import first_few
 from orthoflow.workflow.inputs import (
@@ -43,6 +43,22 @@ from orthoflow.workflow.problems import ProblemLog
 _MOST_LISTED: Final = 10_000
 # By default a run is in runs/<name>/ below the folder of its workflow.
 _FOLDERS_ABOVE: Final = 3
+
+
+class ProblemsError(OrthoflowError):
+    """Several things are wrong; `problems` has a sentence each."""
+
+    def __init__(self, problems: Iterable[str]) -> None:
+        self.problems = tuple(problems)
+        super().__init__("\n".join(self.problems))
+
+
+class RefusedRunError(ProblemsError, RecordError):
+    """A run cannot be repeated unchanged, or input files differ from its record."""
+
+
+class MissingMethodsError(ProblemsError, PluginError):
+    """Methods or product types of a record are not installed."""
 
 
 @dataclass(frozen=True, kw_only=True)

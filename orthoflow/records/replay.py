@@ -17,9 +17,14 @@ from orthoflow.engine.environment import environment
 from orthoflow.engine.keys import input_digest, read_preimage, stated_versions
 from orthoflow.engine.plan import RunOptions, RunPlan, plan_run
 from orthoflow.engine.store import Store
-from orthoflow.errors import PluginError, RecordError, WorkflowError
+from orthoflow.errors import PluginError, WorkflowError
 from orthoflow.records.compare import ComparedMetric, Pair, ProductDistance, compare_metrics
-from orthoflow.records.inputs import LaidOutInputs, find_inputs
+from orthoflow.records.inputs import (
+    LaidOutInputs,
+    MissingMethodsError,
+    RefusedRunError,
+    find_inputs,
+)
 from orthoflow.records.runs import Run
 from orthoflow.records.verify import verify_run
 from orthoflow.workflow.expand import Cell, CellOutput, WorkflowInput
@@ -72,26 +77,26 @@ def plan_replay(
         earlier: stores that may have noted positions of input files.
 
     Raises:
-        RecordError: the record was changed, a method has another result version or takes
+        RefusedRunError: the record was changed, a method has another result version or takes
             other parameters, or an input file was changed.
         MissingInputsError: only input files are missing.
-        PluginError: only methods or product types are missing.
+        MissingMethodsError: only methods or product types are missing.
         InvalidArgumentsError: `inputs` names no input of the workflow.
         InputError: there is nothing at a given path.
     """
     findings = verify_run(run.path, also_published=False).findings
     if problems := findings or (*_inconsistencies(run), *_loose_ends(run)):
-        raise RecordError(
-            "\n".join(f"{run.path} is not as it was written: {problem}" for problem in problems)
+        raise RefusedRunError(
+            f"{run.path} is not as it was written: {problem}" for problem in problems
         )
     try:
         workflow = workflow_from_resolved(run.record.workflow_resolved, run.record.workflow_source)
     except WorkflowError as error:
-        raise RecordError(f"{run.path}: {error}") from error
+        raise RefusedRunError([f"{run.path}: {error}"]) from error
     unknown = [cell.address for cell in run.record.cells if _variant(cell, workflow) is None]
     if unknown:
-        raise RecordError(
-            "\n".join(f"{run.path}: its workflow has no step {address}" for address in unknown)
+        raise RefusedRunError(
+            f"{run.path}: its workflow has no step {address}" for address in unknown
         )
     missing, others = _method_problems(run, catalog)
     digests = store.file_digests()
@@ -105,11 +110,11 @@ def plan_replay(
         noted=[one.file_digests() for one in earlier],
     )
     if others or search.is_changed:
-        raise RecordError("\n".join((*others, *missing, *search.problems)))
+        raise RefusedRunError((*others, *missing, *search.problems))
     if search.problems:
         raise MissingInputsError((*missing, *search.problems))
     if missing:
-        raise PluginError("\n".join(missing))
+        raise MissingMethodsError(missing)
     if store.folder.is_dir():
         digests.save()
     paths = search.paths

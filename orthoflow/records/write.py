@@ -49,7 +49,6 @@ from orthoflow.errors import (
     DamageError,
     InputError,
     OrthoflowError,
-    RecordError,
     StoreError,
 )
 from orthoflow.files.geotiff import name_run
@@ -58,7 +57,7 @@ from orthoflow.products import (
     Orthoimages,
     Walls,
 )
-from orthoflow.records.inputs import embedded_inputs, find_inputs
+from orthoflow.records.inputs import RefusedRunError, embedded_inputs, find_inputs
 from orthoflow.records.runs import (
     METRICS_FILE,
     PRODUCTS_FOLDER,
@@ -559,7 +558,7 @@ def write_embedded(run: Run, path: Path, store: Store, inputs: Sequence[str] = (
 
     Raises:
         InputError: an input file is missing.
-        RecordError: an input file was changed.
+        RefusedRunError: an input file was changed.
         ArgumentError: a product is in neither record nor store.
         StoreError: the disk cannot be written.
         InvalidArgumentsError: `inputs` names no input of the workflow.
@@ -634,7 +633,7 @@ def _input_files(
         workflow, record.inputs, run.folder, digests, given=given, extracted=extracted
     )
     if search.is_changed:
-        raise RecordError("\n".join(search.problems))
+        raise RefusedRunError(search.problems)
     if search.problems:
         raise MissingInputsError(search.problems)
     return {
