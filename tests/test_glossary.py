@@ -44,7 +44,6 @@ STILL_TO_CLEAN: Final = {
     "orthoflow/files": 42,
     "orthoflow/geometry": 5,
     "orthoflow/products": 6,
-    "orthoflow/records": 32,
     "orthoflow/report": 102,
     "plugins/orthoflow_plugins": 4,
     "plugins/orthoflow_plugins/inspect": 9,
@@ -55,7 +54,7 @@ STILL_TO_CLEAN: Final = {
     "plugins/orthoflow_plugins/plane": 1,
     "plugins/orthoflow_plugins/raster": 5,
     "plugins/orthoflow_plugins/read": 33,
-    "provenance/orthoflow_provenance": 27,
+    "provenance/orthoflow_provenance": 1,
 }
 
 

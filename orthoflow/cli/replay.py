@@ -87,7 +87,7 @@ def replay(
     folder = output or new_run_folder(f"{original.record.name}-replay", run_id)
     with (
         _store_folder(store, folder) as store_folder,
-        embedded_inputs(original, folder.parent) as laid_out,
+        embedded_inputs(original, folder.parent) as placed,
     ):
         opened = Store(store_folder)
         planned = plan_replay(
@@ -96,7 +96,7 @@ def replay(
             opened,
             options,
             inputs=inputs,
-            laid_out=laid_out,
+            placed=placed,
             earlier=_earlier_stores(),
         )
         call = _Call(

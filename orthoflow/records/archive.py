@@ -300,12 +300,12 @@ def _add_run(crate: _Crate, record: RunRecord, files: list[str], license_text: s
     for profile, name in _PROFILES.items():
         crate.add(profile, "CreativeWork", name=name, version=profile.rpartition("/")[2])
     options = " ".join(record.overrides)
-    said = f"ran with {options}" if options else "ran as it stands"
+    note = f"ran with {options}" if options else "ran as it stands"
     crate.add(
         WORKFLOW_FILE,
         ["File", "SoftwareSourceCode", "ComputationalWorkflow", "HowTo"],
         name=record.name,
-        description=f"The workflow as its author wrote it; it {said}. {RESOLVED_FILE} has what "
+        description=f"The workflow as its author wrote it; it {note}. {RESOLVED_FILE} has what "
         "ran, with every parameter.",
         version=record.created_by,
         encodingFormat="text/yaml",
@@ -435,8 +435,8 @@ def _add_cell(
         owner, _, name = product.source.rpartition(".")
         if owner != "inputs" and product.source not in given:
             raise RecordError(
-                f"the record says that {product.source} was taken, which no step that ran gave: "
-                "`orthoflow verify` says what else does not fit"
+                f"the record states that {product.source} was taken, which no step that ran gave: "
+                "`orthoflow verify` reports what else does not fit"
             )
         source = f"{WORKFLOW_FILE}#inputs/{name}" if owner == "inputs" else given[product.source]
         target = f"{tool}/{port}"
@@ -499,9 +499,9 @@ def _add_method(crate: _Crate, cell: RecordedCell) -> str:
 
 def _add_action(crate: _Crate, cell: RecordedCell) -> str:
     """Add the execution of a cell with its products, metrics and costs."""
-    said = "computed in this run" if cell.status == "ok" else "failed in this run"
+    note = "computed in this run" if cell.status == "ok" else "failed in this run"
     if cell.cached_from:
-        said = f"computed by the earlier run {cell.cached_from} and taken from the store"
+        note = f"computed by the earlier run {cell.cached_from} and taken from the store"
     made = []
     for port, product in cell.outputs.items():
         made.append(
@@ -534,7 +534,7 @@ def _add_action(crate: _Crate, cell: RecordedCell) -> str:
         f"#run-of-{cell.address}",
         "CreateAction",
         name=f"{cell.method} as {cell.address}",
-        description=said,
+        description=note,
         instrument=_ref(_tool_id(cell)),
         startTime=cell.started,
         endTime=cell.ended,
@@ -565,9 +565,9 @@ def _how_to_read(record: RunRecord) -> str:
     return (
         f"With the Python package {DISTRIBUTION} {version} (of an index, or its wheel from those "
         f"who made this crate) `orthoflow verify {RECORD_FILE}` in "
-        "this folder says whether record and products are as they were written, `orthoflow show "
+        "this folder reports whether record and products are as they were written, `orthoflow show "
         f"{RECORD_FILE}` what it holds, `orthoflow replay {RECORD_FILE} -o ../again` computes it "
-        f"anew from {source}; any HDF5 reader opens it, too. Paths in "
+        f"again from {source}; any HDF5 reader opens it, too. Paths in "
         f"{WORKFLOW_FILE} are of the machine that it ran on."
     )
 
@@ -577,7 +577,7 @@ def _media_type(name: str) -> str:
     return known or mimetypes.guess_type(name)[0] or "application/octet-stream"
 
 
-# Any: what attributes may be is for `prov` to tell.
+# Any: `prov` defines what attributes may be.
 Attributes = list[tuple[QualifiedName | str | Identifier, Any]]
 # Names of attributes are of this program; names of things are of the run.
 _TERMS: Final = "urn:orthoflow:terms:"

@@ -453,13 +453,13 @@ class RunComparison:
         else:
             apart.append("products")
         n_alone = sum(not row.is_shared for row in self.cells)
-        said = (
+        parts = (
             f"{', '.join(differing)} differ" if differing else "",
             f"no {', '.join(apart)} in common" if apart else "",
             f"{n_alone} steps in one of them only" if n_alone else "",
         )
         runs = f"{self.left.run_id!r} and {self.right.run_id!r}"
-        return f"<RunComparison of {runs}: {'; '.join(filter(None, said))}>"
+        return f"<RunComparison of {runs}: {'; '.join(filter(None, parts))}>"
 
     @property
     def measured(self) -> tuple[Pair[ComparedMetric], ...]:
@@ -592,7 +592,7 @@ def _readdressed(left: Run, right: Run) -> dict[str, str]:
     varied = {
         step for run in (left, right) for cell in run.cells.values() for step in cell.assignment
     }
-    varying = _telling_parameters((left, right), varied)
+    varying = _distinguishing_parameters((left, right), varied)
     # A skipped cell has no inputs, so its origin is unknown.
     ours, theirs = (
         {at: _way(run, cell, varied, None) for at, cell in run.cells.items() if _has_run(cell)}
@@ -638,7 +638,7 @@ def _pair(
             found[address] = free[way].pop(0)
 
 
-def _telling_parameters(
+def _distinguishing_parameters(
     runs: Sequence[Run], varied: Collection[str]
 ) -> dict[tuple[str, str], frozenset[str]]:
     """Find the parameters that distinguish variants of a step and method within one of the runs."""
@@ -648,10 +648,10 @@ def _telling_parameters(
         for cell in run.cells.values():
             if cell.step in varied:
                 for name, value in cell.params.items():
-                    told = values.setdefault((cell.step, cell.method, name), set())
-                    told.add(canonical_json(value))
-        for (step, method, name), told in values.items():
-            if len(told) > 1:
+                    seen = values.setdefault((cell.step, cell.method, name), set())
+                    seen.add(canonical_json(value))
+        for (step, method, name), seen in values.items():
+            if len(seen) > 1:
                 found.setdefault((step, method), set()).add(name)
     return {key: frozenset(names) for key, names in found.items()}
 
@@ -660,7 +660,7 @@ def _way(
     run: Run,
     cell: RecordedCell,
     varied: Collection[str],
-    telling: Mapping[tuple[str, str], Collection[str]] | None,
+    distinguishing: Mapping[tuple[str, str], Collection[str]] | None,
 ) -> tuple[object, ...]:
     """Return the identity of a cell without the names of its variants.
 
@@ -669,12 +669,16 @@ def _way(
         cell: the cell.
         varied: steps that vary in either run; they count with their method, a step without variants
             as its only variant.
-        telling: by step and method the parameters that count; None for all.
+        distinguishing: by step and method the parameters that count; None for all.
     """
     called = {}
     for one in run.upstream(cell.address):
         if one.step in varied:
-            names = one.params if telling is None else telling.get((one.step, one.method), ())
+            names = (
+                one.params
+                if distinguishing is None
+                else distinguishing.get((one.step, one.method), ())
+            )
             params = {name: value for name, value in one.params.items() if name in names}
             called[one.step] = (one.method, canonical_json(params))
     factors = tuple(cell.assignment.get(factor) for factor in (DATA, SEED))

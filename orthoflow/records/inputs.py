@@ -88,7 +88,7 @@ def find_inputs(
 ) -> InputSearch:
     """Search files with the content that a record states, under any name.
 
-    Searches where `given` says; otherwise the `extracted` files, the paths of the workflow, below
+    Searches the paths in `given`; otherwise the `extracted` files, the paths of the workflow, below
     the working directory, the run's folder and its parents, and these folders themselves; and where
     a store has noted that a run found them.
 
@@ -122,7 +122,7 @@ def find_inputs(
     return InputSearch(paths=paths, problems=tuple(problems), is_changed=is_changed)
 
 
-class LaidOutInputs:
+class PlacedInputs:
     """Input files of a record under its names, in a temporary folder.
 
     Attributes:
@@ -172,7 +172,7 @@ class LaidOutInputs:
 
 
 @contextmanager
-def embedded_inputs(run: Run, beside: Path) -> Iterator[LaidOutInputs]:
+def embedded_inputs(run: Run, beside: Path) -> Iterator[PlacedInputs]:
     """Return the input files in a record as files, as long as the context lasts.
 
     Args:
@@ -184,12 +184,12 @@ def embedded_inputs(run: Run, beside: Path) -> Iterator[LaidOutInputs]:
         StoreError: the disk cannot be written.
     """
     with ExitStack() as stack:
-        laid_out = LaidOutInputs(beside, stack)
+        placed = PlacedInputs(beside, stack)
         if any(entry.embedded for entry in run.record.inputs):
-            folder = laid_out.folder()
+            folder = placed.folder()
             with record_errors(run.path), writing_to(folder):
-                laid_out.extracted = extract_files(run.path, run.record.inputs, folder)
-        yield laid_out
+                placed.extracted = extract_files(run.path, run.record.inputs, folder)
+        yield placed
 
 
 def _find(
@@ -246,7 +246,7 @@ def _size_of_file(path: Path) -> int | None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Places:
-    """Candidate positions of the files of one input: in folders, or only where a user said.
+    """Candidate positions of the files of one input: in folders, or only given paths.
 
     Attributes:
         folders: to search.

@@ -20,8 +20,8 @@ from orthoflow.engine.store import Store
 from orthoflow.errors import PluginError, WorkflowError
 from orthoflow.records.compare import ComparedMetric, Pair, ProductDistance, compare_metrics
 from orthoflow.records.inputs import (
-    LaidOutInputs,
     MissingMethodsError,
+    PlacedInputs,
     RefusedRunError,
     find_inputs,
 )
@@ -61,7 +61,7 @@ def plan_replay(
     options: RunOptions,
     *,
     inputs: Sequence[str] = (),
-    laid_out: LaidOutInputs | None = None,
+    placed: PlacedInputs | None = None,
     earlier: Sequence[Store] = (),
 ) -> Replay:
     """Check that a run can be repeated, and plan it. Nothing is computed.
@@ -72,7 +72,7 @@ def plan_replay(
         store: where the replay keeps its results.
         options: of the replay.
         inputs: `NAME=PATH`, each as after `--input`.
-        laid_out: the files from the record, and those with other names now, see `embedded_inputs`;
+        placed: the files from the record, and those with other names now, see `embedded_inputs`;
             without it the files must have their names.
         earlier: stores that may have noted positions of input files.
 
@@ -106,7 +106,7 @@ def plan_replay(
         run.folder,
         digests,
         given=inputs,
-        extracted=laid_out.extracted if laid_out else None,
+        extracted=placed.extracted if placed else None,
         noted=[one.file_digests() for one in earlier],
     )
     if others or search.is_changed:
@@ -118,10 +118,8 @@ def plan_replay(
     if store.folder.is_dir():
         digests.save()
     paths = search.paths
-    if laid_out:
-        paths = {
-            entry.name: laid_out.named(entry, paths[entry.name]) for entry in run.record.inputs
-        }
+    if placed:
+        paths = {entry.name: placed.named(entry, paths[entry.name]) for entry in run.record.inputs}
     found = _with_files(workflow, paths)
     cells = [_cell(cell, workflow) for cell in run.record.cells]
     plan = plan_run(cells, found, catalog, store, options)
@@ -283,7 +281,7 @@ def _changes(run: Run, plan: RunPlan) -> tuple[frozenset[str], tuple[str, ...]]:
         if stated_versions(preimage, "code") != dict(facts.code):
             changed.add(cell.method)
             notes.append(
-                f"{cell.method}: its code is not that of the record, though both say result "
+                f"{cell.method}: its code is not that of the record, though both state result "
                 f"version {cell.result_version}"
             )
         recorded_tools = stated_versions(preimage, "tools")

@@ -200,8 +200,7 @@ def require_unchanged(run: Run, *paths: Path) -> None:
         state = published_state(run.folder, expected)
         if state == "changed":
             raise RecordError(
-                f"{path} was changed after the run: the record says that it has the digest "
-                f"{expected.sha256}"
+                f"{path} was changed after the run: the record states the digest {expected.sha256}"
             )
         if state != "same":
             raise RecordError(f"{path} cannot be read: {state}")
@@ -224,7 +223,7 @@ class Run:
 
     Attributes:
         path: the record file.
-        record: everything the record says except the products' arrays.
+        record: everything the record states except the products' arrays.
         output: reads an output by address and port from the open record; None to open it for each.
         files_folder: replaces the folder of the record if its files are elsewhere.
         home: the run folder of an unfinished run, whose record is elsewhere.
@@ -306,8 +305,10 @@ class Run:
     def __repr__(self) -> str:
         counts = Counter(cell.status for cell in self.record.cells)
         statuses = ", ".join(f"{count} {status}" for status, count in counts.items())
-        said = self.with_failure(f"{self.record.name} in {self.folder}: {statuses or 'no steps'}")
-        return shown(f"<Run {said}>")
+        sentence = self.with_failure(
+            f"{self.record.name} in {self.folder}: {statuses or 'no steps'}"
+        )
+        return shown(f"<Run {sentence}>")
 
     def with_failure(self, sentence: str) -> str:
         """Append to a sentence about a run which step failed first and why, if one did."""
@@ -485,8 +486,8 @@ def record_errors(path: Path) -> Iterator[None]:
     except OrthoflowError:
         raise
     except RecordFormatError as error:
-        said = _with_path(path, str(error))
-        raise RecordError(f"{said}{_AWAY if _DAMAGED in said else ''}") from error
+        sentence = _with_path(path, str(error))
+        raise RecordError(f"{sentence}{_AWAY if _DAMAGED in sentence else ''}") from error
     except PermissionError as error:
         raise ArgumentError(f"{path} cannot be read: permission denied") from error
     except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
@@ -530,8 +531,8 @@ def figure_files(run: Run, addresses: Iterable[str]) -> Mapping[str, RecordedFig
         for figure in run.cells[address].figures:
             path = f"{cell_file_name(address)}/{figure.name}{_suffix(run, figure)}"
             named.append((path, figure))
-            if said := name_problem(figure.name) or path_problem(path):
-                problems.append(f"the figure {figure.name!r} of {address} {said}")
+            if sentence := name_problem(figure.name) or path_problem(path):
+                problems.append(f"the figure {figure.name!r} of {address} {sentence}")
     if twice := colliding(path for path, _ in named):
         problems.append(f"two figures are named {twice!r}, as some systems see it")
     if problems:
@@ -622,8 +623,7 @@ def creating(folder: Path, path: str) -> Iterator[BinaryIO]:
 def _check_digest(path: Path, stream: BufferedReader, expected: PublishedFile | None) -> None:
     if expected and hashlib.file_digest(stream, "sha256").hexdigest() != expected.sha256:
         raise RecordError(
-            f"{path} was changed after the run: the record says that it has the digest "
-            f"{expected.sha256}"
+            f"{path} was changed after the run: the record states the digest {expected.sha256}"
         )
 
 
@@ -635,7 +635,7 @@ def _check_size(path: Path, found: os.stat_result, expected: PublishedFile | Non
         )
     # A sparse file of a terabyte would fill the disk.
     if found.st_size > _ALWAYS_COPIED_BYTES and found.st_size > 8 * 512 * found.st_blocks:
-        raise RecordError(f"{path} says it has {found.st_size} bytes, but most of it is a hole")
+        raise RecordError(f"{path} claims {found.st_size} bytes, but most of it is a hole")
 
 
 def _suffix(run: Run, figure: RecordedFigure) -> str:

@@ -167,7 +167,7 @@ def _collection(run: Run, orthos: list[_Ortho]) -> dict[str, JsonValue]:
     if len(on_earth) < len(orthos):
         text += (
             " Those without a geometry lie in the plane of their wall: their coordinate system is "
-            "none on Earth, and the extent of the collection says nothing of them."
+            "none on Earth, and the extent of the collection does not include them."
         )
     bbox: list[JsonValue] = list(_bbox(on_earth) if on_earth else _EVERYWHERE)
     items: list[JsonValue] = [

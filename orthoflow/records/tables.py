@@ -352,8 +352,8 @@ class RunSet:
                     first.setdefault((cell.step, _choice(cell)), name)
         names: dict[tuple[str, Choice], str] = {}
         for (step, choice), name in first.items():
-            others = [two for (one, two), said in first.items() if (one, said) == (step, name)]
-            names[step, choice] = name + _told_apart(choice, others)
+            others = [two for (one, two), other in first.items() if (one, other) == (step, name)]
+            names[step, choice] = name + _distinction(choice, others)
         return names
 
     def _joined(self, same: tuple[tuple[Run, RecordedCell], ...]) -> JoinedCell:
@@ -416,19 +416,19 @@ def _choice(cell: RecordedCell) -> Choice:
     return cell.method, json.dumps(dict(cell.params), sort_keys=True)
 
 
-def _told_apart(choice: Choice, others: Sequence[Choice]) -> str:
+def _distinction(choice: Choice, others: Sequence[Choice]) -> str:
     """Return how a choice differs from others of its name; empty if there are none."""
     if len(set(others)) < 2:
         return ""
     params = json.loads(choice[1])
-    told = [
+    differing = [
         f"{name}={json.dumps(value)}"
         for name, value in params.items()
         if any(json.loads(other).get(name) != value for _, other in others)
     ]
     methods = {method for method, _ in others}
-    said = [*([choice[0]] if len(methods) > 1 else []), *told]
-    return f" ({', '.join(said)})"
+    parts = [*([choice[0]] if len(methods) > 1 else []), *differing]
+    return f" ({', '.join(parts)})"
 
 
 _WORD: Final = re.compile(r"(?<!^)(?=[A-Z])")

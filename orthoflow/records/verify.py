@@ -98,7 +98,7 @@ def sign_record(path: Path, key_file: Path, password: Callable[[], str]) -> Sign
     public_key = _openssh(key.public_key())
     if earlier is not None and earlier.public_key != public_key:
         raise ArgumentError(
-            f"beside {path} there is a signature already, said to be of the key "
+            f"beside {path} there is a signature already, which names the key "
             f"{earlier.fingerprint}: remove {path.name}{SIGNATURE_SUFFIX} to sign with another"
         )
     content_sha256 = read_run(path).content_sha256
@@ -147,7 +147,7 @@ def check_signature(record: Path, signer: Path) -> Signature:
     wanted = _openssh(key)
     if found.public_key != wanted:
         raise RecordError(
-            f"the signature beside {record.name} is said to be of the key {found.fingerprint}, "
+            f"the signature beside {record.name} names the key {found.fingerprint}, "
             f"not of {_fingerprint(wanted)} in {signer}"
         )
     from cryptography.exceptions import InvalidSignature  # noqa: PLC0415 - only those who sign
@@ -343,7 +343,9 @@ def verify_run(
         return Verification(path=record_path, findings=findings, wrong=f"{record_path} {wrong}")
     with record_errors(record_path), open_record(record_path) as opened:
         record, seal = opened.record, opened.content_sha256
-        contradictions = [said for cell in record.cells for said in _contradictions(opened, cell)]
+        contradictions = [
+            sentence for cell in record.cells for sentence in _contradictions(opened, cell)
+        ]
     signed_with, unsigned, notes = _check_signature(record_path, signer)
     changed: list[str] = []
     states: list[PublishedState] = []
@@ -442,7 +444,7 @@ def _is_own_page(folder: Path, name: str, content_sha256: str) -> bool:
 def _page_note(folder: Path, name: str) -> Note:
     text = (
         f"{name} does not show this record, or was changed since it was written; `orthoflow report "
-        f"{shlex.quote(str(folder))}` makes it anew"
+        f"{shlex.quote(str(folder))}` makes it again"
     )
     return Note(code="page", text=text)
 
@@ -472,7 +474,7 @@ def _check_signature(record: Path, signer: Path | None) -> tuple[str, list[str],
         if (found := read_signature(record)) is None:
             return "", [], []
         text = (
-            f"there is a signature, said to be of the key {found.fingerprint}, that was not "
+            f"there is a signature, which names the key {found.fingerprint}, that was not "
             "checked: name the signer's public key with --signer"
         )
     except RecordError as error:
@@ -497,9 +499,9 @@ def _published_notes(path: Path, record: RunRecord, missing: list[str]) -> Itera
         if len(missing) == n_published:
             # A record that is passed on alone is among unrelated files.
             return
-    foreign, others = _unnamed(path, record)
-    if foreign:
-        rest = first_few(foreign, most=_UNCOVERED_MOST)
+    unnamed, others = _unnamed(path, record)
+    if unnamed:
+        rest = first_few(unnamed, most=_UNCOVERED_MOST)
         yield Note(
             code="foreign", text=f"the record does not name {rest}, among its published files"
         )
@@ -513,7 +515,7 @@ def _unnamed(path: Path, record: RunRecord) -> tuple[list[str], list[str]]:
     known = {path.name, f"{path.name}{SIGNATURE_SUFFIX}", PRODUCTS_FOLDER, JOURNAL, LOGS, *_VIEWS}
     _, folders, files = next(os.walk(path.parent), ("", [], []))
     named = {file.path for file in record.published}
-    foreign: set[str] = set()
+    unnamed: set[str] = set()
     for place, _, below in os.walk(path.parent / PRODUCTS_FOLDER):
-        foreign |= {Path(place, name).relative_to(path.parent).as_posix() for name in below}
-    return sorted(foreign - named), sorted({*folders, *files} - known)
+        unnamed |= {Path(place, name).relative_to(path.parent).as_posix() for name in below}
+    return sorted(unnamed - named), sorted({*folders, *files} - known)

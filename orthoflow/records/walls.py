@@ -300,7 +300,7 @@ def _require_orthoimages(run: Run, address: str, wall: int | None) -> None:
         if is_wanted and not (run.folder / path).exists():
             raise RecordError(
                 f"{path} is gone from {run.folder}, where the run left it: copy it back, or "
-                f"make it anew by `orthoflow replay {shlex.quote(str(run.path))} -o NEW`"
+                f"make it again with `orthoflow replay {shlex.quote(str(run.path))} -o NEW`"
             )
 
 
@@ -398,11 +398,11 @@ def _wall_result(
     known = planes is not None and isinstance(index, int) and 0 <= index < len(planes)
     plane_index = index if known and isinstance(index, int) else None
     description = described(first, content) if "ortho" in rasters else None
-    said = [description.accuracy] if description and error.exists() else []
+    phrase = [description.accuracy] if description and error.exists() else []
     if planes is not None and plane_index is not None:
         rms_mm = 1e3 * float(planes.rms_m[plane_index])
         count = f"{int(planes.n_points[plane_index]):,}"
-        said.append(Phrase(key="plane_noise", values={"count": count, "rms": f"{rms_mm:.1f}"}))
+        phrase.append(Phrase(key="plane_noise", values={"count": count, "rms": f"{rms_mm:.1f}"}))
     return WallResult(
         number=number,
         name=str(content.get("name") or f"wall {number}"),
@@ -410,7 +410,7 @@ def _wall_result(
         plane_index=plane_index,
         frame=frame,
         rasters=rasters,
-        accuracy=tuple(said),
+        accuracy=tuple(phrase),
         colours=colours if "ortho" in rasters else None,
         intensity_source=str(about.get("intensity_source", "laser")),
     )
@@ -432,7 +432,7 @@ def _with_inspections(run: Run, wall: WallResult, measured: tuple[Phrase, ...]) 
     """Add the findings of inspections, or that the accuracy of an orthoimage is unknown."""
     if not measured and "ortho" in wall.rasters:
         unmeasured = _unmeasured(run)
-        is_stated = {"expected_error", "not_checked"} & {said.key for said in wall.accuracy}
+        is_stated = {"expected_error", "not_checked"} & {phrase.key for phrase in wall.accuracy}
         if not is_stated or unmeasured.key == "unmeasured_given":
             measured = (unmeasured,)
     return replace(wall, accuracy=(*wall.accuracy, *measured))

@@ -176,7 +176,7 @@ def _publish_cell(
     taken = [METRICS_FILE]
     for port, files in files_of.items():
         for file, sha256 in files.items():
-            # Two outputs of one type publish equal names: the port tells them apart.
+            # Two outputs of one type publish equal names: the port distinguishes them.
             marks = chain(("", f"{port}_"), (f"{port}_{number}_" for number in count(2)))
             names = (f"{mark}{file.name}" for mark in marks)
             name = next(name for name in names if not colliding([*taken, name]))
@@ -577,8 +577,8 @@ def write_embedded(run: Run, path: Path, store: Store, inputs: Sequence[str] = (
     whole = tuple(
         dataclasses.replace(entry, embedded=bool(entry.files)) for entry in run.record.inputs
     )
-    with embedded_inputs(run, path.parent) as laid_out:
-        files = _input_files(run, store.file_digests(), inputs, laid_out.extracted)
+    with embedded_inputs(run, path.parent) as placed:
+        files = _input_files(run, store.file_digests(), inputs, placed.extracted)
         _write_again(path, dataclasses.replace(run.record, inputs=whole), run, store, files)
     return read_run(path)
 
@@ -664,13 +664,11 @@ def write_part(part: Run, folder: Path, store: Store) -> Run:
         published=tuple(file for file in published if file.path in copied),
     )
     path = folder / RECORD_FILE
-    with embedded_inputs(part, folder) as laid_out:
+    with embedded_inputs(part, folder) as placed:
         files = {
             file.sha256: place
             for entry in record.inputs
-            for file, place in zip(
-                entry.files, laid_out.extracted.get(entry.name, ()), strict=False
-            )
+            for file, place in zip(entry.files, placed.extracted.get(entry.name, ()), strict=False)
         }
         _write_again(path, record, part, store, files, embed=False)
     return read_run(path)
@@ -680,7 +678,7 @@ _TYPES: Final = frozenset((Orthoimages.type_name, Walls.type_name))
 
 
 @contextmanager
-def with_files(run: Run, tell: Callable[[str], None] = lambda _: None) -> Iterator[Run]:
+def with_files(run: Run, report: Callable[[str], None] = lambda _: None) -> Iterator[Run]:
     """Return a run with the rasters that it published.
 
     Those beside the record are used. If there are none, they are created from the walls and
@@ -688,7 +686,7 @@ def with_files(run: Run, tell: Callable[[str], None] = lambda _: None) -> Iterat
 
     Args:
         run: the run.
-        tell: called with a sentence if files are created.
+        report: called with a sentence if files are created.
 
     Raises:
         RecordError: the record is damaged.
@@ -706,8 +704,8 @@ def with_files(run: Run, tell: Callable[[str], None] = lambda _: None) -> Iterat
         folder = scratch / "run"
         folder.mkdir()
         made = publish_products(folder, run.record.cells, files_of, run.record.run_id)
-        tell(
-            f"{run.path} lies alone: its rasters are made anew of the products in it, and "
+        report(
+            f"{run.path} stands alone: its rasters are made again from the products in it, and "
             "other files that were published are left out"
         )
         record = replace(run.record, published=made)

@@ -51,7 +51,7 @@ _CHUNK_BYTES: Final = 1 << 20
 _SMALL_BYTES: Final = 4096
 _EXACT: Final = 0.0
 _ALONE: Final = "only one of the products has it"
-# Of numbers in the metadata, which say something about a product and are not the product itself:
+# Of numbers in the metadata, which describe a product and are not the product itself:
 # other versions of numerical libraries round their last digits in another way.
 _STATED_SHARE: Final = 1e-6
 _UNITS: Final = ("mm", "m", "px", "deg")
@@ -70,7 +70,7 @@ class StoredPayload:
         metadata: JSON; holds everything that is not an array.
         arrays: name -> array, read-only; mapped ones are views of a `numpy.memmap`.
         mapped: stored contiguous and uncompressed.
-        digest: digest that was stored with the product; `payload_digest` says whether it is true.
+        digest: digest that was stored with the product; `payload_digest` checks it.
     """
 
     type_name: str

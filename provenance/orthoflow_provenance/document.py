@@ -52,7 +52,7 @@ class RecordFormatError(ValueError):
     """
 
 
-class ForeignFormatError(RecordFormatError):
+class UnknownFormatError(RecordFormatError):
     """The file is of another program, or of another version of the format: it cannot be checked."""
 
 
@@ -70,7 +70,7 @@ class UnsafeFileError(RecordFormatError):
 
 @dataclass(frozen=True, kw_only=True)
 class Quantity:
-    """What the annotation of a measured number says of it.
+    """Label, unit and direction of a measured number.
 
     Attributes:
         label: what tables call it, beside its unit.
@@ -118,8 +118,8 @@ class Metric:
         label: what tables call it, where its method declares that; empty without.
         better: which values are better, `lower`, `higher` or `one`; empty where none are.
         description: what else to know of it, one sentence.
-        headline: it is one of the numbers that say how good a result is.
-        counted_by: metric of the same step that says how many items it sums up; values over
+        headline: it is one of the numbers that state how good a result is.
+        counted_by: metric of the same step with the number of items it summarises; values over
             unequal numbers of them are not comparable.
     """
 
@@ -163,7 +163,7 @@ class RecordedDiagnostic:
 
 @dataclass(frozen=True, kw_only=True)
 class Figure:
-    """What is said of a picture, wherever it is.
+    """Name, caption and type of a picture.
 
     Attributes:
         name: name the method gave.
@@ -316,7 +316,7 @@ class Costs:
         stored_mib: what its products, their published files and its figures take in the store;
             equal ones of several cells lie there once. None for cells without a result too.
         compile_s: seconds on the clock that the step's process loaded modules and compiled kernels,
-            before, in and after the call. It hangs on what ran before, so nothing is ranked by it.
+            before, in and after the call. It depends on earlier steps, so nothing is ranked by it.
     """
 
     wall_s: Annotated[float, Quantity(label="time", unit="s", better="lower")] = 0.0
@@ -396,7 +396,7 @@ class RecordedCell(CellOutcome):
     outputs: Mapping[str, RecordedProduct] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        # Logs and lists of parameters are for whoever asks for them.
+        # Logs and lists of parameters are too long for a line.
         metrics, figures = len(self.metrics), len(self.figures)
         return (
             f"<RecordedCell {self.address!r}: {self.method}, {self.status}, {self.wall_s:.3g} s, "
@@ -406,7 +406,7 @@ class RecordedCell(CellOutcome):
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class RunRecord:
-    """Everything a record says except the products' arrays.
+    """The whole record except the products' arrays.
 
     Attributes:
         run_id: opaque, unique.
@@ -464,9 +464,9 @@ def cost_metrics(costs: Costs) -> tuple[Metric, ...]:
     )
 
 
-# Any: keywords for a constructor, whose own annotations say what they are.
+# Any: keywords for a constructor, whose own annotations state their types.
 def shared_fields(source: object, part: type) -> dict[str, Any]:
-    """Return what an object says in the fields of a part that it has, as keywords."""
+    """Return the fields of an object that belong to one of its base classes, as keywords."""
     return {item.name: getattr(source, item.name) for item in fields(part)}
 
 

@@ -23,9 +23,9 @@ from orthoflow_provenance.document import (
     FORMAT_VERSION,
     PRODUCT_FORMAT,
     RUN_FORMAT,
-    ForeignFormatError,
     LockedFileError,
     RecordFormatError,
+    UnknownFormatError,
 )
 from orthoflow_provenance.paths import check_name
 
@@ -76,7 +76,7 @@ _PLAIN_CLASSES: Final = frozenset({h5py.h5t.INTEGER, h5py.h5t.FLOAT})
 
 @contextmanager
 def reading(place: str) -> Iterator[None]:
-    """Turn whatever HDF5 says about a damaged place into one sentence.
+    """Turn any error of HDF5 about a damaged place into one sentence.
 
     Raises:
         RecordFormatError: something inside failed.
@@ -304,7 +304,7 @@ def create_file(path: Path) -> Iterator[h5py.File]:
             finally:
                 file.close()
         finally:
-            # Whatever HDF5 made of it, what the disk said first is the reason.
+            # Whatever HDF5 made of it, the first error of the disk is the reason.
             sink.close()
     except BaseException:
         path.unlink(missing_ok=True)
@@ -323,7 +323,7 @@ def safe_open(path: Path) -> Iterator[h5py.File]:
     """Open an HDF5 file for reading after looking at every object in it.
 
     Raises:
-        ForeignFormatError: the file is no HDF5 file, or something of the following is so because
+        UnknownFormatError: the file is no HDF5 file, or something of the following is so because
             another program or another version wrote it.
         LockedFileError: the file is open for writing elsewhere, or was left so by a crash.
         RecordFormatError: the file is damaged, or holds links other than hard links, an object
@@ -340,7 +340,7 @@ def safe_open(path: Path) -> Iterator[h5py.File]:
             _Inspection(file, path).run()
         except RecordFormatError as error:
             # What a file is comes before what is forbidden in it.
-            raise _foreign(file) or error from error
+            raise _unknown(file) or error from error
         yield file
     finally:
         file.close()
@@ -350,12 +350,12 @@ def _check_superblock(path: Path) -> None:
     with path.open("rb") as stream:
         start = stream.read(_SUPERBLOCK_BYTES)
     if not start.startswith(_SIGNATURE):
-        raise ForeignFormatError(f"{path.name} must be an HDF5 file, but does not begin like one")
+        raise UnknownFormatError(f"{path.name} must be an HDF5 file, but does not begin like one")
     if len(start) == _SUPERBLOCK_BYTES and start[8] == 3 and start[11] & _WRITER_MARKS:
         raise LockedFileError(
             f"{path.name} is open for writing in another program, or was left so by one that "
             f"crashed: close that program; if there is none, `h5clear -s {path.name}` (of the HDF5 "
-            "tools) takes the mark away, and `orthoflow verify` says whether the file is whole"
+            "tools) takes the mark away, and `orthoflow verify` reports whether the file is whole"
         )
 
 
@@ -370,37 +370,37 @@ def check_format(file: h5py.File, name: str) -> None:
     """Refuse files of another format, or of another version of this one.
 
     Raises:
-        ForeignFormatError: the file is such a one.
+        UnknownFormatError: the file is such a one.
     """
     file_name = Path(file.filename).name
     try:
         found = text_attribute(file, "format")
         version = text_attribute(file, "format_version")
     except RecordFormatError as error:
-        raise ForeignFormatError(
+        raise UnknownFormatError(
             f"{file_name} must be of format {name}, but it names no format: it was not written by "
             "orthoflow, or it is damaged"
         ) from error
     if found != name:
-        raise ForeignFormatError(f"{file_name} must be of format {name}, got {found!r}")
+        raise UnknownFormatError(f"{file_name} must be of format {name}, got {found!r}")
     if version != FORMAT_VERSION:
-        raise ForeignFormatError(
+        raise UnknownFormatError(
             f"{file_name} has format version {version!r}, this program reads version "
             f"{FORMAT_VERSION}: use the orthoflow that wrote it, or a newer one"
         )
 
 
-def _foreign(file: h5py.File) -> ForeignFormatError | None:
+def _unknown(file: h5py.File) -> UnknownFormatError | None:
     """Return that a refused file is of another program or version; None for one of ours."""
     try:
         if not all(_is_short_text(file, name) for name in (b"format", b"format_version")):
             name = Path(file.filename).name
-            return ForeignFormatError(
+            return UnknownFormatError(
                 f"{name} is not a record of orthoflow: it does not name that format; give a run.h5"
             )
         is_product = text_attribute(file, "format") == PRODUCT_FORMAT
         check_format(file, PRODUCT_FORMAT if is_product else RUN_FORMAT)
-    except ForeignFormatError as error:
+    except UnknownFormatError as error:
         return error
     except (RecordFormatError, *HDF5_ERRORS):
         return None
@@ -506,14 +506,14 @@ class _Inspection:
         declared = math.prod(dataset.shape or ()) * itemsize
         stored = dataset.get_storage_size()
         unfounded = declared > max(_ALWAYS_ALLOWED_BYTES, _LARGEST_RATIO * stored)
-        sizes = f"says it has {declared} bytes, but the file holds {stored} for it"
+        sizes = f"declares {declared} bytes, but the file holds {stored} for it"
         self._refuse(place, unfounded, sizes)
         # Many that each stay below what is always allowed would be a flood together.
         self._unfounded_bytes += max(0, declared - _LARGEST_RATIO * stored)
         self._stored_bytes += stored
-        together = "and those before it say they have more than 64 MiB that the file cannot hold"
+        together = "and those before it declare more than 64 MiB that the file cannot hold"
         self._refuse(place, self._unfounded_bytes > _ALWAYS_ALLOWED_BYTES, together)
-        together = "and the datasets before it say more than the file can hold"
+        together = "and the datasets before it declare more than the file can hold"
         self._refuse(place, self._stored_bytes > self._size_bytes, together)
 
     def _check_attributes(self, item: h5py.h5g.GroupID | h5py.h5d.DatasetID, place: str) -> None:

@@ -1,4 +1,4 @@
-"""Files below a folder whose names come from strangers: nothing leads out, only files are read.
+"""Files below a folder whose names are untrusted: nothing leads out, only files are read.
 
 Every name that a record, a crate, an archive or a plugin gives becomes a path here and nowhere
 else. Reading and writing go down folder by folder through descriptors, so that nothing can be
@@ -232,7 +232,7 @@ def _parts(path: str) -> list[str]:
 
 def _check_regular(found: os.stat_result, path: str) -> None:
     if not stat.S_ISREG(found.st_mode):
-        raise UnsafeFileError(f"{path!r} must be a file, but {_said(found)} stands there")
+        raise UnsafeFileError(f"{path!r} must be a file, but {_kind_of(found)} stands there")
 
 
 def _check_same(looked_at: os.stat_result, opened: os.stat_result, path: str) -> None:
@@ -240,7 +240,7 @@ def _check_same(looked_at: os.stat_result, opened: os.stat_result, path: str) ->
         raise UnsafeFileError(f"{path!r} was exchanged while it was opened")
 
 
-def _said(found: os.stat_result) -> str:
+def _kind_of(found: os.stat_result) -> str:
     if _is_link(found):
         return "a link"
     return "a folder" if stat.S_ISDIR(found.st_mode) else "a device, a pipe or a socket"
@@ -281,8 +281,8 @@ def _path_of_folder(folder: Path, names: list[str], *, is_made: bool) -> Path:
                 folder.mkdir()
         found = folder.lstat()
         if _is_link(found):
-            said = "/".join(names[: depth + 1])
-            raise UnsafeFileError(f"{said!r} is a link, and links are not followed")
+            where = "/".join(names[: depth + 1])
+            raise UnsafeFileError(f"{where!r} is a link, and links are not followed")
     if not folder.is_dir():
         raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(folder))
     return folder

@@ -107,7 +107,7 @@ class OpenRecord:
 
         Raises:
             RecordFormatError: there is no such output, it is not embedded, it is damaged, or it is
-                not what its digest says.
+                not that of its digest.
         """
         cell = next((cell for cell in self.record.cells if cell.address == address), None)
         output = None if cell is None else cell.outputs.get(port)
@@ -123,7 +123,7 @@ class OpenRecord:
         # Who shows or hands on arrays has not looked at the seal of the file.
         if (found := payload_digest(payload)) != output.digest:
             raise RecordFormatError(
-                f"{group.name} has the digest {found}, the record says {output.digest}: it was "
+                f"{group.name} has the digest {found}, the record states {output.digest}: it was "
                 "changed, or the file is damaged"
             )
         return payload
@@ -574,7 +574,7 @@ def _extracted(opened: h5py.File, entry: RecordedInput, folder: Path) -> Iterato
     for index, file in enumerate(entry.files):
         check_name(file.sha256, "the file")
         dataset = dataset_of(files, file.sha256)
-        # Before anything is written: the record says how much room it takes.
+        # Before anything is written: the record states how much room it takes.
         if dataset.dtype != np.uint8 or dataset.shape != (file.size_bytes,):
             raise RecordFormatError(
                 f"{dataset.name} must be the {file.size_bytes} bytes of {file.name!r}, got "
@@ -585,7 +585,7 @@ def _extracted(opened: h5py.File, entry: RecordedInput, folder: Path) -> Iterato
             sha256 = dataset_sha256(dataset, stream.write)
         if sha256 != file.sha256:
             raise RecordFormatError(
-                f"{dataset.name} has the SHA-256 {sha256}, the record says {file.sha256} of "
+                f"{dataset.name} has the SHA-256 {sha256}, the record states {file.sha256} of "
                 f"{file.name!r}"
             )
         yield path_below(folder, inside)

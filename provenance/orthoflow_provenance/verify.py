@@ -16,13 +16,13 @@ from orthoflow_provenance.document import (
     DIGEST_PREFIX,
     FIGURE_SUFFIXES,
     RUN_FORMAT,
-    ForeignFormatError,
     LockedFileError,
     PublishedFile,
     RecordedCell,
     RecordedFile,
     RecordFormatError,
     RunRecord,
+    UnknownFormatError,
     cost_metrics,
     parse_json,
     sha256_text,
@@ -97,7 +97,7 @@ def verify_record(path: Path, *, with_arrays: bool = True) -> tuple[Finding, ...
             found += _seal_findings(file, path) if with_arrays else ()
             return tuple(found)
     except RecordFormatError as error:
-        codes = {LockedFileError: "locked", ForeignFormatError: "foreign"}
+        codes = {LockedFileError: "locked", UnknownFormatError: "foreign"}
         return (Finding(codes.get(type(error), "damaged"), "/", str(error)),)
     except HDF5_ERRORS as error:
         return (Finding("damaged", "/", f"{path.name} cannot be read: {error}"),)
@@ -150,7 +150,7 @@ def _seal_findings(file: h5py.File, path: Path) -> Iterator[Finding]:
 def _object_findings(
     file: h5py.File, record: RunRecord, nodes: Mapping[str, Node], contents: Container[str]
 ) -> Iterator[Finding]:
-    """Compare every object that is not named by digest with what the document says."""
+    """Compare every object that is not named by digest with what the document states."""
     places = {product_path(digest).rpartition("/")[2] for digest in _embedded(record)}
     known = set(nodes) | {f"/{SEAL}", f"/{PRODUCTS}", f"/{FILES}"}
     missing = set(known)
@@ -194,16 +194,16 @@ def _attribute_problems(
             )
         for name in () if is_product else expected & set(item.attrs):
             if not _is_same(np.asarray(item.attrs[name]), node.attributes[name]):
-                yield f"its attribute {name!r} is not what the document says"
+                yield f"its attribute {name!r} is not what the document states"
 
 
 def _data_problem(item: h5py.Group | h5py.Dataset, data: NDArray[np.generic]) -> str:
     if not isinstance(item, h5py.Dataset):
         return "is a group in the place of a dataset"
     if item.shape != data.shape or item.nbytes != data.nbytes:
-        return "is not what the document says"
+        return "is not what the document states"
     found = np.asarray(read_whole(item))
-    return "" if _is_same(found, data) else "is not what the document says"
+    return "" if _is_same(found, data) else "is not what the document states"
 
 
 def _is_same(found: NDArray[Any], expected: NDArray[Any]) -> bool:
@@ -279,7 +279,7 @@ def _product_findings(file: h5py.File, record: RunRecord) -> Iterator[Finding]:
             payload = read_payload(open_group(file, place), map_arrays=True)
             found = payload_digest(payload)
             if found != digest or payload.digest != digest:
-                problem = f"has the digest {found}, the record says {digest}"
+                problem = f"has the digest {found}, the record states {digest}"
                 yield Finding("product", place, problem)
         except RecordFormatError as error:
             yield Finding("product", place, str(error))
@@ -335,7 +335,7 @@ def _name_findings(record: RunRecord) -> Iterator[Finding]:
             problem = f"two figures are named {twice!r}, as some systems see it"
             yield Finding("field", f"{place}/figures", problem)
     for place, name in named:
-        # What must not be empty is said elsewhere.
+        # That names must not be empty is checked elsewhere.
         if name and (problem := name_problem(name)):
             yield Finding("name", place, f"{name!r} {problem}, so no file can be named so")
 

@@ -95,7 +95,7 @@ def test_of_a_record_with_changed_arrays_neither_it_nor_its_seal_is_handed_on(
         assert "its seal does not hold for /products/" in refused.stderr
         assert "; changed records are not exported: use another copy" in refused.stderr
         assert not (studio.folder / "whole").exists()
-    with pytest.raises(RecordError, match=r"has the digest .*, the record says .* another copy"):
+    with pytest.raises(RecordError, match=r"has the digest .*, the record states .* another copy"):
         open_run("first").product("survey", "planes")
 
 

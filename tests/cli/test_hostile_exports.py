@@ -1,4 +1,4 @@
-"""What lies beside a record is as the record says and nothing else, whatever is made of it."""
+"""What lies beside a record is as the record states and nothing else, whatever is made of it."""
 
 from __future__ import annotations
 

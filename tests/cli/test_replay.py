@@ -137,7 +137,7 @@ def test_an_edited_parameter_is_named(studio: Studio) -> None:
         rows = params[()]
         rows["value"][0] = b"3.0"
         params[...] = rows
-    assert "/cells/survey/params: is not what the document says" in refused(studio)
+    assert "/cells/survey/params: is not what the document states" in refused(studio)
 
 
 def test_another_result_version_is_named(studio: Studio) -> None:

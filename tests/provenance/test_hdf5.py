@@ -156,8 +156,8 @@ FORBIDDEN: list[tuple[Callable[[h5py.File], None], str]] = [
     (named_type, ":/a is neither a group nor a dataset"),
     (external_storage, ":/a keeps its data in another file"),
     (virtual_dataset, ":/a is a virtual dataset"),
-    (dataset_without_data, "says it has 8000000000000 bytes, but the file holds 0 for it"),
-    (contiguous_dataset_without_data, "says it has 8000000000000 bytes"),
+    (dataset_without_data, "declares 8000000000000 bytes, but the file holds 0 for it"),
+    (contiguous_dataset_without_data, "declares 8000000000000 bytes"),
     (gigantic_chunk, ":/a has chunks of more than 64 MiB"),
     (gzip_twice, "must use each of shuffle, gzip, fletcher32 at most once and no other"),
     (other_filter, "must use each of shuffle, gzip, fletcher32 at most once and no other"),
@@ -171,7 +171,7 @@ FORBIDDEN: list[tuple[Callable[[h5py.File], None], str]] = [
     (way_up, ":/.. is not a place in a record: the object '..' cannot be a name"),
     (name_with_escape, "is not a place in a record: the object 'a\\x1b[2J' cannot be a name"),
     (name_in_no_encoding, ":/\\xff\\xfe cannot be read, the file is damaged"),
-    (flood_of_small_datasets, ":/c and those before it say they have more than 64 MiB"),
+    (flood_of_small_datasets, ":/c and those before it declare more than 64 MiB"),
     (deep_nesting, "is nested more than 32 groups deep"),
 ]
 
@@ -210,7 +210,7 @@ def test_datasets_that_share_their_bytes_are_refused(tmp_path: Path) -> None:
     for old, new in ((other, start), (len(content), length)):
         content = content.replace(old.to_bytes(8, "little"), new.to_bytes(8, "little"))
     path.write_bytes(content[:length])
-    with pytest.raises(RecordFormatError, match="say more than the file can"), safe_open(path):
+    with pytest.raises(RecordFormatError, match="declare more than the file can"), safe_open(path):
         pass
 
 

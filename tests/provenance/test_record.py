@@ -448,7 +448,7 @@ def test_arrays_that_are_not_what_their_digest_says_are_not_read(
     assert "product" in {found.code for found in verify_record(path)}
     with (
         open_record(path) as opened,
-        pytest.raises(RecordFormatError, match="the record says sha256:"),
+        pytest.raises(RecordFormatError, match="the record states sha256:"),
     ):
         opened.payload(WALL, "walls")
 
@@ -592,7 +592,7 @@ def test_a_changed_byte_is_named_and_not_taken_out(tmp_path: Path) -> None:
         hostile.seal(file)
     [finding] = verify_record(path)
     assert finding.code == "file"
-    with pytest.raises(RecordFormatError, match=r"has the SHA-256 .* the record says"):
+    with pytest.raises(RecordFormatError, match=r"has the SHA-256 .* the record states"):
         extract_files(path, read_record(path).inputs, tmp_path / "out")
 
 

@@ -41,8 +41,8 @@ def test_rasters_are_made_of_the_products_and_go_away_again(alone: Run) -> None:
         states = {published_state(found.folder, file) for file in found.record.published}
         assert states == {"same"}
     left_out = "and other files that were published are left out"
-    made_anew = "its rasters are made anew of the products in it"
-    assert said == [f"{alone.path} lies alone: {made_anew}, {left_out}"]
+    made_anew = "its rasters are made again from the products in it"
+    assert said == [f"{alone.path} stands alone: {made_anew}, {left_out}"]
     assert not ortho.exists()
 
 

@@ -208,7 +208,7 @@ def test_a_sparse_file_is_told_by_its_size(finished: Studio, folder: Path) -> No
     os.truncate(run / "report.html", 1 << 40)
     done = finished("export", run, "--to", "ro-crate", "-o", "other")
     assert done.exit_code == 3
-    assert "report.html says it has 1099511627776 bytes, but most of it is a hole" in done.output
+    assert "report.html claims 1099511627776 bytes, but most of it is a hole" in done.output
     assert after.user + after.system - before.user - before.system < 5
 
 

@@ -102,7 +102,7 @@ def test_a_missing_signature_and_anothers_are_findings(finished: Studio, run: Pa
     done = finished("verify", run, "--signer", "jane.pub")
     assert done.exit_code == 3
     # Nobody has checked that it is joe's: it may be what is left of another record.
-    assert "the signature beside run.h5 is said to be of the key SHA256:" in done.output
+    assert "the signature beside run.h5 names the key SHA256:" in done.output
     assert ", not of SHA256:" in done.output
     # Who says to be jane has not her key.
     signature = json.loads((run / "run.h5.sig").read_text())
