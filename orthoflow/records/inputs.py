@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import shutil
 import stat
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -162,12 +161,8 @@ class PlacedInputs:
             return paths
         links = tuple(self.folder() / name for name in names)
         for link, path in zip(links, paths, strict=True):
-            try:
+            with writing_to(link.parent):
                 link.symlink_to(path)
-            except OSError:
-                # On Windows most users cannot create links.
-                with writing_to(link.parent):
-                    shutil.copyfile(path, link)
         return links
 
 

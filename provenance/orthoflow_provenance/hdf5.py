@@ -7,7 +7,6 @@ succeeds, remembers the first error, and raises it once HDF5 is out of the way.
 
 from __future__ import annotations
 
-import errno
 import math
 import os
 from collections.abc import Iterator
@@ -209,11 +208,7 @@ class FileSink:
 
     def __init__(self, path: Path) -> None:
         # Through a link it would be another's file that is emptied.
-        flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC
-        for name in ("O_NOFOLLOW", "O_CLOEXEC", "O_BINARY"):
-            flags |= int(getattr(os, name, 0))
-        if not hasattr(os, "O_NOFOLLOW") and path.is_symlink():
-            raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
+        flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC
         self._descriptor = os.open(path, flags, 0o666)
         # What could not be written since a failure, in order: offset and bytes.
         self._kept: list[tuple[int, bytes]] = []

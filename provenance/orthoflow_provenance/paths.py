@@ -2,13 +2,11 @@
 
 Every name that a record, a crate, an archive or a plugin gives becomes a path here and nowhere
 else. Reading and writing go down folder by folder through descriptors, so that nothing can be
-exchanged for a link between the look and the use. Windows has no folders by number: there a name is
-looked at before it is used, and a file after; folders could still be exchanged meanwhile.
+exchanged for a link between the look and the use.
 """
 
 from __future__ import annotations
 
-import errno
 import os
 import re
 import secrets
@@ -16,7 +14,6 @@ import stat
 import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from io import BufferedReader
 from pathlib import Path
 from typing import BinaryIO, Final
@@ -35,35 +32,12 @@ _DEVICES: Final = re.compile(
     r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³])[ ]*(\..*)?", re.IGNORECASE | re.DOTALL
 )
 _DRIVE: Final = re.compile(r"[A-Za-z]:")
-_BY_NUMBER: Final = os.open in os.supports_dir_fd and hasattr(os, "O_DIRECTORY")
-# On Windows bytes are bytes only where one asks.
-_SAFE: Final = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_CLOEXEC", "O_BINARY"))
-_FOLDER_FLAGS: Final = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | _SAFE
+_SAFE: Final = os.O_NOFOLLOW | os.O_CLOEXEC
+_FOLDER_FLAGS: Final = os.O_RDONLY | os.O_DIRECTORY | _SAFE
 # The first folder is what the user named, and may be a link.
-_FIRST_FLAGS: Final = _FOLDER_FLAGS & ~getattr(os, "O_NOFOLLOW", 0)
-_FILE_FLAGS: Final = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | _SAFE
+_FIRST_FLAGS: Final = _FOLDER_FLAGS & ~os.O_NOFOLLOW
+_FILE_FLAGS: Final = os.O_RDONLY | os.O_NONBLOCK | _SAFE
 _NEW_FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _SAFE
-
-
-@dataclass(frozen=True)
-class _Place:
-    """A folder that files are opened in.
-
-    Attributes:
-        path: of the folder.
-        number: its descriptor; None where the system opens nothing below one.
-    """
-
-    path: Path
-    number: int | None
-
-    def at(self, name: str) -> str | Path:
-        """What calls with `dir_fd=number` take for a file or folder in it."""
-        return self.path / name if self.number is None else name
-
-    def look(self, name: str) -> os.stat_result:
-        """What stands there, no link followed."""
-        return os.stat(self.at(name), dir_fd=self.number, follow_symlinks=False)
 
 
 def holds_control(text: str) -> bool:
@@ -165,15 +139,12 @@ def open_below(folder: Path, path: str) -> BufferedReader:
     """
     *folders, name = _parts(path)
     with _folder_below(folder, folders) as parent:
-        looked_at = parent.look(name)
-        _check_regular(looked_at, path)
+        # Opening a device may do something.
+        _check_regular(os.stat(name, dir_fd=parent, follow_symlinks=False), path)
         with _link_refused(parent, name, path):
-            descriptor = os.open(parent.at(name), _FILE_FLAGS, dir_fd=parent.number)
+            descriptor = os.open(name, _FILE_FLAGS, dir_fd=parent)
     try:
-        opened = os.fstat(descriptor)
-        _check_regular(opened, path)
-        if parent.number is None:
-            _check_same(looked_at, opened, path)
+        _check_regular(os.fstat(descriptor), path)
         return os.fdopen(descriptor, "rb")
     except BaseException:
         os.close(descriptor)
@@ -192,14 +163,14 @@ def create_below(folder: Path, path: str) -> Iterator[BinaryIO]:
     """
     *folders, name = _parts(path)
     with _folder_below(folder, folders, is_made=True) as parent:
-        aside, at = parent.at(f".{secrets.token_hex(8)}.part"), parent.number
+        aside = f".{secrets.token_hex(8)}.part"
         try:
-            with os.fdopen(os.open(aside, _NEW_FLAGS, 0o666, dir_fd=at), "wb") as stream:
+            with os.fdopen(os.open(aside, _NEW_FLAGS, 0o666, dir_fd=parent), "wb") as stream:
                 yield stream
-            os.replace(aside, parent.at(name), src_dir_fd=at, dst_dir_fd=at)
+            os.replace(aside, name, src_dir_fd=parent, dst_dir_fd=parent)
         except BaseException:
             with suppress(OSError):
-                os.unlink(aside, dir_fd=at)
+                os.unlink(aside, dir_fd=parent)
             raise
 
 
@@ -212,14 +183,12 @@ def files_below(folder: Path, path: str) -> tuple[str, ...]:
         OSError: the folder cannot be read.
     """
     try:
-        with _folder_below(folder, _parts(path)) as inside:
-            where = inside.path if inside.number is None else inside.number
-            with os.scandir(where) as entries:
-                return tuple(
-                    entry.name
-                    for entry in entries
-                    if entry.is_file(follow_symlinks=False) and not name_problem(entry.name)
-                )
+        with _folder_below(folder, _parts(path)) as inside, os.scandir(inside) as entries:
+            return tuple(
+                entry.name
+                for entry in entries
+                if entry.is_file(follow_symlinks=False) and not name_problem(entry.name)
+            )
     except (FileNotFoundError, NotADirectoryError, UnsafeFileError):
         return ()
 
@@ -235,67 +204,39 @@ def _check_regular(found: os.stat_result, path: str) -> None:
         raise UnsafeFileError(f"{path!r} must be a file, but {_kind_of(found)} stands there")
 
 
-def _check_same(looked_at: os.stat_result, opened: os.stat_result, path: str) -> None:
-    if not os.path.samestat(looked_at, opened):
-        raise UnsafeFileError(f"{path!r} was exchanged while it was opened")
-
-
 def _kind_of(found: os.stat_result) -> str:
-    if _is_link(found):
+    if stat.S_ISLNK(found.st_mode):
         return "a link"
     return "a folder" if stat.S_ISDIR(found.st_mode) else "a device, a pipe or a socket"
 
 
-def _is_link(found: os.stat_result) -> bool:
-    # Windows has others besides: junctions.
-    return stat.S_ISLNK(found.st_mode) or bool(getattr(found, "st_reparse_tag", 0))
-
-
 @contextmanager
-def _folder_below(folder: Path, names: list[str], *, is_made: bool = False) -> Iterator[_Place]:
+def _folder_below(folder: Path, names: list[str], *, is_made: bool = False) -> Iterator[int]:
     """Go down folder by folder; the first one may be a link, it is what the user named."""
-    if not _BY_NUMBER:
-        yield _Place(_path_of_folder(folder, names, is_made=is_made), None)
-        return
-    path = folder.joinpath(*names)
     descriptor = os.open(folder, _FIRST_FLAGS)
     try:
         for depth, name in enumerate(names):
             if is_made:
                 with suppress(FileExistsError):
                     os.mkdir(name, dir_fd=descriptor)
-            with _link_refused(_Place(folder, descriptor), name, "/".join(names[: depth + 1])):
+            with _link_refused(descriptor, name, "/".join(names[: depth + 1])):
                 inner = os.open(name, _FOLDER_FLAGS, dir_fd=descriptor)
             os.close(descriptor)
             descriptor = inner
-        yield _Place(path, descriptor)
+        yield descriptor
     finally:
         os.close(descriptor)
 
 
-def _path_of_folder(folder: Path, names: list[str], *, is_made: bool) -> Path:
-    for depth, name in enumerate(names):
-        folder = folder / name
-        if is_made:
-            with suppress(FileExistsError):
-                folder.mkdir()
-        found = folder.lstat()
-        if _is_link(found):
-            where = "/".join(names[: depth + 1])
-            raise UnsafeFileError(f"{where!r} is a link, and links are not followed")
-    if not folder.is_dir():
-        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(folder))
-    return folder
-
-
 @contextmanager
-def _link_refused(parent: _Place, name: str, path: str) -> Iterator[None]:
+def _link_refused(parent: int, name: str, path: str) -> Iterator[None]:
     """State that a link stands there; which error the system gives for one depends on the flags."""
     try:
         yield
     except OSError as error:
         with suppress(OSError):
-            if _is_link(parent.look(name)):
+            found = os.stat(name, dir_fd=parent, follow_symlinks=False)
+            if stat.S_ISLNK(found.st_mode):
                 raise UnsafeFileError(f"{path!r} is a link, and links are not followed") from error
         raise
 
