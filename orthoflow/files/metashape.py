@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -211,27 +211,31 @@ class _Similarity:
 
     def __init__(self, transform: ET.Element | None, path: Path) -> None:
         self.rotation, self.shift, self.scale = np.eye(3), np.zeros(3), 1.0
-        self.is_placed = transform is not None and bool(
-            transform.findtext("translation", "").strip()
-        )
+        self.is_placed = False
         if transform is None:
             return
-        rotation, shift, scale = (
-            transform.findtext(name, "").split() for name in ("rotation", "translation", "scale")
-        )
-        if rotation:
-            self.rotation = rotation_of(_some(rotation, 9, path, "rotation"), path, "the chunk")
-        if shift:
-            self.shift = np.array(_some(shift, 3, path, "translation"))
-        if scale:
-            (self.scale,) = _some(scale, 1, path, "scale")
+        self.is_placed = bool(transform.findtext("translation", "").strip())
+        self.rotation, self.shift = _pose(transform, ("translation",), path, "the chunk")
+        if words := transform.findtext("scale", "").split():
+            (self.scale,) = _some(words, 1, path, "scale", "the chunk")
         if not self.scale > 0.0:
             raise damaged(path, f"the scale of the chunk must be positive, got {self.scale:g}")
 
 
-def _some(
-    words: list[str], count: int, path: Path, what: str, whose: str = "the chunk"
-) -> list[float]:
+def _pose(
+    element: ET.Element, places: Sequence[str], path: Path, whose: str
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return rotation and shift as an element states them, the shift under one of some names."""
+    rotation, shift = np.eye(3), np.zeros(3)
+    if words := element.findtext("rotation", "").split():
+        rotation = rotation_of(_some(words, 9, path, "rotation", whose), path, whose)
+    for name in places:
+        if words := element.findtext(name, "").split():
+            return rotation, np.array(_some(words, 3, path, name, whose))
+    return rotation, shift
+
+
+def _some(words: list[str], count: int, path: Path, what: str, whose: str) -> list[float]:
     if len(words) != count:
         raise damaged(path, f"the {what} of {whose} must be {count} numbers, got {len(words)}")
     return numbers_of(words, path, f"the {what} of {whose}")
@@ -243,14 +247,8 @@ class _Sensor:
     def __init__(self, element: ET.Element, path: Path) -> None:
         self.label = element.get("label", element.get("id", ""))
         self.lens, self.note = self._lens(element, path)
-        self.rotation, self.location = np.eye(3), np.zeros(3)
-        whose = f"sensor {self.label}"
-        rotation = element.findtext("rotation", "").split()
-        location = (element.findtext("location") or element.findtext("translation") or "").split()
-        if rotation:
-            self.rotation = rotation_of(_some(rotation, 9, path, "rotation", whose), path, whose)
-        if location:
-            self.location = np.array(_some(location, 3, path, "location", whose))
+        places = ("location", "translation")
+        self.rotation, self.location = _pose(element, places, path, f"sensor {self.label}")
         shutter = element.findtext("rolling_shutter", "").strip().lower()
         self.has_rolling_shutter = shutter not in ("", "none", "disabled", *_OFF)
 
@@ -358,9 +356,4 @@ def _rolling_shutter(element: ET.Element, sensor: _Sensor) -> str:
 
 def _matrix(element: ET.Element, name: str, path: Path) -> NDArray[np.float64] | None:
     words = element.findtext("transform", "").split()
-    if not words:
-        return None
-    values = numbers_of(words, path, f"the transform of {name}")
-    if len(values) != 16:
-        raise damaged(path, f"the transform of {name} must be 16 numbers, got {len(values)}")
-    return np.array(values).reshape(4, 4)
+    return np.reshape(_some(words, 16, path, "transform", name), (4, 4)) if words else None
