@@ -105,9 +105,10 @@ def _layer(
     """Project a photo onto one wall; None if no pixel hits it."""
     from orthoflow.geometry.interpolation import Surroundings
     from orthoflow.geometry.narrow_gaps import narrow_gaps
+    from orthoflow.geometry.occluders import nothing_in_the_way
     from orthoflow_plugins.ortho.filling import painted_between
     from orthoflow_plugins.ortho.forward_kernels import NO_PIXEL, Catch, throw_pixels
-    from orthoflow_plugins.ortho.surfaces import is_before, view_of
+    from orthoflow_plugins.ortho.surfaces import cells_seen, is_before, view_of
 
     view = view_of(photo.viewer, surface, params)
     if not is_before(view, surface):
@@ -136,12 +137,17 @@ def _layer(
         quality=np.asarray(new("quality", shape, np.float32), np.float32),
         filled=filled,
     )
+    # Which cells are in the photo, whatever hides them.
+    from_anywhere, empty = view._replace(cosine_least=-1.0), nothing_in_the_way(photo.viewer)
+    free = surface.relief._replace(bottoms=np.full_like(surface.relief.bottoms, np.inf))
     # Whether a gap is narrow depends on cells two discs away, and its colour on those one farther.
     reach_rows = 2 * params.fill_gap_cells + 2
     for band in bands_with_reach(shape, cells_most=_BAND_CELLS, reach_rows=reach_rows):
         inner, width = band.inner, surface.frame.width
         pixel, depth_m = catch.pixel[band.around], surface.relief.depth[band.around]
-        seen, quality = _seen(photo.viewer, surface, band.rows, border_px=view.border_px)
+        visible = cells_seen(from_anywhere, free, empty, band.rows, slice(0, width))
+        seen = visible.mask == LayerMask.PAINTED
+        quality = np.maximum(visible.quality, np.float32(0.0))
         is_painted = pixel != NO_PIXEL
         gaps = narrow_gaps(is_painted, params.fill_gap_cells)
         gaps = gaps[(gaps >= inner.start * width) & (gaps < inner.stop * width)]
@@ -192,26 +198,3 @@ def _ray_lattice(viewer: ViewingCamera, surface: Surface) -> NDArray[np.float64]
         lines[whole] = inner + (lines[whole] - inner) / (border - (whole - 1))
         lines[whole + 1 :] = lines[whole]
     return rays
-
-
-def _seen(
-    viewer: ViewingCamera, surface: Surface, rows: slice, *, border_px: float
-) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
-    """Report which cells of some rows are in the photo, and how many of its pixels each covers."""
-    frame, depth = surface.frame, surface.relief.depth[rows]
-    seen = np.zeros(depth.shape, dtype=np.bool_)
-    quality = np.zeros(depth.shape, dtype=np.float32)
-    columns = np.arange(frame.width) + 0.5
-    area_px = viewer.fx * viewer.fy * frame.gsd_m**2
-    for row in range(len(depth)):
-        places = np.column_stack([columns, np.full(frame.width, rows.start + row + 0.5)])
-        points = frame.world_from_wall(places, depth[row].astype(np.float64))
-        u, v, distance = viewer.project(points).T
-        towards = viewer.centre_world - points
-        with np.errstate(invalid="ignore"):
-            cosine = towards @ frame.normal_world / np.linalg.norm(towards, axis=1)
-            seen[row] = (u >= 0) & (u < viewer.width) & (v >= 0) & (v < viewer.height)
-            border = np.minimum(np.minimum(u, viewer.width - u), np.minimum(v, viewer.height - v))
-            value = cosine * area_px / distance**2 * np.clip(border / border_px, 0.0, 1.0)
-        quality[row] = np.where(seen[row], np.nan_to_num(value), 0.0)
-    return seen, np.maximum(quality, 0.0)

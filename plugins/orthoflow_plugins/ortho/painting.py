@@ -19,13 +19,12 @@ from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 from orthoflow.geometry.levels import Colours, level_of
 from orthoflow.geometry.threads import in_threads
 from orthoflow_plugins.ortho.parameters import BackwardParams
-from orthoflow_plugins.ortho.surfaces import Surface
+from orthoflow_plugins.ortho.surfaces import Surface, cells_seen
 from orthoflow_plugins.ortho.visibility_kernels import (
     OCCLUDED,
     PAINTED,
     TileVisibility,
     WallView,
-    look_at_cells,
 )
 
 Tile = tuple[slice, slice]
@@ -171,10 +170,7 @@ def _visible(
         slice(max(0, part.start - margin), min(size, part.stop + margin))
         for part, size in zip(tile, surface.frame.shape, strict=True)
     )
-    size = (rows.stop - rows.start, columns.stop - columns.start)
-    u, v, quality = np.empty((3, *size), dtype=np.float32)
-    visible = TileVisibility(u=u, v=v, mask=np.empty(size, dtype=np.uint8), quality=quality)
-    look_at_cells(view, surface.relief, buffer, visible, rows.start, columns.start)
+    visible = cells_seen(view, surface.relief, buffer, rows, columns)
     inner_rows, inner_columns = (
         slice(part.start - around.start, part.stop - around.start)
         for part, around in zip(tile, (rows, columns), strict=True)

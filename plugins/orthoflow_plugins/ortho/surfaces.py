@@ -13,11 +13,19 @@ from numpy.typing import DTypeLike, NDArray
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.bands import Allocate, bands_with_reach, in_memory
 from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 from orthoflow.geometry.robust import depth_noise_m
 from orthoflow.products import Wall, Walls
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.ortho.parameters import VisibilityParams
-from orthoflow_plugins.ortho.visibility_kernels import BLOCK_CELLS, FINE_CELLS, Relief, WallView
+from orthoflow_plugins.ortho.visibility_kernels import (
+    BLOCK_CELLS,
+    FINE_CELLS,
+    Relief,
+    TileVisibility,
+    WallView,
+    look_at_cells,
+)
 
 # Surfaces of walls with more cells are kept in files, and computed in bands of so many.
 _IN_MEMORY_MOST: Final = 1 << 26
@@ -102,6 +110,17 @@ def view_of(camera: ViewingCamera, surface: Surface, params: VisibilityParams) -
         cosine_least=math.cos(math.radians(params.incidence_max_deg)),
         border_px=max(1.0, params.border_share * min(camera.width, camera.height)),
     )
+
+
+def cells_seen(
+    view: WallView, relief: Relief, buffer: DepthBuffer, rows: slice, columns: slice
+) -> TileVisibility:
+    """Determine which cells of a part of a wall a photo sees, and where."""
+    size = (rows.stop - rows.start, columns.stop - columns.start)
+    u, v, quality = np.empty((3, *size), dtype=np.float32)
+    visible = TileVisibility(u=u, v=v, mask=np.empty(size, dtype=np.uint8), quality=quality)
+    look_at_cells(view, relief, buffer, visible, rows.start, columns.start)
+    return visible
 
 
 def is_before(view: WallView, surface: Surface) -> bool:

@@ -1,4 +1,4 @@
-"""Rays of every sixteenth pixel, and which cells a photo shows."""
+"""Rays of every sixteenth pixel, and what lies between them."""
 
 from __future__ import annotations
 
@@ -63,35 +63,3 @@ def test_rays_between_those_of_the_lattice_are_those_of_the_camera(size: tuple[i
         # Just before the border: what lies beyond is not asked for.
         found = between(min(u, size[0] - 1e-9), min(v, size[1] - 1e-9))
         np.testing.assert_allclose(found, ray, atol=1e-5 * np.linalg.norm(ray))
-
-
-@pytest.mark.parametrize("moved_px", [(0.0, 0.0), (-300.0, -250.0)], ids=["right", "left"])
-def test_cells_are_seen_inside_the_photo_and_worth_their_pixels(
-    moved_px: tuple[float, float],
-) -> None:
-    depths = scenes.depth_m()
-    depths[30:60, 20:50] = np.nan
-    surface = surface_of(depths)
-    # A photo of a part of the wall.
-    camera = scenes.camera(WHERE, aside_m=0.4, width=1000)
-    camera = replace(
-        camera, width=700, height=500, cx=camera.cx + moved_px[0], cy=camera.cy + moved_px[1]
-    )
-    rows = slice(20, 200)
-    seen, quality = dsm_forward._seen(camera, surface, rows, border_px=40.0)
-    at = np.stack(np.meshgrid(np.arange(scenes.SHAPE[1]), np.arange(20, 200)), axis=-1) + 0.5
-    heights = depths[rows].ravel().astype(np.float64)
-    points = WHERE.world_from_wall(at.reshape(-1, 2), heights)
-    u, v, along = camera.project(points).T
-    with np.errstate(invalid="ignore"):
-        inside = np.min([u, 700.0 - u, v, 500.0 - v], axis=0)
-        expected = (inside >= 0.0) & (u < 700.0) & (v < 500.0)
-    np.testing.assert_array_equal(seen.ravel(), expected)
-    assert 0.1 < expected.mean() < 0.9
-    # Some of what is not seen lies beside the photo by less than a pixel, or is by less within it.
-    assert (expected & (inside < 1.0)).any()
-    towards = camera.centre_world - points
-    cosine = towards @ WHERE.normal_world / np.linalg.norm(towards, axis=1)
-    area = camera.fx * camera.fy * WHERE.gsd_m**2 / along**2
-    worth = np.where(expected, cosine * area * np.clip(inside / 40.0, 0.0, 1.0), 0.0)
-    np.testing.assert_allclose(quality.ravel(), np.nan_to_num(worth), rtol=1e-5, atol=1e-6)

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
 from orthoflow_plugins.ortho.parameters import VisibilityParams
-from orthoflow_plugins.ortho.surfaces import Surface, relief_of, view_of
+from orthoflow_plugins.ortho.surfaces import Surface, cells_seen, relief_of, view_of
 from orthoflow_plugins.ortho.visibility_kernels import (
     NO_SURFACE,
     OCCLUDED,
@@ -17,7 +17,6 @@ from orthoflow_plugins.ortho.visibility_kernels import (
     Relief,
     TileVisibility,
     WallView,
-    look_at_cells,
 )
 
 from orthoflow.geometry.cameras import ViewingCamera
@@ -58,16 +57,9 @@ def seen_of(
     camera: ViewingCamera,
     buffer: DepthBuffer | None = None,
 ) -> TileVisibility:
-    height, width = scenes.SHAPE
-    visible = TileVisibility(
-        u=np.empty((height, width), dtype=np.float32),
-        v=np.empty((height, width), dtype=np.float32),
-        mask=np.empty((height, width), dtype=np.uint8),
-        quality=np.empty((height, width), dtype=np.float32),
-    )
     view = view_of(camera, surface, PARAMS)
-    look_at_cells(view, surface.relief, buffer or nothing_in_the_way(camera), visible, 0, 0)
-    return visible
+    rows, columns = (slice(0, size) for size in scenes.SHAPE)
+    return cells_seen(view, surface.relief, buffer or nothing_in_the_way(camera), rows, columns)
 
 
 @pytest.mark.parametrize("aside_m", [-0.7, 0.0, 1.4])
