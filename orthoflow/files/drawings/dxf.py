@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -21,36 +20,24 @@ if TYPE_CHECKING:
     from ezdxf.layouts.layout import Modelspace
 
 
-@dataclass(frozen=True, kw_only=True)
-class Layer:
-    """A layer with a name of the US National CAD Standard.
-
-    Attributes:
-        holds: its content.
-        colour: number of the colour in CAD programs.
-        weight: width of its lines, hundredths of a millimetre, as in ISO 128.
-    """
-
-    holds: str
-    colour: int
-    weight: int
-
-
+# Layers with names of the US National CAD Standard: content, AutoCAD colour, and line weight in
+# hundredths of a millimetre, as in ISO 128.
+Layers = Mapping[str, tuple[str, int, int]]
 # Walls are elevations (A-ELEV), the room in space is a model of surfaces (A-WALL).
-LAYERS: Final = {
-    "A-ELEV-IMAG": Layer(holds="orthoimages", colour=7, weight=13),
-    "A-ELEV-OTLN": Layer(holds="outline of the orthoimage", colour=8, weight=13),
-    "A-ELEV-EDGE": Layer(holds="edges to neighbouring planes", colour=7, weight=35),
-    "A-ELEV-OPNG": Layer(holds="openings, regular", colour=4, weight=35),
-    "A-WALL-EDGE": Layer(holds="edges in which planes meet", colour=1, weight=35),
-    "A-WALL-OTLN": Layer(holds="outline of the room at the floor", colour=5, weight=50),
-    "A-WALL-FACE": Layer(holds="faces of walls", colour=252, weight=13),
-    "A-WALL-OPNG": Layer(holds="openings in space", colour=4, weight=35),
-    "A-SURV-PNTS": Layer(holds="surveyed points", colour=6, weight=25),
-    "A-ANNO-GRID": Layer(holds="grid with coordinates", colour=9, weight=13),
-    "A-ANNO-LEVL": Layer(holds="height marks", colour=3, weight=18),
-    "A-ANNO-DIMS": Layer(holds="dimensions", colour=2, weight=18),
-    "A-ANNO-TEXT": Layer(holds="names and notes", colour=7, weight=18),
+LAYERS: Final[Layers] = {
+    "A-ELEV-IMAG": ("orthoimages", 7, 13),
+    "A-ELEV-OTLN": ("outline of the orthoimage", 8, 13),
+    "A-ELEV-EDGE": ("edges to neighbouring planes", 7, 35),
+    "A-ELEV-OPNG": ("openings, regular", 4, 35),
+    "A-WALL-EDGE": ("edges in which planes meet", 1, 35),
+    "A-WALL-OTLN": ("outline of the room at the floor", 5, 50),
+    "A-WALL-FACE": ("faces of walls", 252, 13),
+    "A-WALL-OPNG": ("openings in space", 4, 35),
+    "A-SURV-PNTS": ("surveyed points", 6, 25),
+    "A-ANNO-GRID": ("grid with coordinates", 9, 13),
+    "A-ANNO-LEVL": ("height marks", 3, 18),
+    "A-ANNO-DIMS": ("dimensions", 2, 18),
+    "A-ANNO-TEXT": ("names and notes", 7, 18),
 }
 # Letters of 2.5 mm at 1:50.
 _TEXT_M: Final = 0.125
@@ -74,7 +61,7 @@ def write_wall_dxf(path: Path, wall: DrawnWall, lines: RoomLines | None) -> None
     Raises:
         StoreError: it cannot be written.
     """
-    document, space = _new_document()
+    document, space = _wall_document()
     frame = wall.frame
     corners = wall.place_m(frame.corners_world())
     _add_polygon(space, corners, "A-ELEV-OTLN")
@@ -120,7 +107,7 @@ def write_room_dxf(path: Path, walls: Sequence[DrawnWall], lines: RoomLines) -> 
     Raises:
         StoreError: it cannot be written.
     """
-    document, space = _new_document()
+    document, space = _wall_document()
     for wall in walls:
         _add_placed_wall(document, space, wall)
     for index, name in enumerate(lines.planes.names):
@@ -137,21 +124,26 @@ def write_room_dxf(path: Path, walls: Sequence[DrawnWall], lines: RoomLines) -> 
     save_document(document, path)
 
 
-def _new_document() -> tuple[Drawing, Modelspace]:
+def new_document(layers: Layers, text_m: float, version: str = _VERSION) -> Drawing:
+    """Make a document in metres, with layers and a style of dimensions with texts of a height."""
     from ezdxf.filemanagement import new
 
-    document = new(_VERSION, setup=True, units=_METRES)
-    for name, given in LAYERS.items():
-        layer = document.layers.add(name, color=given.colour, lineweight=given.weight)
-        layer.description = given.holds
-    add_dimension_style(document, _TEXT_M)
+    document = new(version, setup=True, units=_METRES)
+    for name, (description, colour, weight) in layers.items():
+        document.layers.add(name, color=colour, lineweight=weight).description = description
+    _add_dimension_style(document, text_m)
+    return document
+
+
+def _wall_document() -> tuple[Drawing, Modelspace]:
+    document = new_document(LAYERS, _TEXT_M)
     _add_blocks(document)
     # LibreCAD takes the limits of paper space as its paper, in metres: A3.
     document.paperspace().dxf.limmax = (0.42, 0.297)
     return document, document.modelspace()
 
 
-def add_dimension_style(document: Drawing, text_m: float) -> None:
+def _add_dimension_style(document: Drawing, text_m: float) -> None:
     """Define the style of dimensions: metres with three decimals, text above the line.
 
     The header has the same, because some programs redraw dimensions from it alone.

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.drawings.dxf import DIMENSION_STYLE, add_dimension_style, save_document
+from orthoflow.files.drawings.dxf import DIMENSION_STYLE, Layers, new_document, save_document
 from orthoflow.files.drawings.key_plans import cut_plan, is_map_crs, up_label
 from orthoflow.files.drawings.pens import FINE_MM, box, fill, line
 from orthoflow.files.drawings.sections import CutLine, Section
@@ -34,9 +34,7 @@ if TYPE_CHECKING:
     from ezdxf.layouts.layout import Modelspace
     from ezdxf.math import Vec2
 
-# Layers with names of the US National CAD Standard for sections: content, AutoCAD colour and line
-# weight in hundredths of a millimetre (ISO 128: 0.5 cut, 0.25 and 0.13 the rest).
-LAYERS: Final = {
+LAYERS: Final[Layers] = {
     "A-SECT-MCUT": ("what is cut", 7, 50),
     "A-SECT-MBND": ("what lies beyond", 8, 13),
     "A-SECT-PATT": ("hatches of what is solid", 8, 13),
@@ -54,7 +52,6 @@ _AROUND_MM: Final = 2.0 + _SOLID_MM
 _DIMENSIONS_MM: Final = 14.0
 _BELOW_MM: Final = 28.0
 _TEXTS_MM: Final = 160.0
-_METRES: Final = 6
 # Widths of ISO 128 that a page has.
 _WIDTHS_MM: Final = np.array([0.13, 0.25, 0.35, 0.5])
 
@@ -208,16 +205,10 @@ def _render(document: Document, backend: Any) -> None:
 
 
 def _document(drawing: SectionDrawing, *, with_texts: bool = True) -> Document:
-    from ezdxf.filemanagement import new
-
-    document = new("R2018", setup=True, units=_METRES)
-    for name, (description, colour, weight) in LAYERS.items():
-        layer = document.layers.add(name, color=colour, lineweight=weight)
-        layer.description = description
+    document = new_document(LAYERS, drawing.mm(_TEXT_MM), "R2018")
     document.layers.get("A-SECT-HIDN").dxf.linetype = "DASHED"
     document.header["$LTSCALE"] = drawing.mm(8.0)
     document.header["$PDMODE"] = 0
-    add_dimension_style(document, drawing.mm(_TEXT_MM))
     space = document.modelspace()
     section = drawing.section
     for cut in section.lines:
