@@ -46,7 +46,7 @@ def find_workflow(name_or_path: str | Path) -> Path:
     path = Path(name_or_path)
     if path.is_file():
         return path
-    if path.exists() and path.parent != Path():
+    if path.exists() and (path.parent != Path() or path.stem not in shipped_workflows()):
         raise WorkflowError(f"{path} is a folder or a device; give a workflow file")
     return shipped_workflow(str(name_or_path))
 

@@ -75,6 +75,7 @@ COMMANDS = [
     # Mistakes of users: a sentence, and 2.
     "chek studio.yaml",
     "check nowhere.yaml",
+    "check .",
     "check wrong.yaml",
     "check studio.yaml --set paint.gray=9 --input numbers=n.txt",
     "check studio.yaml --input number=none.txt",

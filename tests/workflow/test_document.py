@@ -14,6 +14,7 @@ from orthoflow.files.yaml_positions import Scalar
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.model import CallSection
 from orthoflow.workflow.problems import InvalidArgumentsError, Problem, UnusablePluginError
+from orthoflow.workflow.source import find_workflow
 from tests.laboratories import (
     GOOD,
     laboratory_catalog,
@@ -104,13 +105,16 @@ def test_a_device_is_no_file_of_parameters(catalog: Catalog, write: Path) -> Non
         load_workflow(write, catalog, set_files=["/dev/zero"])
 
 
-@pytest.mark.parametrize("name", ["nowhere.yaml", "folder"])
 def test_a_name_that_is_neither_file_nor_recipe_lists_the_recipes(
-    name: str, catalog: Catalog, write: Path
+    catalog: Catalog, write: Path
 ) -> None:
-    write.with_name("folder").mkdir()
-    with pytest.raises(WorkflowError, match=rf"no workflow file {name} .*shipped: .*direct"):
-        load_workflow(name, catalog)
+    with pytest.raises(WorkflowError, match=r"no workflow file nowhere.yaml .*shipped: .*direct"):
+        load_workflow("nowhere.yaml", catalog)
+    for name in ("folder", "direct"):
+        write.with_name(name).mkdir()
+    with pytest.raises(WorkflowError, match="folder is a folder or a device"):
+        load_workflow("folder", catalog)
+    assert find_workflow("direct").suffix == ".yaml"
 
 
 BROKEN_METHOD = """
