@@ -16,7 +16,7 @@ from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.sdk.hooks import ENTRY_POINT_GROUP
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.model import Workflow
-from orthoflow.workflow.problems import InvalidWorkflowError
+from orthoflow.workflow.source import InvalidWorkflowError
 
 LABORATORY = Path(__file__).parent / "laboratory"
 GOOD = """\

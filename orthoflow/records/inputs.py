@@ -36,7 +36,7 @@ from orthoflow.workflow.inputs import (
     written_files,
 )
 from orthoflow.workflow.model import Workflow, WorkflowInputSpec
-from orthoflow.workflow.problems import ProblemLog
+from orthoflow.workflow.source import ProblemLog
 
 # Maximum number of files of a folder that is searched by content; in a larger one only by name.
 _MOST_LISTED: Final = 10_000

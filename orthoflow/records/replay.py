@@ -30,7 +30,7 @@ from orthoflow.records.verify import verify_run
 from orthoflow.workflow.expand import Cell, CellOutput, WorkflowInput
 from orthoflow.workflow.inputs import MissingInputsError
 from orthoflow.workflow.model import StepVariant, Workflow
-from orthoflow.workflow.resolved import workflow_from_resolved
+from orthoflow.workflow.views import workflow_from_resolved
 
 _ENVIRONMENT: tuple[str, ...] = ("python", "os", "cpu")
 

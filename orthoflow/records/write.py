@@ -71,7 +71,7 @@ from orthoflow.records.walls import write_walls_json
 from orthoflow.untrusted_text import first_few
 from orthoflow.version import __version__
 from orthoflow.workflow.inputs import MissingInputsError
-from orthoflow.workflow.resolved import resolved_json, workflow_from_resolved
+from orthoflow.workflow.views import resolved_json, workflow_from_resolved
 
 if TYPE_CHECKING:
     from orthoflow.engine.plan import RunPlan

@@ -24,7 +24,7 @@ from orthoflow.workflow.model import (
     is_acyclic,
 )
 from orthoflow.workflow.parameters import DraftStep
-from orthoflow.workflow.problems import ProblemLog
+from orthoflow.workflow.source import ProblemLog
 
 _WILDCARDS: Final = frozenset("*?[")
 

@@ -48,8 +48,7 @@ from orthoflow.workflow.parameters import (
     overrides_of_settings,
     resolve_call,
 )
-from orthoflow.workflow.problems import ProblemLog, validate
-from orthoflow.workflow.source import find_workflow, read_text
+from orthoflow.workflow.source import ProblemLog, find_workflow, read_text, validate
 
 _STEPS: Final = "steps"
 _OF_CALLS: Final = tuple(CallSection.model_fields)

@@ -40,8 +40,7 @@ from orthoflow.workflow.parameters import (
     overrides_of_settings,
     resolve_call,
 )
-from orthoflow.workflow.problems import ProblemLog, validate
-from orthoflow.workflow.source import read_text
+from orthoflow.workflow.source import ProblemLog, read_text, validate
 
 # Files and folders that are examined for one input: `/**` would take hours.
 #: files and folders visited for one entry of an input (a folder, or a pattern such as `**/*.e57`)

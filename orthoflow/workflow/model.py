@@ -29,7 +29,7 @@ from pydantic_core import PydanticCustomError
 
 from orthoflow.catalog.discovery import NAME_PATTERN
 from orthoflow.products.product import JsonValue
-from orthoflow.workflow.problems import Problem
+from orthoflow.workflow.source import Problem
 
 FORMAT: Final = 1
 #: `repeat` of a method call

@@ -23,7 +23,7 @@ from orthoflow.sdk.hooks import KindSpec
 from orthoflow.sdk.lines import describe_error
 from orthoflow.sdk.methods import Method
 from orthoflow.workflow.model import MOST_SWEPT, CallSection, Reference, StepVariant, SweepSection
-from orthoflow.workflow.problems import InvalidWorkflowError, ProblemLog, validate
+from orthoflow.workflow.source import InvalidWorkflowError, ProblemLog, validate
 
 Report: TypeAlias = Callable[[str], None]
 

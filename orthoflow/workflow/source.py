@@ -1,11 +1,18 @@
-"""Finding and reading a workflow's text."""
+"""The text of a workflow: where it is found, how it is read, and all that is wrong with it."""
 
 from __future__ import annotations
 
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, Literal, NoReturn, TypeAlias, TypeVar
 
-from orthoflow.errors import WorkflowError, did_you_mean
+from pydantic import BaseModel, ValidationError
+
+from orthoflow.errors import ArgumentError, OrthoflowError, PluginError, WorkflowError, did_you_mean
+from orthoflow.files.documents import existing, mistakes
+from orthoflow.files.yaml_positions import Document, Location, Position, path_text, read_yaml
+from orthoflow.products.product import JsonValue
 from orthoflow.untrusted_text import open_file
 
 #: bytes of a workflow file
@@ -74,3 +81,256 @@ def read_text(path: Path, what: str = "a workflow file", most_bytes: int = MOST_
             f"{path}:{line}:{column}: expected UTF-8 text, got the byte "
             f"0x{content[error.start]:02x}; save the file as UTF-8"
         ) from error
+
+
+# Problems -----------------------------------------------------------------------------------------
+
+#: problems of a workflow that are reported at once
+MOST_PROBLEMS: Final = 100
+_SNIPPET_WIDTH: Final = 120
+Model = TypeVar("Model", bound=BaseModel)
+_Origin: TypeAlias = Literal["file", "plugin", "input", "option"]
+# Of what cannot be read.
+NOTHING: Final = Document(value=None, places={(): Position(line=1, column=1)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Problem:
+    """One problem.
+
+    Attributes:
+        file: the workflow file as the user named it, or the command-line option.
+        line: from 1; 0 for a command-line option.
+        column: from 1; 0 for a command-line option.
+        path: location in the document, keys joined by dots, e.g. `steps.wall.params.gsd_m`.
+        message: one sentence.
+        text: the offending line, empty for a command-line option.
+    """
+
+    file: str
+    line: int = 0
+    column: int = 0
+    path: str = ""
+    message: str
+    text: str = ""
+
+    @property
+    def place(self) -> str:
+        """Return its place, as the sentence begins: `hall.yaml:3:9: steps.wall: `."""
+        where = f"{self.file}:{self.line}:{self.column}" if self.line else self.file
+        return f"{where}: {self.path}: " if self.path else f"{where}: "
+
+    def __str__(self) -> str:
+        head = f"{self.place}{self.message}"
+        # Around the column, so that a line of a thousand characters does not hide the message.
+        is_long = len(self.text) > _SNIPPET_WIDTH
+        start = max(0, self.column - 1 - _SNIPPET_WIDTH // 2) if is_long else 0
+        cut = self.text[start : start + _SNIPPET_WIDTH]
+        shown = "".join(char if char.isprintable() else " " for char in cut)
+        if not shown.strip():
+            return head
+        indent = len(shown) - len(shown.lstrip())
+        caret = " " * max(0, self.column - 1 - start - indent) + "^"
+        return f"{head}\n    {shown.strip()}\n    {caret}"
+
+
+class _ProblemsError(OrthoflowError):
+    """Some problems, a line each or more; `problems` holds them for tools."""
+
+    def __init__(self, problems: tuple[Problem, ...]) -> None:
+        self.problems = problems
+        super().__init__("\n".join(str(problem) for problem in problems))
+
+
+class InvalidWorkflowError(_ProblemsError, WorkflowError):
+    """A workflow file has problems."""
+
+
+class UnusablePluginError(_ProblemsError, PluginError):
+    """A workflow is correct, but plugins it needs are not; `problems` names where it needs them."""
+
+
+class InvalidArgumentsError(_ProblemsError, ArgumentError):
+    """Command-line options do not fit the workflow."""
+
+
+@dataclass
+class ProblemLog:
+    """Collects problems while a workflow is read.
+
+    Attributes:
+        file: the workflow file as the user named it.
+        lines: its text.
+        document: its values with their positions; empty before it is parsed.
+        unnamed: the first key of locations, if paths do not state it.
+    """
+
+    file: str
+    lines: tuple[str, ...] = ()
+    document: Document = NOTHING
+    unnamed: str = ""
+    _found: list[tuple[_Origin, Problem]] = field(default_factory=list)
+
+    def parse(self, text: str) -> Document | None:
+        """Parse YAML; problems are added, None if nothing can be read."""
+        found = read_yaml(text, self)
+        self.document = found or NOTHING
+        return found
+
+    def beside(self, file: str, text: str) -> ProblemLog:
+        """Return a log of another file, whose problems are raised together with these."""
+        return replace(
+            self, file=file, lines=tuple(text.splitlines()), document=NOTHING, unnamed=""
+        )
+
+    @property
+    def has_any(self) -> bool:
+        """Whether there is a problem besides missing input files."""
+        return any(origin != "input" for origin, _ in self._found)
+
+    def add(self, position: Position, path: str, message: str) -> None:
+        """Add a problem at a position.
+
+        Raises:
+            InvalidWorkflowError: there are so many that the file must be something else.
+        """
+        self._add("file", self._at(position, path, message))
+        if sum(origin == "file" for origin, _ in self._found) > MOST_PROBLEMS:
+            more = f"more than {MOST_PROBLEMS} problems; correct those above and try again"
+            self._found[-1] = ("file", self._at(position, path, more))
+            self._raise()
+
+    def _add(self, origin: _Origin, problem: Problem) -> None:
+        if (origin, problem) not in self._found:
+            self._found.append((origin, problem))
+
+    def report(
+        self,
+        location: Location,
+        message: str,
+        *,
+        at_key: bool = False,
+        shown: Location | None = None,
+    ) -> None:
+        """Add a problem of the value, or of the key, at a location in the tree.
+
+        Args:
+            location: where it is in the tree.
+            message: one sentence.
+            at_key: the position is that of the key.
+            shown: the path stated in the problem, if it differs.
+        """
+        path = self.path(location if shown is None else shown)
+        self.add(self.position(location, at_key=at_key), path, message)
+
+    def report_plugin(self, location: Location, message: str) -> None:
+        """Add a problem of a plugin that the file needs here."""
+        problem = self._at(self.position(location), self.path(location), message)
+        self._add("plugin", problem)
+
+    def report_input(self, place: Problem | None, message: str) -> None:
+        """Add a problem of input files; the file itself decides the type of the error."""
+        if len(self._found) < 2 * MOST_PROBLEMS:
+            nowhere = Problem(file=self.file, message="")
+            self._add("input", replace(place or nowhere, message=message))
+
+    def report_option(self, option: str, message: str) -> None:
+        """Add a problem of a command-line option, e.g. `--set wall.gsd_m=0`."""
+        self._add("option", Problem(file=option, message=message))
+
+    def place(self, location: Location) -> Problem | None:
+        """Return a problem without its message; None if the value comes from no file."""
+        position = self.position(location)
+        return self._at(position, self.path(location), "") if position.line else None
+
+    def position(self, location: Location, *, at_key: bool = False) -> Position:
+        """Return the position of a value, or of its key; of a missing one what is around it."""
+        return self.document.position(location, at_key=at_key)
+
+    def path(self, location: Location) -> str:
+        """Format a location: `steps.wall.in.cloud[1]`, without indices of non-lists."""
+        stated, _ = self.document.resolve(location)
+        return path_text(stated[1:] if stated[:1] == (self.unnamed,) else stated)
+
+    def has(self, location: Location) -> bool:
+        """Whether there is a value at a location, be it null."""
+        return self.document.resolve(location)[1] == location
+
+    def get(self, location: Location) -> JsonValue:
+        """Return the value at a location; None if there is none."""
+        return self.document.get(location)
+
+    def raise_any(self) -> None:
+        """End with all problems found so far, if there are any.
+
+        Raises:
+            InvalidWorkflowError: the file has problems.
+            InvalidArgumentsError: only command-line options have.
+            UnusablePluginError: only plugins have.
+        """
+        if self.has_any:
+            self._raise()
+
+    def _raise(self) -> NoReturn:
+        # Those of the command line stand last.
+        in_order = sorted(
+            self._found,
+            key=lambda one: ("" if one[0] == "option" else one[1].file, one[1].line, one[1].column),
+        )
+        in_order.sort(key=lambda one: one[0] == "option")
+        origins = {origin for origin, _ in in_order}
+        error: type[_ProblemsError] = InvalidWorkflowError
+        if "file" not in origins:
+            error = InvalidArgumentsError if "option" in origins else UnusablePluginError
+        raise error(tuple(problem for _, problem in in_order))
+
+    def _at(self, position: Position, path: str, message: str) -> Problem:
+        text = self.lines[position.line - 1] if 0 < position.line <= len(self.lines) else ""
+        return Problem(
+            file=self.file,
+            line=position.line,
+            column=position.column,
+            path=path,
+            message=message,
+            text=text,
+        )
+
+
+def validate(
+    model: type[Model], data: JsonValue, log: ProblemLog, location: Location = ()
+) -> Model | None:
+    """Validate the content of a document; all mistakes are reported at their places.
+
+    The model is then made without the invalid parts, so that the following checks see the rest.
+
+    Args:
+        model: the expected form.
+        data: the value at the location.
+        log: has the tree of the document, and receives the problems.
+        location: of the value in the tree.
+
+    Returns:
+        The model of all valid parts; None if the whole is invalid.
+    """
+    data, is_first = deepcopy(data), True
+    while True:
+        try:
+            return model.model_validate(data)
+        except ValidationError as error:
+            found = list(mistakes(error, model, data))
+        for loc, message, at_key in found if is_first else ():
+            log.report((*location, *loc), message, at_key=at_key)
+        is_first = False
+        unfit = {existing(data, loc) for loc, _, _ in found}
+        if () in unfit:
+            return None
+        # Later items of a list first.
+        for *outer, last in sorted(
+            unfit,
+            key=lambda loc: (len(loc), [part for part in loc if isinstance(part, int)]),
+            reverse=True,
+        ):
+            place: Any = data
+            for part in outer:
+                place = place[part]
+            del place[last]

@@ -35,8 +35,8 @@ from orthoflow.sdk import Method
 from orthoflow.testing.trials import Trial, run_trial
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import expand_cells
-from orthoflow.workflow.resolved import resolved_json, workflow_from_resolved
 from orthoflow.workflow.source import shipped_workflows
+from orthoflow.workflow.views import resolved_json, workflow_from_resolved
 from tests import photo_files, samples, scan_files
 from tests.fuzz.harness import Target
 from tests.fuzz.mutation import (

@@ -15,8 +15,8 @@ from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import Cell, derive_seed, expand_cells
 from orthoflow.workflow.inputs import read_rows, resolve_input_files
 from orthoflow.workflow.model import Workflow
-from orthoflow.workflow.problems import InvalidWorkflowError, ProblemLog
-from orthoflow.workflow.resolved import resolved_json, workflow_from_resolved
+from orthoflow.workflow.source import InvalidWorkflowError, ProblemLog
+from orthoflow.workflow.views import resolved_json, workflow_from_resolved
 
 ROOMS = """\
 orthoflow: 1

@@ -13,8 +13,12 @@ from orthoflow.errors import PluginError, WorkflowError
 from orthoflow.files.yaml_positions import Scalar
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.model import CallSection
-from orthoflow.workflow.problems import InvalidArgumentsError, Problem, UnusablePluginError
-from orthoflow.workflow.source import find_workflow
+from orthoflow.workflow.source import (
+    InvalidArgumentsError,
+    Problem,
+    UnusablePluginError,
+    find_workflow,
+)
 from tests.laboratories import (
     GOOD,
     laboratory_catalog,

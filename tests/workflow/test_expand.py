@@ -19,7 +19,7 @@ from orthoflow.workflow.expand import (
     derive_seed,
     expand_cells,
 )
-from orthoflow.workflow.resolved import resolved_json, workflow_from_resolved
+from orthoflow.workflow.views import resolved_json, workflow_from_resolved
 from tests.laboratories import GOOD, load
 
 TWO_ORTHOS = """\

@@ -13,7 +13,7 @@ from syrupy.assertion import SnapshotAssertion
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.sdk import MetricSpec
 from orthoflow.workflow.document import load_workflow
-from orthoflow.workflow.problems import InvalidWorkflowError
+from orthoflow.workflow.source import InvalidWorkflowError
 from tests.laboratories import GOOD, with_steps
 
 # Behind `x: {use: plane.hough2d, in: {cloud: cloud.cloud}`.

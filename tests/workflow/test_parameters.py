@@ -22,8 +22,8 @@ from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import swept_indices
 from orthoflow.workflow.model import Workflow
 from orthoflow.workflow.parameters import variant_names
-from orthoflow.workflow.problems import InvalidArgumentsError, InvalidWorkflowError
-from orthoflow.workflow.resolved import resolved_json
+from orthoflow.workflow.source import InvalidArgumentsError, InvalidWorkflowError
+from orthoflow.workflow.views import resolved_json
 from tests.laboratories import GOOD, load, with_steps
 
 SETS = {

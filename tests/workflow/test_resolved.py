@@ -13,7 +13,7 @@ from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.errors import WorkflowError
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.model import Workflow
-from orthoflow.workflow.resolved import resolved_json, workflow_from_resolved
+from orthoflow.workflow.views import resolved_json, workflow_from_resolved
 
 RECIPES = sorted((Path(__file__).resolve().parents[2] / "workflows").glob("*.yaml"))
 

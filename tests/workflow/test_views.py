@@ -20,10 +20,8 @@ from orthoflow.workflow.model import (
     SeedSection,
     WorkflowFile,
 )
-from orthoflow.workflow.problems import InvalidWorkflowError
-from orthoflow.workflow.resolved import resolved_json
-from orthoflow.workflow.source import shipped_workflow, shipped_workflows
-from orthoflow.workflow.views import mermaid, workflow_schema
+from orthoflow.workflow.source import InvalidWorkflowError, shipped_workflow, shipped_workflows
+from orthoflow.workflow.views import mermaid, resolved_json, workflow_schema
 from tests import workflow_format
 from tests.laboratories import (
     GOOD,
