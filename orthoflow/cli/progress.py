@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 from orthoflow.cli.commands import echo_error
 from orthoflow.cli.tables import counted, duration
-from orthoflow.diagnostics import PLAIN_WARNING
+from orthoflow.diagnostics import PLAIN_WARNING, Diagnostic
 from orthoflow.engine.journal import (
     CellFinished,
-    CellProgress,
     CellReported,
     CellStarted,
     RunEvent,
@@ -209,11 +208,11 @@ class Progress:
                     cell.state, cell.text, cell.fraction = "running", "starting", 0.0
                     cell.started = time.monotonic()
                     return f"{event.address}: started"
-                case CellProgress():
+                case CellReported() if event.event.kind == "progress":
                     cell = self._cells.setdefault(event.address, CellState(state="running"))
-                    cell.fraction, cell.text = event.fraction, event.text
-                case CellReported():
-                    return self._reported_line(event)
+                    cell.fraction, cell.text = event.event.fraction, event.event.text
+                case CellReported() if event.event.diagnostic is not None:
+                    return self._reported_line(event.address, event.event.diagnostic)
                 case CellFinished():
                     result = event.result
                     self._cells[event.address] = CellState(
@@ -226,22 +225,21 @@ class Progress:
                     return f"{_end_text(event)}{more}"
         return ""
 
-    def _reported_line(self, event: CellReported) -> str:
+    def _reported_line(self, address: str, one: Diagnostic) -> str:
         """A diagnostic in a line; empty for notes, and for codes reported before."""
-        one = event.diagnostic
         if one.is_summary:
-            return f"{event.address}: {one.text}"
+            return f"{address}: {one.text}"
         if one.severity == "note":
             return ""
         is_plain = one.code == PLAIN_WARNING.code
         key = (one.code, one.text if is_plain else "")
         if key in self._reported:
-            self._n_similar[event.address] += 1
+            self._n_similar[address] += 1
             return ""
         self._reported.add(key)
         # The summary has the sentences.
         about = f" ({one.subject})" if one.subject else ""
-        return f"{event.address}: {one.severity}: {one.text if is_plain else one.code + about}"
+        return f"{address}: {one.severity}: {one.text if is_plain else one.code + about}"
 
     def cells(self) -> dict[str, CellState]:
         """Return all cells as they are now."""

@@ -11,17 +11,19 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Final, Literal, Self, TypeAlias
+from typing import TYPE_CHECKING, Final, Literal, Self, TypeAlias
 
 from orthoflow_provenance.document import UnsafeFileError
 from orthoflow_provenance.paths import path_below
 from pydantic import TypeAdapter
 
-from orthoflow.diagnostics import Diagnostic
 from orthoflow.engine.durability import is_locked, lock_file, sync_folder, writing_to
 from orthoflow.engine.environment import now, time_in_a_name
 from orthoflow.engine.results import CellResult, CellStatus
 from orthoflow.errors import ArgumentError, DiskSpaceError, RecordError, StoreError
+
+if TYPE_CHECKING:
+    from orthoflow.sdk.context import StepEvent
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,28 +49,11 @@ class CellStarted:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CellProgress:
-    """A running cell has reached this fraction, 0..1."""
-
-    address: str
-    fraction: float
-    text: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class CellLogged:
-    """A running cell wrote a line to its log."""
-
-    address: str
-    text: str
-
-
-@dataclass(frozen=True, kw_only=True)
 class CellReported:
-    """A running cell reports a diagnostic."""
+    """A running cell reports its progress, a line of its log or a diagnostic."""
 
     address: str
-    diagnostic: Diagnostic
+    event: StepEvent
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,9 +71,7 @@ class CellFinished:
     cached: bool
 
 
-RunEvent: TypeAlias = (
-    RunStarted | CellStarted | CellProgress | CellLogged | CellReported | CellFinished
-)
+RunEvent: TypeAlias = RunStarted | CellStarted | CellReported | CellFinished
 RunListener: TypeAlias = Callable[[RunEvent], None]
 
 

@@ -19,8 +19,6 @@ from orthoflow.engine.environment import environment, now
 from orthoflow.engine.journal import (
     LOGS,
     CellFinished,
-    CellLogged,
-    CellProgress,
     CellReported,
     CellStarted,
     Journal,
@@ -165,10 +163,8 @@ def execute(
             )
         )
         with _scratch(store, journal.run_id) as scratch, _watching_interruptions() as interruption:
-            executor = _executor_of(
-                plan, scratch, _passing_on(listen), lambda: interruption.is_asked
-            )
             run = _Run(plan, store, journal, listen, scratch=scratch, logs=folder / LOGS)
+            executor = _executor_of(plan, scratch, run.report, lambda: interruption.is_asked)
             try:
                 with closing(executor):
                     run.go(executor, interruption)
@@ -220,6 +216,10 @@ class _Run:
                 self._break_off(executor)
             self._advance(executor)
             self._poll(executor)
+
+    def report(self, address: str, event: StepEvent) -> None:
+        """Pass on what a cell reports."""
+        self._listen(CellReported(address=address, event=event))
 
     def _poll(self, executor: Executor) -> None:
         ends = executor.poll(_POLL_S) if self._running else {}
@@ -323,7 +323,7 @@ class _Run:
         result, damage = self._store.take(key.key)
         if damage:
             damaged = _STORED_RESULT_DAMAGED.of("", {"damage": damage})
-            self._listen(CellReported(address=cell.address, diagnostic=damaged))
+            self.report(cell.address, _event_of(damaged))
             self._journal.write("damaged", address=cell.address, key=key.key, what=damage)
         return result
 
@@ -424,7 +424,7 @@ class _Run:
         elif result.status == "ok":
             # Stored under its key it would count as the result of that key's code.
             changed = _CODE_CHANGED.of("", {})
-            self._listen(CellReported(address=cell.address, diagnostic=changed))
+            self.report(cell.address, _event_of(changed))
             result = _reporting(result, changed)
         elif result.exit_code != CancelledStepError.exit_code:
             self._store.remember_failure(task.key, result.error_message)
@@ -478,6 +478,10 @@ class _Run:
         self._listen(CellFinished(address=cell.address, result=result, cached=is_cached))
 
 
+def _event_of(diagnostic: Diagnostic) -> StepEvent:
+    return StepEvent(kind="diagnostic", text=diagnostic.text, diagnostic=diagnostic)
+
+
 def _reporting(result: CellResult, *more: Diagnostic) -> CellResult:
     reported = (*result.diagnostics, *more)
     return dataclasses.replace(result, diagnostics=reported, warnings=warning_texts(reported))
@@ -485,18 +489,6 @@ def _reporting(result: CellResult, *more: Diagnostic) -> CellResult:
 
 def _cores(cell: Cell, capacity: Capacity) -> int:
     return min(cell.cores or capacity.share, capacity.cores_of_one)
-
-
-def _passing_on(listen: RunListener) -> StepListener:
-    def forward(address: str, event: StepEvent) -> None:
-        if event.kind == "progress":
-            listen(CellProgress(address=address, fraction=event.fraction, text=event.text))
-        elif event.diagnostic is not None:
-            listen(CellReported(address=address, diagnostic=event.diagnostic))
-        else:
-            listen(CellLogged(address=address, text=event.text))
-
-    return forward
 
 
 @contextmanager

@@ -18,11 +18,9 @@ from orthoflow.cli.progress import (
     left_of_run,
     working_on,
 )
-from orthoflow.diagnostics import PLAIN_WARNING, DiagnosticSpec
+from orthoflow.diagnostics import PLAIN_WARNING, Diagnostic, DiagnosticSpec
 from orthoflow.engine.journal import (
     CellFinished,
-    CellLogged,
-    CellProgress,
     CellReported,
     CellStarted,
     RunEvent,
@@ -30,6 +28,7 @@ from orthoflow.engine.journal import (
 )
 from orthoflow.engine.plan import PlannedCell
 from orthoflow.engine.results import CellResult
+from orthoflow.sdk.context import StepEvent
 from orthoflow.workflow.expand import Cell
 
 OK = CellResult(status="ok", started="2026-01-02T03:04:05.000Z", wall_s=1.25, compile_s=1.9)
@@ -40,17 +39,27 @@ FAILED = CellResult(
 SKIPPED = CellResult(status="skipped", error_message="needs plane, which failed")
 
 
+def progressed(address: str, fraction: float, text: str) -> CellReported:
+    event = StepEvent(kind="progress", text=text, fraction=fraction)
+    return CellReported(address=address, event=event)
+
+
+def of_diagnostic(address: str, one: Diagnostic) -> CellReported:
+    event = StepEvent(kind="diagnostic", text=one.text, diagnostic=one)
+    return CellReported(address=address, event=event)
+
+
 def reported(address: str, text: str, code: str = "warning", subject: str = "") -> CellReported:
     spec = DiagnosticSpec(code=code, severity="warning", text="{text}")
-    return CellReported(address=address, diagnostic=spec.of(subject, {"text": text}))
+    return of_diagnostic(address, spec.of(subject, {"text": text}))
 
 
 EVENTS: list[RunEvent] = [
     RunStarted(run_id="r1", n_cells=5, is_resumed=False),
     CellFinished(address="cloud", result=OK, cached=True),
     CellStarted(address="plane"),
-    CellProgress(address="plane", fraction=0.5, text="peeling"),
-    CellLogged(address="plane", text="a detail"),
+    progressed("plane", 0.5, "peeling"),
+    CellReported(address="plane", event=StepEvent(kind="log", text="a detail")),
     reported("plane", "the side is a [guess]"),
     reported("plane", "no point", code="empty-wall", subject="wall 2"),
     reported("plane", "no point", code="empty-wall", subject="wall 17"),
@@ -109,7 +118,7 @@ def test_a_log_shows_a_long_step_again(
     with progress:
         progress.take(RunStarted(run_id="r1", n_cells=2, is_resumed=False))
         progress.take(CellStarted(address="plane"))
-        progress.take(CellProgress(address="plane", fraction=0.25, text="peeling"))
+        progress.take(progressed("plane", 0.25, "peeling"))
         time.sleep(0.7)
     lines = capsys.readouterr().err.splitlines()
     assert lines[:2] == ["run r1: 2 steps, about 2 min 00 s left", "plane: started"]
@@ -301,10 +310,9 @@ def test_text_of_steps_is_shown_and_not_obeyed(capsys: pytest.CaptureFixture[str
     events: list[RunEvent] = [
         RunStarted(run_id=evil, n_cells=1, is_resumed=False),
         CellStarted(address=f"a {evil}"),
-        CellProgress(address=f"a {evil}", fraction=0.5, text=evil),
-        CellReported(
-            address=f"a {evil}",
-            diagnostic=dataclasses.replace(PLAIN_WARNING.of("", {"text": ""}), text=evil),
+        progressed(f"a {evil}", 0.5, evil),
+        of_diagnostic(
+            f"a {evil}", dataclasses.replace(PLAIN_WARNING.of("", {"text": ""}), text=evil)
         ),
         CellFinished(address=f"b {evil}", result=result, cached=False),
     ]

@@ -129,7 +129,7 @@ def test_an_inline_run_can_be_interrupted_too(world: World) -> None:
     before = signal.getsignal(signal.SIGINT)
 
     def interrupt(event: object) -> None:
-        if type(event).__name__ == "CellProgress":
+        if type(event).__name__ == "CellReported":
             os.kill(os.getpid(), signal.SIGINT)
 
     left: list[RunOutcome] = []

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from orthoflow.engine.dask import CORES
-from orthoflow.engine.journal import CellProgress, RunEvent
+from orthoflow.engine.journal import CellReported, RunEvent
 from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.errors import OrthoflowError
 from tests.engine_world import World, digests
@@ -116,7 +116,7 @@ class Once:
         self.thread = threading.Thread(target=work)
 
     def __call__(self, event: RunEvent) -> None:
-        if isinstance(event, CellProgress) and self.thread.ident is None:
+        if isinstance(event, CellReported) and self.thread.ident is None:
             self.thread.start()
 
 

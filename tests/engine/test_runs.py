@@ -10,12 +10,12 @@ import pytest
 
 from orthoflow.engine.environment import environment
 from orthoflow.engine.journal import (
-    CellLogged,
-    CellProgress,
+    CellReported,
     CellStarted,
 )
 from orthoflow.engine.scheduler import execute
 from orthoflow.errors import InputError
+from orthoflow.sdk.context import StepEvent
 from tests.engine_world import World, digests
 
 CHAIN = """
@@ -103,15 +103,16 @@ def test_everything_a_step_says_is_in_its_log(world: World) -> None:
     assert (world.folder / "run" / "logs" / "b.log").read_text() == log.replace(" \0", " ") or (
         "\0" in (world.folder / "run" / "logs" / "b.log").read_text()
     )
-    assert CellLogged(address="b", text="a line of log") in world.events
+    line = StepEvent(kind="log", text="a line of log")
+    assert CellReported(address="b", event=line) in world.events
 
 
 def test_progress_is_passed_on_while_a_step_runs(world: World) -> None:
     world.run(one("slow", "{steps: 12}"))
     fractions = [
-        event.fraction
+        event.event.fraction
         for event in world.events
-        if isinstance(event, CellProgress) and event.address == "b"
+        if isinstance(event, CellReported) and event.address == "b"
     ]
     assert len(fractions) >= 3
     assert fractions == sorted(fractions)
