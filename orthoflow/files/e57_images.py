@@ -30,6 +30,10 @@ _FROM_Y_UP: Final = np.diag([1.0, -1.0, -1.0])
 _FROM_PANORAMA: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 _REPRESENTATIONS: Final = ("pinhole", "spherical", "cylindrical", "visualReference")
 _CONTENTS: Final = {"jpegImage": ".jpg", "pngImage": ".png"}
+_PINHOLE: Final = (
+    *("imageWidth", "imageHeight", "focalLength", "pixelWidth", "pixelHeight"),
+    *("principalPointX", "principalPointY"),
+)
 _UNUSUAL: Final = re.compile(r"[^\w.-]+")
 
 
@@ -162,10 +166,7 @@ def _camera(path: Path, name: str, node: Any, kind: str, shown: Any) -> GivenCam
             rotation=rotation,
             translation=-rotation @ centre,
         )
-    values = {
-        field: number_of(shown[field])
-        for field in ("imageWidth", "imageHeight", "focalLength", "pixelWidth", "pixelHeight")
-    } | {field: number_of(shown[field]) for field in ("principalPointX", "principalPointY")}
+    values = {field: number_of(shown[field]) for field in _PINHOLE}
     if not all(math.isfinite(value) for value in values.values()) or not all(
         values[field] > 0.0 for field in ("focalLength", "pixelWidth", "pixelHeight")
     ):

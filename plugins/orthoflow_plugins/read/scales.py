@@ -90,9 +90,9 @@ def choose_scales(
     """
     scales: list[IntensityScale | None] = [None] * len(ranges)
     known = [(seen, one) for seen, one in zip(ranges, stated, strict=True) if seen and one]
-    largest_part = max(
-        (_part(seen, one) for seen, one in known if _is_within(seen, one)), default=0
-    )
+    # Where the largest values lie between limits, 0..1.
+    parts = [(s[1] - one[0]) / (one[1] - one[0]) for s, one in known if _is_within(s, one)]
+    largest_part = max(parts, default=0.0)
     groups: list[tuple[list[int], tuple[float, float]]] = []
     for k, (seen, limits) in enumerate(zip(ranges, stated, strict=True)):
         if seen is None:
@@ -127,11 +127,6 @@ def _nominal(seen: tuple[float, float]) -> tuple[float, float] | None:
 def _is_within(seen: tuple[float, float], limits: tuple[float, float]) -> bool:
     slack = 1e-6 * (limits[1] - limits[0])
     return limits[0] - slack <= seen[0] and seen[1] <= limits[1] + slack
-
-
-def _part(seen: tuple[float, float], limits: tuple[float, float]) -> float:
-    """Where the largest value lies between limits, 0..1."""
-    return (seen[1] - limits[0]) / (limits[1] - limits[0])
 
 
 def _join(
