@@ -251,6 +251,20 @@ def test_terms_that_opencv_lacks_are_taken_over_by_the_others(
     assert np.abs(project(given, points) - formula(points, terms)).max() < MAX_LEFT_OUT_PX
 
 
+def test_terms_of_a_fisheye_that_opencv_lacks_are_taken_over(tmp_path: Path) -> None:
+    terms = {"f": 500.0, "k1": 0.03, "p1": 1e-3, "p2": -5e-4, "p3": 0.1, "p4": -0.05}
+    sensor = sensor_of(terms).replace('"frame"', '"fisheye"')
+    (given,) = read(tmp_path, document(sensors=sensor))
+    assert isinstance(given.lens, Intrinsics | FisheyeLens)
+    # As in a frame camera, with the angle off the axis for its tangent.
+    xy = np.random.default_rng(1).uniform([-0.6, -0.45], [0.6, 0.45], (50, 2))
+    theta = np.hypot(*xy.T)[:, None]
+    rays = np.column_stack([xy * np.sin(theta) / theta, np.cos(theta)])
+    expected = formula(np.column_stack([xy, np.ones(50)]), terms)
+    viewing = given.lens if isinstance(given.lens, FisheyeLens) else given.lens.posed()
+    assert np.abs(viewing.project(rays)[:, :2] - expected).max() < MAX_LEFT_OUT_PX
+
+
 def test_what_cannot_be_taken_over_is_stated_in_pixels(tmp_path: Path) -> None:
     sensor = SENSOR.replace("</f>", "</f><p1>0.01</p1><p3>20</p3><p4>-60</p4>")
     (given,) = read(tmp_path, document(sensors=sensor))
