@@ -243,13 +243,15 @@ def _set_states(
     cosines, leaves_m, nearest = projected[3], projected[4], buffer.nearest.reshape(-1)
     width, height, zero = f(view.camera[21]), f(view.camera[22]), f(0.0)
     per_pixel, stride = f(1.0 / buffer.reduction), np.int32(buffer.nearest.shape[1])
+    last_row, last_column = np.int32(buffer.nearest.shape[0] - 1), stride - np.int32(1)
     cosine_least = f(view.cosine_least)
     for j in range(mask.size):
         u, v = us[j], vs[j]
         is_inside = (u >= zero) & (u < width) & (v >= zero) & (v < height)
         at_row, at_column = v * per_pixel, u * per_pixel
-        place = np.int32(at_row if is_inside else zero) * stride
-        places[j] = place + np.int32(at_column if is_inside else zero)
+        # Just before the border, quotients may round up to the next pixel of the buffer.
+        down = min(np.int32(at_row if is_inside else zero), last_row)
+        places[j] = down * stride + min(np.int32(at_column if is_inside else zero), last_column)
     for j in range(mask.size):
         nearests[j] = nearest[np.uintp(places[j])]
     outside, painted = np.uint8(OUTSIDE), np.uint8(PAINTED)
@@ -320,10 +322,11 @@ def _hide_low_cells(
         for _ in range(n_steps):
             start, at, level = start + step, at + move, level + rise
             # The surface is linear between the two cells beside the ray, which may be the same.
-            first = np.int64(at)
-            share, first = np.float32(at - first), start + first * side
-            one = surface[np.uintp(first)]
-            other = surface[np.uintp(first + (side if share > zero else 0))]
+            # At the border rounding must not lead beyond it.
+            first = int(at)
+            share, second = np.float32(at - first), min(first + 1, n_beside - 1)
+            one = surface[np.uintp(start + first * side)]
+            other = surface[np.uintp(start + (second if share > zero else first) * side)]
             if one + share * (other - one) > level:
                 mask[j] = OCCLUDED
                 break

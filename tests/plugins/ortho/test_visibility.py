@@ -224,3 +224,24 @@ def test_visibility_none_paints_the_board_and_says_so(tmp_path: Path) -> None:
     assert (layer.rgb[..., 2] == scenes.BLUE[scenes.BOARD]).sum() > 1000
     assert not (layer.mask == LayerMask.OCCLUDED).any()
     assert any("visibility none" in warning for warning in ctx.warnings)
+
+
+def test_cells_at_the_border_of_a_photo_ask_the_last_pixel_of_the_buffer() -> None:
+    # Positions just before column 8190, divided by 8190, are 1 in float32.
+    size, gsd_m = 8190, 1e-8
+    assert np.nextafter(np.float32(size), np.float32(0.0)) * np.float32(1.0 / size) == 1.0
+    flat = np.zeros(25)
+    flat[[0, 4, 8, 11]] = 1.0, 1.0, -1.0, 1.0
+    flat[12:16], flat[21:24] = (3000.0, 3000.0, size - 0.0077, 2000.0), (size, size, 10.0)
+    view = WallView(
+        camera=flat, column=0.0, row=0.0, height_m=1.0, gsd_m=gsd_m, front_m=0.1,
+        tolerance_m=0.001, cosine_least=0.1, border_px=1.0,
+    )  # fmt: skip
+    relief = relief_of(samples.wall(samples.facing_south(gsd_m, 512, 1)), hides=False)
+    # What lies behind the buffer in memory hides everything.
+    memory = np.array([[np.inf, 0.0]], dtype=np.float32)
+    buffer = DepthBuffer(nearest=memory[:, :1], reduction=float(size))
+    mask = cells_seen(view, relief, buffer, slice(0, 1), slice(0, 512)).mask
+    n_inside = np.count_nonzero(mask == PAINTED)
+    assert 200 < n_inside < 300
+    assert (mask[0, n_inside:] == LayerMask.OUTSIDE).all()
