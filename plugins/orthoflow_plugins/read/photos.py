@@ -126,6 +126,7 @@ class ReadPhotos(Method):
     """
 
     id = "read.photos"
+    result_version: ClassVar[int] = 2
     repeatable: ClassVar[tuple[str, ...]] = ("calibration", "cameras", "masks")
     determinism = "exact"
     metrics = (
