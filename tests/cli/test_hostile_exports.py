@@ -66,7 +66,7 @@ def test_a_small_file_that_says_it_is_huge_costs_nothing(
     exchange_ortho(run, width, height)
     assert (run / ORTHO).stat().st_size < 50_000
     for target in PICTURED:
-        check_refused(run, target, 2, f"says it has {width} x {height} cells", "cannot hold")
+        check_refused(run, target, 2, f"states {width} x {height} cells", "cannot hold")
 
 
 @pytest.mark.parametrize("gsd_m", [1e-300, 1e300])

@@ -154,8 +154,9 @@ def test_only_files_are_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert files_below(folder, "nothing") == ()
 
 
-def test_a_file_exchanged_for_a_link_after_the_look_is_not_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("exchanged_for", ["link", "pipe"])
+def test_a_file_exchanged_after_the_look_is_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exchanged_for: str
 ) -> None:
     (tmp_path / "secret").write_text("secret")
     (tmp_path / "run").mkdir()
@@ -168,7 +169,10 @@ def test_a_file_exchanged_for_a_link_after_the_look_is_not_read(
         if arguments[0] == "a.tif" and not is_exchanged:
             is_exchanged.append(True)
             (tmp_path / "run" / "a.tif").unlink()
-            (tmp_path / "run" / "a.tif").symlink_to(tmp_path / "secret")
+            if exchanged_for == "link":
+                (tmp_path / "run" / "a.tif").symlink_to(tmp_path / "secret")
+            else:
+                os.mkfifo(tmp_path / "run" / "a.tif")
         return found  # type: ignore[no-any-return]
 
     with monkeypatch.context() as patch:

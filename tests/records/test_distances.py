@@ -87,6 +87,12 @@ def test_values_may_lie_apart_as_their_type_allows(
     assert (found.reason == "") is (n_values == 0)
 
 
+def test_a_number_and_no_number_have_no_difference() -> None:
+    found = compared(payload(depth_m=[np.nan, 1.0]), payload(depth_m=[1.0, 1.5]))
+    (distance,) = found.distances
+    assert (found.verdict, distance.largest, distance.n_values) == ("different", None, 2)
+
+
 def test_what_cannot_be_had_is_not_measured() -> None:
     found = compared(payload(n=[1]), None)
     assert found.verdict == "not measured"
