@@ -9,12 +9,15 @@ checked. Each room is measured four times: `planes` (plane-methods.yaml, paper_p
 `orient` (orient-methods.yaml), `ortho` (ortho-methods.yaml) and `surfaces`, where orthoimages are
 made from photos on a surface (backward) and from points (direct), on the scan and on points that
 semi-global matching (OpenCV) finds in the photos, as skarlatos2012 had; orientations are the true
-ones there. Check points are compared over those that all orthoimages of a room show.
+ones there, and the mouldings those of the designed wall, as drawn walls have too few corners for
+check points on edges. Check points are compared over those that all orthoimages of a room show.
 
 Every room goes to `FOLDER/<part>-<seed>.json` as soon as it is measured, and is not measured again.
 From these files and the pages of benchmarks/pages docs/papers.md and docs/choosing.md are written:
-a place `{{part: cell metric}}` becomes mean ± standard deviation (largest) of the first ten rooms,
-`{{part: cell metric < cell metric}}` in how many rooms of each set that holds.
+a place `{{part: cell metric}}` becomes mean±standard deviation of the first ten rooms,
+`{{part: cell metric < cell metric ? text | other text}}` the text where the ranking holds and the
+other where it does not (see `ranking_holds`), with the counts of rooms. Cells that no page names
+are not run.
 """
 
 from __future__ import annotations
@@ -28,7 +31,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
@@ -39,21 +42,37 @@ import numpy as np
 from numpy.typing import NDArray
 from orthoflow_plugins.colour.photos import ColourPhotos
 from orthoflow_plugins.inspect.checkpoints import InspectCheckpoints
-from orthoflow_plugins.inspect.truth import InspectTruth
+from orthoflow_plugins.inspect.findings import check_findings
+from orthoflow_plugins.inspect.orientation_errors import (
+    PoseError,
+    pose_errors,
+    pose_findings,
+    tie_findings,
+)
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
 from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
 from orthoflow_plugins.raster.grid import RasterGrid
 from orthoflow_plugins.simulate.room import SimulateRoom
 from ruamel.yaml import YAML
+from scipy.stats import binomtest
 
-from orthoflow.catalog.discovery import discover_catalog
+from orthoflow.catalog.discovery import Catalog, discover_catalog
 from orthoflow.errors import OrthoflowError
 from orthoflow.files.images import decode_image
-from orthoflow.products import Camera, Inspection, Photos, PointCloud
+from orthoflow.geometry.scene_views import SceneCameras
+from orthoflow.products import (
+    Camera,
+    Cameras,
+    Inspection,
+    Photos,
+    PointCloud,
+    Truth,
+    Walls,
+)
 from orthoflow.sdk import Method, StepContext
 from orthoflow.workflow.document import load_workflow
-from orthoflow.workflow.expand import CellOutput, expand_cells
+from orthoflow.workflow.expand import Cell, CellOutput, expand_cells
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 # The rooms that are summed up, and others by which rankings are checked.
@@ -61,11 +80,11 @@ SETS: Final = (range(1, 11), range(101, 106))
 DRAWN: Final = {"geometry": "drawn", "decoration": "drawn"}
 COARSE: Final = {
     **DRAWN,
-    "scan_step_m": 0.005,
-    "panorama_step_m": 0.03,
-    "photo_gsd_m": 0.004,
+    "scan_step_m": 0.006,
+    "panorama_step_m": 0.04,
+    "photo_gsd_m": 0.005,
 }
-# Recipes of a part, what is set in their rooms, and cells of their walls.
+# Recipes of a part, and what is set in their rooms.
 RECIPES: Final[Mapping[str, tuple[tuple[str, ...], dict[str, Any]]]] = {
     "planes": (
         ("workflows/plane-methods.yaml", "benchmarks/paper_planes.yaml"),
@@ -74,7 +93,14 @@ RECIPES: Final[Mapping[str, tuple[tuple[str, ...], dict[str, Any]]]] = {
     "orient": (("workflows/orient-methods.yaml",), COARSE),
     "ortho": (("workflows/ortho-methods.yaml",), COARSE),
 }
-WALL_GSD_M: Final = 0.006
+PAGES: Final = ROOT / "benchmarks" / "pages"
+WALL_GSD_M: Final = 0.008
+# skarlatos2012, 4.2: the DSM of LPS had 5 cm at cells of 2 cm.
+DSM_CELLS: Final = 2.5
+# A ranking is stated where it holds in this share of the rooms of each set, and a two-sided sign
+# test over all rooms gives less than this probability by chance.
+RANKING_SHARE: Final = 0.9
+RANKING_P: Final = 0.05
 # Nearest and farthest surface from a camera.
 RANGES_M: Final = (1.5, 3.6)
 # Photos of a row of `variant2`.
@@ -102,29 +128,13 @@ def run(
 
 def recipes(part: str, seed: int) -> Iterator[tuple[str, float]]:
     """Run the recipes of a part in one room; return metrics by `cell metric`."""
-    names, room = RECIPES[part]
     catalog = discover_catalog()
-    for name in names:
-        tree = YAML(typ="safe").load((ROOT / name).read_text())
-        tree["seed"] = seed
-        tree["steps"]["room"]["params"].update(room)
-        if "wall" in tree["steps"]:
-            tree["steps"]["wall"]["params"]["gsd_m"] = WALL_GSD_M
-            tree["compare"]["design"] = "one-at-a-time"
-        for step in tree["steps"].values():
-            for variant in step.get("variants", {}).values():
-                variant.pop("repeat", None)
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "recipe.yaml"
-            path.write_text(json.dumps(tree))
-            cells = expand_cells(load_workflow(path, catalog), catalog)
+    for name in RECIPES[part][0]:
         given: dict[str, Any] = {}
-        for cell in cells:
+        poses: dict[str, tuple[PoseError, ...]] = {}
+        for cell in cells_of(part, name, seed, catalog):
             sources = cell.inputs.items()
             if cell.skip_reason or not all(str(source) in given for _, source in sources):
-                continue
-            if part == "orient" and cell.step == "surf" and not cell.address.endswith("=dlt"):
-                # Of orientations only the DLT is compared with the intensity (Figure 25).
                 continue
             method = catalog.method(cell.method).load()
             inputs = method.In(**{port: given[str(source)] for port, source in sources})
@@ -135,32 +145,100 @@ def recipes(part: str, seed: int) -> Iterator[tuple[str, float]]:
                     given[str(CellOutput(address=cell.address, port=port))] = getattr(out, port)
                 for metric, value in metrics.items():
                     yield f"{cell.address} {metric}", value
+                if part == "orient" and cell.step == "orient":
+                    errors = poses_against_truth(out.cameras, given)
+                    poses[cell.address] = errors
+                    ties = tie_findings(out.cameras, given["wall.walls"], given["room.truth"])
+                    for finding in [*pose_findings(errors), *ties]:
+                        yield f"{cell.address} {finding.name}", finding.value
         points = {
-            address: by_point(product)
+            address.removesuffix(".inspection"): by_point(product)
             for address, product in given.items()
             if address.startswith("points@")
         }
-        yield from on_common(points)
+        yield from on_common(points, WALL_GSD_M)
+        yield from common_poses(poses)
 
 
-def on_common(points: Mapping[str, Mapping[tuple[Any, ...], float]]) -> Iterator[tuple[str, float]]:
-    """Return RMS lengths in mm over the check points that all orthoimages show, by class."""
+def poses_against_truth(cameras: Cameras, given: Mapping[str, Any]) -> tuple[PoseError, ...]:
+    """Return true errors of poses, also of photos that were refused."""
+    truth: Truth = given["room.truth"]
+    views = SceneCameras(truth.scene, cores=2)
+    return tuple(pose_errors(cameras, given["wall.walls"], truth, views))
+
+
+def common_poses(poses: Mapping[str, Sequence[PoseError]]) -> Iterator[tuple[str, float]]:
+    """Return the RMS error on the wall of the photos that all methods orient by guided ties."""
+    walls_mm = {
+        address: {
+            error.photo: 1e3 * error.wall_m
+            for error in errors
+            if error.status == "ok" and error.wall_m is not None
+        }
+        for address, errors in poses.items()
+        if "reties=guided" in address
+    }
+    common = set.intersection(*map(set, walls_mm.values())) if walls_mm else set()
+    for address, found in walls_mm.items():
+        yield f"{address} common_n_photos", float(len(common))
+        if common:
+            rms_mm = float(np.sqrt(np.mean([found[photo] ** 2 for photo in common])))
+            yield f"{address} common_pose_wall_rms_mm", rms_mm
+
+
+def cells_of(part: str, name: str, seed: int, catalog: Catalog) -> list[Cell]:
+    """Return the cells of a recipe in a room that pages name, and those that these need."""
+    tree = YAML(typ="safe").load((ROOT / name).read_text())
+    tree["seed"] = seed
+    tree["steps"]["room"]["params"].update(RECIPES[part][1])
+    if "wall" in tree["steps"]:
+        tree["steps"]["wall"]["params"]["gsd_m"] = WALL_GSD_M
+        tree["compare"]["design"] = "one-at-a-time"
+    for step in tree["steps"].values():
+        for variant in step.get("variants", {}).values():
+            variant.pop("repeat", None)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "recipe.yaml"
+        path.write_text(json.dumps(tree))
+        cells = expand_cells(load_workflow(path, catalog), catalog)
+    needed = cells_named(part)
+    for cell in reversed(cells):
+        if cell.address in needed:
+            sources = cell.inputs.values()
+            needed |= {one.address for one in sources if isinstance(one, CellOutput)}
+    return [cell for cell in cells if cell.address in needed]
+
+
+def cells_named(part: str) -> set[str]:
+    """Return the addresses of cells of which the pages state a metric."""
+    places = [
+        place[2]
+        for page in PAGES.glob("*.md")
+        for place in PLACE.finditer(page.read_text())
+        if place[1] == part
+    ]
+    return {word for place in places for word in place.split() if "@" in word}
+
+
+def on_common(points: Mapping[str, Residuals], gsd_m: float) -> Iterator[tuple[str, float]]:
+    """Return statistics over the check points that all orthoimages show, by class.
+
+    Args:
+        points: cell -> residuals of its orthoimage.
+        gsd_m: side of a cell.
+    """
     if not points:
         return
     common = set.intersection(*(set(found) for found in points.values()))
     for address, found in points.items():
-        name = address.removesuffix(".inspection")
-        yield f"{name} n_of_its_own", float(len(found))
+        yield f"{address} n_of_its_own", float(len(found))
         for kind in ("flat", "vertical edge", "all"):
-            lengths = np.array([found[key] for key in common if kind in ("all", key[0])])
-            yield f"{name} common_{kind.replace(' ', '_')}", float(len(lengths))
-            if len(lengths):
-                rms_mm = float(np.sqrt(np.mean(lengths**2)))
-                yield f"{name} common_{kind.replace(' ', '_')}_mm", rms_mm
-
-
-def numbers(inspection: Inspection) -> dict[str, float]:
-    return {finding.name: finding.value for finding in inspection.findings if finding.wall <= 0}
+            shifts_m = np.array([found[key] for key in common if kind in ("all", key[0])])
+            prefix = f"common_{kind.replace(' ', '_')}_"
+            yield f"{address} {prefix}n", float(len(shifts_m))
+            if len(shifts_m):
+                for finding in check_findings(shifts_m, gsd_m, prefix=prefix):
+                    yield f"{address} {finding.name}", finding.value
 
 
 def surfaces(seed: int) -> Iterator[tuple[str, float]]:
@@ -169,46 +247,75 @@ def surfaces(seed: int) -> Iterator[tuple[str, float]]:
         SimulateRoom,
         SimulateRoom.In(),
         seed,
-        **COARSE,
+        **{**COARSE, "decoration": "designed"},
         photo_layout="variant2",
         # Of oblique neighbours one may stand above the other, which the matching of rows excludes.
         photo_obliquity_deg=3.0,
-        check_points_most=20,
+        check_points_most=40,
     )[0]
-    cameras = room.truth.cameras
-    seen = {"photos": room.photos, "cameras": cameras}
-    coloured = run(ColourPhotos, ColourPhotos.In(cloud=room.cloud, **seen), seed)[0].cloud
-    points = {}
-    for source, cloud in (("scanned", coloured), ("matched", matched_cloud(room))):
-        main = room.truth.planes.names.index("main wall")
+    seen = {"photos": room.photos, "cameras": room.truth.cameras}
+    main = room.truth.planes.names.index("main wall")
+
+    def walls_of(cloud: PointCloud, gsd_m: float) -> Walls:
         inputs = RasterGrid.In(cloud=cloud, planes=room.truth.planes)
-        walls = run(RasterGrid, inputs, seed, gsd_m=0.008, buffer_m=0.3, ranks=(main,))[0].walls
-        for way in ("backward", "direct"):
-            if way == "direct":
-                direct = PointcloudDirect.In(walls=walls, cloud=cloud)
-                layers = run(PointcloudDirect, direct, seed)[0].layers
-            else:
-                backward = DsmBackward.In(walls=walls, cloud=cloud, **seen)
-                layers = run(DsmBackward, backward, seed)[0].layers
-            joined = MosaicSeams.In(layers=layers, walls=walls)
-            images = run(MosaicSeams, joined, seed, gains="none")[0].orthoimages
-            shown = {"orthoimages": images, "walls": walls, "truth": room.truth}
-            asked = InspectCheckpoints.In(checkpoints=room.checkpoints, **shown)
-            name = f"points@{source},{way}"
-            points[name] = by_point(run(InspectCheckpoints, asked, seed)[0].inspection)
-            found = numbers(run(InspectTruth, InspectTruth.In(**shown), seed)[0].inspection)
-            for metric in ("rmse_u_mm", "rmse_v_mm", "completeness"):
-                yield f"check@{source},{way} {metric}", found[metric]
-    yield from on_common(points)
+        walls: Walls
+        walls = run(RasterGrid, inputs, seed, gsd_m=gsd_m, buffer_m=0.3, ranks=(main,))[0].walls
+        return walls
+
+    coloured = run(ColourPhotos, ColourPhotos.In(cloud=room.cloud, **seen), seed)[0].cloud
+    matched = matched_cloud(room)
+    on_scan, on_matched = (walls_of(cloud, WALL_GSD_M) for cloud in (coloured, matched))
+    on_dsm = coarser(on_matched, walls_of(matched, DSM_CELLS * WALL_GSD_M))
+    points = {}
+    for name, walls, cloud in (
+        ("scanned,backward", on_scan, coloured),
+        ("scanned,direct", on_scan, coloured),
+        ("matched,backward", on_matched, matched),
+        ("matched,coarse", on_dsm, matched),
+        ("matched,direct", on_matched, matched),
+    ):
+        if name.endswith("direct"):
+            direct = PointcloudDirect.In(walls=walls, cloud=cloud)
+            layers = run(PointcloudDirect, direct, seed)[0].layers
+        else:
+            backward = DsmBackward.In(walls=walls, cloud=cloud, **seen)
+            layers = run(DsmBackward, backward, seed)[0].layers
+        joined = MosaicSeams.In(layers=layers, walls=walls)
+        images = run(MosaicSeams, joined, seed, gains="none")[0].orthoimages
+        asked = InspectCheckpoints.In(
+            orthoimages=images, walls=walls, truth=room.truth, checkpoints=room.checkpoints
+        )
+        inspection = run(InspectCheckpoints, asked, seed)[0].inspection
+        points[f"points@{name}"] = by_point(inspection)
+    yield from on_common(points, WALL_GSD_M)
 
 
-def by_point(inspection: Inspection) -> dict[tuple[Any, ...], float]:
-    """Return the length of each residual in mm, by class and place."""
-    lengths = 1e3 * np.hypot(*inspection.displacement_m.T)
+def coarser(walls: Walls, dsm: Walls) -> Walls:
+    """Return walls whose depths are interpolated from those of a coarser raster."""
+    (wall,), (coarse,) = walls.walls, dsm.walls
+    rows, columns = np.mgrid[: wall.frame.height, : wall.frame.width] + 0.5
+    cells = np.column_stack([columns.ravel(), rows.ravel()])
+    at = coarse.frame.wall_from_world(wall.frame.world_from_wall(cells))[:, :2] - 0.5
+    across, down = (axis.reshape(rows.shape).astype(np.float32) for axis in at.T)
+    depth_m = cv2.remap(
+        coarse.depth_m.astype(np.float32), across, down, cv2.INTER_LINEAR, borderValue=(np.nan,)
+    )
+    both = np.isfinite(depth_m) & np.isfinite(wall.depth_m)
+    mixed_m = np.where(both, depth_m, wall.depth_m).astype(wall.depth_m.dtype)
+    return replace(walls, walls=(replace(wall, depth_m=mixed_m),))
+
+
+Residuals = Mapping[tuple[Any, ...], NDArray[np.float64]]
+
+
+def by_point(inspection: Inspection) -> Residuals:
+    """Return residuals (2,) in metres, by class and place."""
     places = np.round(inspection.points_world, 3)
     return {
-        (inspection.kinds[kind], *place.tolist()): float(length)
-        for kind, place, length in zip(inspection.kind, places, lengths, strict=True)
+        (inspection.kinds[kind], *place.tolist()): shift_m
+        for kind, place, shift_m in zip(
+            inspection.kind, places, inspection.displacement_m, strict=True
+        )
     }
 
 
@@ -311,7 +418,8 @@ def filled_in(text: str, sets: Sets) -> str:
 
     Args:
         text: with places `{{part: cell metric}}`, `{{part: cell metric : share}}` for per cent,
-            `: mean` without scatter, `: median`, and `{{part: cell metric < cell metric}}`.
+            `: mean` without scatter, `: median`, and
+            `{{part: cell metric < cell metric ? text | other text}}`.
         sets: part -> sets -> rooms -> numbers by `cell metric`.
     """
     return PLACE.sub(lambda place: _text_of(place[2].strip(), sets[place[1]]), text)
@@ -319,25 +427,39 @@ def filled_in(text: str, sets: Sets) -> str:
 
 def _text_of(place: str, sets: Sequence[Sequence[Mapping[str, float]]]) -> str:
     if " < " in place:
-        first, second = place.split(" < ")
-        counts = [_how_often(first, second, rooms) for rooms in sets if rooms]
-        return " and ".join(counts) or "not yet measured"
+        ranking, _, texts = place.partition(" ? ")
+        stated, _, otherwise = texts.partition(" | ")
+        counts = [counted(*ranking.split(" < "), rooms) for rooms in sets]
+        rooms = " and ".join(f"{n_true} of {n_both}" for n_true, n_both in counts)
+        return f"{stated if ranking_holds(counts) else otherwise} ({rooms} rooms)"
     key, _, form = place.partition(" : ")
-    if form == "n":
-        return str(sum(key in room for room in sets[0]))
     factor = 100.0 if form == "share" else 1.0
     values = factor * np.abs([room[key] for room in sets[0] if key in room])
     if not len(values):
-        return "no value in these rooms" if any(sets[0]) else "not yet measured"
+        return "no value" if any(sets[0]) else "not measured"
     if form in ("mean", "median"):
         return _number(float(getattr(np, form)(values)))
-    spread = f" ± {_number(float(values.std(ddof=1)), 2)}" if len(values) > 1 else ""
-    return f"{_number(float(values.mean()))}{spread} ({_number(float(values.max()))})"
+    # Without spaces, so that lines are not broken there.
+    spread = f"±{_number(float(values.std(ddof=1)), 2)}" if len(values) > 1 else ""
+    return f"{_number(float(values.mean()))}{spread}"
 
 
-def _how_often(first: str, second: str, rooms: Sequence[Mapping[str, float]]) -> str:
+def counted(first: str, second: str, rooms: Sequence[Mapping[str, float]]) -> tuple[int, int]:
+    """Return in how many rooms the first is smaller, and how many have both."""
     both = [(abs(room[first]), abs(room[second])) for room in rooms if {first, second} <= set(room)]
-    return f"{sum(a < b for a, b in both)} of {len(both)}"
+    return sum(a < b for a, b in both), len(both)
+
+
+def ranking_holds(counts: Sequence[tuple[int, int]]) -> bool:
+    """Report whether a ranking may be stated: it holds in both sets of seeds, not by chance.
+
+    Args:
+        counts: of each set, in how many rooms it holds, and how many there are.
+    """
+    n_true, n_both = (sum(column) for column in zip(*counts, strict=True))
+    if not all(n and true >= RANKING_SHARE * n for true, n in counts):
+        return False
+    return bool(binomtest(n_true, n_both).pvalue < RANKING_P)
 
 
 def _number(value: float, digits: int = 3) -> str:
@@ -368,12 +490,13 @@ def main() -> None:
         part: [[room for room in seeds if room] for seeds in both] for part, both in sets.items()
     }
     newest_s = max(path.stat().st_mtime for path in options.folder.glob("*.json"))
+    counts = ", ".join(f"{part} {len(one)} and {len(two)}" for part, (one, two) in rooms.items())
     made = (
-        f"{datetime.fromtimestamp(newest_s, UTC):%Y-%m-%d} on {platform.machine()}, "
-        f"{os.cpu_count()} cores, Python {platform.python_version()}, in rooms of both sets: "
-        + ", ".join(f"{part} {len(one)} and {len(two)}" for part, (one, two) in rooms.items())
+        f"Measured {datetime.fromtimestamp(newest_s, UTC):%Y-%m-%d} on {platform.machine()}, "
+        f"{os.cpu_count()} cores, Python {platform.python_version()}; rooms of the first and the "
+        f"second set of seeds: {counts}"
     )
-    for page in sorted((ROOT / "benchmarks" / "pages").glob("*.md")):
+    for page in sorted(PAGES.glob("*.md")):
         text = page.read_text().replace("{{made}}", made)
         (ROOT / "docs" / page.name).write_text(filled_in(text, rooms))
 

@@ -422,8 +422,8 @@ def draw_positions(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
     feet = np.array([one.estimate.resection.camera.centre_world for one in candidates])
     everything = np.vstack([feet, *(wall.corners_world for wall in walls.values())]) - origin
     spans_m = np.ptp(everything @ axes_world.T, axis=0)
-    # To scale, with room for the names above, and for the labels.
-    heights = np.clip(2.9 * spans_m[[2, 1]] / spans_m[0], 0.5, 3.5) + np.array([0.6, 0.0])
+    # To scale.
+    heights = np.clip(2.9 * spans_m[[2, 1]] / spans_m[0], 0.5, 3.5)
     figure = column_figure(float(heights.sum()) + 0.9)
     panels = figure.subplots(2, 1, height_ratios=heights)
     for panel, axis, label in zip(panels, (2, 1), ("before it", "down it"), strict=True):
@@ -432,7 +432,7 @@ def draw_positions(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
             ring = (wall.corners_world[[0, 1, 2, 3, 0]] - origin) @ shown
             panel.plot(*ring.T, color=plane_ink(wall.number), linewidth=1.2)
         for candidate in candidates:
-            _draw_position(panel, candidate, origin, shown, turn_deg=40.0 if axis == 2 else 0.0)
+            _draw_position(panel, candidate, origin, shown, is_named=axis == 1)
         panel.set_aspect("equal")
         panel.set_xlabel("along the first wall [m]")
         panel.set_ylabel(f"{label} [m]")
@@ -465,7 +465,7 @@ def _draw_position(
     origin: NDArray[np.float64],
     shown: NDArray[np.float64],
     *,
-    turn_deg: float,
+    is_named: bool,
 ) -> None:
     """Draw a photo's place, view and control onto two axes (3, 2) of the world."""
     camera = candidate.estimate.resection.camera
@@ -475,15 +475,11 @@ def _draw_position(
     x, y = ((camera.centre_world - origin) @ shown).tolist()
     across, down = (_VIEW_M * camera.rotation[2] @ shown).tolist()
     axes.arrow(x, y, across, down, head_width=0.2 * _VIEW_M, color=_CURVE_COLOUR, linewidth=0.8)
-    axes.annotate(
-        candidate.photo.name,
-        (x, y),
-        xytext=(2, 2),
-        textcoords="offset points",
-        fontsize=6.0,
-        rotation=turn_deg,
-        rotation_mode="anchor",
-    )
+    # From above one photo stands over the other, and so would their names.
+    if is_named:
+        axes.annotate(
+            candidate.photo.name, (x, y), xytext=(2, 2), textcoords="offset points", fontsize=6.0
+        )
 
 
 def _draw_pooled(ctx: StepContext, pooled: dict[TieRole, NDArray[np.float64]]) -> None:
