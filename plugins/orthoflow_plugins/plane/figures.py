@@ -190,7 +190,7 @@ def draw_thickness(
     ]
     n_panels = 1 + len(classes) + bool(bars)
     n_rows = -(-n_panels // 2)
-    figure = column_figure(1.5 * n_rows + (0.0 if row is None else 1.3))
+    figure = column_figure(1.75 * n_rows + (0.0 if row is None else 1.3))
     grid = figure.add_gridspec(n_rows + (row is not None), 2 if n_panels > 1 else 1)
     places = iter([grid[k // 2, k % 2] for k in range(n_panels)])
     sigmas = [(planes.names[k], 1000.0 * item.sigma_m) for k, item in known]
