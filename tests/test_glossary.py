@@ -44,7 +44,7 @@ STILL_TO_CLEAN: Final = {
     "orthoflow/files": 42,
     "orthoflow/geometry": 5,
     "orthoflow/products": 6,
-    "orthoflow/report": 102,
+    "orthoflow/report": 4,
     "plugins/orthoflow_plugins": 4,
     "plugins/orthoflow_plugins/inspect": 9,
     "plugins/orthoflow_plugins/match": 52,

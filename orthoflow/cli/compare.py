@@ -34,7 +34,7 @@ if TYPE_CHECKING:
         ParameterValue,
         RunComparison,
     )
-    from orthoflow.report.differences import Alike
+    from orthoflow.report.differences import RowGroup
 
 Value = TypeVar("Value")
 _NOTHING: Final = "-"
@@ -157,7 +157,7 @@ def _print_pairs(
         step_of: the step of each cell.
         whose: of which steps the rows are, if not of all.
     """
-    from orthoflow.report.differences import alike_rows, alike_texts
+    from orthoflow.report.differences import grouped_rows, grouped_texts
 
     different = [row for row in rows if not row.is_same]
     if not different:
@@ -165,7 +165,9 @@ def _print_pairs(
         return
     echo("", f"{title}: {_counts(rows)}{whose}")
     kept = (
-        alike_rows(different, id) if most is None else alike_texts(different, text, step_of or {})
+        grouped_rows(different, id)
+        if most is None
+        else grouped_texts(different, text, step_of or {})
     )
     echo_table(
         ("", "A", "B"),
@@ -225,13 +227,13 @@ def _parameter_text(parameter: ParameterValue) -> str:
 
 def _print_metrics(comparison: RunComparison, most: int | None) -> None:
     """Print metrics that differ by more than rounding; times and memory apart and last."""
-    from orthoflow.report.differences import alike_rows, moved_first, repeats_as_one
+    from orthoflow.report.differences import grouped_rows, moved_first, repeats_as_one
 
     measured, step_of = comparison.measured, comparison.step_of
     echo("", f"metrics: {_counts(measured)}{comparison.of_shared_steps}")
     different = moved_first([row for row in measured if not row.is_same], step_of)
     if most is None:
-        _print_numbers(alike_rows(different, id))
+        _print_numbers(grouped_rows(different, id))
     else:
         kept = repeats_as_one(row for row in different if row.is_moved)
         _print_numbers(kept[:most])
@@ -239,11 +241,11 @@ def _print_metrics(comparison: RunComparison, most: int | None) -> None:
     costs = [row for row in comparison.shared(comparison.metrics) if row.either.is_cost]
     different = [row for row in costs if not row.is_same]
     echo("", f"times and memory: {_counts(costs)}")
-    _print_numbers(alike_rows(different, id)[:most])
+    _print_numbers(grouped_rows(different, id)[:most])
     echo_left_out(len(different), most)
 
 
-def _print_numbers(rows: Sequence[Alike[ComparedMetric]]) -> None:
+def _print_numbers(rows: Sequence[RowGroup[ComparedMetric]]) -> None:
     from orthoflow.report.differences import metric_label
 
     echo_table(

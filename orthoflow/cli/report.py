@@ -43,10 +43,10 @@ def report(runs: tuple[str, ...], output: Path | None, store: Path) -> int:
     target = output if output is not None else opened[0].home_folder / REPORT_FILE
     if not target.parent.is_dir():
         raise ArgumentError(f"{target.parent} does not exist: make the folder, or choose another")
-    doubts = {run.path: doubt for run in opened if (doubt := broken_seal(run))}
+    broken_seals = {run.path: broken for run in opened if (broken := broken_seal(run))}
     if output is None:
-        write_page(opened[0], target, doubts=doubts)
+        write_page(opened[0], target, broken_seals=broken_seals)
     else:
-        write_report(opened, target, doubts=doubts, stores=stores_at(store))
+        write_report(opened, target, broken_seals=broken_seals, stores=stores_at(store))
     echo(f"report: {target}")
-    return code_for(doubts.values(), "the page states it")
+    return code_for(broken_seals.values(), "the page states it")

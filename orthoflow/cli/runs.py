@@ -168,9 +168,9 @@ def print_runs(
     kept: Sequence[RunSummary], found: Sequence[RunSummary], *, metrics: Sequence[str] = ()
 ) -> None:
     """Print a table of runs of those found, what went wrong in them, and how many there are."""
-    from orthoflow.report.browsing import differing_facts, key_metrics, told_apart
+    from orthoflow.report.browsing import differing_facts, distinguishing, key_metrics
 
-    names = list(metrics) or list(told_apart(key_metrics(kept, most=_METRICS_MOST), kept))
+    names = list(metrics) or list(distinguishing(key_metrics(kept, most=_METRICS_MOST), kept))
     _require_known(names, kept)
     facts = differing_facts(found)
     echo_table(

@@ -61,7 +61,7 @@ class Parameter(NamedTuple):
     value: JsonValue
 
     def address(self, *, with_data: bool, variant: str) -> str:
-        """Return its name, with the dataset or a variant where these are told apart."""
+        """Return its name, with the dataset or a variant where these differ."""
         at = f"@{DATA}={self.data}" if with_data and self.data else ""
         if not variant:
             return f"{self.step}{at}.{self.name}"
@@ -87,18 +87,18 @@ class RunSummary:
 
     Attributes:
         folder: of the run, as its finder named it.
-        state: `ok`; `failed`, some cell did; `running`, just now; `unfinished`, it was broken off;
+        state: `ok`; `failed`, some cell did; `running`, just now; `unfinished`, it was interrupted;
             `damaged`, the record cannot be read, or its seal does not hold.
         reason: what failed, first, or why it cannot be read; empty where all is well.
         workflow: name of the workflow.
         run_id: of the run.
-        started: ISO 8601 UTC; empty where nothing says it.
+        started: ISO 8601 UTC; empty if unknown.
         metrics: numbers of the baseline by `step.metric`, and by `metric` alone as the last step
             has it; of several datasets the median, of what is yes or no the share.
         n_datasets: that it ran on; 0 for a run on none.
         n_values: how many of these have each of the numbers; empty for a run on none.
         labels: what each of these is, in words.
-        headlines: those that say how good the result is, most important first.
+        headlines: the headline numbers, most important first.
         flags: those that are 1 where something is so and 0 where not.
         facts: what may differ between runs beside parameters: `seed`, `orthoflow` (its version),
             methods of the baseline by `step.use`, and inputs by `input <name>`.
@@ -149,25 +149,25 @@ def run_folders(folders: Sequence[Path]) -> list[Path]:
 
 
 def summaries(folders: Iterable[Path]) -> Iterator[RunSummary]:
-    """Sum up run folders one after the other; what cannot be read is told, not raised."""
+    """Summarise run folders one after the other; those that cannot be read are reported."""
     for folder in folders:
         yield _summary(folder)
 
 
 def differing_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValue]]:
-    """What of its distinct facts tells each run from others of the same workflow, by its folder.
+    """Facts that distinguish each run from others of the same workflow, by its folder.
 
     A fact that some of them lack differs only where two others disagree on it.
     """
-    told = distinct_facts(runs)
+    facts = distinct_facts(runs)
     values: dict[tuple[str, str], set[str]] = {}
     for run in runs:
-        for name, value in told[run.folder].items():
+        for name, value in facts[run.folder].items():
             values.setdefault((run.workflow, name), set()).add(_sorted_json(value))
     return {
         run.folder: {
             name: value
-            for name, value in told[run.folder].items()
+            for name, value in facts[run.folder].items()
             if len(values[run.workflow, name]) > 1
         }
         for run in runs
@@ -177,18 +177,18 @@ def differing_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValu
 def distinct_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValue]]:
     """All facts and parameters of each run, by its folder: each once, by the name of `--set`.
 
-    Of a sweep all values are told as one text, without the dataset what is the same on all
+    All values of a sweep are one text, without the dataset what is the same on all
     datasets of each run of the workflow, and without the variant what all variants of a step have
     and is the same in them.
     """
     by_data: set[tuple[str, str, str]] = set()
     by_variant: set[tuple[str, str, str]] = set()
-    told = {run.folder: _told_values(run) for run in runs}
+    swept = {run.folder: _swept_values(run) for run in runs}
     for run in runs:
         variants: dict[str, set[str]] = {}
         for one in run.parameters:
             variants.setdefault(one.step, set()).add(one.variant)
-        for (step, name), found in told[run.folder].items():
+        for (step, name), found in swept[run.folder].items():
             key = run.workflow, step, name
             for variant in {variant for _, variant in found}:
                 own = {value for (_, other), value in found.items() if other == variant}
@@ -204,12 +204,12 @@ def distinct_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValue
             name = one.address(
                 with_data=key in by_data, variant=one.variant if key in by_variant else ""
             )
-            values = told[run.folder][one.step, one.name][one.data, one.variant]
+            values = swept[run.folder][one.step, one.name][one.data, one.variant]
             facts[run.folder][name] = one.value if len(values) == 1 else "|".join(values)
     return facts
 
 
-def _told_values(
+def _swept_values(
     run: RunSummary,
 ) -> dict[tuple[str, str], dict[tuple[str, str], tuple[str, ...]]]:
     """Values of parameters as JSON, of a sweep several: step and name -> dataset and variant."""
@@ -227,24 +227,24 @@ def _sorted_json(value: JsonValue) -> str:
 
 
 def key_metrics(runs: Iterable[RunSummary], *, most: int) -> list[str]:
-    """Names of the numbers that say how good some runs are, those of most of them first."""
+    """Names of the headline numbers of some runs, those of most runs first."""
     counts = Counter(name for run in runs for name in run.headlines)
     chosen = sorted(counts, key=lambda name: -counts[name])[:most]
     return [name for name in counts if name in chosen]
 
 
-def told_apart(names: Iterable[str], runs: Sequence[RunSummary]) -> Iterator[str]:
-    """Put `step.metric` in the place of names that are not the same thing in all runs."""
+def distinguishing(names: Iterable[str], runs: Sequence[RunSummary]) -> Iterator[str]:
+    """Replace names of different metrics in different runs by `step.metric`."""
     for name in names:
-        said = {run.labels[name] for run in runs if name in run.labels}
-        if len(said) < 2:
+        labels = {run.labels[name] for run in runs if name in run.labels}
+        if len(labels) < 2:
             yield name
             continue
         yield from dict.fromkeys(
             own
             for run in runs
             for own, label in run.labels.items()
-            if own.endswith(f".{name}") and label in said
+            if own.endswith(f".{name}") and label in labels
         )
 
 
@@ -275,7 +275,7 @@ def _summary(folder: Path) -> RunSummary:
         return _of_run(folder, run)
     except OrthoflowError as error:
         return RunSummary(folder=folder, state="damaged", reason=str(error))
-    except Exception as error:  # noqa: BLE001 - a record may hold anything; the others shall be told
+    except Exception as error:  # noqa: BLE001 - a record may contain anything; the others are still listed
         reason = f"the record is not as one was written: {type(error).__name__}: {error}"
         return RunSummary(folder=folder, state="damaged", reason=reason)
 
@@ -350,22 +350,22 @@ def _called_by_set(cell: RecordedCell) -> str:
 
 
 def _unfinished(folder: Path) -> RunSummary:
-    """What the first line of the journal says of a run without a record."""
+    """Summarise a run without a record from the first line of its journal."""
     try:
         with open_file(folder / JOURNAL) as journal:
             first = parse_json(journal.readline(_FIRST_LINE_BYTES).decode("utf-8"))
     except (OSError, ValueError) as error:
         reason = f"it has no {RECORD_FILE}, and its journal cannot be read: {error}"
         return RunSummary(folder=folder, state="damaged", reason=reason)
-    said = first if isinstance(first, dict) else {}
+    labels = first if isinstance(first, dict) else {}
     is_under_way = is_running(folder)
     return RunSummary(
         folder=folder,
         state="running" if is_under_way else "unfinished",
         reason="" if is_under_way else f"continues with the same command and -o {folder}",
-        workflow=str(said.get("workflow", "")),
-        run_id=str(said.get("run_id", "")),
-        started=str(said.get("time", "")),
+        workflow=str(labels.get("workflow", "")),
+        run_id=str(labels.get("run_id", "")),
+        started=str(labels.get("time", "")),
     )
 
 
@@ -375,7 +375,7 @@ def write_run_table(runs: Sequence[RunSummary], path: Path, *, among: Sequence[R
     Args:
         runs: in the order of the rows.
         path: file to write.
-        among: those that they were chosen from; in what they differ is told against all of these.
+        among: those from which they were chosen, and against which differences are stated.
 
     Raises:
         StoreError: it cannot be written.
@@ -386,7 +386,7 @@ def write_run_table(runs: Sequence[RunSummary], path: Path, *, among: Sequence[R
     known = dict.fromkeys(name for run in runs for name in run.metrics if "." not in name)
     names = {
         name: next(run.labels[name] for run in runs if name in run.labels)
-        for name in told_apart(known, runs)
+        for name in distinguishing(known, runs)
     }
     rows = []
     for index, run in enumerate(runs):
@@ -405,7 +405,7 @@ def write_run_table(runs: Sequence[RunSummary], path: Path, *, among: Sequence[R
             title=f"{len(runs)} runs",
             rows=rows,
             names=names,
-            key_names=set(told_apart(key_metrics(runs, most=_KEYS_MOST), runs)),
+            key_names=set(distinguishing(key_metrics(runs, most=_KEYS_MOST), runs)),
             reasons={str(run.folder): run.reason for run in runs if run.reason},
         )
     )

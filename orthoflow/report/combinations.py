@@ -140,7 +140,7 @@ def unequal_walls(combinations: Iterable[Combination]) -> str:
         if len(wall) == len(_FIRST_WALL):
             room = (one.run.path, one.assignment.get(DATA, ""))
             by_room.setdefault(room, []).append((one, wall))
-    told = []
+    groups = []
     for shown in by_room.values():
         # What most of them show is what the odd ones do not.
         walls = [wall for _, wall in shown]
@@ -153,13 +153,13 @@ def unequal_walls(combinations: Iterable[Combination]) -> str:
         if odd:
             n_others = len(shown) - len(odd)
             others = "the other shows" if n_others == 1 else f"the {n_others} others show"
-            told.append(f"{first_few(odd, most=_ODD_MOST)}, {others} {_wall_words(usual)}")
-    if not told:
+            groups.append(f"{first_few(odd, most=_ODD_MOST)}, {others} {_wall_words(usual)}")
+    if not groups:
         return ""
     return (
         "not all combinations show the same wall first, so numbers of it speak of different ones "
         "(near of the wall takes the one at a point, where it was found): "
-        f"{first_few(told, most=_ROOMS_MOST)}"
+        f"{first_few(groups, most=_ROOMS_MOST)}"
     )
 
 
@@ -259,7 +259,7 @@ class Way:
     """Where on the page the cells of one combination stand, a row of the comparison.
 
     Attributes:
-        anchor: where the page tells of it.
+        anchor: its place on the page.
         name: the variants in words.
         cells: addresses of the cells that are shown here.
         elsewhere: address -> anchor of the combination above that shows it; empty for what stands
@@ -292,7 +292,7 @@ def ways(run: Run, prefix: str) -> tuple[Way, ...]:
 
 
 def improved_on(run: Run, addresses: Collection[str]) -> frozenset[str]:
-    """Cells whose result a later step of the same kind takes further: a first orientation, say."""
+    """Cells whose result a later step of the same kind continues, such as a first orientation."""
     return frozenset(
         before.address
         for address in addresses

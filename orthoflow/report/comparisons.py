@@ -18,7 +18,7 @@ from orthoflow.report.combinations import (
     is_missing,
     wanted_metrics,
 )
-from orthoflow.report.environments import alike_environments
+from orthoflow.report.environments import group_environments
 from orthoflow.report.numbers import number, number_with_spread
 from orthoflow.report.rankings import BETTER, Mark, Value, cost_share, rank
 from orthoflow.report.summaries import headline_keys
@@ -132,7 +132,7 @@ class ComparisonTable:
 
     @property
     def forced(self) -> str:
-        """Options that measure all anew, in one environment; empty where there is but one."""
+        """Options that measure all again in one environment; empty if there is only one."""
         if not any(sign.isupper() for sign in self.groups):
             return ""
         steps = dict.fromkeys((*self.steps, *(column.step for column in self.columns)))
@@ -151,7 +151,7 @@ class ComparisonTable:
 
     @property
     def _names(self) -> list[str]:
-        """What tells each row from the others."""
+        """What distinguishes each row from the others."""
         variants = (
             variants_text(
                 {
@@ -163,8 +163,8 @@ class ComparisonTable:
             for row in self.rows
         )
         return [
-            f"{row.run}: {said}" if self.shows_runs else said
-            for row, said in zip(self.rows, variants, strict=True)
+            f"{row.run}: {text}" if self.shows_runs else text
+            for row, text in zip(self.rows, variants, strict=True)
         ]
 
     @property
@@ -216,7 +216,7 @@ def comparison_table(runs: Sequence[Run]) -> ComparisonTable | None:
     """Put the combinations of one or more runs beside each other; None when there is but one.
 
     Values are ranked only among those of one environment and one set of data; with more than one
-    of either, letters say which is which.
+    of either, letters distinguish them.
     """
     combinations = [one for run in runs for one in combinations_of(run)]
     if len(combinations) < 2:
@@ -455,7 +455,7 @@ class Origins:
     """Capital letters for the environments, small ones for the data of one or more runs.
 
     Attributes:
-        environments: id -> letter, the same for those that are alike.
+        environments: id -> letter, the same for equivalent ones.
         data: run, and its dataset or nothing -> letter.
         legend: what each sign in use stands for; empty when all is of one kind.
     """
@@ -467,27 +467,27 @@ class Origins:
     @staticmethod
     def of(runs: Sequence[Run]) -> Origins:
         """Look through the environments and the data of runs."""
-        alike = alike_environments(runs)
-        signs = {key: _letter(index) for index, key in enumerate(alike.words)}
+        groups = group_environments(runs)
+        signs = {key: _letter(index) for index, key in enumerate(groups.words)}
         # What each run was given, or each of its datasets: digests -> places that have them.
         named: dict[tuple[str, ...], dict[_Place, str]] = {}
         for run in runs:
             datasets = {cell.assignment.get(DATA, "") for cell in run.record.cells} - {""}
             for data in sorted(datasets) if len(runs) > 1 and datasets else ("",):
-                said = f"{run.record.run_id}{f', dataset {data}' if data else ''}"
-                named.setdefault(_data_of(run, data), {})[(*_name(run), data)] = said
+                text = f"{run.record.run_id}{f', dataset {data}' if data else ''}"
+                named.setdefault(_data_of(run, data), {})[(*_name(run), data)] = text
         # No digits: raised behind a number they would look like powers.
         small = {key: _letter(index).lower() for index, key in enumerate(named)}
         legend: dict[str, str] = {}
         if len(signs) > 1:
-            legend |= {signs[key]: words for key, words in alike.words.items()}
+            legend |= {signs[key]: words for key, words in groups.words.items()}
         if len(named) > 1:
             legend |= {
-                small[key]: f"data of run {'; '.join(dict.fromkeys(said.values()))}"
-                for key, said in named.items()
+                small[key]: f"data of run {'; '.join(dict.fromkeys(text.values()))}"
+                for key, text in named.items()
             }
-        places = {place: small[key] for key, said in named.items() for place in said}
-        letters = {key: signs[first] for key, first in alike.first.items()}
+        places = {place: small[key] for key, text in named.items() for place in text}
+        letters = {key: signs[first] for key, first in groups.first.items()}
         return Origins(environments=letters, data=places, legend=legend)
 
     def letters(self, one: Combination, environment: str) -> str:

@@ -32,7 +32,7 @@ from orthoflow.workflow.model import DATA
 _MOST_CURVES: Final = 12
 _LONGEST_NAME: Final = 120
 _MOST_LINES: Final = 6
-# What a record of a stranger says may be any number; differences of larger ones are none.
+# An untrusted record may have any number; differences of larger ones are meaningless.
 _LARGEST: Final = 1e100
 _FEWEST_VALUES: Final = 2
 # What measures walls gives one of these.
@@ -220,12 +220,12 @@ def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
         else set()
     )
     for column in sorted(columns, key=lambda one: not one.headline):
-        for (step, parameter), alike in swept.items():
-            # A parameter over itself says nothing.
+        for (step, parameter), group in swept.items():
+            # A parameter over itself is meaningless.
             is_behind = any(cell.step == column.step and step in cell.assignment for cell in cells)
             if (column.step, column.metric) == (step, parameter) or not is_behind:
                 continue
-            drawn = [*alike, *_unswept(cells, step, parameter, found)]
+            drawn = [*group, *_unswept(cells, step, parameter, found)]
             lines: dict[str, _Line] = {}
             for sweep in drawn:
                 method = sweep.method if len(drawn) > 1 else ""
@@ -290,7 +290,7 @@ def _curve(
         before: list[tuple[str, int]] | None = None
         for x, found in sorted(line.items(), key=lambda one: one[0] or 0.0):
             # The hard datasets are often those that a value fails on: no line between points of
-            # unlike datasets or repeats says that one is better.
+            # unlike datasets or repeats means that one is better.
             origins = sorted((one.dataset, one.n_repeats) for one in found)
             is_joined = before in (None, origins)
             is_broken |= not is_joined
@@ -309,21 +309,21 @@ def _curve(
     # Sizes of errors are never below 0, and what is judged by more and lies in 0 to 1 is a share.
     is_size = column.better == "lower" and all(point.y >= 0.0 for point in every)
     is_share = column.better == "higher" and all(0.0 <= point.y <= 1.0 for point in every)
-    said = _points_words(lines, column.unit, n_datasets)
+    caption = _points_words(lines, column.unit, n_datasets)
     if is_broken:
         what = "datasets or repeats" if is_over else "numbers of repeats"
-        said += f", no line between those of unlike {what}"
+        caption += f", no line between those of unlike {what}"
     if partly:
-        said += f"; of only some repeats: {first_few(partly)}"
+        caption += f"; of only some repeats: {first_few(partly)}"
     if column.better in BETTER:
-        said += f"; {BETTER[column.better]}"
+        caption += f"; {BETTER[column.better]}"
     if column.better == "lower" and not cost_share(column.unit):
-        said += ", of signed errors their sizes"
+        caption += ", of signed errors their sizes"
     if any(None in line for line in lines.values()):
-        said += "; level lines are of what was not swept"
+        caption += "; level lines are of what was not swept"
     if base := [x for line in lines.values() for x, found in line.items() if found[0].is_baseline]:
         filled = "level line with filled points" if base[0] is None else "filled point"
-        said += f"; the {filled} is the baseline"
+        caption += f"; the {filled} is the baseline"
     shape = (
         "A flat stretch is where the parameter does not matter; at a steep end the chosen value "
         "decides the result."
@@ -333,7 +333,7 @@ def _curve(
     return Curve(
         name=f"{column.step}.{column.metric}_over_{parameter}",
         title=f"{column.titled} ({column.step}) over {parameter}",
-        caption=f"Points are {said}. {shape}{caveats}",
+        caption=f"Points are {caption}. {shape}{caveats}",
         lines=drawn,
         below=parameter,
         beside=column.titled,

@@ -140,12 +140,12 @@ def _value(measured: MetricRow | None) -> Value:
 def _limit(part: Run, own: AbstractSet[str]) -> str:
     """What the baseline's steps of this dataset warn of; failures stand beside it."""
     baseline = {cell.address for cell in baseline_cells(part)} & own
-    said = [
+    texts = [
         limit.text
         for limit in limits(part)
         if not baseline.isdisjoint(limit.cells) and not limit.is_failure
     ]
-    return f"{said[0]} (and {len(said) - 1} more)" if len(said) > 1 else "".join(said)
+    return f"{texts[0]} (and {len(texts) - 1} more)" if len(texts) > 1 else "".join(texts)
 
 
 def _photos(measured: _Measured) -> Value:

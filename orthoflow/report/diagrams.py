@@ -39,7 +39,7 @@ class Diagram:
 
 
 def run_diagram(run: Run) -> Diagram:
-    """Lay out the cells of a run that ran or should have.
+    """Arrange the cells of a run that ran or should have.
 
     They go downwards where a page holds the widest level, else from left to right. With more cells
     than a reader can follow, cells of a step become one box.
@@ -72,7 +72,7 @@ def run_diagram(run: Run) -> Diagram:
             gaps = (_GAP, _GAP_LEVELS) if is_down else (_GAP_LEVELS, _GAP)
             places[name] = (1 + x * (BOX[0] + gaps[0]), 1 + y * (BOX[1] + gaps[1]))
             depths[name] = depth
-    # The page of one dataset says which it is.
+    # The page of one dataset names it.
     is_alone = len({cell.assignment.get(DATA) for cell in run.cells.values()} - {None}) == 1
     boxes = []
     for name, cells in groups.items():

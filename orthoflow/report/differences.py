@@ -1,4 +1,4 @@
-"""Two runs side by side: in what they differ, what is alike as one row, and how far apart."""
+"""Two runs side by side: what differs, equal differences in one row, and how far apart."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _NOTHING: Final = "-"
 
 @dataclass(frozen=True, kw_only=True)
 class Difference:
-    """One thing that the two runs say differently."""
+    """A value that differs between the two runs."""
 
     cell: str
     name: str
@@ -44,8 +44,8 @@ class DifferenceTable:
     Attributes:
         title: what kind.
         n_compared: how many things both runs have.
-        n_different: of how many of them they say something else.
-        rows: those that differ, and those that only one run has; what is said alike is one.
+        n_different: number of those that differ.
+        rows: those that differ, and those that only one run has; equal ones are grouped.
         n_alone: how many things only one run has.
         n_rounded: how many things differ by rounding only; they have no row.
         whose: of which steps they are, if not of all.
@@ -72,7 +72,7 @@ class ProductRow:
 
 @dataclass(frozen=True, kw_only=True)
 class Differences:
-    """Everything the page says of two runs.
+    """All differences of two runs.
 
     Attributes:
         left: id of the first run.
@@ -120,11 +120,11 @@ def _table(
     text: Callable[[Side], str],
     step_of: Mapping[str, str] | None = None,
 ) -> DifferenceTable:
-    """State what differs between things, of those of a step once what is said alike."""
+    """Return what differs between things, with equal differences of a step grouped."""
     steps = step_of or {}
     counts = DifferenceCounts.of(pairs)
     rows = []
-    for one in alike_texts([pair for pair in pairs if not pair.is_same], text, steps):
+    for one in grouped_texts([pair for pair in pairs if not pair.is_same], text, steps):
         pair = one.pair
         rows.append(
             Difference(
@@ -199,12 +199,12 @@ def _parameter_text(parameter: ParameterValue) -> str:
     return f"{text} (set)" if parameter.is_set else text
 
 
-# --- rows that say the same as one, how good results are first ---
+# --- equal rows as one, headline numbers first ---
 
 
 @dataclass(frozen=True, kw_only=True)
-class Alike(Generic[Side]):
-    """Rows that say the same.
+class RowGroup(Generic[Side]):
+    """Equal rows.
 
     Attributes:
         pair: the first of them.
@@ -218,7 +218,7 @@ class Alike(Generic[Side]):
         """Name what they are of: a cell, or else a step and how many cells of it.
 
         >>> rows = [Pair(cell=f"wall@{name}", name="cell_m", left=1, right=2) for name in "ab"]
-        >>> [row] = alike_rows(rows, key=lambda pair: pair.name)
+        >>> [row] = grouped_rows(rows, key=lambda pair: pair.name)
         >>> row.label({"wall@a": "wall"})
         'wall.cell_m, 2 steps'
         """
@@ -231,29 +231,29 @@ class Alike(Generic[Side]):
         return f"{what}, {self.n} steps"
 
 
-def alike_rows(
+def grouped_rows(
     pairs: Iterable[Pair[Side]], key: Callable[[Pair[Side]], Hashable]
-) -> list[Alike[Side]]:
+) -> list[RowGroup[Side]]:
     """Put pairs together whose keys are equal, in the order of the first ones."""
     first: dict[Hashable, Pair[Side]] = {}
     counts: Counter[Hashable] = Counter()
     for pair in pairs:
-        told = key(pair)
-        first.setdefault(told, pair)
-        counts[told] += 1
-    return [Alike(pair=pair, n=counts[told]) for told, pair in first.items()]
+        text = key(pair)
+        first.setdefault(text, pair)
+        counts[text] += 1
+    return [RowGroup(pair=pair, n=counts[text]) for text, pair in first.items()]
 
 
-def alike_texts(
+def grouped_texts(
     pairs: Iterable[Pair[Side]], text: Callable[[Side], str], step_of: Mapping[str, str]
-) -> list[Alike[Side]]:
-    """Put pairs together that say the same of one step."""
+) -> list[RowGroup[Side]]:
+    """Group pairs with equal texts for one step."""
 
     def key(pair: Pair[Side]) -> Hashable:
         sides = (None if side is None else text(side) for side in (pair.left, pair.right))
         return (step_of.get(pair.cell, pair.cell), pair.name, *sides)
 
-    return alike_rows(pairs, key)
+    return grouped_rows(pairs, key)
 
 
 def without_seeds(cells: Iterable[Pair[CellFacts]]) -> list[Pair[CellFacts]]:
@@ -275,7 +275,7 @@ def moved_first(
 ) -> list[Pair[ComparedMetric]]:
     """Put metrics in the order in which a reader asks for them.
 
-    First those that say how good results are, then others with a good side, then the rest, rounding
+    First headline numbers, then others with a good side, then the rest, rounding
     last. Of each metric of a step the largest relative change comes first, and its next one behind
     the first of all others: many rooms do not push a metric out of sight.
     """
@@ -296,18 +296,18 @@ def moved_first(
 
 def repeats_as_one(
     pairs: Iterable[Pair[ComparedMetric]],
-) -> list[Alike[ComparedMetric]]:
+) -> list[RowGroup[ComparedMetric]]:
     """Put repeats of a cell together in which a metric has the same values."""
 
     def key(pair: Pair[ComparedMetric]) -> Hashable:
         sides = (side and (side.value, side.unit) for side in (pair.left, pair.right))
         return (pair.cell.partition("#")[0], pair.name, *sides)
 
-    return alike_rows(pairs, key)
+    return grouped_rows(pairs, key)
 
 
-def metric_label(row: Alike[ComparedMetric]) -> str:
-    """Name a metric and its cell, and say of how many repeats."""
+def metric_label(row: RowGroup[ComparedMetric]) -> str:
+    """Name a metric and its cell, with the number of repeats."""
     repeats = f", {row.n} repeats" if row.n > 1 else ""
     return f"{row.pair.cell}.{row.pair.name}{repeats}"
 

@@ -13,7 +13,7 @@ from orthoflow.version import DISTRIBUTION
 
 
 @dataclass(frozen=True, kw_only=True)
-class AlikeEnvironments:
+class EnvironmentGroups:
     """Which environments of some runs are one for those who compare.
 
     Attributes:
@@ -24,17 +24,17 @@ class AlikeEnvironments:
     first: Mapping[str, str]
     words: Mapping[str, str]
 
-    def are_alike(self, one: str, other: str) -> bool:
+    def are_comparable(self, one: str, other: str) -> bool:
         """Whether values of two environments may be compared."""
         return self.first.get(one, one) == self.first.get(other, other)
 
 
-def alike_environments(runs: Iterable[Run]) -> AlikeEnvironments:
+def group_environments(runs: Iterable[Run]) -> EnvironmentGroups:
     """Join the environments in which what the methods of the runs use is the same.
 
     Of packages those count that the methods' distributions, or this one, require; all of them
     where one of these is not installed here. What only one environment has is nothing that both
-    could have used: a plugin that was installed between two runs, say.
+    could have used, such as a plugin that was installed between two runs.
     """
     runs = tuple(runs)
     environments = {one.id: one for run in runs for one in run.record.environments}
@@ -50,8 +50,8 @@ def alike_environments(runs: Iterable[Run]) -> AlikeEnvironments:
         like = next((name for name, seen in known.items() if _agree(seen, facts)), key)
         first[key] = like
         known[like] = facts | known.get(like, {})
-    words = told_apart([environments[key] for key in known], used)
-    return AlikeEnvironments(first=first, words=words)
+    words = distinct_words([environments[key] for key in known], used)
+    return EnvironmentGroups(first=first, words=words)
 
 
 def environment_words(environment: RecordedEnvironment) -> str:
@@ -63,7 +63,7 @@ def environment_words(environment: RecordedEnvironment) -> str:
     )
 
 
-def told_apart(
+def distinct_words(
     environments: Sequence[RecordedEnvironment], used: Collection[str] | None = None
 ) -> dict[str, str]:
     """State where things were computed, with the packages in which each is unlike the first.
@@ -85,9 +85,9 @@ def told_apart(
 
 def _other_packages(own: Mapping[str, str], others: Mapping[str, str]) -> str:
     """State in which packages an environment differs from another; empty where in none."""
-    said = [f"{name} {own[name]}" for name in own if own[name] != others.get(name)]
-    said += [f"no {name}" for name in others if name not in own]
-    return f"; unlike the first with {first_few(said)}" if said else ""
+    texts = [f"{name} {own[name]}" for name in own if own[name] != others.get(name)]
+    texts += [f"no {name}" for name in others if name not in own]
+    return f"; unlike the first with {first_few(texts)}" if texts else ""
 
 
 def _packages(environment: RecordedEnvironment, used: Collection[str] | None) -> dict[str, str]:

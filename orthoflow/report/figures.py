@@ -23,7 +23,7 @@ _BYTES_MOST: Final = 3_900_000  # of all figures on a page; a third more in base
 _BASELINE_SHARE: Final = 0.7
 _SIDES_PX: Final = (700, 480, 340, 240)
 _DPI: Final = 300
-_SMALL_BYTES: Final = 20_000  # not worth drawing anew
+_SMALL_BYTES: Final = 20_000  # not worth drawing again
 
 
 @dataclass(frozen=True, kw_only=True)

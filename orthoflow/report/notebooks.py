@@ -135,7 +135,7 @@ class OpenedRun(Run):
             data: name of the dataset, where the run has several; None for the first one.
 
         Raises:
-            ArgumentError: the run has no such orthoimage; says which there are.
+            ArgumentError: the run has no such orthoimage; lists those it has.
         """
         part = self if data is None else self._part(data)
         places = dict(embedded_products(part, "orthoimages"))
@@ -171,7 +171,7 @@ class OpenedRun(Run):
     def compare(
         self, other: str | Path | Run, *, store: str | Path = ".orthoflow"
     ) -> ShownComparison:
-        """Lay this run beside another one, see `RunComparison`.
+        """Compare this run with another one, see `RunComparison`.
 
         Args:
             other: the run, its folder or its record.
@@ -187,7 +187,7 @@ class OpenedRun(Run):
         return ShownComparison(**vars(compare_runs(self, opened, stores=stores_at(store))))
 
     def _way_to_logs(self) -> str:
-        """How to read what the steps said that failed; empty where none did."""
+        """How to read the logs of failed steps; empty if none failed."""
         failed = [cell for cell in self.record.cells if cell.status == "failed"]
         if not failed or not failed[0].log:
             return ""
@@ -203,8 +203,8 @@ class OpenedRun(Run):
         )
         apart = unequal_walls(combinations_of(self))
         counts = Counter(cell.status for cell in record.cells)
-        told = ", ".join(f"{count} {status}" for status, count in counts.items()) or "none"
-        steps = f"{self.with_failure(f'steps: {told}')}{self._way_to_logs()}"
+        counts_text = ", ".join(f"{count} {status}" for status, count in counts.items()) or "none"
+        steps = f"{self.with_failure(f'steps: {counts_text}')}{self._way_to_logs()}"
         return (
             f"<div><p><b>{_html(record.name)}</b>, {_html(record.started)}<br>{_html(steps)}</p>"
             + (f"<p>{_html(apart)}</p>" if apart else "")
@@ -232,7 +232,7 @@ def open_run(path: str | Path) -> OpenedRun:
     """
     plain = open_plain_run(path)
     if doubt := broken_seal(plain):
-        warnings.warn(f"{doubt}; rely on nothing that is said of it here", stacklevel=2)
+        warnings.warn(f"{doubt}; rely on nothing shown of it here", stacklevel=2)
     return OpenedRun(path=plain.path, record=plain.record)
 
 
@@ -254,35 +254,37 @@ class ShownComparison(RunComparison):
     """Two runs side by side, as a notebook shows them."""
 
     def _repr_html_(self) -> str:
-        said = f"<p>{_html(repr(self))}</p>{self._parameters_html()}"
+        html = f"<p>{_html(repr(self))}</p>{self._parameters_html()}"
         if not Difference.of(self.measured).n_shared:
-            return f"{said}<p>They have no number in common, time and memory left aside.</p>"
+            return f"{html}<p>They have no number in common, time and memory left aside.</p>"
         differing = [row for row in self.measured if row.is_shared and row.is_moved]
         moved = [(row.cell, row.name) for row in moved_first(differing, self.step_of)]
         if not moved:
             return (
-                f"{said}<p>No number that both runs have differs, time and memory, and rounding, "
+                f"{html}<p>No number that both runs have differs, time and memory, and rounding, "
                 "left aside.</p>"
             )
         table = self.metric_table().set_index(["cell", "metric"])
         first = table.loc[moved[:_ROWS_MOST]].reset_index()
         n_more = len(moved) - len(first)
         more = f"<p>{n_more} more, which <code>metric_table()</code> has.</p>" if n_more else ""
-        return f"{said}{first.to_html(index=False)}{more}"
+        return f"{html}{first.to_html(index=False)}{more}"
 
     def _parameters_html(self) -> str:
         """The parameters in which both differ, the first few."""
         rows = [row for row in self.shared(self.parameters) if row.is_shared and not row.is_same]
-        told = [
+        counts_text = [
             f"{row.cell}.{row.name}: {' -> '.join(json.dumps(side.value) for side in sides)}"
             for row in rows
             if (sides := [one for one in (row.left, row.right) if one is not None])
         ]
-        return f"<p>{_html(first_few(told, most=_PARAMETERS_MOST))}</p>" if told else ""
+        return (
+            f"<p>{_html(first_few(counts_text, most=_PARAMETERS_MOST))}</p>" if counts_text else ""
+        )
 
 
 class NoFigureError(ArgumentError, KeyError):
-    """A run has no figure of a name; a `KeyError` as of every mapping, which says what there is."""
+    """A run has no figure of a name; a `KeyError` as of every mapping, which lists those it has."""
 
     __str__ = Exception.__str__  # KeyError would put the sentence between quotes
 
@@ -367,7 +369,7 @@ class WallImage:
     def to_xarray(self) -> Any:  # Any: of a library that need not be there
         """Return an `xarray.DataArray` with x along the wall and y as heights, as the GeoTIFF has.
 
-        Its coordinate `is_shown` (y, x) tells cells that are black from those that show nothing.
+        Its coordinate `is_shown` (y, x) distinguishes black cells from empty ones.
 
         Raises:
             PluginError: xarray is not installed.

@@ -181,7 +181,7 @@ def _overlay(
     points_world, lengths_m, kinds = vectors
     frame = frame_of(ground)
     magnification = magnification_for(frame, lengths_m[kinds != "rejected"])
-    # Left out evenly. Rejected ties may be metres off: a mark says that they are there.
+    # Left out evenly. Rejected ties may be metres off: a mark shows them.
     chosen = np.unique(np.linspace(0, len(kinds) - 1, min(most, len(kinds))).astype(np.int64))
     drawn_m = np.where((kinds == "rejected")[:, None], 0.0, lengths_m)[chosen]
     feet = frame.wall_from_world(points_world[chosen])[:, :2]

@@ -1,4 +1,4 @@
-"""Writing the page: the templates filled with what the records say."""
+"""Writing the page: the templates filled from the records."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ _VIEWERS: Final = {
     "model of the room": Path("export/gltf/room.html"),
     "orthoimages to measure on": Path("export/tiles/index.html"),
 }
-_NO_DOUBTS: Final[Mapping[Path, str]] = MappingProxyType({})
+_NONE_BROKEN: Final[Mapping[Path, str]] = MappingProxyType({})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +90,7 @@ class _Part:
 
 
 def write_page(
-    run: Run, path: Path, *, go_on: str = "", doubts: Mapping[Path, str] = _NO_DOUBTS
+    run: Run, path: Path, *, go_on: str = "", broken_seals: Mapping[Path, str] = _NONE_BROKEN
 ) -> None:
     """Write the report of one run, and its figures as PNG and SVG files into `figures/` beside it.
 
@@ -101,7 +101,7 @@ def write_page(
         run: the run.
         path: file to write.
         go_on: of a run that was interrupted, the command that goes on with it.
-        doubts: record -> why nobody should rely on it.
+        broken_seals: record -> why its seal does not hold.
 
     Raises:
         StoreError: a file cannot be written.
@@ -117,13 +117,13 @@ def write_page(
         parts = parts_of(opened)
         for name, page in pages.items():
             target = path.parent / page
-            section = _section(parts[name], "r1-", target.parent, doubts)
+            section = _section(parts[name], "r1-", target.parent, broken_seals)
             section.title, section.whole = f"{run.record.name}: {name}", f"../{path.name}"
             _write([parts[name]], [section], target, section.title)
         if pages:
             section = _overview(opened, "r1-", path.parent, pages)
         else:
-            section = _section(opened, "r1-", path.parent, doubts, with_files=True)
+            section = _section(opened, "r1-", path.parent, broken_seals, with_files=True)
         _write([opened], [section], path, run.record.name, go_on=go_on)
     write_figures(run, path.parent, addresses, inside=FIGURES_FOLDER)
 
@@ -133,16 +133,16 @@ def write_report(
     path: Path,
     *,
     go_on: str = "",
-    doubts: Mapping[Path, str] = _NO_DOUBTS,
+    broken_seals: Mapping[Path, str] = _NONE_BROKEN,
     stores: Sequence[Store] = (),
 ) -> None:
     """Write one self-contained HTML file about one or more runs.
 
     Args:
-        runs: opened with `orthoflow.open_run`; of two, the page also says what differs.
+        runs: opened with `orthoflow.open_run`; of two, the page also lists the differences.
         path: file to write; replaced as a whole, never half.
         go_on: of a run that was interrupted, the command that goes on with it.
-        doubts: record -> why nobody should rely on it.
+        broken_seals: record -> why its seal does not hold.
         stores: where products are that the records of two runs only name.
 
     Raises:
@@ -152,7 +152,7 @@ def write_report(
     sections = [
         _overview(run, f"r{index}-", path.parent, {})
         if pages_of(run)
-        else _section(run, f"r{index}-", path.parent, doubts, share=1 / len(runs))
+        else _section(run, f"r{index}-", path.parent, broken_seals, share=1 / len(runs))
         for index, run in enumerate(runs, start=1)
     ]
     title = ", ".join(dict.fromkeys(run.record.name for run in runs))
@@ -222,7 +222,7 @@ def _section(
     run: Run,
     prefix: str,
     folder: Path,
-    doubts: Mapping[Path, str] = _NO_DOUBTS,
+    broken_seals: Mapping[Path, str] = _NONE_BROKEN,
     *,
     share: float = 1.0,
     with_files: bool = False,
@@ -233,7 +233,7 @@ def _section(
         run: the run.
         prefix: what the anchors begin with.
         folder: that the page lies in; files are named from there.
-        doubts: record -> why nobody should rely on it.
+        broken_seals: record -> why its seal does not hold.
         share: which part of the page's bytes pictures may take.
         with_files: the figures' own files are written beside the page.
     """
@@ -272,7 +272,7 @@ def _section(
         prefix=prefix,
         title=run.record.name,
         whole="",
-        doubt=doubts.get(run.path, ""),
+        broken=broken_seals.get(run.path, ""),
         answers=answers(run),
         is_measured=is_measured,
         is_unfinished=any(is_missing(cell) for cell in run.record.cells),

@@ -16,7 +16,7 @@ from orthoflow.records import RecordedCell
 from orthoflow.records.runs import MetricRow, Run, is_rounding
 from orthoflow.report.combinations import Combination, Measured, combinations_of
 from orthoflow.report.comparisons import comparison_columns
-from orthoflow.report.environments import AlikeEnvironments, alike_environments
+from orthoflow.report.environments import EnvironmentGroups, group_environments
 from orthoflow.report.rankings import BETTER, badness, is_flag
 from orthoflow.untrusted_text import first_few
 from orthoflow.workflow.expand import variants_text
@@ -27,7 +27,7 @@ _DECIDING_SHARE: Final = 0.5
 _MOST_DECIDING: Final = 3
 # Of four differences that all agree p is 0.125: a test of so few can show nothing.
 _FEWEST_TESTED: Final = 5
-# Of two methods the signed ranks say more.
+# For two methods signed ranks are more powerful.
 _FEWEST_RANKED: Final = 3
 # Of six that all agree p is 0.031, of five 0.0625.
 _FEWEST_SHOWN: Final = 6
@@ -88,9 +88,9 @@ class MethodOverDatasets:
             or no the mean, the share of yes.
         spread: 1.4826 times the median absolute deviation from it; NaN without any, and of shares.
         paired: against the reference; None for itself, and where neither more nor less is better.
-        n_unlike: datasets on which both have a value, of environments that are not alike.
+        n_unlike: datasets on which both have a value, of different environments.
         n_other_photos: datasets on which both have a value, of unequal numbers of photos.
-        own: of the variants those that the step hangs on.
+        own: the variants on which the step depends.
     """
 
     name: str
@@ -154,19 +154,19 @@ class MetricOverDatasets:
 
     @property
     def reference(self) -> str:
-        """What the others are compared with, where nothing is said of them."""
-        return next((one.name for one in self.told if one.is_reference), "")
+        """What the others are compared with unless stated otherwise."""
+        return next((one.name for one in self.distinct if one.is_reference), "")
 
     @property
-    def told(self) -> tuple[MethodOverDatasets, ...]:
-        """The combinations, those of the same cells as one, named by what the step hangs on."""
-        alike: dict[tuple[str, tuple[str, ...]], MethodOverDatasets] = {}
+    def distinct(self) -> tuple[MethodOverDatasets, ...]:
+        """The combinations, those of the same cells as one, named by what the step depends on."""
+        groups: dict[tuple[str, tuple[str, ...]], MethodOverDatasets] = {}
         for one in self.methods:
             key = one.own, one.failed
-            if key not in alike or one.is_reference:
-                alike[key] = one
-        # Where one of them failed in a step behind, only the whole name tells which.
-        times = Counter(own for own, _ in alike)
+            if key not in groups or one.is_reference:
+                groups[key] = one
+        # If one of them failed in a later step, only the whole name is unique.
+        times = Counter(own for own, _ in groups)
         short = {one.name: one.own for one in self.methods if times[one.own] == 1}
         return tuple(
             replace(
@@ -174,7 +174,7 @@ class MetricOverDatasets:
                 name=short.get(one.name, one.name),
                 against=short.get(one.against, one.against),
             )
-            for one in alike.values()
+            for one in groups.values()
         )
 
 
@@ -192,7 +192,7 @@ def middle_of(values: NDArray[np.float64], unit: str) -> float:
 def spread_of(values: NDArray[np.float64], unit: str) -> float:
     """How far the values of several datasets lie apart; NaN without any.
 
-    A share has none: it says itself how many are the one and how many the other.
+    A share has none, since it determines both counts.
     """
     return math.nan if is_flag(unit) or not values.size else median_deviation(values)
 
@@ -214,7 +214,7 @@ def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
     every = [one for by_name in found.values() for one in by_name.values()]
     if len(names) < 2 or not every:
         return ()
-    alike = alike_environments(parts.values())
+    groups = group_environments(parts.values())
     reference = next((_method(one) for one in every if one.is_baseline), next(iter(found)))
     partners = _partners(
         {method: next(iter(ways.values())) for method, ways in found.items()}, reference
@@ -222,8 +222,8 @@ def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
     return _corrected(
         MetricOverDatasets(
             column=column,
-            methods=_methods(found, names, partners, column, alike),
-            ranks=_mean_ranks(found, names, column, alike),
+            methods=_methods(found, names, partners, column, groups),
+            ranks=_mean_ranks(found, names, column, groups),
         )
         for column in comparison_columns(every)
     )
@@ -232,7 +232,9 @@ def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
 def _corrected(metrics: Iterable[MetricOverDatasets]) -> tuple[MetricOverDatasets, ...]:
     """Correct all p of a run together, by Holm: of many comparisons some are small by chance."""
     metrics = tuple(metrics)
-    found = [one.paired.p for metric in metrics for one in metric.told if one.paired is not None]
+    found = [
+        one.paired.p for metric in metrics for one in metric.distinct if one.paired is not None
+    ]
     corrected = holm([p for p in found if math.isfinite(p)])
     return tuple(
         replace(
@@ -264,7 +266,7 @@ def _mean_ranks(
     found: Mapping[str, Mapping[str, Combination]],
     names: Sequence[str],
     column: MetricRow,
-    alike: AlikeEnvironments,
+    groups: EnvironmentGroups,
 ) -> MeanRanks | None:
     """Rank all methods on the datasets on which each has a value that may be compared."""
     if column.better not in BETTER:
@@ -279,7 +281,8 @@ def _mean_ranks(
         values = [one.measured(column.step, column.metric) for one in ways if one.failure is None]
         known = [value for value in values if value is not None]
         if len(known) < len(methods) or any(
-            not alike.are_alike(known[0].environment, value.environment) for value in known[1:]
+            not groups.are_comparable(known[0].environment, value.environment)
+            for value in known[1:]
         ):
             continue
         if any(_other_photos(ways[0], other, column) for other in ways[1:]):
@@ -375,7 +378,7 @@ def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
         n_datasets: how many the run has.
     """
     judged = [metric for metric in over if metric.column.better in BETTER]
-    rows = [one for metric in judged for one in metric.told if one.against]
+    rows = [one for metric in judged for one in metric.distinct if one.against]
     if not rows:
         return ""
     tested = [one for one in rows if one.paired is not None and math.isfinite(one.paired.p)]
@@ -383,21 +386,21 @@ def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
         few = (
             f"{n_datasets} datasets are too few for a test"
             if n_datasets < _FEWEST_SHOWN
-            else "values of environments that are not alike are not compared"
+            else "values of different environments are not compared"
             if any(one.n_unlike for one in rows)
             else "too few of the datasets differ for a test"
         )
         return (
             f"Nobody is shown to lead: {few}; it takes {_FEWEST_SHOWN} that differ to show anything"
         )
-    said = []
-    alike: dict[str, list[str]] = {}
+    leads = []
+    groups: dict[str, list[str]] = {}
     for name, against in dict.fromkeys((one.name, one.against) for one in rows):
         n_both = sum((one.name, one.against) == (name, against) for one in rows)
         shown = [
             (metric.column.title, one.paired.effect)
             for metric in judged
-            for one in metric.told
+            for one in metric.distinct
             if (one.name, one.against) == (name, against)
             and one.paired is not None
             and one.paired.p_holm < _SHOWN_P
@@ -412,21 +415,20 @@ def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
             if labels
         )
         if how:
-            said.append(f"{name} against {against}: {how}")
+            leads.append(f"{name} against {against}: {how}")
         else:
-            alike.setdefault(against, []).append(name)
-    if not said:
+            groups.setdefault(against, []).append(name)
+    if not leads:
         return f"Nobody is shown to lead in any of {len(judged)} numbers ({_TEST})"
-    others = f"; and {len(said) - _NAMED} more" if len(said) > _NAMED else ""
-    return (
-        f"Shown over the datasets ({_TEST}): {'; '.join(said[:_NAMED])}{others}{_not_shown(alike)}"
-    )
+    others = f"; and {len(leads) - _NAMED} more" if len(leads) > _NAMED else ""
+    named = "; ".join(leads[:_NAMED])
+    return f"Shown over the datasets ({_TEST}): {named}{others}{_not_shown(groups)}"
 
 
-def _not_shown(alike: Mapping[str, Sequence[str]]) -> str:
+def _not_shown(groups: Mapping[str, Sequence[str]]) -> str:
     """State who is not shown to differ from what it is compared with; empty without any."""
     pairs = [
-        f"{first_few(names, most=_NAMED)} against {against}" for against, names in alike.items()
+        f"{first_few(names, most=_NAMED)} against {against}" for against, names in groups.items()
     ]
     return f". No difference is shown of {'; '.join(pairs)}" if pairs else ""
 
@@ -436,7 +438,7 @@ def _methods(
     names: Sequence[str],
     partners: Mapping[str, str],
     column: MetricRow,
-    alike: AlikeEnvironments,
+    groups: EnvironmentGroups,
 ) -> tuple[MethodOverDatasets, ...]:
     step, is_judged = column.step, column.better in BETTER
     measured = {
@@ -461,7 +463,7 @@ def _methods(
         like = {
             name: value
             for name, value in both.items()
-            if alike.are_alike(value.environment, theirs[name].environment)
+            if groups.are_comparable(value.environment, theirs[name].environment)
         }
         ours = {
             name: value
@@ -499,7 +501,7 @@ def _other_photos(one: Combination, other: Combination, column: MetricRow) -> bo
 
 
 def _own(ways: Iterable[Combination], step: str) -> str:
-    """Name those variants of a combination that a step hangs on."""
+    """Name the variants of a combination on which a step depends."""
     cells = (cell for one in ways for cell in one.cells if cell.step == step)
     found = {k: v for cell in cells for k, v in cell.assignment.items() if k != DATA}
     return variants_text(found)
@@ -528,7 +530,7 @@ def paired_differences(worse: Mapping[str, float], better: str, unit: str = "1")
     Args:
         worse: dataset -> how much worse than the reference the method is there, finite; at least
             one; zero where they are level.
-        better: which values are, for the sign of the differences that are told.
+        better: which values are, for the sign of the differences.
         unit: of its values.
     """
     sign = -1.0 if better == "higher" else 1.0

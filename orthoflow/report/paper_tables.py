@@ -116,13 +116,13 @@ def _over(over: Sequence[MetricOverDatasets]) -> Table:
 
     rows = []
     for metric in over:
-        for one in metric.told:
+        for one in metric.distinct:
             paired = one.paired
-            told = ["--"] * 3
+            statistics_of = ["--"] * 3
             if paired is not None:
                 low, high = (text(edge, 3) for edge in paired.interval)
                 interval = "--" if "--" in (low, high) else f"{low} to {high}"
-                told = [text(paired.median, 3), interval, text(paired.p_holm, 2)]
+                statistics_of = [text(paired.median, 3), interval, text(paired.p_holm, 2)]
             name = f"{metric.column.step}: {metric.column.titled}"
             rows.append(
                 (
@@ -131,7 +131,7 @@ def _over(over: Sequence[MetricOverDatasets]) -> Table:
                     one.name or "all",
                     str(one.n),
                     text(one.median),
-                    *told,
+                    *statistics_of,
                 )
             )
     return Table(

@@ -154,7 +154,7 @@ def _drawn(
     oriented: Sequence[Camera],
     walls: Mapping[int, tuple[str, WallFrame]],
 ) -> tuple[tuple[PlanWall, ...], tuple[PlanPhoto, ...]]:
-    """Lay walls, by number, and photos into the view from above."""
+    """Return walls, by number, and photos in the view from above."""
     axes = basis_from_up(up)[:2].T
     photos = []
     for camera in oriented:

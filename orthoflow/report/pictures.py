@@ -1,4 +1,4 @@
-"""Pictures for the page: products as small images, those of one wall laid over each other."""
+"""Pictures for the page: products as small images, those of one wall over each other."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _FULL_PICTURES: Final = 24
 # 0.15 bytes each.
 _CLOSE_CELLS: Final = 12_000_000
 
-# Depths are told to a millimetre at so many places of a wall, some 40 kB of a page.
+# Number of places of a wall with depths to a millimetre, some 40 kB of a page.
 _PLACES_MOST: Final = 8_000
 # The bar of the scale takes this share of the picture's width, at most.
 _BAR_SHARE: Final = 0.3
@@ -109,9 +109,9 @@ class Picture:
 
     @property
     def layer(self) -> str:
-        """What it shows beside its wall, with its variants: alike for all walls of a cell."""
-        said = self.title.removeprefix(self.name).strip(" ,")
-        return said if said and not said.startswith("(") else f"orthoimage {said}".strip()
+        """What it shows besides its wall, with its variants: the same for all walls of a cell."""
+        text = self.title.removeprefix(self.name).strip(" ,")
+        return text if text and not text.startswith("(") else f"orthoimage {text}".strip()
 
 
 def data_uri(content: bytes, media_type: str) -> str:
@@ -231,9 +231,9 @@ def _states(image: Orthoimage) -> str:
         OrthoMask.OCCLUDED: "hidden from every photo",
         OrthoMask.NONE: "in no oriented photo",
     }
-    shares = {said: count_cells(image.mask, state) for state, said in words.items()}
-    told = [f"{_percent(n / image.mask.size)} {said}" for said, n in shares.items() if n]
-    return ", ".join(told)
+    shares = {text: count_cells(image.mask, state) for state, text in words.items()}
+    texts = [f"{_percent(n / image.mask.size)} {text}" for text, n in shares.items() if n]
+    return ", ".join(texts)
 
 
 def _depth(run: Run, address: str, index: int, wall: Wall) -> _Drawing:
@@ -310,7 +310,7 @@ def frame_words(frame: WallFrame) -> str:
 def embedded_products(run: Run, type_name: str) -> tuple[tuple[str, str], ...]:
     """Cells and ports whose product of a type lies in the record; equal products once.
 
-    Repeats of a random method are left out: they are alike but for their numbers.
+    Repeats of a random method are left out: they differ in their numbers only.
     """
     found: dict[str, tuple[str, str]] = {}
     for address, cell in run.cells.items():

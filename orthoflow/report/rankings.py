@@ -13,7 +13,7 @@ from orthoflow.records.runs import is_rounding
 # Without repeats of both nobody knows how far values of the same method lie apart, nor where they
 # all give one value. What is nearer than this share of the best is no difference then; times and
 # memory scatter more, times from run to run by so much (docs/performance.md), whatever their
-# repeats in one run say.
+# repeats in one run suggest.
 _ALIKE_SHARE: Final = 0.01
 _ALIKE_COST_SHARES: Final = {"s": 0.3, "MiB": 0.1}
 FLAG: Final = "yes/no"

@@ -17,7 +17,7 @@ from markupsafe import Markup, escape
 from orthoflow.records import COSTS
 from orthoflow.records.runs import Run
 from orthoflow.report.diagrams import BOX, run_diagram
-from orthoflow.report.environments import told_apart
+from orthoflow.report.environments import distinct_words
 from orthoflow.report.numbers import number, number_with_unit
 from orthoflow.report.pictures import DIVERGING
 from orthoflow.report.rankings import BETTER
@@ -42,7 +42,7 @@ def environment() -> jinja2.Environment:
     environment.filters |= {
         "with_unit": number_with_unit,
         "number": number,
-        "environments": told_apart,
+        "environments": distinct_words,
         "cited": cited,
         # A long name or address may be broken behind its underscores, and before its variants.
         "breakable": lambda name: Markup(re.sub(r"([_@,])", r"\1<wbr>", str(escape(shown(name))))),

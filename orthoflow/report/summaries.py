@@ -1,4 +1,4 @@
-"""What the page says in numbers and words, taken from the record."""
+"""Numbers and sentences of the page, taken from the record."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Answer:
 
 @dataclass(frozen=True, kw_only=True)
 class Limit:
-    """A sentence on what limits the result, the cells that say it, and whether they failed."""
+    """A sentence on what limits the result, its cells, and whether they failed."""
 
     text: str
     cells: tuple[str, ...]
@@ -49,7 +49,7 @@ class Limit:
 
 
 def headline_keys(cells: Iterable[RecordedCell]) -> list[tuple[str, str]]:
-    """Return step and metric of the numbers that say how good results are, as methods declare.
+    """Return step and metric of the headline numbers, as methods declare them.
 
     What checks results stands first, then the last of the other steps; in a step in the order in
     which its method reports. Of a metric that several steps report the last step's counts: it takes
@@ -139,7 +139,7 @@ def limits(run: Run, on_show: str = "") -> tuple[Limit, ...]:
         found[1] for file in run.record.published if (found := _IMAGE.search(file.path)) is not None
     }
     shown = set(_PLANE.findall(on_show))
-    # What a later orientation leaves open of the photos it says itself.
+    # A later orientation reports by itself which photos it leaves open.
     oriented = [
         cell.address
         for cell in by_baseline

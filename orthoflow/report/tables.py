@@ -103,14 +103,14 @@ class PlaneTables:
 
 
 def plane_tables(run: Run) -> tuple[PlaneTables, ...]:
-    """The planes of every cell that found some; those that print alike once."""
+    """The planes of every cell that found some; equal tables once."""
     found: list[PlaneTables] = []
     places = embedded_products(run, "planes")
     for (address, _), payload in zip(places, run.payloads(places), strict=True):
         planes = Planes.from_payload(payload)
         # Of several sources of sides, how many planes each has.
         counts = Counter(planes.side_source(index) for index in range(len(planes)))
-        told = PlaneTables(
+        tables = PlaneTables(
             cell=address,
             viewpoint=", ".join(
                 f"{source} ({count})" if len(counts) > 1 else source
@@ -124,12 +124,12 @@ def plane_tables(run: Run) -> tuple[PlaneTables, ...]:
         )
         for place, other in enumerate(found):
             if (other.viewpoint, other.planes, other.materials) == (
-                *(told.viewpoint, told.planes, told.materials),
+                *(tables.viewpoint, tables.planes, tables.materials),
             ):
                 found[place] = replace(other, later=(*other.later, address))
                 break
         else:
-            found.append(told)
+            found.append(tables)
     return tuple(found)
 
 

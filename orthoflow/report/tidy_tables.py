@@ -81,7 +81,7 @@ def combination_rows(run: Run) -> Iterator[Sequence[Value]]:
 def dataset_rows(run: Run) -> Iterator[Sequence[Value]]:
     """Return a header, then a row per metric and combination of what holds over all datasets.
 
-    What nobody knows, p of two datasets say, is an empty cell.
+    Unknown values, such as p for two datasets, are empty cells.
     """
     yield (
         *("step", "metric", "combination", "against", "datasets", "failed", "absent"),

@@ -9,7 +9,7 @@ import pytest
 
 from orthoflow.records import RecordedEnvironment
 from orthoflow.report import environments as module
-from orthoflow.report.environments import alike_environments
+from orthoflow.report.environments import group_environments
 from tests.report_runs import HeldRun, cell, environment, record
 
 FIRST = environment()
@@ -21,7 +21,7 @@ def packages(name: str, **versions: str) -> RecordedEnvironment:
 
 def first_alike(*others: RecordedEnvironment) -> list[str]:
     told = record([cell("a")], environments=(FIRST, *others))
-    return [*alike_environments([HeldRun(path=Path("r.h5"), record=told)]).first.values()]
+    return [*group_environments([HeldRun(path=Path("r.h5"), record=told)]).first.values()]
 
 
 @pytest.mark.parametrize(

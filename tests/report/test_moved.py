@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from orthoflow.records.compare import ComparedMetric, Pair
-from orthoflow.report.differences import alike_texts, moved_first, without_seeds
+from orthoflow.report.differences import grouped_texts, moved_first, without_seeds
 from tests.compared_runs import compared
 
 
@@ -76,7 +76,7 @@ def test_steps_that_one_run_alone_has_are_one_row_per_step_whatever_their_seeds(
         replace(shared, cell=cell, name=step, left=replace(shared.either, seed=seed), right=None)
         for seed, (cell, step) in enumerate(cells.items())
     ]
-    rows = alike_texts(without_seeds(pairs), str, cells)
+    rows = grouped_texts(without_seeds(pairs), str, cells)
     assert [row.label(cells) for row in rows] == ["plane, 2 steps", "wall, 2 steps"]
     assert "seed" in str(pairs[0].left)
     assert not any("seed" in str(row.pair.left) for row in rows)

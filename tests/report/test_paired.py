@@ -12,7 +12,7 @@ from scipy.stats import wilcoxon
 
 from orthoflow.records.runs import MetricRow
 from orthoflow.report import paired as module
-from orthoflow.report.environments import AlikeEnvironments
+from orthoflow.report.environments import EnvironmentGroups
 from orthoflow.report.paired import (
     MethodOverDatasets,
     MetricOverDatasets,
@@ -20,7 +20,7 @@ from orthoflow.report.paired import (
     paired_differences,
 )
 
-ALIKE = AlikeEnvironments(first={}, words={})
+ALIKE = EnvironmentGroups(first={}, words={})
 
 
 def worse(*values: float) -> dict[str, float]:
@@ -119,14 +119,14 @@ def leading(n_methods: int, p: float) -> Any:
 
 
 def test_who_leads_is_said_of_six_at_most() -> None:
-    judged_not = SimpleNamespace(column=column(""), told=leading(2, 0.01).told)
+    judged_not = SimpleNamespace(column=column(""), distinct=leading(2, 0.01).distinct)
     assert module.who_leads([judged_not], 9) == ""
     assert module.who_leads([leading(0, 0.01)], 9) == ""
     few = module.who_leads([leading(2, math.nan)], 5)
     assert "5 datasets are too few for a test" in few
     assert "too few of the datasets differ" in module.who_leads([leading(2, math.nan)], 6)
     apart = leading(2, math.nan)
-    apart.told[1].n_unlike = 6
+    apart.distinct[1].n_unlike = 6
     assert "environments that are not alike" in module.who_leads([apart], 6)
     assert module.who_leads([leading(2, 0.051)] * 3, 9) == (
         "Nobody is shown to lead in any of 3 numbers (p below 0.05 after Holm's correction)"
@@ -298,7 +298,7 @@ def test_what_does_not_hang_on_a_step_has_one_row_for_all_its_variants() -> None
 
     def told(*rows: MethodOverDatasets) -> list[tuple[str, str]]:
         metric = MetricOverDatasets(column=column("lower"), methods=rows)
-        return [(one.name, one.against) for one in metric.told]
+        return [(one.name, one.against) for one in metric.distinct]
 
     every = [row(plane, corner) for plane in "ab" for corner in "yx"]
     assert told(*every) == [("plane=a", ""), ("plane=b", "plane=a")]
