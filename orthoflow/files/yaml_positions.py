@@ -61,7 +61,7 @@ class Document:
 
     Attributes:
         value: of the whole document.
-        places: location -> position of the value there; `()` is the whole document.
+        places: location -> position of the value there; at least of `()`, the whole document.
         keys: location -> position of the key.
     """
 
@@ -78,7 +78,8 @@ class Document:
             if is_found and isinstance(part, int) and not isinstance(value, list):
                 continue
             stated.append(part)
-            is_found = is_found and (*found, part) in self.places
+            parts = range(len(value)) if isinstance(value, list) else value
+            is_found = is_found and isinstance(value, dict | list) and part in parts  # type: ignore[operator]
             if is_found:
                 value, found = value[part], (*found, part)  # type: ignore[index]
         return tuple(stated), found
@@ -94,6 +95,9 @@ class Document:
     def position(self, location: Location, *, at_key: bool = False) -> Position:
         """Return the position of a value, or of its key; of a missing one what is around it."""
         _, found = self.resolve(location)
+        # Values from Python have the place of the whole alone.
+        while found not in self.places:
+            found = found[:-1]
         return (at_key and self.keys.get(found)) or self.places[found]
 
 

@@ -18,7 +18,7 @@ from orthoflow.report.browsing import (
     RunSummary,
     differing_facts,
     distinct_facts,
-    distinct_words,
+    distinguishing,
     key_metrics,
     run_folders,
     summaries,
@@ -79,7 +79,7 @@ def test_a_name_that_is_not_the_same_thing_in_all_runs_is_told_with_its_step() -
         labelled(rms_mm="of the check", check__rms_mm="of the check", plane__rms_mm="of the plane"),
         labelled(other__rms_mm="of something that nobody shows", n="points"),
     ]
-    assert list(distinct_words(["n", "rms_mm", "unknown"], runs)) == [
+    assert list(distinguishing(["n", "rms_mm", "unknown"], runs)) == [
         *("n", "plane.rms_mm", "check.rms_mm", "unknown"),
     ]
 

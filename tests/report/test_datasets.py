@@ -203,7 +203,7 @@ def test_a_dataset_that_the_run_was_broken_off_before_is_not_complete(
     assert table.rows[-1].missing == ("plane@data=court,plane=slow", "plane@data=court,plane=quick")
     write_report([broken_off], tmp_path / "report.html", go_on="orthoflow run x")
     page = (tmp_path / "report.html").read_text()
-    assert "broken off before plane@data=court,plane=slow (and 1 more)" in page
+    assert "interrupted before plane@data=court,plane=slow (and 1 more)" in page
 
 
 def test_a_part_of_a_run_is_its_dataset_and_what_all_share(rooms: Run) -> None:

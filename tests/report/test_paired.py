@@ -115,7 +115,7 @@ def leading(n_methods: int, p: float) -> Any:
         )
         for k in range(n_methods + 1)
     ]
-    return SimpleNamespace(column=column("lower"), told=methods)
+    return SimpleNamespace(column=column("lower"), distinct=methods)
 
 
 def test_who_leads_is_said_of_six_at_most() -> None:
@@ -127,7 +127,7 @@ def test_who_leads_is_said_of_six_at_most() -> None:
     assert "too few of the datasets differ" in module.who_leads([leading(2, math.nan)], 6)
     apart = leading(2, math.nan)
     apart.distinct[1].n_unlike = 6
-    assert "environments that are not alike" in module.who_leads([apart], 6)
+    assert "values of different environments" in module.who_leads([apart], 6)
     assert module.who_leads([leading(2, 0.051)] * 3, 9) == (
         "Nobody is shown to lead in any of 3 numbers (p below 0.05 after Holm's correction)"
     )
@@ -203,7 +203,7 @@ def column(better: str, metric: str = "rms_mm", unit: str = "mm") -> MetricRow:
         cell="check",
         step="check",
         method="inspect.truth",
-        metric=metric,
+        name=metric,
         value=0.0,
         unit=unit,
         label="error",

@@ -330,7 +330,7 @@ def offset_column(step: str) -> MetricRow:
         cell=step,
         step=step,
         method="",
-        metric="plane_offset_mm",
+        name="plane_offset_mm",
         value=0.0,
         unit="mm",
         better="lower",
