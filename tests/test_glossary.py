@@ -40,20 +40,20 @@ _TEMPLATE_CODE: Final = re.compile(r"\{[{%#].*?[}%#]\}|<(?:script|style).*?</|<[
 # only fall; a package without one holds none.
 STILL_TO_CLEAN: Final = {
     "orthoflow/cli": 9,
-    "orthoflow/engine": 20,
-    "orthoflow/files": 42,
+    "orthoflow/engine": 2,
+    "orthoflow/files": 5,
     "orthoflow/geometry": 5,
-    "orthoflow/products": 6,
+    "orthoflow/products": 2,
     "orthoflow/report": 4,
     "plugins/orthoflow_plugins": 4,
-    "plugins/orthoflow_plugins/inspect": 9,
+    "plugins/orthoflow_plugins/inspect": 5,
     "plugins/orthoflow_plugins/match": 52,
     "plugins/orthoflow_plugins/mosaic": 6,
     "plugins/orthoflow_plugins/orient": 48,
     "plugins/orthoflow_plugins/ortho": 8,
     "plugins/orthoflow_plugins/plane": 1,
     "plugins/orthoflow_plugins/raster": 5,
-    "plugins/orthoflow_plugins/read": 33,
+    "plugins/orthoflow_plugins/read": 4,
     "provenance/orthoflow_provenance": 1,
 }
 

@@ -101,7 +101,7 @@ def run_attempt(task: Task, name: str, topic: str, retries: int, methods: str) -
 def describe_loss(who: str, times: int) -> str:
     """Report that a task was given up because workers were lost."""
     lost = "its worker was lost" if times == 1 else f"its workers were lost, {times} in a row"
-    return f"{who} was given up: {lost}; the logs of the workers may say why"
+    return f"{who} was given up: {lost}; the logs of the workers may state why"
 
 
 def _result(executor: LocalExecutor, home: Path, worker: Worker, name: str) -> CellResult:

@@ -6,7 +6,7 @@ is p2 and p1 in OpenCV (Metashape Pro manual, appendix on camera models). A came
 from it to the chunk, whose own transform leads to the world: of a chunk with a geographic or
 projected coordinate system to geocentric metres of its datum, from where poses are converted into
 that system.
-The cameras of a rig other than its master have no matrix but the master's, and their sensor says
+The cameras of a rig other than its master have no matrix but the master's, and their sensor states
 where it stands in the master's axes.
 """
 

@@ -673,9 +673,8 @@ def _doubt(what: str, value_mm: float | None, possible_mm: tuple[float, float]) 
     shortest, longest = possible_mm
     if value_mm is None or shortest <= value_mm <= longest:
         return ""
-    return (
-        f"EXIF says a {what} of {value_mm:g} mm, which no lens has ({shortest:g} to {longest:g} mm)"
-    )
+    limits = f"{shortest:g} to {longest:g} mm"
+    return f"EXIF states a {what} of {value_mm:g} mm, which no lens has ({limits})"
 
 
 def _believed_focal_length(exif: Exif, width: int, height: int) -> FocalLength:
@@ -700,7 +699,7 @@ def _believed_focal_length(exif: Exif, width: int, height: int) -> FocalLength:
         return FocalLength(value_px=by_equivalent, reason="35 mm equivalent over the diagonal")
     return FocalLength(
         value_px=None,
-        reason=f"EXIF says {exif.focal_mm:g} mm but neither the pixel pitch nor the 35 mm "
+        reason=f"EXIF states {exif.focal_mm:g} mm but neither the pixel pitch nor the 35 mm "
         "equivalent",
     )
 

@@ -89,7 +89,7 @@ TIE_COLUMNS: Final = (
     "residual_u_px",
     "residual_v_px",
     "sigma_px",
-    # A comment line would break plain CSV readers, so the header says it in a column of its own.
+    # A comment line would break plain CSV readers, so the header states it in a column of its own.
     "opencv_pixel_convention",
 )
 
@@ -331,9 +331,9 @@ def _publish_raster(
         stem: path without a suffix.
         values: (rows, cols).
         wall: whose raster it is.
-        about: what the sidecar says of the wall besides.
+        about: what the sidecar states of the wall besides.
         content: what the values are.
-        tags: of the GeoTIFF: the unit, and what else it says of the values.
+        tags: of the GeoTIFF: the unit, and what else it states of the values.
         digest: of the product.
     """
     all_tags = raster_tags(wall.frame, digest=digest, name=wall.name, content=content, extra=tags)

@@ -104,7 +104,7 @@ def read_sidecar(path: Path) -> dict[str, object]:
 
 
 def sidecar_of(text: str, name: str) -> dict[str, object]:
-    """Read the text of a JSON object that says where a raster lies.
+    """Read the text of a JSON object that states where a raster lies.
 
     Raises:
         InputError: it is something else, nested too deeply, or has numbers of too many digits.
@@ -136,7 +136,7 @@ def frame_of_raster(
     Args:
         content: `origin_world`, `u_world`, `v_world` (down), `normal_world` of that plane, as in
             the sidecars that orthoflow writes; X counts along u and Y against v from what
-            `x_of_left_m` and `height_of_top_m` (or `y_of_top_m`) say of that origin, or without
+            `x_of_left_m` and `height_of_top_m` (or `y_of_top_m`) state of that origin, or without
             them from 0, or with `map_crs` from its place in the map.
         raster: where the GeoTIFF lies.
         shape: its rows and columns.
@@ -192,7 +192,7 @@ def frame_of_raster(
 
 
 def placed_raster(path: Path) -> tuple[WallFrame, dict[str, object]]:
-    """Return where a published GeoTIFF lies, and the sidecar beside it that says so.
+    """Return where a published GeoTIFF lies, and the sidecar beside it that states so.
 
     Raises:
         InputError: one of them cannot be read.
@@ -315,7 +315,7 @@ class OrthoFile:
         path: its GeoTIFF.
         about: its wall, size and accuracy.
         frame: where its cells lie.
-        digest: of the product, empty where the sidecar does not say it.
+        digest: of the product, empty where the sidecar does not state it.
     """
 
     path: Path

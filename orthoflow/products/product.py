@@ -67,7 +67,7 @@ class Product:
     """Base of all product types; subclasses are frozen dataclasses.
 
     Fields may be numpy arrays, bytes, JSON values, members of an `IntEnum`, other dataclasses and
-    tuples of these; each may be None where its annotation says so. `None` means absent.
+    tuples of these; each may be None where its annotation states so. `None` means absent.
 
     Attributes:
         type_name: identity in workflows, store and record; never changes.

@@ -176,7 +176,7 @@ def test_a_file_without_photos_is_refused(tmp_path: Path) -> None:
 
 def test_a_size_that_is_not_the_photos_is_refused(tmp_path: Path) -> None:
     path = written(tmp_path, pinhole(numbers=NUMBERS | {"imageWidth": 65}))
-    with pytest.raises(InputError, match="has 64 x 48 pixels, but its file says 65 x 48"):
+    with pytest.raises(InputError, match="has 64 x 48 pixels, but its file states 65 x 48"):
         read(path)
 
 

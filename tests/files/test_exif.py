@@ -182,7 +182,7 @@ def test_the_focal_length_follows_the_stored_array(
 def test_a_focal_length_that_no_lens_has_is_not_multiplied_by_the_pitch(said_mm: float) -> None:
     focal = focal_length(exif_of(focal_mm=said_mm, resolution_px_per_mm=160), 6000, 4000)
     assert focal.value_px is None
-    assert f"EXIF says a focal length of {said_mm:g} mm, which no lens has" in focal.doubt
+    assert f"EXIF states a focal length of {said_mm:g} mm, which no lens has" in focal.doubt
     both = exif_of(focal_mm=said_mm, focal_35mm=28, resolution_px_per_mm=160)
     assert focal_length(both, 1500, 1000).value_px == pytest.approx(28 / 36 * 1500, rel=1e-12)
 
@@ -247,7 +247,7 @@ def test_a_pitch_belongs_to_a_sensor_that_there_is(px_per_mm: float, is_sensor: 
     assert (found.value_px is not None) is is_sensor
     if not is_sensor:
         assert found.reason == (
-            "EXIF says 30 mm but neither the pixel pitch nor the 35 mm equivalent"
+            "EXIF states 30 mm but neither the pixel pitch nor the 35 mm equivalent"
         )
 
 

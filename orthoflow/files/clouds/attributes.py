@@ -396,7 +396,7 @@ def describe_cloud(path: Path, attributed: AttributedCloud, name: str, n_points:
         "points": n_points,
         "points_of_the_cloud": len(cloud),
         "product_digest": attributed.name,
-        "coordinates": "metres, as the scan has them; z or another axis is up as `up` says",
+        "coordinates": "metres, as the scan has them; z or another axis is up as `up` states",
         "up": numbers(cloud.up),
         "origin_world": numbers(cloud.origin),
         "coordinate_system_wkt": attributed.crs_wkt or None,

@@ -83,7 +83,7 @@ def find_format(path: Path) -> Format:
     """Return the format of a point file: by its content if that is certain, else by its suffix.
 
     Raises:
-        InputError: the file is missing, empty, not what its suffix says, or of an unknown format.
+        InputError: the file is missing, empty, not what its suffix states, or of an unknown format.
     """
     if not path.is_file():
         found = "a folder" if path.is_dir() else "nothing"

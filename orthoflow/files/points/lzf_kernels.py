@@ -14,7 +14,7 @@ def decompress_lzf(packed: NDArray[np.uint8], plain: NDArray[np.uint8]) -> int:
 
     Args:
         packed: compressed bytes.
-        plain: array to fill, as long as the header says.
+        plain: array to fill, as long as the header states.
 
     Returns:
         Bytes written, or -1 when the data are damaged or do not fit.

@@ -222,7 +222,7 @@ def _unpacked(packed: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def cut_off(path: Path, what: str, found: str, expected: str) -> InputError:
-    """Return the error for a file that ends before its header says it does."""
+    """Return the error for a file that ends before the length that its header states."""
     return InputError(
         f"{path.name} is cut off: its {what} holds {found}, its header states {expected}; copy or "
         "export it again"

@@ -1,6 +1,6 @@
 """A pyramid of tiles of one orthoimage, as Deep Zoom images have it, made band by band.
 
-`NAME.dzi` says the size, `NAME_files/LEVEL/COLUMN_ROW.webp` are the tiles: the last level has the
+`NAME.dzi` states the size, `NAME_files/LEVEL/COLUMN_ROW.webp` are the tiles: the last level has the
 cells as they are, each before it half as many a side, level 0 is one pixel. Tiles are transparent
 where the orthoimage is empty. The page beside them pans, zooms and measures: one file, no server,
 nothing from elsewhere.

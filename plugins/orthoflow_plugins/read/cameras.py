@@ -36,9 +36,9 @@ NOT_ORIENTED: Final = DiagnosticSpec(
 class ReadCameras(Method):
     """Read poses and lenses: `cameras.json`, COLMAP, Metashape, Bundler, RealityCapture.
 
-    They must be in the frame of the scan; `orient.given` says when they show no wall. Photos are
+    They must be in the frame of the scan; `orient.given` reports those without a wall. Photos are
     found by their file names, with or without suffix, and by their folders where several have one
-    name. A photo that the files say nothing of, that was disabled there, or whose lens differs
+    name. A photo that the files do not mention, that was disabled there, or whose lens differs
     from OpenCV's models by more than half a pixel, is not oriented, and the reason is stated; what
     differs by less is reported.
 
@@ -78,7 +78,7 @@ class ReadCameras(Method):
     )
 
     class Params(MethodParams):
-        """What the files do not say themselves."""
+        """What the files do not state."""
 
         unit: Unit = Field(
             "m", description="Unit of the files' coordinates; the poses are in metres."

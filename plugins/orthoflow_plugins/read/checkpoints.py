@@ -38,7 +38,7 @@ class ReadCheckpoints(Method):
     citations: ClassVar[tuple[str, ...]] = ()
 
     class Params(MethodParams):
-        """What the files do not say themselves."""
+        """What the files do not state."""
 
         unit: Unit = Field(
             "m", description="Unit of x, y, z in the files; the points are in metres."

@@ -195,7 +195,7 @@ def _largest_scan(cloud: PointCloud) -> tuple[int, NDArray[np.int64]]:
 
 
 def _station(cloud: PointCloud, scan: int) -> NDArray[np.float64] | None:
-    """Where a scan was taken from, as an offset (3,); None where the files do not say."""
+    """Where a scan was taken from, as an offset (3,); None where the files do not state."""
     stations = cloud.stations
     if stations is None or scan >= len(stations) or cloud.stations_source == "view_from":
         return None

@@ -28,12 +28,12 @@ _IMAGES: Final = (".tif", ".tiff")
 class ReadOrthoimage(Method):
     """Read orthoimages from GeoTIFF files whose X and Y are metres in the plane of a wall.
 
-    Where that plane lies in the world says a JSON file of the same name among the input's files
+    A JSON file of the same name states where that plane lies, among the input's files
     (`wall.tif`, `wall.json`), with `origin_world`, `u_world`, `v_world`, `normal_world` as beside
     every raster that orthoflow writes: a copy of `wall_0_intensity.json` will do. Files of
     orthoflow itself need none. X and Y of the GeoTIFF are those of orthoflow's own: at that origin
     they are `x_of_left_m` and `height_of_top_m`, 0 where the JSON file has neither. So another
-    size, cell size or part of the wall is no obstacle. `wall` in the JSON file says which wall
+    size, cell size or part of the wall is no obstacle. `wall` in the JSON file states which wall
     it is of: the place of its plane in `planes.json`, which names of files have too.
     """
 
@@ -47,7 +47,7 @@ class ReadOrthoimage(Method):
     citations: ClassVar[tuple[str, ...]] = ()
 
     class Params(MethodParams):
-        """What the files do not say themselves."""
+        """What the files do not state."""
 
         wall: int = Field(
             0,
@@ -127,7 +127,7 @@ def _read(path: Path, among: Sequence[Path], wall: int) -> Orthoimage:
 
 
 def _place(path: Path, among: Sequence[Path], raster: RasterFile) -> dict[str, object]:
-    """What the JSON file beside an image says, or the tag that orthoflow writes."""
+    """What the JSON file beside an image states, or the tag that orthoflow writes."""
     for other in among:
         if other.stem == path.stem and other.suffix.lower() == ".json":
             return read_sidecar(other)

@@ -1,4 +1,4 @@
-"""`read.photos`: a folder of photographs, with what EXIF and a calibration say of their cameras."""
+"""`read.photos`: a folder of photographs, with their cameras from EXIF and a calibration."""
 
 from __future__ import annotations
 
@@ -111,8 +111,8 @@ class ReadPhotos(Method):
 
     A panorama, in an E57 file or named in `panoramas`, becomes six photos, the faces of a cube, as
     PNG; their lenses are exact. So does a photo whose lens is a fisheye (OpenCV's model), as the
-    calibration or the given cameras say, but of faces only what it shows; and what the given
-    cameras say is a panorama.
+    calibration or the given cameras state, but of faces only what it shows; and what the given
+    cameras state is a panorama.
 
     The files' bytes are kept and never encoded again. Pixels are those of the stored array: the
     EXIF orientation is written down, not applied. Of a TIFF with several pages the largest that is
@@ -146,7 +146,7 @@ class ReadPhotos(Method):
     )
 
     class Params(MethodParams):
-        """What files and calibration do not say."""
+        """What files and calibration do not state."""
 
         panoramas: tuple[str, ...] = Field(
             (),
@@ -229,7 +229,7 @@ class _Source:
     Attributes:
         name: of the photo.
         content: a file, the bytes of one inside an E57 file, or a face of a cube.
-        lens: what that file says of its lens.
+        lens: what that file states of its lens.
         whole: name of the photo that it is a face of, whose lens nobody else knows; or "".
         folder: of the file, within the input.
     """
@@ -289,7 +289,7 @@ class _Cubes:
         return [_Source(name=image.name, content=image.content, lens=lens)]
 
     def _lens(self, name: str, folder: str) -> WideLens | None:
-        """Return the lens of a wide photo: as the cameras say, else the calibration."""
+        """Return the lens of a wide photo: of the given cameras, else of the calibration."""
         camera = None if self.given is None else self.given.of_photo(name, folder)
         if camera is not None and isinstance(camera.lens, WideLens):
             return camera.lens
@@ -328,7 +328,7 @@ class _Cubes:
         ]
 
 
-# Of a photo that the user says is one, of any size.
+# Of a photo that the user states is one, of any size.
 _PANORAMA: Final = PanoramaLens(width=0, height=0)
 
 
@@ -473,7 +473,7 @@ def _read_photo(
         intrinsics = calibrated or intrinsics
     if intrinsics is not None and (intrinsics.width, intrinsics.height) != (width, height):
         raise InputError(
-            f"photo {name} has {width} x {height} pixels, but its file says "
+            f"photo {name} has {width} x {height} pixels, but its file states "
             f"{intrinsics.width} x {intrinsics.height}: export it again"
         )
     photo = Photo(

@@ -262,7 +262,7 @@ def report_precision(
 
 
 def unit_and_source(count: ScanCount, unit: str | None) -> tuple[str, str]:
-    """Unit of a scan and where it is from; `unit` is what the user says, or None."""
+    """Unit of a scan and where it is from; `unit` is what the user states, or None."""
     if unit is not None:
         return unit, "cloud.unit"
     stated = count.scan.unit

@@ -81,7 +81,7 @@ def choose_scales(
     Args:
         ranges: `robust_range` of each scan's data; None without intensity.
         stated: limits that each states.
-        intensity_max: what the user says is full intensity, or None.
+        intensity_max: what the user states is full intensity, or None.
 
     Returns:
         The user's; else the stated limits, where the data keep to them and take more than a small

@@ -84,7 +84,7 @@ class ReadScan(Method):
     )
 
     class Params(MethodParams):
-        """What the files do not say themselves."""
+        """What the files do not state."""
 
         up: UpDirection = Field("z", description="World direction that is up in the files.")
         unit: Unit | None = Field(

@@ -37,7 +37,7 @@ class ReadTies(Method):
     citations: ClassVar[tuple[str, ...]] = ()
 
     class Params(MethodParams):
-        """What the files do not say themselves."""
+        """What the files do not state."""
 
         unit: Unit = Field("m", description="Unit of x, y, z in the files; the ties are in metres.")
         sigma_px: float = Field(
