@@ -1,65 +1,29 @@
-"""Covariances that remain valid when observations have common errors."""
+"""Covariances of adjustments whose points have errors in common with their neighbours."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-# The correlation lengths that are tried, as shares of the extent of what a photo sees. Long-range
-# errors are absorbed by the pose and leave almost no trace in the residuals, but errors of
-# registration, of a scanner path or of stereo do not end where residuals cease to show them.
-_PARTS: Final = ((0.03,), (0.1,), (0.25, 0.6, 1.2))
-# Products of pairs of more points add no information.
-_MAX_POINTS: Final = 280
-_MIN_POINTS: Final = 30
-# An error counts as common if it is this many times larger than chance makes it for independent
-# errors.
-_MIN_SIGNIFICANCE: Final = 5.0
-# Kinds of errors whose explanations differ by less than this are not distinguished.
-_MIN_OWN_SHARE: Final = 0.02
-
-
-def honest_covariance(
-    jacobian: NDArray[np.float64],
-    residuals: NDArray[np.float64],
-    cofactors: NDArray[np.float64],
-    groups: NDArray[np.intp] | None,
-    *,
-    sigma0: float,
-) -> NDArray[np.float64]:
-    """Return a covariance that does not treat the points of a group as independent.
-
-    The pose is adjusted, to first order, without each group in turn (delete-group jackknife: the
-    CR3 estimate of Bell & McCaffrey 2002). If these poses differ by more than the residuals
-    explain, their scatter is the covariance; it is never smaller than what the residuals explain.
-
-    Args:
-        jacobian: (n, 2, p) derivatives of each point's two observations, in standard deviations.
-        residuals: (n, 2) observed - computed, in standard deviations.
-        cofactors: (p, p) inverse of the normal matrix, prior included.
-        groups: (n,) group of each point, or None if all are independent.
-        sigma0: standard deviation of unit weight.
-    """
-    plain = sigma0**2 * cofactors
-    if groups is None:
-        return plain
-    names, group = np.unique(groups, return_inverse=True)
-    n_free = len(plain)
-    if names.size <= n_free:
-        return plain
-    order = np.argsort(group, kind="stable")
-    starts = np.flatnonzero(np.diff(group[order], prepend=-1))
-    jacobian, residuals = jacobian[order], residuals[order]
-    pulls = np.add.reduceat(np.einsum("nij,ni->nj", jacobian, residuals), starts)
-    normals = np.add.reduceat(np.einsum("nij,nik->njk", jacobian, jacobian), starts)
-    left_out = _inverses(np.eye(n_free) - normals @ cofactors) @ pulls[:, :, None]
-    moves = (cofactors @ left_out)[:, :, 0]
-    return widened_by_moves(plain, moves)
+# Correlation lengths, as shares of the extent of what a photo sees: of errors that are rough
+# (exponential correlation: matching, structure, steps between scans) and of smooth ones (Gaussian:
+# bending, drift of a path, stereo). Shorter ones are as good as independent, and longer ones are
+# shifts and tilts of the whole, which no residual shows.
+_ROUGH: Final = (0.04, 0.15, 0.5, 1.5)
+_SMOOTH: Final = (0.05, 0.15, 0.4, 1.0)
+# Standard deviation of the common error over that of the independent one: equally likely on a
+# logarithmic scale beforehand, but for an exponential decay at 1.
+_RATIOS: Final = np.geomspace(0.003, 10.0, 25)
+# Neighbouring points of a photo are taken together, in as many cells at most.
+_MAX_CELLS: Final = 130
+_MAX_CELLS_OF_SEVERAL: Final = 280
+_FINEST_CELL: Final = 0.02
+_COARSER: Final = 1.15
+# Directions of the residuals that an adjustment absorbs, as share of their variance.
+_ABSORBED: Final = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +39,6 @@ class AdjustedPoints:
         pulls: (n, p, 3) effect of an error of the position on the normal equations, per metre.
         towards: (n, 3) unit vectors out of the surface: errors of a cloud are largest in depth.
         cofactors: (p, p) inverse of the normal matrix.
-        weight: number of points of the adjustment that each point represents.
     """
 
     photo: NDArray[np.intp]
@@ -86,23 +49,6 @@ class AdjustedPoints:
     pulls: NDArray[np.float64]
     towards: NDArray[np.float64]
     cofactors: NDArray[np.float64]
-    weight: float = 1.0
-
-    def thinned(self) -> AdjustedPoints:
-        """Return evenly spread points, as many as the estimate of common errors needs."""
-        n_points = len(self.places)
-        chosen = np.unique(np.linspace(0, n_points - 1, min(n_points, _MAX_POINTS)).astype(int))
-        return AdjustedPoints(
-            photo=self.photo[chosen],
-            places=self.places[chosen],
-            residuals=self.residuals[chosen],
-            jacobian=self.jacobian[chosen],
-            by_place=self.by_place[chosen],
-            pulls=self.pulls[chosen],
-            towards=self.towards[chosen],
-            cofactors=self.cofactors,
-            weight=n_points / len(chosen),
-        )
 
     @property
     def extent_m(self) -> float:
@@ -115,99 +61,117 @@ class AdjustedPoints:
         return 2.0 * float(np.median(reaches))
 
 
-@dataclass(frozen=True, kw_only=True)
-class CommonError:
-    """An error common to neighbouring points: a sum of parts with different correlation lengths.
+def honest_covariance(points: AdjustedPoints, sigma0: float) -> NDArray[np.float64]:
+    """Return the covariance (p, p) of an adjustment whose points may have common errors.
 
-    Attributes:
-        of_places_m: standard deviation of each coordinate of a position, common to all photos, for
-            each part; empty if points have independent errors.
-        of_depths_m: additional standard deviation of depth.
-        of_photos_m: standard deviation of what only the points of one photo have in common, e.g.
-            from its lens or its matching.
-        lengths_m: correlation lengths of the parts; the correlation is the sum of exp(-distance /
-            length).
-        sigma_alone: standard deviation of the independent error of each observation, in units of
-            its stated one.
+    Each residual has an independent error and one in common with its neighbours: of the places,
+    which all photos share, of their depth alone, or of one photo (its lens, its matching). What an
+    adjustment absorbs of a common error leaves no residual, so that its size and its correlation
+    length are never known for certain. No test decides whether there is one: the covariance is a
+    mean over all kinds, lengths and sizes, each weighted by the likelihood of the residuals that
+    remain after the adjustment (restricted likelihood: Harville 1977,
+    doi:10.1080/01621459.1977.10480998; averaged: Hoeting et al. 1999, doi:10.1214/ss/1009212519).
+
+    A shift of all places at once leaves no residual at all, and is not stated.
+
+    Args:
+        points: those whose places are known.
+        sigma0: standard deviation of unit weight of the whole adjustment. Its variance counts as
+            independent: ties between photos have no part in errors of places.
     """
+    is_one, extent_m = not points.photo.any(), max(points.extent_m, 1e-9)
+    cells = _cells(points, extent_m, _MAX_CELLS if is_one else _MAX_CELLS_OF_SEVERAL)
+    counts = np.bincount(cells)
+    n_cells = len(counts)
 
-    of_places_m: tuple[float, ...] = ()
-    of_depths_m: tuple[float, ...] = ()
-    of_photos_m: tuple[float, ...] = ()
-    lengths_m: tuple[tuple[float, ...], ...] = ()
-    sigma_alone: float
+    def means(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        sums = np.zeros((n_cells, *values.shape[1:]))
+        np.add.at(sums, cells, values)
+        return sums / counts.reshape(-1, *[1] * (values.ndim - 1))
 
-    @property
-    def is_any(self) -> bool:
-        """Whether points have a common error at all."""
-        return any(self.of_places_m + self.of_depths_m + self.of_photos_m)
+    # Means in their own standard deviations, were all errors independent.
+    roots = np.sqrt(counts)[:, None, None]
+    residuals = means(points.residuals)
+    scatter = float(((points.residuals - residuals[cells]) ** 2).sum())
+    n_scattered = 2 * (len(cells) - n_cells)
+    jacobian = (roots * means(points.jacobian)).reshape(2 * n_cells, -1)
+    by_place = roots * means(points.by_place)
+    pulls = counts[:, None, None] * means(points.pulls)
+    places, towards, photo = means(points.places), means(points.towards), np.zeros(n_cells)
+    photo[cells] = points.photo
+    moved = jacobian @ points.cofactors
+    shares, axes = np.linalg.eigh(np.eye(2 * n_cells) - moved @ jacobian.T)
+    kept = shares > _ABSORBED
+    whitening = axes[:, kept] / np.sqrt(shares[kept])
+    white = whitening.T @ (roots[:, :, 0] * residuals).ravel()
+    n_free = white.size + n_scattered
 
-
-def common_error(points: AdjustedPoints) -> CommonError:
-    """Estimate the common error of neighbouring points from the products of their residuals.
-
-    An adjustment absorbs a part of such an error; the part grows with the correlation length and
-    with the number of photos that see the same places. Expected products are therefore those of
-    residuals after the adjustment. The products of all pairs, also of points in different photos,
-    are explained by independent errors and by common ones of each kind and length (least squares of
-    variance components, MINQUE: Rao 1971, doi:10.1016/0047-259X(71)90001-7).
-    """
-    from scipy.optimize import nnls  # noqa: PLC0415 - most who load this module adjust nothing
-
-    if len(points.places) < _MIN_POINTS:
-        return CommonError(sigma_alone=1.0)
-    some, extent_m = points.thinned(), points.extent_m
-    flat = some.jacobian.reshape(-1, some.jacobian.shape[2])
-    moved = flat @ some.cofactors
-    # A point absorbs its own share of an independent error, and of a common error as much as all
-    # points that it represents.
-    expected = [np.eye(len(flat)) - moved @ flat.T]
-    moved *= some.weight
-    for directions, correlations in _kinds(some, [np.multiply(part, extent_m) for part in _PARTS]):
-        products = sum(np.outer(by, by) for by, _ in directions)
+    evidence, variances, errors = [], [], []
+    # Mean square, in standard deviations, of an error of one metre.
+    unit = float((points.by_place**2).sum()) / (2 * len(cells))
+    apart = np.linalg.norm(places[:, None] - places, axis=2) / extent_m
+    correlations = [np.exp(-apart / length) for length in _ROUGH]
+    correlations += [np.exp(-0.5 * (apart / length) ** 2) for length in _SMOOTH]
+    for directions, among in _kinds(by_place, pulls, towards, photo):
+        products = np.asarray(sum(np.outer(by, by) for by, _ in directions))
         for correlation in correlations:
-            errors = products * np.repeat(np.repeat(correlation, 2, 0), 2, 1)
-            taken_up = (
-                sum(by[:, None] * np.repeat(correlation @ pulls, 2, 0) for by, pulls in directions)
-                @ moved.T
+            shared = correlation * among
+            pulled = np.asarray(sum(pull.T @ shared @ pull for _, pull in directions))
+            absorbed = np.asarray(
+                sum(by[:, None] * np.repeat(shared @ pull, 2, axis=0) for by, pull in directions)
             )
-            errors += moved @ _sum_over(directions, correlation) @ moved.T
-            expected.append(errors - taken_up - taken_up.T)
-    layers = np.array([layer.ravel() for layer in expected])
-    scales = np.maximum(np.linalg.norm(layers, axis=1), 1e-300)
-    layers /= scales[:, None]
-    residuals = some.residuals.ravel()
-    normal, right = layers @ layers.T, layers @ np.outer(residuals, residuals).ravel()
-    # An error that does not exist is estimated with at most this deviation.
-    chance = math.sqrt(2.0) * float(residuals @ residuals) / len(residuals)
-    taken = [0]
-    while True:
-        # Added one at a time while each explains more than chance does: fitted together, errors
-        # that do not exist would take shares of the others.
-        solved = np.linalg.solve(normal[np.ix_(taken, taken)], normal[taken])
-        left = np.maximum(1.0 - (normal[taken] * solved).sum(axis=0), 1e-9)
-        found = (right - right[taken] @ solved) / np.sqrt(left)
-        found[[*taken, *np.flatnonzero(left < _MIN_OWN_SHARE)]] = 0.0
-        best = int(found.argmax())
-        if found[best] <= _MIN_SIGNIFICANCE * chance:
-            break
-        taken.append(best)
-    root = np.linalg.cholesky(normal[np.ix_(taken, taken)])
-    variances = np.zeros(len(layers))
-    variances[taken] = nnls(root.T, np.linalg.solve(root, right[taken]))[0]
-    variances /= scales
-    if not variances[1:].any():
-        return CommonError(sigma_alone=math.sqrt(variances[0]))
+            absorbed = absorbed @ moved.T
+            expected = products * np.repeat(np.repeat(shared, 2, axis=0), 2, axis=1)
+            expected += moved @ pulled @ moved.T - absorbed - absorbed.T
+            values, vectors = np.linalg.eigh(whitening.T @ expected @ whitening / unit)
+            spread = 1.0 + _RATIOS[:, None] ** 2 * np.maximum(values, 0.0)
+            squares = ((vectors.T @ white) ** 2 / spread).sum(axis=1) + scatter
+            evidence.append(
+                -0.5 * np.log(spread).sum(axis=1) - 0.5 * n_free * np.log(squares) - _RATIOS
+            )
+            variances.append(squares / max(n_free - 2, 1))
+            errors.append(pulled / unit)
+    weights = np.exp(np.array(evidence) - np.max(evidence))
+    weights *= np.array(variances) / weights.sum()
+    # The mean of a standard deviation: that of a variance is the tail of what is known beforehand.
+    of_kinds = (weights @ _RATIOS) ** 2 / np.maximum(weights.sum(axis=1), 1e-300)
     # Rounded, so that later results do not depend on the order of summation.
-    alone, *sigmas = (float(f"{sigma:.4g}") for sigma in np.sqrt(variances))
-    n = len(_PARTS)
-    return CommonError(
-        of_places_m=tuple(sigmas[:n]),
-        of_depths_m=tuple(sigmas[n : 2 * n]),
-        of_photos_m=tuple(sigmas[2 * n :]) or (0.0,) * n,
-        lengths_m=tuple(tuple(length * extent_m for length in lengths) for lengths in _PARTS),
-        sigma_alone=alone,
-    )
+    shares_of = [float(f"{value:.4g}") for value in of_kinds]
+    common = sum(share * error for share, error in zip(shares_of, errors, strict=True))
+    moves = points.cofactors @ _stable(np.asarray(common)) @ points.cofactors
+    return sigma0**2 * points.cofactors + moves
+
+
+_Direction = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Derivatives (2 n,) of observations by errors along it, and their pulls (n, p)."""
+
+
+def _kinds(
+    by_place: NDArray[np.float64],
+    pulls: NDArray[np.float64],
+    towards: NDArray[np.float64],
+    photo: NDArray[np.float64],
+) -> list[tuple[list[_Direction], NDArray[np.bool_]]]:
+    """Return the directions of each kind of common error, and which points (n, n) share it."""
+    axes = [(by_place[:, :, axis].ravel(), pulls[:, :, axis]) for axis in range(3)]
+    by_depth = np.einsum("nid,nd->ni", by_place, towards).ravel()
+    depth = [(by_depth, np.einsum("npd,nd->np", pulls, towards))]
+    is_one = np.equal.outer(photo, photo)
+    all_share = np.ones_like(is_one)
+    kinds = [(axes, all_share), (depth, all_share)]
+    return kinds if is_one.all() else [*kinds, (axes, is_one)]
+
+
+def _cells(points: AdjustedPoints, extent_m: float, n_most: int) -> NDArray[np.intp]:
+    """Return the cell (n,) of each point: cubes of places, each photo by itself."""
+    side = _FINEST_CELL
+    while True:
+        cubes = np.floor(points.places / (side * extent_m)).astype(np.intp)
+        keys = np.column_stack([points.photo, cubes])
+        cells = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
+        if cells.max() < n_most:
+            return np.asarray(cells, dtype=np.intp)
+        side *= _COARSER
 
 
 def outwards(places: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -217,106 +181,8 @@ def outwards(places: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArra
     return np.asarray(across if (centre - middle) @ across > 0.0 else -across)
 
 
-def with_common_error(
-    covariance: NDArray[np.float64], points: AdjustedPoints
-) -> NDArray[np.float64]:
-    """Widen the covariance (p, p) of an adjustment by the common error of its points."""
-    error = common_error(points)
-    if not error.is_any:
-        return covariance
-    some, shared = points.thinned(), np.zeros_like(covariance)
-    sigmas_m = (error.of_places_m, error.of_depths_m, error.of_photos_m)
-    for of_kind_m, (directions, correlations) in zip(
-        sigmas_m, _kinds(some, error.lengths_m), strict=False
-    ):
-        for sigma_m, correlation in zip(of_kind_m, correlations, strict=True):
-            if sigma_m:
-                shared += sigma_m**2 * _sum_over(directions, correlation)
-    move = some.weight * points.cofactors
-    spread = error.sigma_alone**2 * points.cofactors + move @ stable(shared) @ move.T
-    return widened(covariance, spread)
-
-
-_Direction = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Derivatives (2 n,) of observations by errors along it, and their pulls (n, p)."""
-
-
-def _kinds(
-    some: AdjustedPoints, lengths_m: Sequence[Sequence[float] | NDArray[np.float64]]
-) -> Iterator[tuple[list[_Direction], list[NDArray[np.float64]]]]:
-    """Return the directions of each kind of common error, and its correlations (n, n) by part."""
-    apart_m = np.linalg.norm(some.places[:, None] - some.places, axis=2)
-    correlations = [
-        np.sum([np.exp(-apart_m / length_m) for length_m in part], axis=0) for part in lengths_m
-    ]
-    axes = [(some.by_place[:, :, axis].ravel(), some.pulls[:, :, axis]) for axis in range(3)]
-    along = np.einsum("nid,nd->ni", some.by_place, some.towards).ravel()
-    yield axes, correlations
-    yield [(along, np.einsum("npd,nd->np", some.pulls, some.towards))], correlations
-    is_one = some.photo[:, None] == some.photo
-    if not is_one.all():
-        yield axes, [correlation * is_one for correlation in correlations]
-
-
-def _sum_over(
-    directions: Sequence[_Direction], correlation: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the covariance (p, p) of the sum of all pulls, each times an error of one metre."""
-    return np.asarray(sum(pulls.T @ correlation @ pulls for _, pulls in directions))
-
-
-def stable(sums: NDArray[np.float64]) -> NDArray[np.float64]:
+def _stable(sums: NDArray[np.float64]) -> NDArray[np.float64]:
     """Round sums (p, p) so that they do not depend on the number of threads of BLAS."""
     scale = np.sqrt(np.maximum(np.diag(sums), 1e-300))
     unit = np.outer(scale, scale)
     return np.asarray(np.round(sums / unit, 7) * unit, dtype=np.float64)
-
-
-def _inverses(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return inverses (n, p, p); pseudo-inverses where a single group determines a parameter."""
-    try:
-        return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
-    except np.linalg.LinAlgError:
-        return np.asarray(np.linalg.pinv(matrices), dtype=np.float64)
-
-
-def widened_by_moves(plain: NDArray[np.float64], moves: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Widen a covariance (p, p) by what leaving out each of some groups changes (g, p).
-
-    Of few groups and many unknowns the largest spread is far too large and the smallest far too
-    small by chance, so that the larger of two covariances is too large along most axes even where
-    nothing errs together. Spreads are drawn towards their mean by the share of their differences
-    that chance explains (Ledoit & Wolf 2004, doi:10.1016/S0047-259X(03)00096-4).
-    """
-    n, p = moves.shape
-    root = _root(plain)
-    white = math.sqrt((n - 1) / n) * moves @ np.linalg.inv(root).T
-    spread = white.T @ white
-    mean = np.trace(spread) / p * np.eye(p)
-    differences = float(((spread - mean) ** 2).sum())
-    of_chance = float(((white**2).sum(axis=1) ** 2).sum() - (spread**2).sum() / n)
-    kept = max(0.0, 1.0 - of_chance / differences) if differences > 0.0 else 0.0
-    return widened(plain, root @ (mean + kept * (spread - mean)) @ root.T)
-
-
-def widened(plain: NDArray[np.float64], spread: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the larger of two covariances (p, p) along each axis that whitens the first."""
-    root = _root(plain)
-    inverse = np.linalg.inv(root)
-    values, axes = np.linalg.eigh(inverse @ spread @ inverse.T)
-    widened = root @ axes * np.sqrt(np.maximum(values, 1.0))
-    result: NDArray[np.float64] = widened @ widened.T
-    return result
-
-
-def _root(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return R (p, p) with R R' the covariance, enlarged if rounding made it indefinite."""
-    try:
-        return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
-    except np.linalg.LinAlgError:
-        # Some unknowns are poorly determined: their variances dwarf the others.
-        sigmas = np.sqrt(np.diag(covariance))
-        values, axes = np.linalg.eigh(covariance / np.outer(sigmas, sigmas))
-        least = len(values) * np.finfo(np.float64).eps * values[-1]
-        root = sigmas[:, None] * axes * np.sqrt(np.maximum(values, least))
-        return np.asarray(root, dtype=np.float64)

@@ -28,7 +28,6 @@ from orthoflow.geometry.covariances import (
     AdjustedPoints,
     honest_covariance,
     outwards,
-    with_common_error,
 )
 from orthoflow.geometry.frames import cross_matrix
 from orthoflow.geometry.rows import Rows
@@ -104,7 +103,7 @@ def adjust(
     *,
     prior: ViewingCamera | None = None,
     lens: LensFreedom | None = None,
-    groups: NDArray[np.intp] | None = None,
+    independent: bool = True,
     soft_limit: float = math.inf,
 ) -> Resection:
     """Adjust a camera to the points it sees.
@@ -115,8 +114,8 @@ def adjust(
         prior: its interior orientation is the prior of the free lens parameters; by default that of
             `start`.
         lens: which parameters of the interior orientation are free; none by default.
-        groups: (n,) group of each point, e.g. a cell of the image, within which residuals may be
-            correlated; None takes all as independent.
+        independent: whether the points have independent errors; if not, neighbours may have errors
+            in common (`geometry.covariances`).
         soft_limit: residuals beyond this many standard deviations get less weight (Huber).
 
     Raises:
@@ -124,7 +123,9 @@ def adjust(
     """
     camera = fitted(seen, start, prior=prior, lens=lens, soft_limit=soft_limit)
     prior = start if prior is None else prior
-    return stated(seen, camera, prior=prior, lens=lens, groups=groups, soft_limit=soft_limit)
+    return stated(
+        seen, camera, prior=prior, lens=lens, independent=independent, soft_limit=soft_limit
+    )
 
 
 def stated(
@@ -133,7 +134,7 @@ def stated(
     *,
     prior: ViewingCamera | None = None,
     lens: LensFreedom | None = None,
-    groups: NDArray[np.intp] | None = None,
+    independent: bool = True,
     soft_limit: float = math.inf,
 ) -> Resection:
     """Return the accuracy of the camera that `fitted` found, with the same arguments as `adjust`.
@@ -153,12 +154,10 @@ def stated(
     from_prior = float((np.diag(cofactors)[POSE_PARAMETERS:] / lens.sigmas**2).sum())
     redundancy = 2 * len(seen) - n_free + from_prior
     sigma0 = math.sqrt(float((errors.residuals**2).sum()) / redundancy)
-    covariance = honest_covariance(
-        errors.jacobian, errors.residuals, cofactors, groups, sigma0=sigma0
-    )
-    points = problem.adjusted_points(camera.shifted(middle), errors, cofactors)
-    if groups is not None:
-        covariance = with_common_error(covariance, points)
+    covariance = sigma0**2 * cofactors
+    if not independent:
+        local = camera.shifted(middle)
+        covariance = honest_covariance(problem.adjusted_points(local, errors, cofactors), sigma0)
     factor = float(np.trace(np.linalg.solve(cofactors, covariance))) / n_free
     to_world = moved_origin(camera, middle, n_free)
     return Resection(

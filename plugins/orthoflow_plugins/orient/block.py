@@ -24,15 +24,14 @@ from orthoflow.geometry.cameras import (
 )
 from orthoflow.geometry.covariances import (
     AdjustedPoints,
+    honest_covariance,
     outwards,
-    widened_by_moves,
-    with_common_error,
 )
 from orthoflow.geometry.resection import whiten
 from orthoflow.geometry.rows import Rows
 from orthoflow.products import JsonValue, Photo
 from orthoflow.sdk import DiagnosticSpec
-from orthoflow_plugins.orient.pose import PLACES_A_SIDE, Lens, Note, places_in_photo
+from orthoflow_plugins.orient.pose import Lens, Note
 
 # A known point is never exact: an adjustment divides by its variance.
 _MIN_SIGMA_M: Final = 1e-6
@@ -241,15 +240,10 @@ def block_covariance(block: Block, *, soft_limit: float) -> BlockCovariance:
     for start, lens in zip(block.lens_starts, block.lenses, strict=False):
         sigmas = lens.freedom.sigmas
         prior[start : start + sigmas.size] = 1.0 / sigmas**2
-    cells = np.zeros(len(block.seen), dtype=np.intp)
-    for photo, camera in enumerate(block.cameras):
-        mine = block.seen.photo == photo
-        in_photo = places_in_photo(block.seen.pixels[mine], camera)
-        cells[mine] = photo * PLACES_A_SIDE**2 + in_photo
-    rows = _rows(block, soft_limit, cells)
+    rows = _rows(block, soft_limit)
     normal = np.diag(prior)
     squares, n_rows = 0.0, 0
-    for columns, _, jacobian, residuals in rows:
+    for columns, jacobian, residuals in rows:
         # Not by BLAS: its sums depend on the number of threads.
         normal[np.ix_(columns, columns)] += np.einsum("ij,ik->jk", jacobian, jacobian)
         squares += float((residuals**2).sum())
@@ -262,15 +256,7 @@ def block_covariance(block: Block, *, soft_limit: float) -> BlockCovariance:
     if redundancy <= 0.0 or not (np.diag(cofactors) > 0.0).all():
         raise GeometryError("the ties do not determine the block of photos")
     sigma0 = math.sqrt(squares / redundancy)
-    matrix = _honest(rows, cofactors, sigma0**2 * cofactors)
-    shares_lens = any(
-        lens.freedom.sigmas.size > 0 and block.lens_of.count(index) > 1
-        for index, lens in enumerate(block.lenses)
-    )
-    if shares_lens or block.is_joint.any():
-        # Photos of one place share the errors that the scan has there.
-        matrix = _honest(_rows(block, soft_limit, _places(block)), cofactors, matrix)
-    matrix = with_common_error(matrix, _adjusted_points(block, cofactors, soft_limit))
+    matrix = honest_covariance(_adjusted_points(block, cofactors, soft_limit), sigma0)
     return BlockCovariance(matrix=matrix, cofactors=cofactors, sigma0=sigma0, redundancy=redundancy)
 
 
@@ -346,33 +332,10 @@ def correlation_notes(
     return notes
 
 
-_Rows = tuple[NDArray[np.intp], int, NDArray[np.float64], NDArray[np.float64]]
+_Rows = tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]
 """Equations in standard deviations, points eliminated: columns (c,) of the unknowns that take part,
-group of observations that may err together, jacobian (r, c) and residuals (r,).
+jacobian (r, c) and residuals (r,).
 """
-
-
-def _honest(
-    rows: list[_Rows], cofactors: NDArray[np.float64], plain: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Widen by what leaving out each group changes, see `geometry.covariances`."""
-    by_group: dict[int, list[_Rows]] = {}
-    for part in rows:
-        by_group.setdefault(part[1], []).append(part)
-    # Fewer groups than unknowns of a photo say nothing of it.
-    if len(by_group) <= max(part[0].size for part in rows):
-        return plain
-    moves = []
-    for parts in by_group.values():
-        columns = np.unique(np.concatenate([part[0] for part in parts]))
-        normal, pull = np.zeros((columns.size, columns.size)), np.zeros(columns.size)
-        for own, _, jacobian, residuals in parts:
-            at = np.searchsorted(columns, own)
-            normal[np.ix_(at, at)] += np.einsum("ij,ik->jk", jacobian, jacobian)
-            pull[at] += np.einsum("ij,i->j", jacobian, residuals)
-        inner = np.eye(columns.size) - normal @ cofactors[np.ix_(columns, columns)]
-        moves.append(cofactors[:, columns] @ (np.linalg.pinv(inner) @ pull))
-    return widened_by_moves(plain, np.array(moves))
 
 
 def _adjusted_points(
@@ -416,14 +379,8 @@ def _adjusted_points(
     )
 
 
-def _rows(block: Block, soft_limit: float, groups: NDArray[np.intp]) -> list[_Rows]:
-    """Equations of the unknowns that remain when every point is eliminated.
-
-    Args:
-        block: as adjusted.
-        soft_limit: residuals beyond so many standard deviations count less.
-        groups: (m,) of the observations.
-    """
+def _rows(block: Block, soft_limit: float) -> list[_Rows]:
+    """Return the equations of the unknowns that remain when every point is eliminated."""
     seen = block.seen
     joint = block.is_joint[seen.point]
     covariances = pixel_covariances(block)
@@ -432,12 +389,10 @@ def _rows(block: Block, soft_limit: float, groups: NDArray[np.intp]) -> list[_Ro
     for photo in range(len(block.cameras)):
         mine, columns = np.flatnonzero(seen.photo == photo), block.columns(photo)
         by_camera, by_point, off = _seen_by(block, photo, mine, covariances[mine], soft_limit)
-        for group in np.unique(groups[mine]).tolist():
-            alone = (groups[mine] == group) & ~joint[mine]
-            jacobian = by_camera[alone].reshape(-1, columns.size)
-            rows.append((columns, group, jacobian, off[alone].ravel()))
+        alone = ~joint[mine]
+        rows.append((columns, by_camera[alone].reshape(-1, columns.size), off[alone].ravel()))
         for nth in np.flatnonzero(joint[mine]):
-            one = columns, int(groups[mine[nth]]), by_camera[nth], off[nth]
+            one = columns, by_camera[nth], off[nth]
             stacked.setdefault(int(seen.point[mine[nth]]), []).append((one, by_point[nth]))
     return rows + [_without_point(block, point, parts) for point, parts in stacked.items()]
 
@@ -479,7 +434,7 @@ def _without_point(
     jacobian = np.zeros((2 * len(parts) + n_known, columns.size))
     by_point = np.zeros((len(jacobian), 3))
     residuals = np.zeros(len(jacobian))
-    for nth, ((own, _, by_camera, off), of_point) in enumerate(parts):
+    for nth, ((own, by_camera, off), of_point) in enumerate(parts):
         two = slice(2 * nth, 2 * nth + 2)
         jacobian[two, np.searchsorted(columns, own)] = by_camera
         by_point[two], residuals[two] = of_point, off
@@ -489,20 +444,7 @@ def _without_point(
         residuals[-3:] = (block.points.known[point] - block.points.now[point]) / least
     across = np.linalg.qr(by_point, mode="complete").Q[:, 3:]
     remaining = np.einsum("ij,ik->jk", across, jacobian)
-    return columns, parts[0][0][1], remaining, np.einsum("ij,i->j", across, residuals)
-
-
-def _places(block: Block) -> NDArray[np.intp]:
-    """Group (m,) of each observation: a place in the world, as wide as a cell of the photos."""
-    seen = block.seen
-    widths = []
-    for photo, camera in enumerate(block.cameras):
-        distances = camera.project(block.points.now[seen.point[seen.photo == photo]])[:, 2]
-        if distances.size:
-            side_px = max(camera.width, camera.height) / PLACES_A_SIDE
-            widths.append(side_px / camera.fx * float(np.median(distances)))
-    cubes = np.floor(block.points.now[seen.point] / float(np.median(widths))).astype(np.intp)
-    return np.asarray(np.unique(cubes, axis=0, return_inverse=True)[1].ravel(), dtype=np.intp)
+    return columns, remaining, np.einsum("ij,i->j", across, residuals)
 
 
 def _set_up(block: Block) -> tuple[Any, Any]:

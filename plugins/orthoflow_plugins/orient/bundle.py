@@ -122,6 +122,7 @@ class OrientColmapBundle(Method):
 
     id: ClassVar[str] = "orient.colmap-bundle"
     determinism: ClassVar[Determinism] = "seeded"
+    result_version: ClassVar[int] = 2
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         *ORIENTATION_METRICS,
         MetricSpec("n_photo_points", label="points seen in several photos"),

@@ -41,7 +41,6 @@ from orthoflow_plugins.orient.pose import (
     TiedPhoto,
     adjusted,
     no_pose,
-    places_in_photo,
     robust_start,
 )
 from orthoflow_plugins.orient.report import hand_over
@@ -93,6 +92,7 @@ class OrientDlt(Method):
 
     id: ClassVar[str] = "orient.dlt"
     determinism: ClassVar[Determinism] = "seeded"
+    result_version: ClassVar[int] = 2
     metrics: ClassVar[tuple[MetricSpec, ...]] = ORIENTATION_METRICS
     citations: ClassVar[tuple[str, ...]] = (
         "Abdel-Aziz, Karara 1971, Direct linear transformation, doi:10.14358/PERS.81.2.103",
@@ -319,7 +319,7 @@ def _with_what_is_missing(
             model.camera,
             prior=start.lens.prior,
             lens=freedom,
-            groups=places_in_photo(control.pixels_photo, model.camera),
+            independent=False,
             soft_limit=SOFT_LIMIT * max(model.sigma0, 1.0),
         )
     except GeometryError:

@@ -26,7 +26,6 @@ from orthoflow_plugins.orient.pose import (
     estimate_pose,
     expected_px,
     no_pose,
-    places_in_photo,
     robust_start,
     unit_deviation,
     without_chance,
@@ -47,6 +46,7 @@ class OrientPnp(Method):
 
     id: ClassVar[str] = "orient.pnp"
     determinism: ClassVar[Determinism] = "seeded"
+    result_version: ClassVar[int] = 2
     metrics: ClassVar[tuple[MetricSpec, ...]] = ORIENTATION_METRICS
     citations: ClassVar[tuple[str, ...]] = (
         "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (3.6, 4.3)",
@@ -110,7 +110,7 @@ def estimate_by_opencv(tied: TiedPhoto, params: OrientParams) -> Estimate | str:
             if np.array_equal(agreeing & ~is_check, used):
                 break
         chosen = alike.take(used)
-        resection = stated(chosen, camera, groups=places_in_photo(chosen.pixels_photo, camera))
+        resection = stated(chosen, camera, independent=False)
     except GeometryError as error:
         return f"{error}: use orient.pnp with method weighted"
     return Estimate(

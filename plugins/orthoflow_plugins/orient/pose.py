@@ -163,13 +163,6 @@ SOFT_LIMIT: Final = 3.0
 One normal tie in a hundred does; at 2, one in seven did, which cost exactness and understated the
 error by another tenth.
 """
-PLACES_A_SIDE: Final = 5
-"""Cells a side of a photo within which ties may err together.
-
-On simulated rooms ties agree in their errors up to some 60 px of 1200: with 6 cells more of that
-crosses the borders, with 4 too few are left to learn from (error over stated, pooled over 94
-photos: 1.39 with 6, 1.34 with 5).
-"""
 _LEAST_FOR_POSE: Final = 4
 _CONFIDENCE: Final = 0.99999
 _MAX_TRIALS: Final = 20_000
@@ -477,9 +470,8 @@ def adjusted(tied: TiedPhoto, start: Start, params: OrientParams) -> Estimate:
         if np.array_equal(again & ~is_check, used) and abs(unit / before - 1.0) < _SETTLED_SHARE:
             break
         agreeing = again
-    groups = places_in_photo(control.pixels_photo, camera)
     resection = stated(
-        control, camera, prior=prior, lens=lens, groups=groups, soft_limit=soft_limit
+        control, camera, prior=prior, lens=lens, independent=False, soft_limit=soft_limit
     )
     source = start.lens.source
     return Estimate(resection=resection, source=source, fit=fit, agreeing=again, limit=limit)
@@ -500,11 +492,6 @@ def image_cells(
     scaled = np.clip(scaled, 0, side - 1)
     cells: NDArray[np.intp] = scaled[:, 1] * side + scaled[:, 0]
     return cells
-
-
-def places_in_photo(pixels_photo: NDArray[np.float64], camera: ViewingCamera) -> NDArray[np.intp]:
-    """Number (n,) the cells of a photo within which ties may err together."""
-    return image_cells(pixels_photo, (camera.width, camera.height), PLACES_A_SIDE)
 
 
 def without_chance(normalised: NDArray[np.float64], limit: float) -> float:
@@ -561,8 +548,7 @@ def _calibration_doubt(found: Estimate, control: SeenPoints) -> str:
         step = first_step(control, camera, _OTHER_LENS, soft_limit=SOFT_LIMIT)
         if abs(step[POSE_PARAMETERS]) < _MIN_FOCAL_STEP:
             return ""
-        cells = places_in_photo(control.pixels_photo, camera)
-        free = adjust(control, camera, lens=_OTHER_LENS, groups=cells, soft_limit=SOFT_LIMIT)
+        free = adjust(control, camera, lens=_OTHER_LENS, independent=False, soft_limit=SOFT_LIMIT)
     except GeometryError:
         return ""
     off = abs(math.log(free.camera.fx / camera.fx))
