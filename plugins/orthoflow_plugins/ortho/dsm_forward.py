@@ -148,6 +148,8 @@ def _layer(
         visible = cells_seen(from_anywhere, free, empty, band.rows, slice(0, width))
         seen = visible.mask == LayerMask.PAINTED
         quality = np.maximum(visible.quality, np.float32(0.0))
+        # Twelve bytes per cell, which are not needed beside those of the gaps.
+        del visible
         is_painted = pixel != NO_PIXEL
         gaps = narrow_gaps(is_painted, params.fill_gap_cells)
         gaps = gaps[(gaps >= inner.start * width) & (gaps < inner.stop * width)]

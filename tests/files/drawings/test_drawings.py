@@ -215,7 +215,7 @@ def test_a_record_alone_is_drawn_as_its_run_is(run: Path, tmp_path: Path, target
     for source, name in ((run, "of-run"), (alone, "alone")):
         done = export(source, target, tmp_path / name)
         assert done.exit_code == 0, done.output
-    assert f"note: {alone} stands alone: its rasters are made anew" in done.output
+    assert f"note: {alone} stands alone: its rasters are made again" in done.output
     made, wanted = (
         {
             path.relative_to(tmp_path / name): path.read_bytes()

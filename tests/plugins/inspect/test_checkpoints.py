@@ -375,6 +375,7 @@ def test_points_that_are_carried_back_into_space_are_off_by_their_distance() -> 
     assert checkpoints._findings_in_space(points[1:2], surveyed, [2]) == []
 
 
+@pytest.mark.usefixtures("charts")
 def test_each_picture_is_drawn_with_the_residuals_of_its_own_points(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
