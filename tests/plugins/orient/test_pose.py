@@ -70,6 +70,31 @@ def tied(photo: Photo, seen: SeenPoints, is_check: NDArray[np.bool_]) -> TiedPho
     )
 
 
+@pytest.mark.parametrize("factor", [0.4, 2.5])
+def test_a_pose_depends_on_the_ratios_of_the_sigmas_of_its_ties_alone(factor: float) -> None:
+    """What counts less as too far off follows how far ties are off, not what they state."""
+    viewer = camera()
+    rng = np.random.default_rng(7)
+    seen = seen_by(viewer, 200, sigma_px=0.5)
+    # Longer tails than normal ones: many are beyond the limit.
+    off_px = 0.35 * rng.standard_t(3, size=(200, 2))
+    seen = replace(seen, pixels_photo=seen.pixels_photo + off_px)
+    scaled = replace(seen, sigma_px=factor * seen.sigma_px, sigma_m=factor * seen.sigma_m)
+    check = np.arange(200) % 5 == 0
+    # The same ties are sampled first.
+    params = OrientParams(threshold_px=4.0)
+    found, other = (
+        estimate_pose(tied(photo_by(viewer), each, check), params) for each in (seen, scaled)
+    )
+    assert isinstance(found, Estimate)
+    assert isinstance(other, Estimate)
+    np.testing.assert_array_equal(found.agreeing, other.agreeing)
+    np.testing.assert_allclose(
+        found.resection.camera.centre_world, other.resection.camera.centre_world, atol=1e-6
+    )
+    np.testing.assert_allclose(found.resection.covariance, other.resection.covariance, rtol=1e-2)
+
+
 @pytest.mark.parametrize("scale", [0.2, 1.0, 2.9])
 def test_the_unit_deviation_is_that_of_normal_vectors(scale: float) -> None:
     rng = np.random.default_rng(3)
