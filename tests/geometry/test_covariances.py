@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Final
 
 import numpy as np
 import pytest
+import threadpoolctl
 from numpy.typing import NDArray
 
 from orthoflow.geometry.cameras import ViewingCamera
@@ -25,6 +26,15 @@ VIEW: Final = ViewingCamera(
     rotation=np.eye(3),
     translation=np.array([0.0, 0.0, 8.0]),
 )
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    """Waiting for each other, threads of BLAS take many times as long on a busy machine."""
+    with threadpoolctl.threadpool_limits(1):
+        yield
+
+
 Draw = Callable[[NDArray[np.float64], np.random.Generator], NDArray[np.float64]]
 
 
