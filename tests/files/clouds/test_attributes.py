@@ -55,7 +55,7 @@ def test_normals_look_at_the_scanner_of_their_scan() -> None:
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_normals_look_where_those_of_their_planes_do_else_up(sign: float) -> None:
-    # Two places, and nobody knows which points are of which.
+    # Two stations, and it is unknown which points belong to which.
     cloud = corner(stations=ORIGIN + np.ones((2, 3)), stations_source="view_from")
     index = IS_FLOOR.astype(np.int16)
     index[-N_SIDE:] = -1
@@ -69,9 +69,9 @@ def test_normals_look_where_those_of_their_planes_do_else_up(sign: float) -> Non
 
 def test_a_station_is_known_where_the_files_say_one_for_every_scan() -> None:
     stations = ORIGIN + np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
-    told = with_attributes(corner(stations=stations, stations_source="file"))
-    assert told.scans == (0, 1)
-    np.testing.assert_array_equal([told.station(0), told.station(1)], stations)
+    cloud_of_two = with_attributes(corner(stations=stations, stations_source="file"))
+    assert cloud_of_two.scans == (0, 1)
+    np.testing.assert_array_equal([cloud_of_two.station(0), cloud_of_two.station(1)], stations)
     assert (
         with_attributes(corner(stations=stations, stations_source="view_from")).station(0) is None
     )
@@ -87,7 +87,7 @@ def test_what_no_colour_is_known_for_is_grey() -> None:
     (plain,) = replace(with_attributes(cloud), colouring="intensity").blocks()
     assert all((plain[name] == plain["red"]).all() for name in _RGB)
     assert len(np.unique(plain["red"])) > 100
-    # Without planes there is no deviation, without labels no plane to be told by its colour.
+    # Without planes there is no deviation, without labels no plane to colour by.
     for colouring in ("deviation", "plane", "rgb"):
         (block,) = replace(with_attributes(cloud), colouring=colouring).blocks()
         np.testing.assert_array_equal(block[_RGB], plain[_RGB])

@@ -91,9 +91,9 @@ def test_a_focal_length_that_cannot_be_is_told_even_where_another_is_used(
     first, second = read(*made.write(tmp_path, files))
     assert first.exif_focal_px is None
     assert second.exif_focal_px == pytest.approx(500.0)
-    told = "EXIF states a 35 mm equivalent of {} mm, which no lens has (4 to 3000 mm)"
-    assert f"photo a.jpg: {told.format(65535)}: it is not used" in read.warnings
-    assert f"photo b.jpg: {told.format(1)}: it is not used" in read.warnings
+    message = "EXIF states a 35 mm equivalent of {} mm, which no lens has (4 to 3000 mm)"
+    assert f"photo a.jpg: {message.format(65535)}: it is not used" in read.warnings
+    assert f"photo b.jpg: {message.format(1)}: it is not used" in read.warnings
 
 
 def test_a_panorama_becomes_six_photos_with_exact_lenses(tmp_path: Path, read: PhotoReader) -> None:
