@@ -9,8 +9,8 @@ checked. Each room is measured four times: `planes` (plane-methods.yaml, paper_p
 `orient` (orient-methods.yaml), `ortho` (ortho-methods.yaml) and `surfaces`, where orthoimages are
 made from photos on a surface (backward) and from points (direct), on the scan and on points that
 semi-global matching (OpenCV) finds in the photos, as skarlatos2012 had; orientations are the true
-ones there, and the mouldings those of the designed wall, as drawn walls have too few corners for
-check points on edges. Check points are compared over those that all orthoimages of a room show.
+ones there, and plaques at drawn places give the main wall corners for check points at edges. Check
+points are compared over those that all orthoimages of a room show.
 
 Every room goes to `FOLDER/<part>-<seed>.json` as soon as it is measured, and is not measured again.
 From these files and the pages of benchmarks/pages docs/papers.md and docs/choosing.md are written:
@@ -247,7 +247,9 @@ def surfaces(seed: int) -> Iterator[tuple[str, float]]:
         SimulateRoom,
         SimulateRoom.In(),
         seed,
-        **{**COARSE, "decoration": "designed"},
+        **COARSE,
+        # Drawn walls have 0 to 16 corners that are seen, too few for check points at edges.
+        n_plaques=24,
         photo_layout="variant2",
         # Of oblique neighbours one may stand above the other, which the matching of rows excludes.
         photo_obliquity_deg=3.0,

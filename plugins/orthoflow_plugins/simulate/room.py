@@ -169,6 +169,13 @@ class SimulateRoom(Method):
             description="Share of the main wall covered by cloth with one repeated motif; by "
             "default 0.095 of the designed wall and none of a drawn one.",
         )
+        n_plaques: int = Field(
+            0,
+            ge=0,
+            le=40,
+            description="Plaques of 12 to 45 cm on a drawn main wall, 2 to 15 cm thick, so that "
+            "it has corners for check points at edges; fewer where there is no place.",
+        )
         photo_layout: PhotoLayout = Field(
             "none",
             description="quick: 6 photos of the main wall; variant1: 8 photos of whole walls, 4 "
@@ -226,6 +233,11 @@ class SimulateRoom(Method):
 
         @model_validator(mode="after")
         def _only_drawn_rooms_have_a_seed(self) -> Self:
+            if self.n_plaques and self.decoration != "drawn":
+                raise ValueError(
+                    f"n_plaques {self.n_plaques} is for drawn walls, but decoration is "
+                    f"{self.decoration}: set decoration to drawn, or leave out n_plaques"
+                )
             if self.design_seed is not None and self.decoration != "drawn":
                 raise ValueError(
                     f"design_seed {self.design_seed} draws a room, but decoration is "
@@ -286,6 +298,7 @@ class SimulateRoom(Method):
             obstacle=params.obstacle,
             spectral_gap=_SPECTRAL_GAPS[params.spectral_gap],
             textile_share=textile_share,
+            n_plaques=params.n_plaques,
             geometry=geometry,
         )
         turn_deg = params.turn_deg + (float(place_rng.uniform(0.0, 360.0)) if is_moved else 0.0)

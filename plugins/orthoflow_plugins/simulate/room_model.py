@@ -99,6 +99,8 @@ _BEYOND_M: Final = 0.1
 # A bay narrower than this stays bare, and so does the wall beside and above what is in it.
 _BAY_LEAST_M: Final = 0.7
 _BESIDE_M: Final = 0.12
+_PLAQUE_GAP_M: Final = 0.1
+_PLAQUE_TRIES: Final = 40
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,6 +177,7 @@ def build_room(
     obstacle: bool = True,
     spectral_gap: float = 0.3,
     textile_share: float = TEXTILE_BY_DESIGN,
+    n_plaques: int = 0,
     geometry: Geometry = DESIGNED,
 ) -> Room:
     """Build the room.
@@ -185,6 +188,7 @@ def build_room(
         obstacle: an object stands free in front of the main wall.
         spectral_gap: 0 when the laser sees the painted patterns, 1 when others.
         textile_share: share of the main wall covered by one repeated motif, at most `MOST_TEXTILE`.
+        n_plaques: plaques on a drawn main wall, at most.
         geometry: where its planes lie.
     """
     draft = SceneDraft()
@@ -193,11 +197,13 @@ def build_room(
         for number, side in enumerate(sides):
             _build_wall(side, number, relief, [] if number else _cloths(textile_share))
     else:
-        # Of a stream of their own: walls with and without a cloth are otherwise the same.
-        cloth = _drawn_cloth(textile_share, rng.spawn(1)[0])
+        # Of streams of their own: walls with and without cloth or plaques are otherwise the same.
+        cloth_rng, plaque_rng = rng.spawn(2)
+        cloth = _drawn_cloth(textile_share, cloth_rng)
         for side, (name, ground, span, _) in zip(sides, _WALLS, strict=True):
-            draw_wall(side, name, ground, span, rng, relief=relief, cloth=cloth)
-            cloth = None
+            holes = draw_wall(side, name, ground, span, rng, relief=relief, cloth=cloth)
+            _draw_plaques(side, span, n_plaques, holes, relief, plaque_rng)
+            cloth, n_plaques = None, 0
     wide: Extent = (-3.4, 3.4, -3.2, 3.2)
     for (name, paint), (normal, height_m) in zip(
         _LEVELS, (geometry.floor, geometry.ceiling), strict=True
@@ -408,8 +414,10 @@ def draw_wall(
     *,
     relief: float = 1.0,
     cloth: Extent | None = None,
-) -> None:
+) -> list[Extent]:
     """Build a wall with relief up to 0.3 m in front of it and recesses up to 0.45 m behind it.
+
+    Returns the extents of its recesses.
 
     Niches and doors are registered as planes of their own.
 
@@ -431,8 +439,39 @@ def draw_wall(
     cloths = [] if cloth is None else [cloth]
     for extent in cloths:
         wall.place(extent, 0.0, _DAMASK, SurfaceRole.WALL, plane=plane, holes=holes)
-    holes = [*holes, *cloths]
-    wall.place(_FULL, 0.0, ground, SurfaceRole.WALL, plane=plane, holes=holes)
+    wall.place(_FULL, 0.0, ground, SurfaceRole.WALL, plane=plane, holes=[*holes, *cloths])
+    return holes
+
+
+def _draw_plaques(
+    wall: Side,
+    span: tuple[float, float],
+    n_plaques: int,
+    holes: Sequence[Extent],
+    relief: float,
+    rng: np.random.Generator,
+) -> None:
+    """Fix plaques to a wall beside its recesses; one that finds no place is left out."""
+    taken = list(holes)
+    for _ in range(n_plaques):
+        for _ in range(_PLAQUE_TRIES):
+            width_m, height_m = rng.uniform(0.12, 0.45, 2)
+            left_m = rng.uniform(span[0], span[1] - width_m)
+            low_m = rng.uniform(FLOOR_M, CEILING_M - height_m)
+            extent = (left_m, left_m + width_m, low_m, low_m + height_m)
+            if not any(_overlap(extent, other) for other in taken):
+                taken.append(extent)
+                wall.box(extent, relief * rng.uniform(0.02, 0.15), (STUCCO, GILT)[rng.integers(2)])
+                break
+
+
+def _overlap(one: Extent, other: Extent) -> bool:
+    return (
+        one[0] < other[1] + _PLAQUE_GAP_M
+        and other[0] < one[1] + _PLAQUE_GAP_M
+        and one[2] < other[3] + _PLAQUE_GAP_M
+        and other[2] < one[3] + _PLAQUE_GAP_M
+    )
 
 
 def _drawn_cloth(share: float, rng: np.random.Generator) -> Extent | None:

@@ -127,6 +127,41 @@ def test_a_cloth_may_hang_on_drawn_walls(tmp_path: Path) -> None:
     np.testing.assert_array_equal(bare.truth.labels, hung.truth.labels)
 
 
+def test_plaques_give_drawn_walls_check_points_at_edges(tmp_path: Path) -> None:
+    drawn = {**COARSE, "decoration": "drawn", "check_points_most": 20}
+    bare = simulate(tmp_path / "bare", **drawn)
+    hung = simulate(tmp_path / "hung", **drawn, n_plaques=24)
+    assert hung.checkpoints.classes.count("vertical edge") == 20
+    # Nothing else has moved: the same planes, and the rectangles of the bare room among others.
+    np.testing.assert_array_equal(hung.truth.planes.normal, bare.truth.planes.normal)
+    rectangles = [
+        {tuple(row) for row in np.column_stack([room.truth.scene.centre, room.truth.scene.extent])}
+        for room in (bare, hung)
+    ]
+    assert rectangles[0] < rectangles[1]
+    # A front and four sides each, beside one another and 2 to 15 cm before the wall.
+    scene = hung.truth.scene
+    added = [
+        k for k in range(len(scene)) if (*scene.centre[k], *scene.extent[k]) not in rectangles[0]
+    ]
+    main = hung.truth.planes.names.index("main wall")
+    normal = hung.truth.planes.normal[main]
+    fronts = [k for k in added if abs(scene.normal[k] @ normal) > 0.999]
+    assert 5 * len(fronts) == len(added)
+    assert len(fronts) > 10
+    heights = scene.centre[fronts] @ normal - hung.truth.planes.offset[main]
+    assert np.abs(heights).min() > 0.019
+    assert np.abs(heights).max() < 0.151
+    a0, a1, b0, b1 = scene.extent[fronts].T
+    apart = (
+        np.maximum(a0[:, None], a0) - np.minimum(a1[:, None], a1),
+        np.maximum(b0[:, None], b0) - np.minimum(b1[:, None], b1),
+    )
+    assert (np.maximum(*apart) > 0.09)[~np.eye(len(fronts), dtype=bool)].all()
+    with pytest.raises(ValueError, match="n_plaques 3 is for drawn walls"):
+        SimulateRoom.Params(n_plaques=3)
+
+
 def test_points_are_on_the_rays_of_their_rows_and_columns(tmp_path: Path) -> None:
     cloud = simulate(tmp_path, **COARSE).cloud
     assert cloud.scan is not None
