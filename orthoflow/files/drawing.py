@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry import WallFrame
+from orthoflow.geometry.frames import RasterAxes
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import Colormap
@@ -24,6 +27,15 @@ _MAX_HEIGHT_INCHES: Final = 6.0
 # More pixels along a picture's longer side than a column shows cost time only.
 _MAX_SIDE_PX: Final = 1000
 _MISSING: Final = "#8a949e"
+# What X and Y of a wall's raster are, as its files have them.
+_AXES: Final[Mapping[RasterAxes, tuple[str, str]]] = {
+    "wall": ("along the wall [m]", "height [m]"),
+    "level": ("x [m]", "y [m]"),
+    "map": ("east [m]", "north [m]"),
+    "plane": ("across [m]", "up [m]"),
+}
+# Height of the numbers and the label below a picture with axes.
+_AXIS_INCHES: Final = 0.25
 # Any: matplotlib's own types name every setting that it has.
 _STYLE: Final[Mapping[Any, Any]] = {
     "font.family": "DejaVu Sans",
@@ -93,30 +105,60 @@ def column_figure(height_inches: float) -> Figure:
 
 
 def picture_figure(
-    picture: NDArray[np.uint8], *, extra_inches: float = 0.0, size: tuple[int, int] | None = None
+    picture: NDArray[np.uint8], *, extra_inches: float = 0.0, frame: WallFrame | None = None
 ) -> tuple[Figure, Axes]:
-    """Return a figure that shows a picture, and its axes, whose units are the picture's pixels.
+    """Return a figure that shows a picture, and its axes.
+
+    The units of the axes are the picture's pixels, or columns and rows of a wall's raster. A wall's
+    figure is labelled in metres, as the raster's files have them.
 
     Args:
         picture: (rows, cols) grey or (rows, cols, 3) RGB.
         extra_inches: height for a legend or a colour bar.
-        size: rows and columns that the axes count, of a picture drawn smaller.
+        frame: of the wall that the picture shows, which may have more cells than it has pixels.
     """
-    rows, columns = size or picture.shape[:2]
+    rows, columns = picture.shape[:2] if frame is None else frame.shape
     height = min(COLUMN_INCHES * rows / columns, _MAX_HEIGHT_INCHES)
-    figure = column_figure(height + extra_inches)
+    figure = column_figure(height + extra_inches + (_AXIS_INCHES if frame else 0.0))
     axes = figure.add_subplot()
     axes.set_axis_off()
     axes.set_anchor("N")
     extent = (0.0, float(columns), float(rows), 0.0)
     axes.imshow(picture, cmap="gray", vmin=0, vmax=255, extent=extent)
+    if frame is not None:
+        _label_in_metres(axes, frame)
     return figure, axes
 
 
+def _label_in_metres(axes: Axes, frame: WallFrame) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    (left_m, top_m), down = frame.raster_corner_m, frame.raster_down
+    gsd_m = frame.gsd_m
+    axes.set_axis_on()
+    axes.spines[:].set_visible(False)
+    axes.tick_params(left=False, bottom=False, labelleft=False, labelbottom=False)
+    along = axes.secondary_xaxis(
+        "bottom", functions=(lambda u: left_m + gsd_m * u, lambda x: (x - left_m) / gsd_m)
+    )
+    up = axes.secondary_yaxis(
+        "left", functions=(lambda v: top_m + down * gsd_m * v, lambda y: (y - top_m) / down / gsd_m)
+    )
+    for axis, label in zip((along.xaxis, up.yaxis), _AXES[frame.raster_axes], strict=True):
+        axis.set_label_text(label)
+        axis.set_major_locator(MaxNLocator(5))
+
+
 def map_chart(
-    values: NDArray[np.floating], label: str, *, low: float, high: float, cmap: str = "inferno"
+    values: NDArray[np.floating],
+    label: str,
+    frame: WallFrame,
+    *,
+    low: float,
+    high: float,
+    cmap: str = "inferno",
 ) -> bytes:
-    """Return a map of values (rows, cols) with its colour bar, as WebP; NaN is grey."""
+    """Return a map of values (rows, cols) of a wall with its colour bar, as WebP; NaN is grey."""
     import matplotlib as mpl
 
     with in_column_style():
@@ -124,7 +166,7 @@ def map_chart(
         colours: Colormap = mpl.colormaps[cmap].with_extremes(bad=_MISSING)
         scale = mpl.colors.Normalize(low, high)
         rgb = colours(scale(np.ma.masked_invalid(small)), bytes=True)[..., :3]
-        figure, axes = picture_figure(rgb, extra_inches=0.45)
+        figure, axes = picture_figure(rgb, extra_inches=0.45, frame=frame)
         figure.colorbar(
             mpl.cm.ScalarMappable(scale, colours),
             ax=axes,

@@ -19,6 +19,7 @@ from orthoflow.files.drawing import (
     round_scale,
 )
 from orthoflow.files.images import decode_image
+from orthoflow.geometry import WallFrame, frame_over
 
 
 def test_no_letter_is_smaller_than_six_points_at_the_width_of_a_column() -> None:
@@ -52,10 +53,55 @@ def test_a_picture_keeps_its_proportions_and_leaves_room(shape: tuple[int, int])
     assert axes.get_xlim() == (0.0, shape[1])
 
 
+@pytest.mark.parametrize(
+    ("up", "normal", "axes", "left", "top"),
+    [
+        ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0), ("along the wall [m]", "height [m]"), 2.5, 6.0),
+        ((0.0, 0.0, 1.0), (0.0, 0.0, 1.0), ("x [m]", "y [m]"), 4.0, 5.0),
+        (None, (0.0, -1.0, 0.0), ("across [m]", "up [m]"), 0.0, 0.0),
+    ],
+)
+def test_a_picture_of_a_wall_has_the_axes_of_its_files(
+    up: tuple[float, float, float] | None,
+    normal: tuple[float, float, float],
+    axes: tuple[str, str],
+    left: float,
+    top: float,
+) -> None:
+    normal_world = np.array(normal)
+    u_world = np.array([1.0, 0.0, 0.0])
+    frame = WallFrame(
+        origin_world=np.array([4.0, 5.0, 6.0]),
+        u_world=u_world,
+        v_world=np.cross(u_world, normal_world),
+        normal_world=normal_world,
+        gsd_m=0.01,
+        width=200,
+        height=100,
+        left_m=2.5,
+        up=up,
+    )
+    with in_column_style():
+        figure, shown = picture_figure(np.zeros((50, 100), dtype=np.uint8), frame=frame)
+        figure.draw_without_rendering()
+    # Columns and rows of the raster, whatever the picture's own size.
+    assert shown.get_xlim() == (0.0, 200.0)
+    along, up_axis = shown.child_axes
+    assert (along.get_xlabel(), up_axis.get_ylabel()) == axes
+    # A number stands where its place in the raster is drawn.
+    column, row = 60.0, 30.0
+    drawn = shown.transData.transform((column, row))
+    down = 0.01 * row
+    assert along.transData.transform((left + 0.01 * column, 0.0))[0] == pytest.approx(drawn[0])
+    assert up_axis.transData.transform((0.0, top - down))[1] == pytest.approx(drawn[1])
+
+
 def test_means_of_a_large_map_leave_out_what_is_unknown() -> None:
     values = np.full((2_000, 2_000), np.nan)
     values[::2] = 1.0
-    shown = decode_image(map_chart(values, "error [mm]", low=0.0, high=1.0), "map")
+    corners = np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [2.0, 0.0, 2.0]])
+    frame = frame_over(corners, np.array([0.0, -1.0, 0.0]), gsd_m=0.001)
+    shown = decode_image(map_chart(values, "error [mm]", frame, low=0.0, high=1.0), "map")
     # Half known: the full colour, neither mixed with zeros nor missing.
     np.testing.assert_allclose(shown[400, 500], (252, 255, 164), atol=10)
 

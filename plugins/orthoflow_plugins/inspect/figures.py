@@ -15,6 +15,7 @@ from orthoflow.files.drawing import (
     picture_figure,
     round_scale,
 )
+from orthoflow.geometry import WallFrame
 from orthoflow.geometry.levels import eight_bits
 from orthoflow.products import Orthoimage
 
@@ -33,21 +34,23 @@ _ENLARGED_MOST: Final = 500.0
 _ARROW_COLOURS: Final = ("#1a8a1a", "#d09000", "#d01c1c")
 
 
-def depth_error_map(depth_m: NDArray[np.float64]) -> bytes:
+def depth_error_map(depth_m: NDArray[np.float64], frame: WallFrame) -> bytes:
     """Return a picture of depth errors: blue behind the truth, red in front."""
     label = "measured - true depth [mm]"
-    return map_chart(1e3 * depth_m, label, low=-DEPTH_SPAN_MM, high=DEPTH_SPAN_MM, cmap="RdBu_r")
+    high = DEPTH_SPAN_MM
+    return map_chart(1e3 * depth_m, label, frame, low=-high, high=high, cmap="RdBu_r")
 
 
-def colour_error_map(error_grey: NDArray[np.float64]) -> bytes:
+def colour_error_map(error_grey: NDArray[np.float64], frame: WallFrame) -> bytes:
     """Return a picture of colour errors: bright if large."""
-    return map_chart(error_grey, "colour error [grey levels]", low=0.0, high=COLOUR_SPAN_GREY)
+    label = "colour error [grey levels]"
+    return map_chart(error_grey, label, frame, low=0.0, high=COLOUR_SPAN_GREY)
 
 
-def displacement_map(displacement_cells: NDArray[np.float64]) -> bytes:
+def displacement_map(displacement_cells: NDArray[np.float64], frame: WallFrame) -> bytes:
     """Return a picture of displacements (rows, cols): bright if large."""
     high = DISPLACEMENT_SPAN_CELLS
-    return map_chart(displacement_cells, "displacement [cells]", low=0.0, high=high)
+    return map_chart(displacement_cells, "displacement [cells]", frame, low=0.0, high=high)
 
 
 @in_column_style()
@@ -75,7 +78,7 @@ def vector_map(
     size = (max(1, round(columns * scale)), max(1, round(rows * scale)))
     small = cv2.resize(_grey_means(image), size, interpolation=cv2.INTER_AREA)
     pale = np.clip(0.4 * np.asarray(small) + 150.0, 0.0, 255.0).astype(np.uint8)
-    figure, axes = picture_figure(pale, size=(rows, columns), extra_inches=0.22)
+    figure, axes = picture_figure(pale, frame=image.frame, extra_inches=0.22)
     if not len(places):
         return encode_chart(figure)
     length = np.linalg.norm(shift_cells, axis=1)

@@ -601,20 +601,20 @@ class _Judge:
 def _draw(image: Orthoimage, verdict: _Verdict, ctx: StepContext) -> None:
     ctx.figure(
         f"wall_{image.number}_depth_error",
-        partial(depth_error_map, verdict.depth_m),
+        partial(depth_error_map, verdict.depth_m, image.frame),
         f"{image.name}: measured - true depth. Fine grain is noise of the scanner; whole areas of "
         "one colour are a plane or a surface in the wrong place.",
     )
     ctx.figure(
         f"wall_{image.number}_colour_error",
-        partial(colour_error_map, verdict.grey),
+        partial(colour_error_map, verdict.grey, image.frame),
         f"{image.name}: colour error. Bright "
         "outlines are displaced edges, bright areas wrong paint or light of another photo.",
     )
     if verdict.sources is not None:
         ctx.figure(
             f"wall_{image.number}_displacement",
-            partial(displacement_map, verdict.length_m / image.frame.gsd_m),
+            partial(displacement_map, verdict.length_m / image.frame.gsd_m, image.frame),
             f"{image.name}: true displacement of cells of {1e3 * image.frame.gsd_m:g} mm that "
             f"photos painted. Dark is good; a "
             "bright area with a sharp border is a photo oriented worse than its neighbours.",

@@ -431,7 +431,9 @@ def _source_map(image: Orthoimage) -> bytes:
     handles = [Patch(color=colours[k], label=image.sources[k]) for k in named if counts[k]]
     abreast = 3 if max((len(name) for name in image.sources), default=0) < _LONG_NAME else 2
     legend_in = 0.1 + 0.13 * -(-len(handles) // abreast)
-    figure, _ = picture_figure(np.rint(picture).astype(np.uint8), extra_inches=legend_in)
+    figure, _ = picture_figure(
+        np.rint(picture).astype(np.uint8), extra_inches=legend_in, frame=image.frame
+    )
     figure.legend(handles=handles, loc="outside lower center", ncols=abreast)
     return encode_chart(figure)
 

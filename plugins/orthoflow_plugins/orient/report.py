@@ -22,6 +22,7 @@ from orthoflow.files.drawing import (
     round_scale,
 )
 from orthoflow.files.images import decode_image
+from orthoflow.geometry import frame_over
 from orthoflow.geometry.cameras import to_opencv
 from orthoflow.geometry.resection import pixels_by_point
 from orthoflow.geometry.robust import median_deviation
@@ -392,9 +393,10 @@ def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
         median_m, high_m = np.percentile(best[shown], [50.0, 98.0])
         error_mm = np.where(shown, 1e3 * best, np.nan)
         label = "predicted error of a coordinate [mm]"
+        frame = frame_over(wall.corners_world, wall.normal, gsd_m=cell_m)
         ctx.figure(
             f"wall_{wall.number}_predicted_error",
-            partial(map_chart, error_mm, label, low=0.0, high=round_scale(1e3 * high_m)),
+            partial(map_chart, error_mm, label, frame, low=0.0, high=round_scale(1e3 * high_m)),
             f"Predicted error of a coordinate on {wall.name}, of the photo that knows each place "
             f"best, median {1e3 * median_m:.2g} mm; grey where no oriented photo shows the wall. "
             "Bright places far from ties are where the orthoimage may be off; more ties there "

@@ -9,8 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.files.drawing import encode_chart, in_column_style, picture_figure
 from orthoflow.files.images import encode_png, encode_webp
-from orthoflow.geometry import basis_from_up
+from orthoflow.geometry import WallFrame, basis_from_up
 from orthoflow.products import PointCloud
 
 _PLAN_SIDE_PX: Final = 640
@@ -40,11 +41,23 @@ _PAPER: Final = 245
 _INK: Final = (40, 40, 40)
 
 
-def plan_view_png(cloud: PointCloud) -> bytes:
-    """Return a PNG of the cloud seen from above, brighter where it is denser (logarithmic)."""
+@in_column_style()
+def plan_chart(cloud: PointCloud) -> bytes:
+    """Return a picture of the cloud seen from above with axes in metres, as WebP."""
+    grey, frame = plan_view(cloud)
+    return encode_chart(picture_figure(grey, frame=frame)[0])
+
+
+def plan_view(cloud: PointCloud) -> tuple[NDArray[np.uint8], WallFrame]:
+    """Return the cloud seen from above, brighter where it is denser (logarithmic).
+
+    Returns:
+        (rows, cols) grey, and its position in the world.
+    """
     step = max(1, len(cloud) // _PLAN_SAMPLE)
     offsets = np.column_stack([cloud.x[::step], cloud.y[::step], cloud.z[::step]])
-    plan = offsets.astype(np.float64) @ basis_from_up(cloud.up)[:2].T
+    first, second, up = basis_from_up(cloud.up)
+    plan = offsets.astype(np.float64) @ np.column_stack([first, second])
     # Percentiles, so that stray points do not shrink the building to a dot.
     low, high = np.percentile(plan, [0.1, 99.9], axis=0)
     span = max(float((high - low).max()), 1e-6)
@@ -56,7 +69,18 @@ def plan_view_png(cloud: PointCloud) -> bytes:
     shades = np.log1p(counts)
     grey = np.rint(255.0 * shades / max(float(shades.max()), 1.0)).astype(np.uint8)
     # Row 0 is at the bottom of a map and at the top of an image.
-    return encode_png(np.ascontiguousarray(grey.reshape(size[1], size[0])[::-1]))
+    gsd_m = span / _PLAN_SIDE_PX
+    frame = WallFrame(
+        origin_world=cloud.origin + low[0] * first + (low[1] + gsd_m * size[1]) * second,
+        u_world=first,
+        v_world=-second,
+        normal_world=up,
+        gsd_m=gsd_m,
+        width=int(size[0]),
+        height=int(size[1]),
+        up=tuple(cloud.up.tolist()),
+    )
+    return np.ascontiguousarray(grey.reshape(size[1], size[0])[::-1]), frame
 
 
 def polar_view_png(cloud: PointCloud) -> bytes | None:

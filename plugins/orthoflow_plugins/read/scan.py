@@ -22,7 +22,7 @@ from orthoflow.geometry.cloud_quality import judge_quality
 from orthoflow.products import InputFiles, PointCloud
 from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow_plugins.read.assembly import CloudAssembly, ScanCount
-from orthoflow_plugins.read.figures import plan_view_png, polar_view_png, scan_lines_png
+from orthoflow_plugins.read.figures import plan_chart, polar_view_png, scan_lines_png
 from orthoflow_plugins.read.reporting import (
     COLOUR_LIMIT,
     COLOURS_GREY,
@@ -171,7 +171,7 @@ class ReadScan(Method):
         cloud = _finish(ctx, assembly, params)
         ctx.figure(
             "plan",
-            plan_view_png(cloud),
+            plan_chart(cloud),
             "The cloud from above, brighter where denser: walls are thin bright lines; "
             "double lines are misaligned scans.",
         )

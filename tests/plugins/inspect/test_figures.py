@@ -44,13 +44,15 @@ def arrows(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
 def test_maps_have_the_width_of_a_column_and_a_colour_bar() -> None:
     error = np.full((1_800, 450), 30.0)
     error[:900] = np.nan
-    shown = decode_image(colour_error_map(error), "map").astype(int)
+    frame = grey_image(1_800, 450).frame
+    shown = decode_image(colour_error_map(error, frame), "map").astype(int)
     assert shown.shape[1] == 1003
     middle = shown[:, 502]
     # Unknown cells are grey, half of the span is the middle of the colours.
     np.testing.assert_allclose(middle[200], (138, 148, 158), atol=12)
     np.testing.assert_allclose(middle[1200], (188, 55, 84), atol=12)
-    red, _, blue = decode_image(depth_error_map(np.full((300, 300), 0.01)), "map")[300, 502]
+    square = depth_error_map(np.full((300, 300), 0.01), grey_image(300, 300).frame)
+    red, _, blue = decode_image(square, "map")[300, 502]
     assert red > blue
 
 

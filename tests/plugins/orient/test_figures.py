@@ -110,8 +110,9 @@ def test_the_map_of_a_wall_shows_the_photo_that_knows_each_place_best(
 ) -> None:
     context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
     corners = np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 0.0], [9.0, 0.0, 0.0], [9.0, 0.0, 2.0]])
-    wall = SimpleNamespace(index=3, number=8, name="floor 8", corners_world=corners)
-    hidden = SimpleNamespace(index=5, number=9, name="wall 9", corners_world=corners)
+    normal = np.array([0.0, -1.0, 0.0])
+    wall = SimpleNamespace(index=3, number=8, name="floor 8", corners_world=corners, normal=normal)
+    hidden = SimpleNamespace(index=5, number=9, name="wall 9", corners_world=corners, normal=normal)
     shape = (20, 90)
     rng = np.random.default_rng(0)
     first, second = rng.uniform(0.001, 0.01, (2, *shape))

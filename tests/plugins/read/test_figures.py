@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.read import figures
 from orthoflow_plugins.read.figures import (
-    plan_view_png,
+    plan_view,
     polar_view_png,
     scan_lines_png,
 )
@@ -32,7 +32,7 @@ def test_a_plan_is_as_bright_as_the_logarithm_of_its_points() -> None:
     x, y = np.meshgrid(np.arange(640) / 320.0, np.arange(320) / 320.0)
     grid = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
     crowd = np.tile([1.6, 0.8, 3.0], (7, 1))
-    shown = pixels(plan_view_png(cloud_of(np.concatenate([grid, crowd]))))
+    shown, frame = plan_view(cloud_of(np.concatenate([grid, crowd])))
     # The outermost thousandth is cut off.
     assert shown.shape[1] == 640
     assert shown.shape[0] == pytest.approx(320, abs=2)
@@ -43,6 +43,10 @@ def test_a_plan_is_as_bright_as_the_logarithm_of_its_points() -> None:
     assert column / 639 == pytest.approx(0.8, abs=0.01)
     # Row 0 is the top: four fifths up.
     assert 1.0 - row / (len(shown) - 1) == pytest.approx(0.8, abs=0.01)
+    # The middle of that pixel lies at the crowd, in metres of the world.
+    place = frame.raster_from_wall(np.array([[column + 0.5, row + 0.5]]))[0]
+    np.testing.assert_allclose(place, [1.6, 0.8], atol=0.004)
+    assert frame.raster_axes == "level"
     single = values[counts.argmax()]
     crowded = {round(255.0 * np.log(2.0) / np.log(1.0 + n)) for n in (8, 9, 10)}
     assert int(single) in crowded
