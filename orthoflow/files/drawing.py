@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import colorsys
 import io
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.frames import RasterAxes
@@ -34,6 +34,7 @@ _AXES: Final[Mapping[RasterAxes, tuple[str, str]]] = {
     "map": ("east [m]", "north [m]"),
     "plane": ("across [m]", "up [m]"),
 }
+_Scale = Callable[[ArrayLike], NDArray[np.float64]]
 # Height of the numbers and the label below a picture with axes.
 _AXIS_INCHES: Final = 0.25
 # Any: matplotlib's own types name every setting that it has.
@@ -133,20 +134,21 @@ def picture_figure(
 def _label_in_metres(axes: Axes, frame: WallFrame) -> None:
     from matplotlib.ticker import MaxNLocator
 
-    (left_m, top_m), down = frame.raster_corner_m, frame.raster_down
-    gsd_m = frame.gsd_m
+    def line(start_m: float, step_m: float) -> tuple[_Scale, _Scale]:
+        return (
+            lambda cells: start_m + step_m * np.asarray(cells, dtype=np.float64),
+            lambda metres: (np.asarray(metres, dtype=np.float64) - start_m) / step_m,
+        )
+
+    left_m, top_m = frame.raster_corner_m
     axes.set_axis_on()
     axes.spines[:].set_visible(False)
     axes.tick_params(left=False, bottom=False, labelleft=False, labelbottom=False)
-    along = axes.secondary_xaxis(
-        "bottom", functions=(lambda u: left_m + gsd_m * u, lambda x: (x - left_m) / gsd_m)
-    )
-    up = axes.secondary_yaxis(
-        "left", functions=(lambda v: top_m + down * gsd_m * v, lambda y: (y - top_m) / down / gsd_m)
-    )
+    along = axes.secondary_xaxis("bottom", functions=line(left_m, frame.gsd_m))
+    up = axes.secondary_yaxis("left", functions=line(top_m, frame.raster_down * frame.gsd_m))
     for axis, label in zip((along.xaxis, up.yaxis), _AXES[frame.raster_axes], strict=True):
         axis.set_label_text(label)
-        axis.set_major_locator(MaxNLocator(5))
+        axis.set_major_locator(MaxNLocator(5, steps=(1, 2, 5, 10)))
 
 
 def map_chart(
