@@ -57,6 +57,7 @@ if os.environ.pop("PYTHONDONTWRITEBYTECODE", ""):
 settings.register_profile(
     "everywhere",
     deadline=None,
+    max_examples=100 if IS_LONG else 25,
     derandomize=not IS_LONG,
     suppress_health_check=[HealthCheck.too_slow],
 )
@@ -145,6 +146,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         return len(first) + 1 + (soon.index(module) if module in soon else len(soon))
 
     items.sort(key=turn)
+    if not IS_LONG:
+        later = pytest.mark.skip(reason=f"{REASONS['long']} --long")
+        for item in items:
+            if item.get_closest_marker("long"):
+                item.add_marker(later)
     if config.getoption("--with-programs") and config.cache is not None:
         lacking = set(config.cache.get(_LACKING, []))
         items[:] = [item for item in items if item.nodeid in lacking]

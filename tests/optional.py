@@ -16,7 +16,7 @@ REASONS: Final = {
     "data": "needs the real scans and photos in ../shared/data",
     "right": "needs a right that this user or container lacks",
     "platform": "needs Linux",
-    "long": ".ci/run --long",
+    "long": ".ci/run",
 }
 
 

@@ -18,7 +18,6 @@ from orthoflow.cli import program
 from orthoflow.sdk.hooks import ENTRY_POINT_GROUP
 from orthoflow.testing import conformance_cases
 from orthoflow.workflow.views import workflow_schema
-from tests.long_loops import IS_LONG
 from tests.road.conftest import metrics_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -103,7 +102,6 @@ def succeed(folder: Path, *command: str | Path) -> str:
 
 
 @pytest.mark.long
-@pytest.mark.skipif(not IS_LONG, reason="installs the examples from an index: .ci/run --long")
 @pytest.mark.parametrize("name", ["orthoflow-pyransac3d", "orthoflow-poselib", "orthoflow-cracks"])
 def test_an_example_installs_and_passes_its_tests(name: str, tmp_path: Path) -> None:
     python = environment(tmp_path / "venv")
@@ -114,7 +112,6 @@ def test_an_example_installs_and_passes_its_tests(name: str, tmp_path: Path) -> 
 
 
 @pytest.mark.long
-@pytest.mark.skipif(not IS_LONG, reason="installs the examples from an index: .ci/run --long")
 def test_the_examples_stand_beside_our_own_methods(tmp_path: Path) -> None:
     python = environment(tmp_path / "venv")
     for name in ("orthoflow-pyransac3d", "orthoflow-poselib"):

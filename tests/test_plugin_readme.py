@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.long_loops import IS_LONG
 from tests.road.conftest import metrics_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -32,7 +31,6 @@ def test_the_way_is_at_most_fifteen_commands_long() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.skipif(not IS_LONG, reason="makes an environment and a plugin in it: .ci/run --long")
 def test_the_commands_of_the_readme_lead_to_a_comparison(tmp_path: Path) -> None:
     venv.create(tmp_path / "venv", with_pip=True)
     scripts = tmp_path / "venv" / "bin"

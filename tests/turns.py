@@ -8,6 +8,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tests.long_loops import long_only
+
 _Value = TypeVar("_Value", bound=np.generic)
 
 
@@ -40,3 +42,5 @@ class Turn:
 
 
 TURNS = [Turn(is_mirrored, quarters) for is_mirrored in (False, True) for quarters in range(4)]
+# A quarter and a mirror image lead to all others, which only the long run tries.
+OTHER_TURNS = [TURNS[1], TURNS[4], *long_only(*(TURNS[k] for k in (2, 3, 5, 6, 7)))]

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.catalog.distributions import package_path
-from orthoflow.errors import ArgumentError, OrthoflowError, ProductError
+from orthoflow.errors import ArgumentError
 from orthoflow.products import InputFiles, Product
 from orthoflow.sdk import Method
 from orthoflow.sdk.lines import describe_error
@@ -100,27 +100,11 @@ def _failure(error: Exception, witness: Callable[[], Witness]) -> str:
             for one in error.errors(include_url=False)
         )
     own = package_path(trial.method.__module__)
-    makes = _making(error)
-    frames = list(traceback.extract_tb(error.__traceback__))[:makes]
+    frames = traceback.extract_tb(error.__traceback__)
     within = [one for one in frames if own and Path(one.filename).resolve().is_relative_to(own)]
     where = f" ({Path(within[-1].filename).name}:{within[-1].lineno})" if within else ""
     where = "" if str(error).endswith(where) else where
-    if not isinstance(error, OrthoflowError):
-        return f"the method raised {describe_error(error)}{where}"
-    # Raised behind the method's back, by a product that it makes or by what it reports.
-    is_of_product = makes is not None or frames[-1:] != within[-1:]
-    if isinstance(error, ProductError) and frames and is_of_product:
-        return f"what the method makes is not valid: {error}{where}"
-    return f"the method refuses the suite's inputs: {error}{where}"
-
-
-def _making(error: Exception) -> int | None:
-    """How many frames of a traceback stand before a product that is made looks at itself."""
-    for index, (frame, _) in enumerate(traceback.walk_tb(error.__traceback__)):
-        looks = frame.f_code.co_name == "__post_init__"
-        if looks and isinstance(frame.f_locals.get("self"), Product):
-            return index
-    return None
+    return f"on the suite's inputs the method raised {describe_error(error)}{where}"
 
 
 def conformance_cases(

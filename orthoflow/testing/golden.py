@@ -1,25 +1,18 @@
 """Golden results: what a method gave when its author last looked, to notice when results move.
 
 The bits of a result depend on more than the method: on the processor and on the version of every
-library that computes. So the file keeps the digest, which must come again where it was recorded,
-and a sample of the numbers, which must come again anywhere within the tolerances of the product
-types. Numbers that a product states about itself have no tolerance, and a share over few cells may
-move by any amount with the last bits of what goes in. So they are held to the file where the same
-bits go in: give a method inputs that no other method computed.
+library that computes. So the file keeps a sample of the numbers, which must come again within the
+tolerances of the product types. Numbers that a product states about itself have no tolerance, and a
+share over few cells may move by any amount with the last bits of what goes in: they are held to the
+file where the same sample goes in.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
-import os
-import platform
 import re
-import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cache
-from importlib import metadata
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -28,15 +21,11 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from orthoflow.engine.durability import lock_file
-from orthoflow.engine.store import digest_of
 from orthoflow.errors import InputError
 from orthoflow.products import JsonValue, Product
 from orthoflow.products.product import Payload, Tolerance
-from orthoflow.sdk import Method
-from orthoflow.testing.isolation import INSTRUCTION_SWITCHES
 from orthoflow.testing.trials import Trial
 
-_CPU: Final = Path("/proc/cpuinfo")
 _AT_MOST: Final = 32
 # A cell on the rim of something falls to either side by the last bit of a number: one in so many.
 _STRAY_SHARE: Final = 1 / 16
@@ -53,16 +42,17 @@ _METADATA: Final = "metadata"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fingerprint:
-    """What is kept of a product.
+class Sample:
+    """Numbers from an array.
 
     Attributes:
-        digest: of the whole.
-        sample: some numbers of each array, by name.
+        shape: of the array.
+        values: up to 32 of its values to nine digits, by a rule that knows the size only; None
+            for NaN.
     """
 
-    digest: str
-    sample: Mapping[str, Sample]
+    shape: Sequence[int]
+    values: Sequence[float | None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,17 +63,15 @@ class Golden:
         result_version: of the method.
         tools: as the method declares them; with others it may give something else.
         params: those that differ from the defaults, as JSON.
-        environment: digest of what else bits depend on.
-        inputs: by port; files are left out.
-        outputs: by port.
+        inputs: samples of each array by port; files are left out.
+        outputs: likewise.
     """
 
     result_version: int
     tools: Mapping[str, str]
     params: str
-    environment: str
-    inputs: Mapping[str, Fingerprint]
-    outputs: Mapping[str, Fingerprint]
+    inputs: Mapping[str, Mapping[str, Sample]]
+    outputs: Mapping[str, Mapping[str, Sample]]
 
 
 _FORMAT: Final = TypeAdapter(dict[str, Golden])
@@ -106,91 +94,42 @@ def golden_problem(file: Path, trial: Trial, outputs: Mapping[str, Product]) -> 
     Raises:
         InputError: the file is something else.
     """
-    known, now = _read(file), _golden(trial, outputs)
-    before = known.get(trial.method.id)
-    if before is None or _is_of_something_else(before, now, trial):
+    inputs = {port: given for port, given in trial.inputs.items() if isinstance(given, Product)}
+    now = Golden(
+        result_version=trial.method.result_version,
+        tools=dict(trial.method.tools()),
+        params=json.dumps(dict(trial.params), sort_keys=True),
+        inputs={port: sample_of(product) for port, product in inputs.items()},
+        outputs={port: sample_of(product) for port, product in outputs.items()},
+    )
+    before = _read(file).get(trial.method.id)
+    is_of_the_same = (
+        before is not None
+        and replace(before, inputs={}, outputs={}) == replace(now, inputs={}, outputs={})
+        and before.inputs.keys() == now.inputs.keys()
+        and not any(
+            sample_problem(before.inputs[port], now.inputs[port], product.tolerances)
+            for port, product in inputs.items()
+        )
+    )
+    if before is None or not is_of_the_same:
         _record(file, trial.method.id, now)
         return ""
     for port in sorted({*before.outputs, *now.outputs}):
-        if moved := _moved(before, now, port, trial.method, outputs.get(port)):
+        moved = "one of them has none"
+        if port in before.outputs and port in outputs:
+            moved = sample_problem(
+                before.outputs[port],
+                now.outputs[port],
+                outputs[port].tolerances,
+                numbers_stated=before.inputs == now.inputs,
+            )
+        if moved:
             return (
                 f"output {port} is another one than {file.name} has ({moved}), but result_version "
                 f"is {now.result_version} still: raise it, or find out why the result moved"
             )
     return ""
-
-
-def _golden(trial: Trial, outputs: Mapping[str, Product]) -> Golden:
-    return Golden(
-        result_version=trial.method.result_version,
-        tools=dict(trial.method.tools()),
-        params=json.dumps(dict(trial.params), sort_keys=True),
-        environment=_environment(),
-        inputs=_fingerprints(_products(trial)),
-        outputs=_fingerprints(outputs),
-    )
-
-
-def _products(trial: Trial) -> dict[str, Product]:
-    return {port: given for port, given in trial.inputs.items() if isinstance(given, Product)}
-
-
-def _fingerprints(products: Mapping[str, Product]) -> dict[str, Fingerprint]:
-    return {
-        port: Fingerprint(digest=digest_of(product), sample=sample_of(product))
-        for port, product in products.items()
-    }
-
-
-def _is_of_something_else(before: Golden, now: Golden, trial: Trial) -> bool:
-    if (before.result_version, before.tools) != (now.result_version, now.tools):
-        return True
-    if before.params != now.params or before.inputs.keys() != now.inputs.keys():
-        return True
-    return any(
-        sample_problem(before.inputs[port].sample, now.inputs[port].sample, product.tolerances)
-        for port, product in _products(trial).items()
-    )
-
-
-def _moved(
-    before: Golden, now: Golden, port: str, method: type[Method], product: Product | None
-) -> str:
-    """What differs, in a few words; empty where the result is the same."""
-    if port not in before.outputs or product is None:
-        return "one of them has none"
-    old, new = before.outputs[port], now.outputs[port]
-    if old.digest == new.digest:
-        return ""
-    same_went_in = all(
-        before.inputs[port].digest == given.digest for port, given in now.inputs.items()
-    )
-    problem = sample_problem(
-        old.sample, new.sample, product.tolerances, numbers_stated=same_went_in
-    )
-    # The same bits come out where the same go in, at the same place.
-    must_be_alike = same_went_in and before.environment == now.environment
-    if problem or method.determinism == "loose" or not must_be_alike:
-        return problem
-    return (
-        "in bits, not beyond the tolerances of its type, where libraries and processor are the same"
-    )
-
-
-@cache
-def _environment() -> str:
-    """Digest of Python, processor, what of it is switched off, and every installed distribution."""
-    cpu = _CPU.read_text(encoding="utf-8").splitlines() if _CPU.is_file() else []
-    installed = {(found.metadata["Name"], found.version) for found in metadata.distributions()}
-    parts = [
-        sys.version,
-        platform.machine(),
-        *platform.libc_ver(),
-        *sorted({line for line in cpu if line.startswith(("model", "flags"))}),
-        *(f"{name}={os.environ[name]}" for name in INSTRUCTION_SWITCHES if name in os.environ),
-        *sorted(f"{name} {version}" for name, version in installed),
-    ]
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
 def _read(file: Path) -> dict[str, Golden]:
@@ -225,20 +164,6 @@ def _text(known: Mapping[str, Golden]) -> str:
     text = json.dumps(_FORMAT.dump_python(dict(known)), indent=1, sort_keys=True)
     # A line per list of numbers: what moved shows in a comparison of versions.
     return re.sub(r"\[[^\[\]]+\]", lambda found: " ".join(found[0].split()), text) + "\n"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sample:
-    """Numbers from an array.
-
-    Attributes:
-        shape: of the array.
-        values: up to 32 of its values to nine digits, by a rule that knows the size only; None
-            for NaN.
-    """
-
-    shape: Sequence[int]
-    values: Sequence[float | None]
 
 
 def sample_of(product: Product) -> dict[str, Sample]:

@@ -5,25 +5,23 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import pickle
 import sys
 import tempfile
 import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import threadpoolctl
 
-from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.engine.kernels import VARIABLE, reload_numba_config
 from orthoflow.engine.local import start_process
-from orthoflow.engine.store import Store
-from orthoflow.products import InputFiles, Product
 from orthoflow.testing.trials import Trial, run_trial
 
 # With these, libraries compute with other instructions than the processor has, and to other bits.
-INSTRUCTION_SWITCHES: Final = (
+_INSTRUCTION_SWITCHES: Final = (
     "NPY_DISABLE_CPU_FEATURES",
     "NUMBA_CPU_FEATURES",
     "NUMBA_CPU_NAME",
@@ -56,7 +54,12 @@ def run_elsewhere(trial: Trial, folder: Path) -> ElsewhereRun:
     places = {name: world / name for name in ("cwd", "home", "tmp")}
     for place in places.values():
         place.mkdir(parents=True, exist_ok=True)
-    process = start_process(_run_apart, (world, _task(trial, world)), trial.method.id)
+    kept = ("PATH", "LD_LIBRARY_PATH", VARIABLE, *_INSTRUCTION_SWITCHES)
+    environment = {name: os.environ[name] for name in kept if name in os.environ}
+    # Two where the session has one, else one.
+    algebra_threads = 2 if os.environ.get("OPENBLAS_NUM_THREADS") == "1" else 1
+    arguments = (world, pickle.dumps(trial), environment, algebra_threads)
+    process = start_process(_run_apart, arguments, trial.method.id)
     process.join(_LIMIT_S)
     if process.exitcode is None:
         process.kill()
@@ -79,30 +82,9 @@ def run_elsewhere(trial: Trial, folder: Path) -> ElsewhereRun:
     return ElsewhereRun(digests=json.loads((world / "digests.json").read_text()), strays=strays)
 
 
-def _task(trial: Trial, world: Path) -> dict[str, object]:
-    kept = ("PATH", "LD_LIBRARY_PATH", VARIABLE, *INSTRUCTION_SWITCHES)
-    store = Store(world / "store")
-    inputs: dict[str, object] = {}
-    for name, product in trial.inputs.items():
-        if isinstance(product, Product):
-            reference = store.put_product(product, None)
-            inputs[name] = {"type": reference.type_name, "digest": reference.digest}
-        else:
-            inputs[name] = {"name": product.name, "paths": [str(path) for path in product.paths]}
-    return {
-        "method": trial.method.id,
-        "inputs": inputs,
-        "params": dict(trial.params),
-        "seed": trial.seed,
-        "cores": trial.cores,
-        # Two where the session has one, else one.
-        "algebra_threads": 2 if os.environ.get("OPENBLAS_NUM_THREADS") == "1" else 1,
-        "environment": {name: os.environ[name] for name in kept if name in os.environ},
-    }
-
-
-# Any below: a task is what this module made itself.
-def _run_apart(world: Path, task: dict[str, Any]) -> None:
+def _run_apart(
+    world: Path, pickled: bytes, environment: Mapping[str, str], algebra_threads: int
+) -> None:
     code = 1
     try:
         output = os.open(world / "output.txt", os.O_WRONLY | os.O_CREAT)
@@ -110,41 +92,21 @@ def _run_apart(world: Path, task: dict[str, Any]) -> None:
         for descriptor, replaced in ((nothing, 0), (output, 1), (output, 2)):
             os.dup2(descriptor, replaced)
         os.environ.clear()
-        os.environ.update(task["environment"], HOME=str(world / "home"), TMPDIR=str(world / "tmp"))
+        os.environ.update(environment, HOME=str(world / "home"), TMPDIR=str(world / "tmp"))
         # As the engine does for its steps: a font cache is matplotlib's, not the method's.
         os.environ["MPLCONFIGDIR"] = str(world / "matplotlib")
         os.environ.setdefault(VARIABLE, str(world / "numba"))
         reload_numba_config()
         tempfile.tempdir = None
         os.chdir(world / "cwd")
-        with threadpoolctl.threadpool_limits(task["algebra_threads"]):
-            _run_task(world, task)
+        importlib.invalidate_caches()
+        with threadpoolctl.threadpool_limits(algebra_threads):
+            # The method is imported here, too.
+            run = run_trial(pickle.loads(pickled), world / "scratch", draws=False)
+        (world / "digests.json").write_text(json.dumps(dict(run.digests)))
         code = 0
     except BaseException:  # noqa: BLE001 - it goes to the file that the parent reads
         traceback.print_exc()
     finally:
         sys.stderr.flush()
         os._exit(code)
-
-
-def _run_task(world: Path, task: dict[str, Any]) -> None:
-    importlib.invalidate_caches()
-    catalog = discover_catalog()
-    store = Store(world / "store")
-    inputs: dict[str, Product | InputFiles] = {}
-    for name, stored in task["inputs"].items():
-        if "paths" in stored:
-            paths = tuple(Path(path) for path in stored["paths"])
-            inputs[name] = InputFiles(name=stored["name"], paths=paths)
-        else:
-            cls = catalog.product_class(stored["type"])
-            inputs[name] = store.get_product(stored["digest"], cls)
-    trial = Trial(
-        method=catalog.method(task["method"]).load(),
-        inputs=inputs,
-        params=task["params"],
-        seed=task["seed"],
-        cores=task["cores"],
-    )
-    run = run_trial(trial, world / "scratch", draws=False)
-    (world / "digests.json").write_text(json.dumps(dict(run.digests)))

@@ -15,6 +15,7 @@ import pytest
 
 from orthoflow.records.open import open_run
 from tests.laboratories import write_distribution
+from tests.long_loops import long_only
 from tests.workshop_runs import command, orthoflow, workshop_environment, write_studio
 
 # Where no test asks for the processes of steps.
@@ -188,7 +189,7 @@ def test_a_bad_input_ends_with_2_and_skips_what_needs_it(tmp_path: Path) -> None
     assert open_run(tmp_path / "r").cells["paint"].error_message == "needs survey, which failed"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, *long_only(signal.SIGTERM)])
 def test_an_interrupted_run_ends_with_130_and_goes_on_with_the_same_folder(
     tmp_path: Path, number: signal.Signals
 ) -> None:

@@ -115,7 +115,7 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StoredRuns]
         yield found
 
 
-@pytest.mark.long  # one of each class in a normal run
+@pytest.mark.longer
 def test_no_damage_of_a_store_is_sealed_as_good(laboratory: StoredRuns) -> None:
     rng = random.Random(20150808)
     expected = laboratory.sealed("quiet")

@@ -35,6 +35,7 @@ from tests.engine_world import (
     start_fork_server,
     toy_world,
 )
+from tests.long_loops import long_only
 
 STEPS = """
 steps:
@@ -138,6 +139,7 @@ def test_workers_of_its_own_give_the_same_digests(office: Office) -> None:
     )
 
 
+@pytest.mark.long
 def test_when_memory_is_short_the_largest_step_of_all_own_workers_goes(
     office: Office, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -185,6 +187,7 @@ def test_a_step_whose_worker_is_killed_runs_again(office: Office) -> None:
     assert digests(outcome) == office.quiet
 
 
+@pytest.mark.long
 def test_a_step_that_loses_its_workers_is_given_up(office: Office) -> None:
     listen, _ = office.killer()
     plan = office.plan(retries=0)
@@ -194,7 +197,7 @@ def test_a_step_that_loses_its_workers_is_given_up(office: Office) -> None:
     assert outcome.results["other"].status == "ok"
 
 
-@pytest.mark.parametrize("own", [False, True], ids=["workers", "own workers"])
+@pytest.mark.parametrize("own", [False, *long_only(True)], ids=["workers", "own workers"])
 def test_an_interrupted_run_stops_its_workers_and_goes_on_with_any_executor(
     office: Office, own: bool
 ) -> None:
@@ -212,7 +215,7 @@ def test_an_interrupted_run_stops_its_workers_and_goes_on_with_any_executor(
     assert digests(outcome) == office.quiet
 
 
-@pytest.mark.parametrize("own", [False, True], ids=["workers", "own workers"])
+@pytest.mark.parametrize("own", [False, *long_only(True)], ids=["workers", "own workers"])
 def test_a_step_that_nobody_waits_for_is_stopped(office: Office, own: bool) -> None:
     steps: list[int] = []
 
@@ -243,6 +246,7 @@ def _target(link: Path) -> str:
         return ""
 
 
+@pytest.mark.long
 def test_a_lost_scheduler_is_said_and_the_run_goes_on_without(
     office: Office, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -122,7 +122,7 @@ def befall(laboratory: StoredRuns, scene: str, fault: str, operation: int) -> in
 
 
 @pytest.mark.parametrize(("scene", "fault"), EVERY if IS_LONG else FEW)
-@pytest.mark.long  # one operation of a few in a normal run
+@pytest.mark.longer
 def test_a_fault_at_any_operation_loses_nothing_and_seals_nothing_wrong(
     laboratory: StoredRuns, scene: str, fault: str
 ) -> None:
@@ -140,7 +140,6 @@ def test_a_fault_at_any_operation_loses_nothing_and_seals_nothing_wrong(
     assert not found, "\n".join([f"{len(found)} of {len(operations)}", *found[:20]])
 
 
-@pytest.mark.skipif(not IS_LONG, reason="500 kills: .ci/run --long")
 @pytest.mark.long
 def test_five_hundred_kills_at_random_moments_lose_nothing(laboratory: StoredRuns) -> None:
     rng = random.Random(20261123)

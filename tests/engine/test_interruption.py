@@ -60,8 +60,8 @@ def quiet(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
         return digests(world.run(STEPS, executor="inline"))
 
 
-@pytest.mark.long  # twice in a normal run
-@pytest.mark.parametrize("attempt", range(10 if IS_LONG else 2))
+@pytest.mark.longer
+@pytest.mark.parametrize("attempt", range(10 if IS_LONG else 1))
 def test_a_run_killed_at_any_moment_resumes_with_the_same_digests(
     world: World, quiet: dict[str, str], attempt: int
 ) -> None:

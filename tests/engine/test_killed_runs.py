@@ -55,7 +55,7 @@ def killer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Killer]:
         yield found
 
 
-@pytest.mark.long  # ten in a normal run
+@pytest.mark.longer
 def test_killed_runs_go_on_and_end_with_the_same_digests(killer: Killer) -> None:
     started = time.monotonic()
     watched = killer("watched")

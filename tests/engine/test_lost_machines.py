@@ -22,13 +22,9 @@ from orthoflow.engine.journal import CellReported, RunEvent
 from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.errors import OrthoflowError
 from tests.engine_world import World, digests
-from tests.long_loops import IS_LONG
 from tests.optional import skip
 
-pytestmark = [
-    pytest.mark.long,
-    pytest.mark.skipif(not IS_LONG, reason="waits for what is lost: .ci/run --long"),
-]
+pytestmark = pytest.mark.long
 HERE, AWAY = "10.213.77.1", "10.213.77.2"
 N_SLOW = 8
 N_RUNS, N_KILLS = 10, 5

@@ -23,6 +23,7 @@ from orthoflow.records.verify import verify_run
 from tests.engine_world import install_toys, toy_world
 from tests.forked_commands import run_command
 from tests.killed_runs import ROOT, run_here
+from tests.long_loops import long_only
 from tests.optional import skip_unless
 from tests.stored_runs import WORKFLOW
 
@@ -145,7 +146,14 @@ def check_sentence(said: str, *parts: str) -> None:
 # Homes and folders --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("home", ["unset", "unwritable", "a file"])
+@pytest.mark.parametrize(
+    "home",
+    [
+        "unwritable",
+        *long_only("unset"),
+        *long_only("a file"),
+    ],
+)
 def test_no_home_is_needed(desk: Desk, home: str) -> None:
     place = desk.folder.parent / "home"
     if home == "unwritable":
@@ -250,7 +258,10 @@ def test_the_store_of_another_user_serves_as_far_as_it_may_be_written(
 # What a machine has too little of -----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("n_files", [12, 20, 64])
+@pytest.mark.parametrize(
+    "n_files",
+    [20, *long_only(12, 64)],
+)
 def test_few_open_files_are_enough_or_are_said(desk: Desk, n_files: int) -> None:
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (n_files, n_files))
@@ -270,7 +281,10 @@ def test_few_open_files_are_enough_or_are_said(desk: Desk, n_files: int) -> None
         check_finished(desk)
 
 
-@pytest.mark.parametrize("mib", [175, 260, 600])
+@pytest.mark.parametrize(
+    "mib",
+    [260, *long_only(175, 600)],
+)
 def test_too_little_memory_is_said_and_nothing_is_lost(desk: Desk, mib: int) -> None:
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_AS, (mib << 20, mib << 20))

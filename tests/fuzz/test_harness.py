@@ -14,7 +14,7 @@ import pytest
 
 from orthoflow.errors import InputError
 from tests.fuzz.e57_pages import crc32c, e57_of, logical_of
-from tests.fuzz.harness import Outcome, Target, fuzz, write_case
+from tests.fuzz.harness import IS_FUZZED, Outcome, Target, fuzz, write_case
 from tests.fuzz.mutation import (
     Mutate,
     mutate_bytes,
@@ -24,9 +24,11 @@ from tests.fuzz.mutation import (
     mutate_text,
     mutate_yaml,
 )
+from tests.optional import skip_unless
 from tests.photo_files import picture, png
 from tests.scan_files import read_points, write_e57
 
+pytestmark = skip_unless(IS_FUZZED, "long", "the fuzzing itself")
 _SEED = b'{"a": [1, 2.5, true], "b": {"c": "text"}}'
 
 

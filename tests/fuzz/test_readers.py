@@ -7,7 +7,10 @@ from pathlib import Path
 import pytest
 
 from tests.fuzz import read_cameras, readers
-from tests.fuzz.harness import fuzz
+from tests.fuzz.harness import IS_FUZZED, fuzz
+from tests.optional import skip_unless
+
+pytestmark = skip_unless(IS_FUZZED, "long", "damaged files for every reader")
 
 MODULES = {name: module.__name__ for module in (readers, read_cameras) for name in module.NAMES}
 

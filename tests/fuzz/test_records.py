@@ -7,7 +7,10 @@ from pathlib import Path
 import pytest
 
 from tests.fuzz import record_exports, records
-from tests.fuzz.harness import N_CASES, fuzz
+from tests.fuzz.harness import IS_FUZZED, N_CASES, fuzz
+from tests.optional import skip_unless
+
+pytestmark = skip_unless(IS_FUZZED, "long", "damaged records for every command")
 
 MODULES = {name: module.__name__ for module in (records, record_exports) for name in module.NAMES}
 

@@ -23,6 +23,7 @@ from orthoflow.geometry.outlines import (
 from orthoflow.products import Planes
 from tests import samples
 from tests.drawing_runs import CORNER, GAP_M, SIZE_M, box_planes, box_points
+from tests.long_loops import seeds
 
 # Survey coordinates of 5e6 m have 1e-9 m in float64; solving a system loses a little.
 _EXACT_M = 1e-7
@@ -76,7 +77,7 @@ def test_nearly_parallel_planes_meet_nowhere() -> None:
         assert (line_of(up, other) is not None) == meets
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", seeds(4))
 def test_a_line_is_its_point_nearest_to_the_origin_and_a_direction_of_length_one(
     seed: int,
 ) -> None:

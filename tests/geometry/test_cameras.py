@@ -13,6 +13,7 @@ from orthoflow.geometry.camera_kernels import largest_radius, project_point
 from orthoflow.geometry.cameras import LensFreedom, ViewingCamera, linearised, looking_at, stepped
 from orthoflow.geometry.compiling import interpreted
 from tests import samples
+from tests.long_loops import seeds
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -43,7 +44,7 @@ def points(seed: int) -> np.ndarray:
     return np.random.default_rng(seed).uniform([-1.5, -0.3, -1.0], [1.5, 0.3, 1.0], (200, 3))
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", seeds(6))
 def test_projection_is_opencvs_half_a_pixel_on(seed: int) -> None:
     viewer = camera(seed)
     matrix = np.array([[viewer.fx, 0, viewer.cx - 0.5], [0, viewer.fy, viewer.cy - 0.5], [0, 0, 1]])
@@ -55,7 +56,7 @@ def test_projection_is_opencvs_half_a_pixel_on(seed: int) -> None:
     np.testing.assert_allclose(found[:, :2] - 0.5, expected[:, 0], atol=1e-8)  # pixels
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", seeds(6))
 def test_the_ray_of_a_points_pixel_leads_back_to_the_point(seed: int) -> None:
     viewer = camera(seed)
     scene = points(seed)

@@ -21,6 +21,7 @@ from orthoflow.geometry import (
     wall_axes,
 )
 from orthoflow.geometry.frames import UP_VECTORS, UpDirection
+from tests.long_loops import seeds
 
 Z_UP = np.array([0.0, 0.0, 1.0])
 
@@ -42,7 +43,7 @@ def test_with_z_up_the_frame_is_the_world() -> None:
     np.testing.assert_array_equal(basis_from_up(Z_UP), np.eye(3))
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", seeds(8))
 def test_a_plane_through_three_points_contains_them(seed: int) -> None:
     points = np.random.default_rng(seed).normal(size=(3, 3)) + 1e5
     plane = plane_through(points)
@@ -88,7 +89,7 @@ def test_omega_and_phi_are_those_of_the_papers_equation(omega: float, phi: float
 
 
 @pytest.mark.parametrize("direction", UP_VECTORS, ids=str)
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", seeds(4))
 def test_wall_axes_run_right_and_down_for_the_viewer(direction: UpDirection, seed: int) -> None:
     up = up_vector(direction)
     normal = np.random.default_rng(seed).normal(size=3)
@@ -112,7 +113,7 @@ def rectangle(normal: NDArray[np.float64], width_m: float, height_m: float) -> N
     return top_left + np.array(steps)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", seeds(4))
 def test_world_and_wall_coordinates_are_inverse(seed: int) -> None:
     rng = np.random.default_rng(seed)
     normal = unit(np.append(rng.normal(size=2), 0.02))

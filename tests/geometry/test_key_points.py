@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from orthoflow.geometry.key_points import in_turns, root_sift
+from tests.long_loops import seeds
 
 
 def test_cells_take_turns_and_their_strongest_come_first() -> None:
@@ -17,7 +18,7 @@ def test_cells_take_turns_and_their_strongest_come_first() -> None:
     assert in_turns(cell, (-strength,), 2).tolist() == [0, 4]
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", seeds(4))
 def test_what_is_taken_does_not_hang_on_the_order_given(seed: int) -> None:
     rng = np.random.default_rng(seed)
     cell, strength = rng.integers(0, 12, 300), rng.integers(0, 5, 300).astype(float)
@@ -32,7 +33,7 @@ def test_nothing_gives_nothing() -> None:
     assert in_turns(np.empty(0, np.intp), (np.empty(0),), 5).size == 0
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", seeds(3))
 def test_descriptors_are_whole_and_of_one_length(seed: int) -> None:
     raw = np.random.default_rng(seed).integers(0, 256, (50, 128)).astype(np.float32)
     rooted = root_sift(raw)

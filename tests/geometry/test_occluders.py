@@ -20,6 +20,7 @@ from orthoflow.geometry.occluders import (
     occluders_in,
 )
 from tests import samples, scenes
+from tests.long_loops import seeds
 from tests.plane_scenes import cloud_of
 
 ORIGIN = np.array([10.0, -4.0, 2.0])
@@ -65,7 +66,7 @@ def camera() -> ViewingCamera:
     )
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", seeds(2))
 def test_points_are_counted_with_those_in_the_voxels_around(seed: int) -> None:
     points = points_m(seed)
     found = occluders_in(cloud_of(points, origin=tuple(ORIGIN)), box(), FAR, n_least=4, threads=2)

@@ -10,6 +10,7 @@ import pytest
 from orthoflow.errors import GeometryError
 from orthoflow.geometry.frames import Plane, angle_between_deg, omega_phi_deg, plane_through
 from tests import scenes
+from tests.long_loops import seeds
 
 UP = np.array([0.0, 0.0, 1.0])
 # Two metres along (0.6, 0, 0.8).
@@ -49,7 +50,7 @@ def test_a_normal_is_a_unit_vector(normal: list[float], is_plane: bool) -> None:
         Plane(normal=np.array(normal), offset_m=0.0)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", seeds(3))
 def test_a_plane_runs_through_its_three_points_by_the_right_hand_rule(seed: int) -> None:
     rng = np.random.default_rng(seed)
     points = rng.normal(0.0, 5.0, (3, 3))

@@ -22,6 +22,7 @@ from orthoflow.geometry.rastering import (
 from orthoflow.geometry.slabs import Offsets, Slab
 from orthoflow.products import PointCloud
 from tests import raster_scenes as scenes
+from tests.long_loops import seeds
 
 
 def slab_of(wall: scenes.KnownWall, *, front_m: float = 0.15, behind_m: float = 0.15) -> Slab:
@@ -62,7 +63,7 @@ def sorted_winners(cloud: PointCloud, slab: Slab) -> NDArray[np.uint32]:
     return winners
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", seeds(4))
 def test_the_topmost_point_is_the_one_that_sorting_finds(seed: int) -> None:
     wall = scenes.upright_wall(shape=(60, 80))
     cloud, slab = random_cloud(wall, n_points=60_000, seed=seed), slab_of(wall)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from orthoflow.geometry.robust import MEDIAN_LENGTH, NMAD_FACTOR, median_deviation
+from tests.long_loops import seeds
 
 
 def test_factors_are_those_of_the_normal_distribution() -> None:
@@ -34,7 +35,7 @@ def test_deviations_are_told_from_the_middle(
     assert median_deviation(np.array(values), middle) == NMAD_FACTOR * deviation
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", seeds(4))
 def test_a_tenth_of_wild_values_moves_it_by_less_than_they_move_a_standard_deviation(
     seed: int,
 ) -> None:
@@ -47,7 +48,7 @@ def test_a_tenth_of_wild_values_moves_it_by_less_than_they_move_a_standard_devia
     assert np.std(errors) > 100.0
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", seeds(4))
 def test_half_of_all_normal_vectors_are_shorter_than_the_median_length(seed: int) -> None:
     vectors = np.random.default_rng(seed).normal(size=(40_000, 2))
     shorter = np.linalg.norm(vectors, axis=1) < MEDIAN_LENGTH

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import scene_rays
 from orthoflow.geometry.scene_rays import Hits, points_on
+from tests.long_loops import seeds
 
 
 def surface(low: NDArray[np.float64], high: NDArray[np.float64]) -> float:
@@ -25,7 +26,7 @@ def tree_of(low: NDArray[np.float64], high: NDArray[np.float64]) -> scene_rays._
     return tree
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", seeds(12))
 @pytest.mark.parametrize("n", [2, 3, 7])
 def test_boxes_are_split_where_rays_have_the_least_to_do(seed: int, n: int) -> None:
     rng = np.random.default_rng(seed)

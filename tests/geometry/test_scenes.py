@@ -14,6 +14,7 @@ from orthoflow.geometry.scene_rays import Hits
 from orthoflow.geometry.scene_views import Rendering, render, render_frame
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind, Viewers
 from tests import scenes
+from tests.long_loops import seeds
 from tests.scene_rays import cast, colours_at
 
 
@@ -84,7 +85,7 @@ def cell_u(frame: WallFrame) -> NDArray[np.float64]:
     return -2.0 + frame.gsd_m * (np.arange(frame.width) + 0.5)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", seeds(4))
 def test_rays_hit_what_trying_every_rectangle_says(seed: int) -> None:
     scene = random_scene(seed)
     rng = np.random.default_rng(seed + 100)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import scene_rays
 from orthoflow.geometry.scenes import TextureKind
+from tests.long_loops import seeds
 
 SEED = 7
 # splitmix64 of seed 0: the first numbers of its reference implementation (Vigna 2015).
@@ -37,7 +38,7 @@ PARTS = (
 tk = SimpleNamespace(**{name: callable_from_python(name) for name in PARTS})
 
 
-@pytest.mark.parametrize("draw", range(3))
+@pytest.mark.parametrize("draw", seeds(3))
 def test_numbers_are_those_of_splitmix64(draw: int) -> None:
     state = (draw + 1) * 0x9E3779B97F4A7C15 % 2**64
     assert int(tk.mixed_bits(np.uint64(state))) == REFERENCE[draw]

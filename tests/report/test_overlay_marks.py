@@ -17,6 +17,7 @@ from orthoflow.report.environments import environment_words
 from orthoflow.report.overlays import magnification_for, overlays, residuals_on_wall
 from orthoflow.report.pictures import Picture, sliders
 from orthoflow.report.rankings import Mark
+from tests.long_loops import seeds
 from tests.report_runs import (
     CENTRE,
     FRAME,
@@ -110,7 +111,7 @@ def test_marks_are_left_out_evenly_where_a_page_has_many(tmp_path: Path) -> None
     assert found.caption.endswith(", 50 of them shown")
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", seeds(4))
 def test_what_moves_a_pixel_is_as_long_on_the_wall(seed: int) -> None:
     rng = np.random.default_rng(seed)
     upright = camera()

@@ -13,7 +13,6 @@ import pytest
 import orthoflow
 from orthoflow.files.geotiff import read_raster
 from orthoflow.geometry import angle_between_deg
-from tests.long_loops import IS_LONG
 from tests.road.conftest import Shell, metrics_of
 
 SHIFT_M = (634512.347, 486215.781, 112.193)
@@ -155,7 +154,6 @@ def _change_one_byte(record: Path, what: str) -> None:
     record.write_bytes(content)
 
 
-@pytest.mark.slow
 def test_the_decorated_hall_gives_its_main_wall(shell: Shell, shared_data: Path) -> None:
     scan = shared_data / "heritage-hall-west-wall" / "west_wall.laz"
     options = ("--set=wall.gsd_m=0.02", "--set=wall.buffer_m=0.45", *ONE_WALL, "--executor=inline")
@@ -173,7 +171,6 @@ def test_the_decorated_hall_gives_its_main_wall(shell: Shell, shared_data: Path)
     assert np.mean(image.shown) > 0.95
 
 
-@pytest.mark.slow
 def test_a_gridded_e57_gives_intensity_and_depth(shell: Shell, shared_data: Path) -> None:
     scan = shared_data / "pump-e57" / "pumpAVisualReferenceImage.e57"
     options = ("--set=wall.gsd_m=0.02", *ONE_WALL, "--executor=inline")
@@ -189,10 +186,6 @@ def test_a_gridded_e57_gives_intensity_and_depth(shell: Shell, shared_data: Path
     assert np.nanmax(intensity) <= 1.0
 
 
-ONLY_LONG = (
-    pytest.mark.long,
-    pytest.mark.skipif(not IS_LONG, reason="every other scan: .ci/run --long"),
-)
 QUICKEST = "indoor-laz/indoor.laz"
 OTHER_SCANS = {
     "fountain-p11/cloud_from_photos.laz": ("cloud.up=-z",),
@@ -205,11 +198,10 @@ OTHER_SCANS = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "scan",
     [
-        pytest.param(scan, marks=() if scan == QUICKEST else ONLY_LONG, id=scan)
+        pytest.param(scan, marks=() if scan == QUICKEST else pytest.mark.long, id=scan)
         for scan in OTHER_SCANS
     ],
 )

@@ -23,7 +23,6 @@ import orthoflow
 from orthoflow.products import PointCloud
 from orthoflow.testing import example_room
 from tests.documented import ROOT, blocks, commands_of, documented_commands, written_files
-from tests.long_loops import IS_LONG
 from tests.optional import need_programs
 from tests.road.conftest import COARSE, Ended, Shell
 from tests.scan_files import write_las
@@ -88,7 +87,6 @@ def test_the_tutorial(shell: Shell) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.skipif(not IS_LONG, reason="computes the quickstart three times: .ci/run --long")
 def test_the_tutorial_as_it_stands(shell: Shell) -> None:
     Story().follow("docs/tutorial.md", shell)
 

@@ -10,7 +10,6 @@ import pytest
 from click.testing import CliRunner
 
 from orthoflow.cli.program import program
-from tests.long_loops import IS_LONG
 from tests.road.conftest import Shell
 
 Write = Callable[[str, str], Path]
@@ -78,19 +77,9 @@ def test_all_errors_of_a_workflow_file_come_at_once_with_their_lines(
         assert expected in ended.said
 
 
-def test_the_errors_are_data_for_other_programs(shell: Shell, write: Write) -> None:
-    write("wrong.yaml", SIX_ERRORS)
-    problems = json.loads(shell("check", "wrong.yaml", "--json").out)["problems"]
-    assert {3, 5, 8, 9, 10} <= {problem["line"] for problem in problems}
-
-
 BAD_SCANS: dict[str, bytes] = {
     "corrupt.laz": b"LASF" + bytes(range(256)) * 8,
-    "text.e57": b"this is not a scan\n" * 50,
     "empty.las": b"",
-    "empty.xyz": b"",
-    "words.xyz": b"the quick brown fox\njumps over\n",
-    "header.ply": b"ply\nformat ascii 1.0\nelement vertex 5\nproperty float x\n",
     "photo.jpg": b"\xff\xd8\xff\xe0 not a scan",
 }
 
@@ -125,6 +114,7 @@ def test_a_scan_that_is_not_there_is_named(shell: Shell) -> None:
     assert no_traceback(ended.said)
 
 
+@pytest.mark.long
 def test_methods_that_misbehave_fail_alone(with_stranger: Shell, write: Write) -> None:
     write("mischief.yaml", MISCHIEF)
     # The others go on while one hangs, for as long as it may and is then waited for.
@@ -157,7 +147,6 @@ def test_methods_that_misbehave_fail_alone(with_stranger: Shell, write: Write) -
 
 
 @pytest.mark.long
-@pytest.mark.skipif(not IS_LONG, reason="fills the machine's memory: .ci/run --long")
 def test_a_method_that_eats_all_memory_is_stopped_and_the_rest_goes_on(
     with_stranger: Shell, write: Write
 ) -> None:

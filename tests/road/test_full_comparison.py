@@ -12,13 +12,9 @@ from orthoflow.records.open import open_run
 from orthoflow.records.runs import Run
 from orthoflow.records.verify import verify_run
 from tests.browser import Page
-from tests.long_loops import IS_LONG
 from tests.road.conftest import ROOT, Shell
 
-pytestmark = [
-    pytest.mark.long,
-    pytest.mark.skipif(not IS_LONG, reason="a hundred cells: .ci/run --long"),
-]
+pytestmark = pytest.mark.long
 WORKFLOW = ROOT / "benchmarks" / "full_comparison.yaml"
 PLANES = ("hough2d", "hough3d", "ransac", "region")
 ORIENTATIONS = ("pnp", "dlt", "bundle")

@@ -12,14 +12,14 @@ from pathlib import Path
 import pytest
 
 import orthoflow
-from tests.long_loops import IS_LONG
 from tests.road.conftest import Shell
 
 RUN = (
     *("run", "direct.yaml", "--until", "wall"),
     *("--set", "room.scan_step_m=0.05", "--set", "wall.gsd_m=0.05"),
 )
-KILLS = 10 if IS_LONG else 1
+KILLS = 10
+pytestmark = pytest.mark.long
 
 
 def digests(run_folder: Path) -> dict[str, str]:
@@ -48,7 +48,6 @@ def quiet(tmp_path_factory: pytest.TempPathFactory, store: Path) -> Quiet:
     return Quiet(time.monotonic() - started, digests(shell.folder / "run"))
 
 
-@pytest.mark.long  # once in a normal run
 def test_killed_runs_resume_with_the_same_digests(shell: Shell, quiet: Quiet) -> None:
     rng = random.Random(20150807)
     for attempt in range(KILLS):
@@ -76,30 +75,6 @@ def _kill_after(shell: Shell, arguments: tuple[str, ...], seconds: float) -> Non
     except subprocess.TimeoutExpired:
         process.send_signal(signal.SIGKILL)
         process.wait()
-
-
-def test_ctrl_c_says_how_to_go_on(shell: Shell) -> None:
-    store = "store"
-    arguments = (*RUN, "-o", "run", "--store", store)
-    process = subprocess.Popen(
-        shell.command(*arguments),
-        cwd=shell.folder,
-        env=shell.variables(),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        stdin=subprocess.DEVNULL,
-        text=True,
-        start_new_session=True,
-    )
-    assert process.stdout is not None
-    said = process.stdout.readline()  # it has begun
-    time.sleep(1.0)
-    process.send_signal(signal.SIGINT)
-    said += process.communicate(timeout=60)[0]
-    assert process.returncode == 130, said
-    assert "Traceback" not in said
-    assert "-o run" in said
-    assert shell(*arguments).code == 0
 
 
 def test_both_executors_give_the_same_digests(shell: Shell, quiet: Quiet) -> None:

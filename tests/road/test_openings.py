@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from tests.road.conftest import Shell, metrics_of
-from tests.road.test_direct import SMALL
+
+SMALL = ("--set", "room.scan_step_m=0.016", "--set", "wall.gsd_m=0.024")
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +27,7 @@ def test_niche_door_and_windows_of_the_room_are_found(road: Shell) -> None:
     assert numbers["check", "n_true_openings"] == 4
     assert numbers["check", "n_found_openings"] == 4
     assert numbers["check", "n_false_openings"] == 0
-    # Cells of 18 mm, points of the walls beside 12 to 36 mm apart.
+    # Cells of 24 mm, points of the walls beside 16 to 48 mm apart.
     assert numbers["check", "opening_iou_min"] >= 0.93
     assert numbers["check", "side_rmse_cells"] <= 1.0
     assert numbers["check", "side_error_over_sigma"] <= 1.5

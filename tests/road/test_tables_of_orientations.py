@@ -7,13 +7,9 @@ from pathlib import Path
 import pytest
 
 from orthoflow.workflow.source import shipped_workflow
-from tests.long_loops import IS_LONG
 from tests.road.conftest import Shell, metrics_of, without_variants
 
-pytestmark = [
-    pytest.mark.long,
-    pytest.mark.skipif(not IS_LONG, reason="recipes that compare: .ci/run --long"),
-]
+pytestmark = pytest.mark.long
 SMALL = (
     *("--set", "room.scan_step_m=0.004", "--set", "room.photo_gsd_m=0.003"),
     *("--set", "wall.gsd_m=0.006", "--executor", "inline"),

@@ -6,13 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.long_loops import IS_LONG
 from tests.road.conftest import Shell, metrics_of
 
-pytestmark = [
-    pytest.mark.long,
-    pytest.mark.skipif(not IS_LONG, reason="recipes that compare: .ci/run --long"),
-]
+pytestmark = pytest.mark.long
 GSD_MM = 6.0
 SMALL = (
     *("--set", "room.scan_step_m=0.004", "--set", "room.photo_gsd_m=0.003"),

@@ -7,13 +7,9 @@ from pathlib import Path
 import pytest
 
 from orthoflow.workflow.source import shipped_workflow
-from tests.long_loops import IS_LONG
 from tests.road.conftest import Shell, metrics_of
 
-pytestmark = [
-    pytest.mark.long,
-    pytest.mark.skipif(not IS_LONG, reason="recipes that compare: .ci/run --long"),
-]
+pytestmark = pytest.mark.long
 DETECTORS = (
     "hough2d", "hough2d-unit", "hough2d-canny", "hough2d-raw", "hough2d-1in20",
     "hough3d", "hough3d-1in20", "hough3d-full",

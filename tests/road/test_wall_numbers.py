@@ -18,7 +18,7 @@ from tests.road.conftest import Shell, metrics_of
 
 # Neither the first planes nor all of one kind, so that no place among the rasters is a number.
 RANKS = (1, 3, 4)
-SETS = ("room.scan_step_m=0.02", "wall.gsd_m=0.02", f"wall.ranks={list(RANKS)}")
+SETS = ("room.scan_step_m=0.04", "wall.gsd_m=0.04", f"wall.ranks={list(RANKS)}")
 NAMED = re.compile(r"\b(?:wall|floor|ceiling|level|slope) \d+\b")
 
 

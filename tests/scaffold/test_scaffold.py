@@ -23,7 +23,6 @@ from orthoflow.testing import Trial, conformance_cases, example_inputs, run_tria
 from orthoflow.workflow.checks import lint_workflow
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import expand_cells
-from tests.long_loops import IS_LONG
 
 ROOT = Path(__file__).resolve().parents[2]
 KINDS = sorted(discover_catalog().kinds)
@@ -262,7 +261,6 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.long
-@pytest.mark.skipif(not IS_LONG, reason="installs a plugin per kind: .ci/run --long")
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_new_plugin_installs_and_passes_its_tests_at_once(
     kind: str, environment: Path, tmp_path: Path

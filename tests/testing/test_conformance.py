@@ -143,8 +143,16 @@ def _blank_charts(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
         blank_charts(request, monkeypatch)
 
 
-@pytest.mark.parametrize("case", CASES, ids=str)
+# Comparators of another library: loading it takes longer than all of their checks.
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, marks=pytest.mark.long if "open3d" in case.method_id else ())
+        for case in CASES
+    ],
+    ids=str,
+)
 def test_our_methods_conform(case: ConformanceCase, request: pytest.FixtureRequest) -> None:
-    if "open3d" in str(case):
+    if "open3d" in case.method_id:
         request.getfixturevalue("_open3d")
     case.run()

@@ -306,7 +306,7 @@ BESIDE_SAYS = {
 STOPPED: dict[str, tuple[str, str, str]] = {
     "wrong_key": (
         "outputs-are-valid",
-        r"the method raised KeyError: 'tolerance' \(floors\.py:\d+\)",
+        r"on the suite's inputs the method raised KeyError: 'tolerance' \(floors\.py:\d+\)",
         """
         def look_at(self, cloud):
             return {}["tolerance"]
@@ -314,7 +314,7 @@ STOPPED: dict[str, tuple[str, str, str]] = {
     ),
     "wrong_output": (
         "outputs-are-valid",
-        r"what the method makes is not valid: labels\.plane_index must be .* \(floors\.py:\d+\)",
+        r".*raised ProductError: labels\.plane_index must be .* \(floors\.py:\d+\)",
         """
         def look_at(self, cloud):
             PointLabels(plane_index=np.zeros(len(cloud), dtype=np.int64))
@@ -322,7 +322,7 @@ STOPPED: dict[str, tuple[str, str, str]] = {
     ),
     "wrong_metric": (
         "outputs-are-valid",
-        r"what the method makes is not valid: metric height must be finite, got nan.* \(floors.*\)",
+        r".*raised ProductError: metric height must be finite, got nan.* \(floors.*\)",
         """
         def listen(self, ctx):
             ctx.metric("height", float("nan"), "m")
@@ -330,7 +330,7 @@ STOPPED: dict[str, tuple[str, str, str]] = {
     ),
     "no_figure": (
         "outputs-are-valid",
-        r"what the method makes is not valid: figure plan must be .* \(floors\.py:\d+\)",
+        r".*raised ProductError: figure plan must be .* \(floors\.py:\d+\)",
         """
         def listen(self, ctx):
             ctx.figure("plan", b"no picture", "A plan.")
@@ -495,7 +495,7 @@ def test_a_result_that_moved_without_its_version_is_noticed(
 def test_a_method_that_raises_what_nobody_expects_is_told_in_a_sentence() -> None:
     cases = conformance_cases("plane.floor", inputs=lambda: {"cloud": None})
     (case,) = (case for case in cases if case.check.name == "outputs-are-valid")
-    assert re.fullmatch(r"the method raised AttributeError: .* \(floors\.py:\d+\)", case.problem())
+    assert re.search(r"method raised AttributeError: .* \(floors\.py:\d+\)$", case.problem())
 
 
 @pytest.mark.usefixtures("cheats")

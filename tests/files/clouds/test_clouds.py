@@ -27,6 +27,7 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Intrinsics, Photo, PointCloud, PointLabels
 from tests import cloud_scenes
 from tests.cloud_scenes import ORIGIN, planes
+from tests.long_loops import seeds
 
 N_SIDE = 60
 STATIONS = ORIGIN + np.array([[2.0, 1.0, 1.5], [1.0, 2.0, 1.0]])
@@ -326,7 +327,7 @@ def test_only_what_is_asked_for_is_written(tmp_path: Path) -> None:
     assert write_laz(tmp_path / "none.laz", with_attributes(box_world=box + 100.0)) == 0
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", seeds(3))
 def test_cleaning_takes_the_outliers_and_nothing_else(tmp_path: Path, seed: int) -> None:
     cloud = corner()
     random = np.random.default_rng(seed)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from orthoflow.files.drawings.regular_openings import regular_opening
+from tests.long_loops import seeds
 
 
 def wobbled(outline: np.ndarray, seed: int, sd_m: float) -> np.ndarray:
@@ -17,7 +18,7 @@ def wobbled(outline: np.ndarray, seed: int, sd_m: float) -> np.ndarray:
     return np.array(points) + np.random.default_rng(seed).normal(0.0, sd_m, (len(points), 2))
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", seeds(5))
 def test_a_window_with_uneven_sides_is_a_rectangle(seed: int) -> None:
     box = np.array([[1.0, 0.5], [2.2, 0.5], [2.2, 2.0], [1.0, 2.0]])
     found = regular_opening(wobbled(box, seed, 0.005), 0.005)

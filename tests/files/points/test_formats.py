@@ -23,6 +23,7 @@ from orthoflow.files.points.lzf_kernels import decompress_lzf
 from orthoflow.files.points.scan_file import load_library, reading
 from tests import scan_files
 from tests.fuzz.e57_pages import e57_of
+from tests.long_loops import seeds
 from tests.scan_files import read_all, read_points
 
 POINTS = np.round(np.random.default_rng(3).uniform(-5.0, 5.0, (40, 3)), 4)
@@ -302,7 +303,7 @@ def test_lzf_repeats_what_it_refers_to(reference: bytes, plain: bytes | None) ->
     assert (found[:count].tobytes() if count >= 0 else None) == plain
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", seeds(4))
 def test_damaged_lzf_data_never_leave_their_array(seed: int) -> None:
     packed = np.random.default_rng(seed).integers(0, 256, 300).astype(np.uint8)
     assert decompress_lzf(packed, np.zeros(64, np.uint8)) == -1

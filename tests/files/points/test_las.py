@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError
 from orthoflow.files.points import las, open_scan
 from tests import scan_files
+from tests.long_loops import seeds
 from tests.scan_files import read_all
 
 
@@ -43,7 +44,7 @@ def test_only_the_classes_asked_for_are_given_and_the_rest_is_counted(
     assert sum(block.left_out["other_class"] for block in blocks) == (~wanted & ~withheld).sum()
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", seeds(12))
 def test_changed_bytes_in_a_laz_file_end_in_one_sentence_or_in_points(
     tmp_path: Path, seed: int
 ) -> None:

@@ -44,7 +44,6 @@ from orthoflow.products import (
 from orthoflow.sdk import StepContext
 from tests import inspect_scenes, samples
 from tests.inspect_scenes import BUFFER_M, GSD_M, points_at
-from tests.long_loops import IS_LONG
 
 
 def context(folder: Path) -> StepContext:
@@ -218,7 +217,6 @@ def test_what_is_not_found_is_said(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.skipif(not IS_LONG, reason="a room of many points: .ci/run --long")
 def test_points_of_a_simulated_room_are_found_by_its_truth(tmp_path: Path) -> None:
     params = SimulateRoom.Params(scan_step_m=0.1, panorama_step_m=0.3)
     room = SimulateRoom().run(SimulateRoom.In(), params, context(tmp_path))
@@ -261,7 +259,6 @@ def test_points_of_a_simulated_room_are_found_by_its_truth(tmp_path: Path) -> No
 TLS_PATCHES = ("T1.1", "T1.2", "T1.3", "T2.1", "T2.2", "T2.3", "T3.1", "T3.2")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "names",
     [
@@ -269,10 +266,7 @@ TLS_PATCHES = ("T1.1", "T1.2", "T1.3", "T2.1", "T2.2", "T2.3", "T3.1", "T3.2")
         pytest.param(
             TLS_PATCHES,
             id="all",
-            marks=(
-                pytest.mark.long,
-                pytest.mark.skipif(not IS_LONG, reason="all eight patches: .ci/run --long"),
-            ),
+            marks=pytest.mark.long,
         ),
     ],
 )

@@ -14,6 +14,8 @@ from orthoflow_plugins.match.displacements import (
     search_shifts,
 )
 
+from tests.long_loops import seeds
+
 SIDE = 44
 HALF = 5
 
@@ -47,7 +49,7 @@ def rooms(side: int) -> tuple[NDArray[np.float64], ...]:
 # --- whole cells ---
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", seeds(3))
 def test_the_shift_of_highest_correlation_is_found_with_its_lead(seed: int) -> None:
     rng = np.random.default_rng(seed)
     half, radius = 4, 3

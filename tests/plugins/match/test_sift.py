@@ -20,6 +20,7 @@ from orthoflow.geometry.key_points import (
 from orthoflow.products import Photo, Photos, TieRole, Ties, Walls
 from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
+from tests.long_loops import seeds
 
 MAX_FEATURES = 3000
 
@@ -110,7 +111,7 @@ def test_the_key_points_that_are_kept_are_described_as_if_all_were(walls: Walls)
         np.testing.assert_array_equal(getattr(few, name), getattr(every, name)[:100])
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", seeds(3))
 def test_neighbours_within_a_window_are_those_of_brute_force(seed: int) -> None:
     rng = np.random.default_rng(seed)
     first = rng.integers(0, 80, (600, 128)).astype(np.float32)

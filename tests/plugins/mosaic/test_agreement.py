@@ -17,6 +17,7 @@ from orthoflow_plugins.mosaic.blocks import depth_edges
 
 from orthoflow.products import Layer, LayerMask
 from tests import samples
+from tests.long_loops import seeds
 
 SHAPE = (150, 210)
 
@@ -133,7 +134,7 @@ def sources(seed: int, shape: tuple[int, int] = (11, 9)) -> NDArray[np.int16]:
 
 
 @pytest.mark.parametrize("at_once", [1, 3, 11, 1024])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", seeds(2))
 def test_seams_are_where_the_right_or_lower_neighbour_is_of_another(
     monkeypatch: pytest.MonkeyPatch, seed: int, at_once: int
 ) -> None:

@@ -20,6 +20,7 @@ from orthoflow.errors import MethodError
 from orthoflow.geometry.bands import in_memory
 from orthoflow.products import Layer, LayerMask, OrthoMask
 from tests import samples
+from tests.long_loops import seeds
 
 SHAPE = (23, 17)
 PLAIN = MosaicSeams.Params(island_cells_min=1)
@@ -155,7 +156,7 @@ def patches(source: NDArray[np.int16], index: int) -> list[list[tuple[int, int]]
 
 
 @pytest.mark.parametrize("cells_min", [2, 5, 9])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", seeds(2))
 def test_small_patches_go_to_the_source_about_them_that_shows_them_too(
     seed: int, cells_min: int
 ) -> None:

@@ -11,7 +11,7 @@ from orthoflow_plugins.mosaic.seams import MosaicSeams
 from orthoflow.products import Layer, LayerMask, Layers, Orthoimage, Walls
 from tests import inspect_scenes, samples
 from tests import raster_scenes as scenes
-from tests.turns import TURNS, Turn
+from tests.turns import OTHER_TURNS, TURNS, Turn
 
 
 def layers_and_walls(shape: tuple[int, int], turn: Turn) -> tuple[Layers, Walls]:
@@ -55,7 +55,7 @@ def mosaic(shape: tuple[int, int], turn: Turn, folder: Path, **params: object) -
     return MosaicSeams().run(inputs, chosen, scenes.context(folder)).orthoimages.images[0]
 
 
-@pytest.mark.parametrize("turn", TURNS[1:], ids=str)
+@pytest.mark.parametrize("turn", OTHER_TURNS, ids=str)
 @pytest.mark.parametrize(
     ("seams", "shape"),
     [

@@ -12,7 +12,6 @@ from orthoflow.products import Camera
 from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
 from tests.adverse_cases import GSD_M, KINDS, AdverseCase, adverse_case, every_case
-from tests.long_loops import IS_LONG
 
 
 def oriented(case: AdverseCase, folder: Path) -> Camera:
@@ -39,7 +38,6 @@ def test_a_photo_in_trouble_is_right_or_refused(tmp_path: Path, kind: str) -> No
 
 
 @pytest.mark.long
-@pytest.mark.skipif(not IS_LONG, reason="200 photos: .ci/run --long")
 def test_of_two_hundred_photos_in_trouble_the_solvable_ones_are_ok(tmp_path: Path) -> None:
     n_solvable = n_ok = 0
     for case in every_case(10):

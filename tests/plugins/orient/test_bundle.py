@@ -26,6 +26,7 @@ from orthoflow.products import Cameras, Photo, Photos, Ties
 from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
 from tests import block_scenes as bs
+from tests.long_loops import seeds
 from tests.scenes import SURVEY_SHIFT_M
 
 FEW = {"max_features": 1500}
@@ -130,7 +131,7 @@ def with_errors_that_reach_far(ties: Ties, seed: int, sigma_m: float) -> Ties:
     return replace(ties, points_world=ties.points_world + sigma_m * off)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", seeds(3))
 def test_errors_of_the_scan_do_not_split_one_camera_into_several_lenses(
     tmp_path: Path, seed: int
 ) -> None:

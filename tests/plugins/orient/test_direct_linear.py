@@ -22,6 +22,7 @@ from orthoflow.geometry.frames import rotation_from_vector
 from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Intrinsics, Photo
 from tests import samples
+from tests.long_loops import seeds
 
 SIZE_PX = (4000, 3000)
 
@@ -80,7 +81,7 @@ def estimated(
 
 
 @pytest.mark.parametrize("scale", [1.0, -3.0, 0.02])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", seeds(4))
 def test_a_projection_matrix_comes_apart_into_what_it_was_made_of(seed: int, scale: float) -> None:
     rng = np.random.default_rng(seed)
     rotation = rotation_from_vector(rng.normal(size=3))

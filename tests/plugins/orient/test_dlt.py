@@ -24,6 +24,7 @@ from orthoflow.products import Cameras, Photo, Photos, Ties, TieWall
 from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
 from tests import samples
+from tests.long_loops import seeds
 
 SIZE_PX = (4000, 3000)
 # A grey photo: what it shows is in the ties.
@@ -116,7 +117,7 @@ def frame_errors_px(found: ViewingCamera, true: ViewingCamera) -> NDArray[np.flo
     return np.linalg.norm(found.project(points)[:, :2] - pixels, axis=1)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", seeds(3))
 def test_eleven_parameters_miss_the_corners_of_a_distorted_photo_by_ten_pixels(
     tmp_path: Path, seed: int
 ) -> None:
@@ -129,7 +130,7 @@ def test_eleven_parameters_miss_the_corners_of_a_distorted_photo_by_ten_pixels(
     assert any("its lens has distortion that a DLT" in warning for warning in ctx.warnings)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", seeds(3))
 @pytest.mark.parametrize(
     ("distortion", "full", "most_px", "rms_px"),
     [("k1", False, 4.0, 0.7), ("k1 k2 p1 p2", True, 4.0, 0.7)],

@@ -26,6 +26,7 @@ from scipy import optimize, stats
 
 from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Photo
+from tests.long_loops import seeds
 
 N_TIES = 100
 WALL = KnownWall(
@@ -350,7 +351,7 @@ def test_one_tie_in_twenty_five_must_agree(n_agree: int, is_enough: bool) -> Non
         assert found[1].startswith("only 3.9% of 1000 ties agree")
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", seeds(4))
 def test_the_area_of_a_hull_is_that_of_its_polygon(seed: int) -> None:
     # Points within a triangle whose corners are among them.
     rng = np.random.default_rng(seed)

@@ -17,6 +17,7 @@ from orthoflow.products import Cameras, Intrinsics, Photo, Photos, TieRole, Ties
 from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
 from tests import samples
+from tests.long_loops import seeds
 from tests.scenes import SURVEY_SHIFT_M
 
 PIXEL = Photo(
@@ -199,7 +200,7 @@ def test_an_exif_focal_length_is_improved(tmp_path: Path, factor: float) -> None
     assert found.intrinsics.fx == pytest.approx(plain.fx, rel=0.006)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", seeds(4))
 def test_opencvs_pose_is_the_least_squares_of_ties_that_count_alike(
     tmp_path: Path, seed: int
 ) -> None:
@@ -237,7 +238,7 @@ def test_opencvs_pose_leaves_the_lens_as_it_is_known(tmp_path: Path) -> None:
     assert found.intrinsics.source == "exif"
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", seeds(8))
 def test_random_ties_are_never_ok(tmp_path: Path, seed: int) -> None:
     camera = ms.camera_before(ms.textured_wall(0))
     ties = known_ties(camera, seed, n=300, wrong_share=1.0)

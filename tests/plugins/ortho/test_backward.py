@@ -17,6 +17,7 @@ from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import Camera, Cameras, Layer, LayerMask, Layers, PointCloud
 from orthoflow.sdk import StepContext
 from tests import ortho_scenes as scenes
+from tests.long_loops import seeds
 from tests.raster_scenes import cloud_of, context
 
 
@@ -164,7 +165,7 @@ def test_a_sparse_board_hides_as_well_as_a_dense_one(tmp_path: Path) -> None:
     assert (layer.mask[is_behind_board] == LayerMask.OCCLUDED).all()
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", seeds(3))
 def test_noise_and_spikes_of_the_surface_hide_little(tmp_path: Path, seed: int) -> None:
     rng = np.random.default_rng(seed)
     noisy = scenes.depth_m() + rng.normal(0.0, 0.002, scenes.SHAPE).astype(np.float32)

@@ -15,6 +15,7 @@ from orthoflow_plugins.ortho.surfaces import Surface, relief_of, view_of
 from orthoflow_plugins.ortho.visibility_kernels import Relief, WallView
 
 from tests import ortho_scenes as scenes
+from tests.long_loops import seeds
 
 TOLERANCE_M: Final = 0.008
 
@@ -71,7 +72,7 @@ def met(
     return -1.0, "nothing"
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", seeds(2))
 def test_rays_meet_the_first_patch_on_their_way_and_no_sides(seed: int) -> None:
     view, relief = boxes(seed)
     rng = np.random.default_rng(seed)

@@ -17,7 +17,7 @@ from orthoflow.geometry import frame_over
 from orthoflow.products import Layer, LayerMask, Walls
 from tests import raster_scenes as scenes
 from tests import samples
-from tests.turns import TURNS, Turn
+from tests.turns import OTHER_TURNS, TURNS, Turn
 
 SHAPE = (30, 41)
 
@@ -42,7 +42,7 @@ def painted(turn: Turn, folder: Path, **params: object) -> Layer:
     return PointcloudDirect().run(inputs, chosen, scenes.context(folder)).layers.layers[0]
 
 
-@pytest.mark.parametrize("turn", TURNS[1:], ids=str)
+@pytest.mark.parametrize("turn", OTHER_TURNS, ids=str)
 @pytest.mark.parametrize(
     ("colouring", "inpaint"),
     [
@@ -71,7 +71,7 @@ def test_a_turned_cloud_paints_the_turned_layer(
     )
 
 
-@pytest.mark.parametrize("turn", TURNS[1:], ids=str)
+@pytest.mark.parametrize("turn", OTHER_TURNS, ids=str)
 @pytest.mark.parametrize("resampling", ["nearest", "bilinear", "cubic", "lanczos"])
 def test_a_turned_photo_is_sampled_alike(resampling: Resampling, turn: Turn) -> None:
     rng = np.random.default_rng(8)

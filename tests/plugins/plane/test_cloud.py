@@ -15,6 +15,7 @@ from orthoflow_plugins.plane.support import SurfaceRaster
 
 from orthoflow.errors import ProductError
 from orthoflow.geometry import Plane, wall_axes
+from tests.long_loops import seeds
 from tests.plane_scenes import cloud_of, prepared, search_in
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -58,7 +59,7 @@ def nearest_holder(points_m: NDArray[np.float64], rasters: list[SurfaceRaster]) 
     return np.where(np.isfinite(distances.min(axis=0)), nearest, np.int8(-1))
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", seeds(4))
 def test_planes_that_cross_share_the_sample_by_distance(seed: int) -> None:
     rasters = crossing_rasters(seed, 5)
     search = search_in(prepared_cloud(seed))
@@ -73,7 +74,7 @@ def test_planes_that_cross_share_the_sample_by_distance(seed: int) -> None:
         np.testing.assert_array_equal(points.x, points_m[expected < 0, 0].astype(np.float32))
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", seeds(4))
 def test_one_pass_for_all_planes_assigns_as_one_plane_after_the_other(seed: int) -> None:
     rasters = crossing_rasters(seed, 5)
     cloud = prepared_cloud(seed)

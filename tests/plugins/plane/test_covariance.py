@@ -17,7 +17,6 @@ from scipy import ndimage
 
 from orthoflow.geometry import Plane, wall_axes
 from orthoflow.products import Planes
-from tests.long_loops import IS_LONG
 from tests.plane_scenes import context
 from tests.random_rooms import random_room
 
@@ -163,7 +162,6 @@ def test_stated_sigmas_of_scanned_rooms_are_their_errors(tmp_path: Path) -> None
 
 
 @pytest.mark.long
-@pytest.mark.skipif(not IS_LONG, reason="fifty rooms: .ci/run --long")
 @pytest.mark.parametrize("step_deg", [0.5, 1.0])
 def test_stated_sigmas_of_fifty_rooms_are_their_errors(step_deg: float, tmp_path: Path) -> None:
     found = [item for seed in range(50) for item in room_ratios(seed, tmp_path, step_deg=step_deg)]

@@ -29,11 +29,11 @@ from scipy import ndimage
 from orthoflow.geometry import wall_axes
 from orthoflow.geometry.slabs import Offsets, read_only
 from tests import scenes
+from tests.long_loops import seeds
 
 UP: Final = np.array([0.0, 0.0, 1.0])
 # Three blocks and a piece of one.
 N_POINTS: Final = 3 * BLOCK_POINTS + 61
-SEEDS: Final = range(3)
 
 
 def offsets_of(points_m: NDArray[np.float64]) -> Offsets:
@@ -76,7 +76,7 @@ def along(slab: NDArray[np.float64], points_m: NDArray[np.float64]) -> NDArray[n
 
 
 @pytest.mark.parametrize("parts", [1, 3])
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", seeds(3))
 def test_points_are_counted_in_their_cell_and_storey(seed: int, parts: int) -> None:
     rng = np.random.default_rng(seed)
     shape = (5, 7, 4)
@@ -149,7 +149,7 @@ def summed_cells(
     return counts, sums
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", seeds(3))
 def test_all_planes_at_once_sum_the_points_that_they_own(seed: int) -> None:
     rng = np.random.default_rng(seed)
     slabs = slab_rows(rng, 4)
@@ -218,7 +218,7 @@ def test_labels_are_the_names_of_claims() -> None:
 # --- hypotheses ---
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", seeds(3))
 def test_consensus_counts_points_near_planes_and_weighs_them_by_distance(seed: int) -> None:
     rng = np.random.default_rng(seed)
     points = rng.uniform(-1.0, 1.0, (3, N_POINTS)).astype(np.float32)
@@ -245,7 +245,7 @@ def moments(points: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArra
     return np.array([float((weights * term).sum()) for term in terms])
 
 
-@pytest.mark.parametrize("seed", range(30))
+@pytest.mark.parametrize("seed", seeds(30))
 def test_the_flattest_plane_is_the_smallest_eigenvector(seed: int) -> None:
     rng = np.random.default_rng(seed)
     shape = scenes.random_rotation(rng) * rng.uniform(0.01, 2.0, 3)
@@ -294,7 +294,7 @@ def reweighted(
 
 
 @pytest.mark.parametrize("freedom", [FREE, VERTICAL, LEVEL], ids=["free", "vertical", "level"])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", seeds(4))
 def test_robust_fits_are_reweighted_least_squares(seed: int, freedom: int) -> None:
     rng = np.random.default_rng(seed)
     tolerance_m = 0.05

@@ -15,6 +15,7 @@ from orthoflow_plugins.plane.region import Region
 
 from orthoflow.products import Planes, PointCloud
 from orthoflow.sdk import StepContext
+from tests.long_loops import long_only
 
 DETECTORS = [Hough2d, Hough3d, Ransac, Region]
 SIZE_M = np.array([5.0, 4.0, 2.8])
@@ -71,7 +72,7 @@ def detected(method: type, points: NDArray[np.float64], tmp_path: Path, **params
     return planes
 
 
-@pytest.mark.parametrize("noise_m", [0.001, 0.005, 0.02, 0.03])
+@pytest.mark.parametrize("noise_m", [0.001, 0.02])
 def test_the_noise_of_a_flat_wall_is_measured(noise_m: float) -> None:
     found = measure_noise(wall(np.random.default_rng(3), noise_m, 120_000))
     assert found is not None
@@ -102,7 +103,9 @@ def test_one_noisy_wall_is_found_at_defaults(method: type, tmp_path: Path) -> No
     assert abs(planes.offset[0]) < 0.001
 
 
-@pytest.mark.parametrize(("seed", "noise_m", "shared_m"), [(11, 0.03, 0.0), (12, 0.01, 0.01)])
+@pytest.mark.parametrize(
+    ("seed", "noise_m", "shared_m"), [(12, 0.01, 0.01), *long_only((11, 0.03, 0.0))]
+)
 @pytest.mark.parametrize("method", DETECTORS, ids=lambda method: method.id)
 def test_every_wall_of_a_noisy_room_is_found_at_defaults(
     method: type, seed: int, noise_m: float, shared_m: float, tmp_path: Path
@@ -117,7 +120,7 @@ def test_a_clean_cloud_has_the_tolerances_of_before(tmp_path: Path) -> None:
     assert planes.tolerance_m == 0.05
 
 
-@pytest.mark.parametrize("noise_m", [0.005, 0.025])
+@pytest.mark.parametrize("noise_m", [0.025, *long_only(0.005)])
 @pytest.mark.parametrize("method", DETECTORS, ids=lambda method: method.id)
 def test_a_wall_of_four_square_metres_is_found_beside_denser_clutter(
     method: type, noise_m: float, tmp_path: Path

@@ -29,7 +29,6 @@ def detect(method: type[Method], folder: Path, **params: Any) -> tuple[Any, Step
     return method().run(method.In(cloud=cloud), method.Params(**params), ctx), ctx
 
 
-@pytest.mark.heavy
 @pytest.mark.usefixtures("_open3d")
 @pytest.mark.parametrize("name", COMPARATORS)
 def test_comparators_find_the_large_planes_of_a_room(name: str, tmp_path: Path) -> None:
@@ -43,7 +42,6 @@ def test_comparators_find_the_large_planes_of_a_room(name: str, tmp_path: Path) 
     assert np.mean(own == np.bincount(own[own >= 0]).argmax()) > 0.97
 
 
-@pytest.mark.heavy
 @pytest.mark.usefixtures("_open3d")
 def test_a_constraint_passes_over_what_open3d_finds_first(tmp_path: Path) -> None:
     planes = detect(Open3dRansac, tmp_path, constraint="horizontal")[0].planes

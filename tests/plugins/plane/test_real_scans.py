@@ -55,7 +55,6 @@ def hall(
     return planes
 
 
-@pytest.mark.slow
 def test_the_main_wall_of_the_hall_is_found(hall: Planes) -> None:
     assert angle_between_deg(hall.normal[0], MAIN) < 0.1
     assert hall.plane(0).distances_m(ON_MAIN[None])[0] == pytest.approx(0.0, abs=0.01)
@@ -63,7 +62,6 @@ def test_the_main_wall_of_the_hall_is_found(hall: Planes) -> None:
     assert hall.viewpoint == "guess"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("in_front_m", [0.25, -0.36], ids=["cases", "recesses"])
 def test_parallel_planes_of_the_hall_are_found_and_face_the_hall(
     in_front_m: float, hall: Planes
@@ -75,7 +73,6 @@ def test_parallel_planes_of_the_hall_are_found_and_face_the_hall(
     assert np.abs(in_front - in_front_m)[faces_hall].min() < 0.03
 
 
-@pytest.mark.slow
 def test_floor_and_ceiling_of_the_hall_are_found(hall: Planes) -> None:
     kinds = [name.split()[0] for name in hall.names]
     assert {"floor", "ceiling"} <= set(kinds)
@@ -83,7 +80,6 @@ def test_floor_and_ceiling_of_the_hall_are_found(hall: Planes) -> None:
     assert angle_between_deg(hall.normal[floor], np.array([0, 0, 1.0])) < 0.2
 
 
-@pytest.mark.slow
 def test_the_exactness_stated_of_a_real_wall_holds_between_its_halves(
     hall_cloud: PointCloud, tmp_path: Path
 ) -> None:
@@ -106,7 +102,6 @@ def test_the_exactness_stated_of_a_real_wall_holds_between_its_halves(
     assert 1e-4 < first.sigma_offset_m(0) < 2e-3
 
 
-@pytest.mark.slow
 def test_levels_of_a_building_with_y_up_are_found(shared_data: Path, tmp_path: Path) -> None:
     points = points_of(shared_data / "indoor-laz" / "indoor.laz")
     cloud = cloud_of(points, up=(0.0, 1.0, 0.0))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Final
 
 import numpy as np
 import pytest
@@ -17,7 +16,7 @@ from orthoflow_plugins.plane.votes import (
     vote_planes,
 )
 
-SEEDS: Final = range(3)
+from tests.long_loops import seeds
 
 
 def voted(
@@ -67,7 +66,7 @@ def test_cells_of_an_image_vote_for_the_lines_through_them(
     np.testing.assert_array_equal(votes - 1, expected)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", seeds(3))
 def test_places_vote_for_the_planes_through_them(seed: int) -> None:
     rng = np.random.default_rng(seed)
     shape, bin_m, n_bins = (22, 35), 0.1, 30

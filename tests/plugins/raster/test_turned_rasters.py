@@ -13,7 +13,7 @@ from orthoflow_plugins.raster.grid import RasterGrid
 
 from orthoflow.products import PointCloud, SurfaceMask, Wall
 from tests import raster_scenes as scenes
-from tests.turns import TURNS, Turn
+from tests.turns import OTHER_TURNS, TURNS, Turn
 
 SHAPE = (34, 43)
 SURFACES = ("median", "denoised", "nearest", "centre", "topmost", "mean", "tin")
@@ -106,7 +106,7 @@ def assert_turned(wall: Wall, turned: Wall, turn: Turn) -> None:
     assert (off > 0).mean() < 0.001
 
 
-@pytest.mark.parametrize("turn", TURNS[1:], ids=str)
+@pytest.mark.parametrize("turn", OTHER_TURNS, ids=str)
 @pytest.mark.parametrize("surface", SURFACES)
 def test_a_turned_cloud_gives_the_turned_raster(tmp_path: Path, surface: str, turn: Turn) -> None:
     scattered = in_any_order(0.8)
@@ -117,7 +117,7 @@ def test_a_turned_cloud_gives_the_turned_raster(tmp_path: Path, surface: str, tu
     assert_turned(wall, rastered(scattered, turn, tmp_path, surface=surface), turn)
 
 
-@pytest.mark.parametrize("turn", TURNS[1:], ids=str)
+@pytest.mark.parametrize("turn", OTHER_TURNS, ids=str)
 @pytest.mark.parametrize("gap_cells", [1, 3])
 def test_gaps_of_any_width_close_alike_on_all_sides(
     tmp_path: Path, gap_cells: int, turn: Turn
@@ -128,7 +128,7 @@ def test_gaps_of_any_width_close_alike_on_all_sides(
     assert_turned(wall, rastered(scattered, turn, tmp_path, **params), turn)
 
 
-@pytest.mark.parametrize("turn", TURNS[1:], ids=str)
+@pytest.mark.parametrize("turn", OTHER_TURNS, ids=str)
 def test_neighbours_in_a_scan_span_gaps_alike_in_all_directions(tmp_path: Path, turn: Turn) -> None:
     params = {"surface": "centre"}
     wall = rastered(in_rows(), TURNS[0], tmp_path, **params)
@@ -138,7 +138,7 @@ def test_neighbours_in_a_scan_span_gaps_alike_in_all_directions(tmp_path: Path, 
     assert_turned(wall, rastered(in_rows(), turn, tmp_path, **params), turn)
 
 
-@pytest.mark.parametrize("turn", TURNS[1:], ids=str)
+@pytest.mark.parametrize("turn", OTHER_TURNS, ids=str)
 def test_even_cells_that_are_all_equally_near_are_weighed_evenly(
     tmp_path: Path, turn: Turn
 ) -> None:

@@ -15,6 +15,7 @@ from orthoflow.errors import MethodError
 from orthoflow.products import CheckPoints
 from tests import raster_scenes as scenes
 from tests.inspect_scenes import points_at
+from tests.long_loops import seeds
 
 SURVEY = np.array([634512.347, 486215.781, 112.193])
 
@@ -42,7 +43,7 @@ def places(seed: int, count: int = 8) -> NDArray[np.float64]:
     return np.random.default_rng(seed).uniform(-5.0, 5.0, (count, 3))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", seeds(3))
 def test_the_transformation_is_found_and_moves_the_cloud(tmp_path: Path, seed: int) -> None:
     true, source = turned(seed), places(seed)
     out, metrics = register(tmp_path, points_at(source), points_at(true.apply(source)))

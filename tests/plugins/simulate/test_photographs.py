@@ -20,6 +20,7 @@ from orthoflow.geometry.scenes import SurfaceRole
 from orthoflow.products import Truth
 from orthoflow.sdk import StepContext
 from tests import scenes
+from tests.long_loops import seeds
 from tests.scene_rays import cast, colours_at
 
 COARSE = {"scan_step_m": 0.1, "photo_layout": "quick", "photo_gsd_m": 0.008}
@@ -212,7 +213,7 @@ def test_a_block_overlaps_by_seventy_and_fifty_percent(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("layout", ["quick", "variant1", "variant2"])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", seeds(4))
 def test_nobody_stands_inside_furniture_or_walls(layout: PhotoLayout, seed: int) -> None:
     scene = build_room().scene
     views = SceneCameras(scene)
