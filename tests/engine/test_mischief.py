@@ -11,6 +11,7 @@ import pytest
 from orthoflow.engine.results import CellResult
 from orthoflow.engine.scheduler import RunOutcome
 from tests.engine_world import World, has_ended, start_fork_server
+from tests.long_loops import long_only
 
 WHO = "method work.{} of toy-plugin 1.0"
 
@@ -42,7 +43,7 @@ def test_what_a_step_started_ends_with_it(world: World) -> None:
     assert has_ended(int(world.store.get_product(digest, Numbers).values[0]))
 
 
-@pytest.mark.parametrize("name", ["hides", "hides_and_crashes", "hides_and_stops"])
+@pytest.mark.parametrize("name", ["hides_and_crashes", *long_only("hides", "hides_and_stops")])
 def test_what_was_started_in_another_session_by_a_process_that_is_gone_ends_too(
     world: World, name: str
 ) -> None:

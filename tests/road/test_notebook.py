@@ -13,6 +13,7 @@ from tests.road.conftest import CHECKOUT, ROOT
 NOTEBOOK = ROOT / "examples" / "runs.ipynb"
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("default")  # of the notebook's own machinery
 def test_the_notebook_runs_and_shows_what_it_promises(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
