@@ -119,7 +119,7 @@ def place_folder(aside: Path, final: Path) -> bool:
     """Rename a finished folder into place.
 
     Returns:
-        False if another writer was first; the new folder is then removed.
+        False if another writer was first; the new folder then stays where it is.
 
     Raises:
         StoreError: the disk cannot be written.
@@ -132,7 +132,6 @@ def place_folder(aside: Path, final: Path) -> bool:
         except OSError as error:
             if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
                 raise
-            remove_tree(aside)
             return False
         sync_folder(final.parent)
     return True

@@ -244,12 +244,13 @@ class Store:
                 digest = write_product_file(aside / PRODUCT, product.to_payload())
                 final = self._object(digest)
                 tag = publisher_tag if publisher else ""
-                if not self._is_there(final, tag):
+                is_there = partial(self._is_there, final, tag)
+                if not is_there():
                     if publisher is not None:
                         publish_into(aside / PUBLISHED, product, publisher, digest)
                         sync_tree(aside / PUBLISHED)
                     _describe(aside, final.name, type(product).type_name, tag)
-                    self._place(aside, final)
+                    self._place(aside, final, is_there)
         except RecordFormatError as error:
             raise ProductError(f"a {product.type_name} cannot be stored: {error}") from error
         finally:
@@ -321,11 +322,15 @@ class Store:
         """
         sha256 = hashlib.sha256(content).hexdigest()
         folder = self.objects / sha256
-        if self._damaged_part(folder):
+
+        def is_there() -> bool:
+            return not self._damaged_part(folder, again=True)
+
+        if not is_there():
             aside = self._new_folder()
             try:
                 write_whole(aside / BLOB, content)
-                self._place(aside, folder)
+                self._place(aside, folder, is_there)
             finally:
                 remove_tree(aside)
         return sha256
@@ -495,8 +500,12 @@ class Store:
             folder.mkdir(parents=True)
         return folder
 
-    def _place(self, aside: Path, final: Path) -> None:
+    def _place(self, aside: Path, final: Path, is_there: Callable[[], bool]) -> None:
+        """Give a finished object its name, in the place of one that cannot be used."""
         if os.path.lexists(final):
+            # Another run has stored an equal one meanwhile, and may be reading it.
+            if is_there():
+                return
             with contextlib.suppress(FileNotFoundError):
                 self._remove(final)
         place_folder(aside, final)

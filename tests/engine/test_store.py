@@ -92,6 +92,10 @@ def publish_link(product: Product, folder: Path, digest: str, /) -> None:
     (folder / "link.txt").symlink_to("/etc/hostname")
 
 
+def publish_note(product: Product, folder: Path, digest: str, /) -> None:
+    (folder / "note.txt").write_text(digest)
+
+
 def publish_pipe(product: Product, folder: Path, digest: str, /) -> None:
     os.mkfifo(folder / "pipe")
 
@@ -129,6 +133,22 @@ def test_a_damaged_product_is_replaced_when_it_is_computed_again(
     damage(object_folder(store, ref) / "product.h5")  # type: ignore[operator]
     assert store.put_product(heights()) == ref
     np.testing.assert_array_equal(store.get_product(ref.digest, Heights).values, heights().values)
+
+
+def test_an_equal_object_of_another_run_is_left_in_place(store: Store) -> None:
+    """The other run may read it: publishing takes long enough for both to have found none."""
+    other = Store(store.folder)
+
+    first: list[int] = []
+
+    def publish_twice(product: Product, folder: Path, digest: str, /) -> None:
+        ref = other.put_product(product, publish_note, publisher_tag="1")
+        first.append(object_folder(store, ref).stat().st_ino)
+        publish_note(product, folder, digest)
+
+    ref = store.put_product(heights(), publish_twice, publisher_tag="1")
+    assert [object_folder(store, ref).stat().st_ino] == first
+    assert not list((store.scratch / "loose").iterdir())
 
 
 def test_reading_a_damaged_product_says_so_and_removes_it(store: Store) -> None:
