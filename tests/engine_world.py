@@ -18,18 +18,20 @@ from multiprocessing import forkserver
 from multiprocessing.context import ForkServerProcess
 from multiprocessing.reduction import DupFd
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, cast
 
 import pytest
 
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.engine import local
-from orthoflow.engine.journal import RunEvent
+from orthoflow.engine.journal import RunEvent, RunListener
 from orthoflow.engine.plan import RunOptions, RunPlan, plan_run
 from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.engine.store import Store
 from orthoflow.errors import OrthoflowError
+from orthoflow.records.runs import Run
+from orthoflow.records.write import executed_and_written
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import expand_cells
 from tests.engine_mischief import MISCHIEF, NAMES
@@ -76,7 +78,22 @@ class World:
     ) -> RunOutcome:
         plan = self.plan(steps, sets=sets, **options)
         self.events.clear()
-        return execute(plan, self.folder / into, store or self.store, self.events.append)
+        return self.execute(plan, into, store or self.store)
+
+    def execute(
+        self,
+        plan: RunPlan,
+        into: str,
+        store: Store | None = None,
+        listen: RunListener | None = None,
+    ) -> RunOutcome:
+        """Execute a plan; what turns out to be damaged is computed again, as commands do."""
+        store = store or self.store
+        outcome, _ = executed_and_written(
+            lambda: execute(plan, self.folder / into, store, listen or self.events.append),
+            lambda outcome: cast("Run", outcome),
+        )
+        return outcome
 
     def status(self, steps: str, **options: object) -> dict[str, tuple[str, str]]:
         plan = self.plan(steps, **options)  # type: ignore[arg-type]

@@ -147,10 +147,10 @@ def run(
     with prepared(
         known.workflow, changes, folder, Path(known.store), embed=known.embed, **choices
     ) as call:
-        made = call.make()
+        _, made = call.make()
     from orthoflow.report.notebooks import open_run
 
-    return open_run(made.run.path)
+    return open_run(made.path)
 
 
 # Any: JSON.

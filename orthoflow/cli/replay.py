@@ -162,7 +162,7 @@ class _Call:
 
         for note in self.replay.notes:
             echo(f"note: {note}", err=self.as_json)
-        made = executed(
+        _, made = executed(
             self.replay.plan,
             self.replay.workflow,
             self.store,
@@ -170,7 +170,7 @@ class _Call:
             self.run_id,
             embed=self.replay.is_embedded,
             report=lambda made: write_report([made], self.folder / REPORT_FILE),
-        ).run
+        )
         distances = self._distances(made)
         metrics = replayed_metrics(self.original, made, distances, self.replay.changed_methods)
         differs = any(item.verdict == "different" for item in distances) or any(

@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from orthoflow.engine.store import Store
     from orthoflow.records import RecordedCell
     from orthoflow.records.runs import Run
-    from orthoflow.records.write import WrittenRun
     from orthoflow.workflow.model import (
         Workflow,
     )
@@ -144,20 +143,20 @@ class Call:
         from orthoflow.engine.journal import LOGS
         from orthoflow.records.runs import REPORT_FILE
 
-        made = self.make()
-        folder = made.run.folder
+        outcome, run = self.make()
+        folder = run.folder
         report = folder / REPORT_FILE
-        _print_tracebacks(made.run.record.cells, folder / LOGS)
-        if any(DiskSpaceError.__name__ == cell.error_type for cell in made.run.record.cells):
+        _print_tracebacks(run.record.cells, folder / LOGS)
+        if any(DiskSpaceError.__name__ == cell.error_type for cell in run.record.cells):
             echo_error(f"with more disk space, the same command with -o {folder} goes on")
         try:
-            _print_summary(made, report)
+            _print_summary(run, report, outcome.resumed)
         except BrokenPipeError:
             # The reader has closed the pipe; the exit code still states how the run ended.
             silence_stdout()
-        return made.outcome.exit_code
+        return outcome.exit_code
 
-    def make(self) -> WrittenRun:
+    def make(self) -> tuple[RunOutcome, Run]:
         """Execute, record and report."""
         from orthoflow.engine.journal import new_run_folder, new_run_id
         from orthoflow.records.runs import REPORT_FILE
@@ -217,7 +216,7 @@ def executed(  # noqa: PLR0913 - what a run is made of
     report: Callable[[Run], None],
     listen: RunListener = lambda _: None,
     on_interruption: Callable[[RunOutcome], None] = lambda _: None,
-) -> WrittenRun:
+) -> tuple[RunOutcome, Run]:
     """Execute a plan, show how far it is, and write products, record and report."""
     from orthoflow.cli.progress import Progress, working_on
     from orthoflow.engine.scheduler import execute
@@ -290,9 +289,15 @@ def _print_tracebacks(cells: Iterable[RecordedCell], logs: Path) -> None:
             echo_error(f"{cell.address}: traceback: {logs / cell_file_name(cell.address)}.log")
 
 
-def _print_summary(made: WrittenRun, report: Path) -> None:
-    """Write the table of cells, the warnings, and last the report, the record and the images."""
-    run, cells = made.run, made.run.record.cells
+def _print_summary(run: Run, report: Path, kept: Collection[str]) -> None:
+    """Write the table of cells, the warnings, and last the report, the record and the images.
+
+    Args:
+        run: the finished run.
+        report: its report.
+        kept: addresses of the cells that an interrupted attempt had computed.
+    """
+    cells = run.record.cells
     echo()
     echo_table(
         ("step", "method", "status", "time", "remark"),
@@ -300,11 +305,7 @@ def _print_summary(made: WrittenRun, report: Path) -> None:
             (
                 cell.address,
                 cell.method,
-                "cached"
-                if cell.cached_from
-                else "kept"
-                if cell.address in made.kept
-                else cell.status,
+                "cached" if cell.cached_from else "kept" if cell.address in kept else cell.status,
                 duration(cell.wall_s) if cell.status != "skipped" and cell.started else "",
                 _remark(cell),
             )
@@ -314,13 +315,7 @@ def _print_summary(made: WrittenRun, report: Path) -> None:
     if any(cell.warnings for cell in cells):
         echo()
     echo_diagnostics(cells, run.folder)
-    echo("", _cached_text(cells, made.kept))
-    if made.outcome.damaged:
-        damaged = made.outcome.damaged
-        were = "were" if len(damaged) > 1 else "was"
-        named = ", ".join(f"{address} ({what})" for address, what in damaged.items())
-        count = counted(len(damaged), "result")
-        echo(f"{count} of the store {were} damaged and computed again: {named}")
+    echo("", _cached_text(cells, kept))
     from orthoflow.report.combinations import baseline_of
     from orthoflow.workflow.expand import variants_text
 

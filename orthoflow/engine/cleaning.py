@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from orthoflow.engine.durability import exclusive_lock, remove_tree, shared_lock, size_of
-from orthoflow.engine.store import WHOLE, Store, is_store, require_store
+from orthoflow.engine.store import Store, is_store, require_store
 from orthoflow.errors import ArgumentError
 
 _DAY_S: Final = 86_400.0
@@ -21,7 +21,7 @@ class Damage:
 
     Attributes:
         name: its path below the store's folder.
-        what: the damaged part; for a result, why it is unusable.
+        what: the damaged file; for a result, which of its files are damaged or missing.
     """
 
     name: str
@@ -57,13 +57,10 @@ def check_store(store: Store) -> Soundness:
         return Soundness(n_results=0, n_objects=0, damaged=())
     with shared_lock(store.lock_file):
         names = _named_by_digest(store.objects)
-        parts = {name: store.damage(name, with_published=True, again=True) for name in names}
+        files = {name: store.damage(name, with_published=True, again=True) for name in names}
         keys = _named_by_digest(store.results)
-        reasons = {key: store.damage_of_result(key) for key in keys}
-    # A missing object was replaced by a run, or removed by somebody: results show it.
-    objects = [
-        Damage(name=f"objects/{n}", what=w) for n, w in parts.items() if w not in ("", WHOLE)
-    ]
+        reasons = {key: store.remove_unusable(key) for key in keys}
+    objects = [Damage(name=f"objects/{n}", what=file) for n, file in files.items() if file]
     results = [Damage(name=f"results/{key}.json", what=why) for key, why in reasons.items() if why]
     return Soundness(
         n_results=len(keys) - len(results),
@@ -127,22 +124,10 @@ def _collect(store: Store, older_than_days: float | None, *, is_dry: bool) -> Ga
             results.append(path)
         else:
             kept |= result.objects
-    gone = {path.stem for path in results}
     objects = [path for path in _children(store.objects) if path.name not in kept]
-    preimages = [
-        path
-        for path in store.preimages.glob("*/*.json")
-        if path.stem in gone or not (store.results / path.name).exists()
-    ]
-    half_written = [
-        path
-        for folder in (store.results, store.preimages)
-        for path in folder.glob("**/.*-*")
-        if path.is_file()
-    ]
+    half_written = store.results.glob(".*-*")
     # Results first: after a kill in between, no result remains whose objects are gone.
-    unneeded = (*results, *preimages, *objects, *_children(store.failures))
-    unneeded = (*unneeded, *_children(store.scratch), *half_written)
+    unneeded = (*results, *objects, *_children(store.scratch), *half_written)
     freed_bytes = sum(size_of(path) for path in unneeded)
     for path in () if is_dry else unneeded:
         remove_tree(path)

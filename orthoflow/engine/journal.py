@@ -87,9 +87,7 @@ _FORMAT: Final = "orthoflow/journal/1"
 _LONGEST_FILE_NAME: Final = 200  # bytes, with room for a suffix; file systems stop at 255
 
 
-LineEvent: TypeAlias = Literal[
-    "run", "resumed", "interrupted", "ended", "started", "finished", "damaged"
-]
+LineEvent: TypeAlias = Literal["run", "resumed", "interrupted", "ended", "started", "finished"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +96,7 @@ class JournalLine:
 
     Attributes:
         event: `run` in the first line; `resumed`, `interrupted` or `ended` of the run as a whole;
-            `started`, `finished` or `damaged`, of the stored result, of a cell.
+            `started` or `finished` of a cell.
         time: ISO 8601 UTC.
         format: name and version of this file, in its first line, as are `run_id` and `workflow`.
         run_id: id of the run.
@@ -109,7 +107,6 @@ class JournalLine:
         cached: its result was in the store.
         error: the sentence of a failure.
         error_type: class of a failure.
-        what: the damaged parts.
     """
 
     event: LineEvent
@@ -123,7 +120,6 @@ class JournalLine:
     cached: bool = False
     error: str = ""
     error_type: str = ""
-    what: str = ""
 
 
 class Journal:
@@ -134,7 +130,6 @@ class Journal:
         is_resumed: the folder held an unfinished run.
         started: ISO 8601 UTC, of the first attempt.
         finished_keys: keys of the cells that this run has computed before it was interrupted.
-        damaged: address -> damaged parts of its stored result found in this run.
     """
 
     def __init__(self, folder: Path, name: str, *, run_id: str = "") -> None:
@@ -178,8 +173,6 @@ class Journal:
         Raises:
             StoreError: the disk cannot be written.
         """
-        if event == "damaged":
-            self.damaged[str(facts["address"])] = str(facts["what"])
         line = {"event": event, "time": now(), **facts}
         text = json.dumps(line, ensure_ascii=False).encode() + b"\n"
         with writing_to(self._folder):
@@ -199,7 +192,6 @@ class Journal:
             raise self._damage()
         self.run_id = first.run_id if first else run_id or new_run_id()
         self.started = first.time if first else now()
-        self.damaged = {line.address: line.what for line in lines if line.event == "damaged"}
         self.finished_keys = frozenset(
             line.key
             for line in lines

@@ -22,7 +22,7 @@ from orthoflow.engine.keys import (
     read_preimage,
 )
 from orthoflow.engine.results import CellResult, ProductRef, ProductTarget
-from orthoflow.engine.store import Preimage, Store
+from orthoflow.engine.store import Store
 from orthoflow.errors import ArgumentError, InputError, PluginError, StoreError
 from orthoflow.geometry.threads import usable_cores
 from orthoflow.products.input_files import InputFiles
@@ -44,8 +44,6 @@ _MOST_NAMED: Final = 4
 _LONGEST_VALUE: Final = 40
 _ABSENT: Final = "absent"
 _FORCED: Final = "forced"
-# Maximum number of incomplete results that are skipped.
-_MOST_LOOKED_AT: Final = 5
 # Parameters of cameras and positions of pictures, which may be equal for several.
 _SIDECARS: Final = frozenset({".aae", ".jgw", ".pgw", ".prj", ".tfw", ".wld", ".xmp"})
 # Time to start a process and to read and store its products.
@@ -114,7 +112,7 @@ class PlannedCell:
         key: its key if its inputs are known, else None.
         inputs: port -> product if they are known.
         result: the stored result of cached cells.
-        took_s: duration of the method's last run, preferably in this step; 0 for cells that do not
+        took_s: duration of the method with the most similar parameters; 0 for cells that do not
             run, None if unknown.
     """
 
@@ -265,8 +263,7 @@ class _Planner:
     store: Store
     force: tuple[str, ...]
     planned: dict[str, PlannedCell] = field(default_factory=dict)
-    _earlier: dict[str, tuple[Preimage, ...]] = field(default_factory=dict)
-    _times: dict[tuple[str, ...], float | None] = field(default_factory=dict)
+    _earlier: dict[str, tuple[CellResult, ...]] = field(default_factory=dict)
 
     def add(self, cell: Cell) -> None:
         """Plan one more cell."""
@@ -275,7 +272,7 @@ class _Planner:
         took_s = self._took_s(cell) if is_run else 0.0
         if planned.status == "unknown yet" and cell.step in self.force:
             planned = replace(planned, status="will run", reason=_FORCED)
-        elif planned.status == "unknown yet" and took_s is None and not self._is_known(cell.method):
+        elif planned.status == "unknown yet" and took_s is None:
             # A method that never ran with this store has no stored results for any inputs.
             reason = "no result of its method is stored"
             planned = replace(planned, status="will run", reason=reason)
@@ -299,46 +296,31 @@ class _Planner:
         is_forced = cell.step in self.force
         result = None if is_forced else self.store.result(key.key)
         if result is None:
-            reason = _FORCED if is_forced else self._why(cell, key)
+            reason = _FORCED if is_forced else explain(key, self._before(cell.method))
             return PlannedCell(cell=cell, status="will run", reason=reason, key=key, inputs=refs)
         reason = f"in the store since {result.ended}"
         return PlannedCell(
             cell=cell, status="cached", reason=reason, key=key, inputs=refs, result=result
         )
 
-    def _why(self, cell: Cell, key: CellKey) -> str:
-        failure = self.store.last_failure(key.key)
-        if failure:
-            return f"failed last time: {failure}"
-        return explain(key, cell.step, self._before(cell.method))
-
     def _took_s(self, cell: Cell) -> float | None:
-        """Duration of the method in the most similar call: same step, same parameters."""
+        """Duration of the method in the call with the most similar parameters; None if unknown."""
         params = {
             f"params.{name}": json.dumps(value, ensure_ascii=False, sort_keys=True)
             for name, value in cell.params.items()
         }
-        place = (cell.method, cell.step, *params.values())
 
-        def distance(earlier: Preimage) -> tuple[bool, int]:
-            before = _ingredients(earlier.text)
-            n_changed = sum(before.get(name) != value for name, value in params.items())
-            return (earlier.step != cell.step, n_changed)
+        def n_changed(earlier: CellResult) -> int:
+            before = _ingredients(earlier.key_preimage)
+            return sum(before.get(name) != value for name, value in params.items())
 
-        if place not in self._times:
-            # Stable: the newest of equally similar ones comes first.
-            nearest = sorted(self._before(cell.method), key=distance)[:_MOST_LOOKED_AT]
-            results = (self.store.result(item.key) for item in nearest)
-            found = next((result for result in results if result is not None), None)
-            self._times[place] = None if found is None else found.wall_s + _START_S
-        return self._times[place]
+        # The newest of equally similar ones.
+        nearest = min(self._before(cell.method), key=n_changed, default=None)
+        return None if nearest is None else nearest.wall_s + _START_S
 
-    def _is_known(self, method: str) -> bool:
-        return any(self.store.result(item.key) is not None for item in self._before(method))
-
-    def _before(self, method: str) -> tuple[Preimage, ...]:
+    def _before(self, method: str) -> tuple[CellResult, ...]:
         if method not in self._earlier:
-            self._earlier[method] = self.store.earlier_preimages(method)
+            self._earlier[method] = self.store.earlier_results(method)
         return self._earlier[method]
 
 
@@ -395,22 +377,20 @@ def _product_targets(
     return targets
 
 
-def explain(key: CellKey, step: str, earlier: Sequence[Preimage]) -> str:
+def explain(key: CellKey, earlier: Sequence[CellResult]) -> str:
     """Return what changed since the most similar earlier result of the same method.
 
     Args:
         key: of the cell.
-        step: name of its step; earlier results of that step are preferred.
-        earlier: preimages of the method's earlier results, newest first.
+        earlier: results of the method, the last used first.
     """
     if not earlier:
         return "never ran before"
-    if any(preimage.key == key.key for preimage in earlier):
-        return "its result is no longer in the store"
+    if any(result.key == key.key for result in earlier):
+        return "its stored result is incomplete or damaged"
     now = _ingredients(key.preimage)
-    candidates = [preimage for preimage in earlier if preimage.step == step] or list(earlier)
     before = min(
-        (_ingredients(item.text) for item in candidates),
+        (_ingredients(result.key_preimage) for result in earlier),
         key=lambda ingredients: len(_changed(ingredients, now)),
     )
     changes = _changed(before, now)

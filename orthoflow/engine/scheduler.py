@@ -66,10 +66,8 @@ _CODE_CHANGED: Final = DiagnosticSpec(
 _STORED_RESULT_DAMAGED: Final = DiagnosticSpec(
     code="stored-result-damaged",
     severity="warning",
-    text="the stored result was damaged ({damage}) and was computed again",
+    text="the stored result was damaged ({damage}) and is computed again",
 )
-# How often a failed cell with damaged inputs is repeated.
-_MOST_REPEATS: Final = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +81,6 @@ class RunOutcome:
         results: address -> result, in the order of the plan.
         cached: address -> id of the run that computed it, for results of other runs.
         resumed: addresses that this run had computed before it was interrupted.
-        damaged: address -> damaged parts of its stored result, for cells that were computed again.
         inputs: workflow input -> files; None if it is optional and absent.
     """
 
@@ -93,7 +90,6 @@ class RunOutcome:
     results: Mapping[str, CellResult]
     cached: Mapping[str, str] = field(default_factory=dict)
     resumed: frozenset[str] = frozenset()
-    damaged: Mapping[str, str] = field(default_factory=dict)
     inputs: Mapping[str, PlannedInput | None] = field(default_factory=dict)
 
     @property
@@ -143,6 +139,8 @@ def execute(
     Raises:
         ArgumentError: the run folder holds a finished run or other files, or a path is not text.
         StoreError: the disk cannot be written, or the run folder is in use.
+        DamageError: an input of a step was damaged in the store and has been removed; the same call
+            computes it again.
         CancelledStepError: interrupted by Ctrl-C or SIGTERM.
         ClusterError: the scheduler was lost, or does not answer.
         PluginError: workers have other versions of a method or library, or dask is missing.
@@ -198,7 +196,6 @@ class _Run:
         self._cached: dict[str, str] = {}
         self._resumed: set[str] = set()
         self._made: set[str] = set()
-        self._repeats: dict[str, int] = {}
         self._waiting = {item.cell.address: item for item in self._plan.cells}
         # Keys and inputs of cells that wait for free cores.
         self._ready: dict[str, tuple[CellKey, Mapping[str, ProductRef]]] = {}
@@ -249,7 +246,6 @@ class _Run:
             results={address: self._results[address] for address in order},
             cached={a: self._cached[a] for a in order if a in self._cached},
             resumed=frozenset(self._resumed),
-            damaged={a: self._journal.damaged[a] for a in order if a in self._journal.damaged},
             inputs=self._plan.inputs,
         )
 
@@ -277,9 +273,8 @@ class _Run:
             known = self._known(planned.cell, key) if key.key in self._made else None
             if known is not None:
                 self._settle(planned.cell, known, is_cached=True)
-            elif self._has_room(planned.cell, executor.capacity) and not self._is_held_up(
-                planned.cell, refs
-            ):
+            elif self._has_room(planned.cell, executor.capacity):
+                self._require_sound(planned.cell, refs)
                 self._start(planned.cell, key, refs, executor)
 
     def _prepare(self, cell: Cell) -> None:
@@ -324,35 +319,13 @@ class _Run:
         if damage:
             damaged = _STORED_RESULT_DAMAGED.of("", {"damage": damage})
             self.report(cell.address, _event_of(damaged))
-            self._journal.write("damaged", address=cell.address, key=key.key, what=damage)
         return result
 
-    def _is_held_up(
-        self, cell: Cell, refs: Mapping[str, ProductRef], *, again: bool = False
-    ) -> bool:
-        """Whether a cell must wait because its stored inputs are damaged.
-
-        The cells that gave them, and all that depend on these, are then settled again.
-        """
-        givers = {
-            source.address
-            for port, ref in refs.items()
-            if isinstance(source := cell.inputs[port], CellOutput)
-            and not self._store.is_sound(ref.digest, again=again)
-        }
-        affected = set(givers)
-        for item in self._plan.cells if givers else ():
-            address = item.cell.address
-            if affected.intersection(needed_addresses(item.cell)):
-                affected.add(address)
-            if address in affected and address in self._results:
-                del self._results[address]
-                self._waiting[address] = item
-            if address in affected:
-                self._ready.pop(address, None)
-                self._cached.pop(address, None)
-                self._resumed.discard(address)
-        return bool(givers)
+    def _require_sound(self, cell: Cell, refs: Mapping[str, ProductRef]) -> None:
+        """Check every byte of the products that a cell takes; remove what is damaged."""
+        for port, ref in refs.items():
+            if isinstance(cell.inputs[port], CellOutput) and not self._store.is_sound(ref.digest):
+                raise DamageError(f"{cell.inputs[port]}, which {cell.address} takes, was damaged")
 
     def _is_under_way(self, key: CellKey) -> bool:
         """Whether an equal cell already runs; its result will then serve both."""
@@ -409,54 +382,24 @@ class _Run:
 
     def _take(self, task: Task, result: CellResult) -> None:
         remove_tree(Path(task.folder))
-        planned = next(item for item in self._plan.cells if item.cell.address == task.address)
-        cell = planned.cell
-        if self._is_to_repeat(cell, task, result):
-            self._waiting[cell.address] = planned
-            # Another run may have given the result meanwhile.
-            self._ready.pop(cell.address, None)
-            return
+        cell = next(one.cell for one in self._plan.cells if one.cell.address == task.address)
+        if result.error_type == DamageError.__name__:
+            # Not the fault of the method: its inputs were damaged after they had been checked.
+            self._require_sound(cell, {port: given.ref for port, given in task.inputs.items()})
+            raise DamageError(result.error_message)
         if result.status == "ok" and self._plan.methods[cell.method].is_code_unchanged():
             self._made.add(task.key)
-            self._store.put_result(task.key, result, cell.step)
+            self._store.put_result(task.key, result)
             self._store.trust(result)
-            self._store.forget_failure(task.key)
         elif result.status == "ok":
             # Stored under its key it would count as the result of that key's code.
             changed = _CODE_CHANGED.of("", {})
             self.report(cell.address, _event_of(changed))
             result = _reporting(result, changed)
-        elif result.exit_code != CancelledStepError.exit_code:
-            self._store.remember_failure(task.key, result.error_message)
-        if self._has_other_inputs_now(cell, task):
-            # Its input was damaged and came out differently when it was computed again.
-            self._waiting[cell.address] = planned
-            return
         self._settle(cell, result)
-
-    def _is_to_repeat(self, cell: Cell, task: Task, result: CellResult) -> bool:
-        """Whether a cell failed because of its stored inputs, not because of its method."""
-        repeats = self._repeats.get(cell.address, 0)
-        if result.status == "ok" or result.exit_code == CancelledStepError.exit_code:
-            return False
-        refs = {port: given.ref for port, given in task.inputs.items()}
-        is_fault_of_store = self._is_held_up(cell, refs, again=True)
-        # Another run may have removed what this one was about to read, and replaced it since.
-        is_fault_of_store |= result.error_type == DamageError.__name__
-        self._repeats[cell.address] = repeats + 1
-        return is_fault_of_store and repeats < _MOST_REPEATS
-
-    def _has_other_inputs_now(self, cell: Cell, task: Task) -> bool:
-        if not all(address in self._results for address in needed_addresses(cell)):
-            return True
-        refs = known_inputs(cell, self._plan.inputs, self._results)
-        return refs != {port: given.ref for port, given in task.inputs.items()}
 
     def _settle(self, cell: Cell, result: CellResult, *, is_cached: bool = False) -> None:
         self._waiting.pop(cell.address, None)
-        damage = self._journal.damaged.get(cell.address)
-        if damage and result.status == "ok":
-            result = _reporting(result, _STORED_RESULT_DAMAGED.of("", {"damage": damage}))
         # Their names are those of this workflow, the result may be another's.
         named = (placed(one, cell.setting, self._step_of) for one in result.diagnostics)
         result = _reporting(dataclasses.replace(result, diagnostics=()), *named)

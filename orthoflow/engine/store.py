@@ -5,16 +5,14 @@ Layout below the store's folder:
     objects/<digest>/product.h5     a product, `object.json` beside it, `files/` what it publishes
     objects/<digest>/blob           a figure
     results/<key>.json              what a cell gave, naming objects
-    preimages/<method>/<key>.json   small copies of the keys' preimages, for explanations
-    failures/<key>                  how cells failed last time; disposable
     digests.json                    memory of input files' digests; disposable
     scratch/<run id>/               work in progress; removed with its run
     lock                            shared by runs, exclusive for garbage collection
 
 Everything has the digest of its bytes and is checked when a run, or an export, uses it. What is
-damaged is removed and computed again. Figures name themselves, and keys their preimages; results
-and descriptions of objects begin with the digest of the rest. They show what is damaged, not
-who did it: whoever can write to the store can write digests, too.
+damaged is removed; a run then starts again from what is left. Figures name themselves; results and
+descriptions of objects begin with the digest of the rest. They show what is damaged, not who did
+it: whoever can write to the store can write digests, too.
 """
 
 from __future__ import annotations
@@ -22,12 +20,10 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
-import json
 import os
 import stat
-import time
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -36,7 +32,6 @@ from typing import Final, Literal, Protocol, TypeVar
 from orthoflow_provenance.document import (
     RecordFormatError,
     canonical_json,
-    sha256_text,
     shared_fields,
 )
 from pydantic import TypeAdapter
@@ -63,29 +58,24 @@ from orthoflow.engine.results import (
 )
 from orthoflow.errors import ArgumentError, DamageError, ProductError, StoreError
 from orthoflow.products.product import Payload, Product
-from orthoflow.sdk.lines import one_line
-from orthoflow.untrusted_text import open_file, parse_json
 
-# Created together when a store is first used. The last one identifies a store: a git repository has
+# Created together when a store is first used. Together they identify a store: a git repository has
 # `objects`, and any folder may have `results`.
-_MADE: Final = ("scratch", "results", "objects", "preimages")
+_MADE: Final = ("scratch", "objects", "results")
 # Other files that may be created first, such as a lock. A separate disk has `lost+found`, and
 # systems create hidden files everywhere.
-_OURS: Final = frozenset({*_MADE, "failures", "digests.json", "lock", "lost+found"})
+_OURS: Final = frozenset({*_MADE, "digests.json", "lock", "lost+found"})
 PRODUCT: Final = "product.h5"
 PUBLISHED: Final = "files"
 BLOB: Final = "blob"
 DESCRIPTION: Final = "object.json"
-# The missing part if nothing of an object exists.
-WHOLE: Final = "whole object"
-_PARTS: Final = {PRODUCT: "product file", BLOB: "figure", DESCRIPTION: "description"}
 # The machine lacks a resource: that does not mean damage.
 _SHORTAGES: Final = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 
 
 def is_store(folder: Path) -> bool:
     """Whether a folder is the store of a run."""
-    return (folder / _MADE[-1]).is_dir()
+    return all((folder / name).is_dir() for name in _MADE)
 
 
 def require_store(folder: Path) -> None:
@@ -127,16 +117,12 @@ def make_store(folder: Path) -> None:
 
 
 __all__ = [
-    "Preimage",
     "Publisher",
     "Store",
     "canonical_json",
     "digest_of",
 ]
 
-_READ_RETRY_S: Final = 0.05
-# A reason is in one column of a table; the record of the run has the whole sentence.
-_LONGEST_FAILURE: Final = 400
 
 ProductT = TypeVar("ProductT", bound=Product)
 
@@ -167,15 +153,6 @@ class StoredProduct:
     files: Mapping[str, tuple[int, str]]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Preimage:
-    """Key preimage of an earlier result, with the name of its step."""
-
-    key: str
-    step: str
-    text: str
-
-
 class Store:
     """A folder of products and results that runs share, also at the same time.
 
@@ -195,13 +172,10 @@ class Store:
         self.scratch = self.folder / "scratch"
         self.results = self.folder / "results"
         self.objects = self.folder / "objects"
-        self.preimages = self.folder / "preimages"
-        self.failures = self.folder / "failures"
         self.lock_file = self.folder / "lock"
         self._workspace = workspace or self.scratch / "loose"
         # Unchanged files need not be read twice; the first read checks them.
         self._sound: set[tuple[Path, int, int, int, int]] = set()
-        self._found_damaged: dict[str, str] = {}
 
     def file_digests(self) -> FileDigests:
         """Return the cache of input files' digests; call its `save` when done."""
@@ -276,9 +250,6 @@ class Store:
         from orthoflow_provenance.arrays import read_product_file  # noqa: PLC0415 - as above
 
         path = self._object(digest) / PRODUCT
-        if not path.is_file():
-            # Another run may be replacing the folder by an equal one at this moment.
-            time.sleep(_READ_RETRY_S)
         if not path.exists():
             raise DamageError(f"the store {self.folder} has no product {digest}")
         what = f"the stored product {digest[:19]} in {self.folder}"
@@ -324,7 +295,7 @@ class Store:
         folder = self.objects / sha256
 
         def is_there() -> bool:
-            return not self._damaged_part(folder, again=True)
+            return not self._damaged_file(folder, again=True)
 
         if not is_there():
             aside = self._new_folder()
@@ -350,12 +321,12 @@ class Store:
 
     # Damage -------------------------------------------------------------------------------------
 
-    def is_sound(self, name: str, *, again: bool = False) -> bool:
+    def is_sound(self, name: str) -> bool:
         """Whether a product or a figure has its original bytes; see `damage`."""
-        return not self.damage(name, again=again)
+        return not self.damage(name)
 
     def damage(self, name: str, *, with_published: bool = False, again: bool = False) -> str:
-        """Return the damaged part of an object, and remove the object; empty if it is intact.
+        """Return which file of an object is damaged, and remove the object; empty if it is intact.
 
         Args:
             name: of the object: digest of a product, or SHA-256 of a figure.
@@ -367,21 +338,13 @@ class Store:
             OSError: the machine lacks memory or open files.
         """
         folder = self._object(name)
-        damaged_part = partial(
-            self._damaged_part, folder, with_published=with_published, again=again
+        damaged_file = partial(
+            self._damaged_file, folder, with_published=with_published, again=again
         )
-        part = damaged_part()
-        if part and not self._remove_damaged(folder, damaged_part):
-            # It is gone, or another run has replaced it, or a read failed only once.
-            part = damaged_part()
-        if part and part != WHOLE:
-            self._found_damaged[folder.name] = part
-        return part
-
-    def damaged_objects(self, names: Iterable[str]) -> tuple[str, ...]:
-        """Check every byte of objects, remove damaged ones and name them."""
-        wanted = dict.fromkeys(names)
-        return tuple(name for name in wanted if self.damage(name, with_published=True, again=True))
+        found = damaged_file()
+        if found:
+            self._remove_damaged(folder, damaged_file)
+        return found
 
     def trust(self, result: CellResult) -> None:
         """Mark the objects of a result that was just computed as intact."""
@@ -394,97 +357,82 @@ class Store:
 
     def result(self, key: str) -> CellResult | None:
         """Result of a key; None without one, or if objects of it are visibly incomplete."""
-        result = self._read_result(key)
-        return None if result is None or self._missing_parts(result) else result
+        return self.look_up(key)[0]
 
-    def take(self, key: str) -> tuple[CellResult | None, str]:
-        """Use the result of a key in a run; visibly damaged parts are removed.
+    def look_up(self, key: str) -> tuple[CellResult | None, str]:
+        """Return the result of a key.
 
         Returns:
-            The result, None if there is none or an incomplete one; and its damaged parts.
-
-        Raises:
-            StoreError: the store cannot be read.
+            The result, None if there is none or it cannot be used; and what of it is damaged or
+            missing, as files below the store's folder.
         """
-        result = self._read_result(key)
-        if result is None:
-            path = self.results / f"{key}.json"
-            is_damaged = self._remove_damaged(path, lambda: self._read_result(key) is None)
-            return None, "result file" if is_damaged else ""
-        if missing := self._missing_parts(result):
-            for name in missing:
-                folder = self.objects / name
-                self._remove_damaged(folder, partial(self._missing_part, folder))
-            return None, ", ".join(dict.fromkeys(missing.values()))
-        with contextlib.suppress(OSError):
-            os.utime(self.results / f"{key}.json")
-        return result, ""
+        path = self.results / f"{key}.json"
+        try:
+            result = result_from_json(path.read_text(encoding="utf-8"), path.name)
+        except FileNotFoundError:
+            return None, ""
+        except (OSError, UnicodeDecodeError) as error:
+            if isinstance(error, OSError) and error.errno in _SHORTAGES:
+                raise
+            return None, f"results/{path.name}"
+        if result.key != key or result.status != "ok":
+            return None, f"results/{path.name}"
+        damaged = {
+            name: self._damaged_file(self.objects / name, with_published=True, by_size=True)
+            for name in sorted(result.objects)
+        }
+        named = [f"objects/{name[:12]}/{file}" for name, file in damaged.items() if file]
+        return (None, ", ".join(named)) if named else (result, "")
 
-    def damage_of_result(self, key: str) -> str:
-        """Return why a result is unusable, and remove it; empty if it is complete.
+    def take(self, key: str) -> tuple[CellResult | None, str]:
+        """Look up a result that a run uses, which garbage collection then keeps longer."""
+        result, damage = self.look_up(key)
+        if result is not None:
+            with contextlib.suppress(OSError):
+                os.utime(self.results / f"{key}.json")
+        return result, damage
+
+    def remove_unusable(self, key: str) -> str:
+        """Remove a result that cannot be used, and return what of it is damaged or missing.
 
         Raises:
             StoreError: it cannot be removed.
         """
-        result = self._read_result(key)
-        reason = "result file" if result is None else ""
-        for name, part in self._missing_parts(result).items() if result is not None else ():
-            reason = f"needs objects/{name[:12]}, which is damaged ({part})"
-        if reason:
-            self._remove_damaged(self.results / f"{key}.json", lambda: self.result(key) is None)
-        return reason
+        _, damage = self.look_up(key)
+        if damage:
+            self._remove_damaged(self.results / f"{key}.json", lambda: self.look_up(key)[1])
+        return damage
 
     def size_bytes(self, result: CellResult) -> int:
         """Return the size of a result's products, their published files and its figures."""
         return sum(folder_size(self.objects / name) for name in result.objects)
 
-    def put_result(self, key: str, result: CellResult, step: str) -> None:
+    def put_result(self, key: str, result: CellResult) -> None:
         """Store the result of a cell; its objects must be in the store already.
 
         Raises:
             StoreError: the disk cannot be written.
         """
         with writing_to(self.folder):
-            folder = self.preimages / result.method
-            folder.mkdir(parents=True, exist_ok=True)
             self.results.mkdir(parents=True, exist_ok=True)
-        preimage = {"step": step, "preimage": result.key_preimage}
         write_whole(self.results / f"{key}.json", result_to_json(result).encode())
-        write_whole(folder / f"{key}.json", json.dumps(preimage).encode())
 
-    def earlier_preimages(self, method: str, *, limit: int = 100) -> tuple[Preimage, ...]:
-        """Yield preimages of earlier results of a method, newest first."""
-        folder = self.preimages / method
+    def earlier_results(self, method: str, *, limit: int = 20) -> tuple[CellResult, ...]:
+        """Return results of a method, the last used first, whether or not they are complete."""
         dated = []
-        with contextlib.suppress(FileNotFoundError):
-            dated = [
-                (entry.stat().st_mtime_ns, entry.path)
-                for entry in os.scandir(folder)
-                if entry.name.endswith(".json") and not entry.name.startswith(".")
-            ]
-        found = (_read_preimage(Path(path)) for _, path in sorted(dated, reverse=True)[:limit])
-        return tuple(preimage for preimage in found if preimage is not None)
-
-    # Failures -----------------------------------------------------------------------------------
-
-    def remember_failure(self, key: str, sentence: str) -> None:
-        """Keep the sentence with which a cell failed, if the disk lets us."""
-        with contextlib.suppress(OSError, StoreError):
-            self.failures.mkdir(parents=True, exist_ok=True)
-            write_whole(self.failures / key, one_line(sentence, _LONGEST_FAILURE).encode())
-
-    def forget_failure(self, key: str) -> None:
-        """Remove the sentence, because the cell has a result now."""
-        with contextlib.suppress(OSError):
-            (self.failures / key).unlink()
-
-    def last_failure(self, key: str) -> str:
-        """Return how a cell failed; empty if it did not, or if the sentence is no longer kept."""
-        with contextlib.suppress(OSError), open_file(self.failures / key) as stream:
-            # Twice, for letters that no terminal shows are longer when they are written out.
-            text = stream.read(4 * _LONGEST_FAILURE).decode(errors="replace")
-            return one_line(text, 2 * _LONGEST_FAILURE)
-        return ""
+        for path in self.results.glob("*.json"):
+            with contextlib.suppress(OSError):
+                dated.append((path.stat().st_mtime_ns, path))
+        found: list[CellResult] = []
+        for _, path in sorted(dated, reverse=True):
+            with contextlib.suppress(OSError, UnicodeDecodeError):
+                text = path.read_text(encoding="utf-8")
+                # Most are of other methods; reading all of them would take a while.
+                if f'"method":"{method}"' in text:
+                    found.append(result_from_json(text, path.name))
+            if len(found) == limit:
+                break
+        return tuple(found)
 
     # Private ------------------------------------------------------------------------------------
 
@@ -517,32 +465,13 @@ class Store:
         path.rename(gone)
         remove_tree(gone)
 
-    def _read_result(self, key: str) -> CellResult | None:
-        path = self.results / f"{key}.json"
-        try:
-            result = result_from_json(path.read_text(encoding="utf-8"), path.name)
-        except (OSError, UnicodeDecodeError) as error:
-            if isinstance(error, OSError) and error.errno in _SHORTAGES:
-                raise
-            return None
-        return result if result.key == key and result.status == "ok" else None
-
     def _is_there(self, folder: Path, publisher_tag: str) -> bool:
         """Whether an equal object is stored, intact, and its published files are current."""
         found = _read_description(folder)
         is_current = found is not None and found.publisher == publisher_tag
-        return is_current and not self._damaged_part(folder, with_published=True, again=True)
+        return is_current and not self._damaged_file(folder, with_published=True, again=True)
 
-    def _missing_parts(self, result: CellResult) -> dict[str, str]:
-        """Return the damaged part of each object of a result that is visibly incomplete."""
-        parts = {name: self._missing_part(self.objects / name) for name in sorted(result.objects)}
-        return {name: self._found_damaged.get(name, part) for name, part in parts.items() if part}
-
-    def _missing_part(self, folder: Path) -> str:
-        """Part of an object that is missing or of another size; empty if none."""
-        return self._damaged_part(folder, with_published=True, by_size=True)
-
-    def _damaged_part(
+    def _damaged_file(
         self,
         folder: Path,
         *,
@@ -552,7 +481,7 @@ class Store:
     ) -> str:
         files = _files_of(folder)
         if not files:
-            return _PARTS[DESCRIPTION] if folder.is_dir() else WHOLE
+            return DESCRIPTION
         for name, (size_bytes, sha256) in files.items():
             path = folder / name
             if _is_published(name) and not with_published:
@@ -571,31 +500,29 @@ class Store:
                     raise
                 is_sound = False
             if not is_sound:
-                return _part_name(name)
+                return name
             if not by_size:
                 self._sound.add(identity)
         return ""
 
-    def _remove_damaged(self, path: Path, is_damaged: Callable[[], object]) -> bool:
+    def _remove_damaged(self, path: Path, damaged: Callable[[], str]) -> None:
         """Remove a file or folder, if it exists and is still damaged.
 
         Raises:
             StoreError: it cannot be removed.
         """
         # Another run may have been faster, and may have stored an intact one.
-        if not os.path.lexists(path) or not is_damaged():
-            return False
+        if not os.path.lexists(path) or not damaged():
+            return
         try:
             with writing_to(self.folder):
                 self._remove(path)
         except StoreError as error:
-            if error.errno == errno.ENOENT:
-                return False
-            raise StoreError(
-                f"{path.parent.name}/{path.name[:12]} in the store {self.folder} is damaged, but "
-                f"cannot be removed: {error}"
-            ) from error
-        return True
+            if error.errno != errno.ENOENT:
+                raise StoreError(
+                    f"{path.parent.name}/{path.name[:12]} in the store {self.folder} is damaged, "
+                    f"but cannot be removed: {error}"
+                ) from error
 
 
 def _identity(path: Path) -> tuple[Path, int, int, int, int]:
@@ -605,11 +532,6 @@ def _identity(path: Path) -> tuple[Path, int, int, int, int]:
 
 def _is_published(name: str) -> bool:
     return name.startswith(f"{PUBLISHED}/")
-
-
-def _part_name(path: str) -> str:
-    """Return the readable name of a file of an object."""
-    return _PARTS.get(path) or f"published file {path.removeprefix(f'{PUBLISHED}/')}"
 
 
 @cache
@@ -675,17 +597,6 @@ def digest_of(product: Product) -> str:
     from orthoflow_provenance.arrays import payload_digest  # noqa: PLC0415 - as above
 
     return payload_digest(product.to_payload())
-
-
-def _read_preimage(path: Path) -> Preimage | None:
-    try:
-        content = parse_json(path.read_text(encoding="utf-8"))
-        if not isinstance(content, dict):
-            return None
-        found = Preimage(key=path.stem, step=content["step"], text=content["preimage"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    return found if sha256_text(found.text) == found.key else None
 
 
 @dataclass(frozen=True, kw_only=True)

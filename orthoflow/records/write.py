@@ -8,7 +8,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain, count
 from pathlib import Path
 from pkgutil import resolve_name
@@ -254,21 +254,6 @@ _MOST_ATTEMPTS: Final = 4
 NOT_YET: Final = "not computed yet: the run was interrupted"
 
 
-@dataclass(frozen=True, kw_only=True)
-class WrittenRun:
-    """A run that was executed, and its record.
-
-    Attributes:
-        run: the finished run.
-        outcome: the result of the engine.
-        kept: addresses that the run folder already had, from an interrupted attempt.
-    """
-
-    run: Run
-    outcome: RunOutcome
-    kept: frozenset[str] = frozenset()
-
-
 def write_run(
     outcome: RunOutcome,
     plan: RunPlan,
@@ -324,7 +309,7 @@ def write_run(
             return read_run(finished)
     except StoreError as error:
         needed = [name for result in outcome.results.values() for name in result.objects]
-        damaged = store.damaged_objects(needed)
+        damaged = [name for name in needed if store.damage(name, with_published=True, again=True)]
         if not damaged and not isinstance(error, DamageError):
             raise
         raise DamageError(
@@ -468,8 +453,8 @@ def _with_missing(outcome: RunOutcome, plan: RunPlan) -> RunOutcome:
 
 def executed_and_written(
     execute: Callable[[], RunOutcome], write: Callable[[RunOutcome], Run]
-) -> WrittenRun:
-    """Execute a run and write it; results that the store has lost are computed again.
+) -> tuple[RunOutcome, Run]:
+    """Execute a run and write it; what turns out to be damaged in the store is computed again.
 
     Args:
         execute: continues the run each time it is called, as `engine.scheduler.execute` does.
@@ -478,15 +463,12 @@ def executed_and_written(
     Raises:
         DamageError: the store loses results faster than they can be computed.
     """
-    outcome = execute()
-    kept = outcome.resumed
     for _ in range(_MOST_ATTEMPTS - 1):
         with suppress(DamageError):
-            return WrittenRun(run=write(outcome), outcome=outcome, kept=kept)
-        outcome = execute()
-        # Results of the first attempt are cached in the second.
-        kept &= outcome.resumed
-    return WrittenRun(run=write(outcome), outcome=outcome, kept=kept)
+            outcome = execute()
+            return outcome, write(outcome)
+    outcome = execute()
+    return outcome, write(outcome)
 
 
 def build_record(

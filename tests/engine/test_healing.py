@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from orthoflow.engine.cleaning import check_store
-from orthoflow.engine.journal import CellStarted, RunEvent
-from orthoflow.engine.scheduler import RunOutcome, execute
+from orthoflow.engine.journal import CellReported, CellStarted, RunEvent
+from orthoflow.engine.scheduler import RunOutcome
 from orthoflow.errors import StoreError
 from tests.engine_world import World, digests
 
@@ -47,7 +47,18 @@ def flip(path: Path, place: int = -8) -> None:
 
 
 def computed(outcome: RunOutcome) -> set[str]:
-    return set(outcome.results) - set(outcome.cached) - outcome.resumed
+    return set(outcome.results) - set(outcome.cached)
+
+
+def damaged(world: World) -> set[str]:
+    """Cells whose stored results were reported as damaged in the last run."""
+    return {
+        event.address
+        for event in world.events
+        if isinstance(event, CellReported)
+        and event.event.diagnostic
+        and event.event.diagnostic.code == "stored-result-damaged"
+    }
 
 
 def test_a_damaged_mapped_scan_is_computed_again_before_a_step_reads_it(world: World) -> None:
@@ -57,12 +68,8 @@ def test_a_damaged_mapped_scan_is_computed_again_before_a_step_reads_it(world: W
     assert again.status == "ok"
     assert {**digests(again), **digests(first)} == digests(again)
     assert computed(again) == {"scan", "means", "more"}
-    assert again.damaged == {"scan": "product file"}
-    (warning,) = again.results["scan"].warnings
-    assert warning == "the stored result was damaged (product file) and was computed again"
-    # Said once: the mended result is like any other.
-    third = run(world, STEPS + MORE, into="third")
-    assert (third.damaged, computed(third), third.results["scan"].warnings) == ({}, set(), ())
+    assert damaged(world) == {"scan"}
+    assert (computed(run(world, STEPS + MORE, into="third")), damaged(world)) == (set(), set())
 
 
 def test_a_damaged_scan_that_no_step_needs_is_left_alone(world: World) -> None:
@@ -71,13 +78,12 @@ def test_a_damaged_scan_that_no_step_needs_is_left_alone(world: World) -> None:
     again = run(
         world, STEPS + "  more: {use: work.draws, in: {numbers: noise.numbers}}\n", into="b"
     )
-    assert computed(again) == {"more"}
-    assert again.damaged == {}
+    assert (computed(again), damaged(world)) == ({"more"}, set())
     found = check_store(world.store)
     digest = digests(first)["scan.scan"]
     assert [item.what for item in found.damaged] == [
-        "product file",
-        f"needs objects/{digest[7:19]}, which is damaged (product file)",
+        "product.h5",
+        f"objects/{digest[7:19]}/object.json",
     ]
 
 
@@ -96,10 +102,10 @@ def test_damage_between_plan_and_use_is_noticed(
     first = run(world, STEPS)
     plan = world.plan(STEPS + MORE, force=("means",), executor=executor)
     harm(product_file(world, first, "scan"))
-    again = execute(plan, world.folder / "again", world.store)
+    again = world.execute(plan, "again")
     assert again.status == "ok"
     assert {**digests(again), **digests(first)} == digests(again)
-    assert set(again.damaged) == {"scan"}
+    assert damaged(world) == {"scan"}
 
 
 def test_a_step_that_fails_over_damage_is_repeated_and_its_method_not_blamed(world: World) -> None:
@@ -114,10 +120,10 @@ def test_a_step_that_fails_over_damage_is_repeated_and_its_method_not_blamed(wor
             harmed.append(event)
             os.truncate(path, 3000)
 
-    again = execute(plan, world.folder / "again", world.store, harm_behind_the_check)
+    again = world.execute(plan, "again", listen=harm_behind_the_check)
     assert again.status == "ok"
     assert digests(again) == digests(first)
-    assert set(again.damaged) == {"scan"}
+    assert computed(again) == {"scan", "means"}
 
 
 def test_a_failing_method_is_still_to_blame_for_sound_inputs(world: World) -> None:
@@ -144,7 +150,7 @@ def test_what_is_computed_again_and_differs_takes_what_follows_along(
 
     monkeypatch.setattr(works.Means, "run", other)
     flip(product_file(world, first, "noise"))
-    again = execute(plan, world.folder / "again", world.store)
+    again = world.execute(plan, "again")
     assert again.status == "ok"
     assert digests(again)["means.numbers"] != digests(first)["means.numbers"]
     (given,) = again.results["noise"].inputs.values()
@@ -169,7 +175,7 @@ def test_a_result_file_that_is_damaged_is_made_again(world: World) -> None:
     path.write_text(text.replace('"wall_s":0', '"wall_s":9'))
     assert path.read_text() != text
     again = run(world, STEPS, into="again")
-    assert (computed(again), again.damaged) == ({"noise"}, {"noise": "result file"})
+    assert (computed(again), damaged(world)) == ({"noise"}, {"noise"})
 
 
 # Reading without a run ----------------------------------------------------------------------------

@@ -10,11 +10,9 @@ from pathlib import Path
 import pytest
 
 from orthoflow.engine import keys
-from orthoflow.engine.cleaning import collect_garbage
 from orthoflow.engine.keys import CellKey, MethodFacts, cell_key
 from orthoflow.engine.plan import RunOptions, explain
-from orthoflow.engine.results import ProductRef
-from orthoflow.engine.store import Preimage
+from orthoflow.engine.results import CellResult, ProductRef
 from orthoflow.errors import ArgumentError
 from orthoflow.geometry.threads import usable_cores
 from orthoflow.workflow.expand import Cell
@@ -164,9 +162,9 @@ def test_an_exact_method_has_the_same_key_for_every_seed() -> None:
 # Reasons ------------------------------------------------------------------------------------------
 
 
-def preimage_of(step: str = "step", cell: Cell = CELL, **facts: object) -> Preimage:
+def result_of(cell: Cell = CELL, **facts: object) -> CellResult:
     made = cell_key(cell, dataclasses.replace(FACTS, **facts), INPUTS)  # type: ignore[arg-type]
-    return Preimage(key=made.key, step=step, text=made.preimage)
+    return CellResult(status="ok", method=FACTS.method, key=made.key, key_preimage=made.preimage)
 
 
 NOW = cell_key(CELL, FACTS, INPUTS)
@@ -175,28 +173,27 @@ NOW = cell_key(CELL, FACTS, INPUTS)
 @pytest.mark.parametrize(
     ("earlier", "reason"),
     [
-        (preimage_of(cell=dataclasses.replace(CELL, params={"amount": 2.5})),
+        (result_of(dataclasses.replace(CELL, params={"amount": 2.5})),
          "params.amount: 2.5 -> 1.0"),
-        (preimage_of(cell=dataclasses.replace(CELL, params={})), "params.amount: absent -> 1.0"),
-        (preimage_of(cell=dataclasses.replace(CELL, params={"amount": "x" * 99})),
+        (result_of(dataclasses.replace(CELL, params={})), "params.amount: absent -> 1.0"),
+        (result_of(dataclasses.replace(CELL, params={"amount": "x" * 99})),
          f'params.amount: "{"x" * 36}... -> 1.0'),
-        (preimage_of(result_version=7), "result_version 7 -> 1"),
-        (preimage_of(tools={"tool": "0.9"}), 'tool "0.9" -> "1"'),
-        (preimage_of(code={"plugin": "zz"}), "code changed"),
-        (preimage_of(code={}), "code changed"),
-        (preimage_of(cell=dataclasses.replace(CELL, seed=6)), "seed 6 -> 5"),
-        (Preimage(key=NOW.key, step="step", text=NOW.preimage),
-         "its result is no longer in the store"),
+        (result_of(result_version=7), "result_version 7 -> 1"),
+        (result_of(tools={"tool": "0.9"}), 'tool "0.9" -> "1"'),
+        (result_of(code={"plugin": "zz"}), "code changed"),
+        (result_of(code={}), "code changed"),
+        (result_of(dataclasses.replace(CELL, seed=6)), "seed 6 -> 5"),
+        (result_of(), "its stored result is incomplete or damaged"),
     ],
 )  # fmt: skip
-def test_the_changed_ingredient_is_named(earlier: Preimage, reason: str) -> None:
-    assert explain(NOW, "step", [earlier]) == reason
+def test_the_changed_ingredient_is_named(earlier: CellResult, reason: str) -> None:
+    assert explain(NOW, [earlier]) == reason
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{"])
 def test_an_unreadable_earlier_preimage_does_no_harm(text: str) -> None:
-    earlier = Preimage(key="x", step="step", text=text)
-    assert explain(CellKey(key="k", preimage="{}"), "step", [earlier]) == (
+    earlier = dataclasses.replace(result_of(), key="x", key_preimage=text)
+    assert explain(CellKey(key="k", preimage="{}"), [earlier]) == (
         "its key is made in another way than before"
     )
 
@@ -284,42 +281,6 @@ def test_a_raised_result_version_counts(world: World) -> None:
     )
     forget_toys()
     assert world.status(CHAIN)["first"] == ("will run", "code changed, result_version 1 -> 2")
-
-
-# What failed last time ----------------------------------------------------------------------------
-
-FAILING = """
-steps:
-  first: {use: make.range}
-  second: {use: work.unreadable, in: {numbers: first.numbers}}
-"""
-
-
-def test_the_plan_says_what_failed_last_time_until_garbage_is_collected(world: World) -> None:
-    world.run(FAILING, executor="inline")
-    planned = world.status(FAILING)
-    assert planned["second"] == (
-        "will run",
-        "failed last time: a.csv:2: no number; a.csv:3: two numbers",
-    )
-    assert world.status(FAILING, force=("second",))["second"] == ("will run", "forced")
-    assert collect_garbage(world.store, dry_run=True).freed_bytes > 0
-    collect_garbage(world.store)
-    assert world.status(FAILING)["second"] == ("will run", "never ran before")
-
-
-def test_a_result_takes_back_the_failure_before_it(world: World) -> None:
-    store = world.store
-    key = next(item.key for item in world.plan(CHAIN).cells if item.key is not None)
-    store.remember_failure(key.key, "no\x1b[2J " + "room " * 100_000)
-    said = world.status(CHAIN)["first"][1]
-    assert said.startswith("failed last time: no\\x1b[2J room")
-    assert len(said) < 500
-    run(world, CHAIN)
-    assert store.last_failure(key.key) == ""
-    # What somebody else put there keeps nobody waiting.
-    os.mkfifo(store.failures / key.key)
-    assert store.last_failure(key.key) == ""
 
 
 # How long it takes --------------------------------------------------------------------------------

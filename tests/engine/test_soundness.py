@@ -35,7 +35,7 @@ def kept(store: Store, name: str, value: float) -> tuple[str, ProductRef]:
     result = CellResult(
         status="ok", key=key, key_preimage=name, method="a.b", run_id="r1", outputs={"out": ref}
     )
-    store.put_result(key, result, "step")
+    store.put_result(key, result)
     return key, ref
 
 

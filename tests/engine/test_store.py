@@ -184,14 +184,14 @@ def test_a_result_comes_back_equal(store: Store) -> None:
         log="λ\nline",
         seed=2**53 - 1,
     )
-    store.put_result(KEY, result, "step")
+    store.put_result(KEY, result)
     assert store.result(KEY) == result
     assert result_from_json(result_to_json(result), "x") == result
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"format": "orthoflow/result/9"}', "{}"])
 def test_an_unreadable_result_is_a_miss(store: Store, text: str) -> None:
-    store.put_result(KEY, ok_result(store, heights()), "step")
+    store.put_result(KEY, ok_result(store, heights()))
     (store.results / f"{KEY}.json").write_text(text)
     assert store.result(KEY) is None
 
@@ -254,9 +254,9 @@ def test_a_full_disk_is_one_sentence_and_leaves_nothing_valid(tiny_disk: Path) -
 def test_a_full_disk_while_writing_a_result_keeps_the_old_one(tiny_disk: Path) -> None:
     store = Store(tiny_disk / "store")
     old = ok_result(store, heights())
-    store.put_result(KEY, old, "step")
+    store.put_result(KEY, old)
     with pytest.raises(StoreError, match="No space left"):
-        store.put_result(KEY, dataclasses.replace(old, log="x" * (4 << 20)), "step")
+        store.put_result(KEY, dataclasses.replace(old, log="x" * (4 << 20)))
     assert store.result(KEY) == old
 
 
@@ -266,9 +266,9 @@ def test_a_full_disk_while_writing_a_result_keeps_the_old_one(tiny_disk: Path) -
 def test_garbage_collection_keeps_exactly_what_results_need(store: Store) -> None:
     with store.in_use():
         kept = ok_result(store, heights("kept"))
-        store.put_result(KEY, kept, "step")
+        store.put_result(KEY, kept)
         lost = ok_result(store, heights("lost"), key="cd" * 32)
-        store.put_result("cd" * 32, lost, "step")
+        store.put_result("cd" * 32, lost)
     (object_folder(store, lost.outputs["p0"]) / "product.h5").unlink()
     store.put_product(heights("nobody needs me"))
     (store.scratch / "left-over").mkdir()
@@ -280,13 +280,14 @@ def test_garbage_collection_keeps_exactly_what_results_need(store: Store) -> Non
     assert store.result(KEY) == kept
     assert [path.name for path in store.objects.iterdir()] == [kept.outputs["p0"].digest[7:]]
     assert list(store.scratch.iterdir()) == []
-    assert [item.key for item in store.earlier_preimages("toy.make")] == [KEY]
+    assert [item.key for item in store.earlier_results("toy.make")] == [KEY]
+    assert store.earlier_results("toy.other") == ()
 
 
 def test_garbage_collection_removes_what_was_not_used_for_long(store: Store) -> None:
     with store.in_use():
         for key in (KEY, "cd" * 32):
-            store.put_result(key, ok_result(store, heights(key), key=key), "step")
+            store.put_result(key, ok_result(store, heights(key), key=key))
     old = time.time() - 10 * 86400
     os.utime(store.results / f"{KEY}.json", (old, old))
     assert collect_garbage(store, older_than_days=5).n_results == 1
@@ -313,7 +314,7 @@ def test_garbage_collection_of_nothing_and_of_negative_days(store: Store) -> Non
 def test_the_listing_names_results_with_their_size(store: Store) -> None:
     assert list_results(store) == ()
     result = ok_result(store, heights())
-    store.put_result(KEY, result, "step")
+    store.put_result(KEY, result)
     (item,) = list_results(store)
     size = sum(path.stat().st_size for path in object_folder(store, result.outputs["p0"]).iterdir())
     assert (item.key, item.method, item.run_id, item.size_bytes, item.is_complete) == (

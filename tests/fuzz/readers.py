@@ -413,12 +413,9 @@ def _read_result(path: Path) -> object:
     store = Store(path.parent / "store")
     with store.in_use():
         (store.results / f"{_KEY}.json").write_bytes(path.read_bytes())
-        preimages = store.preimages / "make.range"
-        preimages.mkdir()
-        (preimages / f"{_KEY}.json").write_bytes(path.read_bytes())
         (store.folder / "digests.json").write_bytes(path.read_bytes())
         store.file_digests().digest(path)
-        return store.result(_KEY), list_results(store), store.earlier_preimages("make.range")
+        return store.result(_KEY), list_results(store), store.earlier_results("make.range")
 
 
 def _read_object(path: Path) -> object:
