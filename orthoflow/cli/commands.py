@@ -341,7 +341,6 @@ def output_option(name: str) -> Callable[[_Decorated], _Decorated]:
 
 EXIT_GOOD: Final = 0
 EXIT_CELL_FAILED: Final = 1
-EXIT_INVALID: Final = 2
 EXIT_RECORD_DIFFERS: Final = 3
 EXIT_PLUGIN_MISSING: Final = 4
 EXIT_INTERRUPTED: Final = 130

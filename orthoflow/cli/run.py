@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,7 +32,14 @@ from orthoflow.cli.tables import (
     echo_diagnostics,
     echo_table,
 )
-from orthoflow.errors import ArgumentError, DamageError, DiskSpaceError, StoreError
+from orthoflow.errors import (
+    ArgumentError,
+    CancelledStepError,
+    ClusterError,
+    DiskSpaceError,
+    OrthoflowError,
+    StoreError,
+)
 from orthoflow.untrusted_text import shown_json
 
 if TYPE_CHECKING:
@@ -140,13 +146,16 @@ class Call:
 
     def go(self) -> int:
         """Execute, record, report and print the summary."""
-        from orthoflow.engine.journal import LOGS
+        from orthoflow.engine.journal import LOGS, cell_file_name
         from orthoflow.records.runs import REPORT_FILE
 
         outcome, run = self.make()
         folder = run.folder
         report = folder / REPORT_FILE
-        _print_tracebacks(run.record.cells, folder / LOGS)
+        for address, failed in outcome.failed.items():
+            if failed.is_bug:
+                log = folder / LOGS / f"{cell_file_name(address)}.log"
+                echo_error(f"{address}: traceback: {log}")
         if any(DiskSpaceError.__name__ == cell.error_type for cell in run.record.cells):
             echo_error(f"with more disk space, the same command with -o {folder} goes on")
         try:
@@ -177,32 +186,36 @@ class Call:
                     begin_run(self.plan, self.workflow, folder, self.store, run_id)
                 log(event)
 
-            return executed(
-                self.plan,
-                self.workflow,
-                self.store,
-                folder,
-                run_id,
-                embed=self.embed,
-                report=lambda run: write_page(run, folder / REPORT_FILE),
-                listen=listen,
-                on_interruption=partial(self._show_unfinished, folder),
-            )
+            try:
+                return executed(
+                    self.plan,
+                    self.workflow,
+                    self.store,
+                    folder,
+                    run_id,
+                    embed=self.embed,
+                    report=lambda run: write_page(run, folder / REPORT_FILE),
+                    listen=listen,
+                )
+            except (CancelledStepError, ClusterError, StoreError):
+                if has_begun:
+                    _report_unfinished(folder)
+                raise
 
-    def _show_unfinished(self, folder: Path, outcome: RunOutcome) -> None:
-        """Write the report of an interrupted run: what is there, and how to go on."""
-        from orthoflow.records.runs import REPORT_FILE
-        from orthoflow.records.write import show_unfinished
-        from orthoflow.report import write_page
 
-        report = folder / REPORT_FILE
-        go_on = command_again(folder)
+def _report_unfinished(folder: Path) -> None:
+    """Write the report of an interrupted run: what is there, and how to go on.
 
-        def show(run: Run) -> None:
-            write_page(run, report, go_on=go_on)
+    Nothing if that fails, e.g. on a full disk: the run itself loses nothing.
+    """
+    from orthoflow.records.open import open_unfinished
+    from orthoflow.records.runs import REPORT_FILE
+    from orthoflow.report import write_page
 
-        if show_unfinished(outcome, self.plan, self.workflow, folder, self.store, show):
-            echo_error(f"report of the finished steps: {report}")
+    report = folder / REPORT_FILE
+    with suppress(OrthoflowError, OSError):
+        write_page(open_unfinished(folder, publish=True), report, go_on=command_again(folder))
+        echo_error(f"report of the finished steps: {report}")
 
 
 def executed(  # noqa: PLR0913 - what a run is made of
@@ -215,7 +228,6 @@ def executed(  # noqa: PLR0913 - what a run is made of
     embed: bool,
     report: Callable[[Run], None],
     listen: RunListener = lambda _: None,
-    on_interruption: Callable[[RunOutcome], None] = lambda _: None,
 ) -> tuple[RunOutcome, Run]:
     """Execute a plan, show how far it is, and write products, record and report."""
     from orthoflow.cli.progress import Progress, working_on
@@ -234,20 +246,13 @@ def executed(  # noqa: PLR0913 - what a run is made of
                 listen(event)
                 progress.take(event)
 
-            return execute(
-                plan, folder, store, take, run_id=run_id, on_interruption=on_interruption
-            )
+            return execute(plan, folder, store, take, run_id=run_id)
 
     def write(outcome: RunOutcome) -> Run:
-        try:
-            with working_on("writing the products, the record and the report"):
-                return write_run(
-                    outcome, plan, workflow, folder, store, embed=embed, before_finish=report
-                )
-        except StoreError as error:
-            if not isinstance(error, DamageError):
-                on_interruption(outcome)
-            raise
+        with working_on("writing the products, the record and the report"):
+            return write_run(
+                outcome, plan, workflow, folder, store, embed=embed, before_finish=report
+            )
 
     return executed_and_written(run, write)
 
@@ -278,15 +283,6 @@ def _json_log(path: Path | None, plan: RunPlan) -> Iterator[RunListener]:
                     file.write(f"{shown_json(json.dumps(one, ensure_ascii=False))}\n")
 
         yield listen
-
-
-def _print_tracebacks(cells: Iterable[RecordedCell], logs: Path) -> None:
-    """Write to standard error where the tracebacks of bugs are; why cells failed stands there."""
-    from orthoflow.engine.journal import cell_file_name
-
-    for cell in cells:
-        if cell.status == "failed" and "Traceback (most recent call last)" in cell.log:
-            echo_error(f"{cell.address}: traceback: {logs / cell_file_name(cell.address)}.log")
 
 
 def _print_summary(run: Run, report: Path, kept: Collection[str]) -> None:

@@ -87,7 +87,7 @@ class CellResult(CellOutcome):
         inputs: port -> product.
         outputs: port -> product.
         figures: pictures.
-        traceback: for `--debug` and bug reports, empty when ok.
+        is_bug: the method raised none of our errors: its log has the traceback.
         exit_code: of the error class, 0 when ok.
     """
 
@@ -97,7 +97,7 @@ class CellResult(CellOutcome):
     inputs: Mapping[str, ProductRef] = field(default_factory=dict)
     outputs: Mapping[str, ProductRef] = field(default_factory=dict)
     figures: tuple[FigureRef, ...] = ()
-    traceback: str = ""
+    is_bug: bool = False
     exit_code: int = 0
 
     @property

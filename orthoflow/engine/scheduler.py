@@ -6,7 +6,7 @@ import dataclasses
 import signal
 import threading
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -48,10 +48,8 @@ from orthoflow.engine.worker import Task, TaskInput
 from orthoflow.errors import (
     ArgumentError,
     CancelledStepError,
-    ClusterError,
     DamageError,
     PluginError,
-    StoreError,
 )
 from orthoflow.sdk.context import StepEvent
 from orthoflow.sdk.lines import one_line, text_of_path
@@ -120,7 +118,6 @@ def execute(
     listen: RunListener = ignore,
     *,
     run_id: str = "",
-    on_interruption: Callable[[RunOutcome], None] | None = None,
 ) -> RunOutcome:
     """Run a plan to its end.
 
@@ -133,8 +130,6 @@ def execute(
         store: receives products and results.
         listen: called with events as they happen.
         run_id: id of a new run, generated if empty; a resumed run keeps its own.
-        on_interruption: called with the results so far before the run ends with `StoreError`,
-            `ClusterError` or `CancelledStepError`; cells without results are not included.
 
     Raises:
         ArgumentError: the run folder holds a finished run or other files, or a path is not text.
@@ -163,13 +158,8 @@ def execute(
         with _scratch(store, journal.run_id) as scratch, _watching_interruptions() as interruption:
             run = _Run(plan, store, journal, listen, scratch=scratch, logs=folder / LOGS)
             executor = _executor_of(plan, scratch, run.report, lambda: interruption.is_asked)
-            try:
-                with closing(executor):
-                    run.go(executor, interruption)
-            except (CancelledStepError, ClusterError, StoreError):
-                if on_interruption is not None:
-                    on_interruption(run.so_far())
-                raise
+            with closing(executor):
+                run.go(executor, interruption)
         return run.outcome()
 
 
@@ -226,19 +216,7 @@ class _Run:
     def outcome(self) -> RunOutcome:
         """Return the results of the run, in the order of the plan."""
         self._journal.write("ended")
-        return self._outcome_of(item.cell.address for item in self._plan.cells)
-
-    def so_far(self) -> RunOutcome:
-        """Return the results so far, without cells that were asked to stop."""
-        return self._outcome_of(
-            address
-            for item in self._plan.cells
-            if (address := item.cell.address) in self._results
-            and self._results[address].exit_code != CancelledStepError.exit_code
-        )
-
-    def _outcome_of(self, addresses: Iterable[str]) -> RunOutcome:
-        order = tuple(addresses)
+        order = [item.cell.address for item in self._plan.cells]
         return RunOutcome(
             run_id=self._journal.run_id,
             started=self._journal.started,
@@ -282,8 +260,10 @@ class _Run:
         needed = needed_addresses(cell)
         if not all(address in self._results for address in needed):
             return
-        reason = cell.skip_reason or self._missing(needed)
-        if reason:
+        if cell.skip_reason:
+            self._settle(cell, self._skipped(cell, cell.skip_reason, cell.skip_type))
+            return
+        if reason := self._missing(needed):
             self._settle(cell, self._skipped(cell, reason))
             return
         refs = known_inputs(cell, self._plan.inputs, self._results)
@@ -301,11 +281,12 @@ class _Run:
                 return f"needs {address}, which {verb}"
         return ""
 
-    def _skipped(self, cell: Cell, reason: str) -> CellResult:
+    def _skipped(self, cell: Cell, reason: str, why: str = "") -> CellResult:
         facts = self._plan.methods.get(cell.method) or MethodIdentity(method=cell.method)
         return CellResult(
             status="skipped",
             run_id=self._journal.run_id,
+            error_type=why,
             error_message=reason,
             **shared_fields(facts, MethodIdentity),
         )

@@ -61,7 +61,7 @@ from orthoflow.errors import (
     ProductError,
     StepFailedError,
 )
-from orthoflow.geometry.kernel_news import heard_by
+from orthoflow.geometry.compile_events import on_compiling
 from orthoflow.products.input_files import InputFiles
 from orthoflow.products.product import Product
 from orthoflow.sdk.context import Drawing, StepContext, StepEvent
@@ -286,22 +286,22 @@ def run_task(
         has_own_process: whether this process ends with the task.
     """
     started = now()
-    sampler, news = MemorySampler(), _News(listen)
+    sampler, progress = MemorySampler(), _ProgressWithCompiling(listen)
     meter = LoadingMeter(sets_aside=has_own_process)
-    call = _Call(task, news.listen, is_cancelled, meter, sampler)
+    call = _Call(task, progress.listen, is_cancelled, meter, sampler)
     try:
-        with sampler, meter, heard_by(news.compiling):
+        with sampler, meter, on_compiling(progress.compiling):
             result = call.run()
     except BaseException as error:
         # If Ctrl-C is ignored, only the method can have raised it.
         is_users = signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
         if isinstance(error, KeyboardInterrupt) and is_users:
             raise
-        trace = _trace(error)
+        result = failed_result(task, explain_failure(task, error))
         if not isinstance(error, OrthoflowError):
             # To the log, and so to the record, where an author looks for the error.
-            news.listen(StepEvent(kind="log", text=trace))
-        result = failed_result(task, explain_failure(task, error), trace)
+            progress.listen(StepEvent(kind="log", text=_trace(error)))
+            result = dataclasses.replace(result, is_bug=True)
     return dataclasses.replace(
         result,
         started=started,
@@ -312,7 +312,7 @@ def run_task(
     )
 
 
-def failed_result(task: Task, error: OrthoflowError, trace: str = "") -> CellResult:
+def failed_result(task: Task, error: OrthoflowError) -> CellResult:
     """Return the result of a cell that failed."""
     # A file reports all problems at once, a line each.
     message = "; ".join(str(error).splitlines()) if type(error) is InputError else error
@@ -321,7 +321,6 @@ def failed_result(task: Task, error: OrthoflowError, trace: str = "") -> CellRes
         status="failed",
         error_type=type(error).__name__,
         error_message=one_line(message, _LONGEST_ERROR) or f"{task.who} failed without a message",
-        traceback=trace,
         exit_code=error.exit_code,
     )
 
@@ -375,7 +374,7 @@ def _disk_failure(error: OSError, store: Path) -> OrthoflowError | None:
     return store_error(error, store) if is_broken(error, store) else None
 
 
-class _News:
+class _ProgressWithCompiling:
     """Forwards messages of a step, and in between which kernel it waits for."""
 
     def __init__(self, listen: Listener) -> None:

@@ -26,7 +26,7 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
 from numba.core.errors import TypingError
 
-from orthoflow.geometry.kernel_news import tell
+from orthoflow.geometry.compile_events import report_compiling
 
 _Kernel = TypeVar("_Kernel", bound=Callable[..., object])
 
@@ -279,13 +279,13 @@ class _Compilation(event.Listener):
         self._n_begun += 1
         # What numba makes within a function of ours, or of its own, is all called alike.
         name = kernel.py_func.__qualname__.partition(".")[0]
-        tell(f"compiling {name} ({self._n_begun} so far)")
+        report_compiling(f"compiling {name} ({self._n_begun} so far)")
 
     def on_end(self, event: event.Event) -> None:
         """Report that all is compiled."""
         self._depth -= 1
         if self._depth == 0:
-            tell("")
+            report_compiling("")
 
 
 event.register("numba:compile", _Compilation())  # type: ignore[no-untyped-call]

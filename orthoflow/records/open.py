@@ -7,14 +7,21 @@ import dataclasses
 import json
 import shutil
 import tempfile
+from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-from orthoflow_provenance.document import RecordFormatError, from_json, parse_json
+from orthoflow_provenance.document import (
+    CellStatus,
+    RecordedCell,
+    RecordFormatError,
+    from_json,
+    parse_json,
+)
 from orthoflow_provenance.record import write_record
 
-from orthoflow.engine.journal import RECORD_FILE, readable_lines
-from orthoflow.errors import ArgumentError, StoreError
+from orthoflow.engine.journal import RECORD_FILE, kept_from_others, readable_lines
+from orthoflow.errors import ArgumentError, CancelledStepError, StoreError
 from orthoflow.records.runs import Run, find_record, published_state, read_run
 from orthoflow.records.write import (
     OUTLINE_FILE,
@@ -23,6 +30,8 @@ from orthoflow.records.write import (
     recorded_cell,
     recorded_environments,
 )
+
+_INTERRUPTED: Final = CancelledStepError.__name__
 
 
 def open_run(path: str | Path) -> Run:
@@ -45,14 +54,18 @@ def has_outline(folder: Path) -> bool:
     return (folder / OUTLINE_FILE).is_file() and not (folder / RECORD_FILE).is_file()
 
 
-def open_unfinished(folder: Path) -> Run:
+def open_unfinished(folder: Path, *, publish: bool = False) -> Run:
     """Open an unfinished run; cells without a result yet are skipped in it.
 
-    Its record is in a folder that is removed with this process, as are its published files if the
-    run folder does not have them. The run folder is not written to.
+    Its record is in a folder that is removed with this process.
+
+    Args:
+        folder: of the run.
+        publish: write its products into the run folder, of a run that was interrupted; otherwise
+            they are beside the temporary record, if the run folder does not have them.
 
     Raises:
-        ArgumentError: its outline or its store is missing or unreadable.
+        ArgumentError: its outline or its store is missing or unreadable, or the run goes on.
         StoreError: the disk cannot be written.
     """
     from orthoflow.engine.store import Store  # noqa: PLC0415 - only who looks at such a run
@@ -68,10 +81,29 @@ def open_unfinished(folder: Path) -> Run:
             f"{error}; repeat the run with -o {folder} to finish it"
         ) from error
     lines = readable_lines(folder)
-    ended = [line for line in lines if line.event == "finished"]
-    found = {line.address: (line, store.result(line.key)) for line in ended if line.key}
-    results = {address: result for address, (_, result) in found.items() if result is not None}
-    cached = {address for address, (line, _) in found.items() if line.cached}
+    ended = {line.address: line for line in lines if line.event == "finished"}
+    found = {address: store.result(line.key) for address, line in ended.items() if line.key}
+    results = {address: result for address, result in found.items() if result is not None}
+
+    def known(cell: RecordedCell) -> RecordedCell:
+        result, line = results.get(cell.address), ended.get(cell.address)
+        if result is not None and line is not None:
+            return recorded_cell(
+                cell,
+                result,
+                store,
+                sources=sources.get(cell.address, {}),
+                embedded=embedded,
+                cached_from=result.run_id if line.cached else "",
+            )
+        if line is None or not line.error or line.error_type == _INTERRUPTED:
+            return cell
+        status: CellStatus = "failed" if line.status == "failed" else "skipped"
+        return dataclasses.replace(
+            cell, status=status, error_type=line.error_type, error_message=line.error
+        )
+
+    cells = tuple(map(known, record.cells))
     began = next((line for line in lines if line.event == "run"), None)
     record = dataclasses.replace(
         record,
@@ -79,26 +111,16 @@ def open_unfinished(folder: Path) -> Run:
         run_id=began.run_id if began else record.run_id,
         started=began.time if began else record.started,
         ended=lines[-1].time if lines else record.ended,
-        status="failed" if any(one.status == "failed" for one in results.values()) else "ok",
+        status="failed" if any(cell.status == "failed" for cell in cells) else "ok",
         environments=recorded_environments(results),
-        cells=tuple(
-            recorded_cell(
-                cell,
-                results[cell.address],
-                store,
-                sources=sources.get(cell.address, {}),
-                embedded=embedded,
-                cached_from=results[cell.address].run_id if cell.address in cached else "",
-            )
-            if cell.address in results
-            else cell
-            for cell in record.cells
-        ),
+        cells=cells,
     )
     aside = Path(tempfile.mkdtemp(prefix="orthoflow-"))
     atexit.register(shutil.rmtree, aside, ignore_errors=True)
     files = files_of_outputs(results, store)
-    published = publish_products(aside, record.cells, files, record.run_id)
+    target = folder if publish else aside
+    with kept_from_others(folder) if publish else nullcontext():
+        published = publish_products(target, record.cells, files, record.run_id)
     path = aside / RECORD_FILE
     try:
         write_record(path, dataclasses.replace(record, published=published), store.product_file)

@@ -253,6 +253,7 @@ def _cell(recorded: RecordedCell, workflow: Workflow) -> Cell:
         cores=variant.cores if variant else None,
         timeout_s=variant.timeout_s if variant else None,
         skip_reason=recorded.error_message if recorded.status == "skipped" else "",
+        skip_type=recorded.error_type if recorded.status == "skipped" else "",
     )
 
 

@@ -48,7 +48,6 @@ from orthoflow.errors import (
     ArgumentError,
     DamageError,
     InputError,
-    OrthoflowError,
     StoreError,
 )
 from orthoflow.files.geotiff import name_run
@@ -251,7 +250,8 @@ def recorded_cell(
 
 _UNFINISHED: Final = f".{RECORD_FILE}.unfinished"
 _MOST_ATTEMPTS: Final = 4
-NOT_YET: Final = "not computed yet: the run was interrupted"
+# `error_type` of cells that an unfinished run has not computed yet.
+NOT_YET: Final = "not-computed-yet"
 
 
 def write_run(
@@ -364,40 +364,6 @@ def files_of_outputs(
     }
 
 
-def show_unfinished(
-    outcome: RunOutcome,
-    plan: RunPlan,
-    workflow: Workflow,
-    run_folder: Path,
-    store: Store,
-    show: Callable[[Run], None],
-) -> bool:
-    """Publish and show the results of an interrupted run; the run stays unfinished.
-
-    Args:
-        outcome: the results, as passed by `execute` to `on_interruption`.
-        plan: the plan of the run.
-        workflow: the document of the plan.
-        run_folder: its folder.
-        store: holds the products and pictures.
-        show: called with a run whose record is temporary, e.g. to write the report; cells without a
-            result yet are skipped in it.
-
-    Returns:
-        False if it cannot be shown, e.g. on a full disk: the run itself loses nothing.
-    """
-    whole = _with_missing(outcome, plan)
-    try:
-        unfinished = _publish(whole, plan, workflow, run_folder, store, embed=False)
-        try:
-            show(read_run(unfinished, later_name=RECORD_FILE))
-        finally:
-            unfinished.unlink(missing_ok=True)
-    except (OrthoflowError, OSError):
-        return False
-    return True
-
-
 def begin_run(
     plan: RunPlan, workflow: Workflow, run_folder: Path, store: Store, run_id: str
 ) -> None:
@@ -415,7 +381,7 @@ def begin_run(
     outcome = RunOutcome(run_id=run_id, started=began, ended=began, results={})
     content = {
         "store": str(store.folder.absolute()),
-        "record": to_json(build_record(_with_missing(outcome, plan), plan, workflow, store)),
+        "record": to_json(build_record(outcome, plan, workflow, store)),
         "sources": {item.cell.address: _sources(item.cell) for item in plan.cells},
         "embedded": sorted(_embedded_types(plan)),
     }
@@ -431,24 +397,6 @@ def _embedded_types(plan: RunPlan, *, embed: bool = False) -> frozenset[str]:
     """Return the product types whose arrays go into a record."""
     specs = plan.products.items()
     return frozenset(name for name, one in specs if embed or resolve_name(one.target).embedded)
-
-
-def _with_missing(outcome: RunOutcome, plan: RunPlan) -> RunOutcome:
-    """Return an outcome in which cells without a result yet are skipped."""
-    missing = {
-        item.cell.address: CellResult(
-            status="skipped",
-            run_id=outcome.run_id,
-            error_message=item.cell.skip_reason or NOT_YET,
-            **shared_fields(
-                plan.methods.get(item.cell.method) or MethodIdentity(method=item.cell.method),
-                MethodIdentity,
-            ),
-        )
-        for item in plan.cells
-        if item.cell.address not in outcome.results
-    }
-    return dataclasses.replace(outcome, results={**outcome.results, **missing})
 
 
 def executed_and_written(
@@ -479,7 +427,7 @@ def build_record(
     *,
     embed: bool = False,
 ) -> RunRecord:
-    """Convert the engine's outcome into a record.
+    """Convert the engine's outcome into a record; cells without a result are skipped in it.
 
     Raises:
         DamageError: the store lost a picture of the run.
@@ -489,26 +437,33 @@ def build_record(
     workflow = dataclasses.replace(workflow, overrides=overrides)
     results = outcome.results
     embedded = _embedded_types(plan, embed=embed)
-    cells = tuple(
-        recorded_cell(
-            RecordedCell(
-                status="skipped",
-                address=cell.address,
-                step=cell.step,
-                assignment=dict(cell.assignment),
-                repeat=cell.repeat,
-                params=dict(cell.params),
-                params_set=dict(cell.params_set),
-            ),
+
+    def recorded(cell: Cell) -> RecordedCell:
+        identity = plan.methods.get(cell.method) or MethodIdentity(method=cell.method)
+        found = RecordedCell(
+            status="skipped",
+            error_type=NOT_YET,
+            error_message="not computed yet: the run was interrupted",
+            address=cell.address,
+            step=cell.step,
+            assignment=dict(cell.assignment),
+            repeat=cell.repeat,
+            params=dict(cell.params),
+            params_set=dict(cell.params_set),
+            **shared_fields(identity, MethodIdentity),
+        )
+        if cell.address not in results:
+            return found
+        return recorded_cell(
+            found,
             results[cell.address],
             store,
             sources=_sources(cell),
             embedded=embedded,
             cached_from=outcome.cached.get(cell.address, ""),
         )
-        for cell in (item.cell for item in plan.cells)
-        if cell.address in results
-    )
+
+    cells = tuple(recorded(item.cell) for item in plan.cells)
     return RunRecord(
         run_id=outcome.run_id,
         name=workflow.name,

@@ -197,7 +197,7 @@ def is_check(cell: RecordedCell) -> bool:
 
 def is_missing(cell: RecordedCell) -> bool:
     """Return whether the run was interrupted before the cell."""
-    return cell.status == "skipped" and cell.error_message == NOT_YET
+    return cell.error_type == NOT_YET
 
 
 def combinations_of(run: Run) -> tuple[Combination, ...]:

@@ -396,11 +396,7 @@ def _value(
 def _absent(one: Combination, origins: Origins, column: MetricRow) -> Value:
     """What stands where there is no number: nothing was found, or nobody asked."""
     own = [cell for cell in one.cells if cell.step == column.step]
-    asked = [
-        cell
-        for cell in own
-        if not is_missing(cell) and not cell.error_message.startswith(NOT_ASKED_FOR)
-    ]
+    asked = [cell for cell in own if not is_missing(cell) and cell.error_type != NOT_ASKED_FOR]
     if one.failure is not None and (asked or not own):
         # Of another run the step may be, and not of this one.
         asked = [one.failure] if _has_step(one.run, column.step) else []

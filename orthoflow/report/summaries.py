@@ -178,8 +178,7 @@ def results(run: Run) -> dict[str, tuple[str, ...]]:
     """Which cells have a result, failed, were not reached or not asked for: which -> addresses."""
     found: dict[str, tuple[str, ...]] = {"ok": (), "failed": (), "skipped": (), "not asked for": ()}
     for cell in run.record.cells:
-        is_unasked = cell.status == "skipped" and cell.error_message.startswith(NOT_ASKED_FOR)
-        which = "not asked for" if is_unasked else cell.status
+        which = "not asked for" if cell.error_type == NOT_ASKED_FOR else cell.status
         found[which] = (*found[which], cell.address)
     return found
 

@@ -312,7 +312,8 @@ def _yaml(path: Path) -> Recognised:
 
 
 def _cameras_summary(paths: Sequence[Path]) -> str:
-    return f"{len(read_given_cameras(paths))} cameras"
+    n_cameras = len(read_given_cameras(paths))
+    return "1 camera" if n_cameras == 1 else f"{n_cameras} cameras"
 
 
 def _read(kind: FileKind, path: Path, summary: Callable[[Path], str]) -> Recognised:

@@ -37,8 +37,8 @@ Assignment: TypeAlias = dict[str, str]
 MOST_CELLS: Final = 20_000
 # The product of methods that measure the quality of others' results.
 _JUDGEMENT: Final = "inspection"
-# Beginning of the reason of a cell without optional data, unlike one after a failure.
-NOT_ASKED_FOR: Final = "only "
+# Why a cell is skipped that optional data decide about, unlike one after a failure.
+NOT_ASKED_FOR: Final = "not-asked-for"
 _SEED_BITS: Final = 53  # exact in every JSON reader, also those that only know doubles
 
 
@@ -84,6 +84,7 @@ class Cell:
         cores: requested number of cores, or None for all.
         timeout_s: seconds, or None.
         skip_reason: why the cell will not run (optional data absent), empty if it will.
+        skip_type: the same for programs, as the `error_type` of its result.
     """
 
     address: str
@@ -98,6 +99,7 @@ class Cell:
     cores: int | None = None
     timeout_s: float | None = None
     skip_reason: str = ""
+    skip_type: str = ""
 
     @property
     def setting(self) -> str:
@@ -633,6 +635,7 @@ class _Expansion:
             cores=variant.cores,
             timeout_s=variant.timeout_s,
             skip_reason=skip_reason,
+            skip_type=NOT_ASKED_FOR if skip_reason else "",
         )
 
 
@@ -661,4 +664,4 @@ def _compared_steps(workflow: Workflow, methods: Mapping[str, type[Method]]) -> 
 
 def _reason(*causes: str) -> str:
     """Return why a cell is skipped: any of the causes suffices."""
-    return f"{NOT_ASKED_FOR}{' or '.join(causes)}"
+    return f"only {' or '.join(causes)}"

@@ -338,7 +338,8 @@ class CellOutcome(MethodIdentity, Costs):
 
     Attributes:
         status: ok, failed or skipped.
-        error_type: class of the error, empty when ok; for skipped cells empty too.
+        error_type: class of the error, empty when ok; of skipped cells `not-asked-for` where
+            optional data decide, else empty.
         error_message: one sentence; for skipped cells the reason.
         key: cache key, SHA-256 in hexadecimal digits; empty when never known.
         key_preimage: canonical JSON the key is the digest of.

@@ -17,20 +17,20 @@ import pytest
 from orthoflow_provenance.verify import verify_record
 
 from orthoflow.catalog.discovery import discover_catalog
-from orthoflow.engine.journal import is_running
+from orthoflow.engine.journal import Journal, is_running
 from orthoflow.engine.plan import RunOptions, RunPlan, plan_run
 from orthoflow.engine.results import FigureRef
 from orthoflow.engine.scheduler import RunOutcome, execute
 from orthoflow.engine.store import Store
 from orthoflow.errors import DamageError, StoreError
-from orthoflow.records.open import open_run
+from orthoflow.records.open import open_run, open_unfinished
 from orthoflow.records.runs import Run
 from orthoflow.records.verify import verify_run
 from orthoflow.records.write import (
+    NOT_YET,
     begin_run,
     executed_and_written,
     publish_products,
-    show_unfinished,
     write_run,
 )
 from orthoflow.workflow.document import load_workflow
@@ -137,35 +137,6 @@ def test_a_failing_report_leaves_the_run_unfinished_and_the_next_attempt_cleans_
     assert not (executed.folder / "products" / "left-over").exists()
 
 
-def test_what_was_broken_off_is_shown_and_stays_unfinished(executed: Executed) -> None:
-    survey = {"survey": executed.outcome.results["survey"]}
-    broken_off = dataclasses.replace(executed.outcome, results=survey)
-    seen: list[Run] = []
-
-    def look(run: Run) -> None:
-        assert run.product("survey", "planes") is not None
-        seen.append(run)
-
-    def refuse(_run: Run) -> None:
-        raise OSError(28, "No space left on device")
-
-    shown = [
-        show_unfinished(
-            broken_off, executed.plan, executed.workflow, executed.folder, executed.store, show
-        )
-        for show in (look, refuse)
-    ]
-    assert shown == [True, False]
-    assert {address: cell.status for address, cell in seen[0].cells.items()} == {
-        "survey": "ok",
-        "paint": "skipped",
-    }
-    assert seen[0].cells["paint"].error_message == "not computed yet: the run was interrupted"
-    assert (executed.folder / "products" / "survey" / "planes.json").is_file()
-    assert not list(executed.folder.glob("*run.h5*"))
-    assert executed.write().record.status == "ok"
-
-
 def test_a_run_that_is_not_finished_opens_as_far_as_it_is(executed: Executed) -> None:
     begin_run(executed.plan, executed.workflow, executed.folder, executed.store, "later")
     journal = executed.folder / "journal.jsonl"
@@ -183,16 +154,43 @@ def test_a_run_that_is_not_finished_opens_as_far_as_it_is(executed: Executed) ->
         "survey": "ok",
         "paint": "skipped",
     }
+    assert run.cells["paint"].error_message == "not computed yet: the run was interrupted"
     assert run.product("survey", "planes") is not None
     assert [path.name for path in run.files["survey"]]
     assert verify_record(run.path) == ()
     assert run.home_folder == executed.folder
     # It may be going on.
     assert not (executed.folder / "products").exists()
+    shown = open_unfinished(executed.folder, publish=True)
+    assert shown.folder == executed.folder
+    assert (executed.folder / "products" / "survey" / "planes.json").is_file()
+    assert not list(executed.folder.glob("*run.h5*"))
     journal.write_text("".join(lines))
     finished = executed.write()
     assert open_run(executed.folder).record == finished.record
     assert not list(executed.folder.glob(".outline*"))
+
+
+@pytest.mark.parametrize(
+    ("error_type", "expected"),
+    [("MethodError", ("failed", "MethodError")), ("CancelledStepError", ("skipped", NOT_YET))],
+)
+def test_an_unfinished_run_names_what_failed_and_not_what_was_interrupted(
+    executed: Executed, error_type: str, expected: tuple[str, str]
+) -> None:
+    begin_run(executed.plan, executed.workflow, executed.folder, executed.store, "later")
+    with Journal(executed.folder, executed.plan.name) as journal:
+        journal.write(
+            "finished",
+            address="paint",
+            key="0" * 64,
+            status="failed",
+            error="no paint",
+            error_type=error_type,
+        )
+    run = open_run(executed.folder)
+    assert (run.cells["paint"].status, run.cells["paint"].error_type) == expected
+    assert run.record.status == ("failed" if expected[0] == "failed" else "ok")
 
 
 def test_copies_do_not_share_their_bytes_with_the_store(executed: Executed) -> None:

@@ -192,7 +192,7 @@ def test_a_dataset_that_the_run_was_broken_off_before_is_not_complete(
     rooms: HeldRun, tmp_path: Path
 ) -> None:
     cells = tuple(
-        replace(one, status="skipped", error_message=NOT_YET)
+        replace(one, status="skipped", error_type=NOT_YET, error_message="not yet")
         if one.assignment.get("data") == "court" and one.step == "plane"
         else one
         for one in rooms.record.cells

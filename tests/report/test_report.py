@@ -377,7 +377,13 @@ def test_a_value_says_what_it_is_the_mean_of(
             ),
             False,
         ),
-        ((cell("plane"), cell("check", status="skipped", error_message=NOT_YET)), False),
+        (
+            (
+                cell("plane"),
+                cell("check", status="skipped", error_type=NOT_YET, error_message="not yet"),
+            ),
+            False,
+        ),
         ((cell("plane"),), False),
         ((cell("plane", status="failed"),), False),
     ],
@@ -405,7 +411,15 @@ def test_what_a_run_was_broken_off_before_has_no_time_and_is_not_counted(
 ) -> None:
     # Of `coarse` only the step before is there, as where the room was built and no plane sought.
     cells = [
-        replace(one, status="skipped", error_message=NOT_YET, metrics=(), outputs={}, figures=())
+        replace(
+            one,
+            status="skipped",
+            error_type=NOT_YET,
+            error_message="not yet",
+            metrics=(),
+            outputs={},
+            figures=(),
+        )
         if one.assignment and one.address != "plane@plane=coarse"
         else one
         for one in compared.record.cells

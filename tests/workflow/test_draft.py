@@ -311,7 +311,7 @@ def test_a_raster_with_its_frame_beside_it_is_an_orthoimage(tmp_path: Path) -> N
 def test_a_list_of_cameras_is_one_by_its_columns_and_its_ending(tmp_path: Path) -> None:
     text = f"{REALITYCAPTURE}a.jpg,1,2,3,0,0,0,24,0,0,0,0,0,0,0,0\n"
     found = one(tmp_path / "cameras.csv", text)
-    assert (found.kind, found.summary) == ("cameras", "1 cameras")
+    assert (found.kind, found.summary) == ("cameras", "1 camera")
     assert one(tmp_path / "cameras.txt", text).kind == "unknown"
 
 
