@@ -68,55 +68,55 @@ def test_the_page_names_most_built_in_methods() -> None:
         assert missing <= {"inspect.truth", "inspect.openings", "plane.open3d-patches"}
 
 
-@pytest.mark.parametrize("code", NAMED)
-def test_every_parameter_named_exists_and_takes_the_value(code: str) -> None:
-    method_id, _, setting = code.partition(" ")
-    params = discover_catalog().method(method_id).load().Params
-    if not setting:
-        return
-    name, _, value = setting.partition(": ")
-    assert name in params.model_fields
-    if value:
-        params.model_validate({name: YAML(typ="safe").load(value)})
+def test_every_parameter_named_exists_and_takes_the_value() -> None:
+    catalog = discover_catalog()
+    for code in NAMED:
+        method_id, _, setting = code.partition(" ")
+        params = catalog.method(method_id).load().Params
+        name, _, value = setting.partition(": ")
+        assert not name or name in params.model_fields, code
+        if value:
+            params.model_validate({name: YAML(typ="safe").load(value)})
 
 
-@pytest.mark.parametrize("figure", FIGURES)
-def test_every_figure_named_is_drawn_by_a_method(figure: str) -> None:
-    name = re.escape(figure.removesuffix("_...")).replace("_0_", r"_\{[^}]+\}_")
+def test_every_figure_named_is_drawn_by_a_method() -> None:
     sources = (ROOT / "plugins" / "orthoflow_plugins").rglob("*.py")
-    assert any(re.search(rf'"{name}"', source.read_text()) for source in sources)
+    whole = "\n".join(source.read_text() for source in sources)
+    for figure in FIGURES:
+        name = re.escape(figure.removesuffix("_...")).replace("_0_", r"_\{[^}]+\}_")
+        assert re.search(rf'"{name}"', whole), figure
 
 
 def test_every_metric_named_is_declared_by_a_method() -> None:
     methods = discover_catalog().methods
     ours = [name for name in methods if methods[name].distribution.name == "orthoflow-tls"]
-    loaded = [discover_catalog().method(name).load() for name in ours]
+    loaded = [methods[name].load() for name in ours]
     known = {metric.name for method in loaded for metric in method.metric_specs()}
     assert len(METRICS) > 15
     unknown = {name for name in METRICS if not any(fnmatchcase(name, one) for one in known)}
     assert unknown == set()
 
 
-@pytest.mark.parametrize("code", [code for code in CODE if re.fullmatch(r"[a-z-]+\.yaml", code)])
-def test_every_workflow_named_is_shipped(code: str) -> None:
-    assert code.removesuffix(".yaml") in shipped_workflows()
+def test_every_workflow_named_is_shipped() -> None:
+    named = {code.removesuffix(".yaml") for code in CODE if re.fullmatch(r"[a-z-]+\.yaml", code)}
+    assert named
+    assert named <= {*shipped_workflows()}
 
 
-@pytest.mark.parametrize("what", list(ROWS))
-def test_every_row_has_a_source_or_the_reason_why_it_has_none(what: str) -> None:
-    section, (_, _, here, *values, deviation) = ROWS[what]
-    assert deviation, "none where there is none"
-    if here == "-":
-        assert deviation != "none", "neither a method nor the reason why there is none"
-    elif PART.search(section):
-        theirs, by_theirs, ours = values
-        assert theirs
-        assert by_theirs
-        assert ours
-        assert (by_theirs, ours) != ("-", "-")
-    else:
-        (test,) = values
-        assert SOURCE.search(test), "nothing that checks it"
+def test_every_row_has_a_source_or_the_reason_why_it_has_none() -> None:
+    for what, (section, (_, _, here, *values, deviation)) in ROWS.items():
+        assert deviation, f"{what}: none where there is none"
+        if here == "-":
+            assert deviation != "none", f"{what}: neither a method nor the reason"
+        elif PART.search(section):
+            theirs, by_theirs, ours = values
+            assert theirs, what
+            assert by_theirs, what
+            assert ours, what
+            assert (by_theirs, ours) != ("-", "-"), what
+        else:
+            (test,) = values
+            assert SOURCE.search(test), f"{what}: nothing that checks it"
 
 
 def test_the_page_is_what_its_template_becomes() -> None:

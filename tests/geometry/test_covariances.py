@@ -117,6 +117,7 @@ DRAWN: Final[dict[str, tuple[Draw, int]]] = {
 }
 
 
+@pytest.mark.long
 def test_what_neighbours_share_is_stated() -> None:
     """Stated over true of each kind of error, and normalised errors of all of them together.
 

@@ -10,6 +10,7 @@ import pytest
 BENCHMARKS = Path(__file__).parents[3] / "benchmarks"
 
 
+@pytest.mark.long
 def test_photos_of_repeating_windows_are_oriented_where_they_are(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

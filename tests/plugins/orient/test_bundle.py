@@ -108,6 +108,7 @@ def test_ties_between_photos_make_them_more_exact(
     assert photo_ties["n_points"] > 200
 
 
+@pytest.mark.long
 def test_stated_errors_are_those_of_repeated_orientations(tmp_path: Path) -> None:
     ratios = []
     for seed in range(8):
@@ -141,6 +142,7 @@ def test_errors_of_the_scan_do_not_split_one_camera_into_several_lenses(
     assert len({camera.intrinsics for camera in together.cameras}) == 1
 
 
+@pytest.mark.long
 def test_errors_of_the_scan_that_reach_far_are_stated(tmp_path: Path) -> None:
     """Relative to the scan: how far it is off on the average, nothing in it can show."""
     ratios = []
