@@ -23,6 +23,7 @@ from orthoflow.geometry import bands
 from orthoflow.geometry.bands import count_cells, count_known, holds_cells
 from orthoflow.products import Layer, LayerMask, Layers, SurfaceMask, Walls
 from tests import inspect_scenes, ortho_scenes, raster_scenes
+from tests.long_loops import long_only
 from tests.plugins.ortho.test_direct import bare_walls
 from tests.raster_scenes import context
 
@@ -88,7 +89,7 @@ def large_inputs(folder: Path, n: int = 7) -> DsmBackward.In:
     )
 
 
-@pytest.mark.parametrize("method", [DsmBackward, DsmForward])
+@pytest.mark.parametrize("method", [DsmBackward, *long_only(DsmForward)])
 @pytest.mark.usefixtures("small_bands")
 def test_layers_are_painted_and_reported_without_memory_per_cell(
     tmp_path: Path, method: type[DsmBackward | DsmForward]
@@ -224,7 +225,7 @@ def mosaic(layers: tuple[Layer, ...], folder: Path, **params: object) -> MosaicS
     return MosaicSeams().run(inputs, chosen, context(folder))
 
 
-@pytest.mark.parametrize("seams", ["best-view", "priority", "graph-cut", "voronoi"])
+@pytest.mark.parametrize("seams", ["graph-cut", *long_only("best-view", "priority", "voronoi")])
 @pytest.mark.usefixtures("small_bands")
 def test_mosaics_are_joined_and_reported_without_memory_per_cell(
     tmp_path: Path, seams: str
@@ -248,7 +249,7 @@ def crop(layer: Layer, n_rows: int) -> Layer:
     )
 
 
-@pytest.mark.parametrize("seams", ["best-view", "priority", "graph-cut", "voronoi"])
+@pytest.mark.parametrize("seams", ["graph-cut", *long_only("best-view", "priority", "voronoi")])
 def test_bands_do_not_show_in_mosaics_nor_in_what_is_told_of_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seams: str
 ) -> None:
