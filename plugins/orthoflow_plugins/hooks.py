@@ -43,6 +43,7 @@ _METHODS: Final = {
     "lenses refined",
     "orient.given:OrientGiven": "poses of other programs, unchanged or "
     "corrected by ties measured by hand",
+    "dense.sgm:DenseSgm": "the surface that neighbouring photos show, by semi-global matching",
     "colour.photos:ColourPhotos": "each point takes the colour of the photo that shows it best",
     "ortho.pointcloud_direct:PointcloudDirect": "the topmost point colours its cell",
     "ortho.dsm_backward:DsmBackward": "each cell of a wall takes its "
@@ -108,6 +109,12 @@ def orthoflow_kinds() -> list[KindSpec]:
             summary="orient the photos to the scan",
             inputs=_ports("ties photos cameras walls"),
             outputs=_ports("cameras"),
+        ),
+        KindSpec(
+            name="dense",
+            summary="match the surface that oriented photos show",
+            inputs=_ports("photos cameras"),
+            outputs=_ports("cloud"),
         ),
         KindSpec(
             name="colour",

@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from orthoflow.geometry import UpDirection, basis_from_up, up_vector
-from orthoflow.products import Calibration, CheckPoints, Intrinsics, Photos, PointCloud, Truth
+from orthoflow.products import (
+    Calibration,
+    Cameras,
+    CheckPoints,
+    Intrinsics,
+    Photos,
+    PointCloud,
+    Truth,
+)
 from orthoflow.sdk import Determinism, Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow_plugins.simulate.photographs import (
     Film,
@@ -249,10 +257,11 @@ class SimulateRoom(Method):
         """No inputs."""
 
     class Out(Ports):
-        """The scan, the photos, and the truth about them."""
+        """The scan, the photos, and the truth about them; `cameras` are the true ones."""
 
         cloud: PointCloud
         photos: Photos
+        cameras: Cameras
         calibration: Calibration
         checkpoints: CheckPoints
         truth: Truth
@@ -362,6 +371,7 @@ class SimulateRoom(Method):
         return self.Out(
             cloud=cloud,
             photos=photos,
+            cameras=truth.cameras or Cameras(cameras=()),
             calibration=Calibration(patterns=("*",) * len(known), intrinsics=known),
             checkpoints=check_points(delivery, views, n_most=params.check_points_most),
             truth=truth,

@@ -1,0 +1,226 @@
+"""`dense.sgm`: the surface that oriented photos show, by semi-global matching."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Final, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from orthoflow.errors import MethodError
+from orthoflow.files.images import decode_image
+from orthoflow.geometry import UpDirection, up_vector
+from orthoflow.geometry.cameras import ViewingCamera, opencv_matrix
+from orthoflow.products import Cameras, Photo, Photos, PointCloud
+from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
+
+# Rows of a rectified pair run along its base: photos above each other are no pair.
+_ALONG_ROWS: Final = np.cos(np.radians(30.0))
+_SIDEWAYS: Final = np.sin(np.radians(25.0))
+_SAME_VIEW: Final = np.cos(np.radians(30.0))
+# Parallax as a share of a photo's width: 70 % of overlap is what blocks are flown with; with less
+# than half a surface looks different, and of bases much shorter depths are poor.
+_BEST_PARALLAX: Final = 0.3
+_LEAST_PARALLAX: Final = 0.05
+_MOST_PARALLAX: Final = 0.5
+# Settings of OpenCV's matcher for colour images, from its documentation.
+_BLOCK_PX: Final = 5
+_SMALL_STEP: Final = 8 * 3 * _BLOCK_PX**2
+_LARGE_STEP: Final = 32 * 3 * _BLOCK_PX**2
+
+
+class _View(NamedTuple):
+    """An oriented photo."""
+
+    photo: Photo
+    camera: ViewingCamera
+
+
+class DenseSgm(Method):
+    """Match the surface that oriented photos show, from neighbouring photos (SGM of OpenCV).
+
+    Each photo is matched with the one to its right that looks the same way and whose overlap comes
+    nearest to 70 %: bases within 30 deg of the rows of the photo and at least 25 deg off its axis,
+    axes within 30 deg, 50 to 95 % of overlap. Points take the colour of the left photo; there is
+    one scan per pair, whose station is that photo's centre. Photos above each other are not
+    matched.
+    """
+
+    id: ClassVar[str] = "dense.sgm"
+    determinism = "loose"
+    metrics = (
+        MetricSpec("n_pairs", label="pairs of photos"),
+        MetricSpec("n_points", label="points"),
+        MetricSpec("matched_share", label="pixels of left photos that were matched"),
+    )
+    citations: ClassVar[tuple[str, ...]] = (
+        (
+            "Hirschmueller 2008, Stereo processing by semiglobal matching and mutual information, "
+            "doi:10.1109/TPAMI.2007.1166"
+        ),
+    )
+
+    class Params(MethodParams):
+        """Where the surface lies, and how dense its points are."""
+
+        nearest_m: float = Field(1.0, gt=0.0, description="Distance of the nearest surface.")
+        farthest_m: float = Field(
+            10.0, gt=0.0, description="Distance of the farthest surface; the range costs time."
+        )
+        spacing_m: float = Field(
+            0.0,
+            ge=0.0,
+            description="Of points of a pair in one cube of this side the first is kept; 0 keeps "
+            "one per pixel.",
+        )
+        up: UpDirection = Field("z", description="World direction that is up.")
+
+        @model_validator(mode="after")
+        def _farthest_is_beyond_nearest(self) -> Self:
+            if self.farthest_m <= self.nearest_m:
+                raise ValueError(
+                    f"farthest_m {self.farthest_m:g} must be greater than nearest_m "
+                    f"{self.nearest_m:g}"
+                )
+            return self
+
+    class In(Ports):
+        """The photos and their orientation."""
+
+        photos: Photos
+        cameras: Cameras
+
+    class Out(Ports):
+        """The points of all pairs."""
+
+        cloud: PointCloud
+
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Choose pairs, match each, and join their points."""
+        views = _oriented(inputs)
+        distance_m = float(np.sqrt(params.nearest_m * params.farthest_m))
+        neighbours = [(left, _right_of(left, views, distance_m)) for left in views]
+        pairs = [(left, right) for left, right in neighbours if right is not None]
+        if not pairs:
+            raise MethodError(
+                f"of {len(views)} oriented photos none stands beside another that looks the same "
+                "way: photos that overlap sideways by 50 to 95 % are needed, seen from "
+                f"{distance_m:.2g} m (nearest_m and farthest_m)"
+            )
+        parts = []
+        n_pixels = n_matched = 0
+        for done, (left, right) in enumerate(pairs):
+            ctx.progress(done / len(pairs), f"{left.photo.name} and {right.photo.name}")
+            points, rgb, shown = _matched(left, right, params)
+            n_pixels, n_matched = n_pixels + shown, n_matched + len(points)
+            if params.spacing_m:
+                cubes = np.floor(points / params.spacing_m).astype(np.int64)
+                kept = np.unique(cubes, axis=0, return_index=True)[1]
+                points, rgb = points[kept], rgb[kept]
+            parts.append((points, rgb))
+        n_points = sum(len(points) for points, _ in parts)
+        if not n_points:
+            raise MethodError(
+                f"no pair of photos matches between {params.nearest_m:g} and "
+                f"{params.farthest_m:g} m: set nearest_m and farthest_m to where the surface is"
+            )
+        ctx.metric("n_pairs", len(pairs), "1")
+        ctx.metric("n_points", n_points, "1")
+        ctx.metric("matched_share", n_matched / n_pixels, "1")
+        origin = np.floor(np.mean([left.camera.centre_world for left, _ in pairs], axis=0))
+        x, y, z = (np.concatenate([points for points, _ in parts]) - origin).T.astype(np.float32)
+        cloud = PointCloud(
+            origin=origin,
+            x=x.copy(),
+            y=y.copy(),
+            z=z.copy(),
+            up=up_vector(params.up),
+            rgb=np.concatenate([rgb for _, rgb in parts]),
+            scan=np.repeat(np.arange(len(parts)), [len(points) for points, _ in parts]).astype(
+                np.uint16
+            ),
+            stations=np.array([left.camera.centre_world for left, _ in pairs]),
+            stations_source="file",
+        )
+        return self.Out(cloud=cloud)
+
+
+def _oriented(inputs: DenseSgm.In) -> list[_View]:
+    cameras = {camera.photo: camera for camera in inputs.cameras.cameras if camera.status == "ok"}
+    return [
+        _View(photo, cameras[photo.name].viewing())
+        for photo in inputs.photos.photos
+        if photo.name in cameras
+    ]
+
+
+def _right_of(left: _View, views: list[_View], distance_m: float) -> _View | None:
+    """Return the photo to the right whose overlap is the best one for matching, or None."""
+    lens, axes = left.camera, left.camera.rotation
+    found: list[tuple[float, int]] = []
+    for place, other in enumerate(views):
+        base = axes @ (other.camera.centre_world - lens.centre_world)
+        sideways = float(np.hypot(base[0], base[1]))
+        # The share of the photo by which a surface moves from the one to the other.
+        parallax = lens.fx * sideways / distance_m / lens.width
+        if (
+            _LEAST_PARALLAX <= parallax <= _MOST_PARALLAX
+            and base[0] >= _ALONG_ROWS * sideways
+            and sideways >= _SIDEWAYS * float(np.linalg.norm(base))
+            and axes[2] @ other.camera.rotation[2] >= _SAME_VIEW
+            and axes[0] @ other.camera.rotation[0] >= _SAME_VIEW
+        ):
+            found.append((abs(np.log(parallax / _BEST_PARALLAX)), place))
+    return views[min(found)[1]] if found else None
+
+
+def _matched(
+    left: _View, right: _View, params: DenseSgm.Params
+) -> tuple[NDArray[np.float64], NDArray[np.uint8], int]:
+    """Match a pair.
+
+    Returns:
+        Points (n, 3) in the world, their colours (n, 3), and the number of pixels that were tried.
+    """
+    import cv2
+
+    images = [decode_image(view.photo.encoded, view.photo.name) for view in (left, right)]
+    first, second = left.camera, right.camera
+    turn = second.rotation @ first.rotation.T
+    shift = second.translation - turn @ first.translation
+    size = (first.width, first.height)
+    matrices = [opencv_matrix(first), opencv_matrix(second)]
+    lenses = [first.distortion, second.distortion]
+    r1, r2, p1, p2, back, _, _ = cv2.stereoRectify(
+        matrices[0], lenses[0], matrices[1], lenses[1], size, turn, shift[:, None], alpha=-1
+    )
+    rectified = [
+        cv2.remap(
+            image, *cv2.initUndistortRectifyMap(k, lens, r, p, size, cv2.CV_32FC1), cv2.INTER_LINEAR
+        )
+        for image, k, lens, r, p in zip(images, matrices, lenses, (r1, r2), (p1, p2), strict=True)
+    ]
+    reach = abs(p2[0, 3])
+    most, least = (int(reach / distance) for distance in (params.nearest_m, params.farthest_m))
+    # A multiple of 16 that leaves pixels to match.
+    n_disparities = 16 * min(-(-(most - least) // 16), (size[0] - least - _BLOCK_PX) // 16 - 1)
+    if n_disparities < 16:
+        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8), size[0] * size[1]
+    matcher = cv2.StereoSGBM.create(
+        minDisparity=least,
+        numDisparities=n_disparities,
+        blockSize=_BLOCK_PX,
+        P1=_SMALL_STEP,
+        P2=_LARGE_STEP,
+        disp12MaxDiff=1,
+        uniquenessRatio=10,
+        speckleWindowSize=100,
+        speckleRange=2,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )
+    disparity = matcher.compute(*rectified).astype(np.float32) / 16.0
+    kept = disparity >= max(least, 1)
+    in_view = cv2.reprojectImageTo3D(disparity, back)[kept].astype(np.float64) @ r1
+    points = (in_view - first.translation) @ first.rotation
+    return points, np.asarray(rectified[0][kept], dtype=np.uint8), kept.size

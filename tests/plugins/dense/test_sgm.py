@@ -1,0 +1,109 @@
+"""`dense.sgm`: points of oriented photos lie on the surface that these show."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from orthoflow_plugins.dense.sgm import DenseSgm
+from orthoflow_plugins.simulate.room import SimulateRoom
+
+from orthoflow.errors import MethodError
+from orthoflow.geometry.scene_views import SceneCameras
+from orthoflow.products import Cameras, PointCloud
+from tests import raster_scenes as scenes
+
+NEAR_FAR: Mapping[str, object] = {"nearest_m": 1.5, "farthest_m": 3.6}
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> SimulateRoom.Out:
+    params = SimulateRoom.Params(
+        scan_step_m=0.05,
+        panorama_step_m=0.2,
+        photo_layout="variant2",
+        photo_gsd_m=0.008,
+        photo_obliquity_deg=3.0,
+    )
+    ctx = scenes.context(tmp_path_factory.mktemp("room"))
+    return SimulateRoom().run(SimulateRoom.In(), params, ctx)
+
+
+def matched(
+    folder: Path, inputs: DenseSgm.In, **params: object
+) -> tuple[PointCloud, dict[str, float]]:
+    ctx = scenes.context(folder)
+    out = DenseSgm().run(inputs, DenseSgm.Params.model_validate({**NEAR_FAR, **params}), ctx)
+    return out.cloud, {metric.name: metric.value for metric in ctx.metrics}
+
+
+def test_points_lie_on_the_surface(tmp_path: Path, room: SimulateRoom.Out) -> None:
+    cameras = room.truth.cameras
+    assert cameras is not None
+    assert room.cameras == cameras
+    cloud, metrics = matched(tmp_path, DenseSgm.In(photos=room.photos, cameras=room.cameras))
+    # Three rows of six photos, whose last ones have nothing to their right.
+    assert metrics["n_pairs"] == 15
+    assert metrics["n_points"] == len(cloud)
+    # Of the 70 % that overlap, without a rim as wide as the range of disparities.
+    assert metrics["matched_share"] > 0.3
+    assert cloud.stations is not None
+    assert cloud.scan is not None
+    assert cloud.rgb is not None
+    chosen = np.random.default_rng(1).choice(len(cloud), 5_000, replace=False)
+    points, stations = cloud.points_world(chosen), cloud.stations[cloud.scan[chosen]]
+    # The first surface on the ray from the station through the point, by the exact scene.
+    views = SceneCameras(room.truth.scene, cores=1)
+    share = np.concatenate(
+        [
+            views.cast(station, points[(stations == station).all(axis=1)] - station).t
+            for station in cloud.stations
+        ]
+    )
+    distance = np.concatenate(
+        [
+            np.linalg.norm(points[(stations == station).all(axis=1)] - station, axis=1)
+            for station in cloud.stations
+        ]
+    )
+    off_m = np.abs(share - 1.0) * distance
+    # A pixel of 8 mm at a base of a third of the distance: 0.3 px of disparity are 8 mm.
+    assert np.median(off_m) < 0.008
+    # The others lie at edges, of which one photo shows what the other does not.
+    assert np.mean(off_m < 0.03) > 0.85
+
+
+def test_of_points_in_one_cube_one_is_kept(tmp_path: Path, room: SimulateRoom.Out) -> None:
+    inputs = DenseSgm.In(photos=room.photos, cameras=room.cameras)
+    dense, _ = matched(tmp_path / "dense", inputs)
+    coarse, _ = matched(tmp_path / "coarse", inputs, spacing_m=0.05)
+    assert coarse.scan is not None
+    cubes = np.column_stack([coarse.scan, np.floor(coarse.points_world() / 0.05 + 1e-6)])
+    # Offsets are float32: a few points at the sides of cubes fall into the next one.
+    assert len(np.unique(cubes, axis=0)) > 0.99 * len(coarse)
+    assert len(coarse) < 0.2 * len(dense)
+    given = {tuple(row) for row in np.round(dense.points_world(), 4)}
+    assert all(tuple(row) in given for row in np.round(coarse.points_world()[:1000], 4))
+
+
+def test_photos_without_a_neighbour_and_surfaces_elsewhere_are_refused(
+    tmp_path: Path, room: SimulateRoom.Out
+) -> None:
+    alone = Cameras(cameras=room.cameras.cameras[:1])
+    with pytest.raises(MethodError, match="of 1 oriented photos none stands beside another"):
+        matched(tmp_path / "alone", DenseSgm.In(photos=room.photos, cameras=alone))
+    refused = [replace(room.cameras.cameras[0], status="refused"), *room.cameras.cameras[1:2]]
+    with pytest.raises(MethodError, match="of 1 oriented photos"):
+        matched(
+            tmp_path / "refused",
+            DenseSgm.In(photos=room.photos, cameras=Cameras(cameras=tuple(refused))),
+        )
+    # The first and the one above it: their base runs along columns.
+    above = Cameras(cameras=(room.cameras.cameras[0], room.cameras.cameras[6]))
+    with pytest.raises(MethodError, match="of 2 oriented photos"):
+        matched(tmp_path / "above", DenseSgm.In(photos=room.photos, cameras=above))
+    with pytest.raises(ValueError, match=r"farthest_m 1 must be greater than nearest_m 1\.5"):
+        DenseSgm.Params(nearest_m=1.5, farthest_m=1.0)
