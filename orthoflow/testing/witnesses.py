@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoflow.engine.store import digest_of
 from orthoflow.products import Product
@@ -17,8 +17,6 @@ from orthoflow.sdk import Method
 from orthoflow.testing.examples import example_inputs
 from orthoflow.testing.isolation import ElsewhereRun, run_elsewhere
 from orthoflow.testing.trials import Trial, TrialRun, run_trial
-
-Array = NDArray[np.generic]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,23 +46,12 @@ class Witness:
 
     @cached_property
     def first(self) -> WatchedRun:
-        """The run, watched; inputs that it changed are as before afterwards."""
-        inputs, state = _digests(self.trial.inputs), _global_state()
-        copies = {
-            name: [array.copy() for array in _arrays(self.trial.inputs[name])] for name in inputs
-        }
-        changed: tuple[str, ...] = ()
-        try:
-            run = _run(self.trial)
-        finally:
-            after = _digests(self.trial.inputs)
-            changed = tuple(name for name in inputs if inputs[name] != after[name])
-            # Other methods are tried on the same examples.
-            for name in changed:
-                arrays = _arrays(self.trial.inputs[name])
-                for array, copy in zip(arrays, copies[name], strict=True):
-                    if array.flags.writeable:
-                        np.copyto(array, copy)
+        """The run, watched."""
+        inputs, state = deepcopy(dict(self.trial.inputs)), _global_state()
+        before = _digests(inputs)
+        run = _run(replace(self.trial, inputs=inputs))
+        after = _digests(inputs)
+        changed = tuple(name for name in before if before[name] != after[name])
         return WatchedRun(run=run, changed_inputs=changed, drew_globally=state != _global_state())
 
     @cached_property
@@ -94,10 +81,6 @@ def _run(trial: Trial) -> TrialRun:
 
 def _digests(inputs: Mapping[str, object]) -> dict[str, str]:
     return {name: digest_of(given) for name, given in inputs.items() if isinstance(given, Product)}
-
-
-def _arrays(given: object) -> list[Array]:
-    return list(given.to_payload().arrays.values()) if isinstance(given, Product) else []
 
 
 def _global_state() -> str:

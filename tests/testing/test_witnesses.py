@@ -13,14 +13,11 @@ from orthoflow.testing.witnesses import Witness
 
 
 class Meddling(Method):
-    """Moves the first point of its input, and fails where it is told to."""
+    """Moves the first point of its input."""
 
     id = "plane.meddling"
 
-    class Params(MethodParams):
-        """Whether it fails."""
-
-        fails: bool = False
+    Params = MethodParams
 
     class In(Ports):
         """What it spoils."""
@@ -32,12 +29,10 @@ class Meddling(Method):
 
         planes: Planes
 
-    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+    def run(self, inputs: In, params: MethodParams, ctx: StepContext) -> Out:
         """Spoil it."""
         inputs.cloud.x.flags.writeable = True
         inputs.cloud.x[0] += 1.0
-        if params.fails:
-            raise ValueError("no wall")
         return self.Out(planes=example_room()[1])
 
 
@@ -53,9 +48,7 @@ def test_drawing_from_numpys_own_generator_is_seen() -> None:
     class Dicing(Meddling):
         id = "plane.dicing"
 
-        def run(
-            self, inputs: Meddling.In, params: Meddling.Params, ctx: StepContext
-        ) -> Meddling.Out:
+        def run(self, inputs: Meddling.In, params: MethodParams, ctx: StepContext) -> Meddling.Out:
             np.random.random()  # noqa: NPY002 - the global one is what is watched
             return self.Out(planes=example_room()[1])
 
