@@ -90,7 +90,7 @@ def test_a_record_names_no_folder(finished: tuple[Path, str, str]) -> None:
 def test_a_second_run_is_all_cached_and_says_so(finished: tuple[Path, str, str]) -> None:
     folder = finished[0]
     arguments = ("run", "studio.yaml", "--set", "survey.offset_m=-3")
-    again = orthoflow(folder, *arguments)
+    again = orthoflow(folder, *arguments, *INLINE)
     assert again.returncode == 0, again.stderr
     assert "all 2 steps were cached" in again.stdout.splitlines()
     [named] = (folder / "runs").glob("studio-*")
@@ -106,6 +106,7 @@ def test_a_forced_step_runs_again(finished: tuple[Path, str, str]) -> None:
     again = orthoflow(
         folder,
         *("run", "studio.yaml", "--set", "survey.offset_m=-3", "--force", "survey", "-o", "forced"),
+        *INLINE,
     )
     assert again.returncode == 0, again.stderr
     # Early cut-off: the forced step gives equal planes, so the paint is not done again.
@@ -115,7 +116,10 @@ def test_a_forced_step_runs_again(finished: tuple[Path, str, str]) -> None:
 def test_until_leaves_out_what_follows_and_says_so(finished: tuple[Path, str, str]) -> None:
     folder = finished[0]
     assert (
-        orthoflow(folder, "run", "studio.yaml", "--until", "survey", "-o", "part").returncode == 0
+        orthoflow(
+            folder, "run", "studio.yaml", "--until", "survey", "-o", "part", *INLINE
+        ).returncode
+        == 0
     )
     part = open_run(folder / "part")
     assert list(part.cells) == ["survey"]
@@ -135,20 +139,6 @@ def test_an_input_from_the_command_line_is_recorded_by_content(tmp_path: Path) -
     assert "input number: n.txt, 3 B, sha256 " in shown
 
 
-def test_embed_makes_a_record_that_verifies(tmp_path: Path) -> None:
-    write_studio(tmp_path)
-    done = orthoflow(tmp_path, "run", "studio.yaml", "--embed", "-o", "r", *INLINE)
-    assert done.returncode == 0, done.stderr
-    checked = orthoflow(tmp_path, "verify", "r")
-    assert checked.returncode == 0
-    seal, last = checked.stdout.splitlines()
-    assert re.fullmatch(r"seal: sha256:[0-9a-f]{64}", seal)
-    assert re.fullmatch(
-        r"verified: 2 products, seal ok, \d+ published files unchanged, 1 report page as written",
-        last,
-    )
-
-
 @pytest.mark.parametrize(
     ("method", "code", "sentence"),
     [
@@ -164,7 +154,7 @@ def test_a_failed_cell_leaves_a_record_a_report_and_its_exit_code(
     tmp_path: Path, method: str, code: int, sentence: str
 ) -> None:
     write_studio(tmp_path, method)
-    done = orthoflow(tmp_path, "run", "studio.yaml", "-o", "r")
+    done = orthoflow(tmp_path, "run", "studio.yaml", "-o", "r", *INLINE)
     assert done.returncode == code
     assert sentence.removeprefix("paint failed: ") in done.stderr
     assert "Traceback" not in done.stderr + done.stdout
@@ -183,7 +173,8 @@ def test_a_failed_cell_leaves_a_record_a_report_and_its_exit_code(
 def test_a_bad_input_ends_with_2_and_skips_what_needs_it(tmp_path: Path) -> None:
     write_studio(tmp_path)
     (tmp_path / "empty.txt").touch()
-    done = orthoflow(tmp_path, "run", "studio.yaml", "--input", "number=empty.txt", "-o", "r")
+    given = ("--input", "number=empty.txt")
+    done = orthoflow(tmp_path, "run", "studio.yaml", *given, "-o", "r", *INLINE)
     assert done.returncode == 2
     assert "empty.txt is empty, expected one number" in done.stderr
     assert open_run(tmp_path / "r").cells["paint"].error_message == "needs survey, which failed"
@@ -243,7 +234,7 @@ def test_an_interrupted_run_ends_with_130_and_goes_on_with_the_same_folder(
 
 def test_a_run_that_failed_for_want_of_room_goes_on_with_the_same_folder(tmp_path: Path) -> None:
     write_studio(tmp_path, "paint.room")
-    arguments = ("run", "studio.yaml", "-o", "r")
+    arguments = ("run", "studio.yaml", "-o", "r", *INLINE)
     failed = orthoflow(tmp_path, *arguments, environment={"WORKSHOP_DISK_IS_FULL": "1"})
     assert failed.returncode == 1
     assert "with more disk space, the same command with -o r goes on" in failed.stderr

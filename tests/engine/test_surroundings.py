@@ -183,15 +183,11 @@ def test_a_folder_may_have_any_name_of_any_length(tmp_path: Path) -> None:
     assert len(str(desk.folder)) > 200
     for command in (
         ("run", "toy.yaml", "-o", "run"),
-        ("report", "run"),
-        ("verify", "run"),
         ("export", "run", "--to", "ro-crate", "-o", "crate"),
         (
             *("replay", "crate", "-o", "again", *IN_THIS_PROCESS),
             *("--input", f"numbers={desk.folder / 'numbers.txt'}"),
         ),
-        ("cache", "verify"),
-        ("cache", "gc"),
     ):
         code, said = desk.forked(*command, environment={"HOME": str(desk.folder)})
         assert code == 0, said
@@ -212,20 +208,15 @@ def test_what_may_only_be_read_is_read_and_nothing_else(used_desk: Desk) -> None
     desk = used_desk
     read_only(desk.folder)
     for command in (
-        ("show", "run"),
         ("verify", "run"),
         ("plan", "toy.yaml"),
-        ("cache", "list"),
     ):
         code, said = desk.forked(*command)
         assert code == 0, said
     for command in (
         ("run", "toy.yaml", "-o", "second", *IN_THIS_PROCESS),
-        ("report", "run"),
         ("export", "run", "--to", "ro-crate", "-o", "crate"),
-        ("replay", "run", "-o", "again", "--input", "numbers=numbers.txt", *IN_THIS_PROCESS),
         ("cache", "gc"),
-        ("cache", "verify"),
     ):
         code, said = desk.forked(*command)
         # 2: where an export goes is an argument.

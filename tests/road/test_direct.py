@@ -186,7 +186,6 @@ def test_a_gridded_e57_gives_intensity_and_depth(shell: Shell, shared_data: Path
     assert np.nanmax(intensity) <= 1.0
 
 
-QUICKEST = "indoor-laz/indoor.laz"
 OTHER_SCANS = {
     "fountain-p11/cloud_from_photos.laz": ("cloud.up=-z",),
     "ceiling-808/808_db.ply": (),
@@ -198,13 +197,8 @@ OTHER_SCANS = {
 }
 
 
-@pytest.mark.parametrize(
-    "scan",
-    [
-        pytest.param(scan, marks=() if scan == QUICKEST else pytest.mark.long, id=scan)
-        for scan in OTHER_SCANS
-    ],
-)
+@pytest.mark.long
+@pytest.mark.parametrize("scan", OTHER_SCANS)
 def test_every_other_scan_goes_through_or_ends_with_a_sentence(
     shell: Shell, shared_data: Path, scan: str
 ) -> None:
