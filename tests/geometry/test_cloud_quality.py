@@ -106,7 +106,7 @@ Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # as most
 UP = {"x": 0, "y": 1, "z": 2}
 
 
-@pytest.mark.parametrize("turned_deg", [8.0, 20.0, 45.0, 70.0])
+@pytest.mark.parametrize("turned_deg", [20.0, 70.0])
 def test_a_room_on_its_side_shows_which_axis_is_up(turned_deg: float) -> None:
     upright, fallen = room(turned_deg), room(turned_deg) @ Y_UP.T
     for points, up in ((upright, "z"), (fallen, "y"), (fallen[:, [1, 0, 2]], "x")):

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.covariances import AdjustedPoints, honest_covariance
 from orthoflow.geometry.resection import SeenPoints, adjust, predicted_covariances
+from tests.long_loops import long_only
 
 VIEW: Final = ViewingCamera(
     width=3000,
@@ -174,7 +175,7 @@ def shifted_photos(
     )
 
 
-@pytest.mark.parametrize("shared_by", ["places", "depths", "photos"])
+@pytest.mark.parametrize("shared_by", ["depths", *long_only("places", "photos")])
 def test_photos_share_the_errors_of_places_but_not_their_own(shared_by: str) -> None:
     """Their shifts, correlated between photos as those of drawn errors scatter."""
     covariances, shifts = [], []
