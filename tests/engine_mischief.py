@@ -46,12 +46,6 @@ def hides(values, params, ctx):
 
 
 @work("exact")
-def hides_and_crashes(values, params, ctx):
-    ctx.log(f"hidden {hidden()}")
-    os.abort()
-
-
-@work("exact")
 def hides_and_stops(values, params, ctx):
     ctx.log(f"hidden {hidden()}")
     time.sleep(600)
@@ -90,22 +84,6 @@ def closes_streams(values, params, ctx):
 
 
 @work("exact")
-def digs_deep(values, params, ctx):
-    os.chdir(ctx.scratch)
-    for _ in range(1500):
-        os.mkdir("deeper")
-        os.chdir("deeper")
-    return values
-
-@work("exact")
-def replaces_log(values, params, ctx):
-    log = os.readlink("/proc/self/fd/2")
-    os.unlink(log)
-    os.mkfifo(log)
-    print("still heard")
-    return values
-
-@work("exact")
 def stops(values, params, ctx):
     os.killpg(0, 19)
 
@@ -126,15 +104,6 @@ def writes_nothing_more(values, params, ctx):
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
     return values
 
-
-@work("exact")
-def goes_on_writing(values, params, ctx):
-    array = np.zeros(1 << 20)
-    def write():
-        while True:
-            array[:] += 1.0
-    threading.Thread(target=write, daemon=True).start()
-    return array
 
 class Speechless(Exception):
     def __str__(self):

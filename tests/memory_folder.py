@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from orthoflow.engine.measuring import available_memory
+import psutil
 
 _MEMORY: Final = Path("/dev/shm")
 _NAME: Final = "orthoflow-tests"
@@ -31,7 +31,7 @@ def has_room() -> bool:
     if not os.access(_MEMORY, os.W_OK):
         return False
     is_large = shutil.disk_usage(_MEMORY).free > _ROOM_BYTES
-    return is_large and available_memory().available > _LEFT_BYTES
+    return is_large and psutil.virtual_memory().available > _LEFT_BYTES
 
 
 @contextmanager

@@ -206,11 +206,11 @@ def _machine() -> Iterator[Finding]:
         yield Finding("platform", "limited", found, "only Linux on x86-64 is tested")
     yield Finding("cores", "ok", str(usable_cores()))
     try:
-        from orthoflow.engine.measuring import available_memory
+        import psutil
 
-        n_bytes = available_memory().available
-    except (ImportError, OSError, KeyError, ValueError):
-        # The engine does not load when a core library is missing, which is a finding of its own.
+        n_bytes = psutil.virtual_memory().available
+    except (ImportError, OSError):
+        # A library that is missing is a finding of its own.
         yield Finding("memory", "limited", "unknown", "cannot be measured")
         return
     cost = "scans of many millions of points will not fit"

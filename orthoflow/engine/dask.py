@@ -50,18 +50,18 @@ _POLL_S: Final = 0.1
 _LOOK_S: Final = 1.0
 
 
-def look_around(path: str, methods: str) -> tuple[str, float, str]:
+def look_around(path: str, methods: str) -> tuple[str, str]:
     """Return the surroundings of a worker: runs on each before it gets a task.
 
     Returns:
-        Content of the file, or why it cannot be read; its time, seconds since 1970; how its methods
-        or libraries differ, empty if they are the same.
+        Content of the file, or why it cannot be read; how its methods or libraries differ, empty if
+        they are the same.
     """
     try:
         seen = Path(path).read_text(encoding="utf-8")
     except OSError as error:
         seen = error.strerror or "it cannot be read"
-    return seen, time.time(), misfit(methods)
+    return seen, misfit(methods)
 
 
 def run_attempt(task: Task, name: str, topic: str, retries: int, methods: str) -> str:
@@ -138,8 +138,6 @@ _WATCH_S: Final = 2.0
 # Steps have 5 s to stop by themselves, and their workers are informed within one.
 _STOPPING_S: Final = 20.0
 _CLOSE_S: Final = 5.0
-# File times decide what is old in a store.
-_CLOCKS_APART_S: Final = 60.0
 # Otherwise each worker would check a hundred times a second what its thread does, which is to wait,
 # and fifty times its own loop.
 _QUIET: Final = {
@@ -336,7 +334,7 @@ class DaskExecutor:
     def _look_at_workers(self, scratch: Path) -> None:
         path, word = scratch / _PROOF_FILE, uuid.uuid4().hex
         write_whole(path, word.encode())
-        found: Mapping[str, tuple[str, float, str] | Exception] = self._client.run(
+        found: Mapping[str, tuple[str, str] | Exception] = self._client.run(
             look_around, str(path), self._methods, workers=list(self._workers()), on_error="return"
         )
         for address, answer in found.items():
@@ -345,17 +343,12 @@ class DaskExecutor:
                     f"worker {address} cannot run orthoflow ({type(answer).__name__}: "
                     f"{one_line(answer)}); install the same version there"
                 )
-            seen, clock_s, wrong = answer
+            seen, wrong = answer
             if seen != word:
                 raise ArgumentError(
                     f"worker {address} does not see the store {scratch.parent.parent} "
                     f"({one_line(seen)}): give a --store on a file system that all workers "
                     f"have at the same place"
-                )
-            if abs(clock_s - time.time()) > _CLOCKS_APART_S:
-                raise ArgumentError(
-                    f"the clock of worker {address} is {clock_s - time.time():+.0f} s off "
-                    f"this one: set both, ages of results go by them"
                 )
             if wrong:
                 raise PluginError(f"worker {address}: {wrong}; install there what the plan has")

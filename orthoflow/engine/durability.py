@@ -7,7 +7,6 @@ import hashlib
 import os
 import re
 import shutil
-import subprocess
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -16,18 +15,6 @@ from typing import Final
 
 from orthoflow.errors import StoreError
 from orthoflow.untrusted_text import open_file
-
-_REASONS = {
-    errno.ENOSPC: "No space left on the disk; free some, or choose another folder",
-    errno.EDQUOT: "the disk quota is used up; free some space, or choose another folder",
-    errno.EFBIG: "the file would be larger than allowed here; choose another folder",
-    errno.EIO: "Input/output error, the disk or its connection fails; choose another folder",
-    errno.ESTALE: "Stale file handle, the disk is not connected any more; reconnect it",
-    errno.EROFS: "the disk is read-only; choose another folder",
-    errno.EACCES: "permission is denied; choose another folder",
-    errno.EPERM: "permission is denied; choose another folder",
-    errno.ENOTDIR: "a file stands where a folder is needed; choose another folder",
-}
 
 # Errors in the store that are not the fault of a method.
 _BROKEN = frozenset({errno.EIO, errno.ESTALE, errno.EROFS, errno.ENODEV, errno.ENXIO})
@@ -44,8 +31,10 @@ def is_broken(error: OSError, folder: Path) -> bool:
 
 def store_error(error: OSError, folder: Path) -> StoreError:
     """Turn an error of the operating system into one sentence that names the folder."""
-    reason = _REASONS.get(error.errno or 0, error.strerror or str(error))
-    failure = StoreError(f"cannot write to {folder}: {reason}")
+    reason = error.strerror or str(error)
+    failure = StoreError(
+        f"cannot write to {folder}: {reason}; make that possible, or choose another folder"
+    )
     failure.errno = error.errno
     return failure
 
@@ -166,11 +155,9 @@ def remove_tree(folder: Path) -> None:
     if folder.is_symlink() or folder.is_file():
         folder.unlink(missing_ok=True)
         return
-    try:
+    # Before Python 3.13 it recurses for every level.
+    with suppress(RecursionError):
         shutil.rmtree(folder, ignore_errors=True)
-    except RecursionError:
-        # Before Python 3.13 it recurses for every level, and there may be thousands.
-        subprocess.run(["rm", "-rf", "--", folder], stderr=subprocess.DEVNULL, check=False)
 
 
 def folder_size(folder: Path) -> int:

@@ -6,7 +6,6 @@ import hashlib
 import os
 import platform
 import subprocess
-import sys
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from functools import cache
@@ -38,12 +37,6 @@ def environment(threads: int) -> RecordedEnvironment:
     content = {name: value for name, value in asdict(unnamed).items() if name != "id"}
     digest = hashlib.sha256(canonical_json(content).encode()).hexdigest()
     return replace(unnamed, id=f"sha256:{digest}")
-
-
-def python_path() -> str:
-    """Return `PYTHONPATH` for a child process with the import path of this one."""
-    paths = [str(Path(path).absolute()) for path in sys.path]
-    return os.pathsep.join(dict.fromkeys(paths))
 
 
 @cache

@@ -2,11 +2,6 @@
 
 Paths, step names, cores, timeouts and time stamps are excluded on purpose. The code of a method and
 the versions of the libraries that it may use are included for every method automatically.
-
-    python -m orthoflow.engine.keys plane.hough2d ortho.dsm-backward
-
-prints what decides the results of methods here, as JSON behind a line break: so a worker of a
-cluster finds out whether it computes what a plan states.
 """
 
 from __future__ import annotations
@@ -15,7 +10,6 @@ import hashlib
 import json
 import os
 import re
-import subprocess
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -23,7 +17,7 @@ from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Final, TypeAlias, cast
+from typing import Final, TypeAlias, cast
 
 from orthoflow.catalog.catalog import Catalog, MethodEntry, ProductEntry
 from orthoflow.catalog.discovery import discover_catalog
@@ -34,7 +28,6 @@ from orthoflow.catalog.distributions import (
     source_files,
 )
 from orthoflow.catalog.guarding import UserInterrupt, guarded
-from orthoflow.engine.environment import python_path
 from orthoflow.engine.results import MethodIdentity, ProductRef, RecordedFile, canonical_json
 from orthoflow.errors import OrthoflowError, PluginError
 from orthoflow.products.product import JsonValue
@@ -46,8 +39,6 @@ from orthoflow.workflow.expand import Cell
 
 _WHAT: Final = "orthoflow/cell"
 _CODE: Final = "its code"
-# For another process to load methods.
-_TIMEOUT_S: Final = 300.0
 _KEY_VERSION: Final = 1
 _ROOT: Final = Path(__file__).resolve().parents[1]
 # Parts of the framework on which a method's result can depend; engine and command line cannot
@@ -332,28 +323,19 @@ def methods_text(methods: Mapping[str, MethodFacts]) -> str:
 
 def misfit(methods: str) -> str:
     """State in what the methods installed here differ from those of a plan; empty if nowhere."""
-    planned = json.loads(methods)
-    try:
-        here = json.loads(_methods_here(tuple(planned)))
-    except (OSError, ValueError, subprocess.SubprocessError) as error:
-        return f"its methods cannot be loaded ({type(error).__name__})"
-    return next(
-        (wrong for name in planned if (wrong := _difference(name, planned[name], here[name]))), ""
-    )
-
-
-@cache
-def _methods_here(names: tuple[str, ...]) -> str:
-    """Ask another process, so that this one loads none of them."""
-    asked = subprocess.run(
-        [sys.executable, "-P", "-m", "orthoflow.engine.keys", *names],
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=_TIMEOUT_S,
-        env={**os.environ, "PYTHONPATH": python_path()},
-    )
-    return asked.stdout.rpartition("\n")[2]
+    catalog = discover_catalog()
+    for name, planned in json.loads(methods).items():
+        try:
+            here = _facts(method_facts(name, catalog))
+        except OrthoflowError as error:
+            return str(error)
+        for what in sorted((planned.keys() | here.keys()) - {_CODE}):
+            before, now = planned.get(what, "none"), here.get(what, "none")
+            if before != now:
+                return f"{name} has {what} {now} there, {before} in the plan"
+        if planned[_CODE] != here[_CODE]:
+            return f"{name} has other code there"
+    return ""
 
 
 def _facts(facts: MethodFacts) -> dict[str, JsonValue]:
@@ -363,29 +345,3 @@ def _facts(facts: MethodFacts) -> dict[str, JsonValue]:
         "the result version": facts.result_version,
         _CODE: dict(facts.code),
     }
-
-
-# Any: JSON that `_facts` gave, here and in the process of a worker.
-def _difference(name: str, planned: dict[str, Any], here: dict[str, Any] | str) -> str:
-    if isinstance(here, str):
-        return here
-    for what in sorted((planned.keys() | here.keys()) - {_CODE}):
-        before, now = planned.get(what, "none"), here.get(what, "none")
-        if before != now:
-            return f"{name} has {what} {now} there, {before} in the plan"
-    return "" if planned[_CODE] == here[_CODE] else f"{name} has other code there"
-
-
-def _print_facts(names: Sequence[str]) -> None:
-    catalog = discover_catalog()
-    found: dict[str, JsonValue] = {}
-    for name in names:
-        try:
-            found[name] = _facts(method_facts(name, catalog))
-        except OrthoflowError as error:
-            found[name] = str(error)
-    sys.stdout.write("\n" + json.dumps(found))
-
-
-if __name__ == "__main__":
-    _print_facts(sys.argv[1:])

@@ -29,14 +29,21 @@ from pydantic import TypeAdapter
 from orthoflow.engine.durability import write_whole, writing_to
 from orthoflow.engine.environment import now
 from orthoflow.engine.kernels import VARIABLE, kernel_folder, kernels_in, private_folder
-from orthoflow.engine.measuring import GIB, MIB, MemoryGuard, oom_kills, process_memory
+from orthoflow.engine.measuring import (
+    GIB,
+    MIB,
+    memory_shortage,
+    oom_kills,
+    process_memory,
+    tree_memory,
+)
 from orthoflow.engine.results import CellResult, result_from_json
 from orthoflow.engine.worker import EVENT, RESULT, Task, failed_result, run_step, run_task
 from orthoflow.errors import CancelledStepError, OrthoflowError, StepFailedError, StoreError
 from orthoflow.geometry.threads import address_space
 from orthoflow.sdk.context import StepEvent
 from orthoflow.sdk.lines import one_line
-from orthoflow.untrusted_text import shown
+from orthoflow.untrusted_text import open_file, shown
 
 PRELOADED: Final = ["orthoflow.engine.preload"]
 _THREAD_VARIABLES: Final = (
@@ -69,9 +76,8 @@ _GRACE_S: Final = 5.0
 _MOST_MESSAGES: Final = 256
 _LARGEST_MESSAGE: Final = 64 << 20
 _LONGEST_LAST_LINE: Final = 300
-# The end of a long log is kept: errors are at the end.
+# The end of a long log is kept in the record: errors are at the end.
 _KEPT_BYTES: Final = 256 << 10
-_LARGEST_LOG: Final = 8 << 20
 _MOST_LINES: Final = 2000
 _CRASHES: Final = {
     signal.SIGSEGV: "segmentation fault",
@@ -189,52 +195,14 @@ class InlineExecutor:
         self._waiting.clear()
 
 
-class StepLog:
-    """An open log that another process appends to, while this one limits its size.
-
-    It stays open, because its name may refer to anything by the time that the step has ended.
-    """
-
-    def __init__(self, path: Path) -> None:
-        """Begin an empty log.
-
-        Raises:
-            StoreError: it cannot be written.
-        """
-        opened = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_NOFOLLOW
-        with writing_to(path.parent):
-            self._descriptor = os.open(path, opened, 0o666)
-        self._n_dropped = 0
-        self._notice = b""
-
-    def shorten(self) -> None:
-        """Drop all but the end of a log that has grown too long; the writer continues after it."""
-        size = os.fstat(self._descriptor).st_size
-        if size <= _LARGEST_LOG:
-            return
-        # What is written before the file is truncated is lost with the rest.
-        tail = self._tail(size)
-        self._n_dropped += size - len(self._notice) - len(tail)
-        self._notice = f"... ({self._n_dropped} bytes before)\n".encode()
-        # A full disk affects the log, not the run.
-        with suppress(OSError):
-            os.ftruncate(self._descriptor, 0)
-            os.write(self._descriptor, self._notice + tail)
-
-    def text(self) -> str:
-        """End of the log, without NUL characters, which no text in a record may contain."""
-        size = os.fstat(self._descriptor).st_size
-        tail = self._tail(size)
-        text = tail.decode("utf-8", errors="replace").replace("\0", "")
-        n_before = self._n_dropped + size - len(self._notice) - len(tail)
-        return text if size == len(tail) else f"... ({n_before} bytes before)\n{text}"
-
-    def close(self) -> None:
-        """Close it; no further reads are possible."""
-        os.close(self._descriptor)
-
-    def _tail(self, size: int) -> bytes:
-        return os.pread(self._descriptor, _KEPT_BYTES, max(0, size - _KEPT_BYTES))
+def _log_text(path: Path) -> str:
+    """End of a log, without NUL characters, which no text in a record may contain."""
+    with suppress(OSError), open_file(path) as stream:
+        n_before = max(0, os.fstat(stream.fileno()).st_size - _KEPT_BYTES)
+        stream.seek(n_before)
+        text = stream.read(_KEPT_BYTES).decode("utf-8", errors="replace").replace("\0", "")
+        return f"... ({n_before} bytes before)\n{text}" if n_before else text
+    return ""
 
 
 def _with_descendants(process_id: int) -> list[psutil.Process]:
@@ -248,15 +216,6 @@ def _kill(processes: Iterable[psutil.Process]) -> None:
     for one in processes:
         with suppress(psutil.Error):
             one.kill()
-
-
-def _is_at_work_in(process: psutil.Process, scratch: Path) -> bool:
-    with suppress(psutil.Error):
-        if process.environ().get("TMPDIR") == str(scratch):
-            return True
-        # A user's shell that looks at the folder has a terminal; a step has none.
-        return process.terminal() is None and Path(process.cwd()).is_relative_to(scratch)
-    return False
 
 
 def start_process(
@@ -339,7 +298,6 @@ class _Step:
         task: the task.
         process: its process.
         pipe: what it sends, as in `worker.run_step`.
-        log: its output.
         clock: monotonic seconds at the start.
         reason: why we stopped it; None otherwise.
         is_victim: stopped because of lack of memory.
@@ -358,7 +316,10 @@ class _Step:
         with writing_to(Path(task.folder).parent):
             task.scratch.mkdir(parents=True, exist_ok=True)
         self.task = task
-        self.log = StepLog(Path(task.log))
+        # The log begins empty; a link that somebody put there is not followed.
+        opened = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW
+        with writing_to(Path(task.log).parent):
+            os.close(os.open(task.log, opened, 0o666))
         self._started, self._oom_kills = now(), oom_kills()
         self.clock = time.monotonic()
         self.reason: OrthoflowError | None = None
@@ -373,7 +334,6 @@ class _Step:
                 self.process = start_process(run_step, arguments, task.address)
             except StepFailedError as error:
                 self.pipe.close()
-                self.log.close()
                 raise StepFailedError(
                     f"no process could be started for {task.who}: {error}"
                 ) from error
@@ -398,38 +358,33 @@ class _Step:
         _kill(_with_descendants(self.pid))
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self.pid, signal.SIGKILL)
-        if self.process.exitcode:
-            # What a step that crashed had started has another parent now.
-            scratch = self.task.scratch
-            _kill(one for one in psutil.process_iter() if _is_at_work_in(one, scratch))
 
     def close(self) -> None:
-        """Close its files."""
-        self.log.close()
+        """Release its resources."""
         self.pipe.close()
         if not self.process.is_alive():
             self.process.close()
 
     def outcome(self) -> CellResult:
         """Return the result of the process, which has ended."""
-        peak_mib = round(self.peak_bytes / MIB, 1)
+        peak_mib, log = round(self.peak_bytes / MIB, 1), _log_text(Path(self.task.log))
         if self.reason is None and self.result is not None:
             peak_mib = max(self.result.peak_rss_mib, peak_mib)
-            return dataclasses.replace(self.result, peak_rss_mib=peak_mib, log=self.log.text())
+            return dataclasses.replace(self.result, peak_rss_mib=peak_mib, log=log)
         return dataclasses.replace(
-            failed_result(self.task, self.reason or self._reason_of_silence()),
+            failed_result(self.task, self.reason or self._reason_of_silence(log)),
             started=self._started,
             ended=now(),
             wall_s=round(time.monotonic() - self.clock, 4),
             peak_rss_mib=peak_mib,
-            log=self.log.text(),
+            log=log,
         )
 
-    def _reason_of_silence(self) -> OrthoflowError:
+    def _reason_of_silence(self, log: str) -> OrthoflowError:
         code = self.process.exitcode or 0
         if code == -signal.SIGKILL and oom_kills() > self._oom_kills:
             return describe_memory(self.task.who, self.peak_bytes)
-        tail = one_line(self.log.text().strip().rpartition("\n")[2], _LONGEST_LAST_LINE)
+        tail = one_line(log.strip().rpartition("\n")[2], _LONGEST_LAST_LINE)
         return StepFailedError(describe_exit(self.task.who, code, self.peak_bytes, tail))
 
 
@@ -444,7 +399,6 @@ class LocalExecutor:
     capacity: Capacity
     listen: StepListener
     _running: dict[str, _Step] = field(default_factory=dict)
-    _guard: MemoryGuard = field(default_factory=MemoryGuard)
     _unstarted: dict[str, CellResult] = field(default_factory=dict)
 
     def start(self, task: Task) -> None:
@@ -465,7 +419,7 @@ class LocalExecutor:
         ends, self._unstarted = self._unstarted, {}
         steps = self._running.values()
         pipes = [step.pipe for step in steps if not step.pipe.closed]
-        timeout_s = 0.0 if ends else min(timeout_s, self._guard.interval_s)
+        timeout_s = 0.0 if ends else timeout_s
         wait([*pipes, *(step.process.sentinel for step in steps)], timeout_s)
         # Checked before the last messages are read: nothing is sent after the end.
         ended = [step for step in steps if not step.process.is_alive()]
@@ -516,7 +470,6 @@ class LocalExecutor:
         time_now = time.monotonic()
         for step in self._running.values():
             step.peak_bytes = max(step.peak_bytes, process_memory(step.pid))
-            step.log.shorten()
             limit = step.task.timeout_s
             if step.kill_at is not None and time_now > step.kill_at:
                 step.kill()
@@ -525,23 +478,25 @@ class LocalExecutor:
         self._guard_memory()
 
     def _guard_memory(self) -> None:
-        steps = _all_running.copy()
-        victim = self._guard.check(steps)
+        """Stop the largest step if the machine runs out of memory."""
+        floor, steps = memory_shortage(), _all_running.copy()
         # One at a time: the memory of a dying process is not released at once.
-        if victim is None or any(step.is_victim for step in steps.values()):
+        if not floor or any(step.is_victim for step in steps.values()):
             return
-        step, n_bytes = steps[victim[0]], victim[1]
-        if self._running.get(step.task.address) is not step:
-            # Its own executor stops it.
+        held = {pid: tree_memory(pid) for pid in steps}
+        largest = max(held, key=held.__getitem__, default=0)
+        # Another program may be the cause: stopping a small step would not help. A step of another
+        # executor is stopped by that one.
+        if not largest or held[largest] < floor or steps[largest] not in self._running.values():
             return
+        step = steps[largest]
         step.is_victim = True
-        step.reason = describe_memory(step.task.who, n_bytes)
-        step.peak_bytes = max(step.peak_bytes, n_bytes)
+        step.reason = describe_memory(step.task.who, held[largest])
+        step.peak_bytes = max(step.peak_bytes, held[largest])
         step.kill()
 
     def _end(self, step: _Step) -> CellResult:
         step.kill()
-        step.log.shorten()
         result = step.outcome()
         self._forget(step)
         return result

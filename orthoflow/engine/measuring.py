@@ -1,4 +1,4 @@
-"""Time and memory of methods, processes and the machine, and choice of a step to stop."""
+"""Time and memory of methods, processes and the machine."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ import importlib
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
 from typing import Any, Final, Self, cast
@@ -20,13 +19,6 @@ from orthoflow.geometry.threads import start_beside
 
 MIB: Final = 1 << 20
 GIB: Final = 1 << 30
-_CGROUPS: Final = Path("/sys/fs/cgroup")
-# Version 1 expresses "unlimited" as a number near 2**63.
-_UNLIMITED: Final = 1 << 60
-# A process can allocate memory at about this rate; the next check must precede the limit.
-_FASTEST_BYTES_PER_S: Final = 6 * GIB
-_SHORTEST_S: Final = 0.01
-_LONGEST_S: Final = 0.25
 
 
 def process_memory(process_id: int | None = None) -> int:
@@ -50,108 +42,14 @@ def tree_memory(root: int) -> int:
     return sum(process_memory(process) for process in (root, *(one.pid for one in children)))
 
 
-@dataclass(frozen=True, kw_only=True)
-class AvailableMemory:
-    """Memory that processes here can still get, and the total."""
+def memory_shortage() -> int:
+    """Return the least memory that should stay free, in bytes, if less is available; else 0.
 
-    available: int
-    total: int
-
-    @property
-    def floor(self) -> int:
-        """Below this the machine fails unpredictably: 512 MiB or 3 % of the total."""
-        return min(max(512 * MIB, self.total * 3 // 100), self.total // 8)
-
-
-def available_memory() -> AvailableMemory:
-    """Measure the machine and every control group of this process."""
-    memory = psutil.virtual_memory()
-    total, available = memory.total, memory.available
-    for limit, used in _group_limits():
-        total = min(total, limit)
-        available = min(available, limit - used)
-    return AvailableMemory(available=max(0, available), total=total)
-
-
-def _group_limits() -> list[tuple[int, int]]:
-    """Yield (limit, used) of this process's memory control groups and their parents, in bytes."""
-    try:
-        lines = Path("/proc/self/cgroup").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return []
-    found: list[tuple[int, int]] = []
-    for line in lines:
-        _, controllers, path = line.split(":", 2)
-        if controllers == "":
-            found += _limits_upwards(_CGROUPS, path, _V2)
-        elif "memory" in controllers.split(","):
-            found += _limits_upwards(_CGROUPS / "memory", path, _V1)
-    return found
-
-
-_V1: Final = {
-    "limit": "memory.limit_in_bytes",
-    "used": "memory.usage_in_bytes",
-    "cache": "total_inactive_file",
-}
-_V2: Final = {"limit": "memory.max", "used": "memory.current", "cache": "inactive_file"}
-
-
-def _limits_upwards(root: Path, path: str, names: Mapping[str, str]) -> list[tuple[int, int]]:
-    folder = root / path.lstrip("/")
-    found: list[tuple[int, int]] = []
-    # Inside a container the path may be the host's; the container's own group is then the root.
-    for level in [folder, *folder.parents]:
-        if not level.is_relative_to(root):
-            break
-        limit = _number(level / names["limit"])
-        used = _number(level / names["used"])
-        if limit is not None and used is not None and limit < _UNLIMITED:
-            found.append((limit, used - _reclaimable(level, names["cache"])))
-    return found
-
-
-def _number(path: Path) -> int | None:
-    try:
-        return int(path.read_text(encoding="ascii"))
-    except (OSError, ValueError):
-        return None
-
-
-def _reclaimable(folder: Path, name: str) -> int:
-    try:
-        lines = (folder / "memory.stat").read_text(encoding="ascii").splitlines()
-    except OSError:
-        return 0
-    return sum(int(line.split()[1]) for line in lines if line.split()[0] == name)
-
-
-class MemoryGuard:
-    """Watches the remaining memory while steps run.
-
-    Attributes:
-        interval_s: time until the next check at the latest.
+    Below it, 512 MiB or 3 % of the total, a machine fails unpredictably.
     """
-
-    def __init__(self) -> None:
-        self.interval_s = _LONGEST_S
-
-    def check(self, roots: Iterable[int]) -> tuple[int, int] | None:
-        """Choose a step to stop if too little memory is left.
-
-        Args:
-            roots: root process of every running step.
-
-        Returns:
-            Root process of that step, and its memory in bytes.
-        """
-        memory = available_memory()
-        margin = memory.available - memory.floor
-        self.interval_s = min(max(margin / _FASTEST_BYTES_PER_S, _SHORTEST_S), _LONGEST_S)
-        held = {root: tree_memory(root) for root in roots} if margin <= 0 else {}
-        largest, n_bytes = max(held.items(), key=lambda item: item[1], default=(0, 0))
-        # Another program may be the cause: stopping a small step would not help.
-        return (largest, n_bytes) if held and n_bytes >= memory.floor else None
+    memory = psutil.virtual_memory()
+    floor = min(max(512 * MIB, memory.total * 3 // 100), memory.total // 8)
+    return floor if memory.available <= floor else 0
 
 
 def oom_kills() -> int:

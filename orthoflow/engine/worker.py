@@ -51,7 +51,7 @@ from orthoflow.engine.results import (
     result_to_json,
     shared_fields,
 )
-from orthoflow.engine.store import Publisher, Store, digest_of
+from orthoflow.engine.store import Publisher, Store
 from orthoflow.errors import (
     DiskSpaceError,
     InputError,
@@ -69,10 +69,6 @@ from orthoflow.sdk.lines import one_line
 from orthoflow.sdk.methods import Method, labelled
 from orthoflow.untrusted_text import shown
 
-# Inputs up to this size are digested again after the run: they must not have changed.
-_CHECKED_BYTES: Final = 16 << 20
-# The main one, the sampler of memory, and the one that waits for the coordinator.
-_OWN_THREADS: Final = 3
 # With a margin for the method's own message, which is cut shorter, and the words around it.
 _LONGEST_ERROR: Final = 4000
 _LONGEST_TRACE: Final = 64 << 10
@@ -474,7 +470,9 @@ class _Call:
             self._processor_s = max(0.0, round(self._cpu_s() - cpu_s - drawing_cpu_s, 4))
         # Not through `progress`: a step that was asked to stop, but finished, has a result.
         self._context.listen(StepEvent(kind="progress", text="keeping the results", fraction=1.0))
-        self._check_inputs(inputs)
+        for given in self.task.inputs.values():
+            for file in given.files:
+                _check_file(file)
         result = dataclasses.replace(
             blank_result(self.task),
             outputs=self._keep(self._products(cls, outputs, inputs)),
@@ -505,18 +503,6 @@ class _Call:
                 f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()
             )
             raise MethodError(f"{self.task.who} refuses its parameters: {problems}") from error
-
-    def _check_inputs(self, inputs: Mapping[str, Product | InputFiles]) -> None:
-        for port, given in self.task.inputs.items():
-            for file in given.files:
-                _check_file(file)
-            product = inputs[port]
-            is_checked = isinstance(product, Product) and _n_bytes(product) <= _CHECKED_BYTES
-            if is_checked and digest_of(cast("Product", product)) != given.ref.digest:
-                raise MethodError(
-                    f"{self.task.who} changed its input {port}, which is read-only; "
-                    f"it must work on a copy"
-                )
 
     def _products(
         self, cls: type[Method], outputs: object, inputs: Mapping[str, Product | InputFiles]
@@ -550,17 +536,7 @@ class _Call:
             refs[port] = self._store.put_product(
                 product, publisher, publisher_tag=expected.publisher_tag
             )
-            self._check_output(port, product, refs[port])
         return refs
-
-    def _check_output(self, port: str, product: Product, ref: ProductRef) -> None:
-        # Only a running thread can change what was returned, and threads are visible.
-        is_checked = _n_bytes(product) <= _CHECKED_BYTES or threading.active_count() > _OWN_THREADS
-        if is_checked and digest_of(product) != ref.digest:
-            raise MethodError(
-                f"{self.task.who} changed its output {port} after it had returned it; it must wait "
-                f"for its threads"
-            )
 
     def _keep_figures(self) -> tuple[FigureRef, ...]:
         return tuple(
@@ -599,10 +575,6 @@ def _check_file(file: FileRef) -> None:
         ) from error
     if not is_same:
         raise InputError(f"the input file {path} changed while it was read; run again")
-
-
-def _n_bytes(product: Product) -> int:
-    return sum(array.nbytes for array in product.to_payload().arrays.values())
 
 
 def _trace(error: BaseException) -> str:

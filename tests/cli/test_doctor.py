@@ -11,12 +11,12 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import psutil
 import pytest
 from click.testing import CliRunner
 
 from orthoflow.cli import program
 from orthoflow.cli.doctor import LIBRARIES
-from orthoflow.engine import measuring
 
 GIB = 1 << 30
 
@@ -32,8 +32,7 @@ def libraries(monkeypatch: pytest.MonkeyPatch) -> dict[str, tuple[str, str]]:
 @pytest.fixture(autouse=True)
 def _here(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A machine with nothing to find fault with."""
-    memory = measuring.AvailableMemory(available=8 * GIB, total=8 * GIB)
-    monkeypatch.setattr(measuring, "available_memory", lambda: memory)
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=8 * GIB))
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=99 * GIB))
     monkeypatch.chdir(tmp_path)
 

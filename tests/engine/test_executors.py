@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.engine.local import Capacity, InlineExecutor, StepLog
+from orthoflow.engine.local import Capacity, InlineExecutor
 from orthoflow.engine.worker import Task
 from tests.engine_world import toy_world
 
@@ -36,19 +36,3 @@ def test_what_is_in_line_ends_as_interrupted_once_it_is_cancelled(
         assert end[1].error_message == "step a was interrupted"
     executor.close()
     assert executor.poll(0.0) == {}
-
-
-def test_a_log_that_grows_too_long_keeps_its_end_and_counts_the_rest(tmp_path: Path) -> None:
-    path = tmp_path / "log"
-    log = StepLog(path)
-    with path.open("ab", buffering=0) as writer:
-        for _ in range(2):
-            writer.write(b"x" * (9 << 20))
-            log.shorten()
-            assert path.stat().st_size < 1 << 20
-        writer.write(b"the end\n")
-    said = log.text()
-    log.close()
-    kept = said.partition("\n")[2]
-    assert kept.endswith("xxxthe end\n")
-    assert said.startswith(f"... ({(18 << 20) + 8 - len(kept)} bytes before)\n")

@@ -8,12 +8,12 @@ import re
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from orthoflow.engine import measuring as machine_memory
 from orthoflow.engine.measuring import (
-    AvailableMemory,
     process_memory,
     tree_memory,
 )
@@ -134,7 +134,7 @@ def test_a_full_disk_in_a_method_names_the_store(world: World) -> None:
     result = bad_result(world, "full_disk", executor="inline")
     assert result.error_type == "DiskSpaceError"
     assert result.error_message.startswith(
-        f"cannot write to {world.store.folder}: No space left on the disk"
+        f"cannot write to {world.store.folder}: No space left on device"
     )
 
 
@@ -206,11 +206,11 @@ def test_a_method_that_eats_all_memory_is_stopped_and_the_coordinator_lives(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # A machine of 8 GiB with 1.5 GiB left, less what the steps take.
-    def little_memory() -> AvailableMemory:
+    def little_memory() -> SimpleNamespace:
         taken = tree_memory(os.getpid()) - process_memory()
-        return AvailableMemory(available=1536 * MIB - taken, total=8192 * MIB)
+        return SimpleNamespace(available=1536 * MIB - taken, total=8192 * MIB)
 
-    monkeypatch.setattr(machine_memory, "available_memory", little_memory)
+    monkeypatch.setattr(machine_memory.psutil, "virtual_memory", little_memory)
     result = bad_result(world, "eat")
     assert result.error_type == "StepFailedError"
     assert result.error_message == (
@@ -253,7 +253,7 @@ steps:
     failed = outcome.results["large"]
     assert failed.error_type == "StoreError"
     assert failed.error_message.startswith(
-        f"cannot write to {tiny_world.store.folder}: No space left on the disk"
+        f"cannot write to {tiny_world.store.folder}: No space left on device"
     )
 
 

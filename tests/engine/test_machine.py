@@ -21,20 +21,10 @@ from orthoflow.engine.durability import (
     whole_folder,
 )
 from orthoflow.engine.file_digests import FileDigests
-from orthoflow.engine.measuring import AvailableMemory, MemoryGuard
 from orthoflow.errors import InputError, StoreError
 from tests.faulty_files import FaultyFiles
 
 MIB = 1 << 20
-
-
-@pytest.fixture
-def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder whose files stand for those of the kernel."""
-    for module in (measuring, environment):
-        monkeypatch.setattr(module, "Path", lambda path: tmp_path / str(path).lstrip("/"))
-    monkeypatch.setattr(measuring, "_CGROUPS", tmp_path / "sys/fs/cgroup")
-    return tmp_path
 
 
 def write(folder: Path, files: dict[str, str]) -> None:
@@ -52,73 +42,17 @@ def test_memory_of_a_tree_is_that_of_a_process_and_all_that_it_started() -> None
     assert measuring.tree_memory(1 << 30) == 0
 
 
-GROUP: dict[str, dict[str, str]] = {
-    "none": {},
-    "version 2": {
-        "proc/self/cgroup": "0::/outer/inner\n",
-        "sys/fs/cgroup/outer/inner/memory.max": "max\n",
-        "sys/fs/cgroup/outer/inner/memory.current": f"{100 * MIB}\n",
-        "sys/fs/cgroup/outer/memory.max": f"{1000 * MIB}\n",
-        "sys/fs/cgroup/outer/memory.current": f"{700 * MIB}\n",
-        "sys/fs/cgroup/outer/memory.stat": f"file 7\ninactive_file {200 * MIB}\n",
-        "sys/fs/memory.max": f"{1 * MIB}\n",
-        "sys/fs/memory.current": "0\n",
-    },
-    "version 1": {
-        "proc/self/cgroup": "12:cpu:/x\n4:blkio,memory:/outer\n",
-        "sys/fs/cgroup/memory/outer/memory.limit_in_bytes": f"{2000 * MIB}\n",
-        "sys/fs/cgroup/memory/outer/memory.usage_in_bytes": f"{500 * MIB}\n",
-        "sys/fs/cgroup/memory/outer/memory.stat": f"total_inactive_file {30 * MIB}\ncache 9\n",
-        "sys/fs/cgroup/memory/memory.limit_in_bytes": "9223372036854771712\n",
-        "sys/fs/cgroup/memory/memory.usage_in_bytes": f"{9000 * MIB}\n",
-    },
-    "a group of the host's": {
-        "proc/self/cgroup": "0::/not/here\n",
-        "sys/fs/cgroup/memory.max": f"{600 * MIB}\n",
-        "sys/fs/cgroup/memory.current": f"{700 * MIB}\n",
-    },
-    "other controllers": {
-        "proc/self/cgroup": "12:cpu:/x\n",
-        "sys/fs/cgroup/memory/x/memory.limit_in_bytes": "1\n",
-        "sys/fs/cgroup/memory/x/memory.usage_in_bytes": "1\n",
-    },
-}
-
-
 @pytest.mark.parametrize(
-    ("group", "available_mib", "total_mib"),
-    [
-        ("none", 4096, 8192),
-        ("version 2", 500, 1000),
-        ("version 1", 1530, 2000),
-        ("a group of the host's", 0, 600),
-        ("other controllers", 4096, 8192),
-    ],
+    ("total_mib", "floor_mib"), [(2048, 256), (8192, 512), (64 << 10, (64 << 10) * 3 / 100)]
 )
-def test_the_tightest_group_says_how_much_is_left(
-    machine: Path, monkeypatch: pytest.MonkeyPatch, group: str, available_mib: int, total_mib: int
+def test_memory_is_short_at_the_floor_and_not_above(
+    monkeypatch: pytest.MonkeyPatch, total_mib: int, floor_mib: float
 ) -> None:
-    here = SimpleNamespace(total=8192 * MIB, available=4096 * MIB)
-    monkeypatch.setattr(measuring.psutil, "virtual_memory", lambda: here)
-    write(machine, GROUP[group])
-    assert measuring.available_memory() == AvailableMemory(
-        available=available_mib * MIB, total=total_mib * MIB
-    )
-
-
-@pytest.mark.parametrize(("over", "is_stopped"), [(1, False), (0, True), (-1, True)])
-def test_a_step_is_stopped_at_the_floor_and_not_above(
-    monkeypatch: pytest.MonkeyPatch, over: int, is_stopped: bool
-) -> None:
-    here = AvailableMemory(available=0, total=64 << 30)
-    left = AvailableMemory(available=here.floor + over, total=here.total)
-    monkeypatch.setattr(measuring, "available_memory", lambda: left)
-    monkeypatch.setattr(measuring, "tree_memory", {1: here.floor, 2: here.floor - 1}.__getitem__)
-    found = MemoryGuard().check([2, 1])
-    assert (found is not None) == is_stopped
-    if found is not None:
-        assert found == (1, here.floor)
-        assert MemoryGuard().check([2]) is None
+    floor = int(floor_mib * MIB)
+    for over, expected in ((1, 0), (0, floor), (-1, floor)):
+        here = SimpleNamespace(total=total_mib * MIB, available=floor + over)
+        monkeypatch.setattr(measuring.psutil, "virtual_memory", lambda here=here: here)
+        assert measuring.memory_shortage() == expected
 
 
 # --- versions ---
@@ -158,9 +92,6 @@ def test_a_file_that_changes_while_it_is_read_is_refused(
     monkeypatch.setattr(file_digests, "file_sha256", read)
     with pytest.raises(InputError, match="scan changed while it was read; run again"):
         FileDigests(tmp_path / "memo").digest(path)
-
-
-# --- hours ---
 
 
 # --- locks ---

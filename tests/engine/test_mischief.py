@@ -43,7 +43,7 @@ def test_what_a_step_started_ends_with_it(world: World) -> None:
     assert has_ended(int(world.store.get_product(digest, Numbers).values[0]))
 
 
-@pytest.mark.parametrize("name", ["hides_and_crashes", *long_only("hides", "hides_and_stops")])
+@pytest.mark.parametrize("name", ["hides", *long_only("hides_and_stops")])
 def test_what_was_started_in_another_session_by_a_process_that_is_gone_ends_too(
     world: World, name: str
 ) -> None:
@@ -60,8 +60,8 @@ def test_a_step_that_kills_the_server_of_all_steps_fails_and_the_next_run_has_an
 ) -> None:
     result = result_of(all_of(world, "kills_server"), "kills_server")
     assert result.error_message.startswith(f"{WHO.format('kills_server')} ended its process")
-    again = all_of(world, "closes_streams", "digs_deep", into="next")
-    assert [result.error_message for result in again.results.values()] == ["", "", ""]
+    again = all_of(world, "closes_streams", into="next")
+    assert [result.error_message for result in again.results.values()] == ["", ""]
 
 
 def test_a_machine_without_room_for_a_process_fails_the_step_alone(
@@ -81,7 +81,7 @@ def test_limits_of_a_step_are_its_own(world: World) -> None:
     said = result_of(outcome, "opens_nothing_more").error_message
     assert "Too many open files" in said
     said = result_of(outcome, "writes_nothing_more").error_message
-    assert "the file would be larger than allowed here" in said
+    assert "File too large" in said
     again = all_of(world, "closes_streams", into="next")
     assert result_of(again, "closes_streams").error_message == ""
 
@@ -96,7 +96,7 @@ def test_the_process_that_a_method_forked_gives_no_result(world: World) -> None:
 def test_what_a_method_says_is_bounded(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     # One that never ends shall not go on long.
     monkeypatch.setattr("orthoflow.engine.local._GRACE_S", 0.3)
-    outcome = all_of(world, "never_silent", "prints_much", "replaces_log")
+    outcome = all_of(world, "never_silent", "prints_much")
     flood = result_of(outcome, "never_silent")
     assert "ran past its timeout of 2 s" in flood.error_message
     assert flood.wall_s < 30
@@ -104,13 +104,6 @@ def test_what_a_method_says_is_bounded(world: World, monkeypatch: pytest.MonkeyP
     assert printed.log.startswith("... (")
     assert printed.log.endswith("the end\n")
     assert len(printed.log) < 300_000
-    sizes = {
-        path.name: path.stat().st_size
-        for path in (world.folder / "run" / "logs").iterdir()
-        if path.is_file()
-    }
-    assert sizes["bad@bad=prints_much.log"] <= 8 << 20
-    assert result_of(outcome, "replaces_log").log == "still heard\n"
 
 
 def test_a_step_that_stands_still_is_killed(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -159,11 +152,3 @@ def test_no_descriptor_is_left_open_by_a_run(world: World) -> None:
 
 def n_open() -> int:
     return len(list(Path("/proc/self/fd").iterdir()))
-
-
-def test_an_output_that_a_thread_still_changes_is_refused(world: World) -> None:
-    result = result_of(all_of(world, "goes_on_writing"), "goes_on_writing")
-    assert result.error_message == (
-        f"{WHO.format('goes_on_writing')} changed its output numbers after it had returned it; it "
-        f"must wait for its threads"
-    )

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 from pathlib import Path
 
 import pytest
 
-from orthoflow.engine import keys
 from orthoflow.engine.keys import CellKey, MethodFacts, cell_key
 from orthoflow.engine.plan import RunOptions, explain
 from orthoflow.engine.results import CellResult, ProductRef
@@ -67,20 +65,6 @@ CELL = Cell(address="step", step="step", method="work.noise", params={"amount": 
 LEFT = ProductRef(type_name="numbers", encoding_version=1, digest="sha256:" + "1" * 64)
 RIGHT = dataclasses.replace(LEFT, digest="sha256:" + "2" * 64)
 INPUTS = {"left": LEFT, "right": RIGHT}
-
-
-def test_a_machine_whose_methods_cannot_be_asked_does_not_fit(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    planned = keys.methods_text({"work.noise": FACTS})
-    here = dict.fromkeys(["work.noise"], "method work.noise is broken")
-    monkeypatch.setattr(keys, "_methods_here", lambda _: planned)
-    assert keys.misfit(planned) == ""
-    monkeypatch.setattr(keys, "_methods_here", lambda _: json.dumps(here))
-    assert keys.misfit(planned) == "method work.noise is broken"
-    monkeypatch.setattr(keys, "_methods_here", lambda _: "")
-    said = keys.misfit(planned)
-    assert said == "its methods cannot be loaded (JSONDecodeError)"
 
 
 def test_an_executor_and_its_cores_are_those_that_are_asked_for() -> None:

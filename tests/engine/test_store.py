@@ -243,7 +243,7 @@ def test_a_full_disk_is_one_sentence_and_leaves_nothing_valid(tiny_disk: Path) -
     store = Store(tiny_disk / "store")
     rng = np.random.default_rng(1)
     large = Heights(values=rng.random(300_000))
-    with pytest.raises(StoreError, match=r"cannot write to .*store.*: No space left on the disk"):
+    with pytest.raises(StoreError, match=r"cannot write to .*store.*: No space left on device"):
         store.put_product(large)
     assert not list(store.objects.glob("*"))
     assert not list((store.scratch / "loose").iterdir())
