@@ -186,19 +186,6 @@ def fitted(
     return problem.solve(start.shifted(middle)).shifted(-middle)
 
 
-def first_step(
-    seen: SeenPoints, camera: ViewingCamera, lens: LensFreedom, *, soft_limit: float = math.inf
-) -> NDArray[np.float64]:
-    """Return the first step of an adjustment with more unknowns (6 + free,).
-
-    Raises:
-        GeometryError: too few points, or they do not determine the pose.
-    """
-    middle, problem = _problem(seen, camera, lens, soft_limit)
-    local = camera.shifted(middle)
-    return problem.step(local, problem.errors(local), damping=0.0)
-
-
 def misfit(seen: SeenPoints, camera: ViewingCamera) -> Misfit:
     """Compute the fit of points to a camera, each against its own expected deviation."""
     middle = seen.points_world.mean(axis=0) if len(seen) else np.zeros(3)

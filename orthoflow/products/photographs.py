@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import ClassVar, Self
+from typing import ClassVar, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import ProductError
-from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.cameras import LensFreedom, ViewingCamera, unmeasured
 from orthoflow.products.product import (
     JsonValue,
     Product,
@@ -19,6 +19,9 @@ from orthoflow.products.product import (
     require_shapes,
 )
 from orthoflow.products.walls import Wall
+
+# Focal length where neither calibration nor EXIF states it, over the longer side.
+_USUAL_FOCAL: Final = 0.8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,6 +118,27 @@ class Photo:
     mask: bytes | None = None
     camera: str = ""
     folder: str = ""
+
+    def lens_prior(self) -> tuple[ViewingCamera, LensFreedom]:
+        """Return what is known of the lens before any orientation: calibration, EXIF, or nothing.
+
+        Returns:
+            A camera with the likeliest lens, at the origin of its own axes, and how far that lens
+            may be off; not at all if it is calibrated.
+        """
+        if self.intrinsics is not None:
+            return self.intrinsics.posed(), LensFreedom()
+        longest_px, exif_px = max(self.width, self.height), self.exif_focal_px
+        focal_px = exif_px or _USUAL_FOCAL * longest_px
+        lens = Intrinsics(
+            width=self.width,
+            height=self.height,
+            fx=focal_px,
+            fy=focal_px,
+            cx=0.5 * self.width,
+            cy=0.5 * self.height,
+        )
+        return lens.posed(), unmeasured(longest_px, has_exif=exif_px is not None)
 
 
 @dataclass(frozen=True, kw_only=True)

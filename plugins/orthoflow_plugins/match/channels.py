@@ -1,10 +1,9 @@
-"""Channels: what of a picture survives another spectral band, and where it fixes a displacement.
+"""Channels: features of a picture that persist in another spectral band, and their texture.
 
-Dense channels of oriented gradients (after Ye et al. 2019, CFOG): the strength of the gradient
-across each of several directions, smoothed, and evened out locally. A light joint on dark stone and
-a dark joint on light stone look alike in them. Where bands look alike, the grey itself is sharper;
-where they do not, a mixture of a photo's colours, another one about each place, may be what the
-laser sees.
+Dense channels of oriented gradients (after Ye et al. 2019, CFOG): the gradient strength in several
+directions, smoothed and normalised locally. A light joint on dark stone and a dark joint on light
+stone have equal channels. Where the bands are similar, the grey values are sharper; where they are
+not, a combination of a photo's colours, estimated at each place, may resemble the laser intensity.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from threading import Lock
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,23 +24,23 @@ from orthoflow.geometry.narrow_gaps import narrow_gaps
 from orthoflow.products import SurfaceMask, Wall
 from orthoflow_plugins.match.pictures import filled_smoothly, usual_spread_m
 
-# Gaps between joined cells in which no disc of this radius fits are filled, as rasters have it.
+# Gaps between joined cells in which no disc of this radius fits are filled, as in rasters.
 _GAP_CELLS: Final = 2
-# So many cells are joined at once: some 100 MB.
+# Cells that are joined at once: some 100 MB.
 _CELLS_AT_ONCE: Final = 1 << 22
 
 
 def in_cells_of_points(wall: Wall) -> Wall:
     """Join the cells of a wall until about one point lies in each.
 
-    Points count where they lie: what a joined cell shows is carried to its centre.
+    Values are interpolated from the centroids of the points to the centres of joined cells.
 
     Args:
         wall: with intensity or not.
 
     Returns:
-        The same wall where its cells are not much finer than its points lie apart; else with
-        depths, spreads, counts and intensity of joined cells, without colours.
+        The same wall if its cells are not much finer than its point spacing; else depths, spreads,
+        counts and intensity of joined cells, without colours.
     """
     gsd_m = wall.frame.gsd_m
     factor = math.floor(scan_step_m(wall.count, gsd_m=gsd_m) / gsd_m)
@@ -77,14 +76,14 @@ def _join(
     places: NDArray[np.float32],
     which: tuple[slice, float],
 ) -> None:
-    """Fill some rows of a joined wall with what its measured cells hold, and where they lie.
+    """Fill some rows of a joined wall with values and centroids of its measured cells.
 
     Args:
         wall: the wall.
-        factor: how many of its cells lie along the side of a joined one.
-        joined: filled, a row for each of these rows.
-        places: (rows, cols, 2) as `Surroundings` has them, likewise.
-        which: the rows, and depths that differ by more are of different surfaces.
+        factor: cells along the side of a joined one.
+        joined: the wall whose rows are filled.
+        places: (rows, cols, 2) centroids as in `Surroundings`, filled as well.
+        which: the rows, and the difference of depths beyond which surfaces differ.
     """
     rows, layer_m = which
     assert wall.intensity is not None  # noqa: S101 - asked before
@@ -93,7 +92,7 @@ def _join(
     measured = blocks.of(wall.mask) == SurfaceMask.MEASURED
     depths_m = np.where(measured, blocks.of(wall.depth_m), np.float32(np.nan))
     n_known = np.isfinite(depths_m).sum(axis=2)
-    # A depth that was measured, none between two surfaces; what is no number comes last.
+    # A measured depth, none between two surfaces; NaN is sorted to the end.
     middle = np.maximum(n_known - 1, 0) // 2
     depth_m = np.take_along_axis(np.sort(depths_m, axis=2), middle[:, :, None], axis=2)
     on_surface = np.abs(depths_m - depth_m) <= layer_m
@@ -117,11 +116,11 @@ def _join(
 
 
 class _Blocks:
-    """Rows of joined cells, and what lies in each.
+    """Blocks of cells that are joined.
 
     Args:
         rows: of joined cells.
-        factor: how many cells lie along the side of a joined one.
+        factor: cells along the side of a joined one.
         width: columns of joined cells.
     """
 
@@ -139,7 +138,7 @@ class _Blocks:
 
 
 def _complete(joined: Wall, around: Surroundings) -> None:
-    """Fill narrow gaps, and carry what cells show from where their points lie to their centres."""
+    """Fill narrow gaps, and interpolate intensity from centroids of points to cell centres."""
     assert joined.intensity is not None  # noqa: S101 - asked before
     depth_m, intensity = joined.depth_m.reshape(-1), joined.intensity.reshape(-1)
     known = np.isfinite(joined.depth_m)
@@ -159,35 +158,34 @@ _POOL_SIGMA_CELLS: Final = 0.8
 _EVEN_SIGMA_CELLS: Final = 12.0
 _BROAD_STEP: Final = 4
 _MARGIN_CELLS: Final = 2
-# Depths about a cell that differ by more than this many cells and spreads of a point are a step of
-# the relief; nine depths of an even surface differ by three spreads, seldom by five.
+# Depths about a cell that differ by more than this many cells and point spreads are a step of the
+# relief; nine depths of a smooth surface differ by three spreads, seldom by five.
 _STEP_CELLS: Final = 1.0
 _STEP_SPREADS: Final = 6.0
-# Where more than such a share of so many cells a side is beside steps, relief is all there is:
-# rooms with mouldings have 0.06 to 0.11, a carved fountain 0.21.
+# Surfaces with more cells beside steps than this share, within so many cells, have no texture but
+# relief: rooms with mouldings have 0.06 to 0.11, a carved fountain 0.21.
 _RELIEF_CELLS: Final = 121
 _RELIEF_SHARE: Final = 0.16
-# Places with texture lie so far apart, and are taken in turns from a grid of so many cells a side.
+# Least distance between places with texture, which are taken in turns from the cells of a grid.
 _APART_CELLS: Final = 5
 HALF_PATCH_CELLS: Final = 10
-"""Patches of a wall and a photo that are compared are (2 h + 1) cells wide."""
+"""Patches that are compared are (2 h + 1) cells wide."""
 _GRID: Final = 16
 
 
-@dataclass(frozen=True, kw_only=True)
-class Channels:
-    """A picture to be matched.
+class Channels(NamedTuple):
+    """A picture to be matched, in the form that compiled kernels take.
 
     Attributes:
         values: (rows, cols, c) float32, 0 where not known.
-        known: (rows, cols) float32, 1 where values mean something, else 0.
+        known: (rows, cols) float32, 1 where values are known, else 0.
     """
 
     values: NDArray[np.float32]
     known: NDArray[np.float32]
 
     def part(self, cells: tuple[slice, slice]) -> Channels:
-        """Return some rows and columns."""
+        """Return a section of the picture."""
         return Channels(
             values=np.ascontiguousarray(self.values[cells]),
             known=np.ascontiguousarray(self.known[cells]),
@@ -195,7 +193,7 @@ class Channels:
 
 
 def gradient_channels(grey: NDArray[np.float32]) -> Channels:
-    """Return the oriented gradients of a picture with NaN where nothing is known."""
+    """Return the oriented gradients of a picture that is NaN where unknown."""
     import cv2
 
     gradient, known = _gradient(grey)
@@ -213,12 +211,12 @@ def gradient_channels(grey: NDArray[np.float32]) -> Channels:
 
 
 def grey_channels(grey: NDArray[np.float32]) -> Channels:
-    """Return a picture itself, less its local mean, evened out; for bands that look alike."""
+    """Return grey values less their local mean, normalised, for similar spectral bands."""
     return colour_channels(grey[:, :, None])
 
 
 def colour_channels(colours: NDArray[np.float32]) -> Channels:
-    """Give the colours (rows, cols, c) of a picture, less their local means, evened out as one."""
+    """Return colours (rows, cols, c) less their local means, normalised together."""
     import cv2
 
     known = _safe(np.asarray(np.isfinite(colours).all(axis=2)))
@@ -234,7 +232,7 @@ CHANNELS: Final[Mapping[str, Callable[[NDArray[np.float32]], Channels]]] = {
     "gradients": gradient_channels,
     "grey": grey_channels,
 }
-"""By name, what of a wall's intensity may be compared."""
+"""Channels of a wall's intensity by name."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -243,10 +241,10 @@ class WallTarget:
 
     Attributes:
         wall: the wall.
-        grey: its intensity, NaN where it has no depth; None where it shows nothing.
-        channels: of its intensity, by content, as far as they were needed.
+        grey: its intensity, NaN where it has no depth; None without intensity.
+        channels: of its intensity by name, computed when needed.
         textures: of these channels, likewise.
-        grain: as `grain_of` gives it, as soon as it was needed.
+        grain: result of `grain_of`, likewise.
     """
 
     wall: Wall
@@ -257,7 +255,7 @@ class WallTarget:
     lock: Lock = field(default_factory=Lock)
 
     def prepare(self, content: str) -> None:
-        """Compute channels and texture unless that was done before, maybe by another thread."""
+        """Compute channels and texture unless another thread has done so."""
         with self.lock:
             if self.grey is None or content in self.channels:
                 return
@@ -277,11 +275,11 @@ def target_of(wall: Wall) -> WallTarget:
 
 
 def _at_steps(wall: Wall) -> NDArray[np.bool_]:
-    """Cells (rows, cols) beside a step of the relief.
+    """Find cells (rows, cols) beside a step of the relief.
 
-    Where in its cell the edge lies nobody knows, and its points are of both sides: an edge of the
-    picture there is off by part of a cell. A photo from aside shows the step's face, or what is
-    behind it not at all. Slopes, however steep, are no steps; and where steps are everywhere, as on
+    The position of the edge within its cell is unknown, and its points are of both sides, so an
+    edge of the picture is off by part of a cell. An oblique photo shows the face of the step, or
+    hides what is behind it. Slopes, however steep, are no steps; where steps are everywhere, as on
     carved stone, they are kept, since little else would be left to compare.
     """
     import cv2
@@ -292,10 +290,10 @@ def _at_steps(wall: Wall) -> NDArray[np.bool_]:
     low = cv2.erode(np.where(known, wall.depth_m, inf), kernel)
     bent = np.zeros(wall.frame.shape, dtype=np.bool_)
     for depth_m, found in ((wall.depth_m, bent), (wall.depth_m.T, bent.T)):
-        # How far cells are off the line between their neighbours; no number beside void.
+        # Deviation from the line between neighbours; NaN beside void.
         off_m = np.abs(depth_m[:-2] - 2.0 * depth_m[1:-1] + depth_m[2:])
         found[1:-1] |= off_m > 0.5 * step_m
-    # Far from all depths both are none, and lie beyond each other.
+    # Far from all depths both are infinite.
     with np.errstate(over="ignore"):
         beside = known & bent & (high - low > step_m)
     n_beside, n_known = (
@@ -306,15 +304,14 @@ def _at_steps(wall: Wall) -> NDArray[np.bool_]:
 
 
 def least_step_m(wall: Wall) -> float:
-    """By how much depths differ at a step of the relief, at least."""
+    """Return the smallest difference of depths at a step of the relief."""
     return max(_STEP_CELLS * wall.frame.gsd_m, _STEP_SPREADS * usual_spread_m(wall))
 
 
 def grain_of(wall: Wall) -> NDArray[np.float32]:
-    """How many cells share one measured cell around each cell (rows, cols), at least 1.
+    """Return the number of cells per measured cell around each cell (rows, cols), at least 1.
 
-    What fills a gap follows from the cells about it and errs with them: a patch tells no more than
-    its measured cells do.
+    Filled cells follow from measured ones and share their errors: they add no information.
     """
     import cv2
 
@@ -325,10 +322,9 @@ def grain_of(wall: Wall) -> NDArray[np.float32]:
 
 
 def texture(channels: Channels) -> NDArray[np.float32]:
-    """How well the surroundings of each cell fix a displacement in both directions.
+    """Return how well the patch of each cell (rows, cols) determines a displacement.
 
-    The smaller eigenvalue of the gradients' second moments over the patch (Shi & Tomasi 1994),
-    (rows, cols).
+    The smaller eigenvalue of the gradients' second moments over the patch (Shi & Tomasi 1994).
     """
     import cv2
 
@@ -346,14 +342,14 @@ def texture(channels: Channels) -> NDArray[np.float32]:
 def textured_places(
     strength: NDArray[np.float32], usable: NDArray[np.bool_], n_most: int
 ) -> NDArray[np.intp]:
-    """Cells (n, 2) = (column, row) with the most texture around them.
+    """Select cells (n, 2) = (column, row) with the most texture.
 
     The best are taken in turns from a grid, so that they cover the usable part evenly.
 
     Args:
-        strength: (rows, cols) as `texture` gives it.
-        usable: (rows, cols), where cells may be taken.
-        n_most: at most so many.
+        strength: (rows, cols) as returned by `texture`.
+        usable: (rows, cols), cells that may be selected.
+        n_most: maximum number of cells.
     """
     import cv2
 
@@ -379,7 +375,7 @@ def _gradient(
 
 
 def _safe(known: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Cells away from void, whose filling would look like an edge."""
+    """Select cells away from void, whose filling would look like an edge."""
     import cv2
 
     kernel = np.ones((2 * _MARGIN_CELLS + 1, 2 * _MARGIN_CELLS + 1), dtype=np.uint8)
@@ -387,7 +383,7 @@ def _safe(known: NDArray[np.bool_]) -> NDArray[np.float32]:
 
 
 def _evened(values: NDArray[np.float32], known: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Divide by the local strength, so that weak and strong edges count alike."""
+    """Divide by the local strength, so that weak and strong edges have equal weight."""
     strength = np.einsum("ijk,ijk->ij", values, values) * known
     local = np.sqrt(_broadly(strength) / np.maximum(_broadly(known), 1e-3))
     floor = 0.1 * float(np.median(local[known > 0.0])) if (known > 0.0).any() else 1.0

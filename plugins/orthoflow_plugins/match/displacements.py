@@ -1,7 +1,7 @@
-"""How far two pictures of one wall are displaced at chosen places, to a fraction of a cell.
+"""Displacements between two pictures of one wall at chosen places, to a fraction of a cell.
 
-First the best whole cell by correlation within a radius, then least-squares matching (Grün 1985):
-the shift, with its standard deviation, that brings both patches together.
+The best whole cell by correlation within a radius, then least-squares matching (Grün 1985): the
+shift that aligns both patches, with its standard deviation.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,20 +26,8 @@ _CONVERGED_CELLS: Final = 0.002
 _MAX_STEP_CELLS: Final = 0.7
 _MIN_KNOWN_SHARE: Final = 0.3
 _RIDGE: Final = 1e-3
-# Of the cells that a search looks at, which are every second: neighbours still agree somewhat.
+# Correlation between neighbouring cells of a search leaves one independent cell in this many.
 _INDEPENDENT: Final = 1.5
-
-
-class Picture(NamedTuple):
-    """A picture of several channels.
-
-    Attributes:
-        values: (rows, cols, c) float32.
-        known: (rows, cols) float32, 1 where values mean something, else 0.
-    """
-
-    values: NDArray[np.float32]
-    known: NDArray[np.float32]
 
 
 @compiled
@@ -58,7 +46,7 @@ def search_shifts(
         places: (n, 2) int64 (column, row), at least half + radius cells from the border.
         reach: half, radius: patches are 2 half + 1 cells wide, shifts up to the radius are tried.
         found: (n, 4) float64, filled with the shift (across, down), its correlation, and its lead
-            over the best place elsewhere, -1 where the best lies on the rim of the search.
+            over the best of the others, -1 if it lies on the border of the search.
     """
     side = 2 * reach[1] + 1
     scores = np.empty(side * side)
@@ -78,13 +66,13 @@ def search_mixtures(
     reach: tuple[int, int],
     found: NDArray[np.float64],
 ) -> None:
-    """As `search_shifts`, with the mixture of the second's channels that fits best at each shift.
+    """Like `search_shifts`, with the combination of the second's channels that fits best.
 
     Args:
         first: (rows, cols, 1) float32.
         second: (rows, cols, 3) float32.
-        places: as there.
-        reach: as there.
+        places: as in `search_shifts`.
+        reach: as in `search_shifts`.
         found: (n, 7) float64, as there, and the gains of the three channels at the best shift.
     """
     side = 2 * reach[1] + 1
@@ -115,7 +103,7 @@ def _take_best(scores: NDArray[np.float64], found: NDArray[np.float64]) -> None:
     found[2] = scores[top]
     found[3] = -1.0
     if 0 < down < side - 1 and 0 < across < side - 1:
-        # Correlations reach down to -1: that much the best leads by where no other place is.
+        # The lead over nothing is that over the smallest correlation.
         elsewhere = -1.0
         for k in range(side * side):
             if max(abs(k // side - down), abs(k % side - across)) > 2:
@@ -130,7 +118,7 @@ def _mixed(
     where: tuple[tuple[int, int], tuple[int, int], int],
     gains: NDArray[np.float64],
 ) -> float:
-    """Correlation of a patch with the best mixture of three channels, whose gains are filled in."""
+    """Correlate a patch with the best combination of three channels, whose gains are filled in."""
     at, to, half = where
     n, sa, sb, sc, sd = 0, 0.0, 0.0, 0.0, 0.0
     saa, sab, sac, sad = 0.0, 0.0, 0.0, 0.0
@@ -149,7 +137,7 @@ def _mixed(
     saa, sab, sac, sad = saa - sa * sa / n, sab - sa * sb / n, sac - sa * sc / n, sad - sa * sd / n
     sbc, sbd, scd = sbc - sb * sc / n, sbd - sb * sd / n, scd - sc * sd / n
     sbb, scc, sdd = sbb - sb * sb / n, scc - sc * sc / n, sdd - sd * sd / n
-    # Colours of one material follow each other: their small differences must not decide.
+    # Channels of one material are nearly collinear: their small differences must not decide.
     ridge = _RIDGE * (sbb + scc + sdd) + 1e-12
     sbb, scc, sdd = sbb + ridge, scc + ridge, sdd + ridge
     # Cofactors of the symmetric matrix of products.
@@ -160,7 +148,7 @@ def _mixed(
     gains[1] = (kbc * sab + kcc * sac + kcd * sad) / determinant
     gains[2] = (kbd * sab + kcd * sac + kdd * sad) / determinant
     explained = gains[0] * sab + gains[1] * sac + gains[2] * sad
-    # Three gains fit some of what is chance: of the rest, as much as they may have taken.
+    # Adjusted for the degrees of freedom of three gains, which fit some of the noise.
     free = n / _INDEPENDENT
     share = explained / max(saa, 1e-20)
     return math.sqrt(max(0.0, 1.0 - (1.0 - share) * (free - 1.0) / max(free - 4.0, 1.0)))
@@ -174,7 +162,7 @@ def _correlation(
     to: tuple[int, int],
     half: int,
 ) -> float:
-    """Correlation of two patches, each channel without its mean."""
+    """Correlate two patches, each channel without its mean."""
     cross, own, other = 0.0, 0.0, 0.0
     for c in range(first.shape[2]):
         n, sa, sb, saa, sbb, sab = 0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -196,8 +184,8 @@ def _correlation(
 
 @compiled
 def match_patches(
-    first: Picture,
-    second: Picture,
+    first: Channels,
+    second: Channels,
     places: NDArray[np.int64],
     window: NDArray[np.float64],
     patch: tuple[NDArray[np.float64], ...],
@@ -206,14 +194,14 @@ def match_patches(
     """Least-squares matching of each patch: shift, a gain, an offset per channel.
 
     Args:
-        first: `Picture`.
-        second: `Picture`.
+        first: the first picture.
+        second: the second one.
         places: (n, 2) int64 (column, row) of the patches' centres in the first picture.
         window: (p, p) float64 weights of a patch's cells.
-        patch: room to work in: (p, p), (p + 3, p, c) and (p, p, c) float64.
-        found: (n, 4) float64: the shift (across, down), improved in place; filled with the
-            standard deviation of a coordinate for independent cells, inf where a patch fixes none,
-            and the correlation.
+        patch: scratch arrays: (p, p), (p + 3, p, c) and (p, p, c) float64.
+        found: (n, 4) float64: the shift (across, down), refined in place; filled with the standard
+            deviation of a coordinate for independent cells, inf if undetermined, and the
+            correlation.
     """
     weight, lines, moved = patch
     least = 0.0
@@ -243,13 +231,13 @@ def match_patches(
 
 @kernel_part
 def _sample(
-    first: Picture,
-    second: Picture,
+    first: Channels,
+    second: Channels,
     place: tuple[int, int],
     shift: tuple[float, float],
     patch: tuple[NDArray[np.float64], ...],
 ) -> float:
-    """Resample the second picture around a shifted place; give the sum of the weights."""
+    """Resample the second picture around a shifted place and return the sum of the weights."""
     window, weight, lines, moved = patch
     rows, columns, n_channels = second.values.shape
     side = len(window)
@@ -314,7 +302,7 @@ def _improvement(
     moved: NDArray[np.float64],
     total: float,
 ) -> tuple[float, float, float, float]:
-    """One Gauss-Newton step (down, across), its standard deviation, and the correlation."""
+    """Return a Gauss-Newton step (down, across), its standard deviation, and the correlation."""
     side, n_channels = len(weight), values.shape[2]
     top, left = place[0] - side // 2, place[1] - side // 2
     # Sums of products of: a, reference; b, moved; x and y, slopes across and down.
@@ -353,13 +341,13 @@ def _improvement(
     )
 
 
-# Patches of which less is known than this say nothing.
+# Patches of which less is known are not measured.
 _MIN_KNOWN: Final = 0.6
 CORRELATION_AREA_CELLS: Final = 6.0
-"""Neighbouring residuals of smoothed pictures agree: independent ones are this much fewer."""
+"""Area over which residuals of smoothed pictures correlate: one independent cell in this many."""
 _MAX_DRIFT_CELLS: Final = 1.5
 _MAX_DISAGREEMENT_CELLS: Final = 0.5
-# About patches that are cut out: as far as they drift, and what interpolates there.
+# Margin of patches that are cut out: the drift, and the neighbours of the interpolation.
 _CUT_MARGIN_CELLS: Final = 6
 
 
@@ -369,7 +357,7 @@ class Displacements(Rows):
 
     Attributes:
         places: (n, 2) intp (column, row) cells of the first picture.
-        shift_cells: (n, 2) float64: what is at cell + shift in the second picture.
+        shift_cells: (n, 2) float64 from a cell to the same place in the second picture.
         score: (n,) correlation.
         sigma_cells: (n,) float64 standard deviation of a coordinate of the shift.
     """
@@ -392,18 +380,18 @@ def measure(
 ) -> Displacements:
     """Measure displacements from the first picture to the second at cells (n, 2) of the first.
 
-    Where the first has one channel and the second three, each patch of the first is compared with
-    the mixture of the second's channels that fits it best.
+    If the first has one channel and the second three, each patch of the first is compared with the
+    combination of the second's channels that fits it best.
 
     Args:
         first: the first picture.
         second: the second one.
         places: (column, row) of the first picture.
-        radius_cells: how far is looked.
-        min_score: smallest correlation; half of what patches of right places have (0.35), less
-            where patches are many and judged by their neighbours.
+        radius_cells: search radius.
+        min_score: smallest correlation; half of that of right places (0.35), less where patches are
+            many and judged by their neighbours.
         min_distinct: by how much the best correlation must exceed the next peak.
-        threads: patches are shared between so many.
+        threads: number of threads.
     """
     places = _well_known(first, second, places, radius_cells)
     is_mixed = (first.values.shape[2], second.values.shape[2]) == (1, 3)
@@ -429,7 +417,7 @@ def _mixed_and_refined(
     min_score: float,
     threads: int,
 ) -> Displacements:
-    """Refine each patch in a mixture of its own: all patches, cut out, one below the other."""
+    """Refine each patch in its own combination of channels: patches are cut out and stacked."""
     begun = found[:, :2].astype(np.intp)
     reach = HALF_PATCH_CELLS + _CUT_MARGIN_CELLS
     one = _cut_out(first, places, reach, np.ones((len(places), 1), dtype=np.float32))
@@ -445,7 +433,7 @@ def _mixed_and_refined(
 def _cut_out(
     picture: Channels, centres: NDArray[np.intp], reach: int, gains: NDArray[np.float32]
 ) -> Channels:
-    """Cut out patches about centres (n, 2), each mixed by its gains (n, c) to a single channel."""
+    """Cut out patches about centres (n, 2), each combined by its gains (n, c) to one channel."""
     side = 2 * reach + 1
     rows, columns = picture.known.shape
     values, known = (np.zeros((len(centres), side, side), dtype=np.float32) for _ in range(2))
@@ -466,7 +454,7 @@ def _cut_out(
 def _well_known(
     first: Channels, second: Channels, places: NDArray[np.intp], radius_cells: int
 ) -> NDArray[np.intp]:
-    """Places whose search stays inside the pictures and whose patches are mostly known."""
+    """Select places whose search stays inside the pictures and whose patches are mostly known."""
     import cv2
 
     reach = radius_cells + HALF_PATCH_CELLS + 2
@@ -488,7 +476,7 @@ def _refined(
 ) -> Displacements:
     begun = found[:, :2]
     forth, sigma_forth, score = _matched(first, second, places, begun, threads)
-    # Both ways, halved: what interpolation does to one of the pictures then cancels.
+    # Half the difference of both directions: effects of interpolating one picture cancel.
     middle = np.rint(forth).astype(np.intp)
     back, sigma_back, _ = _matched(second, first, places + middle, -forth, threads)
     shifts = 0.5 * (forth - back)
@@ -512,12 +500,11 @@ def _matched(
     begun: NDArray[np.float64],
     threads: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Shifts (n, 2), their standard deviations (n,) and correlations (n,)."""
-    one, other = (Picture(picture.values, picture.known) for picture in (first, second))
+    """Return shifts (n, 2), their standard deviations (n,) and correlations (n,)."""
     places = np.ascontiguousarray(places)
     found = np.zeros((len(places), 4))
     found[:, :2] = begun
-    # The middle of a patch counts more, the border hardly.
+    # Gaussian weights: the border of a patch hardly counts.
     steps = np.arange(-HALF_PATCH_CELLS, HALF_PATCH_CELLS + 1) / (0.6 * HALF_PATCH_CELLS)
     bell = np.exp(-0.5 * steps**2)
     window = np.outer(bell, bell)
@@ -525,9 +512,9 @@ def _matched(
     shapes = ((side, side), (side + 3, side, n_channels), (side, side, n_channels))
     in_threads(
         [
-            partial(match_patches, one, other, places[part], window, rooms, found[part])
+            partial(match_patches, first, second, places[part], window, scratch, found[part])
             for part in even_parts(len(places), threads)
-            for rooms in [tuple(np.empty(shape) for shape in shapes)]
+            for scratch in [tuple(np.empty(shape) for shape in shapes)]
         ]
     )
     sigma = math.sqrt(CORRELATION_AREA_CELLS) * found[:, 2]

@@ -1,4 +1,4 @@
-"""`match.guided`: photos already oriented roughly, matched where they must lie on the walls."""
+"""`match.guided`: photos with approximate poses, matched near their positions on the walls."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ if TYPE_CHECKING:
     from orthoflow_plugins.match.tracing import Trace
     from orthoflow_plugins.match.warping import Before
 
-# Points of the cloud with fewer about them are outliers and hide nothing, as in `ortho`.
+# Points of the cloud with fewer neighbours are outliers and hide nothing, as in `ortho`.
 _MIN_POINTS = 6
 NOTHING_AGREES: Final = DiagnosticSpec(
     code="photo-without-matches",
     severity="warning",
-    text="photo {subject}: no place on the walls matches it at its pose",
+    text="photo {subject}: no part of the walls matches it at its pose",
     remedy="check its pose, or remove it",
 )
 
 
 class MatchGuided(Method):
-    """Warp each photo into the walls by its pose and measure how far it is displaced there.
+    """Warp each photo onto the walls by its pose and measure its displacements there.
 
-    Only what the photo shows of a wall is searched, within a small radius (the mask of
-    markiewicz2015 taken to its end), in oriented gradients and in mixtures of the photo's colours,
-    which survive that a laser sees another colour than a camera. Cells finer than points lie apart
-    are joined for it; patches keep off steps of the relief and, with the cloud wired, off what
-    stands free before the walls. The pose is refitted and the photo warped again until held-out
-    ties stop improving. Photos without a pose are looked for on what the others show of the walls,
-    then traced like these; those not found there give no ties.
+    Only the visible part of a wall is searched, within a small radius (the mask of markiewicz2015
+    taken further), in oriented gradients, grey values and combinations of the photo's colours,
+    which allow for the different wavelengths of laser and camera. Cells finer than the point
+    spacing are joined; patches avoid steps of the relief and, with the cloud wired, parts that
+    objects before the walls hide. The pose is refitted and the photo warped again until held-out
+    ties stop improving. Photos without a pose are matched with what the others show of the walls
+    first; those not found there give no ties.
     """
 
     id: ClassVar[str] = "match.guided"
@@ -81,28 +81,28 @@ class MatchGuided(Method):
     )
 
     class Params(MethodParams):
-        """What is compared, and how many ties."""
+        """Channels that are compared, and number of ties."""
 
         preset: Literal["none", "paper"] = Field(
             default="none",
-            description="paper: only the mask of markiewicz2015: key points as OpenCV sets "
-            "SIFT, those of a wall that the photo shows by its pose with their best match in "
-            "the photo, once; of the other options `ratio` applies.",
+            description="paper: only the mask of markiewicz2015: OpenCV's default SIFT, the best "
+            "match in the photo of each key point of a wall that it shows by its pose, once; of "
+            "the other options `ratio` applies.",
         )
         ratio: float | None = Field(
             default=None,
             gt=0,
             le=1,
-            description="With preset: paper alone: largest distance of the best match over the "
-            "second best, 0.8 unless given, as its openMVG has it; null for any.",
+            description="Only with preset: paper: largest distance of the best match over the "
+            "second best, 0.8 unless given, as in openMVG; null for any.",
         )
         channels: Literal["auto", "gradients", "grey", "colours"] = Field(
             default="auto",
-            description="What is compared: oriented gradients; the grey itself, which is sharper "
-            "where laser and camera see the same; colours, mixed in each patch as fits the wall "
-            "best, where they do not. auto: gradients and grey, and colours where grey is not the "
-            "better one; each photo keeps what has the smallest error of held-out ties over the "
-            "root of their number and over how far apart they lie.",
+            description="Channels that are compared: oriented gradients; grey values, which are "
+            "sharper where laser and camera are similar; colours, combined in each patch to fit "
+            "the wall best, where they are not. auto: gradients and grey, and colours where grey "
+            "is not better; each photo keeps the channels with the smallest error of held-out "
+            "ties over the root of their number and over their spread.",
         )
         max_ties: int = Field(
             default=1200, ge=50, description="Places measured per photo, spread evenly."
@@ -114,7 +114,7 @@ class MatchGuided(Method):
             return with_paper_ratio(given)
 
     class In(Ports):
-        """Photos, the walls, where the photos were taken, roughly, the cloud, ties by hand."""
+        """Photos, walls, approximate orientations, the cloud, and ties measured by hand."""
 
         photos: Photos
         walls: Walls
@@ -123,12 +123,12 @@ class MatchGuided(Method):
         hand: Ties | None = None
 
     class Out(Ports):
-        """Points of the photos known on the walls."""
+        """Tie points between photos and walls."""
 
         ties: Ties
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Trace the oriented photos on the walls, find those without a pose, and make ties."""
+        """Match the oriented photos with the walls, then those without a pose."""
         photos, walls = inputs.photos, inputs.walls
         require_photos(photos)
         if inputs.cloud is not None:
@@ -151,7 +151,7 @@ class MatchGuided(Method):
 
     @classmethod
     def tools(cls) -> dict[str, str]:
-        """OpenCV warps and correlates."""
+        """OpenCV warps and filters."""
         return opencv_version()
 
 
@@ -161,11 +161,11 @@ def _traced(
     params: MatchGuided.Params,
     ctx: StepContext,
 ) -> dict[str, Trace]:
-    """Trace oriented photos on the walls, and those that they help to find, by name."""
+    """Match oriented photos with the walls, and those found by them; results by name."""
     from orthoflow_plugins.match.channels import in_cells_of_points, target_of
     from orthoflow_plugins.match.tracing import (
         CONTENTS,
-        Desk,
+        Setup,
         estimated_lens,
         recovered_traces,
         trace_photo,
@@ -174,7 +174,7 @@ def _traced(
     photos = inputs.photos.photos
     indices = [index for index, photo in enumerate(photos) if photo.name in oriented]
     ctx.progress(0.0, "walls")
-    desk = Desk(
+    setup = Setup(
         targets=[target_of(in_cells_of_points(wall)) for wall in inputs.walls.walls],
         before=_before(inputs, [oriented[photos[index].name] for index in indices]),
         max_ties=params.max_ties,
@@ -185,7 +185,7 @@ def _traced(
     def trace(index: int) -> Trace:
         photo = photos[index]
         lens = estimated_lens(photo, oriented[photo.name].intrinsics)
-        return trace_photo(index, photo, oriented[photo.name].viewing(), desk, lens)
+        return trace_photo(index, photo, oriented[photo.name].viewing(), setup, lens)
 
     traces: dict[str, Trace] = {}
     for index, found in zip(indices, one_by_one(trace, indices, ctx.cores), strict=True):
@@ -196,14 +196,14 @@ def _traced(
             ctx.report(NOTHING_AGREES, subject=name)
     if len(indices) == len(photos):
         return traces
-    recovered = recovered_traces(inputs.photos, oriented, desk, list(traces.values()))
+    recovered = recovered_traces(inputs.photos, oriented, setup, list(traces.values()))
     for name in recovered:
-        ctx.log(f"photo {name}: found with what other photos show of the walls")
+        ctx.log(f"photo {name}: found by what other photos show of the walls")
     return traces | recovered
 
 
 def _oriented(cameras: Cameras) -> dict[str, Camera]:
-    """Cameras of the oriented photos by name.
+    """Return the cameras of oriented photos by name.
 
     Raises:
         MethodError: no photo is oriented.
@@ -219,7 +219,7 @@ def _oriented(cameras: Cameras) -> dict[str, Camera]:
 
 
 def _before(inputs: MatchGuided.In, cameras: list[Camera]) -> Before | None:
-    """What stands free before the walls, where the cloud is wired."""
+    """Return the points before the walls if the cloud is wired."""
     from orthoflow.geometry.occluders import occluders_before
     from orthoflow_plugins.match.warping import Before
 
@@ -234,7 +234,7 @@ def _before(inputs: MatchGuided.In, cameras: list[Camera]) -> Before | None:
         spacing_m=walls.points_apart_m(),
         stations_world=cloud.stations,
         n_least=_MIN_POINTS,
-        # Photos share the processors already.
+        # Photos are processed in parallel already.
         threads=1,
     )
     return Before(occluders=occluders, front_m=tuple(slab.front_m for slab in slabs))

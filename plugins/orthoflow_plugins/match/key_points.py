@@ -1,8 +1,8 @@
-"""Key points of photos and walls, and what a photo shares with walls by them.
+"""Key points of photos and walls, and their matches.
 
-OpenCV's SIFT moves every key point by a quarter of a pixel, right and down, unless its precise
-upscaling is on (opencv issue 23123; measured with 5.0: 0.25 px, of all sizes). That would be a
-systematic error of the orientation, so it is taken off where the upscaling is left as it was.
+OpenCV's SIFT shifts every key point by a quarter of a pixel, right and down, unless its precise
+upscaling is on (opencv issue 23123; measured with 5.0: 0.25 px, for all sizes). That would be a
+systematic error of the orientation, so it is subtracted where the upscaling is the default one.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from orthoflow_plugins.match.pictures import (
     wall_picture,
 )
 
-# OpenCV's own contrast, half of which still brings right matches, and its ratio of curvatures.
+# OpenCV's default contrast, half of which still gives right matches, and its ratio of curvatures.
 _OPENCV_CONTRAST: Final = 0.04
 _MIN_CONTRAST: Final = 0.02
 _MAX_EDGE_RATIO: Final = 10.0
@@ -48,33 +48,28 @@ _TILE_OVERLAP_PX: Final = 96
 _SPREAD_CELLS: Final = 12
 # Smaller pictures have no key points.
 _MIN_SIDE_PX: Final = 16
-# A photo is tried at this size first, then at twice, until a wall is recognised.
+# A photo is matched at this size first, then at twice the size, until a wall is recognised.
 _FIRST_SIDE_PX: Final = 800
-# So many key points of a photo and of each wall suffice to tell which walls a photo shows.
+# Key points of a photo and of each wall that suffice to recognise the walls in a photo.
 _FIRST_IN_PHOTO: Final = 3000
 _FIRST_ON_WALL: Final = 4000
-# The homography of a wall with relief is only roughly right: share of the photo's diagonal.
+# A homography is approximate on a wall with relief: tolerance over the photo's diagonal.
 _LOOSE_SHARE: Final = 0.02
-# A factor of 1.4 between pixels and cells is nothing to key points that have a size of their own.
+# A factor of 1.4 between pixels and cells does not matter to scale-invariant key points.
 _LOG_SCALE_APART: Final = 0.35
-# A photo whose mirror image is recognised by so many matches, and by so many times more than it, is
-# mirrored; a front that is symmetric or repeats gives both about as many.
-_CLEARLY_MIRRORED: Final = 24
-_MIRRORED_OVER: Final = 2
-# In the second look, a key point's size (log2) and direction are those expected, up to so much.
+# Tolerances of a key point's size (log2) and direction in the guided match.
 _MAX_LOG_SIZE: Final = 0.7
 _MAX_ANGLE_DEG: Final = 30.0
 _VOID_MARGIN_CELLS: Final = 3
 MIN_AGREEING: Final = 8
-"""Matches that agree with one homography where a photo shows a wall."""
+"""Fewest matches with a common homography by which a wall is recognised."""
 _SEED: Final = 1
-# Matches in one square of this side are one place.
+# Matches in one square of this side count once.
 _PLACE_PX: Final = 2.0
 
-# Key points bear another strength of contrast, not another sign. A laser that sees red dark, or
-# bright what the eye sees dark, shows half of all edges the other way round than grey does; in a
-# mixture of the photo's colours most are as the laser sees them. Which mixture that is nobody knows
-# beforehand: the one is taken in which most key points agree.
+# Descriptors are invariant to the strength of contrast, not to its sign. If materials differ in
+# brightness between laser and photo, half of all edges may be inverted; a combination of the
+# photo's colours may restore most signs. Which one is unknown: the one with most matches is taken.
 MIXTURES: Final[Mapping[str, tuple[float, float, float]]] = {
     "green less red": (-1.0, 1.0, 0.0),
     "red as dark": (-1.0, 0.0, 0.0),
@@ -82,28 +77,28 @@ MIXTURES: Final[Mapping[str, tuple[float, float, float]]] = {
     "negative": (-0.299, -0.587, -0.114),
     "red less green": (1.0, -1.0, 0.0),
 }
-"""By name, weights of red, green and blue, in the order in which they are tried."""
+"""Weights of red, green and blue by name, in the order in which they are tried."""
 
-# Measured in rooms of inverted contrast: up to 15 matches agreed on a wrong place, and once 19. A
-# mixture that recognises a wall needs more than 15, as there are several of them.
+# In rooms of inverted contrast up to 15 matches agreed on a wrong place, and once 19. A mixture
+# needs more than 15 matches, as several are tried.
 LEAST: Final = 16
-# From so many on, neither another mixture is tried nor structure.
+# With this many matches, neither another mixture nor structure is tried.
 CLEARLY: Final = 24
-# A mixture is there to find the place, not to measure it.
+# Mixtures find the place and need not measure it.
 _LONGEST_SIDE_PX: Final = 2000
-# A photo without colours has but one mixture.
+# A photo without colours has only one mixture.
 _MIN_GREY_LEVELS: Final = 8.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Features(Rows):
-    """Key points of an image: the first n of them are the n strongest, spread over the image.
+    """Key points of an image: the first n are the n strongest, spread over the image.
 
     Attributes:
         pixels: (n, 2) float64 (u, v), first pixel centre at (0.5, 0.5).
         sizes_px: (n,) float64 diameter of the described neighbourhood.
         angles_deg: (n,) float64 main direction of the gradient, clockwise from u.
-        descriptors: (n, 128) float32 RootSIFT, or SIFT where asked for, whole numbers.
+        descriptors: (n, 128) float32 RootSIFT or SIFT, whole numbers.
     """
 
     pixels: NDArray[np.float64]
@@ -112,11 +107,11 @@ class Features(Rows):
     descriptors: NDArray[np.float32]
 
     def undescribed(self) -> Features:
-        """Return places and sizes without the descriptors, which are most of the bytes."""
+        """Return positions and sizes without the descriptors, which take most memory."""
         return replace(self, descriptors=self.descriptors[:, :0].copy())
 
     def strongest(self, n_most: int) -> Features:
-        """Return the first ones, without copying them."""
+        """Return the first key points without a copy."""
         return self.take(slice(n_most))
 
     def scaled(self, factor: float) -> Features:
@@ -124,10 +119,10 @@ class Features(Rows):
         return replace(self, pixels=self.pixels * factor, sizes_px=self.sizes_px * factor)
 
     def mirrored(self, width_px: float) -> Features:
-        """Give the key points as they would be in the image of this width, left and right swapped.
+        """Return the key points of the image of this width with left and right swapped.
 
-        Mirroring keeps the main direction of a key point as its own: along it, the rows of the
-        4 x 4 fields of 8 directions swap, and directions turn the other way.
+        Relative to the main direction, mirroring swaps the rows of the 4 x 4 fields of 8 directions
+        and reverses the sense of the directions.
         """
         fields = self.descriptors.reshape(-1, 4, 4, 8)[:, ::-1]
         turned = fields[..., (8 - np.arange(8)) % 8]
@@ -150,9 +145,9 @@ def find_features(
 
     Args:
         picture: (rows, cols) grey.
-        max_features: at most so many.
+        max_features: maximum number.
         usable: (rows, cols), False where no key point may lie; None allows all.
-        as_opencv: SIFT as OpenCV sets it (markiewicz2015): other contrast, descriptors as they are.
+        as_opencv: OpenCV's default SIFT (markiewicz2015): higher contrast, SIFT descriptors.
     """
     import cv2
 
@@ -169,7 +164,7 @@ def find_features(
     ]
     points = np.vstack([tile[1] for tile in tiles])
     pixels = points[:, :2]
-    # Threads find key points in any order; the image alone orders them.
+    # OpenCV's threads return key points in any order.
     chosen = np.lexsort(points[:, :4].T)
     if usable is not None:
         most = np.array(usable.shape[::-1]) - 1
@@ -192,8 +187,8 @@ def find_features(
 
 
 _Tile = tuple[tuple[slice, slice], NDArray[np.float64], list[Any]]
-"""Key points that a tile of an image owns: rows and columns that were looked at, a margin wider
-than the tile; (n, 5) u, v, size, angle, response; and OpenCV's own, in the frame of these.
+"""Key points in a tile of an image: rows and columns that were searched, with a margin; (n, 5) u,
+v, size, angle, response; and OpenCV's key points in the frame of the searched part.
 """
 
 
@@ -223,10 +218,10 @@ def _in_tile(
 def _described(
     sift: Any, picture: NDArray[np.uint8], tiles: list[_Tile], chosen: NDArray[np.intp]
 ) -> NDArray[np.float32]:
-    """SIFT descriptors (n, 128) of chosen key points, counted through all tiles.
+    """Compute SIFT descriptors (n, 128) of chosen key points, numbered through all tiles.
 
-    Only what is kept is described: of a rich picture that is one key point in ten, and describing
-    takes longer than finding.
+    In a picture with much texture one key point in ten is kept, and description takes longer than
+    detection.
     """
     raw = np.empty((len(chosen), 128), dtype=np.float32)
     first = 0
@@ -240,7 +235,7 @@ def _described(
 
 
 class PairingParams(MethodParams):
-    """How photos are paired with walls by key points."""
+    """How photos are matched with walls by key points."""
 
     max_features: int = Field(
         default=8000, ge=50, description="Key points per photo and per wall, spread evenly."
@@ -262,7 +257,7 @@ class PairingParams(MethodParams):
 
     @property
     def max_ratio(self) -> float:
-        """The ratio up to which matches count, 1 where all do."""
+        """Largest ratio of a match; 1 allows any."""
         return 1.0 if self.ratio is None else self.ratio
 
 
@@ -273,9 +268,9 @@ class Pair:
     Attributes:
         wall: index of the wall.
         matches: first = key points of the photo, second = of the wall.
-        agreeing: (n,) bool, which agree with one homography, roughly.
+        agreeing: (n,) bool, inliers of an approximate homography.
         is_shown: enough agree, and the wall is not seen from behind.
-        homography: (3, 3) photo pixels from wall pixels, roughly, of a wall that is shown.
+        homography: (3, 3) approximate, photo pixels from wall pixels, of a wall that is shown.
     """
 
     wall: int
@@ -287,19 +282,17 @@ class Pair:
 
 @dataclass(frozen=True, kw_only=True)
 class PhotoPairs:
-    """What the walls share with a photo.
+    """Matches of a photo with all walls.
 
     Attributes:
         features: key points of the photo, pixels of the full image.
-        scale: the photo was matched shrunk by this.
-        pairs: one per wall that had matches.
-        radius_px: matches were also searched so far from where a homography puts them; a wrong
-            one's matches lie evenly within this.
-        is_mirrored: the walls recognise the mirrored photo better; then none counts as shown.
-        is_surely_mirrored: they do so clearly, at two sizes of the photo with key points of their
-            own; else it may show a pattern that repeats, or another wall.
-        n_recognised: matches that agreed before others were searched where these put them.
-        picture: what of the photo was matched.
+        scale: factor by which the photo was reduced.
+        pairs: one per wall with matches.
+        radius_px: radius of the guided match; matches with a wrong homography are evenly
+            distributed within it.
+        is_mirrored: the mirrored photo matches better; then no wall counts as shown.
+        n_recognised: inliers before the guided match.
+        picture: grey or name of the mixture.
     """
 
     features: Features
@@ -307,23 +300,22 @@ class PhotoPairs:
     pairs: tuple[Pair, ...]
     radius_px: float
     is_mirrored: bool = False
-    is_surely_mirrored: bool = False
     n_recognised: int = 0
     picture: str = "grey"
 
     @property
     def n_verified(self) -> int:
-        """Ties that agree, over the walls shown."""
+        """Inliers over the walls shown."""
         return sum(int(pair.agreeing.sum()) for pair in self.pairs if pair.is_shown)
 
 
 def wall_features(wall: Wall, max_features: int, *, as_opencv: bool = False) -> Features | None:
-    """Key points of a wall's intensity; None where it shows nothing.
+    """Find key points of a wall's intensity; None without intensity.
 
     Args:
         wall: the wall.
-        max_features: at most so many.
-        as_opencv: as `find_features` has it, of the picture as it is.
+        max_features: maximum number.
+        as_opencv: as in `find_features`, in the intensity without equalisation.
     """
     clip_limit = 0.0 if as_opencv else CLIP_LIMIT
     picture = wall_picture(wall, clip_limit=clip_limit, void_margin_cells=_VOID_MARGIN_CELLS)
@@ -338,15 +330,15 @@ def wall_features(wall: Wall, max_features: int, *, as_opencv: bool = False) -> 
 def pair_photo(
     grey: NDArray[np.uint8], walls: Sequence[Features | None], params: PairingParams
 ) -> PhotoPairs:
-    """Recognise the walls in a photo, coarse to fine, then match these at their own resolution.
+    """Recognise the walls in a photo, coarse to fine, then match them at their own resolution.
 
-    Key points of a photo much finer than the raster find no partner there, but many false ones;
-    at one cell per pixel both show the same detail (domain measurements: 2 to 5 times the ties).
+    Key points of a photo much finer than the raster have no partner there, but many false ones; at
+    one cell per pixel both show the same detail, which gives 2 to 5 times the tie points.
 
     Args:
         grey: (height, width) of the photo.
-        walls: key points per wall, None where it shows nothing.
-        params: how.
+        walls: key points per wall, None without intensity.
+        params: how to match.
     """
     seeker = _Seeker(grey=grey, params=params)
     first, features = seeker.first_look(walls)
@@ -355,15 +347,8 @@ def pair_photo(
     n_mirrored = seeker.n_verified_mirrored(first, walls)
     if n_mirrored > first.n_verified:
         refused = tuple(replace(pair, is_shown=False, homography=None) for pair in first.pairs)
-        return replace(
-            first,
-            pairs=refused,
-            is_mirrored=True,
-            is_surely_mirrored=_is_mirror(n_mirrored, first.n_verified)
-            and seeker.is_mirror_at_another_size(first, walls),
-            n_recognised=first.n_verified,
-        )
-    # How many wall cells a pixel of the photo, as it was matched, is wide.
+        return replace(first, pairs=refused, is_mirrored=True, n_recognised=first.n_verified)
+    # Wall cells per pixel of the reduced photo.
     ratios = [
         wall.sizes_px[pair.matches.second[pair.agreeing]]
         / (first.features.sizes_px[pair.matches.first[pair.agreeing]] * first.scale)
@@ -383,15 +368,15 @@ def pair_photo(
 def pair_in_colours(
     photo: Photo, walls: Sequence[Features | None], params: PairingParams
 ) -> PhotoPairs:
-    """Pair a photo with walls in grey; where that shows none clearly, in mixtures of its colours.
+    """Match a photo with walls in grey; if that shows none clearly, in mixtures of its colours.
 
     Args:
         photo: the photo.
-        walls: key points per wall, None where it shows nothing.
-        params: how.
+        walls: key points per wall, None without intensity.
+        params: how to match.
 
     Returns:
-        What most key points agree in, grey where no mixture has more.
+        The matches of the picture with most inliers, grey unless a mixture has more.
     """
     best = pair_photo(photo_grey(photo), walls, params)
     if best.n_recognised >= CLEARLY:
@@ -411,7 +396,7 @@ def pair_in_colours(
 
 
 def mixed(rgb: NDArray[np.uint8], name: str) -> NDArray[np.uint8] | None:
-    """Mix a photo's colours, stretched to all grey levels; None for what shows nothing.
+    """Combine a photo's colours, stretched to all grey levels; None without contrast.
 
     Args:
         rgb: (height, width, 3).
@@ -428,23 +413,23 @@ def mixed(rgb: NDArray[np.uint8], name: str) -> NDArray[np.uint8] | None:
 def side_matches(
     grey: NDArray[np.uint8], walls: Sequence[Features | None], params: PairingParams
 ) -> NDArray[np.intp]:
-    """Count the matches that agree when walls are seen from the front, and from behind.
+    """Count the inliers of a photo with walls seen from the front, and from behind.
 
     A wall whose normal points away from the viewer is a mirror image of what the photo shows.
 
     Args:
         grey: (height, width) of the photo.
-        walls: key points per wall, None where it shows nothing or is not asked about.
-        params: how.
+        walls: key points per wall, None without intensity or if its side is known.
+        params: how to match.
 
     Returns:
-        (walls, 2): front, behind; 0 where fewer than the least agree.
+        (walls, 2): front, behind; 0 below `MIN_AGREEING`.
     """
     seeker = _Seeker(grey=grey, params=params)
     counts = np.zeros((len(walls), 2), dtype=np.intp)
     scale = min(seeker.finest, _FIRST_SIDE_PX / max(grey.shape))
     while True:
-        # All key points: a wall that was laid on cells roughly shares few of the strongest.
+        # All key points: a coarsely rastered wall shares few of the strongest.
         features = seeker.key_points(scale)
         for side, seen in enumerate((features, features.mirrored(grey.shape[1]))):
             for pair in seeker.pairs(seen, scale, walls).pairs:
@@ -464,18 +449,18 @@ def rematched(
     radius_px: float,
     ratio: float,
 ) -> Matches:
-    """Add matches within reach of what is expected: place, size and direction of key points.
+    """Add matches near their expected position, size and direction (guided match).
 
-    A motif that repeats farther off no longer takes part in the ratio test, which brings several
-    times the matches.
+    Motifs that repeat farther away take no part in the ratio test, which gives several times the
+    matches.
 
     Args:
-        matches: of the first look; they stay.
+        matches: the matches so far, which are kept.
         sets: key points of the photo and of the wall.
-        expected: (m, 2) photo pixels where the wall's key points should be.
-        agreeing: (n,) bool, which of the first look's matches agree with that.
-        radius_px: how wrong it may be.
-        ratio: largest distance of the best over the second best within reach.
+        expected: (m, 2) expected photo pixels of the wall's key points.
+        agreeing: (n,) bool, inliers of the matches so far.
+        radius_px: search radius.
+        ratio: largest distance of the best over the second best within the radius.
     """
     photo, wall = sets
     good = matches.take(agreeing)
@@ -507,26 +492,26 @@ def rematched(
 
 @dataclass(frozen=True, kw_only=True)
 class _Seeker:
-    """Looks for walls in one photo."""
+    """Matches one photo with walls at several scales."""
 
     grey: NDArray[np.uint8]
     params: PairingParams
 
     @property
     def finest(self) -> float:
-        """Largest scale the photo is matched at."""
+        """Largest scale at which the photo is matched."""
         return min(1.0, self.params.max_side_px / float(max(self.grey.shape)))
 
     def key_points(self, scale: float) -> Features:
-        """Key points of the photo shrunk by a scale, in pixels of the full photo."""
+        """Find key points of the photo reduced by a scale, in pixels of the full photo."""
         small = equalised(shrunk(self.grey, scale), CLIP_LIMIT)
         return find_features(small, self.params.max_features).scaled(1.0 / scale)
 
     def first_look(self, walls: Sequence[Features | None]) -> tuple[PhotoPairs, Features]:
-        """Recognise walls at growing scales, by the strongest key points, or else by all.
+        """Recognise walls at increasing scales, by the strongest key points, or else by all.
 
         Returns:
-            The best pairs, and all key points at their scale.
+            The best matches, and all key points at their scale.
         """
         scale = min(self.finest, _FIRST_SIDE_PX / max(self.grey.shape))
         found: tuple[PhotoPairs, Features] | None = None
@@ -544,7 +529,7 @@ class _Seeker:
     def pairs(
         self, features: Features, scale: float, walls: Sequence[Features | None]
     ) -> PhotoPairs:
-        """Match key points, found at a scale, with walls, all that are not None."""
+        """Match key points found at a scale with the walls that are not None."""
         radius_px = _LOOSE_SHARE * math.hypot(*self.grey.shape)
         pairs = []
         for index, wall in enumerate(walls):
@@ -558,32 +543,14 @@ class _Seeker:
         return PhotoPairs(features=features, scale=scale, pairs=tuple(pairs), radius_px=radius_px)
 
     def n_verified_mirrored(self, first: PhotoPairs, walls: Sequence[Features | None]) -> int:
-        """Matches that would agree, over the walls shown, had the photo been mirrored.
+        """Count the inliers of the mirrored photo on the walls shown.
 
-        A front that is symmetric matches its own mirror image in part, and the pose found would
-        look right where it is.
+        A symmetric facade matches its own mirror image in part, with a plausible pose.
         """
         mirrored = first.features.mirrored(self.grey.shape[1])
         few = len(mirrored) <= _FIRST_IN_PHOTO
         shown = _shown(first, _strongest(walls) if few else walls)
         return self.pairs(mirrored, first.scale, shown).n_verified
-
-    def is_mirror_at_another_size(
-        self, first: PhotoPairs, walls: Sequence[Features | None]
-    ) -> bool:
-        """Whether the mirrored photo is also recognised by key points of another size of it."""
-        scale = 2.0 * first.scale if 2.0 * first.scale <= self.finest else 0.5 * first.scale
-        features, shown = self.key_points(scale), _shown(first, walls)
-        direct, mirrored = (
-            self.pairs(seen, scale, shown).n_verified
-            for seen in (features, features.mirrored(self.grey.shape[1]))
-        )
-        return _is_mirror(mirrored, direct)
-
-
-def _is_mirror(n_mirrored: int, n_direct: int) -> bool:
-    """Whether so many matches speak for a mirrored photo that a pattern's symmetry cannot."""
-    return n_mirrored >= max(_CLEARLY_MIRRORED, _MIRRORED_OVER * n_direct)
 
 
 def _strongest(walls: Sequence[Features | None]) -> list[Features | None]:
@@ -591,7 +558,7 @@ def _strongest(walls: Sequence[Features | None]) -> list[Features | None]:
 
 
 def _shown(pairs: PhotoPairs, walls: Sequence[Features | None]) -> list[Features | None]:
-    """Only the walls that a photo shows."""
+    """Keep only the walls that a photo shows."""
     shown = {pair.wall for pair in pairs.pairs if pair.is_shown}
     return [wall if index in shown else None for index, wall in enumerate(walls)]
 
@@ -599,13 +566,13 @@ def _shown(pairs: PhotoPairs, walls: Sequence[Features | None]) -> list[Features
 def verified(
     index: int, matches: Matches, sets: tuple[Features, Features], loose_px: float
 ) -> Pair:
-    """Ask which matches agree with one homography of a wall, roughly.
+    """Find the inliers of an approximate homography of a wall.
 
     Args:
         index: of the wall.
         matches: of key points of the photo and of the wall.
-        sets: these.
-        loose_px: matches agree up to this distance in the photo.
+        sets: these key points.
+        loose_px: largest distance of an inlier in the photo.
     """
     features, wall = sets
     source, target = wall.pixels[matches.second], features.pixels[matches.first]
@@ -616,14 +583,14 @@ def verified(
     if homography is not None:
         with np.errstate(divide="ignore", invalid="ignore"):
             agreeing = np.hypot(*(mapped(homography, source) - target).T) < loose_px
-    # Many key points of a texture may fall on one place of the other image: count places.
+    # Many key points of a texture may match one position in the other image: count positions.
     n_places = min(
         len(np.unique(np.floor(pixels[agreeing] / _PLACE_PX), axis=0))
         for pixels in (source, target)
     )
     is_shown = homography is not None and n_places >= MIN_AGREEING
     if homography is not None and is_shown:
-        # The wall keeps its sense of rotation in the photo; from behind it is mirrored.
+        # From behind, the sense of rotation is reversed.
         middle = source[agreeing].mean(axis=0)
         here, *there = mapped(homography, middle + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
         is_shown = bool(np.linalg.det(np.array(there) - here) > 0.0)
@@ -639,7 +606,7 @@ def verified(
 def _completed(
     pairs: PhotoPairs, walls: Sequence[Features | None], params: PairingParams
 ) -> PhotoPairs:
-    """Add what a second look finds, each key point only where the homography roughly puts it."""
+    """Add matches near the positions expected by the homographies."""
     completed = []
     for pair in pairs.pairs:
         wall = walls[pair.wall]
@@ -671,7 +638,7 @@ def _homography(
 
     params = sampling(loose_px, trials=10_000)
     params.confidence = 0.9999
-    params.sampler = cv2.SAMPLING_PROSAC  # takes the matches in the order of their quality
+    params.sampler = cv2.SAMPLING_PROSAC  # samples the best matches first
     order = np.argsort(ratio, kind="stable")
     try:
         found: Any = cv2.findHomography(source[order], target[order], params)[0]
@@ -682,7 +649,7 @@ def _homography(
 
 
 def sampling(threshold_px: float, *, trials: int) -> Any:
-    """Return how OpenCV samples robustly: MSAC, improved locally, the same each time."""
+    """Return parameters of robust sampling by OpenCV: MSAC with local optimisation, seeded."""
     import cv2
 
     params: Any = cv2.UsacParams()

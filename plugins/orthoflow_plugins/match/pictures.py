@@ -1,4 +1,4 @@
-"""Pictures to match: photos and wall rasters as grey of even contrast, and points on the walls."""
+"""Pictures to match: photos and wall rasters with equalised contrast, and points on the walls."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from orthoflow.geometry.threads import in_order
 from orthoflow.products import Photo, Photos, Wall, Walls
 
 _OPENCV: Final = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless")
-# Each works on a picture of its own, which takes up to a gigabyte.
+# Each thread takes up to a gigabyte for its picture.
 _MAX_AT_ONCE: Final = 4
 CLIP_LIMIT: Final = 3.0
 """Limit of local contrast equalisation (CLAHE)."""
 _TILES: Final = 8
 _CELL_SIGMA: Final = 1.0 / np.sqrt(12.0)
-# Depths about a point that differ by more than this many cells are an edge of the relief.
+# Depths about a point that differ by more cells are an edge of the relief.
 _SMOOTH_CELLS: Final = 1.0
-# Of how many cells, on an even surface, the usual spread of points is told.
+# Most and fewest cells on a smooth surface from which the usual spread of points is estimated.
 _MAX_SPREADS: Final = 100_000
 _MIN_SPREADS: Final = 100
-# A wall whose spread in depth is unknown is taken as this accurate, in cells.
+# Standard deviation of the depth where it cannot be estimated, in cells.
 _UNKNOWN_SIGMA_CELLS: Final = 0.5
 
 
@@ -42,7 +42,7 @@ def require_photos(photos: Photos) -> None:
 
 
 def require_intensity(walls: Walls) -> None:
-    """Refuse walls that show nothing.
+    """Refuse walls without intensity.
 
     Raises:
         MethodError: there are no walls, or none has intensity or colour.
@@ -64,11 +64,10 @@ def wall_picture(
     Args:
         wall: the wall.
         clip_limit: of the local equalisation; 0 only stretches the grey levels.
-        void_margin_cells: key points keep so far from the centre of larger voids.
+        void_margin_cells: half the side of the neighbourhood that must be measured.
 
     Returns:
-        Grey (rows, cols), void filled from around; and where enough of the neighbourhood was
-        measured.
+        Grey (rows, cols) with void interpolated; and cells whose neighbourhood was measured.
     """
     import cv2
 
@@ -80,7 +79,7 @@ def wall_picture(
     low, high = np.percentile(wall.intensity[known], (0.5, 99.5))
     scaled = (wall.intensity - low) / max(float(high - low), 1e-9)
     filled = filled_smoothly(np.where(known, np.clip(scaled, 0.0, 1.0), np.nan))
-    # Cells hold single points of a scan: their speckle hides the texture from key points.
+    # Cells hold single points of a scan, whose speckle hides the texture.
     grey = np.asarray(cv2.medianBlur(np.rint(filled * 255.0).astype(np.uint8), 3), dtype=np.uint8)
     side = 2 * void_margin_cells + 1
     share = cv2.blur(known.astype(np.float32), (side, side), borderType=cv2.BORDER_REPLICATE)
@@ -88,7 +87,7 @@ def wall_picture(
 
 
 def filled_smoothly(values: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Fill NaN from around, coarser the farther from what is known (push-pull)."""
+    """Interpolate NaN, coarser with the distance from known values (push-pull)."""
     import cv2
 
     known = np.isfinite(values)
@@ -107,7 +106,7 @@ def filled_smoothly(values: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def equalised(grey: NDArray[np.uint8], clip_limit: float) -> NDArray[np.uint8]:
-    """Even out contrast locally (CLAHE); 0 leaves the picture as it is."""
+    """Equalise contrast locally (CLAHE); a limit of 0 leaves the picture unchanged."""
     import cv2
 
     if clip_limit == 0.0 or min(grey.shape) < 2 * _TILES:
@@ -121,7 +120,7 @@ def photo_rgb(photo: Photo) -> NDArray[np.uint8]:
 
     Raises:
         InputError: the file is no image.
-        MethodError: the image has another size than the photo claims.
+        MethodError: the size of the image is not that of the photo.
     """
     rgb = decode_image(photo.encoded, f"photo {photo.name}")
     if rgb.shape[:2] != (photo.height, photo.width):
@@ -133,27 +132,26 @@ def photo_rgb(photo: Photo) -> NDArray[np.uint8]:
 
 
 def photo_grey(photo: Photo) -> NDArray[np.uint8]:
-    """Return a photo's grey (Rec. 601), (height, width); raises as `photo_rgb` does."""
+    """Return a photo's grey (Rec. 601), (height, width), or raise as `photo_rgb`."""
     import cv2
 
     return np.asarray(cv2.cvtColor(photo_rgb(photo), cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
 def shrunk(grey: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:
-    """Shrink a picture by a factor below 1, averaging; pixel frames scale exactly by it.
+    """Reduce a picture by a factor below 1 with a low-pass filter; (u, v) becomes (u, v) x factor.
 
-    The size is a whole number, so the picture is warped, not resized to the rounded size: a
-    position (u, v) lands at (u, v) x factor.
+    The picture is warped, not resized, because a resize scales by the rounded size.
     """
     import cv2
 
     if factor >= 1.0:
         return grey
     width, height = (max(1, int(side * factor)) for side in (grey.shape[1], grey.shape[0]))
-    # Gaussian of the width that keeps what the coarser grid can show.
+    # The width of the Gaussian matches the resolution of the coarser grid.
     sigma = 0.5 * np.sqrt(max(0.0, factor**-2 - 1.0))
     soft = cv2.GaussianBlur(grey, (0, 0), sigma) if sigma > 0.1 else grey
-    # Ours (0.5, 0.5) / factor, as OpenCV counts.
+    # (0.5, 0.5) / factor in OpenCV's convention.
     shift = HALF_PIXEL / factor - HALF_PIXEL
     matrix = np.array([[1.0 / factor, 0.0, shift], [0.0, 1.0 / factor, shift]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -168,17 +166,17 @@ def points_on_wall(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """Lift positions (n, 2) = (column, row) of a wall's raster onto its surface.
 
-    Between cells the depth is interpolated where the surface is smooth; at an edge of the relief
-    the nearest cell's depth holds, with the step in its standard deviation.
+    The depth is interpolated where the surface is smooth; at an edge of the relief it is that of
+    the nearest cell, and the step is part of its standard deviation.
 
     Args:
         wall: the wall.
         pixels_wall: the positions.
-        usual_m: what `usual_spread_m` says of the wall, where it has been asked before.
+        usual_m: result of `usual_spread_m` for the wall, computed if None.
 
     Returns:
         World points (n, 3) and their standard deviations (n,) in metres, and whether (n,) the wall
-        has a depth there; the rest is NaN without it.
+        has a depth there; points are NaN without one.
     """
     columns, rows = pixels_wall[:, 0] - 0.5, pixels_wall[:, 1] - 0.5
     height, width = wall.frame.shape
@@ -194,7 +192,7 @@ def points_on_wall(
     count = np.maximum(wall.count[cell].astype(np.float64), 1.0)
     own = wall.sigma_m[cell].astype(np.float64)
     own = np.where(np.isfinite(own) & (count > 1.0), own, usual)
-    # A cell's depth is a mean or median of its points, and its content lies anywhere in the cell.
+    # The depth of a cell is a mean or median of points that lie anywhere in the cell.
     noise = np.maximum(own / np.sqrt(count), 0.3 * usual)
     step = np.where(smooth, 0.0, spread)
     sigma = np.sqrt(noise**2 + (0.5 * _CELL_SIGMA * gsd_m) ** 2 + (step * _CELL_SIGMA) ** 2)
@@ -202,10 +200,10 @@ def points_on_wall(
 
 
 def usual_spread_m(wall: Wall) -> float:
-    """Spread of the points of a cell, median over cells that lie on an even surface.
+    """Return the median spread of the points of a cell over cells on a smooth surface.
 
-    Where points lie farther apart than cells are wide, most cells with several points are those on
-    steps of the relief, and their spread is that of the relief.
+    Where the point spacing exceeds the cells, most cells with several points are on steps of the
+    relief, whose height is their spread.
     """
     gsd_m = wall.frame.gsd_m
     rows, columns = np.nonzero(np.isfinite(wall.sigma_m))
@@ -220,7 +218,7 @@ def usual_spread_m(wall: Wall) -> float:
 def _spread_about(
     wall: Wall, rows: NDArray[np.intp], columns: NDArray[np.intp]
 ) -> NDArray[np.float64]:
-    """Difference (n,) of the largest and smallest depth in 3 x 3 cells about each."""
+    """Return the range (n,) of depths in 3 x 3 cells about each."""
     height, width = wall.frame.shape
     nearest = wall.depth_m[rows, columns].astype(np.float64)
     steps = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)])
@@ -254,10 +252,9 @@ _Result = TypeVar("_Result")
 def one_by_one(
     function: Callable[[_Item], _Result], items: Sequence[_Item], cores: int
 ) -> Iterator[_Result]:
-    """Return a function's results item by item, several computed at once in threads.
+    """Return a function's results in order, computed by several threads.
 
-    OpenCV's own threads help little with pictures of this size: each worker gets its share of
-    them, and the rest is Python's.
+    OpenCV's own threads gain little with pictures of this size, so they are divided among these.
     """
     import cv2
 
@@ -267,7 +264,7 @@ def one_by_one(
 
 
 def opencv_version() -> dict[str, str]:
-    """OpenCV's distribution and version, whichever of its distributions is installed."""
+    """Return name and version of the installed distribution of OpenCV."""
     for name in _OPENCV:
         try:
             return {name: version(name)}

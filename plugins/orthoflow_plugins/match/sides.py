@@ -1,4 +1,4 @@
-"""`face.photos`: from which side walls are seen, asked of the photos where no scanner says it."""
+"""`face.photos`: the visible side of walls from photos, where scanner stations are unknown."""
 
 from __future__ import annotations
 
@@ -42,14 +42,13 @@ from orthoflow_plugins.match.pictures import (
     require_photos,
 )
 
-# Key points need cells as fine as the points lie; what is between them is filled from around. A
-# wall is no larger than key points are found on at once.
+# Cells as fine as the point spacing, gaps filled, and the largest number of them.
 _SPACINGS_PER_CELL: Final = 0.6
 _FILLED_CELLS: Final = 2
 _MAX_CELLS: Final = 4_000_000
 _MIN_POINTS: Final = 3
-# So many matches over all photos must agree on a side, and so many times as many as on the other: a
-# front that is symmetric agrees with its mirror image in part.
+# Inliers over all photos that decide on a side, and their ratio to those of the other side: a
+# symmetric facade matches its mirror image in part.
 _MIN_AGREEING: Final = 16
 _MIN_MARGIN_RATIO: Final = 2.0
 SIDES_GUESSED: Final = DiagnosticSpec(
@@ -63,13 +62,13 @@ SIDES_GUESSED: Final = DiagnosticSpec(
 
 
 class FaceByPhotos(Method):
-    """Turn planes whose side was guessed to the side from which the photos show them.
+    """Turn planes whose side was guessed to the side that the photos show.
 
-    A wall seen from behind is a mirror image of what photos show. Where no scanner station says
-    from which side a plane was seen, the cloud is laid on it roughly, and photos are matched with
-    that picture as they are and mirrored, in mixtures of their colours where grey says nothing of
-    any plane; the side on which clearly more matches agree is taken.
-    Planes whose side is known are left as they are, and cost nothing; so are floors and ceilings.
+    A wall seen from behind is a mirror image of what photos show. If no scanner station determines
+    the side of a plane, the cloud is rastered coarsely on it, and photos are matched with that
+    picture as they are and mirrored, in mixtures of their colours if grey decides no plane; the
+    side with clearly more inliers is taken. Planes whose side is known, floors and ceilings are
+    left unchanged.
     """
 
     id: ClassVar[str] = "face.photos"
@@ -84,7 +83,7 @@ class FaceByPhotos(Method):
     )
 
     class Params(MethodParams):
-        """Nothing to choose."""
+        """No parameters."""
 
     class In(Ports):
         """The planes, the cloud that they were found in, and the photos."""
@@ -99,7 +98,7 @@ class FaceByPhotos(Method):
         planes: Planes
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Ask the photos about each plane whose side was guessed."""
+        """Decide the side of each plane whose side was guessed."""
         del params
         planes, cloud = inputs.planes, inputs.cloud
         require_photos(inputs.photos)
@@ -123,7 +122,7 @@ class FaceByPhotos(Method):
         sources: list[SideSource] = [planes.side_source(index) for index in range(len(planes))]
         n_turned = 0
         for index, (front, behind) in zip(asked, counts.tolist(), strict=True):
-            if not _is_told(front, behind):
+            if not _is_decided(front, behind):
                 continue
             sources[index] = "photos"
             if behind > front:
@@ -131,7 +130,7 @@ class FaceByPhotos(Method):
                 n_turned += 1
                 ctx.log(
                     f"{planes.names[index]}: turned, {behind} matches of the photos agree on its "
-                    f"other side, {front} on the one that was guessed"
+                    f"other side, {front} on the guessed one"
                 )
         ctx.metric("n_planes_turned", n_turned, "1")
         ctx.metric("n_planes_seen", sources.count("photos"), "1")
@@ -146,10 +145,9 @@ class FaceByPhotos(Method):
         pictures: Sequence[Features | None],
         ctx: StepContext,
     ) -> NDArray[np.intp]:
-        """Matches (planes, 2) that agree with the front and with the other side of each plane.
+        """Count inliers (planes, 2) on the front and on the other side of each plane.
 
-        In grey; where that tells nothing of any plane, in the first mixture of colours that does,
-        as a laser that sees red dark may show it.
+        In grey; if that decides no plane, in the first mixture of colours that does.
         """
         counts = np.zeros((len(pictures), 2), dtype=np.intp)
 
@@ -165,7 +163,7 @@ class FaceByPhotos(Method):
             for nth, matches in enumerate(found):
                 ctx.progress((nth + 1) / (len(photos.photos) + 1), f"photos on both sides, {name}")
                 tried += matches
-            if any(_is_told(front, behind) for front, behind in tried.tolist()):
+            if any(_is_decided(front, behind) for front, behind in tried.tolist()):
                 return tried
             if name == "grey":
                 counts = tried
@@ -173,18 +171,18 @@ class FaceByPhotos(Method):
 
     @classmethod
     def tools(cls) -> dict[str, str]:
-        """OpenCV finds and describes the key points."""
+        """OpenCV detects and describes key points."""
         return opencv_version()
 
 
-def _is_told(front: int, behind: int) -> bool:
-    """Whether matches tell the side of a plane."""
+def _is_decided(front: int, behind: int) -> bool:
+    """Whether the numbers of inliers decide the side of a plane."""
     least = max(_MIN_AGREEING, _MIN_MARGIN_RATIO * min(front, behind))
     return max(front, behind) >= least
 
 
 def _warn_of_guesses(planes: Planes, sources: Sequence[SideSource], ctx: StepContext) -> None:
-    """State of which planes the side stays a guess, as the detector said of more of them."""
+    """Report the planes whose side remains a guess."""
     named = sources or [planes.side_source(index) for index in range(len(planes))]
     guessed = [name for name, source in zip(planes.names, named, strict=True) if source == "guess"]
     if guessed:
@@ -192,7 +190,7 @@ def _warn_of_guesses(planes: Planes, sources: Sequence[SideSource], ctx: StepCon
 
 
 def _features(planes: Planes, index: int, cloud: PointCloud, cores: int) -> Features | None:
-    """Key points of the cloud laid on a plane; None where it shows nothing."""
+    """Find key points of the cloud rastered on a plane; None if there are none."""
     corners = planes.corners[index]
     area_m2 = float(
         np.linalg.norm(corners[3] - corners[0]) * np.linalg.norm(corners[1] - corners[0])
@@ -218,7 +216,7 @@ def _features(planes: Planes, index: int, cloud: PointCloud, cores: int) -> Feat
 def _grey_on(
     frame: WallFrame, tolerance_m: float, cloud: PointCloud, cores: int
 ) -> NDArray[np.float32]:
-    """Grey 0..1 (rows, cols) of the cloud's topmost points and between; NaN where none is near."""
+    """Return grey 0..1 (rows, cols) of the topmost points, gaps filled; NaN where none is near."""
     import cv2
 
     from orthoflow.geometry.rastering import topmost_points
@@ -235,7 +233,6 @@ def _grey_on(
         grey[has_point] = cloud.rgb[points].astype(np.float32) @ weights / np.float32(255.0)
     grey = grey.reshape(frame.shape)
     filled = filled_smoothly(grey)
-    # Where no point is near nothing is known.
     side = 2 * _FILLED_CELLS + 1
     near = cv2.dilate(np.isfinite(grey).astype(np.uint8), np.ones((side, side), np.uint8))
     filled[np.asarray(near) == 0] = np.nan

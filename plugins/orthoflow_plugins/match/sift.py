@@ -41,21 +41,15 @@ BY_EDGES: Final = DiagnosticSpec(
     code="photo-placed-by-edges",
     severity="warning",
     text="photo {subject}: placed by edges alone, which can be wrong where patterns repeat",
-    remedy="look at its overlay",
+    remedy="check its overlay",
 )
 MIRRORED: Final = DiagnosticSpec(
     code="photo-mirrored",
     severity="warning",
-    text="photo {subject}: its mirror image agrees with the walls and it does not, so it gets no "
-    "ties",
-    remedy="turn it back if it is mirrored; else the sides of the planes may be wrong (view_from "
-    "of read.scan)",
-)
-AMBIGUOUS: Final = DiagnosticSpec(
-    code="photo-ambiguous",
-    severity="warning",
-    text="photo {subject}: its mirror image agrees with the walls no worse than it does, so it "
-    "gets no ties: it shows a pattern that repeats, another wall, or is mirrored",
+    text="photo {subject}: its mirror image matches the walls better than the photo itself, so it "
+    "gets no ties: it is mirrored, shows a repeating pattern or another wall, or the sides of the "
+    "planes are wrong",
+    remedy="flip the photo if it is mirrored; check view_from of read.scan",
 )
 NO_WALL: Final = DiagnosticSpec(
     code="photo-shows-no-wall",
@@ -67,11 +61,11 @@ NO_WALL: Final = DiagnosticSpec(
 class MatchSift(Method):
     """Match photos with the intensity rasters of the walls: RootSIFT, mutual, ratio test.
 
-    Every photo is tried on every wall, by its strongest key points first, then by all on the walls
-    recognised; where its grey shows none clearly, mixtures of its colours are tried too, then where
-    edges run, whichever side is brighter, if another photo confirms the place. Walls on which the
-    matches do not agree roughly with a homography keep them as rejected. Ties carry the surface's
-    depth, so relief counts.
+    Every photo is matched with every wall, by its strongest key points first, then by all on the
+    walls recognised. If grey shows no wall clearly, mixtures of its colours are tried, then the
+    course of edges, whichever side is brighter, if another photo confirms the place. Matches that
+    do not fit a homography of the wall are kept as rejected ties. Ties include the depth of the
+    surface.
     """
 
     id: ClassVar[str] = "match.sift"
@@ -95,23 +89,23 @@ class MatchSift(Method):
     )
 
     class Params(PairingParams):
-        """Key points, and what counts as a match."""
+        """Key points, and criteria of a match."""
 
         preset: Literal["none", "paper"] = Field(
             default="none",
-            description="paper: SIFT as OpenCV sets it, on the pictures as they are, and the key "
-            "points of a wall with their best match in the photo, as in markiewicz2015; of the "
-            "other options `ratio` applies.",
+            description="paper: OpenCV's default SIFT without equalisation, and the best match in "
+            "the photo of each key point of a wall, as in markiewicz2015; of the other options "
+            "`ratio` applies.",
         )
         structure: Literal["never", "confirmed", "alone"] = Field(
             default="confirmed",
-            description="Whether photos in which no key points show a wall clearly are laid on the "
-            "walls in many sizes and compared by where edges run, in colours, intensity and "
-            "relief. confirmed: a place counts when another photo, at its own place, shows the "
-            "same things there. alone: also when no photo says so, by which a photo of something "
-            "else with the same pattern may be accepted: check the overlays. The errors of "
-            "such ties are correlated, so an orientation "
-            "from them states too small an error: match.guided measures again.",
+            description="Whether photos without clear matches of key points are compared with the "
+            "walls at many scales by the course of edges, in colours, intensity and relief. "
+            "confirmed: a place is accepted if another photo, at its own place, shows the same "
+            "key points there. alone: also without confirmation, which may accept a photo of "
+            "another object with the same pattern: check the overlays. The errors of such ties "
+            "are correlated, so the error stated by an orientation from them is too small: "
+            "match.guided measures them again.",
         )
 
         @model_validator(mode="before")
@@ -127,7 +121,7 @@ class MatchSift(Method):
         hand: Ties | None = None
 
     class Out(Ports):
-        """Points of the photos known on the walls."""
+        """Tie points between photos and walls."""
 
         ties: Ties
 
@@ -153,7 +147,7 @@ class MatchSift(Method):
 
     @classmethod
     def tools(cls) -> dict[str, str]:
-        """OpenCV finds and describes the key points."""
+        """OpenCV detects and describes key points."""
         return opencv_version()
 
 
@@ -164,10 +158,10 @@ def _matched(
     params: MatchSift.Params,
     ctx: StepContext,
 ) -> tuple[list[TiePiece], dict[str, JsonValue], list[float]]:
-    """Pair photos with the walls, and place those that show none clearly with the others' help.
+    """Match photos with the walls, and place photos without clear matches by structure.
 
     Returns:
-        Ties, what there is to say of each photo, and how far ties were searched in each.
+        Ties, details of each photo, and the search radius of each.
     """
 
     def pair(photo: Photo) -> PhotoPairs:
@@ -196,7 +190,7 @@ def _placed(
     params: MatchSift.Params,
     ctx: StepContext,
 ) -> dict[int, Placed]:
-    """Place the photos by structure in which no key points show a wall clearly, by index."""
+    """Place photos without clear matches of key points by structure; by index."""
     from orthoflow_plugins.match.placing import confirmed, places_of
     from orthoflow_plugins.match.structures import wall_structure
 
@@ -205,7 +199,6 @@ def _placed(
         for index, pairs in enumerate(paired)
         if not pairs.is_mirrored and pairs.n_recognised < CLEARLY
     ]
-    # A photo alone has nobody to confirm it.
     if params.structure == "never" or not unclear:
         return {}
     if params.structure == "confirmed" and len(paired) < 2:
@@ -230,9 +223,9 @@ def _placed(
             ctx.report(BY_EDGES, subject=name)
         else:
             ctx.log(
-                f"photo {name}: where edges run suggests a place on "
+                f"photo {name}: edges suggest a place on "
                 f"{walls.walls[found[0].piece.wall].name}, but no other photo confirms it; "
-                f"structure: alone takes it all the same"
+                f"structure: alone would accept it"
             )
     return placed
 
@@ -244,7 +237,7 @@ def _pieces(
     rest: list[TiePiece] = []
     for pair in pairs.pairs:
         features = on_walls[pair.wall]
-        assert features is not None  # noqa: S101 - pairs are made of walls that have key points
+        assert features is not None  # noqa: S101 - only walls with key points have matches
         piece = key_point_ties(
             (photo, pair.wall),
             walls.walls[pair.wall],
@@ -269,10 +262,8 @@ def _note(
             "agreeing_share": placed.share,
         }
     shown = [walls.walls[pair.wall].name for pair in pairs.pairs if pair.is_shown]
-    if pairs.is_surely_mirrored:
+    if pairs.is_mirrored:
         ctx.report(MIRRORED, subject=name)
-    elif pairs.is_mirrored:
-        ctx.report(AMBIGUOUS, subject=name)
     elif not shown:
         ctx.report(NO_WALL, subject=name)
     return {

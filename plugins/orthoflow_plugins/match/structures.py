@@ -1,11 +1,11 @@
 """Structure of photos and walls: where edges run, whichever side of them is brighter.
 
-A laser sees another colour than a camera: contrast may be weaker, gone or inverted, another one on
-each material. Edges stay where they are, and so does the line they run along (modulo 180 degrees);
-steps of the relief are edges of the wall, too. A photo is laid on the wall in many sizes; each time
-nine overlapping parts of it are correlated over the whole wall and may slip a little against each
-other, as perspective has it. What their sum stands out by from all other places of the wall at that
-size tells places of different sizes apart.
+A laser measures at another wavelength than a camera: contrast may be weaker, absent or inverted,
+differently for each material. Edges keep their position and orientation (modulo 180 degrees); steps
+of the relief are edges of the wall, too. A photo is compared with the wall at many scales: nine
+overlapping parts of it are correlated with the whole wall and may shift a little against each other
+to allow for perspective. Scales are compared by how far the best sum of correlations stands out
+from those at all other positions.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from orthoflow.products import Wall
 from orthoflow_plugins.match.channels import Channels
 from orthoflow_plugins.match.pictures import filled_smoothly, usual_spread_m
 
-# The shorter side of a wall has so many cells, unless it is rastered more coarsely.
+# Cells of the shorter side of a wall, unless its raster is coarser.
 _CELLS: Final = 200.0
-# Widths on the wall that are tried, as shares of the wall's shorter side: the longer side of a
-# photo from the first, its shorter side up to the second.
+# Scales that are tried, by the size of the photo on the wall over the shorter side of the wall:
+# smallest longer side and largest shorter side of the photo.
 _SIZES: Final = (0.2, 1.6)
 _STEP: Final = 1.1
 _MAX_PART_CELLS: Final = 250
 _MIN_PART_CELLS: Final = 16
-# How far a part may slip, as a share of the photo's width.
+# How far a part may shift, over the photo's width.
 _SLIP_SHARE: Final = 0.03
-# A step of the relief of so much counts as a step from black to white.
+# A step of the relief that weighs as much as a step from black to white.
 _STEP_M: Final = 0.5
 _MIN_KNOWN: Final = 0.8
 _NOISE_SIGMA_CELLS: Final = 1.0
@@ -41,53 +41,47 @@ _EVEN_SIGMA_CELLS: Final = 12.0
 _POOL_SIGMA_CELLS: Final = 1.5
 _BROAD_SIGMA_CELLS: Final = 15.0
 _STRONGEST: Final = 3.0
-# Parts that lie mostly beside the wall must not win by what little they show.
+# Parts that lie mostly beside the wall must not win by the little overlap.
 _MIN_ENERGY: Final = 0.25
-# Another place begins so far off, as a share of the photo's width, or at such another size (log).
+# Places differ by at least this distance, over the photo's width, or by this logarithm of scales.
 _ELSEWHERE: Final = (0.25, 0.25)
-# A photo's longer side has so many cells at most where it is compared, finely or roughly: larger
-# sizes on the wall are compared in cells that are twice as wide, or four times.
-_FINE_CELLS: Final = 250
-_ROUGH_CELLS: Final = 160
-# What is pooled so broadly is as well seen in every second cell.
+# Cells of a photo's longer side when it is compared: larger photos are compared in cells that are
+# two or four times as wide.
+_PHOTO_CELLS: Final = 250
+# Channels are pooled so broadly that every second cell suffices.
 _SAMPLE_CELLS: Final = 2
 _LEVELS: Final = 3
 PHOTO_SIDE_PX: Final = 2 * _MAX_PART_CELLS
-"""Longer side to which a photo is reduced first: no size needs more."""
+"""Longer side to which a photo is reduced first: no scale needs more."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class WallStructure:
-    """A wall's structure, ready to be correlated with.
+    """The structure of a wall, ready for correlation.
 
     Attributes:
-        wall: in cells of this size.
+        wall: in coarse cells.
         channels: its structure.
-        fine: likewise in cells of this size, of twice that, and of four times, for photos of up to
-            `_FINE_CELLS`.
-        rough: likewise, of up to `_ROUGH_CELLS`.
-        usual_spread_m: as `usual_spread_m` gives it.
+        levels: the same in cells of this size, of twice and of four times the size.
+        usual_spread_m: as returned by `usual_spread_m`.
     """
 
     wall: Wall
     channels: Channels
-    fine: Sequence[Spectra]
-    rough: Sequence[Spectra]
+    levels: Sequence[Spectra]
     usual_spread_m: float
 
 
 @dataclass(frozen=True, kw_only=True)
 class Spectra:
-    """A wall's structure as parts of a photo are correlated with it.
+    """Fourier transforms of the structure of a wall.
 
     Attributes:
         layers: (c, ...) complex64 of the channels, conjugated.
-        energy: likewise, of their squares' sum.
+        energy: the same of the sum of their squares.
         shape: rows and columns of samples.
-        padded: that they were computed with, so that parts lie beside the wall before they meet it
-            again.
-        sample_m: a sample is so wide.
-        photo_cells: the longer side of a photo has at most so many cells.
+        padded: the same with padding, so that a part leaves the wall before it wraps around.
+        sample_m: width of a sample.
     """
 
     layers: NDArray[np.complex64]
@@ -95,19 +89,18 @@ class Spectra:
     shape: tuple[int, int]
     padded: tuple[int, int]
     sample_m: float
-    photo_cells: int
 
 
 @dataclass(frozen=True, kw_only=True)
 class Place:
-    """Where a photo may lie on a wall.
+    """A possible position of a photo on a wall.
 
     Attributes:
         centre_m: (2,) float64 metres right and down from the corner of the wall's raster.
-        width_m: of the photo on the wall, roughly.
-        lead: by how many robust deviations it stands out from other places at its size.
-        parts_photo: (9, 2) float64 centres of the photo's parts, shares of its width and height.
-        parts_m: (9, 2) float64 where each of them was found, as `centre_m`.
+        width_m: of the photo on the wall, approximately.
+        lead: by how many robust deviations it stands out from other positions at its scale.
+        parts_photo: (9, 2) float64 centres of the photo's parts, relative to its width and height.
+        parts_m: (9, 2) float64 their positions on the wall, as `centre_m`.
     """
 
     centre_m: NDArray[np.float64]
@@ -118,7 +111,7 @@ class Place:
 
 
 def wall_structure(wall: Wall) -> WallStructure | None:
-    """Prepare a wall; None where it shows nothing."""
+    """Prepare a wall; None if it has no intensity or is too small."""
     if wall.intensity is None or not np.isfinite(wall.intensity).any():
         return None
     factor = max(1, round(min(wall.frame.shape) / _CELLS))
@@ -129,7 +122,7 @@ def wall_structure(wall: Wall) -> WallStructure | None:
     levels = [(channels, coarse.frame.gsd_m)]
     intensity, depth_m = coarse.intensity, coarse.depth_m
     for _ in range(1, _LEVELS):
-        # Means of intensity; of depth one of four, where most of them are known.
+        # Means of intensity; one of four depths where most of them are known.
         known = _halved(np.isfinite(depth_m)) >= _MIN_KNOWN
         rows, columns = known.shape
         depth_m = np.where(known, depth_m[: 2 * rows : 2, : 2 * columns : 2], np.float32(np.nan))
@@ -138,8 +131,7 @@ def wall_structure(wall: Wall) -> WallStructure | None:
     return WallStructure(
         wall=coarse,
         channels=channels,
-        fine=[_spectra(*level, _FINE_CELLS) for level in levels],
-        rough=[_spectra(*level, _ROUGH_CELLS) for level in levels],
+        levels=[_spectra(*level) for level in levels],
         usual_spread_m=usual_spread_m(coarse),
     )
 
@@ -161,13 +153,12 @@ def _halved(values: NDArray[np.floating]) -> NDArray[np.float32]:
     )
 
 
-def _spectra(channels: Channels, cell_m: float, photo_cells: int) -> Spectra:
-    """Spectra for photos whose longer side has at most so many cells."""
+def _spectra(channels: Channels, cell_m: float) -> Spectra:
     from scipy import fft
 
     layers = _samples(channels)
     energy = np.einsum("cij,cij->ij", layers, layers)
-    photo = photo_cells // _SAMPLE_CELLS
+    photo = _PHOTO_CELLS // _SAMPLE_CELLS
     most = photo // 2 + 2 * _slip(photo) + 1
     rows, columns = (int(fft.next_fast_len(length + most, real=True)) for length in energy.shape)
     spectra = _spectrum(layers, (rows, columns))
@@ -177,7 +168,6 @@ def _spectra(channels: Channels, cell_m: float, photo_cells: int) -> Spectra:
         shape=(energy.shape[0], energy.shape[1]),
         padded=(rows, columns),
         sample_m=_SAMPLE_CELLS * cell_m,
-        photo_cells=photo_cells,
     )
 
 
@@ -191,7 +181,7 @@ def _slip(width: int) -> int:
 
 
 def structure_of(layers: NDArray[np.float32], known: NDArray[np.bool_]) -> Channels:
-    """Return the structure of a picture (rows, cols, layers), NaN or not known where void."""
+    """Return the structure of a picture (rows, cols, layers) NaN or not known where void."""
     import cv2
 
     soft = []
@@ -205,16 +195,16 @@ def structure_of(layers: NDArray[np.float32], known: NDArray[np.bool_]) -> Chann
 
 
 def _coarser(wall: Wall, factor: int) -> Wall:
-    """Join factor x factor cells of a wall: its intensity's mean, 0 to 1, and one of its depths."""
+    """Join factor x factor cells of a wall: the mean intensity, 0 to 1, and one of the depths."""
     import cv2
 
-    assert wall.intensity is not None  # noqa: S101 - asked before
+    assert wall.intensity is not None  # noqa: S101 - checked before
     height, width = (max(1, length // factor) for length in wall.frame.shape)
     known = np.isfinite(wall.depth_m) & np.isfinite(wall.intensity)
     low, high = np.percentile(wall.intensity[np.isfinite(wall.intensity)], (1.0, 99.0))
     scaled = np.clip((wall.intensity - low) / max(float(high - low), 1e-9), 0.0, 1.0)
     grey = np.rint(255.0 * filled_smoothly(np.where(known, scaled, np.nan))).astype(np.uint8)
-    # Cells hold single points of a scan, and their speckle is no structure.
+    # Cells hold single points of a scan, whose speckle is no structure.
     grey = np.asarray(cv2.medianBlur(grey, 3), dtype=np.uint8)
     cells = (slice(0, height * factor), slice(0, width * factor))
 
@@ -241,23 +231,19 @@ def _coarser(wall: Wall, factor: int) -> Wall:
     )
 
 
-def likely_places(
-    rgb: NDArray[np.uint8], wall: WallStructure, *, n_most: int, roughly: bool = False
-) -> list[Place]:
-    """Return the places of a wall that a photo may show, the likeliest first.
+def likely_places(rgb: NDArray[np.uint8], wall: WallStructure, *, n_most: int) -> list[Place]:
+    """Return the positions on a wall that a photo may show, the likeliest first.
 
     Args:
-        rgb: (height, width, 3) of the photo, taken roughly upright.
+        rgb: (height, width, 3) of the photo, upright to some 9 degrees.
         wall: the wall.
-        n_most: at most so many.
-        roughly: compare large photos in wider cells, in less than half of the time; `closer` then
-            tells more of each place.
+        n_most: maximum number of positions.
     """
-    levels = wall.rough if roughly else wall.fine
-    found = [
-        _best_of_size(rgb, width, levels)
-        for width in _widths_cells(rgb.shape, wall.wall.frame.shape)
-    ]
+    found = []
+    for width in _widths_cells(rgb.shape, wall.wall.frame.shape):
+        longer = width * max(1.0, rgb.shape[0] / rgb.shape[1])
+        level = max(0, math.ceil(math.log2(longer / _PHOTO_CELLS)))
+        found.append(_best_at(rgb, width / 2**level, wall.levels[level]))
     places: list[Place] = []
     for place in sorted(found, key=lambda each: -each.lead):
         if len(places) < n_most and all(_is_elsewhere(place, other) for other in places):
@@ -265,23 +251,11 @@ def likely_places(
     return places
 
 
-def closer(rgb: NDArray[np.uint8], wall: WallStructure, place: Place) -> Place:
-    """Return the likeliest place of a photo at the size of one that was found roughly."""
-    return _best_of_size(rgb, place.width_m / wall.wall.frame.gsd_m, wall.fine)
-
-
-def _best_of_size(rgb: NDArray[np.uint8], width: float, levels: Sequence[Spectra]) -> Place:
-    """Best place of a photo whose width is so many cells of the first level."""
-    longer = width * max(1.0, rgb.shape[0] / rgb.shape[1])
-    nth = max(0, math.ceil(math.log2(longer / levels[0].photo_cells)))
-    return _best_at(rgb, width / 2**nth, levels[nth])
-
-
 def _widths_cells(photo: Sequence[int], wall: tuple[int, ...]) -> list[int]:
-    """Widths in cells that a photo is tried at."""
+    """Return the widths in cells at which a photo is compared."""
     height, width = photo[0], photo[1]
     least = _SIZES[0] * min(wall) * width / max(height, width)
-    # Each part has half of the photo's sides.
+    # Each part has half the sides of the photo.
     most = min(
         _SIZES[1] * min(wall) * width / min(height, width),
         2.0 * (_MAX_PART_CELLS - 1) * width / max(height, width),
@@ -292,7 +266,7 @@ def _widths_cells(photo: Sequence[int], wall: tuple[int, ...]) -> list[int]:
 
 
 def _best_at(rgb: NDArray[np.uint8], width_cells: float, wall: Spectra) -> Place:
-    """Best place of a photo whose width is so many cells."""
+    """Return the best position of a photo at a given width in cells."""
     import cv2
     from scipy import fft
 
@@ -312,14 +286,14 @@ def _best_at(rgb: NDArray[np.uint8], width_cells: float, wall: Spectra) -> Place
         for top in (0, (height - side[0]) // 2, height - side[0])
         for left in (0, (width - side[1]) // 2, width - side[1])
     ]
-    # Energy of the wall under a part, at every place of its corner (wrapped): of all parts alike.
+    # Energy of the wall under a part at every position of its corner (wrapped), the same for all.
     box = _spectrum(np.ones((1, *side), dtype=np.float32), wall.padded)[0]
     under = np.asarray(fft.irfft2(wall.energy * np.conj(box), wall.padded), dtype=np.float32)
     maps = [
         _part_map(channels[:, top : top + side[0], left : left + side[1]], under, wall)
         for top, left in corners
     ]
-    # Where the photo's corner is when its centre is on the wall.
+    # Corners of a photo whose centre is on the wall.
     rows, columns = (
         np.arange(n) - m // 2 for n, m in zip(wall.shape, (height, width), strict=True)
     )
@@ -352,7 +326,7 @@ def _best_at(rgb: NDArray[np.uint8], width_cells: float, wall: Spectra) -> Place
 def _part_map(
     part: NDArray[np.float32], under: NDArray[np.float32], wall: Spectra
 ) -> NDArray[np.float32]:
-    """Correlation of a part of a photo with the wall, at every place of its corner (wrapped)."""
+    """Correlate a part of a photo with the wall, at every position of its corner (wrapped)."""
     from scipy import fft
 
     own = float(np.einsum("cij,cij->", part, part))
@@ -364,7 +338,7 @@ def _part_map(
 
 
 def _spectrum(layers: NDArray[np.float32], padded: tuple[int, int]) -> NDArray[np.complex64]:
-    """Spectra of layers (c, rows, cols), padded; the rows that are added are not transformed."""
+    """Transform layers (c, rows, cols) with padding; padded rows are not transformed."""
     from scipy import fft
 
     along = fft.rfft(layers, padded[1], axis=2)
@@ -372,7 +346,7 @@ def _spectrum(layers: NDArray[np.float32], padded: tuple[int, int]) -> NDArray[n
 
 
 def _slipped(part: NDArray[np.float32], at: tuple[int, int], slip: int) -> NDArray[np.float64]:
-    """Best (column, row) of a part's corner, at most slipped so far from a place."""
+    """Return the best (column, row) of a part's corner within a distance of a position."""
     steps = np.arange(-slip, slip + 1)
     rows, columns = at[0] + steps, at[1] + steps
     near = part[np.ix_(rows % part.shape[0], columns % part.shape[1])]
@@ -391,10 +365,10 @@ def _is_elsewhere(place: Place, other: Place) -> bool:
 def _channels(
     layers: Sequence[NDArray[np.float32]], known: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Channels (5, rows, cols) of the line that edges run along, of all layers together.
+    """Return channels (5, rows, cols) of the orientation of edges, of all layers together.
 
-    Doubled and fourfold angles of the gradient and its strength, evened out locally: the first
-    terms of a histogram of directions modulo 180 degrees.
+    Doubled and fourfold angles of the gradient and its strength, normalised locally: the first
+    terms of a histogram of orientations modulo 180 degrees.
     """
     import cv2
 

@@ -1,11 +1,10 @@
-"""Ties by pieces, each piece one photo on one wall: made from key points, joined, without twins.
+"""Ties between photos and walls: from key points or measured by hand, joined without duplicates.
 
-Ties that a person measured join them. `preset: paper` matches as markiewicz2015 did (3.5, 3.6,
-4.3): SIFT as OpenCV sets it, and the best match. That is the one of its reference [36], openMVG: a
-key point of the wall takes its nearest descriptor in the photo where the next one is clearly
-farther (the ratio of distances, 0.8 in openMVG's documentation); without a ratio, however near it
-is. Without poses that is every key point of the wall; with them, those in the part that the photo
-shows by its first pose.
+`preset: paper` matches as markiewicz2015 did (3.5, 3.6, 4.3): OpenCV's default SIFT, and the best
+match of its reference [36], openMVG: the nearest descriptor in the photo of a key point of the
+wall, if the ratio of the distances of the nearest and the second nearest allows (0.8 in openMVG's
+documentation). Without poses all key points of a wall are matched; with poses, those in the part
+that the photo shows.
 """
 
 from __future__ import annotations
@@ -34,13 +33,13 @@ from orthoflow_plugins.match.warping import Projection, project_walls
 if TYPE_CHECKING:
     from orthoflow.sdk import StepContext
 
-# How well SIFT places a key point, in pixels of the image it was found in: for the smallest ones,
-# and growing with their size.
+# Standard deviation of a SIFT key point, in pixels of its image: of the smallest ones, and in
+# proportion to their size.
 _MIN_SIGMA_PX: Final = 0.35
 _SIGMA_PER_SIZE: Final = 0.06
 # At an edge of the relief a key point belongs to neither side.
 _MAX_SIGMA_CELLS: Final = 3.0
-# What openMVG's documentation names for its best match, and key points of a picture at most.
+# The ratio of openMVG's documentation, and the maximum number of key points of a picture.
 _PAPER_RATIO: Final = 0.8
 _PAPER_FEATURES: Final = 50_000
 BY_HAND_ALONE: Final = DiagnosticSpec(
@@ -58,7 +57,7 @@ class TiePiece(SeenPoints):
     Attributes:
         photo: index of the photo.
         wall: index of the wall.
-        role: what they are good for.
+        role: of the ties.
     """
 
     photo: int
@@ -86,7 +85,7 @@ def piece_on_wall(
     usual_m: float | None = None,
     role: TieRole = TieRole.CONTROL,
 ) -> TiePiece:
-    """Ties of one photo with places of one wall; those not known on either are left out.
+    """Return ties of one photo with positions on one wall, without those unknown on either.
 
     Args:
         at: index of the photo and of the wall.
@@ -94,7 +93,7 @@ def piece_on_wall(
         pixels_photo: (n, 2).
         cells: (n, 2) (column, row) of the wall's raster, first cell centre at (0.5, 0.5).
         sigma_px: (n,) standard deviation of a coordinate of a pixel.
-        usual_m: as `points_on_wall` has it.
+        usual_m: as in `points_on_wall`.
         role: of the ties.
     """
     points_world, sigma_m, known = points_on_wall(wall, cells, usual_m=usual_m)
@@ -118,13 +117,13 @@ def key_point_ties(
     scale: float = 1.0,
     role: TieRole = TieRole.CONTROL,
 ) -> TiePiece:
-    """Ties of one photo with one wall; pairs whose place on the wall is not known are left out.
+    """Return ties of one photo with one wall, without those whose depth is unknown or uncertain.
 
     Args:
         at: index of the photo and of the wall.
         wall: the wall.
-        sets: the pairs' key points in the photo (pixels of the full image) and on the wall.
-        scale: the photo's were found in the photo shrunk by this.
+        sets: matched key points in the photo (pixels of the full image) and on the wall.
+        scale: factor by which the photo was reduced to find them.
         role: of the ties.
     """
     in_photo, on_wall = sets
@@ -144,18 +143,18 @@ def paper_ties(
     ratio: float | None,
     ctx: StepContext,
 ) -> tuple[list[TiePiece], list[Features | None]]:
-    """Best matches of photos with every wall, as markiewicz2015 has them.
+    """Find the best matches of photos with every wall as in markiewicz2015.
 
     Args:
         photos: the photos.
         walls: the walls.
-        cameras: by photo; only what a photo shows by its pose is matched, of a photo without one
-            nothing. Without cameras all may be matched.
+        cameras: by photo; key points outside the photo by its pose are not matched, nor photos
+            without a pose. None matches everything.
         ratio: largest distance of the best match over the second best; None for any.
-        ctx: takes progress.
+        ctx: the context, for progress.
 
     Returns:
-        Ties, and key points of each wall, None where it shows nothing.
+        Ties, and key points of each wall, None without intensity.
     """
 
     def look(wall: Wall) -> Features | None:
@@ -187,14 +186,14 @@ def paper_ties(
 
 # Any: what a user wrote, before it is checked.
 def with_paper_ratio(given: Any) -> Any:
-    """Fill in the ratio of `preset: paper` where the parameters of a matcher say none."""
+    """Fill in the ratio of `preset: paper` if none is given."""
     if isinstance(given, dict) and given.get("preset") == "paper":
         return {"ratio": _PAPER_RATIO, **given}
     return given
 
 
 def _within(features: Features, shown: Projection | None, wall: Wall) -> Features | None:
-    """Key points of a wall in the part that a photo shows."""
+    """Select the key points of a wall in the part that a photo shows."""
     if shown is None:
         return None
     mask = np.zeros(wall.frame.shape, dtype=np.bool_)
@@ -211,14 +210,14 @@ def ties_of(
     *,
     search_radius_px: tuple[float | None, ...] = (),
 ) -> Ties:
-    """Join pieces into one product, in their order, without what is masked in its photo.
+    """Join pieces into one product, in their order, without masked pixels.
 
     Args:
         pieces: the ties.
         photos: all photos.
         walls: all walls.
-        details: what people may want to know.
-        search_radius_px: one per photo, as `Ties` has it.
+        details: for the report.
+        search_radius_px: one per photo, as in `Ties`.
     """
     masks = [used_pixels(photo) for photo in photos.photos]
     kept: list[TiePiece] = [_NOTHING]
@@ -254,22 +253,21 @@ def joined(pieces: Sequence[TiePiece]) -> SeenPoints:
 
 
 def parted(pieces: Sequence[TiePiece], kept: NDArray[np.bool_]) -> list[TiePiece]:
-    """Take of each piece what is kept (n,) of all of them."""
+    """Take the kept ties (n,) of all pieces piece by piece."""
     parts = np.split(kept, np.cumsum([len(piece) for piece in pieces])[:-1])
     return [piece.take(part) for piece, part in zip(pieces, parts, strict=True)]
 
 
 def without_twins(pieces: Sequence[TiePiece]) -> list[TiePiece]:
-    """Keep one of several ties that say the same: one place of a photo on overlapping walls.
+    """Keep one of several ties of the same key point with the same surface on overlapping walls.
 
-    Planes that lie close to each other show the same surface when the rasters reach far; twins
-    would count twice in the orientation. The one with the smallest `sigma_m` stays.
+    Rasters of planes close to each other contain the same surface, which would count twice in the
+    orientation. The tie with the smallest `sigma_m` is kept.
     """
     if len(pieces) < 2:
         return list(pieces)
     seen = joined(pieces)
     pixels, points, sigma_m = seen.pixels_photo, seen.points_world, seen.sigma_m
-    # Twins share key point and surface, up to the rasters' cells.
     order = np.lexsort((sigma_m, pixels[:, 1].round(3), pixels[:, 0].round(3)))
     kept = np.ones(len(pixels), dtype=np.bool_)
     first = 0
@@ -287,13 +285,13 @@ def without_twins(pieces: Sequence[TiePiece]) -> list[TiePiece]:
 def ties_by_hand_alone(
     hand: Ties | None, photos: Photos, walls: Walls, ctx: StepContext
 ) -> Ties | None:
-    """Return the ties by hand where the walls show nothing that a photo could be matched with.
+    """Return the ties measured by hand if no wall has intensity.
 
     Returns:
-        None where the walls show something.
+        None if a wall has intensity.
 
     Raises:
-        MethodError: the walls show nothing, and nobody measured a tie.
+        MethodError: no wall has intensity, and there are no ties measured by hand.
     """
     if hand is None or any(wall.intensity is not None for wall in walls.walls):
         require_intensity(walls)
@@ -303,13 +301,13 @@ def ties_by_hand_alone(
 
 
 def with_ties_by_hand(ties: Ties, hand: Ties | None, walls: Walls, ctx: StepContext) -> Ties:
-    """Put ties that a person measured behind those that matching found.
+    """Append ties measured by hand to those of matching.
 
     Args:
         ties: of all photos, with their walls.
-        hand: measured by a person, in the photos of the same names; None for none.
+        hand: measured by hand, in photos of the same names; may be None.
         walls: the walls of `ties`.
-        ctx: takes how many they are.
+        ctx: the context, for their number.
     """
     if hand is None or not len(hand.photo):
         return ties

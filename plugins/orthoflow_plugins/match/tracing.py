@@ -1,10 +1,9 @@
-"""One photo on all walls by its pose: measured, cleaned, the pose refitted, measured again.
+"""Match one photo with all walls by its pose: measure, reject, refit the pose, measure again.
 
-Where a laser sees another colour than a camera, a photo may share too few key points with the
-intensity of a wall for a first pose. With another photo of the wall it shares hundreds. So the
-oriented photos are painted on the walls, the missing one is matched with that picture, and its pose
-follows; then it is traced on the scan as any other photo, so that its ties are known from the scan
-alone.
+A photo may share too few key points with the laser intensity of a wall for a first pose, but
+hundreds with another photo of the wall. So oriented photos are painted on the walls, and a photo
+without a pose is matched with these pictures; then it is matched with the scan as any other photo,
+so that its ties depend on the scan alone.
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ from orthoflow.geometry.cameras import (
     ViewingCamera,
     opencv_matrix,
     to_opencv,
-    unmeasured,
 )
 from orthoflow.geometry.resection import SeenPoints, adjust, misfit
 from orthoflow.geometry.robust import MEDIAN_LENGTH, NMAD_FACTOR
@@ -54,7 +52,7 @@ from orthoflow_plugins.match.ties import (
 from orthoflow_plugins.match.warping import Before, Projection, View, view_of
 
 _Painted = tuple[Wall, Features | None]
-"""A wall with an intensity from photos, NaN where none shows it, and key points of that."""
+"""A wall with intensity from photos, NaN where none shows it, and its key points."""
 
 
 _NEIGHBOURS: Final = 12
@@ -63,19 +61,18 @@ _REJECTION: Final = 3.5
 _HELD_OUT: Final = 4
 _LEAST: Final = 12
 _MAX_SIGMA_CELLS: Final = 2.0
-# What no refinement gets below: the raster's own interpolation.
+# Standard deviation of the raster's own interpolation.
 _SIGMA_FLOOR_CELLS: Final = 0.1
 _OCCUPIED_CELLS: Final = 5.0
-# How far a place is searched in the first round; halved in every next, down to the least.
+# Search radius of the first round, halved in every further one down to the least.
 _FIRST_RADIUS_CELLS: Final = 8
 _MIN_RADIUS: Final = 2
-# Photos are warped and measured at most so often.
 _MAX_ROUNDS: Final = 4
-# Warping again by a pose that moves the photo less than this on the walls changes nothing.
+# A pose that moves the photo less than this on the walls is final.
 _SETTLED_CELLS: Final = 0.3
-# Held-out error has to fall by this share for another round.
+# Relative decrease of the held-out error required for another round.
 _MIN_GAIN: Final = 0.03
-# Compared only where what came before leaves doubts.
+# Compared only where the others are not clearly good.
 _LAST: Final = "colours"
 _FEW_SHARE: Final = 0.25
 
@@ -84,24 +81,23 @@ _MIN_AGREEING: Final = 24
 _POSE_LIMIT_SHARE: Final = 0.002
 _POSE_TRIALS: Final = 2000
 _PARAMS: Final = PairingParams()
-# Lenses of one camera: a focal length is that near to what EXIF states.
+# Relative difference to the focal length of EXIF within which a lens is that of the same camera.
 _NEAR_FOCAL: Final = 0.1
 
 CONTENTS: Final = ("gradients", "grey", _LAST)
-"""All that may be compared, in the order in which it is tried."""
+"""Channels that may be compared, in the order in which they are tried."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Desk:
-    """What photos are laid on, and how they are compared.
+class Setup:
+    """The walls that photos are matched with, and how.
 
     Attributes:
         targets: all walls; any of them may hide another.
-        before: what stands free before the walls, as far as it is known: patches keep off what it
-            hides.
+        before: points before the walls; cells that they hide are not matched; None if unknown.
         max_ties: places measured per photo.
-        contents: what is compared, of `gradients`, `grey` and `colours`; the best one is kept.
-        threads: patches are shared between so many.
+        contents: channels that are compared, of `CONTENTS`; the best one is kept.
+        threads: number of threads per photo.
     """
 
     targets: Sequence[WallTarget]
@@ -118,17 +114,17 @@ class Desk:
 
 @dataclass(frozen=True, kw_only=True)
 class Trace:
-    """What tracing a photo on the walls found.
+    """The result of matching a photo with the walls.
 
     Attributes:
         photo: index of the photo.
-        pieces: ties per wall, outliers left out.
+        pieces: ties per wall without outliers.
         n_measured: displacements measured in the last round.
-        n_outliers: of these, dropped.
+        n_outliers: rejected displacements.
         held_out_px: RMS of a residual coordinate of held-out ties, per round.
-        content: what was compared.
-        camera: the pose that it was traced from.
-        settled: the pose in the end.
+        content: channels that were compared.
+        camera: the initial pose.
+        settled: the final pose.
     """
 
     photo: int
@@ -146,7 +142,7 @@ class Trace:
         return sum(len(piece) for piece in self.pieces)
 
     def json(self) -> JsonValue:
-        """Return what people may want to know of it."""
+        """Return the numbers for the report."""
         return {
             "n_ties": self.n_ties,
             "n_measured": self.n_measured,
@@ -157,14 +153,12 @@ class Trace:
 
 
 _Round = tuple[list[TiePiece], int]
-"""Ties per wall, outliers left out, and how many displacements were measured."""
+"""Ties per wall without outliers, and the number of measured displacements."""
 _Known = tuple[LensFreedom, ViewingCamera]
-"""What of a lens may be off, and a camera with the lens as it is known."""
-
-
+"""Free parameters of a lens, and a camera with the lens as known beforehand."""
 _Refitted = tuple[ViewingCamera, float, _Known | None]
 """A pose by the ties of a round, the RMS of a residual coordinate of held-out ties in pixels, and
-what of the lens was free.
+the free parameters of the lens.
 """
 
 
@@ -172,7 +166,7 @@ def trace_photo(
     index: int,
     photo: Photo,
     camera: ViewingCamera,
-    desk: Desk,
+    setup: Setup,
     lens: LensFreedom | None = None,
 ) -> Trace:
     """Match a photo with the walls it shows by its pose, until held-out ties stop improving.
@@ -180,23 +174,22 @@ def trace_photo(
     Args:
         index: of the photo.
         photo: the photo.
-        camera: its pose, good to a few cells on the walls.
-        desk: what it is laid on.
-        lens: how far the lens may be off, too, where it was only estimated. Held as first ties had
-            it where ties ask for another, it would bend what is searched, and leave out as wrong
-            what contradicts it.
+        camera: its pose, accurate to a few cells on the walls.
+        setup: the walls, and how to match.
+        lens: how far an estimated lens may be off. If it were fixed, right ties that contradict the
+            first estimate would be rejected.
     """
-    view = view_of(index, photo, camera, desk.walls, desk.before)
+    view = view_of(index, photo, camera, setup.walls, setup.before)
     found: tuple[Trace, View] | None = None
-    for content in desk.contents:
+    for content in setup.contents:
         if content == _LAST and found is not None:
-            # Laser and camera may see different things: grey says less than edges, or little.
-            is_little = found[0].n_ties < _FEW_SHARE * desk.max_ties
+            # Laser and camera may differ: grey values match worse than edges, or at few places.
+            is_little = found[0].n_ties < _FEW_SHARE * setup.max_ties
             if found[0].content == "grey" and not is_little:
                 continue
-        # What one content found out about the pose is the next one's start.
+        # The pose of one content is the start of the next.
         start = (view, _FIRST_RADIUS_CELLS) if found is None else (found[1], _MIN_RADIUS)
-        tried = _traced(start, desk, content, lens)
+        tried = _traced(start, setup, content, lens)
         if found is not None:
             new, old = tried[0], found[0]
             if new.held_out_px and old.held_out_px:
@@ -211,23 +204,22 @@ def trace_photo(
 
 
 def estimated_lens(photo: Photo, found: Intrinsics | None) -> LensFreedom | None:
-    """Return how far the lens of a photo may be off that its first orientation estimated.
+    """Return how far the estimated lens of a first orientation may be off.
 
     Returns:
-        None where it was calibrated, or given from elsewhere.
+        None if the lens was calibrated or given.
     """
     if photo.intrinsics is not None or found is None or found.source != "estimated":
         return None
-    longer_px = max(photo.width, photo.height)
-    return unmeasured(longer_px, has_exif=photo.exif_focal_px is not None)
+    return photo.lens_prior()[1]
 
 
 def lens_by_ties(trace: Trace, lens: LensFreedom) -> tuple[ViewingCamera, float]:
-    """Return a camera as a photo's ties alone have it, and the standard deviation of ln f.
+    """Return the camera adjusted to a photo's own ties, and the standard deviation of ln f.
 
     Args:
         trace: of the photo.
-        lens: how far the lens may be off from that of its pose, the focal length among it.
+        lens: free parameters of the lens, the focal length among them.
     """
     try:
         found = adjust(joined(trace.pieces), trace.settled, lens=lens, soft_limit=2.0)
@@ -237,7 +229,7 @@ def lens_by_ties(trace: Trace, lens: LensFreedom) -> tuple[ViewingCamera, float]
 
 
 def _promised(trace: Trace) -> float:
-    """Held-out error over the root of the number of ties and over how far apart they lie."""
+    """Return the held-out error over the root of the number of ties and over their spread."""
     pixels = joined(trace.pieces).pixels_photo
     if len(pixels) < _LEAST:
         return math.inf
@@ -247,21 +239,21 @@ def _promised(trace: Trace) -> float:
 
 def _traced(
     start: tuple[View, int],
-    desk: Desk,
+    setup: Setup,
     content: str,
     lens: LensFreedom | None = None,
 ) -> tuple[Trace, View]:
-    """Trace a photo by one content; also how it lay on the walls in the end."""
+    """Match a photo by one content; return its final projection onto the walls as well."""
     view, radius = start
     known = None if lens is None else (lens, view.camera)
     best: _Round | None = None
     free: _Known | None = None
     history: list[float] = []
     for _ in range(_MAX_ROUNDS):
-        found = _measured(view, desk, radius, content)
+        found = _measured(view, setup, radius, content)
         fit = _refitted(joined(found[0]), view.camera, known)
         if fit is None:
-            # A round that finds too little does not spoil the one before.
+            # A round with too few ties does not replace the one before.
             best = best or found
             break
         camera, held_out_px, freed = fit
@@ -271,7 +263,7 @@ def _traced(
             best, free = found, freed
         if not improved or _moved_cells(found[0], view, camera) < _SETTLED_CELLS:
             break
-        view = view.posed(camera, desk.walls)
+        view = view.posed(camera, setup.walls)
         radius = max(_MIN_RADIUS, radius // 2)
     pieces, n_measured = best or ([], 0)
     cleaned = _without_misfits(pieces, view.camera, free)
@@ -289,7 +281,7 @@ def _traced(
 
 
 def _moved_cells(pieces: list[TiePiece], view: View, refitted: ViewingCamera) -> float:
-    """How far another pose moves the photo on the walls, at the ties (RMS)."""
+    """Return by how much another pose moves the photo on the walls, at the ties (RMS)."""
     squares = []
     for piece in pieces:
         projection = view.projections[piece.wall]
@@ -302,9 +294,9 @@ def _moved_cells(pieces: list[TiePiece], view: View, refitted: ViewingCamera) ->
     return float(np.sqrt(np.concatenate(squares).mean()))
 
 
-def _measured(view: View, desk: Desk, radius: int, content: str) -> _Round:
-    targets = desk.targets
-    # Visible cells of a wall, in photo pixels, so that walls of any resolution compare.
+def _measured(view: View, setup: Setup, radius: int, content: str) -> _Round:
+    targets = setup.targets
+    # Visible area of each wall in photo pixels.
     sizes = [
         0 if item is None else int(np.isfinite(item.u).sum() * item.pixels_per_cell**2)
         for item in view.projections
@@ -312,7 +304,7 @@ def _measured(view: View, desk: Desk, radius: int, content: str) -> _Round:
     occupied: set[tuple[int, int]] = set()
     pieces: list[TiePiece] = []
     n_measured = 0
-    # The wall that fills most of the photo first: planes close to each other show one surface.
+    # Largest first: planes close to each other contain the same surface.
     for index in sorted(range(len(targets)), key=lambda k: (-sizes[k], k)):
         projection, target = view.projections[index], targets[index]
         if projection is None or target.grey is None or sizes[index] == 0:
@@ -323,13 +315,13 @@ def _measured(view: View, desk: Desk, radius: int, content: str) -> _Round:
         channels = target.channels[on_wall].part(projection.part)
         usable = (channels.known > 0.0) & np.isfinite(projection.u)
         strength = target.textures[on_wall][projection.part]
-        places = textured_places(strength, usable, max(50, round(desk.max_ties * share)))
+        places = textured_places(strength, usable, max(50, round(setup.max_ties * share)))
         places = _unoccupied(places, projection, occupied)
         if content == "colours":
             shown = colour_channels(view.colours_on_wall(projection))
         else:
             shown = CHANNELS[content](view.on_wall(index, projection))
-        moved = measure(channels, shown, places, radius, threads=desk.threads)
+        moved = measure(channels, shown, places, radius, threads=setup.threads)
         n_measured += len(moved.places)
         moved = moved.take(agrees_around(moved))
         grain = target.grain[0][projection.part]
@@ -345,10 +337,10 @@ def _piece(
     found: tuple[Displacements, Projection],
     grain: NDArray[np.float32],
 ) -> TiePiece:
-    """Ties of one photo with one wall; residuals agree over the cells of a grain.
+    """Return the ties of one photo with one wall.
 
-    A gap is filled over the grain's cells, and pictures are smoothed besides: one after the other,
-    so that the areas over which residuals agree add up.
+    Residuals correlate over the cells that fill a gap and, independently, over those of the
+    smoothing: the areas add up.
     """
     moved, projection = found
     alone = grain[moved.places[:, 1], moved.places[:, 0]].astype(np.float64)
@@ -367,9 +359,9 @@ def _piece(
 def _refitted(
     seen: SeenPoints, camera: ViewingCamera, known: _Known | None = None
 ) -> _Refitted | None:
-    """Pose from three quarters of the ties, and how it fits the rest; None where there is none.
+    """Return the pose from three quarters of the ties and its misfit at the rest; None if too few.
 
-    The lens moves with it where that fits the rest better, too.
+    The lens is adjusted as well if that fits the rest better.
     """
     if len(seen) < _LEAST:
         return None
@@ -384,7 +376,7 @@ def _refitted(
             continue
         residuals = misfit(seen.take(held_out), fitted).residuals_px
         lengths = np.linalg.norm(residuals, axis=1)
-        # Outliers that are left must not decide whether to go on.
+        # Remaining outliers must not decide whether to continue.
         kept = residuals[lengths <= 3.0 * float(np.median(lengths))]
         held_out_px = float(np.sqrt(np.mean(kept**2)))
         if best is None or held_out_px < (1.0 - _MIN_GAIN) * best[1]:
@@ -397,15 +389,15 @@ def fitted_pose(
     camera: ViewingCamera,
     lens: _Known | None = None,
 ) -> ViewingCamera:
-    """Return the pose that points agree with, those left out that do not.
+    """Adjust a pose to points and reject outliers in turns.
 
     Args:
         seen: the points.
-        camera: to start from.
-        lens: what of the lens is free, and a camera whose lens is what is known of it beforehand.
+        camera: the start.
+        lens: free parameters of the lens, and a camera with its prior.
 
     Raises:
-        GeometryError: they determine none.
+        GeometryError: the points determine no pose.
     """
     freedom, prior = (None, None) if lens is None else lens
     for _ in range(3):
@@ -421,7 +413,7 @@ def fitted_pose(
 def _without_misfits(
     pieces: list[TiePiece], camera: ViewingCamera, free: _Known | None = None
 ) -> list[TiePiece]:
-    """Ties that fit one pose; displaced neighbourhoods pass the median of their neighbours."""
+    """Reject ties that do not fit the pose; groups of wrong ties pass the median of neighbours."""
     seen = joined(pieces)
     if len(seen) < _LEAST:
         return pieces
@@ -437,7 +429,7 @@ def _limit(lengths: NDArray[np.float64]) -> float:
 
 
 def agrees_around(moved: Displacements) -> NDArray[np.bool_]:
-    """Displacements that agree with the median of their neighbours."""
+    """Select displacements that agree with the median of their neighbours."""
     from scipy.spatial import cKDTree
 
     count = len(moved.places)
@@ -450,7 +442,7 @@ def agrees_around(moved: Displacements) -> NDArray[np.bool_]:
     median = np.median(shifts, axis=1)
     spread = NMAD_FACTOR * np.median(np.abs(shifts - median[:, None]), axis=1)
     tolerance = np.maximum(_MEDIAN_TOLERANCE_CELLS, 3.0 * spread)
-    # Where the neighbours themselves do not agree, nothing can be told apart from chance.
+    # Neighbours that disagree with each other may agree with anything by chance.
     agrees = (np.abs(moved.shift_cells - median) <= tolerance) & (spread < 2.0)
     return np.asarray(agrees.all(axis=1))
 
@@ -458,7 +450,7 @@ def agrees_around(moved: Displacements) -> NDArray[np.bool_]:
 def _unoccupied(
     places: NDArray[np.intp], projection: Projection, occupied: set[tuple[int, int]]
 ) -> NDArray[np.intp]:
-    """Places whose part of the photo no other wall has taken; they take it."""
+    """Select places in parts of the photo that no other wall occupies, and occupy them."""
     side = _OCCUPIED_CELLS * max(projection.pixels_per_cell, 1e-6)
     u = projection.u[places[:, 1], places[:, 0]]
     v = projection.v[places[:, 1], places[:, 0]]
@@ -471,29 +463,28 @@ def _unoccupied(
 def recovered_traces(
     photos: Photos,
     oriented: Mapping[str, Camera],
-    desk: Desk,
+    setup: Setup,
     traces: Sequence[Trace],
 ) -> dict[str, Trace]:
-    """Trace photos without a pose from the one that the traced photos give them.
+    """Match photos without a pose, starting from their poses in the matched photos.
 
     Args:
         photos: all photos.
         oriented: cameras of those with a pose, by name.
-        desk: the walls.
+        setup: the walls.
         traces: of the oriented photos.
 
     Returns:
-        By name, for each photo that was found.
+        Results of the photos that were found, by name.
     """
     recovered: dict[str, Trace] = {}
     known = [trace for trace in traces if trace.n_ties]
     settled = _settled(photos, oriented, known)
     missing = [k for k, photo in enumerate(photos.photos) if photo.name not in oriented]
-    views = [_view(trace, photos, desk) for trace in known] if missing else []
+    views = [_view(trace, photos, setup) for trace in known] if missing else []
     is_new = bool(known)
     while is_new and missing:
-        # What was found shows more of the walls, for the next round.
-        painted = painted_walls(views, desk.walls)
+        painted = painted_walls(views, setup.walls)
         n_before = len(recovered)
         for index in missing:
             photo = photos.photos[index]
@@ -503,10 +494,10 @@ def recovered_traces(
                 pose = recovered_pose(photo_grey(photo), painted, lens.posed())
             if pose is None:
                 continue
-            found = trace_photo(index, photo, pose, desk, estimated_lens(photo, lens))
+            found = trace_photo(index, photo, pose, setup, estimated_lens(photo, lens))
             if found.n_ties:
                 recovered[photo.name] = found
-                views.append(_view(found, photos, desk))
+                views.append(_view(found, photos, setup))
         missing = [k for k in missing if photos.photos[k].name not in recovered]
         is_new = len(recovered) > n_before
     return recovered
@@ -515,9 +506,9 @@ def recovered_traces(
 def _settled(
     photos: Photos, oriented: Mapping[str, Camera], traces: Sequence[Trace]
 ) -> dict[str, Camera]:
-    """Cameras of traced photos by name, first those whose ties tell most of the focal length.
+    """Return cameras of matched photos by name, those with the most precise focal length first.
 
-    A lens that was only estimated is that by these ties.
+    Estimated lenses are adjusted to the new ties.
     """
     cameras: list[tuple[float, Camera]] = []
     for trace in traces:
@@ -533,24 +524,24 @@ def _settled(
     return {camera.photo: camera for _, camera in cameras}
 
 
-def _view(trace: Trace, photos: Photos, desk: Desk) -> View:
-    """Lay a photo onto the walls as it lay there in the end; its first pose hides what it hides."""
+def _view(trace: Trace, photos: Photos, setup: Setup) -> View:
+    """Project a photo onto the walls by its final pose, with the occlusions of its first."""
     photo = photos.photos[trace.photo]
-    first = view_of(trace.photo, photo, trace.camera, desk.walls, desk.before)
-    return first.posed(trace.settled, desk.walls)
+    first = view_of(trace.photo, photo, trace.camera, setup.walls, setup.before)
+    return first.posed(trace.settled, setup.walls)
 
 
 def painted_walls(views: Sequence[View], walls: Sequence[Wall]) -> list[_Painted]:
-    """Paint oriented photos on the walls, in each cell the one that shows the wall largest."""
+    """Paint oriented photos on the walls, in each cell that of the highest resolution."""
     painted = []
     for index, wall in enumerate(walls):
         grey = np.full(wall.frame.shape, np.nan, dtype=np.float32)
-        laid = [
+        shown_by = [
             (view, projection)
             for view in views
             if (projection := view.projections[index]) is not None
         ]
-        for view, projection in sorted(laid, key=lambda each: each[1].pixels_per_cell):
+        for view, projection in sorted(shown_by, key=lambda each: each[1].pixels_per_cell):
             shown = view.on_wall(index, projection)
             part = grey[projection.part]
             part[np.isfinite(shown)] = shown[np.isfinite(shown)]
@@ -564,12 +555,12 @@ def recovered_pose(
     painted: Sequence[_Painted],
     lens: ViewingCamera,
 ) -> ViewingCamera | None:
-    """Find the pose of a photo by painted walls; None where they do not show what it shows.
+    """Find the pose of a photo by its matches with painted walls; None if there are too few.
 
     Args:
         grey: (height, width) of the photo.
         painted: the walls.
-        lens: its interior orientation, roughly; the pose is ignored.
+        lens: its approximate interior orientation; the pose is ignored.
     """
     pairs = pair_photo(grey, [features for _, features in painted], _PARAMS)
     pieces = []
@@ -588,12 +579,12 @@ def recovered_pose(
 
 
 def lens_of(photo: Photo, oriented: Mapping[str, Camera], photos: Photos) -> Intrinsics | None:
-    """Return a photo's lens: calibrated, or as it came out for a photo of the same camera.
+    """Return a photo's lens: calibrated, or as estimated for a photo of the same camera.
 
-    What came out counts more than what EXIF states, which is wrong for all photos of a lens.
+    The estimate is preferred to EXIF, which may be wrong for all photos of a lens.
 
     Returns:
-        None when nothing is known of it.
+        None without either.
     """
     focal_px = {each.name: each.exif_focal_px for each in photos.photos}
     similar = [
@@ -616,7 +607,7 @@ def pose_of_most(
     lens: ViewingCamera,
     limit_px: float,
 ) -> ViewingCamera | None:
-    """Pose that most points agree with, good enough to trace the photo from."""
+    """Return the pose with most inliers, accurate enough to start from; None if too few."""
     import cv2
 
     params = sampling(limit_px, trials=_POSE_TRIALS)

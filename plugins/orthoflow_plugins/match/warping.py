@@ -1,4 +1,4 @@
-"""A photo laid into a wall's raster by a known pose, with what hides what."""
+"""A photo projected onto the raster of a wall by its pose, with occlusion."""
 
 from __future__ import annotations
 
@@ -17,27 +17,26 @@ from orthoflow_plugins.match.pictures import photo_grey, photo_rgb, shrunk
 if TYPE_CHECKING:
     from orthoflow.geometry.occluders import Occluders
 
-# A view flatter than this onto the wall shows too little to match.
+# Flatter views of the wall are not matched.
 _GRAZING_COSINE: Final = 0.15
-# Side of a cell of the depth buffer, in photo pixels per wall cell; wide enough that the projected
-# cells of a surface leave no gaps between them.
+# Side of a cell of the depth buffer, in wall cells: projected cells of a surface leave no gaps.
 _BUFFER_CELLS: Final = 2.0
-# Surface behind what a buffer cell saw counts as hidden beyond this, in wall cells.
+# Surface farther than this behind the nearest of a buffer cell is hidden, in wall cells.
 _HIDDEN_CELLS: Final = 6.0
 _ROWS_AT_ONCE: Final = 256
-# What stands free is scanned from elsewhere, and the pose is good to a few cells: cells so near to
-# hidden ones may be hidden.
+# Objects before a wall were scanned from elsewhere, and the pose is accurate to a few cells: cells
+# this near to hidden ones may be hidden.
 _BESIDE_CELLS: Final = 3
-# Which part of a wall a photo shows is found on every so many cells first.
+# Step in cells by which the part of a wall in a photo is found first.
 _COARSE: Final = 8
 _MIN_CELLS: Final = 100
-# Where OpenCV samples what is not shown; the value is not used.
+# Where OpenCV samples cells outside the photo; the value is not used.
 _OUTSIDE_PX: Final = -10.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Projection:
-    """Where the cells of a wall appear in a photo, for the part of the wall that does.
+    """Positions of the cells of a wall in a photo, for the part of the wall that it shows.
 
     Attributes:
         part: rows and columns of the wall's raster that the arrays cover.
@@ -59,22 +58,22 @@ class Projection:
         return np.array([self.part[1].start, self.part[0].start], dtype=np.intp)
 
     def pixels_at(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Pixels (n, 2) at fractional cells (n, 2) = (column, row) of the part; NaN beside void."""
+        """Return pixels (n, 2) of fractional cells (n, 2) = (column, row); NaN beside void."""
         return np.column_stack([between(self.u, at), between(self.v, at)])
 
     def hide(self, mask: NDArray[np.bool_]) -> None:
-        """Take cells (rows, cols) out."""
+        """Mark cells (rows, cols) as hidden."""
         self.u[mask] = np.nan
         self.v[mask] = np.nan
 
 
 @dataclass(frozen=True, kw_only=True)
 class Before:
-    """What stands free before walls.
+    """Points before the walls that may hide them.
 
     Attributes:
-        occluders: the cloud.
-        front_m: of each wall, how far before its plane its raster holds what is there.
+        occluders: the points.
+        front_m: distance before the plane of each wall up to which points belong to its raster.
     """
 
     occluders: Occluders
@@ -83,17 +82,16 @@ class Before:
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """A photo laid onto the walls by a pose.
+    """A photo projected onto the walls by a pose.
 
     Attributes:
         index: of the photo.
         grey: (height, width) of the photo.
-        colours: gives its (height, width, 3), which few photos need.
+        colours: returns its colours (height, width, 3), which few photos need.
         camera: the pose.
-        projections: of each wall, None where the photo does not show it.
-        hidden: of each wall, the cells that something free before it hides; empty where nothing
-            is known of that.
-        warped: the grey in the raster of each wall, as far as it was needed.
+        projections: of each wall, None if the photo does not show it.
+        hidden: cells of each wall that points before it hide; empty if unknown.
+        warped: the grey in the raster of each wall, computed when needed.
     """
 
     index: int
@@ -115,7 +113,7 @@ class View:
         return warp_photo(self.colours(), projection)
 
     def posed(self, camera: ViewingCamera, walls: Sequence[Wall]) -> View:
-        """Lay the photo onto the walls by another pose."""
+        """Project the photo onto the walls by another pose."""
         projections = _bared(project_walls(camera, walls), self.hidden)
         return replace(self, camera=camera, projections=projections, warped={})
 
@@ -127,21 +125,21 @@ def view_of(
     walls: Sequence[Wall],
     before: Before | None = None,
 ) -> View:
-    """Lay a photo onto the walls by a pose.
+    """Project a photo onto the walls by a pose.
 
     Args:
         index: of the photo.
         photo: the photo.
         camera: the pose.
         walls: all walls.
-        before: what stands free before the walls, where that is known; it hides them.
+        before: points before the walls, which hide them; None if unknown.
     """
     projections = project_walls(camera, walls)
     hidden = [] if before is None else _hidden(projections, camera, walls, before)
     return View(
         index=index,
         grey=photo_grey(photo),
-        # Every round warps them to every wall again: decoded once.
+        # Decoded once for all rounds and walls.
         colours=cache(partial(photo_rgb, photo)),
         camera=camera,
         projections=_bared(projections, hidden),
@@ -155,7 +153,7 @@ def _hidden(
     walls: Sequence[Wall],
     before: Before,
 ) -> list[NDArray[np.bool_]]:
-    """Cells of each wall that points before its raster hide, and those near them."""
+    """Find the cells of each wall that points before its raster hide, and those near them."""
     import cv2
 
     from orthoflow.geometry.occluders import depth_buffer
@@ -167,14 +165,14 @@ def _hidden(
         mask = np.zeros(wall.frame.shape, dtype=np.uint8)
         if projection is not None:
             seen = np.isfinite(projection.u)
-            # Within a rounding of the photo's far border a single-precision pixel lies on it.
+            # Rounded to single precision, a pixel may lie on the far border.
             rows, columns = (
                 np.minimum((pixels[seen] / buffer.reduction).astype(np.intp), length - 1)
                 for pixels, length in zip(
                     (projection.v, projection.u), buffer.nearest.shape, strict=True
                 )
             )
-            # How far along its ray from the camera to the cell the nearest point is, 0 to 1.
+            # Position of the nearest point on the ray from the camera to the cell, 0 to 1.
             along = np.minimum(buffer.nearest[rows, columns] / projection.distance[seen], 1.0)
             frame = wall.frame
             camera_m = float((camera.centre_world - frame.origin_world) @ frame.normal_world)
@@ -188,7 +186,7 @@ def _hidden(
 def _bared(
     projections: Sequence[Projection | None], hidden: Sequence[NDArray[np.bool_]]
 ) -> Sequence[Projection | None]:
-    """Projections without the cells that are hidden."""
+    """Mark the hidden cells of projections."""
     for projection, mask in zip(projections, hidden, strict=bool(hidden)):
         if projection is not None:
             projection.hide(mask[projection.part])
@@ -196,9 +194,9 @@ def _bared(
 
 
 def project_walls(camera: ViewingCamera, walls: Sequence[Wall]) -> list[Projection | None]:
-    """Project the surfaces of all walls into a photo; None where a wall is not in it.
+    """Project the surfaces of all walls into a photo; None if a wall is not in it.
 
-    Cells that another surface hides, of the same wall or another one, are NaN.
+    Cells hidden by another surface, of the same wall or another one, are NaN.
     """
     seen = [_in_photo(camera, wall) for wall in walls]
     shown = [(wall, item) for wall, item in zip(walls, seen, strict=True) if item is not None]
@@ -222,15 +220,14 @@ def project_walls(camera: ViewingCamera, walls: Sequence[Wall]) -> list[Projecti
 
 
 def warp_photo(picture: NDArray[np.uint8], projection: Projection) -> NDArray[np.float32]:
-    """Resample a photo at the cells of a wall, averaged down to the cells' size first.
+    """Resample a photo at the cells of a wall, after reduction to their resolution.
 
     Args:
         picture: (height, width) or (height, width, c).
-        projection: where the cells are in the photo.
+        projection: positions of the cells in the photo.
 
     Returns:
-        (rows, cols) or (rows, cols, c) over `projection.part`, 0..255; NaN where the photo does not
-        show the wall.
+        (rows, cols) or (rows, cols, c) over `projection.part`, 0..255; NaN outside the photo.
     """
     import cv2
 
@@ -259,7 +256,7 @@ def _in_photo(camera: ViewingCamera, wall: Wall) -> Projection | None:
     )
     if float(towards @ frame.normal_world) <= 0.0:
         return None
-    # Around the wall: survey coordinates would cost digits.
+    # Relative to the wall: survey coordinates would lose digits.
     near = camera.shifted(frame.origin_world)
     coarse = _project_cells(near, wall, (slice(0, frame.height), slice(0, frame.width)), _COARSE)
     part = _part_in_photo(np.isfinite(coarse[0]), frame.shape)
@@ -278,7 +275,7 @@ def _in_photo(camera: ViewingCamera, wall: Wall) -> Projection | None:
 
 
 def _part_in_photo(seen: NDArray[np.bool_], shape: tuple[int, int]) -> tuple[slice, slice] | None:
-    """Rows and columns about the coarse cells that are in the photo, a coarse cell wider."""
+    """Return rows and columns of the coarse cells in the photo, with a margin of one of them."""
     if not seen.any():
         return None
     spans = []
@@ -292,7 +289,7 @@ def _part_in_photo(seen: NDArray[np.bool_], shape: tuple[int, int]) -> tuple[sli
 def _project_cells(
     near: ViewingCamera, wall: Wall, part: tuple[slice, slice], step: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Pixels u and v and distance of every step-th cell of a part; the world begins at the wall."""
+    """Return u, v and distance of every step-th cell of a part; the wall is the world's origin."""
     frame = wall.frame
     rows = np.arange(part[0].start, part[0].stop, step)
     columns = np.arange(part[1].start, part[1].stop, step)
@@ -312,7 +309,7 @@ def _project_cells(
 
 
 def between(raster: NDArray[np.float32], at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Values (n,) at fractional cell indices (n, 2) = (column, row); NaN beside unknown cells."""
+    """Interpolate (n,) at fractional cell indices (n, 2) = (column, row); NaN beside unknown."""
     height, width = raster.shape
     inside = (at >= 0.0).all(axis=1) & (at[:, 0] < width - 1) & (at[:, 1] < height - 1)
     left = np.where(inside, at[:, 0], 0.0).astype(np.intp)

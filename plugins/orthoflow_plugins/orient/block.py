@@ -1,7 +1,7 @@
-"""A block of photos that share lenses and points: its adjustment, and how exact it is.
+"""A block of photos that share lenses and points: bundle adjustment and covariance.
 
-COLMAP's cost functions and the Ceres solver adjust it; the covariance of all unknowns is honest
-about what errs together.
+COLMAP's cost functions and the Ceres solver adjust it; the covariance of all unknowns includes
+correlated errors of the observations.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from orthoflow.products import JsonValue, Photo
 from orthoflow.sdk import DiagnosticSpec
 from orthoflow_plugins.orient.pose import Lens, Note
 
-# A known point is never exact: an adjustment divides by its variance.
+# Lower limit of the standard deviation of a known point, whose variance is a divisor.
 _MIN_SIGMA_M: Final = 1e-6
 _CORRELATED: Final = 0.95
 _MIN_FOR_PLANE: Final = 3
@@ -45,9 +45,9 @@ _CONVERGED: Final = 1e-8
 _MODEL: Final = "FULL_OPENCV"
 _N_VALUES: Final = 12
 _COLUMNS: Final = {"cx": 2, "cy": 3, "k1": 4, "k2": 5, "p1": 6, "p2": 7}
-# fx and fy are values of their own; so tight a prior ties them where their ratio is known.
+# COLMAP has fx and fy; this prior of their ratio fixes it.
 _TIED_ASPECT: Final = 1e-5
-# An observation this far off under a loss this narrow pulls with nothing.
+# An observation this far off has no weight with a loss this narrow.
 _FAR_PX: Final = -1e6
 _NOTHING: Final = 1e-9
 LENS_CONFUSED: Final = DiagnosticSpec(
@@ -63,7 +63,7 @@ LENS_CONFUSED: Final = DiagnosticSpec(
 
 @dataclass(frozen=True, kw_only=True)
 class Observations(Rows):
-    """Pixels at which photos see points.
+    """Pixels of points in photos.
 
     Attributes:
         photo: (m,) index of the camera.
@@ -80,11 +80,11 @@ class Observations(Rows):
 
 @dataclass(frozen=True, kw_only=True)
 class Points(Rows):
-    """Points that photos see.
+    """Points of a block.
 
     Attributes:
-        now: (k, 3) metres, where the adjustment has them.
-        known: (k, 3) metres, where the scan has them; anything without the scan.
+        now: (k, 3) metres, adjusted.
+        known: (k, 3) metres, in the scan; any value without the scan.
         sigma_m: (k,) standard deviation of each coordinate of `known`; inf without the scan.
     """
 
@@ -95,7 +95,7 @@ class Points(Rows):
 
 @dataclass(frozen=True, kw_only=True)
 class Block:
-    """Cameras, lenses, points and what is seen of them, in a world with its origin nearby.
+    """Cameras, lenses, points and observations, in a world with its origin nearby.
 
     Attributes:
         cameras: one per photo.
@@ -113,23 +113,23 @@ class Block:
 
     @property
     def is_joint(self) -> NDArray[np.bool_]:
-        """Points (k,) seen more than once: they move; the others only widen their pixel."""
+        """Points (k,) seen more than once, which are adjusted; others only widen their pixel."""
         return np.bincount(self.seen.point, minlength=len(self.points)) > 1
 
     @property
     def lens_starts(self) -> NDArray[np.intp]:
-        """First column of each lens in the block's normal matrix, behind the poses; and its end."""
+        """First column of each lens in the normal matrix, after the poses; and the end."""
         sizes = [lens.freedom.sigmas.size for lens in self.lenses]
         return POSE_PARAMETERS * len(self.cameras) + np.cumsum([0, *sizes], dtype=np.intp)
 
     def columns(self, photo: int) -> NDArray[np.intp]:
-        """Columns of a photo's pose and of its lens in the normal matrix."""
+        """Return the columns of a photo's pose and lens in the normal matrix."""
         first, last = self.lens_starts[self.lens_of[photo] :][:2]
         pose = POSE_PARAMETERS * photo + np.arange(POSE_PARAMETERS)
         return np.concatenate([pose, np.arange(first, last)])
 
     def photos_of(self, lens: int) -> list[int]:
-        """Photos that share a lens."""
+        """Return the photos that share a lens."""
         return [photo for photo, of in enumerate(self.lens_of) if of == lens]
 
 
@@ -138,8 +138,8 @@ class BlockCovariance:
     """The covariance of a block.
 
     Attributes:
-        matrix: (p, p), the columns as `Block.columns` gives them.
-        cofactors: (p, p) the same for sigmas taken as they are.
+        matrix: (p, p), columns as in `Block.columns`.
+        cofactors: (p, p) the same from the a priori sigmas.
         sigma0: standard deviation of unit weight.
         redundancy: observations beyond what determines the unknowns.
     """
@@ -151,11 +151,11 @@ class BlockCovariance:
 
 
 def solve(block: Block, *, soft_limit: float) -> Block:
-    """Adjust all cameras, lenses and jointly seen points at once.
+    """Adjust all cameras, lenses and points seen more than once.
 
     Args:
-        block: where to start.
-        soft_limit: residuals beyond so many standard deviations count less (Huber).
+        block: the start.
+        soft_limit: residuals beyond so many standard deviations get less weight (Huber).
 
     Raises:
         GeometryError: the block has no solution.
@@ -163,8 +163,8 @@ def solve(block: Block, *, soft_limit: float) -> Block:
     import pyceres
 
     ceres: Any = pyceres
-    # The solver changes poses, lenses and points in place. COLMAP's adjuster has to outlive it, and
-    # one and the same object of the problem keeps costs and losses alive.
+    # The solver changes poses, lenses and points in place. COLMAP's adjuster must outlive it, and a
+    # single reference to the problem keeps costs and losses alive.
     scene, adjuster = _set_up(block)
     problem = adjuster.problem
     images = [scene.images[index + 1] for index in range(len(block.cameras))]
@@ -177,7 +177,7 @@ def solve(block: Block, *, soft_limit: float) -> Block:
     options = ceres.SolverOptions()
     options.max_num_iterations = _ITERATIONS
     options.function_tolerance = _CONVERGED
-    # Sums of several threads come in any order.
+    # The order of sums of several threads is not reproducible.
     options.num_threads = 1
     kinds = ceres.LinearSolverType
     options.linear_solver_type = kinds.DENSE_SCHUR if joint else kinds.DENSE_NORMAL_CHOLESKY
@@ -208,11 +208,11 @@ def solve(block: Block, *, soft_limit: float) -> Block:
 
 
 def pixel_covariances(block: Block, *, alone: bool = False) -> NDArray[np.float64]:
-    """Covariances (m, 2, 2) of the pixels; of points seen once, with that of the point.
+    """Return covariances (m, 2, 2) of the pixels, including that of the point if seen once.
 
     Args:
         block: the block.
-        alone: take every point as if it were seen once.
+        alone: include that of every point.
     """
     seen = block.seen
     covariances = (seen.sigma_px**2)[:, None, None] * np.eye(2)
@@ -231,7 +231,7 @@ def block_covariance(block: Block, *, soft_limit: float) -> BlockCovariance:
 
     Args:
         block: as adjusted.
-        soft_limit: residuals beyond so many standard deviations count less (Huber).
+        soft_limit: residuals beyond so many standard deviations get less weight (Huber).
 
     Raises:
         GeometryError: the observations do not determine the block.
@@ -263,7 +263,7 @@ def block_covariance(block: Block, *, soft_limit: float) -> BlockCovariance:
 def lenses_json(
     block: Block, photos: Sequence[Photo], covariance: NDArray[np.float64]
 ) -> JsonValue:
-    """Return each lens as it came out, with standard deviations where it was free."""
+    """Return each adjusted lens, with standard deviations of free parameters."""
     entries: list[JsonValue] = []
     sigmas = np.sqrt(np.diag(covariance))
     for index, lens in enumerate(block.lenses):
@@ -285,7 +285,7 @@ def lenses_json(
 
 
 def lens_statistics(block: Block) -> JsonValue:
-    """Mean and SD of what is free, over lenses of one image size that are free alike."""
+    """Return mean and SD of free parameters over lenses of one size with the same ones."""
     kinds: dict[tuple[int, int, tuple[str, ...]], list[NDArray[np.float64]]] = {}
     for index, lens in enumerate(block.lenses):
         camera, names = block.cameras[block.lens_of.index(index)], lens.freedom.names
@@ -311,9 +311,9 @@ def lens_statistics(block: Block) -> JsonValue:
 def correlation_notes(
     block: Block, photos: Sequence[Photo], cofactors: NDArray[np.float64]
 ) -> list[tuple[str, Note]]:
-    """Return where photos hardly tell their lens from their pose, each with the first photo."""
+    """Return the lens parameters that correlate with poses, each with the first photo."""
     notes: list[tuple[str, Note]] = []
-    # Lenses of one camera, which nothing says to be one, have each to be told from its own photos.
+    # Separate lenses of what may be one camera are each determined by their own photos.
     shared = ", or intrinsics: shared where one camera took them all at one zoom,"
     also = shared if len(block.lenses) > 1 else ""
     scale = np.sqrt(np.diag(cofactors))
@@ -322,7 +322,7 @@ def correlation_notes(
         members = block.photos_of(index)
         for column, name in enumerate(lens.freedom.names, block.lens_starts[index]):
             of_poses = correlations[: POSE_PARAMETERS * len(block.cameras), column]
-            # Only what all its photos confuse stays unknown.
+            # Only what is correlated in all its photos is undetermined.
             confused = of_poses.reshape(-1, POSE_PARAMETERS)[members].min(axis=0)
             worst = int(confused.argmax())
             if confused[worst] > _CORRELATED:
@@ -333,17 +333,17 @@ def correlation_notes(
 
 
 _Rows = tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]
-"""Equations in standard deviations, points eliminated: columns (c,) of the unknowns that take part,
-jacobian (r, c) and residuals (r,).
+"""Equations in standard deviations with points eliminated: columns (c,) of the unknowns, Jacobian
+(r, c) and residuals (r,).
 """
 
 
 def _adjusted_points(
     block: Block, cofactors: NDArray[np.float64], soft_limit: float
 ) -> AdjustedPoints:
-    """The places of the scan that photos see, and how far they are from there."""
+    """Return the points of the scan with their residuals in the photos."""
     known = np.isfinite(block.points.sigma_m[block.seen.point])
-    # Also what several photos see is compared with where the scan has it.
+    # Points seen by several photos are compared with the scan as well.
     at_scan = replace(block.points, now=block.points.known)
     block = replace(block, points=at_scan, seen=block.seen.take(known))
     seen, n_known = block.seen, len(block.seen)
@@ -357,7 +357,7 @@ def _adjusted_points(
         by_camera, by_point, off = _seen_by(block, photo, mine, with_places[mine], soft_limit)
         residuals[mine], by_place[mine] = off, by_point
         jacobian[mine[:, None, None], [[0], [1]], own] = by_camera
-        # A place pulls with what it is known by, once for all photos that see it.
+        # The error of a place acts once through all photos that see it.
         by_camera, by_point, _ = _seen_by(block, photo, mine, of_pixels[mine], math.inf)
         pulls[mine[:, None, None], [[0], [1], [2]], own] = np.einsum(
             "nip,nid->ndp", by_camera, by_point
@@ -380,7 +380,7 @@ def _adjusted_points(
 
 
 def _rows(block: Block, soft_limit: float) -> list[_Rows]:
-    """Return the equations of the unknowns that remain when every point is eliminated."""
+    """Return the equations of the remaining unknowns after elimination of all points."""
     seen = block.seen
     joint = block.is_joint[seen.point]
     covariances = pixel_covariances(block)
@@ -404,7 +404,7 @@ def _seen_by(
     covariances: NDArray[np.float64],
     soft_limit: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Equations of a photo's m observations, in standard deviations, robust weights applied.
+    """Return equations of a photo's m observations, in standard deviations, robustly weighted.
 
     Returns:
         Derivatives by pose and lens (m, 2, c) and by the points (m, 2, 3), and residuals (m, 2).
@@ -427,7 +427,7 @@ def _seen_by(
 def _without_point(
     block: Block, point: int, parts: list[tuple[_Rows, NDArray[np.float64]]]
 ) -> _Rows:
-    """Eliminate a point seen by several photos: what its position cannot explain remains."""
+    """Eliminate a point seen by several photos."""
     columns = np.unique(np.concatenate([one[0] for one, _ in parts]))
     sigma_m = float(block.points.sigma_m[point])
     n_known = 3 if math.isfinite(sigma_m) else 0
@@ -448,10 +448,10 @@ def _without_point(
 
 
 def _set_up(block: Block) -> tuple[Any, Any]:
-    """Let COLMAP set up poses and lenses: its scene, and its adjuster.
+    """Set up poses and lenses as COLMAP's scene and adjuster.
 
-    The manifold on which a pose moves is to be had from COLMAP's adjuster only, and that wants
-    observations: two of one point per photo, so far off that they pull with nothing.
+    Only COLMAP's adjuster provides the manifold of a pose, and it requires observations: two of one
+    point per photo, so far off that they have no weight.
     """
     import pycolmap
 
@@ -490,7 +490,7 @@ def _add_observations(
     joint: dict[int, NDArray[np.float64]],
     soft_limit: float,
 ) -> None:
-    """Add what is seen: of a point of its own as a wider pixel, of a joint one as it is."""
+    """Add observations: of points seen once with the point's covariance, of others without."""
     import pyceres
     import pycolmap
     from pycolmap import cost_functions
@@ -521,15 +521,15 @@ def _add_observations(
 def _values(camera: ViewingCamera) -> NDArray[np.float64]:
     if camera.skew:
         raise MethodError(
-            f"a lens of the block has a skew of {camera.skew:.1f} px, which no model of COLMAP "
-            "has: calibrate it without, or use orient.dlt or orient.pnp"
+            f"a lens of the block has a skew of {camera.skew:.1f} px, which no camera model of "
+            "COLMAP has: calibrate it without, or use orient.dlt or orient.pnp"
         )
     values = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion]
     return np.pad(np.array(values), (0, _N_VALUES - len(values)))
 
 
 def _limit_lens(problem: Any, lens: Lens, values: NDArray[np.float64]) -> None:
-    """Hold what is not free of a lens, and pull the rest towards what is known of it."""
+    """Fix parameters of a lens that are not free, and constrain the others by their prior."""
     import pyceres
 
     ceres: Any = pyceres

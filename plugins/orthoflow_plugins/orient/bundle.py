@@ -78,28 +78,26 @@ from orthoflow_plugins.orient.report import Oriented, hand_over
 
 _SHARE_BY_ITSELF: Final = 0.4
 _SHARE_FEATURES: Final = 0.7
-# Photos are tied when each shows so much of what the other shows of the walls.
+# Photos are tied if each shows this share of what the other shows of the walls.
 _MIN_OVERLAP: Final = 0.2
-# So many points between photos fix a block; more would only take time.
+# More points between photos would only take time.
 _MAX_PHOTO_POINTS: Final = 1000
-# So shared, a lens is asked of each of its photos whether it can be its own.
+# Sharing by which each photo of a lens is tested.
 _TESTED: Final = "focal-group"
 _ROUNDS: Final = 5
 _TIE_SIGMA_START_PX: Final = 0.5
 _TIE_SIGMA_RANGE_PX: Final = (0.1, 2.0)
-# Scan ties of several photos at one place of the wall are one point of the scan.
+# Scan ties of several photos this close together are one point of the scan.
 _SAME_PLACE_M: Final = 1e-6
-# Of photos without EXIF nobody knows whether one lens took them. A person who takes a series seldom
-# changes it, and a lens that many photos share is known far better than that of any of them. But a
-# lens may have zoomed, and a program may have turned a picture. So each photo's own ties are asked.
-# One photo in a thousand is given a lens of its own although it shares that of the others.
-_CHANCE: Final = 1e-3
-# A camera has one lens. A series that zoomed differs by more than this share of the focal length;
-# what errors of the scan that neighbouring ties have in common do to the focal length of one photo
-# is less (up to 0.7 % on photogrammetric clouds of 10 to 30 mm noise).
+# Whether photos without EXIF share a lens is unknown. A series is seldom taken with several, and
+# the lens of many photos is determined far better than that of one. But a zoom lens may have been
+# used, or a picture rotated or cropped. So the focal length by each photo's own ties is compared.
+# Zooming changes it by more than this share; correlated errors of the scan change that of one photo
+# by less (up to 0.7 % on photogrammetric clouds of 10 to 30 mm noise).
 _MIN_ZOOM: Final = 0.02
 _ZOOM_SIGMAS: Final = 5.0
-# Those that contradict most bend the lens, so that others contradict it, too: these leave first.
+# The photos that contradict most distort the lens, so that others contradict it as well: they are
+# separated first.
 _SHARE_OF_WORST: Final = 0.5
 NO_BLOCK: Final = DiagnosticSpec(
     code="bundle-without-result",
@@ -111,13 +109,13 @@ NO_BLOCK: Final = DiagnosticSpec(
 class OrientColmapBundle(Method):
     """Orient all photos at once: bundle adjustment with the scan as control.
 
-    Each photo is first oriented by itself, and one whose pose agrees with its ties no better than
-    chance stays out. Key points that photos share tie them to each other. COLMAP's cost functions
-    and the Ceres solver then adjust poses, lenses and points together: every tie with a wall pulls
-    with the standard deviation that its matcher gives, ties between photos with the one that their
-    residuals show. Lenses without calibration start from EXIF and are refined, common to the photos
-    that share a focal length, or without EXIF to those whose ties do not contradict that. Photos
-    are judged as in `orient.pnp`, by the same withheld ties.
+    Each photo is first oriented separately; photos whose ties agree with their pose no better than
+    by chance are left out. Key points matched between photos tie them to each other. COLMAP's cost
+    functions and the Ceres solver then adjust poses, lenses and points together: ties with walls
+    are weighted by the standard deviations of their matcher, ties between photos by that of their
+    residuals. Lenses without calibration start from EXIF and are refined, shared by photos of one
+    focal length, or without EXIF by those whose ties do not contradict. The gates are those of
+    `orient.pnp`, with the same check points.
     """
 
     id: ClassVar[str] = "orient.colmap-bundle"
@@ -140,20 +138,20 @@ class OrientColmapBundle(Method):
     )
 
     class Params(OrientParams):
-        """Lenses and ties between photos, and what `orient.pnp` takes, too."""
+        """Lenses, ties between photos, and the parameters of `orient.pnp`."""
 
         intrinsics: Sharing = Field(
             default="focal-group",
-            description="Which photos share a lens: those of one size and one focal length, or of "
-            "one size where no file says it and their ties do not contradict (focal-group), "
-            "all of one size (shared), or none (per-photo).",
+            description="Which photos share a lens: those of one size and one stated focal length, "
+            "or of one size without any if their ties do not contradict (focal-group), all of "
+            "one size (shared), or none (per-photo).",
         )
         refine: Refined = Field(
             default="uncalibrated",
             description="Which lenses the adjustment refines: uncalibrated, all, or none.",
         )
         photo_ties: bool = Field(
-            default=True, description="Tie the photos to each other, too, where they overlap."
+            default=True, description="Tie overlapping photos to each other as well."
         )
         max_features: int = Field(
             default=3000, ge=100, description="Key points per photo for ties between photos."
@@ -188,7 +186,7 @@ class OrientColmapBundle(Method):
 
     @classmethod
     def tools(cls) -> dict[str, str]:
-        """COLMAP and Ceres adjust, OpenCV finds key points."""
+        """COLMAP and Ceres adjust, OpenCV detects key points."""
         names = ("pycolmap", "pyceres", "scipy", "opencv-python-headless")
         return {name: version(name) for name in names}
 
@@ -196,11 +194,11 @@ class OrientColmapBundle(Method):
 def _by_itself(
     tied: TiedPhoto, ties: Ties, params: OrientColmapBundle.Params
 ) -> Trusted | Oriented:
-    """Orient a photo by its own ties; refused where they agree by chance only."""
+    """Orient a photo by its own ties; refuse it if they agree by chance only."""
     found = by_itself(tied, ties, params, estimate_pose)
     if isinstance(found, Oriented):
         return found
-    # A wrong pose would pull at the photos that are tied to it.
+    # A wrong pose would distort the photos that are tied to it.
     against = refusal(candidate_of(tied, ties, params, found.estimate), GATES_BEFORE_BLOCK)
     if against is None:
         return found
@@ -210,7 +208,7 @@ def _by_itself(
 def _adjusted(
     block: Sequence[Trusted], params: OrientColmapBundle.Params, ctx: StepContext
 ) -> Adjusted | None:
-    """Adjust photos with shared lenses, and again with lenses of their own where ties ask."""
+    """Adjust photos with shared lenses, and again with separate lenses where ties contradict."""
     photos = [item.tied.photo for item in block]
     cameras = [item.estimate.resection.camera for item in block]
     between = _photo_ties(block, params, ctx)
@@ -253,7 +251,7 @@ def _photo_ties(
 def _report_block(
     ctx: StepContext, adjusted: Adjusted, photos: Sequence[Photo]
 ) -> dict[str, JsonValue]:
-    """Report of the block as a whole; of its photos, each tells itself."""
+    """Report metrics and diagnostics of the block as a whole."""
     block, covariance = adjusted.block, adjusted.covariance
     for photo, (note, values) in correlation_notes(block, photos, covariance.cofactors):
         ctx.report(note, subject=photo, **values)
@@ -285,10 +283,10 @@ class Adjusted:
         covariance: of all unknowns.
         estimates: one per photo, in the world.
         tie_sigma_px: standard deviation of a coordinate of a tie between photos, in pixels of the
-            picture it was found in; NaN without ties.
-        tie_rmse_px: root mean square of such a coordinate's residual, photo pixels; NaN without.
-        n_tie_points: points that only photos see.
-        n_tie_observations: in how many photos, added up.
+            picture in which it was found; NaN without ties.
+        tie_rmse_px: root mean square of their residual coordinates, photo pixels; NaN without ties.
+        n_tie_points: points that the scan does not contain.
+        n_tie_observations: observations of these points.
     """
 
     block: Block
@@ -303,14 +301,14 @@ class Adjusted:
 
 @dataclass(kw_only=True)
 class _Weights:
-    """What an adjustment takes of the ties, and how exact they are.
+    """Inliers and weights of an adjustment.
 
     Attributes:
-        agreeing: per photo, (n,) bool of its scan ties.
+        agreeing: per photo, (n,) bool, inliers of its scan ties.
         units: standard deviation of unit weight of each photo's scan ties.
         limits: of each photo's scan ties, in standard deviations.
-        tie_active: (m,) bool of the observations between photos.
-        tie_sigma: of these, in pixels of the picture they were found in.
+        tie_active: (m,) bool, inliers of the observations between photos.
+        tie_sigma: their standard deviation, pixels of the picture in which they were found.
     """
 
     agreeing: list[NDArray[np.bool_]]
@@ -326,13 +324,13 @@ def adjust_block(
     groups: tuple[tuple[int, ...], tuple[Lens, ...]],
     params: OrientParams,
 ) -> Adjusted:
-    """Adjust photos and lenses together: reject, weigh anew, until nothing changes.
+    """Adjust photos and lenses together; reject and reweight until the inliers stay the same.
 
     Args:
         photos: the photos.
         ties: between them, in the world.
         groups: index of each photo's lens, and the lenses.
-        params: what is rejected.
+        params: how to reject.
 
     Raises:
         GeometryError: the ties do not determine the block.
@@ -393,27 +391,23 @@ def adjust_block(
 
 
 def of_another_lens(photos: Sequence[Trusted], adjusted: Adjusted) -> Set[int]:
-    """Find the photos that cannot have the lens that they share by their size alone.
+    """Find the photos whose own focal length contradicts the lens shared by their size alone.
 
     Args:
         photos: of the block.
         adjusted: the block.
 
     Returns:
-        Indices of those that contradict it most; of the others another adjustment tells.
+        Indices of those that contradict it most; the others are decided by another adjustment.
     """
     block = adjusted.block
-    widenings = [_widening(item.estimate.resection) for item in photos]
-    # Of the photos whose ties lie in enough places to tell it.
-    usual = float(np.median([each for each in widenings if each > 1.0] or [1.0]))
     excesses: dict[int, float] = {}
     for at, lens in enumerate(block.lens_of):
         alone, shared = photos[at].estimate.resection, adjusted.estimates[at].resection
         if block.lenses[lens].source != UNKNOWN or block.lens_of.count(lens) < 2:
             continue
         off = abs(math.log(alone.camera.fx / shared.camera.fx))
-        if off > max(_MIN_ZOOM, _ZOOM_SIGMAS * focal_sigma(alone)):
-            excesses[at] = _excess(photos[at], shared.camera, usual)
+        excesses[at] = off / max(_MIN_ZOOM, _ZOOM_SIGMAS * focal_sigma(alone))
     most = max(excesses.values(), default=0.0)
     return frozenset(
         at for at, excess in excesses.items() if excess > max(1.0, _SHARE_OF_WORST * most)
@@ -425,7 +419,7 @@ def _start(
     groups: tuple[tuple[int, ...], tuple[Lens, ...]],
     middle: NDArray[np.float64],
 ) -> tuple[ViewingCamera, ...]:
-    """Cameras to start from, in a world shifted to `middle`."""
+    """Return the initial cameras, in a world shifted to `middle`."""
     alone = [item.estimate.resection.camera for item in photos]
     cameras: list[ViewingCamera] = []
     lens_of, lenses = groups
@@ -435,10 +429,10 @@ def _start(
         if not lens.freedom.sigmas.size:
             own = posed(lens.prior, own)
         elif lens.source == UNKNOWN:
-            # From that of the photo whose own ties tell most of the focal length.
+            # From the photo whose own ties determine the focal length best.
             best = min(members, key=lambda k: focal_sigma(photos[k].estimate.resection))
             if best != at:
-                # With another focal length a photo stands elsewhere.
+                # Another focal length changes the position.
                 own = posed(alone[best], own)
                 with suppress(GeometryError):
                     own = fitted(item.tied.control(item.estimate.agreeing), own)
@@ -455,7 +449,7 @@ def _block(
     state: tuple[tuple[ViewingCamera, ...], NDArray[np.float64], NDArray[np.float64]],
     weights: _Weights,
 ) -> Block:
-    """Join scan ties and ties between photos; cameras, and points that only photos see, as now."""
+    """Build the block from scan ties and ties between photos, with current cameras and points."""
     cameras, positions, middle = state
     seen = [
         item.tied.seen.take(chosen) for item, chosen in zip(photos, weights.agreeing, strict=True)
@@ -494,7 +488,7 @@ def _block(
 def _weighed(
     photos: Sequence[Trusted], fits: Sequence[Misfit], used: _Weights, rejection_sigma: float
 ) -> _Weights:
-    """Reject scan ties that disagree with the block, and estimate how exact the rest is."""
+    """Reject outliers among the scan ties and estimate the standard deviation of the rest."""
     agreeing, units, limits = [], [], []
     for item, fit, some in zip(photos, fits, used.agreeing, strict=True):
         is_check = item.tied.is_check
@@ -509,11 +503,11 @@ def _weighed(
 def _weigh_between(
     ties: PhotoTies, lengths: NDArray[np.float64], weights: _Weights, rejection_sigma: float
 ) -> None:
-    """Do the same with the ties between photos, whose residuals (m,) have these lengths."""
+    """Do the same for ties between photos from the lengths (m,) of their residuals."""
     from scipy.special import chdtri  # scipy.stats would take seconds to import
 
     active = weights.tie_active
-    # Of 2 m coordinates, 3 go into the point: its sum of squares is as chi-square of the rest.
+    # Of 2 m coordinates 3 determine the point: the sum of squares is chi-square with the rest.
     squares = np.bincount(ties.point[active], lengths[active] ** 2)
     n_seeing = np.bincount(ties.point[active])
     is_tied = n_seeing > 1
@@ -521,7 +515,7 @@ def _weigh_between(
     sigma = math.sqrt(float(np.median(squares[is_tied] / usual)))
     weights.tie_sigma = float(np.clip(sigma, *_TIE_SIGMA_RANGE_PX))
     near = lengths <= rejection_sigma * weights.tie_sigma
-    # Of points that at least two photos still see.
+    # Points need inliers in two photos.
     counts = np.bincount(ties.point[near], minlength=len(ties.points_world))
     weights.tie_active = near & (counts[ties.point] > 1)
 
@@ -529,7 +523,7 @@ def _weigh_between(
 def _tie_residuals(
     ties: PhotoTies, cameras: Sequence[ViewingCamera], positions: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Length (m,) in pixels of the residuals of the ties between photos."""
+    """Return the lengths (m,) in pixels of the residuals of ties between photos."""
     lengths = np.full(len(ties.photo), np.inf)
     for at, camera in enumerate(cameras):
         mine = ties.photo == at
@@ -546,7 +540,7 @@ def _resection(
     middle: NDArray[np.float64],
     unit: float,
 ) -> Resection:
-    """Return a photo's part of the block, with a standard deviation of unit weight, by itself."""
+    """Return the resection of one photo of the block."""
     columns = block.columns(at)
     own = covariance.matrix[np.ix_(columns, columns)]
     cofactors = covariance.cofactors[np.ix_(columns, columns)]
@@ -559,36 +553,3 @@ def _resection(
         variance_factor=unit**2 * float(np.trace(np.linalg.solve(cofactors, own))) / len(columns),
         lens=block.lenses[block.lens_of[at]].freedom,
     )
-
-
-def _excess(item: Trusted, shared: ViewingCamera, usual_widening: float) -> float:
-    """How much worse a photo's ties fit the shared lens, at any pose, than chance has it.
-
-    The likelihood ratio of the photo's own lens and the shared one, as chi-square over its limit.
-    """
-    from scipy.special import chdtri  # scipy.stats would take seconds to import
-
-    alone = item.estimate.resection
-    n_free = alone.lens.sigmas.size
-    if not n_free:
-        return 0.0
-    control = item.tied.control(item.estimate.agreeing)
-    limit = SOFT_LIMIT * alone.sigma0
-    try:
-        camera = fitted(control, shared, soft_limit=limit)
-    except GeometryError:
-        return math.inf
-    losses = []
-    for viewer in (camera, alone.camera):
-        lengths = misfit(control, viewer).normalised
-        # Squares, of those beyond the limit less (Huber).
-        soft = np.where(lengths <= limit, lengths**2, limit * (2.0 * lengths - limit))
-        losses.append(float(soft.sum()))
-    widening = max(_widening(alone), usual_widening)
-    chance = float(chdtri(n_free, _CHANCE))
-    return (losses[0] - losses[1]) / (alone.sigma0**2 * widening * chance)
-
-
-def _widening(alone: Resection) -> float:
-    """By how much a photo's variances grow because residuals of neighbouring ties agree."""
-    return alone.variance_factor / alone.sigma0**2

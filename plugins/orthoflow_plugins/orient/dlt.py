@@ -1,7 +1,7 @@
-"""`orient.dlt`: each photo by itself by a direct linear transform (markiewicz2015, 3.6 and 4.3).
+"""`orient.dlt`: direct linear transform of single photos (markiewicz2015, 3.6 and 4.3).
 
-Eleven parameters, without anything known before, start an adjustment; what the lens model of that
-leaves out is stated as error.
+Eleven parameters, without prior knowledge, start an adjustment; distortion that its lens model
+omits is included in the stated error.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ from orthoflow_plugins.orient.report import hand_over
 
 Distortion = Literal["none", "k1", "k1 k2 p1 p2"]
 
-# Nearly free: what points with relief say of a lens outweighs these by far.
+# Nearly free: points with relief determine a lens far better.
 _FREE: Final = {"focal_sigma": 1.0, "aspect_sigma": 0.5}
 _CENTRE_SHARE: Final = 0.5
 _SKEW_SHARE: Final = 0.5
-# Decentring and principal point explain each other on all but the deepest relief.
+# Decentring and principal point are correlated except on deep relief.
 _PINNED_CENTRE_SHARE: Final = 0.05
 _FULL: Final = "k1 k2 p1 p2"
 _FREEDOMS: Final[Mapping[Distortion, LensFreedom]] = {
@@ -62,32 +62,31 @@ _FREEDOMS: Final[Mapping[Distortion, LensFreedom]] = {
 _LEAST: Final[Mapping[Distortion, int]] = {"none": 12, "k1": 16, _FULL: 24}
 # Relief below this many standard deviations of the points is mostly their noise.
 _RELIEF_SIGMAS: Final = 10.0
-# Flatter control leaves the eleven parameters to the rounding of its coordinates.
+# With flatter control, rounding of coordinates determines the eleven parameters.
 _MAX_CONDITION: Final = 5000.0
-# Ties that deviate so many times more than they should show what the lens model lacks.
+# Standard deviation of unit weight beyond which the lens model is insufficient.
 _MAX_SIGMA0: Final = 1.5
 # Points per side of the grid over a photo on which lens models are compared.
 _FRAME: Final = 12
 DLT_MISFIT: Final = DiagnosticSpec(
     code="dlt-without-distortion",
     severity="warning",
-    text="photo {subject}: its ties deviate {sigma0:.1f} times as much as they should, and a "
-    "fuller lens model would move its points by {moved_px:.1f} px: its lens has distortion that a "
-    "DLT without that does not describe, worst at the corners; the stated error is {factor:.1f} "
-    "times as large for it",
+    text="photo {subject}: its ties deviate {sigma0:.1f} times as much as expected, and a complete "
+    "lens model moves its points by {moved_px:.1f} px: its lens has distortion that this DLT does "
+    "not model, most at the corners; the stated error is {factor:.1f} times as large for it",
     remedy="{step}.distortion=k1k2, or a calibration",
     rank_by="sigma0",
 )
 
 
 class OrientDlt(Method):
-    """Orient each photo by eleven parameters, or more with distortion, known from its ties alone.
+    """Orient each photo by eleven parameters, or more with distortion, from its ties alone.
 
-    Calibration and EXIF serve only to reject wrong ties, with `prior: none` not even that. The
+    Calibration and EXIF serve only to reject wrong ties, and not at all with `prior: none`. The
     linear solution starts a weighted adjustment of pose, fx, fy and principal point (and
-    distortion); of the eleven parameters the skew is recorded but kept only when asked, since no
-    lens of today has one. Control that lies near one plane does not determine the parameters and is
-    refused. Everything is judged as in `orient.pnp`.
+    distortion); the skew is recorded but kept only on request, since modern cameras have none.
+    Nearly coplanar control points do not determine the parameters and are refused. The gates are
+    those of `orient.pnp`.
     """
 
     id: ClassVar[str] = "orient.dlt"
@@ -101,7 +100,7 @@ class OrientDlt(Method):
     )
 
     class Params(OrientParams):
-        """The distortion that is estimated besides, and what `orient.pnp` takes, too."""
+        """Distortion, skew, and the parameters of `orient.pnp`."""
 
         distortion: Distortion = Field(
             default="none",
@@ -110,21 +109,20 @@ class OrientDlt(Method):
         )
         skew: bool = Field(
             default=False,
-            description="Keep the skew, the eleventh parameter: rows and "
-            "columns of the camera's pixels need not be perpendicular. It is also used for "
-            "the orthoimage.",
+            description="Keep the skew, the eleventh parameter, for rows and columns of pixels "
+            "that are not perpendicular; also in the orthoimage.",
         )
         prior: Literal["lens", "none"] = Field(
             default="lens",
-            description="How wrong ties are rejected: with the lens from calibration or EXIF, "
-            "or without a known lens, by trying the usual focal lengths (markiewicz2015).",
+            description="How wrong ties are rejected: with the lens of calibration or EXIF, or by "
+            "trying usual focal lengths (markiewicz2015).",
         )
 
     In = OrientIn
     Out = OrientOut
 
     def run(self, inputs: OrientIn, params: Params, ctx: StepContext) -> OrientOut:
-        """Orient the photos one after the other."""
+        """Orient the photos one by one."""
 
         def estimator(tied: TiedPhoto, _: OrientParams) -> Estimate | str:
             return estimate_dlt(tied, params)
@@ -139,7 +137,7 @@ class OrientDlt(Method):
 
 
 def relief(points: NDArray[np.float64]) -> tuple[float, float]:
-    """Measure how far points (n, 3) leave the plane that fits them best.
+    """Measure the relief of points (n, 3) about their best-fitting plane.
 
     Returns:
         Root mean square distance from it, and standard deviation along its longer axis, metres.
@@ -177,8 +175,8 @@ def direct_linear(
     rows = np.zeros((len(pixels), 2, 12))
     rows[:, 0, :4], rows[:, 0, 8:] = xyz, -uv[:, :1] * xyz
     rows[:, 1, 4:8], rows[:, 1, 8:] = xyz, -uv[:, 1:] * xyz
-    # Of the normal equations, summed in order: a singular value decomposition of the rows adds up
-    # differently with another number of threads. The adjustment makes good the lost digits.
+    # By normal equations, summed in order: a singular value decomposition depends on the number of
+    # threads. The adjustment recovers the lost digits.
     values, vectors = np.linalg.eigh(np.einsum("nij,nik->jk", rows, rows))
     matrix = vectors[:, 0].reshape(3, 4)
     inverse_px = np.array(
@@ -191,10 +189,10 @@ def direct_linear(
 
 
 def estimate_dlt(tied: TiedPhoto, params: OrientDlt.Params) -> Estimate | str:
-    """Orient a photo by a direct linear transform of its control ties, or say why not.
+    """Orient a photo by a direct linear transform of its control points, or return why not.
 
-    With `prior: none` neither calibration nor EXIF helps to reject wrong ties either. Without
-    `skew` the adjustment goes on from square pixels.
+    With `prior: none` neither calibration nor EXIF is used to reject wrong ties. Without `skew` the
+    adjustment starts from square pixels.
     """
     if params.prior == "none":
         tied = replace(tied, photo=replace(tied.photo, intrinsics=None, exif_focal_px=None))
@@ -230,7 +228,7 @@ def estimate_dlt(tied: TiedPhoto, params: OrientDlt.Params) -> Estimate | str:
 
 
 def _normalisation(values: NDArray[np.float64], length: float) -> tuple[NDArray[np.float64], float]:
-    """Shift and scale that bring points to the origin, at this distance from it on average."""
+    """Return shift and scale that centre points at a mean distance from the origin."""
     shift = values.mean(axis=0)
     mean = float(np.linalg.norm(values - shift, axis=1).mean())
     if not mean > 0.0:
@@ -241,7 +239,7 @@ def _normalisation(values: NDArray[np.float64], length: float) -> tuple[NDArray[
 def _decomposed(
     matrix: NDArray[np.float64], points: NDArray[np.float64], size_px: tuple[int, int]
 ) -> ViewingCamera:
-    """Take a projection matrix (3, 4) apart."""
+    """Decompose a projection matrix (3, 4)."""
     if np.linalg.det(matrix[:, :3]) < 0.0:
         matrix = -matrix
     # RQ from QR: rows and columns in reverse order.
@@ -279,11 +277,11 @@ def _freedom(distortion: Distortion, size_px: tuple[int, int], *, keeps_skew: bo
 
 
 def _too_poor(control: SeenPoints, distortion: Distortion, least: int) -> str:
-    """State why control does not suffice for eleven parameters and more; empty when it does."""
+    """Return why control points do not suffice for eleven parameters or more; empty if they do."""
     if len(control) < least:
         return (
-            f"only {len(control)} control ties agree with one pose, a DLT with distortion "
-            f'"{distortion}" needs {least}'
+            f"only {len(control)} control points agree with one pose, a DLT with distortion "
+            f'"{distortion}" requires {least}'
         )
     rms_m, extent_m = relief(control.points_world)
     sigma_m = float(np.sqrt(np.mean(control.sigma_m**2)))
@@ -299,18 +297,18 @@ def _too_poor(control: SeenPoints, distortion: Distortion, least: int) -> str:
 def _with_what_is_missing(
     estimate: Estimate, control: SeenPoints, start: Start, freedom: LensFreedom
 ) -> Estimate:
-    """Widen what is stated of a camera by how far a fuller lens model would move it, everywhere.
+    """Add the systematic error of an incomplete lens model to the covariance.
 
-    Residuals show hardly a tenth of what a lens model lacks: the other parameters take up the rest,
-    and bend the photo between and beyond the ties. So the error of the poorer camera is taken as
-    its distance from the fuller one, and the error of that one on top. With the distortion of a
-    usual lens unknown, eleven parameters stated a ninth of their error without this.
+    Residuals show hardly a tenth of missing distortion: the other parameters absorb the rest and
+    distort the photo between and beyond the ties. So the error is that of the complete model plus
+    the distance from it. Without this, eleven parameters with the unknown distortion of a usual
+    lens stated a ninth of their error.
 
     Args:
-        estimate: by the poorer model.
-        control: the ties that determined it.
-        start: what it started from.
-        freedom: what the fuller model may change of the lens.
+        estimate: by the incomplete model.
+        control: its control points.
+        start: of its adjustment.
+        freedom: of the lens in the complete model.
     """
     model = estimate.resection
     try:
@@ -334,7 +332,7 @@ def _with_what_is_missing(
     wider = replace(model, covariance=full.covariance + np.outer(bias, bias), lens=full.lens)
     factor = _variance_px2(wider, points) / _variance_px2(model, points)
     wider = replace(wider, variance_factor=factor * model.variance_factor)
-    # A misfit of the lens bends neighbouring ties alike, and has widened the poorer model already.
+    # Neighbouring ties share a misfit of the lens, which the variance factor includes already.
     beyond_noise = factor * model.variance_factor / model.sigma0**2
     notes: tuple[Note, ...] = ()
     if model.sigma0 > _MAX_SIGMA0 or beyond_noise > _MAX_SIGMA0**2:
@@ -352,10 +350,10 @@ def _flat(control: SeenPoints, why: str) -> str:
 
 
 def _bias(camera: ViewingCamera, full: Resection, control: SeenPoints) -> NDArray[np.float64]:
-    """How the parameters (p,) would have to change to see all the frame as the full model does.
+    """Return the change of parameters (p,) that fits the complete model over the whole frame.
 
-    Not the difference of the parameters: focal length and distance, say, differ by much that
-    cancels, and to first order it would not.
+    The difference of the parameters would not do: large changes of focal length and distance
+    cancel, but not to first order.
     """
     middle = control.points_world.mean(axis=0)
     points = _frame_points(camera, control) - middle
@@ -370,7 +368,7 @@ def _bias(camera: ViewingCamera, full: Resection, control: SeenPoints) -> NDArra
 
 
 def _frame_points(camera: ViewingCamera, control: SeenPoints) -> NDArray[np.float64]:
-    """Points (n, 3) behind the pixels of a grid over the photo, each as far as control near it."""
+    """Return points (n, 3) on a grid over the photo, as far as the nearest control point."""
     across, down = ((np.arange(_FRAME) + 0.5) / _FRAME for _ in range(2))
     pixels = np.stack(np.meshgrid(across * camera.width, down * camera.height), axis=-1)
     pixels = pixels.reshape(-1, 2)
@@ -387,11 +385,11 @@ def _frame_points(camera: ViewingCamera, control: SeenPoints) -> NDArray[np.floa
 def _moved_px(
     camera: ViewingCamera, other: ViewingCamera, points: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """How far (n, 2) another camera sees points from where the first sees them, in pixels."""
+    """Return the displacement (n, 2) in pixels of points between two cameras."""
     return other.project(points)[:, :2] - camera.project(points)[:, :2]
 
 
 def _variance_px2(resection: Resection, points: NDArray[np.float64]) -> float:
-    """Mean predicted variance of a coordinate of the pixels of points (n, 3)."""
+    """Return the mean predicted variance of a pixel coordinate of points (n, 3)."""
     covariances = predicted_covariances(resection, points)
     return 0.5 * float(np.trace(covariances, axis1=1, axis2=2).mean())

@@ -1,7 +1,7 @@
-"""What an orientation must meet before its photo may be called `ok`: a table of gates.
+"""Gates: the criteria that an orientation must meet.
 
-Each gate names what is measured of an orientation, its limit, where that comes from, and the
-sentence of a refusal.
+Each gate declares a value of the orientation, its limit, the source of the limit, and the reason of
+a refusal.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ from orthoflow_plugins.orient.pose import (
 )
 
 _GRID_SIDE: Final = 15
-# A view flatter than this onto the wall paints nothing useful.
+# Flatter views of a wall are not painted.
 _GRAZING_COSINE: Final = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
 class KnownWall:
-    """A wall as ties describe it.
+    """A wall as described by ties.
 
     Attributes:
         index: of the wall.
-        number: for people: the place of its plane in `planes.json`.
-        name: for people.
+        number: of its plane in `planes.json`, for messages.
+        name: for messages.
         corners_world: (4, 3) metres: top-left, then counter-clockwise for the viewer.
         normal: (3,) unit vector towards the viewer.
-        gsd_m: cell of its raster, or None when the ties do not say.
+        gsd_m: cell of its raster, or None if unknown.
         has_side: whether the normal is known to point to the viewer.
     """
 
@@ -63,14 +63,14 @@ class KnownWall:
 
 @dataclass(frozen=True, kw_only=True)
 class WallError:
-    """Predicted error of a photo on the walls it shows.
+    """Predicted error of a photo on its walls.
 
     Attributes:
         rms_m: standard deviation of a coordinate in the wall's plane, RMS over the footprint.
         worst_m: the largest one in the footprint, and at the corners of the image.
         corners_m: (4,) the same at the corners of the image, top-left, top-right, bottom-left,
             bottom-right; NaN where a corner shows none of the walls.
-        footprint_px: (n, 2) pixels of the grid points that lie in the footprint.
+        footprint_px: (n, 2) pixels of the grid points in the footprint.
         sigmas_m: (n,) standard deviation of a coordinate in the wall's plane at these.
     """
 
@@ -92,7 +92,7 @@ class WallError:
 
 
 def known_walls(ties: Ties, chosen: NDArray[np.bool_]) -> list[KnownWall]:
-    """Describe the walls of some ties: from what their matcher says, else from the points."""
+    """Describe the walls of some ties, by their matcher if it does, else by the points."""
     walls = []
     for index in np.unique(ties.wall[chosen & (ties.wall >= 0)]):
         if int(index) < len(ties.walls):
@@ -105,7 +105,7 @@ def known_walls(ties: Ties, chosen: NDArray[np.bool_]) -> list[KnownWall]:
 
 
 def wall_error(resection: Resection, walls: Sequence[KnownWall]) -> WallError | None:
-    """Predict the error on the walls from the covariance; None when the photo shows no wall."""
+    """Predict the error on the walls from the covariance; None if the photo shows no wall."""
     parts = [_variances(resection, wall, _grid(wall, (_GRID_SIDE, _GRID_SIDE))) for wall in walls]
     variances = np.concatenate([np.empty(0), *(part[0] for part in parts)])
     shown = np.isfinite(variances)
@@ -124,7 +124,7 @@ def wall_error(resection: Resection, walls: Sequence[KnownWall]) -> WallError | 
 def sigmas_on_wall(
     resection: Resection, wall: KnownWall, shape: tuple[int, int]
 ) -> NDArray[np.float64]:
-    """Predicted standard deviation of a coordinate in a wall's plane, on a grid over the wall.
+    """Predict the standard deviation of a coordinate in a wall's plane, on a grid over the wall.
 
     Returns:
         (rows, cols) metres, the first row at the top, NaN where the photo does not show the wall.
@@ -134,9 +134,9 @@ def sigmas_on_wall(
 
 
 def _at_corners(resection: Resection, walls: Sequence[KnownWall]) -> NDArray[np.float64]:
-    """Variances (4,) where the corners of the image show a wall, of several the largest."""
+    """Return variances (4,) at the corners of the image, the largest of all walls shown there."""
     camera, worst = resection.camera, np.full(4, np.nan)
-    # The middles of the outermost pixels, which the image holds for certain.
+    # Centres of the outermost pixels.
     corners_px = np.array(
         [[u, v] for v in (0.5, camera.height - 0.5) for u in (0.5, camera.width - 0.5)]
     )
@@ -155,7 +155,7 @@ def _at_corners(resection: Resection, walls: Sequence[KnownWall]) -> NDArray[np.
 
 
 def _grid(wall: KnownWall, shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Centres (rows * cols, 3) of the cells of a grid over a wall's rectangle."""
+    """Return the cell centres (rows * cols, 3) of a grid over a wall's rectangle."""
     top_left, bottom_left, _, top_right = wall.corners_world
     down, along = (
         axis.ravel()
@@ -172,7 +172,7 @@ def _grid(wall: KnownWall, shape: tuple[int, int]) -> NDArray[np.float64]:
 def _variances(
     resection: Resection, wall: KnownWall, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Variances (n,) per coordinate and pixels (n, 2) of wall points; NaN where not shown."""
+    """Return variances (n,) and pixels (n, 2) of wall points; NaN where not shown."""
     pixels = _seen(resection.camera, points, wall.normal)
     variances = np.full(len(points), np.nan)
     shown = np.isfinite(pixels[:, 0])
@@ -195,7 +195,7 @@ def _variances(
 def _seen(
     camera: ViewingCamera, points: NDArray[np.float64], normal: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Pixels (n, 2) of wall points; NaN outside the image or under a grazing view."""
+    """Return pixels (n, 2) of wall points; NaN outside the image or at grazing angles."""
     pixels = camera.project(points)[:, :2]
     towards = camera.centre_world - points
     cosine = np.abs(towards @ normal) / np.linalg.norm(towards, axis=1)
@@ -217,7 +217,7 @@ def _described(index: int, ties: Ties) -> KnownWall:
 
 
 def _fitted(index: int, points: NDArray[np.float64]) -> KnownWall:
-    """The bounding rectangle of points in their own plane, the side unknown."""
+    """Return the bounding rectangle of points in their own plane, the side unknown."""
     middle = points.mean(axis=0)
     axes = np.linalg.svd(points - middle, full_matrices=False)[2]
     local = (points - middle) @ axes[:2].T
@@ -236,8 +236,8 @@ def _fitted(index: int, points: NDArray[np.float64]) -> KnownWall:
 
 _MIN_TIES: Final = 8
 _CROWDED_RATIO: Final = 10
-# Right ties gather close to where they should be, wrong ones do not: several shares of the limit
-# are tried.
+# Residuals of right ties are concentrated near 0, unlike those of wrong ones: several radii, as
+# shares of the limit, are tested.
 _CHANCE_RADII: Final = (0.2, 0.35, 0.6, 1.0)
 _PLACE_PX: Final = 8.0
 _MIN_CHECKS: Final = 5
@@ -245,8 +245,8 @@ _MIN_ON_WALL: Final = 4
 CROWDED: Final = DiagnosticSpec(
     code="ties-crowded",
     severity="warning",
-    text="photo {subject}: a quarter of it has {n_most} ties, another {n_least}: more than "
-    "{ratio} times as many",
+    text="photo {subject}: one quarter has {n_most} ties, another {n_least}: more than {ratio} "
+    "times as many",
 )
 SMALL_HULL: Final = DiagnosticSpec(
     code="control-covers-little",
@@ -259,27 +259,25 @@ FOCAL_ESTIMATED: Final = DiagnosticSpec(
     severity="warning",
     text="photo {subject}: neither calibration nor EXIF states its focal length, which was "
     "estimated",
-    remedy="a calibration file makes it more certain",
+    remedy="a calibration file makes it more accurate",
 )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Candidate:
-    """An orientation to judge: what is known of it, and what the gates measure.
-
-    What a gate measures is None where nothing can be said.
+    """An orientation with the values that the gates test, None where undefined.
 
     Attributes:
         photo: the photo.
         seen: its ties.
-        is_check: (n,) withheld ties.
+        is_check: (n,) check points.
         walls: index of the wall of each tie (n,).
-        estimate: the pose found.
-        known: the walls of the ties that agree.
-        error: predicted error on these walls, None when the photo shows none of them.
-        params: limits among them.
-        search_radius_px: the matcher looked for ties so far from where it expected them, so that
-            wrong ones lie within this, too; inf when it looked everywhere.
+        estimate: the estimated pose.
+        known: the walls of the inliers.
+        error: predicted error on these walls, None if the photo shows none of them.
+        params: with the limits.
+        search_radius_px: of the matcher about expected positions, within which wrong ties lie, too;
+            inf if it searched everywhere.
     """
 
     photo: Photo
@@ -294,20 +292,20 @@ class Candidate:
 
     @cached_property
     def control(self) -> NDArray[np.bool_]:
-        """Control ties that agree."""
+        """Inliers among the control points."""
         return self.estimate.agreeing & ~self.is_check
 
     @cached_property
     def withheld(self) -> NDArray[np.bool_]:
-        """Withheld ties that agree."""
+        """Inliers among the check points."""
         return self.estimate.agreeing & self.is_check
 
     @cached_property
     def checked(self) -> NDArray[np.bool_]:
-        """Withheld ties that agree and are none of the control once more, which checks nothing.
+        """Inliers among the check points that do not duplicate a control point.
 
-        A key point whose gradients have two directions is two features in one place, and both may
-        be matched with the same point.
+        A key point with two main directions has two features in one place, and both may be matched
+        with the same point.
         """
         places = np.column_stack([self.seen.pixels_photo, self.seen.points_world])
         place = np.unique(places, axis=0, return_inverse=True)[1].ravel()
@@ -315,13 +313,13 @@ class Candidate:
 
     @cached_property
     def quadrant_counts(self) -> list[int]:
-        """Ties that agree in the quarters of the photo, as `image_cells` numbers them."""
+        """Inliers in the quarters of the photo, in the order of `image_cells`."""
         cells = self._quarters(self.seen.pixels_photo[self.estimate.agreeing])
         return [int((cells == quarter).sum()) for quarter in range(4)]
 
     @cached_property
     def gsd_m(self) -> float | None:
-        """Smallest cell of its walls, None when the ties do not say."""
+        """Smallest cell of its walls, None if unknown."""
         return min((wall.gsd_m for wall in self.known if wall.gsd_m is not None), default=None)
 
     @property
@@ -336,44 +334,44 @@ class Candidate:
 
     @property
     def n_control(self) -> int:
-        """Control ties that agree."""
+        """Inliers among the control points."""
         return int(self.control.sum())
 
     @property
     def n_for_control(self) -> int:
-        """Ties that are not withheld."""
+        """Control points."""
         return int((~self.is_check).sum())
 
     @property
     def n_agree(self) -> int:
-        """Withheld ties that agree."""
+        """Inliers among the check points."""
         return int(self.withheld.sum())
 
     @property
     def n_check(self) -> int:
-        """Withheld ties."""
+        """Check points."""
         return int(self.is_check.sum())
 
     @property
     def agreeing_share(self) -> float:
-        """Share of all ties that agree."""
+        """Share of inliers among all ties."""
         return float(self.estimate.agreeing.mean())
 
     @property
     def control_share(self) -> float:
-        """Share of the ties that are not withheld that agree."""
+        """Share of inliers among the control points."""
         return self.n_control / self.n_for_control
 
     @property
     def chance(self) -> float:
-        """Probability that as many withheld ties agree with a wrong pose (binomial)."""
+        """Probability that as many check points agree with a wrong pose (binomial)."""
         from scipy.special import bdtrc  # scipy.stats would take seconds to import
 
         fit, limit = self.estimate.fit, self.estimate.limit
         inside = self.estimate.agreeing & (fit.normalised > 0.0)
         lengths_px = np.linalg.norm(fit.residuals_px[inside], axis=1)
         px = float(np.median(lengths_px / fit.normalised[inside]))
-        # Wrong ties gather where the texture is, not all over the photo.
+        # Wrong ties lie where there is texture, not all over the photo.
         textured = max(hull_area(self.seen.pixels_photo), 1.0) / 4.0
         area = min(textured, (2.0 * self.search_radius_px) ** 2)
         found = []
@@ -387,14 +385,14 @@ class Candidate:
 
     @property
     def check_over_control(self) -> float | None:
-        """How often withheld ties agree, over how often the control does."""
+        """Ratio of the shares of inliers among check and control points."""
         if self.n_check < _MIN_CHECKS:
             return None
         return self.n_agree / self.n_check / self.control_share
 
     @property
     def check_rms_over_control(self) -> float | None:
-        """How far withheld ties deviate, over how far the control does."""
+        """Ratio of the RMS residuals of check and control points."""
         if self.n_agree < _MIN_CHECKS:
             return None
         squares = self.estimate.fit.normalised**2
@@ -402,14 +400,13 @@ class Candidate:
 
     @cached_property
     def poor_quarter(self) -> tuple[int, str] | None:
-        """How many ties a quarter of the photo has that has too few, and why that is too few.
+        """Number of ties in a quarter of the photo with too few, and the reason.
 
-        After markiewicz2015 each quarter needs two ties. But an obstacle before the wall, or a view
-        past the end of the wall, may fill a quarter in which no tie can be. A surveyor keeps such a
-        photo when the rest of it fixes the pose: the error predicted for the walls in that quarter
-        must be as small at its worst place as it has to be on the average of the photo. A quarter
-        that shows no wall is painted nowhere and needs nothing. Only strictly the paper's rule
-        holds as it stands.
+        In markiewicz2015 each quarter needs two ties. But an obstacle, or a view past the end of
+        the wall, may fill a quarter in which there can be no tie. Such a photo is usable if the
+        rest of it determines the pose: the largest predicted error on the walls in that quarter
+        must meet the limit of the average over the photo. A quarter that shows no wall needs no
+        ties. `strict` applies the rule of the paper.
         """
         params = self.params
         for quarter, count in enumerate(self.quadrant_counts):
@@ -432,12 +429,12 @@ class Candidate:
 
     @property
     def n_in_poor_quarter(self) -> int | None:
-        """Ties of a quarter that has too few."""
+        """Number of ties in a quarter with too few."""
         return None if self.poor_quarter is None else self.poor_quarter[0]
 
     @property
     def before_wall_m(self) -> float | None:
-        """Least distance before a wall, of those with some control and a side."""
+        """Smallest distance before a wall with control points and a known side."""
         centre = self.estimate.resection.camera.centre_world
         used = self.walls[self.control]
         return min(
@@ -456,7 +453,7 @@ class Candidate:
 
     @cached_property
     def hull_ratio(self) -> float:
-        """Hull of the control over the footprint of its walls in the photo; 0 without one."""
+        """Area of the control's hull over that of its walls in the photo; 0 without walls."""
         if self.error is None:
             return 0.0
         footprint = hull_area(self.error.footprint_px)
@@ -474,10 +471,9 @@ class Candidate:
 
     @cached_property
     def needed_tie(self) -> tuple[float, NDArray[np.float64]] | None:
-        """Largest predicted error, in cells, without one tie of a pose from few, and its pixel.
+        """Largest predicted error, in cells, without one of few ties, and the pixel of that tie.
 
-        A wrong tie that the others cannot tell does no more harm than the pose without it is
-        uncertain.
+        An undetected wrong tie displaces the pose by no more than the uncertainty without it.
         """
         without = [wall_error(one, self.known) for one in self.estimate.without_one]
         if self.gsd_m is None or not without:
@@ -489,7 +485,7 @@ class Candidate:
 
     @property
     def cells_without_one(self) -> float | None:
-        """The first of these."""
+        """Largest predicted error, in cells, without one of few ties."""
         return None if self.needed_tie is None else self.needed_tie[0]
 
     def _quarters(self, pixels: NDArray[np.float64]) -> NDArray[np.intp]:
@@ -498,15 +494,15 @@ class Candidate:
 
 @dataclass(frozen=True, kw_only=True)
 class Gate:
-    """A condition that an orientation has to meet.
+    """A criterion for an orientation.
 
     Attributes:
         name: for the record.
-        value: what of a `Candidate` is measured; None passes.
-        at_least: smallest value that passes, or the parameter that holds it.
+        value: attribute of a `Candidate`; None passes.
+        at_least: smallest value that passes, or the parameter with it.
         at_most: largest one, likewise.
-        source: where the limit comes from.
-        text: the sentence of a refusal, of the candidate `c` and the `limit`.
+        source: of the limit.
+        text: reason of a refusal, a template of the candidate `c` and the `limit`.
     """
 
     name: str
@@ -523,14 +519,14 @@ CONTROL_GATES: Final = (
         value="n_control",
         at_least=12,
         source="twice the unknowns of a pose",
-        text="only {c.n_control} of {c.n_for_control} control ties agree with one pose, at least "
+        text="only {c.n_control} of {c.n_for_control} control points agree with one pose, at least "
         "{limit} must",
     ),
     Gate(
         name="share",
         value="agreeing_share",
         at_least=0.04,
-        source="robust sampling finds a pose among so few right ties (benchmarks/robust_pose.py)",
+        source="robust sampling finds a pose among these outliers (benchmarks/robust_pose.py)",
         text="only {c.agreeing_share:.1%} of {c.n_ties} ties agree with one pose, at least "
         "{limit:.1%} must",
     ),
@@ -538,28 +534,28 @@ CONTROL_GATES: Final = (
         name="chance",
         value="chance",
         at_most=1e-5,
-        source="one wrong pose in a hundred thousand may look right (binomial test)",
-        text="{c.n_agree} of {c.n_check} withheld ties agree with the pose, as a wrong pose could "
-        "have by chance",
+        source="one wrong pose in a hundred thousand passes (binomial test)",
+        text="{c.n_agree} of {c.n_check} check points agree with the pose, as many as with a wrong "
+        "pose by chance",
     ),
     Gate(
         name="check-share",
         value="check_over_control",
         at_least=0.5,
-        source="withheld ties agree as often as the control of a right pose",
-        text="{c.n_agree} of {c.n_check} withheld ties agree with the pose, but "
-        "{c.control_share:.0%} of the control does: the pose was fitted to chance",
+        source="with a right pose, check points agree as often as control points",
+        text="{c.n_agree} of {c.n_check} check points agree with the pose, but "
+        "{c.control_share:.0%} of the control points: the pose was fitted to chance",
     ),
     Gate(
         name="check-rms",
         value="check_rms_over_control",
         at_most=2.0,
-        source="withheld ties deviate as much as the control of a right pose",
-        text="the check ties deviate {c.check_rms_over_control:.1f} times as much as the control, "
-        "at most {limit:g} times is plausible",
+        source="with a right pose, check points deviate as much as control points",
+        text="the check points deviate {c.check_rms_over_control:.1f} times as much as the control "
+        "points, at most {limit:g} times is plausible",
     ),
 )
-"""What the ties themselves must show."""
+"""Agreement of the ties."""
 
 _SIDE: Final = Gate(
     name="side",
@@ -612,14 +608,14 @@ GATES: Final = (
         at_least="min_hull_ratio",
         source="the job",
         text="the control covers {c.hull_ratio:.1%} of the part of the photo that shows the walls, "
-        "at least {limit:.1%} is needed",
+        "at least {limit:.1%} is required",
     ),
     *_ON_WALLS,
 )
-"""All that an orientation by ties of a matcher must meet, in the order in which it is asked."""
+"""Gates of an orientation by ties of a matcher, in order."""
 
 GATES_BEFORE_BLOCK: Final = (*CONTROL_GATES, _SIDE)
-"""What keeps a photo from harming others; what it lacks in exactness, these may bring."""
+"""Gates before a bundle adjustment, in which other photos may improve the accuracy."""
 
 GATES_BY_HAND: Final = (
     _SIDE,
@@ -632,22 +628,22 @@ GATES_BY_HAND: Final = (
         source="the job",
         text="without the tie at (u {c.needed_tie[1][0]:.0f}, v {c.needed_tie[1][1]:.0f}) its "
         "predicted error on the wall would be {c.cells_without_one:.1f} cells of {c.gsd_mm:g} mm, "
-        "at most {limit:g} are allowed: if that tie were wrong, the others could not reveal it; "
-        "measure more of them, farther apart",
+        "at most {limit:g} are allowed: an error of that tie could not be detected; measure more, "
+        "farther apart",
     ),
 )
-"""What a pose from ties that a person measured must meet."""
+"""Gates of a pose from ties measured by hand."""
 
 
 def refusal(candidate: Candidate, gates: Sequence[Gate] | None = None) -> tuple[str, str] | None:
-    """Judge an orientation; None where it meets all gates.
+    """Test an orientation; None if it meets all gates.
 
     Args:
         candidate: the orientation.
-        gates: in this order; without them, all that its ties ask for.
+        gates: in order; None for those of its ties.
 
     Returns:
-        Name of the first gate that refuses, and the reason as a sentence.
+        Name of the first gate that refuses, and the reason.
     """
     if gates is None:
         gates = GATES_BY_HAND if candidate.estimate.without_one else GATES
@@ -662,17 +658,17 @@ def refusal(candidate: Candidate, gates: Sequence[Gate] | None = None) -> tuple[
 
 
 def too_few(n_ties: int) -> str:
-    """State why ties are too few for an orientation; empty when they suffice."""
+    """Return why ties are too few for an orientation; empty if they suffice."""
     if n_ties >= _MIN_TIES:
         return ""
     return (
-        f"{n_ties} ties with the walls, at least {_MIN_TIES} are needed: the photo "
-        "shows none of the walls, or too differently, or in cells that are too coarse"
+        f"{n_ties} ties with the walls, at least {_MIN_TIES} are required: the photo shows none of "
+        "the walls, its colours differ too much from the intensity, or the cells are too coarse"
     )
 
 
 def warnings_for(candidate: Candidate) -> list[Note]:
-    """State what limits an orientation that is `ok`."""
+    """Return warnings about an accepted orientation."""
     notes: list[Note] = []
     counts = candidate.quadrant_counts
     if max(counts) > _CROWDED_RATIO * min(counts):
@@ -686,7 +682,7 @@ def warnings_for(candidate: Candidate) -> list[Note]:
 
 
 def hull_area(pixels: NDArray[np.float64]) -> float:
-    """Area of the convex hull of points (n, 2); 0 for fewer than three or points on a line."""
+    """Return the area of the convex hull of points (n, 2); 0 for fewer than three or collinear."""
     from scipy.spatial import ConvexHull, QhullError
 
     if len(pixels) < 3:

@@ -25,7 +25,7 @@ from orthoflow_plugins.orient.pose import (
 from orthoflow_plugins.orient.report import Oriented, hand_over, measure_expected
 
 _SIDE: Final = 15
-# A tie farther off than that does not belong to the pose.
+# Residual of a tie that contradicts the pose, in standard deviations.
 _DISAGREEING: Final = 3.5
 POSE_DISAGREES: Final = DiagnosticSpec(
     code="pose-against-ties",
@@ -38,12 +38,12 @@ POSE_DISAGREES: Final = DiagnosticSpec(
 
 
 class OrientGiven(Method):
-    """Take poses from elsewhere as they are.
+    """Take poses of other programs unchanged.
 
-    Nothing proves them: their status is ok, their lens says `given`, and an error on the wall is
-    stated only where the files do. A photo with at least six ties measured by hand is oriented by
-    these, with the given lens, and judged by them; fewer only check the given pose. Poses in
-    another frame than the scan's are refused: none of them shows a wall then.
+    They are not verified: their status is ok, the source of their lens is `given`, and an error on
+    the wall is stated only if the files do. A photo with at least six ties measured by hand is
+    oriented by these, with the given lens, and must meet their gates; fewer ties only check the
+    given pose. Poses in another frame than the scan's are refused, as none of them shows a wall.
     """
 
     id: ClassVar[str] = "orient.given"
@@ -52,10 +52,10 @@ class OrientGiven(Method):
     citations: ClassVar[tuple[str, ...]] = ()
 
     class Params(OrientParams):
-        """The gates that a pose by ties measured by hand has to pass."""
+        """Limits of the gates of a pose by ties measured by hand."""
 
     class In(Ports):
-        """The poses, the photos, the walls they may show, and ties measured by hand."""
+        """Poses, photos, walls, and ties measured by hand."""
 
         cameras: Cameras
         photos: Photos
@@ -65,7 +65,7 @@ class OrientGiven(Method):
     Out = OrientOut
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> OrientOut:
-        """Take the poses, and check those that can be."""
+        """Take the poses, and check those with ties."""
         given = {camera.photo: camera for camera in inputs.cameras.cameras}
         if inputs.walls is not None:
             _require_a_wall_in_view(list(given.values()), inputs.walls)
@@ -84,7 +84,7 @@ class OrientGiven(Method):
             known = replace(photo, intrinsics=camera.intrinsics or photo.intrinsics)
             found.append(_oriented(known, camera, ties, params, ctx))
         unchecked = [item.camera.photo for item in found if item.entry is None]
-        return OrientOut(cameras=hand_over(ctx, ties, photos, found, _said(unchecked)))
+        return OrientOut(cameras=hand_over(ctx, ties, photos, found, _details(unchecked)))
 
 
 def _as_they_are(ctx: StepContext, cameras: Sequence[Camera]) -> Cameras:
@@ -96,10 +96,10 @@ def _as_they_are(ctx: StepContext, cameras: Sequence[Camera]) -> Cameras:
     for camera in cameras:
         if camera.status != "ok":
             ctx.report(NOT_ORIENTED, subject=camera.photo, status=camera.status)
-    return Cameras(cameras=tuple(cameras), details=_said([camera.photo for camera in cameras]))
+    return Cameras(cameras=tuple(cameras), details=_details([camera.photo for camera in cameras]))
 
 
-def _said(unchecked: Sequence[str]) -> dict[str, JsonValue]:
+def _details(unchecked: Sequence[str]) -> dict[str, JsonValue]:
     return {
         "given": list(unchecked),
         "given_meaning": "photos whose poses were used unchecked",

@@ -1,4 +1,4 @@
-"""Ties between photos: key points, which of them several photos share, joined to tracks."""
+"""Ties between photos: key points matched between pairs and joined to tracks."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from orthoflow.geometry.key_points import in_turns, mutual_matches, root_sift
 from orthoflow.products import Photo
 from orthoflow_plugins.orient.pose import camera_rays
 
-# Larger photos are shrunk: SIFT takes 0.23 GB per million pixels, and thousands of key points at
-# half the resolution tie photos as well as more at full.
+# Larger photos are reduced: SIFT takes 0.23 GB per million pixels, and thousands of key points at
+# half the resolution tie photos as well as more at full resolution.
 _MAX_SIDE_PX: Final = 1600
 _CONTRAST_THRESHOLD: Final = 0.02
 _SPREAD_CELLS: Final = 16
 _MAX_RATIO: Final = 0.85
 _MAX_PARTNERS: Final = 8
-# The poses are known to a few pixels already.
+# The poses are known to a few pixels.
 _MAX_OFF_LINE_PX: Final = 6.0
 _MAX_OFF_POINT_PX: Final = 8.0
 _MIN_ANGLE: Final = np.radians(2.0)
@@ -46,14 +46,14 @@ class PhotoFeatures:
 
 @dataclass(frozen=True, kw_only=True)
 class PhotoTies:
-    """Points that several photos see, unknown to the scan.
+    """Points seen by several photos that are not in the scan.
 
     Attributes:
         photo: (m,) index of the photo of each observation.
         point: (m,) index of its point, 0..k-1, each at least twice.
         pixels: (m, 2).
         scale: (m,) pixels of the photo per pixel in which the key point was found.
-        points_world: (k, 3) metres, where the poses given have them.
+        points_world: (k, 3) metres, intersected from the given poses.
     """
 
     photo: NDArray[np.intp]
@@ -108,11 +108,11 @@ def photo_features(photo: Photo, n_most: int) -> PhotoFeatures:
 def overlapping_pairs(
     cameras: Sequence[ViewingCamera], points: Sequence[NDArray[np.float64]], least_share: float
 ) -> list[tuple[int, int]]:
-    """Choose the pairs of photos that show much of the same.
+    """Choose the pairs of photos with enough overlap.
 
     Args:
         cameras: of the photos.
-        points: (n, 3) of each photo, what it shows of the walls.
+        points: (n, 3) points of the walls in each photo.
         least_share: of one photo's points that the other must show.
     """
     shares = np.zeros((len(cameras), len(cameras)))
@@ -135,13 +135,13 @@ def tie_photos(
     pairs: Sequence[tuple[int, int]],
     n_most: int,
 ) -> PhotoTies:
-    """Match key points of pairs of photos, and join what agrees with the poses to tracks.
+    """Match key points of pairs of photos, and join those that agree with the poses to tracks.
 
     Args:
         cameras: of the photos, known to a few pixels.
         features: of the photos.
         pairs: photos to match.
-        n_most: points at most; those that most photos see are kept.
+        n_most: maximum number of points, those with most observations first.
     """
     starts = np.concatenate([[0], np.cumsum([len(item.pixels) for item in features])])
     rays = [
@@ -166,7 +166,7 @@ def _off_line_px(
     first: tuple[ViewingCamera, NDArray[np.float64]],
     second: tuple[ViewingCamera, NDArray[np.float64]],
 ) -> NDArray[np.float64]:
-    """Distance (n,) in pixels of rays of the second photo from the epipolar lines of the first."""
+    """Return distances (n,) in pixels of rays of the second photo from their epipolar lines."""
     rotation = second[0].rotation @ first[0].rotation.T
     baseline = second[0].translation - rotation @ first[0].translation
     lines = first[1] @ (cross_matrix(baseline) @ rotation).T
@@ -176,7 +176,7 @@ def _off_line_px(
 
 
 def _tracks(links: NDArray[np.intp], starts: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    """Sets of linked key points, longest first; none with two points of one photo."""
+    """Return sets of linked key points, longest first, without those with two of one photo."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -202,7 +202,7 @@ def _located(
     rays: Sequence[NDArray[np.float64]],
     tracks: Sequence[NDArray[np.intp]],
 ) -> PhotoTies:
-    """Intersect the rays of each track, and keep those that meet; all of one length at once."""
+    """Intersect the rays of each track and keep those that agree; all of one length at once."""
     counts = [len(item.pixels) for item in features]
     photo_of = np.repeat(np.arange(len(cameras)), counts)
     pixels = np.vstack([item.pixels for item in features])
@@ -234,7 +234,7 @@ def _located(
 def _meeting(
     tracks: NDArray[np.intp], centres: NDArray[np.float64], directions: NDArray[np.float64]
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Tracks (k, m) whose rays (n, m, 3) meet in front and not too flat, and where (k, 3)."""
+    """Return tracks (k, m) whose rays meet in front at a sufficient angle, and points (k, 3)."""
     unit = directions / np.linalg.norm(directions, axis=2, keepdims=True)
     cosines = np.einsum("nid,njd->nij", unit, unit)
     wide = cosines.min(axis=(1, 2)) < np.cos(_MIN_ANGLE)

@@ -1,4 +1,4 @@
-"""Photos one by one: their ties, which of them only check, and the verdict on each orientation."""
+"""Photos one by one: ties, check points, lens priors, and the acceptance of each orientation."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ from orthoflow_plugins.orient.report import Oriented, numbers_json
 
 MIN_TIES: Final = 6
 _MAX_WRONG: Final = 2
-# So many ways to leave ties out are tried: two of 24 ties, one of any number.
+# Subsets that are tried at most: two of 24 ties left out, one of any number.
 _MAX_TRIALS: Final = 300
-# Right ties are called contradictory once in a thousand photos.
+# Probability that right ties are called contradictory.
 _CONTRADICTION: Final = 1e-3
-# Of the longest length of a residual that is left over: 3.5 standard deviations of a coordinate.
+# Limit of residuals, in standard deviations of a coordinate.
 _LIMIT: Final = 3.5
-# Adjusted from two starts, one pose comes out twice to far less than that.
+# The same pose, adjusted from two starts, differs by far less.
 _ONE_POSE_RAD: Final = math.radians(2.0)
 BY_HAND: Final = DiagnosticSpec(
     code="photo-oriented-by-hand",
@@ -69,19 +69,19 @@ HAND_TIES_LEFT_OUT: Final = DiagnosticSpec(
 
 
 _Fit = tuple[float, Resection, ViewingCamera]
-"""An adjustment to some ties: the probability of residuals as large by chance, were the sigmas
-right, the camera, and its lens as it was known beforehand.
+"""An adjustment to some ties: the probability of larger residuals with these sigmas, the camera,
+and the prior of its lens.
 """
 
 
 def pose_by_hand(tied: TiedPhoto) -> tuple[Estimate, Start] | str:
-    """Orient a photo by the ties that a person measured, or say why not.
+    """Orient a photo by its ties measured by hand, or return why not.
 
     Args:
-        tied: the photo; of its ties at least `MIN_TIES` are measured by a person.
+        tied: the photo, with at least `MIN_TIES` ties measured by hand.
 
     Returns:
-        The orientation by them alone, and where an adjustment of all ties starts from it.
+        The orientation by them alone, and the start of an adjustment of all ties.
     """
     seen = tied.seen
     known, hand = lens_prior(tied.photo), seen.take(tied.by_hand)
@@ -113,7 +113,7 @@ def pose_by_hand(tied: TiedPhoto) -> tuple[Estimate, Start] | str:
 
 
 def _consistent(hand: SeenPoints, lens: Lens) -> tuple[NDArray[np.intp], _Fit] | str:
-    """Find the ties that fit together: all, or all but one or two that are plainly wrong."""
+    """Find consistent ties: all, or all but one or two that are clearly wrong."""
     n_most = min(_MAX_WRONG, len(hand) - MIN_TIES)
     if math.comb(len(hand), n_most) > _MAX_TRIALS:
         n_most = 1
@@ -131,23 +131,23 @@ def _consistent(hand: SeenPoints, lens: Lens) -> tuple[NDArray[np.intp], _Fit] |
         if len(fitting) == 1:
             return fitting[0]
         if fitting:
-            doubtful = sorted(
+            suspect = sorted(
                 {int(at) for kept, _ in fitting for at in np.setdiff1d(np.arange(len(hand)), kept)}
             )
             return (
-                f"its {len(hand)} ties measured by hand contradict each other, and it is not plain "
-                f"which is wrong, one of {_places(hand.pixels_photo[doubtful])}: measure them "
+                f"its {len(hand)} ties measured by hand contradict each other, and it is not clear "
+                f"which is wrong, one of {_places(hand.pixels_photo[suspect])}: measure them "
                 "again, or add more"
             )
     return (
         f"its {len(hand)} ties measured by hand contradict each other by more than their sigma_px "
-        f"says, and leaving out up to {n_most} of them does not help ({MIN_TIES} must stay): "
+        f"allows, and leaving out up to {n_most} of them does not help ({MIN_TIES} must remain): "
         "measure them again, or add more"
     )
 
 
 def _fits(seen: SeenPoints, known: Lens) -> Iterator[_Fit]:
-    """Adjust from every start, and give what the ties allow."""
+    """Adjust from every start and return the fits that the ties allow."""
     from scipy.special import chdtrc  # scipy.stats would take seconds to import
 
     for lens in (known.prior, *known.guesses):
@@ -156,7 +156,7 @@ def _fits(seen: SeenPoints, known: Lens) -> Iterator[_Fit]:
                 found = adjust(seen, start, prior=lens, lens=known.freedom)
             except GeometryError:
                 continue
-            # Observations beyond what determines the camera; a known lens is observed as well.
+            # The prior of the lens counts as observations.
             cofactors = np.diag(found.covariance / found.sigma0**2)
             of_lens = cofactors[POSE_PARAMETERS:] / found.lens.sigmas**2
             redundancy = float(2 * len(seen) - len(cofactors) + of_lens.sum())
@@ -167,7 +167,7 @@ def _fits(seen: SeenPoints, known: Lens) -> Iterator[_Fit]:
 
 
 def _distinct(fits: Iterator[_Fit]) -> list[_Fit]:
-    """The best of each pose."""
+    """Return the best fit of each distinct pose."""
     kept: list[_Fit] = []
     for fit in sorted(fits, key=lambda each: -each[0]):
         turns = [fit[1].camera.rotation @ other[1].camera.rotation.T for other in kept]
@@ -178,7 +178,7 @@ def _distinct(fits: Iterator[_Fit]) -> list[_Fit]:
 
 
 def _starts(seen: SeenPoints, lens: ViewingCamera) -> list[ViewingCamera]:
-    """Poses that fit ties exactly in the sense of SQPnP and, of points in a plane, of IPPE."""
+    """Return the poses of SQPnP and, for coplanar points, of IPPE."""
     import cv2
 
     straight = undistorted_pixels(seen.pixels_photo, lens)
@@ -192,7 +192,7 @@ def _starts(seen: SeenPoints, lens: ViewingCamera) -> list[ViewingCamera]:
     centroid = points.mean(axis=0)
     _, across, axes = np.linalg.svd(points - centroid, full_matrices=False)
     if across[2] < 1e-2 * across[1]:
-        # IPPE takes nothing but points of one plane: onto it, then.
+        # IPPE requires exactly coplanar points.
         flat = points - np.outer((points - centroid) @ axes[2], axes[2])
         posed.append((cv2.SOLVEPNP_IPPE, flat))
     call: Any = cv2.solvePnPGeneric
@@ -214,34 +214,33 @@ def _starts(seen: SeenPoints, lens: ViewingCamera) -> list[ViewingCamera]:
 
 
 def _as_stated(resection: Resection) -> Resection:
-    """Take the ties' own standard deviations where few residuals are small by luck."""
+    """Use the a priori standard deviations if few residuals are small by chance."""
     unit = max(1.0, resection.sigma0)
     covariance = resection.covariance * (unit / resection.sigma0) ** 2
     return replace(resection, covariance=covariance, sigma0=unit, variance_factor=unit**2)
 
 
 def _places(pixels: NDArray[np.float64] | Sequence[NDArray[np.float64]]) -> str:
-    """Pixels as they stand in a file of ties."""
+    """List pixels in the convention of a file of ties."""
     counted = to_opencv(np.asarray(pixels))
     return ", ".join(f"(u {u:.0f}, v {v:.0f})" for u, v in counted)
 
 
 _SEED_LIMIT: Final = 2**31 - 1
-# More ties of a photo than that tell nothing new.
+# More ties of a photo do not improve its pose.
 _MAX_TIES: Final = 20_000
-# Check points come evenly from so many cells a side of a photo.
+# Check points are drawn evenly from a grid with this many cells a side.
 _STRATA: Final = 6
-# Photos of a lens that are asked whether EXIF is right.
-_ASKED_OF_LENS: Final = 5
-# So many photos of a camera, which agree up to this factor, say more than the EXIF of another.
+# Photos of a lens by which its EXIF is tested.
+_TESTED_PER_LENS: Final = 5
+# Photos of a camera whose focal lengths agree within a factor, and then outweigh EXIF of another.
 _MIN_OTHERS: Final = 2
 _SAME_FOCAL: Final = 1.05
 EXIF_CONTRADICTED: Final = DiagnosticSpec(
     code="exif-focal-contradicted",
     severity="warning",
-    text="photos {subject}: EXIF states a focal length of {exif_px:.0f} px, but their ties ask "
-    "for {focal_px:.0f} px, a factor of {factor:.2f}: EXIF is not used (digital zoom, an "
-    "adapter, or "
+    text="photos {subject}: EXIF states a focal length of {exif_px:.0f} px, but their ties give "
+    "{focal_px:.0f} px, a factor of {factor:.2f}: EXIF is not used (digital zoom, an adapter, or "
     "a cropped picture)",
     remedy="a calibration file resolves this",
 )
@@ -256,13 +255,13 @@ EXIF_LEFT_OUT: Final = DiagnosticSpec(
 
 @dataclass(frozen=True, kw_only=True)
 class Trusted:
-    """A photo whose own ties orient it beyond chance.
+    """A photo with an orientation by its own ties.
 
     Attributes:
         tied: its ties.
-        estimate: its orientation by itself.
-        by_hand: its orientation by the ties that a person measured alone, where it has one.
-        kept: (n,) bool, these of its ties.
+        estimate: its separate orientation.
+        by_hand: its orientation by ties measured by hand alone, or None.
+        kept: (n,) bool, the ties of that orientation.
     """
 
     tied: TiedPhoto
@@ -271,7 +270,7 @@ class Trusted:
     kept: NDArray[np.bool_]
 
     def judged(self, ties: Ties, params: OrientParams, estimate: Estimate) -> Oriented:
-        """Judge an orientation by all ties; where it is against those by hand, these count."""
+        """Judge an orientation by all ties; if it contradicts those by hand, take theirs."""
         found = judged(self.tied, candidate_of(self.tied, ties, params, estimate))
         is_with_hand = not (self.kept & (found.role == TieRole.REJECTED)).any()
         if self.by_hand is None or (found.camera.status == "ok" and is_with_hand):
@@ -283,7 +282,7 @@ Look = TypeVar("Look", bound=Trusted | Oriented)
 
 
 def require(ties: Ties, photos: Photos) -> None:
-    """Refuse what no orientation can start from.
+    """Refuse inputs without photos or ties.
 
     Raises:
         MethodError: no photos, no ties, or ties of other photos.
@@ -296,10 +295,10 @@ def require(ties: Ties, photos: Photos) -> None:
             "matching step"
         )
     names = {photo.name for photo in photos.photos}
-    strangers = [name for name in ties.photo_names if name not in names]
-    if strangers:
+    unknown = [name for name in ties.photo_names if name not in names]
+    if unknown:
         raise MethodError(
-            f"the ties name photo {strangers[0]}, which is not among the photos given: wire "
+            f"the ties name photo {unknown[0]}, which is not among the photos given: wire "
             "the photos that the ties were made from"
         )
 
@@ -308,7 +307,7 @@ def tied_photo(
     photo: Photo, ties: Ties, params: OrientParams, rng: np.random.Generator
 ) -> TiedPhoto:
     """Choose the ties of a photo and split them into control and check."""
-    # Drawn for every photo, so that one photo's ties do not change the luck of the next.
+    # Drawn for every photo, so that its samples do not depend on the ties of others.
     own = np.random.default_rng(int(rng.integers(_SEED_LIMIT)))
     chosen = _usable(ties, photo.name)
     seen = SeenPoints(
@@ -340,10 +339,10 @@ def withheld(
     share: float,
     rng: np.random.Generator,
 ) -> NDArray[np.bool_]:
-    """Choose the check points (n,): a share of the ties, evenly from all parts of the image.
+    """Choose check points (n,): a share of the ties, evenly from all parts of the image.
 
-    The ties are shuffled, ordered by the cell of the image they lie in, and one of every 1 / share
-    is taken along that order: each cell gives its share, and the whole is at least `share`.
+    The ties are shuffled, sorted by their cell of the image, and every (1 / share)-th is taken, so
+    that each cell contributes its share and the total is at least `share`.
     """
     shuffled = rng.permutation(len(pixels_photo))
     cells = image_cells(pixels_photo, size_px, _STRATA)
@@ -358,10 +357,10 @@ def withheld(
 def with_believable_priors(
     photos: Sequence[Photo], ties: Ties, params: OrientParams, ctx: StepContext
 ) -> list[Photo]:
-    """Replace focal lengths of EXIF that photos of their camera contradict by what these ask for.
+    """Replace focal lengths of EXIF that the ties of photos of that lens contradict.
 
-    EXIF is wrong for all photos of a lens, as by digital zoom, adapters and programs that cut a
-    picture. The photos with most ties are asked; the others get the lens that these gave.
+    Digital zoom, adapters and cropping make EXIF wrong for all photos of a lens. The photos with
+    most ties are tested, and the others get the focal length that these give.
     """
     believed = list(photos)
     lenses: dict[tuple[object, ...], list[int]] = {}
@@ -370,24 +369,24 @@ def with_believable_priors(
             key = (photo.camera, photo.width, photo.height, photo.exif_focal_px)
             lenses.setdefault(key, []).append(at)
     for members in lenses.values():
-        # Drawn apart, so that the luck of an orientation does not hang on whether EXIF is there.
+        # A separate generator: orientations must not depend on the presence of EXIF.
         rng = np.random.default_rng(0)
         tied = [tied_photo(photos[at], ties, params, rng) for at in members]
         tied.sort(key=lambda each: -len(each.seen))
-        asked = [focal_without_exif(each, params) for each in tied[:_ASKED_OF_LENS]]
-        found = [focal_px for focal_px in asked if focal_px is not None]
-        if 2 * len(found) <= len(asked):
+        tested = [focal_without_exif(each, params) for each in tied[:_TESTED_PER_LENS]]
+        found = [focal_px for focal_px in tested if focal_px is not None]
+        if 2 * len(found) <= len(tested):
             continue
         focal_px = float(np.median(found))
         first = photos[members[0]]
-        said_px = first.exif_focal_px or math.nan
+        exif_px = first.exif_focal_px or math.nan
         names = f"{first.name} and {len(members) - 1} more" if len(members) > 1 else first.name
         ctx.report(
             EXIF_CONTRADICTED,
             subject=names,
-            exif_px=said_px,
+            exif_px=exif_px,
             focal_px=focal_px,
-            factor=focal_px / said_px,
+            factor=focal_px / exif_px,
         )
         for at in members:
             believed[at] = replace(photos[at], exif_focal_px=focal_px)
@@ -397,7 +396,7 @@ def with_believable_priors(
 def each_by_itself(
     ties: Ties, photos: Photos, params: OrientParams, ctx: StepContext, estimator: Estimator
 ) -> list[Oriented]:
-    """Orient the photos one after the other by their own ties alone, and judge each.
+    """Orient the photos separately by their own ties, and judge each.
 
     Raises:
         MethodError: no photos, no ties, or ties of other photos.
@@ -421,13 +420,13 @@ def looked_at(
     ctx: StepContext,
     share: float = 1.0,
 ) -> list[Look]:
-    """Orient photos one after the other, and those again that a wrong prior may have spoilt.
+    """Orient photos one by one, and again if EXIF contradicts other photos of the camera.
 
     Args:
         photos: the photos.
         look: orients one.
-        ctx: is told of progress, and of priors that are not used.
-        share: of the step that this is.
+        ctx: the context, for progress and diagnostics.
+        share: of the step's progress.
     """
     found = []
     for nth, tied in enumerate(photos):
@@ -445,7 +444,7 @@ def looked_at(
 
 
 def _focal_px(found: Trusted | Oriented) -> float | None:
-    """Focal length of a photo that is oriented."""
+    """Return the focal length of an oriented photo."""
     if isinstance(found, Trusted):
         return found.estimate.resection.camera.fx
     return found.camera.intrinsics.fx if found.camera.intrinsics is not None else None
@@ -454,7 +453,7 @@ def _focal_px(found: Trusted | Oriented) -> float | None:
 def _focal_of_others(
     photo: Photo, photos: Sequence[TiedPhoto], found: Sequence[Trusted | Oriented]
 ) -> float | None:
-    """Focal length of the other photos of a camera, where they agree and EXIF is far from it."""
+    """Return the focal length of other photos of a camera if they agree and EXIF contradicts."""
     if photo.intrinsics is not None or photo.exif_focal_px is None:
         return None
     camera = (photo.camera, photo.width, photo.height)
@@ -477,13 +476,13 @@ def by_itself(
     """Orient a photo by its own ties.
 
     Returns:
-        What is final where ties by hand alone orient it, or nothing does.
+        A final result if only ties by hand orient it, or none.
     """
     alone, kept = None, np.zeros(len(tied.seen), dtype=np.bool_)
     reason = too_few(len(tied.seen))
     if tied.by_hand.sum() >= MIN_TIES:
         alone, pose = oriented_by_hand(tied, ties, params)
-        # What a person measured is never withheld, so that the others have to check the pose.
+        # Ties by hand are never check points, so the others have to check the pose.
         too_few_others = too_few(int((~tied.by_hand).sum()))
         if pose is not None:
             own, start = pose
@@ -504,7 +503,7 @@ def by_itself(
 def oriented_by_hand(
     tied: TiedPhoto, ties: Ties, params: OrientParams
 ) -> tuple[Oriented, tuple[Estimate, Start] | None]:
-    """Orient a photo by the ties that a person measured alone, of which there are enough."""
+    """Orient a photo by its ties measured by hand alone."""
     found = pose_by_hand(tied)
     if isinstance(found, str):
         return refused(tied, found), None
@@ -512,7 +511,7 @@ def oriented_by_hand(
 
 
 def _joined(tied: TiedPhoto, ties: Ties, params: OrientParams, start: Start) -> Estimate | None:
-    """Orient a photo by all ties from the pose by hand; None where they are against it."""
+    """Orient a photo by all ties from the pose by hand; None if they contradict it."""
     try:
         joined = adjusted(tied, start, params)
     except GeometryError:
@@ -524,7 +523,7 @@ def _joined(tied: TiedPhoto, ties: Ties, params: OrientParams, start: Start) -> 
 def candidate_of(
     tied: TiedPhoto, ties: Ties, params: OrientParams, estimate: Estimate
 ) -> Candidate:
-    """Bring together what an orientation is judged by."""
+    """Return the data by which an orientation is judged."""
     used = np.zeros(len(ties.photo), dtype=np.bool_)
     used[tied.chosen[estimate.agreeing]] = True
     known = known_walls(ties, used)
@@ -544,7 +543,7 @@ def candidate_of(
 
 
 def judged(tied: TiedPhoto, candidate: Candidate) -> Oriented:
-    """Call an orientation ok, or say why not."""
+    """Accept an orientation, or refuse it with the reason."""
     against, estimate = refusal(candidate), candidate.estimate
     entry = numbers_json(candidate) if candidate.control.any() else {}
     if against is not None:
@@ -585,7 +584,7 @@ def refused(tied: TiedPhoto, reason: str) -> Oriented:
 
 
 def _usable(ties: Ties, name: str) -> NDArray[np.intp]:
-    """Ties of a photo that may be used: not rejected by the matcher, thinned evenly."""
+    """Return the ties of a photo that the matcher did not reject, thinned evenly."""
     mine = ties_of_photo(ties, name)
     mine = np.asarray(mine[ties.role[mine] != TieRole.REJECTED], dtype=np.intp)
     if len(mine) <= _MAX_TIES:

@@ -1,4 +1,4 @@
-"""`orient.pnp`: each photo by itself from its ties with the walls (markiewicz2015, 3.6 and 4.3)."""
+"""`orient.pnp`: single-photo resection from ties with the walls (markiewicz2015, 3.6 and 4.3)."""
 
 from __future__ import annotations
 
@@ -10,38 +10,36 @@ import numpy as np
 from pydantic import Field
 
 from orthoflow.errors import GeometryError
-from orthoflow.geometry.cameras import ViewingCamera, opencv_matrix, to_opencv
-from orthoflow.geometry.resection import SeenPoints, misfit, stated
+from orthoflow.geometry.cameras import LensFreedom, ViewingCamera, opencv_matrix, to_opencv
+from orthoflow.geometry.resection import SeenPoints
 from orthoflow.sdk import Method, MetricSpec, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.orient.photos import each_by_itself
 from orthoflow_plugins.orient.pose import (
-    MAX_ROUNDS,
     ORIENTATION_METRICS,
     Estimate,
     OrientIn,
     OrientOut,
     OrientParams,
     TiedPhoto,
+    adjusted,
     estimate_pose,
     expected_px,
     no_pose,
     robust_start,
-    unit_deviation,
-    without_chance,
 )
 from orthoflow_plugins.orient.report import hand_over
 
-# solvePnP needs six points where they are not in a plane.
+# solvePnP needs six points if they are not coplanar.
 _LEAST: Final = 6
 
 
 class OrientPnp(Method):
-    """Orient each photo by itself: robust pose, then a weighted adjustment with the full lens.
+    """Orient each photo separately: robust pose, then a weighted adjustment with the full lens.
 
-    A share of the ties is withheld from all of it and checks the result. A photo is `ok` only if
-    its ties suffice and lie well, the withheld ones agree beyond chance, the camera stands in
-    front of the wall, and the predicted error on the wall is small; else the reason is said.
+    A share of the ties is withheld as check points. A photo is `ok` only if its ties suffice and
+    are well distributed, the check points agree beyond chance, the camera is in front of the wall,
+    and the predicted error on the wall is small; else the reason is stated.
     """
 
     id: ClassVar[str] = "orient.pnp"
@@ -56,13 +54,12 @@ class OrientPnp(Method):
     )
 
     class Params(OrientParams):
-        """How the pose is adjusted, rejection, withheld share, and the gates to pass."""
+        """Adjustment, rejection, share of check points, and limits of the gates."""
 
         method: Literal["weighted", "opencv"] = Field(
             default="weighted",
-            description="weighted: each tie counts by its own sigmas and an uncalibrated lens is "
-            "refined; opencv: cv2.solvePnP, iterative, all ties with equal weight, the lens "
-            "unchanged "
+            description="weighted: each tie is weighted by its own sigmas and an uncalibrated lens "
+            "is refined; opencv: cv2.solvePnP, iterative, equal weights, fixed lens "
             "(markiewicz2015).",
         )
 
@@ -70,7 +67,7 @@ class OrientPnp(Method):
     Out = OrientOut
 
     def run(self, inputs: OrientIn, params: Params, ctx: StepContext) -> OrientOut:
-        """Orient the photos one after the other."""
+        """Orient the photos one by one."""
         estimator = estimate_pose if params.method == "weighted" else estimate_by_opencv
         found = each_by_itself(inputs.ties, inputs.photos, params, ctx, estimator)
         return OrientOut(cameras=hand_over(ctx, inputs.ties, inputs.photos.photos, found))
@@ -82,47 +79,31 @@ class OrientPnp(Method):
 
 
 def estimate_by_opencv(tied: TiedPhoto, params: OrientParams) -> Estimate | str:
-    """Orient a photo by `cv2.solvePnP` (iterative, Levenberg-Marquardt), or say why not.
+    """Orient a photo by `cv2.solvePnP` (iterative, Levenberg-Marquardt), or return why not.
 
-    Every tie counts alike, the lens stays as it is known, and solvePnP starts from nothing. Ties
-    that deviate too much are rejected, and it is called again until they stay the same. The first
-    of them are told by sampling, as everywhere here: least squares of all would not bear them.
+    All ties have the same weight, the lens is fixed, and solvePnP starts without a pose. Outliers
+    are rejected, and it is called again until the ties stay the same. The first inliers are those
+    of robust sampling: least squares of all ties would fail.
     """
-    seen, is_check = tied.seen, tied.is_check
     robust = robust_start(tied, params)
     if robust is None:
-        return no_pose(seen)
-    # Each pixel as uncertain as is usual, the points exact.
-    alike = replace(
-        seen,
-        sigma_px=np.full(len(seen), expected_px(tied.control(robust.agreeing))),
-        sigma_m=np.zeros(len(seen)),
-    )
-    agreeing = robust.agreeing
+        return no_pose(tied.seen)
+    # Pixels of equal uncertainty, exact points.
+    n = len(tied.seen)
+    sigma_px = np.full(n, expected_px(tied.control(robust.agreeing)))
+    equal = replace(tied, seen=replace(tied.seen, sigma_px=sigma_px, sigma_m=np.zeros(n)))
+    fixed = replace(robust.lens, freedom=LensFreedom())
     try:
-        for _ in range(MAX_ROUNDS):
-            used = agreeing & ~is_check
-            camera = _solved(alike.take(used), robust.camera)
-            fit = misfit(alike, camera)
-            unit = unit_deviation(fit.normalised[used])
-            limit = without_chance(fit.normalised[~is_check], params.rejection_sigma * unit)
-            agreeing = fit.normalised <= limit
-            if np.array_equal(agreeing & ~is_check, used):
-                break
-        chosen = alike.take(used)
-        resection = stated(chosen, camera, independent=False)
+        return adjusted(equal, replace(robust, lens=fixed), params, _solved)
     except GeometryError as error:
         return f"{error}: use orient.pnp with method weighted"
-    return Estimate(
-        resection=resection, source=robust.lens.source, fit=fit, agreeing=agreeing, limit=limit
-    )
 
 
 def _solved(seen: SeenPoints, lens: ViewingCamera) -> ViewingCamera:
-    """Return the camera at the pose that solvePnP finds.
+    """Return the camera at the pose of solvePnP.
 
     Raises:
-        GeometryError: it finds none.
+        GeometryError: there is none.
     """
     import cv2
 
@@ -130,7 +111,7 @@ def _solved(seen: SeenPoints, lens: ViewingCamera) -> ViewingCamera:
         raise GeometryError(f"solvePnP needs {_LEAST} ties, {len(seen)} agree with one pose")
     if lens.skew:
         raise GeometryError(f"solvePnP knows no skew, and the lens has {lens.skew:.1f} px of it")
-    # Survey coordinates would cost digits.
+    # Survey coordinates would lose digits.
     middle = seen.points_world.mean(axis=0)
     # Any: the stubs want one of its many array types.
     call: Any = cv2.solvePnP

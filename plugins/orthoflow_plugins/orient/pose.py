@@ -1,4 +1,4 @@
-"""The pose of one photo: what is known of its lens, robust start, adjustment, ties that agree."""
+"""The pose of one photo: lens prior, robust start, adjustment, and rejection of ties."""
 
 from __future__ import annotations
 
@@ -19,14 +19,12 @@ from orthoflow.geometry.cameras import (
     opencv_matrix,
     to_opencv,
     undistorted,
-    unmeasured,
 )
 from orthoflow.geometry.resection import (
     Misfit,
     Resection,
     SeenPoints,
     adjust,
-    first_step,
     fitted,
     misfit,
     stated,
@@ -35,7 +33,7 @@ from orthoflow.geometry.robust import MEDIAN_LENGTH
 from orthoflow.products import Cameras, Intrinsics, Photo, Photos, Ties
 from orthoflow.sdk import DiagnosticSpec, MethodParams, MetricSpec, Ports
 
-# What an orientation says of a photo: a spec and its values.
+# A diagnostic of a photo: its declaration and values.
 Note: TypeAlias = tuple[DiagnosticSpec, Mapping[str, Any]]
 NOT_ORIENTED: Final = DiagnosticSpec(
     code="photo-not-oriented",
@@ -47,7 +45,7 @@ NOT_ORIENTED: Final = DiagnosticSpec(
 def _median_and_worst(
     name: str, label: str, *, is_headline: bool = False, description: str = ""
 ) -> tuple[MetricSpec, MetricSpec]:
-    """Metrics of single photos: the median one and the worst one."""
+    """Declare a metric of photos as median and worst."""
 
     def spec(which: str, **more: Any) -> MetricSpec:
         return MetricSpec(
@@ -84,7 +82,7 @@ ORIENTATION_METRICS: Final = (
         description="against the scan; errors of depth and scan add to it",
     ),
 )
-"""What every orientation reports of its photos."""
+"""Metrics of all orientation methods."""
 
 
 class OrientIn(Ports):
@@ -107,8 +105,8 @@ class OrientParams(MethodParams):
         default=3.5,
         gt=1,
         le=20,
-        description="Ties that deviate by more than this "
-        "many of their standard deviations are rejected.",
+        description="Ties with residuals beyond this multiple of their standard deviation are "
+        "rejected.",
     )
     threshold_px: float | None = Field(
         default=None,
@@ -154,42 +152,40 @@ class OrientParams(MethodParams):
 Sharing = Literal["focal-group", "shared", "per-photo"]
 Refined = Literal["uncalibrated", "all", "none"]
 UNKNOWN: Final = "none"
-"""Source of a lens of which neither a calibration nor EXIF says anything."""
+"""Source of a lens with neither calibration nor EXIF."""
 MAX_ROUNDS: Final = 8
-"""An adjustment and its rejections take turns at most so often."""
+"""Most rounds of adjustment and rejection."""
 SOFT_LIMIT: Final = 3.0
-"""Residuals beyond so many standard deviations pull less (Huber).
+"""Residuals beyond so many standard deviations get less weight (Huber).
 
-One normal tie in a hundred does; at 2, one in seven did, which cost exactness and understated the
-error by another tenth.
+That is one normal tie in a hundred; at 2 it was one in seven, which reduced the accuracy and
+understated the error by another tenth.
 """
 _LEAST_FOR_POSE: Final = 4
 _CONFIDENCE: Final = 0.99999
 _MAX_TRIALS: Final = 20_000
-# A standard deviation of unit weight that changes by less changes no tie's weight to speak of.
+# Relative change of the standard deviation of unit weight below which it has converged.
 _SETTLED_SHARE: Final = 0.02
 _SIGMA0_RANGE: Final = (0.1, 3.0)
 _MAX_CHANCE_SHARE: Final = 0.1
 _TIGHTENING: Final = 0.8
 _MAX_TIGHTENED: Final = 7
-# What is known of a lens beforehand keeps it in bounds; so many ties make the equations solvable.
+# Ties needed to solve for a lens, which its prior constrains.
 _LEAST_FOR_LENS: Final = 8
-# A calibration that is off by more than both is another lens's.
+# A calibration whose focal length is off by more than both is that of another lens.
 _MIN_FOCAL_OFF: Final = 0.03
 _FOCAL_OFF_SIGMAS: Final = 5.0
-# A first step far below that saves the rest of the adjustment.
-_MIN_FOCAL_STEP: Final = 0.5 * _MIN_FOCAL_OFF
 _LEAST_FOR_FOCAL: Final = 25
 MIN_EXIF_OFF: Final = 0.15
-"""EXIF is off by some percent at most where it is right (of ln f).
+"""Deviation of ln f beyond which EXIF is wrong if many more ties agree with the other value.
 
-A focal length farther from it that many more ties agree with shows that it is wrong.
+Correct EXIF is within a few percent.
 """
 _MANY_MORE: Final = 1.2
 _OTHER_LENS: Final = LensFreedom(focal_sigma=0.35, k1_sigma=0.1)
 _EXIF_FACTORS: Final = (1.0, 0.94, 1.06)
-_UNKNOWN_FACTORS: Final = (0.6, 0.75, 0.95, 1.2, 1.6, 2.2)
-# How far a calibration may be off where it is refined all the same.
+_UNKNOWN_FACTORS: Final = (0.75, 0.9375, 1.1875, 1.5, 2.0, 2.75)
+# Prior standard deviations of a calibration that is refined.
 _CALIBRATED: Final = LensFreedom(
     focal_sigma=0.01, k1_sigma=0.02, k2_sigma=0.04, tangential_sigma=1e-3
 )
@@ -199,13 +195,13 @@ _UNDONE: Final = 1e-9
 
 @dataclass(frozen=True, kw_only=True)
 class Lens:
-    """A lens that one photo or several were taken with.
+    """The lens of one photo or several.
 
     Attributes:
-        prior: what it is beforehand, the likeliest; its pose says nothing.
-        freedom: how far it may change.
-        source: what `prior` is known from: `calibration`, `exif`, `UNKNOWN` ...
-        guesses: what else it may be, with which a first pose is looked for.
+        prior: the likeliest lens; its pose is not used.
+        freedom: prior standard deviations of its parameters.
+        source: of the prior: `calibration`, `exif`, `UNKNOWN` ...
+        guesses: other lenses to try for a first pose.
     """
 
     prior: ViewingCamera
@@ -215,30 +211,17 @@ class Lens:
 
 
 def lens_prior(photo: Photo) -> Lens:
-    """Return what is known of a photo's lens: its calibration, else EXIF, else what is usual."""
+    """Return what is known of a photo's lens, and focal lengths to try."""
+    known, freedom = photo.lens_prior()
     if photo.intrinsics is not None:
-        prior = photo.intrinsics.posed()
-        return Lens(prior=prior, freedom=LensFreedom(), source=photo.intrinsics.source)
-    longest, exif_px = max(photo.width, photo.height), photo.exif_focal_px
-    factors = _UNKNOWN_FACTORS if exif_px is None else _EXIF_FACTORS
+        return Lens(prior=known, freedom=freedom, source=photo.intrinsics.source)
+    source, factors = (
+        (UNKNOWN, _UNKNOWN_FACTORS) if photo.exif_focal_px is None else ("exif", _EXIF_FACTORS)
+    )
     prior, *guesses = (
-        Intrinsics(
-            width=photo.width,
-            height=photo.height,
-            fx=(exif_px or longest) * factor,
-            fy=(exif_px or longest) * factor,
-            cx=0.5 * photo.width,
-            cy=0.5 * photo.height,
-            source="exif",
-        ).posed()
-        for factor in factors
+        replace(known, fx=known.fx * factor, fy=known.fy * factor) for factor in factors
     )
-    return Lens(
-        prior=prior,
-        freedom=unmeasured(longest, has_exif=exif_px is not None),
-        source=UNKNOWN if exif_px is None else "exif",
-        guesses=tuple(guesses),
-    )
+    return Lens(prior=prior, freedom=freedom, source=source, guesses=tuple(guesses))
 
 
 def lens_groups(
@@ -252,11 +235,11 @@ def lens_groups(
 
     Args:
         photos: the photos.
-        cameras: each oriented by itself; where nothing is known of a lens, they start it.
-        sharing: `focal-group`: photos of one size and one focal length share a lens, or those of
-            one size of which no file says it; `shared`: all of one size do; `per-photo`: none do.
-        refined: which lenses may change.
-        apart: photos that have a lens of their own whatever they have in common with others.
+        cameras: oriented photo by photo; the start of lenses without a prior.
+        sharing: `focal-group`: photos of one size and one stated focal length share a lens, or
+            those of one size without any; `shared`: all of one size; `per-photo`: none.
+        refined: which lenses are adjusted.
+        apart: photos with a lens of their own in any case.
 
     Returns:
         Index of each photo's lens, and the lenses.
@@ -295,7 +278,7 @@ def focal_sigma(resection: Resection) -> float:
 
 
 def camera_rays(camera: ViewingCamera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Directions (n, 3) with z = 1 in camera axes; NaN where the distortion cannot be undone."""
+    """Return directions (n, 3) with z = 1 in camera axes; NaN where distortion has no inverse."""
     found = undistorted(*camera.bent_rays(pixels.T), camera.distortion)
     rays = np.column_stack([found[0], found[1], np.ones(len(pixels))])
     rays[~(found[2] < _UNDONE)] = np.nan
@@ -304,15 +287,15 @@ def camera_rays(camera: ViewingCamera, pixels: NDArray[np.float64]) -> NDArray[n
 
 @dataclass(frozen=True, kw_only=True)
 class TiedPhoto:
-    """A photo with the ties it is oriented by.
+    """A photo with its ties.
 
     Attributes:
         photo: the photo.
         chosen: (n,) index into all ties.
-        seen: these ties as an adjustment takes them.
-        is_check: (n,) withheld from every estimation.
-        by_hand: (n,) measured by a person.
-        seed: of the samples.
+        seen: these ties as observations.
+        is_check: (n,) check points, withheld from every estimation.
+        by_hand: (n,) measured by hand.
+        seed: of robust sampling.
     """
 
     photo: Photo
@@ -323,24 +306,24 @@ class TiedPhoto:
     seed: int
 
     def control(self, agreeing: NDArray[np.bool_]) -> SeenPoints:
-        """Return the ties that agree (n,) and are not withheld."""
+        """Return the inliers (n,) that are not check points."""
         return self.seen.take(agreeing & ~self.is_check)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """A photo's pose with what it was found from.
+    """The estimated pose of a photo.
 
     Attributes:
         resection: the adjusted camera.
-        source: what was known of the lens before: `calibration`, `exif`, `none` ...
-        fit: of all the photo's ties, control and check.
+        source: of the lens prior: `calibration`, `exif`, `none` ...
+        fit: residuals of all the photo's ties, control and check.
         agreeing: (n,) bool, ties within the limit.
         limit: in standard deviations, as `fit.normalised`.
-        notes: what its method has to say of it.
-        numbers: what its method alone measures, by name, for the record.
-        without_one: of a pose from ties that a person measured, how exact it is without each of
-            them in turn; empty for others.
+        notes: diagnostics of the method.
+        numbers: further results of the method by name, for the record.
+        without_one: of a pose from ties measured by hand, the accuracy without each of them in
+            turn; else empty.
     """
 
     resection: Resection
@@ -354,7 +337,7 @@ class Estimate:
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """Its interior orientation; where it was estimated, that is its source."""
+        """The interior orientation, with source `estimated` if it was adjusted."""
         was_estimated = self.resection.lens.sigmas.size or self.source == UNKNOWN
         return Intrinsics.of(
             self.resection.camera, source="estimated" if was_estimated else self.source
@@ -362,18 +345,20 @@ class Estimate:
 
 
 Estimator = Callable[[TiedPhoto, OrientParams], Estimate | str]
-"""Orients one photo by its control ties, or says why it cannot."""
+"""Orients one photo by its control points, or returns the reason why not."""
+Solver = Callable[[SeenPoints, ViewingCamera], ViewingCamera]
+"""Estimates a pose from points and a start, or raises a `GeometryError`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Start:
-    """Where the adjustment of a photo starts.
+    """The start of an adjustment.
 
     Attributes:
         camera: pose and lens.
-        lens: what is known of the lens beforehand.
-        agreeing: (n,) bool, ties that determine the first adjustment.
-        n_least_for_lens: ties that must agree before the lens may change.
+        lens: prior of the lens.
+        agreeing: (n,) bool, ties of the first adjustment.
+        n_least_for_lens: inliers needed to adjust the lens.
     """
 
     camera: ViewingCamera
@@ -383,7 +368,7 @@ class Start:
 
 
 def estimate_pose(tied: TiedPhoto, params: OrientParams) -> Estimate | str:
-    """Orient a photo by its control ties, each by its own sigmas, or say why not."""
+    """Orient a photo by its control points, weighted by their own sigmas, or return why not."""
     start = robust_start(tied, params)
     if start is None:
         return no_pose(tied.seen)
@@ -391,14 +376,14 @@ def estimate_pose(tied: TiedPhoto, params: OrientParams) -> Estimate | str:
         found = adjusted(tied, start, params)
     except GeometryError:
         return no_pose(tied.seen)
-    return _calibration_doubt(found, tied.control(found.agreeing)) or found
+    return _contradicted_calibration(found, tied.control(found.agreeing)) or found
 
 
 def focal_without_exif(tied: TiedPhoto, params: OrientParams) -> float | None:
-    """Return the focal length in pixels that a photo's ties ask for where EXIF's contradicts them.
+    """Return the focal length in pixels from a photo's ties if they contradict that of EXIF.
 
     Returns:
-        None where they do not contradict it, or say too little of it.
+        None if they do not contradict it, or do not determine it.
     """
     exif_px = tied.photo.exif_focal_px
     if tied.photo.intrinsics is not None or exif_px is None or len(tied.seen) < _LEAST_FOR_FOCAL:
@@ -420,16 +405,16 @@ def focal_without_exif(tied: TiedPhoto, params: OrientParams) -> float | None:
 
 
 def no_pose(seen: SeenPoints) -> str:
-    """State that a photo's ties contradict each other."""
+    """Return the reason that too few ties agree."""
     return f"no pose agrees with enough of its {len(seen)} ties"
 
 
 def robust_start(tied: TiedPhoto, params: OrientParams) -> Start | None:
-    """Find the pose that most control ties agree with; None when there is none."""
+    """Find the pose with most inliers among the control points; None if there is none."""
     lens, control = lens_prior(tied.photo), tied.seen.take(~tied.is_check)
     threshold_px = params.threshold_px
     if threshold_px is None:
-        # A lens known only roughly misplaces even right ties.
+        # An approximate lens displaces even right ties.
         slack = 1.0 if lens.source not in ("exif", UNKNOWN) else 2.0
         threshold_px = slack * params.rejection_sigma * expected_px(control)
     best: tuple[ViewingCamera, NDArray[np.bool_]] | None = None
@@ -441,17 +426,25 @@ def robust_start(tied: TiedPhoto, params: OrientParams) -> Start | None:
         return None
     agreeing = np.zeros(len(tied.seen), dtype=np.bool_)
     agreeing[~tied.is_check] = best[1]
-    # Points that appear twice say nothing new to a pose of six unknowns.
+    # Duplicate points do not help to determine a pose.
     if len(set(map(tuple, tied.seen.points_world[agreeing].round(4).tolist()))) < 5:
         return None
     return Start(camera=best[0], lens=replace(lens, prior=best[0]), agreeing=agreeing)
 
 
-def adjusted(tied: TiedPhoto, start: Start, params: OrientParams) -> Estimate:
-    """Adjust and reject in turns until the control ties stay the same.
+def adjusted(
+    tied: TiedPhoto, start: Start, params: OrientParams, solve: Solver | None = None
+) -> Estimate:
+    """Adjust and reject in turns until the control points stay the same.
+
+    Args:
+        tied: the photo.
+        start: pose, lens and first control points.
+        params: how to reject.
+        solve: estimates the pose; None for the weighted, robust adjustment of pose and lens.
 
     Raises:
-        GeometryError: the ties that agree do not determine the camera.
+        GeometryError: the inliers do not determine the camera.
     """
     seen, is_check, prior = tied.seen, tied.is_check, start.lens.prior
     camera, agreeing = start.camera, start.agreeing
@@ -459,10 +452,13 @@ def adjusted(tied: TiedPhoto, start: Start, params: OrientParams) -> Estimate:
     for _ in range(MAX_ROUNDS):
         used = agreeing & ~is_check
         lens = start.lens.freedom if used.sum() >= start.n_least_for_lens else LensFreedom()
-        control, soft_limit = seen.take(used), SOFT_LIMIT * unit
-        # A lens that may not change is the one known beforehand.
+        control, soft_limit = seen.take(used), math.inf if solve else SOFT_LIMIT * unit
+        # A fixed lens is that of the prior.
         begin = camera if lens.sigmas.size else posed(prior, camera)
-        camera = fitted(control, begin, prior=prior, lens=lens, soft_limit=soft_limit)
+        if solve:
+            camera = solve(control, begin)
+        else:
+            camera = fitted(control, begin, prior=prior, lens=lens, soft_limit=soft_limit)
         fit = misfit(seen, camera)
         before, unit = unit, unit_deviation(fit.normalised[used])
         limit = without_chance(fit.normalised[~is_check], params.rejection_sigma * unit)
@@ -478,7 +474,7 @@ def adjusted(tied: TiedPhoto, start: Start, params: OrientParams) -> Estimate:
 
 
 def ties_of_photo(ties: Ties, name: str) -> NDArray[np.intp]:
-    """Index of the ties of a photo."""
+    """Return the indices of the ties of a photo."""
     if name not in ties.photo_names:
         return np.empty(0, dtype=np.intp)
     return np.flatnonzero(ties.photo == ties.photo_names.index(name))
@@ -487,7 +483,7 @@ def ties_of_photo(ties: Ties, name: str) -> NDArray[np.intp]:
 def image_cells(
     pixels_photo: NDArray[np.float64], size_px: tuple[int, int], side: int
 ) -> NDArray[np.intp]:
-    """Cell (n,) of each pixel in a grid of side x side cells over an image (width, height)."""
+    """Return the cell (n,) of each pixel in a grid of side x side cells over an image."""
     scaled = np.floor(pixels_photo * side / np.array(size_px)).astype(np.intp)
     scaled = np.clip(scaled, 0, side - 1)
     cells: NDArray[np.intp] = scaled[:, 1] * side + scaled[:, 0]
@@ -495,10 +491,10 @@ def image_cells(
 
 
 def without_chance(normalised: NDArray[np.float64], limit: float) -> float:
-    """Tighten a limit until hardly any wrong tie lies within it by chance.
+    """Tighten a limit until it admits hardly any outlier by chance.
 
-    Wrong ties near a pose lie evenly around where they should be: the ring from one to three
-    times the limit has eight times the area within it and tells how many to expect.
+    Residuals of outliers near a pose are distributed evenly: the ring from one to three times the
+    limit has eight times the area within it, so an eighth of its ties are expected within.
     """
     lengths = np.sort(normalised[np.isfinite(normalised)])
     for tightened in limit * _TIGHTENING ** np.arange(_MAX_TIGHTENED):
@@ -509,13 +505,13 @@ def without_chance(normalised: NDArray[np.float64], limit: float) -> float:
 
 
 def unit_deviation(normalised: NDArray[np.float64]) -> float:
-    """Robust standard deviation of unit weight, kept within reason."""
+    """Return the robust standard deviation of unit weight, within plausible limits."""
     median = float(np.median(normalised)) if normalised.size else 1.0
     return float(np.clip(median / MEDIAN_LENGTH, *_SIGMA0_RANGE))
 
 
 def expected_px(seen: SeenPoints) -> float:
-    """Usual deviation of a tie before any pose: the photo's scale from the spread of its ties."""
+    """Return the a priori deviation of a tie, with the image scale from the spread of the ties."""
     spread_px = float(np.median(np.abs(seen.pixels_photo - np.median(seen.pixels_photo, axis=0))))
     lengths = np.abs(seen.points_world - np.median(seen.points_world, axis=0)).max(axis=1)
     per_metre = spread_px / max(0.5 * float(np.median(lengths)), 1e-6)
@@ -524,30 +520,27 @@ def expected_px(seen: SeenPoints) -> float:
 
 
 def posed(lens: ViewingCamera, pose: ViewingCamera) -> ViewingCamera:
-    """Return the lens of one camera the pose of another."""
+    """Return a camera with the lens of one and the pose of another."""
     return replace(lens, rotation=pose.rotation, translation=pose.translation)
 
 
 def undistorted_pixels(pixels: NDArray[np.float64], lens: ViewingCamera) -> NDArray[np.float64]:
-    """Pixels (n, 2) as without distortion and skew; NaN where the lens model cannot be undone."""
+    """Return pixels (n, 2) without distortion and skew; NaN where the lens model has no inverse."""
     if not (lens.distortion.any() or lens.skew):
         return pixels
     rays = camera_rays(lens, pixels)
     return rays[:, :2] * [lens.fx, lens.fy] + [lens.cx, lens.cy]
 
 
-def _calibration_doubt(found: Estimate, control: SeenPoints) -> str:
-    """Say that a calibrated photo was taken with another focal length; empty when it may be right.
+def _contradicted_calibration(found: Estimate, control: SeenPoints) -> str:
+    """Return the reason that a calibrated photo has another focal length; empty if it may be right.
 
-    The pose of such a photo takes up most of the mistake, and its residuals do not show the rest.
+    The pose absorbs most of a wrong focal length, and the residuals do not show the rest.
     """
     camera = found.resection.camera
     if found.resection.lens.sigmas.size or len(control) < _LEAST_FOR_FOCAL:
         return ""
     try:
-        step = first_step(control, camera, _OTHER_LENS, soft_limit=SOFT_LIMIT)
-        if abs(step[POSE_PARAMETERS]) < _MIN_FOCAL_STEP:
-            return ""
         free = adjust(control, camera, lens=_OTHER_LENS, independent=False, soft_limit=SOFT_LIMIT)
     except GeometryError:
         return ""
@@ -556,26 +549,25 @@ def _calibration_doubt(found: Estimate, control: SeenPoints) -> str:
     if off < max(_MIN_FOCAL_OFF, _FOCAL_OFF_SIGMAS * sigma):
         return ""
     return (
-        f"its ties ask for a focal length of {free.camera.fx:.0f} px, give or take "
-        f"{sigma * free.camera.fx:.0f} px, but its calibration says {camera.fx:.0f} px: the "
-        "calibration belongs to another "
-        "lens, zoom or image size"
+        f"its ties give a focal length of {free.camera.fx:.0f} px +- "
+        f"{sigma * free.camera.fx:.0f} px, but its calibration states {camera.fx:.0f} px: the "
+        "calibration belongs to another lens, zoom or image size"
     )
 
 
 def _robust_pose(
     seen: SeenPoints, lens: ViewingCamera, threshold_px: float, seed: int
 ) -> tuple[ViewingCamera, NDArray[np.bool_]] | None:
-    """Find the pose that most ties agree with (MSAC on P3P: Torr & Zisserman 2000).
+    """Find the pose with most inliers (MSAC on P3P: Torr & Zisserman 2000).
 
     Args:
         seen: the ties.
         lens: the camera's interior orientation; its pose is ignored.
-        threshold_px: ties agree up to this distance.
+        threshold_px: largest residual of an inlier.
         seed: of the samples.
 
     Returns:
-        The camera at that pose and the ties (n,) that agree with it; None when no pose is found.
+        The camera at that pose and its inliers (n,); None if no pose is found.
     """
     import cv2
 
@@ -591,10 +583,10 @@ def _robust_pose(
     usac.maxIterations = _MAX_TRIALS
     usac.confidence = _CONFIDENCE
     usac.randomGeneratorState = seed
-    # Several threads give another result each time.
+    # With several threads results are not reproducible.
     usac.isParallel = False
     usac.score = cv2.SCORE_METHOD_MSAC
-    # The adjustment that follows does what a local optimisation would do in thrice the time.
+    # The subsequent adjustment replaces a local optimisation at a third of the time.
     usac.loMethod = cv2.LOCAL_OPTIM_NULL
     call: Any = cv2.solvePnPRansac
     try:

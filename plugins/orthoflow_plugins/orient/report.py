@@ -1,4 +1,4 @@
-"""What an orientation step reports: one product, warnings, metrics, pictures, and residuals."""
+"""Reports of an orientation step: product, diagnostics, metrics, figures and residuals."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ _NAME_LETTERS: Final = 14
 _MAX_KERNELS: Final = 5000
 _KINDS: Final = (TieRole.CONTROL, TieRole.CHECK)
 
-COLUMNS_SAID: Final[Mapping[str, JsonValue]] = {
+RESIDUAL_COLUMNS: Final[Mapping[str, JsonValue]] = {
     "residual": "observed - computed; u and v of the photo",
     "unit": "px of the photo, cell of the wall's raster, or mm on the wall: px times the median "
     "size of a pixel there",
@@ -79,16 +79,16 @@ COLUMNS_SAID: Final[Mapping[str, JsonValue]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Oriented:
-    """What became of one photo.
+    """The result of one photo.
 
     Attributes:
-        camera: its orientation, or why there is none.
-        chosen: (n,) index into all ties of those that were used.
+        camera: its orientation, or the reason why there is none.
+        chosen: (n,) indices of its ties among all ties.
         role: (n,) `TieRole` of these.
         residuals_px: (n, 2) observed - computed, NaN without an orientation.
         entry: for the record.
-        notes: what limits it.
-        candidate: what it was judged by, of a photo that is ok.
+        notes: diagnostics.
+        candidate: the values that were tested, if it was accepted.
     """
 
     camera: Camera
@@ -100,13 +100,13 @@ class Oriented:
     candidate: Candidate | None = None
 
     def residuals_of(self, kind: TieRole) -> NDArray[np.float64]:
-        """Residuals (m, 2) of one role that are known."""
+        """Return the known residuals (m, 2) of one role."""
         values = self.residuals_px[self.role == kind]
         return np.asarray(values[np.isfinite(values).all(axis=1)])
 
 
 def pixel_mm(candidate: Candidate) -> float:
-    """Size of a pixel of the photo at its control, median."""
+    """Return the median size of a pixel of the photo at its control points."""
     camera = candidate.estimate.resection.camera
     derivatives = pixels_by_point(camera, candidate.seen.points_world[candidate.control])
     across = np.linalg.svd(derivatives, compute_uv=False)
@@ -118,7 +118,7 @@ def numbers_json(candidate: Candidate) -> dict[str, JsonValue]:
     estimate, error = candidate.estimate, candidate.error
     result, n_agreeing = estimate.resection, int(estimate.agreeing.sum())
     entry: dict[str, JsonValue] = {
-        # Withheld ties that are one of the control again check nothing.
+        # Check points that duplicate a control point are not counted.
         "n_control": n_agreeing - int(candidate.checked.sum()),
         "n_check": int(candidate.checked.sum()),
         "n_rejected": len(candidate.seen) - n_agreeing,
@@ -166,7 +166,7 @@ def residual_rows(
         photo: name of the photo.
         role: `control` or `check`.
         residuals_px: (n, 2), observed - computed.
-        units: by name, how many of them a pixel is; `cell` among them if it is known.
+        units: size of a pixel in each unit by name; `cell` if known.
 
     Returns:
         One row per coordinate and unit; none without residuals.
@@ -212,14 +212,14 @@ def hand_over(
     found: Sequence[Oriented],
     details: dict[str, JsonValue] | None = None,
 ) -> Cameras:
-    """Return the product and tell the rest through the context.
+    """Return the product; report diagnostics, metrics and figures.
 
     Args:
-        ctx: takes warnings, metrics and figures.
-        ties: all ties, as they were given.
+        ctx: the context.
+        ties: all ties of the input.
         photos: the photos.
-        found: what became of each.
-        details: what the method says beyond what every orientation says.
+        found: the result of each.
+        details: further details of the method.
     """
     role, residuals = ties.role.copy(), np.full_like(ties.residual_px, np.nan)
     for photo, oriented in zip(photos, found, strict=True):
@@ -237,9 +237,9 @@ def hand_over(
     draw_wall_errors(ctx, candidates)
     draw_positions(ctx, candidates)
     draw_residuals(ctx, [item for item in found if item.camera.status == "ok"])
-    said: dict[str, JsonValue] = {
+    common: dict[str, JsonValue] = {
         "photos": {item.camera.photo: item.entry for item in found},
-        "residual_columns": dict(COLUMNS_SAID),
+        "residual_columns": dict(RESIDUAL_COLUMNS),
         "sigma_wall": "standard deviation of one coordinate in the wall's plane, from the "
         "covariance, RMS over what the photo shows of its walls",
     }
@@ -247,18 +247,18 @@ def hand_over(
         cameras=tuple(item.camera for item in found),
         ties=replace(ties, role=role, residual_px=residuals),
         residual_table=tuple(row for each in candidates for row in residual_table(each)),
-        details=said | (details or {}),
+        details=common | (details or {}),
     )
 
 
 def measure_expected(ctx: StepContext, cameras: Sequence[Camera]) -> None:
-    """Report the errors on the wall that orientations carry; nothing where none carries one."""
+    """Report the stated errors on the wall, if any."""
     sigmas = [camera.sigma_wall_m for camera in cameras if camera.sigma_wall_m is not None]
     _sum_up(ctx, "sigma_wall_mm", [1000.0 * sigma for sigma in sigmas], "mm")
 
 
 def _chance_of_mean(values: NDArray[np.float64]) -> float | None:
-    """Probability of a mean as far from 0 when there is no shift; None for fewer than two."""
+    """Return the probability of a larger mean without a shift; None for fewer than two."""
     from scipy.special import stdtr  # scipy.stats would take seconds to import
 
     n = len(values)
@@ -271,7 +271,7 @@ def _chance_of_mean(values: NDArray[np.float64]) -> float | None:
 
 
 def _skewness(values: NDArray[np.float64]) -> float | None:
-    """Third standardised moment; None where nothing varies."""
+    """Return the third standardised moment; None without variance."""
     centred = values - values.mean()
     variance = float(np.mean(centred**2))
     return float(np.mean(centred**3)) / variance**1.5 if variance > 0.0 else None
@@ -367,11 +367,11 @@ def _with_legend(canvas: NDArray[np.uint8], counts: Mapping[TieRole, int]) -> by
 
 
 def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
-    """Draw the predicted error over each wall, at every place that of the photo that knows it best.
+    """Draw the predicted error over each wall, at every place that of the most accurate photo.
 
     Args:
-        ctx: takes the pictures.
-        candidates: of the photos that are ok.
+        ctx: the context.
+        candidates: of accepted photos.
     """
     walls = {wall.index: wall for candidate in candidates for wall in candidate.known}
     for index in sorted(walls):
@@ -388,8 +388,7 @@ def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
         shown = np.isfinite(best)
         if not shown.any():
             continue
-        # A corner that photos hardly reach must not darken all the rest; of orientations that are
-        # compared the scale is mostly the same.
+        # Percentiles: a corner that photos hardly reach must not dominate the scale.
         median_m, high_m = np.percentile(best[shown], [50.0, 98.0])
         error_mm = np.where(shown, 1e3 * best, np.nan)
         label = "predicted error of a coordinate [mm]"
@@ -397,8 +396,8 @@ def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
         ctx.figure(
             f"wall_{wall.number}_predicted_error",
             partial(map_chart, error_mm, label, frame, low=0.0, high=round_scale(1e3 * high_m)),
-            f"Predicted error of a coordinate on {wall.name}, of the photo that knows each place "
-            f"best, median {1e3 * median_m:.2g} mm; grey where no oriented photo shows the wall. "
+            f"Predicted error of a coordinate on {wall.name}, of the most accurate photo at each "
+            f"place, median {1e3 * median_m:.2g} mm; grey where no oriented photo shows the wall. "
             "Bright places far from ties are where the orthoimage may be off; more ties there "
             "would help.",
         )
@@ -406,13 +405,13 @@ def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
 
 @in_column_style()
 def draw_positions(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
-    """Draw where the photos were taken, and the control, along the first wall and facing it.
+    """Draw positions of photos and control points along the first wall and facing it.
 
-    After skarlatos2012, Figure 3. Of a floor the second view is its plan.
+    After skarlatos2012, Figure 3. For a floor the second view is its plan.
 
     Args:
-        ctx: takes the picture.
-        candidates: of the photos that are ok.
+        ctx: the context.
+        candidates: of accepted photos.
     """
     walls = {wall.index: wall for candidate in candidates for wall in candidate.known}
     if not walls:
@@ -450,7 +449,7 @@ def draw_positions(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
 
 @in_column_style()
 def draw_residuals(ctx: StepContext, photos: Sequence[Oriented]) -> None:
-    """Draw histograms of the residuals of oriented photos, all together and each by itself."""
+    """Draw histograms of the residuals of oriented photos, together and separately."""
     pooled = {
         kind: np.vstack([np.empty((0, 2)), *(photo.residuals_of(kind) for photo in photos)])
         for kind in _KINDS
@@ -469,7 +468,7 @@ def _draw_position(
     *,
     is_named: bool,
 ) -> None:
-    """Draw a photo's place, view and control onto two axes (3, 2) of the world."""
+    """Draw a photo's position, view and control points on two axes (3, 2) of the world."""
     camera = candidate.estimate.resection.camera
     control = (candidate.seen.points_world[candidate.control] - origin) @ shown
     step = max(1, len(control) // _MAX_CONTROL)
@@ -477,7 +476,7 @@ def _draw_position(
     x, y = ((camera.centre_world - origin) @ shown).tolist()
     across, down = (_VIEW_M * camera.rotation[2] @ shown).tolist()
     axes.arrow(x, y, across, down, head_width=0.2 * _VIEW_M, color=_CURVE_COLOUR, linewidth=0.8)
-    # From above one photo stands over the other, and so would their names.
+    # From above photos of one column coincide, and so would their names.
     if is_named:
         axes.annotate(
             candidate.photo.name, (x, y), xytext=(2, 2), textcoords="offset points", fontsize=6.0
@@ -490,7 +489,7 @@ def _draw_pooled(ctx: StepContext, pooled: dict[TieRole, NDArray[np.float64]]) -
     reach = _reach(np.vstack(list(pooled.values())))
     for (kind, values), row in zip(pooled.items(), panels, strict=True):
         for label, column, axes in zip("uv", values.T, row, strict=True):
-            # One outline instead of forty bars, each of which takes its time to draw.
+            # One outline is faster than forty bars.
             counts, edges = np.histogram(column, bins=_BARS, range=(-reach, reach))
             axes.stairs(counts, edges, fill=True, color=_BAR_COLOUR)
             _draw_curves(axes, column, edges)
@@ -513,7 +512,7 @@ def _draw_each(
     photos: Sequence[Oriented],
     pooled: dict[TieRole, NDArray[np.float64]],
 ) -> None:
-    """Draw a row per photo, a panel per role and coordinate, all bars up to its height."""
+    """Draw a row per photo and a panel per role and coordinate."""
     shown = photos[:_MAX_PHOTOS]
     figure = column_figure(len(pooled) * (0.45 + 0.22 * len(shown)))
     panels = figure.subplots(len(pooled), 2, squeeze=False, sharex=True, sharey=True)
@@ -562,7 +561,7 @@ def _draw_curves(
     scale: float = 1.0,
     base: float = 0.0,
 ) -> None:
-    """Draw the normal distribution of some values and their density, which shows their lobes."""
+    """Draw the normal distribution and the density of values, which shows several modes."""
     grid = np.linspace(edges[0], edges[-1], 161)
     curve = scale * _normal(values, edges, grid) + base
     axes.plot(grid, curve, color="black", linestyle="--", linewidth=0.6, label="normal")
@@ -576,19 +575,19 @@ def _draw_curves(
 
 
 def _end_of(name: str) -> str:
-    """Shorten a photo's name at its beginning: photos differ at the end of theirs."""
+    """Shorten a photo's name at its beginning, as names of a series differ at the end."""
     return name if len(name) <= _NAME_LETTERS else f"..{name[2 - _NAME_LETTERS :]}"
 
 
 def _reach(values: NDArray[np.float64]) -> float:
-    """Return the largest residual that is drawn, the same in all panels of figures that compare."""
+    """Return the largest residual that is drawn, the same in all panels of a figure."""
     return round_scale(max(float(np.percentile(np.abs(values), _PERCENTILE)), 1e-6))
 
 
 def _normal(
     values: NDArray[np.float64], edges: NDArray[np.float64], grid: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Counts per bar of a normal distribution with the mean and SD of the values."""
+    """Return counts per bar of a normal distribution with mean and SD of the values."""
     mean, deviation = float(values.mean()), max(float(values.std()), 1e-9)
     density = np.exp(-0.5 * ((grid - mean) / deviation) ** 2) / deviation / np.sqrt(2.0 * np.pi)
     return np.asarray(len(values) * (edges[1] - edges[0]) * density)

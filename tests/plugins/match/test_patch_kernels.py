@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.match.channels import Channels
 from orthoflow_plugins.match.displacements import (
-    Picture,
     match_patches,
     search_mixtures,
     search_shifts,
@@ -96,7 +96,7 @@ def _window(half: int) -> NDArray[np.float64]:
 
 
 def matched(
-    first: Picture, second: Picture, start: tuple[float, float], place: tuple[int, int] = (22, 20)
+    first: Channels, second: Channels, start: tuple[float, float], place: tuple[int, int] = (22, 20)
 ) -> NDArray[np.float64]:
     window = _window(HALF)
     found = np.array([[*start, 0.0, 0.0]])
@@ -114,8 +114,8 @@ def test_a_shift_is_found_whatever_gain_and_offsets_are(
     shift: tuple[float, float], gain: float
 ) -> None:
     offsets = np.array([3.0, -2.0], dtype=np.float32)
-    first = Picture(picture(), known())
-    second = Picture(np.float32(gain) * picture(shift) + offsets, known())
+    first = Channels(picture(), known())
+    second = Channels(np.float32(gain) * picture(shift) + offsets, known())
     start = (round(shift[0] + 0.3), round(shift[1] - 0.3))
     across, down, sigma, score = matched(first, second, (float(start[0]), float(start[1])))
     # Cubic convolution of waves of a dozen cells.
@@ -140,7 +140,7 @@ def test_deviation_and_correlation_are_those_of_weighted_least_squares() -> None
     ]
     mask = known()
     mask[15:19, 18:24] = 0.0
-    first, second = Picture(noisy[0], mask), Picture(noisy[1], known())
+    first, second = Channels(noisy[0], mask), Channels(noisy[1], known())
     across, down, sigma, score = matched(first, second, (1.0, 0.0))
     window = _window(HALF)
     rows = 20 + np.arange(-HALF, HALF + 1)
@@ -181,7 +181,7 @@ def test_deviation_and_correlation_are_those_of_weighted_least_squares() -> None
 
 
 def test_patches_that_fix_no_shift_have_no_deviation() -> None:
-    first, second = Picture(picture(), known()), Picture(picture((0.5, 0.25)), known())
+    first, second = Channels(picture(), known()), Channels(picture((0.5, 0.25)), known())
     # Too near to the border, in either picture.
     reach = HALF + 3
     for place, is_fine in (
@@ -202,13 +202,13 @@ def test_patches_that_fix_no_shift_have_no_deviation() -> None:
         mask = known(0.0)
         mask[:n_rows] = 1.0
         share = float((window * mask[15:26, 17:28]).sum() / window.sum())
-        is_fine = math.isfinite(matched(Picture(picture(), mask), second, (0.0, 0.0))[2])
+        is_fine = math.isfinite(matched(Channels(picture(), mask), second, (0.0, 0.0))[2])
         assert is_fine == (share > 0.3), share
         verdicts.add(is_fine)
     assert verdicts == {False, True}
-    flat = Picture(np.ones((SIDE, SIDE, 2), dtype=np.float32), known())
+    flat = Channels(np.ones((SIDE, SIDE, 2), dtype=np.float32), known())
     assert math.isinf(matched(flat, second, (0.0, 0.0))[2])
-    negative = Picture(-picture(), known())
+    negative = Channels(-picture(), known())
     assert math.isinf(matched(first, negative, (0.0, 0.0))[2])
 
 

@@ -6,9 +6,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.match import placing
 from orthoflow_plugins.match.placing import Placed, places_of
 from orthoflow_plugins.match.structures import WallStructure, wall_structure
 
@@ -75,29 +73,6 @@ def test_neither_a_lens_nor_how_the_camera_was_held_needs_to_be_known() -> None:
     assert abs(found.camera.fx / camera.fx - 1.0) < 0.05
 
 
-@pytest.mark.parametrize("degrees", [0.0, 90.0, 180.0, 270.0, 15.0, -105.0, 45.0, 210.0])
-@pytest.mark.parametrize(("shape", "scale"), [((300, 400), 1.0), ((1300, 850), 0.5)])
-def test_a_turned_photo_says_where_its_places_are(
-    degrees: float, shape: tuple[int, int], scale: float
-) -> None:
-    rows, columns = np.indices(shape, dtype=np.float64) + 0.5
-    rgb = np.dstack([255 * columns / shape[1], 255 * rows / shape[0], 0 * rows]).astype(np.uint8)
-    made = placing.turned(rgb, degrees, scale)
-    height, width = made.rgb.shape[:2]
-    across, down = np.meshgrid([0.1, 0.4, 0.5, 0.9], [0.1, 0.5, 0.8])
-    shares = np.column_stack([across.ravel(), down.ravel()])
-    at = (shares * [width, height]).astype(int)
-    shown = made.rgb[at[:, 1], at[:, 0], :2] / 255.0 * shape[::-1]
-    centres = (at + 0.5) / [width, height]
-    # Of 255 levels, rounded down and smoothed.
-    assert np.abs(shown - scale * made.pixels_photo(centres)).max() < 1.5 * max(shape) / 255
-    # All of it is photo: nothing black from beside it.
-    assert made.rgb[..., 1].min() > 0 or degrees % 90 == 0
-    assert made.size_px[0] / made.size_px[1] == pytest.approx(width / height, rel=0.01)
-    # What has to be turned by parts of a quarter is shrunk before.
-    assert max(height, width) <= 1200 or degrees % 90 == 0
-
-
 def test_a_mirrored_photo_is_placed_nowhere() -> None:
     mirrored = np.ascontiguousarray(decode_image(usual_photo().encoded, "a.png")[:, ::-1])
     assert placed(replace(usual_photo(), encoded=encode_png(mirrored), exif_focal_px=840.0)) is None
@@ -106,9 +81,6 @@ def test_a_mirrored_photo_is_placed_nowhere() -> None:
 def test_a_wall_that_shows_nothing_places_no_photo() -> None:
     blind = replace(patchy_wall(), intensity=None)
     assert places_of(0, usual_photo(), [wall_structure(blind)]) == []
-
-
-# --- how places are judged ---
 
 
 def test_a_photo_of_another_wall_is_placed_nowhere() -> None:

@@ -168,8 +168,7 @@ def test_a_mirrored_photo_is_recognised_as_such(
     ctx = context(tmp_path)
     ties = ties_of(photos, palace, ctx)
     assert not (ties.role != TieRole.REJECTED).any()
-    (said,) = ctx.warnings
-    assert said.startswith("photo a.png: its mirror image agrees with the walls and it does not")
+    assert [each.code for each in ctx.diagnostics] == ["photo-mirrored"]
 
 
 @pytest.mark.parametrize("n_even", [0, 400], ids=["steps alone", "some elsewhere"])

@@ -7,7 +7,6 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.match.structures import (
     WallStructure,
-    closer,
     likely_places,
     structure_of,
     wall_structure,
@@ -85,9 +84,3 @@ def test_a_piece_of_the_wall_lies_where_it_was_taken_from(
     np.testing.assert_allclose(np.ptp(best.parts_photo, axis=0), 0.5, atol=0.02)
     expected_m = fine_m * (np.array([left, top]) + best.parts_photo * [width, height])
     assert np.abs(best.parts_m - expected_m).max() < slip_m
-    rough = likely_places(np.repeat(cut[..., None], 3, axis=2), structure, n_most=1, roughly=True)
-    assert len(rough) == 1
-    near = closer(np.repeat(cut[..., None], 3, axis=2), structure, rough[0])
-    # The rough look finds the place, a closer one says by how much it stands out.
-    assert np.abs(near.centre_m - truth_m).max() < slip_m
-    assert near.lead == pytest.approx(best.lead, rel=0.15)

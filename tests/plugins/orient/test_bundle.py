@@ -167,7 +167,7 @@ def test_exif_that_the_photos_contradict_is_not_used_and_that_is_reported(
     together = bundle(bs.scan_ties(2), ms.photos(*wrong), ctx, **ALONE)
     assert {camera.status for camera in together.cameras} == {"ok"}
     assert together.cameras[0].viewing().fx == pytest.approx(840.0, rel=0.02)
-    assert any("EXIF is not used" in warning for warning in ctx.warnings)
+    assert "exif-focal-contradicted" in [each.code for each in ctx.diagnostics]
 
 
 @pytest.mark.parametrize("method", ["bundle", "pnp"])
@@ -201,7 +201,9 @@ def test_a_photo_whose_exif_the_others_contradict_is_tried_again_with_their_foca
         cameras = OrientPnp().run(inputs, params, ctx).cameras.cameras
     assert [camera.status for camera in cameras] == ["ok"] * 4
     assert cameras[3].viewing().fx == pytest.approx(840.0, rel=0.03)
-    assert any(warning.startswith("photo d.png: its EXIF contradicts") for warning in ctx.warnings)
+    assert [each.subject for each in ctx.diagnostics if each.code == "exif-focal-left-out"] == [
+        "d.png"
+    ]
 
 
 @pytest.mark.parametrize(("zoom", "n_lenses"), [(0.92, 1), (0.8, 4)])

@@ -125,9 +125,7 @@ def test_a_richer_lens_needs_more_control(
     )
     assert isinstance(enough, Estimate)
     assert isinstance(few, str)
-    assert f"only {least - 1} control ties" in few
-    assert f"needs {least}" in few
-    # Withheld ties are no control.
+    # Check points are no control points.
     is_check = np.arange(least) == 3
     held = estimated(
         viewer,

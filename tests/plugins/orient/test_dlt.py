@@ -127,7 +127,7 @@ def test_eleven_parameters_miss_the_corners_of_a_distorted_photo_by_ten_pixels(
     found = orient(ties_of(true, seed), ctx, **gates).cameras[0]
     assert found.status == "ok"
     assert frame_errors_px(found.viewing(), true).max() >= 10.0
-    assert any("its lens has distortion that a DLT" in warning for warning in ctx.warnings)
+    assert "dlt-without-distortion" in [each.code for each in ctx.diagnostics]
 
 
 @pytest.mark.parametrize("seed", seeds(3))
