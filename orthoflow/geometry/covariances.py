@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import threadpoolctl
 from numpy.typing import NDArray
 
 # Correlation lengths, as shares of the extent of what a photo sees: of errors that are rough
@@ -79,6 +80,13 @@ def honest_covariance(points: AdjustedPoints, sigma0: float) -> NDArray[np.float
         sigma0: standard deviation of unit weight of the whole adjustment. Its variance counts as
             independent: ties between photos have no part in errors of places.
     """
+    # Threads that wait for each other make eigenvalues ten times as slow on a busy machine.
+    with threadpoolctl.threadpool_limits(1):
+        return _averaged(points, sigma0)
+
+
+def _averaged(points: AdjustedPoints, sigma0: float) -> NDArray[np.float64]:
+    """Average over kinds, lengths and sizes of common errors; see `honest_covariance`."""
     is_one, extent_m = not points.photo.any(), max(points.extent_m, 1e-9)
     cells = _cells(points, extent_m, _MAX_CELLS if is_one else _MAX_CELLS_OF_SEVERAL)
     counts = np.bincount(cells)
@@ -105,6 +113,9 @@ def honest_covariance(points: AdjustedPoints, sigma0: float) -> NDArray[np.float
     whitening = axes[:, kept] / np.sqrt(shares[kept])
     white = whitening.T @ (roots[:, :, 0] * residuals).ravel()
     n_free = white.size + n_scattered
+    if not n_free:
+        # No residual says how large a common error is.
+        return sigma0**2 * points.cofactors
 
     evidence, variances, errors = [], [], []
     # Mean square, in standard deviations, of an error of one metre.
@@ -126,6 +137,8 @@ def honest_covariance(points: AdjustedPoints, sigma0: float) -> NDArray[np.float
             values, vectors = np.linalg.eigh(whitening.T @ expected @ whitening / unit)
             spread = 1.0 + _RATIOS[:, None] ** 2 * np.maximum(values, 0.0)
             squares = ((vectors.T @ white) ** 2 / spread).sum(axis=1) + scatter
+            # Of points without any error.
+            squares = np.maximum(squares, np.finfo(np.float64).tiny)
             evidence.append(
                 -0.5 * np.log(spread).sum(axis=1) - 0.5 * n_free * np.log(squares) - _RATIOS
             )

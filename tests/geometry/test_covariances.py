@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
 import pytest
-import threadpoolctl
 from numpy.typing import NDArray
 
 from orthoflow.geometry.cameras import ViewingCamera
@@ -27,13 +26,6 @@ VIEW: Final = ViewingCamera(
     rotation=np.eye(3),
     translation=np.array([0.0, 0.0, 8.0]),
 )
-
-
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    """Waiting for each other, threads of BLAS take many times as long on a busy machine."""
-    with threadpoolctl.threadpool_limits(1):
-        yield
 
 
 Draw = Callable[[NDArray[np.float64], np.random.Generator], NDArray[np.float64]]
@@ -203,3 +195,24 @@ def test_photos_share_the_errors_of_places_but_not_their_own(shared_by: str) -> 
     # Of the first and the last photo, down the picture.
     correlation = stated[1, 7] / math.sqrt(stated[1, 1] * stated[7, 7])
     assert (correlation > 0.4) == (shared_by == "places")
+
+
+@pytest.mark.parametrize(("n_points", "sigma0"), [(3, 1.7), (40, 0.0)])
+def test_points_without_redundancy_or_without_error_state_what_independent_ones_do(
+    n_points: int, sigma0: float
+) -> None:
+    rng = np.random.default_rng(5)
+    jacobian = rng.normal(size=(n_points, 2, 6))
+    flat = jacobian.reshape(-1, 6)
+    points = AdjustedPoints(
+        photo=np.zeros(n_points, dtype=np.intp),
+        places=rng.uniform(-2.0, 2.0, (n_points, 3)),
+        residuals=np.zeros((n_points, 2)),
+        jacobian=jacobian,
+        by_place=rng.normal(size=(n_points, 2, 3)) * 1e3,
+        pulls=rng.normal(size=(n_points, 6, 3)) * 1e3,
+        towards=np.tile([0.0, 0.0, 1.0], (n_points, 1)),
+        cofactors=np.linalg.inv(flat.T @ flat),
+    )
+    stated = honest_covariance(points, sigma0)
+    np.testing.assert_allclose(stated, sigma0**2 * points.cofactors, atol=1e-12)
