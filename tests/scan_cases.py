@@ -175,9 +175,23 @@ def _rgb(scene: Scene, names: str = "rgb") -> dict[str, NDArray[Any]]:
 def csv_named(draw: Draw) -> Case:
     """A CSV file with header, a column of texts among the numbers."""
     scene = draw.scene
-    axes = draw.one_of("x y z", "X Y Z", "Easting Northing Elevation", "POINT_X POINT_Y POINT_Z")
-    colours = draw.one_of("r g b", "Red Green Blue", "R G B", "color_red color_green color_blue")
-    text = draw.one_of("P{}", "Böschung {}", "wall-{}", "")
+    axes = draw.one_of(
+        "x y z",
+        "X Y Z",
+        "Easting Northing Elevation",
+        "POINT_X POINT_Y POINT_Z",
+        "Rechtswert Hochwert Höhe",
+    )
+    colours = draw.one_of(
+        "r g b",
+        "Red Green Blue",
+        "R G B",
+        "color_red color_green color_blue",
+        "Rot Grün Blau",
+    )
+    separator = draw.one_of(",", ";", "\t", ", ")
+    quote = draw.one_of(False, True) and separator != "\t"
+    text = draw.one_of("P{}", "Böschung {}", "wall-{}", "", "Wall, north; {}" if quote else "")
     columns: dict[str, Any] = {"name": [text.format(k) for k in range(len(scene))]} if text else {}
     columns |= dict(zip(axes.split(), scene.points.T, strict=True))
     columns |= dict(zip(colours.split(), scene.rgb.T, strict=True))
@@ -187,15 +201,16 @@ def csv_named(draw: Draw) -> Case:
             scene.reflectance * draw.one_of(1.0, 255.0, 4095.0)
         )
     columns = {name: columns[name] for name in draw.order(list(columns))}
-    separator = draw.one_of(",", ";", "\t", ", ")
+    # The first numbers may all be whole, where others have decimal commas.
+    scene.points[0] = draw.one_of(scene.points[0], np.array([1.0, 2.0, 1.0]))
     path = _write_table(
         draw.folder / draw.one_of("named.csv", "named.txt", "named.xyz"),
         columns,
         separator=separator,
-        decimal="," if separator == ";" and draw.one_of(False, True) else ".",
+        decimal="," if (separator == ";" or quote) and draw.one_of(False, True) else ".",
         end=draw.one_of("\n", "\r\n"),
         encoding=draw.one_of("utf-8", "latin-1", "utf-8-sig"),
-        quote=draw.one_of(False, True) and separator == ",",
+        quote=quote,
     )
     intensity: Literal["linear", "none"] = "linear" if has_intensity else "none"
     return Case(scene=scene, paths=[path], rgb=True, intensity=intensity)
@@ -219,6 +234,21 @@ def text_header_unknown(draw: Draw) -> Case:
     )
     words = header.replace("#", "").replace(separator, " ").replace('"', "").split()
     return Case(scene=draw.scene, paths=[path], refusal=("cloud.columns", *words))
+
+
+def text_names_twice(draw: Draw) -> Case:
+    """Other columns whose names may stand for a coordinate or the intensity, too."""
+    scene = draw.scene
+    other = draw.rng.uniform(0.0, 9.0, (len(scene), 3)).round(3)
+    names = draw.one_of(("N",), ("H",), ("i",), ("E", "N"), ("I", "J", "K"), ("Height",))
+    columns: dict[str, Any] = dict(zip(names, other.T, strict=False))
+    has_intensity = draw.one_of(True, False) or names == ("i",)
+    columns |= dict(zip(draw.one_of("XYZ", "xyz"), scene.points.T, strict=True))
+    if has_intensity:
+        columns["Intensity"] = scene.reflectance
+    columns = {name: columns[name] for name in draw.order(list(columns))}
+    path = _write_table(draw.folder / "a.csv", columns, separator=draw.one_of(",", " ", ";"))
+    return Case(scene=scene, paths=[path], intensity="linear" if has_intensity else "none")
 
 
 def text_index_first(draw: Draw) -> Case:
@@ -298,7 +328,11 @@ def text_units(draw: Draw) -> Case:
         "cm": ("cm", "centimetres", "centimeters"),
     }[unit]
     word = draw.one_of(*spelled)
-    header = draw.one_of(f"X [{word}],Y [{word}],Z [{word}]", f"# units: {word}\nx,y,z")
+    header = draw.one_of(
+        f"X [{word}],Y [{word}],Z [{word}]",
+        f"# units: {word}\nx,y,z",
+        f"x,y,z\n{word},{word},{word}",
+    )
     path = _write_table(
         draw.folder / "a.csv",
         _xyz(
@@ -500,6 +534,34 @@ def points_at_zero(draw: Draw) -> Case:
     )
 
 
+def points_at_one_place(draw: Draw) -> Case:
+    """Points without a return that were moved with the scan, to its scanner or a file's offset."""
+    scene, shift = draw.scene, draw.shift()
+    n_lost = round(draw.one_of(1.0, 0.2, 4.0) * len(scene))
+    places = np.sort(draw.rng.integers(0, len(scene) + 1, n_lost))
+    all_of = Scene(
+        points=np.insert(scene.points + shift, places, STATION + shift, axis=0),
+        reflectance=np.insert(scene.reflectance, places, 0.0),
+        rgb=np.insert(scene.rgb, places, 0, axis=0),
+    )
+    kind = draw.one_of("las", "xyz", "ply", "laz")
+    path = draw.folder / f"a.{kind}"
+    if kind == "ply":
+        scan_files.write_ply(path, {**_xyz(all_of), **_rgb_named(all_of)})
+    elif kind == "xyz":
+        _write_table(path, {**_xyz(all_of), **_rgb(all_of)})
+    else:
+        _write_las(path, all_of, offset=STATION + shift, intensity=np.zeros(len(all_of)))
+    return Case(
+        scene=scene,
+        paths=[path],
+        shift=shift,
+        rgb=True,
+        left_out={"one_place": n_lost},
+        warnings=(f"{n_lost} points lie at exactly",),
+    )
+
+
 # LAS
 
 
@@ -582,8 +644,14 @@ def las_feet(draw: Draw) -> Case:
         ("m", "us-ft", 32618),
     )
     vertical = {"us-ft": 6360, "m": 5703, "ft": 8228}[height]
-    how = draw.one_of("keys", "wkt", "wkt behind the points")
-    if how == "keys":
+    how = draw.one_of("keys", "wkt", "wkt behind the points", "citation")
+    if how == "citation" and level != height:
+        how = "keys"
+    if how == "citation":
+        foot = {"us-ft": "US survey foot", "ft": "foot", "m": "metre"}[level]
+        text = f"PCS Name = site|Linear unit = {foot}|"
+        record = laspy.VLR("LASF_Projection", 34737, "", text.encode() + b"\0")
+    elif how == "keys":
         codes = {"m": 9001, "ft": 9002, "us-ft": 9003}
         keys = [(1024, 1), (3072, epsg), (3076, codes[level])]
         if height != level or draw.one_of(False, True):
@@ -793,6 +861,8 @@ def pcd_names(draw: Draw) -> Case:
     )
     head, body = rest.split(b"DATA", 1)
     if draw.one_of(False, True):
+        head = head.replace(b"HEIGHT 1\n", b"")
+    if draw.one_of(False, True):
         head = b"\n".join(
             line.replace(line.split()[0], line.split()[0].lower(), 1) if line.split() else line
             for line in head.split(b"\n")
@@ -867,6 +937,7 @@ CASES: Final[Mapping[str, Callable[[Draw], Case]]] = {
     for case in (
         csv_named,
         text_header_unknown,
+        text_names_twice,
         text_index_first,
         text_not_a_number,
         text_normals,
@@ -878,6 +949,7 @@ CASES: Final[Mapping[str, Callable[[Draw], Case]]] = {
         e57_two_depths,
         e57_two_intensity_limits,
         points_at_zero,
+        points_at_one_place,
         las_bounds_stale,
         las_count_stale,
         las_feet,

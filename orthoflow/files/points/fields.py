@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain, permutations
@@ -19,18 +20,22 @@ IGNORED: Final = "_"
 _COLOURS: Final = ("r", "g", "b")
 _NORMALS: Final = ("nx", "ny", "nz")
 _READ: Final = ("x", "y", "z", *_COLOURS, "rgb", "intensity", "row", "column")
+# The names of a meaning, the most certain first: of `N X Y Z` the first is no northing.
 _MEANINGS: Final = {
     alias: name
     for name, text in {
-        "x": "x easting east e xcoord xcoordinate cartesianx pointx coordx posx positionx",
-        "y": "y northing north n ycoord ycoordinate cartesiany pointy coordy posy positiony",
-        "z": "z height elevation alt altitude h zcoord zcoordinate cartesianz pointz coordz posz "
-        "positionz",
-        "r": "r red rf colorred colourred diffusered colorr",
-        "g": "g green gf colorgreen colourgreen diffusegreen colorg",
-        "b": "b blue bf colorblue colourblue diffuseblue colorb",
+        "x": "x xcoord xcoordinate cartesianx pointx coordx posx positionx easting east este est "
+        "rechtswert ostwert e",
+        "y": "y ycoord ycoordinate cartesiany pointy coordy posy positiony northing north norte "
+        "nord hochwert nordwert n",
+        "z": "z zcoord zcoordinate cartesianz pointz coordz posz positionz elevation elev height "
+        "altitude alt hohe hoehe hauteur altura quota cota h",
+        "r": "red colorred colourred diffusered rf colorr rot rouge rojo rosso r",
+        "g": "green colorgreen colourgreen diffusegreen gf colorg grun gruen vert verde g",
+        "b": "blue colorblue colourblue diffuseblue bf colorb blau bleu azul blu b",
         "rgb": "rgb rgba packedrgb",
-        "intensity": "intensity i int intensities scalarintensity scalarfield scalarscalarfield",
+        "intensity": "intensity intensities scalarintensity intensitat intensitaet intensite "
+        "intensidad intensita int i scalarfield scalarscalarfield",
         "row": "row rowindex",
         "column": "column columnindex col",
         "nx": "nx normalx xnormal normals0 n0",
@@ -41,6 +46,7 @@ _MEANINGS: Final = {
     }.items()
     for alias in text.split()
 }
+_PLACES: Final = {alias: place for place, alias in enumerate(_MEANINGS)}
 # Substitutes for an intensity, the best first.
 _STAND_INS: Final = (
     *("reflectance", "reflectivity", "scalarreflectance", "amplitude", "scalaramplitude"),
@@ -102,7 +108,8 @@ def plain_name(name: str) -> str:
     """Reduce a field's name to its lower-case letters and digits, without bracketed parts."""
     if len(name) > _LONGEST_NAME:
         return ""
-    return re.sub(r"[^a-z0-9]", "", re.sub(r"[\[(].*?[\])]", "", name.lower()))
+    plain = unicodedata.normalize("NFKD", re.sub(r"[\[(].*?[\])]", "", name.lower()))
+    return re.sub(r"[^a-z0-9]", "", plain)
 
 
 def meaning_of(name: str) -> str:
@@ -110,6 +117,12 @@ def meaning_of(name: str) -> str:
     base, unit = _split_unit(name)
     known = _MEANINGS.get(plain_name(name))
     return known or (_MEANINGS.get(plain_name(base), IGNORED) if unit else IGNORED)
+
+
+def _certainty(label: str) -> int:
+    """Return the place of a name among those of its meaning, the most certain first."""
+    base = label if plain_name(label) in _MEANINGS else _split_unit(label)[0]
+    return _PLACES.get(plain_name(base), 0)
 
 
 def may_be_intensity(name: str) -> bool:
@@ -130,12 +143,17 @@ def columns_of_names(
     Returns:
         None if they do not include x, y and z.
     """
-    names = [meaning_of(label) for label in labels]
-    # If a meaning occurs twice (`I` and `Intensity`), its first field is used.
-    names = [IGNORED if name in names[:index] else name for index, name in enumerate(names)]
+    plain = [plain_name(label) for label in labels]
+    names = [IGNORED] * len(labels)
+    # If a meaning occurs twice (`I` and `Intensity`), the field with its most certain name is used.
+    for index in sorted(range(len(labels)), key=lambda k: _certainty(labels[k])):
+        meaning = meaning_of(labels[index])
+        # I, J, K are a direction.
+        is_direction = plain[index] == "i" and {"j", "k"} <= set(plain)
+        if meaning not in names and not is_direction:
+            names[index] = meaning
     if not {"x", "y", "z"} <= set(names):
         return None
-    plain = [plain_name(label) for label in labels]
     wanted: tuple[str, ...] = ()
     if intensity_field is not None:
         wanted = (plain_name(intensity_field),)

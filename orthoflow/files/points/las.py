@@ -37,7 +37,12 @@ from orthoflow.files.points.scan_file import (
     point_block,
     reading,
 )
-from orthoflow.files.points.units import StatedUnit, unit_of_crs, unit_of_geo_keys
+from orthoflow.files.points.units import (
+    StatedUnit,
+    unit_of_comments,
+    unit_of_crs,
+    unit_of_geo_keys,
+)
 
 FORMAT: Final = "LAS/LAZ"
 _COLOURS: Final = ("red", "green", "blue")
@@ -58,6 +63,7 @@ _EXTRA_BYTES: Final = 14
 MOST_FIXED_CHUNK: Final = 50_000_000
 _WKT_RECORD: Final = 2112
 _GEO_KEYS: Final = 34735
+_GEO_TEXTS: Final = 34737
 _LONGEST_WKT: Final = 100_000
 _MOST_EVLRS: Final = 1000
 _SAMPLE_POINTS: Final = 50_000
@@ -166,12 +172,17 @@ def _unit(path: Path, header: Any) -> StatedUnit | None:
         if found is not None:
             return found
     keys: dict[int, int] = {}
+    citations: list[str] = []
     for vlr in header.vlrs:
-        if vlr.user_id.strip("\0") == "LASF_Projection" and vlr.record_id == _GEO_KEYS:
-            raw = vlr.record_data_bytes()
+        if vlr.user_id.strip("\0") != "LASF_Projection":
+            continue
+        raw = vlr.record_data_bytes()
+        if vlr.record_id == _GEO_KEYS:
             entries = np.frombuffer(raw[: len(raw) // 8 * 8], "<u2").reshape(-1, 4)[1:]
             keys |= {int(key): int(value) for key, place, _, value in entries if place == 0}
-    return unit_of_geo_keys(keys)
+        elif vlr.record_id == _GEO_TEXTS:
+            citations += raw.decode("ascii", "replace").strip("\0").split("|")
+    return unit_of_geo_keys(keys) or unit_of_comments(citations, "GeoTIFF citation")
 
 
 def _wkt_behind_points(path: Path) -> Iterator[str]:

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError
 from orthoflow.files.points.fields import Columns
 from orthoflow.files.points.scan_file import (
-    BLOCK_POINTS,
     PointBlock,
     Scan,
     ScanFile,
@@ -31,8 +30,9 @@ from orthoflow.files.points.text import (
     MOST_LINE_BYTES,
     Layout,
     find_layout,
+    line_at,
     long_line,
-    read_table,
+    read_tables,
     take_lines,
     values_of,
 )
@@ -59,7 +59,6 @@ class _Part:
 
     Attributes:
         start: of the first line of points, bytes; `end` is behind the last one.
-        first_line: number of the first line of points.
         n_points: lines with points.
         n_rows: rows of the grid; points come column by column.
         n_places: rows times columns.
@@ -69,7 +68,6 @@ class _Part:
 
     start: int
     end: int
-    first_line: int
     n_points: int
     n_rows: int
     n_places: int
@@ -102,7 +100,7 @@ def open_ptx(path: Path, *, intensity_field: str | None = None) -> ScanFile:
     del intensity_field
     places = _find_headers(path)
     if len(places) < 2 or places[0][0] > 0:
-        raise _bad_header(path, 1)
+        raise _bad_header(path, 0)
     with path.open("rb") as file:
         parts = [_read_header(path, file, *first, *behind) for first, behind in pairwise(places)]
     notes = [
@@ -126,26 +124,20 @@ def _blocks(path: Path, parts: list[_Part]) -> Iterator[PointBlock]:
     with path.open("rb") as file:
         for scan, part in enumerate(parts):
             file.seek(part.start)
-            n_read, line = 0, part.first_line
-            while n_read < part.n_points:
-                n_lines = min(BLOCK_POINTS, part.n_points - n_read)
-                places = part.columns.places.values()
-                table = read_table(file, part.layout, places, n_lines=n_lines, first_line=line)
-                line += n_lines
-                if file.tell() >= part.end and not len(table):
-                    break
+            n_read, places = 0, part.columns.places.values()
+            for table in read_tables(file, part.layout, places, end=part.end):
                 values = values_of(table, part.columns)
                 if part.is_whole:
-                    index = np.arange(n_read, n_read + len(table), dtype=np.int64)
+                    index = np.arange(n_read, n_read + len(table[0]), dtype=np.int64)
                     values["row"], values["column"] = index % part.n_rows, index // part.n_rows
                 yield point_block(axes_of(values), values, scan=scan, pose=part.pose)
-                n_read += len(table)
+                n_read += len(table[0])
 
 
-def _find_headers(path: Path) -> list[tuple[int, int, int]]:
-    """Offset, number of the line from 1, and filled lines before each header, and at the end."""
-    found: list[tuple[int, int, int]] = []
-    offset, line, n_filled, kept = 0, 1, 0, b""
+def _find_headers(path: Path) -> list[tuple[int, int]]:
+    """Offset of each header, and filled lines before it; the same at the end."""
+    found: list[tuple[int, int]] = []
+    offset, n_filled, kept = 0, 0, b""
     with path.open("rb") as file:
         is_last = False
         while not is_last:
@@ -157,17 +149,16 @@ def _find_headers(path: Path) -> list[tuple[int, int, int]]:
             if not is_last:
                 cut = text.rfind(b"\n", 0, len(text) - _MOST_HEADER_BYTES) + 1
             if not cut and len(text) > MOST_LINE_BYTES:
-                raise long_line(path, line) if found else _bad_header(path, line)
+                raise long_line(path, offset + 1) if found else _bad_header(path, offset)
             begins = [match.start() for match in _HEADER.finditer(text) if match.start() < cut]
             counted = 0
             for place in [*begins, cut]:
                 piece = text[counted:place]
-                n_lines = piece.count(b"\n")
-                line, n_filled = line + n_lines, n_filled + n_lines - len(_BLANK.findall(piece))
+                n_filled += piece.count(b"\n") - len(_BLANK.findall(piece))
                 counted = place
                 if place < cut or is_last:
                     n_open = bool(piece.rpartition(b"\n")[2].strip())
-                    found.append((offset + place, line, n_filled + n_open))
+                    found.append((offset + place, n_filled + n_open))
             offset, kept = offset + cut, text[cut:]
             if len(found) > _MOST_SCANS:
                 raise InputError(f"{path.name} has more than {_MOST_SCANS} scans")
@@ -178,16 +169,12 @@ def _read_header(
     path: Path,
     file: BinaryIO,
     start: int,
-    line: int,
     n_before: int,
     end: int,
-    _line_behind: int,
     n_behind: int,
 ) -> _Part:
     file.seek(start)
-    lines = [
-        item.decode("ascii", "replace") for item in take_lines(file, HEADER_LINES, first_line=line)
-    ]
+    lines = [item.decode("ascii", "replace") for item in take_lines(file, HEADER_LINES)]
     try:
         n_columns, n_rows = (int(item) for item in lines[:2])
         numbers = [[float(item) for item in row.split()] for row in lines[2:]]
@@ -197,15 +184,15 @@ def _read_header(
     except ValueError:
         is_whole = False
     if not is_whole or not np.isfinite(matrix).all():
-        raise _bad_header(path, line)
-    begin, first_line = file.tell(), line + HEADER_LINES
+        raise _bad_header(path, start)
+    begin = file.tell()
     layout, first = None, ""
-    for sample in take_lines(file, _SAMPLE_LINES, first_line=first_line):
+    for sample in take_lines(file, _SAMPLE_LINES):
         if begin >= end:
             break
         text = sample.decode("ascii", "replace").strip()
         if not first and not text:
-            begin, first_line = begin + len(sample), first_line + 1
+            begin += len(sample)
             continue
         first = first or text
         found = find_layout(text)
@@ -217,13 +204,12 @@ def _read_header(
     n_points = n_behind - n_before - HEADER_LINES
     if layout is None and n_points:
         raise InputError(
-            f"{path.name}, line {first_line}: expected x y z, with intensity and r g "
+            f"{path.name}, line {line_at(path, begin)}: expected x y z, with intensity and r g "
             f"b where the scan has them, got {first[:60]!r}"
         )
     return _Part(
         start=begin,
         end=end,
-        first_line=first_line,
         n_points=n_points,
         n_rows=n_rows,
         n_places=n_rows * n_columns,
@@ -232,8 +218,8 @@ def _read_header(
     )
 
 
-def _bad_header(path: Path, line: int) -> InputError:
+def _bad_header(path: Path, place: int) -> InputError:
     return InputError(
-        f"{path.name}, line {line}: expected the ten header lines of a PTX scan (columns, "
-        "rows, scanner position, three axes, a 4 x 4 matrix); export the file again"
+        f"{path.name}, line {line_at(path, place)}: expected the ten header lines of a PTX scan "
+        "(columns, rows, scanner position, three axes, a 4 x 4 matrix); export the file again"
     )

@@ -33,7 +33,7 @@ from orthoflow.files.points.scan_file import (
     point_block,
     reading,
 )
-from orthoflow.files.points.text import Layout, read_stated, take_lines, values_of
+from orthoflow.files.points.text import Layout, read_tables, take_lines, values_of
 from orthoflow.files.points.units import unit_of_comments
 
 _HEADER_BYTES: Final = 1 << 20
@@ -210,8 +210,10 @@ def _open_pcd(
     data = entries["DATA"][0].lower()
     if data not in {"ascii", "binary", "binary_compressed"}:
         raise ValueError(f"data are {data}, expected ascii, binary or binary_compressed")
+    if "POINTS" in entries:
+        entries = {"WIDTH": entries["POINTS"], "HEIGHT": ["1"]} | entries
     width, height = int(entries["WIDTH"][0]), int(entries["HEIGHT"][0])
-    n_points = int(entries["POINTS"][0]) if "POINTS" in entries else width * height
+    n_points = int(entries.get("POINTS", [str(width * height)])[0])
     if height > 1 and width * height != n_points:
         raise ValueError(f"it has {height} rows of {width} points, but {n_points} points")
     pose = [float(item) for item in entries.get("VIEWPOINT", ["0"] * 7)]
@@ -290,15 +292,17 @@ def _text(
     packed = row[columns.places["rgb"]].base if "rgb" in columns.places else None
     layout = Layout(n_columns=starts[-1])
     with path.open("rb") as file:
-        line = file.read(offset).count(b"\n") + 1
+        file.seek(offset)
         for start in range(0, n_skipped, BLOCK_POINTS):
             count = min(BLOCK_POINTS, n_skipped - start)
-            if len(take_lines(file, count, first_line=line + start)) != count:
+            if len(take_lines(file, count)) != count:
                 raise cut_off(path, "elements", "fewer lines", str(n_skipped))
-        for table in read_stated(
-            file, layout, places, n_points=n_points, first_line=line + n_skipped, what=what
-        ):
+        n_read = 0
+        for table in read_tables(file, layout, places, n_rows=n_points):
+            n_read += len(table[0])
             yield values_of(table, columns, packed)
+    if n_read < n_points:
+        raise cut_off(path, what, f"{n_read} points", str(n_points))
 
 
 def _compressed(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import csv
 import io
 import math
 import re
@@ -10,7 +11,6 @@ import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
@@ -26,7 +26,6 @@ from orthoflow.files.points.fields import (
     meaning_of,
 )
 from orthoflow.files.points.scan_file import (
-    BLOCK_POINTS,
     PointBlock,
     ScanFile,
     Values,
@@ -34,15 +33,15 @@ from orthoflow.files.points.scan_file import (
     cut_off,
     point_block,
 )
-from orthoflow.files.points.units import unit_of_comments, unit_of_name
+from orthoflow.files.points.units import unit_of_comments, unit_of_name, unit_of_word
 
 # Lines of text scans and headers are much shorter.
 #: bytes of a line of a text scan
 MOST_LINE_BYTES: Final = 10_000
 _HEADER_LINES: Final = 200
 _SAMPLE_LINES: Final = 1000
-_SCAN_BYTES: Final = 1 << 24
-_LINES_AT_ONCE: Final = 10_000
+# Some 300,000 points at a time.
+_BLOCK_BYTES: Final = 1 << 24
 # Of the number of points; a number that is longer counts nothing.
 _MOST_DIGITS: Final = 20
 _NUMBER: Final = re.compile(
@@ -64,24 +63,37 @@ _NO_WORD: Final = re.compile(
 )
 
 
+# Columns (n,) of numbers.
+Table = Sequence[NDArray[np.float64]]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    r"""How the numbers of a line are separated.
+    """How the numbers of a line are separated.
 
     Attributes:
-        separator: pattern for pandas: a character, or `\s+` for any white space.
+        separator: a character; a space stands for any white space.
         decimal: `.` or `,`.
         n_columns: numbers in the first line.
+        is_quoted: fields may be in quotes, which may hold separators.
     """
 
-    separator: str = r"\s+"
+    separator: str = " "
     decimal: str = "."
     n_columns: int
+    is_quoted: bool = False
 
     def fields(self, line: str) -> list[str]:
         """Split a line, without quotes and the empty field after a closing separator."""
-        split = line.split() if self.separator == r"\s+" else _split(line, self.separator)
-        return [_unquoted(item) for item in split]
+        if self.separator == " ":
+            return [_unquoted(item) for item in line.split()]
+        fields = line.split(self.separator)
+        if '"' in line:
+            fields = next(csv.reader([line], delimiter=self.separator, skipinitialspace=True))
+        fields = [_unquoted(field.strip()) for field in fields]
+        while fields and not fields[-1]:
+            fields.pop()
+        return fields
 
 
 def open_text(
@@ -101,7 +113,7 @@ def open_text(
     n_stated: int | None = None
     headers: list[str] = []
     for index, line in enumerate(lines[:_HEADER_LINES]):
-        layout = None if is_comment(line.encode()) else find_layout(line)
+        layout = None if is_comment(line.encode()) else find_layout(line, lines[index:])
         if layout is not None:
             n_header_lines = index
             break
@@ -137,7 +149,7 @@ def open_text(
     return ScanFile(
         name=path.name,
         format_name="text",
-        n_most=_count_lines(path) - n_header_lines,
+        n_most=line_at(path) - 1 - n_header_lines,
         scans=[columns.scan(unit=unit)],
         read=partial(_blocks, path, layout, columns, n_header_lines, n_stated),
     )
@@ -146,15 +158,12 @@ def open_text(
 def _blocks(
     path: Path, layout: Layout, columns: Columns, n_header_lines: int, n_stated: int | None
 ) -> Iterator[PointBlock]:
-    n_read, line = 0, n_header_lines + 1
+    n_read = 0
     with path.open("rb") as file:
-        take_lines(file, n_header_lines, first_line=1)
-        while file.peek(1):
-            table = read_table(
-                file, layout, columns.places.values(), n_lines=BLOCK_POINTS, first_line=line
-            )
-            line += BLOCK_POINTS
-            n_read += len(table)
+        take_lines(file, n_header_lines)
+        places = columns.places.values()
+        for table in read_tables(file, layout, places):
+            n_read += len(table[0])
             values = values_of(table, columns)
             yield point_block(axes_of(values), values)
     if n_stated is not None and n_read < n_stated:
@@ -166,15 +175,22 @@ def _columns_of_header(
 ) -> Columns | None:
     """Columns as the last header line names them; None where there is no such line.
 
+    A line of units may follow the one of names.
+
     Raises:
         InputError: there is one, and it names no x, y and z for the columns there are.
     """
+    unit: str | None = None
     for header in reversed(headers):
         labels = _labels(header)
+        units = {word for label in labels if (word := unit_of_word(label)) is not None}
+        if len(units) == 1 and all(unit_of_word(label) or not label for label in labels):
+            unit = units.pop()
+            continue
         found = columns_of_names(labels, intensity_field=intensity_field)
         fits = len(labels) == layout.n_columns
         if found is not None and fits:
-            return found
+            return replace(found, unit=unit or found.unit)
         is_remark = header != header.lstrip(_COMMENT)
         names_something = any(
             meaning_of(label) != IGNORED or _NO_WORD.fullmatch(label) for label in labels
@@ -211,7 +227,7 @@ def _labels(header: str) -> list[str]:
 
 def _first_lines(path: Path) -> list[str]:
     with path.open("rb") as file:
-        raw = take_lines(file, _HEADER_LINES + _SAMPLE_LINES, first_line=1)
+        raw = take_lines(file, _HEADER_LINES + _SAMPLE_LINES)
     if raw and raw[0].startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise InputError(f"{path.name} is UTF-16 text: save it as UTF-8 or plain ASCII")
     if any(b"\0" in line for line in raw):
@@ -221,23 +237,32 @@ def _first_lines(path: Path) -> list[str]:
         )
     if raw:
         raw[0] = raw[0].removeprefix(codecs.BOM_UTF8)
-    return [line.decode("utf-8", "replace").strip() for line in raw]
+    try:
+        return [line.decode().strip() for line in raw]
+    except UnicodeDecodeError:
+        return [line.decode("latin-1").strip() for line in raw]
 
 
-def _count_lines(path: Path) -> int:
-    """Count the lines of a file; a last line without an end counts too."""
-    lines, last = 0, b"\n"
+def line_at(path: Path, place: int | None = None) -> int:
+    """Return the number, from 1, of the line that begins at a place of a file; None is its end."""
+    n_lines, n_left, is_within = 1, path.stat().st_size if place is None else place, False
     with path.open("rb") as file:
-        while block := file.read(_SCAN_BYTES):
-            lines += block.count(b"\n")
-            last = block[-1:]
-    return lines + (last != b"\n")
+        while block := file.read(min(_BLOCK_BYTES, n_left)):
+            n_left -= len(block)
+            n_lines += _count_ends(block)
+            is_within = not block.endswith(b"\n")
+    return n_lines + is_within
+
+
+def _count_ends(block: bytes) -> int:
+    # Five times as fast as `bytes.count` where lines are short.
+    return int(np.count_nonzero(np.frombuffer(block, dtype=np.uint8) == ord("\n")))
 
 
 # Any: arrays of any type.
-def values_of(table: NDArray[np.float64], columns: Columns, packed: Any = np.int64) -> Values:
-    """Return the columns (n,) of a table of text by meaning, packed colours in their own type."""
-    values: Values = dict(zip(columns.places, table.T, strict=True))
+def values_of(table: Table, columns: Columns, packed: Any = np.int64) -> Values:
+    """Return the columns of a table of text by meaning, packed colours in their own type."""
+    values: Values = dict(zip(columns.places, table, strict=True))
     if "rgb" in values:
         values["rgb"] = np.nan_to_num(values["rgb"], posinf=0.0, neginf=0.0).astype(packed)
     return values
@@ -249,39 +274,47 @@ def is_comment(line: bytes) -> bool:
     return start.startswith((b"#", b"//")) and not _NOT_A_NUMBER.match(start)
 
 
-def find_layout(line: str) -> Layout | None:
+def find_layout(line: str, sample: Sequence[str] = ()) -> Layout | None:
     """Layout of a line with at least three numbers, and more numbers than texts; None for others.
 
     Numbers may be quoted, as in CSV files.
+
+    Args:
+        line: the first line of numbers.
+        sample: lines after it, which show decimal commas if its own numbers are whole.
     """
     fields, separator = _fields_of(line)
-    numbers = [field for field in fields if _NUMBER.fullmatch(field)]
-    if len(numbers) < 3 or 2 * len(numbers) < len(fields):
+    if not _are_mostly_numbers(fields):
         return None
-    has_comma = separator != "," and any("," in number for number in numbers)
-    return Layout(separator=separator, decimal="," if has_comma else ".", n_columns=len(fields))
+    layout = Layout(
+        separator=separator,
+        n_columns=len(fields),
+        is_quoted=any('"' in item for item in [line, *sample]),
+    )
+    numbers = (field for item in [line, *sample] for field in layout.fields(item))
+    has_comma = any("," in number for number in numbers if _NUMBER.fullmatch(number))
+    return replace(layout, decimal="," if has_comma else ".")
+
+
+def _are_mostly_numbers(fields: Sequence[str]) -> bool:
+    n_numbers = sum(_NUMBER.fullmatch(field) is not None for field in fields)
+    return n_numbers >= 3 and 2 * n_numbers >= len(fields)
 
 
 def _fields_of(line: str) -> tuple[list[str], str]:
     """Fields of a line, and the separator found: semicolon, tab, comma or white space."""
-    words = line.split()
-    tabbed = _split(line, "\t")
-    separator = r"\s+"
-    if ";" in line:
+    # What is in quotes does not separate.
+    bare = re.sub('"[^"]*"', '""', line)
+    words = bare.split()
+    separator = " "
+    if ";" in bare:
         separator = ";"
-    elif "\t" in line and not any(_are_numbers(f.split()) for f in tabbed if " " in f):
+    elif "\t" in bare and not any(_are_numbers(f.split()) for f in bare.split("\t") if " " in f):
         separator = "\t"
     # `1,5 2,5 3,5` is three numbers with decimal commas, `1, 2, 3` and `1,2,3` are not.
-    elif "," in line and not (len(words) >= 3 and _are_numbers(words)):
+    elif "," in bare and not (len(words) >= 3 and _are_numbers(words)):
         separator = ","
     return Layout(separator=separator, n_columns=0).fields(line), separator
-
-
-def _split(line: str, separator: str) -> list[str]:
-    fields = [field.strip() for field in line.split(separator)]
-    while fields and not fields[-1]:
-        fields.pop()
-    return fields
 
 
 def _unquoted(field: str) -> str:
@@ -302,108 +335,109 @@ def _numbers(line: str, layout: Layout) -> list[float]:
     return [float(t) if is_so else math.nan for t, is_so in zip(texts, is_number, strict=True)]
 
 
-def take_lines(file: BinaryIO, n_lines: int, *, first_line: int) -> list[bytes]:
+def take_lines(file: BinaryIO, n_lines: int) -> list[bytes]:
     """Read the next lines of a file, up to a number; never more of a line than it may have.
 
     Raises:
         InputError: a line is longer than `MOST_LINE_BYTES`.
     """
     lines: list[bytes] = []
-    pieces = iter(partial(file.readline, MOST_LINE_BYTES + 1), b"")
-    # Some at a time: what is one line of gigabytes is noticed before it is all in memory.
-    while part := list(islice(pieces, min(_LINES_AT_ONCE, n_lines - len(lines)))):
-        if max(map(len, part)) > MOST_LINE_BYTES:
-            place = next(place for place, line in enumerate(part) if len(line) > MOST_LINE_BYTES)
-            raise long_line(Path(file.name), first_line + len(lines) + place)
-        lines += part
+    while len(lines) < n_lines and (line := file.readline(MOST_LINE_BYTES + 1)):
+        if len(line) > MOST_LINE_BYTES:
+            raise long_line(Path(file.name), file.tell())
+        lines.append(line)
     return lines
 
 
-def long_line(path: Path, line: int) -> InputError:
-    """Return the error for a line that no list of points has."""
+def long_line(path: Path, place: int) -> InputError:
+    """Return the error for a line that no list of points has, at a place of a file within it."""
     return InputError(
-        f"{path.name}, line {line}: the line has more than {MOST_LINE_BYTES} bytes, so this is not "
-        "a list of points; export the file again"
+        f"{path.name}, line {line_at(path, place) - 1}: the line has more than {MOST_LINE_BYTES} "
+        "bytes, so this is not a list of points; export the file again"
     )
 
 
-def read_table(
-    file: BinaryIO, layout: Layout, columns: Iterable[int], *, n_lines: int, first_line: int
-) -> NDArray[np.float64]:
-    """Read the next lines of a file as numbers.
+def read_tables(
+    file: BinaryIO,
+    layout: Layout,
+    columns: Iterable[int],
+    *,
+    n_rows: int | None = None,
+    end: int | None = None,
+) -> Iterator[Table]:
+    """Read lines of numbers in blocks.
 
     Args:
         file: open at the start of a line.
         layout: how numbers are separated.
         columns: which columns are wanted, counted from 0.
-        n_lines: maximum number of lines.
-        first_line: number of the next line, counted from 1, for messages.
+        n_rows: maximum number of rows; None for all. No line after them is read.
+        end: where in the file the last line ends; None for the end of the file.
 
-    Returns:
-        (n, columns) float64; fewer rows at the end of the file and where lines are blank or
-        comments; NaN where a line is too short.
+    Yields:
+        The columns; no rows for lines that are blank or comments, NaN where a line is too short.
 
     Raises:
         InputError: a line holds something else than numbers.
     """
-    lines, wanted = take_lines(file, n_lines, first_line=first_line), list(columns)
-    try:
-        return _parse(lines, layout, wanted)
-    except ValueError as error:
-        kept = [_NOT_A_NUMBER.sub(b"nan", line) for line in lines if not is_comment(line)]
+    wanted, n_left = list(columns), n_rows
+    while n_left != 0:
+        start = file.tell()
+        block = _take_block(file, n_left, end)
+        if not block:
+            return
         try:
-            return _parse(kept, layout, wanted)
-        except ValueError:
-            where, got = f"from line {first_line}", ""
-            for number, line in enumerate(lines, start=first_line):
-                text = line.decode("utf-8", "replace").strip()
-                fields = layout.fields(text)
-                cells = [fields[k] for k in wanted if k < len(fields) and fields[k]]
-                fits = len(fields) <= layout.n_columns and _are_numbers(cells)
-                if not fits and not is_comment(line):
-                    where, got = f"line {number}", f" as in the lines before, got {text[:60]!r}"
-                    break
-            raise InputError(
-                f"{Path(file.name).name}, {where}: expected {layout.n_columns} numbers"
-                f"{got or ' per line'}; correct the line or export the file again"
-            ) from error
-
-
-def read_stated(
-    file: BinaryIO,
-    layout: Layout,
-    columns: Iterable[int],
-    *,
-    n_points: int,
-    first_line: int,
-    what: str,
-) -> Iterator[NDArray[np.float64]]:
-    """Read as many points as a header states, a line each, in blocks.
-
-    Raises:
-        InputError: a line holds something else than numbers, or there are fewer; `what` holds them.
-    """
-    for start in range(0, n_points, BLOCK_POINTS):
-        count = min(BLOCK_POINTS, n_points - start)
-        table = read_table(file, layout, columns, n_lines=count, first_line=first_line + start)
-        if len(table) != count:
-            raise cut_off(Path(file.name), what, f"{start + len(table)} points", str(n_points))
+            table = _table(block, layout, wanted)
+        except ValueError as error:
+            raise _unread_line(Path(file.name), start, block, layout, wanted) from error
+        n_left = None if n_left is None else n_left - len(table[0])
         yield table
 
 
-def _parse(lines: list[bytes], layout: Layout, columns: list[int]) -> NDArray[np.float64]:
+def _take_block(file: BinaryIO, n_lines: int | None, end: int | None) -> bytes:
+    """Read the next whole lines of a file, up to a number of lines and bytes."""
+    size = _BLOCK_BYTES if end is None else min(_BLOCK_BYTES, end - file.tell())
+    block = file.read(size)
+    if block and not block.endswith(b"\n"):
+        rest = file.readline(MOST_LINE_BYTES)
+        if len(rest) == MOST_LINE_BYTES:
+            raise long_line(Path(file.name), file.tell())
+        block += rest
+    if n_lines is not None and _count_ends(block) > n_lines:
+        ends = np.flatnonzero(np.frombuffer(block, dtype=np.uint8) == ord("\n"))
+        kept = int(ends[n_lines - 1]) + 1
+        file.seek(kept - len(block), io.SEEK_CUR)
+        block = block[:kept]
+    return block
+
+
+def _table(block: bytes, layout: Layout, wanted: list[int]) -> Table:
+    """Parse lines; those with comments or other spellings of NaN once more, without these."""
+    try:
+        table = _parse(block, layout, wanted, layout.separator)
+        # Of single spaces as separators, a line of spaces alone would be a row.
+        if layout.separator != " " or not np.isnan(table[0]).any():
+            return table
+    except ValueError:
+        pass
+    if b"#" in block or b"//" in block:
+        block = b"\n".join(line for line in block.split(b"\n") if not is_comment(line))
+    plain = _NOT_A_NUMBER.sub(b"nan", block)
+    return _parse(plain, layout, wanted, layout.separator.replace(" ", r"\s+"))
+
+
+def _parse(block: bytes, layout: Layout, columns: list[int], separator: str) -> Table:
     import pandas as pd
 
-    content = b"".join(lines)
-    if not content.strip():
-        return np.empty((0, len(columns)))
+    if block.isspace() or not block:
+        return [np.empty(0)] * len(columns)
     with warnings.catch_warnings():
         # A longer first line is only warned about and would lose numbers.
         warnings.simplefilter("error", pd.errors.ParserWarning)
         try:
             frame = pd.read_csv(
-                io.BytesIO(content),
-                sep=layout.separator,
+                io.BytesIO(block),
+                sep=separator,
                 decimal=layout.decimal,
                 header=None,
                 # All columns, wanted or not: only so does pandas notice a line with too many.
@@ -414,8 +448,28 @@ def _parse(lines: list[bytes], layout: Layout, columns: list[int]) -> NDArray[np
                 dtype=dict.fromkeys(columns, np.float64),
                 skipinitialspace=True,
                 encoding_errors="replace",
-                quoting=0 if b'"' in lines[0] else 3,
+                quoting=csv.QUOTE_MINIMAL if layout.is_quoted else csv.QUOTE_NONE,
             )
         except pd.errors.ParserWarning as warning:
             raise ValueError(str(warning)) from warning
-    return np.asarray(frame[columns].to_numpy(dtype=np.float64))
+    return [frame[name].to_numpy() for name in columns]
+
+
+def _unread_line(
+    path: Path, start: int, block: bytes, layout: Layout, wanted: list[int]
+) -> InputError:
+    """Return the error for the first line of a block, which begins at `start`, that is no data."""
+    first_line = line_at(path, start)
+    where, got = f"from line {first_line}", " per line"
+    for number, line in enumerate(block.split(b"\n"), start=first_line):
+        text = line.decode("utf-8", "replace").strip()
+        fields = layout.fields(text)
+        cells = [fields[k] for k in wanted if k < len(fields) and fields[k]]
+        fits = len(fields) <= layout.n_columns and _are_numbers(cells)
+        if not fits and not is_comment(line):
+            where, got = f"line {number}", f" as in the lines before, got {text[:60]!r}"
+            break
+    return InputError(
+        f"{path.name}, {where}: expected {layout.n_columns} numbers{got}; correct the line or "
+        "export the file again"
+    )

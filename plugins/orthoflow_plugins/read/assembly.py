@@ -29,6 +29,10 @@ _MOST_SCANS: Final = 2**16
 _POPULATE_WRITE: Final = 23
 _ROUNDING_SAMPLE: Final = 20_000
 _ROUNDING_VALUES: Final = 10
+# No surface has a twentieth of a scan's points at one place, however coordinates are rounded.
+_REPEATED_SAMPLE: Final = 2000
+_REPEATED_SHARE: Final = 0.05
+_FEWEST_REPEATED: Final = 20
 # Decimal rounding, and the powers of two that float32 leaves of large coordinates.
 _ROUNDING_STEPS: Final = sorted(
     {digit * 10.0**power for digit in (1, 2, 5) for power in range(-4, 3)}
@@ -54,6 +58,7 @@ class ScanCount:
         rounding_m: step to which coordinates are rounded, 0 where it is fine.
         colours: how they were scaled, or None without colours.
         first_far_m: the first of the points that lie too far away.
+        repeated_m: the place at which so many of its points lie that they are no returns.
     """
 
     file: str
@@ -69,6 +74,7 @@ class ScanCount:
     rounding_m: float = 0.0
     colours: ColourScale | None = None
     first_far_m: tuple[float, ...] = ()
+    repeated_m: NDArray[np.float64] | None = None
 
     @property
     def n_kept(self) -> int:
@@ -267,6 +273,12 @@ class CloudAssembly:
             count.left_out["not_finite"] += len(lost) - len(far)
             if len(lost) < len(points):
                 bounds = np.stack([points[usable].min(axis=0), points[usable].max(axis=0)])
+        if count.repeated_m is None:
+            count.repeated_m = repeated_place(points[usable])
+        if count.repeated_m is not None:
+            is_there = (points == count.repeated_m).all(axis=1)
+            count.left_out["one_place"] += int(np.count_nonzero(is_there))
+            usable = ~is_there if isinstance(usable, slice) else usable & ~is_there
         if self._box_m is None or not len(points[usable]):
             return usable
         self._reach_m = np.stack(
@@ -324,6 +336,19 @@ def rounding_m(points: NDArray[np.float64], unit_m: float) -> float:
         if len(values) >= _ROUNDING_VALUES:
             found.append(_common_step(values, unit_m))
     return min(found, default=0.0) * unit_m
+
+
+def repeated_place(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Place (3,) at which so many of some points (n, 3) lie that they are no returns, or None.
+
+    Programs that move a scan move points without a return, written as 0 0 0, with it.
+    """
+    sample = points[:: max(1, len(points) // _REPEATED_SAMPLE)]
+    sample = sample[np.isfinite(sample).all(axis=1)]
+    places, counts = np.unique(sample, axis=0, return_counts=True)
+    if counts.max(initial=0) < max(_FEWEST_REPEATED, _REPEATED_SHARE * len(sample)):
+        return None
+    return np.asarray(places[counts.argmax()])
 
 
 def resolution_m(farthest_m: float) -> float:

@@ -122,6 +122,12 @@ TOO_FAR: Final = DiagnosticSpec(
     remedy="check the file and {step}.unit",
     rank_by="n_points",
 )
+ONE_PLACE: Final = DiagnosticSpec(
+    code="points-at-one-place",
+    text="{subject}: {n_points} points lie at exactly {place}: they are not returns of the scanner "
+    "and were left out",
+    rank_by="n_points",
+)
 NO_RETURN: Final = DiagnosticSpec(
     code="points-without-return",
     text="{n_points} points at 0 0 0 are not returns of the scanner and were left out",
@@ -311,6 +317,13 @@ def report_summary(
                 n_points=count.left_out["too_far"],
                 farthest_m=FARTHEST_M,
                 place=" ".join(f"{value:g}" for value in count.first_far_m),
+            )
+        if count.repeated_m is not None:
+            ctx.report(
+                ONE_PLACE,
+                subject=count.title,
+                n_points=count.left_out["one_place"],
+                place=" ".join(f"{value:.3f}" for value in count.repeated_m),
             )
     for spec, cause in ((NO_RETURN, "no_return"), (NOT_FINITE, "not_finite")):
         if left_out[cause]:

@@ -59,6 +59,7 @@ class ReadScan(Method):
     """Read E57, LAS, LAZ, COPC, PLY, PCD, PTX and text scans, several files into one cloud."""
 
     id = "read.scan"
+    result_version: ClassVar[int] = 2
     determinism = "exact"
     metrics = (
         MetricSpec("n_points", label="points"),
