@@ -172,7 +172,7 @@ class ReadScan(Method):
         cloud = _finish(ctx, assembly, params)
         ctx.figure(
             "plan",
-            plan_chart(cloud),
+            partial(plan_chart, cloud),
             "The cloud from above, brighter where denser: walls are thin bright lines; "
             "double lines are misaligned scans.",
         )

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError
 from orthoflow.files.points import open_scan
 from tests import scan_files
+from tests.long_loops import long_only
 
 Fields = dict[str, NDArray[Any]]
 XYZ, RGB = ("x", "y", "z"), ("red", "green", "blue")
@@ -211,7 +212,9 @@ def tolerance(name: str, *, is_survey: bool) -> float:
     return 6e-5 if name.startswith("numpy") else 1e-9
 
 
-@pytest.mark.parametrize("name", ["plyfile binary", "laspy laz 1.4 format 7", "pye57", "numpy"])
+@pytest.mark.parametrize(
+    "name", ["plyfile binary", "pye57", *long_only("laspy laz 1.4 format 7", "numpy")]
+)
 def test_blocks_join_without_a_seam(name: str, tmp_path: Path) -> None:
     file_name, write = WRITERS[name]
     path = tmp_path / file_name
@@ -220,7 +223,7 @@ def test_blocks_join_without_a_seam(name: str, tmp_path: Path) -> None:
     check(read(path), right, atol=1e-6 if name == "pye57" else 1e-9)
 
 
-@pytest.mark.parametrize("share", [0.97, 0.5, 0.1, 0.01])
+@pytest.mark.parametrize("share", [0.97, 0.1, *long_only(0.5, 0.01)])
 @pytest.mark.parametrize("name", [name for name in WRITERS if not name.startswith("open3d")])
 def test_a_file_that_is_cut_off_is_refused_or_read_as_far_as_it_goes(
     name: str, share: float, tmp_path: Path

@@ -17,6 +17,7 @@ from orthoflow_plugins.raster.grid import RasterGrid
 from orthoflow.products import Planes, PointCloud, Thickness, Walls
 from tests import raster_scenes as scenes
 from tests import samples
+from tests.long_loops import long_only
 
 # The wall is seen along +y at y = 0, 4 m wide and 3 m high; depth is -y.
 WIDTH_M, HEIGHT_M = 4.0, 3.0
@@ -169,8 +170,8 @@ def test_growth_adds_whole_cells_and_moves_none(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("surfaces", "detected", "top_m"),
     [
-        ((0, 1, 2), (0, 1, 2), HEIGHT_M),
-        ((0, 1, 2, 3), (0, 1, 2), HEIGHT_M),
+        *long_only(((0, 1, 2), (0, 1, 2), HEIGHT_M)),
+        *long_only(((0, 1, 2, 3), (0, 1, 2), HEIGHT_M)),
         ((0, 1, 2, 3), (), HEIGHT_M),
     ],
     ids=["no ceiling", "a ceiling that was not detected", "nothing detected"],
@@ -259,7 +260,7 @@ def test_the_cornice_of_an_adjoining_wall_is_no_relief_of_this_one(tmp_path: Pat
     np.testing.assert_allclose(edges_m(walls), [0.0, WIDTH_M, 0.0, HEIGHT_M], atol=CORNER_M)
 
 
-@pytest.mark.parametrize("is_set", [False, True], ids=["found", "set"])
+@pytest.mark.parametrize("is_set", [False, *long_only(True)], ids=["found", "set"])
 def test_the_underside_of_a_cornice_does_not_end_the_wall(tmp_path: Path, is_set: bool) -> None:
     # A cornice of 0.2 m: its underside and that of the left wall's make one plane, found as such.
     cornice = patch((0.0, WIDTH_M), (0.2, 0.2), (2.6, HEIGHT_M))
@@ -299,7 +300,7 @@ def part(x: tuple[float, float], depth_m: float, z: tuple[float, float]) -> NDAr
     return patch(x, (depth_m, depth_m), z)
 
 
-@pytest.mark.parametrize(("beyond_m", "grown_m"), [(0.8, 0.8), (1.4, 1.0)])
+@pytest.mark.parametrize(("beyond_m", "grown_m"), [*long_only((0.8, 0.8)), (1.4, 1.0)])
 @pytest.mark.parametrize("side", [0, 1, 2, 3])
 def test_a_wall_grows_by_a_metre_at_most(side: int, beyond_m: float, grown_m: float) -> None:
     strips = (
@@ -613,10 +614,9 @@ def wall_behind_the_basin() -> NDArray:
     [
         ("joined to the wall", BASIN_M),
         ("apart from it", 0.0),
-        ("joined by the ground", 0.0),
-        ("before a wall that faces it", 0.0),
+        *long_only(("joined by the ground", 0.0), ("before a wall that faces it", 0.0)),
         ("before a scanner", 0.0),
-        ("set", 0.3),
+        *long_only(("set", 0.3)),
     ],
 )
 def test_what_stands_far_before_a_wall_belongs_to_it_where_it_hangs_together_with_it(

@@ -341,6 +341,7 @@ def test_eight_bit_colours_in_las_come_back_however_they_were_stored(
 # The method as a whole
 
 
+@pytest.mark.usefixtures("charts")
 def test_a_picture_from_above_is_drawn(
     tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
 ) -> None:
