@@ -118,51 +118,13 @@ def test_the_cloud_is_exported_from_record_and_store(quick: Shell) -> None:
 
 @pytest.mark.parametrize(
     ("target", "file"),
-    [
-        ("gltf", "room.glb"),
-        ("tiles", "index.html"),
-        ("stac", "collection.json"),
-        ("prov", "prov.json"),
-    ],
+    [("gltf", "room.glb"), ("stac", "collection.json")],
 )
 def test_the_orthoimages_are_handed_over(quick: Shell, target: str, file: str) -> None:
     ended = quick("export", "run", "--to", target)
     assert ended.code == 0, ended.said
     assert f"{target}: run/export/{target}: {file}" in ended.out
     assert (quick.folder / "run" / "export" / target / file).is_file()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        (
-            ("--to", "colmap", "--step", "wall", "-o", "elsewhere"),
-            "the step wall holds no orientations; those",
-        ),
-        (("--to", "colmap", "--step", "wal", "-o", "elsewhere"), "has no step 'wal'"),
-        (("--to", "laz", "--step", "wall"), "the step wall holds no labels of points; those"),
-        (("--to", "colmap", "-o", "run"), "run exists already and is not empty"),
-        (("--to", "dwg"), "'dwg' is not one of 'colmap', 'csv', "),
-        (("--to", "ply", "--wall", "99"), "--wall 99: the run has "),
-        (("--to", "gltf", "--wall", "99", "-o", "other"), "mosaic shows no wall 99; it shows 0"),
-        (("--to", "ply", "--box", "1,2,3"), "--box takes six numbers in metres"),
-        (("--to", "e57", "--box", "90,90,90,91,91,91"), "no point of the cloud of plane is left"),
-        (
-            ("--to", "csv", "--clean"),
-            "--clean belongs to --to laz, copc, ply or e57, not to --to csv",
-        ),
-    ],
-    ids=[
-        *("no orientations", "no such cell", "no labels", "folder in use", "no such format"),
-        *("no such wall", "no such orthoimage", "no box", "empty box", "nothing to clean"),
-    ],
-)
-def test_an_export_that_cannot_be_says_why(
-    quick: Shell, arguments: tuple[str, ...], sentence: str
-) -> None:
-    ended = quick("export", "run", *arguments)
-    assert ended.code == 2
-    assert sentence in ended.said
 
 
 @dataclass(frozen=True)
