@@ -1,11 +1,10 @@
-"""The command line as a user calls it, in a folder of its own; a stranger's plugin beside it."""
+"""The command line as a user calls it, in a folder of its own; each command in a process."""
 
 from __future__ import annotations
 
 import csv
 import fcntl
 import os
-import subprocess
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -16,7 +15,6 @@ import pytest
 from tests.forked_commands import run_command
 
 ROOT = Path(__file__).resolve().parents[2]
-STRANGER = ROOT / "tests" / "third_party" / "orthoflow-stranger"
 # A room of which each step takes milliseconds. What ran on it once is in the session's store.
 COARSE = ("--set", "room.scan_step_m=0.08", "--set", "wall.gsd_m=0.08")
 CHECKOUT = tuple(str(ROOT / part) for part in ("", "plugins", "provenance"))
@@ -104,29 +102,6 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def shell(tmp_path: Path, store: Path) -> Shell:
     """The command line with the built-in plugins."""
     return Shell(tmp_path, store)
-
-
-@pytest.fixture(scope="session")
-def stranger_paths(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
-    """Import path with the stranger's plugin installed as a distribution of its own."""
-    target = tmp_path_factory.mktemp("stranger")
-    completed = subprocess.run(
-        [
-            *(sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation"),
-            *("--target", str(target), str(STRANGER)),
-        ],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert completed.returncode == 0, completed.stderr
-    return (*CHECKOUT, str(target))
-
-
-@pytest.fixture
-def with_stranger(tmp_path: Path, store: Path, stranger_paths: tuple[str, ...]) -> Shell:
-    """The command line with the stranger's plugin installed."""
-    return Shell(tmp_path, store, stranger_paths)
 
 
 @pytest.fixture

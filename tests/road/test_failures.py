@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -30,26 +29,6 @@ steps:
   second: {use: mosaic.seams, in: {layers: first.layers}}
   a: {use: raster.grid, in: {cloud: cloud.cloud, planes: b.planes}}
   b: {use: plane.hough2d, in: {cloud: a.cloud}}
-"""
-
-MISCHIEF = """\
-orthoflow: 1
-name: mischief
-steps:
-  room: {use: simulate.room, params: {scan_step_m: 0.1}}
-  bad:
-    in: {cloud: room.cloud}
-    variants:
-      crash: {use: mischief.crash}
-      exit: {use: mischief.exit}
-      raise: {use: mischief.raise}
-      hang: {use: mischief.hang, timeout: 2s}
-      fill: {use: mischief.fill}
-      meddle: {use: mischief.meddle}
-      wrong: {use: mischief.wrong}
-      good: {use: mischief.good}
-  wall: {use: raster.grid, in: {cloud: room.cloud, planes: bad.planes}, params: {gsd_m: 0.1}}
-compare: {design: product}
 """
 
 
@@ -112,51 +91,3 @@ def test_a_scan_that_is_not_there_is_named(shell: Shell) -> None:
     assert ended.code == 2
     assert "nowhere.laz" in ended.said
     assert no_traceback(ended.said)
-
-
-@pytest.mark.long
-def test_methods_that_misbehave_fail_alone(with_stranger: Shell, write: Write) -> None:
-    write("mischief.yaml", MISCHIEF)
-    # The others go on while one hangs, for as long as it may and is then waited for.
-    ended = with_stranger("run", "mischief.yaml", "-o", "run", "--jobs", "2")
-    assert ended.code == 1
-    assert no_traceback(ended.said)
-    shown = json.loads(with_stranger("show", "run", "--json").out)
-    cells = {cell["address"]: cell for cell in shown["cells"]}
-    reasons = {
-        "crash": "segmentation fault",
-        "exit": "17",
-        "raise": "KeyError",
-        "hang": "2 s",
-        "fill": "No space left",
-        "meddle": "writes to an array that is read-only, as all its inputs are",
-        "wrong": "must give a planes on its port planes, got PointCloud",
-    }
-    for variant, reason in reasons.items():
-        cell = cells[f"bad@bad={variant}"]
-        assert cell["status"] == "failed"
-        assert reason in cell["error_message"]
-        if variant != "fill":  # there the disk is to blame
-            who = f"method mischief.{variant} of orthoflow-stranger 0.3.0 "
-            assert cell["error_message"].startswith(who)
-        assert cells[f"wall@bad={variant}"]["status"] == "skipped"
-    assert cells["room"]["status"] == "ok"
-    assert cells["bad@bad=good"]["status"] == "ok"
-    assert cells["wall@bad=good"]["status"] == "ok"
-    assert with_stranger("verify", "run").code == 0
-
-
-@pytest.mark.long
-def test_a_method_that_eats_all_memory_is_stopped_and_the_rest_goes_on(
-    with_stranger: Shell, write: Write
-) -> None:
-    write("eat.yaml", MISCHIEF.replace("crash: {use: mischief.crash}", "eat: {use: mischief.eat}"))
-    ended = with_stranger("run", "eat.yaml", "-o", "run", "--set", "room.scan_step_m=0.1")
-    assert ended.code == 1
-    cells = {
-        cell["address"]: cell
-        for cell in json.loads(with_stranger("show", "run", "--json").out)["cells"]
-    }
-    assert cells["bad@bad=eat"]["status"] == "failed"
-    assert "memory" in cells["bad@bad=eat"]["error_message"]
-    assert cells["wall@bad=good"]["status"] == "ok"
