@@ -131,6 +131,7 @@ def test_a_cluster_gives_the_same_digests_and_says_how_far_it_is(office: Office)
     assert any(0.0 < fraction < 1.0 for fraction in fractions)
 
 
+@pytest.mark.long
 def test_workers_of_its_own_give_the_same_digests(office: Office) -> None:
     assert digests(office.world.run(STEPS, into="own", executor="dask", force=("second",))) == (
         office.quiet
@@ -175,6 +176,7 @@ steps:
     assert outcome.results["wrong"].environment is not None
 
 
+@pytest.mark.long
 def test_a_step_whose_worker_is_killed_runs_again(office: Office) -> None:
     listen, killed = office.killer()
     outcome = execute(office.plan(), office.world.folder / "killed", office.world.store, listen)
@@ -210,7 +212,8 @@ def test_an_interrupted_run_stops_its_workers_and_goes_on_with_any_executor(
     assert digests(outcome) == office.quiet
 
 
-@pytest.mark.parametrize("own", [False, *long_only(True)], ids=["workers", "own workers"])
+@pytest.mark.long
+@pytest.mark.parametrize("own", [False, True], ids=["workers", "own workers"])
 def test_a_step_that_nobody_waits_for_is_stopped(office: Office, own: bool) -> None:
     steps: list[int] = []
 

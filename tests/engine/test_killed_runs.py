@@ -17,7 +17,7 @@ from tests.killed_runs import Answer, RunServer, run_server
 from tests.long_loops import IS_LONG
 from tests.workshop_runs import workshop_environment, write_studio
 
-KILLS = 100 if IS_LONG else 10
+KILLS = 100 if IS_LONG else 4
 
 
 @dataclass(frozen=True)
