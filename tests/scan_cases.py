@@ -631,6 +631,23 @@ def las_count_stale(draw: Draw) -> Case:
     )
 
 
+def colours_of_few_bits(draw: Draw) -> Case:
+    """Colours of 10 or 12 bits in fields of 16, without a limit."""
+    scene = draw.scene
+    most = draw.one_of(1023, 4095)
+    scene.rgb[:10] = 255
+    deep = np.rint(scene.rgb / 255.0 * most).astype(np.uint16)
+    path = draw.folder / draw.one_of("a.las", "a.ply", "a.xyz")
+    if path.suffix == ".las":
+        deep_scene = Scene(points=scene.points, reflectance=scene.reflectance, rgb=deep)
+        _write_las(path, deep_scene, offset=np.zeros(3), factor=1, intensity=np.zeros(len(scene)))
+    else:
+        colours = dict(zip(("red", "green", "blue"), deep.T, strict=True))
+        write = scan_files.write_ply if path.suffix == ".ply" else _write_table
+        write(path, {**_xyz(scene), **colours})
+    return Case(scene=scene, paths=[path], rgb=True, warnings=(f"colours, which reach {most}",))
+
+
 def las_feet(draw: Draw) -> Case:
     """Feet by GeoTIFF keys or WKT, also with heights in another unit."""
     import laspy
@@ -952,6 +969,7 @@ CASES: Final[Mapping[str, Callable[[Draw], Case]]] = {
         points_at_one_place,
         las_bounds_stale,
         las_count_stale,
+        colours_of_few_bits,
         las_feet,
         las_degrees,
         las_extra_intensity,

@@ -47,6 +47,12 @@ COLOUR_LIMIT: Final = DiagnosticSpec(
     text="{subject}: it states that colours reach {limit:g}, but its colours reach {largest:g}: "
     "they are read as {scale}",
 )
+COLOUR_DEPTH: Final = DiagnosticSpec(
+    code="scan-colour-depth-small",
+    text="{subject}: it states no limit of its colours, which reach {largest:g}: they are read as "
+    "{scale}",
+    rank_by="largest",
+)
 COLOURS_GREY: Final = DiagnosticSpec(
     code="scan-colours-grey",
     text="the colours are all grey and follow the intensity: they do not come from photos",

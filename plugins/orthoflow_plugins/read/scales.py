@@ -15,10 +15,16 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.levels import REC_601
 
-RgbScale = Literal["0..1", "8 bit", "16 bit", "stated limit"]
+RgbScale = Literal["0..1", "8 bit", "10 bit", "12 bit", "16 bit", "stated limit"]
 
-# A wider scale corrects a narrower one.
-_WIDTHS: Final[dict[RgbScale, int]] = {"0..1": 0, "8 bit": 1, "16 bit": 2, "stated limit": 3}
+# Values of full brightness; a wider scale corrects a narrower one.
+_FULL: Final[dict[RgbScale, float]] = {
+    "0..1": 1.0,
+    "8 bit": 255.0,
+    "10 bit": 1023.0,
+    "12 bit": 4095.0,
+    "16 bit": 65535.0,
+}
 
 _BLOCK: Final = 1 << 16
 _SAMPLE: Final = 200_000
@@ -207,7 +213,8 @@ class ColourScale:
     """Finds the scale of one scan's colours while they come.
 
     LAS keeps 8-bit colours in the low byte, or multiplied by 256 or 257; text and PLY keep 0..1 or
-    0..255. A block that goes beyond the scale believed so far corrects what was stored before.
+    0..255; cameras of 10 and 12 bits are met whose values were not multiplied to 16. A block that
+    goes beyond the scale believed so far corrects what was stored before.
     A stated limit is used where the data reach more than a 255th of it and none goes beyond.
 
     Attributes:
@@ -243,20 +250,25 @@ class ColourScale:
     def _widen(self, largest: float, *, is_whole: bool) -> None:
         self.largest = max(self.largest, largest)
         limit = self._limit
-        seen: RgbScale = "16 bit" if largest > 255.0 else "8 bit"
-        if largest <= 1.0 and (limit == 1.0 or (limit is None and not is_whole)):
+        seen: RgbScale = "8 bit"
+        if largest > 255.0:
+            depths: tuple[RgbScale, ...] = ("10 bit", "12 bit", "16 bit")
+            fitting = (one for one in depths if largest <= _FULL[one])
+            # A limit of 16 bits holds for dark colours, too.
+            is_stated = limit is not None and largest <= limit
+            seen = "16 bit" if is_stated else next(fitting, "16 bit")
+        elif largest <= 1.0 and (limit == 1.0 or (limit is None and not is_whole)):
             seen = "0..1"
         if limit is not None and 255.0 < largest <= limit < 65535.0:
             seen = "stated limit"
-        if self.scale is None or _WIDTHS[seen] > _WIDTHS[self.scale]:
-            before = self._stored[: self._count]
-            if self.scale == "0..1":
-                # What looked like full brightness was 0 or 1 of 255.
-                before[:] = np.rint(before / np.float32(255.0)).astype(np.uint8)
-            if seen in ("16 bit", "stated limit"):
-                before[:] = 0
+        full = {**_FULL, "stated limit": limit or 0.0}
+        if self.scale is None:
             self.scale = seen
-        full = {"0..1": 1.0, "8 bit": 255.0, "16 bit": 65535.0, "stated limit": limit}
+        elif full[seen] > full[self.scale]:
+            # What looked like full brightness was 0 or 1 of 255.
+            before = self._stored[: self._count]
+            before[:] = np.rint(before * np.float32(full[self.scale] / full[seen]))
+            self.scale = seen
         fits = limit is None or full[self.scale] == limit or self.largest <= 1.0
         # 16 bits are stated by files of any 16-bit data.
         self.misfit = None if fits or (limit == 65280.0 and self.scale == "16 bit") else limit
@@ -287,7 +299,7 @@ def _to_bytes(
     elif scale == "16 bit":
         # Exact for 8-bit values times 256 and times 257.
         scaled = np.floor(values / np.float32(256.0))
-    elif scale == "0..1":
-        scaled = values * np.float32(255.0)
+    elif scale is not None and scale != "8 bit":
+        scaled = values * np.float32(255.0 / _FULL[scale])
     whole = np.rint(np.clip(np.nan_to_num(scaled), 0.0, 255.0))
     return whole.astype(np.uint8)

@@ -24,6 +24,7 @@ from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow_plugins.read.assembly import CloudAssembly, ScanCount
 from orthoflow_plugins.read.figures import plan_chart, polar_view_png, scan_lines_png
 from orthoflow_plugins.read.reporting import (
+    COLOUR_DEPTH,
     COLOUR_LIMIT,
     COLOURS_GREY,
     COLOURS_ZERO,
@@ -324,6 +325,10 @@ def _colours(
                 limit=colours.misfit,
                 largest=colours.largest,
                 scale=colours.scale,
+            )
+        elif colours.scale in ("10 bit", "12 bit"):
+            ctx.report(
+                COLOUR_DEPTH, subject=count.title, largest=colours.largest, scale=colours.scale
             )
     if has_rgb is not None and not has_rgb.any():
         return None, None

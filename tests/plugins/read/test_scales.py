@@ -106,8 +106,8 @@ def test_colours_are_of_the_widest_scale_that_any_block_shows() -> None:
     ones = np.array([[0.0, 1.0, 1.0]], dtype=np.float32)
     assert stored(ones) == ([[0, 255, 255]], "0..1")
     assert stored(ones, byte) == ([[0, 1, 1], [0, 128, 255]], "8 bit")
-    # What was below 256 of 65536 is black.
-    assert stored(byte, word) == ([[0, 0, 0], [0, 128, 255]], "16 bit")
+    # What was below 256 of 65536 is all but black.
+    assert stored(byte, word) == ([[0, 0, 1], [0, 128, 255]], "16 bit")
     assert stored(word, byte) == ([[0, 128, 255], [0, 0, 0]], "16 bit")
     assert stored(byte, unit) == ([[0, 128, 255], [0, 0, 1]], "8 bit")
 
@@ -119,6 +119,9 @@ def test_colours_are_of_the_widest_scale_that_any_block_shows() -> None:
         (255.0, 255.0, [0, 102, 255], "8 bit"),
         (65535.0, 65535.0, [0, 102, 255], "16 bit"),
         (1023.0, 1023.0, [0, 102, 255], "stated limit"),
+        (1023.0, None, [0, 102, 255], "10 bit"),
+        (4095.0, None, [0, 102, 255], "12 bit"),
+        (4095.0, 1023.0, [0, 102, 255], "12 bit"),
         # What does not fit its limit is read as what it is.
         (255.0, 1.0, [0, 102, 255], "8 bit"),
         (255.0, 65535.0, [0, 102, 255], "8 bit"),
@@ -126,10 +129,10 @@ def test_colours_are_of_the_widest_scale_that_any_block_shows() -> None:
     ],
 )
 def test_a_stated_limit_is_full_brightness_where_data_fit_it(
-    largest: float, limit: float, expected: list[int], scale: str
+    largest: float, limit: float | None, expected: list[int], scale: str
 ) -> None:
     block = np.array([[0.0, 0.4 * largest, largest]])
     assert stored(block, limit=limit) == ([expected], scale)
     colours = ColourScale(np.zeros((1, 3), dtype=np.uint8), limit)
     colours.add(block)
-    assert colours.misfit == (None if largest == limit else limit)
+    assert colours.misfit == (limit if limit != largest else None)
