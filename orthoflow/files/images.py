@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.errors import InputError, ProductError
+from orthoflow.errors import InputError, MethodError, ProductError
 from orthoflow.files.photo_files import (
     MOST_PIXELS,
     is_whole_png,
@@ -24,6 +24,7 @@ from orthoflow.files.photo_files import (
     tiff_pixels,
     unreadable,
 )
+from orthoflow.geometry.cameras import HALF_PIXEL
 from orthoflow.geometry.levels import Colours, eight_bits
 from orthoflow.products import Photo
 
@@ -319,6 +320,52 @@ def _not_an_image(encoded: bytes, name: str, reason: str = "") -> str:
 # Masks are black and white; compression artefacts are rounded to one or the other.
 _USED_LEAST: Final = 128
 _LONGEST_SIDE_PX: Final = 2048
+
+
+def photo_rgb(photo: Photo) -> NDArray[np.uint8]:
+    """Return a photo's colours, (height, width, 3).
+
+    Raises:
+        InputError: the file is no image.
+        MethodError: the size of the image is not that of the photo.
+    """
+    rgb = decode_image(photo.encoded, f"photo {photo.name}")
+    if rgb.shape[:2] != (photo.height, photo.width):
+        raise MethodError(
+            f"photo {photo.name} has {rgb.shape[1]} x {rgb.shape[0]} pixels, but is listed with "
+            f"{photo.width} x {photo.height}"
+        )
+    return rgb
+
+
+def photo_grey(photo: Photo) -> NDArray[np.uint8]:
+    """Return a photo's grey (Rec. 601), (height, width), or raise as `photo_rgb`."""
+    import cv2
+
+    return np.asarray(cv2.cvtColor(photo_rgb(photo), cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+
+
+def reduced(grey: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:
+    """Reduce a picture by a factor below 1 with a low-pass filter; (u, v) becomes (u, v) x factor.
+
+    The picture is warped, not resized, because a resize scales by the rounded size.
+    """
+    import cv2
+
+    if factor >= 1.0:
+        return grey
+    width, height = (max(1, int(side * factor)) for side in (grey.shape[1], grey.shape[0]))
+    # The width of the Gaussian matches the resolution of the coarser grid.
+    sigma = 0.5 * np.sqrt(max(0.0, factor**-2 - 1.0))
+    soft = cv2.GaussianBlur(grey, (0, 0), sigma) if sigma > 0.1 else grey
+    # (0.5, 0.5) / factor in OpenCV's convention.
+    shift = HALF_PIXEL / factor - HALF_PIXEL
+    matrix = np.array([[1.0 / factor, 0.0, shift], [0.0, 1.0 / factor, shift]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(
+        cv2.warpAffine(soft, matrix, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE),
+        dtype=np.uint8,
+    )
 
 
 def decode_mask(encoded: bytes, name: str) -> NDArray[np.bool_]:

@@ -1,9 +1,4 @@
-"""Key points of photos and walls, and their matches.
-
-OpenCV's SIFT shifts every key point by a quarter of a pixel, right and down, unless its precise
-upscaling is on (opencv issue 23123; measured with 5.0: 0.25 px, for all sizes). That would be a
-systematic error of the orientation, so it is subtracted where the upscaling is the default one.
-"""
+"""Matches of photos with walls by key points: recognition, mirror images, mixtures of colours."""
 
 from __future__ import annotations
 
@@ -16,38 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from orthoflow.geometry.cameras import HALF_PIXEL
+from orthoflow.files.images import photo_grey, photo_rgb, reduced
 from orthoflow.geometry.key_points import (
+    Features,
     Matches,
     Window,
-    in_turns,
+    find_features,
     mutual_matches,
     mutual_matches_within,
-    root_sift,
 )
-from orthoflow.geometry.rows import Rows
 from orthoflow.products import Photo, Wall
 from orthoflow.sdk import MethodParams
-from orthoflow_plugins.match.pictures import (
-    CLIP_LIMIT,
-    equalised,
-    photo_grey,
-    photo_rgb,
-    shrunk,
-    wall_picture,
-)
+from orthoflow_plugins.match.pictures import CLIP_LIMIT, equalised, wall_picture
 
-# OpenCV's default contrast, half of which still gives right matches, and its ratio of curvatures.
-_OPENCV_CONTRAST: Final = 0.04
-_MIN_CONTRAST: Final = 0.02
-_MAX_EDGE_RATIO: Final = 10.0
-_SHIFT_BY_UPSCALING_PX: Final = 0.25
-# SIFT doubles the image and keeps all scales: 0.23 GB per million pixels. A tile bounds it.
-_TILE_PX: Final = 2048
-_TILE_OVERLAP_PX: Final = 96
-_SPREAD_CELLS: Final = 12
-# Smaller pictures have no key points.
-_MIN_SIDE_PX: Final = 16
 # A photo is matched at this size first, then at twice the size, until a wall is recognised.
 _FIRST_SIDE_PX: Final = 800
 # Key points of a photo and of each wall that suffice to recognise the walls in a photo.
@@ -88,150 +64,6 @@ CLEARLY: Final = 24
 _LONGEST_SIDE_PX: Final = 2000
 # A photo without colours has only one mixture.
 _MIN_GREY_LEVELS: Final = 8.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class Features(Rows):
-    """Key points of an image: the first n are the n strongest, spread over the image.
-
-    Attributes:
-        pixels: (n, 2) float64 (u, v), first pixel centre at (0.5, 0.5).
-        sizes_px: (n,) float64 diameter of the described neighbourhood.
-        angles_deg: (n,) float64 main direction of the gradient, clockwise from u.
-        descriptors: (n, 128) float32 RootSIFT or SIFT, whole numbers.
-    """
-
-    pixels: NDArray[np.float64]
-    sizes_px: NDArray[np.float64]
-    angles_deg: NDArray[np.float64]
-    descriptors: NDArray[np.float32]
-
-    def undescribed(self) -> Features:
-        """Return positions and sizes without the descriptors, which take most memory."""
-        return replace(self, descriptors=self.descriptors[:, :0].copy())
-
-    def strongest(self, n_most: int) -> Features:
-        """Return the first key points without a copy."""
-        return self.take(slice(n_most))
-
-    def scaled(self, factor: float) -> Features:
-        """Return the same key points in the image enlarged by a factor."""
-        return replace(self, pixels=self.pixels * factor, sizes_px=self.sizes_px * factor)
-
-    def mirrored(self, width_px: float) -> Features:
-        """Return the key points of the image of this width with left and right swapped.
-
-        Relative to the main direction, mirroring swaps the rows of the 4 x 4 fields of 8 directions
-        and reverses the sense of the directions.
-        """
-        fields = self.descriptors.reshape(-1, 4, 4, 8)[:, ::-1]
-        turned = fields[..., (8 - np.arange(8)) % 8]
-        return replace(
-            self,
-            pixels=np.array([width_px, 0.0]) + self.pixels * np.array([-1.0, 1.0]),
-            angles_deg=(180.0 - self.angles_deg) % 360.0,
-            descriptors=np.ascontiguousarray(turned.reshape(-1, 128)),
-        )
-
-
-def find_features(
-    picture: NDArray[np.uint8],
-    max_features: int,
-    usable: NDArray[np.bool_] | None = None,
-    *,
-    as_opencv: bool = False,
-) -> Features:
-    """Find key points, tile by tile, in an order that depends on the image only.
-
-    Args:
-        picture: (rows, cols) grey.
-        max_features: maximum number.
-        usable: (rows, cols), False where no key point may lie; None allows all.
-        as_opencv: OpenCV's default SIFT (markiewicz2015): higher contrast, SIFT descriptors.
-    """
-    import cv2
-
-    sift: Any = cv2.SIFT_create(  # type: ignore[attr-defined]  # missing in OpenCV's stubs
-        contrastThreshold=_OPENCV_CONTRAST if as_opencv else _MIN_CONTRAST,
-        edgeThreshold=_MAX_EDGE_RATIO,
-        enable_precise_upscale=not as_opencv,
-    )
-    shift_px = HALF_PIXEL - (_SHIFT_BY_UPSCALING_PX if as_opencv else 0.0)
-    tiles = [
-        _in_tile(sift, picture, (row, column), shift_px)
-        for row in range(0, picture.shape[0], _TILE_PX)
-        for column in range(0, picture.shape[1], _TILE_PX)
-    ]
-    points = np.vstack([tile[1] for tile in tiles])
-    pixels = points[:, :2]
-    # OpenCV's threads return key points in any order.
-    chosen = np.lexsort(points[:, :4].T)
-    if usable is not None:
-        most = np.array(usable.shape[::-1]) - 1
-        columns, rows = np.clip(pixels[chosen].astype(np.intp), 0, most).T
-        chosen = chosen[usable[rows, columns]]
-    # The strongest, in turns from the cells of a coarse grid.
-    scale = _SPREAD_CELLS / np.array([picture.shape[1], picture.shape[0]])
-    cells = np.minimum((pixels[chosen] * scale).astype(np.intp), _SPREAD_CELLS - 1)
-    u, v, strengths = points[chosen][:, [0, 1, 4]].T
-    chosen = chosen[
-        in_turns(cells[:, 1] * _SPREAD_CELLS + cells[:, 0], (v, u, -strengths), max_features)
-    ]
-    raw = _described(sift, picture, tiles, chosen)
-    return Features(
-        pixels=pixels[chosen],
-        sizes_px=points[chosen, 2],
-        angles_deg=points[chosen, 3],
-        descriptors=raw if as_opencv else root_sift(raw),
-    )
-
-
-_Tile = tuple[tuple[slice, slice], NDArray[np.float64], list[Any]]
-"""Key points in a tile of an image: rows and columns that were searched, with a margin; (n, 5) u,
-v, size, angle, response; and OpenCV's key points in the frame of the searched part.
-"""
-
-
-def _in_tile(
-    sift: Any, picture: NDArray[np.uint8], corner: tuple[int, int], shift_px: float
-) -> _Tile:
-    ends = [
-        min(limit, start + _TILE_PX) for start, limit in zip(corner, picture.shape, strict=True)
-    ]
-    low = [max(0, start - _TILE_OVERLAP_PX) for start in corner]
-    part = (
-        slice(low[0], ends[0] + _TILE_OVERLAP_PX),
-        slice(low[1], ends[1] + _TILE_OVERLAP_PX),
-    )
-    view = np.ascontiguousarray(picture[part])
-    found = sift.detect(view, None) if min(view.shape) >= _MIN_SIDE_PX else ()
-    points = np.array(
-        [(*p.pt, p.size, p.angle, p.response) for p in found], dtype=np.float64
-    ).reshape(-1, 5)
-    points[:, :2] += np.array([low[1], low[0]]) + shift_px
-    ahead = points[:, :2] - np.array([corner[1], corner[0]])
-    size = np.array([ends[1] - corner[1], ends[0] - corner[0]])
-    own = np.flatnonzero(((ahead >= 0.0) & (ahead < size)).all(axis=1))
-    return part, points[own], [found[at] for at in own.tolist()]
-
-
-def _described(
-    sift: Any, picture: NDArray[np.uint8], tiles: list[_Tile], chosen: NDArray[np.intp]
-) -> NDArray[np.float32]:
-    """Compute SIFT descriptors (n, 128) of chosen key points, numbered through all tiles.
-
-    In a picture with much texture one key point in ten is kept, and description takes longer than
-    detection.
-    """
-    raw = np.empty((len(chosen), 128), dtype=np.float32)
-    first = 0
-    for part, _, found in tiles:
-        wanted = np.flatnonzero((chosen >= first) & (chosen < first + len(found)))
-        if wanted.size:
-            points = [found[at - first] for at in chosen[wanted].tolist()]
-            raw[wanted] = sift.compute(np.ascontiguousarray(picture[part]), points)[1]
-        first += len(found)
-    return raw
 
 
 class PairingParams(MethodParams):
@@ -504,7 +336,7 @@ class _Seeker:
 
     def key_points(self, scale: float) -> Features:
         """Find key points of the photo reduced by a scale, in pixels of the full photo."""
-        small = equalised(shrunk(self.grey, scale), CLIP_LIMIT)
+        small = equalised(reduced(self.grey, scale), CLIP_LIMIT)
         return find_features(small, self.params.max_features).scaled(1.0 / scale)
 
     def first_look(self, walls: Sequence[Features | None]) -> tuple[PhotoPairs, Features]:

@@ -10,10 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
-from orthoflow.files.images import decode_image
-from orthoflow.geometry.cameras import HALF_PIXEL
 from orthoflow.geometry.threads import in_order
-from orthoflow.products import Photo, Photos, Wall, Walls
+from orthoflow.products import Photos, Wall, Walls
 
 _OPENCV: Final = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless")
 # Each thread takes up to a gigabyte for its picture.
@@ -113,52 +111,6 @@ def equalised(grey: NDArray[np.uint8], clip_limit: float) -> NDArray[np.uint8]:
         return grey
     clahe = cv2.createCLAHE(clipLimit=clip_limit, tileGridSize=(_TILES, _TILES))
     return np.asarray(clahe.apply(grey), dtype=np.uint8)
-
-
-def photo_rgb(photo: Photo) -> NDArray[np.uint8]:
-    """Return a photo's colours, (height, width, 3).
-
-    Raises:
-        InputError: the file is no image.
-        MethodError: the size of the image is not that of the photo.
-    """
-    rgb = decode_image(photo.encoded, f"photo {photo.name}")
-    if rgb.shape[:2] != (photo.height, photo.width):
-        raise MethodError(
-            f"photo {photo.name} has {rgb.shape[1]} x {rgb.shape[0]} pixels, but is listed with "
-            f"{photo.width} x {photo.height}"
-        )
-    return rgb
-
-
-def photo_grey(photo: Photo) -> NDArray[np.uint8]:
-    """Return a photo's grey (Rec. 601), (height, width), or raise as `photo_rgb`."""
-    import cv2
-
-    return np.asarray(cv2.cvtColor(photo_rgb(photo), cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-
-
-def shrunk(grey: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:
-    """Reduce a picture by a factor below 1 with a low-pass filter; (u, v) becomes (u, v) x factor.
-
-    The picture is warped, not resized, because a resize scales by the rounded size.
-    """
-    import cv2
-
-    if factor >= 1.0:
-        return grey
-    width, height = (max(1, int(side * factor)) for side in (grey.shape[1], grey.shape[0]))
-    # The width of the Gaussian matches the resolution of the coarser grid.
-    sigma = 0.5 * np.sqrt(max(0.0, factor**-2 - 1.0))
-    soft = cv2.GaussianBlur(grey, (0, 0), sigma) if sigma > 0.1 else grey
-    # (0.5, 0.5) / factor in OpenCV's convention.
-    shift = HALF_PIXEL / factor - HALF_PIXEL
-    matrix = np.array([[1.0 / factor, 0.0, shift], [0.0, 1.0 / factor, shift]])
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return np.asarray(
-        cv2.warpAffine(soft, matrix, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE),
-        dtype=np.uint8,
-    )
 
 
 def points_on_wall(

@@ -21,29 +21,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
+from orthoflow.files.images import photo_grey, photo_rgb, reduced
 from orthoflow.geometry.cameras import LensFreedom, ViewingCamera
+from orthoflow.geometry.key_points import Features, find_features
 from orthoflow.geometry.resection import SeenPoints, adjust
 from orthoflow.geometry.threads import in_order
 from orthoflow.products import Photo, Photos, Wall
 from orthoflow_plugins.match.channels import HALF_PATCH_CELLS, Channels
 from orthoflow_plugins.match.displacements import Displacements, measure
-from orthoflow_plugins.match.key_points import (
-    Features,
-    PairingParams,
-    PhotoPairs,
-    find_features,
-    mapped,
-    pair_photo,
-)
-from orthoflow_plugins.match.pictures import (
-    CLIP_LIMIT,
-    equalised,
-    one_by_one,
-    photo_grey,
-    photo_rgb,
-    points_on_wall,
-    shrunk,
-)
+from orthoflow_plugins.match.key_points import PairingParams, PhotoPairs, mapped, pair_photo
+from orthoflow_plugins.match.pictures import CLIP_LIMIT, equalised, one_by_one, points_on_wall
 from orthoflow_plugins.match.structures import (
     PHOTO_SIDE_PX,
     Place,
@@ -135,8 +122,8 @@ def places_of(
         cores: number of threads.
     """
     rgb, longest = photo_rgb(photo), max(photo.width, photo.height)
-    small = shrunk(rgb, min(1.0, _SIDE_PX / longest))
-    tiny = shrunk(rgb, min(1.0, PHOTO_SIDE_PX / longest))
+    small = reduced(rgb, min(1.0, _SIDE_PX / longest))
+    tiny = reduced(rgb, min(1.0, PHOTO_SIDE_PX / longest))
     lens, freedom = photo.lens_prior()
     # Coarse tie points determine no more of a lens.
     freedom = LensFreedom(focal_sigma=freedom.focal_sigma)
@@ -466,7 +453,7 @@ def _shared(
     def look(index: int) -> tuple[NDArray[np.uint8], Features, float]:
         grey = photo_grey(photos.photos[index])
         scale = min(1.0, _LONGEST_SIDE_PX / max(grey.shape))
-        small = shrunk(grey, scale)
+        small = reduced(grey, scale)
         features = find_features(equalised(small, CLIP_LIMIT), _PARAMS.max_features)
         return small, features, scale
 

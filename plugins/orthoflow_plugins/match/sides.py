@@ -11,7 +11,9 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.files.images import photo_grey, photo_rgb
 from orthoflow.geometry.frames import LEVEL_LIMIT_DEG, WallFrame, frame_over
+from orthoflow.geometry.key_points import Features
 from orthoflow.geometry.levels import REC_601
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import (
@@ -27,7 +29,6 @@ from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, MetricSpec, Port
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.match.key_points import (
     MIXTURES,
-    Features,
     PairingParams,
     mixed,
     side_matches,
@@ -37,8 +38,6 @@ from orthoflow_plugins.match.pictures import (
     filled_smoothly,
     one_by_one,
     opencv_version,
-    photo_grey,
-    photo_rgb,
     require_photos,
 )
 

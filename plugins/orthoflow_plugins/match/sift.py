@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from orthoflow.geometry.key_points import Features
 from orthoflow.products import JsonValue, Photo, Photos, TieRole, Ties, Walls
 from orthoflow.sdk import DiagnosticSpec, Method, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.match.key_points import (
     CLEARLY,
     LEAST,
-    Features,
     PairingParams,
     PhotoPairs,
     pair_in_colours,

@@ -16,18 +16,13 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.images import used_pixels
-from orthoflow.geometry.key_points import best_matches
+from orthoflow.files.images import photo_grey, used_pixels
+from orthoflow.geometry.key_points import Features, best_matches, find_features
 from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Camera, JsonValue, Photos, TieRole, Ties, TieWall, Wall, Walls
 from orthoflow.sdk import DiagnosticSpec
-from orthoflow_plugins.match.key_points import Features, find_features, wall_features
-from orthoflow_plugins.match.pictures import (
-    one_by_one,
-    photo_grey,
-    points_on_wall,
-    require_intensity,
-)
+from orthoflow_plugins.match.key_points import wall_features
+from orthoflow_plugins.match.pictures import one_by_one, points_on_wall, require_intensity
 from orthoflow_plugins.match.warping import Projection, project_walls
 
 if TYPE_CHECKING:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
+from orthoflow.files.images import photo_grey
 from orthoflow.geometry.cameras import (
     POSE_PARAMETERS,
     LensFreedom,
@@ -24,6 +25,7 @@ from orthoflow.geometry.cameras import (
     opencv_matrix,
     to_opencv,
 )
+from orthoflow.geometry.key_points import Features
 from orthoflow.geometry.resection import SeenPoints, adjust, misfit
 from orthoflow.geometry.robust import MEDIAN_LENGTH, NMAD_FACTOR
 from orthoflow.products import Camera, Intrinsics, JsonValue, Photo, Photos, Wall
@@ -34,14 +36,7 @@ from orthoflow_plugins.match.channels import (
     textured_places,
 )
 from orthoflow_plugins.match.displacements import CORRELATION_AREA_CELLS, Displacements, measure
-from orthoflow_plugins.match.key_points import (
-    Features,
-    PairingParams,
-    pair_photo,
-    sampling,
-    wall_features,
-)
-from orthoflow_plugins.match.pictures import photo_grey
+from orthoflow_plugins.match.key_points import PairingParams, pair_photo, sampling, wall_features
 from orthoflow_plugins.match.ties import (
     TiePiece,
     joined,

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.files.images import photo_grey, photo_rgb, reduced
 from orthoflow.geometry.cameras import ViewingCamera, to_opencv
 from orthoflow.products import Photo, Wall
-from orthoflow_plugins.match.pictures import photo_grey, photo_rgb, shrunk
 
 if TYPE_CHECKING:
     from orthoflow.geometry.occluders import Occluders
@@ -232,7 +232,7 @@ def warp_photo(picture: NDArray[np.uint8], projection: Projection) -> NDArray[np
     import cv2
 
     factor = min(1.0, 1.0 / max(projection.pixels_per_cell, 1e-6))
-    small = shrunk(picture, factor)
+    small = reduced(picture, factor)
     known = np.isfinite(projection.u)
     map_u, map_v = (
         np.where(known, to_opencv(pixels * factor), _OUTSIDE_PX).astype(np.float32)

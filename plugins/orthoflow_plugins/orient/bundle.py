@@ -15,6 +15,7 @@ from pydantic import Field
 
 from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.key_points import Features
 from orthoflow.geometry.resection import (
     Misfit,
     Resection,
@@ -40,7 +41,6 @@ from orthoflow_plugins.orient.block import (
 from orthoflow_plugins.orient.gates import GATES_BEFORE_BLOCK, refusal
 from orthoflow_plugins.orient.photo_ties import (
     PhotoTies,
-    no_features,
     overlapping_pairs,
     photo_features,
     tie_photos,
@@ -120,7 +120,7 @@ class OrientColmapBundle(Method):
 
     id: ClassVar[str] = "orient.colmap-bundle"
     determinism: ClassVar[Determinism] = "seeded"
-    result_version: ClassVar[int] = 2
+    result_version: ClassVar[int] = 3
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         *ORIENTATION_METRICS,
         MetricSpec("n_photo_points", label="points seen in several photos"),
@@ -239,7 +239,7 @@ def _photo_ties(
     shown = [item.tied.control(item.estimate.agreeing).points_world for item in block]
     pairs = overlapping_pairs(cameras, shown, _MIN_OVERLAP) if params.photo_ties else []
     needed = {at for pair in pairs for at in pair}
-    features = [no_features()] * len(block)
+    features = [Features.none()] * len(block)
     for at in sorted(needed):
         photo = block[at].tied.photo
         done = _SHARE_BY_ITSELF + (_SHARE_FEATURES - _SHARE_BY_ITSELF) * at / len(block)

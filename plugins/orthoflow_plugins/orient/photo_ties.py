@@ -4,44 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.images import decode_image
-from orthoflow.geometry.cameras import ViewingCamera, from_opencv
+from orthoflow.files.images import photo_grey, reduced
+from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.frames import cross_matrix
-from orthoflow.geometry.key_points import in_turns, mutual_matches, root_sift
+from orthoflow.geometry.key_points import Features, find_features, mutual_matches
 from orthoflow.products import Photo
 from orthoflow_plugins.orient.pose import camera_rays
 
 # Larger photos are reduced: SIFT takes 0.23 GB per million pixels, and thousands of key points at
 # half the resolution tie photos as well as more at full resolution.
 _MAX_SIDE_PX: Final = 1600
-_CONTRAST_THRESHOLD: Final = 0.02
-_SPREAD_CELLS: Final = 16
 _MAX_RATIO: Final = 0.85
 _MAX_PARTNERS: Final = 8
 # The poses are known to a few pixels.
 _MAX_OFF_LINE_PX: Final = 6.0
 _MAX_OFF_POINT_PX: Final = 8.0
 _MIN_ANGLE: Final = np.radians(2.0)
-
-
-@dataclass(frozen=True, kw_only=True)
-class PhotoFeatures:
-    """Key points of a photo.
-
-    Attributes:
-        pixels: (n, 2) float64 (u, v) of the photo, first pixel centre at (0.5, 0.5).
-        scale: pixels of the photo per pixel in which they were found.
-        descriptors: (n, 128) float32 RootSIFT, whole numbers.
-    """
-
-    pixels: NDArray[np.float64]
-    scale: float
-    descriptors: NDArray[np.float32]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,46 +46,15 @@ class PhotoTies:
     points_world: NDArray[np.float64]
 
 
-def no_features() -> PhotoFeatures:
-    """Return none."""
-    return PhotoFeatures(
-        pixels=np.empty((0, 2)), scale=1.0, descriptors=np.empty((0, 128), np.float32)
-    )
-
-
-def photo_features(photo: Photo, n_most: int) -> PhotoFeatures:
+def photo_features(photo: Photo, n_most: int) -> Features:
     """Find the strongest key points of a photo, spread over it."""
-    import cv2
+    scale = _reduction(photo.width, photo.height)
+    return find_features(reduced(photo_grey(photo), 1.0 / scale), n_most).scaled(scale)
 
-    rgb = decode_image(photo.encoded, f"photo {photo.name}")
-    grey = rgb if rgb.ndim == 2 else cv2.cvtColor(rgb[:, :, :3], cv2.COLOR_RGB2GRAY)
-    scale = max(1.0, max(grey.shape) / _MAX_SIDE_PX)
-    if scale > 1.0:
-        size = (round(grey.shape[1] / scale), round(grey.shape[0] / scale))
-        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-    ratios = np.array([photo.width / grey.shape[1], photo.height / grey.shape[0]])
-    # Without the precise upscaling every key point is off by a quarter of a pixel.
-    sift: Any = cv2.SIFT_create(  # type: ignore[attr-defined]  # missing in OpenCV's stubs
-        contrastThreshold=_CONTRAST_THRESHOLD, enable_precise_upscale=True
-    )
-    grey = np.ascontiguousarray(grey)
-    found = sift.detect(grey, None)
-    if not found:
-        return no_features()
-    points = np.array([(*p.pt, p.size, p.angle, p.response) for p in found], dtype=np.float64)
-    # Threads find key points in any order; the image alone orders them.
-    order = np.lexsort(points.T[:4])
-    # The strongest, in turns from the cells of a coarse grid.
-    cells = (points[order, :2] * _SPREAD_CELLS / [grey.shape[1], grey.shape[0]]).astype(np.intp)
-    columns, rows = np.clip(cells, 0, _SPREAD_CELLS - 1).T
-    order = order[in_turns(rows * _SPREAD_CELLS + columns, (-points[order, 4],), n_most)]
-    # Described are those that stay: of a rich picture, one in ten.
-    raw = sift.compute(grey, [found[at] for at in order.tolist()])[1]
-    return PhotoFeatures(
-        pixels=from_opencv(points[order, :2]) * ratios,
-        scale=scale,
-        descriptors=root_sift(np.asarray(raw, dtype=np.float32)),
-    )
+
+def _reduction(width: int, height: int) -> float:
+    """Return the pixels of a photo per pixel of the picture in which key points are found."""
+    return max(1.0, max(width, height) / _MAX_SIDE_PX)
 
 
 def overlapping_pairs(
@@ -131,7 +83,7 @@ def overlapping_pairs(
 
 def tie_photos(
     cameras: Sequence[ViewingCamera],
-    features: Sequence[PhotoFeatures],
+    features: Sequence[Features],
     pairs: Sequence[tuple[int, int]],
     n_most: int,
 ) -> PhotoTies:
@@ -198,7 +150,7 @@ def _tracks(links: NDArray[np.intp], starts: NDArray[np.intp]) -> list[NDArray[n
 
 def _located(
     cameras: Sequence[ViewingCamera],
-    features: Sequence[PhotoFeatures],
+    features: Sequence[Features],
     rays: Sequence[NDArray[np.float64]],
     tracks: Sequence[NDArray[np.intp]],
 ) -> PhotoTies:
@@ -226,7 +178,9 @@ def _located(
         photo=photo_of[of_all],
         point=np.repeat(np.arange(len(kept) - 1), [len(track) for track in kept[1:]]),
         pixels=pixels[of_all],
-        scale=np.array([item.scale for item in features])[photo_of[of_all]],
+        scale=np.array([_reduction(camera.width, camera.height) for camera in cameras])[
+            photo_of[of_all]
+        ],
         points_world=np.vstack(points),
     )
 

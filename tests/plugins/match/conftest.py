@@ -9,8 +9,9 @@ from typing import Any, Final
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.match import key_points
+from orthoflow_plugins.match import key_points as matching
 
+from orthoflow.geometry import key_points
 from orthoflow.geometry.key_points import Matches
 
 # What compares runs, or looks at how key points are found, finds them anew each time.
@@ -81,4 +82,4 @@ def _key_points_found_once(request: pytest.FixtureRequest, monkeypatch: pytest.M
     if request.path.stem != "test_features" and request.node.originalname not in _ANEW:
         monkeypatch.setattr(key_points, "_in_tile", _remembered.in_tile)
         monkeypatch.setattr(key_points, "_described", _remembered.of_chosen)
-        monkeypatch.setattr(key_points, "mutual_matches", _remembered.matches)
+        monkeypatch.setattr(matching, "mutual_matches", _remembered.matches)

@@ -9,17 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from orthoflow_plugins.match.key_points import (
-    PairingParams,
-    PhotoPairs,
-    pair_photo,
-    wall_features,
-)
-from orthoflow_plugins.match.pictures import photo_grey
+from orthoflow_plugins.match.key_points import PairingParams, PhotoPairs, pair_photo, wall_features
 from orthoflow_plugins.match.placing import Placed, confirmed
 from orthoflow_plugins.match.structures import WallStructure, wall_structure
 from orthoflow_plugins.match.ties import TiePiece
 
+from orthoflow.files.images import photo_grey
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import Photos, Wall
 from orthoflow.testing import photographed as ms

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from orthoflow_plugins.match.key_points import find_features
+
+from orthoflow.geometry.key_points import find_features
 
 MAX_FEATURES = 200
 

@@ -8,15 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.match.key_points import (
-    Features,
-    Pair,
-    mapped,
-    rematched,
-    verified,
-)
+from orthoflow_plugins.match.key_points import Pair, mapped, rematched, verified
 
-from orthoflow.geometry.key_points import Matches
+from orthoflow.geometry.key_points import Features, Matches
 
 LOOSE_PX = 20.0
 # Photo pixels from wall pixels: turned, shrunk, and seen a little from aside.

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from orthoflow_plugins.match.key_points import find_features
 from orthoflow_plugins.match.pictures import points_on_wall
 from orthoflow_plugins.match.sift import MatchSift
 from scipy.spatial.distance import cdist
@@ -15,6 +14,7 @@ from scipy.spatial.distance import cdist
 from orthoflow.files.images import encode_png
 from orthoflow.geometry.key_points import (
     Window,
+    find_features,
     mutual_matches_within,
 )
 from orthoflow.products import Photo, Photos, TieRole, Ties, Walls

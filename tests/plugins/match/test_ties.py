@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.match.key_points import Features
 from orthoflow_plugins.match.ties import TiePiece, key_point_ties, ties_of, without_twins
 
 from orthoflow.files.images import encode_png
+from orthoflow.geometry.key_points import Features
 from orthoflow.products import TieRole
 from tests import inspect_scenes
 from tests.inspect_scenes import GSD_M

@@ -12,7 +12,6 @@ from orthoflow_plugins.orient import bundle as bundle_method
 from orthoflow_plugins.orient.block import Block, Observations, Points, block_covariance, solve
 from orthoflow_plugins.orient.bundle import OrientColmapBundle, adjust_block
 from orthoflow_plugins.orient.photo_ties import (
-    PhotoFeatures,
     PhotoTies,
     photo_features,
 )
@@ -21,6 +20,7 @@ from orthoflow_plugins.orient.pnp import OrientPnp
 from orthoflow_plugins.orient.pose import Lens, estimate_pose, lens_groups
 
 from orthoflow.geometry.cameras import LensFreedom
+from orthoflow.geometry.key_points import Features
 from orthoflow.geometry.resection import SeenPoints, adjust
 from orthoflow.products import Cameras, Photo, Photos, Ties
 from orthoflow.sdk import StepContext
@@ -44,10 +44,10 @@ def bundle(ties: Ties, photos: Photos, ctx: StepContext, **params: object) -> Ca
     return OrientColmapBundle().run(inputs, OrientColmapBundle.Params(**params), ctx).cameras
 
 
-_found: dict[tuple[bytes, int], PhotoFeatures] = {}
+_found: dict[tuple[bytes, int], Features] = {}
 
 
-def found_once(photo: Photo, n_most: int) -> PhotoFeatures:
+def found_once(photo: Photo, n_most: int) -> Features:
     """Key points of a picture, which are the same whatever is known of its lens."""
     key = (photo.encoded, n_most)
     if key not in _found:

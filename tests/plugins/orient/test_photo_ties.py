@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -10,7 +11,6 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.orient import photo_ties
 from orthoflow_plugins.orient.photo_ties import (
-    PhotoFeatures,
     PhotoTies,
     overlapping_pairs,
     photo_features,
@@ -19,6 +19,7 @@ from orthoflow_plugins.orient.photo_ties import (
 
 from orthoflow.files.images import encode_png
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
+from orthoflow.geometry.key_points import Features
 from orthoflow.products import Photo
 from tests import samples
 
@@ -43,29 +44,30 @@ def described(count: int, seed: int = 0) -> NDArray[np.float32]:
     return np.random.default_rng(seed).integers(0, 60, (count, 128)).astype(np.float32)
 
 
+def features(pixels: NDArray[np.float64], descriptors: NDArray[np.float32]) -> Features:
+    n = len(pixels)
+    return Features(
+        pixels=pixels, sizes_px=np.ones(n), angles_deg=np.zeros(n), descriptors=descriptors
+    )
+
+
 def scene_points(count: int = 30) -> NDArray[np.float64]:
     return np.random.default_rng(2).uniform((-1.0, 4.0, -0.8), (1.2, 6.0, 1.2), (count, 3))
 
 
 def seen_in(
     points: NDArray[np.float64], moved: dict[tuple[int, int], tuple[float, float]] | None = None
-) -> list[PhotoFeatures]:
+) -> list[Features]:
     """Key points of all points in all photos, in an order of its own in each; some moved."""
-    features = []
+    found = []
     for photo, view in enumerate(CAMERAS):
         pixels = view.project(points)[:, :2]
         for (of, point), by in (moved or {}).items():
             if of == photo:
                 pixels[point] += by
         order = np.random.default_rng(photo).permutation(len(points))
-        features.append(
-            PhotoFeatures(
-                pixels=pixels[order],
-                scale=1.0 + photo,
-                descriptors=described(len(points))[order],
-            )
-        )
-    return features
+        found.append(features(pixels[order], described(len(points))[order]))
+    return found
 
 
 def observed(ties: PhotoTies, points: NDArray[np.float64]) -> list[list[int]]:
@@ -83,26 +85,23 @@ def test_points_are_tied_in_all_photos_that_see_them_where_they_are() -> None:
     assert observed(ties, points) == [[0, 1, 2, 3]] * 30
     apart = np.linalg.norm(points[:, None] - ties.points_world[None], axis=2).min(axis=0)
     np.testing.assert_allclose(apart, 0.0, atol=1e-7)
-    for photo, point, pixel, scale in zip(
-        ties.photo, ties.point, ties.pixels, ties.scale, strict=True
-    ):
+    for photo, point, pixel in zip(ties.photo, ties.point, ties.pixels, strict=True):
         expected = CAMERAS[photo].project(ties.points_world[point][None])[0, :2]
         np.testing.assert_allclose(pixel, expected, atol=1e-5)
-        assert scale == 1.0 + photo
+    # Key points of photos of 1000 px are found at full size, those of larger ones at 1600 px.
+    assert set(ties.scale) == {1.0}
+    large = [replace(view, width=3200, height=2560) for view in CAMERAS]
+    assert set(tie_photos(large, seen_in(points), PAIRS, 1000).scale) == {2.0}
 
 
 def test_of_many_points_those_that_most_photos_see_are_kept() -> None:
     points = scene_points()
-    features = seen_in(points)
+    known_to = seen_in(points)
     # The last two photos know the first ten points alone.
     for photo in (2, 3):
         order = np.random.default_rng(photo).permutation(30)
-        known = order < 10
-        old = features[photo]
-        features[photo] = PhotoFeatures(
-            pixels=old.pixels[known], scale=old.scale, descriptors=old.descriptors[known]
-        )
-    ties = tie_photos(CAMERAS, features, PAIRS, 12)
+        known_to[photo] = known_to[photo].take(order < 10)
+    ties = tie_photos(CAMERAS, known_to, PAIRS, 12)
     seen = observed(ties, points)
     assert seen[:10] == [[0, 1, 2, 3]] * 10
     assert sum(photos == [0, 1] for photos in seen[10:]) == 2
@@ -149,11 +148,8 @@ def test_rays_must_meet_at_two_degrees(angle_deg: float, is_tied: bool) -> None:
         camera((0.2 + half, 0.0, 0.3), focal_px=900.0),
     ]
     points = np.array([[0.2, 5.0, 0.3], [0.2, 5.0, 0.3]])
-    features = [
-        PhotoFeatures(pixels=view.project(points)[:, :2], scale=1.0, descriptors=described(2))
-        for view in views
-    ]
-    ties = tie_photos(views, features, [(0, 1)], 10)
+    found = [features(view.project(points)[:, :2], described(2)) for view in views]
+    ties = tie_photos(views, found, [(0, 1)], 10)
     assert len(ties.points_world) == (2 if is_tied else 0)
 
 
@@ -181,13 +177,10 @@ def disc_photo(width: int, height: int, radius: float) -> tuple[Photo, NDArray[n
     return photo, centres
 
 
-@pytest.mark.parametrize(("width", "scale"), [(800, 1.0), (1600, 1.0), (2400, 1.5)])
-def test_key_points_lie_in_pixels_of_the_photo_however_it_was_shrunk(
-    width: int, scale: float
-) -> None:
+@pytest.mark.parametrize("width", [800, 2400])
+def test_key_points_are_in_pixels_of_the_photo_when_it_was_reduced(width: int) -> None:
     photo, centres = disc_photo(width, 150, 18.0)
     found = photo_features(photo, 100)
-    assert found.scale == pytest.approx(scale)
     for centre in centres:
         assert np.linalg.norm(found.pixels - centre, axis=1).min() < 0.5
     assert found.descriptors.shape == (len(found.pixels), 128)
@@ -201,12 +194,12 @@ def test_points_behind_a_camera_are_none() -> None:
     """Rays that come together meet before both photos, rays that go apart behind them."""
     views = [camera((-1.0, 0.0, 0.0), focal_px=900.0), camera((1.0, 0.0, 0.0), focal_px=900.0)]
     for inwards, n_points in ((0.3, 2), (-0.3, 0)):
-        features = []
+        found = []
         for view, aside in zip(views, (inwards, -inwards), strict=True):
             ways = np.array([[aside, 1.0, 0.05], [aside, 1.0, 0.1]])
             pixels = view.project(view.centre_world + 5.0 * ways)[:, :2]
-            features.append(PhotoFeatures(pixels=pixels, scale=1.0, descriptors=described(2)))
-        assert len(tie_photos(views, features, [(0, 1)], 10).points_world) == n_points
+            found.append(features(pixels, described(2)))
+        assert len(tie_photos(views, found, [(0, 1)], 10).points_world) == n_points
 
 
 def test_a_track_with_two_points_of_one_photo_is_none() -> None:
