@@ -14,11 +14,6 @@ from orthoflow_plugins.match import key_points as matching
 from orthoflow.geometry import key_points
 from orthoflow.geometry.key_points import Matches
 
-# What compares runs, or looks at how key points are found, finds them anew each time.
-_ANEW: Final = (
-    "test_the_number_of_threads_does_not_show",
-    "test_ties_are_the_same_with_any_number_of_threads",
-)
 # Each holds some megabytes.
 _PICTURES_MOST: Final = 32
 
@@ -79,7 +74,7 @@ _remembered = _Remembered()
 @pytest.fixture(autouse=True)
 def _key_points_found_once(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Look at each picture, and match two of them, once: tests look at the same few."""
-    if request.path.stem != "test_features" and request.node.originalname not in _ANEW:
+    if request.path.stem != "test_features":
         monkeypatch.setattr(key_points, "_in_tile", _remembered.in_tile)
         monkeypatch.setattr(key_points, "_described", _remembered.of_chosen)
         monkeypatch.setattr(matching, "mutual_matches", _remembered.matches)

@@ -63,17 +63,6 @@ def test_ties_lie_where_the_true_camera_sees_their_points(
     assert 0.3 < np.sqrt(np.mean((right / stated[:, None]) ** 2)) < 1.5
 
 
-def test_ties_are_the_same_with_any_number_of_threads(
-    scene: ms.TexturedWall, walls: Walls, tmp_path: Path
-) -> None:
-    photos = ms.photos(ms.photo_of(scene, ms.camera_before(scene)))
-    (tmp_path / "one").mkdir()
-    one = ties_of(photos, walls, context(tmp_path / "one", cores=1))
-    two = ties_of(photos, walls, context(tmp_path, cores=2))
-    np.testing.assert_array_equal(one.pixels_photo, two.pixels_photo)
-    np.testing.assert_array_equal(one.points_world, two.points_world)
-
-
 def test_a_photo_of_nothing_known_is_warned_of(
     scene: ms.TexturedWall, walls: Walls, tmp_path: Path
 ) -> None:

@@ -160,33 +160,6 @@ def test_a_fifth_of_the_ties_is_withheld_from_everything(tmp_path: Path) -> None
     )
 
 
-def test_the_same_seed_gives_the_same_bits(tmp_path: Path) -> None:
-    camera = ms.camera_before(ms.textured_wall(0))
-    ties = known_ties(camera, 6, wrong_share=0.5)
-    found = []
-    for name in ("one", "two"):
-        (tmp_path / name).mkdir()
-        found.append(orient(ties, calibrated(camera), context(tmp_path / name)).cameras[0])
-    first, second = found
-    np.testing.assert_array_equal(
-        first.translation_camera_from_world, second.translation_camera_from_world
-    )
-    np.testing.assert_array_equal(first.covariance, second.covariance)
-
-
-def test_survey_coordinates_change_nothing(tmp_path: Path) -> None:
-    scene = ms.textured_wall(0)
-    camera = ms.camera_before(scene)
-    cameras = orient(
-        known_ties(camera, 7, shift_m=SURVEY_SHIFT_M), calibrated(camera), context(tmp_path)
-    )
-    found = cameras.cameras[0]
-    assert found.status == "ok"
-    assert found.sigma_wall_m == pytest.approx(0.0001, abs=0.0004)
-    near = found.viewing().shifted(SURVEY_SHIFT_M)
-    assert ms.wall_error_m(scene, near, camera) < 0.0005
-
-
 @pytest.mark.parametrize("factor", [0.97, 1.0, 1.03])
 def test_an_exif_focal_length_is_improved(tmp_path: Path, factor: float) -> None:
     camera = ms.camera_before(ms.textured_wall(0), centre=(0.2, -1.8, 0.4))
