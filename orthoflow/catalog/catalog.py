@@ -148,8 +148,7 @@ class MethodEntry(Announced):
     def source_files(self) -> tuple[Path, ...]:
         """Python files whose content can change the method's results, sorted.
 
-        The packages of the hooks and of the class; they matter when `distribution.is_released` is
-        False. Never empty for a method that loads from files.
+        The packages of the hooks and of the class. Never empty for a method that loads from files.
         """
         return source_files(
             (self.distribution.source_folder, package_path(self.spec.target.partition(":")[0]))

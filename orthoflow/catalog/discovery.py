@@ -77,7 +77,7 @@ def discover_catalog(entry_points: Iterable[EntryPoint] | None = None) -> Catalo
             disabled.append(entry.name)
             continue
         try:
-            with guarded(f"plugin {entry.name} of {distribution}"):
+            with guarded():
                 claims += [(spec, distribution) for spec in _announced(entry)]
         except UserInterrupt:
             raise

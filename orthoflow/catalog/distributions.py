@@ -1,4 +1,4 @@
-"""Which distribution brought a plugin, whether it is a released install, and where its code is."""
+"""Which distribution brought a plugin, and where its code is."""
 
 from __future__ import annotations
 
@@ -21,15 +21,12 @@ class DistributionInfo:
     Attributes:
         name: name of the distribution.
         version: its version.
-        is_released: installed from an index, so that name and version stand for the code; False
-            for editable installs, installs from a folder or URL, and code run from a checkout.
         source_folder: folder of the package that holds the hooks; None for a plugin of a single
             module, which lies beside unrelated code (see `MethodEntry.source_files`).
     """
 
     name: str
     version: str
-    is_released: bool
     source_folder: Path | None
 
     def __str__(self) -> str:
@@ -42,14 +39,11 @@ def describe_distribution(entry_point: EntryPoint) -> DistributionInfo:
     folder = code if code is not None and code.is_dir() else None
     distribution = entry_point.dist
     if distribution is None:
-        return DistributionInfo(
-            name=entry_point.name, version="0", is_released=False, source_folder=folder
-        )
+        return DistributionInfo(name=entry_point.name, version="0", source_folder=folder)
     name, version = _name_and_version(distribution)
     return DistributionInfo(
         name=name or entry_point.name,
         version=version or "0",
-        is_released=_is_released(distribution, code),
         source_folder=folder,
     )
 
@@ -61,14 +55,6 @@ def _name_and_version(distribution: Distribution) -> tuple[str, str]:
     except ValueError:
         return "", ""
     return str(stated["Name"] or ""), str(stated["Version"] or "")
-
-
-def _is_released(distribution: Distribution, code: Path | None) -> bool:
-    # pip writes direct_url.json for everything that does not come from an index; code that lies
-    # elsewhere than its metadata was put in front of a release, e.g. by PYTHONPATH.
-    if code is None or distribution.read_text("direct_url.json") is not None:
-        return False
-    return code.is_relative_to(Path(str(distribution.locate_file(""))).resolve())
 
 
 def package_path(module: str) -> Path | None:

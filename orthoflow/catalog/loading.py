@@ -38,7 +38,7 @@ def import_target(target: str, what: str, distribution: DistributionInfo) -> obj
     module_name, _, name = target.partition(":")
     module: object = None
     try:
-        with guarded(f"{what} of {distribution}"):
+        with guarded():
             module = import_module(module_name)
             return typing.cast("object", getattr(module, name))
     except UserInterrupt:
@@ -61,7 +61,7 @@ def _way_out(error: BaseException, target: str, distribution: DistributionInfo) 
     other = f"another version of {distribution.name}"
     if missing and missing.partition(".")[0] != package:
         return f"install what is missing, or {other}"
-    return f"install {other}" if distribution.is_released else "mend its source, or the hooks"
+    return f"mend its source or the hooks, or install {other}"
 
 
 def load_method(

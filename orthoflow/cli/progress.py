@@ -35,15 +35,12 @@ if TYPE_CHECKING:
 # Below these, the progress of a step does not yet predict its remaining time.
 _MIN_FRACTION: Final = 0.05
 _MIN_ELAPSED_S: Final = 2.0
-# A step that reports no progress advances by its earlier duration, up to this fraction.
-_MAX_BY_CLOCK: Final = 0.95
 _REFRESH_PER_S: Final = 4
 # A log file gets a line at least so often.
 _EVERY_S: Final = 10.0
 _NOTEBOOK_EVERY_S: Final = 1.0
-# Of more lines a notebook shows the last, so that the running steps stay in view below them.
+# While it runs, a notebook shows the last lines, so that the running steps stay in view below them.
 _NOTEBOOK_LINES: Final = 40
-_NOTEBOOK_LINES_KEPT: Final = 1000
 # Shorter times of loading and compiling are not mentioned.
 _MIN_COMPILE_S: Final = 2.0
 _STYLES: Final = {
@@ -87,15 +84,6 @@ class CellState:
         if self.fraction < _MIN_FRACTION or elapsed_s < _MIN_ELAPSED_S:
             return None
         return elapsed_s * (1 - self.fraction) / self.fraction
-
-    def done(self, now_s: float) -> float:
-        """How far it is, 0..1: as it reports, or as far as it was by now the last time."""
-        if not self.took_s or self.state != "running":
-            return self.fraction
-        by_clock = (now_s - self.started) / self.took_s
-        if by_clock > 1 and self.fraction:
-            return self.fraction
-        return max(self.fraction, min(by_clock, _MAX_BY_CLOCK))
 
 
 def left_of_run(cells: Iterable[CellState], now_s: float, *, jobs: int = 1) -> str:
@@ -173,7 +161,7 @@ class Progress:
     def __exit__(self, *_: object) -> None:
         self._stack.close()
         if self._notebook:
-            self._notebook.show(_last(self._lines, _NOTEBOOK_LINES_KEPT))
+            self._notebook.show(self._lines)
 
     def take(self, event: RunEvent) -> None:
         """Show an event of the run."""
@@ -263,7 +251,7 @@ class Progress:
             if cell.state == "running":
                 left_s = cell.left_s(now_s)
                 parts = [
-                    f"{100 * cell.done(now_s):.0f} %",
+                    f"{100 * cell.fraction:.0f} %",
                     cell.text,
                     f"{duration(now_s - cell.started)} so far",
                     f"about {about(left_s)} left" if left_s is not None else "",
@@ -271,7 +259,7 @@ class Progress:
                 running.append(f"{address}: {', '.join(part for part in parts if part)}")
         if self._notebook:
             left = [self.left()] if running else []
-            lines = [*_last(self._lines, _NOTEBOOK_LINES), *running, *filter(None, left)]
+            lines = [*self._lines[-_NOTEBOOK_LINES:], *running, *filter(None, left)]
             self._notebook.show(lines)
         elif running:
             echo_error(*running)
@@ -302,7 +290,7 @@ class Progress:
             if address not in chosen:
                 continue
             running = cell.state == "running"
-            state = f"{100 * cell.done(now_s):3.0f} %" if running else cell.state
+            state = f"{100 * cell.fraction:3.0f} %" if running else cell.state
             seconds = now_s - cell.started if running else cell.wall_s
             left_s = cell.left_s(now_s) if running else None
             table.add_row(
@@ -326,14 +314,6 @@ def _end_text(event: CellFinished) -> str:
     # The summary states why something was skipped.
     why = f": {result.error_message}" if result.status == "failed" else ""
     return f"{event.address}: {result.status}{took}{why}"
-
-
-def _last(lines: Sequence[str], most: int) -> list[str]:
-    """The first line and the last ones, and how many there are between them."""
-    n_more = len(lines) - most
-    if n_more <= 0:
-        return list(lines)
-    return [lines[0], f"... {counted(n_more, 'line')} more", *lines[n_more + 1 :]]
 
 
 class _NotebookOutput:

@@ -171,7 +171,7 @@ class DaskExecutor:
         # Its own workers have the code that made the plan.
         self._methods = methods_text(plan.methods) if self._address else ""
         self._running: dict[str, tuple[Task, Future[str]]] = {}
-        self._news: queue.SimpleQueue[tuple[str, StepEvent | None]] = queue.SimpleQueue()
+        self._messages: queue.SimpleQueue[tuple[str, StepEvent | None]] = queue.SimpleQueue()
         self._topic = f"orthoflow-{uuid.uuid4().hex}"
         self._stop_at: float | None = None
         self._capacity = capacity
@@ -209,7 +209,9 @@ class DaskExecutor:
             resources={CORES: task.cores},
         )
         self._running[task.address] = (task, future)
-        future.add_done_callback(lambda _, address=task.address: self._news.put((address, None)))
+        future.add_done_callback(
+            lambda _, address=task.address: self._messages.put((address, None))
+        )
 
     def poll(self, timeout_s: float) -> dict[str, CellResult]:
         """Wait for tasks to end, up to a time; forwards messages of running tasks.
@@ -220,7 +222,7 @@ class DaskExecutor:
         ended: list[str] = []
         with suppress(queue.Empty):
             while True:
-                address, event = self._news.get(timeout=timeout_s)
+                address, event = self._messages.get(timeout=timeout_s)
                 timeout_s = 0.0
                 if event is None:
                     ended.append(address)
@@ -287,7 +289,7 @@ class DaskExecutor:
     def _receive(self, event: tuple[float, Any]) -> None:
         with suppress(TypeError, ValueError):
             address, text = event[1]
-            self._news.put((str(address), EVENTS.validate_json(text, strict=True)))
+            self._messages.put((str(address), EVENTS.validate_json(text, strict=True)))
 
     def _watch(self) -> None:
         """Check every two seconds which workers are present."""

@@ -199,7 +199,7 @@ def stated_versions(preimage: Mapping[str, JsonValue], name: str) -> dict[str, s
 
 def _tools(cls: type[Method]) -> dict[str, str]:
     try:
-        with guarded(f"method {cls.id}"):
+        with guarded():
             return {str(name): str(version) for name, version in cls.tools().items()}
     except UserInterrupt:
         raise

@@ -200,7 +200,7 @@ class _Run:
         """
         while self._waiting or self._running:
             if interruption.is_asked:
-                self._break_off(executor)
+                self._interrupt(executor)
             self._advance(executor)
             self._poll(executor)
 
@@ -227,7 +227,7 @@ class _Run:
             inputs=self._plan.inputs,
         )
 
-    def _break_off(self, executor: Executor) -> None:
+    def _interrupt(self, executor: Executor) -> None:
         executor.cancel()
         while self._running:
             self._poll(executor)

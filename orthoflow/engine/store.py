@@ -11,8 +11,8 @@ Layout below the store's folder:
 
 Everything has the digest of its bytes and is checked when a run, or an export, uses it. What is
 damaged is removed; a run then starts again from what is left. Figures name themselves; results and
-descriptions of objects begin with the digest of the rest. They show what is damaged, not who did
-it: whoever can write to the store can write digests, too.
+descriptions of objects begin with the digest of the rest. They show damage, not forgery: whoever
+can write to the store can write digests, too.
 """
 
 from __future__ import annotations

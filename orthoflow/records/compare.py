@@ -178,14 +178,14 @@ def _distance(
 
 def _named(difference: ArrayDifference, payload: Payload) -> ArrayDifference:
     """Identify a value in a list by the name and the unit beside it."""
-    way = difference.name.split("/")
+    path = difference.name.split("/")
     beside: JsonValue = dict(payload.metadata)
-    for part in way[:-1]:
+    for part in path[:-1]:
         if isinstance(beside, dict):
             beside = beside.get(part)
         elif isinstance(beside, list) and part.isdecimal() and int(part) < len(beside):
             beside = beside[int(part)]
-    if way[-1] != "value" or not isinstance(beside, dict) or "name" not in beside:
+    if path[-1] != "value" or not isinstance(beside, dict) or "name" not in beside:
         return difference
     unit = beside.get("unit", difference.unit)
     return replace(difference, name=f"{beside['name']}, {difference.name}", unit=str(unit))
@@ -507,8 +507,7 @@ def compare_runs(left: Run, right: Run, *, stores: Sequence[Store] = ()) -> RunC
     """Compare two runs.
 
     Cells correspond if they have the same step, dataset and seed, and each step that varies before
-    them has the same method and parameters; otherwise if their addresses are equal; otherwise if
-    those steps have the same method, and the same values of the parameters that vary in either run.
+    them has the same method and parameters; otherwise if their addresses are equal.
 
     Args:
         left: the first run.
@@ -585,28 +584,29 @@ def _per_cell(
 def _readdressed(left: Run, right: Run) -> dict[str, str]:
     """Find cells of the second run that the first has under another address.
 
-    Names of variants are labels, not identity: cells with the same method and parameters
-    correspond, then those with the same address, then those with the same values of the parameters
-    that vary.
+    Names of variants are labels, not identity: cells with the same methods and parameters
+    correspond, then those with the same address.
     """
     varied = {
         step for run in (left, right) for cell in run.cells.values() for step in cell.assignment
     }
-    varying = _distinguishing_parameters((left, right), varied)
     # A skipped cell has no inputs, so its origin is unknown.
     ours, theirs = (
-        {at: _way(run, cell, varied, None) for at, cell in run.cells.items() if _has_run(cell)}
+        {
+            address: _identity(run, cell, varied)
+            for address, cell in run.cells.items()
+            if cell.status != "skipped"
+        }
         for run in (left, right)
     )
-    found = {address: address for address, way in theirs.items() if ours.get(address) == way}
-    _pair(found, ours, theirs)
-    free = left.cells.keys() - found.values()
-    found |= {at: at for at in right.cells.keys() - found.keys() if at in free}
-    _pair(
-        found,
-        {at: _way(left, left.cells[at], varied, varying) for at in ours},
-        {at: _way(right, right.cells[at], varied, varying) for at in theirs},
-    )
+    found = {address: address for address, one in theirs.items() if ours.get(address) == one}
+    free: dict[tuple[object, ...], list[str]] = {}
+    for address, one in ours.items():
+        if address not in found:
+            free.setdefault(one, []).append(address)
+    for address, one in theirs.items():
+        if address not in found and free.get(one):
+            found[address] = free[one].pop(0)
     return {theirs: ours for theirs, ours in found.items() if theirs != ours}
 
 
@@ -618,69 +618,20 @@ def _label(right: Run, address: str, readdressed: Mapping[str, str]) -> str:
     return readdressed.get(address, address)
 
 
-def _has_run(cell: RecordedCell) -> bool:
-    return cell.status != "skipped"
-
-
-def _pair(
-    found: dict[str, str],
-    ours: Mapping[str, tuple[object, ...]],
-    theirs: Mapping[str, tuple[object, ...]],
-) -> None:
-    """Pair cells of the second run with the corresponding ones of the first."""
-    taken = set(found.values())
-    free: dict[tuple[object, ...], list[str]] = {}
-    for address, way in ours.items():
-        if address not in taken:
-            free.setdefault(way, []).append(address)
-    for address, way in theirs.items():
-        if address not in found and free.get(way):
-            found[address] = free[way].pop(0)
-
-
-def _distinguishing_parameters(
-    runs: Sequence[Run], varied: Collection[str]
-) -> dict[tuple[str, str], frozenset[str]]:
-    """Find the parameters that distinguish variants of a step and method within one of the runs."""
-    found: dict[tuple[str, str], set[str]] = {}
-    for run in runs:
-        values: dict[tuple[str, str, str], set[str]] = {}
-        for cell in run.cells.values():
-            if cell.step in varied:
-                for name, value in cell.params.items():
-                    seen = values.setdefault((cell.step, cell.method, name), set())
-                    seen.add(canonical_json(value))
-        for (step, method, name), seen in values.items():
-            if len(seen) > 1:
-                found.setdefault((step, method), set()).add(name)
-    return {key: frozenset(names) for key, names in found.items()}
-
-
-def _way(
-    run: Run,
-    cell: RecordedCell,
-    varied: Collection[str],
-    distinguishing: Mapping[tuple[str, str], Collection[str]] | None,
-) -> tuple[object, ...]:
-    """Return the identity of a cell without the names of its variants.
+def _identity(run: Run, cell: RecordedCell, varied: Collection[str]) -> tuple[object, ...]:
+    """Return what a cell is, without the names of its variants.
 
     Args:
         run: the run of the cell.
         cell: the cell.
-        varied: steps that vary in either run; they count with their method, a step without variants
-            as its only variant.
-        distinguishing: by step and method the parameters that count; None for all.
+        varied: steps that vary in either run; they count with their method and parameters, a step
+            without variants as its only variant.
     """
-    called = {}
-    for one in run.upstream(cell.address):
-        if one.step in varied:
-            names = (
-                one.params
-                if distinguishing is None
-                else distinguishing.get((one.step, one.method), ())
-            )
-            params = {name: value for name, value in one.params.items() if name in names}
-            called[one.step] = (one.method, canonical_json(params))
+    called = {
+        one.step: (one.method, canonical_json(dict(one.params)))
+        for one in run.upstream(cell.address)
+        if one.step in varied
+    }
     factors = tuple(cell.assignment.get(factor) for factor in (DATA, SEED))
     return cell.step, cell.repeat, factors, tuple(sorted(called.items()))
 

@@ -9,7 +9,6 @@ import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -42,9 +41,6 @@ from orthoflow.workflow.parameters import (
 )
 from orthoflow.workflow.source import ProblemLog, read_text, validate
 
-# Files and folders that are examined for one input: `/**` would take hours.
-#: files and folders visited for one entry of an input (a folder, or a pattern such as `**/*.e57`)
-MOST_LOOKED_AT: Final = 100_000
 #: bytes of a table of datasets
 MOST_TABLE_BYTES: Final = 4_000_000
 #: datasets of a table
@@ -246,9 +242,8 @@ def _find(spec: WorkflowInputSpec, pattern: str) -> list[Path]:
     where = " in the working directory" if spec.is_given else f" beside {beside} ({path})"
     if Path(pattern).is_absolute():
         where = ""
-    look = _Look(f"input {spec.name}: {pattern}{where}")
     if path.is_dir():
-        files = [item for item in look.below(path) if item.name[0] != "."]
+        files = [item for item in _below(path) if item.is_file()]
         missing = f"the folder {pattern}{where} holds no files"
     elif path.exists():
         files, missing = [path], ""
@@ -257,7 +252,9 @@ def _find(spec: WorkflowInputSpec, pattern: str) -> list[Path]:
         missing = f"{pattern}{where} is a link to {path.readlink()}, which is not there"
     elif glob.has_magic(pattern):
         # Names may contain brackets; only a path that does not exist is treated as a pattern.
-        files = [match for match in look.for_pattern(spec.folder, pattern) if match.is_file()]
+        # Path.glob knows no absolute patterns.
+        matches = glob.iglob(pattern, root_dir=spec.folder, recursive=True)  # noqa: PTH207
+        files = [spec.folder / match for match in matches if (spec.folder / match).is_file()]
         missing = f"no file matches {pattern}{where}"
     else:
         files, missing = [], f"there is no file {pattern}{where}{_meant(path)}"
@@ -274,70 +271,11 @@ def _meant(path: Path) -> str:
     return ""
 
 
-class _Look:
-    """Lists folders, and counts what it sees there."""
-
-    def __init__(self, what: str) -> None:
-        self._what = what
-        self._n_seen = 0
-
-    def into(self, folder: Path) -> Iterator[Path]:
-        """Return the contents of a folder, empty if it cannot be read.
-
-        Raises:
-            InputError: there are too many.
-        """
-        try:
-            with os.scandir(folder) as entries:
-                for entry in entries:
-                    self._n_seen += 1
-                    if self._n_seen > MOST_LOOKED_AT:
-                        raise InputError(
-                            f"{self._what} has more than {MOST_LOOKED_AT} files and folders to "
-                            "look at; name a folder nearer to the files"
-                        )
-                    yield folder / entry.name
-        except OSError:
-            return
-
-    def below(self, folder: Path) -> Iterator[Path]:
-        """Yield the files in a folder and its subfolders; links to folders are not followed."""
-        waiting = [folder]
-        while waiting:
-            for path in self.into(waiting.pop()):
-                if path.is_dir():
-                    if path.name[0] != "." and not path.is_symlink():
-                        waiting.append(path)
-                elif path.is_file():
-                    yield path
-
-    def for_pattern(self, folder: Path, pattern: str) -> list[Path]:
-        """Yield what a pattern matches below a folder, as `glob` does with `recursive`.
-
-        Raises:
-            InputError: there are too many.
-        """
-        anchor = Path(pattern).anchor
-        found = [folder / anchor]
-        for part in Path(pattern).parts[bool(anchor) :]:
-            matches = (path for place in found for path in self._matches(place, part))
-            # `**/**` reaches one place in many ways.
-            found = list(dict.fromkeys(matches))
-        return found
-
-    def _matches(self, folder: Path, part: str) -> Iterator[Path]:
-        if part == "**":
-            waiting = [folder]
-            while waiting:
-                place = waiting.pop()
-                yield place
-                waiting += (path for path in self.into(place) if path.name[0] != ".")
-        elif not glob.has_magic(part) or os.path.lexists(folder / part):
-            yield folder / part
-        else:
-            for path in self.into(folder):
-                if fnmatchcase(path.name, part) and (path.name[0] != "." or part[0] == "."):
-                    yield path
+def _below(folder: Path) -> Iterator[Path]:
+    """Yield the files in a folder and its subfolders; links to folders are not followed."""
+    for place, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if name[0] != "."]
+        yield from (Path(place, name) for name in names if name[0] != ".")
 
 
 # Datasets -----------------------------------------------------------------------------------------

@@ -294,7 +294,7 @@ def _resolved(
     params = (*draft.location, "params")
     reports = {override.keys[0]: override.report for override in overrides}
     try:
-        with guarded(f"checking the parameters of {draft.id}"):
+        with guarded():
             checked = model.model_validate_json(json.dumps(as_set), strict=True)
             resolved: dict[str, JsonValue] = checked.model_dump(mode="json")
             # As in the step: a default may be refused once it is given like any other value.

@@ -60,7 +60,6 @@ def test_an_entry_point_of_no_distribution_is_known_by_its_own_name(
         DistributionInfo(
             name="mine",
             version="0",
-            is_released=False,
             source_folder=None if source is None else folder / source,
         )
     )

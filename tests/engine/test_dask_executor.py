@@ -68,7 +68,7 @@ def an_executor(folder: Path, *futures: Future, **more: Any) -> Any:
         "_address": "tcp://x:1",
         "_methods": "{}",
         "_running": {str(n): (a_task(folder, str(n)), future) for n, future in enumerate(futures)},
-        "_news": queue.SimpleQueue(),
+        "_messages": queue.SimpleQueue(),
         "_stop_at": None,
         "_capacity": ONE,
         "_looked": time.monotonic(),
@@ -137,9 +137,6 @@ def test_without_workers_a_run_waits_a_minute(
     [
         ({}, None, ""),
         ({"seen": "No such file"}, ArgumentError, "does not see the store .*No such file"),
-        ({"clock_s": 61.0}, ArgumentError, r"is \+6[01] s off this one: set both"),
-        ({"clock_s": -61.0}, ArgumentError, r"is -6[12] s off this one: set both"),
-        ({"clock_s": 58.0}, None, ""),
         ({"misfit": "numpy is older"}, PluginError, "w1: numpy is older; install there what the"),
         (ImportError("no orthoflow"), PluginError, "cannot run orthoflow .ImportError: no ortho"),
     ],
@@ -154,8 +151,7 @@ def test_workers_are_looked_at_before_they_get_a_task(
         if isinstance(said, Exception):
             return {"w1": said}
         seen = said.get("seen", Path(path).read_text())
-        clock_s = time.time() + said.get("clock_s", 0.0)
-        return {"w1": (seen, clock_s, said.get("misfit", ""))}
+        return {"w1": (seen, said.get("misfit", ""))}
 
     executor = an_executor(tmp_path, _client=a_client(run=look))
     if error is None:

@@ -123,22 +123,6 @@ def test_a_plain_run_is_compared_with_the_variant_that_does_the_same(studio: Stu
     assert compare_runs(variants, plain).readdressed == {"paint": "paint@paint=grey-128"}
 
 
-def test_of_a_changed_method_the_variant_with_the_same_swept_value_is_compared(
-    studio: Studio,
-) -> None:
-    variants, changed = open_run("swept"), open_run("fine")
-    told = compare_runs(changed, variants)
-    assert told.readdressed == {"paint@paint=grey-128": "paint"}
-    moved = {
-        row.name: (row.left.value, row.right.value)
-        for row in told.shared(told.parameters)
-        if row.left and row.right and row.left.value != row.right.value
-    }
-    assert moved == {"gsd_m": (0.25, 0.5)}
-    # 131 is no value of the sweep.
-    assert compare_runs(open_run("grey"), variants).readdressed == {}
-
-
 def test_distances_are_told_in_the_units_of_the_type(studio: Studio) -> None:
     survey, paint = verdicts(studio, "near")
     assert survey[:2] == ("survey", "within tolerance")

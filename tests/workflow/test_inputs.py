@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import glob
-import json
-import re
 from pathlib import Path
 
 import pytest
@@ -101,37 +98,3 @@ def test_an_input_option_must_exist_even_when_the_input_is_optional(
 ) -> None:
     with pytest.raises(InputError, match=r"there is no file a\.jpg in the working directory"):
         names(project, catalog, "{optional: true}", "photos=a.jpg")
-
-
-def test_a_pattern_matches_what_glob_matches(
-    project: Path, catalog: Catalog, tmp_path: Path
-) -> None:
-    for name in ("x/y/c.jpg", "x/.z/d.jpg", "x/e[2]/f.jpg", "x/e2/g.jpg"):
-        path = project / "photos" / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()
-    (project / "photos" / "x" / "again").symlink_to("y")
-    for pattern in (
-        *("photos/**", "**/c.jpg", "photos/x/*/*.jpg", "**/**/[cd].jpg", "photos/**/.*.jpg"),
-        *("photos/x/../?.jpg", "p*/x/.z/*", "photos/x/e[[]2]/*", f"{tmp_path}/*/photos/*/*/c.jpg"),
-    ):
-        matches = glob.glob(str(project / pattern), recursive=True)  # noqa: PTH207 - the one to be like
-        expected = sorted({Path(match).name for match in matches if Path(match).is_file()})
-        found = names(project, catalog, f"{{files: {json.dumps(pattern)}}}")
-        assert found is not None
-        assert sorted(set(found)) == expected, pattern
-        assert expected, pattern
-
-
-@pytest.mark.parametrize("pattern", ["photos", "photos/*.jpg", "**/*.e57", "**/**/**/*"])
-def test_looking_ends_where_there_is_too_much(
-    project: Path, catalog: Catalog, monkeypatch: pytest.MonkeyPatch, pattern: str
-) -> None:
-    monkeypatch.setattr("orthoflow.workflow.inputs.MOST_LOOKED_AT", 4)
-    place = re.escape(str(project / pattern))
-    with pytest.raises(
-        InputError,
-        match=f" input photos: {re.escape(pattern)} beside the workflow \\({place}\\) has more "
-        "than 4 files and folders to look at; name a folder nearer to the files$",
-    ):
-        names(project, catalog, f"{{files: {json.dumps(pattern)}}}")
