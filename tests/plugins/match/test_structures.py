@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -70,7 +73,11 @@ def test_a_piece_of_the_wall_lies_where_it_was_taken_from(
     # Inverted: edges stay where they are.
     cut = 255 - grey[top : top + height, left : left + width]
     places = likely_places(np.repeat(cut[..., None], 3, axis=2), structure, n_most=3)
-    assert 1 <= len(places) <= 3
+    assert 1 < len(places) <= 3
+    for one, other in itertools.combinations(places, 2):
+        apart_m = np.hypot(*(one.centre_m - other.centre_m))
+        # The same place at a neighbouring scale is no other one.
+        assert apart_m > 0.25 * one.width_m or abs(math.log(one.width_m / other.width_m)) > 0.25
     best = places[0]
     leads = [place.lead for place in places]
     assert leads == sorted(leads, reverse=True)
