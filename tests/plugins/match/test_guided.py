@@ -21,6 +21,7 @@ from orthoflow_plugins.match.sift import MatchSift
 from scipy.ndimage import gaussian_filter, shift
 
 from orthoflow.errors import MethodError
+from orthoflow.files.images import decode_image, encode_png
 from orthoflow.products import Camera, Cameras, Photos, Ties, Walls
 from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
@@ -172,6 +173,22 @@ def test_a_pose_far_off_gives_hardly_any_ties(
     off = ms.nudged(camera, (0.0, 0.15, 0.0, -0.4, 0.0, 0.0))
     photos, start = ms.photos(ms.photo_of(scene, camera)), ms.cameras(ms.oriented(off))
     assert len(guided(photos, walls, start, tmp_path).photo) < 30
+
+
+def test_ties_on_a_part_of_the_wall_that_was_moved_are_rejected(
+    scene: ms.TexturedWall, walls: Walls, tmp_path: Path
+) -> None:
+    # They agree with their neighbours, by four cells beside the others.
+    camera = ms.camera_before(scene)
+    photo = ms.photo_of(scene, camera)
+    rgb = decode_image(photo.encoded, "a.png").copy()
+    rgb[220:380, 380:540] = rgb[220:380, 372:532]
+    moved = replace(photo, encoded=encode_png(rgb))
+    start = ms.cameras(ms.oriented(camera))
+    ties = guided(ms.photos(moved), walls, start, tmp_path, channels="gradients")
+    error_px = np.linalg.norm(ties.pixels_photo - camera.project(ties.points_world)[:, :2], axis=1)
+    assert len(error_px) > 200
+    assert error_px.max() < 4.0
 
 
 def test_no_oriented_photo_is_refused_with_the_reasons(
