@@ -17,7 +17,7 @@ from orthoflow.engine.scheduler import execute
 from orthoflow.errors import ArgumentError, CancelledStepError, StoreError
 from orthoflow.records.runs import find_record
 from tests.engine_world import World, digests, start_coordinator, toy_world
-from tests.long_loops import IS_LONG
+from tests.long_loops import IS_LONG, long_only
 
 STEPS = """
 steps:
@@ -109,7 +109,9 @@ def test_steps_and_what_they_started_die_with_their_coordinator(world: World) ->
     assert not is_alive(grandchild)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda s: s.name)
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, *long_only(signal.SIGTERM)], ids=lambda s: s.name
+)
 def test_an_interrupted_run_says_so(world: World, number: signal.Signals) -> None:
     long = STEPS.replace("steps: 6", "steps: 2000")
     process = start_coordinator(world, long, "run")

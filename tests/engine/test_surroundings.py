@@ -249,9 +249,10 @@ def test_the_store_of_another_user_serves_as_far_as_it_may_be_written(
 # What a machine has too little of -----------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "n_files",
-    [20, *long_only(12, 64)],
+    [12, 20, 64],
 )
 def test_few_open_files_are_enough_or_are_said(desk: Desk, n_files: int) -> None:
     def limit() -> None:
@@ -272,9 +273,10 @@ def test_few_open_files_are_enough_or_are_said(desk: Desk, n_files: int) -> None
         check_finished(desk)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "mib",
-    [260, *long_only(175, 600)],
+    [175, 260, 600],
 )
 def test_too_little_memory_is_said_and_nothing_is_lost(desk: Desk, mib: int) -> None:
     def limit() -> None:

@@ -19,15 +19,16 @@ from orthoflow.records.runs import Run
 from tests.road.conftest import Ended, Shell, metrics_of
 from tests.scan_files import write_las
 
-# A sixth of the shipped recipe's cells and of its points of the main wall, a quarter of its pixels.
+# A third of the shipped recipe's cells, and of its points of the main wall, fewer of the others;
+# less than half of its pixels.
 SMALL = (
-    *("--set", "room.scan_step_m=0.0065", "--set", "room.panorama_step_m=0.04"),
-    *("--set", "room.photo_gsd_m=0.0055", "--set", "wall.gsd_m=0.01"),
+    *("--set", "room.scan_step_m=0.0045", "--set", "room.panorama_step_m=0.03"),
+    *("--set", "room.photo_gsd_m=0.0038", "--set", "wall.gsd_m=0.007"),
 )
-GSD_MM, PHOTO_GSD_MM = 10.0, 5.5
+GSD_MM, PHOTO_GSD_MM = 7.0, 3.8
 # What the recipe for simulated data sets, for the recipe for own data.
 SAME_WALL = (
-    *("--set", "wall.gsd_m=0.01", "--set", "wall.buffer_m=0.3"),
+    *("--set", "wall.gsd_m=0.007", "--set", "wall.buffer_m=0.3"),
     *("--set", "wall.n_walls_max=1"),
 )
 FOOT_M = 0.3048
