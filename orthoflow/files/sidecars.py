@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -342,30 +342,28 @@ class OrthoFile:
         rows, columns = self.frame.shape
         factor = max(1.0, max(rows, columns) / longest_px)
         shape = (max(1, round(rows / factor)), max(1, round(columns / factor)))
-        return self._read(slice(0, rows), shape)
+        return self.part((0, 0, columns, rows), shape)
 
-    def bands(self, n_rows: int) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.bool_]]]:
-        """Return colours and what is shown, `n_rows` at a time from the top.
+    def part(
+        self, cells: tuple[int, int, int, int], shape: tuple[int, int]
+    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        """Colours (r, c, 3) and what is shown (r, c) of a part, averaged to fewer pixels.
+
+        Args:
+            cells: left, top, right and bottom of the part.
+            shape: requested rows and columns, at most as many as cells.
 
         Raises:
             InputError: the file cannot be read.
         """
-        rows, columns = self.frame.shape
-        for first in range(0, rows, n_rows):
-            end = min(rows, first + n_rows)
-            yield self._read(slice(first, end), (end - first, columns))
-
-    def _read(
-        self, rows: slice, shape: tuple[int, int]
-    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        part = (0.0, float(rows.start), float(self.frame.width), float(rows.stop))
+        left, top, right, bottom = map(float, cells)
         with RasterParts(self.path) as raster:
             if raster.bands < _COLOURS or raster.dtype not in ("uint8", "uint16"):
                 raise InputError(
                     f"{self.path} has {raster.bands} bands of {raster.dtype}, expected "
                     f"{_COLOURS} of 8 or 16 bits"
                 )
-            bands, shown = raster.read(part, shape)
+            bands, shown = raster.read((left, top, right, bottom), shape)
         return eight_bits(np.ascontiguousarray(bands[:, :, :_COLOURS])), shown
 
 

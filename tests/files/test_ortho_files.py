@@ -75,15 +75,10 @@ def test_pictures_are_averaged_to_their_longest_side(
             np.testing.assert_allclose(rgb[0, 0], mean, atol=1.0)
 
 
-@pytest.mark.parametrize(("n_rows", "heights"), [(4, [4, 2]), (3, [3, 3]), (7, [6])])
-def test_bands_are_the_picture_from_the_top(
-    tmp_path: Path, n_rows: int, heights: list[int]
-) -> None:
-    bands = list(ortho(tmp_path).bands(n_rows))
-    assert [len(rgb) for rgb, _ in bands] == heights
-    shown = np.concatenate([shown for _, shown in bands])
-    np.testing.assert_array_equal(shown, SHOWN)
-    np.testing.assert_array_equal(np.concatenate([rgb for rgb, _ in bands])[shown], RGB[shown])
+def test_a_part_is_that_of_the_picture(tmp_path: Path) -> None:
+    rgb, shown = ortho(tmp_path).part((1, 2, COLUMNS, 5), (3, COLUMNS - 1))
+    np.testing.assert_array_equal(shown, SHOWN[2:5, 1:])
+    np.testing.assert_array_equal(rgb[shown], RGB[2:5, 1:][shown])
 
 
 def test_depths_are_no_colours(tmp_path: Path) -> None:

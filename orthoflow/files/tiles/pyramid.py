@@ -1,4 +1,4 @@
-"""A pyramid of tiles of one orthoimage, as Deep Zoom images have it, made band by band.
+"""A pyramid of tiles of one orthoimage, as Deep Zoom images have it.
 
 `NAME.dzi` states the size, `NAME_files/LEVEL/COLUMN_ROW.webp` are the tiles: the last level has the
 cells as they are, each before it half as many a side, level 0 is one pixel. Tiles are transparent
@@ -9,14 +9,12 @@ nothing from elsewhere.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoflow.files.geotiff import local_crs_name
 from orthoflow.files.images import encode_webp
@@ -30,9 +28,9 @@ _PLACE: Final = "/*IMAGES*/[]"
 
 
 def write_tiles(folder: Path, name: str, ortho: OrthoFile) -> int:
-    """Write the tiles of an orthoimage; gives their number.
+    """Write the tiles of an orthoimage, and return their number.
 
-    Memory holds two bands of 512 rows, however large the orthoimage is.
+    Memory holds one tile, however large the orthoimage is.
 
     Args:
         folder: existing folder.
@@ -44,10 +42,22 @@ def write_tiles(folder: Path, name: str, ortho: OrthoFile) -> int:
         InputError: the orthoimage cannot be read.
     """
     rows, columns = ortho.frame.shape
-    levels = _Levels(folder=folder / f"{name}_files", width=columns, height=rows)
-    levels.write(ortho.bands(TILE_PX))
+    last, count = last_level(columns, rows), 0
+    for level in range(last + 1):
+        target = folder / f"{name}_files" / str(level)
+        target.mkdir(parents=True)
+        factor = 2 ** (last - level)
+        step = TILE_PX * factor
+        for row, top in enumerate(range(0, rows, step)):
+            for column, left in enumerate(range(0, columns, step)):
+                right, bottom = min(left + step, columns), min(top + step, rows)
+                shape = (-(-(bottom - top) // factor), -(-(right - left) // factor))
+                rgb, shown = ortho.part((left, top, right, bottom), shape)
+                tile = np.dstack([rgb, np.where(shown, np.uint8(255), np.uint8(0))])
+                write_bytes(target / f"{column}_{row}.{SUFFIX}", encode_webp(tile))
+                count += 1
     write_text(folder / f"{name}.dzi", _descriptor(columns, rows))
-    return levels.counts[0]
+    return count
 
 
 def last_level(width: int, height: int) -> int:
@@ -57,88 +67,6 @@ def last_level(width: int, height: int) -> int:
     (0, 10, 11)
     """
     return (max(width, height) - 1).bit_length()
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Levels:
-    """The levels of a pyramid while rows come in from the top.
-
-    Attributes:
-        folder: of all tiles.
-        width: columns of the last level.
-        height: rows of it.
-        waiting: rows of each level that are no whole row of tiles yet, (r, c, 4) uint8.
-        done: rows of tiles that are written, by level.
-        counts: how many tiles are.
-    """
-
-    folder: Path
-    width: int
-    height: int
-    waiting: dict[int, NDArray[np.uint8]] = field(default_factory=dict)
-    done: dict[int, int] = field(default_factory=dict)
-    counts: list[int] = field(default_factory=lambda: [0])
-
-    def write(self, bands: Iterable[tuple[NDArray[np.uint8], NDArray[np.bool_]]]) -> None:
-        """Take all bands of the orthoimage."""
-        level = last_level(self.width, self.height)
-        for number in range(level + 1):
-            (self.folder / str(number)).mkdir(parents=True)
-        for rgb, shown in bands:
-            alpha = np.where(shown, np.uint8(255), np.uint8(0))
-            self._take(level, np.dstack([rgb, alpha]))
-        for number in range(level, -1, -1):
-            self._flush(number)
-
-    def _take(self, level: int, rows: NDArray[np.uint8]) -> None:
-        waiting = self.waiting.pop(level, None)
-        rows = rows if waiting is None else np.concatenate([waiting, rows])
-        while len(rows) >= TILE_PX:
-            self._row_of_tiles(level, rows[:TILE_PX])
-            rows = rows[TILE_PX:]
-        if len(rows):
-            self.waiting[level] = rows.copy()
-
-    def _flush(self, level: int) -> None:
-        rows = self.waiting.pop(level, None)
-        if rows is not None:
-            self._row_of_tiles(level, rows)
-
-    def _row_of_tiles(self, level: int, rows: NDArray[np.uint8]) -> None:
-        """Write rows of a level as tiles, and hand them on at half the size."""
-        place = self.done.get(level, 0)
-        self.done[level] = place + 1
-        for column in range(-(-rows.shape[1] // TILE_PX)):
-            tile = np.ascontiguousarray(rows[:, column * TILE_PX : (column + 1) * TILE_PX])
-            path = self.folder / str(level) / f"{column}_{place}.{SUFFIX}"
-            write_bytes(path, encode_webp(tile))
-            self.counts[0] += 1
-        if level > 0:
-            self._take(level - 1, halved(rows))
-
-
-def halved(cells: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Average 2 x 2 cells (r, c, 4), colours by those that are not transparent.
-
-    At an odd border the last row or column stands alone.
-    """
-    rows, columns = cells.shape[:2]
-    padded = np.zeros((rows + rows % 2, columns + columns % 2, 4), dtype=np.uint16)
-    padded[:rows, :columns] = cells
-    alpha = padded[:, :, 3:] // 255
-    padded[:, :, :3] *= alpha
-    quarters = [padded[a::2, b::2] for a in (0, 1) for b in (0, 1)]
-    # 16 bits hold four times 255.
-    sums = quarters[0] + quarters[1] + quarters[2] + quarters[3]
-    weights = sums[:, :, 3:] // 255
-    half = np.zeros((*sums.shape[:2], 4), dtype=np.uint8)
-    half[:, :, :3] = (sums[:, :, :3] + weights // 2) // np.maximum(weights, 1)
-    # Shown where at least half of what there is of the four is; a border has fewer.
-    there = np.full(weights.shape, 4, dtype=np.uint16)
-    there[-1:] //= 1 + rows % 2
-    there[:, -1:] //= 1 + columns % 2
-    half[:, :, 3] = np.where(2 * weights >= there, 255, 0)[:, :, 0]
-    return half
 
 
 def _descriptor(width: int, height: int) -> str:

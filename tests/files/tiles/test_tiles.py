@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from orthoflow.files.sidecars import OrthoFile
 from orthoflow.files.tiles import pyramid
-from orthoflow.files.tiles.pyramid import halved, write_tiles, write_viewer
+from orthoflow.files.tiles.pyramid import write_tiles, write_viewer
 from tests.browser import Page
 from tests.ortho_file_scenes import CORNER, GSD_M, UP, WALL_SHAPE, colours, room
 
@@ -66,19 +65,6 @@ def test_every_level_shows_the_whole_orthoimage(
         assert np.abs(part - whole).mean() < 4.0
 
 
-def test_halving_averages_what_is_shown() -> None:
-    cells = np.zeros((3, 5, 4), np.uint8)
-    cells[:2, :2] = [[[10, 0, 0, 255], [20, 0, 0, 255]], [[30, 0, 0, 255], [99, 99, 99, 0]]]
-    cells[0, 2] = (50, 60, 70, 255)
-    cells[2, 4] = (7, 8, 9, 255)
-    half = halved(cells)
-    assert half.shape == (2, 3, 4)
-    assert half[0, 0].tolist() == [20, 0, 0, 255]
-    # One of four is too few, the corner alone is all that there is.
-    assert half[0, 1, 3] == 0
-    assert half[1, 2].tolist() == [7, 8, 9, 255]
-
-
 def test_the_page_shows_and_measures_without_a_server(
     new_page: Callable[[], Page], tiled: Path, tmp_path: Path
 ) -> None:
@@ -127,15 +113,3 @@ def test_names_do_not_end_the_script(tiled: Path) -> None:
     text = (tiled / "index.html").read_text()
     assert text.count("</script>") == 1
     assert "wall \\u003c/script\\u003e 0" in text
-
-
-def test_an_orthoimage_is_read_in_bands(tmp_path: Path) -> None:
-    wall, floor = room(tmp_path / "files")
-    assert isinstance(wall, OrthoFile)
-    assert (wall.wall, floor.wall) == (0, 1)
-    bands = list(wall.bands(256))
-    assert [len(rgb) for rgb, _ in bands] == [256, 256, 189]
-    whole = np.concatenate([rgb for rgb, _ in bands])
-    shown = np.concatenate([mask for _, mask in bands])
-    np.testing.assert_array_equal(whole[shown], colours(WALL_SHAPE)[shown])
-    assert np.count_nonzero(~shown) == 200 * 300
