@@ -14,8 +14,8 @@ from orthoflow.geometry.threads import in_order
 from orthoflow.records import RecordedFigure
 from orthoflow.records.runs import FIGURES_FOLDER, GRAPH_FILE, Run, figure_files, write_files
 from orthoflow.report.combinations import baseline_addresses
+from orthoflow.report.diagrams import graph_file
 from orthoflow.report.pictures import Picture, data_uri
-from orthoflow.report.rendering import graph_file
 from orthoflow.untrusted_text import is_plain_svg
 
 _BYTES_MOST: Final = 3_900_000  # of all figures on a page; a third more in base64

@@ -1,62 +1,45 @@
-"""Ties with their residuals, and displacements, as vectors drawn over the walls."""
+"""Ties with their residuals, and displacements, as vectors drawn on pictures of the walls."""
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.files.drawing import COLUMN_INCHES, encode_chart, picture_figure, styled
 from orthoflow.files.drawings.papers import round_below
+from orthoflow.files.images import decode_image
 from orthoflow.geometry import WallFrame
 from orthoflow.products import Camera, Cameras, Inspection, TieRole
 from orthoflow.records.runs import Run
-from orthoflow.report.pictures import Picture, embedded_products, frame_of
+from orthoflow.report.pictures import Picture, data_uri, embedded_products, frame_of, side_px
 
-_MARKS_MOST: Final = 600  # in one drawing
-_MARKS_FEW: Final = 50
-_MARKS_IN_ALL: Final = 12_000  # on a page, about 130 bytes each
+_MAX_MARKS: Final = 600  # in one drawing
 # Drawn length of a vector of RMS length, and of the reference, as shares of the longer side.
 _RMS_SHARE: Final = 0.025
 _REFERENCE_SHARE: Final = 0.08
 _STEP_M: Final = 1e-3  # for derivatives; photos change by about a pixel over it
+# Kind -> marker and colour, visible on light and dark pictures.
+_MARKERS: Final = {
+    "control": ("o", "#3ee066"),
+    "check": ("s", "#ffe11f"),
+    "rejected": ("x", "#ff3b30"),
+}
+_OTHERS: Final = ("o", "#4db8ff")
+# World points (n, 3), lengths (n, 2) in metres along u and v, and kinds (n,).
+_Vectors: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.str_]]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Overlay:
-    """A drawing over the picture of a wall, in its cells.
-
-    Attributes:
-        title: what it shows.
-        caption: magnification and counts, in words.
-        cell: address of the cell that gave the vectors.
-        ground: the picture that it lies over.
-        marks: kind, and (column, row) of foot and end, of each vector.
-        reference: words and length of a reference arrow.
-    """
-
-    title: str
-    caption: str
-    cell: str
-    ground: Picture
-    marks: Sequence[tuple[str, tuple[float, float, float, float]]]
-    reference: tuple[str, float]
-
-    @property
-    def frame(self) -> WallFrame:
-        """Frame of the wall's raster."""
-        return frame_of(self.ground)
-
-
-def overlays(run: Run, walls: Sequence[Picture], *, share: float = 1.0) -> Iterator[Overlay]:
+def overlays(run: Run, walls: Sequence[Picture], *, share: float = 1.0) -> Iterator[Picture]:
     """Draw the ties of every orientation and the displacements of every inspection of a run.
 
     Args:
         run: the run.
-        walls: pictures of its walls, which the drawings lie over.
-        share: which part of a page's bytes they may take.
+        walls: pictures of its walls, on which vectors are drawn.
+        share: which part of a page's bytes the drawings may take.
     """
     cameras, inspections = (embedded_products(run, name) for name in ("cameras", "inspection"))
     # Digest of a walls product -> the first picture of each of its walls.
@@ -66,30 +49,32 @@ def overlays(run: Run, walls: Sequence[Picture], *, share: float = 1.0) -> Itera
             if product.type_name == "walls" and picture.frame is not None:
                 known.setdefault(product.digest, {}).setdefault(picture.wall, picture)
     n_drawings = (len(cameras) + len(inspections)) * max(map(len, known.values()), default=1)
-    most = min(_MARKS_MOST, max(_MARKS_FEW, round(share * _MARKS_IN_ALL / max(1, n_drawings))))
+    side = side_px(n_drawings / share)
     for (address, _), payload in zip(cameras, run.payloads(cameras), strict=True):
         yield from _of_ties(
-            address, Cameras.from_payload(payload), _behind(run, address, known), most
+            address, Cameras.from_payload(payload), _walls_before(run, address, known), side
         )
     for (address, _), payload in zip(inspections, run.payloads(inspections), strict=True):
         found = Inspection.from_payload(payload)
-        for wall, ground in _behind(run, address, known).items():
+        for wall, ground in _walls_before(run, address, known).items():
             here = (found.wall == wall) & np.isfinite(found.displacement_m).all(axis=1)
             if here.any():
-                lengths_m = found.displacement_m[here]
-                names = np.array(found.kinds)[found.kind[here]]
                 yield _overlay(
                     address,
                     ground,
-                    (found.points_world[here], lengths_m, np.full(len(names), "shown")),
+                    (
+                        found.points_world[here],
+                        found.displacement_m[here],
+                        np.array(found.kinds)[found.kind[here]],
+                    ),
                     f"Displacements in the orthoimage of {ground.name}, {address}",
-                    # The numbers of a method leave out what lies beside depth steps.
-                    f"{_counts(names, lengths_m)}, beside depth steps, too",
-                    most,
+                    side,
+                    # The numbers of a method leave these out.
+                    remark="points beside depth steps included; ",
                 )
 
 
-def _behind(
+def _walls_before(
     run: Run, address: str, known: Mapping[str, Mapping[int, Picture]]
 ) -> Mapping[int, Picture]:
     """Pictures of the nearest walls that went into a cell."""
@@ -101,8 +86,8 @@ def _behind(
 
 
 def _of_ties(
-    address: str, cameras: Cameras, grounds: Mapping[int, Picture], most: int
-) -> Iterator[Overlay]:
+    address: str, cameras: Cameras, grounds: Mapping[int, Picture], side: int
+) -> Iterator[Picture]:
     ties = cameras.ties
     if ties is None:
         return
@@ -123,8 +108,7 @@ def _of_ties(
                 ground,
                 (ties.points_world[here], lengths_m[here], kinds[here]),
                 f"Ties of {ground.name}, {address}",
-                _counts(kinds[here], lengths_m[here]),
-                most,
+                side,
             )
 
 
@@ -172,34 +156,80 @@ def magnification_for(frame: WallFrame, lengths_m: NDArray[np.float64]) -> float
 def _overlay(
     address: str,
     ground: Picture,
-    vectors: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.str_]],
+    vectors: _Vectors,
     title: str,
-    counted: str,
-    most: int,
-) -> Overlay:
-    """Draw vectors: world points (n, 3), lengths (n, 2) in metres along u and v, and kinds (n,)."""
+    side: int,
+    *,
+    remark: str = "",
+) -> Picture:
     points_world, lengths_m, kinds = vectors
     frame = frame_of(ground)
     magnification = magnification_for(frame, lengths_m[kinds != "rejected"])
-    # Left out evenly. Rejected ties may be metres off: a mark shows them.
-    chosen = np.unique(np.linspace(0, len(kinds) - 1, min(most, len(kinds))).astype(np.int64))
-    drawn_m = np.where((kinds == "rejected")[:, None], 0.0, lengths_m)[chosen]
-    feet = frame.wall_from_world(points_world[chosen])[:, :2]
-    ends = np.hstack([feet, feet + magnification * drawn_m / frame.gsd_m])
-    reference_px = _REFERENCE_SHARE * max(frame.width, frame.height)
-    reference_mm = round_below(1e3 * reference_px * frame.gsd_m / magnification)
+    feet = frame.wall_from_world(points_world)[:, :2]
+    # Left out evenly.
+    chosen = np.unique(np.linspace(0, len(kinds) - 1, min(_MAX_MARKS, len(kinds))).astype(np.int64))
+    longest = max(frame.width, frame.height)
+    reference_mm = round_below(1e3 * _REFERENCE_SHARE * longest * frame.gsd_m / magnification)
     some = "" if len(chosen) == len(kinds) else f", {len(chosen)} of them shown"
-    return Overlay(
+    return Picture(
+        uri=data_uri(
+            _drawn(
+                ground,
+                {kind: chosen[kinds[chosen] == kind] for kind in dict.fromkeys(kinds.tolist())},
+                feet,
+                magnification * lengths_m / frame.gsd_m,
+                (f"{reference_mm:g} mm", 1e-3 * reference_mm * magnification / frame.gsd_m),
+                side,
+            ),
+            "image/webp",
+        ),
         title=title,
-        caption=f"{counted}; vectors drawn {magnification:g} times as long{some}",
+        caption=f"{_counts(kinds, lengths_m)}; {remark}vectors drawn {magnification:g} times as "
+        f"long{some}",
         cell=address,
-        ground=ground,
-        marks=[
-            (kind, (row[0], row[1], row[2], row[3]))
-            for kind, row in zip(kinds[chosen].tolist(), ends.tolist(), strict=True)
-        ],
-        reference=(f"{reference_mm:g} mm", 1e-3 * reference_mm * magnification / frame.gsd_m),
     )
+
+
+def _drawn(
+    ground: Picture,
+    groups: Mapping[str, NDArray[np.int64]],
+    feet: NDArray[np.float64],
+    vectors: NDArray[np.float64],
+    reference: tuple[str, float],
+    side: int,
+) -> bytes:
+    """Draw marks and vectors on the picture of a wall, as WebP.
+
+    Args:
+        ground: the picture.
+        groups: kind -> which of the places have it.
+        feet: (n, 2) places in cells.
+        vectors: (n, 2) likewise.
+        reference: text and length in cells of the reference vector.
+        side: the drawing's longer side, pixels.
+    """
+    frame = frame_of(ground)
+    content = base64.b64decode(ground.uri.partition(",")[2])
+    columns_px = side * min(1.0, frame.width / frame.height)
+    with styled({"font.size": 7.0, "savefig.dpi": columns_px / COLUMN_INCHES}):
+        figure, axes = picture_figure(
+            decode_image(content, ground.title), size=(frame.height, frame.width), extra_inches=0.3
+        )
+        axes.autoscale(enable=False)
+        for kind, members in groups.items():
+            marker, colour = _MARKERS.get(kind, _OTHERS)
+            u, v = feet[members].T
+            axes.scatter(u, v, s=3, marker=marker, color=colour, linewidths=0.6, label=kind)
+            # Rejected ties may be metres off: a mark shows them.
+            if kind != "rejected":
+                ends = np.stack([feet[members], feet[members] + vectors[members]])
+                axes.plot(*ends.T.swapaxes(1, 2), color=colour, linewidth=0.8)
+        text, length = reference
+        low = 1.03 * frame.height
+        axes.plot([0.0, length], [low, low], color="black", clip_on=False)
+        axes.annotate(text, (length, low), (3, 0), textcoords="offset points", va="center")
+        figure.legend(loc="outside lower right", ncols=3)
+        return encode_chart(figure)
 
 
 def _counts(kinds: NDArray[np.str_], lengths_m: NDArray[np.float64]) -> str:

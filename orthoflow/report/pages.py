@@ -37,10 +37,10 @@ from orthoflow.report.combinations import (
 from orthoflow.report.comparisons import comparison_table
 from orthoflow.report.curves import curves, curves_over
 from orthoflow.report.dataset_tables import dataset_table
-from orthoflow.report.diagrams import run_diagram
+from orthoflow.report.diagrams import graph_picture
 from orthoflow.report.differences import differences
 from orthoflow.report.figures import FigureGroup, figure_groups, write_figures
-from orthoflow.report.overlays import Overlay, overlays
+from orthoflow.report.overlays import overlays
 from orthoflow.report.paired import over_datasets, who_leads
 from orthoflow.report.photo_plans import photo_plan
 from orthoflow.report.pictures import (
@@ -73,7 +73,7 @@ class _Part:
     cells: tuple[RecordedCell, ...] = ()
     orthoimages: tuple[Picture, ...] = ()
     walls: tuple[Picture, ...] = ()
-    overlays: tuple[Overlay, ...] = ()
+    overlays: tuple[Picture, ...] = ()
     planes: tuple[PlaneTables, ...] = ()
     figures: tuple[FigureGroup, ...] = ()
 
@@ -208,7 +208,7 @@ def _overview(run: Run, prefix: str, folder: Path, pages: Mapping[str, str]) -> 
         run=run,
         limits=limits(run),
         results=results(run),
-        diagram=run_diagram(next(iter(parts.values()))),
+        diagram=graph_picture(next(iter(parts.values()))),
         citations=citations(run),
         datasets=dataset_table(parts, pages),
         curves=curves_over(parts),
@@ -290,7 +290,7 @@ def _section(
         places=cursor_places(orthoimages, walls),
         photos=sorted({camera.photo for one in photographed for camera in one.cameras}),
         plan=photo_plan(run, walls),
-        diagram=run_diagram(run),
+        diagram=graph_picture(run),
         record_file=(from_page / run.file_name).as_posix(),
         citations=citations(run),
         viewers={

@@ -15,8 +15,6 @@ import jinja2
 from markupsafe import Markup, escape
 
 from orthoflow.records import COSTS
-from orthoflow.records.runs import Run
-from orthoflow.report.diagrams import BOX, run_diagram
 from orthoflow.report.environments import distinct_words
 from orthoflow.report.numbers import number, number_with_unit
 from orthoflow.report.pictures import DIVERGING
@@ -60,7 +58,6 @@ def environment() -> jinja2.Environment:
         "costs": COSTS,
         "version": __version__,
         "depth_colours": DIVERGING.tolist(),
-        "box": BOX,
         "css": Markup(css),
         "early_script": Markup(early),
         "script": Markup(script),
@@ -93,9 +90,3 @@ def cited(citation: str) -> Markup:
             str(escape(shown(citation))),
         )
     )
-
-
-def graph_file(run: Run) -> bytes:
-    """Return the graph of a run as an SVG file."""
-    template = environment().get_template("graph.svg.j2")
-    return template.render(diagram=run_diagram(run)).encode("utf-8")

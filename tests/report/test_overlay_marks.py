@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import base64
 import re
-from collections import Counter
 from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
+from orthoflow.files.images import decode_image
 from orthoflow.report.combinations import combinations_of
 from orthoflow.report.comparisons import Origins, comparison_table
 from orthoflow.report.environments import environment_words
 from orthoflow.report.overlays import magnification_for, overlays, residuals_on_wall
-from orthoflow.report.pictures import Picture, sliders
+from orthoflow.report.pictures import Picture, sliders, wall_pictures
 from orthoflow.report.rankings import Mark
 from tests.long_loops import seeds
 from tests.report_runs import (
@@ -41,74 +44,57 @@ def test_magnifications_are_one_two_or_five(rms_m: float, found: float) -> None:
     assert magnification_for(FRAME, lengths_m) == pytest.approx(found)
 
 
-def wall_pictures(*marks: str, walls: int = 1) -> list[Picture]:
-    return [
-        Picture(
-            uri="",
-            title="",
-            caption="",
-            cell=f"wall@plane={mark}",
-            wall=wall,
-            number=8,
-            name="wall 8",
-            frame=FRAME,
-            id=f"{mark}-{wall}",
-        )
-        for mark in marks
-        for wall in range(walls)
-    ]
+def drawn(picture: Picture) -> NDArray[np.uint8]:
+    return decode_image(base64.b64decode(picture.uri.partition(",")[2]), picture.title)
 
 
-def test_ties_and_displacements_lie_over_the_wall_of_their_cell(tmp_path: Path) -> None:
+def test_ties_and_displacements_are_drawn_on_the_wall_of_their_cell(tmp_path: Path) -> None:
     run = compared_run(tmp_path)
-    found = list(overlays(run, wall_pictures("fine", "coarse")))
-    assert [(one.cell, one.ground.id) for one in found] == [
-        (f"{step}@plane={mark}", f"{mark}-0")
-        for step in ("orient", "check")
+    walls = list(wall_pictures(run))
+    found = list(overlays(run, walls))
+    assert [(one.cell, one.title) for one in found] == [
+        (f"{step}@plane={mark}", f"{what} of wall 0, {step}@plane={mark}")
+        for step, what in (("orient", "Ties"), ("check", "Displacements in the orthoimage"))
         for mark in ("fine", "coarse")
     ]
     ties, _, displacements, _ = found
-    assert ties.title == "Ties of wall 8, orient@plane=fine"
-    assert displacements.title == "Displacements in the orthoimage of wall 8, check@plane=fine"
-    assert displacements.caption == (
-        "2 patch (RMS 0.71 mm along u, 0.71 mm along v), beside depth steps, too; "
-        "vectors drawn 20 times as long"
-    )
     assert re.fullmatch(
         r"10 control \(RMS [\d.]+ mm along u, [\d.]+ mm along v\), 10 check \(RMS .*\), "
         r"10 rejected; vectors drawn \d+ times as long",
         ties.caption,
     )
-    assert Counter(kind for kind, _ in ties.marks) == {"control": 10, "check": 10, "rejected": 10}
-    # Rejected ones have no vector; others one that is magnified, as is the reference.
-    for kind, (u, v, x, y) in ties.marks:
-        assert ((u, v) == (x, y)) is (kind == "rejected")
-    lengths = [np.hypot(x - u, y - v) for _, (u, v, x, y) in displacements.marks]
-    np.testing.assert_allclose(lengths, 20 * 1e-3 / FRAME.gsd_m, rtol=1e-6)
-    words, long = displacements.reference
-    assert long == pytest.approx(20 * 1e-3 * float(words.removesuffix(" mm")) / FRAME.gsd_m)
-    assert 0.03 * FRAME.width <= long <= 0.08 * FRAME.width
     # Of walls that no picture shows there is no drawing.
-    assert list(overlays(run, wall_pictures("fine")[:0])) == []
+    assert list(overlays(run, [])) == []
+    # One vector to the right and one down, of 1 mm and 20 times as long: 2 cells of 1.2 m / 120.
+    assert "drawn 20 times" in displacements.caption
+    rgb = drawn(displacements).astype(int)
+    blue = (rgb[..., 2] - rgb[..., 0] > 80) & (np.arange(len(rgb)) < 0.85 * len(rgb))[:, None]
+    spots, n_spots = ndimage.label(blue)
+    assert n_spots == 2
+    sizes = [[part.stop - part.start for part in slices] for slices in ndimage.find_objects(spots)]
+    long_px = 2.0 / FRAME.width * 0.92 * rgb.shape[1]
+    tall, wide = sorted(sizes, reverse=True)
+    mark_px = min(*tall, *wide)
+    assert max(tall) - 0.5 * mark_px == pytest.approx(long_px, abs=4.0)
+    assert max(wide) - 0.5 * mark_px == pytest.approx(long_px, abs=4.0)
 
 
-def test_marks_are_left_out_evenly_where_a_page_has_many(tmp_path: Path) -> None:
+def test_marks_are_left_out_evenly_where_there_are_many(tmp_path: Path) -> None:
     run = compared_run(tmp_path)
     (cameras,) = (run.products[place] for place in run.products if place[0] == "orient@plane=fine")
     ties = cameras.ties
     many = replace(
         ties,
         **{
-            field.name: np.concatenate([getattr(ties, field.name)] * 10)
+            field.name: np.concatenate([getattr(ties, field.name)] * 30)
             for field in fields(ties)
             if isinstance(getattr(ties, field.name), np.ndarray)
             and len(getattr(ties, field.name)) == len(ties.photo)
         },
     )
     products = {**run.products, ("orient@plane=fine", "cameras"): replace(cameras, ties=many)}
-    found = next(overlays(replace(run, products=products), wall_pictures("fine"), share=1e-6))
-    assert len(found.marks) == 50
-    assert found.caption.endswith(", 50 of them shown")
+    found = next(overlays(replace(run, products=products), list(wall_pictures(run))))
+    assert found.caption.endswith(", 600 of them shown")
 
 
 @pytest.mark.parametrize("seed", seeds(4))

@@ -260,14 +260,6 @@ def test_a_click_is_where_the_pointer_was_told_to_be(page: Page) -> None:
     assert float(u[0]) == pytest.approx(30.0, abs=0.6)
 
 
-def test_vectors_lie_over_the_intensity_of_their_wall(page: Page) -> None:
-    grounds = page.evaluate(
-        "[...document.querySelectorAll('.stack')]"
-        ".map(stack => stack.querySelectorAll('img').length)"
-    )
-    assert grounds == [1, 1, 1, 1]
-
-
 def test_the_theme_follows_the_system_until_it_is_chosen(page: Page) -> None:
     colour = "getComputedStyle(document.body).backgroundColor"
     button = "document.getElementById('theme')"

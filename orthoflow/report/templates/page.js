@@ -195,9 +195,6 @@
     copy.alt = "";
     return copy;
   };
-  for (const stack of document.querySelectorAll("[data-ground]")) {
-    if (stack.dataset.ground) stack.prepend(pictureOf(stack.dataset.ground));
-  }
 
   // Two pictures of a wall, the left one cut off at the dividing line.
   for (const slider of document.querySelectorAll("[data-slider]")) {
@@ -428,7 +425,7 @@
     const perCell = (place.scale * size.width) / size.cells;
     shown.classList.toggle("cells", perCell > 2);
     const whole = size.metres ? `, 10 cm are ${Math.round((0.1 * place.scale * size.width) / size.metres)} px` : "";
-    view.scale.textContent = size.cells ? `${Math.round(100 * perCell)} %${whole}` : "";
+    view.scale.textContent = `${Math.round(100 * perCell)} %${whole}`;
   };
   const fit = () => {
     const { clientWidth, clientHeight } = view.stage;
@@ -445,14 +442,12 @@
   const open = (figure) => {
     now = figure;
     const picture = figure.querySelector(".picture");
-    const image = picture.querySelector("img"), drawn = picture.querySelector("svg:not(.legend)");
-    const box = (drawn ?? image).getBoundingClientRect();
-    const natural = drawn ? { width: drawn.viewBox.baseVal.width, height: drawn.viewBox.baseVal.height }
-      : { width: image.naturalWidth || box.width, height: image.naturalHeight || box.height };
-    size = { ...natural, cells: image && !drawn ? natural.width : 0, metres: Number(figure.dataset.widthM ?? 0) };
+    const image = picture.querySelector("img"), box = image.getBoundingClientRect();
+    const natural = { width: image.naturalWidth || box.width, height: image.naturalHeight || box.height };
+    size = { ...natural, cells: natural.width, metres: Number(figure.dataset.widthM ?? 0) };
     const shown = document.createElement("div");
-    shown.className = `shown ${figure.className} ${picture.className.replace("picture", "")}`;
-    for (const part of picture.querySelectorAll(":scope > img, :scope > svg:not(.legend)")) shown.append(part.cloneNode(true));
+    shown.className = `shown ${figure.className}`;
+    shown.append(image.cloneNode(true));
     shown.querySelector("img.few")?.removeAttribute("style");
     const marks = picture.querySelector(":scope > .marks")?.cloneNode(true);
     if (marks) { marks.removeAttribute("style"); shown.append(marks); }
@@ -485,7 +480,7 @@
     picture.append(button);
     // On orthoimages and walls a click collects a point.
     if (!figure.classList.contains("raster")) {
-      picture.querySelector("img, svg").addEventListener("click", () => open(figure));
+      picture.querySelector("img").addEventListener("click", () => open(figure));
     }
   });
   view.previous.addEventListener("click", () => go(-1));
