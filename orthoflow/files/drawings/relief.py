@@ -129,7 +129,7 @@ def write_depth_figure(depth: Path, frame: WallFrame, path: Path, light: Light) 
     """Write a PNG: coloured depths with shading, contours, and a legend in millimetres."""
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import TwoSlopeNorm
+    from matplotlib.colors import CenteredNorm
     from matplotlib.figure import Figure
 
     with RasterParts(depth) as source:
@@ -140,10 +140,10 @@ def write_depth_figure(depth: Path, frame: WallFrame, path: Path, light: Light) 
         gsd_m = source.gsd_m * factor
     values = np.where(shown, np.asarray(depths, np.float32), np.nan)
     stretch = stretch_of(depth)
-    # The plane is white; parts in front of it red, parts behind it blue, each with its own range.
-    norm = TwoSlopeNorm(0.0, min(1e3 * stretch.low, -1.0), max(1e3 * stretch.high, 1.0))
+    # The plane is white; equal depths in front of it (red) and behind it (blue) are equally dark.
+    norm = CenteredNorm(0.0, halfrange=max(1.0, 1e3 * max(-stretch.low, stretch.high)))
     grey = shaded(values, gsd_m, light)
-    colours = colormaps["RdBu_r"](norm(1e3 * np.nan_to_num(values)).filled())[..., :3]
+    colours = colormaps["RdBu_r"](norm(1e3 * np.nan_to_num(values)))[..., :3]
     mixed = np.clip(colours * (0.35 + 0.65 * grey[..., None] / grey.max(initial=1)), 0.0, 1.0)
     mixed[grey == NOTHING] = 1.0
     corners = frame.raster_from_wall(np.array([[0.0, frame.height], [frame.width, 0.0]]))
@@ -165,7 +165,7 @@ def write_depth_figure(depth: Path, frame: WallFrame, path: Path, light: Light) 
         ax=axes,
         label="depth towards the viewer, mm",
         shrink=0.9,
-        spacing="proportional",
+        extend="both",
     )
     scale.outline.set_linewidth(0.5)
     figure.savefig(path, dpi=150, metadata={"Software": None})

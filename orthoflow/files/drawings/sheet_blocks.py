@@ -293,27 +293,29 @@ def _legend(drawing: Drawing, sheet: Sheet) -> Iterator[Any]:
                 label("legend_match", language),
             )
         )
-    if rows:
-        yield paragraph(label("legend", language), is_bold=True)
-    for draw, text in rows:
-        yield _Row(draw, text)
+    for place, (draw, text) in enumerate(rows):
+        # The heading is never separated from the first row.
+        yield _Row(draw, text, label("legend", language) if place == 0 else "")
 
 
 class _Row(Flowable):  # type: ignore[misc] # reportlab has no types
-    """A symbol of the legend with its text."""
+    """A symbol of the legend with its text, below a heading if there is one."""
 
-    def __init__(self, symbol: Callable[[Canvas], None], text: str) -> None:
+    def __init__(self, symbol: Callable[[Canvas], None], text: str, heading: str) -> None:
         super().__init__()
         self.symbol, self.text = symbol, paragraph(text)
+        self.heading = paragraph(heading, is_bold=True)
 
     def wrap(self, wide: float, high: float) -> tuple[float, float]:
         """Return its size in points."""
         _, text_high = self.text.wrap(wide - _SYMBOL_MM * POINTS_PER_MM, high)
         self.height = max(text_high, 5.0 * POINTS_PER_MM)
-        return wide, self.height
+        _, heading_high = self.heading.wrap(wide, high)
+        return wide, self.height + heading_high
 
     def draw(self) -> None:
         """Draw it, the symbol beside the first row of the text."""
+        self.heading.drawOn(self.canv, 0.0, self.height)
         self.text.drawOn(self.canv, _SYMBOL_MM * POINTS_PER_MM, self.height - self.text.height)
         self.canv.saveState()
         self.canv.translate(0.0, self.height - 4.3 * POINTS_PER_MM)

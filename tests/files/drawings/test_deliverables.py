@@ -16,9 +16,10 @@ from PIL import Image
 
 from orthoflow.cli.program import program
 from orthoflow.files.drawings.elevations import ElevationWall, elevation, unfolded
-from orthoflow.files.drawings.relief import NOTHING, Light, shaded
+from orthoflow.files.drawings.relief import NOTHING, Light, shaded, write_depth_figure
 from orthoflow.files.drawings.sheet_contents import SheetText
 from orthoflow.files.drawings.title_blocks import TitleBlock
+from orthoflow.files.sidecars import placed_raster
 from orthoflow.geometry.frames import frame_over
 from orthoflow.records.open import open_run
 from orthoflow.records.walls import delivered_walls, room_results, write_walls_json
@@ -58,6 +59,32 @@ def test_light_from_above_meets_what_looks_up() -> None:
     assert below.min() > above.max()
     depths[5, 5] = np.nan
     assert shaded(depths, 0.01, Light())[5, 5] == NOTHING
+
+
+def test_equal_depths_before_and_behind_the_plane_have_equally_strong_colours(
+    run: Path, tmp_path: Path
+) -> None:
+    depth = next((run / "products").rglob(f"wall_{WALL}_depth.tif"))
+    with rasterio.open(depth) as given:
+        profile = given.profile
+    # Three bands: 40 mm behind the plane, on it, and 10 mm before it.
+    depths_m = np.repeat([-0.04, 0.0, 0.01], -(-profile["height"] // 3))[: profile["height"]]
+    shaped = tmp_path / "depth.tif"
+    with rasterio.open(shaped, "w", **profile) as target:
+        target.write(np.repeat(depths_m[:, None], profile["width"], axis=1).astype("f4"), 1)
+    write_depth_figure(shaped, placed_raster(depth)[0], tmp_path / "figure.png", Light())
+    with Image.open(tmp_path / "figure.png") as figure:
+        rgb = np.asarray(figure.convert("RGB")).astype(int)
+    colours, counts = np.unique(rgb.reshape(-1, 3), axis=0, return_counts=True)
+    paleness = colours.min(axis=1) / np.maximum(colours.max(axis=1), 1)
+    common = {
+        sign: paleness[of][np.argmax(counts[of])]
+        for sign in (-1, 1)
+        for of in [np.flatnonzero(sign * (colours[:, 0] - colours[:, 2]) > 8)]
+    }
+    # A quarter of the depth is a pale red beside a full blue.
+    assert common[-1] < 0.2
+    assert common[1] > 0.6
 
 
 def test_relief_lies_where_the_depths_do(run: Path, tmp_path: Path) -> None:
