@@ -132,6 +132,7 @@ def _print_comparison(run: Run) -> bool:
     if all(set(cell.assignment) <= {DATA} for cell in run.record.cells):
         return False
     from orthoflow.records.runs import parts_of
+    from orthoflow.report.combinations import combinations_of
     from orthoflow.report.comparisons import comparison_table
     from orthoflow.report.paired import over_datasets, who_leads
     from orthoflow.workflow.expand import variants_text
@@ -141,10 +142,17 @@ def _print_comparison(run: Run) -> bool:
     rows: list[tuple[str, ...]]
     if over := over_datasets(parts):
         names = [f"{one.column.step}.{one.column.metric}" for one in over]
-        rows = [
-            (methods[0].name, *(_median(one) for one in methods))
-            for methods in zip(*(one.methods for one in over), strict=True)
+        combinations = [
+            {step: variant for step, variant in one.assignment.items() if step != DATA}
+            for part in parts.values()
+            for one in combinations_of(part)
         ]
+        rows = list(
+            dict.fromkeys(
+                (variants_text(one), *(_median(metric.method_of(one)) for metric in over))
+                for one in combinations
+            )
+        )
         leaders = who_leads(over, len(parts))
         shown = dict(zip(names[:_COLUMNS_MOST], over, strict=False))
         counts = {name: [one.n for one in metric.methods] for name, metric in shown.items()}
@@ -153,12 +161,9 @@ def _print_comparison(run: Run) -> bool:
             f"{medians(counts, len(parts))}"
         )
     elif table := comparison_table([run]):
-        names = [f"{one.step}.{one.metric}" for one in table.columns]
+        names = [f"{one.step}.{one.metric}" for one in table.columns if one.step]
         rows = [
-            (
-                variants_text(dict(zip(table.steps, row.variants, strict=True))),
-                *(value.text or _NOTHING for value in row.values),
-            )
+            (row.name, *(value.text or _NOTHING for value in row.values[: len(names)]))
             for row in table.rows
         ]
         leaders, about = "", "means of the repeats ± their standard deviation, where there are some"
@@ -175,10 +180,10 @@ def _print_comparison(run: Run) -> bool:
     return True
 
 
-def _median(one: MethodOverDatasets) -> str:
+def _median(one: MethodOverDatasets | None) -> str:
     from orthoflow.report import numbers
 
-    if math.isnan(one.median):
+    if one is None or math.isnan(one.median):
         return _NOTHING
     if math.isnan(one.spread):
         return numbers.number(one.median)

@@ -214,18 +214,20 @@ def combinations_of(run: Run) -> tuple[Combination, ...]:
         if not any(part < other for other in parts)
     ]
     baseline = baseline_of(run)
-    return tuple(
-        Combination(
-            run=run,
-            assignment=dict(items),
-            cells=tuple(
-                cell
-                for cell in run.record.cells
-                if frozenset(cell.assignment.items()) <= frozenset(items)
-            ),
-            is_baseline=_is_baseline(dict(items), baseline),
-        )
-        for items in largest
+    return tuple(combination_of(run, dict(items), baseline) for items in largest)
+
+
+def combination_of(
+    run: Run, assignment: Mapping[str, str], baseline: Mapping[str, str]
+) -> Combination:
+    """Return all cells that lead to what has some variants, and to nothing that needs more."""
+    return Combination(
+        run=run,
+        assignment=assignment,
+        cells=tuple(
+            cell for cell in run.record.cells if cell.assignment.items() <= assignment.items()
+        ),
+        is_baseline=_is_baseline(assignment, baseline),
     )
 
 

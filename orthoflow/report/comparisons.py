@@ -1,38 +1,43 @@
-"""The comparison table: combinations as rows, metrics as columns, best and worst marked."""
+"""The comparison table: combinations as rows, metrics as columns, the best marked."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from string import ascii_uppercase
 from typing import Final, TypeAlias
 
-from orthoflow.records import COSTS
+from orthoflow.records import COSTS, RunRecord
 from orthoflow.records.runs import MetricRow, Run, cell_metrics, is_rounding
 from orthoflow.report.combinations import (
     Combination,
     Measured,
     combinations_of,
-    is_missing,
     wanted_metrics,
 )
-from orthoflow.report.environments import group_environments
+from orthoflow.report.environments import EnvironmentGroups, group_environments
 from orthoflow.report.numbers import number, number_with_spread
 from orthoflow.report.rankings import BETTER, Mark, Value, cost_share, rank
 from orthoflow.report.summaries import headline_keys
-from orthoflow.workflow.expand import NOT_ASKED_FOR, variants_text
 from orthoflow.workflow.model import DATA
 
 _NOTHING: Final = "-"
-# Seconds of loading and compiling in which a compiler was at work.
-_COMPILING_S: Final = 5.0
 # A machine that does nothing else moves the times of short steps by so much.
 _TIMED_S: Final = 0.1
 _LEADS: Final = (Mark.BEST, Mark.NEAR)
-_DESCRIBED_MOST: Final = 12  # metrics that are shown where none of quality differs
-_NAMED: Final = 3  # numbers that a combination is best in
+_MAX_DESCRIBED: Final = 12  # metrics that are shown where none of quality differs
+_MAX_NAMED: Final = 3  # numbers that a combination is best in
+# Cost of the steps in which combinations differ; processor time hardly depends on other programs.
+_SUMMED: Final = tuple(
+    MetricRow(cell="", step="", method="", name=name, value=0.0, unit=unit, label=label,
+              better="lower", headline=True)
+    for name, unit, label in (
+        ("cpu_s", "s", "processor time"),
+        ("peak_rss_mib", "MiB", "memory"),
+    )
+)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,74 +47,41 @@ class Row:
     Attributes:
         run: the run it belongs to, its workflow and id.
         variants: variant of each varied step; a dash where the step has no part in it.
+        name: these in words, with the run where there are several.
         is_baseline: the workflow calls it its baseline.
         failure: where and why it failed, empty when it did not.
         missing: addresses that the run was interrupted before.
         values: one per column.
-        time: processor seconds of the cells that the variants have a part in: they hardly depend
-            on what else the machine does.
-        memory: largest memory of these cells.
-        has_compiler: the memory is also that of compiling, so that no memory is ranked.
         remark: what was cached and what else to know, in words.
     """
 
     run: str
     variants: tuple[str, ...]
+    name: str
     is_baseline: bool
     failure: str
     missing: tuple[str, ...]
     values: tuple[Value, ...]
-    time: Value
-    memory: Value
     remark: str
-    has_compiler: bool = False
 
     @property
-    def judged(self) -> tuple[Value, ...]:
-        """All its numbers."""
-        return *self.values, self.time, self.memory
+    def time(self) -> Value:
+        """Processor seconds of the cells that the variants have a part in."""
+        return self.values[-2]
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """Signs of the environments and data of its numbers, each once."""
-        return tuple(
-            dict.fromkeys(value.group for value in self.judged if value.text if value.group)
-        )
+        """Letters of the environments and data of its numbers, each once."""
+        return tuple(dict.fromkeys(value.group for value in self.values if value.group))
 
     @property
     def shortfall(self) -> str:
         """Why it has no time and no memory, in a word or two; empty when it is whole."""
         return "failed" if self.failure else "not computed" if self.missing else ""
 
-
-@dataclass(frozen=True, kw_only=True)
-class Standing:
-    """How often a combination leads among the others.
-
-    Attributes:
-        name: its variants, behind the run where there are several.
-        is_baseline: the workflow calls it its baseline.
-        shortfall: why it did not come to its end, empty when it did.
-        n_best: numbers in which it is clearly best.
-        n_near: numbers in which it is among the best, and no difference is shown.
-        n_worst: numbers in which it is worst.
-        best_in: what it is clearly best in, at most three.
-        groups: signs of its environments and data, where there are several.
-        is_unranked: nothing of it is ranked, as no other has a sign of it.
-        time: processor seconds of the cells that the variants have a part in: they hardly depend
-            on what else the machine does.
-    """
-
-    name: str
-    is_baseline: bool
-    shortfall: str
-    n_best: int
-    n_near: int
-    n_worst: int
-    best_in: tuple[str, ...]
-    groups: tuple[str, ...]
-    is_unranked: bool
-    time: Value
+    def count(self, mark: Mark) -> int:
+        """In how many numbers it stands like this."""
+        return sum(value.mark is mark for value in self.values)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,10 +90,11 @@ class ComparisonTable:
 
     Attributes:
         steps: the varied steps.
-        columns: metrics.
+        columns: metrics, processor time and memory last.
         rows: in the order of the runs and their graphs.
         shows_runs: rows come from more than one run.
-        groups: letter -> what environment or data it stands for; empty when all is of one kind.
+        groups: letter -> what environment and data it stands for; empty when all is of one kind.
+        forced: options that measure all again in one environment; empty if there is only one.
     """
 
     steps: tuple[str, ...]
@@ -129,14 +102,7 @@ class ComparisonTable:
     rows: tuple[Row, ...]
     shows_runs: bool
     groups: Mapping[str, str]
-
-    @property
-    def forced(self) -> str:
-        """Options that measure all again in one environment; empty if there is only one."""
-        if not any(sign.isupper() for sign in self.groups):
-            return ""
-        steps = dict.fromkeys((*self.steps, *(column.step for column in self.columns)))
-        return " ".join(f"--force {step}" for step in steps if step != DATA)
+    forced: str = ""
 
     @property
     def n_whole(self) -> int:
@@ -146,70 +112,37 @@ class ComparisonTable:
     @property
     def baseline(self) -> str:
         """The combination that the others are compared with; empty where there is none, or two."""
-        found = [one for row, one in zip(self.rows, self._names, strict=True) if row.is_baseline]
+        found = [row.name for row in self.rows if row.is_baseline]
         return found[0] if len(found) == 1 else ""
-
-    @property
-    def _names(self) -> list[str]:
-        """What distinguishes each row from the others."""
-        variants = (
-            variants_text(
-                {
-                    step: chosen
-                    for step, chosen in zip(self.steps, row.variants, strict=True)
-                    if chosen != _NOTHING
-                }
-            )
-            for row in self.rows
-        )
-        return [
-            f"{row.run}: {text}" if self.shows_runs else text
-            for row, text in zip(self.rows, variants, strict=True)
-        ]
 
     @property
     def n_judged(self) -> int:
         """How many of the columns have a good side, time and memory included."""
-        return sum(column.better in BETTER for column in self.columns) + 2
+        return sum(column.better in BETTER for column in self.columns)
 
     @property
     def n_undecided(self) -> int:
         """In how many of these no combination leads, so that they count for nobody."""
-        places = zip(*(row.judged for row in self.rows), strict=True)
+        places = zip(*(row.values for row in self.rows), strict=True)
         return self.n_judged - sum(any(one.mark in _LEADS for one in place) for place in places)
 
     @property
-    def glance(self) -> tuple[Standing, ...]:
-        """How often each combination leads; who is best, then near the best most often first."""
-        labels = [
-            *(f"{one.step}: {one.titled}" for one in self.columns),
-            "processor time",
-            "memory",
+    def glance(self) -> tuple[Row, ...]:
+        """The rows: which is best, then near the best most often first."""
+
+        def place(row: Row) -> tuple[bool, int, int]:
+            return bool(row.shortfall), -row.count(Mark.BEST), -row.count(Mark.NEAR)
+
+        return tuple(sorted(self.rows, key=place))
+
+    def best_in(self, row: Row) -> tuple[str, ...]:
+        """Name what a row is clearly best in, at most three."""
+        found = [
+            ": ".join(filter(None, (column.step, column.titled)))
+            for column, value in zip(self.columns, row.values, strict=True)
+            if value.mark is Mark.BEST
         ]
-        found = []
-        groups = [row.groups for row in self.rows]
-        for row, name, own in zip(self.rows, self._names, groups, strict=True):
-            marks = [value.mark for value in row.judged]
-            best = [label for label, mark in zip(labels, marks, strict=True) if mark is Mark.BEST]
-            found.append(
-                Standing(
-                    name=name,
-                    is_baseline=row.is_baseline,
-                    shortfall=row.shortfall,
-                    n_best=len(best),
-                    n_near=marks.count(Mark.NEAR),
-                    n_worst=marks.count(Mark.WORST),
-                    best_in=(*best[:_NAMED], *(["..."] if len(best) > _NAMED else [])),
-                    groups=own,
-                    is_unranked=own != () and sum(not set(own).isdisjoint(e) for e in groups) == 1,
-                    time=row.time,
-                )
-            )
-
-        def place(one: Standing) -> tuple[bool, int, int, int]:
-            return bool(one.shortfall), -one.n_best, -one.n_near, one.n_worst
-
-        return tuple(sorted(found, key=place))
+        return (*found[:_MAX_NAMED], *(["..."] if len(found) > _MAX_NAMED else []))
 
 
 def comparison_table(runs: Sequence[Run]) -> ComparisonTable | None:
@@ -222,16 +155,42 @@ def comparison_table(runs: Sequence[Run]) -> ComparisonTable | None:
     if len(combinations) < 2:
         return None
     steps = tuple(dict.fromkeys(step for one in combinations for step in one.assignment))
-    columns = comparison_columns(combinations)
-    origins = Origins.of(runs)
+    metrics = comparison_columns(combinations)
+    columns = (*metrics, *_SUMMED)
+    origins = Origins.of(combinations)
     labels = _run_labels(runs)
-    rows = [_row(one, steps, columns, origins, labels[_name(one.run)]) for one in combinations]
+    values = [
+        (*(_value(one, origins, column) for column in metrics), *_costs(one, origins))
+        for one in combinations
+    ]
+    ranked = [
+        rank(of_column, column.better, column.unit)
+        for column, of_column in zip(columns, zip(*values, strict=True), strict=True)
+    ]
+    rows = tuple(
+        Row(
+            run=labels[one.run.path, one.run.record.run_id],
+            variants=tuple(one.assignment.get(step, _NOTHING) for step in steps),
+            name=(f"{labels[one.run.path, one.run.record.run_id]}: " if len(runs) > 1 else "")
+            + one.name,
+            is_baseline=one.is_baseline,
+            failure=f"{one.failure.address}: {one.failure.error_message}" if one.failure else "",
+            missing=tuple(cell.address for cell in one.missing),
+            values=own,
+            remark=_remark(one),
+        )
+        for one, own in zip(combinations, zip(*ranked, strict=True), strict=True)
+    )
+    forced = dict.fromkeys((*steps, *(column.step for column in metrics)))
     return ComparisonTable(
         steps=steps,
         columns=columns,
-        rows=_ranked(rows, columns),
+        rows=rows,
         shows_runs=len(runs) > 1,
         groups=origins.legend,
+        forced=" ".join(f"--force {step}" for step in forced if step != DATA)
+        if len(origins.environments.words) > 1 and origins.letters
+        else "",
     )
 
 
@@ -280,7 +239,7 @@ def _described(
     for key in keys:
         if _differs(key, combinations):
             by_step.setdefault(key[0], []).append(key)
-    return [key for own in reversed(by_step.values()) for key in own][:_DESCRIBED_MOST]
+    return [key for own in reversed(by_step.values()) for key in own][:_MAX_DESCRIBED]
 
 
 def _matching(patterns: Iterable[str], known: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
@@ -294,66 +253,25 @@ def _matching(patterns: Iterable[str], known: Iterable[tuple[str, str]]) -> list
     return list(found)
 
 
-def _row(
-    one: Combination,
-    steps: Sequence[str],
-    columns: Sequence[MetricRow],
-    origins: Origins,
-    label: str,
-) -> Row:
-    failed = one.failure
+def _costs(one: Combination, origins: Origins) -> tuple[Value, Value]:
+    """Processor time and memory of the steps that the variants have a part in, if all is there."""
     varied = [cell for cell in one.varied_cells if cell.status == "ok"]
-    group = origins.letters(one, varied[0].environment if varied else "")
-    has_cost = failed is None and not one.missing and bool(varied)
-    time_s = sum(cell.cpu_s for cell in varied)
-    has_compiler = has_cost and max(cell.compile_s or 0.0 for cell in varied) > _COMPILING_S
-    cost_group = "".join(dict.fromkeys(origins.letters(one, cell.environment) for cell in varied))
-    return Row(
-        run=label,
-        variants=tuple(one.assignment.get(step, _NOTHING) for step in steps),
-        is_baseline=one.is_baseline,
-        failure=f"{failed.address}: {failed.error_message}" if failed else "",
-        missing=tuple(cell.address for cell in one.missing),
-        values=tuple(
-            _value(one.measured(column.step, column.metric), one, origins, column)
-            for column in columns
-        ),
-        time=_time(time_s, cost_group) if has_cost else Value(),
-        memory=_memory(max(cell.peak_rss_mib for cell in varied), group) if has_cost else Value(),
-        has_compiler=has_compiler,
-        remark="; ".join(
-            part
-            for part in (
-                "a step compiled, which takes memory, too: none is ranked" if has_compiler else "",
-                _remark(one),
-            )
-            if part
-        ),
+    if one.failure or one.missing or not varied:
+        return Value(), Value()
+    time_s, memory_mib = sum(cell.cpu_s for cell in varied), max(c.peak_rss_mib for c in varied)
+    group = "".join(dict.fromkeys(origins.letter(one, cell.environment) for cell in varied))
+    text = f"{time_s:.2f}" if time_s < 1.0 else f"{time_s:.1f}"
+    return (
+        Value(text=text, sort=time_s, spread=_TIMED_S, group=group),
+        Value(text=f"{memory_mib:.0f}", sort=memory_mib, group=group),
     )
-
-
-def _time(seconds: float, group: str) -> Value:
-    text = f"{seconds:.2f}" if seconds < 1.0 else f"{seconds:.1f}"
-    return Value(text=text, sort=seconds, spread=_TIMED_S, group=group)
-
-
-def _memory(mib: float, group: str) -> Value:
-    return Value(text=f"{mib:.0f}", sort=mib, group=group)
-
-
-# Record, id of the run, and name of the dataset.
-_Place: TypeAlias = tuple[Path, str, str]
-
-
-def _name(run: Run) -> tuple[Path, str]:
-    return run.path, run.record.run_id
 
 
 def _run_labels(runs: Sequence[Run]) -> dict[tuple[Path, str], str]:
     """The workflow with the options that not all runs have, the run's folder and its id."""
     shared = frozenset.intersection(*(frozenset(run.record.overrides) for run in runs))
     return {
-        _name(run): ", ".join(
+        (run.path, run.record.run_id): ", ".join(
             (
                 " ".join(
                     (run.record.name, *(one for one in run.record.overrides if one not in shared))
@@ -366,15 +284,17 @@ def _run_labels(runs: Sequence[Run]) -> dict[tuple[Path, str], str]:
     }
 
 
-def _value(
-    measured: Measured | None, one: Combination, origins: Origins, column: MetricRow
-) -> Value:
+def measured_text(measured: Measured) -> str:
+    """Print a value, of repeats with their standard deviation."""
+    if measured.n_repeats > 1:
+        return number_with_spread(measured.value, measured.spread)
+    return number(measured.value)
+
+
+def _value(one: Combination, origins: Origins, column: MetricRow) -> Value:
+    measured = one.measured(column.step, column.metric)
     if measured is None:
-        return _absent(one, origins, column)
-    repeated = measured.n_repeats > 1
-    text = (
-        number_with_spread(measured.value, measured.spread) if repeated else number(measured.value)
-    )
+        return Value()
     # Of a repeat that missed the wall there is no error of it, and the others look as good as any.
     of_all = (
         f" ({measured.n_repeats} of {measured.n_all} repeats)"
@@ -382,31 +302,15 @@ def _value(
         else ""
     )
     sizes = "the sizes of errors of both signs in " if measured.is_of_sizes else ""
-    of_what = f"{sizes}{measured.n_repeats} repeats"
+    of_what = f"mean and standard deviation of {sizes}{measured.n_repeats} repeats"
     return Value(
-        text=f"{text}{of_all}",
+        text=f"{measured_text(measured)}{of_all}",
         sort=measured.value,
         spread=measured.spread,
-        group=origins.letters(one, measured.environment),
-        note=f"mean and standard deviation of {of_what}" if repeated else "",
+        group=origins.letter(one, measured.environment),
+        note=of_what if measured.n_repeats > 1 else "",
         n_items=one.n_items(column.step, column.counted_by),
     )
-
-
-def _absent(one: Combination, origins: Origins, column: MetricRow) -> Value:
-    """What stands where there is no number: nothing was found, or nobody asked."""
-    own = [cell for cell in one.cells if cell.step == column.step]
-    asked = [cell for cell in own if not is_missing(cell) and cell.error_type != NOT_ASKED_FOR]
-    if one.failure is not None and (asked or not own):
-        # Of another run the step may be, and not of this one.
-        asked = [one.failure] if _has_step(one.run, column.step) else []
-    if not asked:
-        return Value()
-    return Value(group=origins.letters(one, asked[0].environment), found_nothing=True)
-
-
-def _has_step(run: Run, step: str) -> bool:
-    return any(cell.step == step for cell in run.record.cells)
 
 
 def _remark(one: Combination) -> str:
@@ -418,101 +322,90 @@ def _remark(one: Combination) -> str:
         parts.append(
             f"{len(cached)} of {n_computed} steps cached, with their time in run {sources}"
         )
-    n_older = sum(cell.status == "ok" and cell.compile_s is None for cell in one.varied_cells)
-    if n_older:
-        of_all = f"{n_older} of {len(one.varied_cells)} steps"
-        parts.append(f"{of_all} with loading and compiling in their time")
     if one.n_failed_repeats:
         parts.append(f"{one.n_failed_repeats} repeats failed")
     return "; ".join(parts)
 
 
-def _ranked(rows: Sequence[Row], columns: Sequence[MetricRow]) -> tuple[Row, ...]:
-    by_column = [
-        rank([row.values[index] for row in rows], column.better, column.unit)
-        for index, column in enumerate(columns)
-    ]
-    times = rank([row.time for row in rows], "lower", "s")
-    has_compiler = any(row.has_compiler for row in rows)
-    memories = rank([row.memory for row in rows], "" if has_compiler else "lower", "MiB")
-    return tuple(
-        replace(
-            row,
-            values=tuple(values[index] for values in by_column),
-            time=times[index],
-            memory=memories[index],
-        )
-        for index, row in enumerate(rows)
-    )
+# Environment, the first of its equivalent ones, and digests of data.
+_Origin: TypeAlias = tuple[str, tuple[str, ...]]
+# Record, id of the run, and dataset.
+_Place: TypeAlias = tuple[Path, str, str]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Origins:
-    """Capital letters for the environments, small ones for the data of one or more runs.
+    """A letter for each environment and set of data that values of combinations are of.
 
     Attributes:
-        environments: id -> letter, the same for equivalent ones.
-        data: run, and its dataset or nothing -> letter.
-        legend: what each sign in use stands for; empty when all is of one kind.
+        environments: the environments.
+        data: record, run and dataset -> digests of what the methods were given.
+        letters: environment and data -> letter; without any when all is of one kind.
+        legend: letter -> what it stands for.
     """
 
-    environments: Mapping[str, str]
-    data: Mapping[_Place, str]
+    environments: EnvironmentGroups
+    data: Mapping[_Place, tuple[str, ...]]
+    letters: Mapping[_Origin, str]
     legend: Mapping[str, str]
 
     @staticmethod
-    def of(runs: Sequence[Run]) -> Origins:
-        """Look through the environments and the data of runs."""
-        groups = group_environments(runs)
-        signs = {key: _letter(index) for index, key in enumerate(groups.words)}
-        # What each run was given, or each of its datasets: digests -> places that have them.
-        named: dict[tuple[str, ...], dict[_Place, str]] = {}
-        for run in runs:
-            datasets = {cell.assignment.get(DATA, "") for cell in run.record.cells} - {""}
-            for data in sorted(datasets) if len(runs) > 1 and datasets else ("",):
-                text = f"{run.record.run_id}{f', dataset {data}' if data else ''}"
-                named.setdefault(_data_of(run, data), {})[(*_name(run), data)] = text
-        # No digits: raised behind a number they would look like powers.
-        small = {key: _letter(index).lower() for index, key in enumerate(named)}
-        legend: dict[str, str] = {}
-        if len(signs) > 1:
-            legend |= {signs[key]: words for key, words in groups.words.items()}
-        if len(named) > 1:
-            legend |= {
-                small[key]: f"data of run {'; '.join(dict.fromkeys(text.values()))}"
-                for key, text in named.items()
-            }
-        places = {place: small[key] for key, text in named.items() for place in text}
-        letters = {key: signs[first] for key, first in groups.first.items()}
-        return Origins(environments=letters, data=places, legend=legend)
+    def of(combinations: Sequence[Combination]) -> Origins:
+        """Look through the environments and the data of combinations."""
+        groups = group_environments({_place(one)[:2]: one.run for one in combinations}.values())
+        data: dict[_Place, tuple[str, ...]] = {}
+        places: dict[_Origin, dict[str, None]] = {}
+        for one in combinations:
+            name = one.assignment.get(DATA, "")
+            if _place(one) not in data:
+                data[_place(one)] = _data_of(one.run.record, name)
+            place = f"{one.run.record.run_id}{f', dataset {name}' if name else ''}"
+            for cell in one.cells:
+                if cell.status == "ok":
+                    first = groups.first.get(cell.environment, cell.environment)
+                    places.setdefault((first, data[_place(one)]), {})[place] = None
+        if len(places) < 2:
+            return Origins(environments=groups, data=data, letters={}, legend={})
+        n_environments, n_data = (len(set(parts)) for parts in zip(*places, strict=True))
+        letters = {origin: _letter(index) for index, origin in enumerate(places)}
+        legend = {
+            letters[origin]: "; ".join(
+                [groups.words.get(origin[0], origin[0])] * (n_environments > 1)
+                + [f"data of run {'; '.join(texts)}"] * (n_data > 1)
+            )
+            for origin, texts in places.items()
+        }
+        return Origins(environments=groups, data=data, letters=letters, legend=legend)
 
-    def letters(self, one: Combination, environment: str) -> str:
-        """Return the sign of a value; empty when all values are of one kind."""
-        has_several = len(set(self.environments.values())) > 1
-        letter = self.environments.get(environment, "?") if has_several else ""
-        if len(set(self.data.values())) < 2:
-            return letter
-        own = (*_name(one.run), one.assignment.get(DATA, ""))
-        return letter + self.data.get(own, "?")
+    def letter(self, one: Combination, environment: str) -> str:
+        """Return the letter of a value; empty when all values are of one kind."""
+        first = self.environments.first.get(environment, environment)
+        return self.letters.get((first, self.data[_place(one)]), "")
+
+
+def _place(one: Combination) -> _Place:
+    return one.run.path, one.run.record.run_id, one.assignment.get(DATA, "")
+
+
+def _data_of(record: RunRecord, data: str) -> tuple[str, ...]:
+    """What the methods were given: digests of input files, and of simulated data."""
+    digests = [
+        file.sha256
+        for given in record.inputs
+        # `scan@hall` is that of one dataset; the others' have no part in it.
+        if given.name.partition("@")[2] in {"", data}
+        for file in given.files
+    ]
+    digests += [
+        product.digest
+        for cell in record.cells
+        if cell.status == "ok" and not cell.inputs and cell.assignment.get(DATA, data) == data
+        for product in cell.outputs.values()
+    ]
+    return tuple(sorted(digests))
 
 
 def _letter(index: int) -> str:
     # 27 environments in one report: AA follows Z.
     first, last = divmod(index, len(ascii_uppercase))
     return (ascii_uppercase[first - 1] if first else "") + ascii_uppercase[last]
-
-
-def _data_of(run: Run, data: str) -> tuple[str, ...]:
-    """What the methods were given: digests of input files, and of simulated data."""
-    return tuple(sorted(_digests(run, data)))
-
-
-def _digests(run: Run, data: str) -> Iterator[str]:
-    for given in run.record.inputs:
-        # `scan@hall` is that of one dataset; the others' have no part in it.
-        if not data or given.name.partition("@")[2] in {"", data}:
-            yield from (file.sha256 for file in given.files)
-    for cell in run.record.cells:
-        is_own = not data or cell.assignment.get(DATA, data) == data
-        if is_own and cell.status == "ok" and not cell.inputs:
-            yield from (product.digest for product in cell.outputs.values())

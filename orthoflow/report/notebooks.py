@@ -51,11 +51,10 @@ class OpenedRun(Run):
         """Every number of every cell, a row each.
 
         Returns:
-            Columns `cell`, `step`, `method`, one per step that varies (`data` for datasets; the
-            variant, missing where the cell does not have it; with a `=` behind where the step is
-            called as another column), one with the method of each step that sweeps parameters of
-            several (`plane.use`), one per swept parameter (`plane.tolerance_m`, a number),
-            `repeat`, `metric`, `value`, `unit`.
+            Columns `cell`, `step`, `method`, `dataset` of several, `variant.<step>` of each step
+            that varies (missing where the cell does not have it), the method of each step that
+            sweeps parameters of several (`plane.use`), each swept parameter (`plane.tolerance_m`,
+            a number), `repeat`, `metric`, `value`, `unit`.
         """
         import pandas as pd  # noqa: PLC0415 - takes a second, and few ask
 
@@ -75,7 +74,7 @@ class OpenedRun(Run):
             for row in cell_metrics(cell)
         ]
         first, last = ("cell", "step", "method"), ("repeat", "metric", "value", "unit")
-        columns = [*first, *varied.names((*first, *last)), *last]
+        columns = [*first, *varied.names, *last]
         return pd.DataFrame(rows, columns=columns)
 
     @cached_property

@@ -54,6 +54,7 @@ from orthoflow.report.pictures import (
 from orthoflow.report.rendering import environment
 from orthoflow.report.summaries import answers, citations, limits, results, says_how_far_off
 from orthoflow.report.tables import PlaneTables, plane_tables
+from orthoflow.report.tidy_tables import over_table
 
 if TYPE_CHECKING:
     from orthoflow.engine.store import Store
@@ -63,6 +64,12 @@ _VIEWERS: Final = {
     "model of the room": Path("export/gltf/room.html"),
     "orthoimages to measure on": Path("export/tiles/index.html"),
 }
+# Columns of what holds over all datasets.
+_OVER_SHOWN: Final = (
+    *("combination", "datasets", "failed", "absent", "partly", "median", "spread", "pairs"),
+    *("wins", "losses", "median_difference", "interval_low", "interval_high"),
+    *("p", "p_holm", "effect"),
+)
 _NONE_BROKEN: Final[Mapping[Path, str]] = MappingProxyType({})
 
 
@@ -212,7 +219,7 @@ def _overview(run: Run, prefix: str, folder: Path, pages: Mapping[str, str]) -> 
         citations=citations(run),
         datasets=dataset_table(parts, pages),
         curves=curves_over(parts),
-        over=over,
+        over=[(one, over_table([one]).only(*_OVER_SHOWN)) for one in over],
         leads=who_leads(over, len(parts)),
     )
     return section

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
 
 from orthoflow.records.runs import MetricRow, Run, parts_of
-from orthoflow.report.combinations import Combination, Measured, combinations_of
-from orthoflow.report.comparisons import comparison_columns
-from orthoflow.report.numbers import number, number_with_spread
-from orthoflow.report.paired import MetricOverDatasets, over_datasets
+from orthoflow.report.combinations import Combination, combinations_of
+from orthoflow.report.comparisons import comparison_columns, measured_text
+from orthoflow.report.paired import over_datasets
 from orthoflow.report.summaries import citations
-from orthoflow.report.tables import Table, escaped_latex
-from orthoflow.untrusted_text import Value, csv_text, shown
+from orthoflow.report.tables import Column, Table, escaped_latex
+from orthoflow.report.tidy_tables import over_table
+from orthoflow.untrusted_text import shown
 from orthoflow.workflow.model import DATA
 
 # More stand below each other.
@@ -32,12 +32,13 @@ def paper_files(run: Run) -> dict[str, str]:
 
     `results` has a row per combination and dataset with the metrics that the comparison asks for,
     or else the headlines; `datasets` what holds over all datasets, where there are several; the
-    CSV files have every digit, a row per value.
+    CSV file has every digit, a row per value.
     """
-    files = {"results.csv": csv_text([*_tidy(run)])}
+    files = {"results.csv": _values(run).csv()}
     tables = [_results(run)]
     if over := over_datasets(parts_of(run)):
-        tables.append(_over(over))
+        names = ("label", "better", "combination", "datasets", "median", "median_difference")
+        tables.append(over_table(over).only(*names, "interval_low", "interval_high", "p_holm"))
     for table in tables:
         files[f"{table.name}.tex"] = table.latex()
         files[f"{table.name}.md"] = table.markdown()
@@ -45,105 +46,78 @@ def paper_files(run: Run) -> dict[str, str]:
     return files
 
 
-def _tidy(run: Run) -> Iterator[Sequence[Value]]:
-    """Return a header, then a row per combination and metric, with unit and better side."""
+def _values(run: Run) -> Table:
+    """Return a row per combination and metric, with unit and better side."""
     combinations, columns = _compared(run)
     factors = _factors(combinations)
-    yield (
+    names = (
         *(factor if factor != DATA else "dataset" for factor in factors),
         *("step", "metric", "label", "unit", "better", "value", "standard_deviation", "n_repeats"),
     )
-    for one in combinations:
-        for column in columns:
-            if measured := one.measured(column.step, column.metric):
-                spread = None if math.isnan(measured.spread) else measured.spread
-                yield (
-                    *(one.assignment.get(factor, "") for factor in factors),
-                    *(column.step, column.metric, column.titled, column.unit),
-                    *(column.better, measured.value, spread, measured.n_repeats),
-                )
+    return Table(
+        name="results",
+        caption="",
+        columns=tuple(Column(name, name) for name in names),
+        rows=tuple(
+            (
+                *(one.assignment.get(factor, "") for factor in factors),
+                *(column.step, column.metric, column.titled, column.unit, column.better),
+                measured.value,
+                None if math.isnan(measured.spread) else measured.spread,
+                measured.n_repeats,
+            )
+            for one in combinations
+            for column in columns
+            if (measured := one.measured(column.step, column.metric))
+        ),
+    )
 
 
 def _results(run: Run) -> Table:
     """The comparison: metrics as rows where combinations are few, combinations as rows else."""
     combinations, columns = _compared(run)
     factors = _factors(combinations)
-    found = [
-        [one.measured(column.step, column.metric) for column in columns] for one in combinations
+    texts = [
+        [
+            measured_text(value) if (value := one.measured(column.step, column.metric)) else None
+            for column in columns
+        ]
+        for one in combinations
     ]
-    repeated = any(value is not None and value.n_repeats > 1 for row in found for value in row)
+    repeated = any(cell.repeat for one in combinations for cell in one.cells)
     spread = ", mean and standard deviation of the repeats" if repeated else ""
     caption = f"Results of {run.record.name} (run {run.record.run_id}){spread}."
-    texts = [[_value(value) for value in row] for row in found]
+    titles = [f"{column.step}: {column.titled}" for column in columns]
     if len(combinations) <= _FEW_COMBINATIONS:
-        names = [one.name or "value" for one in combinations]
         return Table(
             name="results",
             caption=caption,
-            head=("metric", "better", *names),
-            rows=tuple(
-                (f"{column.step}: {column.titled}", column.better or "--", *values)
-                for column, *values in zip(columns, *texts, strict=True)
+            columns=(
+                *(Column(label, is_numeric=False) for label in ("metric", "better")),
+                *(Column(one.name or "value") for one in combinations),
             ),
-            numeric=frozenset(range(2, 2 + len(combinations))),
+            rows=tuple(
+                (title, column.better or None, *values)
+                for title, column, *values in zip(titles, columns, *texts, strict=True)
+            ),
         )
     return Table(
         name="results",
         caption=caption,
-        head=(
-            *("dataset" if factor == DATA else factor for factor in factors),
-            *(_heading(column) for column in columns),
+        columns=(
+            *(
+                Column("dataset" if factor == DATA else factor, is_numeric=False)
+                for factor in factors
+            ),
+            *(
+                Column(f"{title} ({column.better} is better)" if column.better else title)
+                for title, column in zip(titles, columns, strict=True)
+            ),
         ),
         rows=tuple(
-            (*(one.assignment.get(factor, "--") for factor in factors), *values)
+            (*(one.assignment.get(factor) for factor in factors), *values)
             for one, values in zip(combinations, texts, strict=True)
         ),
-        numeric=frozenset(range(len(factors), len(factors) + len(columns))),
-    )
-
-
-def _value(measured: Measured | None) -> str:
-    if measured is None:
-        return "--"
-    if measured.n_repeats > 1:
-        return number_with_spread(measured.value, measured.spread)
-    return number(measured.value)
-
-
-def _over(over: Sequence[MetricOverDatasets]) -> Table:
-    def text(value: float, significant: int = 4) -> str:
-        return "--" if math.isnan(value) else number(value, significant=significant)
-
-    rows = []
-    for metric in over:
-        for one in metric.distinct:
-            paired = one.paired
-            statistics_of = ["--"] * 3
-            if paired is not None:
-                low, high = (text(edge, 3) for edge in paired.interval)
-                interval = "--" if "--" in (low, high) else f"{low} to {high}"
-                statistics_of = [text(paired.median, 3), interval, text(paired.p_holm, 2)]
-            name = f"{metric.column.step}: {metric.column.titled}"
-            rows.append(
-                (
-                    name,
-                    metric.column.better or "--",
-                    one.name or "all",
-                    str(one.n),
-                    text(one.median),
-                    *statistics_of,
-                )
-            )
-    return Table(
-        name="datasets",
-        caption="Medians over the datasets, median differences from the reference with their 95 % "
-        "confidence intervals, and p of Wilcoxon's signed-rank test after Holm's correction.",
-        head=(
-            *("metric", "better", "combination", "datasets", "median", "difference"),
-            *("95 % interval", "p (Holm)"),
-        ),
-        rows=tuple(rows),
-        numeric=frozenset(range(3, 8)),
     )
 
 
@@ -156,11 +130,6 @@ def _factors(combinations: Iterable[Combination]) -> tuple[str, ...]:
     """Names of what varies, the dataset first."""
     found = dict.fromkeys(step for one in combinations for step in one.assignment)
     return tuple(sorted(found, key=lambda factor: factor != DATA))
-
-
-def _heading(column: MetricRow) -> str:
-    better = f" ({column.better} is better)" if column.better else ""
-    return f"{column.step}: {column.titled}{better}"
 
 
 def bibtex(cited: Mapping[str, Sequence[str]]) -> str:

@@ -15,10 +15,9 @@ from orthoflow.products import Camera, Cameras, Planes, TieRole, Ties
 from orthoflow.records.runs import Run
 from orthoflow.report.charts import ChartFormat, PlanPhoto, PlanWall, as_image, plan_chart
 from orthoflow.report.combinations import baseline_cells
-from orthoflow.report.numbers import number
 from orthoflow.report.pictures import Picture, embedded_products
-from orthoflow.report.tables import Table
-from orthoflow.untrusted_text import first_few
+from orthoflow.report.tables import Column, Table
+from orthoflow.untrusted_text import Value, first_few
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,24 +101,28 @@ def _table(orientation: Cameras) -> Table:
     control, check = (_counts(ties, role) for role in (TieRole.CONTROL, TieRole.CHECK))
     rows = []
     for camera in cameras if is_known else ():
-        values = ["-"] * 4
+        values: list[Value] = [None] * 4
         if camera.status == "ok":
             if camera.sigma_wall_m is not None:
-                values[0] = number(1000 * camera.sigma_wall_m, significant=3)
+                values[0] = 1000 * camera.sigma_wall_m
             if own := squares.get(camera.photo):
-                values[1] = number(math.sqrt(sum(own) / len(own)), significant=3)
+                values[1] = math.sqrt(sum(own) / len(own))
             if ties is not None:
-                values[2:] = [str(counts.get(camera.photo, 0)) for counts in (check, control)]
+                values[2:] = [counts.get(camera.photo, 0) for counts in (check, control)]
         rows.append((camera.photo, *values, camera.status))
     return Table(
         name="photos",
         caption="how well each photo is oriented, of one coordinate on the wall",
-        head=(
-            *("photo", "expected error / mm", "check points, RMS / mm"),
-            *("check points", "control points", "status"),
+        columns=(
+            Column("photo", is_numeric=False),
+            *(
+                Column(label, digits=3)
+                for label in ("expected error / mm", "check points, RMS / mm")
+            ),
+            *(Column(label) for label in ("check points", "control points")),
+            Column("status", is_numeric=False),
         ),
         rows=tuple(rows),
-        numeric=frozenset({1, 2, 3, 4}),
     )
 
 

@@ -1,4 +1,4 @@
-"""Best and worst of a column, among values that may be compared, by what makes a metric good."""
+"""The best of a column, among values that may be compared, by what makes a metric good."""
 
 from __future__ import annotations
 
@@ -14,18 +14,17 @@ from orthoflow.records.runs import is_rounding
 # all give one value. What is nearer than this share of the best is no difference then; times and
 # memory scatter more, times from run to run by so much (docs/performance.md), whatever their
 # repeats in one run suggest.
-_ALIKE_SHARE: Final = 0.01
-_ALIKE_COST_SHARES: Final = {"s": 0.3, "MiB": 0.1}
+_LEVEL_SHARE: Final = 0.01
+_LEVEL_COST_SHARES: Final = {"s": 0.3, "MiB": 0.1}
 FLAG: Final = "yes/no"
 
 
 class Mark(Enum):
-    """How a value stands among its like."""
+    """How a value stands among those that it may be compared with."""
 
     NONE = ""
     BEST = "best"
     NEAR = "among the best, no difference shown"
-    WORST = "worst"
     FEWER = "over fewer items, not ranked"
 
 
@@ -38,11 +37,9 @@ class Value:
         sort: the number that the table is sorted by, NaN where there is none.
         spread: standard deviation over repeats, NaN without repeats.
         mark: how it stands among the values of its group.
-        group: letters of its environment and data, empty when the table has one of each.
+        group: letter of its environment and data, empty when the table has one of each.
         note: more in words, e.g. how many repeats.
         n_items: items that it sums up, NaN where nobody counts them.
-        found_nothing: there is no number though its step was asked for one, by a failure or because
-            nothing was found.
     """
 
     text: str = ""
@@ -52,21 +49,18 @@ class Value:
     group: str = ""
     note: str = ""
     n_items: float = math.nan
-    found_nothing: bool = False
 
 
 def rank(values: Sequence[Value], better: str, unit: str = "1") -> list[Value]:
-    """Mark the best and the worst of each group; a group whose values are all equal has neither.
+    """Mark the best of each group; a group whose values are all level has none.
 
     Groups with a value of a single run are not ranked: on another machine, or with another seed,
     another may be the best. A value whose distance from the best is not above both their standard
     deviations together (in quadrature), or where one of them has repeats of one value, not above a
     hundredth of the best (a tenth of a memory, three tenths of a time), or just of rounding, is
-    marked as near the best and never as worst; the best is then only among the best, too. The worst
-    is marked where every other value is as far from it, and where nobody of its group found
-    nothing, which is worse; costs, which a method may just not have, are ranked all the same. What
-    sums up fewer items than another of its group is not ranked: who refuses the difficult photos
-    has smaller errors of the rest.
+    marked as near the best; the best is then only among the best, too. What sums up fewer items
+    than another of its group is not ranked: a method that refuses difficult photos has smaller
+    errors of the rest.
 
     Args:
         values: a column.
@@ -90,25 +84,17 @@ def rank(values: Sequence[Value], better: str, unit: str = "1") -> list[Value]:
             continue
         scores = {index: badness(values[index].sort, better) for index in members}
         best = values[min(members, key=scores.__getitem__)]
-        leading = {i for i in members if _are_alike(values[i], best, better, unit)}
+        leading = {i for i in members if _are_level(values[i], best, better, unit)}
         if len(leading) == len(members):
             continue
-        worst = max(members, key=scores.__getitem__)
-        is_worst = not (_has_found_nothing(values, group) and cost_share(unit) == 0.0) and not any(
-            _are_alike(values[worst], values[i], better, unit) for i in members if i != worst
-        )
-        for index in members:
-            mark = Mark.NONE
-            if index in leading:
-                # What several share nobody leads in.
-                mark = Mark.NEAR if len(leading) > 1 else Mark.BEST
-            elif index == worst and is_worst:
-                mark = Mark.WORST
+        for index in leading:
+            # What several share nobody leads in.
+            mark = Mark.NEAR if len(leading) > 1 else Mark.BEST
             marked[index] = replace(values[index], mark=mark)
     return marked
 
 
-def _are_alike(one: Value, other: Value, better: str, unit: str) -> bool:
+def _are_level(one: Value, other: Value, better: str, unit: str) -> bool:
     """Whether nothing shows that a value differs from a better one."""
     if is_rounding(badness(one.sort, better), badness(other.sort, better)):
         return True
@@ -117,7 +103,7 @@ def _are_alike(one: Value, other: Value, better: str, unit: str) -> bool:
         for value in (one, other)
         if math.isfinite(value.spread) and not is_rounding(value.sort, value.sort + value.spread)
     ]
-    share = max(cost_share(unit), 0.0 if len(known) == 2 else _ALIKE_SHARE)
+    share = max(cost_share(unit), 0.0 if len(known) == 2 else _LEVEL_SHARE)
     # Signed errors count by their size.
     own, leading = (abs(v.sort) if better == "lower" else v.sort for v in (one, other))
     return abs(own - leading) <= max(math.hypot(*known), share * abs(leading))
@@ -125,11 +111,7 @@ def _are_alike(one: Value, other: Value, better: str, unit: str) -> bool:
 
 def cost_share(unit: str) -> float:
     """Return by what share values scatter from run to run: times and memory do, others do not."""
-    return _ALIKE_COST_SHARES.get(unit, 0.0)
-
-
-def _has_found_nothing(values: Sequence[Value], group: str) -> bool:
-    return any(value.found_nothing and value.group == group for value in values)
+    return _LEVEL_COST_SHARES.get(unit, 0.0)
 
 
 # What a method declares of a metric (`MetricSpec.better`), in words; others are not judged.

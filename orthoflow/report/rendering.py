@@ -18,7 +18,7 @@ from orthoflow.records import COSTS
 from orthoflow.report.environments import distinct_words
 from orthoflow.report.numbers import number, number_with_unit
 from orthoflow.report.pictures import DIVERGING
-from orthoflow.report.rankings import BETTER
+from orthoflow.report.rankings import BETTER, Mark
 from orthoflow.untrusted_text import shown
 from orthoflow.version import __version__
 
@@ -56,6 +56,7 @@ def environment() -> jinja2.Environment:
     environment.globals |= {
         "better": BETTER,
         "costs": COSTS,
+        "marks": (Mark.BEST, Mark.NEAR),
         "version": __version__,
         "depth_colours": DIVERGING.tolist(),
         "css": Markup(css),

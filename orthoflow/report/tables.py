@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from orthoflow.geometry import omega_phi_deg
 from orthoflow.products import Planes
 from orthoflow.records.runs import Run
+from orthoflow.report.numbers import number
 from orthoflow.report.pictures import embedded_products
-from orthoflow.untrusted_text import shown
+from orthoflow.untrusted_text import Value, csv_text, shown
 
 _LATEX: Final = {
     **{sign: f"\\{sign}" for sign in "&%$#_{}"},
@@ -29,35 +30,66 @@ def escaped_latex(text: str) -> str:
     return "".join(_LATEX.get(sign, sign) for sign in shown(text))
 
 
+class Column(NamedTuple):
+    """A column of a table.
+
+    Attributes:
+        label: its heading, with unit and good side.
+        name: in CSV.
+        is_numeric: it stands to the right, and is sorted by numbers.
+        digits: significant ones of its numbers.
+    """
+
+    label: str
+    name: str = ""
+    is_numeric: bool = True
+    digits: int = 4
+
+
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """A table of texts, which pages, LaTeX and Markdown show.
+    """A table, which pages, CSV, LaTeX and Markdown show.
 
     Attributes:
         name: of its files.
         caption: what it shows, one sentence.
-        head: heading of each column.
-        rows: of texts.
-        numeric: places of the columns of numbers, which stand to the right.
+        columns: heading of each column.
+        rows: of values; None for nothing.
     """
 
     name: str
     caption: str
-    head: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    numeric: frozenset[int]
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[Value, ...], ...]
+
+    def text(self, value: Value, column: Column, missing: str = "-") -> str:
+        """Print a value."""
+        if isinstance(value, float):
+            return number(value, significant=column.digits)
+        return missing if value is None else str(value)
+
+    def only(self, *names: str) -> Table:
+        """Return some of its columns."""
+        places = [place for place, column in enumerate(self.columns) if column.name in names]
+        return replace(
+            self,
+            columns=tuple(self.columns[place] for place in places),
+            rows=tuple(tuple(row[place] for place in places) for row in self.rows),
+        )
+
+    def csv(self) -> str:
+        """Return the table as CSV, numbers with all digits."""
+        return csv_text([[column.name for column in self.columns], *self.rows])
 
     def latex(self) -> str:
         """Return the table as LaTeX, for the package booktabs."""
         import pandas as pd  # noqa: PLC0415 - takes a second, and few ask
 
-        cells = [[escaped_latex(text) for text in row] for row in self.rows]
-        table = pd.DataFrame(cells, columns=[escaped_latex(text) for text in self.head])
-        columns = "".join("r" if place in self.numeric else "l" for place in range(len(self.head)))
-        styled = table.style.hide(axis="index")
+        head, *rows = ([escaped_latex(text) for text in row] for row in self._texts())
+        table = pd.DataFrame(rows, columns=head)
         return str(
-            styled.to_latex(
-                column_format=columns,
+            table.style.hide(axis="index").to_latex(
+                column_format="".join("lr"[column.is_numeric] for column in self.columns),
                 caption=escaped_latex(self.caption),
                 label=f"tab:{self.name}",
                 position_float="centering",
@@ -67,10 +99,15 @@ class Table:
 
     def markdown(self) -> str:
         """Return the table as Markdown, numbers to the right."""
-        rule = ["---:" if place in self.numeric else "---" for place in range(len(self.head))]
-        rows = [self.head, tuple(rule), *self.rows]
-        lines = [f"| {' | '.join(map(_markdown, row))} |" for row in rows]
+        head, *rows = self._texts()
+        rule = ["---:" if column.is_numeric else "---" for column in self.columns]
+        lines = [f"| {' | '.join(map(_markdown, row))} |" for row in (head, rule, *rows)]
         return "\n".join((*lines, "", f"{_markdown(self.caption)}", ""))
+
+    def _texts(self) -> Iterator[Sequence[str]]:
+        yield [column.label for column in self.columns]
+        for row in self.rows:
+            yield [self.text(*place, "--") for place in zip(row, self.columns, strict=True)]
 
 
 def _markdown(text: str) -> str:
@@ -153,12 +190,14 @@ def _plane_table(planes: Planes) -> Table:
     return Table(
         name="planes",
         caption="planes",
-        head=(
-            *("plane", "omega / deg", "phi / deg", "offset / m", "sigma at its centre / mm"),
-            *("rectangle", "points", "RMS / mm", "thickness / mm", "step there / mm"),
+        columns=tuple(
+            Column(label, is_numeric=label not in ("plane", "rectangle"))
+            for label in (
+                *("plane", "omega / deg", "phi / deg", "offset / m", "sigma at its centre / mm"),
+                *("rectangle", "points", "RMS / mm", "thickness / mm", "step there / mm"),
+            )
         ),
         rows=tuple(rows),
-        numeric=frozenset({1, 2, 3, 4, 6, 7, 8, 9}),
     )
 
 
@@ -173,11 +212,13 @@ def _material_table(planes: Planes) -> Table:
     return Table(
         name="materials",
         caption="thickness of the cloud by material",
-        head=("on", "material", "points of the sample", "thickness / mm"),
+        columns=(
+            *(Column(label, is_numeric=False) for label in ("on", "material")),
+            *(Column(label) for label in ("points of the sample", "thickness / mm")),
+        ),
         rows=tuple(
             (place, str(one.name), f"{one.n_points:,}", f"{1000 * one.sigma_m:.2f}")
             for place, spreads in places
             for one in spreads
         ),
-        numeric=frozenset({2, 3}),
     )

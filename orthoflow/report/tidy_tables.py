@@ -1,17 +1,20 @@
-"""Numbers for statistics programs: a column per step that varies, and per parameter of a sweep."""
+"""Numbers of a run as tables for pages, papers and statistics programs."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 from orthoflow.records import RecordedCell
-from orthoflow.records.runs import Run, cell_metrics, parts_of
+from orthoflow.records.runs import Run, cell_metrics
 from orthoflow.report.combinations import Combination, combinations_of
 from orthoflow.report.curves import sweeps
-from orthoflow.report.paired import over_datasets
+from orthoflow.report.paired import MetricOverDatasets
+from orthoflow.report.tables import Column, Table
 from orthoflow.untrusted_text import Value
+from orthoflow.workflow.model import DATA
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,11 +45,14 @@ class Varied:
         several = {step: named for step, named in methods.items() if len({*named.values()}) > 1}
         return cls(steps=tuple(steps), methods=several, swept=swept)
 
-    def names(self, taken: Collection[str]) -> tuple[str, ...]:
-        """Name the columns: steps, with a `=` where a column is called so; parameters in full."""
-        steps = (f"{step}=" if step in taken else step for step in self.steps)
-        methods = (f"{step}.use" for step in self.methods)
-        return (*steps, *methods, *(".".join(parameter) for parameter in self.swept))
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Name the columns, those of steps as in tables of several runs."""
+        return (
+            *("dataset" if step == DATA else f"variant.{step}" for step in self.steps),
+            *(f"{step}.use" for step in self.methods),
+            *(".".join(parameter) for parameter in self.swept),
+        )
 
     def values(self, assignment: Mapping[str, str]) -> tuple[str | float | None, ...]:
         """Return the columns of a cell or combination; None where it has no part in one."""
@@ -56,68 +62,90 @@ class Varied:
         return (*variants, *methods, *numbers)
 
 
-def combination_rows(run: Run) -> Iterator[Sequence[Value]]:
-    """Return a header, then a row per combination and repeat with every number of its cells.
+def combination_table(run: Run) -> Table:
+    """Return a row per combination and repeat with every number of its cells.
 
-    What is not repeated stands in the row of the first repeat only.
+    What is not repeated is in the row of the first repeat only.
     """
     varied = Varied.of(run)
-    fixed = ("repeat", "status")
     metrics = dict.fromkeys(
         (row.step, row.metric) for cell in run.record.cells for row in cell_metrics(cell)
     )
-    yield (*varied.names(fixed), *fixed, *(".".join(metric) for metric in metrics))
+    rows = []
     for one in combinations_of(run):
         for repeat in sorted({cell.repeat for cell in one.cells}):
             cells = [cell for cell in one.cells if cell.repeat == repeat]
             found = {
                 (row.step, row.metric): row.value for cell in cells for row in cell_metrics(cell)
             }
-            status = _status(one, cells)
             values = (found.get(metric) for metric in metrics)
-            yield (*varied.values(one.assignment), repeat, status, *values)
-
-
-def dataset_rows(run: Run) -> Iterator[Sequence[Value]]:
-    """Return a header, then a row per metric and combination of what holds over all datasets.
-
-    Unknown values, such as p for two datasets, are empty cells.
-    """
-    yield (
-        *("step", "metric", "combination", "against", "datasets", "failed", "absent"),
-        *(
-            "partly",
-            "median",
-            "spread",
-            "pairs",
-            "better",
-            "worse",
-            "median_difference",
-            "p",
-            "p_holm",
-            "interval_low",
-            "interval_high",
-            "effect",
-        ),
-        "deciding",
+            rows.append((*varied.values(one.assignment), repeat, _status(one, cells), *values))
+    names = (*varied.names, "repeat", "status", *(".".join(metric) for metric in metrics))
+    return Table(
+        name="combinations",
+        caption="",
+        columns=tuple(Column(name, name) for name in names),
+        rows=tuple(rows),
     )
-    for metric in over_datasets(parts_of(run)):
+
+
+_OVER: Final = (
+    Column("step", "step", is_numeric=False),
+    Column("metric", "metric", is_numeric=False),
+    Column("what", "label", is_numeric=False),
+    Column("unit", "unit", is_numeric=False),
+    Column("good side", "better", is_numeric=False),
+    Column("combination", "combination", is_numeric=False),
+    Column("datasets", "datasets"),
+    Column("failed", "failed"),
+    Column("absent", "absent"),
+    Column("some repeats", "partly"),
+    Column("median", "median"),
+    Column("±", "spread", digits=2),
+    Column("compared", "pairs"),
+    Column("not compared", "apart"),
+    Column("better", "wins"),
+    Column("worse", "losses"),
+    Column("difference", "median_difference", digits=3),
+    Column("95 % from", "interval_low", digits=3),
+    Column("to", "interval_high", digits=3),
+    Column("p", "p", digits=2),
+    Column("p (Holm)", "p_holm", digits=2),
+    Column("effect", "effect", digits=2),
+)
+
+
+def over_table(over: Sequence[MetricOverDatasets]) -> Table:
+    """Return a row per metric and combination of what holds over all datasets.
+
+    Unknown values, such as p for two datasets, are empty.
+    """
+    rows = []
+    for metric in over:
+        column = metric.column
         for one in metric.methods:
             paired = one.paired
-            yield (
-                *(metric.column.step, metric.column.metric, one.name, one.against),
-                *(one.n, len(one.failed), one.n_absent, ", ".join(one.partly)),
-                *map(_known, (one.median, one.spread if one.n > 1 else math.nan)),
-                *(
-                    ("",) * 10
-                    if paired is None
-                    else (
-                        *(paired.n, paired.wins, paired.losses, _known(paired.median)),
-                        *map(_known, (paired.p, paired.p_holm, *paired.interval, paired.effect)),
-                        " ".join(paired.deciding),
-                    )
-                ),
+            differences: tuple[Value, ...] = (None,) * 8
+            if paired is not None:
+                differences = (
+                    *(paired.wins, paired.losses, _known(paired.median)),
+                    *map(_known, (*paired.interval, paired.p, paired.p_holm, paired.effect)),
+                )
+            rows.append(
+                (
+                    *(column.step, column.metric, column.titled, column.unit, column.better),
+                    *(one.name or "all", one.n, one.n_failed, one.n_absent, one.n_partly),
+                    *(_known(one.median), _known(one.spread) if one.n > 1 else None),
+                    *(None if paired is None else paired.n, one.n_apart, *differences),
+                )
             )
+    return Table(
+        name="datasets",
+        caption="Medians over the datasets, median differences from the reference with their 95 % "
+        "confidence intervals, and p of Wilcoxon's signed-rank test after Holm's correction.",
+        columns=_OVER,
+        rows=tuple(rows),
+    )
 
 
 def _known(value: float) -> float | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
+from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -14,8 +15,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from orthoflow.files.images import decode_image
-from orthoflow.report.combinations import combinations_of
-from orthoflow.report.comparisons import Origins, comparison_table
+from orthoflow.report.comparisons import comparison_table
 from orthoflow.report.environments import environment_words
 from orthoflow.report.overlays import magnification_for, overlays, residuals_on_wall
 from orthoflow.report.pictures import Picture, sliders, wall_pictures
@@ -30,6 +30,7 @@ from tests.report_runs import (
     compared_run,
     environment,
     given,
+    metrics,
     record,
 )
 
@@ -172,6 +173,8 @@ def test_rows_of_a_comparison_stand_beside_each_other(tmp_path: Path) -> None:
         ("check", "cpu_s", "processor time / s", "lower"),
         ("check", "peak_rss_mib", "memory / MiB", "lower"),
         ("check", "compile_s", "loading and compiling / s", ""),
+        ("", "cpu_s", "processor time / s", "lower"),
+        ("", "peak_rss_mib", "memory / MiB", "lower"),
     ]
     fine, coarse, broken = table.rows
     here = tmp_path.name
@@ -180,7 +183,7 @@ def test_rows_of_a_comparison_stand_beside_each_other(tmp_path: Path) -> None:
     assert [row.is_baseline for row in table.rows] == [True, False, False]
     assert broken.failure == "plane@plane=broken: no plane & no <wall>"
     assert {value.text for value in broken.values} == {""}
-    assert (broken.time.text, broken.memory.text, broken.remark) == ("", "", "")
+    assert broken.remark == ""
     assert (fine.failure, coarse.failure) == ("", "")
     assert [value.text for value in fine.values[:4]] == ["1.10 ± 0.10", "10", "0.4", "0.9931"]
     assert [value.text for value in coarse.values[:4]] == ["4", "11", "60.4", "0.9931"]
@@ -189,39 +192,41 @@ def test_rows_of_a_comparison_stand_beside_each_other(tmp_path: Path) -> None:
     assert fine.values[0].note == "mean and standard deviation of 3 repeats"
     assert coarse.values[0].note == ""
     assert (fine.time.text, coarse.time.text) == ("5.0", "4.2")
-    # Times that differ by less than 30 % are not told apart.
-    assert (fine.memory.text, fine.time.mark, coarse.time.mark) == ("0", Mark.NONE, Mark.NONE)
+    assert fine.values[-1].text == "0"
     assert fine.remark == "1 of 5 steps cached, with their time in run r0"
 
 
-def test_environments_and_data_have_letters_of_their_own() -> None:
+def test_each_environment_and_set_of_data_has_a_letter() -> None:
     def run(name: str, *cells: object) -> HeldRun:
-        told = record(cells, run_id=name, environments=(environment(name, threads=int(name[1])),))  # type: ignore[arg-type]
-        return HeldRun(path=Path(f"{name}.h5"), record=told)
+        held = record(cells, run_id=name, environments=(environment(name, threads=int(name[1])),))  # type: ignore[arg-type]
+        return HeldRun(path=Path(f"{name}.h5"), record=held)
 
-    one, two = run("e1", cell("a@b=c")), run("e2", cell("a@b=d", environment="e2"))
-    origins = Origins.of([one, two])
+    def letters(*runs: HeldRun) -> tuple[list[tuple[str, ...]], Mapping[str, str]]:
+        table = comparison_table(runs)
+        assert table is not None
+        return [row.groups for row in table.rows], table.groups
+
+    measured = metrics(rms_mm=1.0)
+    one = run("e1", cell("a@b=c", metrics=measured), cell("a@b=d", metrics=measured))
+    two = run("e2", cell("a@b=d", environment="e2", metrics=measured))
     words = (
         f"Python 3.11.2, Linux, toy, 2 processors, {n} threads, code at commit {40 * 'c'}+changes"
         for n in (1, 2)
     )
-    assert origins.legend == dict(zip("AB", words, strict=True))
-    (first,), (second,) = combinations_of(one), combinations_of(two)
-    assert (origins.letters(first, "e1"), origins.letters(second, "e2")) == ("A", "B")
-    assert origins.letters(first, "e9") == "?"
-    bare = replace(environment(), git_commit="")
-    assert environment_words(bare).endswith(", 2 threads")
-    alone = Origins.of([one])
-    assert (dict(alone.legend), alone.letters(first, "e1")) == ({}, "")
+    assert letters(one, two) == ([("A",), ("A",), ("B",)], dict(zip("AB", words, strict=True)))
+    assert letters(one) == ([(), ()], {})
+    assert environment_words(replace(environment(), git_commit="")).endswith(", 2 threads")
     # Rooms of two runs: the same data have the same letter, whichever run they are of.
     rooms = [
         run(
             name,
-            *(cell(f"room@data={room}", outputs={"c": given("", room, "cloud")}) for room in names),
+            *(
+                cell(f"room@data={room}", outputs={"c": given("", room, "cloud")}, metrics=measured)
+                for room in names
+            ),
         )
         for name, names in (("r1", ("a", "b")), ("r2", ("b",)))
     ]
-    of_rooms = Origins.of(rooms)
-    told = [of_rooms.letters(one, "e1") for room in rooms for one in combinations_of(room)]
-    assert [sign[-1] for sign in told] == ["a", "b", "b"]
-    assert of_rooms.legend["b"] == "data of run r1, dataset b; r2, dataset b"
+    found, legend = letters(*rooms)
+    assert found == [("A",), ("B",), ("B",)]
+    assert legend["B"] == "data of run r1, dataset b; r2, dataset b"

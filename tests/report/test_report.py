@@ -10,15 +10,16 @@ import pytest
 from orthoflow_provenance.document import Metric, PublishedFile, RecordedCell
 
 from orthoflow.errors import StoreError
-from orthoflow.records.runs import MetricRow, Run
+from orthoflow.records.runs import Run
 from orthoflow.records.write import NOT_YET
-from orthoflow.report import comparisons, write_figures, write_page, write_report
-from orthoflow.report.combinations import Measured, combinations_of
+from orthoflow.report import write_figures, write_page, write_report
+from orthoflow.report.combinations import combinations_of
 from orthoflow.report.comparisons import comparison_columns, comparison_table
 from orthoflow.report.figures import figure_groups
 from orthoflow.report.rankings import Mark, Value
 from orthoflow.report.rendering import cited
 from orthoflow.report.summaries import answers, citations, limits, results
+from orthoflow.workflow.expand import NOT_ASKED_FOR
 from tests.report_runs import (
     HeldRun,
     cell,
@@ -223,8 +224,8 @@ def test_what_nobody_asked_for_is_not_called_unreached(tmp_path: Path) -> None:
         cell("wall"),
         cell("paint", status="failed", error_message="no disk"),
         cell("check", status="skipped", error_message="needs paint, which failed"),
-        cell("theirs", status="skipped", error_message="only with the input other"),
-        cell("match", status="skipped", error_message="only without the input cameras"),
+        cell("theirs", status="skipped", error_type=NOT_ASKED_FOR),
+        cell("match", status="skipped", error_type=NOT_ASKED_FOR),
     )
     assert results(told) == {
         "ok": ("wall",),
@@ -296,9 +297,9 @@ def test_processor_times_are_ranked_whatever_the_clock_says() -> None:
         assert table is not None
         return [one.time.mark for one in table.rows]
 
-    assert marks(9.0, 6.0) == [Mark.BEST, Mark.WORST]
-    assert marks(0.5, 6.0) == [Mark.BEST, Mark.WORST]
-    assert marks(22.0, 0.5) == [Mark.WORST, Mark.BEST]
+    assert marks(9.0, 6.0) == [Mark.BEST, Mark.NONE]
+    assert marks(0.5, 6.0) == [Mark.BEST, Mark.NONE]
+    assert marks(22.0, 0.5) == [Mark.NONE, Mark.BEST]
     # Either may be wrong by a tenth of a second.
     short = comparison_table([run(row("hough", 2.0, 0.08), row("ransac", 2.0, 0.11))])
     assert short is not None
@@ -309,101 +310,46 @@ def test_processor_times_are_ranked_whatever_the_clock_says() -> None:
     cells = [
         cell("plane@plane=hough", cpu_s=0.75, peak_rss_mib=1234.6),
         cell("wall@plane=hough", cpu_s=0.75, peak_rss_mib=99.0),
-        cell("plane@plane=ransac", cpu_s=0.996, peak_rss_mib=50.0, compile_s=None),
+        cell("plane@plane=ransac", cpu_s=0.996, peak_rss_mib=50.0),
         cell("wall@plane=ransac", status="failed", error_message="no wall"),
-        cell("plane@plane=region", cpu_s=0.996, peak_rss_mib=50.0, compile_s=None),
+        cell("plane@plane=region", cpu_s=0.996, peak_rss_mib=50.0),
         cell("wall@plane=region", cpu_s=0.0),
     ]
     table = comparison_table([run(*cells)])
     assert table is not None
-    assert [(one.time.text, one.memory.text) for one in table.rows] == [
+    assert [tuple(cost.text for cost in one.values[-2:]) for one in table.rows] == [
         *(("1.5", "1235"), ("", ""), ("1.00", "50")),
     ]
-    assert [one.remark for one in table.rows][::2] == [
-        "",
-        "1 of 2 steps with loading and compiling in their time",
+
+
+@pytest.mark.parametrize(
+    ("values", "text", "note"),
+    [
+        ((2.0,), "2", ""),
+        ((1.5, 2.5), "2.00 ± 0.71", "mean and standard deviation of 2 repeats"),
+        ((2.0, None, None), "2 (1 of 3 repeats)", ""),
+        (
+            (-1.5, 2.5),
+            "2.00 ± 0.71",
+            "mean and standard deviation of the sizes of errors of both signs in 2 repeats",
+        ),
+        ((None,), "", ""),
+    ],
+)
+def test_a_value_states_what_it_is_the_mean_of(
+    values: tuple[float | None, ...], text: str, note: str
+) -> None:
+    repeats = [
+        cell(
+            f"plane@plane=one{f'#{index}' if index else ''}",
+            metrics=() if value is None else metrics(rms_mm=value),
+        )
+        for index, value in enumerate(values)
     ]
-
-
-def offset_column(step: str) -> MetricRow:
-    return MetricRow(
-        cell=step,
-        step=step,
-        method="",
-        name="plane_offset_mm",
-        value=0.0,
-        unit="mm",
-        better="lower",
-    )
-
-
-@pytest.mark.parametrize(
-    ("n_repeats", "n_all", "text", "note"),
-    [
-        (1, 1, "2", ""),
-        (2, 2, "2.00 ± 0.50", "mean and standard deviation of 2 repeats"),
-        (1, 3, "2 (1 of 3 repeats)", ""),
-    ],
-)
-def test_a_value_says_what_it_is_the_mean_of(
-    n_repeats: int, n_all: int, text: str, note: str
-) -> None:
-    told = run(cell("plane"))
-    measured = Measured(
-        value=2.0, spread=0.5, n_repeats=n_repeats, n_all=n_all, unit="", environment="e1"
-    )
-    (one,) = combinations_of(told)
-    column = offset_column("plane")
-    value = comparisons._value(measured, one, comparisons.Origins.of([told]), column)
-    assert (value.text, value.note, value.sort, value.spread) == (text, note, 2.0, 0.5)
-    nothing = comparisons._value(None, one, comparisons.Origins.of([told]), column)
-    assert nothing == Value(found_nothing=True)
-    sizes = comparisons._value(
-        replace(measured, is_of_sizes=True), one, comparisons.Origins.of([told]), column
-    )
-    signed = f" the sizes of errors of both signs in {n_repeats} repeats"
-    assert sizes.note == (f"mean and standard deviation of{signed}" if n_repeats > 1 else "")
-
-
-@pytest.mark.parametrize(
-    ("cells", "found_nothing"),
-    [
-        ((cell("plane"), cell("check")), True),
-        ((cell("plane", status="failed"), cell("check", status="skipped")), True),
-        (
-            (
-                cell("plane"),
-                cell("check", status="skipped", error_message="only with the input other"),
-            ),
-            False,
-        ),
-        (
-            (
-                cell("plane"),
-                cell("check", status="skipped", error_type=NOT_YET, error_message="not yet"),
-            ),
-            False,
-        ),
-        ((cell("plane"),), False),
-        ((cell("plane", status="failed"),), False),
-    ],
-    ids=[
-        "nothing found",
-        "failed before",
-        "not asked for",
-        "broken off",
-        "no such step",
-        "no such step, and failed",
-    ],
-)
-def test_who_was_asked_for_a_number_and_has_none_found_nothing(
-    cells: tuple[RecordedCell, ...], found_nothing: bool
-) -> None:
-    told = run(*cells)
-    (one,) = combinations_of(told)
-    column = offset_column("check")
-    value = comparisons._value(None, one, comparisons.Origins.of([told]), column)
-    assert value.found_nothing == found_nothing
+    table = comparison_table([run(*repeats, cell("plane@plane=two", metrics=metrics(rms_mm=3.0)))])
+    assert table is not None
+    value = table.rows[0].values[0]
+    assert (value.text, value.note) == (text, note)
 
 
 def test_what_a_run_was_broken_off_before_has_no_time_and_is_not_counted(
@@ -411,15 +357,7 @@ def test_what_a_run_was_broken_off_before_has_no_time_and_is_not_counted(
 ) -> None:
     # Of `coarse` only the step before is there, as where the room was built and no plane sought.
     cells = [
-        replace(
-            one,
-            status="skipped",
-            error_type=NOT_YET,
-            error_message="not yet",
-            metrics=(),
-            outputs={},
-            figures=(),
-        )
+        replace(one, status="skipped", error_type=NOT_YET, metrics=(), outputs={}, figures=())
         if one.assignment and one.address != "plane@plane=coarse"
         else one
         for one in compared.record.cells
@@ -429,7 +367,7 @@ def test_what_a_run_was_broken_off_before_has_no_time_and_is_not_counted(
     table = comparison_table([broken_off])
     assert table is not None
     fine, coarse = table.rows
-    assert (fine.time.text, fine.memory.text, fine.shortfall) == ("", "", "not computed")
+    assert ([cost.text for cost in fine.values[-2:]], fine.shortfall) == (["", ""], "not computed")
     assert coarse.missing[0] == "wall@plane=coarse"
     assert table.n_whole == 0
     assert [one.shortfall for one in table.glance] == ["not computed"] * 2
@@ -456,8 +394,8 @@ def test_runs_on_different_data_are_not_ranked_together() -> None:
     table = comparison_table(runs)
     assert table is not None
     assert [(row.run, row.values[0].group, row.values[0].mark) for row in table.rows] == [
-        (f"toy <run>, {Path.cwd().name}, r1", "a", Mark.NONE),
-        (f"toy <run>, {Path.cwd().name}, r2", "b", Mark.NONE),
+        (f"toy <run>, {Path.cwd().name}, r1", "A", Mark.NONE),
+        (f"toy <run>, {Path.cwd().name}, r2", "B", Mark.NONE),
     ]
 
 
@@ -474,24 +412,19 @@ def test_runs_of_one_workflow_are_told_apart_by_their_options() -> None:
     ]
 
 
-def test_a_glance_says_who_leads_and_names_three_at_most(compared: Run) -> None:
+def test_a_glance_states_which_lead_and_names_three_at_most(compared: Run) -> None:
     table = comparison_table([compared])
     assert table is not None
-    first, second, last = table.glance
+    first, _, last = table.glance
     assert (first.name, first.is_baseline) == ("plane=fine", True)
     # The other one was run once only, and single runs are not ranked.
-    assert first.best_in == ()
-    assert second.n_worst == 0
-    assert (last.name, last.shortfall, last.n_best) == ("plane=broken", "failed", 0)
-    row = table.rows[0]
-    # At most three are named.
+    assert table.best_in(first) == ()
+    assert (last.name, last.shortfall, last.count(Mark.BEST)) == ("plane=broken", "failed", 0)
     for n_best, named in ((3, 3), (4, 4)):
-        values = [
+        values = tuple(
             Value(mark=Mark.BEST if index < n_best else Mark.NONE)
             for index in range(len(table.columns))
-        ]
-        (leader,) = replace(
-            table, rows=(replace(row, values=tuple(values), time=Value(), memory=Value()),)
-        ).glance
-        assert (leader.n_best, len(leader.best_in)) == (n_best, named)
-        assert (leader.best_in[-1] == "...") is (n_best == 4)
+        )
+        leader = replace(first, values=values)
+        assert (leader.count(Mark.BEST), len(table.best_in(leader))) == (n_best, named)
+        assert (table.best_in(leader)[-1] == "...") is (n_best == 4)

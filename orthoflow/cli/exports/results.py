@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from orthoflow.cli.exports.products import make_empty, output_of, product_of
 from orthoflow.cli.tables import counted
-from orthoflow.untrusted_text import csv_text
 
 if TYPE_CHECKING:
     from orthoflow.cli.exports.choices import Choices
@@ -31,20 +31,24 @@ def export_colmap(run: Run, folder: Path, chosen: Choices) -> str:
 
 def export_csv(run: Run, folder: Path, _chosen: Choices) -> str:
     """Write all tables."""
+    from orthoflow.records.runs import parts_of
     from orthoflow.records.tables import write_csv_tables
-    from orthoflow.report.tidy_tables import combination_rows, dataset_rows
+    from orthoflow.report.paired import over_datasets
+    from orthoflow.report.tidy_tables import combination_table, over_table
 
     make_empty(folder)
     written = [path.name for path in write_csv_tables(run, folder)]
-    tables = {"combinations.csv": [*combination_rows(run)]}
-    header, *over_datasets = dataset_rows(run)
-    if over_datasets:
-        tables["datasets.csv"] = [header, *over_datasets]
-    for name, rows in tables.items():
-        (folder / name).write_text(
-            csv_text(rows), encoding="utf-8", errors="backslashreplace", newline=""
-        )
-    return ", ".join([*written, *tables])
+    tables = [combination_table(run)]
+    if over := over_datasets(parts_of(run)):
+        tables.append(over_table(over))
+    files = {f"{table.name}.csv": table.csv() for table in tables}
+    _write_texts(folder, files)
+    return ", ".join([*written, *files])
+
+
+def _write_texts(folder: Path, files: Mapping[str, str]) -> None:
+    for name, text in files.items():
+        (folder / name).write_text(text, encoding="utf-8", errors="backslashreplace", newline="")
 
 
 def export_figures(run: Run, folder: Path, chosen: Choices) -> str:
@@ -83,8 +87,7 @@ def export_tables(run: Run, folder: Path, _chosen: Choices) -> str:
 
     files = paper_files(run)
     make_empty(folder)
-    for name, text in files.items():
-        (folder / name).write_text(text, encoding="utf-8", errors="backslashreplace", newline="")
+    _write_texts(folder, files)
     return ", ".join(files)
 
 
