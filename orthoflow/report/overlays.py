@@ -212,9 +212,8 @@ def _drawn(
     content = base64.b64decode(ground.uri.partition(",")[2])
     columns_px = side * min(1.0, frame.width / frame.height)
     with styled({"font.size": 7.0, "savefig.dpi": columns_px / COLUMN_INCHES}):
-        figure, axes = picture_figure(
-            decode_image(content, ground.title), size=(frame.height, frame.width), extra_inches=0.3
-        )
+        picture = decode_image(content, ground.title)
+        figure, axes = picture_figure(picture, frame=frame, extra_inches=0.4)
         axes.autoscale(enable=False)
         for kind, members in groups.items():
             marker, colour = _MARKERS.get(kind, _OTHERS)
@@ -225,9 +224,10 @@ def _drawn(
                 ends = np.stack([feet[members], feet[members] + vectors[members]])
                 axes.plot(*ends.T.swapaxes(1, 2), color=colour, linewidth=0.8)
         text, length = reference
-        low = 1.03 * frame.height
-        axes.plot([0.0, length], [low, low], color="black", clip_on=False)
-        axes.annotate(text, (length, low), (3, 0), textcoords="offset points", va="center")
+        above = -0.03 * frame.height
+        axes.plot([0.0, length], [above, above], color="black", clip_on=False)
+        place = (length + 0.01 * frame.width, above)
+        axes.annotate(text, place, va="center", annotation_clip=False)
         figure.legend(loc="outside lower right", ncols=3)
         return encode_chart(figure)
 

@@ -73,7 +73,9 @@ def test_ties_and_displacements_are_drawn_on_the_wall_of_their_cell(tmp_path: Pa
     spots, n_spots = ndimage.label(blue)
     assert n_spots == 2
     sizes = [[part.stop - part.start for part in slices] for slices in ndimage.find_objects(spots)]
-    long_px = 2.0 / FRAME.width * 0.92 * rgb.shape[1]
+    # Their feet are 80 and 40 cells apart.
+    (y0, x0), (y1, x1) = ndimage.center_of_mass(blue, spots, (1, 2))
+    long_px = 2.0 * np.hypot(x1 - x0, y1 - y0) / np.hypot(80.0, 40.0)
     tall, wide = sorted(sizes, reverse=True)
     mark_px = min(*tall, *wide)
     assert max(tall) - 0.5 * mark_px == pytest.approx(long_px, abs=4.0)
