@@ -100,8 +100,6 @@ def _row_json(row: Pair[Any]) -> dict[str, object]:
 
 
 def _print(comparison: RunComparison, *, most: int | None = None) -> None:
-    from orthoflow.report.differences import without_seeds
-
     for mark, record in (("A", comparison.left), ("B", comparison.right)):
         echo(
             f"{mark}: {record.name}, run {record.run_id}, {record.created_by}, {record.started}, "
@@ -119,8 +117,8 @@ def _print(comparison: RunComparison, *, most: int | None = None) -> None:
     else:
         echo("", "workflow: same text")
     _print_pairs("options", [comparison.overrides], " ".join, most)
-    steps = without_seeds(comparison.cells)
-    _print_pairs("steps", [_differing_parts(pair) for pair in steps], str, most, step_of)
+    steps = [_differing_parts(pair) for pair in comparison.cells]
+    _print_pairs("steps", steps, str, most, step_of)
     if comparison.readdressed:
         pairs = [f"{ours} (A) and {theirs} (B)" for theirs, ours in comparison.readdressed.items()]
         named = first_few(pairs, len(pairs) if most is None else _READDRESSED_MOST)
@@ -227,32 +225,31 @@ def _parameter_text(parameter: ParameterValue) -> str:
 
 def _print_metrics(comparison: RunComparison, most: int | None) -> None:
     """Print metrics that differ by more than rounding; times and memory apart and last."""
-    from orthoflow.report.differences import grouped_rows, moved_first, repeats_as_one
+    from orthoflow.report.differences import grouped_rows, grouped_texts, moved_first
 
     measured, step_of = comparison.measured, comparison.step_of
     echo("", f"metrics: {_counts(measured)}{comparison.of_shared_steps}")
     different = moved_first([row for row in measured if not row.is_same], step_of)
     if most is None:
-        _print_numbers(grouped_rows(different, id))
+        _print_numbers(grouped_rows(different, id), step_of)
     else:
-        kept = repeats_as_one(row for row in different if row.is_moved)
-        _print_numbers(kept[:most])
+        moved = [row for row in different if row.is_moved]
+        kept = grouped_texts(moved, lambda side: f"{side.value} {side.unit}", step_of)
+        _print_numbers(kept[:most], step_of)
         echo_left_out(len(kept), most)
     costs = [row for row in comparison.shared(comparison.metrics) if row.either.is_cost]
     different = [row for row in costs if not row.is_same]
     echo("", f"times and memory: {_counts(costs)}")
-    _print_numbers(grouped_rows(different, id)[:most])
+    _print_numbers(grouped_rows(different, id)[:most], step_of)
     echo_left_out(len(different), most)
 
 
-def _print_numbers(rows: Sequence[RowGroup[ComparedMetric]]) -> None:
-    from orthoflow.report.differences import metric_label
-
+def _print_numbers(rows: Sequence[RowGroup[ComparedMetric]], step_of: Mapping[str, str]) -> None:
     echo_table(
         ("metric", "A", "B", "B - A", "unit"),
         [
             (
-                metric_label(one),
+                one.label(step_of),
                 *(
                     _NOTHING if side is None else number(side.value)
                     for side in (one.pair.left, one.pair.right)

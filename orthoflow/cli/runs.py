@@ -52,7 +52,7 @@ _SIGNS: Final[Mapping[str, Callable[[float, float], bool]]] = {
     metavar="'METRIC > X'",
     multiple=True,
     help="Only runs of which it holds: < <= > >= = !=, of a metric, step.metric or parameter (of "
-    "a sweep, of one of its values; step.variant.parameter for those of a variant).",
+    "variants, datasets and sweeps, of one of the values).",
 )
 @click.option(
     "--sort",
@@ -158,10 +158,10 @@ def list_runs(folders: Sequence[Path]) -> list[RunSummary]:
 
 def runs_json(kept: Sequence[RunSummary], found: Sequence[RunSummary]) -> list[dict[str, object]]:
     """Return runs as JSON, with every metric and parameter, and in what they differ from others."""
-    from orthoflow.report.browsing import differing_facts, distinct_facts
+    from orthoflow.report.browsing import differing_facts
 
-    facts, differs = distinct_facts(found), differing_facts(found)
-    return [_row_json(run, facts[run.folder], differs[run.folder]) for run in kept]
+    differs = differing_facts(found)
+    return [_row_json(run, run.all_facts, differs[run.folder]) for run in kept]
 
 
 def print_runs(

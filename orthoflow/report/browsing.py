@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, Literal, NamedTuple, TypeAlias
+from typing import Final, Literal, TypeAlias
 
 import numpy as np
 
@@ -25,7 +25,6 @@ from orthoflow.report.paired import middle_of
 from orthoflow.report.rankings import FLAG, is_flag
 from orthoflow.report.summaries import headline_keys
 from orthoflow.untrusted_text import open_file, parse_json
-from orthoflow.workflow.model import DATA
 
 RunState: TypeAlias = Literal["ok", "failed", "running", "unfinished", "damaged"]
 
@@ -39,46 +38,6 @@ _FIRST_LINE_BYTES: Final = 1 << 16
 _PICTURE_PX: Final = 180
 _PICTURES_MOST: Final = 200  # about 8 kB each
 _KEYS_MOST: Final = 6
-
-
-class Parameter(NamedTuple):
-    """A value of a parameter in one cell.
-
-    Attributes:
-        step: name of the step.
-        data: the dataset; empty for none.
-        variant: of the step, as `--set` names it: without what a sweep appends; empty for none.
-        cell_variant: the same as the cell has it.
-        name: of the parameter.
-        value: its value.
-    """
-
-    step: str
-    data: str
-    variant: str
-    cell_variant: str
-    name: str
-    value: JsonValue
-
-    def address(self, *, with_data: bool, variant: str) -> str:
-        """Return its name, with the dataset or a variant where these differ."""
-        at = f"@{DATA}={self.data}" if with_data and self.data else ""
-        if not variant:
-            return f"{self.step}{at}.{self.name}"
-        return (
-            f"{self.step}{at},{self.step}={variant}.{self.name}"
-            if at
-            else (f"{self.step}.{variant}.{self.name}")
-        )
-
-    @property
-    def addresses(self) -> frozenset[str]:
-        """All its names."""
-        return frozenset(
-            self.address(with_data=with_data, variant=variant)
-            for with_data in (False, True)
-            for variant in ("", self.variant, self.cell_variant)
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +61,7 @@ class RunSummary:
         flags: those that are 1 where something is so and 0 where not.
         facts: what may differ between runs beside parameters: `seed`, `orthoflow` (its version),
             methods of the baseline by `step.use`, and inputs by `input <name>`.
-        parameters: of all cells.
+        parameters: `step.parameter` -> its values, of variants and datasets several.
     """
 
     folder: Path
@@ -118,20 +77,27 @@ class RunSummary:
     headlines: tuple[str, ...] = ()
     flags: tuple[str, ...] = ()
     facts: Mapping[str, JsonValue] = field(default_factory=dict)
-    parameters: tuple[Parameter, ...] = ()
+    parameters: Mapping[str, tuple[JsonValue, ...]] = field(default_factory=dict)
 
     @property
     def names(self) -> frozenset[str]:
         """What `values` knows something of."""
-        of_parameters = (name for one in self.parameters for name in one.addresses)
-        return frozenset((*self.metrics, *self.facts, *of_parameters))
+        return frozenset((*self.metrics, *self.facts, *self.parameters))
 
     def values(self, name: str) -> tuple[JsonValue, ...]:
-        """Return a metric, a fact, or all values of a parameter that a name is of."""
+        """Return a metric, a fact, or all values of a parameter."""
         for known in (self.metrics, self.facts):
             if name in known:
                 return (known[name],)
-        return tuple(one.value for one in self.parameters if name in one.addresses)
+        return self.parameters.get(name, ())
+
+    @property
+    def all_facts(self) -> dict[str, JsonValue]:
+        """Facts and parameters; several values of one are a text, as `0.02|0.05`."""
+        return dict(self.facts) | {
+            name: values[0] if len(values) == 1 else "|".join(map(_sorted_json, values))
+            for name, values in self.parameters.items()
+        }
 
 
 def run_folders(folders: Sequence[Path]) -> list[Path]:
@@ -159,7 +125,7 @@ def differing_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValu
 
     A fact that some of them lack differs only where two others disagree on it.
     """
-    facts = distinct_facts(runs)
+    facts = {run.folder: run.all_facts for run in runs}
     values: dict[tuple[str, str], set[str]] = {}
     for run in runs:
         for name, value in facts[run.folder].items():
@@ -171,54 +137,6 @@ def differing_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValu
             if len(values[run.workflow, name]) > 1
         }
         for run in runs
-    }
-
-
-def distinct_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValue]]:
-    """All facts and parameters of each run, by its folder: each once, by the name of `--set`.
-
-    All values of a sweep are one text, without the dataset what is the same on all
-    datasets of each run of the workflow, and without the variant what all variants of a step have
-    and is the same in them.
-    """
-    by_data: set[tuple[str, str, str]] = set()
-    by_variant: set[tuple[str, str, str]] = set()
-    swept = {run.folder: _swept_values(run) for run in runs}
-    for run in runs:
-        variants: dict[str, set[str]] = {}
-        for one in run.parameters:
-            variants.setdefault(one.step, set()).add(one.variant)
-        for (step, name), found in swept[run.folder].items():
-            key = run.workflow, step, name
-            for variant in {variant for _, variant in found}:
-                own = {value for (_, other), value in found.items() if other == variant}
-                by_data |= {key} if len(own) > 1 else set()
-            for data in {data for data, _ in found}:
-                of_data = {other: value for (one, other), value in found.items() if one == data}
-                is_one = len({*of_data.values()}) == 1 and of_data.keys() == variants[step]
-                by_variant |= set() if is_one else {key}
-    facts: dict[Path, dict[str, JsonValue]] = {run.folder: {**run.facts} for run in runs}
-    for run in runs:
-        for one in run.parameters:
-            key = run.workflow, one.step, one.name
-            name = one.address(
-                with_data=key in by_data, variant=one.variant if key in by_variant else ""
-            )
-            values = swept[run.folder][one.step, one.name][one.data, one.variant]
-            facts[run.folder][name] = one.value if len(values) == 1 else "|".join(values)
-    return facts
-
-
-def _swept_values(
-    run: RunSummary,
-) -> dict[tuple[str, str], dict[tuple[str, str], tuple[str, ...]]]:
-    """Values of parameters as JSON, of a sweep several: step and name -> dataset and variant."""
-    found: dict[tuple[str, str], dict[tuple[str, str], dict[str, None]]] = {}
-    for one in run.parameters:
-        at = found.setdefault((one.step, one.name), {}).setdefault((one.data, one.variant), {})
-        at[_sorted_json(one.value)] = None
-    return {
-        key: {place: tuple(values) for place, values in own.items()} for key, own in found.items()
     }
 
 
@@ -326,27 +244,19 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
         ),
         flags=tuple(flags),
         facts=facts,
-        parameters=tuple(
-            Parameter(
-                cell.step,
-                cell.assignment.get(DATA, ""),
-                _called_by_set(cell),
-                cell.assignment.get(cell.step, ""),
-                name,
-                value,
-            )
-            for cell in record.cells
-            if cell.repeat == 0 and cell.status != "skipped"
-            for name, value in cell.params.items()
-        ),
+        parameters=_parameters(record.cells),
     )
 
 
-def _called_by_set(cell: RecordedCell) -> str:
-    """The variant that `--set` names: a sweep puts parameters and values behind its name."""
-    variant = cell.assignment.get(cell.step, "")
-    swept = [f"-{variant}".find(f"-{parameter}-") for parameter in cell.params]
-    return variant[: min((max(at - 1, 0) for at in swept if at >= 0), default=None)]
+def _parameters(cells: Iterable[RecordedCell]) -> dict[str, tuple[JsonValue, ...]]:
+    """Return the values that each parameter has in the cells, each once."""
+    found: dict[str, dict[str, JsonValue]] = {}
+    for cell in cells:
+        if cell.repeat == 0 and cell.status != "skipped":
+            for name, value in cell.params.items():
+                known = found.setdefault(f"{cell.step}.{name}", {})
+                known.setdefault(_sorted_json(value), value)
+    return {name: tuple(known.values()) for name, known in found.items()}
 
 
 def _unfinished(folder: Path) -> RunSummary:

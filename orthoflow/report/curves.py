@@ -7,6 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -21,11 +22,9 @@ from orthoflow.report.combinations import (
     unequal_walls,
 )
 from orthoflow.report.comparisons import comparison_columns
-from orthoflow.report.numbers import number
 from orthoflow.report.paired import middle_of, spread_of
 from orthoflow.report.pictures import Picture
-from orthoflow.report.rankings import BETTER, cost_share, is_flag
-from orthoflow.untrusted_text import first_few
+from orthoflow.report.rankings import BETTER, is_flag
 from orthoflow.workflow.expand import variants_text
 from orthoflow.workflow.model import DATA
 
@@ -76,7 +75,7 @@ class Curve:
 def curve_files(run: Run, suffix: ChartFormat = "svg") -> dict[str, bytes]:
     """Return the drawings of a run, over its datasets where it has several, as files by name."""
     parts = parts_of(run)
-    drawn = curves_over(parts) if len(parts) > 1 else curves(run)
+    drawn = curves([*parts.values()] if len(parts) > 1 else [run])
     # What a record calls its steps and metrics may be no name of a file.
     names = (re.sub(r"[^\w.-]", "_", curve.name)[:_LONGEST_NAME] for curve in drawn)
     return {
@@ -85,18 +84,16 @@ def curve_files(run: Run, suffix: ChartFormat = "svg") -> dict[str, bytes]:
     }
 
 
-def curves(run: Run) -> tuple[Curve, ...]:
+def curves(parts: Sequence[Run]) -> tuple[Curve, ...]:
     """Draw the metrics of a comparison over every parameter in which variants differ alone.
 
     A sweep is known by what was run, not by how the workflow was written: variants of a step that
     call one method and differ in one number.
+
+    Args:
+        parts: the run, or its datasets, of which medians are drawn and how far they lie apart.
     """
-    return tuple(_curves([run]))[:_MOST_CURVES]
-
-
-def curves_over(parts: Mapping[str, Run]) -> tuple[Curve, ...]:
-    """The same over datasets: medians, and how far the datasets lie apart."""
-    return tuple(_curves(list(parts.values())))[:_MOST_CURVES]
+    return tuple(islice(_curves(parts), _MOST_CURVES))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,14 +188,13 @@ def _unswept(
 
 
 class _Value(NamedTuple):
-    """What one combination measured, and in how many of its repeats."""
+    """What one combination measured, and in how many repeats."""
 
     value: float
     spread: float
     is_baseline: bool
     dataset: str
     n_repeats: int
-    n_all: int
 
 
 # Value of the parameter, None of what was not swept -> what combinations measured there.
@@ -272,7 +268,6 @@ def _lines(
                     one.is_baseline,
                     one.assignment.get(DATA, ""),
                     measured.n_repeats,
-                    measured.n_all,
                 )
             )
     return lines
@@ -284,7 +279,6 @@ def _curve(
     is_over = n_datasets > 1
     xs = [x for line in lines.values() for x in line if x is not None]
     drawn: dict[str, list[ChartPoint]] = {}
-    partly: list[str] = []
     is_broken = False
     for name, line in lines.items():
         before: list[tuple[str, int]] | None = None
@@ -299,41 +293,23 @@ def _curve(
             for place in (min(xs), max(xs)) if x is None else (x,):
                 point = _point(place, found, column, is_over=is_over, is_joined=is_joined)
                 drawn.setdefault(name, []).append(point)
-            at = "" if x is None else f" at {number(x)}"
-            partly += [
-                f"{one.dataset}{at} ({one.n_repeats} of {one.n_all})".lstrip()
-                for one in found
-                if one.n_repeats < one.n_all
-            ]
     every = [point for points in drawn.values() for point in points]
     # Sizes of errors are never below 0, and what is judged by more and lies in 0 to 1 is a share.
     is_size = column.better == "lower" and all(point.y >= 0.0 for point in every)
     is_share = column.better == "higher" and all(0.0 <= point.y <= 1.0 for point in every)
-    caption = _points_words(lines, column.unit, n_datasets)
+    notes = [_points_text(lines, column.unit, n_datasets)]
     if is_broken:
-        what = "datasets or repeats" if is_over else "numbers of repeats"
-        caption += f", no line between those of unlike {what}"
-    if partly:
-        caption += f"; of only some repeats: {first_few(partly)}"
+        notes.append("no line joins points of different datasets or numbers of repeats")
     if column.better in BETTER:
-        caption += f"; {BETTER[column.better]}"
-    if column.better == "lower" and not cost_share(column.unit):
-        caption += ", of signed errors their sizes"
+        notes.append(BETTER[column.better])
     if any(None in line for line in lines.values()):
-        caption += "; level lines are of what was not swept"
-    if base := [x for line in lines.values() for x, found in line.items() if found[0].is_baseline]:
-        filled = "level line with filled points" if base[0] is None else "filled point"
-        caption += f"; the {filled} is the baseline"
-    shape = (
-        "A flat stretch is where the parameter does not matter; at a steep end the chosen value "
-        "decides the result."
-        if max(map(len, lines.values())) > _FEWEST_VALUES
-        else "Of two values a line shows the difference alone, and nothing of what lies between."
-    )
+        notes.append("level lines are of what was not swept")
+    if any(point.is_filled for point in every):
+        notes.append("filled points are the baseline")
     return Curve(
         name=f"{column.step}.{column.metric}_over_{parameter}",
         title=f"{column.titled} ({column.step}) over {parameter}",
-        caption=f"Points are {caption}. {shape}{caveats}",
+        caption=f"Points are {'; '.join(notes)}.{caveats}",
         lines=drawn,
         below=parameter,
         beside=column.titled,
@@ -361,21 +337,18 @@ def _point(
     )
 
 
-def _points_words(lines: Mapping[str, _Line], unit: str, n_datasets: int) -> str:
+def _points_text(lines: Mapping[str, _Line], unit: str, n_datasets: int) -> str:
     """What the points are, and over datasets how many these are: what failed has no part in it."""
     found = [values for line in lines.values() for values in line.values()]
     if n_datasets < 2:
         if any(math.isfinite(one.spread) for values in found for one in values):
             return "means of the repeats, bars their standard deviation"
-        return "one value each: without repeats nobody knows how far they scatter"
+        return "single values without repeats"
     least, most = min(map(len, found)), max(map(len, found))
-    if most == 1:
-        return f"each of the only one of {n_datasets} datasets that has a value, without bars"
     counted = f"{least}" if least == most else f"{least} to {most}"
-    counted += f" of {n_datasets}" if least < n_datasets else ""
     if is_flag(unit):
-        return (
-            f"means of {counted} datasets: the share of them, and of their repeats, "
-            "where it is so (1)"
-        )
-    return f"medians of {counted} datasets, bars 1.4826 times the median absolute deviation"
+        return f"shares of {counted} of {n_datasets} datasets, and of their repeats"
+    return (
+        f"medians of {counted} of {n_datasets} datasets, of errors with signs of their sizes, "
+        "bars 1.4826 times the median absolute deviation"
+    )

@@ -11,7 +11,6 @@ from typing import Final, Generic, TypeVar
 
 from orthoflow.records import RecordedFile
 from orthoflow.records.compare import (
-    CellFacts,
     ComparedMetric,
     Pair,
     ParameterValue,
@@ -100,10 +99,23 @@ def differences(comparison: RunComparison) -> Differences:
         tables=(
             _table("Inputs", comparison.inputs, _files_text),
             _table("Options", [comparison.overrides], " ".join),
-            _table("Steps", without_seeds(comparison.cells), str, step_of),
+            _table("Steps", comparison.cells, str, step_of),
             replace(_table("Parameters", parameters, _parameter_text, step_of), whose=of_shared),
             _table("Environment", comparison.environment, str),
-            replace(_metric_table(comparison.measured, step_of), whose=of_shared),
+            replace(
+                # Time and memory always differ, and stand in the comparison table.
+                _table(
+                    "Metrics, time and memory left aside",
+                    comparison.measured,
+                    _metric_text,
+                    step_of,
+                    different=moved_first(
+                        [pair for pair in comparison.measured if pair.is_moved], step_of
+                    ),
+                    change=_change,
+                ),
+                whose=of_shared,
+            ),
         ),
         products=tuple(
             sorted(
@@ -119,59 +131,50 @@ def _table(
     pairs: Sequence[Pair[Side]],
     text: Callable[[Side], str],
     step_of: Mapping[str, str] | None = None,
+    *,
+    different: Sequence[Pair[Side]] | None = None,
+    change: Callable[[Pair[Side]], str] = lambda _pair: "",
 ) -> DifferenceTable:
-    """Return what differs between things, with equal differences of a step grouped."""
+    """Return what differs between things, with equal differences of a step grouped.
+
+    Args:
+        title: what kind of things.
+        pairs: all.
+        text: how a side is written.
+        step_of: the step of each cell.
+        different: those that have a row, in this order; None for all that differ.
+        change: how far one moved.
+    """
     steps = step_of or {}
     counts = DifferenceCounts.of(pairs)
-    rows = []
-    for one in grouped_texts([pair for pair in pairs if not pair.is_same], text, steps):
-        pair = one.pair
-        rows.append(
-            Difference(
-                cell=pair.cell if one.n == 1 else "",
-                name=pair.name if one.n == 1 else one.label(steps),
-                left=_NOTHING if pair.left is None else text(pair.left),
-                right=_NOTHING if pair.right is None else text(pair.right),
-            )
-        )
+    if different is None:
+        different = [pair for pair in pairs if not pair.is_same]
     return DifferenceTable(
         title=title,
         n_compared=counts.n_shared,
         n_different=counts.n_different,
         n_alone=counts.n_left + counts.n_right,
-        rows=tuple(rows),
-    )
-
-
-def _metric_table(
-    measured: Sequence[Pair[ComparedMetric]], step_of: Mapping[str, str]
-) -> DifferenceTable:
-    """Metrics that differ by more than rounding, how good results are first.
-
-    Time and memory always differ, and stand in the comparison table.
-    """
-    counts = DifferenceCounts.of(measured)
-    moved = [pair for pair in measured if pair.is_moved]
-    rows = []
-    for one in repeats_as_one(moved_first(moved, step_of)):
-        left, right = one.pair.left, one.pair.right
-        rows.append(
-            Difference(
-                cell=one.pair.cell,
-                name=one.pair.name + (f", {one.n} repeats" if one.n > 1 else ""),
-                left=_NOTHING if left is None else number_with_unit(left.value, left.unit),
-                right=_NOTHING if right is None else number_with_unit(right.value, right.unit),
-                change="" if left is None or right is None else number(right.value - left.value),
-            )
-        )
-    return DifferenceTable(
-        title="Metrics, time and memory left aside",
-        n_compared=counts.n_shared,
-        n_different=counts.n_different,
-        n_alone=counts.n_left + counts.n_right,
         n_rounded=counts.n_rounded,
-        rows=tuple(rows),
+        rows=tuple(
+            Difference(
+                cell=one.pair.cell if one.n == 1 else "",
+                name=one.pair.name if one.n == 1 else one.label(steps),
+                left=_NOTHING if one.pair.left is None else text(one.pair.left),
+                right=_NOTHING if one.pair.right is None else text(one.pair.right),
+                change=change(one.pair),
+            )
+            for one in grouped_texts(different, text, steps)
+        ),
     )
+
+
+def _metric_text(metric: ComparedMetric) -> str:
+    return number_with_unit(metric.value, metric.unit)
+
+
+def _change(pair: Pair[ComparedMetric]) -> str:
+    left, right = pair.left, pair.right
+    return "" if left is None or right is None else number(right.value - left.value)
 
 
 def _product_row(distance: ProductDistance) -> ProductRow:
@@ -256,60 +259,23 @@ def grouped_texts(
     return grouped_rows(pairs, key)
 
 
-def without_seeds(cells: Iterable[Pair[CellFacts]]) -> list[Pair[CellFacts]]:
-    """Leave out the seeds of steps that one run alone has: nothing is compared with them."""
-    return [
-        cell
-        if cell.is_shared
-        else replace(
-            cell,
-            left=cell.left and replace(cell.left, seed=None),
-            right=cell.right and replace(cell.right, seed=None),
-        )
-        for cell in cells
-    ]
-
-
 def moved_first(
     pairs: Sequence[Pair[ComparedMetric]], step_of: Mapping[str, str]
 ) -> list[Pair[ComparedMetric]]:
-    """Put metrics in the order in which a reader asks for them.
+    """Put headline numbers first, then others with a good side, then the rest, rounding last.
 
-    First headline numbers, then others with a good side, then the rest, rounding
-    last. Of each metric of a step the largest relative change comes first, and its next one behind
-    the first of all others: many rooms do not push a metric out of sight.
+    Of each of them the largest relative change comes first.
     """
     places = {step: place for place, step in enumerate(dict.fromkeys(step_of.values()))}
-    turns: Counter[tuple[str, str]] = Counter()
-    placed = []
-    for pair in sorted(pairs, key=lambda pair: -_relative_change(pair)):
-        step = step_of.get(pair.cell, pair.cell)
+
+    def key(pair: Pair[ComparedMetric]) -> tuple[bool, int, float, int]:
         facts = pair.right or pair.left
         group = 2 if facts is None else 0 if facts.headline else 1 if facts.better else 2
-        turn = turns[step, pair.name]
-        turns[step, pair.name] += 1
         # A later step takes further what an earlier one has begun, as orientations do.
-        later = -places.get(step, 0) if group == 0 else 0
-        placed.append(((pair.is_rounded, group, turn, later), pair))
-    return [pair for _, pair in sorted(placed, key=lambda one: one[0])]
+        later = -places.get(step_of.get(pair.cell, pair.cell), 0)
+        return pair.is_rounded, group, -_relative_change(pair), later
 
-
-def repeats_as_one(
-    pairs: Iterable[Pair[ComparedMetric]],
-) -> list[RowGroup[ComparedMetric]]:
-    """Put repeats of a cell together in which a metric has the same values."""
-
-    def key(pair: Pair[ComparedMetric]) -> Hashable:
-        sides = (side and (side.value, side.unit) for side in (pair.left, pair.right))
-        return (pair.cell.partition("#")[0], pair.name, *sides)
-
-    return grouped_rows(pairs, key)
-
-
-def metric_label(row: RowGroup[ComparedMetric]) -> str:
-    """Name a metric and its cell, with the number of repeats."""
-    repeats = f", {row.n} repeats" if row.n > 1 else ""
-    return f"{row.pair.cell}.{row.pair.name}{repeats}"
+    return sorted(pairs, key=key)
 
 
 def _relative_change(pair: Pair[ComparedMetric]) -> float:

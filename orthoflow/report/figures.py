@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -15,13 +16,14 @@ from orthoflow.records import RecordedFigure
 from orthoflow.records.runs import FIGURES_FOLDER, GRAPH_FILE, Run, figure_files, write_files
 from orthoflow.report.combinations import baseline_addresses
 from orthoflow.report.diagrams import graph_file
-from orthoflow.report.pictures import Picture, data_uri
+from orthoflow.report.pictures import LONGEST_SIDE_PX, Picture, data_uri
 from orthoflow.untrusted_text import is_plain_svg
 
 _BYTES_MOST: Final = 3_900_000  # of all figures on a page; a third more in base64
 # What the baseline may take of it as it is, before the others share the rest.
 _BASELINE_SHARE: Final = 0.7
-_SIDES_PX: Final = (700, 480, 340, 240)
+_LEAST_SIDE_PX: Final = 240
+_MAX_SIDE_PX: Final = 700
 _DPI: Final = 300
 _SMALL_BYTES: Final = 20_000  # not worth drawing again
 
@@ -140,16 +142,10 @@ def _fitted(figures: tuple[RecordedFigure, ...], bytes_most: float) -> Iterable[
     n_bytes = sum(len(figure.data) for figure in figures)
     if n_bytes <= bytes_most:
         return figures
-    fitted = figures
-    # Bytes go about with the area: begin where it may be enough.
-    sides = [
-        side for side in _SIDES_PX if (side / 1000) ** 2 <= 2 * bytes_most / n_bytes
-    ] or _SIDES_PX[-1:]
-    for side_px in sides:
-        fitted = tuple(in_order(partial(_smaller, side_px=side_px), figures))
-        if sum(len(figure.data) for figure in fitted) <= bytes_most:
-            break
-    return fitted
+    # Bytes go about with the area.
+    side_px = round(LONGEST_SIDE_PX * math.sqrt(0.8 * bytes_most / n_bytes))
+    side_px = min(max(side_px, _LEAST_SIDE_PX), _MAX_SIDE_PX)
+    return tuple(in_order(partial(_smaller, side_px=side_px), figures))
 
 
 def _smaller(figure: RecordedFigure, side_px: int) -> RecordedFigure:

@@ -218,11 +218,11 @@ def _drawn(
         for kind, members in groups.items():
             marker, colour = _MARKERS.get(kind, _OTHERS)
             u, v = feet[members].T
-            axes.scatter(u, v, s=3, marker=marker, color=colour, linewidths=0.6, label=kind)
+            axes.scatter(u, v, s=1.2, marker=marker, color=colour, linewidths=0.5, label=kind)
             # Rejected ties may be metres off: a mark shows them.
             if kind != "rejected":
                 ends = np.stack([feet[members], feet[members] + vectors[members]])
-                axes.plot(*ends.T.swapaxes(1, 2), color=colour, linewidth=0.8)
+                axes.plot(*ends.T.swapaxes(1, 2), color=colour, linewidth=0.6)
         text, length = reference
         above = -0.03 * frame.height
         axes.plot([0.0, length], [above, above], color="black", clip_on=False)

@@ -5,15 +5,14 @@ from __future__ import annotations
 import os
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType, SimpleNamespace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from orthoflow.engine.durability import write_whole
 from orthoflow.errors import StoreError
 from orthoflow.products import Cameras
-from orthoflow.records import RecordedCell
 from orthoflow.records.compare import compare_runs
 from orthoflow.records.runs import (
     FIGURES_FOLDER,
@@ -35,16 +34,15 @@ from orthoflow.report.combinations import (
     ways,
 )
 from orthoflow.report.comparisons import comparison_table
-from orthoflow.report.curves import curves, curves_over
+from orthoflow.report.curves import curves
 from orthoflow.report.dataset_tables import dataset_table
 from orthoflow.report.diagrams import graph_picture
 from orthoflow.report.differences import differences
-from orthoflow.report.figures import FigureGroup, figure_groups, write_figures
+from orthoflow.report.figures import figure_groups, write_figures
 from orthoflow.report.overlays import overlays
 from orthoflow.report.paired import over_datasets, who_leads
 from orthoflow.report.photo_plans import photo_plan
 from orthoflow.report.pictures import (
-    Picture,
     cursor_places,
     embedded_products,
     orthoimage_pictures,
@@ -52,8 +50,8 @@ from orthoflow.report.pictures import (
     wall_pictures,
 )
 from orthoflow.report.rendering import environment
-from orthoflow.report.summaries import answers, citations, limits, results, says_how_far_off
-from orthoflow.report.tables import PlaneTables, plane_tables
+from orthoflow.report.summaries import answers, citations, has_measured_lengths, limits, results
+from orthoflow.report.tables import plane_tables
 from orthoflow.report.tidy_tables import over_table
 
 if TYPE_CHECKING:
@@ -73,27 +71,14 @@ _OVER_SHOWN: Final = (
 _NONE_BROKEN: Final[Mapping[Path, str]] = MappingProxyType({})
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Part:
-    """What methods made that stands in one place of the page."""
-
-    cells: tuple[RecordedCell, ...] = ()
-    orthoimages: tuple[Picture, ...] = ()
-    walls: tuple[Picture, ...] = ()
-    overlays: tuple[Picture, ...] = ()
-    planes: tuple[PlaneTables, ...] = ()
-    figures: tuple[FigureGroup, ...] = ()
-
-    def of(self, addresses: Collection[str]) -> _Part:
-        """What some cells have a part in."""
-        return _Part(
-            cells=tuple(one for one in self.cells if one.address in addresses),
-            orthoimages=tuple(one for one in self.orthoimages if one.cell in addresses),
-            walls=tuple(one for one in self.walls if one.cell in addresses),
-            overlays=tuple(one for one in self.overlays if one.cell in addresses),
-            planes=tuple(one for one in self.planes if one.cell in addresses),
-            figures=tuple(one for one in self.figures if one.cell in addresses),
-        )
+def _part(every: Mapping[str, Sequence[Any]], addresses: Collection[str]) -> SimpleNamespace:
+    """What some cells have a part in, of pictures, tables and cells by kind."""
+    return SimpleNamespace(
+        **{
+            kind: [one for one in ones if (getattr(one, "cell", "") or one.address) in addresses]
+            for kind, ones in every.items()
+        }
+    )
 
 
 def write_page(
@@ -218,7 +203,7 @@ def _overview(run: Run, prefix: str, folder: Path, pages: Mapping[str, str]) -> 
         diagram=graph_picture(next(iter(parts.values()))),
         citations=citations(run),
         datasets=dataset_table(parts, pages),
-        curves=curves_over(parts),
+        curves=curves([*parts.values()]),
         over=[(one, over_table([one]).only(*_OVER_SHOWN)) for one in over],
         leads=who_leads(over, len(parts)),
     )
@@ -260,17 +245,18 @@ def _section(
         for index, picture in enumerate([*orthoimages, *walls])
     ]
     orthoimages, walls = numbered[: len(orthoimages)], numbered[len(orthoimages) :]
-    every = _Part(
-        cells=tuple(cell for cell in run.record.cells if cell.repeat == 0),
-        orthoimages=tuple(orthoimages),
-        walls=tuple(walls),
-        overlays=tuple(overlays(run, walls, share=share)),
-        planes=plane_tables(run),
-        figures=figure_groups(run, share=share, with_files=with_files),
-    )
+    every = {
+        "cells": [cell for cell in run.record.cells if cell.repeat == 0],
+        "orthoimages": orthoimages,
+        "walls": walls,
+        "overlays": list(overlays(run, walls, share=share)),
+        "planes": plane_tables(run),
+        "figures": figure_groups(run, share=share, with_files=with_files),
+    }
     main = baseline_addresses(run)
-    on_show = next((picture.name for picture in every.of(main).orthoimages), "")
-    is_measured = says_how_far_off(run)
+    shown = _part(every, main)
+    on_show = next((picture.name for picture in shown.orthoimages), "")
+    is_measured = has_measured_lengths(run)
     comparison = comparison_table([run])
     places = embedded_products(run, "cameras")
     photographed = [Cameras.from_payload(payload) for payload in run.payloads(places)]
@@ -288,11 +274,11 @@ def _section(
         delivered=delivered_walls(run.folder / PRODUCTS_FOLDER) if on_show else (),
         results=results(run),
         comparison=comparison,
-        curves=curves(run) if comparison else (),
+        curves=curves([run]) if comparison else (),
         common_points=common_points(run) if comparison else (),
-        main=every.of(main),
+        main=shown,
         earlier=improved_on(run, main),
-        ways=[(way, every.of(way.cells)) for way in ways(run, prefix)] if comparison else [],
+        ways=[(way, _part(every, way.cells)) for way in ways(run, prefix)] if comparison else [],
         sliders=sliders(numbered, len(orthoimages)),
         places=cursor_places(orthoimages, walls),
         photos=sorted({camera.photo for one in photographed for camera in one.cameras}),

@@ -414,14 +414,14 @@ def sliders(pictures: Sequence[Picture], n_orthoimages: int) -> list[dict[str, o
         {
             "name": shown(group[0].title.partition(" (")[0]),
             "ratio": frame_of(group[0]).width / frame_of(group[0]).height,
-            "pictures": [_laid(picture, frame_of(group[0])) for picture in group],
+            "pictures": [_placed(picture, frame_of(group[0])) for picture in group],
         }
         for group in groups
         if len(group) > 1
     ]
 
 
-def _laid(picture: Picture, reference: WallFrame) -> dict[str, object]:
+def _placed(picture: Picture, reference: WallFrame) -> dict[str, object]:
     frame = frame_of(picture)
     offset = frame.origin_world - reference.origin_world
     across_m, down_m = reference.width * reference.gsd_m, reference.height * reference.gsd_m

@@ -98,7 +98,7 @@ def answers(run: Run) -> tuple[Answer, ...]:
     return tuple(found[:_MOST_ANSWERS])
 
 
-def says_how_far_off(run: Run) -> bool:
+def has_measured_lengths(run: Run) -> bool:
     """Whether a check of the baseline measured lengths, by which its pictures are off."""
     return any(
         metric.unit == "mm"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 from orthoflow_provenance.document import RecordedFile, RecordedInput
@@ -14,10 +13,8 @@ from orthoflow_provenance.record import write_record
 from orthoflow.errors import ArgumentError
 from orthoflow.report import browsing as module
 from orthoflow.report.browsing import (
-    Parameter,
     RunSummary,
     differing_facts,
-    distinct_facts,
     distinguishing,
     key_metrics,
     run_folders,
@@ -112,7 +109,7 @@ def test_a_run_is_summed_up_by_its_baseline(tmp_path: Path) -> None:
     assert {name: told.metrics[name] for name in wanted} == wanted
     assert told.labels["check.rms_mm"] == told.labels["rms_mm"] == "points to the first plane, RMS"
     assert told.n_datasets == 0
-    assert distinct_facts([told])[folder] == {
+    assert told.all_facts == {
         "seed": 1,
         "orthoflow": "orthoflow 0.1.0",
         "input scan": ["hall.laz 01234567", "b.laz 01234567"],
@@ -145,126 +142,41 @@ def test_of_several_datasets_the_median_counts(tmp_path: Path) -> None:
     of_one = module._of_run(tmp_path, replace(run, record=alone))
     assert of_one.metrics["plane_offset_mm"] == -2.0
     assert (summary.n_datasets, summary.n_values["rms_mm"]) == (3, 3)
-    facts, labels = distinct_facts([summary])[tmp_path], summary.labels
+    labels = summary.labels
     assert labels["rms_mm"] == labels["check.rms_mm"] == "points to the first plane, RMS"
-    assert {name: facts[name] for name in facts if name.endswith("tries")} == {
-        "check@data=hall.tries": 0,
-        "check@data=stairs.tries": 1,
-        "check@data=court.tries": 2,
-    }
+    assert summary.all_facts["check.tries"] == "0|1|2"
 
 
-def test_of_a_sweep_over_datasets_all_values_are_told_once(tmp_path: Path) -> None:
-    def told(name: str, *tries: tuple[int, ...]) -> RunSummary:
-        rooms = ("hall", "stairs", "court")[: len(tries)]
+def test_runs_differ_in_the_values_of_parameters_each_of_which_is_stated_once(
+    tmp_path: Path,
+) -> None:
+    def swept(name: str, *tries: tuple[int, ...]) -> RunSummary:
         cells = [
-            cell(f"check@check=tries-{value},data={room}", params={"tries": value})
-            for room, values in zip(rooms, tries, strict=True)
+            cell(f"check@check=tries-{value},data=room{room}", params={"tries": value})
+            for room, values in enumerate(tries)
             for value in values
         ]
-        resolved = {"datasets": {room: {"inputs": {}, "set": {}} for room in rooms}}
-        made = record(cells, workflow_resolved=json.dumps(resolved))
-        folder = tmp_path / name
-        return module._of_run(folder, HeldRun(path=folder / "run.h5", record=made))
+        folder = written(
+            tmp_path / name,
+            *cells,
+            workflow_resolved=json.dumps({"datasets": {f"room{k}": {} for k in range(len(tries))}}),
+        )
+        (found,) = summaries([folder])
+        return found
 
-    swept, single, apart = (
-        told("a", (1, 2, 3), (1, 2, 3)),
-        told("b", (4,), (4,)),
-        told("c", (4,), (5,)),
-    )
-    assert list(differing_facts([swept, single]).values()) == [
+    several, one = swept("a", (1, 2, 3), (1, 2, 3)), swept("b", (4,), (4,))
+    assert list(differing_facts([several, one]).values()) == [
         {"check.tries": "1|2|3"},
         {"check.tries": 4},
     ]
-    assert list(differing_facts([single, apart]).values()) == [
-        {"check@data=stairs.tries": 4},
-        {"check@data=stairs.tries": 5},
-    ]
-    # Nor does it where others ran on no dataset.
-    plain = replace(
-        single,
-        folder=tmp_path / "p",
-        facts={},
-        parameters=(Parameter("check", "", "", "", "tries", 4),),
-        n_datasets=0,
-    )
-    of_both = [facts["check.tries"] for facts in differing_facts([swept, plain]).values()]
-    assert of_both == ["1|2|3", 4]
-    # A dataset that others lack changes no name.
-    three = told("d", (1, 2), (1, 2), (1, 2))
-    assert differing_facts([three, single])[three.folder] == {"datasets": 3, "check.tries": "1|2"}
-    # `--where` takes both names, and all values.
-    assert three.values("check@data=hall.tries") == (1, 2)
-    assert three.values("check.tries") == (1, 2, 1, 2, 1, 2)
-    assert (apart.values("check.tries"), apart.values("seed")) == ((4, 5), (1,))
-    assert "check.tries" in apart.names
-
-
-def compared(
-    folder: Path,
-    swept: tuple[float, ...] = (0.05,),
-    *,
-    ransac_m: float = 0.05,
-    gsd_m: float = 0.01,
-) -> RunSummary:
-    """A run with two variants on two datasets, and a step behind them."""
-    names = [f"hough-tol_m-{k}" if len(swept) > 1 else "hough" for k in range(len(swept))]
-    tolerances = {**dict(zip(names, swept, strict=True)), "ransac": ransac_m}
-    cells = [
-        one
-        for room in ("hall", "stairs")
-        for variant, tol_m in tolerances.items()
-        for one in (
-            cell(f"plane@data={room},plane={variant}", params={"tol_m": tol_m}),
-            cell(f"wall@data={room},plane={variant}", params={"gsd_m": gsd_m}),
-        )
-    ]
-    resolved = {
-        "datasets": {room: {"inputs": {}, "set": {}} for room in ("hall", "stairs")},
-        "compare": {"baseline": {"plane": names[0]}},
-    }
-    made = record(cells, workflow_resolved=json.dumps(resolved))
-    return module._of_run(folder, HeldRun(path=folder / "run.h5", record=made))
-
-
-@pytest.mark.parametrize(
-    ("changed", "of_first", "of_second"),
-    [
-        # Of a step behind variants, whatever it comes from.
-        ({"gsd_m": 0.02}, {"wall.gsd_m": 0.01}, {"wall.gsd_m": 0.02}),
-        # `--set plane.tol_m` changes each variant, `plane.hough.tol_m` one of them.
-        (
-            {"swept": (0.1,), "ransac_m": 0.1},
-            {"plane.tol_m": 0.05},
-            {"plane.tol_m": 0.1},
-        ),
-        ({"swept": (0.1,)}, {"plane.hough.tol_m": 0.05}, {"plane.hough.tol_m": 0.1}),
-        ({"ransac_m": 0.1}, {"plane.ransac.tol_m": 0.05}, {"plane.ransac.tol_m": 0.1}),
-        # And a sweep has the name that it was written with.
-        (
-            {"swept": (0.02, 0.05, 0.1)},
-            {"plane.hough.tol_m": 0.05},
-            {"plane.hough.tol_m": "0.02|0.05|0.1"},
-        ),
-    ],
-    ids=["behind variants", "each variant", "the baseline's", "another's", "a sweep"],
-)
-def test_what_was_changed_once_is_named_once_and_as_it_is_set(
-    tmp_path: Path,
-    changed: dict[str, Any],
-    of_first: dict[str, object],
-    of_second: dict[str, object],
-) -> None:
-    first, second = compared(tmp_path / "a"), compared(tmp_path / "b", **changed)
-    assert list(differing_facts([first, second]).values()) == [of_first, of_second]
-    # Among all that is told each parameter stands once, too.
-    told = distinct_facts([first, second])[second.folder]
-    is_of_one = any(name.count(".") == 2 for name in of_second)
-    variants = ("plane.hough", "plane.ransac") if is_of_one else ("plane",)
-    wanted = {f"{name}.tol_m": 0.05 for name in variants} | {"wall.gsd_m": 0.01} | of_second
-    assert {name: told[name] for name in told if name.endswith("_m")} == wanted
-    # Each of these names is one that `--where` takes.
-    assert all(second.values(name) for name in of_second)
+    # `--where` takes all values.
+    assert several.values("check.tries") == (1, 2, 3)
+    assert (one.values("seed"), one.values("rms_mm")) == ((1,), ())
+    # A fact that some lack differs only where two others disagree on it.
+    more = swept("c", (4,), (4,), (4,))
+    assert differing_facts([one, more])[more.folder] == {"datasets": 3}
+    bare = replace(one, folder=tmp_path / "d", parameters={})
+    assert differing_facts([one, bare])[one.folder] == {}
 
 
 def test_a_run_without_a_record_says_what_its_journal_begins_with(tmp_path: Path) -> None:

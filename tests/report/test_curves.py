@@ -11,7 +11,7 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from orthoflow.report.comparisons import comparison_table
-from orthoflow.report.curves import Curve, curve_files, curves, curves_over, sweeps
+from orthoflow.report.curves import Curve, curve_files, curves, sweeps
 from orthoflow.report.rankings import Mark
 from tests.report_runs import HeldRun, cell, compared_resolved, metrics, record
 
@@ -72,10 +72,8 @@ def test_where_no_quality_hangs_on_a_sweep_what_differs_is_drawn(tmp_path: Path)
         for value in (0.005, 0.01, 0.02)
     ]
     run = held(tmp_path, cells)
-    names = [curve.name for curve in curves(run)]
+    names = [curve.name for curve in curves([run])]
     assert names == ["wall.void_share_over_wall.gsd_m", "wall.sigma_median_mm_over_wall.gsd_m"]
-    # Nobody says what of it is good, so nobody is best in it.
-    assert all(" is better" not in curve.caption for curve in curves(run))
     table = comparison_table([run])
     assert table is not None
     marks = {value.mark for row in table.rows for value in row.values}
@@ -83,7 +81,7 @@ def test_where_no_quality_hangs_on_a_sweep_what_differs_is_drawn(tmp_path: Path)
     # Where quality differs, the rest is not shown.
     judged = [*cells, cell("check@wall=v0.005", metrics=metrics(rmse_u_mm=1.0))]
     judged += [cell("check@wall=v0.01", metrics=metrics(rmse_u_mm=2.0))]
-    assert [curve.name for curve in curves(held(tmp_path, judged))] == [
+    assert [curve.name for curve in curves([held(tmp_path, judged)])] == [
         "check.rmse_u_mm_over_wall.gsd_m"
     ]
 
@@ -98,7 +96,7 @@ def test_what_is_not_swept_is_a_level_line(tmp_path: Path) -> None:
         )
 
     own = swept(0.02, 0.05, 0.1, repeats=2)
-    (curve,) = curves(held(tmp_path, [*own, region(0), region(1)]))
+    (curve,) = curves([held(tmp_path, [*own, region(0), region(1)])])
     assert list(curve.lines) == ["plane.toy", "plane.region"]
     assert ways(curve) == ["MLL", "ML"]
     level = curve.lines["plane.region"]
@@ -106,9 +104,8 @@ def test_what_is_not_swept_is_a_level_line(tmp_path: Path) -> None:
         (0.02, pytest.approx(0.0045)),
         (0.1, pytest.approx(0.0045)),
     ]
-    assert "; level lines are of what was not swept" in curve.caption
     # Of one method several are told apart; nothing swept is no curve.
-    (curve,) = curves(held(tmp_path, [*own, region(0), region(0, "wider")]))
+    (curve,) = curves([held(tmp_path, [*own, region(0), region(0, "wider")])])
     assert "plane.region, wider" in curve.lines
     # What has the parameter too, at its default, is named by the value.
     default = cell(
@@ -117,11 +114,10 @@ def test_what_is_not_swept_is_a_level_line(tmp_path: Path) -> None:
         params={"tolerance_m": 0.04},
         metrics=metrics(rms_mm=0.004),
     )
-    (curve,) = curves(held(tmp_path, [*own, default]))
+    (curve,) = curves([held(tmp_path, [*own, default])])
     assert "plane.region, tolerance_m=0.04" in curve.lines
-    assert curves(held(tmp_path, [region(0), region(0, "wider")])) == ()
-    (curve,) = curves(held(tmp_path, own))
-    assert "level" not in curve.caption
+    assert curves([held(tmp_path, [region(0), region(0, "wider")])]) == ()
+    (curve,) = curves([held(tmp_path, own)])
     assert list(curve.lines) == [""]
 
 
@@ -138,7 +134,7 @@ def test_what_is_asked_for_is_drawn_and_what_hangs_on_no_sweep_is_not(tmp_path: 
         plain,
         record=replace(plain.record, workflow_resolved=compared_resolved("*.rms_mm", "*.n_planes")),
     )
-    titles = [[one.title.partition(" over ")[0] for one in curves(run)] for run in (plain, asked)]
+    titles = [[one.title.partition(" over ")[0] for one in curves([run])] for run in (plain, asked)]
     error = "points to the first plane, RMS / mm (plane)"
     assert titles == [[], [error, "planes found (plane)"]]
 
@@ -148,18 +144,15 @@ def test_the_baseline_of_a_sweep_is_the_filled_point(tmp_path: Path) -> None:
         swept(0.02, 0.05, 0.1),  # type: ignore[arg-type]
         workflow_resolved=json.dumps({"compare": {"baseline": {"plane": "tolerance_m-0.05"}}}),
     )
-    (curve,) = curves(HeldRun(path=tmp_path / "run.h5", record=told))
+    (curve,) = curves([HeldRun(path=tmp_path / "run.h5", record=told)])
     assert [point.x for point in curve.lines[""] if point.is_filled] == [0.05]
-    assert "the filled point is the baseline" in curve.caption
     region = cell("plane@plane=region", method="plane.region", metrics=metrics(rms_mm=0.004))
     resolved = json.dumps({"compare": {"baseline": {"plane": "region"}}})
     told = record([*swept(0.02, 0.05, 0.1), region], workflow_resolved=resolved)  # type: ignore[list-item]
-    (level,) = curves(HeldRun(path=tmp_path / "run.h5", record=told))
+    (level,) = curves([HeldRun(path=tmp_path / "run.h5", record=told)])
     assert [point.is_filled for point in level.lines["plane.region"]] == [True, True]
-    assert "the level line with filled points is the baseline" in level.caption
-    (plain,) = curves(held(tmp_path, swept(0.02, 0.05, 0.1)))
+    (plain,) = curves([held(tmp_path, swept(0.02, 0.05, 0.1))])
     assert not any(point.is_filled for point in plain.lines[""])
-    assert "baseline" not in plain.caption
 
 
 def test_signed_errors_over_datasets_do_not_make_each_other_small(tmp_path: Path) -> None:
@@ -176,20 +169,18 @@ def test_signed_errors_over_datasets_do_not_make_each_other_small(tmp_path: Path
         name: held(tmp_path, [one for one in cells if one.assignment["data"] == name])
         for name in ("hall", "tower")
     }
-    (curve,) = curves_over(parts)
+    (curve,) = curves([*parts.values()])
     assert [y for _, y in points(curve)] == [0.02, 0.05, 0.1]
-    assert "of signed errors their sizes" in curve.caption
 
 
 def test_a_curve_counts_the_datasets_that_its_points_are_of(tmp_path: Path) -> None:
     fine, failing = swept(0.02, 0.05, 0.1, repeats=2), swept(0.02, 0.05, 0.1, failed=2)
     parts = {"calm": held(tmp_path, fine), "dark": held(tmp_path, failing)}
-    (curve,) = curves_over(parts)
-    assert "medians of 1 to 2 of 2 datasets, bars" in curve.caption
-    assert "no line between those of unlike datasets or repeats" in curve.caption
+    (curve,) = curves([*parts.values()])
+    assert "medians of 1 to 2 of 2 datasets" in curve.caption
     nothing = held(tmp_path, [replace(one, status="failed") for one in swept(0.02, 0.05, 0.1)])
-    (curve,) = curves_over({"calm": held(tmp_path, fine), "broken": nothing})
-    assert "each of the only one of 2 datasets that has a value, without bars" in curve.caption
+    (curve,) = curves([held(tmp_path, fine), nothing])
+    assert "medians of 1 of 2 datasets" in curve.caption
     # Repeats of the one are no spread of datasets.
     assert bars(curve) == []
 
@@ -224,24 +215,17 @@ def test_no_line_joins_points_of_other_datasets_or_repeats(tmp_path: Path) -> No
         "dark": {1.0: none, 2.0: whole, 3.0: whole, 4.0: whole, 5.0: (None, 2.0)},
         "wide": dict.fromkeys((1.0, 2.0, 3.0, 4.0, 5.0), whole),
     }
-    (curve,) = curves_over(over_rooms(tmp_path, values, "rms_mm"))
+    (curve,) = curves([*over_rooms(tmp_path, values, "rms_mm").values()])
     # Of two rooms the first and the second, but of others; the last lacks a repeat of one.
     assert ways(curve) == ["MMMLM"]
-    assert (
-        "medians of 2 to 3 of 3 datasets, bars 1.4826 times the median absolute deviation, no line "
-        "between those of unlike datasets or repeats; of only some repeats: dark at 5 (1 of 2)"
-    ) in curve.caption
+    assert "medians of 2 to 3 of 3 datasets" in curve.caption
     alone = {"calm": {1.0: whole, 2.0: whole, 3.0: (1.0, None)}}
     (run,) = over_rooms(tmp_path, alone, "rms_mm").values()
     cells = [
         replace(one, assignment={"plane": one.assignment["plane"]}) for one in run.record.cells
     ]
-    (curve,) = curves(held(tmp_path, [*cells]))
+    (curve,) = curves([held(tmp_path, [*cells])])
     assert ways(curve) == ["MLM"]
-    assert (
-        "means of the repeats, bars their standard deviation, no line between those of unlike "
-        "numbers of repeats; of only some repeats: at 3 (1 of 2)"
-    ) in curve.caption
 
 
 def test_of_what_is_found_or_not_a_curve_has_the_share_of_rooms(tmp_path: Path) -> None:
@@ -250,14 +234,11 @@ def test_of_what_is_found_or_not_a_curve_has_the_share_of_rooms(tmp_path: Path) 
         "dark": {0.02: (0.0,) * 4, 0.05: (1.0,) * 4, 0.1: (1.0,) * 4},
         "wide": {0.02: (1.0,) * 4, 0.05: (1.0,) * 4, 0.1: (1.0, 0.0, 0.0, 0.0)},
     }
-    (curve,) = curves_over(over_rooms(tmp_path, found, "main_found"))
+    (curve,) = curves([*over_rooms(tmp_path, found, "main_found").values()])
     assert points(curve) == [(0.02, pytest.approx(2 / 3)), (0.05, 1.0), (0.1, 0.75)]
     assert curve.bounds == (0.0, 1.0)
     assert bars(curve) == []
-    assert curve.caption.startswith(
-        "Points are means of 3 datasets: the share of them, and of their repeats, where it is so "
-        "(1); more is better."
-    )
+    assert "shares of 3 of 3 datasets" in curve.caption
 
 
 def test_a_page_has_twelve_curves_of_six_lines(tmp_path: Path) -> None:
@@ -275,10 +256,10 @@ def test_a_page_has_twelve_curves_of_six_lines(tmp_path: Path) -> None:
         asked = compared_resolved("plane.rmse_*")
         return HeldRun(path=tmp_path / "run.h5", record=record(cells, workflow_resolved=asked))
 
-    assert len(curves(many(12, 1))) == 12
-    assert len(curves(many(13, 1))) == 12
+    assert len(curves([many(12, 1)])) == 12
+    assert len(curves([many(13, 1)])) == 12
     for n_lines, n_drawn in ((6, 6), (7, 6)):
-        (curve,) = curves(many(1, n_lines))
+        (curve,) = curves([many(1, n_lines)])
         assert list(curve.lines) == [f"mode=m{k}" for k in range(n_drawn)]
 
 
@@ -309,7 +290,7 @@ def test_errors_over_unequal_numbers_of_photos_are_drawn_with_a_word_of_that(
     ]
     said = {
         curve.title: "Not all sum up as many photos" in curve.caption
-        for curve in curves(held(tmp_path, cells))
+        for curve in curves([held(tmp_path, cells)])
     }
     assert any(said.values()) is is_said
 
@@ -330,6 +311,6 @@ def test_a_curve_over_different_walls_is_drawn_with_a_word_of_that(
         ]
     said = {
         curve.name.partition(".")[0]: "Not all are of the same wall" in curve.caption
-        for curve in curves(held(tmp_path, cells))
+        for curve in curves([held(tmp_path, cells)])
     }
     assert (said["plane"], said["check"]) == (False, is_said)

@@ -1,4 +1,4 @@
-"""Rows that tell in what two runs differ: which are one, and which come first."""
+"""Rows of what differs between two runs: which are grouped, and which come first."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 
 from orthoflow.records.compare import ComparedMetric, Pair
-from orthoflow.report.differences import grouped_texts, moved_first, without_seeds
-from tests.compared_runs import compared
+from orthoflow.report.differences import grouped_texts, moved_first
 
 
 def metric(value: float, unit: str = "mm") -> ComparedMetric:
@@ -44,7 +43,7 @@ def test_rounding_is_a_difference_of_a_millionth_and_none_of_counts(
     assert Pair(name="x", left=left, right=right).is_rounded is is_rounded
 
 
-def test_how_good_results_are_comes_first_and_many_rooms_hide_no_metric() -> None:
+def test_how_good_results_are_comes_first_and_what_moved_most() -> None:
     rooms = [f"check@data={index}" for index in range(3)]
     pairs = [
         *(moved(room, "odd", 1.0, 9.0) for room in rooms),
@@ -59,8 +58,8 @@ def test_how_good_results_are_comes_first_and_many_rooms_hide_no_metric() -> Non
         ("label_iou_mean", "2"),
         ("plane_angle_deg", "2"),
         ("plane_angle_deg", "1"),
-        ("label_iou_mean", "1"),
         ("plane_angle_deg", "0"),
+        ("label_iou_mean", "1"),
         ("colour_rmse_grey", "0"),
         ("odd", "0"),
         ("odd", "1"),
@@ -69,14 +68,12 @@ def test_how_good_results_are_comes_first_and_many_rooms_hide_no_metric() -> Non
     ]
 
 
-def test_steps_that_one_run_alone_has_are_one_row_per_step_whatever_their_seeds() -> None:
-    [shared] = compared(moved("check", "rms_mm", 1.0, 2.0)).cells
-    cells = {f"{step}#{repeat}": step for step in ("plane", "wall") for repeat in (1, 2)}
-    pairs = [
-        replace(shared, cell=cell, name=step, left=replace(shared.either, seed=seed), right=None)
-        for seed, (cell, step) in enumerate(cells.items())
+def test_a_parameter_of_many_cells_that_changes_equally_is_one_row() -> None:
+    cells = [f"plane@data={room}#{repeat}" for room in "ab" for repeat in (1, 2)]
+    pairs = [Pair(cell=cell, name="angle_deg", left=10, right=14) for cell in (*cells, "wall")]
+    step_of = dict.fromkeys(cells, "plane")
+    rows = grouped_texts(pairs, str, step_of)
+    assert [(row.label(step_of), row.n) for row in rows] == [
+        ("plane.angle_deg, 4 steps", 4),
+        ("wall.angle_deg", 1),
     ]
-    rows = grouped_texts(without_seeds(pairs), str, cells)
-    assert [row.label(cells) for row in rows] == ["plane, 2 steps", "wall, 2 steps"]
-    assert "seed" in str(pairs[0].left)
-    assert not any("seed" in str(row.pair.left) for row in rows)

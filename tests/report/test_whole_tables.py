@@ -1,4 +1,4 @@
-"""What the report prints, to the last letter: numbers, ranks, differences and the drawn graph."""
+"""The baseline, headline numbers, and all that differs between two runs."""
 
 from __future__ import annotations
 
@@ -30,12 +30,6 @@ def run(*cells: object, **more: object) -> HeldRun:
     return HeldRun(path=Path("run.h5"), record=record(cells, **more))  # type: ignore[arg-type]
 
 
-# --- numbers ---
-
-
-# --- ranks ---
-
-
 # --- combinations ---
 
 
@@ -52,9 +46,6 @@ def test_the_baseline_is_what_the_workflow_says() -> None:
         assert [one.is_baseline for one in combinations_of(silent)] == [False, False]
         assert [item.address for item in baseline_cells(silent)] == ["plane@plane=fine"]
     assert baseline_cells(run()) == ()
-
-
-# --- what the first screen says ---
 
 
 # --- differences ---
@@ -163,9 +154,6 @@ def test_all_that_differs_between_two_runs_is_told() -> None:
         ),
         ProductRow(cell="a", name="one (planes)", verdict="identical", words=""),
     )
-
-
-# --- the graph ---
 
 
 def test_checks_answer_first_then_the_last_of_the_other_steps() -> None:

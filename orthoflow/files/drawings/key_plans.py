@@ -89,20 +89,9 @@ def key_plan(planes: Planes, frame: WallFrame, number: int = -1) -> KeyPlan:
     corners = frame.corners_world()
     is_map = is_map_crs(frame.map_crs)
     if abs(float(frame.normal_world @ planes.up)) > math.cos(math.radians(60.0)):
-        return _marked_plan(planes, corners, None, number, is_map=is_map)
+        return marked_plan(planes, corners, None, number, is_map=is_map)
     ends = np.array([corners[:2].mean(axis=0), corners[2:].mean(axis=0)])
-    return _marked_plan(planes, ends, frame.normal_world, number, is_map=is_map)
-
-
-def cut_plan(
-    planes: Planes,
-    ends_world: NDArray[np.float64],
-    forward: NDArray[np.float64],
-    *,
-    is_map: bool = False,
-) -> KeyPlan:
-    """Draw planes from above, and mark a vertical cut: its ends (2, 3), and where it looks (3,)."""
-    return _marked_plan(planes, ends_world, -forward, -1, is_map=is_map)
+    return marked_plan(planes, ends, frame.normal_world, number, is_map=is_map)
 
 
 def is_map_crs(crs: str | None) -> bool:
@@ -115,14 +104,23 @@ def up_label(up: NDArray[np.float64], *, is_map: bool) -> str:
     return NORTH if is_map else axis_words(basis_from_up(up)[1])
 
 
-def _marked_plan(
+def marked_plan(
     planes: Planes,
     marked_world: NDArray[np.float64],
     towards_world: NDArray[np.float64] | None,
-    number: int,
+    number: int = -1,
     *,
-    is_map: bool,
+    is_map: bool = False,
 ) -> KeyPlan:
+    """Draw planes from above, and mark what has two ends, or the corners of a level plane.
+
+    Args:
+        planes: of the room.
+        marked_world: (2 or 4, 3) what is marked.
+        towards_world: (3,) from it to the viewer; None for level planes.
+        number: of the marked wall, -1 for none.
+        is_map: world x and y are the east and north of a map.
+    """
     outline = outline_of(planes)
     basis = basis_from_up(planes.up)
     near = marked_world.mean(axis=0)

@@ -50,7 +50,7 @@ class Stretch:
 
 def write_picture(
     raster: Path, part: Part, path: Path, *, scale: int, is_flipped: bool = False
-) -> tuple[int, int]:
+) -> Path:
     """Write a part of a wall's raster as a picture, white where empty.
 
     Cells are unchanged if print resolves them, otherwise averaged to 400 pixels per inch.
@@ -58,12 +58,12 @@ def write_picture(
     Args:
         raster: GeoTIFF of one band, which is stretched to grey, or of three.
         part: of the raster.
-        path: output file without its suffix, which depends on the format: PNG, or JPEG if large.
+        path: output file without its suffix: PNG, or JPEG if large.
         scale: n of 1 : n.
         is_flipped: the rows of the raster go up the paper; `part` refers to the drawing.
 
     Returns:
-        Rows and columns of the picture.
+        The file.
     """
     with RasterParts(raster) as source:
         part = _flipped(part, source) if is_flipped else part
@@ -75,20 +75,13 @@ def write_picture(
         for rows, values, shown in _bands(source, cells, shape):
             colours = _grey(values, stretch) if stretch else eight_bits(cast("Colours", values))
             picture[rows][shown] = colours[shown]
-    _write_encoded(path, np.ascontiguousarray(picture[::-1]) if is_flipped else picture)
-    return shape
+    return _written(path, np.ascontiguousarray(picture[::-1]) if is_flipped else picture)
 
 
 def _flipped(part: Part, source: RasterParts) -> Part:
     """The same part, relative to the opposite edge of the raster."""
     high_m = source.shape[0] * source.gsd_m
     return replace(part, top_m=high_m - part.bottom_m, bottom_m=high_m - part.top_m)
-
-
-def picture_file(path: Path) -> Path:
-    """The file that `write_picture` wrote, with its suffix."""
-    jpeg = path.with_suffix(".jpg")
-    return jpeg if jpeg.exists() else path.with_suffix(".png")
 
 
 def stretch_of(raster: Path) -> Stretch:
@@ -220,12 +213,13 @@ def _grey(values: NDArray[np.generic], stretch: Stretch) -> NDArray[np.uint8]:
     return np.repeat(grey[:, :, None], 3, axis=2)
 
 
-def _write_encoded(path: Path, picture: NDArray[np.uint8]) -> None:
+def _written(path: Path, picture: NDArray[np.uint8]) -> Path:
     import cv2
 
     if picture.shape[0] * picture.shape[1] <= _LOSSLESS_PX:
-        path.with_suffix(".png").write_bytes(encode_png(picture))
-        return
+        path = path.with_suffix(".png")
+        path.write_bytes(encode_png(picture))
+        return path
     # Flipped in place: a copy of an A0 sheet would take 750 MB.
     for row in picture:
         row[:] = row[:, ::-1].copy()
@@ -234,4 +228,6 @@ def _write_encoded(path: Path, picture: NDArray[np.uint8]) -> None:
         *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
     ]
     _, encoded = cv2.imencode(".jpg", picture, options)
-    path.with_suffix(".jpg").write_bytes(encoded.tobytes())
+    path = path.with_suffix(".jpg")
+    path.write_bytes(encoded.tobytes())
+    return path

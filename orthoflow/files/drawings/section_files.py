@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.drawings.dxf import DIMENSION_STYLE, Layers, new_document, save_document
-from orthoflow.files.drawings.key_plans import cut_plan, is_map_crs, up_label
+from orthoflow.files.drawings.key_plans import is_map_crs, marked_plan, up_label
 from orthoflow.files.drawings.pens import FINE_MM, box, fill, line
 from orthoflow.files.drawings.sections import CutLine, Section
 from orthoflow.files.drawings.sheet_contents import (
@@ -122,7 +122,7 @@ def section_sheet(
     if not is_plan:
         x_m = np.array([drawing.section.bounds_m[0], drawing.section.bounds_m[2]])
         ends_world = cut.origin_world + np.outer(x_m, cut.x_world)
-        plan = cut_plan(planes, ends_world, cut.forward_world, is_map=is_map_crs(crs))
+        plan = marked_plan(planes, ends_world, -cut.forward_world, is_map=is_map_crs(crs))
     phrase = Phrase(key="axes_level")
     if is_map_crs(crs):
         phrase = Phrase(key="axes_map", values={"crs": crs})

@@ -29,7 +29,6 @@ from orthoflow.files.drawings.pens import (
 from orthoflow.files.drawings.printed_pictures import (
     contours,
     label_place,
-    picture_file,
     stretch_of,
     write_picture,
 )
@@ -116,10 +115,10 @@ def _grey_ramp(canvas: Canvas) -> None:
 def draw_raster(placed: Placed, raster: Path, *, is_flipped: bool = False) -> None:
     """Draw the part of a raster that a picture shows, white where empty."""
     part = placed.view.part
-    write_picture(raster, part, placed.scratch, scale=placed.scale, is_flipped=is_flipped)
+    file = write_picture(raster, part, placed.scratch, scale=placed.scale, is_flipped=is_flipped)
     left, bottom, right, top = placed.edges_mm
     placed.canvas.drawImage(
-        str(picture_file(placed.scratch)),
+        str(file),
         *(POINTS_PER_MM * number for number in (left, bottom, right - left, top - bottom)),
     )
 

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from orthoflow.files.drawings import printed_pictures
 from orthoflow.files.drawings.papers import Part
 from orthoflow.files.drawings.printed_pictures import (
     contours,
-    picture_file,
     stretch_of,
     write_picture,
 )
@@ -26,13 +26,19 @@ def ramp(rows: int, columns: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uin
     return np.stack([right * 255 // columns, down * 255 // rows, 0 * right], axis=2).astype("u1")
 
 
+def pictured(folder: Path, part: Part, scale: int) -> NDArray[np.uint8]:
+    return decode_image(
+        write_picture(folder / "a.tif", part, folder / "p", scale=scale).read_bytes()
+    )
+
+
 def test_cells_are_kept_as_they_are_where_print_shows_them(tmp_path: Path) -> None:
     rgb = ramp(50, 100)
     shown = np.ones((50, 100), dtype=np.bool_)
     shown[:5] = False
     write_orthoimage(tmp_path / "a.tif", rgb, shown, place=GridPlace(gsd_m=0.01), tags={})
-    assert write_picture(tmp_path / "a.tif", WHOLE, tmp_path / "p", scale=20) == (50, 100)
-    picture = decode_image(picture_file(tmp_path / "p").read_bytes())
+    picture = pictured(tmp_path, WHOLE, 20)
+    assert picture.shape == (50, 100, 3)
     np.testing.assert_array_equal(picture[5:], rgb[5:])
     assert (picture[:5] == 255).all()
 
@@ -43,8 +49,8 @@ def test_a_part_has_the_cells_of_its_place(tmp_path: Path) -> None:
         tmp_path / "a.tif", rgb, np.ones((50, 100), np.bool_), place=GridPlace(gsd_m=0.01), tags={}
     )
     part = Part(left_m=0.2, top_m=0.1, right_m=0.5, bottom_m=0.3)
-    assert write_picture(tmp_path / "a.tif", part, tmp_path / "p", scale=20) == (20, 30)
-    picture = decode_image(picture_file(tmp_path / "p").read_bytes())
+    picture = pictured(tmp_path, part, 20)
+    assert picture.shape == (20, 30, 3)
     np.testing.assert_array_equal(picture, rgb[10:30, 20:50])
 
 
@@ -54,9 +60,8 @@ def test_finer_cells_than_print_shows_are_averaged_to_400_per_inch(tmp_path: Pat
     shown = np.ones((1000, 2000), np.bool_)
     write_orthoimage(tmp_path / "a.tif", rgb, shown, place=GridPlace(gsd_m=0.0005), tags={})
     # 1 m at 1:50 is 20 mm: 0.787 inches, 315 pixels of 6.35 cells.
-    shape = write_picture(tmp_path / "a.tif", WHOLE, tmp_path / "p", scale=50)
-    assert shape == (158, 315)
-    picture = decode_image(picture_file(tmp_path / "p").read_bytes())
+    picture = pictured(tmp_path, WHOLE, 50)
+    assert picture.shape == (158, 315, 3)
     # The mean of 40 independent cells is 40 times less wild, and as bright.
     assert picture.mean() == pytest.approx(rgb.mean(), abs=1.0)
     assert picture.std() < rgb.std() / 3
@@ -73,9 +78,9 @@ def test_large_pictures_are_jpeg_with_the_colours_they_had(
     part = Part(left_m=0.0, top_m=0.0, right_m=40.0, bottom_m=30.0)
     for lossless_px, suffix in ((120_000, ".png"), (119_999, ".jpg")):
         monkeypatch.setattr(printed_pictures, "_LOSSLESS_PX", lossless_px)
-        write_picture(tmp_path / "a.tif", part, tmp_path / suffix[1:], scale=50)
-        assert picture_file(tmp_path / suffix[1:]).suffix == suffix
-    picture = decode_image(picture_file(tmp_path / "jpg").read_bytes()).astype(int)
+        file = write_picture(tmp_path / "a.tif", part, tmp_path / "p", scale=50)
+        assert file.suffix == suffix
+    picture = decode_image(file.read_bytes()).astype(int)
     assert picture.shape == (300, 400, 3)
     # No chroma is thinned out: beside the edge too colours are right to JPEG's rounding.
     assert np.abs(picture[:, :190] - (200, 40, 90)).max() <= 3
@@ -89,8 +94,7 @@ def test_grey_is_stretched_and_nothing_is_white(tmp_path: Path) -> None:
     stretch = stretch_of(tmp_path / "a.tif")
     low, high = np.nanpercentile(values, (2, 98))
     assert (stretch.low, stretch.high) == (pytest.approx(low), pytest.approx(high))
-    write_picture(tmp_path / "a.tif", WHOLE, tmp_path / "p", scale=20)
-    picture = decode_image(picture_file(tmp_path / "p").read_bytes())
+    picture = pictured(tmp_path, WHOLE, 20)
     assert (picture[:, :10] == 255).all()
     assert (picture[:, 11] == 0).all()
     assert (np.diff(picture[0, 10:, 0].astype(int)) >= 0).all()
@@ -102,8 +106,7 @@ def test_grey_of_a_wall_that_nobody_saw_is_white(tmp_path: Path) -> None:
     )
     stretch = stretch_of(tmp_path / "a.tif")
     assert (stretch.low, stretch.high) == (0.0, 1.0)
-    write_picture(tmp_path / "a.tif", WHOLE, tmp_path / "p", scale=20)
-    assert (decode_image(picture_file(tmp_path / "p").read_bytes()) == 255).all()
+    assert (pictured(tmp_path, WHOLE, 20) == 255).all()
     assert contours(tmp_path / "a.tif", WHOLE, scale=10, interval_m=0.1) == []
 
 

@@ -23,7 +23,7 @@ from orthoflow.errors import ArgumentError
 from orthoflow.files.drawings import pens
 from orthoflow.files.drawings.key_plans import KeyPlan
 from orthoflow.files.drawings.papers import FOOT_M, SCALES, Paper, Part, paper_of, usual_papers
-from orthoflow.files.drawings.printed_pictures import picture_file, write_picture
+from orthoflow.files.drawings.printed_pictures import write_picture
 from orthoflow.files.drawings.sheet_contents import (
     Drawing,
     Picture,
@@ -488,8 +488,8 @@ def test_a_reflected_ceiling_lies_over_its_floor(tmp_path: Path) -> None:
         write_raster(raster, values, place=GridPlace.of(frame), tags={})
         whole = Part(left_m=0.0, top_m=0.0, right_m=3.0, bottom_m=2.0)
         is_flipped = frame.raster_down > 0.0
-        write_picture(raster, whole, tmp_path / name, scale=10, is_flipped=is_flipped)
-        seen[name] = np.asarray(Image.open(picture_file(tmp_path / name)).convert("L"))
+        file = write_picture(raster, whole, tmp_path / name, scale=10, is_flipped=is_flipped)
+        seen[name] = np.asarray(Image.open(file).convert("L"))
         axes = axes_of(frame)
         # X to the right and Y up the paper, and so the key plan's up.
         assert (axes.across, axes.down) == (
