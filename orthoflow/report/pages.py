@@ -245,7 +245,7 @@ def _section(
         for index, picture in enumerate([*orthoimages, *walls])
     ]
     orthoimages, walls = numbered[: len(orthoimages)], numbered[len(orthoimages) :]
-    every = {
+    every: dict[str, Sequence[Any]] = {
         "cells": [cell for cell in run.record.cells if cell.repeat == 0],
         "orthoimages": orthoimages,
         "walls": walls,
