@@ -143,7 +143,7 @@ def _fitted(figures: tuple[RecordedFigure, ...], bytes_most: float) -> Iterable[
     if n_bytes <= bytes_most:
         return figures
     # Bytes go about with the area.
-    side_px = round(LONGEST_SIDE_PX * math.sqrt(0.8 * bytes_most / n_bytes))
+    side_px = round(LONGEST_SIDE_PX * math.sqrt(0.8 * max(0.0, bytes_most) / n_bytes))
     side_px = min(max(side_px, _LEAST_SIDE_PX), _MAX_SIDE_PX)
     return tuple(in_order(partial(_smaller, side_px=side_px), figures))
 

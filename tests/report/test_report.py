@@ -120,7 +120,7 @@ def test_figures_beyond_the_budget_are_drawn_smaller(
     )
     monkeypatch.setattr("orthoflow.report.figures._BYTES_MOST", 100)
     monkeypatch.setattr("orthoflow.report.figures._SMALL_BYTES", 0)
-    monkeypatch.setattr("orthoflow.report.figures._SIDES_PX", (40, 20))
+    monkeypatch.setattr("orthoflow.report.figures._LEAST_SIDE_PX", 40)
     groups = figure_groups(compared)
     assert [len(group.pictures) for group in groups] == [2, 2]
     assert sum(len(picture.uri) for group in groups for picture in group.pictures) < before / 2
