@@ -6,6 +6,7 @@ Light on purpose, as all of the catalog.
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import sys
 import threading
@@ -25,7 +26,8 @@ class UserInterrupt(KeyboardInterrupt):
 def guarded() -> Iterator[None]:
     """Keep what the code inside does from the rest of the program.
 
-    What it prints goes to standard error, and the limit of recursion stays.
+    What it prints goes to standard error; the working folder, which paths of users count from, and
+    the limit of recursion stay.
 
     Raises:
         UserInterrupt: the user pressed Ctrl-C.
@@ -33,7 +35,7 @@ def guarded() -> Iterator[None]:
     """
     limit = sys.getrecursionlimit()
     try:
-        with contextlib.redirect_stdout(sys.stderr), _interrupts_marked():
+        with _working_folder_kept(), contextlib.redirect_stdout(sys.stderr), _interrupts_marked():
             yield
     finally:
         left = sys.getrecursionlimit()
@@ -41,6 +43,17 @@ def guarded() -> Iterator[None]:
         if left < limit:
             # Also in the place of the RecursionError that it leads to.
             raise PluginError(f"it lowers Python's recursion limit from {limit} to {left}")
+
+
+@contextmanager
+def _working_folder_kept() -> Iterator[None]:
+    """Return to the working folder, even if it has no name any more."""
+    folder = os.open(".", os.O_PATH)
+    try:
+        yield
+    finally:
+        os.fchdir(folder)
+        os.close(folder)
 
 
 @contextmanager

@@ -141,8 +141,10 @@ def test_a_plugin_that_fails_is_listed_and_harms_nobody(
 def test_a_plugin_that_loads_has_no_say_in_the_rest_of_the_program(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    text = "print('hello')\n" + hooks(methods=method("plane.mine", "a:B"))
+    text = "import os; os.chdir('/'); print('hello')\n" + hooks(methods=method("plane.mine", "a:B"))
+    before = Path.cwd()
     catalog = with_plugin("talkative", text, tmp_path, monkeypatch)
+    assert Path.cwd() == before
     assert "plane.mine" in catalog.methods
     assert capsys.readouterr() == ("", "hello\n")
 
