@@ -126,6 +126,8 @@ def picture_figure(
     axes.set_anchor("N")
     extent = (0.0, float(columns), float(rows), 0.0)
     axes.imshow(picture, cmap="gray", vmin=0, vmax=255, extent=extent)
+    # Arrows that reach beyond the picture do not change what is shown of it.
+    axes.autoscale(enable=False)
     if frame is not None:
         _label_in_metres(axes, frame)
     return figure, axes

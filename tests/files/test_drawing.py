@@ -50,7 +50,10 @@ def test_a_picture_keeps_its_proportions_and_leaves_room(shape: tuple[int, int])
     width, height = figure.get_size_inches()
     assert width == COLUMN_INCHES
     assert height == pytest.approx(min(width * shape[0] / shape[1], 6.0) + 0.5)
+    axes.quiver([0.0], [shape[0]], [0.0], [shape[0]], angles="xy", scale_units="xy", scale=1.0)
+    axes.plot([-shape[1]], [0.0])
     assert axes.get_xlim() == (0.0, shape[1])
+    assert axes.get_ylim() == (shape[0], 0.0)
 
 
 @pytest.mark.parametrize(
