@@ -333,5 +333,5 @@ def test_what_an_earlier_run_left_is_never_published(tmp_path: Path) -> None:
         is_through = files.count < operation
     # Its folders are listed and removed, the new one is filled and read.
     assert len(refusals) >= 6
-    told = re.compile("Input/output|Stale file|read-only")
-    assert [said for said in refusals if not told.search(said)] == []
+    of_disk = re.compile("Input/output|Stale file|Read-only")
+    assert [refusal for refusal in refusals if not of_disk.search(refusal)] == []
