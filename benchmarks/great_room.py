@@ -1,9 +1,11 @@
 """The room that the plane detectors are measured on: a palace hall, scanned by ray casting.
 
-After markiewicz2015: 8.6 x 4.2 x 5 m, main wall at omega 102 degrees leaning by 0.8, a niche 25 cm
-deep, a fireplace, pilasters, mouldings, windows, furniture, and a leaning mirror behind which
-the scanner sees the room again. A panorama and a detail scan of the main wall, points in the order
-of the scan. Built and scanned with the parts that `simulate.room` is made of.
+After markiewicz2015: 8.6 x 4.2 x 5 m, a leaning main wall, a niche 25 cm deep, a fireplace,
+pilasters, mouldings, windows, furniture, and a leaning mirror behind which the scanner sees the
+room again. A panorama and a detail scan of the main wall, points in the order
+of the scan. Built and scanned with the parts that `simulate.room` is made of. How the room is
+turned, tilted and shifted in the world is drawn by a seed, so that no wall lies on the steps of a
+search.
 
     python benchmarks/great_room.py FOLDER        # room.npy, labels.npy and truth.json for others
 """
@@ -13,7 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -31,7 +33,9 @@ from orthoflow_plugins.simulate.building import (
     wall_side,
 )
 from orthoflow_plugins.simulate.scanning import SPOILT, Errors, Scanned, Scanner, Sweep
+from scipy.spatial.transform import Rotation
 
+from orthoflow.geometry import Plane
 from orthoflow.geometry.scene_rays import RAYS_AT_ONCE, SceneRays
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind, cell_states, uniforms
 from orthoflow.geometry.threads import in_runs
@@ -78,9 +82,10 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--points", type=int, default=FULL_POINTS)
     parser.add_argument("--cores", type=int, default=2)
+    parser.add_argument("--seed", type=int, default=1, help="draws where the room lies")
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
-    room = great_room(options.points, cores=options.cores)
+    room = great_room(options.points, cores=options.cores, seed=options.seed)
     np.save(options.folder / "room.npy", np.column_stack([room.x, room.y, room.z]))
     np.save(options.folder / "labels.npy", room.plane_index)
     truth = {
@@ -94,8 +99,8 @@ def main() -> None:
     (options.folder / "truth.json").write_text(json.dumps({"planes": truth}, indent=1))
 
 
-def great_room(n_points: int, *, cores: int) -> GreatRoom:
-    """Build the room and scan it with about so many rays."""
+def great_room(n_points: int, *, cores: int, seed: int = 1) -> GreatRoom:
+    """Build the room, scan it with about so many rays, and lay it where a seed says."""
     draft = SceneDraft()
     mirror = _build(draft)
     scene = draft.finished(spectral_gap=0.0)
@@ -124,9 +129,28 @@ def great_room(n_points: int, *, cores: int) -> GreatRoom:
         _mirrored(scene, mirror, sweep, part)
         start += size
     plane_index = np.append(scene.plane_index, -1).astype(np.int8)[np.maximum(points.rectangle, -1)]
-    return GreatRoom(
+    room = GreatRoom(
         x=points.x, y=points.y, z=points.z, plane_index=plane_index, planes=tuple(draft.planes)
     )
+    rng = np.random.default_rng(seed)
+    angles_deg = [rng.uniform(0.0, 360.0), *rng.uniform(-0.5, 0.5, 2)]
+    turn = Rotation.from_euler("ZYX", angles_deg, degrees=True).as_matrix()
+    return _moved(room, turn, rng.uniform(-1.0, 1.0, 3))
+
+
+def _moved(room: GreatRoom, turn: NDArray[np.float64], shift_m: NDArray[np.float64]) -> GreatRoom:
+    """Turn and shift a room; its points are changed in place."""
+    for first in range(0, len(room.x), RAYS_AT_ONCE):
+        part = slice(first, first + RAYS_AT_ONCE)
+        points = np.column_stack([room.x[part], room.y[part], room.z[part]]).astype(np.float64)
+        room.x[part], room.y[part], room.z[part] = (points @ turn.T + shift_m).T
+    planes = []
+    for item in room.planes:
+        normal = turn @ item.plane.normal
+        offset_m = item.plane.offset_m + float(normal @ shift_m)
+        moved = Plane(normal=normal, offset_m=offset_m)
+        planes.append(replace(item, plane=moved, outline=item.outline @ turn.T + shift_m))
+    return replace(room, planes=tuple(planes))
 
 
 def _sweeps(n_points: int) -> list[Sweep]:

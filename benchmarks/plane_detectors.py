@@ -120,6 +120,7 @@ def main() -> None:
     parser.add_argument("--npy", type=Path, help="(n, 3) float32 points instead of the room")
     parser.add_argument("--truth", type=Path, help="JSON with planes: {name: {n: [3], R}}")
     parser.add_argument("--labels", type=Path, help="(n,) true plane of each point, names as ints")
+    parser.add_argument("--seed", type=int, default=1, help="draws where the room lies")
     parser.add_argument("--cores", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--no-peers", action="store_true")
@@ -147,7 +148,7 @@ def _room(cloud: PointCloud, planes: list[tuple[str, NDArray, float]], labels: N
 
 
 def _simulated(options: argparse.Namespace) -> Room:
-    scanned = great_room(options.points, cores=options.cores)
+    scanned = great_room(options.points, cores=options.cores, seed=options.seed)
     planes = [(p.name, p.plane.normal, p.plane.offset_m) for p in scanned.planes]
     return _room(_cloud(scanned.x, scanned.y, scanned.z), planes, scanned.plane_index)
 
