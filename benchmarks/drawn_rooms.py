@@ -167,14 +167,30 @@ def reduced(part: str, name: str, seed: int) -> dict[str, Any]:
             varied[step] = list(content["variants"])
             for variant in content["variants"].values():
                 variant.pop("repeat", None)
-    wanted = [one for one in named if set(one) == set(varied)]
-    combinations = [dict(zip(varied, one, strict=True)) for one in product(*varied.values())]
-    left_out = [one for one in combinations if wanted and one not in wanted]
-    first = next(one for one in combinations if one not in left_out)
+    # Of steps that a page names together, the combinations that it does not name.
+    left_out = [
+        combination
+        for together in {tuple(one): None for one in named}
+        for combination in combinations(together, varied)
+        if not any(combination.items() <= one.items() for one in named)
+    ]
+    first = next(
+        one
+        for one in combinations(tuple(varied), varied)
+        if not any(other.items() <= one.items() for other in left_out)
+    )
     tree["compare"] = {"design": "product", "baseline": first}
     if left_out:
         tree["compare"]["exclude"] = left_out
     return tree
+
+
+def combinations(
+    steps: Sequence[str], variants: Mapping[str, Sequence[str]]
+) -> list[dict[str, str]]:
+    """Return all combinations of variants of some steps."""
+    chosen = product(*(variants[step] for step in steps))
+    return [dict(zip(steps, one, strict=True)) for one in chosen]
 
 
 def needed(step: str, steps: Mapping[str, Any]) -> set[str]:
