@@ -232,14 +232,14 @@ def compared_run(folder: Path) -> HeldRun:
         products[f"orient@plane={mark}", "cameras"] = cameras_product()
         products[f"check@plane={mark}", "inspection"] = inspection_product()
         products[f"mosaic@plane={mark}", "orthoimages"] = orthoimages_product(shift)
-    told = record(
+    recorded = record(
         cells,
         status="failed",
         workflow_resolved=compared_resolved(
             "plane.rms_mm", "plane.omega_deg", "check.*", "*.wall_s"
         ),
     )
-    return HeldRun(path=folder / "run.h5", record=told, products=products)
+    return HeldRun(path=folder / "run.h5", record=recorded, products=products)
 
 
 def picture(shift: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:

@@ -101,15 +101,23 @@ def test_a_run_is_summed_up_by_its_baseline(tmp_path: Path) -> None:
         status="failed",
         inputs=(RecordedInput(name="scan", files=(scan, replace(scan, name="b.laz"))),),
     )
-    (told,) = summaries([folder])
-    assert (told.folder, told.state, told.reason) == (folder, "failed", "bad: no plane")
-    assert (told.workflow, told.run_id, told.started) == ("hall", "r1", "2026-01-02T03:04:05Z")
+    (recorded,) = summaries([folder])
+    assert (recorded.folder, recorded.state, recorded.reason) == (folder, "failed", "bad: no plane")
+    assert (recorded.workflow, recorded.run_id, recorded.started) == (
+        "hall",
+        "r1",
+        "2026-01-02T03:04:05Z",
+    )
     # A later step has the plain name.
     wanted = {"plane.rms_mm": 3.0, "check.rms_mm": 1.0, "rms_mm": 1.0, "omega_deg": 4.0}
-    assert {name: told.metrics[name] for name in wanted} == wanted
-    assert told.labels["check.rms_mm"] == told.labels["rms_mm"] == "points to the first plane, RMS"
-    assert told.n_datasets == 0
-    assert told.all_facts == {
+    assert {name: recorded.metrics[name] for name in wanted} == wanted
+    assert (
+        recorded.labels["check.rms_mm"]
+        == recorded.labels["rms_mm"]
+        == "points to the first plane, RMS"
+    )
+    assert recorded.n_datasets == 0
+    assert recorded.all_facts == {
         "seed": 1,
         "orthoflow": "orthoflow 0.1.0",
         "input scan": ["hall.laz 01234567", "b.laz 01234567"],
@@ -132,8 +140,8 @@ def test_of_several_datasets_the_median_counts(tmp_path: Path) -> None:
         for k, (name, value) in enumerate({"hall": 1.0, "stairs": 2.0, "court": 5.0}.items())
     ]
     rooms = {name: {"inputs": {}, "set": {}} for name in ("hall", "stairs", "court")}
-    told = record(cells, workflow_resolved=json.dumps({"datasets": rooms}))
-    run = HeldRun(path=tmp_path / "run.h5", record=told)
+    recorded = record(cells, workflow_resolved=json.dumps({"datasets": rooms}))
+    run = HeldRun(path=tmp_path / "run.h5", record=recorded)
     summary = module._of_run(tmp_path, run)
     assert (summary.metrics["rms_mm"], summary.metrics["check.rms_mm"]) == (2.0, 2.0)
     # Of errors with signs their sizes, of angles themselves; of one dataset as it was measured.
@@ -183,8 +191,8 @@ def test_a_run_without_a_record_says_what_its_journal_begins_with(tmp_path: Path
     folder = a_run(tmp_path / "going")
     began = {"event": "run", "time": "2026-01-02T11:00:00Z", "run_id": "x", "workflow": "hall"}
     (folder / "journal.jsonl").write_text(json.dumps(began) + "\n" + "broken")
-    (told,) = summaries([folder])
-    assert told == RunSummary(
+    (recorded,) = summaries([folder])
+    assert recorded == RunSummary(
         folder=folder,
         state="unfinished",
         reason=f"continues with the same command and -o {folder}",
@@ -202,8 +210,8 @@ def test_a_first_line_has_64_kilobytes(tmp_path: Path, n_bytes: int, state: str)
     folder = a_run(tmp_path / "going")
     text = json.dumps({"workflow": "x"})
     (folder / "journal.jsonl").write_text(text[:-1].ljust(n_bytes - 1) + "}")
-    (told,) = summaries([folder])
-    assert told.state == state
+    (recorded,) = summaries([folder])
+    assert recorded.state == state
 
 
 def test_what_cannot_be_read_is_told_and_the_others_are_summed_up(tmp_path: Path) -> None:
@@ -226,11 +234,11 @@ def test_a_record_that_nobody_foresaw_is_damaged(
 
     monkeypatch.setattr(module, "_of_run", fails)
     folder = written(tmp_path / "odd", cell("plane"))
-    (told,) = summaries([folder])
-    assert (told.state, told.reason) == (
+    (recorded,) = summaries([folder])
+    assert (recorded.state, recorded.reason) == (
         *("damaged", "the record is not as one was written: RecursionError: too deep"),
     )
     monkeypatch.setattr(module, "broken_seal", lambda _run: "its seal does not hold")
-    (told,) = summaries([folder])
-    assert told == RunSummary(folder=folder, state="damaged", reason="its seal does not hold")
-    assert told.n_datasets == 0
+    (recorded,) = summaries([folder])
+    assert recorded == RunSummary(folder=folder, state="damaged", reason="its seal does not hold")
+    assert recorded.n_datasets == 0

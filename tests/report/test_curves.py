@@ -104,7 +104,7 @@ def test_what_is_not_swept_is_a_level_line(tmp_path: Path) -> None:
         (0.02, pytest.approx(0.0045)),
         (0.1, pytest.approx(0.0045)),
     ]
-    # Of one method several are told apart; nothing swept is no curve.
+    # Of one method several are recorded apart; nothing swept is no curve.
     (curve,) = curves([held(tmp_path, [*own, region(0), region(0, "wider")])])
     assert "plane.region, wider" in curve.lines
     # What has the parameter too, at its default, is named by the value.
@@ -140,16 +140,16 @@ def test_what_is_asked_for_is_drawn_and_what_hangs_on_no_sweep_is_not(tmp_path: 
 
 
 def test_the_baseline_of_a_sweep_is_the_filled_point(tmp_path: Path) -> None:
-    told = record(
+    recorded = record(
         swept(0.02, 0.05, 0.1),  # type: ignore[arg-type]
         workflow_resolved=json.dumps({"compare": {"baseline": {"plane": "tolerance_m-0.05"}}}),
     )
-    (curve,) = curves([HeldRun(path=tmp_path / "run.h5", record=told)])
+    (curve,) = curves([HeldRun(path=tmp_path / "run.h5", record=recorded)])
     assert [point.x for point in curve.lines[""] if point.is_filled] == [0.05]
     region = cell("plane@plane=region", method="plane.region", metrics=metrics(rms_mm=0.004))
     resolved = json.dumps({"compare": {"baseline": {"plane": "region"}}})
-    told = record([*swept(0.02, 0.05, 0.1), region], workflow_resolved=resolved)  # type: ignore[list-item]
-    (level,) = curves([HeldRun(path=tmp_path / "run.h5", record=told)])
+    recorded = record([*swept(0.02, 0.05, 0.1), region], workflow_resolved=resolved)  # type: ignore[list-item]
+    (level,) = curves([HeldRun(path=tmp_path / "run.h5", record=recorded)])
     assert [point.is_filled for point in level.lines["plane.region"]] == [True, True]
     (plain,) = curves([held(tmp_path, swept(0.02, 0.05, 0.1))])
     assert not any(point.is_filled for point in plain.lines[""])
@@ -302,11 +302,11 @@ def test_a_curve_over_different_walls_is_drawn_with_a_word_of_that(
     cells = []
     for value, area in ((1.0, 16.0), (2.0, area_m2)):
         variant = f"plane=limit-{value:g}"
-        told = metrics(omega_deg=10.0, phi_deg=0.0, area_m2=area)
+        recorded = metrics(omega_deg=10.0, phi_deg=0.0, area_m2=area)
         found = metrics(rms_mm=value)
         cells += [
             cell(f"plane@{variant}", params={"limit": value}, metrics=found),
-            cell(f"wall@{variant}", method="raster.grid", metrics=told),
+            cell(f"wall@{variant}", method="raster.grid", metrics=recorded),
             cell(f"check@{variant}", method="inspect.toy", metrics=metrics(rmse_u_mm=value)),
         ]
     said = {

@@ -69,9 +69,9 @@ def run_of(folder: Path, rms_mm: dict[str, tuple[float, float | None]]) -> HeldR
         "datasets": {name: {"inputs": {}, "set": {}} for name in rms_mm},
         "compare": {"baseline": {"plane": "slow"}, "metrics": ["plane.rms_mm"]},
     }
-    told = record(cells, workflow_resolved=json.dumps(resolved), status="failed")
+    recorded = record(cells, workflow_resolved=json.dumps(resolved), status="failed")
     products = {(image, "orthoimages"): orthoimages_product(0)}
-    return HeldRun(path=folder / "run.h5", record=told, products=products)
+    return HeldRun(path=folder / "run.h5", record=recorded, products=products)
 
 
 @pytest.fixture
@@ -190,6 +190,6 @@ def test_pages_are_not_written_through_a_link(rooms: Run, tmp_path: Path) -> Non
 
 
 def test_a_step_called_data_makes_no_datasets(rooms: Run) -> None:
-    told = replace(rooms, record=replace(rooms.record, workflow_resolved="{}"))
-    assert datasets_of(told) == ()
-    assert parts_of(told) == {}
+    recorded = replace(rooms, record=replace(rooms.record, workflow_resolved="{}"))
+    assert datasets_of(recorded) == ()
+    assert parts_of(recorded) == {}

@@ -20,8 +20,8 @@ def packages(name: str, **versions: str) -> RecordedEnvironment:
 
 
 def first_alike(*others: RecordedEnvironment) -> list[str]:
-    told = record([cell("a")], environments=(FIRST, *others))
-    return [*group_environments([HeldRun(path=Path("r.h5"), record=told)]).first.values()]
+    recorded = record([cell("a")], environments=(FIRST, *others))
+    return [*group_environments([HeldRun(path=Path("r.h5"), record=recorded)]).first.values()]
 
 
 @pytest.mark.parametrize(

@@ -22,8 +22,8 @@ def figure(name: str, data: bytes, media_type: str = PNG) -> RecordedFigure:
 
 
 def run(cells: Sequence[RecordedCell]) -> HeldRun:
-    told = record(cells, workflow_resolved=compared_resolved("plane.rms_mm"))
-    return HeldRun(path=Path("run") / "run.h5", record=told)
+    recorded = record(cells, workflow_resolved=compared_resolved("plane.rms_mm"))
+    return HeldRun(path=Path("run") / "run.h5", record=recorded)
 
 
 def shown(of: HeldRun, **more: object) -> list[tuple[str, str, int]]:

@@ -71,8 +71,8 @@ def run(
         cells.append(cell(f"plane@plane={variant}"))
         cells.append(cell(address, outputs={"out": given("", digest, type_name)}, log=log))
         held[address, "out"] = product
-    told = record(cells, workflow_resolved=compared_resolved("plane.rms_mm"))
-    return HeldRun(path=Path("run") / "run.h5", record=told, products=held)
+    recorded = record(cells, workflow_resolved=compared_resolved("plane.rms_mm"))
+    return HeldRun(path=Path("run") / "run.h5", record=recorded, products=held)
 
 
 # --- sizes ---
@@ -147,15 +147,15 @@ def walls(*, has_intensity: bool = True, source: str = "laser") -> Walls:
 
 
 def test_causes_of_unknown_cells_are_found_where_the_step_has_told_them() -> None:
-    told = run(walls(), type_name="walls", variants="fine", log="4.0% show nothing")
-    *_, depth = wall_pictures(told)
+    recorded = run(walls(), type_name="walls", variants="fine", log="4.0% show nothing")
+    *_, depth = wall_pictures(recorded)
     words = "96.0 % of the cells known; causes of the others: log of mosaic@plane=fine"
     assert depth.caption == words
 
 
 def test_a_wall_has_pictures_of_its_intensity_and_its_depth() -> None:
-    told = run(walls(), type_name="walls", variants="fine")
-    intensity, depth = wall_pictures(told)
+    recorded = run(walls(), type_name="walls", variants="fine")
+    intensity, depth = wall_pictures(recorded)
     assert (intensity.title, depth.title) == (
         *("wall 8, intensity (plane=fine)", "wall 8, depth (plane=fine)"),
     )
@@ -170,14 +170,14 @@ def test_a_wall_has_pictures_of_its_intensity_and_its_depth() -> None:
     assert depth.depths is not None
     assert intensity.depths is None
     # Only half as large where a page gives them a fiftieth of its bytes: one product is fifty.
-    assert shown(next(wall_pictures(told, share=0.02)))[1] == 490
+    assert shown(next(wall_pictures(recorded, share=0.02)))[1] == 490
     (alone,) = wall_pictures(run(walls(has_intensity=False), type_name="walls", variants="fine"))
     assert alone.title == "wall 8, depth (plane=fine)"
 
 
 def test_grey_of_colours_is_no_laser_intensity() -> None:
-    told = run(walls(source="luminance"), type_name="walls", variants="fine")
-    assert next(wall_pictures(told)).caption == (
+    recorded = run(walls(source="luminance"), type_name="walls", variants="fine")
+    assert next(wall_pictures(recorded)).caption == (
         "no laser intensity in the scan: grey of its colours instead"
     )
 
@@ -210,19 +210,19 @@ def test_equal_products_and_repeats_are_shown_once() -> None:
         ),
         cell("mosaic", outputs={"walls": given("", "e", "orthoimages")}),
     ]
-    told = HeldRun(path=Path("run.h5"), record=record(cells))
-    assert embedded_products(told, "walls") == (
+    recorded = HeldRun(path=Path("run.h5"), record=record(cells))
+    assert embedded_products(recorded, "walls") == (
         *(("wall@plane=fine", "walls"), ("wall@plane=fine", "more")),
     )
-    assert embedded_products(told, "orthoimages") == (("mosaic", "walls"),)
+    assert embedded_products(recorded, "orthoimages") == (("mosaic", "walls"),)
 
 
 def test_a_thumbnail_is_the_last_of_some_cells() -> None:
-    told = run(orthoimages(), orthoimages())
+    recorded = run(orthoimages(), orthoimages())
     both = {"mosaic@plane=fine", "mosaic@plane=coarse"}
-    small = thumbnail(told, both, longest_side_px=120)
+    small = thumbnail(recorded, both, longest_side_px=120)
     assert shown(Picture(uri=small, title="", caption="")) == (30, 120)
-    assert thumbnail(told, {"plane@plane=fine"}, longest_side_px=120) == ""
+    assert thumbnail(recorded, {"plane@plane=fine"}, longest_side_px=120) == ""
 
 
 # --- one place ---
@@ -265,11 +265,11 @@ def turned(degrees: float, axis: str) -> Any:
 def test_rasters_of_one_wall_lie_within_five_degrees_and_a_tenth(
     frame: Any, *, is_same: bool
 ) -> None:
-    told = [
+    recorded = [
         Picture(uri="", title=title, caption="", frame=one)
         for title, one in (("wall 4", FRAME), ("wall 4, depth", frame))
     ]
-    assert len(sliders(told, 1)) == is_same
+    assert len(sliders(recorded, 1)) == is_same
 
 
 # --- scales and depths for the cursor ---
