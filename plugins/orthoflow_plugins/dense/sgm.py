@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from orthoflow.errors import MethodError
-from orthoflow.files.images import decode_image
+from orthoflow.files.images import photo_rgb
 from orthoflow.geometry import UpDirection, up_vector
 from orthoflow.geometry.cameras import ViewingCamera, opencv_matrix
 from orthoflow.products import Cameras, Photo, Photos, PointCloud
@@ -185,7 +185,7 @@ def _matched(
     """
     import cv2
 
-    images = [decode_image(view.photo.encoded, view.photo.name) for view in (left, right)]
+    images = [photo_rgb(view.photo) for view in (left, right)]
     first, second = left.camera, right.camera
     turn = second.rotation @ first.rotation.T
     shift = second.translation - turn @ first.translation
