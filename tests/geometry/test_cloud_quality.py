@@ -76,15 +76,6 @@ def test_coarse_clouds_are_judged_on_larger_pieces_and_few_points_not_at_all() -
     assert judge_quality(offsets(room), None) is None
 
 
-def test_the_largest_pieces_are_a_metre_wide() -> None:
-    rng = np.random.default_rng(5)
-    u, v = (axis.ravel() for axis in np.meshgrid(*2 * [np.arange(0.0, 9.0, 0.12)]))
-    thin = judge_quality(offsets(np.column_stack([u, v, rng.normal(0.0, 0.01, u.size)])), None)
-    assert thin is not None
-    assert thin.side_m == 1.0
-    assert thin.sigma_m == pytest.approx(0.01, rel=0.15)
-
-
 def room(turned_deg: float, *, without_level: bool = False) -> NDArray[np.float64]:
     """Points on the six sides of a room of 6 x 4 x 3 m, turned about z; noise of 2 mm."""
     rng = np.random.default_rng(7)

@@ -6,10 +6,8 @@ import re
 
 import numba
 
-from orthoflow.engine.worker import _ProgressWithCompiling
 from orthoflow.geometry import compiling
 from orthoflow.geometry.compile_events import on_compiling
-from orthoflow.sdk import StepEvent
 
 
 def test_a_kernel_and_those_that_it_needs_are_reported_once() -> None:
@@ -33,20 +31,3 @@ def test_a_kernel_and_those_that_it_needs_are_reported_once() -> None:
     assert int(second) == int(first) + 1
     assert namespace["inner"](1.5) == 2.5  # type: ignore[operator]
     assert len(reported) == 3
-
-
-def test_progress_shows_what_is_compiled_and_then_again_the_activity_before() -> None:
-    events: list[StepEvent] = []
-    progress = _ProgressWithCompiling(events.append)
-    progress.listen(StepEvent(kind="progress", text="peeling", fraction=0.25))
-    for text in ("compiling outer", "compiling inner", "", "compiling other", ""):
-        progress.compiling(text)
-    assert [event.text for event in events] == [
-        "peeling",
-        "compiling outer",
-        "compiling inner",
-        "peeling",
-        "compiling other",
-        "peeling",
-    ]
-    assert {event.fraction for event in events} == {0.25}

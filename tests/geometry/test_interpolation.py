@@ -153,9 +153,3 @@ def test_of_equally_near_points_that_nearest_the_viewer_tells_the_surface() -> N
             threads=1,
         )
         assert into.depth_m[2] == np.float32(0.3)
-
-
-def test_arrays_that_are_not_there_are_left_alone() -> None:
-    values = cell_values(np.zeros(3, dtype=np.float32))
-    assert (values.intensity.shape, values.rgb.shape) == ((0,), (0, 3))
-    assert (values.intensity.dtype, values.rgb.dtype) == (np.float32, np.uint8)

@@ -11,12 +11,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.depth_buffer_kernels import COUNT_MOST
 from orthoflow.geometry.occluders import (
     Box,
-    _closed,
     depth_buffer,
-    nothing_in_the_way,
     occluders_in,
 )
 from tests import samples, scenes
@@ -162,18 +159,6 @@ def test_without_stations_few_points_that_are_spread_evenly_hide_nothing() -> No
     assert is_kept(face).mean() > 0.95
 
 
-def test_larger_voxels_hold_as_many_more_points_of_a_line() -> None:
-    wide = Box(low=np.zeros(3), high=np.array([200.0, 300.0, 40.0]), spacing_m=0.005)
-    found = occluders_in(cloud_of(np.zeros((3, 3))), wide, None, n_least=4, threads=1)
-    assert found.n_least == math.ceil(4 * found.around.side_m / (6.0 * 0.005)) > 50
-
-
-def test_counts_end_before_their_sums_overflow() -> None:
-    crowd = np.tile([0.0, 0.0, 2.5], (COUNT_MOST + 500, 1))
-    found = occluders_in(cloud_of(crowd), box(), None, n_least=4, threads=1)
-    assert found.around.counts.max() == COUNT_MOST
-
-
 def test_voxels_grow_where_a_box_would_have_too_many() -> None:
     wide = Box(low=np.zeros(3), high=np.array([200.0, 300.0, 40.0]), spacing_m=0.005)
     found = occluders_in(cloud_of(np.zeros((3, 3))), wide, None, n_least=4, threads=1)
@@ -228,14 +213,6 @@ def closed(nearest: NDArray[np.float32]) -> NDArray[np.float32]:
     return ndimage.maximum_filter(lowest, 3, mode="nearest")
 
 
-def test_holes_of_a_pixel_or_two_are_closed() -> None:
-    nearest = np.random.default_rng(0).uniform(1.0, 9.0, (12, 17)).astype(np.float32)
-    nearest[nearest > 6.0] = np.inf
-    before = nearest.copy()
-    np.testing.assert_array_equal(_closed(nearest), closed(nearest))
-    np.testing.assert_array_equal(nearest, before)
-
-
 def test_what_is_at_the_camera_or_behind_it_hides_nothing() -> None:
     at = np.tile([[0.0, 0.0, 0.04], [0.0, 0.0, -0.5]], (50, 1))
     around = Box(low=np.full(3, -1.0), high=np.ones(3), spacing_m=0.1)
@@ -246,10 +223,3 @@ def test_what_is_at_the_camera_or_behind_it_hides_nothing() -> None:
     cloud = cloud_of(at + np.array([0.0, 0.0, 0.02]), origin=tuple(ORIGIN))
     found = depth_buffer(occluders_in(cloud, around, None, n_least=2, threads=1), level)
     assert found.nearest.min() == pytest.approx(0.06)
-
-
-def test_an_empty_world_hides_nothing() -> None:
-    found = nothing_in_the_way(camera())
-    assert found.reduction == 100.0
-    assert found.nearest.shape == (1, 1)
-    assert np.isinf(found.nearest).all()

@@ -155,19 +155,6 @@ def test_the_largest_level_plane_is_the_floor(tilt_deg: float, *, is_floor: bool
     assert found.floor_m == pytest.approx(0.5 * rise - 0.5 if is_floor else 0.4)
 
 
-def test_lines_that_hardly_cross_do_not_join() -> None:
-    x, y, _ = SIZE
-    for angle_deg, n_joined in ((16.0, 0), (19.0, 2)):
-        end = (x + 4.0 * np.cos(np.radians(angle_deg)), y - 4.0 * np.sin(np.radians(angle_deg)))
-        found = outline(wall((0.0, y), (x, y)), wall((x, y), end))
-        assert len(found.walls) == n_joined
-
-
-def test_a_room_without_walls_has_no_outline() -> None:
-    outline = room_outline([], np.zeros((0, 4, 3)), np.array([0.0, 0.0, 1.0]))
-    assert (outline.walls, outline.chains_world, outline.floor_m) == ((), (), 0.0)
-
-
 @pytest.mark.parametrize("slope", [0.0, 0.08, -0.08])
 def test_walls_reach_up_to_a_ceiling_that_slopes(slope: float) -> None:
     sloping = CEILING + np.outer(CEILING[:, 0], [0.0, 0.0, slope])

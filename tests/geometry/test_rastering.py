@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -95,13 +94,6 @@ def test_points_that_are_left_out_win_nothing(threads: int) -> None:
     np.testing.assert_array_equal(winners["n_points"], expected["n_points"])
 
 
-def test_of_equal_points_the_first_wins() -> None:
-    wall = scenes.upright_wall()
-    twins = wall.world(np.full(5, 3.5), np.full(5, 4.5), np.zeros(5))
-    winners = topmost_points(scenes.cloud_of(twins), slab_of(wall), threads=1)
-    assert winners["point"][4 * 40 + 3] == 0
-
-
 @pytest.mark.parametrize(("dtype", "nothing"), [("u1", 0), ("f4", np.nan)])
 def test_cells_take_every_channel_of_their_winner(dtype: str, nothing: float) -> None:
     wall = scenes.upright_wall(shape=(60, 80))
@@ -168,15 +160,6 @@ def test_blocks_beside_a_wall_are_not_read_and_nothing_else_changes(
     assert (found[0]["point"] != NO_POINT).mean() > 0.9
 
 
-def test_a_block_with_a_point_that_is_no_number_is_read() -> None:
-    wall = scenes.upright_wall(shape=(60, 80))
-    cloud = random_cloud(wall, n_points=1_100_000, seed=2)
-    spoilt = replace(cloud, x=cloud.x.copy())
-    spoilt.x[::60_000] = np.nan
-    winners = topmost_points(spoilt, slab_of(wall), threads=2)
-    assert (winners["point"] != NO_POINT).all()
-
-
 def test_only_what_may_lie_in_some_rows_is_read() -> None:
     wall = scenes.upright_wall(shape=(60, 80))
     some = random_cloud(wall, n_points=1_100_000, seed=2)
@@ -211,49 +194,6 @@ def test_narrow_gaps_are_the_void_without_its_opening(radius: int, share: float)
     found = narrow_gaps(is_measured, radius)
     expected = ~is_measured & ~opened_void(~is_measured, radius)
     np.testing.assert_array_equal(found, np.flatnonzero(expected))
-
-
-def test_a_measured_cell_lies_within_the_radius_of_each_cell_of_a_gap() -> None:
-    from scipy import ndimage
-
-    is_measured = np.random.default_rng(5).random((40, 60)) < 0.4
-    found = narrow_gaps(is_measured, 3)
-    distances = ndimage.distance_transform_edt(~is_measured).ravel()[found]
-    assert distances.min() >= 1.0
-    assert 2.0 < distances.max() <= 3.0
-
-
-def test_radius_zero_finds_no_gap() -> None:
-    assert narrow_gaps(np.eye(5, dtype=bool), 0).shape == (0,)
-
-
-def test_a_window_keeps_its_shape_to_the_cell() -> None:
-    is_measured = np.ones((30, 30), dtype=bool)
-    is_measured[8:20, 10:18] = False
-    is_measured[5, :] = False
-    void = narrow_gaps(is_measured, 2)
-    # The line at row 5 closes, where it does not end at the border; the window does not, but for
-    # its corners, into which no disc of radius 2 reaches.
-    rows, columns = np.divmod(void, 30)
-    window = (rows >= 8) & (columns >= 10)
-    assert set(rows[~window]) == {5}
-    corners = {(8, 10), (8, 17), (19, 10), (19, 17)}
-    near_corner = [
-        min(abs(r - a) + abs(c - b) for a, b in corners)
-        for r, c in zip(rows[window], columns[window], strict=True)
-    ]
-    assert max(near_corner) <= 1
-
-
-def test_inputs_may_be_read_only_and_mapped(tmp_path: Path) -> None:
-    wall = scenes.upright_wall()
-    cloud, slab = random_cloud(wall, n_points=1000, seed=2), slab_of(wall)
-    np.save(tmp_path / "x.npy", cloud.x)
-    mapped = np.load(tmp_path / "x.npy", mmap_mode="r")
-    points = replace(cloud, x=mapped)
-    np.testing.assert_array_equal(
-        topmost_points(points, slab, threads=1)["point"], sorted_winners(cloud, slab)
-    )
 
 
 def test_places_are_told_of_points_up_to_two_cells_beside_a_gap() -> None:

@@ -26,7 +26,3 @@ def test_taking_and_joining_keep_the_rows_of_all_arrays_together() -> None:
     again = Places.joined([some.take(np.array([1, 0])), PLACES.take(slice(1, 2))])
     assert (again.wall, again.names.tolist()) == (3, ["c", "a", "b"])
     assert again.at.tolist() == [[4.0, 5.0], [0.0, 1.0], [2.0, 3.0]]
-
-
-def test_a_slice_gives_views() -> None:
-    assert np.shares_memory(PLACES.take(slice(0, 2)).at, PLACES.at)

@@ -27,45 +27,12 @@ from orthoflow.geometry.threads import (
 WAIT_S = 20.0
 
 
-@pytest.mark.parametrize("threads", [None, 0, 1, 3])
-@pytest.mark.parametrize("n_tasks", [1, 2, 7])
-def test_every_task_runs_once(n_tasks: int, threads: int | None) -> None:
-    done: list[int] = []
-    in_threads([partial(done.append, index) for index in range(n_tasks)], threads=threads)
-    assert sorted(done) == list(range(n_tasks))
-
-
 @pytest.mark.parametrize(("threads", "n_tasks"), [(None, 4), (4, 4), (3, 6)])
 def test_as_many_tasks_run_at_once_as_there_are_threads(threads: int | None, n_tasks: int) -> None:
     # Each party waits for the others: fewer at once would break the barrier.
     together = threading.Barrier(n_tasks if threads is None else threads)
     in_threads([lambda: together.wait(WAIT_S) and None] * n_tasks, threads=threads)
     assert not together.broken
-
-
-@pytest.mark.parametrize("threads", [1, 2, 3])
-def test_no_more_tasks_run_at_once_than_threads_were_given(threads: int) -> None:
-    running, most, lock, pause = 0, 0, threading.Lock(), threading.Event()
-
-    def task() -> None:
-        nonlocal running, most
-        with lock:
-            running += 1
-            most = max(most, running)
-        pause.wait(0.01)
-        with lock:
-            running -= 1
-
-    in_threads([task] * 12, threads=threads)
-    assert most == threads
-
-
-def test_one_task_runs_in_the_callers_thread() -> None:
-    seen: list[threading.Thread] = []
-    in_threads([lambda: seen.append(threading.current_thread())], threads=4)
-    assert seen == [threading.current_thread()]
-    in_threads([lambda: seen.append(threading.current_thread())] * 2, threads=1)
-    assert threading.current_thread() not in seen[1:]
 
 
 @pytest.mark.parametrize("n_tasks", [1, 5])
@@ -94,10 +61,6 @@ def test_results_come_in_the_order_of_the_items(threads: int) -> None:
     assert list(in_order(square, range(9), threads=threads)) == [n * n for n in range(9)]
 
 
-def test_nothing_gives_nothing() -> None:
-    assert list(in_order(str, [], threads=3)) == []
-
-
 @given(
     n_items=st.integers(0, 500), n_parts=st.integers(1, 40), multiple=st.sampled_from([1, 2, 7, 64])
 )
@@ -110,11 +73,6 @@ def test_parts_are_even_and_make_up_the_range(n_items: int, n_parts: int, multip
     # In whole multiples no part has more than one above another.
     units = [-(-(part.stop - part.start) // multiple) for part in parts]
     assert max(units) - min(units) <= 1
-
-
-def test_parts_are_cut_where_one_would_cut_them() -> None:
-    assert even_parts(10, 3) == [slice(0, 3), slice(3, 6), slice(6, 10)]
-    assert even_parts(10, 2, multiple=4) == [slice(0, 4), slice(4, 10)]
 
 
 @pytest.mark.parametrize("threads", [1, 3])

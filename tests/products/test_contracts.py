@@ -99,13 +99,3 @@ def test_large_products_are_mapped_whatever_their_type(monkeypatch: pytest.Monke
         monkeypatch.setattr(product, "_LARGE_BYTES", limit)
         assert points.to_payload().mapped == is_mapped
         assert labels.to_payload().mapped
-
-
-def test_a_gibibyte_is_large(monkeypatch: pytest.MonkeyPatch) -> None:
-    points = products.PointLabels(plane_index=np.zeros(4, np.int16))
-    monkeypatch.setattr(products.PointLabels, "mapped", False)
-    for n_bytes, is_mapped in ((1 << 30, False), ((1 << 30) + 2, True)):
-        # So many numbers that are one in memory.
-        vast = np.broadcast_to(np.int16(0), n_bytes // 2)
-        object.__setattr__(points, "plane_index", vast)
-        assert points.to_payload().mapped is is_mapped

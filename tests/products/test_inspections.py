@@ -1,4 +1,4 @@
-"""Truths of simulated scenes as older versions stored them."""
+"""Check points have a row each in all of their arrays."""
 
 from __future__ import annotations
 

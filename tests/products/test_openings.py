@@ -8,20 +8,7 @@ import numpy as np
 import pytest
 
 from orthoflow.errors import ProductError
-from orthoflow.products import Openings
-from tests.drawing_runs import WALL, box_openings
-
-
-def test_openings_come_back_from_their_payload() -> None:
-    found = box_openings()
-    again = Openings.from_payload(found.to_payload())
-    (opening,) = found.openings
-    (same,) = again.openings
-    np.testing.assert_array_equal(same.outline_world, opening.outline_world)
-    np.testing.assert_array_equal(same.side_sigma_m, opening.side_sigma_m)
-    assert (same.kind, same.depth_m, same.said) == (opening.kind, opening.depth_m, opening.said)
-    assert again.of_wall(WALL) == (same,)
-    assert again.of_wall(WALL + 1) == ()
+from tests.drawing_runs import box_openings
 
 
 def test_what_it_is_is_said_in_a_line() -> None:

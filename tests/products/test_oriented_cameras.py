@@ -49,8 +49,3 @@ def test_a_photo_without_all_of_it_is_not_oriented(missing: str) -> None:
     camera: Camera = replace(oriented(TRUE), status="too few ties", **{missing: None})
     with pytest.raises(ProductError, match=r"photo a.png is not oriented: too few ties"):
         camera.viewing()
-
-
-def test_lenses_are_without_distortion_unless_they_say_so() -> None:
-    lens = Intrinsics(width=4, height=3, fx=2.0, fy=2.0, cx=2.0, cy=1.5)
-    assert lens.distortion == (0.0, 0.0, 0.0, 0.0, 0.0)

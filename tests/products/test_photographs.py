@@ -1,4 +1,4 @@
-"""Ties and orientations: what older encodings had among their details, and what they have now."""
+"""Ties and lenses: walls of ties, their numbers, and what is refused."""
 
 from __future__ import annotations
 
@@ -9,10 +9,7 @@ import pytest
 
 from orthoflow.errors import ProductError
 from orthoflow.products import (
-    Cameras,
     Intrinsics,
-    JsonValue,
-    ResidualRow,
     TieRole,
     Ties,
     TieWall,
@@ -26,10 +23,6 @@ WALL = TieWall(
     normal_world=(0.0, -1.0, 0.0),
     gsd_m=0.01,
 )
-NUMBERS: dict[str, JsonValue] = dict.fromkeys(
-    ("mean", "sd", "median", "nmad", "rmse", "p95", "max", "beyond_own", "beyond_any"), 0.25
-)
-ROW: dict[str, JsonValue] = {"photo": "a.jpg", "role": "check", "axis": "u", "unit": "px", "n": 3}
 
 
 def ties(**more: object) -> Ties:
@@ -45,35 +38,6 @@ def ties(**more: object) -> Ties:
         residual_px=np.full((2, 2), np.nan),
         **more,  # type: ignore[arg-type]
     )
-
-
-OLD_DETAILS: dict[str, JsonValue] = {
-    "photos": {
-        "a.jpg": {"n_key_points": 812, "search_radius_px": 22.0},
-        "b.jpg": {"n_key_points": 40},
-    },
-    "intensity_source": "laser",
-    "walls": [
-        {
-            "name": "wall 0",
-            "gsd_m": 0.01,
-            "normal": [0.0, -1.0, 0.0],
-            "corners_world": [list(corner) for corner in CORNERS],
-        }
-    ],
-}
-
-
-def test_ties_come_back_with_what_they_say_of_walls_and_of_the_search() -> None:
-    given = ties(walls=(WALL,), search_radius_px=(22.0, None))
-    found = Ties.from_payload(given.to_payload())
-    assert (found.walls, found.search_radius_px) == ((WALL,), (22.0, None))
-
-
-def test_the_table_of_residuals_comes_back() -> None:
-    row = ResidualRow(**(ROW | NUMBERS))  # type: ignore[arg-type]
-    given = Cameras(cameras=(), residual_table=(row, dataclasses.replace(row, shift_p=0.5)))
-    assert Cameras.from_payload(given.to_payload()).residual_table == given.residual_table
 
 
 def test_what_ties_say_of_a_wall_is_what_its_raster_says() -> None:

@@ -1,4 +1,4 @@
-"""`Planes`: what was stated in the details of version 1, and what is refused."""
+"""`Planes`: the sides from which they are seen."""
 
 from __future__ import annotations
 
@@ -7,12 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from orthoflow.errors import ProductError
 from orthoflow.products import (
     Planes,
-    ScanRow,
-    Spread,
-    Thickness,
 )
 from tests import samples
 
@@ -26,28 +22,6 @@ def two_planes() -> Planes:
         rms_m=np.array([0.002, 0.003]),
         names=("wall 0", "floor"),
     )
-
-
-def test_what_was_measured_on_planes_comes_back_as_it_was() -> None:
-    spread = Spread(low=0.0, high=1.0, n_points=60, sigma_m=0.001, name="plaster")
-    thickness = Thickness(
-        sigma_m=0.001, width_95_m=0.004, scan_step_m=0.003, range_m=(spread,), intensity=(spread,)
-    )
-    row = ScanRow(row=3, scan=0, n_points=50, sigma_m=0.001, material=(spread,))
-    planes = replace(two_planes(), tolerance_m=0.02, thickness=(None, thickness), scan_row=row)
-    payload = planes.to_payload()
-    again = Planes.from_payload(payload)
-    assert (again.tolerance_m, again.thickness, again.scan_row) == (0.02, (None, thickness), row)
-
-
-def test_a_tolerance_must_be_positive() -> None:
-    with pytest.raises(ProductError, match=r"planes\.tolerance_m must be positive, got 0"):
-        replace(two_planes(), tolerance_m=0.0)
-
-
-def test_a_thickness_belongs_to_each_plane() -> None:
-    with pytest.raises(ProductError, match="must be empty or one per plane, got 1 for 2"):
-        replace(two_planes(), thickness=(None,))
 
 
 @pytest.mark.parametrize(
@@ -65,18 +39,6 @@ def test_the_side_of_a_plane_is_known_as_all_are_or_by_itself(viewpoint: str, so
     assert [planes.side_source(index) for index in range(2)] == [source, source]
     own = replace(planes, side_from=("photos", "given"))
     assert [own.side_source(index) for index in range(2)] == ["photos", "given"]
-
-
-def test_sides_of_their_own_are_kept_and_no_sides_leave_the_encoding_as_it_was() -> None:
-    own = replace(two_planes(), side_from=("photos", "guess"))
-    assert Planes.from_payload(own.to_payload()).side_from == ("photos", "guess")
-    assert "side_from" not in two_planes().to_payload().metadata
-    assert Planes.from_payload(two_planes().to_payload()).side_from == ()
-
-
-def test_sides_are_none_or_one_per_plane() -> None:
-    with pytest.raises(ProductError, match="side_from must be empty or one per plane, got 1 for 2"):
-        replace(two_planes(), side_from=("photos",))
 
 
 def test_a_plane_turned_round_is_the_same_plane_seen_from_behind() -> None:
@@ -102,9 +64,3 @@ def test_a_plane_turned_round_is_the_same_plane_seen_from_behind() -> None:
     assert again.part_corners is not None
     np.testing.assert_array_equal(again.part_corners, parts)
     np.testing.assert_array_equal(again.offset, planes.offset)
-
-
-def test_a_plane_without_parts_turns_round_too() -> None:
-    turned = two_planes().turned(1)
-    assert turned.part_corners is None
-    np.testing.assert_array_equal(turned.normal[1], [0.0, 0.0, -1.0])

@@ -1,4 +1,4 @@
-"""Numbers that stand for something in files, old and new, keep their meaning."""
+"""Numbers that stand for something in files keep their meaning."""
 
 from __future__ import annotations
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from orthoflow.errors import ProductError
 from orthoflow.products import Layers, Wall, Walls
 from tests import samples
 
@@ -37,11 +36,6 @@ def test_walls_share_a_reach_or_have_their_own() -> None:
     assert (own.front_m, own.behind_m) == (0.05, 0.6)
 
 
-def test_a_reach_belongs_to_each_wall() -> None:
-    with pytest.raises(ProductError, match="1 walls need a buffer each or none, got 2"):
-        replace(walls(wall_at(0.0, "west")), buffers_m=((0.2, 0.4), (0.05, 0.6)))
-
-
 @pytest.mark.parametrize(
     ("point_world", "index"),
     [
@@ -61,10 +55,6 @@ def test_the_nearest_wall_is_that_of_the_nearest_rectangle(
     )
     points_world: NDArray[np.float64] = np.array([point_world])
     assert room.nearest(points_world).tolist() == [index]
-
-
-def test_without_walls_no_wall_is_nearest() -> None:
-    assert walls().nearest(np.zeros((3, 3))).tolist() == [-1, -1, -1]
 
 
 def test_people_know_a_wall_by_its_plane_and_else_by_its_place() -> None:

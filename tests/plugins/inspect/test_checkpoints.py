@@ -6,11 +6,9 @@ import json
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from orthoflow_plugins.inspect import checkpoints, figures
 from orthoflow_plugins.inspect.checkpoints import InspectCheckpoints
 from orthoflow_plugins.inspect.findings import (
@@ -18,26 +16,19 @@ from orthoflow_plugins.inspect.findings import (
     outliers_at_once,
     outliers_iterated,
 )
-from orthoflow_plugins.inspect.patches import GreyImage
 from orthoflow_plugins.inspect.point_places import ShownPoint
-from orthoflow_plugins.inspect.targets import find_crossing
 from orthoflow_plugins.plane.given import GivenPlane
 from orthoflow_plugins.raster.grid import RasterGrid
 from orthoflow_plugins.read.scan import ReadScan
-from orthoflow_plugins.simulate.room import SimulateRoom
-from scipy.ndimage import gaussian_filter
 
 from orthoflow.errors import MethodError
-from orthoflow.files.images import encode_webp
-from orthoflow.geometry import bands, frame_over
-from orthoflow.geometry.scene_views import render_frame
+from orthoflow.geometry import bands
 from orthoflow.products import (
     CheckPoints,
     InputFiles,
     Inspection,
     Orthoimage,
     Orthoimages,
-    OrthoMask,
     Truth,
     Walls,
 )
@@ -174,37 +165,6 @@ def test_the_papers_numbers_for_points_fit_the_iterated_rule_only() -> None:
     assert numbers["n_outliers_iterated"] == 2
 
 
-def target(centre: tuple[float, float], turned_deg: float) -> NDArray[np.float64]:
-    """Quadrants of 40 cells about a centre, as a camera of one cell's sharpness sees them."""
-    fine = (np.arange(400) + 0.5) / 4.0
-    columns, rows = np.meshgrid(fine - centre[0], fine - centre[1])
-    turn = np.radians(turned_deg)
-    one = columns * np.cos(turn) + rows * np.sin(turn)
-    other = rows * np.cos(turn) - columns * np.sin(turn)
-    bright = np.where(one * other > 0.0, 220.0, 40.0)
-    bright[np.hypot(columns, rows) > 40.0] = 130.0
-    smooth = gaussian_filter(bright, 3.0)
-    return np.asarray(smooth.reshape(100, 4, 100, 4).mean(axis=(1, 3)))
-
-
-@pytest.mark.parametrize("turned_deg", [0.0, 20.0, 33.0])
-def test_the_centre_of_a_target_is_found_in_noise_and_holes(turned_deg: float) -> None:
-    rng = np.random.default_rng(3)
-    # A border of fine cells, so that the drawn edges lie just there.
-    centre = (52.25, 47.75)
-    grey = target(centre, turned_deg) + rng.normal(scale=6.0, size=(100, 100))
-    valid = rng.random((100, 100)) > 0.3
-    picture = GreyImage(grey=grey, valid=valid, region=valid)
-    found = find_crossing(picture, np.array([47.0, 52.0]), search_cells=12.0, radius_cells=30.0)
-    assert found is not None
-    np.testing.assert_allclose(found, centre, atol=0.06)  # cells
-    edge = np.where(np.mgrid[:100, :100][1] < 50, 40.0, 220.0)
-    plain = GreyImage(grey=edge, valid=valid, region=valid)
-    assert (
-        find_crossing(plain, np.array([50.0, 50.0]), search_cells=12.0, radius_cells=30.0) is None
-    )
-
-
 def test_what_is_not_found_is_said(tmp_path: Path) -> None:
     walls = inspect_scenes.walls()
     far = points_at(np.array([[50.0, 50.0, 50.0]]))
@@ -214,46 +174,6 @@ def test_what_is_not_found_is_said(tmp_path: Path) -> None:
         inspect(tmp_path, far, walls)
     with pytest.raises(MethodError, match="there is no picture to find check points in"):
         inspect(tmp_path, far, inspect_scenes.walls(source="none"))
-
-
-@pytest.mark.long
-def test_points_of_a_simulated_room_are_found_by_its_truth(tmp_path: Path) -> None:
-    params = SimulateRoom.Params(scan_step_m=0.1, panorama_step_m=0.3)
-    room = SimulateRoom().run(SimulateRoom.In(), params, context(tmp_path))
-    gsd_m, shift = 0.012, np.array([1.4, -0.6])
-    planes = room.truth.planes
-    frame = frame_over(planes.corners[0], planes.normal[0], gsd_m=gsd_m)
-    moved = gsd_m * (shift[0] * frame.u_world + shift[1] * frame.v_world)
-    true = render_frame(
-        room.truth.scene,
-        replace(frame, origin_world=frame.origin_world - moved),
-        buffer_front_m=BUFFER_M,
-        buffer_behind_m=BUFFER_M,
-    )
-    known = true.rectangle >= 0
-    image = samples.orthoimage(
-        frame,
-        name="main wall",
-        rgb=np.nan_to_num(true.rgb).round().astype(np.uint8),
-        mask=np.where(known, OrthoMask.PAINTED, OrthoMask.NO_SURFACE).astype(np.uint8),
-        sources=("truth",),
-    )
-    wall = replace(
-        inspect_scenes.walls().walls[0],
-        frame=frame,
-        depth_m=true.depth_m,
-        sigma_m=np.zeros(frame.shape, dtype=np.float32),
-        count=np.ones(frame.shape, dtype=np.uint32),
-        mask=known.astype(np.uint8),
-        intensity=None,
-    )
-    walls = samples.walls(wall, buffer_m=BUFFER_M)
-    metrics, found, _ = inspect(tmp_path, room.checkpoints, walls, image, room.truth)
-    assert metrics["n_found"] >= 0.7 * metrics["n_points"]
-    assert {"flat", "vertical edge"} == set(found.kinds)
-    for axis, cells in zip("xy", shift, strict=True):
-        assert metrics[f"mean_{axis}_mm"] == pytest.approx(1e3 * gsd_m * cells, abs=0.1e3 * gsd_m)
-        assert metrics[f"nmad_{axis}_mm"] < 0.1e3 * gsd_m
 
 
 TLS_PATCHES = ("T1.1", "T1.2", "T1.3", "T2.1", "T2.2", "T2.3", "T3.1", "T3.2")
@@ -367,44 +287,6 @@ def test_points_that_are_carried_back_into_space_are_off_by_their_distance() -> 
         "max_3d_mm": (pytest.approx(5.0), "mm"),
     }
     assert checkpoints._findings_in_space(points[1:2], surveyed, [2]) == []
-
-
-@pytest.mark.usefixtures("charts")
-def test_each_picture_is_drawn_with_the_residuals_of_its_own_points(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    drawn = []
-
-    def draw(*asked: object) -> bytes:
-        drawn.append(asked)
-        return encode_webp(np.zeros((1, 1, 3), dtype=np.uint8))
-
-    monkeypatch.setattr(checkpoints, "vector_map", draw)
-    images = [
-        replace(inspect_scenes.displaced(0, 0), wall=place, plane_index=number)
-        for place, number in ((0, 7), (1, 9), (2, 4))
-    ]
-    pictures = [SimpleNamespace(wall=image.wall, image=image) for image in images]
-    nowhere = [np.nan] * 3
-    points = [
-        shown_at(wall, place, nowhere)
-        for wall, place in ((2, [11.0, 18.0]), (0, [10.0, 25.0]), (2, [13.0, 20.0]))
-    ]
-    ctx = context(tmp_path)
-    checkpoints._draw(pictures, points, ["a", "b", "c"], ctx)  # type: ignore[arg-type]
-    assert [figure.name for figure in ctx.figures] == ["wall_7_residuals", "wall_4_residuals"]
-    for asked, image, places, shifts, names in zip(
-        drawn,
-        images[::2],
-        ([[10.0, 25.0]], [[11.0, 18.0], [13.0, 20.0]]),
-        ([[0.0, 5.0]], [[1.0, -2.0], [3.0, 0.0]]),
-        (["b"], ["a", "c"]),
-        strict=True,
-    ):
-        assert asked[0] is image
-        np.testing.assert_array_equal(asked[1], places)
-        np.testing.assert_array_equal(asked[2], shifts)
-        assert asked[3] == names
 
 
 def test_points_without_a_class_are_check_points(tmp_path: Path) -> None:

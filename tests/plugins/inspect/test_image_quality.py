@@ -21,7 +21,8 @@ from tests import samples
 
 UP = np.array([0.0, 0.0, 1.0])
 SIDE, GSD_M = 20, 0.01
-FRAME = samples.facing_south(GSD_M, SIDE, SIDE)
+# Far from the origin, as surveys are.
+FRAME = samples.facing_south(GSD_M, SIDE, SIDE, (5.0e6, 4.0e5, 100.0))
 # The edge lies on the middle of this column.
 EDGE = 30
 
@@ -77,13 +78,23 @@ def test_the_filled_share_is_of_what_is_shown() -> None:
     assert found == {"filled_share": pytest.approx(2.0 / 7.0)}
 
 
-def camera(cells_across: float, cells_down: float) -> ViewingCamera:
-    """Square before the wall and far away; a pixel covers so many cells."""
+def camera(cells_per_pixel: float, turn_deg: float = 0.0) -> ViewingCamera:
+    """Far away, to the right of the wall's normal; a pixel covers so many cells across a ray."""
     middle = FRAME.world_from_wall(np.array([[SIDE / 2, SIDE / 2]]))[0]
-    centre = middle + np.array([0.0, -100.0, 0.0])
-    lens = {"cx": 500.0, "cy": 500.0, "width": 1000, "height": 1000}
-    fx, fy = (100.0 / (cells * GSD_M) for cells in (cells_across, cells_down))
-    return samples.camera(looking_at(centre, middle, UP), centre, fx=fx, fy=fy, **lens)
+    turn = np.radians(turn_deg)
+    centre = middle + 100.0 * np.array([np.sin(turn), -np.cos(turn), 0.0])
+    focal = 100.0 / (cells_per_pixel * GSD_M)
+    lens = {"fx": focal, "fy": focal, "cx": 500.0, "cy": 500.0, "width": 1000, "height": 1000}
+    return samples.camera(looking_at(centre, middle, UP), centre, **lens)
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 60.0])
+def test_a_flat_wall_is_stretched_by_the_cosine_of_the_view(turn_deg: float) -> None:
+    made = image(np.full(FRAME.shape, OrthoMask.PAINTED, dtype=np.uint8), sources=("a.jpg",))
+    spread = cells_per_pixel(made, wall(), ("a.jpg", camera(0.7, turn_deg)))
+    assert len(spread) == SIDE * SIDE
+    # The wall is 0.2 m wide and 100 m away: 0.2 % of perspective.
+    np.testing.assert_allclose(spread, 0.7 / np.cos(np.radians(turn_deg)), rtol=5e-3)
 
 
 def test_only_cells_that_a_photo_painted_are_asked() -> None:
@@ -91,18 +102,13 @@ def test_only_cells_that_a_photo_painted_are_asked() -> None:
     source = np.zeros(FRAME.shape, dtype=np.int16)
     source[:2] = 1
     made = image(mask, source=source, sources=("a.jpg", "b.jpg"))
-    view = camera(1.5, 1.5)
+    view = camera(1.5)
     depth = np.zeros(FRAME.shape, dtype=np.float32)
     depth[4] = np.nan
     # Of the painted rows two are the other's, and one has no depth.
     assert len(cells_per_pixel(made, wall(depth), ("a.jpg", view))) == 2 * SIDE
     assert len(cells_per_pixel(made, wall(depth), ("b.jpg", view))) == 2 * SIDE
     assert len(cells_per_pixel(made, wall(depth), ("c.jpg", view))) == 0
-
-
-def test_an_edge_is_looked_at_as_far_on_either_side_of_it() -> None:
-    np.testing.assert_allclose(image_quality._ALONG, -image_quality._ALONG[::-1], atol=1e-12)
-    np.testing.assert_allclose(np.diff(image_quality._ALONG), np.diff(image_quality._ALONG)[0])
 
 
 @pytest.mark.parametrize(
@@ -117,9 +123,21 @@ def test_a_spread_that_begins_or_ends_grey_tells_nothing(
     assert bool(numbers(edge())) == is_told
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 30), (30, 1)])
-def test_one_row_of_cells_has_no_profiles(shape: tuple[int, int]) -> None:
-    everywhere = np.ones(shape, dtype=np.bool_)
-    grey = np.arange(everywhere.size, dtype=np.float64).reshape(shape)
-    image = GreyImage(grey=grey, valid=everywhere, region=everywhere)
-    assert image_quality._edge_profiles(image).shape == (0, image_quality._ALONG.size)
+@pytest.mark.parametrize("sigma", [0.8, 2.5])
+def test_blurred_edges_show_their_blur(sigma: float) -> None:
+    # Bars 40 cells wide, a little askew so that edges fall anywhere between cells.
+    rows, columns = np.mgrid[:400, :400]
+    place = np.mod(columns + 0.13 * rows, 80.0)
+    signed = np.where(place < 40.0, place - 20.0, 60.0 - place) / np.hypot(1.0, 0.13)
+    grey = 120.0 + 60.0 * erf(signed / (sigma * np.sqrt(2.0)))
+    found = numbers(grey + np.random.default_rng(1).normal(scale=1.0, size=grey.shape))
+    assert found["n_edges"] >= 20
+    # A Gaussian's 10 to 90 % take 2.563 sigma; its MTF halves at sqrt(ln 2 / 2) / (pi sigma).
+    assert found["edge_width_cells"] == pytest.approx(2.563 * sigma, rel=0.1)
+    assert found["mtf50_per_cell"] == pytest.approx(0.1874 / sigma, rel=0.1)
+
+
+def test_an_image_without_edges_has_no_sharpness() -> None:
+    for shape in ((100, 100), (1, 1), (1, 30)):
+        assert numbers(np.full(shape, 90.0)) == {}
+    assert numbers(np.full((100, 100), 90.0), np.zeros((100, 100), dtype=np.bool_)) == {}

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
-import tracemalloc
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.inspect import key_pairs, patches
+from orthoflow_plugins.inspect import key_pairs
 from orthoflow_plugins.inspect.image_quality import OrthoimageGrey
 from orthoflow_plugins.inspect.key_pairs import find_key_pairs
 
-from tests import inspect_scenes
 from tests.inspect_scenes import displaced
 
 
@@ -73,30 +69,3 @@ def test_tiles_of_large_pictures_give_the_pairs_of_the_whole(
             for pairs, order in zip((tiled, whole), by_place, strict=True)
         )
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-6, err_msg=name)
-
-
-def test_large_pictures_take_the_memory_of_a_tile(monkeypatch: pytest.MonkeyPatch) -> None:
-    image = displaced(1.4, -0.6)
-    image = dataclasses.replace(
-        image,
-        frame=inspect_scenes.frame(shape=(560, 720)),
-        rgb=np.tile(image.rgb, (2, 2, 1)),
-        mask=np.tile(image.mask, (2, 2)),
-        source=np.tile(image.source, (2, 2)),
-    )
-    monkeypatch.setattr(key_pairs, "_WHOLE_CELLS", 1000)
-    monkeypatch.setattr(key_pairs, "_TILE_CELLS", 200)
-    monkeypatch.setattr(key_pairs, "_SURF_RIM_CELLS", 64)
-    monkeypatch.setattr(key_pairs, "_RIM_CELLS", 40)
-    monkeypatch.setattr(patches, "_AT_ONCE", 100)
-    grey = OrthoimageGrey(image)
-    find_key_pairs(OrthoimageGrey(displaced(0.0, 0.0)), grey, radius_cells=30.0)  # loaded
-    tracemalloc.start()
-    try:
-        pairs = find_key_pairs(grey, grey, radius_cells=30.0)
-        # A whole picture takes more than 200 bytes a cell.
-        assert tracemalloc.get_traced_memory()[1] < 70 * image.mask.size
-    finally:
-        tracemalloc.stop()
-    assert len(pairs) > 300
-    np.testing.assert_allclose(pairs.shift, 0.0, atol=1e-3)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import tracemalloc
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -56,42 +54,6 @@ def test_large_walls_are_judged_in_coarser_cells_but_sides_as_exactly(
     for name in ("opening_iou_mean", "opening_iou_min"):
         assert coarse.pop(name) == pytest.approx(whole.pop(name), abs=apart)
     assert coarse == pytest.approx(whole, abs=1e-9)
-
-
-def test_a_large_wall_takes_the_memory_of_the_cells_that_it_is_looked_at_in(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    truth, walls = scene()
-    (wall,) = walls.walls
-    found = opening(walls, outwards_m=0.03)
-    rows, columns = 20 * wall.frame.height, 20 * wall.frame.width
-    frame = replace(wall.frame, gsd_m=GSD_M / 20, width=columns, height=rows)
-    nothing = np.broadcast_to(np.float32(0.0), frame.shape)
-    large = replace(
-        wall,
-        frame=frame,
-        depth_m=nothing,
-        sigma_m=nothing,
-        count=np.broadcast_to(np.uint32(1), frame.shape),
-        mask=np.broadcast_to(np.uint8(1), frame.shape),
-    )
-    monkeypatch.setattr(inspected, "_CELLS_TOLD", 15_000)
-    inputs = InspectOpenings.In(
-        truth=truth,
-        walls=replace(walls, walls=(large,)),
-        openings=Openings(openings=(found,), walls=(3,)),
-    )
-    ctx = context(tmp_path)
-    InspectOpenings().run(inputs, InspectOpenings.Params(), ctx)
-    tracemalloc.start()
-    try:
-        InspectOpenings().run(inputs, InspectOpenings.Params(), context(tmp_path))
-        assert tracemalloc.get_traced_memory()[1] < rows * columns
-    finally:
-        tracemalloc.stop()
-    numbers = {metric.name: metric.value for metric in ctx.metrics}
-    # Ten cells of a millimetre do not reach an outline that is three centimetres off.
-    assert (numbers["n_found_openings"], numbers["n_stray_sides"]) == (1, 4)
 
 
 @pytest.mark.parametrize("outwards_m", [0.03, -0.05])

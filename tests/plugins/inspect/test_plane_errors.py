@@ -34,17 +34,6 @@ def counts(findings: list[Finding]) -> dict[str, float]:
     return {finding.name: finding.value for finding in findings}
 
 
-def test_a_main_wall_that_was_not_found_is_told(tmp_path: Path) -> None:
-    truth: Any = SimpleNamespace(planes=floors(0.0, 3.0))
-    ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
-    plane_errors.inspect_planes(floors(3.0), None, None, truth, ctx)
-    (warning,) = ctx.warnings
-    assert "the main wall of the scene is none of the 1 planes" in warning
-    told = {item.name: item.value for item in ctx.metrics}
-    assert (told["main_found"], told["true_planes_found"]) == (0.0, 1.0)
-    assert "plane_offset_mm" not in told
-
-
 def test_labels_are_scored_by_plane_whichever_number_they_have(tmp_path: Path) -> None:
     ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
     labels: Any = SimpleNamespace(plane_index=np.array([2, 2, -1, 0, 0, 0], dtype=np.int16))

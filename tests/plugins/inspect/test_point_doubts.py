@@ -104,12 +104,6 @@ def test_cells_of_another_size_are_so_by_two_hundredths(
     assert told in warning
 
 
-def test_two_points_tell_the_size_of_cells_and_one_tells_nothing(tmp_path: Path) -> None:
-    for count, is_told in ((2, True), (1, False)):
-        warnings, _ = said(tmp_path, points_at(surveyed()[:count], pixels=2.5 * PLACES[:count]))
-        assert any("measured on cells of about" in warning for warning in warnings) == is_told
-
-
 @pytest.mark.parametrize("side", [(-1.0, 0.3), (2.0, 0.3), (0.3, -1.0), (0.3, 2.0)])
 def test_points_are_far_beyond_the_length_of_their_wall(side: tuple[float, float]) -> None:
     image = inspect_scenes.displaced(0, 0)

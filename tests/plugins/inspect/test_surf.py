@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from orthoflow_plugins.inspect import surf
-from orthoflow_plugins.inspect.key_pairs import KeyPairs, no_pairs
+from orthoflow_plugins.inspect.key_pairs import KeyPairs
 from orthoflow_plugins.inspect.surf import InspectSurf
 
 from orthoflow.errors import MethodError
-from orthoflow.products import Inspection, Orthoimage, Orthoimages, OrthoMask, Walls
+from orthoflow.products import Inspection, Orthoimage, Orthoimages, Walls
 from orthoflow.sdk import StepContext
 from tests import inspect_scenes
 from tests.inspect_scenes import GSD_M, displaced
@@ -45,26 +45,6 @@ def test_a_displacement_is_told_to_a_tenth_of_a_cell(
         assert metrics[f"surf_floor_rmse_{axis}_mm"] > metrics[f"floor_rmse_{axis}_mm"]
     assert len(found.displacement_m) == metrics["n_pairs"]
     assert [figure.name for figure in context.figures] == ["wall_0_displacements"]
-
-
-def test_no_key_points_are_looked_for_where_nothing_is_shown(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    looked: list[object] = []
-
-    def find(*arguments: object, **_: object) -> KeyPairs:
-        looked.append(arguments)
-        return no_pairs()
-
-    monkeypatch.setattr(surf, "find_key_pairs", find)
-    image = displaced(0.0, 0.0)
-    blank = replace(image, mask=np.full_like(image.mask, OrthoMask.NONE))
-    metrics, _, context = inspect(tmp_path / "blank", blank, unfit="warn")
-    assert (metrics["n_walls_inspected"], looked) == (0.0, [])
-    assert "0 pairs of SURF key points in one wall" in context.warnings[0]
-    # Nor is a floor, where there are too few pairs for it to say anything.
-    inspect(tmp_path / "shown", image, unfit="warn")
-    assert len(looked) == 1
 
 
 def test_part_of_the_image_displaced_shows_beyond_twice_the_rmse(tmp_path: Path) -> None:

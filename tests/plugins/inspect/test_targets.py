@@ -56,3 +56,12 @@ def test_half_of_a_target_must_be_there_on_both_sides(share: float, is_found: bo
     rows = np.mgrid[:SIDE, :SIDE][0] + 0.5
     valid = np.abs(rows - 60.0) <= share * RADIUS
     assert (found(quadrants(), valid=valid) is not None) == is_found
+
+
+@pytest.mark.parametrize("turned_deg", [0.0, 20.0, 33.0])
+def test_the_centre_of_a_target_is_found_in_noise_and_holes(turned_deg: float) -> None:
+    rng = np.random.default_rng(3)
+    noisy = quadrants(turned_deg) + rng.normal(scale=6.0, size=(SIDE, SIDE))
+    place = found(noisy, (55.0, 64.0), rng.random(noisy.shape) > 0.3)
+    assert place is not None
+    np.testing.assert_allclose(place, CENTRE, atol=0.06)  # cells

@@ -12,8 +12,6 @@ import numpy as np
 import pytest
 import rasterio
 from orthoflow_plugins.inspect import truth as module
-from orthoflow_plugins.inspect.cell_errors import depth_step_band
-from orthoflow_plugins.inspect.findings import report
 from orthoflow_plugins.inspect.truth import InspectTruth
 from orthoflow_plugins.read.orthoimage import ReadOrthoimage
 from orthoflow_plugins.simulate.room import SimulateRoom
@@ -25,7 +23,6 @@ from orthoflow.geometry import frame_over
 from orthoflow.geometry.scene_views import TrueOrthoimage, render_frame
 from orthoflow.products import (
     Cameras,
-    Finding,
     InputFiles,
     Inspection,
     Orthoimage,
@@ -128,7 +125,7 @@ def test_the_true_orthoimage_has_no_error(tmp_path: Path, truth: Truth) -> None:
     ]
 
 
-@pytest.mark.parametrize("shift", [(1.5, 0.0), (0.0, -1.0), (-0.6, 0.3)])
+@pytest.mark.parametrize("shift", [(1.5, 0.0), (-0.6, 0.3)])
 def test_a_displaced_orthoimage_has_just_that_displacement(
     tmp_path: Path, truth: Truth, shift: tuple[float, float]
 ) -> None:
@@ -178,16 +175,6 @@ def test_another_programs_image_is_compared_on_its_own_cells(tmp_path: Path, tru
     assert metrics["n_patches"] > 5
 
 
-def test_a_wall_measured_too_near_has_that_depth_error(tmp_path: Path, truth: Truth) -> None:
-    image = rendered(truth)
-    near = replace(walled(image), depth_m=image.depth_m + np.float32(0.005))
-    metrics, _, _ = inspect(tmp_path, truth, painted(image), near)
-    assert metrics["depth_median_mm"] == pytest.approx(5.0, abs=1e-3)
-    assert metrics["depth_rmse_mm"] == pytest.approx(5.0, abs=1e-3)
-    assert metrics["depth_nmad_mm"] == pytest.approx(0.0, abs=1e-3)
-    assert metrics["depth_within_3sigma"] == 0.0
-
-
 def test_a_tilted_plane_has_its_angle_and_offset(tmp_path: Path, truth: Truth) -> None:
     image = rendered(truth)
     frame = image.frame
@@ -207,60 +194,6 @@ def test_a_tilted_plane_has_its_angle_and_offset(tmp_path: Path, truth: Truth) -
     half_width_m = np.linalg.norm(truth.planes.corners[0][3] - truth.planes.corners[0][0]) / 2
     corner_mm = 4.0 + 1e3 * half_width_m * np.sin(np.radians(0.2))
     assert metrics["plane_corner_max_mm"] == pytest.approx(corner_mm, abs=0.1)
-
-
-def test_the_object_shining_through_is_a_ghost(tmp_path: Path, truth: Truth) -> None:
-    image = painted(rendered(truth))
-    front = render_frame(truth.scene, image.frame, buffer_front_m=1.2, buffer_behind_m=BUFFER_M)
-    ghost = (front.depth_m > 0.4) & (front.depth_m < 0.9)
-    assert ghost.sum() > 500
-    rgb = image.rgb.copy()
-    rgb[ghost] = front.rgb[ghost].round()
-    metrics, _, _ = inspect(tmp_path, truth, replace(image, rgb=rgb), walled(rendered(truth)))
-    ghost &= ~depth_step_band(rendered(truth).depth_m)
-    shown = ghost.sum() / np.count_nonzero(image.mask == OrthoMask.PAINTED)
-    # Some of the object's bright tiles look like the wall.
-    assert 0.6 * shown < metrics["ghost_share"] <= shown
-    assert metrics["gross_colour_share"] >= metrics["ghost_share"]
-
-
-def test_cells_left_unpainted_are_missing_and_filled_ones_are_apart(
-    tmp_path: Path, truth: Truth
-) -> None:
-    image = rendered(truth)
-    mask = painted(image).mask.copy()
-    mask[:, ::4] = OrthoMask.NONE
-    mask[:, 1::4] = OrthoMask.FILLED
-    rgb = painted(image).rgb.astype(np.int64)
-    rgb[:, 1::4] += np.where(rgb[:, 1::4] < 128, 10, -10)
-    metrics, _, _ = inspect(
-        tmp_path,
-        truth,
-        replace(painted(image), mask=mask, rgb=rgb.astype(np.uint8)),
-        walled(image),
-    )
-    assert metrics["completeness"] == pytest.approx(0.5, abs=0.01)
-    assert metrics["completeness_filled"] == pytest.approx(0.75, abs=0.01)
-    assert metrics["filled_colour_rmse_grey"] == pytest.approx(10.0, abs=0.1)
-    assert metrics["colour_rmse_grey"] < 0.3
-
-
-def test_labels_are_matched_whatever_their_numbers(tmp_path: Path, truth: Truth) -> None:
-    image = rendered(truth)
-    count = len(truth.planes)
-    labels = np.where(truth.labels >= 0, count - 1 - truth.labels, -1).astype(np.int16)
-    lost = np.flatnonzero(truth.labels == 0)[::2]
-    labels[lost] = -1
-    metrics, out, _ = inspect(
-        tmp_path, truth, painted(image), walled(image), labels=PointLabels(plane_index=labels)
-    )
-    findings = {finding.name: finding.value for finding in out.inspection.findings}
-    recall = 1.0 - len(lost) / np.count_nonzero(truth.labels == 0)
-    assert findings["label_recall[main wall]"] == pytest.approx(recall)
-    assert findings["label_precision[main wall]"] == 1.0
-    assert findings["label_f1[main wall]"] == pytest.approx(2 * recall / (1 + recall))
-    assert findings["label_iou[main wall]"] == pytest.approx(recall)
-    assert metrics["label_precision_mean"] == 1.0
 
 
 def test_what_cannot_be_compared_is_refused_in_one_sentence(tmp_path: Path, truth: Truth) -> None:
@@ -293,13 +226,17 @@ def inspect_planes(
     folder: Path,
     truth: Truth,
     planes: Planes | None,
-    labels: PointLabels | None,
+    labels: PointLabels | None = None,
     cloud: PointCloud | None = None,
-) -> dict[str, float]:
+) -> tuple[dict[str, float], list[str]]:
+    """Metrics, and codes of diagnostics."""
     context = StepContext(rng=np.random.default_rng(0), cores=1, scratch=folder)
     inputs = InspectTruth.In(truth=truth, planes=planes, labels=labels, cloud=cloud)
     InspectTruth().run(inputs, InspectTruth.Params(), context)
-    return {metric.name: metric.value for metric in context.metrics}
+    return (
+        {metric.name: metric.value for metric in context.metrics},
+        [one.code for one in context.diagnostics],
+    )
 
 
 def test_labels_of_chosen_points_in_another_order_are_compared_with_theirs(
@@ -310,9 +247,14 @@ def test_labels_of_chosen_points_in_another_order_are_compared_with_theirs(
     x = np.zeros(n_points, dtype=np.float32)
     whole = PointCloud(origin=np.zeros(3), up=np.array([0.0, 0.0, 1.0]), x=x, y=x, z=x)
     labels = PointLabels(plane_index=truth.labels[chosen])
-    metrics = inspect_planes(tmp_path, truth, truth.planes, labels, whole.selected(chosen))
+    # A filter before the planes leaves points out, which is not the detector's loss.
+    metrics, codes = inspect_planes(tmp_path, truth, truth.planes, labels, whole.selected(chosen))
     assert metrics["label_iou"] == metrics["label_iou_mean"] == 1.0
-    assert "label_iou" not in inspect_planes(tmp_path, truth, truth.planes, labels)
+    assert codes == ["points-left-out-before-labels"]
+    # Without the numbers of the points the planes are judged alone.
+    metrics, codes = inspect_planes(tmp_path, truth, truth.planes, labels)
+    assert (metrics["main_found"], "label_iou" in metrics) == (1.0, False)
+    assert codes == ["labels-not-compared"]
 
 
 def test_a_displaced_main_wall_has_that_offset_and_a_lost_one_is_said(
@@ -322,18 +264,17 @@ def test_a_displaced_main_wall_has_that_offset_and_a_lost_one_is_said(
     near, far = true.offset.copy(), true.offset.copy()
     near[0] += 0.004
     far[0] += 0.4
-    metrics = inspect_planes(tmp_path, truth, replace(true, offset=near), None)
+    metrics, _ = inspect_planes(tmp_path, truth, replace(true, offset=near))
     assert metrics["plane_offset_mm"] == pytest.approx(4.0, abs=1e-6)
     assert metrics["worst_plane_offset_mm"] == pytest.approx(4.0, abs=1e-6)
     assert metrics["plane_angle_deg"] < 1e-5
-    lost = inspect_planes(tmp_path, truth, replace(true, offset=far), None)
+    lost, codes = inspect_planes(tmp_path, truth, replace(true, offset=far))
+    assert codes == ["main-wall-missed"]
     assert lost["main_found"] == 0.0
     assert lost["true_planes_found"] == len(true) - 1
     assert "plane_angle_deg" not in lost
-    context = StepContext(rng=np.random.default_rng(1), cores=2, scratch=tmp_path)
-    inputs = InspectTruth.In(truth=truth, planes=replace(true, offset=far))
-    InspectTruth().run(inputs, InspectTruth.Params(), context)
-    assert any("the main wall of the scene is none of " in text for text in context.warnings)
+    with pytest.raises(MethodError, match="nothing to inspect: wire orthoimages and walls, or pla"):
+        inspect_planes(tmp_path, truth, None)
 
 
 def test_what_is_wired_and_not_compared_is_told(tmp_path: Path, truth: Truth) -> None:
@@ -348,30 +289,6 @@ def test_what_is_wired_and_not_compared_is_told(tmp_path: Path, truth: Truth) ->
     )
     (said,) = context.warnings
     assert said.startswith("displacements are not traced where truth painted: the cameras have no")
-
-
-def test_nothing_to_inspect_is_refused(tmp_path: Path, truth: Truth) -> None:
-    with pytest.raises(MethodError, match="nothing to inspect: wire orthoimages and walls, or pla"):
-        inspect_planes(tmp_path, truth, None, None)
-
-
-def test_every_wall_tells_its_displacement(tmp_path: Path) -> None:
-    context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
-    findings = [
-        Finding(name=name, value=value, unit="mm", wall=wall)
-        for wall, name, value in (
-            (2, "rmse_u_mm", 1.0),
-            (0, "rmse_u_mm", 2.0),
-            (-1, "rmse_u_mm", 3.0),
-            (0, "plane_angle_deg", 4.0),
-        )
-    ]
-    report(findings, 2, {0: 1, 2: 5}, context)
-    assert {metric.name: metric.value for metric in context.metrics} == {
-        "rmse_u_mm": 1.0,
-        "wall_1_rmse_u_mm": 2.0,
-        "all_rmse_u_mm": 3.0,
-    }
 
 
 def finer(times: int) -> dict[str, Any]:

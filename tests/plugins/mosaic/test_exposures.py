@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -83,16 +81,6 @@ def two(apart: NDArray[np.float64], n_columns: int = 40) -> list[BlockLight]:
     return [BlockLight(box=box, log_light=one.astype(np.float32)) for one in pair]
 
 
-def test_what_is_between_two_exposures_is_shared_alike() -> None:
-    found = estimate(two(np.array([0.4, 0.2, 0.3])), [None, None], is_local=False)
-    apart = found.exposures[0] - found.exposures[1]
-    np.testing.assert_allclose(apart, [0.4, 0.2, 0.3], atol=1e-3)
-    np.testing.assert_allclose(found.exposures[0], -found.exposures[1], atol=1e-3)
-    # Fields are held at nothing, and there is no lens.
-    assert np.abs(found.nodes).max() < 1e-6
-    assert found.lenses.shape == (0, 2)
-
-
 def test_what_no_exposure_explains_goes_into_smooth_fields() -> None:
     # From left to right by a tenth, once as much on either side of the middle.
     slope = np.linspace(-0.05, 0.05, 40)[None, :, None]
@@ -103,62 +91,3 @@ def test_what_no_exposure_explains_goes_into_smooth_fields() -> None:
     flat = estimate(lights, [None, None], is_local=False)
     left = flat.logs(0, lights[0], None) - flat.logs(1, lights[1], None)
     assert np.abs(left).max() < 0.01
-
-
-def test_a_moved_thing_does_not_count() -> None:
-    apart = np.full((10, 40, 3), 0.3)
-    # A fifth of the blocks shows something else.
-    apart[:, :8] = 1.5
-    found = estimate(two(apart), [None, None], is_local=False)
-    assert (found.exposures[0] - found.exposures[1]) == pytest.approx([0.3] * 3, abs=0.01)
-
-
-def blocks(sizes: list[int]) -> Any:
-    """Overlaps of so many blocks."""
-    nothing = np.zeros((0, 2), dtype=np.int64)
-    return [
-        module._Overlap(layers=(0, k + 1), places=(nothing, nothing), apart=np.zeros((size, 3)))
-        for k, size in enumerate(sizes)
-    ]
-
-
-def pull(
-    matrix: NDArray[np.float64],
-    found: NDArray[np.float64],
-    apart: NDArray[np.float64],
-    priors: NDArray[np.float64],
-    sizes: list[int],
-) -> NDArray[np.float64]:
-    """How far each unknown would move by itself: nothing where robust least squares ended.
-
-    A pair's residuals have a spread, of a hundredth at least; of more than fifty blocks the others
-    say nothing new; what lies two spreads off counts half.
-    """
-    left = apart - matrix @ found
-    weights = np.empty(len(apart))
-    first = 0
-    for size in sizes:
-        part = slice(first, first + size)
-        lengths = np.abs(left[part]).mean(axis=1)
-        spread = max(0.01, 1.4826 * float(np.median(lengths)))
-        weights[part] = min(1.0, 50.0 / size) / spread**2 / (1.0 + (lengths / (2.0 * spread)) ** 2)
-        first += size
-    gradient = matrix.T @ (weights[:, None] * left) - found / priors[:, None] ** 2
-    curvature = (weights[:, None] * matrix**2).sum(axis=0) + 1.0 / priors**2
-    return gradient / curvature[:, None]
-
-
-@pytest.mark.parametrize("noise", [0.002, 0.03, 0.3])
-@pytest.mark.parametrize("sizes", [[30, 12], [50, 51], [120, 9, 200]], ids=str)
-def test_what_is_found_is_robust_least_squares(sizes: list[int], noise: float) -> None:
-    from scipy.sparse import csr_array
-
-    rng = np.random.default_rng(9)
-    matrix = rng.normal(size=(sum(sizes), 4))
-    priors = np.array([1.0, 0.5, 0.05, 2.0])
-    true = 0.3 * priors[:, None] * rng.normal(size=(4, 3))
-    apart = matrix @ true + noise * rng.normal(size=(sum(sizes), 3))
-    apart[::9] += 1.0
-    found = module._solved([csr_array(matrix)], apart, priors, blocks(sizes))
-    # Of what the noise leaves unknown of them, a small part; it would be most of it otherwise.
-    assert np.abs(pull(matrix, found, apart, priors, sizes)).max() < 0.02 * noise + 1e-4

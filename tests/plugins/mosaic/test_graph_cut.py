@@ -10,24 +10,9 @@ import numpy as np
 import pytest
 from orthoflow_plugins.mosaic import blocks, graph_cut
 from orthoflow_plugins.mosaic.blocks import Blocks, depth_edges, depth_edges_in
-from orthoflow_plugins.mosaic.graph_cut import CutLabels
 
 from orthoflow.geometry.levels import lit_shares
 from orthoflow.products import LayerMask
-
-
-def test_blocks_have_rows_and_columns_of_their_own() -> None:
-    blocks = Blocks.over((6, 4), 3)
-    assert blocks.rows.tolist() == [0, 3, 6]
-    assert blocks.columns.tolist() == [0, 2, 4]
-
-
-def test_blocks_of_a_box_count_from_its_first_cell() -> None:
-    whole = Blocks.over((48, 70), 10)
-    part = whole.within((slice(1, 3), slice(2, 6)))
-    assert part.shape == (2, 4)
-    np.testing.assert_array_equal(part.rows, whole.rows[1:4] - whole.rows[1])
-    np.testing.assert_array_equal(part.columns, whole.columns[2:7] - whole.columns[2])
 
 
 def test_means_of_blocks_do_not_hang_on_the_bands(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -50,14 +35,6 @@ def test_depth_edges_of_some_rows_are_those_of_the_whole() -> None:
             depth_edges_in(depth_m, slice(start, stop)) for start, stop in itertools.pairwise(parts)
         ]
         np.testing.assert_array_equal(np.concatenate(found), either)
-
-
-def test_a_cell_takes_the_layer_of_its_block() -> None:
-    labels = CutLabels(
-        small=np.array([[0, 1], [2, -1]], dtype=np.int16), blocks=Blocks.over((6, 4), 3)
-    )
-    assert labels.in_rows(slice(2, 4)).tolist() == [[0, 0, 1, 1], [2, 2, -1, -1]]
-    assert labels.in_rows(slice(None)).shape == (6, 4)
 
 
 def test_a_depth_edge_is_a_step_of_more_than_three_centimetres_right_or_down() -> None:
@@ -88,20 +65,14 @@ def cost(of: graph_cut._Scene, one: int, other: int) -> float:
     return float(found)
 
 
-def test_a_seam_costs_what_the_layers_differ_on_both_sides_and_a_little_for_its_length() -> None:
-    assert cost(scene(), 0, 1) == pytest.approx(1000 * (0.3 + 0.7 + 0.01))
-    assert cost(scene(), 1, 0) == cost(scene(), 0, 1)
-    assert cost(scene(), 0, 0) == cost(scene(), 1, 1) == 0.0
-
-
-def test_a_depth_edge_on_either_side_makes_a_seam_dear() -> None:
+def test_a_seam_costs_differences_on_both_sides_its_length_and_depth_edges() -> None:
     plain = cost(scene(), 0, 1)
-    assert cost(scene(edges=(1.0, 0.0)), 0, 1) == plain + 1000
-    assert cost(scene(edges=(0.0, 1.0)), 0, 1) == plain + 1000
-    assert cost(scene(edges=(1.0, 1.0)), 0, 1) == plain + 2000
-
-
-def test_where_only_one_layer_paints_no_difference_is_seen() -> None:
+    assert plain == cost(scene(), 1, 0) == pytest.approx(1000 * (0.3 + 0.7 + 0.01))
+    assert cost(scene(), 0, 0) == cost(scene(), 1, 1) == 0.0
+    # A depth edge on either side makes it dear.
+    for edges in ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0)):
+        assert cost(scene(edges=edges), 0, 1) == plain + 1000 * sum(edges)
+    # Where only one layer paints no difference is seen.
     half = scene()
     half.views[1, 0, 0] = graph_cut._FORBIDDEN
     assert cost(half, 0, 1) == pytest.approx(1000 * (0.7 + 0.01))
@@ -175,23 +146,18 @@ def test_blocks_have_the_mean_colour_of_what_is_painted_as_it_is_balanced(
         np.testing.assert_allclose(balanced.colours[k, row, column], wanted, atol=1e-6)
 
 
-def test_what_no_layer_paints_has_no_label() -> None:
-    layers = two_layers((4, 12), (9, 9))
-    for layer in layers:
-        layer.mask[:, 9:] = LayerMask.OUTSIDE
-    small = graph_cut.cut_labels(layers, None).small
-    assert np.unique(small[:, :9]).tolist() == [0]
-    assert np.unique(small[:, 9:]).tolist() == [-1]
-
-
 @pytest.mark.parametrize(
     ("shape", "small"), [((100, 300), (100, 300)), ((200, 300), (100, 150)), ((8, 9), (8, 9))]
 )
-def test_cuts_are_made_on_some_ten_thousand_cells(
+def test_cuts_are_made_on_some_ten_thousand_cells_that_a_layer_paints(
     monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int], small: tuple[int, int]
 ) -> None:
     monkeypatch.setattr(graph_cut, "_expanded", lambda _scene, labels, _alpha: labels)
-    labels = graph_cut.cut_labels(two_layers(shape, (9, 9)), None)
+    layers = two_layers(shape, (9, 9))
+    for layer in layers:
+        layer.mask[:, -2:] = LayerMask.OUTSIDE
+    labels = graph_cut.cut_labels(layers, None)
     assert labels.small.shape == small
-    # What is left where nothing moves: the better one everywhere.
-    assert not labels.small.any()
+    # What is left where nothing moves: the better one everywhere, none where none paints.
+    assert not labels.small[:, :-2].any()
+    assert (labels.in_rows(slice(0, 2)).shape, labels.small[0, -1]) == ((2, shape[1]), -1)

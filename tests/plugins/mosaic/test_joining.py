@@ -108,7 +108,10 @@ def test_preferences_are_the_same_row_by_row(rule: str) -> None:
     for preference, values in zip(preferences(LAYERS, options), every, strict=True):
         np.testing.assert_array_equal(preference(slice(5, 9)), values[5:9])
     for one, values in zip(LAYERS, every, strict=True):
-        if rule == "best-view":
+        if rule == "priority":
+            bonus = {"3.jpg": 4.0, "1.jpg": 2.0}.get(one.source, 0.0)
+            np.testing.assert_allclose(values, one.quality + bonus)
+        elif rule == "best-view":
             np.testing.assert_array_equal(values, one.quality)
         elif rule == "voronoi":
             # As far as the nearest cell that it does not paint, or the rim, is.
@@ -117,17 +120,6 @@ def test_preferences_are_the_same_row_by_row(rule: str) -> None:
             for cell in [(0, 0), (4, 7), (11, 3), (22, 16)]:
                 away = np.hypot(*(others - np.add(cell, 1)).T).min()
                 assert values[cell] == pytest.approx(away, abs=1e-3)
-
-
-def test_photos_in_the_given_order_go_before_all_qualities() -> None:
-    options = PLAIN.model_copy(update={"seams": "priority", "priority": ("3.jpg", "1.jpg")})
-    found = {
-        one.source: preference(slice(0, SHAPE[0]))
-        for one, preference in zip(LAYERS, preferences(LAYERS, options), strict=True)
-    }
-    assert found["3.jpg"].min() > found["1.jpg"].max()
-    assert found["1.jpg"].min() > max(found["2.jpg"].max(), found["4.jpg"].max())
-    np.testing.assert_array_equal(found["2.jpg"], LAYERS[1].quality)
 
 
 # --- islands ---
@@ -155,7 +147,7 @@ def patches(source: NDArray[np.int16], index: int) -> list[list[tuple[int, int]]
     return found
 
 
-@pytest.mark.parametrize("cells_min", [2, 5, 9])
+@pytest.mark.parametrize("cells_min", [2, 9])
 @pytest.mark.parametrize("seed", seeds(2))
 def test_small_patches_go_to_the_source_about_them_that_shows_them_too(
     seed: int, cells_min: int
@@ -205,7 +197,7 @@ def test_without_a_small_patch_nothing_changes() -> None:
     assert (without_islands(rank, source, layers, 10) == 0).all()
 
 
-@pytest.mark.parametrize("cells_min", [1, 2, 7, 30])
+@pytest.mark.parametrize("cells_min", [1, 7])
 def test_bands_decide_islands_as_the_whole_does(
     monkeypatch: pytest.MonkeyPatch, cells_min: int
 ) -> None:

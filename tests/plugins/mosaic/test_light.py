@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.mosaic.blocks import BlockLight, Blocks, block_light, common, inside, pairs
+from orthoflow_plugins.mosaic.blocks import Blocks, block_light, common, inside
 
-from orthoflow.geometry.levels import light_of_levels, lit, lit_shares
+from orthoflow.geometry.levels import lit, lit_shares
 from orthoflow.products import Layer, LayerMask
 from tests import samples
 
@@ -32,12 +32,6 @@ def layer(rgb: NDArray[np.generic], mask: NDArray[np.uint8] | None = None) -> La
         quality=np.ones(SHAPE, dtype=np.float32),
         filled=None,
     )
-
-
-@pytest.mark.parametrize("highest", [255, 65535])
-def test_levels_are_those_of_srgb(highest: int) -> None:
-    levels = np.arange(highest + 1)
-    np.testing.assert_allclose(light_of_levels(highest), light_of(levels, highest), atol=1e-7)
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
@@ -120,17 +114,3 @@ def test_boxes_share_what_lies_in_both() -> None:
     assert common(box(0, 5, 2, 9), box(5, 8, 2, 9)) is None
     assert common(box(0, 5, 2, 9), box(0, 5, 9, 12)) is None
     assert inside(box(3, 5, 4, 6), box(1, 9, 4, 9)) == box(2, 4, 0, 2)
-
-
-def test_layers_whose_boxes_overlap_are_pairs() -> None:
-    boxes = [box(0, 4, 0, 4), box(4, 8, 0, 4), box(2, 6, 3, 8), box(7, 9, 7, 9)]
-    lights = [
-        BlockLight(
-            box=one,
-            log_light=np.zeros(
-                (one[0].stop - one[0].start, one[1].stop - one[1].start, 3), np.float32
-            ),
-        )
-        for one in boxes
-    ]
-    assert pairs(lights) == [(0, 2, box(2, 4, 3, 4)), (1, 2, box(4, 6, 3, 4))]

@@ -73,46 +73,6 @@ def test_a_single_layer_passes_through(tmp_path: Path) -> None:
     assert image.sources == ("photo 1",)
 
 
-def best_by_hand(layers: list[Layer], cell: tuple[int, int]) -> tuple[int, int]:
-    """State and source of one cell, spelled out."""
-
-    def candidates(*, filled: bool) -> list[tuple[float, int]]:
-        return [
-            (-float(layer.quality[cell]), k)
-            for k, layer in enumerate(layers)
-            if layer.mask[cell] == LayerMask.PAINTED
-            and (layer.filled is not None and layer.filled[cell] > 0) == filled
-        ]
-
-    if candidates(filled=False):
-        return OrthoMask.PAINTED, min(candidates(filled=False))[1]
-    if candidates(filled=True):
-        return OrthoMask.FILLED, min(candidates(filled=True))[1]
-    states = {int(layer.mask[cell]) for layer in layers}
-    if LayerMask.OCCLUDED in states:
-        return OrthoMask.OCCLUDED, -1
-    return (OrthoMask.NO_SURFACE if LayerMask.NO_SURFACE in states else OrthoMask.NONE), -1
-
-
-@pytest.mark.parametrize("n_layers", [2, 3, 5])
-def test_of_several_layers_the_best_paints_each_cell(tmp_path: Path, n_layers: int) -> None:
-    layers = [random_layer(seed, filled=seed != 2) for seed in range(n_layers)]
-    (image,) = joined(Layers(layers=tuple(layers)), tmp_path).images
-    for cell in np.ndindex(image.mask.shape):
-        state, source = best_by_hand(layers, (cell[0], cell[1]))
-        assert (image.mask[cell], image.source[cell]) == (state, source)
-        colour = layers[source].rgb[cell] if source >= 0 else np.zeros(3)
-        np.testing.assert_array_equal(image.rgb[cell], colour)
-    assert image.name == "wall 0"
-
-
-def test_of_equal_layers_the_first_paints(tmp_path: Path) -> None:
-    layer = dataclasses.replace(random_layer(3), filled=None)
-    twin = dataclasses.replace(layer, source="twin", rgb=255 - layer.rgb)
-    (image,) = joined(Layers(layers=(layer, twin)), tmp_path).images
-    assert set(np.unique(image.source)) <= {-1, 0}
-
-
 def test_every_wall_of_the_layers_gets_an_orthoimage(tmp_path: Path) -> None:
     layers = Layers(
         layers=(random_layer(1, wall=0), random_layer(2, wall=2), random_layer(3, wall=0)),
@@ -123,14 +83,6 @@ def test_every_wall_of_the_layers_gets_an_orthoimage(tmp_path: Path) -> None:
         (0, "a", 2),
         (2, "c", 1),
     ]
-
-
-def test_layers_on_different_rasters_are_refused(tmp_path: Path) -> None:
-    layer, other = random_layer(1), random_layer(2)
-    shifted = dataclasses.replace(other.frame, origin_world=other.frame.origin_world + 1.0)
-    moved = dataclasses.replace(other, frame=shifted)
-    with pytest.raises(MethodError, match="lie on different rasters"):
-        joined(Layers(layers=(layer, moved)), tmp_path)
 
 
 def test_no_layers_give_a_sentence(tmp_path: Path) -> None:
@@ -210,17 +162,6 @@ def test_noisy_qualities_do_not_give_specks(tmp_path: Path) -> None:
     np.testing.assert_array_equal(calm.rgb[..., 0], np.where(calm.source == 0, 10, 20))
 
 
-def test_an_island_that_only_its_own_source_sees_stays(tmp_path: Path) -> None:
-    left, right = two_halves()
-    hidden = left.mask.copy()
-    hidden[10:14, 5:9] = LayerMask.OCCLUDED
-    left = smooth_layer("left", left.quality, hidden, rgb=10)
-    (image,) = joined(Layers(layers=(left, right)), tmp_path, island_cells_min=100).images
-    assert (image.source[10:14, 5:9] == 1).all()
-    assert n_patches(image.source) == 3
-    assert (image.mask == OrthoMask.PAINTED).all()
-
-
 def test_a_filling_is_not_enlarged_over_painted_cells(tmp_path: Path) -> None:
     left, right = two_halves()
     filled = np.ones_like(left.mask)
@@ -252,90 +193,47 @@ def test_a_wall_that_nothing_paints_is_empty_and_that_is_said(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("missing", "words"),
+    ("missing", "n_rows", "no_surface", "n_refused", "causes"),
     [
-        (
-            LayerMask.OUTSIDE,
-            "25% lie in no oriented photo (see which are refused, or take one there)",
-        ),
-        (LayerMask.OCCLUDED, "25% are hidden in every photo that looks there"),
+        # Causes of a hundredth of the cells are named.
+        (LayerMask.OUTSIDE, 10, 15, None, ["25% lie in no oriented photo (see which are refused"]),
+        (LayerMask.OCCLUDED, 10, 17, None, ["25% are hidden in every photo", "1% have no surface"]),
+        # A new photo is asked for only where none was refused.
+        (LayerMask.OUTSIDE, 10, 0, 0, ["25% lie in no oriented photo (take one there)"]),
+        (LayerMask.OUTSIDE, 10, 0, 2, ["25% lie in no oriented photo (2 of 3 photos are not"]),
+        # A tenth at least is missing, apart from what has no surface.
+        (LayerMask.OUTSIDE, 3, 800, None, None),
     ],
-    ids=["no photo", "hidden"],
+    ids=["no photo", "hidden", "all oriented", "two refused", "no surface"],
 )
-def test_cells_that_no_photo_shows_are_told_of_with_their_cause(
-    tmp_path: Path, missing: LayerMask, words: str
+def test_empty_cells_are_reported_with_their_causes(
+    tmp_path: Path,
+    missing: LayerMask,
+    n_rows: int,
+    no_surface: int,
+    n_refused: int | None,
+    causes: list[str] | None,
 ) -> None:
     mask = np.full((40, 40), LayerMask.PAINTED, dtype=np.uint8)
-    mask[:10], mask[36:] = missing, LayerMask.NO_SURFACE
+    mask[:n_rows], mask.ravel()[mask.size - no_surface :] = missing, LayerMask.NO_SURFACE
     layer = smooth_layer("one", np.ones((40, 40), dtype=np.float32), mask)
-    ctx = scenes.context(tmp_path)
-    inputs = MosaicSeams.In(layers=Layers(layers=(layer,), names=("west",)))
-    MosaicSeams().run(inputs, MosaicSeams.Params(), ctx)
-    (warning,) = ctx.warnings
-    assert "the orthoimage of west: 35% of its cells are empty: " + words in warning
-    assert "10% have no surface" in warning
-
-
-@pytest.mark.parametrize(
-    ("states", "way"),
-    [
-        (("ok", "ok"), "take one there"),
-        (("ok", "too few ties", "too few ties"), "2 of 3 photos are not oriented"),
-    ],
-    ids=["all oriented", "two refused"],
-)
-def test_a_new_photo_is_asked_for_only_where_none_was_refused(
-    tmp_path: Path, states: tuple[str, ...], way: str
-) -> None:
-    mask = np.full((40, 40), LayerMask.PAINTED, dtype=np.uint8)
-    mask[:10] = LayerMask.OUTSIDE
-    layer = smooth_layer("one", np.ones((40, 40), dtype=np.float32), mask)
-    cameras = Cameras(
-        cameras=tuple(
-            Camera(photo=f"{number}.jpg", status=status) for number, status in enumerate(states)
+    cameras = None
+    if n_refused is not None:
+        states = ["ok", *["too few ties"] * n_refused]
+        cameras = Cameras(
+            cameras=tuple(Camera(photo=f"{k}", status=state) for k, state in enumerate(states))
         )
-    )
     ctx = scenes.context(tmp_path)
     inputs = MosaicSeams.In(layers=Layers(layers=(layer,), names=("west",)), cameras=cameras)
     MosaicSeams().run(inputs, MosaicSeams.Params(), ctx)
-    assert ctx.warnings == [
-        f"the orthoimage of west: 25% of its cells are empty: 25% lie in no oriented photo ({way})"
-    ]
-
-
-@pytest.mark.parametrize(("n_cells", "is_told"), [(15, False), (17, True)])
-def test_causes_of_a_hundredth_of_the_cells_are_told(
-    tmp_path: Path, n_cells: int, *, is_told: bool
-) -> None:
-    mask = np.full((40, 40), LayerMask.PAINTED, dtype=np.uint8)
-    mask[:10], mask[39, :n_cells] = LayerMask.OUTSIDE, LayerMask.NO_SURFACE
-    layer = smooth_layer("one", np.ones((40, 40), dtype=np.float32), mask)
-    ctx = scenes.context(tmp_path)
-    inputs = MosaicSeams.In(layers=Layers(layers=(layer,), names=("west",)))
-    MosaicSeams().run(inputs, MosaicSeams.Params(), ctx)
-    (warning,) = ctx.warnings
-    assert ("1% have no surface" in warning) == is_told
-
-
-@pytest.mark.parametrize(("n_rows", "is_told"), [(3, False), (5, True)])
-def test_empty_cells_of_the_raster_alone_and_few_others_are_not_told_of(
-    tmp_path: Path, n_rows: int, *, is_told: bool
-) -> None:
-    mask = np.full((40, 40), LayerMask.PAINTED, dtype=np.uint8)
-    mask[:n_rows], mask[20:] = LayerMask.OUTSIDE, LayerMask.NO_SURFACE
-    layer = smooth_layer("one", np.ones((40, 40), dtype=np.float32), mask)
-    ctx = scenes.context(tmp_path)
-    inputs = MosaicSeams.In(layers=Layers(layers=(layer,), names=("west",)))
-    MosaicSeams().run(inputs, MosaicSeams.Params(), ctx)
-    assert len(ctx.warnings) == is_told
-
-
-def test_photos_whose_camera_is_not_known_have_no_lens() -> None:
-    known, unknown = (
-        SimpleNamespace(photo=f"{status}.jpg", status=status) for status in ("ok", "failed")
-    )
-    cameras: Any = SimpleNamespace(cameras=(unknown, known))
-    assert seams._oriented(cameras) == {"ok.jpg": known}
+    found = [one.values for one in ctx.diagnostics if one.code == "orthoimage-cells-empty"]
+    assert len(found) == (causes is not None)
+    if causes is not None:
+        assert found[0]["share"] == 0.25 + no_surface / 1600
+        stated = found[0]["causes"].split("; ")
+        assert [one.startswith(two) for one, two in zip(stated, causes, strict=True)] == [
+            True
+        ] * len(causes)
 
 
 def test_a_layer_without_paint_is_no_source_but_tells_what_is_hidden(tmp_path: Path) -> None:
@@ -392,18 +290,6 @@ def test_the_map_of_sources_has_a_colour_for_each(tmp_path: Path) -> None:
         ink = np.array(plane_ink(index))
         # The tint lies on grey: its channels keep their order.
         np.testing.assert_array_equal(np.argsort(shown), np.argsort(ink, kind="stable"))
-
-
-def test_a_wall_joined_in_bands_is_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    layers = Layers(layers=tuple(random_layer(seed) for seed in (1, 2, 3)))
-    (whole,) = joined(layers, tmp_path, island_cells_min=4).images
-    monkeypatch.setattr("orthoflow_plugins.mosaic.joining._BAND_CELLS", 1)
-    monkeypatch.setattr("orthoflow_plugins.mosaic.agreement._ROWS_AT_ONCE", 3)
-    (banded,) = joined(layers, tmp_path, island_cells_min=4).images
-    for name in ("rgb", "mask", "source"):
-        np.testing.assert_array_equal(getattr(whole, name), getattr(banded, name))
 
 
 def test_layers_are_published_when_asked_for(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pytest
 import rasterio
 from numpy.typing import NDArray
 from orthoflow_plugins.mosaic.seams import MosaicSeams
@@ -94,35 +93,6 @@ def test_nearest_brings_the_exact_levels_into_the_geotiff(tmp_path: Path) -> Non
         assert json.loads((tmp_path / f"{name}.json").read_text())["bits"] == 16
 
 
-@pytest.mark.parametrize("resampling", ["bilinear", "cubic", "lanczos"])
-def test_between_pixels_a_ramp_stays_a_ramp(tmp_path: Path, resampling: str) -> None:
-    viewer = scenes.camera(scenes.frame())
-    (layer,) = laid(
-        context(tmp_path), deep_photos(ramp()), viewer, resampling=resampling, antialias=False
-    ).layers
-    shown = layer.mask == LayerMask.PAINTED
-    u, v = seen_at(viewer)[shown].T
-    expected = np.column_stack([60 * (u - 0.5) + 7, 80 * (v - 0.5) + 11])
-    off = np.abs(layer.rgb[shown][:, :2] - expected)
-    # Places are good to a fiftieth of a pixel; OpenCV rounds them to a thirty-second.
-    assert off.max() <= 80 * (1 / 50 if resampling == "bilinear" else 1 / 50 + 1 / 32) + 1
-    assert (layer.rgb[shown][:, 2] == 12345).mean() > 0.99
-
-
-def test_averages_over_cells_keep_sixteen_bits(tmp_path: Path) -> None:
-    where = scenes.frame()
-    viewer = scenes.camera(where, width=2000)
-    rows, columns = np.mgrid[: viewer.height, : viewer.width]
-    deep = np.dstack([20 * columns, 25 * rows, 0 * rows + 999]).astype(np.uint16)
-    (layer,) = laid(context(tmp_path), deep_photos(deep), viewer).layers
-    shown = layer.mask == LayerMask.PAINTED
-    u, v = seen_at(viewer)[shown].T
-    off = np.abs(layer.rgb[shown][:, :2] - np.column_stack([20 * (u - 0.5), 25 * (v - 0.5)]))
-    inner = (u > 30) & (v > 30) & (u < viewer.width - 30) & (v < viewer.height - 30)
-    assert off[inner].max() <= 3.0
-    assert len(np.unique(layer.rgb[shown][:, 1])) > 5000
-
-
 def test_forward_paints_the_photos_own_levels(tmp_path: Path) -> None:
     where = scenes.frame()
     inputs = DsmForward.In(
@@ -158,17 +128,3 @@ def test_a_block_of_both_depths_has_sixteen_bits_and_says_so(tmp_path: Path) -> 
     )
     images, _ = joined(tmp_path, layers, seams="graph-cut")
     assert images.images[0].rgb.dtype == np.uint16
-
-
-def test_gains_keep_sixteen_bits(tmp_path: Path) -> None:
-    where = scenes.frame()
-    viewers = [scenes.camera(where, aside_m=aside) for aside in (-0.3, 0.3)]
-    columns = np.broadcast_to(np.arange(SIDE_PX[0]), SIDE_PX[::-1])
-    light = np.dstack([20000 + 20 * columns] * 3).astype(np.uint16)
-    dark = (light * 0.8).astype(np.uint16)
-    layers = laid(context(tmp_path), deep_photos(light, dark), *viewers)
-    images, ctx = joined(tmp_path, layers, gains="global")
-    assert len(np.unique(images.images[0].rgb)) > 3000
-    metrics = {metric.name: metric.value for metric in ctx.metrics}
-    assert metrics["gain_min"] < 0.95
-    assert metrics["gain_max"] > 1.05

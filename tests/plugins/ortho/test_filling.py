@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.ortho.filling import fillable_gaps, filling_preview, reach_rows, void_counts
+from orthoflow_plugins.ortho.filling import fillable_gaps, filling_preview, void_counts
 
 from orthoflow.products import Layer, LayerMask
 from tests import samples
@@ -40,22 +40,6 @@ def test_a_gap_is_fillable_where_no_window_has_too_many_void_cells() -> None:
         tight[place] = 1
         assert fillable_gaps(is_void, (tight[0], tight[1], tight[2])).sum() < is_void.sum()
     assert fillable_gaps(is_void, (9, 25, 49)).sum() == is_void.sum()
-
-
-@pytest.mark.parametrize(
-    ("inpainting", "radius_px", "least"),
-    [("none", 5.0, 0), ("between", 2.5, 6), ("telea", 2.5, 20)],
-)
-def test_rows_of_a_band_know_all_that_decides_their_gaps(
-    inpainting: str, radius_px: float, least: int
-) -> None:
-    found = reach_rows(inpainting, radius_px)  # type: ignore[arg-type]
-    # Three rows of the largest window, and what a cell takes its colour from; fronts reach farther.
-    assert found >= least
-    assert (found == 0) is (inpainting == "none")
-    if least:
-        further = reach_rows(inpainting, radius_px + 2.0)  # type: ignore[arg-type]
-        assert further == found + 2
 
 
 def layer(shape: tuple[int, int], filled: NDArray[np.uint8] | None) -> Layer:

@@ -80,11 +80,8 @@ def test_layers_come_by_wall_and_then_by_photo(tmp_path: Path) -> None:
         stacked(ctx).joined(np.uint8)
 
 
-@pytest.mark.parametrize("deep", [False, True])
-def test_a_wall_that_no_photo_paints_is_bare_but_tells_what_is_hidden(
-    tmp_path: Path, deep: bool
-) -> None:
-    shown = layer(0, "a", mask_of(a=PAINTED, b=HIDDEN, c=OUTSIDE), deep=deep)
+def test_a_wall_that_no_photo_paints_is_bare_but_states_what_is_hidden(tmp_path: Path) -> None:
+    shown = layer(0, "a", mask_of(a=PAINTED, b=HIDDEN, c=OUTSIDE), deep=True)
     ctx = context(tmp_path)
     stack = stacked(ctx, shown)
     mask = mask_of(a=HIDDEN, b=OUTSIDE, c=OUTSIDE)
@@ -94,7 +91,7 @@ def test_a_wall_that_no_photo_paints_is_bare_but_tells_what_is_hidden(
     stack.note_reached(1, mask)
     # A photo paints this wall.
     stack.note_reached(0, mask_of(a=HIDDEN, b=HIDDEN, c=HIDDEN))
-    found = stack.joined(np.uint16 if deep else np.uint8)
+    found = stack.joined(np.uint16)
     first, second, third = found.layers
     assert first is shown
     assert ctx.warnings == ["no photo shows wall 1, wall 2: the orthoimage stays empty"]
@@ -122,21 +119,3 @@ def test_cells_are_counted_once_however_many_photos_show_them() -> None:
     # Three of four rows have a depth; two are painted on the first wall, one hidden, and two on
     # the second one.
     assert count_shown(walls(), layered) == (3 * 18, 12, 6 + 12)
-
-
-def test_arrays_of_each_layer_have_names_of_their_own(tmp_path: Path) -> None:
-    asked: list[str] = []
-    ctx = context(tmp_path)
-    original = ctx.allocate
-
-    def allocate(product: str, name: str, *more: object) -> np.ndarray:
-        asked.append(f"{product} {name}")
-        return original(product, name, *more)  # type: ignore[arg-type]
-
-    ctx.allocate = allocate  # type: ignore[method-assign, assignment]
-    stack = LayerStack(walls(), ctx)
-    stack.allocator(2)("rgb", (2, 3), np.uint8)
-    stack.painted.append(layer(2, "a", mask_of(a=PAINTED, b=HIDDEN, c=OUTSIDE)))
-    stack.allocator(2)("rgb", (2, 3), np.uint8)
-    stack.scratch(1)("pixel", (2, 3), np.int32)
-    assert asked == ["layers 2.0.rgb", "layers 2.1.rgb", "layers 1.scratch.pixel"]

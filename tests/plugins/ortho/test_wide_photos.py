@@ -79,25 +79,6 @@ def panorama(folder: Path) -> tuple[Path, tuple[Path, ...]]:
     return photo, (xml,)
 
 
-def panorama_inside_e57(folder: Path) -> tuple[Path, tuple[Path, ...]]:
-    """A panorama inside an E57 file, with the pose that the file says."""
-    rotation = rotation_from_vector(np.array([0.1, -0.05, 1.3]))
-    content = ROOM.seen(CENTRE, directions_of_panorama(*PANORAMA) @ rotation.T)
-    width, height = PANORAMA
-    return _e57(
-        folder,
-        kind="spherical",
-        content=encode_png(content),
-        numbers={
-            "imageWidth": width,
-            "imageHeight": height,
-            "pixelWidth": 2 * np.pi / width,
-            "pixelHeight": np.pi / height,
-        },
-        rotation=Rotation.from_matrix(rotation).as_quat(scalar_first=True),
-    )
-
-
 def pinhole_inside_e57(folder: Path) -> tuple[Path, tuple[Path, ...]]:
     """A photo of the north wall inside an E57 file, whose cameras look along -z with y up."""
     width, height, focal, cx, cy = 900, 700, 420.0, 455.5, 342.25
@@ -171,7 +152,6 @@ def displacement_cells(layer: Layer, wall: int) -> NDArray[np.float64]:
         # A hemisphere ahead, in which half of each side lies; or all but the floor.
         (fisheye, {NORTH: 0.98, EAST: 0.3, WEST: 0.3, CEILING: 0.3}),
         (panorama, dict.fromkeys(range(5), 0.98)),
-        (panorama_inside_e57, dict.fromkeys(range(5), 0.98)),
         (pinhole_inside_e57, {NORTH: 0.6}),
     ],
 )
