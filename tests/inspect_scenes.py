@@ -51,12 +51,11 @@ def painted_layer(
     """A layer of the first wall that paints some columns of a picture (rows, cols, 3)."""
     is_painted = np.zeros(rgb.shape[:2], dtype=np.bool_)
     is_painted[:, columns] = True
-    return Layer(
+    return samples.layer(
+        np.where(is_painted, LayerMask.PAINTED, LayerMask.OUTSIDE).astype(np.uint8),
         frame=frame(shape=(rgb.shape[0], rgb.shape[1])),
-        wall=0,
         source=name,
         rgb=np.where(is_painted[..., None], rgb, rgb.dtype.type(0)),
-        mask=np.where(is_painted, LayerMask.PAINTED, LayerMask.OUTSIDE).astype(np.uint8),
         quality=np.where(is_painted, np.float32(quality), np.float32(0.0)),
     )
 

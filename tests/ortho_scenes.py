@@ -6,8 +6,10 @@ tells the surface.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,14 +19,18 @@ from orthoflow.geometry import WallFrame, wall_axes
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
 from orthoflow.products import (
     Cameras,
+    Layer,
     Photo,
     Photos,
     PointCloud,
     Walls,
 )
+from orthoflow.sdk import Ports
 from orthoflow.testing import photographed as ms
 from tests import samples
 from tests.raster_scenes import SURVEY, UP, cloud_of
+
+_Ports = TypeVar("_Ports", bound=Ports)
 
 GSD_M = 0.004
 SHAPE = (240, 320)
@@ -202,3 +208,29 @@ def truth(where: WallFrame, viewer: ViewingCamera) -> Seen:
     points = where.world_from_wall(places, depth_m().ravel().astype(np.float64))
     origins = np.broadcast_to(viewer.centre_world, points.shape)
     return cast(where, origins, points - viewer.centre_world)
+
+
+def inputs(
+    method: type[_Ports],
+    *pictures: NDArray[np.uint8],
+    viewers: Sequence[ViewingCamera] = (),
+    **known: object,
+) -> _Ports:
+    """Inputs of a method: pictures of the wall, rendered unless given, and the cloud."""
+    where = frame()
+    return method(
+        **{
+            "walls": walls(where),
+            "photos": photos(*(pictures or (rendered(),))),
+            "cameras": cameras(*(viewers or (camera(where),))),
+            "cloud": cloud(where),
+            **known,
+        }
+    )
+
+
+def places_off(layer: Layer) -> NDArray[np.float64]:
+    """Errors (rows, cols, 2) in cells of the places that the colours stand for."""
+    rows, columns = np.mgrid[: SHAPE[0], : SHAPE[1]] + 0.5
+    shown = layer.rgb[..., :2].astype(np.float64) + 0.5
+    return ((shown - 4.0 * np.dstack([columns, rows]) + 128.0) % 256.0 - 128.0) / 4.0

@@ -9,7 +9,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.products import Orthoimage, OrthoMask, Planes, SurfaceMask, Ties, Wall, Walls
+from orthoflow.products import (
+    Layer,
+    LayerMask,
+    Orthoimage,
+    OrthoMask,
+    Planes,
+    SurfaceMask,
+    Ties,
+    Wall,
+    Walls,
+)
 
 UP = np.array([0.0, 0.0, 1.0])
 DOWN, SOUTH = np.array([0.0, 0.0, -1.0]), np.array([0.0, -1.0, 0.0])
@@ -93,6 +103,20 @@ def planes(**known: Any) -> Planes:
         "up": UP.copy(),
     }
     return Planes(**{**plain, **known})
+
+
+def layer(mask: NDArray[np.uint8] | tuple[int, int], **known: Any) -> Layer:
+    """A black layer of the first wall, or of its cells where it is painted everywhere."""
+    if isinstance(mask, tuple):
+        mask = np.full(mask, LayerMask.PAINTED, dtype=np.uint8)
+    plain = {
+        "frame": facing_south(0.01, mask.shape[1], mask.shape[0]),
+        "wall": 0,
+        "source": "a.jpg",
+        "rgb": np.zeros((*mask.shape, 3), dtype=np.uint8),
+        "quality": (mask == LayerMask.PAINTED).astype(np.float32),
+    }
+    return Layer(mask=mask, **{**plain, **known})
 
 
 def orthoimage(frame: WallFrame, **known: Any) -> Orthoimage:

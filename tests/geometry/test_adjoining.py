@@ -13,7 +13,6 @@ from orthoflow.errors import InputError
 from orthoflow.files.drawings.key_plans import outline_of, surfaces_of
 from orthoflow.geometry.frames import Plane
 from orthoflow.geometry.outlines import (
-    Edge,
     Surface,
     corners_between,
     edges_between,
@@ -23,7 +22,6 @@ from orthoflow.geometry.outlines import (
 from orthoflow.products import Planes
 from tests import samples
 from tests.drawing_runs import CORNER, GAP_M, SIZE_M, box_planes, box_points
-from tests.long_loops import seeds
 
 # Survey coordinates of 5e6 m have 1e-9 m in float64; solving a system loses a little.
 _EXACT_M = 1e-7
@@ -34,13 +32,6 @@ def test_a_box_has_twelve_edges_each_as_long_as_both_planes_are_known() -> None:
     lengths = sorted(edge.length_m for edge in edges)
     expected = sorted(4 * [side - 2 * GAP_M for side in SIZE_M])
     np.testing.assert_allclose(lengths, expected, atol=_EXACT_M)
-
-
-def test_edges_lie_on_both_planes() -> None:
-    planes = box_planes()
-    for edge in edges_between(surfaces_of(planes)):
-        for index in (edge.first, edge.second):
-            assert np.abs(planes.plane(index).distances_m(edge.ends_world)).max() < _EXACT_M
 
 
 def test_a_box_has_eight_corners() -> None:
@@ -77,27 +68,6 @@ def test_nearly_parallel_planes_meet_nowhere() -> None:
         assert (line_of(up, other) is not None) == meets
 
 
-@pytest.mark.parametrize("seed", seeds(4))
-def test_a_line_is_its_point_nearest_to_the_origin_and_a_direction_of_length_one(
-    seed: int,
-) -> None:
-    rng = np.random.default_rng(seed)
-    square = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    normals = (square[0], square[1] + [0.3, 0.1, -0.2])
-    first, second = (
-        Plane(normal=normal / np.linalg.norm(normal), offset_m=float(rng.normal()))
-        for normal in normals
-    )
-    line = line_of(first, second)
-    assert line is not None
-    point, direction = line
-    assert np.linalg.norm(direction) == pytest.approx(1.0, abs=1e-12)
-    assert point @ direction == pytest.approx(0.0, abs=1e-12)
-    along = point + np.array([[-3.0], [0.0], [5.0]]) * direction
-    for plane in (first, second):
-        np.testing.assert_allclose(plane.distances_m(along), 0.0, atol=1e-12)
-
-
 def test_parts_of_a_plane_have_edges_of_their_own() -> None:
     floor = np.array([[0.0, 4.0, 0.0], [0.0, 0.0, 0.0], [6.0, 0.0, 0.0], [6.0, 4.0, 0.0]])
 
@@ -119,11 +89,6 @@ def test_parts_of_a_plane_have_edges_of_their_own() -> None:
     spans = sorted(sorted(edge.ends_world[:, 0].tolist()) for edge in edges_between(surfaces))
     # Overlapping parts are one, and what is shorter than a hand is none.
     np.testing.assert_allclose(spans, [[0.0, 2.5], [4.0, 5.0], [5.5, 5.61]])
-
-
-def test_an_edge_knows_its_length() -> None:
-    edge = Edge(first=0, second=1, ends_world=np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0]]))
-    assert edge.length_m == 5.0
 
 
 def test_the_outline_of_a_box_is_its_rectangle_at_the_height_of_the_floor() -> None:
@@ -160,16 +125,6 @@ def test_walls_that_are_not_closed_keep_their_free_ends() -> None:
     assert len(chain) == 3
     for point in ends:
         assert np.linalg.norm(chain - point, axis=1).min() < _EXACT_M
-
-
-def test_relief_before_a_wall_is_no_wall_of_the_room() -> None:
-    planes = box_planes()
-    normal = planes.normal[2]
-    before = planes.corners[2] + 0.2 * normal
-    corners = np.concatenate([planes.corners, before[None]])
-    relief = Plane(normal=normal, offset_m=float(before[0] @ normal))
-    outline = room_outline([*(planes.plane(k) for k in range(6)), relief], corners, planes.up)
-    assert sorted(outline.walls) == [2, 3, 4, 5]
 
 
 def test_a_room_whose_up_is_x_has_the_same_outline() -> None:
@@ -227,12 +182,3 @@ def test_more_planes_or_parts_than_a_drawing_bears_are_refused() -> None:
         for work in (surfaces_of, outline_of):
             with pytest.raises(InputError, match=r"planes of .* connected parts, at most"):
                 work(planes)
-
-
-def test_a_rectangle_without_a_width_is_no_wall_of_the_room() -> None:
-    planes = box_planes()
-    corners = planes.corners.copy()
-    corners[0] = corners[0].mean(axis=0)
-    with np.errstate(all="raise"):
-        outline = outline_of(replace(planes, corners=corners))
-    assert 0 not in outline.walls

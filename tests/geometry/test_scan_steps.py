@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from orthoflow.geometry import cloud_quality
 from orthoflow.geometry.cloud_quality import scan_step_m
 
 GSD_M = 0.01
@@ -62,14 +61,3 @@ def test_a_wall_without_points_has_no_step_and_one_point_has_the_wall() -> None:
     one[3, 8] = 1
     # Four doublings make one block of nine columns.
     assert scan_step_m(one, gsd_m=GSD_M) == pytest.approx(16 * GSD_M)
-
-
-@pytest.mark.parametrize("shape", [(6, 8), (7, 8), (6, 9), (7, 9), (1, 1), (1, 5)])
-def test_joined_blocks_hold_the_points_of_two_by_two(shape: tuple[int, int]) -> None:
-    blocks = np.random.default_rng(1).integers(0, 9, shape).astype(np.uint32)
-    joined = cloud_quality._joined(blocks)
-    assert joined.shape == (-(-shape[0] // 2), -(-shape[1] // 2))
-    for row in range(joined.shape[0]):
-        for column in range(joined.shape[1]):
-            part = blocks[2 * row : 2 * row + 2, 2 * column : 2 * column + 2]
-            assert joined[row, column] == part.sum()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -10,20 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rasterio
 from orthoflow_plugins.inspect import truth as module
 from orthoflow_plugins.inspect.truth import InspectTruth
-from orthoflow_plugins.read.orthoimage import ReadOrthoimage
 from orthoflow_plugins.simulate.room import SimulateRoom
-from rasterio.transform import Affine
 
 from orthoflow.errors import MethodError
-from orthoflow.files.sidecars import frame_json
 from orthoflow.geometry import frame_over
 from orthoflow.geometry.scene_views import TrueOrthoimage, render_frame
 from orthoflow.products import (
     Cameras,
-    InputFiles,
     Inspection,
     Orthoimage,
     Orthoimages,
@@ -34,7 +28,6 @@ from orthoflow.products import (
     SurfaceMask,
     Truth,
     Wall,
-    Walls,
 )
 from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
@@ -141,40 +134,6 @@ def test_a_displaced_orthoimage_has_just_that_displacement(
     assert metrics["displaced_share"] < 0.1
 
 
-def test_another_programs_image_is_compared_on_its_own_cells(tmp_path: Path, truth: Truth) -> None:
-    """Cells twice as large, a part of the wall, and a file that says 12 mm too far right."""
-    true = rendered(truth)
-    wrong_m, first = 0.012, 10
-    rows, columns = (side // 2 - first for side in true.frame.shape)
-    part = painted(true).rgb[2 * first : 2 * (first + rows), 2 * first : 2 * (first + columns)]
-    means = part.reshape(rows, 2, columns, 2, 3).mean(axis=(1, 3)).round().astype(np.uint8)
-    side, corner = 2.0 * GSD_M, 2.0 * GSD_M * first
-    with rasterio.open(
-        tmp_path / "theirs.tif",
-        "w",
-        driver="GTiff",
-        count=3,
-        dtype="uint8",
-        height=rows,
-        width=columns,
-        crs="EPSG:2180",
-        transform=Affine(side, 0, corner + wrong_m, 0, -side, -corner),
-    ) as dataset:
-        dataset.write(np.moveaxis(means, 2, 0))
-    (tmp_path / "theirs.json").write_text(json.dumps(frame_json(true.frame)))
-    files = InputFiles(name="other", paths=(tmp_path / "theirs.json", tmp_path / "theirs.tif"))
-    context = StepContext(rng=np.random.default_rng(3), cores=2, scratch=tmp_path)
-    read = (
-        ReadOrthoimage()
-        .run(ReadOrthoimage.In(files=files), ReadOrthoimage.Params(), context)
-        .orthoimages
-    )
-    metrics, _, _ = inspect(tmp_path, truth, read.images[0], walled(true))
-    assert metrics["mean_u_mm"] == pytest.approx(1e3 * wrong_m, abs=0.05e3 * side)
-    assert metrics["mean_v_mm"] == pytest.approx(0.0, abs=0.05e3 * side)
-    assert metrics["n_patches"] > 5
-
-
 def test_a_tilted_plane_has_its_angle_and_offset(tmp_path: Path, truth: Truth) -> None:
     image = rendered(truth)
     frame = image.frame
@@ -197,24 +156,9 @@ def test_a_tilted_plane_has_its_angle_and_offset(tmp_path: Path, truth: Truth) -
 
 
 def test_what_cannot_be_compared_is_refused_in_one_sentence(tmp_path: Path, truth: Truth) -> None:
-    image = rendered(truth)
-    ortho, wall = painted(image), walled(image)
-    with pytest.raises(MethodError, match="is of wall 4, but the walls are 0"):
-        inspect(tmp_path, truth, replace(ortho, plane_index=4), wall)
-    aside = replace(
-        image.frame, origin_world=image.frame.origin_world - 0.5 * image.frame.normal_world
-    )
-    with pytest.raises(MethodError, match=r"lies 0\.500 m before .* and 0\.00 deg askew"):
-        inspect(tmp_path, truth, ortho, replace(wall, frame=aside))
     empty = InspectTruth.In(
         orthoimages=Orthoimages(images=()),
-        walls=Walls(
-            walls=(),
-            up=truth.planes.up,
-            intensity_source="none",
-            buffer_front_m=BUFFER_M,
-            buffer_behind_m=BUFFER_M,
-        ),
+        walls=samples.walls(),
         truth=truth,
     )
     context = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)

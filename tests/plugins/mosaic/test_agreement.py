@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -29,17 +31,9 @@ def layer(
     mask: NDArray[np.uint8] | None = None,
     shape: tuple[int, int] = SHAPE,
 ) -> Layer:
-    if mask is None:
-        mask = np.full(shape, LayerMask.PAINTED, dtype=np.uint8)
-    return Layer(
-        frame=samples.facing_south(0.01, shape[1], shape[0]),
-        wall=0,
-        source="a.jpg",
-        rgb=np.zeros((*shape, 3), np.uint8) if rgb is None else rgb,
-        mask=mask,
-        quality=np.where(mask == LayerMask.PAINTED, quality, 0.0).astype(np.float32),
-        filled=None,
-    )
+    plain = samples.layer(shape if mask is None else mask)
+    values = np.where(plain.mask == LayerMask.PAINTED, quality, 0.0).astype(np.float32)
+    return replace(plain, rgb=plain.rgb if rgb is None else rgb, quality=values)
 
 
 # --- patches ---

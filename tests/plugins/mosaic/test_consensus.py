@@ -45,9 +45,7 @@ def photo(
     if columns is not None:
         mask[:] = LayerMask.OUTSIDE
         mask[:, columns] = LayerMask.PAINTED
-    return Layer(
-        frame=FRAME, wall=0, source=name, rgb=rgb, mask=mask, quality=np.ones(SHAPE, np.float32)
-    )
+    return samples.layer(mask, frame=FRAME, source=name, rgb=rgb)
 
 
 def with_person(levels: NDArray[np.float64]) -> NDArray[np.float64]:

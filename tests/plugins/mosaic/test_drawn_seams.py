@@ -56,25 +56,6 @@ def test_written_seams_give_the_same_mosaic_whatever_the_rule(tmp_path: Path, se
     assert (mosaic(tmp_path, seams=seams).source == first.source).mean() < 0.8
 
 
-def test_seams_of_very_large_walls_are_good_to_some_cells(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    image = mosaic(tmp_path, seams="priority", priority=["photo 2", "photo 1"])
-    write_seams_geojson(tmp_path / "each.geojson", image)
-    # A ninth of the cells: every third column of every third row.
-    monkeypatch.setattr("orthoflow.files.drawings.geojson._SEAM_CELLS_MOST", image.source.size // 8)
-    write_seams_geojson(tmp_path / "some.geojson", image)
-    each, some = (
-        json.loads((tmp_path / name).read_text())["features"]
-        for name in ("each.geojson", "some.geojson")
-    )
-    reach = []
-    for features in (each, some):
-        places = np.vstack([ring for item in features for ring in item["geometry"]["coordinates"]])
-        reach.append([places.min(axis=0), places.max(axis=0)])
-    np.testing.assert_allclose(reach[1], reach[0], atol=3.0 * image.frame.gsd_m)
-
-
 def test_an_area_takes_the_photo_that_is_drawn_where_it_paints(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

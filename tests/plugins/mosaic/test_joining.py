@@ -41,15 +41,8 @@ def layer(seed: int, *, source: str = "", painted: float = 0.4, has_filled: bool
     # Few values, so that some are equal.
     quality = np.where(is_painted, rng.integers(1, 4, SHAPE) / 3.0, 0.0).astype(np.float32)
     filled = (is_painted & (rng.random(SHAPE) < 0.3)).astype(np.uint8)
-    return Layer(
-        frame=samples.facing_south(0.01, SHAPE[1], SHAPE[0]),
-        wall=0,
-        source=source or f"{seed}.jpg",
-        rgb=np.zeros((*SHAPE, 3), np.uint8),
-        mask=mask,
-        quality=quality,
-        filled=filled if has_filled else None,
-    )
+    known = {"source": source or f"{seed}.jpg", "quality": quality}
+    return samples.layer(mask, filled=filled if has_filled else None, **known)
 
 
 def state(of: Layer, cell: tuple[int, int]) -> int:
@@ -265,15 +258,7 @@ def test_distances_inside_a_large_layer_are_linear_between_every_so_many_cells(
     shape = (120, 150)
     mask = np.full(shape, LayerMask.PAINTED, dtype=np.uint8)
     mask[:, :30] = LayerMask.OUTSIDE
-    frame = samples.facing_south(0.01, shape[1], shape[0])
-    large = Layer(
-        frame=frame,
-        wall=0,
-        source="a.jpg",
-        rgb=np.zeros((*shape, 3), np.uint8),
-        mask=mask,
-        quality=np.ones(shape, np.float32),
-    )
+    large = samples.layer(mask)
     options = PLAIN.model_copy(update={"seams": "voronoi"})
     (whole,) = preferences([large], options)
     monkeypatch.setattr(module, "_BAND_CELLS", shape[0] * shape[1] // 8)

@@ -22,16 +22,7 @@ def light_of(levels: NDArray[np.generic], highest: int) -> NDArray[np.float64]:
 
 
 def layer(rgb: NDArray[np.generic], mask: NDArray[np.uint8] | None = None) -> Layer:
-    mask = np.full(SHAPE, LayerMask.PAINTED, np.uint8) if mask is None else mask
-    return Layer(
-        frame=samples.facing_south(0.01, SHAPE[1], SHAPE[0]),
-        wall=0,
-        source="a.jpg",
-        rgb=rgb,  # type: ignore[arg-type]
-        mask=mask,
-        quality=np.ones(SHAPE, dtype=np.float32),
-        filled=None,
-    )
+    return samples.layer(SHAPE if mask is None else mask, rgb=rgb)
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])

@@ -6,11 +6,9 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 
-from orthoflow.errors import MethodError
 from orthoflow.products import Layer, Layers, Orthoimage, Wall, Walls
 from tests import inspect_scenes
 from tests import raster_scenes as scenes
@@ -42,25 +40,6 @@ def mosaic(
 def seam_columns(image: Orthoimage) -> NDArray[np.int64]:
     """First column of the second source in each row."""
     return np.argmax(image.source == 1, axis=1)
-
-
-def test_voronoi_seams_lie_in_the_middle_of_overlaps(tmp_path: Path) -> None:
-    # The first ends at column 80, the second begins at column 40; both end at the rim alike.
-    left, right = layer("left", (0, 80), 10, quality=9.0), layer("right", (40, 120), 20)
-    image, _, _ = mosaic(tmp_path, left, right, seams="voronoi")
-    middle = slice(18, 22)  # farther from the rim above and below than from the seam
-    assert (image.source[middle, :58] == 0).all()
-    assert (image.source[middle, 62:] == 1).all()
-    best, _, _ = mosaic(tmp_path, left, right)
-    assert (seam_columns(best) == 80).all()
-
-
-def test_the_order_of_photos_goes_before_their_quality(tmp_path: Path) -> None:
-    left, right = layer("left", (0, 80), 10, quality=9.0), layer("right", (40, 120), 20)
-    image, _, _ = mosaic(tmp_path, left, right, seams="priority", priority=["right"])
-    assert (seam_columns(image) == 40).all()
-    with pytest.raises(MethodError, match="priority names rigth, but the layers are of left, ri"):
-        mosaic(tmp_path, left, right, seams="priority", priority=["rigth"])
 
 
 def textures() -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:

@@ -23,6 +23,7 @@ from orthoflow.files.publishing import publish_orthoimages
 from orthoflow.geometry import WallFrame, frame_over
 from orthoflow.products import Camera, Cameras, Layer, LayerMask, Layers, Orthoimages, OrthoMask
 from tests import raster_scenes as scenes
+from tests import samples
 
 
 def frame(shape: tuple[int, int] = (6, 8)) -> WallFrame:
@@ -120,12 +121,11 @@ def smooth_layer(
     name: str, quality: NDArray[np.float32], mask: NDArray[np.uint8], *, rgb: int = 7
 ) -> Layer:
     is_painted = mask == LayerMask.PAINTED
-    return Layer(
+    return samples.layer(
+        mask,
         frame=frame(mask.shape),
-        wall=0,
         source=name,
         rgb=np.where(is_painted[..., None], np.uint8(rgb), np.uint8(0)) * np.ones(3, np.uint8),
-        mask=mask,
         quality=np.where(is_painted, quality, np.float32(0.0)),
     )
 

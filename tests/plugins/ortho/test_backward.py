@@ -14,7 +14,7 @@ from orthoflow_plugins.ortho.dsm_backward import DsmBackward
 from orthoflow.errors import MethodError
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.products import Camera, Cameras, Layer, LayerMask, Layers, PointCloud
+from orthoflow.products import Camera, Cameras, LayerMask, Layers, PointCloud
 from orthoflow.sdk import StepContext
 from tests import ortho_scenes as scenes
 from tests.long_loops import seeds
@@ -44,14 +44,6 @@ def run(inputs: DsmBackward.In, ctx: StepContext, **params: object) -> Layers:
     return DsmBackward().run(inputs, DsmBackward.Params.model_validate(params), ctx).layers
 
 
-def shown_places_off(layer: Layer) -> NDArray[np.float64]:
-    """Errors (rows, cols, 2) in cells of the places that the colours stand for."""
-    rows, columns = np.mgrid[: scenes.SHAPE[0], : scenes.SHAPE[1]] + 0.5
-    told = layer.rgb[..., :2].astype(np.float64) + 0.5
-    expected = 4.0 * np.dstack([columns, rows])
-    return ((told - expected + 128.0) % 256.0 - 128.0) / 4.0
-
-
 @pytest.mark.parametrize("aside_m", [-0.7, 0.0, 0.9])
 def test_cells_show_their_own_place_where_they_are_seen_and_nothing_where_they_are_hidden(
     tmp_path: Path, aside_m: float
@@ -63,7 +55,7 @@ def test_cells_show_their_own_place_where_they_are_seen_and_nothing_where_they_a
     expected = np.where(is_raised, scenes.BLUE[scenes.RAISED], scenes.BLUE[scenes.BASE])
     np.testing.assert_array_equal(layer.rgb[..., 2][shown], expected[shown])
     # Half a cell, and half of the quarter cell that a grey level is.
-    assert np.abs(shown_places_off(layer)[shown]).max() <= 0.5 + 0.125
+    assert np.abs(scenes.places_off(layer)[shown]).max() <= 0.5 + 0.125
     seen = scenes.truth(where, scenes.camera(where, aside_m=aside_m))
     is_visible = np.isin(seen.surface, (scenes.BASE, scenes.RAISED)).reshape(scenes.SHAPE)
     is_behind_board = (seen.surface == scenes.BOARD).reshape(scenes.SHAPE)
@@ -111,12 +103,7 @@ def test_nearest_paints_the_source_pixel_itself(tmp_path: Path, distorted: bool)
     where = scenes.frame()
     viewer = scenes.camera(where, distorted=distorted)
     noise = np.random.default_rng(1).integers(1, 256, (viewer.height, viewer.width, 3), np.uint8)
-    inputs = DsmBackward.In(
-        walls=scenes.walls(where),
-        photos=scenes.photos(noise),
-        cameras=scenes.cameras(viewer),
-        cloud=scenes.cloud(where),
-    )
+    inputs = scenes.inputs(DsmBackward.In, noise, viewers=[viewer])
     (layer,) = run(inputs, context(tmp_path), resampling="nearest").layers
     rows, columns = np.nonzero(layer.mask == LayerMask.PAINTED)
     points = where.world_from_wall(
@@ -139,12 +126,7 @@ def test_what_is_finer_than_a_cell_gives_its_mean_grey(tmp_path: Path, resamplin
     rows, columns = np.mgrid[: viewer.height, : viewer.width]
     grey = 40 + 160 * ((rows + columns) % 2)
     picture = np.dstack([grey.astype(np.uint8)] * 3)
-    inputs = DsmBackward.In(
-        walls=scenes.walls(where),
-        photos=scenes.photos(picture),
-        cameras=scenes.cameras(viewer),
-        cloud=scenes.cloud(where),
-    )
+    inputs = scenes.inputs(DsmBackward.In, picture, viewers=[viewer])
     (layer,) = run(inputs, context(tmp_path), resampling=resampling).layers
     shown = layer.mask == LayerMask.PAINTED
     assert shown.sum() > 3000
@@ -173,13 +155,7 @@ def test_survey_coordinates_change_nothing(tmp_path: Path) -> None:
 def test_threads_and_tiles_do_not_show(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from orthoflow_plugins.ortho import painting
 
-    where = scenes.frame()
-    inputs = DsmBackward.In(
-        walls=scenes.walls(where),
-        photos=scenes.photos(scenes.rendered()),
-        cameras=scenes.cameras(scenes.camera(where)),
-        cloud=scenes.cloud(where),
-    )
+    inputs = scenes.inputs(DsmBackward.In)
     found = []
     for cores in (1, 2, 5):
         folder = tmp_path / str(cores)
@@ -234,11 +210,11 @@ def test_cells_without_a_surface_and_outside_the_photo_say_so(tmp_path: Path) ->
     depths = scenes.depth_m()
     depths[200:220, 20:60] = np.nan
     viewer = scenes.camera(where)
-    inputs = DsmBackward.In(
+    inputs = scenes.inputs(
+        DsmBackward.In,
+        scenes.rendered()[:, :500],
+        viewers=[dataclasses.replace(viewer, width=500)],
         walls=scenes.walls(where, depths),
-        photos=scenes.photos(scenes.rendered()[:, :500]),
-        cameras=scenes.cameras(dataclasses.replace(viewer, width=500)),
-        cloud=scenes.cloud(where),
     )
     (layer,) = run(inputs, context(tmp_path)).layers
     assert (layer.mask[200:220, 20:60] == LayerMask.NO_SURFACE).all()
@@ -296,16 +272,10 @@ def test_photos_that_paint_nothing_are_left_out_and_walls_keep_their_index(tmp_p
 
 
 def test_metrics_tell_what_was_painted_and_from_how_far(tmp_path: Path) -> None:
-    where = scenes.frame()
     # A clock that goes on by a second when it is asked.
     clock = count()
     ctx = dataclasses.replace(context(tmp_path), clock_s=lambda: float(next(clock)))
-    inputs = DsmBackward.In(
-        walls=scenes.walls(where),
-        photos=scenes.photos(scenes.rendered()),
-        cameras=scenes.cameras(scenes.camera(where)),
-        cloud=scenes.cloud(where),
-    )
+    inputs = scenes.inputs(DsmBackward.In)
     (layer,) = run(inputs, ctx).layers
     metrics = {metric.name: metric.value for metric in ctx.metrics}
     assert metrics["n_layers"] == 1
@@ -321,13 +291,7 @@ def test_metrics_tell_what_was_painted_and_from_how_far(tmp_path: Path) -> None:
 
 
 def refused(cameras: Cameras, folder: Path, **changes: object) -> str:
-    where = scenes.frame()
-    inputs = DsmBackward.In(
-        walls=scenes.walls(where),
-        photos=scenes.photos(scenes.rendered()),
-        cameras=cameras,
-        cloud=scenes.cloud(where),
-    )
+    inputs = scenes.inputs(DsmBackward.In, cameras=cameras)
     with pytest.raises(MethodError) as caught:
         run(dataclasses.replace(inputs, **changes), context(folder))
     return str(caught.value)

@@ -43,13 +43,7 @@ def deep_photos(*pictures: NDArray[np.uint16] | NDArray[np.uint8]) -> Photos:
 
 
 def laid(ctx: StepContext, photos: Photos, *viewers: ViewingCamera, **params: object) -> Layers:
-    where = scenes.frame()
-    inputs = DsmBackward.In(
-        walls=scenes.walls(where),
-        photos=photos,
-        cameras=scenes.cameras(*viewers),
-        cloud=scenes.cloud(where),
-    )
+    inputs = scenes.inputs(DsmBackward.In, viewers=viewers, photos=photos)
     return DsmBackward().run(inputs, DsmBackward.Params.model_validate(params), ctx).layers
 
 
@@ -94,13 +88,7 @@ def test_nearest_brings_the_exact_levels_into_the_geotiff(tmp_path: Path) -> Non
 
 
 def test_forward_paints_the_photos_own_levels(tmp_path: Path) -> None:
-    where = scenes.frame()
-    inputs = DsmForward.In(
-        walls=scenes.walls(where),
-        photos=deep_photos(ramp()),
-        cameras=scenes.cameras(scenes.camera(where)),
-        cloud=scenes.cloud(where),
-    )
+    inputs = scenes.inputs(DsmForward.In, photos=deep_photos(ramp()))
     (layer,) = DsmForward().run(inputs, DsmForward.Params(), context(tmp_path)).layers.layers
     assert layer.rgb.dtype == np.uint16
     assert layer.filled is not None

@@ -45,15 +45,8 @@ def test_a_gap_is_fillable_where_no_window_has_too_many_void_cells() -> None:
 def layer(shape: tuple[int, int], filled: NDArray[np.uint8] | None) -> Layer:
     mask = np.full(shape, LayerMask.PAINTED, dtype=np.uint8)
     mask[:, -5:] = LayerMask.OCCLUDED
-    return Layer(
-        frame=samples.facing_south(0.01, shape[1], shape[0]),
-        wall=0,
-        source="scan",
-        rgb=np.where((mask == LayerMask.PAINTED)[..., None], (10, 20, 30), 0).astype(np.uint8),
-        mask=mask,
-        quality=np.ones(shape, dtype=np.float32),
-        filled=filled,
-    )
+    rgb = np.where((mask == LayerMask.PAINTED)[..., None], (10, 20, 30), 0).astype(np.uint8)
+    return samples.layer(mask, rgb=rgb, filled=filled)
 
 
 def shown(of: Layer) -> NDArray[np.uint8]:

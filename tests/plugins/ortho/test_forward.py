@@ -10,7 +10,6 @@ from tempfile import mkdtemp
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from orthoflow_plugins.ortho import dsm_forward
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
 from orthoflow_plugins.ortho.dsm_forward import DsmForward
@@ -43,14 +42,6 @@ def layer_of(aside_m: float, width: int = 1000) -> Layer:
     return thrown(given, context(Path(mkdtemp())))
 
 
-def errors_cells(layer: Layer) -> NDArray[np.float64]:
-    """Errors (rows, cols, 2) of the places that the colours tell."""
-    rows, columns = np.mgrid[: scenes.SHAPE[0], : scenes.SHAPE[1]] + 0.5
-    told = layer.rgb[..., :2].astype(np.float64) + 0.5
-    expected = 4.0 * np.dstack([columns, rows])
-    return ((told - expected + 128.0) % 256.0 - 128.0) / 4.0
-
-
 @pytest.mark.parametrize("aside_m", [-0.7, 0.9])
 def test_every_pixel_paints_the_cell_that_it_shows(aside_m: float) -> None:
     layer = layer_of(aside_m)
@@ -60,7 +51,7 @@ def test_every_pixel_paints_the_cell_that_it_shows(aside_m: float) -> None:
     expected = np.where(is_raised, scenes.BLUE[scenes.RAISED], scenes.BLUE[scenes.BASE])
     assert np.mean(layer.rgb[..., 2][taken] == expected[taken]) > 0.999
     # Half a cell, half of the quarter cell that a grey level is, and a hundredth of a pixel.
-    assert np.quantile(np.abs(errors_cells(layer)[taken]), 0.999) <= 0.5 + 0.125 + 0.01
+    assert np.quantile(np.abs(scenes.places_off(layer)[taken]), 0.999) <= 0.5 + 0.125 + 0.01
 
 
 @pytest.mark.parametrize("aside_m", [-0.7, 0.9])

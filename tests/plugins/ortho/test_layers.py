@@ -47,15 +47,8 @@ def mask_of(**rows: LayerMask) -> np.ndarray:
 
 
 def layer(wall: int, source: str, mask: np.ndarray, *, deep: bool = False) -> Layer:
-    return Layer(
-        frame=walls().walls[0].frame,
-        wall=wall,
-        source=source,
-        rgb=np.zeros((*SHAPE, 3), dtype=np.uint16 if deep else np.uint8),
-        mask=mask,
-        quality=np.where(mask == PAINTED, 1.0, 0.0).astype(np.float32),
-        filled=None,
-    )
+    rgb = np.zeros((*SHAPE, 3), dtype=np.uint16 if deep else np.uint8)
+    return samples.layer(mask, wall=wall, source=source, rgb=rgb)
 
 
 def stacked(ctx: StepContext, *found: Layer) -> LayerStack:

@@ -22,13 +22,7 @@ MASKED = np.s_[300:420, 400:600]
 def painted(method: type[DsmBackward] | type[DsmForward], photos: Photos, folder: Path) -> Layer:
     # Layers lie in files of the scratch folder.
     folder.mkdir()
-    where = scenes.frame()
-    inputs = method.In(
-        walls=scenes.walls(where),
-        photos=photos,
-        cameras=scenes.cameras(scenes.camera(where)),
-        cloud=scenes.cloud(where),
-    )
+    inputs = scenes.inputs(method.In, photos=photos)
     (layer,) = method().run(inputs, method.Params(), context(folder)).layers.layers
     return layer
 

@@ -13,7 +13,7 @@ from orthoflow_plugins.ortho.photos_on_walls import warn_of_heads
 
 from orthoflow.diagnostics import Diagnostic
 from orthoflow.geometry.frames import rotation_from_vector
-from orthoflow.products import Camera, Photo, Photos
+from orthoflow.products import Camera, Photo
 from orthoflow.sdk import StepContext
 from tests import ortho_scenes as scenes
 from tests.raster_scenes import context
@@ -63,14 +63,5 @@ def test_methods_that_lay_photos_tell_it(
     where = scenes.frame()
     walls = replace(scenes.walls(where), up=-scenes.walls(where).up)
     ctx = context(tmp_path)
-    method().run(
-        method.In(
-            walls=walls,
-            photos=Photos(photos=scenes.photos(scenes.rendered()).photos),
-            cameras=scenes.cameras(scenes.camera(where)),
-            cloud=scenes.cloud(where),
-        ),
-        method.Params(),
-        ctx,
-    )
+    method().run(scenes.inputs(method.In, walls=walls), method.Params(), ctx)
     assert "photos-upside-down" in [one.code for one in ctx.diagnostics]

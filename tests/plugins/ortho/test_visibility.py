@@ -201,13 +201,7 @@ def test_what_hides_is_the_surface_without_spikes_and_with_its_edges_in_full() -
 
 
 def test_visibility_none_paints_the_board_and_says_so(tmp_path: Path) -> None:
-    where = scenes.frame()
-    inputs = DsmBackward.In(
-        walls=scenes.walls(where),
-        photos=scenes.photos(scenes.rendered()),
-        cameras=scenes.cameras(scenes.camera(where)),
-        cloud=scenes.cloud(where),
-    )
+    inputs = scenes.inputs(DsmBackward.In)
     ctx = context(tmp_path)
     params = DsmBackward.Params(visibility="none", resampling="nearest")
     (layer,) = DsmBackward().run(inputs, params, ctx).layers.layers

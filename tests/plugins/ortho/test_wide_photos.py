@@ -17,7 +17,6 @@ from orthoflow.files.cube_faces import FisheyeLens
 from orthoflow.files.images import encode_png
 from orthoflow.geometry.frames import rotation_from_vector
 from orthoflow.products import InputFiles, Layer, LayerMask
-from tests import scan_files
 from tests.box_rooms import BoxRoom
 from tests.raster_scenes import SURVEY, context
 from tests.wide_lenses import directions_of, directions_of_panorama
@@ -79,38 +78,6 @@ def panorama(folder: Path) -> tuple[Path, tuple[Path, ...]]:
     return photo, (xml,)
 
 
-def pinhole_inside_e57(folder: Path) -> tuple[Path, tuple[Path, ...]]:
-    """A photo of the north wall inside an E57 file, whose cameras look along -z with y up."""
-    width, height, focal, cx, cy = 900, 700, 420.0, 455.5, 342.25
-    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    rays = np.stack([(u - cx) / focal, (v - cy) / focal, np.ones_like(u)], axis=-1)
-    return _e57(
-        folder,
-        kind="pinhole",
-        content=encode_png(ROOM.seen(CENTRE, rays @ WORLD_FROM_CAMERA.T)),
-        numbers={
-            "imageWidth": width,
-            "imageHeight": height,
-            "focalLength": 0.0042,
-            "pixelWidth": 1e-5,
-            "pixelHeight": 1e-5,
-            "principalPointX": cx,
-            "principalPointY": cy,
-        },
-        rotation=Rotation.from_matrix(WORLD_FROM_CAMERA @ np.diag([1.0, -1.0, -1.0])).as_quat(
-            scalar_first=True
-        ),
-    )
-
-
-def _e57(folder: Path, **image: object) -> tuple[Path, tuple[Path, ...]]:
-    points = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), np.zeros((3, 5)), strict=True))
-    path = scan_files.write_e57(
-        folder / "room.e57", [{"fields": points}], [{"translation": CENTRE, **image}]
-    )
-    return path, (path,)
-
-
 def painted(folder: Path, photo: Path, cameras: tuple[Path, ...]) -> tuple[Layer, ...]:
     given = InputFiles(name="cameras", paths=cameras)
     photos = ReadPhotos().run(
@@ -152,7 +119,6 @@ def displacement_cells(layer: Layer, wall: int) -> NDArray[np.float64]:
         # A hemisphere ahead, in which half of each side lies; or all but the floor.
         (fisheye, {NORTH: 0.98, EAST: 0.3, WEST: 0.3, CEILING: 0.3}),
         (panorama, dict.fromkeys(range(5), 0.98)),
-        (pinhole_inside_e57, {NORTH: 0.6}),
     ],
 )
 def test_a_room_is_painted_where_it_is(
