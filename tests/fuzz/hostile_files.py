@@ -31,18 +31,7 @@ TEXTS = (
         "x" * 300,
     ),
     *("=1+1", "<script>alert(1)</script>", "ok", "failed", "sha256:" + "0" * 64, "0" * 64, "1e999"),
-    *(
-        "inputs.number",
-        "inputs.",
-        "survey.planes",
-        ".",
-        "{}",
-        "[]",
-        "null",
-        "[" * 2000,
-        "-1",
-        "NaN",
-    ),
+    *("inputs.number", "inputs.", "survey.planes", "{}", "[]", "null", "[" * 2000, "-1", "NaN"),
 )
 NUMBERS = (0, -1, 1, 2**31, 2**62, -(2**62), float("nan"), float("inf"), -0.0, 1e308)
 NAMES = (b"..", b"a\x1b", b"\xff\xfe", b"x" * 300, b"nul", b" ", b"0001", b"a=b@c")

@@ -68,20 +68,9 @@ _METASHAPE: Final = f"""\
 <transform>{" ".join(map(str, _POSE))}</transform></camera></group>
 </cameras></chunk></document>
 """
-_BUNDLER: Final = """\
-# Bundle file v0.3
-2 0
-60.5 -0.1 0.01
-1 0 0
-0 1 0
-0 0 1
-0.5 1.5 2.5
-0 0 0
-0 0 0
-0 0 0
-0 0 0
-0 0 0
-"""
+_BUNDLER: Final = (
+    "# Bundle file v0.3\n2 0\n60.5 -0.1 0.01\n1 0 0\n0 1 0\n0 0 1\n0.5 1.5 2.5\n" + 5 * "0 0 0\n"
+)
 _REALITYCAPTURE: Final = """\
 #name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2
 a.jpg,1.5,2.5,3.5,90,85,0.5,34.0,0.001,-0.002,-0.05,0.01,0,0,0,0
@@ -198,21 +187,15 @@ def _e57_files(folder: Path) -> None:
         "pixelWidth": 2.0 * np.pi / 64,
         "pixelHeight": np.pi / 32,
     }
+    jpeg, png, other = (
+        encode_jpeg(picture),
+        encode_png(photo_files.picture(64, 32)),
+        encode_png(picture),
+    )
     images = [
-        {
-            "kind": "pinhole",
-            "name": "north",
-            "content": encode_jpeg(picture),
-            "numbers": _NUMBERS,
-            **pose,
-        },
-        {
-            "kind": "spherical",
-            "content": encode_png(photo_files.picture(64, 32)),
-            "numbers": sphere,
-            **pose,
-        },
-        {"kind": "visualReference", "content": encode_png(picture)},
+        {"kind": "pinhole", "name": "north", "content": jpeg, "numbers": _NUMBERS, **pose},
+        {"kind": "spherical", "content": png, "numbers": sphere, **pose},
+        {"kind": "visualReference", "content": other},
     ]
     scan_files.write_e57(folder / "room.e57", [{"fields": fields}], images)
 

@@ -194,26 +194,18 @@ def _exif() -> bytes:
     return photo_files.exif_block({**main}, {**inner})
 
 
-def _jpeg_files(folder: Path) -> None:
-    photo_files.write(folder, {"a.jpg": photo_files.jpeg(photo_files.picture(), _exif())})
-
-
-def _png_files(folder: Path) -> None:
-    photo_files.write(folder, {"a.png": photo_files.png(photo_files.picture(), _exif())})
-
-
-def _tiff_files(folder: Path) -> None:
-    photo_files.write(folder, {"a.tif": photo_files.tiff(photo_files.picture(), orientation=6)})
+def _photo_files(folder: Path, *kinds: str) -> None:
+    image, exif = photo_files.picture(), _exif()
+    made = {
+        "jpg": photo_files.jpeg(image, exif),
+        "png": photo_files.png(image, exif),
+        "tif": photo_files.tiff(image, orientation=6),
+    }
+    photo_files.write(folder, {f"a.{kind}": made[kind] for kind in kinds})
 
 
 def _read_photo(path: Path) -> object:
     return _read_with(ReadPhotos, _files(path))
-
-
-def _exif_files(folder: Path) -> None:
-    _jpeg_files(folder)
-    _png_files(folder)
-    _tiff_files(folder)
 
 
 def _read_exif(path: Path) -> object:
@@ -232,10 +224,10 @@ def _read_figure(path: Path) -> object:
     return shrunk_webp(path.read_bytes(), path.name, longest_side_px=32)
 
 
-JPEG = Target(seeds=_jpeg_files, read=_read_photo)
-PNG = Target(seeds=_png_files, read=_read_photo, mutate=mutate_png)
-TIFF = Target(seeds=_tiff_files, read=_read_photo)
-EXIF = Target(seeds=_exif_files, read=_read_exif)
+JPEG = Target(seeds=lambda folder: _photo_files(folder, "jpg"), read=_read_photo)
+PNG = Target(seeds=lambda folder: _photo_files(folder, "png"), read=_read_photo, mutate=mutate_png)
+TIFF = Target(seeds=lambda folder: _photo_files(folder, "tif"), read=_read_photo)
+EXIF = Target(seeds=lambda folder: _photo_files(folder, "jpg", "png", "tif"), read=_read_exif)
 FIGURE = Target(seeds=_figure_files, read=_read_figure)
 
 

@@ -1,4 +1,4 @@
-"""The process behind `harness`: reads one damaged file after the other, and watches itself."""
+"""The process behind `harness`: reads one damaged file after the other."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import os
 import resource
 import shutil
 import signal
-import sys
 import tempfile
 import time
 import traceback
@@ -15,27 +14,12 @@ import warnings
 from contextlib import suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from tests.fuzz.harness import MAX_WALL_S, target_named, write_case
 
 # Address space beyond what is taken when reading begins: what asks for more gets a MemoryError.
 _ADDRESS_SPACE: Final = 4 << 30
-_MODES: Final = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
-# Audit event -> where its arguments name what is changed, and the folders those names start at.
-_CHANGING: Final = {
-    **dict.fromkeys(("os.remove", "os.rmdir"), ((0, 1),)),
-    "os.mkdir": ((0, 2),),
-    "os.rename": ((0, 2), (1, 3)),
-    "os.link": ((1, 3),),
-    "os.symlink": ((1, 2),),
-    **dict.fromkeys(("os.truncate", "os.chmod", "os.chown", "shutil.rmtree"), ((0, None),)),
-    **dict.fromkeys(("subprocess.Popen", "os.system"), ((0, None),)),
-}
-# These change a name, not what a link of that name leads to.
-_NAMING: Final = frozenset(
-    {"os.remove", "os.rmdir", "os.mkdir", "os.rename", "os.link", "os.symlink"}
-)
 
 
 def read_cases(
@@ -59,8 +43,6 @@ def read_cases(
         target.read(Path(shutil.copy(sound, case_folder)))
     taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (taken + _ADDRESS_SPACE,) * 2)
-    watch = _Watch(case_folder)
-    sys.addaudithook(watch.audit)
     end = time.monotonic() + budget_s
     for case in range(first, first + count):
         _empty(case_folder)
@@ -71,7 +53,6 @@ def read_cases(
             Path("/proc/self/clear_refs").write_text("5")
         signal.setitimer(signal.ITIMER_PROF, target.max_cpu_s)
         signal.setitimer(signal.ITIMER_REAL, MAX_WALL_S)
-        watch.is_on = True
         try:
             # As a test would have it, and as no user has: nothing may hang on it.
             with warnings.catch_warnings():
@@ -82,61 +63,16 @@ def read_cases(
         except BaseException as error:  # noqa: BLE001 - whatever it is, it is a finding
             sender.send(("traceback", _described(error)))
         finally:
-            watch.is_on = False
             signal.setitimer(signal.ITIMER_PROF, 0.0)
             signal.setitimer(signal.ITIMER_REAL, 0.0)
         peak_mib = _peak_mib()
         if peak_mib > target.max_mib:
             sender.send(("memory", f"took {peak_mib:.0f} MiB at case {case}"))
-        for write in watch.writes:
-            sender.send(("write", write))
-        watch.writes.clear()
         if time.monotonic() > end:
             break
     # Without what libraries do at exit: that is not what is tested.
     sender.close()
     os._exit(0)
-
-
-class _Watch:
-    """Collects what is written outside a folder while it is on."""
-
-    def __init__(self, folder: Path) -> None:
-        self.is_on = False
-        self.writes: list[str] = []
-        self._allowed = (str(folder), "/dev/null", os.environ.get("NUMBA_CACHE_DIR"))
-
-    def audit(self, event: str, arguments: tuple[Any, ...]) -> None:
-        """Take an audit event."""
-        if not self.is_on:
-            return
-        if event == "open":
-            if not isinstance(arguments[2], int) or not arguments[2] & _MODES:
-                return
-        elif event not in _CHANGING:
-            return
-        for place, start in _CHANGING.get(event, ((0, None),)):
-            name = arguments[place]
-            folder = -1 if start is None else arguments[start]
-            if isinstance(name, str | bytes | os.PathLike) and not self._is_inside(
-                _whole(name, folder, is_name=event in _NAMING)
-            ):
-                self.writes.append(f"{event} of {os.fsdecode(name)!r}")
-
-    def _is_inside(self, whole: str) -> bool:
-        return any(
-            part and (whole == part or whole.startswith(f"{part}/")) for part in self._allowed
-        )
-
-
-def _whole(name: Any, folder: int, *, is_name: bool) -> str:
-    """Return the path of a name in a folder that is open, or in the working one (-1)."""
-    start = Path.cwd() if folder < 0 else Path(f"/proc/self/fd/{folder}")
-    path = start / os.fsdecode(name)
-    # Of `..` and what ends in a slash the last part is no name.
-    if not is_name or path.name == "..":
-        return os.path.realpath(path)
-    return str(Path(os.path.realpath(path.parent)) / path.name)
 
 
 def _described(error: BaseException) -> str:

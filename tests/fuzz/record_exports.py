@@ -20,22 +20,10 @@ import numpy as np
 from orthoflow_provenance.document import RecordedProduct, sha256_text
 from orthoflow_provenance.record import write_record
 
-from orthoflow.geometry import WallFrame
-from orthoflow.products import (
-    Camera,
-    Cameras,
-    Intrinsics,
-    Layer,
-    Layers,
-    Photo,
-    Photos,
-    PointCloud,
-    PointLabels,
-    Product,
-    TieRole,
-)
+from orthoflow.products import PointCloud, PointLabels, Product
 from orthoflow.products.product import Payload
-from tests import drawing_runs, photo_files, samples
+from orthoflow.testing.examples import example, few_points
+from tests import drawing_runs
 from tests import hostile_records as hostile
 from tests.fuzz.harness import Target
 from tests.fuzz.hostile_files import changed_json
@@ -46,6 +34,7 @@ from tests.fuzz.records import (
     Command,
     RefusedError,
     check_command,
+    check_made,
     surroundings,
     with_damage,
 )
@@ -91,85 +80,27 @@ def _cloud() -> PointCloud:
     places = rng.uniform(0.2, 0.8, (300, 3)) * drawing_runs.SIZE_M
     places[:200, 1] = drawing_runs.SIZE_M[1] + rng.normal(0.0, 0.002, 200)
     places[200:280, 2] = 0.0
-    x, y, z = (drawing_runs.box_points(places) - drawing_runs.CORNER).T.astype(np.float32)
-    return PointCloud(
+    return replace(
+        few_points(drawing_runs.box_points(places) - drawing_runs.CORNER),
         origin=drawing_runs.CORNER,
-        x=x,
-        y=y,
-        z=z,
-        up=np.array([0.0, 0.0, 1.0]),
-        intensity=rng.uniform(0.0, 1.0, 300).astype(np.float32),
-        rgb=rng.integers(0, 256, (300, 3)).astype(np.uint8),
         scan=(np.arange(300) % 2).astype(np.uint16),
         stations=np.array([drawing_runs.CORNER + 1.0, drawing_runs.CORNER + 1.5]),
-        stations_source="file",
-        source={"files": ["a.e57", "b.e57"]},
     )
-
-
-def _labels() -> PointLabels:
-    plane = np.repeat([drawing_runs.WALL, 0, -1], [200, 80, 20])
-    return PointLabels(plane_index=plane.astype(np.int16))
-
-
-def _cameras(frame: WallFrame) -> Cameras:
-    size = 640, 480
-    lens = Intrinsics(
-        width=size[0], height=size[1], fx=500.0, fy=500.0, cx=320.0, cy=240.0, source="given"
-    )
-    rotation = np.array([frame.u_world, frame.v_world, -frame.normal_world])
-    middle = frame.world_from_wall(np.array([[190.0, 115.0]]))[0]
-    camera = Camera(
-        photo="a.jpg",
-        status="ok",
-        intrinsics=lens,
-        rotation_camera_from_world=rotation,
-        translation_camera_from_world=-rotation @ (middle + 2.5 * frame.normal_world),
-    )
-    places = np.random.default_rng(6).uniform((50, 50), (300, 200), (12, 2))
-    ties = samples.ties(
-        places,
-        photo_names=("a.jpg",),
-        points_world=frame.world_from_wall(places),
-        sigma_px=np.ones(12),
-        sigma_m=np.full(12, 0.001),
-        role=np.full(12, TieRole.CONTROL, dtype=np.uint8),
-        residual_px=np.zeros((12, 2)),
-    )
-    return Cameras(cameras=(camera, Camera(photo="b.jpg", status="dark")), ties=ties)
-
-
-def _layers(frame: WallFrame) -> Layers:
-    small = replace(frame, width=40, height=30)
-    layer = Layer(
-        frame=small,
-        wall=0,
-        source="a.jpg",
-        rgb=np.full((30, 40, 3), 90, np.uint8),
-        mask=np.ones((30, 40), np.uint8),
-        quality=np.ones((30, 40), np.float32),
-    )
-    return Layers(layers=(layer,), names=("wall 2",), plane_indices=(drawing_runs.WALL,))
-
-
-def _photos() -> Photos:
-    encoded = photo_files.jpeg(photo_files.picture(640, 480))
-    return Photos(photos=(Photo(name="a.jpg", encoded=encoded, width=640, height=480),))
 
 
 @cache
 def _payloads() -> dict[tuple[str, str], Payload]:
     """What each step gives, by its port, with what the drawing run has."""
-    frame = drawing_runs.wall_frame(drawing_runs.box_planes())
-    more: dict[tuple[str, str], Product] = {
+    plane = np.repeat([drawing_runs.WALL, 0, -1], [200, 80, 20])
+    given = {
         ("scan", "cloud"): _cloud(),
-        ("photos", "photos"): _photos(),
-        ("plane", "labels"): _labels(),
-        ("orient", "cameras"): _cameras(frame),
-        ("ortho", "layers"): _layers(frame),
+        ("plane", "labels"): PointLabels(plane_index=plane.astype(np.int16)),
+        ("photos", "photos"): example("photos"),
+        ("orient", "cameras"): example("cameras"),
+        ("ortho", "layers"): example("layers"),
     }
-    named = {(step, item.type_name): item for step, item in drawing_runs.box_products().items()}
-    return {place: item.to_payload() for place, item in {**named, **more}.items()}
+    given |= {(step, item.type_name): item for step, item in drawing_runs.box_products().items()}
+    return {place: item.to_payload() for place, item in given.items() if isinstance(item, Product)}
 
 
 # Which step takes what of which other one.
@@ -306,26 +237,10 @@ def _read(path: Path) -> None:
     before = surroundings(folder)
     limit_s = MAX_CPU_S if mark else float("inf")
     codes = [check_command(Studio(folder), command, run, max_cpu_s=limit_s) for command in commands]
-    _check_made(folder / "out", run)
+    check_made(folder / "out", run)
     assert surroundings(folder) == before
     if any(codes):
         raise RefusedError
-
-
-def _check_made(out: Path, run: Path) -> None:
-    """What was made is files, nothing from outside, and what was text stays text."""
-    for path in out.rglob("*"):
-        if path.is_relative_to(run):
-            continue
-        assert not path.is_symlink(), path
-        assert path.is_file() or path.is_dir(), path
-        if path.is_file():
-            content = path.read_bytes()
-            assert SECRET.encode() not in content, path
-            if path.suffix == ".html":
-                assert b"<script>alert" not in content
-            elif path.suffix in (".json", ".geojson"):
-                json.loads(content)
 
 
 RECORD_EXPORTS = Target(
