@@ -112,12 +112,6 @@ def test_a_fisheye_has_terms_of_its_own(tmp_path: Path) -> None:
     assert without == (replace(plain, radial=(0.0, 0.0, 0.0, 0.0)),)
 
 
-def test_values_may_be_shared_between_cameras(tmp_path: Path) -> None:
-    text = "cameras:\n  a.jpg: &c {" + GOOD + "}\n  b.jpg: *c\n"
-    calibration = read(tmp_path, text)
-    assert [item.fx for item in calibration.lenses] == [3000.0, 3000.0]
-
-
 def folds(radii: np.ndarray, k1: float, k2: float, k3: float) -> bool:
     """Whether the distorted radius ever shrinks on the way to the corner, by plain differences."""
     squares = radii**2
@@ -145,20 +139,12 @@ def test_a_lens_is_refused_just_where_its_radius_turns_back(tmp_path: Path, plac
             assert the_lens(read(tmp_path, text)).distortion == tuple(lens)
 
 
-@pytest.mark.parametrize(
-    ("name", "pattern"),
-    [
-        ("a.jpg", "a.jpg"),
-        ("IMG_0012.jpg", "IMG_00*.jpg"),
-        ("IMG_0100.jpg", "*"),
-        ("img_0012.jpg", "*"),
-        ("x[1].jpg", "x[1].jpg"),
-    ],
-)
-def test_the_first_entry_that_matches_holds(name: str, pattern: str) -> None:
+def test_the_first_entry_that_matches_holds() -> None:
     patterns = ("a.jpg", "x[1].jpg", "IMG_00*.jpg", "*", "never")
-    assert matching_pattern(patterns, name) == pattern
-    assert matching_pattern(("b*",), name) is None
+    names = ("a.jpg", "IMG_0012.jpg", "IMG_0100.jpg", "img_0012.jpg", "x[1].jpg")
+    found = [matching_pattern(patterns, name) for name in names]
+    assert found == ["a.jpg", "IMG_00*.jpg", "*", "*", "x[1].jpg"]
+    assert matching_pattern(("b*",), "a.jpg") is None
 
 
 def test_another_size_is_refused_and_a_turned_one_named() -> None:
@@ -181,57 +167,24 @@ def test_another_size_is_refused_and_a_turned_one_named() -> None:
         ("", "calibration.yaml:1:1: the document is empty"),
         ("- 1\n", "calibration.yaml:1:1: expected the keys cameras, got a list"),
         ("cameras: {}\n", "1:10: cameras: mapping should have at least 1 item"),
-        ("cameras:\n  1: {" + GOOD + "}\n", "2:3: cameras: a key must be text, got 1"),
-        ("cameras:\n  a.jpg: 5\n", "2:10: cameras.a.jpg: input should be a mapping, got 5"),
         ("cameras:\n  a.jpg: {width: 10}\n", "2:3: cameras.a.jpg.fx: fx is missing"),
-        (
-            "cameras:\n  a.jpg:\n    heigth: 5\n",
-            "3:5: cameras.a.jpg.heigth: unknown key heigth (did you mean height?)",
-        ),
-        (
-            "cameras:\n  a.jpg: {width: 4000, height: 3000, fx: 3000,5, fy: 3000}\n",
-            "3000,5 is two numbers; decimals have a point: 3000.5",
-        ),
-        ("cameras: {}\nnotes: x\n", "2:1: notes: unknown key notes; known here: cameras"),
-        ("cameras: {a: {" + GOOD + "}, a: {" + GOOD + "}}", "the key is there already, in line 1"),
-        ("cameras: {a: {" + GOOD + "]}", "calibration.yaml:1:14: this is not YAML: the brace"),
-        (
-            "cameras:\n  a.jpg: {width: 4000.5}\n",
-            '2:18: cameras.a.jpg.width: input should be a whole number, got 4000.5',
-        ),
+        ("cameras:\n  a.jpg:\n    heigth: 5\n",
+         "3:5: cameras.a.jpg.heigth: unknown key heigth (did you mean height?)"),
+        ("cameras:\n  a.jpg: {width: 4000, height: 3000, fx: 3000,5, fy: 3000}\n",
+         "3000,5 is two numbers; decimals have a point: 3000.5"),
         ("cameras:\n  a.jpg: {fx: .nan}\n", '.fx: input should be a finite number, got nan'),
-        (
-            'cameras: {"*": {' + GOOD + ", distortion: [0.1, 0, 0, 0]}}",
-            "expected the 5 numbers [k1, k2, p1, p2, k3], got 4 values",
-        ),
-        (
-            'cameras: {"*": {field_of_view_deg: 90, ' + GOOD + "}}",
-            'cameras.*: field_of_view_deg belongs to model: fisheye',
-        ),
-        (
-            'cameras: {"*": {model: fisheye, field_of_view_deg: 400, ' + GOOD + "}}",
-            "the fisheye lens is none: a field of view of 400 degrees, expected one below 360",
-        ),
-        (
-            'cameras: {"*": {model: fisheye, ' + GOOD + ", distortion: [-0.8, 0, 0, 0]}}",
-            "share a pixel; expected k1, k2, k3, k4 of a calibration that covers the whole image",
-        ),
-        (
-            'cameras: {"*": {' + GOOD + ", distortion: [0.1, 0, x, 0, 0]}}",
-            'cameras.*.distortion[2]: input should be a valid number, got the text "x"',
-        ),
-        (
-            'cameras: {"*": {' + GOOD.replace("fx: 3000", "fx: 28") + "}}",
-            "expected the focal length in pixels, at least a tenth of the image's 4000, got 28",
-        ),
-        (
-            'cameras: {"*": {' + GOOD.replace("cx: 1999.5", "cx: 19995") + "}}",
-            'cameras.*.cx: expected the principal point in pixels',
-        ),
-        (
-            'cameras: {"*": {' + GOOD + ", distortion: [-1.5, 0, 0, 0, 0]}}",
-            'cameras.*.distortion: the lens model folds back inside the image',
-        ),
+        ("cameras: {'*': {" + GOOD + ", distortion: [0.1, 0, 0, 0]}}",
+         "expected the 5 numbers [k1, k2, p1, p2, k3], got 4 values"),
+        ("cameras: {'*': {field_of_view_deg: 90, " + GOOD + "}}",
+         'cameras.*: field_of_view_deg belongs to model: fisheye'),
+        ("cameras: {'*': {model: fisheye, field_of_view_deg: 400, " + GOOD + "}}",
+         "the fisheye lens is none: a field of view of 400 degrees, expected one below 360"),
+        ("cameras: {'*': {model: fisheye, " + GOOD + ", distortion: [-0.8, 0, 0, 0]}}",
+         "share a pixel; expected k1, k2, k3, k4 of a calibration that covers the whole image"),
+        ("cameras: {'*': {" + GOOD.replace("fx: 3000", "fx: 28") + "}}",
+         "expected the focal length in pixels, at least a tenth of the image's 4000, got 28"),
+        ("cameras: {'*': {" + GOOD.replace("cx: 1999.5", "cx: 19995") + "}}",
+         'cameras.*.cx: expected the principal point in pixels'),
     ],
 )  # fmt: skip
 def test_a_mistake_is_one_sentence_with_its_place(tmp_path: Path, text: str, problem: str) -> None:
@@ -244,20 +197,3 @@ def test_all_mistakes_come_at_once_in_the_order_of_the_file(tmp_path: Path) -> N
     places = [int(line.split(":")[1]) for line in lines]
     assert places == sorted(places)
     assert {2, 3, 4, 5, 6} == set(places)
-
-
-def test_what_is_no_text_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "calibration.yaml"
-    path.write_bytes(b"\xff\xd8\xff\xe0")
-    with pytest.raises(InputError, match=r"calibration\.yaml is not UTF-8 text"):
-        read_calibration(path)
-    path.write_bytes(b"#" * 1_000_001)
-    with pytest.raises(
-        InputError, match=r"has 1000001 bytes, a calibration file \(YAML\) at most 400000"
-    ):
-        read_calibration(path)
-    with pytest.raises(InputError, match=r"gone\.yaml cannot be read: No such file"):
-        read_calibration(tmp_path / "gone.yaml")
-    path.write_text("[" * 1200)
-    with pytest.raises(InputError, match="1:61: the document is nested deeper than 60 levels"):
-        read_calibration(path)

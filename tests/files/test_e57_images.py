@@ -148,39 +148,21 @@ def test_a_panorama_becomes_six_photos_that_show_each_direction_where_it_is(
     assert (n_seen == 1).all()
 
 
-def test_the_seam_of_a_panorama_does_not_show(tmp_path: Path) -> None:
-    photos, _ = read(written(tmp_path, spherical()))
-    back = next(photo for photo in photos.photos if photo.name.endswith("_back.png"))
-    middle = decode_image(back.encoded).astype(int)
-    column = middle.shape[1] // 2
-    steps = np.abs(np.diff(middle[:, column - 3 : column + 3], axis=1)).max()
-    assert steps <= 2
-
-
-def test_a_part_of_a_panorama_is_told(tmp_path: Path) -> None:
+def test_what_is_no_photo_is_refused_with_the_reason(tmp_path: Path) -> None:
     half = spherical()
     half["numbers"] = half["numbers"] | {"pixelHeight": 0.5 * np.pi / 360}
     (image,) = read_e57_images(written(tmp_path, half))
     assert "a part of a panorama, only whole ones are taken" in image.camera.reason
+    with pytest.raises(InputError, match=r"room\.e57 holds no photos"):
+        read(written(tmp_path))
+    for change, message in (
+        ({"imageWidth": 65}, "has 64 x 48 pixels, but its file states 65 x 48"),
+        ({"pixelWidth": 0.0}, r"the lens of photo room_000\.jpg is none"),
+    ):
+        with pytest.raises(InputError, match=message):
+            read(written(tmp_path, pinhole(numbers=NUMBERS | change)))
 
 
 def test_names_in_the_file_cannot_lead_out_of_a_folder(tmp_path: Path) -> None:
     (image,) = read_e57_images(written(tmp_path, pinhole(name="../../etc/pass wd\t.jpg")))
     assert image.name == "room_000_etc_pass_wd.jpg"
-
-
-def test_a_file_without_photos_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"room\.e57 holds no photos"):
-        read(written(tmp_path))
-
-
-def test_a_size_that_is_not_the_photos_is_refused(tmp_path: Path) -> None:
-    path = written(tmp_path, pinhole(numbers=NUMBERS | {"imageWidth": 65}))
-    with pytest.raises(InputError, match="has 64 x 48 pixels, but its file states 65 x 48"):
-        read(path)
-
-
-def test_a_lens_that_is_none_is_refused(tmp_path: Path) -> None:
-    path = written(tmp_path, pinhole(numbers=NUMBERS | {"pixelWidth": 0.0}))
-    with pytest.raises(InputError, match=r"the lens of photo room_000\.jpg is none"):
-        read(path)

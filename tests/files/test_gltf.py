@@ -136,6 +136,7 @@ def test_walls_are_painted_with_colours_that_have_their_light_already(written: P
     assert {node["extras"]["surface"] for node in told["nodes"][1:]} == {"plane"}
 
 
+@pytest.mark.long
 def test_a_page_shows_the_model_without_a_server(
     new_page: Callable[[], Page], written: Path, carved: Path, tmp_path: Path
 ) -> None:
