@@ -12,18 +12,29 @@ import numpy as np
 import pytest
 
 from orthoflow.errors import InputError
-from orthoflow.files import calibration, images, metashape, polygons, sidecars, survey_points
+from orthoflow.files import (
+    calibration,
+    camera_formats,
+    colmap,
+    images,
+    metashape,
+    polygons,
+    sidecars,
+    survey_points,
+)
 from orthoflow.files.camera_formats import read_given_cameras
 from orthoflow.files.drawings import title_blocks
 from orthoflow.files.images import encode_png
 
 LENS = "cameras: {a.jpg: {width: 640, height: 480, fx: 500, fy: 500, cx: 319.5, cy: 239.5}}"
 CSV = "name,x,y,z\na,1,2,3\nlong name,1.25,2.5,3.125\n"
+CAMERA = "<camera id='0' sensor_id='0' label='a.jpg'/>"
 CHUNK = (
     "<document><chunk><sensors><sensor id='0'><resolution width='640' height='480'/>"
     "<calibration><f>500</f></calibration></sensor></sensors>"
-    "<cameras><camera id='0' sensor_id='0' label='a.jpg'/></cameras></chunk></document>"
+    f"<cameras>{CAMERA}</cameras></chunk></document>"
 )
+TWO = CHUNK.replace(CAMERA, 2 * CAMERA)
 MASK = {
     "type": "FeatureCollection",
     "features": [
@@ -67,6 +78,20 @@ def decoded(path: Path) -> object:
     return images.decode_image(path.read_bytes(), path.name)
 
 
+def cameras_of(suffix: str) -> Callable[[Path], object]:
+    return lambda path: read_given_cameras([path.rename(path.with_suffix(suffix))])
+
+
+def colmap_of_two(path: Path) -> object:
+    for name, text in (
+        ("cameras.txt", "1 PINHOLE 64 48 50 50 32 24\n"),
+        ("images.txt", "1 1 0 0 0 0 0 0 1 a.jpg\n\n2 1 0 0 0 0 0 0 1 b.jpg\n\n"),
+    ):
+        path.with_name(name).write_text(text)
+    return read_given_cameras([path.with_name(name) for name in ("cameras.txt", "images.txt")])
+
+
+REALITYCAPTURE = "#name,x,y,alt,heading,pitch,roll,f\n" + "a.jpg,1,2,3,0,0,0,24\n" * 2
 BLOCK = "project: Hall\ntitle: West wall\n"
 LIMITS = [
     limit(calibration, "MOST_BYTES", LENS, None, calibration.read_calibration),
@@ -78,6 +103,9 @@ LIMITS = [
     limit(polygons, "MOST_BYTES", json.dumps(MASK), None, masks),
     limit(polygons, "MOST_POLYGONS", json.dumps(MASK), 3, masks),
     limit(sidecars, "MOST_SIDECAR_BYTES", '{"gsd_m": 0.5}', None, sidecars.read_sidecar),
+    limit(camera_formats, "MOST_CAMERAS", REALITYCAPTURE, 2, cameras_of(".csv")),
+    limit(colmap, "MOST_CAMERAS", "", 2, colmap_of_two),
+    limit(camera_formats, "MOST_CAMERAS", TWO, 2, cameras_of(".xml")),
     limit(metashape, "MOST_TAGS", CHUNK, CHUNK.count("<"), metashape.read_metashape_xml),
     limit(metashape, "MOST_PIXELS", CHUNK, 640 * 480, metashape.read_metashape_xml),
     Limit(
@@ -94,14 +122,16 @@ LIMITS = [
 def test_what_is_as_large_as_allowed_is_read_and_nothing_larger(
     limit: Limit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = tmp_path / "file"
-    path.write_bytes(limit.content)
-    usual = limit.read(path)
+    def read() -> str:
+        (tmp_path / "file").write_bytes(limit.content)
+        return repr(limit.read(tmp_path / "file"))
+
+    usual = read()
     monkeypatch.setattr(limit.module, limit.constant, limit.size)
-    assert repr(limit.read(path)) == repr(usual)
+    assert read() == usual
     monkeypatch.setattr(limit.module, limit.constant, limit.size - 1)
     with pytest.raises(InputError):
-        limit.read(path)
+        read()
 
 
 @pytest.mark.parametrize(

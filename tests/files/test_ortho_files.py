@@ -56,27 +56,17 @@ def test_orthoimages_are_known_by_their_names_and_come_in_the_order_of_their_wal
     ]
 
 
-@pytest.mark.parametrize(
-    ("longest_px", "shape"), [(3, (2, 3)), (9, (6, 9)), (100, (6, 9)), (1, (1, 1))]
-)
-def test_pictures_are_averaged_to_their_longest_side(
-    tmp_path: Path, longest_px: int, shape: tuple[int, int]
-) -> None:
-    rgb, shown = ortho(tmp_path).shrunk(longest_px)
-    assert rgb.shape == (*shape, 3)
-    assert shown.shape == shape
-    if shape == RGB.shape[:2]:
-        np.testing.assert_array_equal(rgb[shown], RGB[SHOWN])
-    else:
-        # All cells of the first are shown, so it is their mean.
-        side = ROWS // shape[0], COLUMNS // shape[1]
-        if SHOWN[: side[0], : side[1]].all():
-            mean = RGB[: side[0], : side[1]].mean(axis=(0, 1))
-            np.testing.assert_allclose(rgb[0, 0], mean, atol=1.0)
-
-
-def test_a_part_is_that_of_the_picture(tmp_path: Path) -> None:
-    rgb, shown = ortho(tmp_path).part((1, 2, COLUMNS, 5), (3, COLUMNS - 1))
+def test_pictures_are_averaged_to_their_longest_side_and_cut(tmp_path: Path) -> None:
+    image = ortho(tmp_path)
+    for longest_px, shape in ((3, (2, 3)), (1, (1, 1)), (100, (6, 9))):
+        rgb, shown = image.shrunk(longest_px)
+        assert rgb.shape == (*shape, 3)
+        assert shown.shape == shape
+    np.testing.assert_array_equal(rgb[shown], RGB[SHOWN])
+    # All cells of the first are shown, so it is their mean.
+    mean = RGB[:3, :3].mean(axis=(0, 1))
+    np.testing.assert_allclose(image.shrunk(3)[0][0, 0], mean, atol=1.0)
+    rgb, shown = image.part((1, 2, COLUMNS, 5), (3, COLUMNS - 1))
     np.testing.assert_array_equal(shown, SHOWN[2:5, 1:])
     np.testing.assert_array_equal(rgb[shown], RGB[2:5, 1:][shown])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import rasterio
 
 from orthoflow.files import geotiff, publishing
 from orthoflow.files.geotiff import local_crs_name
@@ -22,7 +24,6 @@ from orthoflow.products import (
     Planes,
     TieRole,
     Ties,
-    Wall,
 )
 from tests import samples
 
@@ -130,21 +131,6 @@ def test_planes_are_told_completely(tmp_path: Path) -> None:
     assert ["part_corners_world" in plane for plane in plain] == [False, False]
 
 
-DEPTH = np.array([[0.0, 1.0, 2.0], [np.nan, 3.0, 4.0]], np.float32)
-
-
-def wall() -> Wall:
-    return Wall(
-        frame=FRAME,
-        plane_index=2,
-        name="north",
-        depth_m=DEPTH,
-        sigma_m=np.zeros((2, 3), np.float32),
-        count=np.ones((2, 3), np.uint32),
-        mask=np.array([[1, 1, 2], [0, 1, 1]], np.uint8),
-    )
-
-
 MASK = np.array([[0, 1, 2], [3, 4, 1]], np.uint8)
 RGB = np.arange(18, dtype=np.uint8).reshape(2, 3, 3)
 
@@ -206,6 +192,10 @@ def test_orthoimages_are_told_completely(
     np.testing.assert_array_equal(read.shown, shown)
     tags = {**TAGS, "name": "north"}
     assert {key: read.tags[key] for key in [*tags, "content"]} == {**tags, "content": content}
+    if profile is not None:
+        with rasterio.open(tmp_path / "wall_7_ortho.tif") as dataset:
+            kept = dataset.tags(ns="COLOR_PROFILE")["SOURCE_ICC_PROFILE"]
+        assert base64.b64decode(kept) == profile
     mask = geotiff.read_raster(tmp_path / "wall_7_ortho_mask.tif")
     np.testing.assert_array_equal(mask.values, MASK)
     assert mask.tags == {**tags, "content": of_mask}

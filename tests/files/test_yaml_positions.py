@@ -88,7 +88,7 @@ NO_YAML = "this is not YAML: "
     ("text", "place", "words"),
     [
         ("", (1, 1, ""), "the document is empty"),
-        ("a: 1\nb: 2\na: 3", (3, 1, "a"), "the key is there already, in line 1; remove one of them"),
+        ("a: 1\na: 3", (2, 1, "a"), "the key is there already, in line 1; remove one of them"),
         ("a: {3: x}", (1, 5, "a"), "a key must be text, got 3"),
         ("a: {~: x}", (1, 5, "a"), "a key must be text, got ~"),
         ("a:\n  ? [x]\n  : 1", (2, 5, "a"), "a key must be text, got a list or mapping"),

@@ -17,14 +17,12 @@ from orthoflow.files.clouds import attributes, copc
 from orthoflow.files.clouds.attributes import AttributedCloud, describe_cloud, plane_colour
 from orthoflow.files.clouds.copc import write_copc
 from orthoflow.files.clouds.neighbourhoods import neighbourhoods_of
-from orthoflow.files.clouds.photo_colours import PointColours, colour_points
 from orthoflow.files.clouds.writers import write_e57, write_laz, write_ply
 from orthoflow.files.geotiff import epsg_wkt
-from orthoflow.files.images import encode_png
 from orthoflow.files.points import PointQuery, open_scan
 from orthoflow.geometry.frames import frame_over
 from orthoflow.geometry.slabs import Slab
-from orthoflow.products import Intrinsics, Photo, PointCloud, PointLabels
+from orthoflow.products import PointCloud, PointLabels
 from tests import cloud_scenes
 from tests.cloud_scenes import ORIGIN, planes
 from tests.long_loops import seeds
@@ -249,32 +247,30 @@ def test_an_e57_says_of_each_scan_what_it_holds(tmp_path: Path) -> None:
             node = root["data3D"][scan]
             assert node["name"].value() == f"scan {scan}"
             own = points[cloud.scan == scan] - STATIONS[scan]
-            for axis, low, high in zip("xyz", own.min(axis=0), own.max(axis=0), strict=True):
-                bounds = node["cartesianBounds"]
-                assert bounds[f"{axis}Minimum"].value() == pytest.approx(low, abs=1e-8)
-                assert bounds[f"{axis}Maximum"].value() == pytest.approx(high, abs=1e-8)
-            for name in ("colorRed", "colorGreen", "colorBlue"):
-                limits = node["colorLimits"]
-                ends = limits[f"{name}Minimum"].value(), limits[f"{name}Maximum"].value()
-                assert ends == (0, 255)
-            limits = node["intensityLimits"]
-            ends = limits["intensityMinimum"].value(), limits["intensityMaximum"].value()
-            assert ends == (0.0, 1.0)
+            bounds = limits_of(node["cartesianBounds"], *"xyz")
+            assert np.ravel(bounds) == pytest.approx(
+                np.ravel(list(zip(own.min(axis=0), own.max(axis=0), strict=True))), abs=1e-8
+            )
+            colours = ("colorRed", "colorGreen", "colorBlue")
+            assert limits_of(node["colorLimits"], *colours) == [(0, 255)] * 3
+            assert limits_of(node["intensityLimits"], "intensity") == [(0.0, 1.0)]
             turned = node["pose"]["rotation"]
             assert [turned[name].value() for name in "wxyz"] == [1.0, 0.0, 0.0, 0.0]
             fields = pye57.libe57.StructureNode(node["points"].prototype())
-            for name in ("colorRed", "colorGreen", "colorBlue"):
-                assert (fields[name].minimum(), fields[name].maximum()) == (0, 255)
-            state = fields["cartesianInvalidState"]
-            assert (state.minimum(), state.maximum(), state.value()) == (0, 2, 0)
-            plane = fields["orthoflow:plane"]
-            assert (plane.minimum(), plane.maximum()) == (-32_768, 32_767)
+            ranges = {**dict.fromkeys(colours, (0, 255)), "cartesianInvalidState": (0, 2)}
+            ranges |= {"orthoflow:plane": (-32_768, 32_767), "intensity": (0.0, 1.0)}
+            for name, ends in ranges.items():
+                assert (fields[name].minimum(), fields[name].maximum()) == ends
+            assert fields["cartesianInvalidState"].value() == 0
             # Metres from the scanner have every digit, normals and distances those of float32.
             assert fields["cartesianX"].precision() == pye57.libe57.E57_DOUBLE
             for name in ("nor:normalZ", "orthoflow:deviation", "intensity"):
                 assert fields[name].precision() == pye57.libe57.E57_SINGLE
-            intensity = fields["intensity"]
-            assert (intensity.minimum(), intensity.maximum()) == (0.0, 1.0)
+
+
+def limits_of(node: Any, *names: str) -> list[tuple[float, float]]:
+    ends = ("Minimum", "Maximum")
+    return [tuple(node[name + end].value() for end in ends) for name in names]  # type: ignore[misc]
 
 
 def test_colours_show_what_was_asked_for(tmp_path: Path) -> None:
@@ -348,50 +344,6 @@ def test_cleaning_takes_the_outliers_and_nothing_else(tmp_path: Path, seed: int)
     np.testing.assert_allclose(
         read_laz(tmp_path / "b.laz").world, cloud.points_world(), atol=0.51e-4
     )
-
-
-def test_a_photo_colours_only_what_it_sees() -> None:
-    """A board before the wall hides its middle: those points stay grey and have no photo."""
-    a, b = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-1.0, 1.0, 161)] * 2))
-    wall = np.column_stack([a, b, np.full(len(a), 4.0)])
-    board = np.column_stack([0.25 * a, 0.25 * b, np.full(len(a), 2.0)])
-    x, y, z = (np.ascontiguousarray(v) for v in np.vstack([wall, board]).T.astype(np.float32))
-    cloud = PointCloud(origin=np.zeros(3), x=x, y=y, z=z, up=np.array([0.0, -1.0, 0.0]))
-    inner = Intrinsics(width=400, height=400, fx=600.0, fy=600.0, cx=200.0, cy=200.0)
-    picture = np.zeros((400, 400, 3), np.uint8)
-    picture[:, :200], picture[:, 200:] = (200, 40, 40), (40, 40, 200)
-    photo = Photo(name="a.png", encoded=encode_png(picture), width=400, height=400)
-    n_points = len(cloud)
-    colours = PointColours(
-        rgb=np.full((n_points, 3), 128, np.uint8),
-        best=np.zeros(n_points, np.float32),
-        photo=np.full(n_points, -1, np.int16),
-    )
-    colour_points(cloud, [(photo, inner.posed())], colours)
-    assert colours.photo is not None
-    n_wall = len(wall)
-    # The board, 0.25 m at 2 m, hides 0.5 m at 4 m.
-    hidden = np.maximum(np.abs(a), np.abs(b)) < 0.47
-    shown = np.maximum(np.abs(a), np.abs(b)) > 0.53
-    assert (colours.photo[:n_wall][hidden] == -1).all()
-    assert (colours.rgb[:n_wall][hidden] == 128).all()
-    assert (colours.photo[:n_wall][shown] == 0).all()
-    left = shown & (a < -0.02)
-    assert (colours.rgb[:n_wall][left] == (200, 40, 40)).all()
-    assert (colours.photo[n_wall:] == 0).all()
-
-
-@pytest.mark.usefixtures("_open3d")
-def test_open3d_reads_a_ply_with_colours_and_normals(tmp_path: Path) -> None:
-    from orthoflow_plugins.plane.comparators import load_open3d
-
-    write_ply(tmp_path / "cloud.ply", with_attributes())
-    open3d = load_open3d("this test")
-    found = open3d.io.read_point_cloud(str(tmp_path / "cloud.ply"))
-    other = read_ply(tmp_path / "cloud.ply")
-    np.testing.assert_array_equal(np.asarray(found.points), other.world)
-    np.testing.assert_array_equal(np.rint(255.0 * np.asarray(found.colors)), other.rgb)
-    np.testing.assert_allclose(np.asarray(found.normals), other.normal, atol=1e-6)
 
 
 # The header of LAZ, and the scale of its coordinates

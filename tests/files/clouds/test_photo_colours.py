@@ -71,3 +71,24 @@ def test_a_point_gets_the_colour_of_the_photo_that_shows_it_largest(keeps_photo:
     np.testing.assert_array_equal(colours.rgb, np.repeat(expected[:, None], 3, axis=1))
     if colours.photo is not None:
         np.testing.assert_array_equal(colours.photo, np.where(nobody, -1, best))
+
+
+def test_a_point_behind_a_board_is_not_coloured() -> None:
+    a, b = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-1.0, 1.0, 161)] * 2))
+    wall = np.column_stack([2.0 * a, np.full(len(a), 4.0), b])
+    board = np.column_stack([0.25 * a, np.full(len(a), 2.0), 0.25 * b])
+    grey = encode_png(np.full((HEIGHT, WIDTH, 3), 40, np.uint8))
+    photo = Photo(name="a.png", width=WIDTH, height=HEIGHT, encoded=grey)
+    colours = PointColours(
+        rgb=np.full((2 * len(a), 3), 99, np.uint8),
+        best=np.zeros(2 * len(a), np.float32),
+        photo=np.full(2 * len(a), -1, np.int16),
+    )
+    colour_points(cloud(np.vstack([wall, board])), [(photo, camera(focal=150.0))], colours)
+    assert colours.photo is not None
+    # The board, 0.25 m at 2 m, hides 0.5 m at 4 m.
+    off = np.maximum(np.abs(2.0 * a), np.abs(b))
+    assert (colours.photo[: len(a)][off < 0.45] == -1).all()
+    assert (colours.photo[: len(a)][(off > 0.55) & (np.abs(a) < 0.6)] == 0).all()
+    assert (colours.rgb[: len(a)][off < 0.45] == 99).all()
+    assert (colours.photo[len(a) :] == 0).all()

@@ -129,21 +129,6 @@ def test_what_comes_in_blocks_is_what_there_is(
     assert found.counts[1].first_far_m == pytest.approx(tuple(points[47]))
 
 
-def test_one_scan_needs_no_numbers_and_missing_fields_are_missing(tmp_path: Path) -> None:
-    found = assembled(tmp_path, file("a", block(1, 6)), fields_only())
-    # Colours have a mask of those that there are; of rows and columns there are all or none.
-    assert found.array("has_rgb").tolist() == [True] * 6 + [False] * 6  # type: ignore[union-attr]
-    assert [count.n_without_rgb for count in found.counts] == [0, 6]
-    for name in ("row", "column"):
-        assert found.array(name) is None
-    single = assembled(tmp_path / "other", file("a", block(1, 6)))
-    assert single.array("scan") is None
-
-
-def fields_only() -> ScanFile:
-    return file("b", block(2, 6, rgb=None), fields=("intensity",))
-
-
 def test_a_file_without_a_point_that_can_be_used_is_refused_with_its_counts(tmp_path: Path) -> None:
     lost = block(
         1, 4, points=np.full((4, 3), np.nan), n_read=9, left_out={"invalid": 3, "withheld": 2}
@@ -154,25 +139,6 @@ def test_a_file_without_a_point_that_can_be_used_is_refused_with_its_counts(tmp_
         "a holds no usable points: of 9, left out are 3 invalid, 2 withheld, 4 not finite; export "
         "it again"
     )
-    # Points of other classes, or outside, are no damage.
-    for more in ({"left_out": {"other_class": 5}}, {}):
-        away = block(1, 4, **more)
-        box_m = np.array([HERE + 50.0, HERE + 60.0])
-        growing = assembled(tmp_path / f"{len(more)}", file("a", away), box_m=box_m)
-        assert growing.n_points == 0
-        with pytest.raises(InputError, match="no point is left") as caught:
-            growing.require_points()
-        low, high = (
-            ", ".join(f"{value:.2f}" for value in corner)
-            for corner in (away.points.min(axis=0), away.points.max(axis=0))
-        )
-        assert str(caught.value) == (
-            f"no point is left: {5 * len(more)} are of other classes than those asked for, 4 lie "
-            f"outside the box: the points reach from ({low}) to ({high}); change classes or box "
-            "(read.scan)"
-        )
-    kept = assembled(tmp_path / "kept", file("a", block(1, 1)))
-    kept.require_points()
 
 
 def test_more_points_than_a_header_states_are_refused(tmp_path: Path) -> None:

@@ -20,11 +20,10 @@ SIZE = (64, 48)
 INSIDE = np.s_[10:20, 30:50]
 
 
-def picture(*, masked: bool = True, size: tuple[int, int] = SIZE) -> bytes:
-    """White, with a black rectangle if wanted."""
-    grey = np.full(size[::-1], 255, dtype=np.uint8)
-    if masked:
-        grey[INSIDE] = 0
+def picture() -> bytes:
+    """White, with a black rectangle."""
+    grey = np.full(SIZE[::-1], 255, dtype=np.uint8)
+    grey[INSIDE] = 0
     return encode_png(grey)
 
 
@@ -82,6 +81,19 @@ def test_a_mask_beside_its_photo_is_no_photo(tmp_path: Path) -> None:
     assert [item.name for item in alone] == ["white_mask.png"]
 
 
+def test_masks_of_no_photo_and_files_that_are_none_are_named(tmp_path: Path) -> None:
+    masks = [
+        file_in(tmp_path / "masks", "c.png", picture()),
+        file_in(tmp_path / "masks", "a.png", picture()),
+        file_in(tmp_path / "masks", "notes.txt", "drawn on Friday"),
+        file_in(tmp_path, "none.geojson", polygons("x*.jpg", RING)),
+    ]
+    (photo,), said = read(tmp_path, [photo_in(tmp_path)], masks)
+    np.testing.assert_array_equal(masked(photo), expected())
+    assert "masks of no photo: c.png, x*.jpg: photos are identified by their names" in said
+    assert "neither picture (PNG, JPEG, TIFF) nor polygons (GeoJSON): notes.txt" in said
+
+
 def test_polygons_mask_photos_by_name_or_pattern(tmp_path: Path) -> None:
     files = [photo_in(tmp_path, "a.jpg"), photo_in(tmp_path, "b.jpg")]
     one = file_in(tmp_path, "one.geojson", polygons("a.jpg", RING))
@@ -97,42 +109,17 @@ def test_polygons_mask_photos_by_name_or_pattern(tmp_path: Path) -> None:
     np.testing.assert_array_equal(masked(second), holed)
 
 
-def test_masks_of_no_photo_are_told(tmp_path: Path) -> None:
-    masks = [
-        file_in(tmp_path / "masks", "c.png", picture()),
-        file_in(tmp_path, "none.geojson", polygons("x*.jpg", RING)),
-    ]
-    (photo,), said = read(tmp_path, [photo_in(tmp_path)], masks)
-    assert photo.mask is None
-    assert "masks of no photo: c.png, x*.jpg: photos are identified by their names" in said
-
-
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
-        (
-            "a.png",
-            picture(size=(48, 64), masked=False),
-            r"a.png has 48 x 64 pixels, but a.jpg 64 x",
-        ),
-        (
-            "a.png",
-            encode_png(np.zeros(SIZE[::-1], np.uint8)),
-            "the mask of a.jpg excludes all of it",
-        ),
+        ("a.png", encode_png(np.full(SIZE, 255, np.uint8)), "a.png has 48 x 64 pixels, but a.jpg"),
+        ("a.png", encode_png(np.zeros(SIZE[::-1], np.uint8)), "the mask of a.jpg excludes all"),
         ("a.png", b"no picture", "mask a.png"),
         ("a.txt", "words", r"no file of the masks is a picture .* only a\.txt"),
         ("a.json", "{", "a.json is not a mask of photos: expected a GeoJSON FeatureCollection"),
         ("a.json", '{"features": 3}', "a.json is not a mask of photos"),
-        ("a.json", '{"features": [3]}', r"\(feature 0\)"),
-        (
-            "a.json",
-            polygons("a.jpg", RING).replace("50.0", "1e999"),
-            r"a\.json is not a mask of photos",
-        ),
-        ("a.json", polygons("a.jpg", RING).replace("Polygon", "Point"), r"\(feature 0\)"),
+        ("a.json", polygons("a.jpg", RING).replace("50.0", "1e999"), "a.json is not a mask of"),
         ("a.json", polygons("a.jpg", RING).replace("50.0", "1" + 400 * "0"), r"\(feature 0\)"),
-        ("a.json", polygons("a.jpg", RING).replace("50.0", "1e300"), r"\(feature 0\)"),
         ("a.json", " " * (MOST_BYTES + 1), f"more than {MOST_BYTES} bytes"),
     ],
 )
@@ -142,15 +129,3 @@ def test_what_is_no_mask_is_refused(
     mask = file_in(tmp_path / "masks", name, content)
     with pytest.raises(InputError, match=said):
         read(tmp_path, [photo_in(tmp_path)], [mask])
-
-
-def test_a_file_among_masks_that_is_none_is_left_out_and_named(tmp_path: Path) -> None:
-    masks = [
-        file_in(tmp_path / "masks", name, content)
-        for name, content in (("a.png", picture()), ("notes.txt", "drawn on Friday"))
-    ]
-    (photo,), said = read(tmp_path, [photo_in(tmp_path)], masks)
-    np.testing.assert_array_equal(masked(photo), expected())
-    assert (
-        "left out of the masks, neither picture (PNG, JPEG, TIFF) nor polygons (GeoJSON): notes.txt"
-    ) in said

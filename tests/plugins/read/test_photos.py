@@ -78,24 +78,6 @@ def test_photos_come_by_name_with_their_bytes_untouched(tmp_path: Path, read: Ph
     }
 
 
-def test_a_focal_length_that_cannot_be_is_told_even_where_another_is_used(
-    tmp_path: Path, read: PhotoReader
-) -> None:
-    pitch: dict[int, made.Value] = {
-        made.FOCAL: (50, 1), made.RESOLUTION_X: (10, 1), made.RESOLUTION_UNIT: 4,
-    }  # fmt: skip
-    files = {
-        "a.jpg": made.jpeg(made.picture(), made.exif_block({}, {made.FOCAL_35MM: 65535})),
-        "b.jpg": made.jpeg(made.picture(), made.exif_block({}, pitch | {made.FOCAL_35MM: 1})),
-    }
-    first, second = read(*made.write(tmp_path, files))
-    assert first.exif_focal_px is None
-    assert second.exif_focal_px == pytest.approx(500.0)
-    message = "EXIF states a 35 mm equivalent of {} mm, which no lens has (4 to 3000 mm)"
-    assert f"photo a.jpg: {message.format(65535)}: it is not used" in read.warnings
-    assert f"photo b.jpg: {message.format(1)}: it is not used" in read.warnings
-
-
 def test_a_panorama_becomes_six_photos_with_exact_lenses(tmp_path: Path, read: PhotoReader) -> None:
     files = {"360_a.jpg": encode_jpeg(made.picture(128, 64)), "b.jpg": encode_jpeg(made.picture())}
     photos = read(*made.write(tmp_path, files), panoramas=("360_*",))

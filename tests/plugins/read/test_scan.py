@@ -164,7 +164,7 @@ def test_stray_points_do_not_cost_the_scan_its_precision(
     assert "coordinates are kept to 62.50 mm only" in read.warnings
 
 
-@pytest.mark.parametrize("up", ["z", "x", "-x", "y", "-y", "-z"])
+@pytest.mark.parametrize("up", ["x", "-y"])
 def test_up_is_told_and_nothing_is_turned(
     tmp_path: Path, read: ScanReader, points: NDArray[np.float64], up: str
 ) -> None:
@@ -189,22 +189,17 @@ def test_finite_points_beyond_any_survey_are_named(
     ) in read.warnings
 
 
-def test_rounded_coordinates_are_warned_of_and_others_are_not(
+def test_rounded_coordinates_and_a_scan_of_less_than_a_metre_are_warned_of(
     tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
 ) -> None:
-    read(write_text(tmp_path / "a.xyz", points))
+    path = write_text(tmp_path / "a.xyz", points)
+    read(path)
     assert "rounded" not in read.warnings
+    assert "is that right?" not in read.warnings
+    read(path, unit="mm")
+    assert "m (unit mm): is that right?: set {step}.unit=m if" in read.warnings
     read(write_text(tmp_path / "b.xyz", np.round(points, 2)))
     assert "the coordinates of b.xyz are rounded to 10 mm" in read.warnings
-
-
-def test_a_scan_of_less_than_a_metre_asks_for_its_unit(
-    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
-) -> None:
-    read(write_text(tmp_path / "a.xyz", points))
-    assert "is that right?" not in read.warnings
-    read(write_text(tmp_path / "b.xyz", points), unit="mm")
-    assert "m (unit mm): is that right?: set {step}.unit=m if" in read.warnings
 
 
 # Several files and scans
@@ -329,15 +324,6 @@ def test_grey_colours_made_from_the_intensity_leave_it_a_laser_intensity(
 # Colours
 
 
-@pytest.mark.parametrize("factor", [1, 256, 257], ids=["low-byte", "times-256", "times-257"])
-def test_eight_bit_colours_in_las_come_back_however_they_were_stored(
-    tmp_path: Path, read: ScanReader, points: NDArray[np.float64], factor: int
-) -> None:
-    rgb = np.random.default_rng(0).integers(0, 256, (400, 3))
-    cloud = read(scan_files.write_las(tmp_path / "a.laz", points, rgb=rgb * factor))
-    np.testing.assert_array_equal(cloud.rgb, rgb)
-
-
 # The method as a whole
 
 
@@ -367,83 +353,39 @@ def test_too_little_scratch_space_is_said_before_anything_is_written(
 
 
 @pytest.mark.parametrize(
-    ("name", "params", "n_points", "bounds", "fields"),
+    ("name", "up", "n_points", "bounds", "fields"),
     [
-        (
-            "heritage-hall-west-wall/west_wall.laz",
-            {},
-            3_022_234,
-            ([-3.459, -13.567, -1.101], [-1.500, 11.275, 3.894]),
-            {"rgb"},
-        ),
-        (
-            "fountain-p11/cloud_from_photos.laz",
-            {"up": "-z"},
-            1_505_670,
-            ([-23.064, -16.171, -5.829], [-10.970, -7.678, 1.821]),
-            {"rgb"},
-        ),
-        (
-            "pump-e57/pumpAVisualReferenceImage.e57",
-            {},
-            155_201,
-            ([-2.904, -5.301, -1.900], [1.722, -0.793, 1.843]),
-            {"rgb", "intensity", "row", "column", "stations"},
-        ),
-        (
-            "lion-takanawa/lion_takanawa_1mm.laz",
-            {},
-            341_989,
-            ([-4.985, 1.039, -3.445], [-0.789, 6.724, 1.124]),
-            {"rgb"},
-        ),
-        (
-            "lion-takanawa/lion_takanawa.copc.laz",
-            {},
-            341_989,
-            ([-4.99, 1.04, -3.45], [-0.79, 6.72, 1.12]),
-            {"rgb"},
-        ),
-        (
-            "indoor-laz/indoor.laz",
-            {"up": "y"},
-            808_042,
-            ([-22.99, -1.97, -7.90], [5.63, 7.55, 12.36]),
-            set(),
-        ),
-        (
-            "ceiling-808/808_db.ply",
-            {},
-            47_043,
-            ([-2.289, -3.123, 1.431], [6.019, 7.651, 4.588]),
-            {"rgb"},
-        ),
-        (
-            "ceiling-808/808-60.ply",
-            {"up": "y"},
-            211_368,
-            ([8.090, 2.468, -4.472], [15.891, 5.822, 3.962]),
-            {"rgb"},
-        ),
-        (
-            "tls-targets-sp1/T1.1.txt",
-            {},
-            12_174,
-            ([-0.141, 5.283, -0.030], [0.001, 5.821, 0.115]),
-            {"rgb", "intensity"},
-        ),
+        ("heritage-hall-west-wall/west_wall.laz", "z", 3_022_234,
+         ([-3.459, -13.567, -1.101], [-1.500, 11.275, 3.894]), {"rgb"}),
+        ("fountain-p11/cloud_from_photos.laz", "-z", 1_505_670,
+         ([-23.064, -16.171, -5.829], [-10.970, -7.678, 1.821]), {"rgb"}),
+        ("pump-e57/pumpAVisualReferenceImage.e57", "z", 155_201,
+         ([-2.904, -5.301, -1.900], [1.722, -0.793, 1.843]),
+         {"rgb", "intensity", "row", "column", "stations"}),
+        ("lion-takanawa/lion_takanawa_1mm.laz", "z", 341_989,
+         ([-4.985, 1.039, -3.445], [-0.789, 6.724, 1.124]), {"rgb"}),
+        ("lion-takanawa/lion_takanawa.copc.laz", "z", 341_989,
+         ([-4.99, 1.04, -3.45], [-0.79, 6.72, 1.12]), {"rgb"}),
+        ("indoor-laz/indoor.laz", "y", 808_042,
+         ([-22.99, -1.97, -7.90], [5.63, 7.55, 12.36]), set()),
+        ("ceiling-808/808_db.ply", "z", 47_043,
+         ([-2.289, -3.123, 1.431], [6.019, 7.651, 4.588]), {"rgb"}),
+        ("ceiling-808/808-60.ply", "y", 211_368,
+         ([8.090, 2.468, -4.472], [15.891, 5.822, 3.962]), {"rgb"}),
+        ("tls-targets-sp1/T1.1.txt", "z", 12_174,
+         ([-0.141, 5.283, -0.030], [0.001, 5.821, 0.115]), {"rgb", "intensity"}),
     ],
-)
+)  # fmt: skip
 def test_real_scans_come_out_whole(
     shared_data: Path,
     read: ScanReader,
     name: str,
-    params: dict[str, object],
+    up: str,
     n_points: int,
     bounds: tuple[list[float], list[float]],
     fields: set[str],
 ) -> None:
-    cloud = read(shared_data / name, **params)
+    cloud = read(shared_data / name, up=up)
     assert len(cloud) == n_points
     extremes = [(float(axis.min()), float(axis.max())) for axis in (cloud.x, cloud.y, cloud.z)]
     # The README's figures are rounded to a millimetre.
