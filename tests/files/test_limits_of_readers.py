@@ -34,7 +34,7 @@ CHUNK = (
     "<calibration><f>500</f></calibration></sensor></sensors>"
     f"<cameras>{CAMERA}</cameras></chunk></document>"
 )
-TWO = CHUNK.replace(CAMERA, 2 * CAMERA)
+THREE = CHUNK.replace(CAMERA, 3 * CAMERA)
 MASK = {
     "type": "FeatureCollection",
     "features": [
@@ -59,7 +59,8 @@ class Limit:
     read: Callable[[Path], object]
 
     def __str__(self) -> str:
-        return f"{getattr(self.module, '__name__', '').rpartition('.')[2]}-{self.constant}"
+        module = getattr(self.module, "__name__", "").rpartition(".")[2]
+        return f"{module}-{self.constant}-{self.size}"
 
 
 def limit(
@@ -105,7 +106,7 @@ LIMITS = [
     limit(sidecars, "MOST_SIDECAR_BYTES", '{"gsd_m": 0.5}', None, sidecars.read_sidecar),
     limit(camera_formats, "MOST_CAMERAS", REALITYCAPTURE, 2, cameras_of(".csv")),
     limit(colmap, "MOST_CAMERAS", "", 2, colmap_of_two),
-    limit(camera_formats, "MOST_CAMERAS", TWO, 2, cameras_of(".xml")),
+    limit(camera_formats, "MOST_CAMERAS", THREE, 3, cameras_of(".xml")),
     limit(metashape, "MOST_TAGS", CHUNK, CHUNK.count("<"), metashape.read_metashape_xml),
     limit(metashape, "MOST_PIXELS", CHUNK, 640 * 480, metashape.read_metashape_xml),
     Limit(
