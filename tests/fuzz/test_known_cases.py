@@ -29,6 +29,7 @@ from tests.fuzz.harness import MAX_CPU_S, Target, target_named
 _CORPUS: Final = Path(__file__).parent / "corpus"
 _STEPS: Final = "orthoflow: 1\nsteps:\n  room: {use: simulate.room}\n"
 _RANSAC: Final = "{use: plane.ransac, in: {cloud: room.cloud}, repeat: "
+_REPEATED: Final = "v1: {use: plane.ransac, repeat: 9999}"
 _LENS: Final = "{width: 64, height: 48, fx: 60, fy: 60, cx: 31.5, cy: 23.5}"
 
 
@@ -105,7 +106,7 @@ KNOWN: Final = {
     "cells by the million": ("WORKFLOW", "w.yaml", _variants(12, 10),
         r"steps \d{13} times .* more than 20000"),
     "cells by repeats": ("WORKFLOW", "w.yaml",
-        _variants(2, 3).replace("hough2d}", "ransac, repeat: 9999}", 1),
+        _variants(2, 3).replace("v1: {use: plane.hough2d}", _REPEATED),
         "steps 20012 times"),
     "brackets": ("WORKFLOW", "w.yaml", "orthoflow: 1\nsteps: " + "[" * 50_000,
         "nested deeper than 60 levels"),
