@@ -147,12 +147,3 @@ def test_a_title_block_that_is_no_file_is_refused_at_once(run: Path, tmp_path: P
         done = export(run, "sheet", "--title-block", str(path))
         assert done.exit_code == 2
         assert f"{path.name} cannot be read: it is a folder, a pipe or a device" in done.output
-
-
-def test_a_wall_that_no_usual_scale_gets_onto_one_sheet_has_no_index(run: Path) -> None:
-    exchange_ortho(run, 4096, 4, gsd_m=20.0)
-    done = export(run, "sheet", "--paper", "200x200", "--scale", "40000")
-    assert done.exit_code == 0, done.output
-    names = {path.name for path in (run.parent / "sheet").iterdir()}
-    assert len(names) > 10
-    assert f"wall_{WALL}_index.pdf" not in names

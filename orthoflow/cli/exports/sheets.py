@@ -47,7 +47,7 @@ def write_drawings(
     alone: str = "{stem}_sheet_{number}",
     several: str = "{stem}_sheet_{number}",
 ) -> tuple[int, int, Sequence[Drawing]]:
-    """Choose scale and paper of drawings, and write their sheets and indexes into a new folder.
+    """Choose scale and paper of drawings, and write their sheets into a new folder.
 
     Args:
         folder: made once all is laid out.
@@ -65,16 +65,12 @@ def write_drawings(
     drawings = drawn(scale)
     laid = [lay_out(drawing, given) for drawing in drawings]
     make_empty(folder)
-    for one in laid:
-        stem = one.drawing.stem
-        for sheet, furniture in one.sheets:
-            pattern = alone if len(one.sheets) == 1 else several
-            name = pattern.format(stem=stem, number=sheet.number)
-            write_sheet(folder / f"{name}.pdf", one.drawing, sheet, furniture)
-        if one.index is not None:
-            drawing, sheet, furniture = one.index
-            write_sheet(folder / f"{stem}_index.pdf", drawing, sheet, furniture)
-    return scale, sum(len(one.sheets) for one in laid), drawings
+    for drawing, sheets in zip(drawings, laid, strict=True):
+        for sheet, furniture in sheets:
+            pattern = alone if len(sheets) == 1 else several
+            name = pattern.format(stem=drawing.stem, number=sheet.number)
+            write_sheet(folder / f"{name}.pdf", drawing, sheet, furniture)
+    return scale, sum(map(len, laid)), drawings
 
 
 def text_of(run: Run, name: str, chosen: Choices, notes: tuple[Phrase, ...] = ()) -> SheetText:
@@ -112,7 +108,7 @@ def grid_of(chosen: Choices, scale: int) -> float:
 
 
 def export_sheets(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write `wall_<k>_sheet_<n>.pdf`, and `wall_<k>_index.pdf` where a wall takes several."""
+    """Write `wall_<k>_sheet_<n>.pdf`."""
     text = text_of(run, "", chosen)
     results = room_results(run, chosen.cell, chosen.wall)
     walls = chosen_walls(results, chosen)

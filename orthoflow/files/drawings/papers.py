@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Final, Literal
 
 from orthoflow.errors import ArgumentError
@@ -38,9 +39,8 @@ _EDGE_MM: Final = (150.0, 5000.0)
 MARGIN_MM: Final = 10.0
 # Around a picture: for its frame and the coordinates and heights beside it.
 LEFT_MM: Final = 11.0
-RIGHT_MM: Final = 24.0
-ABOVE_MM: Final = 11.0
 BELOW_MM: Final = 11.0
+_AROUND_MM: Final = (LEFT_MM + 24.0, BELOW_MM + 11.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,58 +141,44 @@ def paper_of(text: str) -> Paper:
 
 
 def usual_papers() -> list[Paper]:
-    """Return usual papers, smallest first, landscape before portrait."""
-    names = sorted(SIZES_MM | LONG_MM, key=lambda name: math.prod((SIZES_MM | LONG_MM)[name]))
-    return [way for name in names for way in (paper_of(name), paper_of(name).turned)]
+    """Return usual papers, smallest first."""
+    papers = SIZES_MM | LONG_MM
+    return [paper_of(name) for name in sorted(papers, key=lambda name: math.prod(papers[name]))]
 
 
-def together(
-    kinds: Sequence[str], size_m: tuple[float, float], paper: Paper, scale: int
-) -> tuple[View, ...]:
-    """Place the pictures of a wall beside or below each other on one sheet; none if too large.
+def placed(kinds: Sequence[str], part: Part, paper: Paper, scale: int) -> tuple[View, ...]:
+    """Place pictures of a part of a wall beside or below each other; none if they are too large.
 
     Args:
         kinds: the pictures.
-        size_m: width and height of the drawn wall.
+        part: the part.
         paper: paper of the sheet.
         scale: n of 1 : n.
     """
-    whole = whole_of(size_m)
-    wide, high = _with_labels(size_m, scale)
-    count, (across, up) = len(kinds), paper.area_mm
-    for columns, rows in ((count, 1), (1, count)):
+    wide, high = (
+        1e3 * edge / scale + around for edge, around in zip(part.size_m, _AROUND_MM, strict=True)
+    )
+    across, up = paper.area_mm
+    for columns, rows in ((len(kinds), 1), (1, len(kinds))):
         # A tolerance of a micrometre: 12.0 m at 1:50 are 240.00000000000003 mm.
         if columns * wide > across + 1e-3 or rows * high > up + 1e-3:
             continue
-        left, bottom = paper.corner_mm
-        left += 0.5 * (across - columns * wide) + LEFT_MM
-        top = bottom + up - 0.5 * (up - rows * high) + BELOW_MM
+        left = paper.corner_mm[0] + 0.5 * (across - columns * wide) + LEFT_MM
+        bottom = paper.corner_mm[1] + 0.5 * (up + rows * high) - high + BELOW_MM
+        right_mm, down_mm = (wide, 0.0) if rows == 1 else (0.0, high)
         return tuple(
-            View(
-                kind=kind,
-                part=whole,
-                corner_mm=(
-                    left + (place * wide if rows == 1 else 0.0),
-                    top - high * (1 + (place if rows > 1 else 0)),
-                ),
-            )
-            for place, kind in enumerate(kinds)
+            View(kind=kind, part=part, corner_mm=(left + k * right_mm, bottom - k * down_mm))
+            for k, kind in enumerate(kinds)
         )
     return ()
 
 
 def cut_up(
-    kinds: Sequence[str],
-    size_m: tuple[float, float],
-    paper: Paper,
-    *,
-    scale: int,
-    grid_m: float,
-) -> tuple[tuple[View, ...], ...]:
-    """Distribute each picture of a wall evenly over as many sheets as it needs.
+    size_m: tuple[float, float], paper: Paper, *, scale: int, grid_m: float
+) -> tuple[Part, ...]:
+    """Distribute a wall evenly over as many sheets as it needs.
 
     Args:
-        kinds: the pictures.
         size_m: width and height of the drawn wall.
         paper: paper of the sheets.
         scale: n of 1 : n.
@@ -201,10 +187,9 @@ def cut_up(
     Raises:
         ArgumentError: it needs more than `MOST_SHEETS`.
     """
-    around = (LEFT_MM + RIGHT_MM, ABOVE_MM + BELOW_MM)
     limits = [
-        1e-3 * scale * max(1.0, limit - labels)
-        for limit, labels in zip(paper.area_mm, around, strict=True)
+        1e-3 * scale * max(1.0, limit - around)
+        for limit, around in zip(paper.area_mm, _AROUND_MM, strict=True)
     ]
     counts = [
         max(1, math.ceil(size / limit - 1e-6)) for size, limit in zip(size_m, limits, strict=True)
@@ -214,16 +199,15 @@ def cut_up(
             f"a wall of {size_m[0]:.2f} x {size_m[1]:.2f} m takes {math.prod(counts):,} sheets at "
             f"1:{scale}, at most {MOST_SHEETS} are drawn: take a larger --paper or --scale"
         )
-    cuts = [
+    across, down = (
         _even_cuts(size, limit, count, grid_m)
         for size, limit, count in zip(size_m, limits, counts, strict=True)
-    ]
-    parts = [
+    )
+    return tuple(
         Part(left_m=left, top_m=top, right_m=right, bottom_m=bottom)
-        for top, bottom in zip(cuts[1], cuts[1][1:], strict=False)
-        for left, right in zip(cuts[0], cuts[0][1:], strict=False)
-    ]
-    return tuple((_alone(kind, part, paper, scale),) for kind in kinds for part in parts)
+        for top, bottom in pairwise(down)
+        for left, right in pairwise(across)
+    )
 
 
 def _even_cuts(size_m: float, limit_m: float, count: int, grid_m: float) -> list[float]:
@@ -232,26 +216,6 @@ def _even_cuts(size_m: float, limit_m: float, count: int, grid_m: float) -> list
     if grid_m > 0.0 and math.ceil(step_m / grid_m - 1e-9) * grid_m <= limit_m + 1e-9:
         step_m = math.ceil(step_m / grid_m - 1e-9) * grid_m
     return [*(place * step_m for place in range(count) if place * step_m < size_m), size_m]
-
-
-def _alone(kind: str, part: Part, paper: Paper, scale: int) -> View:
-    """Return one picture in the middle of its sheet."""
-    wide, high = _with_labels(part.size_m, scale)
-    left, bottom = paper.corner_mm
-    across, up = paper.area_mm
-    return View(
-        kind=kind,
-        part=part,
-        corner_mm=(
-            left + 0.5 * (across - wide) + LEFT_MM,
-            bottom + 0.5 * (up - high) + BELOW_MM,
-        ),
-    )
-
-
-def _with_labels(size_m: tuple[float, float], scale: int) -> tuple[float, float]:
-    wide, high = (1e3 * edge / scale for edge in size_m)
-    return wide + LEFT_MM + RIGHT_MM, high + ABOVE_MM + BELOW_MM
 
 
 def round_below(most: float) -> float:

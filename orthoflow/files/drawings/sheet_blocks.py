@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -17,7 +19,7 @@ from reportlab.lib.colors import Color
 from reportlab.platypus import Flowable, Image, Table
 
 from orthoflow.files.drawings.key_plans import NORTH, KeyPlan
-from orthoflow.files.drawings.papers import MARGIN_MM, Paper, round_below
+from orthoflow.files.drawings.papers import MARGIN_MM, SCALES_FT, Paper, round_below
 from orthoflow.files.drawings.pens import (
     BLACK,
     FRAME_MM,
@@ -53,6 +55,9 @@ _COLUMNS_MM: Final = (90.0, 110.0, 130.0, 150.0, 180.0)
 # ISO 7200: a title block is 180 mm wide at most.
 _TITLE_MM: Final = 180.0
 _STRIP_COLUMN_MM: Final = 85.0
+# Strips are this high at least, and grow by this step.
+_LOWEST_MM: Final = 40.0
+_STRIP_STEP_MM: Final = 2.5
 # Maximum share of the paper that is not for pictures.
 _MOST_SHARE: Final = 0.55
 _PLAN_MM: Final = (35.0, 90.0)
@@ -64,18 +69,10 @@ _SIGNATURE_MM: Final = 14.0
 _LOGO_MM: Final = 16.0
 # Wider title blocks have four columns instead of two.
 _FOUR_COLUMNS_MM: Final = 140.0
-# Scales of imperial rulers: inches on the paper per foot.
-_INCHES: Final = {
-    12: "1",
-    16: "3/4",
-    24: "1/2",
-    32: "3/8",
-    48: "1/4",
-    64: "3/16",
-    96: "1/8",
-    128: "3/32",
-    192: "1/16",
-}
+_PLAIN: Final = [
+    *((f"{side}PADDING", (0, 0), (-1, -1), 0) for side in ("LEFT", "RIGHT", "TOP", "BOTTOM")),
+    ("VALIGN", (0, 0), (-1, -1), "TOP"),
+]
 
 
 class _Picture(Flowable):  # type: ignore[misc] # reportlab has no types
@@ -128,58 +125,38 @@ def furnished(
 ) -> Furniture | None:
     """Pack the blocks beside the pictures; None if the paper is too small.
 
-    Text has at least 2.5 mm; the narrowest column, or the lowest strip, that fits is used. Without
-    key plans, `is_brief`, a smaller paper suffices.
+    Text has at least 2.5 mm; the narrowest column, or the lowest strip, that fits is used, or the
+    one that the paper has. Without key plans, `is_brief`, a smaller paper suffices.
     """
+    is_column = paper.layout == "column"
     wide, high = paper.width_mm - 2 * MARGIN_MM, paper.height_mm - 2 * MARGIN_MM
-    if paper.layout == "column":
-        for block_mm in _COLUMNS_MM:
-            if block_mm > _MOST_SHARE * wide:
-                break
-            inner = block_mm - 2 * _PADDING_MM
-            left = paper.width_mm - MARGIN_MM - block_mm + _PADDING_MM
-            title = _Stack(_title_flowables(drawing, sheet, inner), inner)
-            room = high - 2 * _PADDING_MM - title.high_mm - _GAP_MM
-            notes = _notes(drawing, sheet, is_brief=is_brief)
-            packed = _packed(notes, inner, [left], MARGIN_MM + high, room)
-            if packed is not None:
-                placed = (*packed, *title.placed(left, MARGIN_MM + _PADDING_MM + title.high_mm))
-                return Furniture(paper=replace(paper, block_mm=block_mm), placed=placed)
-        return None
-    title_mm = min(_TITLE_MM, 0.5 * wide)
-    n_columns = max(1, int((wide - title_mm) / _STRIP_COLUMN_MM))
-    column_mm = (wide - title_mm) / n_columns - 2 * _PADDING_MM
-    title = _Stack(_title_flowables(drawing, sheet, title_mm), title_mm)
-    lefts = [MARGIN_MM + _PADDING_MM + k * (column_mm + 2 * _PADDING_MM) for k in range(n_columns)]
-    block_mm = title.high_mm
-    while block_mm <= _MOST_SHARE * high:
-        packed = _packed(
-            _notes(drawing, sheet, is_brief=is_brief),
-            column_mm,
-            lefts,
-            MARGIN_MM + block_mm,
-            block_mm - 2 * _PADDING_MM,
-        )
-        if packed is not None:
-            left = paper.width_mm - MARGIN_MM - title_mm
-            placed = (*packed, *title.placed(left, MARGIN_MM + title.high_mm))
-            return Furniture(paper=replace(paper, block_mm=block_mm), placed=placed)
-        block_mm += 5.0
+    most_mm = _MOST_SHARE * (wide if is_column else high)
+    sizes = _COLUMNS_MM if is_column else np.arange(_LOWEST_MM, most_mm, _STRIP_STEP_MM).tolist()
+    for block_mm in [paper.block_mm] if paper.block_mm else sizes:
+        if block_mm > most_mm:
+            break
+        # A column has the title block at its foot, a strip at its right end.
+        title_mm = block_mm - 2 * _PADDING_MM if is_column else min(_TITLE_MM, 0.5 * wide)
+        title = _title_block(drawing, sheet, title_mm)
+        title_high = _high_mm(title, title_mm)
+        if is_column:
+            lefts, column_mm = [MARGIN_MM + wide - block_mm + _PADDING_MM], title_mm
+            corner, room = (lefts[0], MARGIN_MM + _PADDING_MM), high - title_high - _GAP_MM
+        else:
+            n_columns = max(1, int((wide - title_mm) / _STRIP_COLUMN_MM))
+            pitch_mm = (wide - title_mm) / n_columns
+            lefts = [MARGIN_MM + _PADDING_MM + k * pitch_mm for k in range(n_columns)]
+            column_mm = pitch_mm - 2 * _PADDING_MM
+            corner, room = (MARGIN_MM + wide - title_mm, MARGIN_MM), block_mm
+        top = MARGIN_MM + (high if is_column else block_mm)
+        notes = _notes(drawing, sheet, is_brief=is_brief)
+        packed = _packed(notes, column_mm, lefts, top, room - 2 * _PADDING_MM)
+        if packed is not None and (is_column or title_high <= block_mm):
+            return Furniture(
+                paper=replace(paper, block_mm=block_mm),
+                placed=(*packed, (title, (*corner, title_mm))),
+            )
     return None
-
-
-class _Stack:
-    """Return flowables stacked without gaps."""
-
-    def __init__(self, flowables: Sequence[Any], wide_mm: float) -> None:
-        self.flowables, self.wide_mm = flowables, wide_mm
-        self.heights = [_high_mm(flowable, wide_mm) for flowable in flowables]
-        self.high_mm = sum(self.heights)
-
-    def placed(self, left: float, top: float) -> Iterator[tuple[Any, tuple[float, float, float]]]:
-        for flowable, high in zip(self.flowables, self.heights, strict=True):
-            top -= high
-            yield flowable, (left, top, self.wide_mm)
 
 
 def _high_mm(flowable: Any, wide_mm: float) -> float:
@@ -201,13 +178,13 @@ def _packed(
     column, used = 0, 0.0
     for place, flowable in enumerate(flowables):
         is_plan = isinstance(flowable, _Plan)
-        high = flowable.least_mm if is_plan else _high_mm(flowable, wide_mm)
+        high = _PLAN_MM[0] if is_plan else _high_mm(flowable, wide_mm)
         if used and used + high > high_mm:
             column, used = column + 1, 0.0
         if column == len(lefts) or used + high > high_mm + 1e-6:
             return None
         if is_plan:
-            later = sum(item.least_mm for item in flowables[place + 1 :])
+            later = _PLAN_MM[0] * len(flowables[place + 1 :])
             high = max(high, min(_PLAN_MM[1], high_mm - used - later))
             flowable.high_mm = high
         top = top_mm - _PADDING_MM - used
@@ -231,7 +208,7 @@ def _notes(drawing: Drawing, sheet: Sheet, *, is_brief: bool) -> list[Any]:
     found += _legend(drawing, sheet)
     if is_brief:
         return found
-    if sheet.numbered and sheet.number > 0:
+    if sheet.numbered:
         found.append(_Plan(*_sheet_key(drawing, sheet)))
     if drawing.plan is not None:
         found.append(_Plan(*_key_plan(drawing, drawing.plan)))
@@ -295,35 +272,21 @@ def _legend(drawing: Drawing, sheet: Sheet) -> Iterator[Any]:
         )
     for place, (draw, text) in enumerate(rows):
         # The heading is never separated from the first row.
-        yield _Row(draw, text, label("legend", language) if place == 0 else "")
+        heading = [[paragraph(label("legend", language), is_bold=True), ""]] if place == 0 else []
+        spans = [("SPAN", (0, 0), (-1, 0))] if heading else []
+        symbol = _Picture(4.3, partial(_draw_symbol, draw))
+        yield Table(
+            [*heading, [symbol, paragraph(text)]],
+            colWidths=[_SYMBOL_MM * POINTS_PER_MM, "*"],
+            style=[*_PLAIN, *spans],
+        )
 
 
-class _Row(Flowable):  # type: ignore[misc] # reportlab has no types
-    """A symbol of the legend with its text, below a heading if there is one."""
-
-    def __init__(self, symbol: Callable[[Canvas], None], text: str, heading: str) -> None:
-        super().__init__()
-        self.symbol, self.text = symbol, paragraph(text)
-        self.heading = paragraph(heading, is_bold=True)
-
-    def wrap(self, wide: float, high: float) -> tuple[float, float]:
-        """Return its size in points."""
-        _, text_high = self.text.wrap(wide - _SYMBOL_MM * POINTS_PER_MM, high)
-        self.height = max(text_high, 5.0 * POINTS_PER_MM)
-        _, heading_high = self.heading.wrap(wide, high)
-        return wide, self.height + heading_high
-
-    def draw(self) -> None:
-        """Draw it, the symbol beside the first row of the text."""
-        self.heading.drawOn(self.canv, 0.0, self.height)
-        self.text.drawOn(self.canv, _SYMBOL_MM * POINTS_PER_MM, self.height - self.text.height)
-        self.canv.saveState()
-        self.canv.translate(0.0, self.height - 4.3 * POINTS_PER_MM)
-        self.symbol(self.canv)
-        self.canv.restoreState()
+def _draw_symbol(draw: Callable[[Canvas], None], canvas: Canvas, _wide_mm: float) -> None:
+    draw(canvas)
 
 
-class _Plan(Flowable):  # type: ignore[misc] # reportlab has no types
+class _Plan(_Picture):
     """A heading, and lines (n, 2) in metres below it, as large as the space permits."""
 
     def __init__(
@@ -332,20 +295,12 @@ class _Plan(Flowable):  # type: ignore[misc] # reportlab has no types
         points: NDArray[np.float64],
         draw: Callable[[Canvas, Callable[[NDArray[np.float64]], NDArray[np.float64]], float], None],
     ) -> None:
-        super().__init__()
+        super().__init__(_PLAN_MM[0], self._draw_plan)
         self.heading, self.points, self.draw_lines = paragraph(heading), points, draw
-        self.least_mm = self.high_mm = _PLAN_MM[0]
 
-    def wrap(self, wide: float, _high: float) -> tuple[float, float]:
-        """Return its size in points."""
-        self.width = wide
-        return wide, self.high_mm * POINTS_PER_MM
-
-    def draw(self) -> None:
-        """Draw it."""
-        wide_mm = self.width / POINTS_PER_MM
+    def _draw_plan(self, canvas: Canvas, wide_mm: float) -> None:
         heading_mm = _high_mm(self.heading, wide_mm)
-        self.heading.drawOn(self.canv, 0.0, (self.high_mm - heading_mm) * POINTS_PER_MM)
+        self.heading.drawOn(canvas, 0.0, (self.high_mm - heading_mm) * POINTS_PER_MM)
         low = self.points.min(axis=0)
         size = np.maximum(self.points.max(axis=0) - low, 1e-6)
         # The arrow that points up is on the right.
@@ -353,7 +308,7 @@ class _Plan(Flowable):  # type: ignore[misc] # reportlab has no types
         mm_per_m = float((limits / size).min())
         corner = np.array([2.0, 0.5 * (limits[1] - mm_per_m * size[1]) + 2.0])
         self.draw_lines(
-            self.canv, lambda points: np.asarray(corner + mm_per_m * (points - low)), wide_mm
+            canvas, lambda points: np.asarray(corner + mm_per_m * (points - low)), wide_mm
         )
 
 
@@ -418,10 +373,10 @@ def _sheet_key(drawing: Drawing, sheet: Sheet) -> tuple[str, NDArray[np.float64]
 # --- the title block ---
 
 
-def _title_flowables(drawing: Drawing, sheet: Sheet, wide_mm: float) -> list[Any]:
-    block = drawing.text.block
-    found = [_revisions(drawing, wide_mm)] if block.revisions else []
-    return [*found, _title_table(drawing, sheet, wide_mm)]
+def _title_block(drawing: Drawing, sheet: Sheet, wide_mm: float) -> Any:
+    tables = [_revisions(drawing, wide_mm)] if drawing.text.block.revisions else []
+    tables.append(_title_table(drawing, sheet, wide_mm))
+    return Table([[table] for table in tables], colWidths=[wide_mm * POINTS_PER_MM], style=_PLAIN)
 
 
 def _revisions(drawing: Drawing, wide_mm: float) -> Any:
@@ -470,9 +425,7 @@ def _title_table(drawing: Drawing, sheet: Sheet, wide_mm: float) -> Any:
 def _named(drawing: Drawing, sheet: Sheet) -> Iterator[tuple[str, str]]:
     """The fields that have a name, those of the client in the middle."""
     language, block = drawing.language, drawing.text.block
-    number = label("index", language)
-    if sheet.number:
-        number = f"{label('sheet', language)} {sheet.number}"
+    number = f"{label('sheet', language)} {sheet.number}"
     last = block.revisions[-1].mark if block.revisions else ""
     drawn = f"{block.drawing}, {drawing.text.name}, {number}" if block.drawing else ""
     for key in ("client", "site"):
@@ -487,13 +440,14 @@ def _named(drawing: Drawing, sheet: Sheet) -> Iterator[tuple[str, str]]:
 
 def _scale_and_sheet(drawing: Drawing, sheet: Sheet) -> Iterator[tuple[list[Any], bool]]:
     language = drawing.language
-    inches = _INCHES.get(drawing.scale) if drawing.unit == "ft" else None
+    # Scales of imperial rulers: inches on the paper per foot.
+    is_ruler = drawing.unit == "ft" and 12 <= drawing.scale <= 192 and drawing.scale in SCALES_FT
+    inches = Fraction(12, drawing.scale) if is_ruler else None
     text = f"1:{drawing.scale}" + (f' ({inches}" = 1\'-0")' if inches else "")
     high_mm = TITLE_MM if inches is None else HEADING_MM
     large = paragraph(text, high_mm=high_mm, is_bold=True)
     yield [_small(label("scale", language)), large], False
-    of = "sheet_of" if sheet.number else "index_of"
-    said = label(of, language, number=sheet.number, count=sheet.count)
+    said = label("sheet_of", language, number=sheet.number, count=sheet.count)
     size = sheet.paper.name or f"{sheet.paper.width_mm:g} x {sheet.paper.height_mm:g} mm"
     yield [paragraph(said), paragraph(f"{label('paper', language)} {size}")], False
 
@@ -569,5 +523,4 @@ def _seal(drawing: Drawing, wide_mm: float) -> Any:
     ]
     left = side + 1.0 * POINTS_PER_MM
     cells = [[Drawing(side, side, code), rows]]
-    plain = [("LEFTPADDING", (0, 0), (-1, -1), 0), ("VALIGN", (0, 0), (-1, -1), "TOP")]
-    return Table(cells, colWidths=[left, (wide_mm - 2.4) * POINTS_PER_MM - left], style=plain)
+    return Table(cells, colWidths=[left, (wide_mm - 2.4) * POINTS_PER_MM - left], style=_PLAIN)

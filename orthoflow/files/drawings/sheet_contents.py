@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -167,17 +167,16 @@ class Sheet:
     Attributes:
         paper: its paper.
         views: pictures on it.
-        number: 1 for the first; 0 for the index.
-        count: number of sheets without the index.
-        numbered: for the index the part of each sheet; for one of several sheets the same, as a
-            key.
+        number: 1 for the first.
+        count: number of sheets.
+        numbered: of one of several sheets, the part on each of them.
     """
 
     paper: Paper
     views: tuple[View, ...]
     number: int = 1
     count: int = 1
-    numbered: tuple[tuple[int, Part], ...] = field(default=())
+    numbered: tuple[tuple[int, Part], ...] = ()
 
 
 def axes_of(frame: WallFrame) -> Axes:

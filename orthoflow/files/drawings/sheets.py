@@ -21,7 +21,6 @@ from orthoflow.files.drawings.pens import (
     FINE_MM,
     MATCH_DASHES_MM,
     MEDIUM_MM,
-    RED,
     TEXT_MM,
     WIDE_MM,
     arrow,
@@ -62,9 +61,7 @@ def write_sheet(path: Path, drawing: Drawing, sheet: Sheet, furniture: Furniture
                 scratch = Path(folder) / f"picture_{place}"
                 placed = Placed(canvas=canvas, view=view, scale=drawing.scale, scratch=scratch)
                 drawing.pictures[view.kind].draw(placed)
-                _draw_around(placed, drawing, _neighbours(sheet, view) if sheet.number else {})
-                if sheet.number == 0 and place == 0:
-                    _draw_cuts(placed, sheet)
+                _draw_around(placed, drawing, _neighbours(sheet, view))
             furniture.draw(canvas)
             canvas.showPage()
             canvas.save()
@@ -234,22 +231,3 @@ def _draw_match_lines(placed: Placed, drawing: Drawing, neighbours: dict[str, in
             line(canvas, ends, width_mm=WIDE_MM, dashes_mm=MATCH_DASHES_MM)
             text = label("match_line", drawing.language, number=neighbours[side])
             write_text(canvas, text, at, turned_deg=turned_deg, is_centred=True)
-
-
-def _draw_cuts(placed: Placed, sheet: Sheet) -> None:
-    """Draw the part of the drawing on each sheet into the index."""
-    for number, part in sheet.numbered:
-        corners = placed.on_paper(part.corners_m)
-        line(placed.canvas, corners, width_mm=MEDIUM_MM, colour=RED, is_closed=True)
-        (left, bottom), (right, top) = corners.min(axis=0), corners.max(axis=0)
-        high = max(TEXT_MM, min(10.0, 0.4 * (top - bottom), 0.3 * (right - left)))
-        middle = (0.5 * (left + right), 0.5 * (top + bottom) - 0.5 * high)
-        write_text(
-            placed.canvas,
-            str(number),
-            middle,
-            high_mm=high,
-            is_bold=True,
-            is_centred=True,
-            colour=RED,
-        )

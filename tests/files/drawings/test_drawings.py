@@ -139,32 +139,18 @@ def test_the_step_of_the_wall_is_a_contour(sheet: pdfplumber.page.Page) -> None:
     assert max(line["height"] for line in drawn) * MM > 0.95 * HIGH_M * 20
 
 
-def test_a_wall_that_does_not_fit_takes_several_sheets_and_an_index(
-    run: Path, tmp_path: Path
-) -> None:
+def test_a_wall_that_does_not_fit_takes_several_sheets(run: Path, tmp_path: Path) -> None:
     done = export(run, "sheet", tmp_path / "out", "--scale", 10, "--paper", "A4")
     assert done.exit_code == 0, done.output
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
-    count = len(names) - 1
-    sheets = [f"wall_{WALL}_sheet_{number}.pdf" for number in range(1, count + 1)]
-    assert names == sorted([*sheets, f"wall_{WALL}_index.pdf"])
+    assert names == [f"wall_{WALL}_sheet_{number}.pdf" for number in range(1, len(names) + 1)]
     areas = 0.0
-    for name in sheets:
+    for name in names:
         with pdfplumber.open(tmp_path / "out" / name) as pdf:
             (picture,) = pdf.pages[0].images
             areas += picture["width"] * picture["height"] * MM * MM
-            assert f"of {count}" in pdf.pages[0].extract_text()
+            assert f"of {len(names)}" in pdf.pages[0].extract_text()
     assert areas == pytest.approx(WIDE_M * HIGH_M * 1e4, rel=1e-5)
-    with pdfplumber.open(tmp_path / "out" / f"wall_{WALL}_index.pdf") as pdf:
-        assert f"index of {count} sheets" in pdf.pages[0].extract_text()
-        assert "1:25" in pdf.pages[0].extract_text()
-        # Each sheet's part is framed, all round.
-        red = [
-            box
-            for box in pdf.pages[0].rects
-            if box["stroke"] and box["stroking_color"] == (0.8, 0.0, 0.0)
-        ]
-        assert len(red) == count
 
 
 @pytest.mark.parametrize("has_ties", [True, False])

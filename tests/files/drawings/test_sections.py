@@ -140,7 +140,7 @@ def test_a_sheet_of_it_has_title_block_coordinates_and_lines_in_scale(
     drawn = section_sheet("x", drawing, planes, text, grid=1.0, crs=crs)
     # The arrow of the sheet and that of its key plan have the same label.
     assert drawn.plan is None or drawn.plan.up_label == drawn.up_label
-    ((sheet, furniture),) = lay_out(drawn).sheets
+    ((sheet, furniture),) = lay_out(drawn)
     write_sheet(tmp_path / "x.pdf", drawn, sheet, furniture)
     with pdfplumber.open(tmp_path / "x.pdf") as pdf:
         (page,) = pdf.pages
@@ -179,7 +179,7 @@ def test_a_hatch_too_small_for_a_line_of_its_pattern_is_left_out(tmp_path: Path)
     drawing = SectionDrawing(kind="plan", section=section, scale=100, origin="a box")
     text = SheetText(name="", block=TitleBlock(), notes=(), digest="0" * 64, run="run")
     drawn = section_sheet("x", drawing, planes, text, grid=0.0)
-    ((sheet, furniture),) = lay_out(drawn).sheets
+    ((sheet, furniture),) = lay_out(drawn)
     write_sheet(tmp_path / "x.pdf", drawn, sheet, furniture)
     with pdfplumber.open(tmp_path / "x.pdf") as pdf:
         widths_mm = [line["linewidth"] / POINTS_PER_MM for line in pdf.pages[0].lines]
