@@ -15,6 +15,7 @@ from orthoflow.files.drawings.papers import Part, nice_step
 from orthoflow.files.geotiff import RasterParts
 from orthoflow.files.images import encode_png
 from orthoflow.geometry.levels import Colours, eight_bits
+from orthoflow.geometry.robust import median_deviation
 
 PRINT_DPI: Final = 400.0
 _MM_PER_INCH: Final = 25.4
@@ -26,6 +27,14 @@ _JPEG_QUALITY: Final = 95
 _CONTOUR_PITCH_MM: Final = 0.5
 _SHORTEST_CONTOUR_MM: Final = 6.0
 _OVERVIEW_PX: Final = 1000
+# Contours lie so many standard deviations of the noise apart, at least.
+_CLEAR_OF_NOISE: Final = 4.0
+# Values of one surface differ by so many; they are averaged over a Gaussian of so many cells.
+_SAME_SURFACE: Final = 5.0
+_CALM_CELLS: Final = 4.0
+# The side of a square of cells that may be level, and the share of an interval that it rises then.
+_LEVEL_CELLS: Final = 5
+_LEVEL_SHARE: Final = 0.02
 # A contour must be this many times as long as its number is wide, or it has none.
 _LEAST_WIDTHS: Final = 5.0
 _APART_MM: Final = 12.0
@@ -37,15 +46,19 @@ _STRAIGHT: Final = 0.9
 
 @dataclass(frozen=True, kw_only=True)
 class Stretch:
-    """Values for black and white, and the interval of contours between them."""
+    """Values for black and white, the noise of values, and the interval of contours."""
 
     low: float
     high: float
+    noise: float = 0.0
 
     @property
     def interval(self) -> float:
-        """Interval of contours, a round number, about ten over the range; at least 1 mm."""
-        return nice_step(max((self.high - self.low) / 12.0, 1e-3))
+        """Interval of contours, a round number, about ten over the range.
+
+        At least 1 mm, and so much that noise does not reach from one contour to the next.
+        """
+        return nice_step(max((self.high - self.low) / 12.0, 1e-3, _CLEAR_OF_NOISE * self.noise))
 
 
 def write_picture(
@@ -85,7 +98,10 @@ def _flipped(part: Part, source: RasterParts) -> Part:
 
 
 def stretch_of(raster: Path) -> Stretch:
-    """Return the values of one band for black and white: its 2nd and 98th percentile."""
+    """Return the values of one band for black and white: its 2nd and 98th percentile.
+
+    Their noise is that of an overview.
+    """
     with RasterParts(raster) as source:
         rows, columns = source.shape
         shape = (min(rows, _OVERVIEW_PX), min(columns, _OVERVIEW_PX))
@@ -94,7 +110,46 @@ def stretch_of(raster: Path) -> Stretch:
     if not known.size:
         return Stretch(low=0.0, high=1.0)
     low, high = (float(value) for value in np.percentile(known, (2.0, 98.0)))
-    return Stretch(low=low, high=max(high, low + 1e-6))
+    noise = noise_of(np.where(shown, values, np.nan).astype(np.float32))
+    return Stretch(low=low, high=max(high, low + 1e-6), noise=noise)
+
+
+def noise_of(values: NDArray[np.float32]) -> float:
+    """Estimate the standard deviation of noise, which neighbouring cells (rows, cols) do not share.
+
+    What runs smoothly from cell to cell is no noise, nor are edges, which few cells have.
+    """
+    between = values[:-2, 1:-1] + values[2:, 1:-1] + values[1:-1, :-2] + values[1:-1, 2:]
+    away = values[1:-1, 1:-1] - 0.25 * between
+    known = away[np.isfinite(away)].astype(np.float64)
+    return median_deviation(known) / math.sqrt(1.25) if known.size else 0.0
+
+
+def calmed(values: NDArray[np.float32], noise: float) -> NDArray[np.float32]:
+    """Average values with neighbours from which they differ by noise alone: edges stay sharp.
+
+    Args:
+        values: (rows, cols), NaN where unknown, which stays so.
+        noise: their standard deviation.
+    """
+    import cv2
+
+    if noise <= 0.0:
+        return values
+    known = np.isfinite(values)
+    # Too far away from all others to be averaged with them.
+    filled = np.where(known, values, np.float32(values[known].max() + 20.0 * noise))
+    calm = cv2.bilateralFilter(filled, -1, _SAME_SURFACE * noise, _CALM_CELLS)
+    return np.where(known, calm, np.float32(np.nan))
+
+
+def _is_level(values: NDArray[np.float32], least: float) -> NDArray[np.bool_]:
+    """Return where all values around a cell differ by less."""
+    import cv2
+
+    around = np.ones((_LEVEL_CELLS, _LEVEL_CELLS), dtype=np.uint8)
+    filled = np.where(np.isfinite(values), values, np.float32(1e9))
+    return np.asarray(cv2.dilate(filled, around) - cv2.erode(filled, around) < least)
 
 
 def contours(
@@ -105,7 +160,9 @@ def contours(
     Lines are (n, 2) metres on the wall, to the right and down from the corner of the raster, or of
     the drawing if the raster's rows go up the paper. Levels begin half an interval from the plane,
     because on the plane itself they would only show noise. Depths are averaged over half a
-    millimetre of paper; lines shorter than six are omitted.
+    millimetre of paper, and with those that differ by noise alone. There is no line where they are
+    level within it, or where lines would be more than 12 cm apart: it would only wander. Lines
+    shorter than six millimetres are omitted.
     """
     from contourpy import contour_generator
 
@@ -127,7 +184,12 @@ def contours(
         return []
     x = gsd_m * (left + (np.arange(shape[1]) + 0.5) * (right - left) / shape[1])
     y = gsd_m * (top + (np.arange(shape[0]) + 0.5) * (bottom - top) / shape[0])
-    generator = contour_generator(x, y, np.ma.array(depths.astype(np.float64), mask=~known))
+    surface = np.where(known, depths, np.nan).astype(np.float32)
+    noise = noise_of(surface)
+    surface = calmed(surface, noise)
+    # Of noise alone, one averaged cell in ten thousand rises by more.
+    drawn = known & ~_is_level(surface, max(0.6 * noise, _LEVEL_SHARE * interval_m))
+    generator = contour_generator(x, y, np.ma.array(surface.astype(np.float64), mask=~drawn))
     low, high = (
         math.floor(float(edge) / interval_m) for edge in np.percentile(depths[known], (1.0, 99.0))
     )

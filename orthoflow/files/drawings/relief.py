@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Final
 
@@ -10,13 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.drawings.papers import whole_of
-from orthoflow.files.drawings.printed_pictures import contours, stretch_of
+from orthoflow.files.drawings.printed_pictures import calmed, contours, noise_of, stretch_of
 from orthoflow.files.geotiff import RasterParts
 from orthoflow.files.polygons import Feature, write_features
 from orthoflow.geometry import WallFrame
 
 NOTHING: Final = 0
 _BAND_ROWS: Final = 1024
+_AROUND_ROWS: Final = 8
+# Half the side of a patch from which noise is estimated, cells.
+_PATCH: Final = 128
 _FIGURE_PX: Final = 1600
 # Contours as in a drawing at this scale: smoothed over half a millimetre of its paper.
 _CONTOUR_SCALE: Final = 20
@@ -37,17 +41,20 @@ class Light:
     altitude_deg: float = 25.0
 
 
-def shaded(depths_m: NDArray[np.floating], gsd_m: float, light: Light) -> NDArray[np.uint8]:
+def shaded(
+    depths_m: NDArray[np.floating], gsd_m: float, light: Light, noise_m: float = 0.0
+) -> NDArray[np.uint8]:
     """Shade a depth raster, 1 to 255 by Lambert's cosine law; 0 without a depth.
 
     Args:
         depths_m: (rows, cols) metres towards the viewer, NaN without data.
         gsd_m: side of a cell.
         light: direction of the light.
+        noise_m: standard deviation of depths, which are averaged with those that differ by it.
 
     A surface parallel to the wall's plane has the sine of the light's altitude.
     """
-    depths = np.asarray(depths_m, dtype=np.float32)
+    depths = calmed(np.asarray(depths_m, dtype=np.float32), noise_m)
     down, right = (_slope(depths, axis) / np.float32(gsd_m) for axis in (0, 1))
     azimuth, altitude = np.radians([light.azimuth_deg, light.altitude_deg])
     # Towards the light: right and up on the wall, and towards the viewer.
@@ -81,21 +88,37 @@ def write_relief(depth: Path, path: Path, light: Light) -> None:
 
     with RasterParts(depth) as source, rasterio.open(depth) as placed:
         rows, columns = source.shape
+        noise_m = _noise_m(source)
         profile = {**placed.profile, "dtype": "uint8", "nodata": NOTHING, "predictor": 2}
         with rasterio.open(path, "w", **profile) as target:
             for first in range(0, rows, _BAND_ROWS):
                 last = min(rows, first + _BAND_ROWS)
-                # Slopes need one more row on either side.
-                top, bottom = max(0, first - 1), min(rows, last + 1)
+                # Slopes and means need more rows on either side.
+                top, bottom = max(0, first - _AROUND_ROWS), min(rows, last + _AROUND_ROWS)
                 box = (0.0, float(top), float(columns), float(bottom))
                 depths, _ = source.read(box, (bottom - top, columns))
-                band = shaded(np.asarray(depths, np.float32), source.gsd_m, light)
+                band = shaded(np.asarray(depths, np.float32), source.gsd_m, light, noise_m)
                 kept = band[first - top : first - top + last - first]
                 target.write(kept, 1, window=Window(0, first, columns, last - first))
             target.update_tags(
                 light_azimuth_deg=f"{light.azimuth_deg:g}",
                 light_altitude_deg=f"{light.altitude_deg:g}",
             )
+
+
+def _noise_m(source: RasterParts) -> float:
+    """Return the noise of depths from cell to cell, of patches all over the raster."""
+    rows, columns = (float(count) for count in source.shape)
+    found = []
+    for row, column in product((0.2, 0.5, 0.8), repeat=2):
+        top, left = max(0.0, row * rows - _PATCH), max(0.0, column * columns - _PATCH)
+        bottom, right = min(rows, row * rows + _PATCH), min(columns, column * columns + _PATCH)
+        box = tuple(map(round, (left, top, right, bottom)))
+        depths, shown = source.read(
+            (box[0], box[1], box[2], box[3]), (box[3] - box[1], box[2] - box[0])
+        )
+        found.append(noise_of(np.where(shown, depths, np.nan).astype(np.float32)))
+    return float(np.median(found))
 
 
 def write_contours(depth: Path, frame: WallFrame, path: Path) -> float:
@@ -142,7 +165,7 @@ def write_depth_figure(depth: Path, frame: WallFrame, path: Path, light: Light) 
     stretch = stretch_of(depth)
     # The plane is white; equal depths in front of it (red) and behind it (blue) are equally dark.
     norm = CenteredNorm(0.0, halfrange=max(1.0, 1e3 * max(-stretch.low, stretch.high)))
-    grey = shaded(values, gsd_m, light)
+    grey = shaded(values, gsd_m, light, noise_of(values))
     colours = colormaps["RdBu_r"](norm(1e3 * np.nan_to_num(values)))[..., :3]
     mixed = np.clip(colours * (0.35 + 0.65 * grey[..., None] / grey.max(initial=1)), 0.0, 1.0)
     mixed[grey == NOTHING] = 1.0

@@ -16,7 +16,13 @@ from PIL import Image
 
 from orthoflow.cli.program import program
 from orthoflow.files.drawings.elevations import ElevationWall, elevation, unfolded
-from orthoflow.files.drawings.relief import NOTHING, Light, shaded, write_depth_figure
+from orthoflow.files.drawings.relief import (
+    NOTHING,
+    Light,
+    shaded,
+    write_depth_figure,
+    write_relief,
+)
 from orthoflow.files.drawings.sheet_contents import SheetText
 from orthoflow.files.drawings.title_blocks import TitleBlock
 from orthoflow.files.sidecars import placed_raster
@@ -59,6 +65,24 @@ def test_light_from_above_meets_what_looks_up() -> None:
     assert below.min() > above.max()
     depths[5, 5] = np.nan
     assert shaded(depths, 0.01, Light())[5, 5] == NOTHING
+
+
+def test_noise_of_a_flat_wall_is_not_shaded_and_an_edge_is(run: Path, tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    depths = rng.normal(0.0, 0.002, (400, 600))
+    depths[:, 300:] += 0.03
+    with rasterio.open(next((run / "products").rglob(f"wall_{WALL}_depth.tif"))) as given:
+        profile = {**given.profile, "width": 600, "height": 400}
+    profile["transform"] = rasterio.Affine(0.005, 0, 0, 0, -0.005, 0)
+    with rasterio.open(tmp_path / "depth.tif", "w", **profile) as target:
+        target.write(depths.astype("f4"), 1)
+    write_relief(tmp_path / "depth.tif", tmp_path / "relief.tif", Light(azimuth_deg=90.0))
+    with rasterio.open(tmp_path / "relief.tif") as made:
+        grey = made.read(1).astype(float)
+    flat = np.delete(grey, np.s_[295:305], axis=1)
+    # Noise tilts cells by 15 degrees; averaged, by two.
+    assert flat.std() < 10.0
+    assert grey[:, 299:301].mean() < flat.mean() - 90.0
 
 
 def test_equal_depths_before_and_behind_the_plane_have_equally_strong_colours(

@@ -140,10 +140,26 @@ def test_two_rows_are_enough_for_a_contour_between_them(tmp_path: Path, n_rows: 
         np.testing.assert_allclose(points[:, 1], 0.05, atol=1e-9)
 
 
-def test_a_flat_wall_has_no_contours(tmp_path: Path) -> None:
-    noise = np.random.default_rng(2).normal(0.0, 0.002, (100, 200)).astype(np.float32)
+@pytest.mark.parametrize("depth_m", [0.0, 0.025])
+def test_noise_of_a_flat_wall_draws_no_contours(tmp_path: Path, depth_m: float) -> None:
+    """On the plane, and exactly on a level of the contours."""
+    noise = np.random.default_rng(2).normal(depth_m, 0.002, (100, 200)).astype(np.float32)
     write_raster(tmp_path / "a.tif", noise, place=GridPlace(gsd_m=0.005), tags={})
     assert contours(tmp_path / "a.tif", WHOLE, scale=10, interval_m=0.05) == []
+    stretch = stretch_of(tmp_path / "a.tif")
+    assert stretch.noise == pytest.approx(0.002, rel=0.05)
+    assert contours(tmp_path / "a.tif", WHOLE, scale=10, interval_m=stretch.interval) == []
+
+
+def test_noise_does_not_bend_contours_of_a_slope(tmp_path: Path) -> None:
+    slope = 0.2 * (np.arange(200) + 0.5) / 200.0
+    noisy = np.random.default_rng(4).normal(np.tile(slope, (100, 1)), 0.002).astype(np.float32)
+    write_raster(tmp_path / "a.tif", noisy, place=GridPlace(gsd_m=0.005), tags={})
+    found = contours(tmp_path / "a.tif", WHOLE, scale=10, interval_m=0.05)
+    assert [level for level, _ in found] == pytest.approx([0.025, 0.075, 0.125, 0.175])
+    for level, points in found:
+        # Without averaging noise of 2 mm moves them by 10 mm.
+        assert np.std(points[:, 0] - level / 0.2) < 0.003
 
 
 def test_parts_of_a_raster_read_as_the_whole_does(tmp_path: Path) -> None:
