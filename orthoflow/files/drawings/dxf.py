@@ -41,6 +41,8 @@ LAYERS: Final[Layers] = {
 }
 # Letters of 2.5 mm at 1:50.
 _TEXT_M: Final = 0.125
+_LETTER_M: Final = 0.9 * _TEXT_M
+_ROW_M: Final = 1.8 * _TEXT_M
 _METRES: Final = 6
 _VERSION: Final = "R2010"
 # For programs that do not show attributes the same is written as text beside the mark.
@@ -223,7 +225,7 @@ def _add_opening(
     if regular.kind != "outline":
         rows.append(f"{regular.kind}, deviation {1e3 * regular.deviation_m:.0f} mm")
     for row, text in enumerate(rows, start=1):
-        place = np.array([low[0] + 3 * _TEXT_M, high[1] - 1.8 * row * _TEXT_M])
+        place = np.array([low[0] + 3 * _TEXT_M, high[1] - row * _ROW_M])
         _add_text(space, text, place, "A-ANNO-TEXT")
 
 
@@ -290,7 +292,18 @@ def _add_points(space: Modelspace, names: Iterable[str], places: NDArray[np.floa
 
 
 def _add_text(space: Modelspace, text: str, place: NDArray[np.float64], layer: str) -> None:
+    """Add a text, moved down until it is clear of those already there, as seen from above."""
     added = space.add_text(shown(text), height=_TEXT_M, dxfattribs={"layer": layer})
+    placed = space.query("TEXT")[:-1]
+    others = [(*one.dxf.insert.vec2, len(one.dxf.text)) for one in placed]
+    left, low, n_letters = np.array(others, dtype=np.float64).reshape(-1, 3).T
+    place = place.copy()
+    while np.any(
+        (left < place[0] + _LETTER_M * len(text))
+        & (place[0] < left + _LETTER_M * n_letters)
+        & (np.abs(low - place[1]) < _ROW_M - 1e-9)
+    ):
+        place[1] -= _ROW_M
     added.set_placement(tuple(place.tolist()))
 
 

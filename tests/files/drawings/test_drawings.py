@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Iterator
 from dataclasses import replace
@@ -286,6 +287,18 @@ def drawn(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert done.exit_code == 0, done.output
     assert "1 wall, and the room: 6 planes, 12 edges, 8 corners, 1 opening" in done.output
     return folder
+
+
+@pytest.mark.parametrize("name", [f"wall_{WALL}.dxf", "room.dxf"])
+def test_no_text_lies_on_another(drawn: Path, name: str) -> None:
+    """From above a floor and its ceiling have one middle."""
+    texts = list(ezdxf.readfile(drawn / name).modelspace().query("TEXT"))
+    assert len(texts) > 5
+    for one, other in itertools.combinations(texts, 2):
+        first, second = sorted((one, other), key=lambda text: text.dxf.insert.x)
+        end = first.dxf.insert.x + 0.8 * first.dxf.height * len(first.dxf.text)
+        apart = abs(first.dxf.insert.y - second.dxf.insert.y)
+        assert end < second.dxf.insert.x or apart > first.dxf.height, (one, other)
 
 
 @pytest.mark.parametrize("name", [f"wall_{WALL}.dxf", "room.dxf"])
