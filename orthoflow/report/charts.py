@@ -47,14 +47,12 @@ class ChartPoint:
         y: across.
         spread: half the length of its bar; NaN for none.
         is_filled: it stands out, as that of the baseline does.
-        is_joined: a line leads to it from the point before.
     """
 
     x: float
     y: float
     spread: float = math.nan
     is_filled: bool = False
-    is_joined: bool = True
 
 
 def line_chart(
@@ -104,11 +102,9 @@ def _draw_line(
 ) -> None:
     colour = COLOURS[index % len(COLOURS)]
     x, y = (np.array([getattr(point, key) for point in points]) for key in ("x", "y"))
-    # NaN breaks the line before a point that nothing leads to.
-    breaks = [place for place, point in enumerate(points) if place and not point.is_joined]
     axes.plot(
-        np.insert(x, breaks, math.nan),
-        np.insert(y, breaks, math.nan),
+        x,
+        y,
         color=colour,
         linestyle=_STROKES[index % len(_STROKES)],
         label=name or "_",

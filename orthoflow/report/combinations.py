@@ -151,9 +151,7 @@ def unequal_walls(combinations: Iterable[Combination]) -> str:
             if not _may_be_one_wall(wall, usual)
         ]
         if odd:
-            n_others = len(shown) - len(odd)
-            others = "the other shows" if n_others == 1 else f"the {n_others} others show"
-            groups.append(f"{first_few(odd, most=_ODD_MOST)}, {others} {_wall_words(usual)}")
+            groups.append(f"{first_few(odd, most=_ODD_MOST)}, most {_wall_words(usual)}")
     if not groups:
         return ""
     return (

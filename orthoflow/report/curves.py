@@ -15,12 +15,7 @@ import numpy as np
 from orthoflow.records import RecordedCell
 from orthoflow.records.runs import MetricRow, Run, parts_of
 from orthoflow.report.charts import ChartFormat, ChartPoint, as_image, line_chart
-from orthoflow.report.combinations import (
-    Combination,
-    combinations_of,
-    gives,
-    unequal_walls,
-)
+from orthoflow.report.combinations import Combination, combinations_of
 from orthoflow.report.comparisons import comparison_columns
 from orthoflow.report.paired import middle_of, spread_of
 from orthoflow.report.pictures import Picture
@@ -34,8 +29,6 @@ _MOST_LINES: Final = 6
 # An untrusted record may have any number; differences of larger ones are meaningless.
 _LARGEST: Final = 1e100
 _FEWEST_VALUES: Final = 2
-# What measures walls gives one of these.
-_OF_WALLS: Final = ("walls", "layers", "orthoimages", "inspection")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,40 +146,6 @@ def sweeps(cells: Sequence[RecordedCell]) -> Iterator[Sweep]:
                 )
 
 
-def _unswept(
-    cells: Sequence[RecordedCell], step: str, parameter: str, found: Iterable[Sweep]
-) -> list[Sweep]:
-    """Return each variant of a step that no sweep has, as one without a value.
-
-    Those that have the parameter all the same, at their default, are named by it.
-    """
-    swept = {variant for one in found if one.step == step for variant in one.values}
-    alone = {
-        cell.assignment[step]: cell
-        for cell in cells
-        if cell.step == step
-        and step in cell.assignment
-        and cell.assignment[step] not in swept
-        and cell.status != "skipped"
-    }
-    counts = Counter(cell.method for cell in alone.values())
-    found_alone = []
-    for variant, cell in alone.items():
-        others = [variant] if counts[cell.method] > 1 else []
-        if parameter in cell.params:
-            others.append(f"{parameter}={cell.params[parameter]}")
-        found_alone.append(
-            Sweep(
-                step=step,
-                method=cell.method,
-                parameter="",
-                values={variant: math.nan},
-                others={variant: ", ".join(others)},
-            )
-        )
-    return found_alone
-
-
 class _Value(NamedTuple):
     """What one combination measured, and in how many repeats."""
 
@@ -194,45 +153,35 @@ class _Value(NamedTuple):
     spread: float
     is_baseline: bool
     dataset: str
-    n_repeats: int
 
 
-# Value of the parameter, None of what was not swept -> what combinations measured there.
-_Line = dict[float | None, list[_Value]]
+# Value of the parameter -> what combinations measured there.
+_Line = dict[float, list[_Value]]
 
 
 def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
     combinations = [one for part in parts for one in combinations_of(part)]
-    columns = comparison_columns(combinations)
     cells = [cell for part in parts for cell in part.record.cells]
     # What several methods sweep is one drawing: axes of their own would hide which is better.
     swept: dict[tuple[str, str], list[Sweep]] = {}
-    found = list(sweeps(cells))
-    for sweep in found:
+    for sweep in sweeps(cells):
         swept.setdefault((sweep.step, sweep.parameter), []).append(sweep)
-    of_walls = (
-        {cell.step for cell in cells if gives(cell, *_OF_WALLS)}
-        if unequal_walls(combinations)
-        else set()
-    )
+    columns = comparison_columns(combinations)
     for column in sorted(columns, key=lambda one: not one.headline):
         for (step, parameter), group in swept.items():
             # A parameter over itself is meaningless.
             is_behind = any(cell.step == column.step and step in cell.assignment for cell in cells)
             if (column.step, column.metric) == (step, parameter) or not is_behind:
                 continue
-            drawn = [*group, *_unswept(cells, step, parameter, found)]
-            lines: dict[str, _Line] = {}
-            for sweep in drawn:
-                method = sweep.method if len(drawn) > 1 else ""
-                for name, line in _lines(combinations, sweep, column).items():
-                    lines[", ".join(filter(None, [method, name]))] = line
-            if any(len(line) >= _FEWEST_VALUES for line in lines.values()):
-                first = dict(list(lines.items())[:_MOST_LINES])
-                caveats = _unequal_photos(combinations, column)
-                if column.step in of_walls:
-                    caveats += " Not all are of the same wall."
-                yield _curve(f"{step}.{parameter}", column, first, len(parts), caveats)
+            lines = {
+                ", ".join(filter(None, [sweep.method if len(group) > 1 else "", name])): line
+                for sweep in group
+                for name, line in _lines(combinations, sweep, column).items()
+            }
+            first = dict([one for one in lines.items() if one[1]][:_MOST_LINES])
+            if any(len(line) >= _FEWEST_VALUES for line in first.values()):
+                caveat = _unequal_photos(combinations, column)
+                yield _curve(f"{step}.{parameter}", column, first, len(parts), caveat)
 
 
 def _unequal_photos(combinations: Iterable[Combination], column: MetricRow) -> str:
@@ -250,7 +199,10 @@ def _unequal_photos(combinations: Iterable[Combination], column: MetricRow) -> s
 def _lines(
     combinations: Sequence[Combination], sweep: Sweep, column: MetricRow
 ) -> dict[str, _Line]:
-    """One line per combination of the other variants."""
+    """One line per combination of the other variants, over the datasets that all its points have.
+
+    The hard datasets are often those that a value fails on: without them it would look better.
+    """
     lines: dict[str, _Line] = {}
     for one in combinations:
         variant = one.assignment.get(sweep.step, "")
@@ -260,56 +212,37 @@ def _lines(
         if abs(measured.value) < _LARGEST:
             others = {k: v for k, v in one.assignment.items() if k not in (sweep.step, DATA)}
             name = ", ".join(filter(None, [sweep.others[variant], variants_text(others)]))
-            x = sweep.values[variant]
-            lines.setdefault(name, {}).setdefault(None if math.isnan(x) else x, []).append(
-                _Value(
-                    measured.value,
-                    measured.spread,
-                    one.is_baseline,
-                    one.assignment.get(DATA, ""),
-                    measured.n_repeats,
-                )
-            )
+            dataset = one.assignment.get(DATA, "")
+            value = _Value(measured.value, measured.spread, one.is_baseline, dataset)
+            lines.setdefault(name, {}).setdefault(sweep.values[variant], []).append(value)
+    for name, line in lines.items():
+        shared = set.intersection(*({one.dataset for one in found} for found in line.values()))
+        lines[name] = {
+            x: [one for one in line[x] if one.dataset in shared] for x in sorted(line) if shared
+        }
     return lines
 
 
 def _curve(
-    parameter: str, column: MetricRow, lines: Mapping[str, _Line], n_datasets: int, caveats: str
+    parameter: str, column: MetricRow, lines: Mapping[str, _Line], n_datasets: int, caveat: str
 ) -> Curve:
-    is_over = n_datasets > 1
-    xs = [x for line in lines.values() for x in line if x is not None]
-    drawn: dict[str, list[ChartPoint]] = {}
-    is_broken = False
-    for name, line in lines.items():
-        before: list[tuple[str, int]] | None = None
-        for x, found in sorted(line.items(), key=lambda one: one[0] or 0.0):
-            # The hard datasets are often those that a value fails on: no line between points of
-            # unlike datasets or repeats means that one is better.
-            origins = sorted((one.dataset, one.n_repeats) for one in found)
-            is_joined = before in (None, origins)
-            is_broken |= not is_joined
-            before = origins
-            # What has no value of the parameter is drawn from its least to its largest.
-            for place in (min(xs), max(xs)) if x is None else (x,):
-                point = _point(place, found, column, is_over=is_over, is_joined=is_joined)
-                drawn.setdefault(name, []).append(point)
+    drawn = {
+        name: [_point(x, found, column, is_over=n_datasets > 1) for x, found in line.items()]
+        for name, line in lines.items()
+    }
     every = [point for points in drawn.values() for point in points]
     # Sizes of errors are never below 0, and what is judged by more and lies in 0 to 1 is a share.
     is_size = column.better == "lower" and all(point.y >= 0.0 for point in every)
     is_share = column.better == "higher" and all(0.0 <= point.y <= 1.0 for point in every)
     notes = [_points_text(lines, column.unit, n_datasets)]
-    if is_broken:
-        notes.append("no line joins points of different datasets or numbers of repeats")
     if column.better in BETTER:
         notes.append(BETTER[column.better])
-    if any(None in line for line in lines.values()):
-        notes.append("level lines are of what was not swept")
     if any(point.is_filled for point in every):
         notes.append("filled points are the baseline")
     return Curve(
         name=f"{column.step}.{column.metric}_over_{parameter}",
         title=f"{column.titled} ({column.step}) over {parameter}",
-        caption=f"Points are {'; '.join(notes)}.{caveats}",
+        caption=f"Points are {'; '.join(notes)}.{caveat}",
         lines=drawn,
         below=parameter,
         beside=column.titled,
@@ -317,23 +250,18 @@ def _curve(
     )
 
 
-def _point(
-    x: float, found: Sequence[_Value], column: MetricRow, *, is_over: bool, is_joined: bool
-) -> ChartPoint:
+def _point(x: float, found: Sequence[_Value], column: MetricRow, *, is_over: bool) -> ChartPoint:
     numbers = np.array([one.value for one in found])
     if column.better == "lower":
         # Errors of both signs would make each other small, and the most negative look best.
         numbers = np.abs(numbers)
-    spread = spread_of(numbers, column.unit)
-    if len(found) == 1:
-        # A bar over datasets is how far they lie apart, not how far the repeats of one do.
-        spread = math.nan if is_over else found[0].spread
+    # A bar over datasets is how far they lie apart, not how far the repeats of one do.
+    spread = spread_of(numbers, column.unit) if is_over else found[0].spread
     return ChartPoint(
         x=x,
-        y=middle_of(numbers, column.unit) if len(found) > 1 else float(numbers[0]),
-        spread=spread,
+        y=middle_of(numbers, column.unit),
+        spread=math.nan if is_over and len(found) == 1 else spread,
         is_filled=any(one.is_baseline for one in found),
-        is_joined=is_joined,
     )
 
 

@@ -18,7 +18,6 @@ from orthoflow.report.summaries import limits
 from orthoflow.workflow.expand import variants_text
 from orthoflow.workflow.model import DATA
 
-_ORIENTED: Final = "n_oriented"
 _MOST_COLUMNS: Final = 6
 # Pictures of a page with many rooms get smaller, until they show nothing any more.
 _PICTURES_PX: Final = 2_000_000
@@ -37,7 +36,6 @@ class DatasetRow:
         failed: its failed cells and why they did, without those that were skipped behind them.
         missing: its cells that the run was interrupted before.
         values: one per column.
-        photos: photos oriented, of how many.
         limit: what limits it most, and how much more does.
     """
 
@@ -47,7 +45,6 @@ class DatasetRow:
     failed: tuple[str, ...]
     missing: tuple[str, ...]
     values: tuple[Value, ...]
-    photos: Value
     limit: str
 
 
@@ -58,13 +55,11 @@ class DatasetTable:
     Attributes:
         columns: what is measured of each: step, and metric with its unit.
         rows: in the order of the run.
-        has_photos: some step oriented photos.
         baseline: the variants that the numbers are of; empty where nothing varies.
     """
 
     columns: tuple[tuple[str, str], ...]
     rows: tuple[DatasetRow, ...]
-    has_photos: bool
     baseline: str = ""
 
     @property
@@ -89,7 +84,7 @@ def dataset_table(parts: Mapping[str, Run], pages: Mapping[str, str]) -> Dataset
     # Those of the comparison, which the workflow may have asked for.
     columns = comparison_columns([one for part in parts.values() for one in combinations_of(part)])
     wanted = [(column.step, column.metric) for column in columns]
-    chosen = [key for key in wanted if key in units and key[1] != _ORIENTED][:_MOST_COLUMNS]
+    chosen = [key for key in wanted if key in units][:_MOST_COLUMNS]
     return DatasetTable(
         columns=tuple((row.step, row.titled) for row in (units[key] for key in chosen)),
         rows=tuple(
@@ -104,12 +99,10 @@ def dataset_table(parts: Mapping[str, Run], pages: Mapping[str, str]) -> Dataset
                 ),
                 missing=tuple(cell.address for cell in part.record.cells if is_missing(cell)),
                 values=tuple(_value(measured[name].get(key)) for key in chosen),
-                photos=_photos(measured[name]),
                 limit=_limit(part, own[name]),
             )
             for name, part in parts.items()
         ),
-        has_photos=any(key[1] == _ORIENTED for key in units),
         baseline=variants_text(baseline_of(next(iter(parts.values())))) if parts else "",
     )
 
@@ -146,14 +139,3 @@ def _limit(part: Run, own: AbstractSet[str]) -> str:
         if not baseline.isdisjoint(limit.cells) and not limit.is_failure
     ]
     return f"{texts[0]} (and {len(texts) - 1} more)" if len(texts) > 1 else "".join(texts)
-
-
-def _photos(measured: _Measured) -> Value:
-    # A later step improves on an earlier one.
-    steps = [step for step, metric in measured if metric == _ORIENTED]
-    if not steps:
-        return Value()
-    oriented = measured[steps[-1], _ORIENTED].value
-    total = measured.get((steps[-1], "n_photos"))
-    text = f"{number(oriented)} of {number(total.value)}" if total else number(oriented)
-    return Value(text=text, sort=oriented)

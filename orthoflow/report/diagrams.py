@@ -1,8 +1,7 @@
-"""The graph of a run: cells as boxes in rows, arrows for what they pass on."""
+"""The graph of a run: steps as boxes in rows, arrows for what they pass on."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
@@ -13,15 +12,12 @@ from orthoflow.report.charts import as_image, saved
 from orthoflow.report.numbers import seconds_in_words
 from orthoflow.report.pictures import Picture
 from orthoflow.untrusted_text import shown
-from orthoflow.workflow.model import DATA
 
 if TYPE_CHECKING:
     import networkx as nx
 
 _MAX_ABREAST: Final = 5  # boxes in a row
-_MAX_CELLS: Final = 24
 _MAX_LETTERS: Final = 26
-_DATA: Final = re.compile(r"@data=[^,#]*$|(?<=@)data=[^,#]*,|@data=[^,#]*(?=#)")
 # Distinguished without colours by the width and dashes of the frame.
 _FRAMES: Final[dict[str, dict[str, Any]]] = {
     "ok": {"edgecolor": "#5b6570", "facecolor": "#f3f5f7"},
@@ -32,30 +28,24 @@ _FRAMES: Final[dict[str, dict[str, Any]]] = {
 
 
 def run_graph(run: Run) -> nx.DiGraph[str]:
-    """Return the cells of a run, each below all that it depends on; arrows are products.
+    """Return the steps of a run, each below all that it depends on; arrows are products.
 
-    Of more cells than a reader can follow, cells of a step become one. Nodes have `title`,
-    `state`, `about` (method and time) and `row`; wide levels continue in further rows, and what
-    neither takes nor gives anything because it was skipped is last.
+    Nodes have `state`, `about` (methods and time) and `row`; wide levels continue in further rows,
+    and what neither takes nor gives anything because it was skipped is last.
     """
     import networkx as nx  # noqa: PLC0415 - takes 0.2 seconds
 
-    is_crowded = len(run.cells) > _MAX_CELLS
-    node_of = {name: cell.step if is_crowded else name for name, cell in run.cells.items()}
     members: dict[str, list[RecordedCell]] = {}
-    for address, cell in run.cells.items():
-        members.setdefault(node_of[address], []).append(cell)
-    # The page of one dataset names it.
-    is_alone = len({cell.assignment.get(DATA) for cell in run.cells.values()} - {None}) == 1
+    for cell in run.cells.values():
+        members.setdefault(cell.step, []).append(cell)
     graph: nx.DiGraph[str] = nx.DiGraph()
-    for node, cells in members.items():
-        title = _DATA.sub("", node) if is_alone else node
-        graph.add_node(node, title=title, state=_state(cells), about=_about(cells))
-    for address, cell in run.cells.items():
+    for step, cells in members.items():
+        graph.add_node(step, state=_state(cells), about=_about(cells))
+    for cell in run.cells.values():
         for product in cell.inputs.values():
-            before = node_of.get(product.source.rpartition(".")[0])
-            if before is not None and before != node_of[address]:
-                graph.add_edge(before, node_of[address])
+            before = run.cells.get(product.source.rpartition(".")[0])
+            if before is not None:
+                graph.add_edge(before.step, cell.step)
     loose = [node for node in nx.isolates(graph) if graph.nodes[node]["state"] == "skipped"]
     joined = graph.subgraph(node for node in graph if node not in loose)
     row = 0
@@ -84,7 +74,7 @@ def graph_file(run: Run) -> bytes:
             node: axes.text(
                 about["column"],
                 about["row"],
-                "\n".join(_shortened(about[line]) for line in ("title", "about")),
+                "\n".join(_shortened(line) for line in (node, about["about"])),
                 ha="center",
                 va="center",
                 bbox={"boxstyle": "round", **_FRAMES[about["state"]]},
@@ -125,7 +115,6 @@ def graph_picture(run: Run) -> Picture:
 
 
 def _shortened(text: str) -> str:
-    # The last letters stay: they have the number of a repeat.
     short = text if len(text) <= _MAX_LETTERS else f"{text[: _MAX_LETTERS - 6]}…{text[-5:]}"
     return shown(short)
 

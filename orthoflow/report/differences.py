@@ -6,7 +6,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final, Generic, TypeVar
 
 from orthoflow.records import RecordedFile
@@ -14,7 +14,6 @@ from orthoflow.records.compare import (
     ComparedMetric,
     Pair,
     ParameterValue,
-    ProductDistance,
     RunComparison,
 )
 from orthoflow.records.compare import Difference as DifferenceCounts
@@ -59,69 +58,26 @@ class DifferenceTable:
     whose: str = ""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ProductRow:
-    """How far one product of the two runs lies apart."""
-
-    cell: str
-    name: str
-    verdict: str
-    words: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class Differences:
-    """All differences of two runs.
-
-    Attributes:
-        left: id of the first run.
-        right: id of the second.
-        workflow: unified diff of the workflow files; empty when equal.
-        tables: a table per kind of thing.
-        products: a row per product, those that differ first.
-    """
-
-    left: str
-    right: str
-    workflow: str
-    tables: tuple[DifferenceTable, ...]
-    products: tuple[ProductRow, ...]
-
-
-def differences(comparison: RunComparison) -> Differences:
-    """Put a comparison of two runs into tables of what differs."""
+def differences(comparison: RunComparison) -> tuple[DifferenceTable, ...]:
+    """Put a comparison of two runs into tables of what differs, one per kind of thing."""
     step_of, of_shared = comparison.step_of, comparison.of_shared_steps
     parameters = comparison.shared(comparison.parameters)
-    return Differences(
-        left=comparison.left.run_id,
-        right=comparison.right.run_id,
-        workflow="\n".join(comparison.workflow[2:]),
-        tables=(
-            _table("Inputs", comparison.inputs, _files_text),
-            _table("Options", [comparison.overrides], " ".join),
-            _table("Steps", comparison.cells, str, step_of),
-            replace(_table("Parameters", parameters, _parameter_text, step_of), whose=of_shared),
-            _table("Environment", comparison.environment, str),
-            replace(
-                # Time and memory always differ, and stand in the comparison table.
-                _table(
-                    "Metrics, time and memory left aside",
-                    comparison.measured,
-                    _metric_text,
-                    step_of,
-                    different=moved_first(
-                        [pair for pair in comparison.measured if pair.is_moved], step_of
-                    ),
-                    change=_change,
-                ),
-                whose=of_shared,
-            ),
-        ),
-        products=tuple(
-            sorted(
-                (_product_row(distance) for distance in comparison.products),
-                key=lambda row: row.verdict == "identical",
-            )
+    moved = moved_first([pair for pair in comparison.measured if pair.is_moved], step_of)
+    return (
+        _table("Inputs", comparison.inputs, _files_text),
+        _table("Options", [comparison.overrides], " ".join),
+        _table("Steps", comparison.cells, str, step_of),
+        _table("Parameters", parameters, _parameter_text, step_of, whose=of_shared),
+        _table("Environment", comparison.environment, str),
+        # Time and memory always differ, and stand in the comparison table.
+        _table(
+            "Metrics, time and memory left aside",
+            comparison.measured,
+            _metric_text,
+            step_of,
+            different=moved,
+            change=_change,
+            whose=of_shared,
         ),
     )
 
@@ -134,6 +90,7 @@ def _table(
     *,
     different: Sequence[Pair[Side]] | None = None,
     change: Callable[[Pair[Side]], str] = lambda _pair: "",
+    whose: str = "",
 ) -> DifferenceTable:
     """Return what differs between things, with equal differences of a step grouped.
 
@@ -144,6 +101,7 @@ def _table(
         step_of: the step of each cell.
         different: those that have a row, in this order; None for all that differ.
         change: how far one moved.
+        whose: of which steps they are, if not of all.
     """
     steps = step_of or {}
     counts = DifferenceCounts.of(pairs)
@@ -155,6 +113,7 @@ def _table(
         n_different=counts.n_different,
         n_alone=counts.n_left + counts.n_right,
         n_rounded=counts.n_rounded,
+        whose=whose,
         rows=tuple(
             Difference(
                 cell=one.pair.cell if one.n == 1 else "",
@@ -175,21 +134,6 @@ def _metric_text(metric: ComparedMetric) -> str:
 def _change(pair: Pair[ComparedMetric]) -> str:
     left, right = pair.left, pair.right
     return "" if left is None or right is None else number(right.value - left.value)
-
-
-def _product_row(distance: ProductDistance) -> ProductRow:
-    apart = [
-        f"{number(part.largest)} {part.unit} at most in {part.field}"
-        if part.largest is not None
-        else f"{part.field} cannot be subtracted"
-        for part in distance.distances
-    ]
-    return ProductRow(
-        cell=distance.cell,
-        name=f"{distance.port} ({distance.type_name})",
-        verdict=distance.verdict,
-        words="; ".join([*apart, distance.reason] if distance.reason else apart),
-    )
 
 
 def _files_text(files: Sequence[RecordedFile]) -> str:

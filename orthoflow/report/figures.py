@@ -20,8 +20,6 @@ from orthoflow.report.pictures import LONGEST_SIDE_PX, Picture, data_uri
 from orthoflow.untrusted_text import is_plain_svg
 
 _BYTES_MOST: Final = 3_900_000  # of all figures on a page; a third more in base64
-# What the baseline may take of it as it is, before the others share the rest.
-_BASELINE_SHARE: Final = 0.7
 _LEAST_SIDE_PX: Final = 240
 _MAX_SIDE_PX: Final = 700
 _DPI: Final = 300
@@ -42,15 +40,14 @@ def figure_groups(
 ) -> tuple[FigureGroup, ...]:
     """The figures of every cell, repeats of random methods left out; equal ones once.
 
-    When they are too many for a page, the large ones are drawn smaller, those of the baseline last.
+    When they are too many for a page, the large ones are drawn smaller.
 
     Args:
         run: the run.
         share: which part of a page's bytes they may take.
         with_files: those of `baseline_addresses` lie in `FIGURES_FOLDER` beside the page.
     """
-    main = set(baseline_addresses(run))
-    named = figure_files(run, main) if with_files else {}
+    named = figure_files(run, baseline_addresses(run)) if with_files else {}
     files = {id(figure): path for path, figure in named.items()}
     chosen: dict[tuple[str, str], RecordedFigure] = {}
     seen: set[bytes] = set()
@@ -59,14 +56,7 @@ def figure_groups(
             if figure.data not in seen:
                 seen.add(figure.data)
                 chosen[address, figure.name] = figure
-    fitted: dict[tuple[str, str], RecordedFigure] = {}
-    left = share * _BYTES_MOST
-    others_want = sum(len(one.data) for (owner, _), one in chosen.items() if owner not in main)
-    for is_main in (True, False):
-        part = {key: one for key, one in chosen.items() if (key[0] in main) is is_main}
-        most = max(_BASELINE_SHARE * left, left - others_want) if is_main else left
-        fitted |= dict(zip(part, _fitted(tuple(part.values()), most), strict=True))
-        left -= sum(len(fitted[key].data) for key in part)
+    fitted = dict(zip(chosen, _fitted(tuple(chosen.values()), share * _BYTES_MOST), strict=True))
     groups = []
     for address, cell in run.cells.items():
         pictures = tuple(

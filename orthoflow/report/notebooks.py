@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
-from orthoflow.errors import ArgumentError, PluginError, RecordError, did_you_mean
+from orthoflow.errors import ArgumentError, RecordError, did_you_mean
 from orthoflow.files.images import cells_webp
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.levels import Colours, eight_bits
@@ -29,7 +28,8 @@ from orthoflow.records.tables import RunSet, join_runs
 from orthoflow.records.verify import Verification, broken_seal, verify_run
 from orthoflow.report.combinations import baseline_cells, combinations_of, unequal_walls
 from orthoflow.report.differences import moved_first
-from orthoflow.report.pictures import embedded_products, thumbnail
+from orthoflow.report.pictures import data_uri, embedded_products, thumbnail
+from orthoflow.report.rendering import environment
 from orthoflow.report.summaries import answers
 from orthoflow.report.tidy_tables import Varied
 from orthoflow.untrusted_text import first_few, shown
@@ -193,27 +193,16 @@ class OpenedRun(Run):
         return f"; run.cell({failed[0].address!r}).log has its log"
 
     def _repr_html_(self) -> str:
-        record = self.record
         made = {cell.address for cell in baseline_cells(self)}
-        picture = thumbnail(self, made, longest_side_px=_THUMBNAIL_PX)
-        rows = "".join(
-            f"<tr><td>{_html(one.what)}</td><td>{_html(one.value)}</td><td>{_html(one.cell)}</td></tr>"
-            for one in answers(self)
-        )
-        apart = unequal_walls(combinations_of(self))
-        counts = Counter(cell.status for cell in record.cells)
+        counts = Counter(cell.status for cell in self.record.cells)
         counts_text = ", ".join(f"{count} {status}" for status, count in counts.items()) or "none"
-        steps = f"{self.with_failure(f'steps: {counts_text}')}{self._way_to_logs()}"
-        return (
-            f"<div><p><b>{_html(record.name)}</b>, {_html(record.started)}<br>{_html(steps)}</p>"
-            + (f"<p>{_html(apart)}</p>" if apart else "")
-            + (
-                f'<img alt="first orthoimage" src="{picture}" style="max-width:100%">'
-                if picture
-                else ""
-            )
-            + (f"<table>{rows}</table>" if rows else "")
-            + "</div>"
+        return _html(
+            "run",
+            self.record,
+            f"{self.with_failure(f'steps: {counts_text}')}{self._way_to_logs()}",
+            unequal_walls(combinations_of(self)),
+            thumbnail(self, made, longest_side_px=_THUMBNAIL_PX),
+            answers(self),
         )
 
 
@@ -253,32 +242,25 @@ class ShownComparison(RunComparison):
     """Two runs side by side, as a notebook shows them."""
 
     def _repr_html_(self) -> str:
-        html = f"<p>{_html(repr(self))}</p>{self._parameters_html()}"
-        if not Difference.of(self.measured).n_shared:
-            return f"{html}<p>They have no number in common, time and memory left aside.</p>"
-        differing = [row for row in self.measured if row.is_shared and row.is_moved]
-        moved = [(row.cell, row.name) for row in moved_first(differing, self.step_of)]
-        if not moved:
-            return (
-                f"{html}<p>No number that both runs have differs, time and memory, and rounding, "
-                "left aside.</p>"
-            )
-        table = self.metric_table().set_index(["cell", "metric"])
-        first = table.loc[moved[:_ROWS_MOST]].reset_index()
-        n_more = len(moved) - len(first)
-        more = f"<p>{n_more} more, which <code>metric_table()</code> has.</p>" if n_more else ""
-        return f"{html}{first.to_html(index=False)}{more}"
-
-    def _parameters_html(self) -> str:
-        """The parameters in which both differ, the first few."""
-        rows = [row for row in self.shared(self.parameters) if row.is_shared and not row.is_same]
-        counts_text = [
+        parameters = [
             f"{row.cell}.{row.name}: {' -> '.join(json.dumps(side.value) for side in sides)}"
-            for row in rows
+            for row in self.shared(self.parameters)
+            if row.is_shared and not row.is_same
             if (sides := [one for one in (row.left, row.right) if one is not None])
         ]
-        return (
-            f"<p>{_html(first_few(counts_text, most=_PARAMETERS_MOST))}</p>" if counts_text else ""
+        differing = [row for row in self.measured if row.is_shared and row.is_moved]
+        moved = [(row.cell, row.name) for row in moved_first(differing, self.step_of)]
+        table = ""
+        if moved:
+            numbers = self.metric_table().set_index(["cell", "metric"])
+            table = numbers.loc[moved[:_ROWS_MOST]].reset_index().to_html(index=False)
+        return _html(
+            "comparison",
+            repr(self),
+            first_few(parameters, most=_PARAMETERS_MOST) if parameters else "",
+            Difference.of(self.measured).n_shared,
+            Markup(table),
+            max(0, len(moved) - _ROWS_MOST),
         )
 
 
@@ -314,14 +296,11 @@ class Figures(Mapping[str, RecordedFigure]):
 
     def _repr_html_(self) -> str:
         named = list(self._figures.items())
-        pictures = (
-            _picture(one.data, one.media_type, f"{name}: {one.caption}")
+        pictures = [
+            (data_uri(one.data, one.media_type), f"{name}: {one.caption}")
             for name, one in named[:_FIGURES_MOST]
-        )
-        more = "".join(f"<br>{_html(name)}" for name, _ in named[_FIGURES_MOST:])
-        return "".join(pictures) + (
-            f"<p>By name, <code>figures[...]</code>:{more}</p>" if more else ""
-        )
+        ]
+        return _html("figures", pictures, [name for name, _ in named[_FIGURES_MOST:]])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -333,7 +312,7 @@ class ShownFigure(RecordedFigure):
         Path(path).write_bytes(self.data)
 
     def _repr_html_(self) -> str:
-        return _picture(self.data, self.media_type, self.caption)
+        return _html("picture", data_uri(self.data, self.media_type), self.caption)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -365,34 +344,6 @@ class WallImage:
         """Where the cells lie: `frame.world_from_wall` gives metres."""
         return self.image.frame
 
-    def to_xarray(self) -> Any:  # Any: of a library that need not be there
-        """Return an `xarray.DataArray` with x along the wall and y as heights, as the GeoTIFF has.
-
-        Its coordinate `is_shown` (y, x) distinguishes black cells from empty ones.
-
-        Raises:
-            PluginError: xarray is not installed.
-        """
-        try:
-            import xarray  # noqa: PLC0415 - optional
-        except ImportError as error:
-            raise PluginError("to_xarray needs xarray: pip install xarray") from error
-        frame = self.frame
-        left, top = frame.raster_corner_m
-        down_m = frame.raster_down * frame.gsd_m
-        return xarray.DataArray(
-            self.rgb,
-            dims=("y", "x", "band"),
-            coords={
-                "y": ("y", top + down_m * (np.arange(frame.height) + 0.5), {"units": "m"}),
-                "x": ("x", left + frame.gsd_m * (np.arange(frame.width) + 0.5), {"units": "m"}),
-                "band": ["red", "green", "blue"],
-                "is_shown": (("y", "x"), self.is_shown),
-            },
-            name=self.image.name,
-            attrs={"unit_of_x_and_y": "m", "gsd_m": frame.gsd_m},
-        )
-
     def __array__(
         self, dtype: np.dtype[Any] | None = None, *, copy: bool | None = None
     ) -> NDArray[Any]:
@@ -412,16 +363,10 @@ class WallImage:
             longest_side_px=_THUMBNAIL_PX,
             least_px=_THUMBNAIL_PX // 2,
         )
-        return _picture(picture, "image/webp", repr(self))
+        return _html("picture", data_uri(picture, "image/webp"), repr(self))
 
 
-def _picture(data: bytes, media_type: str, caption: str) -> str:
-    uri = f"data:{media_type};base64,{base64.b64encode(data).decode('ascii')}"
-    return (
-        f'<figure><img src="{escape(uri)}" alt="{_html(caption)}" style="max-width:100%">'
-        f"<figcaption>{_html(caption)}</figcaption></figure>"
-    )
-
-
-def _html(text: str) -> str:
-    return escape(shown(text))
+# Any: what the macro takes.
+def _html(macro: str, *values: Any) -> str:
+    """Fill a macro of the template for notebooks, which escapes what a record states."""
+    return str(getattr(environment().get_template("notebook.html.j2").module, macro)(*values))

@@ -170,13 +170,15 @@ def _write(
     go_on: str = "",
     stores: Sequence[Store] = (),
 ) -> None:
+    compared = compare_runs(*runs, stores=stores) if len(runs) == 2 else None
     text = (
         environment()
         .get_template("page.html.j2")
         .render(
             sections=sections,
             comparison_of_all=comparison_table(runs) if len(runs) > 1 else None,
-            differences=differences(compare_runs(*runs, stores=stores)) if len(runs) == 2 else None,
+            compared=compared,
+            differences=differences(compared) if compared else (),
             title=title,
             go_on=go_on,
         )

@@ -49,11 +49,9 @@ DIVERGING: Final = np.array(
     [[33, 102, 172], [146, 197, 222], [247, 247, 247], [244, 165, 130], [178, 24, 43]],
     dtype=np.float64,
 )
-# Classes between the middle and either end; the middle itself is one, so that 0 is white.
-_STEPS: Final = 127
-_PLACES: Final = np.linspace(0.0, 4.0, 2 * _STEPS + 1)
+_PLACES: Final = np.linspace(-1.0, 1.0, 255)
 _DIVERGING_TABLE: Final = np.rint(
-    np.column_stack([np.interp(_PLACES, np.arange(5), channel) for channel in DIVERGING.T])
+    np.column_stack([np.interp(_PLACES, np.linspace(-1, 1, 5), one) for one in DIVERGING.T])
 ).astype(np.uint8)
 # Rasters of one wall by two methods: their planes are some centimetres and a degree apart at most.
 _SAME_NORMAL_COSINE: Final = float(np.cos(np.radians(5.0)))
@@ -294,7 +292,7 @@ def depth_colours(depth_m: NDArray[np.float32], limit_m: float) -> NDArray[np.ui
     """Colour depths from blue (-limit) over white (0) to red (+limit); NaN is white."""
     place = np.clip(np.asarray(depth_m, dtype=np.float32) / np.float32(limit_m), -1.0, 1.0)
     # One table look-up per cell: mixing colours cell by cell takes ten times as long.
-    index = np.rint(np.nan_to_num(place) * _STEPS + _STEPS).astype(np.int16)
+    index = np.rint(np.nan_to_num(place) * 127.0 + 127.0).astype(np.int16)
     coloured: NDArray[np.uint8] = _DIVERGING_TABLE[index]
     return coloured
 

@@ -83,17 +83,16 @@ class Table:
 
     def latex(self) -> str:
         """Return the table as LaTeX, for the package booktabs."""
-        import pandas as pd  # noqa: PLC0415 - takes a second, and few ask
-
-        head, *rows = ([escaped_latex(text) for text in row] for row in self._texts())
-        table = pd.DataFrame(rows, columns=head)
-        return str(
-            table.style.hide(axis="index").to_latex(
-                column_format="".join("lr"[column.is_numeric] for column in self.columns),
-                caption=escaped_latex(self.caption),
-                label=f"tab:{self.name}",
-                position_float="centering",
-                hrules=True,
+        head, *rows = (" & ".join(map(escaped_latex, row)) + r" \\" for row in self._texts())
+        return "\n".join(
+            (
+                r"\begin{table}",
+                r"\centering",
+                rf"\caption{{{escaped_latex(self.caption)}}}",
+                rf"\label{{tab:{self.name}}}",
+                rf"\begin{{tabular}}{{{''.join('lr'[one.is_numeric] for one in self.columns)}}}",
+                *(r"\toprule", head, r"\midrule", *rows, r"\bottomrule"),
+                *(r"\end{tabular}", r"\end{table}", ""),
             )
         )
 
@@ -123,7 +122,6 @@ class PlaneTables:
         viewpoint: where the side of the viewer comes from, in words.
         planes: a row per plane.
         materials: thickness of the cloud by place and material.
-        later: cells that hand the same planes on.
         before: all cells that have a part in these planes.
     """
 
@@ -131,7 +129,6 @@ class PlaneTables:
     viewpoint: str
     planes: Table
     materials: Table
-    later: tuple[str, ...] = ()
     before: frozenset[str] = frozenset()
 
     def taken_further(self, tables: Iterable[PlaneTables]) -> bool:
@@ -140,33 +137,27 @@ class PlaneTables:
 
 
 def plane_tables(run: Run) -> tuple[PlaneTables, ...]:
-    """The planes of every cell that found some; equal tables once."""
-    found: list[PlaneTables] = []
+    """The planes of every cell that found some; equal products once."""
+    found = []
     places = embedded_products(run, "planes")
     for (address, _), payload in zip(places, run.payloads(places), strict=True):
         planes = Planes.from_payload(payload)
         # Of several sources of sides, how many planes each has.
         counts = Counter(planes.side_source(index) for index in range(len(planes)))
-        tables = PlaneTables(
-            cell=address,
-            viewpoint=", ".join(
-                f"{source} ({count})" if len(counts) > 1 else source
-                for source, count in counts.items()
+        found.append(
+            PlaneTables(
+                cell=address,
+                viewpoint=", ".join(
+                    f"{source} ({count})" if len(counts) > 1 else source
+                    for source, count in counts.items()
+                )
+                if planes.side_from
+                else planes.viewpoint.replace("_", " "),
+                planes=_plane_table(planes),
+                materials=_material_table(planes),
+                before=frozenset(cell.address for cell in run.upstream(address)) - {address},
             )
-            if planes.side_from
-            else planes.viewpoint.replace("_", " "),
-            planes=_plane_table(planes),
-            materials=_material_table(planes),
-            before=frozenset(cell.address for cell in run.upstream(address)) - {address},
         )
-        for place, other in enumerate(found):
-            if (other.viewpoint, other.planes, other.materials) == (
-                *(tables.viewpoint, tables.planes, tables.materials),
-            ):
-                found[place] = replace(other, later=(*other.later, address))
-                break
-        else:
-            found.append(tables)
     return tuple(found)
 
 

@@ -39,14 +39,6 @@ def bars(curve: Curve) -> list[float]:
     return [spread for spread in found if math.isfinite(spread)]
 
 
-def ways(curve: Curve) -> list[str]:
-    """Where the lines begin and go on, a letter per point."""
-    return [
-        "".join("L" if point.is_joined and place else "M" for place, point in enumerate(line))
-        for line in curve.lines.values()
-    ]
-
-
 def held(folder: Path, cells: list[object]) -> HeldRun:
     return HeldRun(path=folder / "run.h5", record=record(cells))  # type: ignore[arg-type]
 
@@ -86,41 +78,6 @@ def test_where_no_quality_hangs_on_a_sweep_what_differs_is_drawn(tmp_path: Path)
     ]
 
 
-def test_what_is_not_swept_is_a_level_line(tmp_path: Path) -> None:
-    def region(repeat: int, name: str = "region") -> object:
-        return cell(
-            f"plane@plane={name}" + (f"#{repeat}" if repeat else ""),
-            method="plane.region",
-            params={"radius_m": 0.1},
-            metrics=metrics(rms_mm=0.004 + 0.001 * repeat),
-        )
-
-    own = swept(0.02, 0.05, 0.1, repeats=2)
-    (curve,) = curves([held(tmp_path, [*own, region(0), region(1)])])
-    assert list(curve.lines) == ["plane.toy", "plane.region"]
-    assert ways(curve) == ["MLL", "ML"]
-    level = curve.lines["plane.region"]
-    assert [(point.x, point.y) for point in level] == [
-        (0.02, pytest.approx(0.0045)),
-        (0.1, pytest.approx(0.0045)),
-    ]
-    # Of one method several are recorded apart; nothing swept is no curve.
-    (curve,) = curves([held(tmp_path, [*own, region(0), region(0, "wider")])])
-    assert "plane.region, wider" in curve.lines
-    # What has the parameter too, at its default, is named by the value.
-    default = cell(
-        "plane@plane=default",
-        method="plane.region",
-        params={"tolerance_m": 0.04},
-        metrics=metrics(rms_mm=0.004),
-    )
-    (curve,) = curves([held(tmp_path, [*own, default])])
-    assert "plane.region, tolerance_m=0.04" in curve.lines
-    assert curves([held(tmp_path, [region(0), region(0, "wider")])]) == ()
-    (curve,) = curves([held(tmp_path, own)])
-    assert list(curve.lines) == [""]
-
-
 def test_what_is_asked_for_is_drawn_and_what_hangs_on_no_sweep_is_not(tmp_path: Path) -> None:
     cells = [
         *(
@@ -146,11 +103,6 @@ def test_the_baseline_of_a_sweep_is_the_filled_point(tmp_path: Path) -> None:
     )
     (curve,) = curves([HeldRun(path=tmp_path / "run.h5", record=recorded)])
     assert [point.x for point in curve.lines[""] if point.is_filled] == [0.05]
-    region = cell("plane@plane=region", method="plane.region", metrics=metrics(rms_mm=0.004))
-    resolved = json.dumps({"compare": {"baseline": {"plane": "region"}}})
-    recorded = record([*swept(0.02, 0.05, 0.1), region], workflow_resolved=resolved)  # type: ignore[list-item]
-    (level,) = curves([HeldRun(path=tmp_path / "run.h5", record=recorded)])
-    assert [point.is_filled for point in level.lines["plane.region"]] == [True, True]
     (plain,) = curves([held(tmp_path, swept(0.02, 0.05, 0.1))])
     assert not any(point.is_filled for point in plain.lines[""])
 
@@ -171,18 +123,6 @@ def test_signed_errors_over_datasets_do_not_make_each_other_small(tmp_path: Path
     }
     (curve,) = curves([*parts.values()])
     assert [y for _, y in points(curve)] == [0.02, 0.05, 0.1]
-
-
-def test_a_curve_counts_the_datasets_that_its_points_are_of(tmp_path: Path) -> None:
-    fine, failing = swept(0.02, 0.05, 0.1, repeats=2), swept(0.02, 0.05, 0.1, failed=2)
-    parts = {"calm": held(tmp_path, fine), "dark": held(tmp_path, failing)}
-    (curve,) = curves([*parts.values()])
-    assert "medians of 1 to 2 of 2 datasets" in curve.caption
-    nothing = held(tmp_path, [replace(one, status="failed") for one in swept(0.02, 0.05, 0.1)])
-    (curve,) = curves([held(tmp_path, fine), nothing])
-    assert "medians of 1 of 2 datasets" in curve.caption
-    # Repeats of the one are no spread of datasets.
-    assert bars(curve) == []
 
 
 def over_rooms(
@@ -208,24 +148,21 @@ def over_rooms(
     }
 
 
-def test_no_line_joins_points_of_other_datasets_or_repeats(tmp_path: Path) -> None:
-    whole, none = (1.0, 2.0), (None, None)
+def test_a_line_is_over_the_rooms_that_all_its_points_have(tmp_path: Path) -> None:
     values: dict[str, dict[float, tuple[float | None, ...]]] = {
-        "calm": {1.0: whole, 2.0: none, 3.0: whole, 4.0: whole, 5.0: whole},
-        "dark": {1.0: none, 2.0: whole, 3.0: whole, 4.0: whole, 5.0: (None, 2.0)},
-        "wide": dict.fromkeys((1.0, 2.0, 3.0, 4.0, 5.0), whole),
+        "calm": {1.0: (1.0, 2.0), 2.0: (2.0, 2.0)},
+        # Where the hard room fails, the rest looks better.
+        "dark": {1.0: (9.0, 9.0), 2.0: (None, None)},
+        "wide": {1.0: (3.0, 4.0), 2.0: (4.0, 4.0)},
     }
     (curve,) = curves([*over_rooms(tmp_path, values, "rms_mm").values()])
-    # Of two rooms the first and the second, but of others; the last lacks a repeat of one.
-    assert ways(curve) == ["MMMLM"]
-    assert "medians of 2 to 3 of 3 datasets" in curve.caption
-    alone = {"calm": {1.0: whole, 2.0: whole, 3.0: (1.0, None)}}
-    (run,) = over_rooms(tmp_path, alone, "rms_mm").values()
-    cells = [
-        replace(one, assignment={"plane": one.assignment["plane"]}) for one in run.record.cells
-    ]
-    (curve,) = curves([held(tmp_path, [*cells])])
-    assert ways(curve) == ["MLM"]
+    assert points(curve) == [(1.0, 2.5), (2.0, 3.0)]
+    assert "medians of 2 of 3 datasets" in curve.caption
+    # Repeats of one room are no spread of rooms.
+    alone = {"calm": values["calm"], "dark": {1.0: (None,), 2.0: (None,)}}
+    (curve,) = curves([*over_rooms(tmp_path, alone, "rms_mm").values()])
+    assert "medians of 1 of 2 datasets" in curve.caption
+    assert bars(curve) == []
 
 
 def test_of_what_is_found_or_not_a_curve_has_the_share_of_rooms(tmp_path: Path) -> None:
@@ -293,24 +230,3 @@ def test_errors_over_unequal_numbers_of_photos_are_drawn_with_a_word_of_that(
         for curve in curves([held(tmp_path, cells)])
     }
     assert any(said.values()) is is_said
-
-
-@pytest.mark.parametrize(("area_m2", "is_said"), [(16.5, False), (1.2, True)])
-def test_a_curve_over_different_walls_is_drawn_with_a_word_of_that(
-    tmp_path: Path, area_m2: float, is_said: bool
-) -> None:
-    cells = []
-    for value, area in ((1.0, 16.0), (2.0, area_m2)):
-        variant = f"plane=limit-{value:g}"
-        recorded = metrics(omega_deg=10.0, phi_deg=0.0, area_m2=area)
-        found = metrics(rms_mm=value)
-        cells += [
-            cell(f"plane@{variant}", params={"limit": value}, metrics=found),
-            cell(f"wall@{variant}", method="raster.grid", metrics=recorded),
-            cell(f"check@{variant}", method="inspect.toy", metrics=metrics(rmse_u_mm=value)),
-        ]
-    said = {
-        curve.name.partition(".")[0]: "Not all are of the same wall" in curve.caption
-        for curve in curves([held(tmp_path, cells)])
-    }
-    assert (said["plane"], said["check"]) == (False, is_said)

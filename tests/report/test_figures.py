@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -54,24 +53,6 @@ def test_all_figures_of_a_page_take_less_than_four_megabytes() -> None:
         sizes = [size for *_, size in shown(run(cells))]
         assert (sizes == [len(one.data) for one in large[:n_figures]]) is is_whole
         assert sum(sizes) <= 3_900_000
-
-
-def test_the_baseline_has_seven_tenths_before_the_others_share_the_rest() -> None:
-    ours, theirs = noise(1), noise(2)
-    cells = [
-        cell("plane@plane=fine", figures=(figure("a", ours),)),
-        cell("plane@plane=coarse", figures=(figure("b", theirs),)),
-    ]
-    whole = len(ours) / 3_900_000
-    # The baseline fits into seven tenths; of the others a quarter of their bytes is left.
-    fits = {name: size for _, name, size in shown(run(cells), share=whole / 0.69)}
-    assert fits["a"] == len(ours)
-    assert fits["b"] < 0.5 * len(theirs)
-    tight = {name: size for _, name, size in shown(run(cells), share=whole / 0.72)}
-    assert tight["a"] < 0.5 * len(ours)
-    # What the others do not need is the baseline's as well.
-    alone = run([cells[0], replace(cells[1], figures=(figure("b", b"small"),))])
-    assert shown(alone, share=whole / 0.95)[0][2] == len(ours)
 
 
 # --- files ---

@@ -5,15 +5,13 @@ from __future__ import annotations
 import csv
 import io
 import json
-import sys
 from dataclasses import replace
-from html import escape
 from pathlib import Path
-from types import SimpleNamespace
 
 import h5py
 import numpy as np
 import pytest
+from markupsafe import escape
 from orthoflow_provenance.document import RecordedFigure, RecordedProduct
 from orthoflow_provenance.record import write_record
 
@@ -221,32 +219,6 @@ def test_an_orthoimage_is_an_array_by_its_wall_s_number(tmp_path: Path) -> None:
         run.orthoimage(cell="first")
 
 
-def test_an_orthoimage_is_handed_on_with_metres_along_its_wall(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def keep(data: object, **told: object) -> SimpleNamespace:
-        return SimpleNamespace(data=data, **told)
-
-    monkeypatch.setitem(sys.modules, "xarray", SimpleNamespace(DataArray=keep))
-    made = cell("mosaic", outputs={"orthoimages": given("", "7", "orthoimages")})
-    image = Painted(path=tmp_path / "run.h5", record=record([made])).orthoimage(8)
-    array = image.to_xarray()
-    rows, columns = image.frame.shape
-    assert array.data is image.rgb
-    assert array.dims == ("y", "x", "band")
-    left, top = image.frame.raster_corner_m
-    # The middles of the cells, the first row on top.
-    step = image.frame.gsd_m
-    (_, x, told), (_, y, _) = array.coords["x"], array.coords["y"]
-    assert told == {"units": "m"}
-    np.testing.assert_allclose(x, np.linspace(left, left + columns * step, 2 * columns + 1)[1::2])
-    np.testing.assert_allclose(y, np.linspace(top, top - rows * step, 2 * rows + 1)[1::2])
-    assert array.attrs == {"unit_of_x_and_y": "m", "gsd_m": step}
-    dims, shown = array.coords["is_shown"]
-    assert dims == ("y", "x")
-    np.testing.assert_array_equal(shown, image.is_shown)
-
-
 def test_an_orthoimage_is_of_the_dataset_that_is_named(tmp_path: Path) -> None:
     made = [
         cell(f"mosaic@data={name}", outputs={"orthoimages": given("", "7", "orthoimages")})
@@ -315,12 +287,8 @@ def test_a_comparison_shows_what_moved() -> None:
     assert html.count("<tr") == 2
     assert "<td>0.5</td>" in html
     assert "plane.a: 1 -&gt; 2" in html
-    assert shown(still, near, alone).endswith(
-        "<p>No number that both runs have differs, time and memory, and rounding, left aside.</p>"
-    )
-    assert shown(alone).endswith(
-        "<p>They have no number in common, time and memory left aside.</p>"
-    )
+    assert "<p>No number that both runs have differs" in shown(still, near, alone)
+    assert "<p>They have no number in common" in shown(alone)
 
 
 def test_a_comparison_shows_first_what_says_how_good_it_is() -> None:

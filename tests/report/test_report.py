@@ -176,12 +176,12 @@ def rastered(omega_deg: float, area_m2: float, place: str) -> RecordedCell:
         ([(359.0, 16.0), (1.0, 18.0)], ""),
         (
             [(359.0, 16.0), (180.0, 16.0)],
-            "shows 16 m2 at omega 180, phi 0 deg, the other shows 16 m2 at omega 359, phi 0 deg",
+            "shows 16 m2 at omega 180, phi 0 deg, most 16 m2 at omega 359, phi 0 deg",
         ),
         # The odd one is named, wherever it stands.
         (
             [(10.0, 1.2), (10.0, 16.0), (10.0, 16.5)],
-            "plane=0 shows 1.2 m2 at omega 10, phi 0 deg, the 2 others show 16 m2 at omega 10, phi",
+            "plane=0 shows 1.2 m2 at omega 10, phi 0 deg, most 16 m2 at omega 10, phi 0 deg",
         ),
     ],
 )
