@@ -7,9 +7,9 @@ from orthoflow.sdk.hooks import KindSpec, MethodSpec, ProductSpec, hookimpl
 from toy_plugin.mischief_names import MISCHIEF
 
 WORKS = ["add", "noise", "sign", "slow", "segfault", "abort", "eat", "hang", "stubborn", "quit",
-         "leave", "raises", "refuses", "unreadable", "needs_library", "no_memory", "full_disk",
+         "leave", "raises", "refuses", "unreadable", "needs_library", "no_memory",
          "changes_input", "wrong_type", "wrong_out", "bad_param", "draws", "chatty", "unstorable",
-         "spawns", "spawns_and_waits", "threads", "around", "fills_mapped", "compiles", "loads",
+         "spawns", "spawns_and_waits", "threads", "compiles", "loads",
          "bad_disk"]
 
 @hookimpl
@@ -323,10 +323,6 @@ def no_memory(values, params, ctx):
     return np.empty(1 << 46)
 
 @work("exact")
-def full_disk(values, params, ctx):
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(ctx.scratch / "x"))
-
-@work("exact")
 def bad_disk(values, params, ctx):
     place = ctx.scratch / "x" if params.steps else "/elsewhere/x"
     raise OSError(int(params.amount), os.strerror(int(params.amount)), str(place))
@@ -372,23 +368,6 @@ def threads(values, params, ctx):
     cache = os.environ["NUMBA_CACHE_DIR"]
     print(cache, os.getcwd(), ctx.scratch)
     return np.array([ctx.cores, *[float(os.environ[name]) for name in names]])
-
-@work("exact")
-def around(values, params, ctx):
-    # Before anything here loads one.
-    loaded = "networkx" in sys.modules
-    import networkx
-    return np.array([
-        os.getpid(), os.getppid(), os.getsid(0), loaded, float(os.environ.get("TOY_NUMBER", -1)),
-        resource.getrlimit(resource.RLIMIT_NOFILE)[0], float(ctx.cores),
-        float(os.environ["OPENBLAS_THREAD_TIMEOUT"]),
-    ])
-
-@work("exact")
-def fills_mapped(values, params, ctx):
-    array = ctx.allocate("numbers", "values", (8 << 20,), np.float64)
-    array[:] = 1.0
-    return array
 
 class Means(Method):
     id = "thin.means"

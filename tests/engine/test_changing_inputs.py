@@ -47,6 +47,10 @@ def append(path: Path) -> None:
         file.write(" 4")
 
 
+def touch(path: Path) -> None:
+    os.utime(path, ns=(1, 1))
+
+
 def run_while(world: World, change: Callable[[Path], object]) -> tuple[str, str]:
     """Status and reason of a step whose input changes as soon as it has begun."""
     plan = world.plan(STEPS, executor="inline")
@@ -57,6 +61,10 @@ def run_while(world: World, change: Callable[[Path], object]) -> tuple[str, str]
 
     result = execute(plan, world.folder / "run", world.store, listen).results["read"]
     return result.status, result.error_message
+
+
+def test_an_input_may_be_touched(world: World) -> None:
+    assert run_while(world, touch) == ("ok", "")
 
 
 @pytest.mark.parametrize("change", [rewrite_in_secret, exchange, append])

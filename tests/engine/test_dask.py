@@ -14,8 +14,7 @@ import pytest
 from distributed import LocalCluster
 
 from orthoflow.engine import dask as engine_dask
-from orthoflow.engine import local
-from orthoflow.engine.dask import CORES, DaskExecutor, look_around
+from orthoflow.engine.dask import CORES, DaskExecutor
 from orthoflow.engine.journal import (
     CellReported,
     RunEvent,
@@ -136,25 +135,6 @@ def test_workers_of_its_own_give_the_same_digests(office: Office) -> None:
     assert digests(office.world.run(STEPS, into="own", executor="dask", force=("second",))) == (
         office.quiet
     )
-
-
-@pytest.mark.long
-def test_when_memory_is_short_the_largest_step_of_all_own_workers_goes(
-    office: Office, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    slow = "use: work.slow, in: {numbers: first.numbers}, params: {steps: 40, amount: "
-    steps = f"  first: {{use: make.range}}\n  a: {{{slow}1}}}}\n  b: {{{slow}2}}}}\n"
-    fresh = World(folder=office.world.folder / "short", site=office.world.site)
-    fresh.folder.mkdir()
-    running = local._all_running
-
-    monkeypatch.setattr(local, "memory_shortage", lambda: (len(running) > 1) << 30)
-    # Both are worth being stopped.
-    monkeypatch.setattr(local, "tree_memory", lambda root: (1 << 33) + (root == min(running)))
-    outcome = fresh.run(f"steps:\n{steps}", executor="dask", jobs=2, cores=2)
-    said = [result.error_message for name, result in outcome.results.items() if name != "first"]
-    assert sorted("needed more memory" in text for text in said) == [False, True]
-    assert not running
 
 
 def test_steps_fail_on_workers_as_they_do_here(office: Office) -> None:
@@ -285,12 +265,6 @@ def test_workers_that_do_not_see_the_store_are_refused(
     monkeypatch.setattr(engine_dask, "write_whole", lambda *_: None)
     with pytest.raises(ArgumentError, match=r"does not see the store .*No such file"):
         office.run()
-
-
-def test_what_a_worker_says_of_itself(tmp_path: Path) -> None:
-    (tmp_path / "word").write_text("hello")
-    assert look_around(str(tmp_path / "word"), "{}") == ("hello", "")
-    assert look_around(str(tmp_path), "{}")[0] == "Is a directory"
 
 
 def test_an_address_without_scheduler_is_refused(

@@ -122,38 +122,36 @@ def test_what_a_method_raises_becomes_one_sentence(world: World, bad: str) -> No
     assert ("Traceback" in result.log, result.is_bug) == (bad in BUGS, bad in BUGS)
 
 
-def test_running_out_of_memory_in_an_allocation_is_a_sentence(world: World) -> None:
-    result = bad_result(world, "no_memory", executor="inline")
-    assert result.error_type == "StepFailedError"
-    assert result.error_message.startswith(
+# What the disk refuses: the kind of error, of what lies in the scratch folder and elsewhere.
+REFUSED = {
+    errno.ENOSPC: ("DiskSpaceError", "DiskSpaceError"),
+    errno.EDQUOT: ("DiskSpaceError", "DiskSpaceError"),
+    errno.EFBIG: ("StepFailedError", "StepFailedError"),
+    errno.EIO: ("StoreError", "MethodError"),
+    errno.ESTALE: ("StoreError", "MethodError"),
+    errno.EROFS: ("StoreError", "MethodError"),
+    errno.EACCES: ("MethodError", "MethodError"),
+}
+
+
+def test_what_disk_and_memory_refuse_is_an_error_of_whoever_is_at_fault(world: World) -> None:
+    steps = "  none: {use: work.no_memory, in: {numbers: a.numbers}}\n" + "".join(
+        f"  e{number}-{is_own}: {{use: work.bad_disk, in: {{numbers: a.numbers}}, "
+        f"params: {{amount: {number}, steps: {is_own}}}}}\n"
+        for number in REFUSED
+        for is_own in (0, 1)
+    )
+    results = world.run(f"steps:\n  a: {{use: make.range}}\n{steps}", executor="inline").results
+    for number, (own, other) in REFUSED.items():
+        for address, kind in ((f"e{number}-1", own), (f"e{number}-0", other)):
+            assert results[address].error_type == kind, (address, results[address].error_message)
+            if kind in ("StoreError", "DiskSpaceError"):
+                expected = f"cannot write to {world.store.folder}: "
+                assert results[address].error_message.startswith(expected)
+    assert results["none"].error_type == "StepFailedError"
+    assert results["none"].error_message.startswith(
         f"method work.no_memory {TOYS} needed more memory than it could get: Unable to allocate"
     )
-
-
-def test_a_full_disk_in_a_method_names_the_store(world: World) -> None:
-    result = bad_result(world, "full_disk", executor="inline")
-    assert result.error_type == "DiskSpaceError"
-    assert result.error_message.startswith(
-        f"cannot write to {world.store.folder}: No space left on device"
-    )
-
-
-@pytest.mark.parametrize("number", [errno.EIO, errno.ESTALE, errno.EROFS])
-def test_a_broken_disk_is_the_stores_fault_and_the_same_command_goes_on(
-    world: World, number: int
-) -> None:
-    steps = """
-steps:
-  a: {use: make.range}
-  b: {use: work.bad_disk, in: {numbers: a.numbers}, params: {amount: %s, steps: %s}}
-"""
-    broken = world.run(steps % (number, 1), executor="inline").results["b"]
-    assert broken.error_type == "StoreError"
-    assert broken.error_message.startswith(f"cannot write to {world.store.folder}: ")
-    # What lies elsewhere is the method's own business.
-    other = world.run(steps % (number, 0), into="other", executor="inline").results["b"]
-    assert other.error_type == "MethodError"
-    assert "/elsewhere/x" in other.error_message
 
 
 CRASHES = {

@@ -13,25 +13,25 @@ def metric(result: CellResult, name: str) -> float:
 
 
 def test_seconds_of_compiling_show_in_compile_s_only(world: World) -> None:
-    outcome = world.run(STEPS.format("compiles", ", params: {amount: 5}"))
+    outcome = world.run(STEPS.format("compiles", ", params: {amount: 3}"))
     result = outcome.results["b"]
     assert result.error_message == ""
     assert result.compile_s is not None
     # What else it loads and compiles takes seconds on a busy machine.
-    assert 5.0 <= result.compile_s < 50.0
-    assert 0.2 <= metric(result, "kernel_s") <= result.wall_s < 4.9
-    # One of the five seconds is the processor's.
+    assert 3.0 <= result.compile_s < 50.0
+    assert 0.2 <= metric(result, "kernel_s") <= result.wall_s < 2.9
+    # One of the three seconds is the processor's.
     assert 0.0 <= metric(result, "kernel_cpu_s") <= result.cpu_s < 0.9
 
 
 def test_loading_shows_in_compile_s_only_and_stops_no_clock_from_a_daemon(world: World) -> None:
     package = world.site / "toy_plugin"
-    (package / "heavy.py").write_text("import time\ntime.sleep(5)\n")
+    (package / "heavy.py").write_text("import time\ntime.sleep(3)\n")
     (package / "aside.py").write_text("import time\ntime.sleep(0.5)\n")
     result = world.run(STEPS.format("loads", "")).results["b"]
     assert result.compile_s is not None
-    assert result.compile_s >= 5.0
-    assert 0.5 <= metric(result, "loads_s") <= result.wall_s < 4.9
+    assert result.compile_s >= 3.0
+    assert 0.5 <= metric(result, "loads_s") <= result.wall_s < 2.9
     (package / "heavy.py").write_text("import time\ntime.sleep(0.1)\n")
     again = world.run(STEPS.format("loads", ""), into="inline", executor="inline", force=("b",))
     assert again.results["b"].compile_s is not None

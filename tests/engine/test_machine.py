@@ -55,6 +55,23 @@ def test_memory_is_short_at_the_floor_and_not_above(
         assert measuring.memory_shortage() == expected
 
 
+@pytest.mark.parametrize(
+    ("error", "is_memory"),
+    [
+        (MemoryError(), True),
+        (OSError(errno.ENOMEM, "Cannot allocate memory"), True),
+        (ImportError("a.so: failed to map segment from shared object"), True),
+        (RuntimeError("can't start new thread"), True),
+        (RuntimeError("no threads"), False),
+        (ImportError("no module named a"), False),
+        (OSError(errno.ENOSPC, "No space left on device"), False),
+    ],
+    ids=str,
+)
+def test_lack_of_memory_differs_from_other_errors(error: Exception, is_memory: bool) -> None:
+    assert measuring.is_for_want_of_memory(error) == is_memory
+
+
 # --- versions ---
 
 

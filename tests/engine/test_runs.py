@@ -14,7 +14,6 @@ from orthoflow.engine.journal import (
     CellStarted,
 )
 from orthoflow.engine.scheduler import execute
-from orthoflow.errors import InputError
 from orthoflow.sdk.context import StepEvent
 from tests.engine_world import World, digests
 
@@ -146,19 +145,6 @@ steps:
     given = outcome.inputs["data"]
     assert given is not None
     assert given.files[0].name == "data.txt"
-
-
-def test_an_input_file_that_changes_while_it_is_read_fails_the_cell(world: World) -> None:
-    data = world.folder / "data.txt"
-    data.write_text("1 2")
-    steps = (
-        "inputs: {data: {files: data.txt}}\nsteps: {a: {use: make.file, in: {files: inputs.data}}}"
-    )
-    plan = world.plan(steps, executor="inline")
-    data.write_text("1 2 3")
-    outcome = execute(plan, world.folder / "run", world.store)
-    assert outcome.results["a"].error_type == InputError.__name__
-    assert "changed while it was read; run again" in outcome.results["a"].error_message
 
 
 def test_results_of_code_that_changed_during_the_run_are_not_kept(world: World) -> None:

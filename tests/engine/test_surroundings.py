@@ -8,13 +8,13 @@ from __future__ import annotations
 import ctypes
 import json
 import os
-import resource
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import MappingProxyType
 
 import pytest
 
@@ -57,55 +57,18 @@ class Desk:
     def __call__(
         self,
         *arguments: str,
-        environment: Mapping[str, str | None] | None = None,
-        before: Callable[[], object] = lambda: None,
-        words: Sequence[str] = ("-m", "orthoflow"),
+        environment: Mapping[str, str] = MappingProxyType({}),
     ) -> tuple[int, str]:
-        """Run a command as a user without the rights of root; exit code, and what it said.
-
-        `words` are those that the interpreter gets before the arguments.
-        """
-        changed = self._variables(environment)
-
-        def prepare() -> None:
-            for capability in _RIGHTS_OF_ROOT:
-                _LIBC.prctl(_PR_CAPBSET_DROP, capability, 0, 0, 0)
-            before()
-
-        done = subprocess.run(
-            [sys.executable, *words, *arguments],
-            cwd=self.folder,
-            env=changed,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=300,
-            preexec_fn=prepare,
+        """Run a command as a user without the rights of root; exit code, and what it said."""
+        done = run_command(
+            self.folder, arguments, {**self.variables, **environment}, forgone=_RIGHTS_OF_ROOT
         )
         return done.returncode, done.stderr
 
-    def forked(
-        self,
-        *arguments: str,
-        environment: Mapping[str, str | None] | None = None,
-    ) -> tuple[int, str]:
-        """Run a command so, where nothing is asked of how it loads: forked from one that has."""
-        changed = self._variables(environment)
-        done = run_command(self.folder, arguments, changed, forgone=_RIGHTS_OF_ROOT)
-        return done.returncode, done.stderr
-
-    def _variables(self, changed: Mapping[str, str | None] | None) -> dict[str, str]:
-        variables = {**os.environ, "PYTHONPATH": self.python_path, **(changed or {})}
-        return {name: value for name, value in variables.items() if value is not None}
-
     @property
-    def python_path(self) -> str:
+    def variables(self) -> dict[str, str]:
         parts = (ROOT, ROOT / "plugins", ROOT / "provenance", self.folder / "site")
-        return os.pathsep.join(map(str, parts))
-
-    def run(self, name: str = "run", **more: object) -> tuple[int, str]:
-        return self("run", "toy.yaml", "-o", name, **more)  # type: ignore[arg-type]
+        return {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, parts))}
 
 
 def desk_in(folder: Path) -> Desk:
@@ -160,16 +123,32 @@ def test_no_home_is_needed(desk: Desk, home: str) -> None:
         place.mkdir(mode=0o500)
     if home == "a file":
         place.touch()
-    value = None if home == "unset" else str(place)
-    cleared = dict.fromkeys(("XDG_CACHE_HOME", "XDG_CONFIG_HOME", "NUMBA_CACHE_DIR"))
-    environment = {"HOME": value, "MPLCONFIGDIR": None, **cleared}
+    changed = ("HOME", "MPLCONFIGDIR", "XDG_CACHE_HOME", "XDG_CONFIG_HOME", "NUMBA_CACHE_DIR")
+    variables = {name: value for name, value in desk.variables.items() if name not in changed}
+    if home != "unset":
+        variables["HOME"] = str(place)
     # One new interpreter for all: what loads in such a home is the same for each command. In one of
     # the homes steps have processes of their own, which load it once more.
     inline = () if home == "unwritable" else IN_THIS_PROCESS
     run = ["run", "toy.yaml", "-o", "run", *inline]
     commands = (run, ["report", "run"], ["compare", "run", "run"])
-    code, said = desk(environment=environment, words=("-c", ONE_BY_ONE, json.dumps(commands)))
-    assert code == 0, said
+
+    def forgo_rights() -> None:
+        for capability in _RIGHTS_OF_ROOT:
+            _LIBC.prctl(_PR_CAPBSET_DROP, capability, 0, 0, 0)
+
+    done = subprocess.run(
+        [sys.executable, "-c", ONE_BY_ONE, json.dumps(commands)],
+        cwd=desk.folder,
+        env=variables,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+        preexec_fn=forgo_rights,
+    )
+    said = done.stderr
+    assert done.returncode == 0, said
     assert "Traceback" not in said
     check_finished(desk)
     assert said.count(ENDED_WELL) == len(commands)
@@ -189,7 +168,7 @@ def test_a_folder_may_have_any_name_of_any_length(tmp_path: Path) -> None:
             *("--input", f"numbers={desk.folder / 'numbers.txt'}"),
         ),
     ):
-        code, said = desk.forked(*command, environment={"HOME": str(desk.folder)})
+        code, said = desk(*command, environment={"HOME": str(desk.folder)})
         assert code == 0, said
     check_finished(desk)
     check_finished(desk, "again")
@@ -211,14 +190,14 @@ def test_what_may_only_be_read_is_read_and_nothing_else(used_desk: Desk) -> None
         ("verify", "run"),
         ("plan", "toy.yaml"),
     ):
-        code, said = desk.forked(*command)
+        code, said = desk(*command)
         assert code == 0, said
     for command in (
         ("run", "toy.yaml", "-o", "second", *IN_THIS_PROCESS),
         ("export", "run", "--to", "ro-crate", "-o", "crate"),
         ("cache", "gc"),
     ):
-        code, said = desk.forked(*command)
+        code, said = desk(*command)
         # 2: where an export goes is an argument.
         assert code in (1, 2), (command, said)
         check_sentence(said, "ermission")
@@ -235,7 +214,7 @@ def test_the_store_of_another_user_serves_as_far_as_it_may_be_written(
     for path in (store, *store.rglob("*")):
         os.chown(path, NOBODY, NOBODY)
         path.chmod(0o777 if is_open else 0o755 if path.is_dir() else 0o644)
-    code, said = desk.forked("run", "toy.yaml", "-o", "second", *IN_THIS_PROCESS)
+    code, said = desk("run", "toy.yaml", "-o", "second", *IN_THIS_PROCESS)
     if is_open:
         assert code == 0, said
         assert all(cell.cached_from for cell in open_run(desk.folder / "second").cells.values())
@@ -243,58 +222,7 @@ def test_the_store_of_another_user_serves_as_far_as_it_may_be_written(
     else:
         assert code == 1, said
         check_sentence(said, "Permission denied; make that possible, or choose")
-    assert desk.forked("cache", "gc")[0] == (0 if is_open else 1)
-
-
-# What a machine has too little of -----------------------------------------------------------------
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    "n_files",
-    [12, 20, 64],
-)
-def test_few_open_files_are_enough_or_are_said(desk: Desk, n_files: int) -> None:
-    def limit() -> None:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (n_files, n_files))
-
-    code, said = desk.run(before=limit)
-    if n_files == 64:
-        assert code == 0, said
-    if code != 0:
-        assert code in (1, 4), said
-        check_sentence(said)
-        # A run whose steps failed is finished; one that was given up goes on in its folder.
-        folder = "again" if code == 1 else "run"
-        code, said = desk.forked("run", "toy.yaml", "-o", folder, *IN_THIS_PROCESS)
-        assert code == 0, said
-        check_finished(desk, folder)
-    else:
-        check_finished(desk)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    "mib",
-    [175, 260, 600],
-)
-def test_too_little_memory_is_said_and_nothing_is_lost(desk: Desk, mib: int) -> None:
-    def limit() -> None:
-        resource.setrlimit(resource.RLIMIT_AS, (mib << 20, mib << 20))
-
-    # Each thread of OpenBLAS takes address space of its own.
-    code, said = desk.run(before=limit, environment={"OPENBLAS_NUM_THREADS": "1"})
-    name = "run"
-    if code != 0:
-        # A little less, and not even the methods load.
-        assert code in (1, 2, 4), said
-        # A step that had too little fails alone, and its run is a whole one.
-        has_ended = (desk.folder / "run" / "run.h5").exists()
-        check_sentence(said.replace(" failed: ", "error: ") if has_ended else said)
-        assert "memory" in said or not has_ended
-        name = "again" if has_ended else "run"
-        assert desk.forked("run", "toy.yaml", "-o", name, *IN_THIS_PROCESS)[0] == 0
-    check_finished(desk, name)
+    assert desk("cache", "gc")[0] == (0 if is_open else 1)
 
 
 # Clocks -------------------------------------------------------------------------------------------
