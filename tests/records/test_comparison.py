@@ -135,15 +135,11 @@ def test_distances_are_told_in_the_units_of_the_type(studio: Studio) -> None:
     assert "12 of 12 values differ by more than 2 grey, the largest by 3" in shown
 
 
-def test_the_workflow_is_compared_line_by_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    studio = open_studio(tmp_path, monkeypatch)
-    studio.run("a")
-    path = tmp_path / "studio.yaml"
-    path.write_text(path.read_text().replace("paint.plain", "paint.fail"))
-    assert studio("run", "studio.yaml", "-o", "b").exit_code == 1
-    said = studio.json("compare", "a", "b")
+def test_the_workflow_is_compared_line_by_line(studio: Studio) -> None:
+    text = (studio.folder / "studio.yaml").read_text()
+    (studio.folder / "failing.yaml").write_text(text.replace("paint.plain", "paint.fail"))
+    assert studio("run", "failing.yaml", "-o", "failed").exit_code == 1
+    said = studio.json("compare", "first", "failed")
     assert said["workflow"][-2:] == [
         "-  paint: {use: paint.plain, in: {planes: survey.planes}}",
         "+  paint: {use: paint.fail, in: {planes: survey.planes}}",

@@ -14,10 +14,6 @@ from orthoflow_provenance.document import (
     Metric,
     RecordedCell,
     RecordedFigure,
-    RecordedFile,
-    RecordedInput,
-    RecordedProduct,
-    RunRecord,
 )
 from orthoflow_provenance.record import write_record
 
@@ -29,11 +25,10 @@ from orthoflow.records.runs import Run, published_files
 from orthoflow.records.verify import verify_run
 from orthoflow.records.write import publish_products
 from tests import samples
-from tests.report_runs import environment
+from tests.report_runs import cell, given
+from tests.report_runs import record as a_record
 
 PNG = b"\x89PNG\r\n\x1a\n picture"
-PREIMAGE = '{"method":"plane.given"}'
-ENVIRONMENT = environment("sha256:" + "e" * 64)
 CLOUD_DIGEST = "sha256:" + "c" * 64
 
 
@@ -48,94 +43,42 @@ def one_plane() -> Planes:
     )
 
 
+def made(address: str, **more: object) -> RecordedCell:
+    """A cell whose key is that of its preimage."""
+    facts: dict[str, object] = {
+        "distribution": "orthoflow-tls",
+        "distribution_version": "0.1.0",
+        "determinism": "exact",
+        "key": hashlib.sha256(b"{}").hexdigest(),
+        "key_preimage": "{}",
+        "started": "2026-01-02T03:04:05.000Z",
+        "ended": "2026-01-02T03:04:06.500Z",
+    }
+    return cell(address, **{**facts, **more})
+
+
 def planes_cell(digest: str) -> RecordedCell:
-    return RecordedCell(
-        address="plane@plane=given",
-        step="plane",
-        method="plane.given",
-        status="ok",
-        assignment={"plane": "given"},
-        distribution="orthoflow-tls",
-        distribution_version="0.1.0",
-        result_version=1,
-        determinism="exact",
-        environment=ENVIRONMENT.id,
-        params={"tolerance_m": 0.02},
-        key=hashlib.sha256(PREIMAGE.encode()).hexdigest(),
-        key_preimage=PREIMAGE,
-        started="2026-01-02T03:04:05.000Z",
-        ended="2026-01-02T03:04:06.500Z",
+    return made(
+        "plane@plane=given",
         wall_s=1.5,
         cpu_s=1.25,
+        compile_s=None,
         peak_rss_mib=128.0,
         metrics=(Metric(name="rms_mm", value=2.0, unit="mm"),),
         figures=(RecordedFigure(name="plan", caption="seen", media_type="image/png", data=PNG),),
-        warnings=("the side of the viewer is a guess",),
-        inputs={
-            "cloud": RecordedProduct(
-                type_name="cloud", encoding_version=1, digest=CLOUD_DIGEST, source="cloud.cloud"
-            )
-        },
-        outputs={
-            "planes": RecordedProduct(
-                type_name="planes", encoding_version=1, digest=digest, embedded=True
-            )
-        },
+        inputs={"cloud": given("cloud.cloud", "c", "cloud")},
+        outputs={"planes": dataclasses.replace(given("", "0", "planes"), digest=digest)},
     )
 
 
 def cloud_cell() -> RecordedCell:
-    return RecordedCell(
-        address="cloud",
-        step="cloud",
-        method="read.scan",
-        status="ok",
-        distribution="orthoflow-tls",
-        distribution_version="0.1.0",
-        result_version=1,
-        determinism="exact",
-        environment=ENVIRONMENT.id,
-        started="2026-01-02T03:04:05.000Z",
-        ended="2026-01-02T03:04:05.000Z",
-        key=hashlib.sha256(b"{}").hexdigest(),
-        key_preimage="{}",
-        outputs={
-            "cloud": RecordedProduct(type_name="cloud", encoding_version=1, digest=CLOUD_DIGEST)
-        },
-    )
+    cloud = dataclasses.replace(given("", "c", "cloud"), embedded=False)
+    return made("cloud", outputs={"cloud": cloud})
 
 
 def failed_cell() -> RecordedCell:
-    return RecordedCell(
-        address="wall",
-        step="wall",
-        method="raster.grid",
-        status="failed",
-        error_type="MethodError",
-        error_message="no cell has a point",
-        wall_s=0.5,
-    )
-
-
-def a_record(digest: str) -> RunRecord:
-    return RunRecord(
-        run_id="20260102-abc",
-        name="room",
-        created_by="orthoflow 0.1.0",
-        status="failed",
-        started="2026-01-02T03:04:05.000Z",
-        ended="2026-01-02T03:04:07.000Z",
-        seed=1729,
-        workflow_source="orthoflow: 1\nname: room\n",
-        workflow_resolved='{"name":"room"}',
-        inputs=(
-            RecordedInput(
-                name="scan",
-                files=(RecordedFile(name="room.e57", size_bytes=10, sha256="a" * 64),),
-            ),
-        ),
-        environments=(ENVIRONMENT,),
-        cells=(cloud_cell(), planes_cell(digest), failed_cell()),
+    return cell(
+        "wall", status="failed", error_type="MethodError", error_message="no cell has a point"
     )
 
 
@@ -151,7 +94,8 @@ def run_folder(tmp_path: Path) -> Path:
     digest = write_product_file(product, one_plane().to_payload())
     folder = tmp_path / "run"
     folder.mkdir()
-    record = a_record(digest)
+    cells = (cloud_cell(), planes_cell(digest), failed_cell())
+    record = a_record(cells, run_id="20260102-abc", status="failed")
     write_record(folder / "run.h5", record, lambda asked: product if asked == digest else None)
     published = tmp_path / "planes.json"
     published.write_text('{"planes": []}', encoding="utf-8")
@@ -166,7 +110,7 @@ def run(run_folder: Path) -> Run:
     return open_run(run_folder)
 
 
-def test_a_product_comes_back_as_it_was(run: Run) -> None:
+def test_products_figures_and_metrics_come_back(run: Run) -> None:
     planes = run.product("plane@plane=given", "planes")
     assert isinstance(planes, Planes)
     for field in dataclasses.fields(Planes):
@@ -176,14 +120,10 @@ def test_a_product_comes_back_as_it_was(run: Run) -> None:
         else:
             assert got == expected
 
-
-def test_a_figure_comes_back_as_bytes(run: Run) -> None:
     assert run.figure("plane@plane=given", "plan").data == PNG
-
-
-def test_metrics_hold_what_the_method_and_the_engine_measured_of_good_cells_only(run: Run) -> None:
+    # Of cells that failed there are none.
     rows = [(row.cell, row.metric, row.value, row.unit) for row in run.metric_rows()]
-    assert rows[3:] == [
+    assert rows[-4:] == [
         ("plane@plane=given", "rms_mm", 2.0, "mm"),
         ("plane@plane=given", "wall_s", 1.5, "s"),
         ("plane@plane=given", "cpu_s", 1.25, "s"),
@@ -219,35 +159,25 @@ def test_no_published_file_takes_the_place_of_another_or_of_the_metrics(tmp_path
 def test_what_a_later_step_gives_anew_is_not_published_beside_it(
     tmp_path: Path, *, changes: bool
 ) -> None:
-    def made(address: str, digit: str, **inputs: str) -> RecordedCell:
+    def giving(address: str, digit: str, **inputs: str) -> RecordedCell:
         """A cell that gives planes, of cells by name -> digit of what they give."""
-        planes = RecordedProduct(
-            type_name="planes", encoding_version=1, digest=f"sha256:{64 * digit}"
-        )
-        return dataclasses.replace(
-            cloud_cell(),
-            address=address,
-            step=address,
-            inputs={
-                f"from_{name}": dataclasses.replace(
-                    planes, digest=f"sha256:{64 * given}", source=f"{name}.planes"
-                )
-                for name, given in inputs.items()
-            },
-            outputs={"planes": planes},
-        )
+        taken = {
+            f"from_{name}": given(f"{name}.planes", other, "planes")
+            for name, other in inputs.items()
+        }
+        return made(address, inputs=taken, outputs={"planes": given("", digit, "planes")})
 
     cells = [
-        made("read", "1", inputs="0"),
-        made("plane", "2", read="1"),
-        made("sides", "3" if changes else "2", plane="2"),
+        giving("read", "1", inputs="0"),
+        giving("plane", "2", read="1"),
+        giving("sides", "3" if changes else "2", plane="2"),
     ]
     files: dict[str, dict[str, Mapping[Path, str]]] = {}
-    for cell in cells:
-        (tmp_path / cell.address).mkdir()
-        path = tmp_path / cell.address / "planes.json"
-        path.write_text(cell.address, encoding="utf-8")
-        files[cell.address] = {"planes": as_stored(path)}
+    for one in cells:
+        (tmp_path / one.address).mkdir()
+        path = tmp_path / one.address / "planes.json"
+        path.write_text(one.address, encoding="utf-8")
+        files[one.address] = {"planes": as_stored(path)}
     publish_products(tmp_path / "run", cells, files, "r")
     products = tmp_path / "run" / "products"
     # What was read stays, and what nobody changed.
@@ -295,64 +225,34 @@ def test_a_long_address_gets_a_folder_name_that_file_systems_take() -> None:
     assert cell_file_name(address) != cell_file_name(other)
 
 
-@pytest.mark.parametrize(("status", "how"), [("failed", "failed"), ("skipped", "was skipped")])
-def test_of_a_step_without_a_result_the_reason_is_said(run: Run, status: str, how: str) -> None:
-    cell = dataclasses.replace(
-        run.cells["cloud"], status=status, outputs={}, error_message="no file"
-    )
-    other = dataclasses.replace(run, record=dataclasses.replace(run.record, cells=(cell,)))
-    with pytest.raises(ArgumentError, match=f"the step cloud gave no 'cloud', it {how}: no file"):
-        other.payload("cloud", "cloud")
+def test_what_a_run_does_not_have_is_said(run: Run) -> None:
+    for status, how in (("failed", "failed"), ("skipped", "was skipped")):
+        lost = cell("cloud", status=status, error_message="no file")
+        other = dataclasses.replace(run, record=dataclasses.replace(run.record, cells=(lost,)))
+        with pytest.raises(ArgumentError, match=f"step cloud gave no 'cloud', it {how}: no file"):
+            other.payload("cloud", "cloud")
+    with pytest.raises(
+        RecordError, match=r"names cloud\.cloud only by its digest: it is in the st"
+    ):
+        run.payload("cloud", "cloud")
+    with pytest.raises(ArgumentError, match="has no step 'roof'; it has cloud, "):
+        run.payload("roof", "x")
+    with pytest.raises(ArgumentError, match="the step cloud has no output 'x'; it has cloud"):
+        run.payload("cloud", "x")
+    with pytest.raises(ArgumentError, match="step cloud has no figure 'plan'; it has none at all"):
+        run.figure("cloud", "plan")
 
 
-@pytest.mark.parametrize(
-    ("call", "error", "message"),
-    [
-        (
-            lambda run: run.payload("cloud", "cloud"),
-            RecordError,
-            "names cloud.cloud only by its digest: it is in the store of the run, from which ",
-        ),
-        (lambda run: run.payload("roof", "x"), ArgumentError, "has no step 'roof'; it has cloud, "),
-        (
-            lambda run: run.payload("cloud", "x"),
-            ArgumentError,
-            "the step cloud has no output 'x'; it has cloud",
-        ),
-        (
-            lambda run: run.figure("cloud", "plan"),
-            ArgumentError,
-            "the step cloud has no figure 'plan'; it has none at all",
-        ),
-    ],
-    ids=["not embedded", "no such cell", "no such output", "no such figure"],
-)
-def test_what_a_run_does_not_have_is_said(run: Run, call, error, message: str) -> None:  # type: ignore[no-untyped-def]
-    with pytest.raises(error) as caught:
-        call(run)
-    assert message in str(caught.value)
-
-
-def test_a_missing_path_is_an_argument_error(tmp_path: Path) -> None:
+def test_what_is_no_finished_record_is_refused(run_folder: Path, tmp_path: Path) -> None:
     with pytest.raises(ArgumentError, match="does not exist; give a run folder or its "):
         open_run(tmp_path / "none")
-
-
-def test_a_folder_without_a_record_is_an_unfinished_run(tmp_path: Path) -> None:
     with pytest.raises(ArgumentError, match=r"holds no run.h5: .* repeat the run with -o "):
         open_run(tmp_path)
-
-
-def test_a_truncated_record_is_refused_and_does_not_verify(run_folder: Path) -> None:
     path = run_folder / "run.h5"
+    verification = verify_run(run_folder)
+    assert (verification.findings, verification.n_products, verification.path) == ((), 1, path)
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(RecordError):
         open_run(path)
     assert verify_run(path).findings
-
-
-def test_an_untouched_record_verifies(run_folder: Path) -> None:
-    verification = verify_run(run_folder)
-    assert (verification.findings, verification.n_products) == ((), 1)
-    assert verification.path == run_folder / "run.h5"

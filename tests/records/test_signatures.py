@@ -30,11 +30,10 @@ PASSWORD = "correct horse"
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Studio]:
-    """Two runs, and keys of two people."""
+    """A run, and keys of two people."""
     with pytest.MonkeyPatch.context() as patch:
         studio = open_studio(tmp_path_factory.mktemp("signatures"), patch)
         studio.run("first")
-        studio.run("second", "--set", "paint.grey=99")
         write_keys(studio.folder)
         yield studio
 
@@ -113,91 +112,6 @@ def test_a_missing_signature_and_anothers_are_findings(finished: Studio, run: Pa
     assert "the signature beside run.h5 does not fit it" in done.output
 
 
-def test_the_signature_of_another_record_does_not_fit(finished: Studio, run: Path) -> None:
-    second = run.parent / "second"
-    shutil.copytree(finished.folder / "second", second)
-    finished("sign", second, "--key", "jane")
-    shutil.copy(second / "run.h5.sig", run)
-    done = finished("verify", run, "--signer", "jane.pub")
-    assert done.exit_code == 3
-    assert "does not fit it: it is another record's" in done.output
-
-
-def test_a_record_that_was_changed_and_sealed_again_is_noticed(finished: Studio, run: Path) -> None:
-    finished("sign", run, "--key", "jane")
-    hostile.reseal(run / "run.h5", lambda record: record.cell("paint").update(log="nothing wrong"))
-    assert finished("verify", run).exit_code == 0
-    done = finished("verify", run, "--signer", "jane.pub")
-    assert done.exit_code == 3
-    assert "does not fit it" in done.output
-
-
-def test_a_record_that_does_not_verify_is_not_signed(finished: Studio, run: Path) -> None:
-    (run / "products" / "metrics.csv").write_text("changed")
-    done = finished("sign", run, "--key", "jane")
-    assert done.exit_code == 3
-    assert "so it is not signed: products/metrics.csv: changed" in done.output
-    assert not (run / "run.h5.sig").exists()
-
-
-def test_the_signature_of_somebody_else_is_not_replaced(finished: Studio, run: Path) -> None:
-    finished("sign", run, "--key", "joe")
-    before = (run / "run.h5.sig").read_text()
-    done = finished("sign", run, "--key", "jane")
-    assert done.exit_code == 2
-    assert ": remove run.h5.sig to sign with another" in done.output
-    assert (run / "run.h5.sig").read_text() == before
-
-
-@pytest.mark.parametrize(
-    "content",
-    ["", "{}", "[]", "\x1b[2J", "[" * 60_000, '{"format": "orthoflow-signature"}', "link"],
-    ids=lambda text: ascii(text[:20]),
-)
-def test_what_is_no_signature_is_a_finding_only_when_one_is_asked_for(
-    finished: Studio, run: Path, content: str
-) -> None:
-    path = run / "run.h5.sig"
-    if content == "link":
-        path.symlink_to("/dev/zero")
-    else:
-        path.write_text(content)
-    done = finished("verify", run)
-    assert done.exit_code == 0, done.output
-    assert "note: run.h5.sig is not a signature, or is damaged" in done.output
-    done = finished("verify", run, "--signer", "jane.pub")
-    assert done.exit_code == 3
-    assert "\nrun.h5.sig is not a signature, or is damaged" in done.stdout
-    assert "\x1b" not in done.output
-
-
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        (("sign", "--key", "nothing"), "there is no key file nothing"),
-        (("sign", "--key", "jane.pub"), "check: sign with the private one, jane"),
-        (("sign", "--key", "other"), "other must be an Ed25519 key; `ssh-keygen -t ed25519` makes"),
-        (("sign", "--key", "jane-protected"), "is protected by a password, and there is no term"),
-        (("verify", "--signer", "jane"), "jane is not a public key in OpenSSH or PEM format"),
-        (("verify", "--signer", "other.pub"), "other.pub must be an Ed25519 key"),
-        (
-            ("verify", "--signer", "studio.yaml"),
-            "studio.yaml is not a public key in OpenSSH or PEM",
-        ),
-    ],
-    ids=lambda value: value if isinstance(value, str) else " ".join(value),
-)
-def test_keys_that_cannot_be_used_get_a_sentence(
-    finished: Studio, run: Path, arguments: tuple[str, ...], sentence: str
-) -> None:
-    done = finished(arguments[0], run, *arguments[1:])
-    assert done.exit_code == 2, done.output
-    assert done.output.startswith("error: ")
-    assert sentence in done.output
-    assert len(done.output.splitlines()) == 1
-    assert not (run / "run.h5.sig").exists()
-
-
 @pytest.mark.parametrize("key", ["jane-protected", "jane-pem-protected"])
 def test_the_password_of_a_key_is_asked_for(
     finished: Studio, run: Path, key: str, monkeypatch: pytest.MonkeyPatch
@@ -206,25 +120,17 @@ def test_the_password_of_a_key_is_asked_for(
     done = finished("sign", run, "--key", key)
     assert done.exit_code == 2
     assert "or the password is wrong" in done.output
+    monkeypatch.undo()
+    monkeypatch.chdir(finished.folder)
+    # On a terminal, out of sight, and where messages go: stdout may be a file.
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
+    asked: list[dict[str, bool]] = []
+    monkeypatch.setattr("click.prompt", lambda _, **how: (asked.append(how), PASSWORD)[1])
+    assert sign._password(Path(key)) == PASSWORD
+    assert asked == [{"hide_input": True, "err": True}]
     monkeypatch.setattr("orthoflow.cli.sign._password", lambda _: PASSWORD)
     assert finished("sign", run, "--key", key).exit_code == 0
     assert finished("verify", run, "--signer", "jane.pub").exit_code == 0
-
-
-def test_on_a_terminal_the_password_is_asked_for_out_of_sight(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    asked: list[tuple[str, bool, bool]] = []
-
-    def prompt(text: str, *, hide_input: bool, err: bool) -> str:
-        asked.append((text, hide_input, err))
-        return PASSWORD
-
-    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
-    monkeypatch.setattr("click.prompt", prompt)
-    assert sign._password(Path("jane")) == PASSWORD
-    # What is asked goes to where messages go: stdout may be a file.
-    assert asked == [("password of jane", True, True)]
 
 
 def test_without_the_library_the_commands_say_so_and_others_do_without(
@@ -251,3 +157,64 @@ def test_a_crate_takes_the_signature_along(finished: Studio, run: Path, tmp_path
         == 0
     )
     assert not (tmp_path / "all" / "run.h5.sig").exists()
+
+
+def test_a_signature_of_something_else_does_not_fit(finished: Studio, run: Path) -> None:
+    finished("sign", run, "--key", "jane")
+    hostile.reseal(run / "run.h5", lambda record: record.cell("paint").update(log="nothing wrong"))
+    assert finished("verify", run).exit_code == 0
+    done = finished("verify", run, "--signer", "jane.pub")
+    assert (done.exit_code, "does not fit it: it is another record's" in done.output) == (3, True)
+    for content in ("{}", "[" * 60_000, '{"format": "orthoflow-signature"}', "link"):
+        path = run / "run.h5.sig"
+        path.unlink()
+        if content == "link":
+            path.symlink_to("/dev/zero")
+        else:
+            path.write_text(content)
+        # A finding only where a signature is asked for.
+        done = finished("verify", run)
+        assert done.exit_code == 0, done.output
+        assert "note: run.h5.sig is not a signature, or is damaged" in done.output
+        done = finished("verify", run, "--signer", "jane.pub")
+        assert done.exit_code == 3
+        assert "\nrun.h5.sig is not a signature, or is damaged" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("sign", "--key", "nothing"), "there is no key file nothing"),
+        (("sign", "--key", "jane.pub"), "check: sign with the private one, jane"),
+        (("sign", "--key", "other"), "other must be an Ed25519 key; `ssh-keygen -t ed25519` makes"),
+        (("sign", "--key", "jane-protected"), "is protected by a password, and there is no term"),
+        (("verify", "--signer", "jane"), "jane is not a public key in OpenSSH or PEM format"),
+        (("verify", "--signer", "other.pub"), "other.pub must be an Ed25519 key"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else " ".join(value),
+)
+def test_keys_that_cannot_be_used_are_refused(
+    finished: Studio, run: Path, arguments: tuple[str, ...], sentence: str
+) -> None:
+    done = finished(arguments[0], run, *arguments[1:])
+    assert (done.exit_code, done.output.count("\n")) == (2, 1), done.output
+    assert done.output.startswith("error: ")
+    assert sentence in done.output
+    assert not (run / "run.h5.sig").exists()
+
+
+def test_a_record_is_signed_by_one_person_and_only_if_it_verifies(
+    finished: Studio, run: Path
+) -> None:
+    finished("sign", run, "--key", "joe")
+    before = (run / "run.h5.sig").read_text()
+    done = finished("sign", run, "--key", "jane")
+    assert done.exit_code == 2
+    assert ": remove run.h5.sig to sign with another" in done.output
+    assert (run / "run.h5.sig").read_text() == before
+    (run / "run.h5.sig").unlink()
+    (run / "products" / "metrics.csv").write_text("changed")
+    done = finished("sign", run, "--key", "jane")
+    assert done.exit_code == 3
+    assert "so it is not signed: products/metrics.csv: changed" in done.output
+    assert not (run / "run.h5.sig").exists()

@@ -147,17 +147,10 @@ def test_what_was_done_to_colours_is_said(params: Any, metrics: Any, said: str) 
     photos = cell(inputs={"photos": output("photos")})
     run: Any = ToyRun(photos=photos, mosaic=cell(params=params, metrics=metrics))
     assert module._colours(run, "mosaic").text() == said
-    run = ToyRun(scan=cell(inputs={"cloud": output("cloud")}), mosaic=cell(params=params))
-    assert module._colours(run, "mosaic").text() == "colours as scanned"
-
-
-@pytest.mark.parametrize(
-    ("least", "said"), [(0, ""), (10, ", without points darker than 10 of 255")]
-)
-def test_points_that_paint_nothing_for_their_colour_are_said(least: int, said: str) -> None:
-    ortho = cell(inputs={"cloud": output("cloud")}, params={"skip_below_grey": least})
-    run: Any = ToyRun(ortho=ortho, mosaic=cell())
-    assert module._colours(run, "mosaic").text() == f"colours as scanned{said}"
+    for least, more in ((0, ""), (10, ", without points darker than 10 of 255")):
+        ortho = cell(inputs={"cloud": output("cloud")}, params={"skip_below_grey": least})
+        run = ToyRun(ortho=ortho, mosaic=cell(params=params))
+        assert module._colours(run, "mosaic").text() == f"colours as scanned{more}"
 
 
 def test_the_last_orthoimages_are_meant_or_else_the_last_walls() -> None:

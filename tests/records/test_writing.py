@@ -7,9 +7,8 @@ import json
 import re
 import shutil
 from dataclasses import dataclass
-from datetime import datetime, timedelta, tzinfo
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import h5py
 import numpy as np
@@ -25,7 +24,6 @@ from orthoflow.engine.store import Store
 from orthoflow.errors import DamageError, StoreError
 from orthoflow.records.open import open_run, open_unfinished
 from orthoflow.records.runs import Run
-from orthoflow.records.verify import verify_run
 from orthoflow.records.write import (
     NOT_YET,
     begin_run,
@@ -37,7 +35,6 @@ from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import expand_cells
 from orthoflow.workflow.model import Workflow
 from tests import photo_files
-from tests.engine_world import toy_world
 from tests.faulty_files import FaultyFiles
 from tests.studios import open_studio
 from tests.workshop_runs import WORKSHOP, write_studio
@@ -203,7 +200,13 @@ def test_copies_do_not_share_their_bytes_with_the_store(executed: Executed) -> N
     assert stored.read_bytes() == before
 
 
-def test_a_product_that_the_store_lost_is_named(executed: Executed) -> None:
+def test_what_the_store_lost_is_named(executed: Executed) -> None:
+    figure = FigureRef(name="plan", caption="", media_type="image/png", sha256="0" * 64)
+    results = dict(executed.outcome.results)
+    results["paint"] = dataclasses.replace(results["paint"], figures=(figure,))
+    outcome = dataclasses.replace(executed.outcome, results=results)
+    with pytest.raises(StoreError, match=r"needs \(the figure plan is damaged\)"):
+        dataclasses.replace(executed, outcome=outcome).write()
     shutil.rmtree(executed.store.objects)
     with pytest.raises(StoreError, match="has no sound product sha256:"):
         executed.write()
@@ -223,16 +226,6 @@ def test_a_run_is_not_finished_in_which_the_disk_refused_a_step(executed: Execut
     with pytest.raises(StoreError, match=r"paint failed: .* the same command with -o .* goes on"):
         dataclasses.replace(executed, outcome=outcome).write()
     assert not (executed.folder / "run.h5").exists()
-
-
-def test_a_figure_that_the_store_lost_is_named(executed: Executed) -> None:
-    figure = FigureRef(name="plan", caption="", media_type="image/png", sha256="0" * 64)
-    results = dict(executed.outcome.results)
-    results["paint"] = dataclasses.replace(results["paint"], figures=(figure,))
-    outcome = dataclasses.replace(executed.outcome, results=results)
-    broken = dataclasses.replace(executed, outcome=outcome)
-    with pytest.raises(StoreError, match=r"needs \(the figure plan is damaged\)"):
-        broken.write()
 
 
 def test_what_a_photo_says_of_people_and_places_stays_in_the_photo(
@@ -275,42 +268,6 @@ def _everything_in(path: Path) -> bytes:
     with h5py.File(path) as file:
         file.visititems(add)
     return b"\n".join(found)
-
-
-def test_a_clock_that_goes_back_by_a_year_spoils_no_record(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Back(datetime):
-        n_asked = 0
-
-        @classmethod
-        def now(cls, tz: tzinfo | None = None) -> Self:  # type: ignore[override]
-            cls.n_asked += 1
-            time = super().now(tz)
-            return time if cls.n_asked < 4 else time - timedelta(days=365)
-
-    with toy_world(tmp_path) as world:
-        path = tmp_path / "toy.yaml"
-        path.write_text(
-            "orthoflow: 1\nname: toy\nsteps:\n  first: {use: make.range}\n"
-            "  last: {use: work.add, in: {numbers: first.numbers}}\n"
-        )
-        catalog = world.catalog()
-        workflow = load_workflow(path, catalog)
-        plan = plan_run(
-            expand_cells(workflow, catalog),
-            workflow,
-            catalog,
-            world.store,
-            RunOptions(executor="inline"),
-        )
-        monkeypatch.setattr("orthoflow.engine.environment.datetime", Back)
-        outcome = execute(plan, tmp_path / "run", world.store)
-        run = write_run(outcome, plan, workflow, tmp_path / "run", world.store)
-        monkeypatch.undo()
-    assert run.record.started > run.record.ended
-    assert all(cell.wall_s >= 0.0 for cell in run.record.cells)
-    assert verify_run(run.path).findings == ()
 
 
 def test_what_an_earlier_run_left_is_never_published(tmp_path: Path) -> None:
