@@ -6,8 +6,11 @@ import dataclasses
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator
+import typing
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, Union
 
 import h5py
 import numpy as np
@@ -18,14 +21,11 @@ from orthoflow_provenance import record as module
 from orthoflow_provenance.arrays import payload_digest
 from orthoflow_provenance.document import (
     InputFileError,
-    Metric,
     PublishedFile,
     RecordedCell,
     RecordedEnvironment,
-    RecordedFigure,
     RecordedFile,
     RecordedInput,
-    RecordedProduct,
     RecordFormatError,
     RunRecord,
 )
@@ -44,110 +44,46 @@ NAME = st.text(st.characters(categories=["L", "N", "P"], exclude_characters="/")
 )
 NUMBER = st.floats(allow_nan=False, allow_infinity=False)
 SHORT = st.integers(-(2**62), 2**62)
-JSON_OBJECT = st.dictionaries(
-    TEXT, st.none() | st.booleans() | st.integers() | TEXT | st.lists(TEXT, max_size=3), max_size=3
-)
-PRODUCTS = st.dictionaries(
-    NAME,
-    st.builds(RecordedProduct, type_name=TEXT, encoding_version=SHORT, digest=TEXT, source=TEXT),
-    max_size=3,
-)
-CELL = st.builds(
-    RecordedCell,
-    address=NAME,
-    step=TEXT,
-    method=TEXT,
-    status=st.sampled_from(["ok", "failed", "skipped"]),
-    assignment=st.dictionaries(TEXT, TEXT, max_size=3),
-    repeat=SHORT,
-    distribution=TEXT,
-    distribution_version=TEXT,
-    result_version=SHORT,
-    determinism=TEXT,
-    error_type=TEXT,
-    error_message=TEXT,
-    params=JSON_OBJECT,
-    params_set=JSON_OBJECT,
-    key=TEXT,
-    key_preimage=TEXT,
-    seed=st.none() | st.integers(),
-    started=TEXT,
-    ended=TEXT,
-    wall_s=NUMBER,
-    cpu_s=NUMBER,
-    peak_rss_mib=NUMBER,
-    stored_mib=st.none() | NUMBER,
-    compile_s=st.none() | NUMBER,
-    environment=TEXT,
-    cached_from=TEXT,
-    metrics=st.lists(
-        st.builds(Metric, name=TEXT, value=NUMBER, unit=TEXT, label=TEXT, better=TEXT), max_size=3
-    ).map(tuple),
-    figures=st.lists(
-        st.builds(
-            RecordedFigure, name=TEXT, caption=TEXT, media_type=TEXT, data=st.binary(max_size=20)
-        ),
-        max_size=3,
-    ).map(tuple),
-    warnings=st.lists(TEXT, max_size=3).map(tuple),
-    citations=st.lists(TEXT, max_size=3).map(tuple),
-    log=TEXT,
-    inputs=PRODUCTS,
-    outputs=PRODUCTS,
-)
-RECORD = st.builds(
-    RunRecord,
-    run_id=TEXT,
-    name=TEXT,
-    created_by=TEXT,
-    status=st.sampled_from(["ok", "failed"]),
-    started=TEXT,
-    ended=TEXT,
-    seed=st.integers(),
-    workflow_source=TEXT,
-    workflow_resolved=TEXT,
-    overrides=st.lists(TEXT, max_size=3).map(tuple),
-    inputs=st.lists(
-        st.builds(
-            RecordedInput,
-            name=NAME,
-            files=st.lists(
-                st.builds(
-                    RecordedFile,
-                    name=TEXT.map(lambda text: text.replace("/", "")),
-                    size_bytes=SHORT,
-                    sha256=TEXT,
-                ),
-                max_size=3,
-            ).map(tuple),
-        ),
-        max_size=3,
-        unique_by=lambda entry: entry.name,
-    ).map(tuple),
-    environments=st.lists(
-        st.builds(
-            RecordedEnvironment,
-            id=NAME,
-            python=TEXT,
-            os=TEXT,
-            cpu=TEXT,
-            cores=SHORT,
-            threads=SHORT,
-            git_commit=TEXT,
-            packages=st.dictionaries(TEXT, TEXT, max_size=3),
-        ),
-        max_size=2,
-        unique_by=lambda entry: entry.id,
-    ).map(tuple),
-    cells=st.lists(CELL, max_size=3, unique_by=lambda cell: cell.address).map(tuple),
-    published=st.lists(
-        st.builds(PublishedFile, path=TEXT, size_bytes=SHORT, sha256=TEXT), max_size=3
-    ).map(tuple),
-)
+UNIQUE: dict[type, Callable[[Any], str]] = {
+    RecordedCell: lambda cell: cell.address,
+    RecordedEnvironment: lambda environment: environment.id,
+    RecordedInput: lambda entry: entry.name,
+}
+JSON_VALUE = st.none() | st.booleans() | st.integers() | TEXT | st.lists(TEXT, max_size=3)
+
+
+# Any: what a dataclass's field may hold.
+def of_type(kind: Any) -> st.SearchStrategy[Any]:
+    """Values of the types that the dataclasses of a record declare."""
+    origin, parts = typing.get_origin(kind), typing.get_args(kind)
+    if dataclasses.is_dataclass(kind):
+        return of_class(kind)
+    if origin is Literal:
+        return st.sampled_from(parts)
+    if origin is tuple:
+        return st.lists(of_type(parts[0]), max_size=3, unique_by=UNIQUE.get(parts[0])).map(tuple)
+    if origin is Mapping:
+        return st.dictionaries(NAME, of_type(parts[1]), max_size=3)
+    if origin in (Union, UnionType):
+        return st.one_of(*map(of_type, parts))
+    plain = {str: TEXT, float: NUMBER, bool: st.booleans(), bytes: st.binary(max_size=20)}
+    return plain.get(kind, {int: SHORT, type(None): st.none()}.get(kind, JSON_VALUE))
+
+
+def of_class(kind: type) -> st.SearchStrategy[Any]:
+    hints = typing.get_type_hints(kind)
+    fields = {name: of_type(hint) for name, hint in hints.items()}
+    if kind in UNIQUE:
+        fields[{RecordedCell: "address", RecordedEnvironment: "id"}.get(kind, "name")] = NAME
+    if kind is RecordedFile:
+        fields["name"] = TEXT.map(lambda text: text.replace("/", ""))
+    if "embedded" in fields:  # neither products nor files lie where the test writes records
+        fields["embedded"] = st.just(value=False)
+    return st.builds(kind, **fields)
 
 
 @settings(max_examples=25)
-@given(RECORD)
+@given(of_class(RunRecord))
 def test_any_record_comes_back_as_it_was_written(
     tmp_path_factory: pytest.TempPathFactory, record: RunRecord
 ) -> None:
@@ -200,16 +136,12 @@ def test_a_product_that_is_not_embedded_is_named_by_its_digest(tmp_path: Path) -
 
 
 def test_a_product_that_left_the_store_cannot_be_embedded(tmp_path: Path) -> None:
-    path, record, _ = write_sample(tmp_path)
+    path, record, shelf = write_sample(tmp_path)
     before = path.read_bytes()
     with pytest.raises(RecordFormatError, match="is not in the store any more: run the workflow"):
         write_record(path, record, lambda _: None)
     assert path.read_bytes() == before
     assert sorted(tmp_path.glob(".*")) == []
-
-
-def test_a_product_file_that_holds_another_product_is_not_embedded(tmp_path: Path) -> None:
-    path, record, shelf = write_sample(tmp_path)
     other = shelf.put(cloud_payload(5))
     with pytest.raises(RecordFormatError, match=r"product-2\.h5 must hold the product sha256:"):
         write_record(path, record, lambda _: shelf.find(other))
@@ -280,16 +212,14 @@ def test_folders_stay_out_of_the_record(tmp_path: Path) -> None:
     assert read_record(path) == told
 
 
-def test_a_file_of_another_kind_is_no_record(tmp_path: Path) -> None:
+def test_what_is_no_record_is_a_finding_and_an_error(tmp_path: Path) -> None:
     _, _, shelf = write_sample(tmp_path)
     (product,) = [shelf.files[digest] for digest in list(shelf.files)[:1]]
     with pytest.raises(
         RecordFormatError, match="must be of format orthoflow-run, got 'orthoflow-p"
     ):
         read_record(product)
-
-
-def test_a_missing_file_is_a_finding_and_an_error_of_the_operating_system(tmp_path: Path) -> None:
+    (tmp_path / "run.h5").unlink()
     (finding,) = verify_record(tmp_path / "run.h5")
     assert "No such file" in finding.problem
     with pytest.raises(FileNotFoundError):
@@ -322,7 +252,7 @@ def _datasets(group: h5py.Group) -> Iterator[h5py.Dataset]:
             yield from _datasets(item)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.7, 0.999])
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.999])
 def test_a_truncated_record_is_a_finding(tmp_path: Path, share: float) -> None:
     path, _, _ = write_sample(tmp_path)
     content = path.read_bytes()
