@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -39,15 +38,6 @@ def planes_of(folder: Path) -> list[dict[str, object]]:
         (folder / "products" / "plane" / "planes.json").read_text()
     )["planes"]
     return found
-
-
-def test_a_second_run_comes_from_the_cache_and_says_so(road: Shell) -> None:
-    ended = road("run", "direct.yaml", *SMALL_WALL, "-o", "again")
-    assert ended.code == 0
-    assert "cached" in ended.out
-    for product in ("planes.json",):
-        first = (road.folder / "run" / "products" / "plane" / product).read_bytes()
-        assert (road.folder / "again" / "products" / "plane" / product).read_bytes() == first
 
 
 def test_layers_are_written_when_asked_for(road: Shell) -> None:
@@ -87,29 +77,6 @@ def test_the_main_wall_and_its_orthoimage_agree_with_the_truth(road: Shell) -> N
     assert metrics["check", "rmse_v_mm"] <= 6.0
 
 
-def test_a_finished_run_folder_is_refused(road: Shell) -> None:
-    ended = road("run", "direct.yaml", *SMALL_WALL, "-o", "run")
-    assert ended.code == 2
-    assert "run.h5" in ended.said
-
-
-def test_a_changed_parameter_reruns_only_what_depends_on_it(road: Shell) -> None:
-    ended = road("plan", "direct.yaml", *SMALL_WALL, "--set", "ortho.inpaint_radius_px=4", "--json")
-    states = {cell["cell"]: cell for cell in json.loads(ended.out)}
-    assert {address: cell["status"] for address, cell in states.items()} == {
-        "cloud": "skipped",
-        "points": "skipped",
-        "survey": "skipped",
-        "room": "cached",
-        "plane": "cached",
-        "wall": "cached",
-        "ortho": "will run",
-        "mosaic": "unknown yet",
-        "check": "unknown yet",
-    }
-    assert "inpaint_radius_px" in states["ortho"]["reason"]
-
-
 def test_survey_coordinates_change_nothing_but_the_origin(road: Shell) -> None:
     shift = "[" + ", ".join(map(str, SHIFT_M)) + "]"
     ended = road(
@@ -128,30 +95,6 @@ def test_survey_coordinates_change_nothing_but_the_origin(road: Shell) -> None:
     ]
     assert images[0].shape == images[1].shape
     assert np.mean(images[0] != images[1]) < 1e-3
-
-
-@pytest.mark.parametrize("dataset", ["plane", "metric", "workflow"])
-def test_one_changed_byte_is_found(road: Shell, tmp_path: Path, dataset: str) -> None:
-    copy = tmp_path / "run.h5"
-    shutil.copy(road.folder / "run" / "run.h5", copy)
-    _change_one_byte(copy, dataset)
-    ended = road("verify", copy)
-    assert ended.code == 3
-    assert "Traceback" not in ended.said
-
-
-def _change_one_byte(record: Path, what: str) -> None:
-    content = bytearray(record.read_bytes())
-    run = orthoflow.open_run(record)
-    needle = {
-        "plane": run.product("plane", "planes").normal[0].tobytes(),
-        "metric": np.float64(run.cells["check"].metrics[0].value).tobytes(),
-        "workflow": b"skarlatos2012",
-    }[what]
-    place = content.find(needle)
-    assert place > 0, f"the {what} is not stored as plain bytes"
-    content[place + 2] ^= 1
-    record.write_bytes(content)
 
 
 def test_the_decorated_hall_gives_its_main_wall(shell: Shell, shared_data: Path) -> None:
