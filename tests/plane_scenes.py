@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +12,9 @@ from orthoflow_plugins.plane.cloud import PreparedCloud, prepare
 from orthoflow_plugins.plane.detector import DetectorParams
 from orthoflow_plugins.plane.search import Search
 
-from orthoflow.products import PointCloud
-from orthoflow.sdk import StepContext
+from orthoflow.geometry import angle_between_deg
+from orthoflow.products import Planes, PointCloud
+from orthoflow.sdk import Method, StepContext
 
 NOISE_M = 0.002
 TOLERANCE_M, FIT_TOLERANCE_M = 0.05, 0.015
@@ -39,6 +41,7 @@ class Rectangle:
         return flat + rng.normal(0.0, noise_m, (self.n_points, 1)) * self.normal
 
 
+STATION = np.array([[0.3, -0.2, 0.1]])
 # A room of 6 x 4 x 3 m; the front wall (y = 2) leans by 0.4 degrees and is the densest.
 LEAN = np.radians(0.4)
 ROOM = (
@@ -94,6 +97,35 @@ def context(folder: Path, *, cores: int = 2) -> StepContext:
     """A step context with a scratch folder of its own."""
     folder.mkdir(parents=True, exist_ok=True)
     return StepContext(rng=np.random.default_rng(0), cores=cores, scratch=folder)
+
+
+def detect(
+    method: type[Method],
+    cloud: PointCloud,
+    folder: Path,
+    *,
+    seed: int = 0,
+    cores: int = 2,
+    **params: Any,
+) -> tuple[Any, StepContext]:
+    """What a detector finds in a cloud, and the context that it reported to."""
+    folder.mkdir(parents=True, exist_ok=True)
+    ctx = StepContext(rng=np.random.default_rng(seed), cores=cores, scratch=folder)
+    return method().run(method.In(cloud=cloud), method.Params(**params), ctx), ctx
+
+
+def nearest(planes: Planes, normal: NDArray[np.float64], centre: NDArray[np.float64]) -> int:
+    """The plane that passes nearest to a true one's centre among those with its direction."""
+    parallel = np.abs(planes.normal @ normal) > np.cos(np.radians(1.0))
+    return int(np.argmin(np.abs(planes.normal @ centre - planes.offset) + 1e6 * ~parallel))
+
+
+def errors(planes: Planes, truth: Rectangle) -> tuple[float, float]:
+    """Angle in degrees and offset at the true centre in metres, of the plane nearest to it."""
+    normal, centre = truth.normal, np.array(truth.centre)
+    found = planes.plane(nearest(planes, normal, centre))
+    angle = angle_between_deg(found.normal, normal)
+    return min(angle, 180.0 - angle), abs(float(found.distances_m(centre[None])[0]))
 
 
 def prepared(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,23 +14,20 @@ from orthoflow_plugins.plane.hough3d import Hough3d
 from orthoflow_plugins.plane.ransac import Ransac
 from orthoflow_plugins.plane.region import Region
 
-from orthoflow.products import Planes, PointCloud
-from orthoflow.sdk import StepContext
+from orthoflow.products import Planes
 from tests.long_loops import long_only
+from tests.plane_scenes import cloud_of, detect, turned
 
-DETECTORS = [Hough2d, Hough3d, Ransac, Region]
+every_detector = pytest.mark.parametrize("method", [Hough2d, Hough3d, Ransac, Region])
 SIZE_M = np.array([5.0, 4.0, 2.8])
 
 
-def wall(rng: np.random.Generator, noise_m: float, n_points: int) -> NDArray[np.float64]:
+def wall(noise_m: float, n_points: int) -> NDArray[np.float64]:
     """One flat wall of 12 x 6 m, upright, with independent noise along its normal."""
-    return np.column_stack(
-        [
-            rng.uniform(0.0, 12.0, n_points),
-            rng.normal(0.0, noise_m, n_points),
-            rng.uniform(0.0, 6.0, n_points),
-        ]
-    )
+    rng = np.random.default_rng(3)
+    points = rng.uniform((0.0, 0.0, 0.0), (12.0, 0.0, 6.0), (n_points, 3))
+    points[:, 1] = rng.normal(0.0, noise_m, n_points)
+    return points
 
 
 def waves(rng: np.random.Generator, places_m: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -48,25 +46,17 @@ def room(rng: np.random.Generator, noise_m: float, shared_m: float) -> NDArray[n
     points = []
     for axis in range(3):
         for level in (0.0, SIZE_M[axis]):
-            area = float(np.prod(np.delete(SIZE_M, axis)))
-            count = int(1500 * area)
+            count = int(500 * np.prod(np.delete(SIZE_M, axis)))
             side = rng.uniform(0.0, 1.0, (count, 3)) * SIZE_M
             side[:, axis] = level + rng.normal(0.0, noise_m, count)
             side[:, axis] += shared_m * waves(rng, np.delete(side, axis, axis=1))
             points.append(side)
-    turn = rng.uniform(0.0, 2.0 * np.pi)
-    rotation = np.array(
-        [[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]]
-    )
-    return np.concatenate(points) @ rotation.T
+    return np.concatenate(points) @ turned(rng.uniform(0.0, 360.0)).T
 
 
-def detected(method: type, points: NDArray[np.float64], tmp_path: Path, **params: object) -> Planes:
-    origin = points.mean(axis=0)
-    x, y, z = np.ascontiguousarray((points - origin).T.astype(np.float32))
-    cloud = PointCloud(origin=origin, x=x, y=y, z=z, up=np.array([0.0, 0.0, 1.0]))
-    ctx = StepContext(rng=np.random.default_rng(5), cores=1, scratch=tmp_path)
-    planes: Planes = method().run(method.In(cloud=cloud), method.Params(**params), ctx).planes
+def detected(method: Any, points: NDArray[np.float64], folder: Path) -> Planes:
+    out, ctx = detect(method, cloud_of(points), folder, seed=5)
+    planes: Planes = out.planes
     metrics = {metric.name: metric.value for metric in ctx.metrics}
     assert metrics["tolerance_m"] == planes.tolerance_m
     return planes
@@ -74,15 +64,13 @@ def detected(method: type, points: NDArray[np.float64], tmp_path: Path, **params
 
 @pytest.mark.parametrize("noise_m", [0.001, 0.02])
 def test_the_noise_of_a_flat_wall_is_measured(noise_m: float) -> None:
-    found = measure_noise(wall(np.random.default_rng(3), noise_m, 120_000))
-    assert found is not None
+    found = measure_noise(wall(noise_m, 120_000))
     assert found == pytest.approx((noise_m, noise_m), rel=0.12)
 
 
 def test_errors_that_neighbours_share_show_in_large_neighbourhoods() -> None:
-    rng = np.random.default_rng(4)
-    points = wall(rng, 0.002, 200_000)
-    points[:, 1] += 0.015 * waves(rng, points[:, [0, 2]])
+    points = wall(0.002, 200_000)
+    points[:, 1] += 0.015 * waves(np.random.default_rng(4), points[:, [0, 2]])
     found = measure_noise(points)
     assert found is not None
     single_m, shared_m = found
@@ -90,44 +78,33 @@ def test_errors_that_neighbours_share_show_in_large_neighbourhoods() -> None:
     assert shared_m > 0.004
 
 
-def test_a_cloud_without_flat_places_has_no_measured_noise() -> None:
+def test_a_cloud_without_flat_places_has_no_measured_noise_and_a_clean_one_usual_tolerances(
+    tmp_path: Path,
+) -> None:
     assert measure_noise(np.random.default_rng(1).uniform(-2.0, 2.0, (30_000, 3))) is None
     assert measure_noise(np.zeros((3, 3))) is None
-
-
-@pytest.mark.parametrize("method", DETECTORS, ids=lambda method: method.id)
-def test_one_noisy_wall_is_found_at_defaults(method: type, tmp_path: Path) -> None:
-    planes = detected(method, wall(np.random.default_rng(1), 0.02, 100_000), tmp_path)
-    assert len(planes) == 1
-    assert np.degrees(np.arccos(abs(planes.normal[0, 1]))) < 0.02
-    assert abs(planes.offset[0]) < 0.001
-
-
-@pytest.mark.parametrize(
-    ("seed", "noise_m", "shared_m"), [(12, 0.01, 0.01), *long_only((11, 0.03, 0.0))]
-)
-@pytest.mark.parametrize("method", DETECTORS, ids=lambda method: method.id)
-def test_every_wall_of_a_noisy_room_is_found_at_defaults(
-    method: type, seed: int, noise_m: float, shared_m: float, tmp_path: Path
-) -> None:
-    planes = detected(method, room(np.random.default_rng(seed), noise_m, shared_m), tmp_path)
-    large = planes.n_points > 0.05 * planes.n_points.sum()
-    assert np.count_nonzero(large) == 6
-
-
-def test_a_clean_cloud_has_the_tolerances_of_before(tmp_path: Path) -> None:
     planes = detected(Hough2d, room(np.random.default_rng(2), 0.002, 0.0), tmp_path)
     assert planes.tolerance_m == 0.05
 
 
-@pytest.mark.parametrize("noise_m", [0.025, *long_only(0.005)])
-@pytest.mark.parametrize("method", DETECTORS, ids=lambda method: method.id)
-def test_a_wall_of_four_square_metres_is_found_beside_denser_clutter(
-    method: type, noise_m: float, tmp_path: Path
+@every_detector
+def test_one_noisy_wall_is_found_at_defaults(method: type, tmp_path: Path) -> None:
+    planes = detected(method, wall(0.02, 60_000), tmp_path)
+    assert len(planes) == 1
+    assert np.degrees(np.arccos(abs(planes.normal[0, 1]))) < 0.03
+    assert abs(planes.offset[0]) < 0.0013
+
+
+@pytest.mark.parametrize(
+    ("noise_m", "shared_m"), [(0.025, 0.003), *long_only((0.005, 0.003), (0.01, 0.01))]
+)
+@every_detector
+def test_walls_of_a_noisy_room_are_found_beside_denser_clutter(
+    method: type, noise_m: float, shared_m: float, tmp_path: Path
 ) -> None:
     """A screen with 2 % of the points, a column and a sphere with 20 %: seven planes, no other."""
     rng = np.random.default_rng(7)
-    walls = room(rng, noise_m, 0.003)[::3]
+    walls = room(rng, noise_m, shared_m)
     middle = 0.5 * (walls.min(axis=0) + walls.max(axis=0))
     along, across = np.array([[0.8, 0.6, 0.0], [0.6, -0.8, 0.0]])
     place = middle + np.array([0.4, 0.5, -0.3])

@@ -1,4 +1,4 @@
-"""Sides, names and rectangles of planes, from stations and points that are known."""
+"""Sides, names, rectangles and deviations of planes, from stations and points that are known."""
 
 from __future__ import annotations
 
@@ -14,17 +14,14 @@ from orthoflow_plugins.plane.fit import FoundPlane
 from orthoflow_plugins.plane.planes import (
     Deviations,
     assemble,
-    face,
-    known_viewpoint,
     measure_planes,
-    middle_viewpoint_m,
+    normality,
     plane_names,
     rectangle_m,
     side_of_remaining,
     side_of_stations,
 )
 from orthoflow_plugins.plane.search import Claim, label, verify
-from orthoflow_plugins.plane.support import SurfaceRaster
 
 from orthoflow.geometry import Plane, wall_axes
 from orthoflow.products import Planes, PointCloud
@@ -36,14 +33,9 @@ WALL = Plane(normal=np.array([0.0, -1.0, 0.0]), offset_m=-2.0)
 CORNERS = rectangle_m(WALL, wall_axes(WALL.normal, UP), np.array([-2.0, 2.0, -1.0, 1.0]))
 
 
-def leaning(rise_deg: float) -> NDArray[np.float64]:
-    rise = np.radians(rise_deg)
-    return np.array([np.cos(rise), 0.0, np.sin(rise)])
-
-
 def test_planes_are_named_by_inclination_and_the_lowest_and_highest_level_apart() -> None:
-    rises = [0.0, 29.0, 31.0, 79.0, 81.0, 90.0, -90.0, -81.0, -79.0, -29.0]
-    normals = np.array([leaning(rise) for rise in rises])
+    rises = np.radians([0.0, 29.0, 31.0, 79.0, 81.0, 90.0, -90.0, -81.0, -79.0, -29.0])
+    normals = np.column_stack([np.cos(rises), np.zeros(10), np.sin(rises)])
     heights = np.array([0.0, 0.0, 0.0, -9.0, 1.0, 0.5, 2.0, 2.5, 9.0, 0.0])
     assert plane_names(normals, heights, UP) == (
         "wall 0", "wall 1", "slope 2", "slope 3", "level 4", "floor 5", "level 6", "ceiling 7",
@@ -54,101 +46,57 @@ def test_planes_are_named_by_inclination_and_the_lowest_and_highest_level_apart(
     assert plane_names(normals[6:8], heights[6:8], UP) == ("level 0", "ceiling 1")
 
 
-def test_corners_run_from_the_top_left_counter_clockwise() -> None:
-    np.testing.assert_allclose(
-        CORNERS, [[-2.0, 2.0, 1.0], [-2.0, 2.0, -1.0], [2.0, 2.0, -1.0], [2.0, 2.0, 1.0]]
-    )
-    raster = SurfaceRaster.over(WALL, CORNERS.repeat(2, axis=0), UP, 0.1)
-    whole, part = np.array([-2.0, 2.0, -1.0, 1.0]), np.array([[-9.0, 1.0, 0.0, 9.0]])
-    for side, corner in ((1, [-2.0, 2.0, 1.0]), (-1, [2.0, 2.0, 1.0])):
-        faced = face(raster, whole, part, side, UP, is_guessed=False)
-        np.testing.assert_allclose(faced.corners_m[0], corner)
-        np.testing.assert_allclose(faced.plane.normal, side * WALL.normal)
-        # No part reaches beyond the whole.
-        low, high = faced.part_corners_m[0].min(axis=0), faced.part_corners_m[0].max(axis=0)
-        np.testing.assert_allclose([low[[0, 2]], high[[0, 2]]], [[-2.0, -1.0], [1.0, 0.0]])
-
-
 # --- from which side ---
 
 
-def cloud(**given: Any) -> PointCloud:
-    plain = cloud_of(np.zeros((6, 3)), origin=(10.0, 20.0, 30.0))
-    if "stations" in given and given["stations"] is not None:
-        given["stations"] = np.array(given["stations"]) + plain.origin
-        given.setdefault("stations_source", "file")
-    return replace(plain, **given)
-
-
-EVERY = np.arange(6)
-MIDDLE = np.array([0.0, 2.0, 0.0])
-
-
-def test_what_is_known_of_the_viewpoint_is_told() -> None:
-    assert known_viewpoint(cloud()) == "guess"
-    assert known_viewpoint(cloud(stations=np.zeros((0, 3)))) == "guess"
-    assert known_viewpoint(cloud(stations=[[0, 0, 0]])) == "stations"
-    assert known_viewpoint(cloud(stations=[[0, 0, 0]], stations_source="view_from")) == "view_from"
-    points = np.array([[0.0, 1.0, 2.0], [4.0, 5.0, 9.0], [1.0, 2.0, 3.0]])
-    np.testing.assert_allclose(middle_viewpoint_m(cloud(), points), [1.0, 2.0, 3.0])
-    two = cloud(stations=[[0, 2, 0], [4, 0, 2]])
-    np.testing.assert_allclose(middle_viewpoint_m(two, points), [2.0, 1.0, 1.0])
-
-
 def test_the_nearest_station_that_is_clear_of_the_plane_tells_the_side() -> None:
-    def side(*stations: tuple[float, float, float]) -> int:
-        return side_of_stations(WALL, MIDDLE, cloud(stations=stations), EVERY)
+    def side(*places: tuple[float, float, float], scan: tuple[int, ...] | None = None) -> int:
+        stations = np.array(places).reshape(-1, 3)
+        known = cloud_of(np.zeros((6, 3)), origin=(10.0, 20.0, 30.0), stations=stations)
+        if scan is not None:
+            known = replace(known, scan=np.resize(scan or (0,), 6).astype(np.uint16))
+        chosen = np.arange(6 if scan is None else len(scan))
+        return side_of_stations(WALL, np.array([0.0, 2.0, 0.0]), known, chosen)
 
     assert side((0, 0, 0)) == 1
     assert side((0, 5, 0)) == -1
     assert side((0, 0, 0), (0, 3, 0)) == -1
     # Five centimetres are in the plane itself.
-    assert side((0, 2.04, 0)) == side((0, 1.96, 0)) == 0
+    assert side((0, 2.04, 0)) == side((0, 1.96, 0)) == side() == 0
     assert side((0, 2.06, 0)) == -1
-    assert side((0, 1.94, 0)) == 1
-    assert side((0, 2.04, 0), (0, 0, 0)) == 1
-    assert side_of_stations(WALL, MIDDLE, cloud(), EVERY) == 0
-    assert side_of_stations(WALL, MIDDLE, cloud(stations=np.zeros((0, 3))), EVERY) == 0
-
-
-def test_scans_of_the_points_have_a_voice_each() -> None:
-    stations = [[0, -9, 0], [0, 3, 0], [0, 2.01, 0]]
-
-    def side(*scans: int) -> int:
-        known = cloud(stations=stations, scan=np.array(scans, dtype=np.uint16))
-        return side_of_stations(WALL, MIDDLE, known, EVERY[: len(scans)])
-
-    assert side(0, 0, 0, 0, 1, 1) == 1
-    assert side(0, 0, 1, 1, 1, 1) == -1
-    assert side(0, 2, 2, 2, 2, 2) == 1
-    # As many on either side, nobody, or a scan that nobody knows: the nearest station.
-    assert side(0, 0, 0, 1, 1, 1) == -1
-    assert side(2, 2, 2, 2, 2, 2) == -1
-    assert side(0, 0, 0, 0, 0, 3) == -1
-    some = cloud(stations=stations, scan=np.zeros(6, dtype=np.uint16))
-    assert side_of_stations(WALL, MIDDLE, some, EVERY[:0]) == -1
+    assert side((0, 1.94, 0)) == side((0, 2.04, 0), (0, 0, 0)) == 1
+    # Each scan of the points counts.
+    three: Any = ((0, -9, 0), (0, 3, 0), (0, 2.01, 0))
+    assert side(*three, scan=(0, 0, 0, 0, 1, 1)) == 1
+    assert side(*three, scan=(0, 0, 1, 1, 1, 1)) == -1
+    assert side(*three, scan=(0, 2, 2, 2, 2, 2)) == 1
+    # As many on either side, none, or a scan without a station: the nearest station.
+    for scan in ((0, 0, 0, 1, 1, 1), (2,) * 6, (0, 0, 0, 0, 0, 3), ()):
+        assert side(*three, scan=scan) == -1
 
 
 def side_by(points: list[tuple[float, float, float]], parallel: list[bool] | None = None) -> int:
-    is_parallel = np.array(parallel if parallel is not None else [False] * len(points))
-    return side_of_remaining(WALL, CORNERS, np.array(points), is_parallel, clear_m=0.05)
+    is_parallel = np.array(parallel or [False] * len(points), dtype=np.bool_)
+    places = np.array(points, dtype=np.float64).reshape(-1, 3)
+    return side_of_remaining(WALL, CORNERS, places, is_parallel, clear_m=0.05)
 
 
 def test_points_before_or_behind_the_rectangle_tell_the_side() -> None:
     assert side_by([(0, 1, 0)]) == 1
     assert side_by([(0, 3, 0)]) == -1
-    # A metre says all: two points at a metre against one far away.
+    assert side_by([]) == side_by([(0, 2, 0)]) == 0
+    # A metre counts fully: two points at a metre against one far away.
     assert side_by([(0, 1, 0), (0, 1, 0.5), (0, 9, 0)]) == 1
-    # Relief says less: three near ones of 20 cm against one of a metre.
+    # Relief counts less: three near ones of 20 cm against one of a metre.
     assert side_by([(0, 1.8, 0)] * 3 + [(0, 3, 0)]) == -1
     assert side_by([(0, 1.8, 0)] * 6 + [(0, 3, 0)]) == 1
-    # Beside it by more than 30 cm nobody is asked, unless nobody else is there.
+    # What lies beside it by more than 30 cm counts only where nothing else is there.
     assert side_by([(2.2, 1, 0), (2.4, 3, 0), (2.4, 3, 0)]) == 1
     assert side_by([(-2.2, 1, 0), (-2.4, 3, 0), (-2.4, 3, 0)]) == 1
     assert side_by([(0, 1, 1.2), (0, 3, 1.4), (0, 3, 1.4)]) == 1
     assert side_by([(0, 1, -1.2), (0, 3, -1.4), (0, 3, -1.4)]) == 1
     assert side_by([(2.4, 3, 0)]) == -1
-    # What is on the plane itself has no say.
+    # What is on the plane itself does not count.
     assert side_by([(0, 1.96, 0)] * 9) == 0
     assert side_by([(0, 1.96, 0)] * 9 + [(0, 2.2, 0)]) == -1
 
@@ -160,24 +108,16 @@ def test_parallel_planes_are_asked_last() -> None:
     assert side_by(behind, [True] * 5) == -1
     # Before the rectangle a parallel one counts more than others beside it.
     assert side_by([*behind, (9, 1, 0)], [True] * 5 + [False]) == -1
-    far = [(9.0, 3.0, 0.0)]
-    assert side_by([*far, (9, 1, 0), (9, 1, 0)], [False, True, True]) == -1
+    assert side_by([(9, 3, 0), (9, 1, 0), (9, 1, 0)], [False, True, True]) == -1
 
 
-def test_a_small_difference_says_nothing() -> None:
-    """A hundredth of what all points say, were each just clear of the plane."""
+def test_a_small_difference_decides_nothing() -> None:
+    """A hundredth of what all points add up to, were each just clear of the plane."""
     bare = [(0.0, 2.0, 0.0)] * 1_999
     # 0.01 * 2000 * 0.05 m: one metre.
     assert side_by([*bare, (0, 1.01, 0)]) == 0
     assert side_by([*bare[:-1], (0, 1.5, 0), (0, 1.48, 0)]) == 1
     assert side_by([*bare[:-1], (0, 2.5, 0), (0, 2.52, 0)]) == -1
-
-
-@pytest.mark.parametrize("n_points", [0, 1])
-def test_without_other_points_no_side_is_told(n_points: int) -> None:
-    points = np.tile([[0.0, 2.0, 0.0]], (n_points, 1))
-    nowhere = np.zeros(n_points, dtype=np.bool_)
-    assert side_of_remaining(WALL, CORNERS, points, nowhere, clear_m=0.05) == 0
 
 
 # --- products ---
@@ -204,16 +144,11 @@ def scene() -> Scene:
     north[:, 1] += rng.exponential(0.003, 24_000)
     west[:, 0] -= rng.exponential(0.002, 8_000)
     seen = cloud_of(np.vstack([west, north, [[0.3, 0.0, 0.0]]]), origin=tuple(ORIGIN))
-    points = np.column_stack([seen.x, seen.y, seen.z])
-    search = search_in(prepared(points, parts=2))
+    search = search_in(prepared(np.column_stack([seen.x, seen.y, seen.z]), parts=2))
     found = []
     for normal, offset_m, votes in (([1.0, 0.0, 0.0], -2.0, 77.0), ([0.0, 1.0, 0.0], 2.0, 99.0)):
-        rough = Candidate(
-            plane=Plane(normal=np.array(normal), offset_m=offset_m),
-            constraint="vertical",
-            votes=votes,
-        )
-        item = verify(rough, search)
+        plane = Plane(normal=np.array(normal), offset_m=offset_m)
+        item = verify(Candidate(plane=plane, constraint="vertical", votes=votes), search)
         assert item is not None
         search.claim(Claim.of(item.raster, item.support, TOLERANCE_M))
         found.append(item)
@@ -229,23 +164,19 @@ def scene() -> Scene:
 
 
 def assembled(
-    scene: Scene, *stations: tuple[float, float, float]
-) -> tuple[Planes, Deviations, NDArray[np.intp]]:
-    known = scene.cloud
+    scene: Scene, *stations: tuple[float, float, float], source: str = "file"
+) -> tuple[Planes, Deviations]:
+    known: Any = scene.cloud
     if stations:
-        known = replace(known, stations=np.array(stations) + ORIGIN, stations_source="file")
-    planes, deviations, _, order = assemble(
-        scene.found, scene.prepared, known, TOLERANCE_M, FIT_TOLERANCE_M
-    )
-    return planes, deviations, order
+        known = replace(known, stations=np.array(stations) + ORIGIN, stations_source=source)
+    return assemble(scene.found, scene.prepared, known, TOLERANCE_M, FIT_TOLERANCE_M)[:2]
 
 
 def test_planes_are_ordered_by_their_points_and_face_the_station(scene: Scene) -> None:
-    planes, _, order = assembled(scene, (0.0, 0.0, 0.0))
+    planes, _ = assembled(scene, (0.0, 0.0, 0.0))
     details: Any = planes.details
     assert planes.names == ("wall 0", "wall 1")
     assert planes.n_points.tolist() == sorted(planes.n_points, reverse=True)
-    np.testing.assert_array_equal(order, [1, 0])
     np.testing.assert_allclose(planes.normal, [[0, -1, 0], [1, 0, 0]], atol=2e-3)
     assert (planes.viewpoint, planes.side_from) == ("stations", ())
     for k, item in enumerate(reversed(scene.found)):
@@ -273,27 +204,22 @@ def test_planes_are_ordered_by_their_points_and_face_the_station(scene: Scene) -
 def test_deviations_follow_a_normal_that_was_turned(scene: Scene) -> None:
     before, after = scene.deviations, assembled(scene, (0.0, 0.0, 0.0))[1]
     assert not np.array_equal(before.histogram[1], before.histogram[1, ::-1])
-    np.testing.assert_array_equal(after.histogram[0], before.histogram[1, ::-1])
-    np.testing.assert_array_equal(after.histogram[1], before.histogram[0])
+    np.testing.assert_array_equal(after.histogram, [before.histogram[1, ::-1], before.histogram[0]])
     np.testing.assert_array_equal(after.mean_fit_m, [-before.mean_fit_m[1], before.mean_fit_m[0]])
     np.testing.assert_array_equal(after.n_fit, before.n_fit[::-1])
     np.testing.assert_array_equal(after.rms_m, before.rms_m[::-1])
     # From behind it is the other way round.
     after = assembled(scene, (-3.0, 3.0, 0.0))[1]
     np.testing.assert_array_equal(after.histogram, [before.histogram[1], before.histogram[0, ::-1]])
-    np.testing.assert_array_equal(after.mean_fit_m, [before.mean_fit_m[1], -before.mean_fit_m[0]])
 
 
 def test_rectangles_end_with_the_points(scene: Scene) -> None:
     planes = assembled(scene, (0.0, 0.0, 0.0))[0]
     north, west = planes.corners - ORIGIN
-    np.testing.assert_allclose(
-        north[:, [0, 2]], [[-1.9, 1], [-1.9, -1], [2, -1], [2, 1]], atol=0.005
-    )
-    np.testing.assert_allclose(
-        west[:, [1, 2]], [[-1.9, 1], [-1.9, -1], [1.9, -1], [1.9, 1]], atol=0.005
-    )
-    assert planes.part_plane is not None
+    # From the top left, counter-clockwise.
+    for found, axis, left, right in ((north, 0, -1.9, 2.0), (west, 1, -1.9, 1.9)):
+        expected = [[left, 1], [left, -1], [right, -1], [right, 1]]
+        np.testing.assert_allclose(found[:, [axis, 2]], expected, atol=0.005)
     np.testing.assert_array_equal(planes.part_plane, [0, 1])
     # Parts are known to a cell, and none reaches beyond the points.
     np.testing.assert_allclose(planes.part_corners, planes.corners, atol=0.06)
@@ -303,32 +229,96 @@ def test_rectangles_end_with_the_points(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize(
-    ("stations", "viewpoint", "side_from", "n_guessed"),
+    ("stations", "source", "viewpoint", "side_from", "guessed"),
     [
-        ([], "guess", (), 2),
-        # In the plane of the larger one it says nothing about that.
-        ([(0.0, 2.0, 0.0)], "stations", ("guess", "stations"), 1),
-        ([(0.0, 2.0, 0.0), (0.0, 0.5, 0.0)], "stations", (), 0),
+        ([], "file", "guess", (), [0, 1]),
+        # In the plane of the larger one it decides nothing about that.
+        ([(0.0, 2.0, 0.0)], "file", "stations", ("guess", "stations"), [0]),
+        ([(0.0, 2.0, 0.0), (0.0, 0.5, 0.0)], "file", "stations", (), []),
+        ([(0.0, 2.0, 0.0)], "view_from", "view_from", ("guess", "given"), [0]),
     ],
 )
 def test_sides_that_no_station_knows_are_guessed(
     scene: Scene,
     stations: list[tuple[float, float, float]],
+    source: str,
     viewpoint: str,
     side_from: tuple[str, ...],
-    n_guessed: int,
+    guessed: list[int],
 ) -> None:
-    planes = assembled(scene, *stations)[0]
+    planes = assembled(scene, *stations, source=source)[0]
     assert (planes.viewpoint, planes.side_from) == (viewpoint, side_from)
     # The other wall lies before each of them.
     np.testing.assert_allclose(planes.normal, [[0, -1, 0], [1, 0, 0]], atol=2e-3)
-    given = planes.details["guessed_sides"]
-    assert given == [k for k in range(2) if n_guessed == 2 or "guess" in side_from[k : k + 1]]
+    assert planes.details["guessed_sides"] == guessed
 
 
-def test_sides_that_were_stated_are_given(scene: Scene) -> None:
-    known = replace(
-        scene.cloud, stations=np.array([[0.0, 2.0, 0.0]]) + ORIGIN, stations_source="view_from"
-    )
-    planes = assemble(scene.found, scene.prepared, known, TOLERANCE_M, FIT_TOLERANCE_M)[0]
-    assert (planes.viewpoint, planes.side_from) == ("view_from", ("guess", "given"))
+# --- deviations ---
+
+
+@pytest.mark.parametrize("parts", [1, 3])
+def test_planes_are_measured_on_all_points_that_they_have(parts: int) -> None:
+    rng = np.random.default_rng(3)
+    cloud = prepared(rng.uniform(-1.0, 1.0, (3_000, 3)), parts=parts)
+    seen = cloud.sample.offsets_m
+    # Level planes at -0.5, 0 and 0.5; the last has no points.
+    heights = np.array([-0.5, 0.0, 0.5])
+    slabs = np.array([[0, 0, 1.0, h, 1.0, 0, 0, 0.1, 0, 1.0, 0, -0.2] for h in heights])
+    find_m, fit_m = 0.2, 0.1
+    claims = np.full(3_000, -1)
+    for k in range(2):
+        claims[np.abs(seen[:, 2] - heights[k]) <= find_m] = k
+    cloud.claims[:] = claims
+    bounds = np.array([[-0.9, 0.8, -0.7, 0.9]] * 3)
+    found = measure_planes(cloud, slabs, bounds, tolerance_m=find_m, fit_tolerance_m=fit_m)
+    for k in range(2):
+        away = seen[claims == k, 2] - heights[k]
+        fits = np.abs(away) <= fit_m
+        u, v = seen[claims == k, 0] - 0.1, seen[claims == k, 1] + 0.2
+        held = fits & (u >= -0.9) & (u <= 0.8) & (v >= -0.7) & (v <= 0.9)
+        assert (found.n_points[k], found.n_fit[k]) == (len(away), fits.sum())
+        assert found.rms_m[k] == pytest.approx(np.sqrt((away**2).mean()), rel=1e-4)
+        assert found.rms_fit_m[k] == pytest.approx(np.sqrt((away[fits] ** 2).mean()), rel=1e-4)
+        assert found.mean_fit_m[k] == pytest.approx(away[fits].mean(), abs=1e-5)
+        assert found.histogram[k].sum() == len(away)
+        sides = [u[held].min(), u[held].max(), v[held].min(), v[held].max()]
+        np.testing.assert_allclose(found.extents_m[k], sides, atol=1e-6)
+    assert (found.n_points[2], found.rms_m[2], found.mean_fit_m[2]) == (0, 0.0, 0.0)
+    # Without points near it a plane reaches as far as its rectangle.
+    np.testing.assert_array_equal(found.extents_m[2], bounds[2])
+
+
+def shape_of(distances_m: NDArray[np.float64], *, is_turned: bool = False) -> Any:
+    counts, _ = np.histogram(distances_m, 200, (-0.05, 0.05))
+    counts = counts[::-1] if is_turned else counts
+    return normality(counts.astype(np.int64), tolerance_m=0.05, fit_tolerance_m=0.015)
+
+
+@pytest.mark.parametrize("sigma_m", [0.001, 0.0035])
+def test_normal_deviations_have_the_moments_and_shares_of_a_normal_distribution(
+    sigma_m: float,
+) -> None:
+    shape = shape_of(np.random.default_rng(1).normal(0.0003, sigma_m, 400_000))
+    assert shape.mean_m == pytest.approx(0.0003, abs=1e-5)
+    assert shape.sigma_m == pytest.approx(sigma_m, rel=0.005)
+    assert shape.skewness == pytest.approx(0.0, abs=0.03)
+    assert shape.excess_kurtosis == pytest.approx(0.0, abs=0.06)
+    # Bins of 0.5 mm are read as evenly filled, which matters where sigma is not much wider.
+    np.testing.assert_allclose(shape.within, [0.6827, 0.9545, 0.9973], atol=0.02)
+    np.testing.assert_allclose(shape.found_sigmas[5:-5], shape.expected_sigmas[5:-5], atol=0.12)
+
+
+def test_relief_shows_as_skewness_and_heavy_tails_and_evenness_as_light_ones() -> None:
+    rng = np.random.default_rng(2)
+    moulded = np.concatenate([rng.normal(0.0, 0.002, 95_000), rng.normal(0.012, 0.001, 5_000)])
+    shape = shape_of(moulded)
+    assert shape.skewness > 1.0
+    assert shape.excess_kurtosis > 2.0
+    assert shape.within[0] > 0.75
+    assert shape_of(moulded, is_turned=True).skewness == pytest.approx(-shape.skewness)
+    even = shape_of(rng.uniform(-0.015, 0.015, 200_000))
+    assert even.excess_kurtosis == pytest.approx(-1.2, abs=0.02)
+    assert even.sigma_m == pytest.approx(0.015 / np.sqrt(3.0), rel=0.01)
+    # Few points or a single bin have no distribution.
+    assert shape_of(rng.normal(0.0, 0.002, 50)) is None
+    assert shape_of(np.full(1000, 1e-4)) is None

@@ -1,21 +1,23 @@
-"""Thickness of the cloud: noise is measured, relief and bow are not, and classes are told apart."""
+"""Thickness of the cloud: noise is measured, relief and bow are not, by class and along a row."""
 
 from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.plane.ransac import Ransac
+from orthoflow_plugins.plane.thickness import RowPoints, measure_thickness, row_points
 from pydantic import ValidationError
 
 from orthoflow.errors import MethodError
 from orthoflow.products import PointCloud
-from orthoflow.sdk import StepContext
-from tests.plane_scenes import cloud_of, context
+from tests import plane_scenes
+from tests.plane_scenes import cloud_of, prepared
 
 # A wall of 6 x 3 m at y = 2, seen from the middle of a room.
 STATION = np.array([[0.0, 0.0, 0.0]])
@@ -29,41 +31,29 @@ def wall(noise_m: NDArray[np.float64] | float, *, bow_m: float = 0.0) -> NDArray
     return np.column_stack([x, y, z])
 
 
-def detect(
-    cloud: PointCloud, folder: Path, **params: object
-) -> tuple[Any, StepContext, dict[str, float]]:
-    ctx = context(folder)
-    out = Ransac().run(Ransac.In(cloud=cloud), Ransac.Params(**params), ctx)
-    return out, ctx, {metric.name: metric.value for metric in ctx.metrics}
+def detect(cloud: PointCloud, folder: Path, **params: object) -> tuple[Any, dict[str, float]]:
+    out, ctx = plane_scenes.detect(Ransac, cloud, folder, **params)
+    return out.planes, {metric.name: metric.value for metric in ctx.metrics}
 
 
-@pytest.mark.parametrize("noise_m", [0.001, 0.004])
-@pytest.mark.parametrize("bow_m", [0.0, 0.006], ids=["flat", "bowed"])
+@pytest.mark.parametrize(("noise_m", "bow_m"), [(0.001, 0.0), (0.001, 0.006), (0.004, 0.006)])
 def test_thickness_is_the_noise_and_not_the_bow(
     noise_m: float, bow_m: float, tmp_path: Path
 ) -> None:
-    _, _, metrics = detect(cloud_of(wall(noise_m, bow_m=bow_m), stations=STATION), tmp_path)
+    _, metrics = detect(cloud_of(wall(noise_m, bow_m=bow_m), stations=STATION), tmp_path)
     # 50 points in a tile, 90 000 in all: half a percent; a bow of 6 mm slopes little in a tile.
     assert metrics["thickness_mm"] == pytest.approx(1000.0 * noise_m, rel=0.03)
     assert metrics["thickness_width_mm"] == pytest.approx(3.92 * 1000.0 * noise_m, rel=0.03)
     assert metrics["thickest_mm"] == metrics["thickness_mm"]
-
-
-def test_the_scan_step_is_that_of_the_points_on_the_plane(tmp_path: Path) -> None:
-    _, _, metrics = detect(cloud_of(wall(0.002)), tmp_path)
     step_mm = 1000.0 * np.sqrt(18.0 / N_POINTS)
     assert metrics["scan_step_mm"] == pytest.approx(step_mm, rel=0.03)
-    assert metrics["thickness_scan_steps"] == pytest.approx(2.0 / step_mm, rel=0.05)
+    assert metrics["thickness_scan_steps"] == pytest.approx(1000.0 * noise_m / step_mm, rel=0.05)
 
 
-@pytest.mark.usefixtures("charts")
 def test_noise_that_grows_with_incidence_and_range_is_told_by_class(tmp_path: Path) -> None:
-    flat = wall(0.0)
-    range_m = np.linalg.norm(flat, axis=1)
-    incidence = np.arccos(2.0 / range_m)
-    noise_m = 0.001 + 0.003 * incidence
-    out, ctx, _ = detect(cloud_of(wall(noise_m), stations=STATION), tmp_path)
-    classes = out.planes.thickness[0]
+    range_m = np.linalg.norm(wall(0.0), axis=1)
+    noise_m = 0.001 + 0.003 * np.arccos(2.0 / range_m)
+    (classes,) = detect(cloud_of(wall(noise_m), stations=STATION), tmp_path)[0].thickness
     assert len(classes.incidence_deg) >= 5
     for item in classes.incidence_deg:
         middle = np.radians(0.5 * (item.low + item.high))
@@ -71,80 +61,147 @@ def test_noise_that_grows_with_incidence_and_range_is_told_by_class(tmp_path: Pa
     sigmas = [item.sigma_m for item in classes.range_m]
     assert sigmas == sorted(sigmas)
     assert sum(item.n_points for item in classes.range_m) > 0.95 * N_POINTS
-    assert "thickness" in {figure.name for figure in ctx.figures}
-
-
-def test_a_material_that_scatters_more_is_told_by_its_intensity(tmp_path: Path) -> None:
-    flat = wall(0.0)
-    fabric = flat[:, 0] > 0.0
-    points = wall(np.where(fabric, 0.004, 0.001))
-    intensity = np.where(fabric, 0.2, 0.8) + np.random.default_rng(1).normal(0, 0.02, N_POINTS)
-    cloud = dataclasses.replace(cloud_of(points), intensity=intensity.astype(np.float32))
-    classes = detect(cloud, tmp_path)[0].planes.thickness[0]
-    assert classes.incidence_deg == ()
-    assert classes.intensity[0].sigma_m == pytest.approx(0.004, rel=0.05)
-    assert classes.intensity[-1].sigma_m == pytest.approx(0.001, rel=0.05)
+    # A view point that was stated is no station.
+    cloud = cloud_of(wall(noise_m), stations=STATION, source="view_from")
+    (classes,) = detect(cloud, tmp_path)[0].thickness
+    assert (classes.incidence_deg, classes.range_m, classes.intensity) == ((), (), ())
 
 
 @pytest.mark.usefixtures("charts")
-def test_named_materials_have_a_thickness_each_on_the_plane_and_along_a_row(
-    tmp_path: Path,
-) -> None:
+def test_materials_have_a_thickness_each_on_the_plane_and_along_a_row(tmp_path: Path) -> None:
     fabric = wall(0.0)[:, 0] > 0.0
-    points = wall(np.where(fabric, 0.004, 0.001))
     intensity = np.where(fabric, 0.2, 0.8) + np.random.default_rng(1).normal(0, 0.02, N_POINTS)
     cloud = dataclasses.replace(
-        cloud_of(points),
+        cloud_of(wall(np.where(fabric, 0.004, 0.001))),
         intensity=intensity.astype(np.float32),
         row=np.repeat(np.arange(30), N_POINTS // 30).astype(np.uint32),
         column=np.zeros(N_POINTS, dtype=np.uint32),
     )
-    names = {"fabric": (0.0, 0.5), "plaster": (0.5, 1.0), "glass": (0.99, 1.0)}
-    with pytest.raises(ValidationError, match=r"begin at 0.99, below 1 where"):
-        Ransac.Params(materials=names)
-    del names["glass"]
-    out, _, _ = detect(cloud, tmp_path, materials=names)
-    thickness, row = out.planes.thickness[0], out.planes.scan_row
+    names = {"fabric": (0.0, 0.5), "plaster": (0.5, 1.0)}
+    planes, _ = detect(cloud, tmp_path, materials=names)
+    thickness, row = planes.thickness[0], planes.scan_row
     for spreads, rel in ((thickness.material, 0.05), (row.material, 0.15)):
         assert [item.name for item in spreads] == ["fabric", "plaster"]
         assert spreads[0].sigma_m == pytest.approx(0.004, rel=rel)
         assert spreads[1].sigma_m == pytest.approx(0.001, rel=rel)
     assert row.n_points == 3000
-
-
-def test_materials_need_intensities(tmp_path: Path) -> None:
+    # By classes of intensity as well.
+    assert thickness.intensity[0].sigma_m == pytest.approx(0.004, rel=0.05)
+    assert thickness.intensity[-1].sigma_m == pytest.approx(0.001, rel=0.05)
     with pytest.raises(MethodError, match="leave out materials"):
-        detect(cloud_of(wall(0.002)), tmp_path, materials={"fabric": (0.0, 0.5)})
+        detect(cloud_of(wall(0.002)), tmp_path, materials=names)
 
 
-@pytest.mark.usefixtures("charts")
-def test_one_row_of_the_scan_is_drawn_where_rows_are_known(tmp_path: Path) -> None:
-    from orthoflow_plugins.plane import search
-
-    rows = []
-    cloud = cloud_of(wall(0.002), stations=STATION)
-    row = np.repeat(np.arange(300), N_POINTS // 300).astype(np.uint32)
-    cloud = dataclasses.replace(cloud, row=row, column=np.zeros(N_POINTS, dtype=np.uint32))
-    original = search.row_points
-
-    def kept(*arguments: Any) -> Any:
-        rows.append(original(*arguments))
-        return rows[-1]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(search, "row_points", kept)
-        detect(cloud, tmp_path)
-    (found,) = rows
-    assert len(found.along_m) == 300
-    assert (np.diff(found.along_m) >= 0.0).all()
-    # A hundred or so points of 2 mm noise.
-    assert np.std(found.distance_m) == pytest.approx(0.002, rel=0.15)
+@pytest.mark.parametrize(
+    ("materials", "message"),
+    [
+        ({"a": (0.2, 0.2)}, "intensities of a must ascend between 0 and 1, got 0.2 and 0.2"),
+        ({"a": (-0.1, 0.2)}, "must ascend"),
+        ({"a": (0.1, 1.1)}, "must ascend"),
+        ({"b": (0.2, 0.5), "a": (0.0, 0.3)}, "intensities of b begin at 0.2, below 0.3 where"),
+    ],
+)
+def test_materials_that_overlap_or_fall_are_refused(
+    materials: dict[str, tuple[float, float]], message: str
+) -> None:
+    with pytest.raises(ValidationError, match=message):
+        Ransac.Params.model_validate({"materials": materials})
 
 
-def test_a_view_point_that_was_stated_is_no_station(tmp_path: Path) -> None:
-    cloud = cloud_of(wall(0.002), stations=STATION, source="view_from")
-    classes = detect(cloud, tmp_path)[0].planes.thickness[0]
-    assert classes.sigma_m < classes.width_95_m
-    assert classes.scan_step_m > 0.0
-    by_class = (classes.incidence_deg, classes.range_m, classes.intensity, classes.material)
-    assert by_class == ((), (), (), ())
+def test_a_row_is_measured_piece_by_piece_about_its_means() -> None:
+    rng = np.random.default_rng(1)
+    along = np.sort(rng.uniform(0.0, 1.0, 300)) + 5.0
+    # Relief by piece, and one piece with three points only.
+    piece = np.floor((along - along[0]) / 0.1).astype(int)
+    kept = (piece != 4) | (np.cumsum(piece == 4) <= 3)
+    along, piece = along[kept], piece[kept]
+    distance = 0.01 * piece + rng.normal(0.0, 0.001, len(along))
+    intensity = rng.uniform(0.0, 1.0, len(along))
+    row = RowPoints(row=7, scan=2, along_m=along, distance_m=distance, intensity=intensity)
+    found = row.measured({"dark": (0.0, 0.5)})
+    deviation, shown = [], []
+    for k in np.unique(piece):
+        mine = piece == k
+        n = np.count_nonzero(mine)
+        if n >= 4:
+            deviation.append((distance[mine] - distance[mine].mean()) / np.sqrt(1.0 - 1.0 / n))
+            shown.append(intensity[mine])
+    values, shades = np.abs(np.concatenate(deviation)), np.concatenate(shown)
+    assert (found.row, found.scan, found.n_points) == (7, 2, len(along))
+    assert found.sigma_m == pytest.approx(1.4826 * np.median(values), rel=1e-4)
+    (dark,) = found.material
+    assert dark.n_points == np.count_nonzero(shades <= 0.5)
+    assert dark.sigma_m == pytest.approx(1.4826 * np.median(values[shades <= 0.5]), rel=1e-4)
+    assert dataclasses.replace(row, intensity=None).measured({"dark": (0.0, 0.5)}).material == ()
+    thin = RowPoints(row=0, scan=0, along_m=np.arange(9.0), distance_m=np.ones(9), intensity=None)
+    assert thin.measured({}).sigma_m is None
+
+
+def test_the_row_with_most_points_on_the_first_plane_is_taken() -> None:
+    # Two scans of a wall at y = 2 in rows of points; row 3 of scan 1 has most on the wall.
+    rng = np.random.default_rng(0)
+    parts, rows, scans = [], [], []
+    for scan, row in np.ndindex(2, 5):
+        count = 60 if (scan, row) == (1, 3) else 40
+        y = 2.0 + rng.normal(0.0, 0.001, count)
+        # A few points of each row lie far before the wall.
+        y[:5] = 0.5
+        parts.append(np.column_stack([rng.uniform(-1.0, 1.0, count), y, np.full(count, 0.1 * row)]))
+        rows += [row] * count
+        scans += [scan] * count
+    plain = cloud_of(np.concatenate(parts), origin=(100.0, 200.0, 300.0))
+    row, scan = np.array(rows, dtype=np.uint32), np.array(scans, dtype=np.uint16)
+    intensity = np.linspace(0.0, 1.0, len(rows), dtype=np.float32)
+    known = dataclasses.replace(plain, row=row, scan=scan, intensity=intensity)
+    planes: Any = SimpleNamespace(
+        normal=np.array([[0.0, -1.0, 0.0]]), offset=np.array([-202.0]), up=np.array([0, 0, 1.0])
+    )
+    cloud = plane_scenes.prepare(known, parts=1)
+    on_wall = np.abs(known.y.astype(float) - 2.0) < 0.1
+    cloud.claims[on_wall] = 0
+    of_sample = np.where(on_wall, 0, -1)
+    found = row_points(planes, of_sample, cloud, known)
+    assert found is not None
+    assert (found.row, found.scan) == (3, 1)
+    mine = np.flatnonzero(on_wall & (row == 3) & (scan == 1))
+    order = mine[np.argsort(known.x[mine])]
+    # To the right of a viewer in the south is east.
+    np.testing.assert_allclose(found.along_m, known.x[order])
+    np.testing.assert_allclose(found.distance_m, 2.0 - known.y[order].astype(float), atol=1e-12)
+    np.testing.assert_allclose(found.intensity, intensity[order])
+    # Without numbers of scans a row is one of all scans.
+    blind = dataclasses.replace(known, scan=None, intensity=None)
+    both = row_points(planes, of_sample, cloud, blind)
+    assert both is not None
+    assert (both.row, both.scan, both.intensity, len(both.along_m)) == (3, 0, None, 35 + 55)
+    # Neither rows nor points, or fewer than twenty.
+    assert row_points(planes, of_sample, cloud, dataclasses.replace(known, row=None)) is None
+    assert row_points(planes, np.full(len(of_sample), -1), cloud, known) is None
+    few = np.where(np.cumsum(on_wall) <= 19, of_sample, -1)
+    cloud.claims[:] = few
+    assert row_points(planes, few, cloud, known) is None
+
+
+def test_thickness_needs_fifty_points_in_tiles_of_four() -> None:
+    rng = np.random.default_rng(2)
+
+    def thickness(n_points: int, per_tile: int) -> Any:
+        x = 0.1 * (np.arange(n_points) // per_tile) + 0.05
+        y = 2.0 + rng.normal(0.0, 0.001, n_points)
+        points = np.column_stack([x, y, np.full(n_points, 0.05)])
+        points = np.vstack([points, [[0.0, 0.0, 9.0]]])
+        planes: Any = type("P", (), {"__len__": lambda _: 1})()
+        planes.normal, planes.offset = np.array([[0.0, -1.0, 0.0]]), [-2.0]
+        planes.up = np.array([0.0, 0.0, 1.0])
+        of_sample = np.append(np.zeros(n_points, dtype=np.int64), -1)
+        cloud = cloud_of(points)
+        (found,) = measure_thickness(planes, of_sample, prepared(points), cloud, 0.05, {})
+        return found
+
+    assert thickness(52, 4) is not None
+    assert thickness(48, 4) is None
+    assert thickness(90, 3) is None
+    found = thickness(4_000, 40)
+    assert found.sigma_m == pytest.approx(0.001, rel=0.05)
+    # Forty points on a square decimetre.
+    assert found.scan_step_m == pytest.approx(0.1 / np.sqrt(40.0))
