@@ -127,7 +127,7 @@ def test_cells_that_fade_state_what_their_plane_scatters_by(tails: str) -> None:
 
 def room_ratios(seed: int, folder: Path) -> list[list[float]]:
     """Of walls, floor and ceiling of a room drawn and scanned by a seed."""
-    chosen = {"geometry": "drawn", "decoration": "drawn", "scan_step_m": 0.04}
+    chosen = {"geometry": "drawn", "scan_step_m": 0.04}
     ctx = replace(context(folder), rng=np.random.default_rng(seed))
     room = SimulateRoom().run(SimulateRoom.In(), SimulateRoom.Params.model_validate(chosen), ctx)
     planes, true = detect(Ransac, room.cloud, folder)[0].planes, room.truth.planes
