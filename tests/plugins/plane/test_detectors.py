@@ -158,7 +158,8 @@ BOXES = tuple(
 def test_what_else_was_scanned_neither_hides_nor_moves_the_walls(
     detector: str, case: str, tmp_path: Path
 ) -> None:
-    expected, points = ROOM[:6], sampled()[HALF]
+    points = sampled()[HALF]
+    expected: tuple[Rectangle, ...] = ROOM[:6]
     if case == "outliers":
         # Five per cent of gross errors.
         points = np.vstack([points, np.random.default_rng(3).uniform(-400.0, 400.0, (2_200, 3))])
@@ -309,7 +310,7 @@ def test_a_part_of_a_large_cloud_is_fitted_whatever_the_number_of_threads(
 @every_method
 def test_metrics_are_those_of_the_planes_and_labels(detector: str, tmp_path: Path) -> None:
     cloud, true = example_room(n_points=40_000)
-    method = DETECTORS[detector][0]
+    method: Any = DETECTORS[detector][0]
     # A clock that goes on when it is asked: once at the beginning, for each plane, and at the end.
     clock, processor = count(), count(step=10)
     ctx = StepContext(
@@ -319,7 +320,7 @@ def test_metrics_are_those_of_the_planes_and_labels(detector: str, tmp_path: Pat
         clock_s=lambda: float(next(clock)),
         processor_s=lambda: float(next(processor)),
     )
-    out: Any = method().run(method.In(cloud=cloud), method.Params(), ctx)
+    out = method().run(method.In(cloud=cloud), method.Params(), ctx)
     planes, labels = out.planes, out.labels.plane_index
     metrics = {metric.name: metric.value for metric in ctx.metrics}
     counts = np.bincount(labels[labels >= 0], minlength=len(planes))

@@ -88,7 +88,7 @@ def test_deviations_are_drawn_with_the_gauss_curve_of_their_fit(
         n_fit=n_points - 7,
         # The last has no distribution, and its deviation is zero: bars alone.
         rms_fit_m=np.array([0.003, 0.003, 0.0]),
-        mean_fit_m=0.001 * np.arange(3),
+        mean_fit_m=np.array([0.0, 0.001, 0.002]),
         histogram=histogram,
         extents_m=np.zeros((3, 4)),
         tolerance_m=0.05,
@@ -136,6 +136,7 @@ def test_planes_are_drawn_with_their_points_and_rectangles(
     # What is on no plane, and the planes, which all turn to the eye.
     for k, drawn in zip((-1, 0, 1, 2), lines(left), strict=True):
         np.testing.assert_allclose(drawn, flat[plane_of_point == k].T, atol=1e-6)
+    assert planes.part_corners is not None
     backdrop, *rectangles = lines(right)
     np.testing.assert_allclose(backdrop, flat.T, atol=1e-6)
     for corners, drawn in zip(planes.part_corners, rectangles, strict=True):
@@ -165,7 +166,7 @@ def test_thickness_is_drawn_by_plane_class_material_and_row(
     third = Thickness(sigma_m=0.002, width_95_m=0.008, scan_step_m=0.006, range_m=spreads(0.005))
     along = np.linspace(0.0, 2.0, 9)
     row = RowPoints(
-        row=17, scan=3, along_m=along, distance_m=0.001 * along, intensity=0.125 * np.arange(9)
+        row=17, scan=3, along_m=along, distance_m=0.001 * along, intensity=np.linspace(0.0, 1.0, 9)
     )
     materials = {"dark": (0.25, 0.5), "bright": (0.75, 0.875)}
     draw_thickness(context(tmp_path), planes_of(), (None, None, None), None, {})
@@ -215,7 +216,7 @@ def test_the_accumulator_is_drawn_with_the_walls_as_lines_and_as_circles(
     # The floor is no line of the plan.
     maximum, front, side = lines(left)
     row, column = np.unravel_index(votes.argmax(), votes.shape)
-    fullest = [15.0 * row, -6.0 + 0.5 * (column + 0.5)]
+    fullest = [15.0 * float(row), -6.0 + 0.5 * (float(column) + 0.5)]
     across = np.array([np.cos(np.radians(fullest[0])), np.sin(np.radians(fullest[0]))])
     np.testing.assert_allclose((maximum.T - [0.0, 0.5]) @ across, fullest[1], atol=1e-9)
     np.testing.assert_allclose([np.sort(front[0]), front[1]], [[-3.0, 3.0], [2.0, 2.0]])

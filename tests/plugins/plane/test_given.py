@@ -16,11 +16,11 @@ from tests.plane_scenes import ROOM, Rectangle, cloud_of, detect, sampled
 
 SURVEY = (634512.347, 486215.781, 112.193)
 # The wall at y = -2, and the floor.
-TRIPLE = {"points": ((-3.0, -2.0, -1.5), (3.0, -2.0, -1.5), (0.0, -2.0, 1.5))}
-TWO = (TRIPLE, {"horizontal": True, "height_m": -1.5})
+TRIPLE: dict[str, Any] = {"points": ((-3.0, -2.0, -1.5), (3.0, -2.0, -1.5), (0.0, -2.0, 1.5))}
+TWO: tuple[dict[str, Any], ...] = (TRIPLE, {"horizontal": True, "height_m": -1.5})
 
 
-def lay(cloud: PointCloud, folder: Path, **params: object) -> Any:
+def lay(cloud: PointCloud, folder: Path, **params: Any) -> Any:
     return detect(GivenPlane, cloud, folder, **params)[0]
 
 
@@ -107,7 +107,7 @@ def test_contradicting_parameters_are_refused(params: dict[str, object], message
     ],
 )
 def test_planes_without_points_are_refused(
-    params: dict[str, object], message: str, tmp_path: Path
+    params: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(MethodError, match=message):
         lay(cloud_of(sampled()), tmp_path, **params)

@@ -32,10 +32,10 @@ def wall(noise_m: float, n_points: int) -> NDArray[np.float64]:
 
 def waves(rng: np.random.Generator, places_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Errors (n,) that neighbours share, of standard deviation 1, over half metres and more."""
-    total = np.zeros(len(places_m))
+    total: NDArray[np.float64] = np.zeros(len(places_m))
     for _ in range(24):
         length_m, direction = rng.uniform(0.6, 3.0), rng.normal(size=places_m.shape[1])
-        direction /= np.linalg.norm(direction)
+        direction = direction / np.linalg.norm(direction)
         phase = rng.uniform(0.0, 2.0 * np.pi)
         total += np.cos(2.0 * np.pi * (places_m @ direction) / length_m + phase)
     return total / np.sqrt(12.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -75,7 +76,7 @@ def test_the_nearest_station_that_is_clear_of_the_plane_tells_the_side() -> None
         assert side(*three, scan=scan) == -1
 
 
-def side_by(points: list[tuple[float, float, float]], parallel: list[bool] | None = None) -> int:
+def side_by(points: Sequence[tuple[float, ...]], parallel: list[bool] | None = None) -> int:
     is_parallel = np.array(parallel or [False] * len(points), dtype=np.bool_)
     places = np.array(points, dtype=np.float64).reshape(-1, 3)
     return side_of_remaining(WALL, CORNERS, places, is_parallel, clear_m=0.05)
@@ -221,6 +222,7 @@ def test_rectangles_end_with_the_points(scene: Scene) -> None:
         expected = [[left, 1], [left, -1], [right, -1], [right, 1]]
         np.testing.assert_allclose(found[:, [axis, 2]], expected, atol=0.005)
     np.testing.assert_array_equal(planes.part_plane, [0, 1])
+    assert planes.part_corners is not None
     # Parts are known to a cell, and none reaches beyond the points.
     np.testing.assert_allclose(planes.part_corners, planes.corners, atol=0.06)
     for part, whole in zip(planes.part_corners, planes.corners, strict=True):

@@ -28,9 +28,9 @@ from tests.plane_scenes import ROOM, STATION, cloud_of, detect, errors, sampled
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def histogram_of(distances_m: NDArray[np.float64], reach_m: float) -> NDArray[np.int32]:
+def histogram_of(distances_m: NDArray[np.float64], reach_m: float) -> NDArray[np.int64]:
     counts = np.histogram(np.abs(distances_m), bins=100, range=(0.0, reach_m))[0]
-    return counts[None].astype(np.int32)
+    return counts[None].astype(np.int64)
 
 
 @pytest.mark.parametrize("seed", range(50 if IS_LONG else 2))

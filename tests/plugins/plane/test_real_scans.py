@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -63,7 +64,8 @@ def test_the_exactness_stated_of_a_real_wall_holds_between_its_halves(
     for part in (slice(0, None, 2), slice(1, None, 2)):
         # In one piece and read-only, as methods get them: kernels would be compiled once more.
         pieces = (np.ascontiguousarray(getattr(hall, name)[part]) for name in "xyz")
-        half = replace(hall, **dict(zip("xyz", read_only(*pieces), strict=True)))
+        columns: dict[str, Any] = dict(zip("xyz", read_only(*pieces), strict=True))
+        half = replace(hall, **columns)
         found.append(detect(Ransac, half, tmp_path, n_planes_max=1)[0].planes)
     first, second = found
     middle = first.corners[0].mean(axis=0)

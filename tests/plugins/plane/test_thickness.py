@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.plane.cloud import prepare
 from orthoflow_plugins.plane.ransac import Ransac
 from orthoflow_plugins.plane.thickness import RowPoints, measure_thickness, row_points
 from pydantic import ValidationError
@@ -156,7 +157,7 @@ def test_the_row_with_most_points_on_the_first_plane_is_taken() -> None:
     planes: Any = SimpleNamespace(
         normal=np.array([[0.0, -1.0, 0.0]]), offset=np.array([-202.0]), up=np.array([0, 0, 1.0])
     )
-    cloud = plane_scenes.prepare(known, parts=1)
+    cloud = prepare(known, parts=1)
     on_wall = np.abs(known.y.astype(float) - 2.0) < 0.1
     cloud.claims[on_wall] = 0
     of_sample = np.where(on_wall, 0, -1)
