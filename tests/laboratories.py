@@ -54,6 +54,40 @@ compare:
   exclude: [{plane: ransac, orient: pnp}]
   metrics: [plane.rms_mm, "*.wall_s"]
 """
+# Rooms that are scanned or simulated, for datasets; and a swept parameter.
+ROOMS = """\
+orthoflow: 1
+name: rooms
+seed: 5
+inputs:
+  scan: {optional: true}
+  photos: {files: shared.jpg}
+steps:
+  shots: {use: read.photos, in: {files: inputs.photos}}
+  cloud: {use: read.scan, in: {files: inputs.scan}}
+  room: {use: simulate.room, unless: inputs.scan}
+  plane:
+    in: {cloud: [cloud.cloud, room.cloud]}
+    variants:
+      hough2d: {use: plane.hough2d, params: {cell_m: 0.02}}
+      ransac: {use: plane.ransac, repeat: 2}
+  wall: {use: raster.grid, in: {cloud: [cloud.cloud, room.cloud], planes: plane.planes}}
+  ties: {use: match.sift, in: {photos: shots.photos, walls: wall.walls}}
+"""
+SWEPT = """\
+orthoflow: 1
+name: swept
+inputs:
+  scan: {optional: true}
+steps:
+  room: {use: simulate.room}
+  cloud: {use: read.scan, in: {files: inputs.scan}}
+  plane:
+    use: plane.hough2d
+    in: {cloud: room.cloud}
+    params: {cell_m: 0.01, tolerance_m: {sweep: [0.02, 0.05, 0.1]}}
+  wall: {use: raster.grid, in: {cloud: room.cloud, planes: plane.planes}}
+"""
 
 
 def entry_points_in(*folders: Path) -> list[EntryPoint]:

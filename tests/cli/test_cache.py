@@ -7,9 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
-from orthoflow.cli.program import program
 from tests.engine_world import toy_world
 from tests.killed_runs import run_here
 
@@ -66,16 +64,16 @@ def test_a_run_says_what_it_found_damaged(say: Said, tmp_path: Path) -> None:
     assert (code, "damaged" in text) == (0, False)
 
 
-def test_verify_names_what_is_damaged_and_removes_it(say: Said, tmp_path: Path) -> None:
-    assert say("cache", "verify") == (
-        0,
-        "0 results and 0 objects in .orthoflow are as they were stored\n",
-    )
+def test_the_store_is_listed_verified_and_collected(say: Said, tmp_path: Path) -> None:
+    as_stored = "0 results and 0 objects in .orthoflow are as they were stored\n"
+    assert say("cache", "verify") == (0, as_stored)
     assert say(*RUN, "first")[0] == 0
-    assert say("cache", "verify") == (
-        0,
-        "2 results and 2 objects in .orthoflow are as they were stored\n",
-    )
+    assert say("cache", "verify") == (0, as_stored.replace("0", "2"))
+    assert {row["method"] for row in json.loads(say("cache", "list", "--json")[1])} == {
+        "make.range",
+        "work.draws",
+    }
+    assert say("cache", "list")[1].splitlines()[-1] == "2 results in .orthoflow"
     [figure] = (tmp_path / ".orthoflow" / "objects").glob("*/blob")
     name = figure.parent.name
     flip(figure)
@@ -90,25 +88,20 @@ def test_verify_names_what_is_damaged_and_removes_it(say: Said, tmp_path: Path) 
     assert not figure.exists()
     assert say("cache", "verify")[0] == 0
     assert say(*RUN, "again")[0] == 0
-
-
-def without_bytecode(folder: Path) -> set[Path]:
-    return {path for path in folder.rglob("*") if "__pycache__" not in path.parts}
+    # What is young is kept, and a rehearsal removes nothing.
+    assert json.loads(say("cache", "gc", "--json")[1])["n_results"] == 0
+    would = say("cache", "gc", "--older-than", "0", "--dry-run")[1]
+    assert would.startswith("would remove 2 results and 2 objects, ")
+    assert say("cache", "gc", "--older-than", "0")[0] == 0
+    assert json.loads(say("cache", "list", "--json")[1]) == []
 
 
 @pytest.mark.parametrize("command", [(*RUN, "first"), ("cache", "gc"), ("cache", "verify")])
 def test_a_folder_of_something_else_is_no_store(
-    command: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    command: tuple[str, ...], say: Said, tmp_path: Path
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    with toy_world(tmp_path):
-        (tmp_path / "toy.yaml").write_text(WORKFLOW)
-        before = without_bytecode(tmp_path)
-        done = CliRunner().invoke(program, [*command, "--store", "."])
-    assert done.exit_code == 2
-    assert done.stderr == (
-        f"error: {tmp_path} is not a store of orthoflow: it holds site and 1 more; name a "
-        "store, or a "
-        "folder that is empty or not there yet, with --store\n"
-    )
-    assert without_bytecode(tmp_path) <= before
+    before = {path for path in tmp_path.iterdir() if path.name != "site"}
+    code, text = say(*command, "--store", ".")
+    assert code == 2
+    assert f"error: {tmp_path} is not a store of orthoflow: it holds " in text
+    assert {path for path in tmp_path.iterdir() if path.name != "site"} == before

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 
-@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
+@pytest.mark.parametrize("closed", [">&-", "<&- >&- 2>&-"])
 def test_a_command_works_with_closed_streams(closed: str, tmp_path: Path) -> None:
     # What is opened later must not get the number of a closed stream, and its output.
     target = tmp_path / "found.txt"
@@ -28,7 +28,6 @@ def test_a_command_works_with_closed_streams(closed: str, tmp_path: Path) -> Non
     assert target.read_text() == "True"
 
 
-@pytest.mark.parametrize("closed", [">&-", "2>&-"])
-def test_the_program_ends_well_with_closed_streams(closed: str) -> None:
-    command = f'"{sys.executable}" -m orthoflow --version {closed}'
+def test_the_program_ends_well_with_closed_streams() -> None:
+    command = f'"{sys.executable}" -m orthoflow --version >&- 2>&-'
     assert subprocess.run(["bash", "-c", command], check=False).returncode == 0

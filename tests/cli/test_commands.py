@@ -11,7 +11,6 @@ import pytest
 from click.testing import CliRunner
 
 from orthoflow.cli.commands import (
-    LazyGroup,
     RecordCommand,
     command_again,
 )
@@ -39,22 +38,6 @@ def test_a_command_is_repeated_with_what_was_given_and_another_folder() -> None:
     assert words[-2:] == ["-o", "new one"]
 
 
-@pytest.mark.parametrize(
-    ("name", "said"),
-    [("bakee", "No such command 'bakee'; did you mean 'bake'?"), ("zzz", "No such command 'zzz'.")],
-)
-def test_a_group_says_which_of_its_commands_was_meant(name: str, said: str) -> None:
-    summaries = {verb: f"{verb} it" for verb in ("wash", "bake")}
-    group = LazyGroup("kitchen", summaries=summaries, target=f"{__name__}:{{}}")
-    done = CliRunner().invoke(group, [name])
-    assert done.exit_code == 2
-    assert said in done.output
-    listed = CliRunner().invoke(group, ["--help"]).output
-    # In the order of work.
-    assert listed.index("wash it") < listed.index("bake it")
-    assert group.list_commands(click.Context(group)) == ["wash", "bake"]
-
-
 # --- what fails on a record ---
 
 
@@ -62,9 +45,7 @@ def failing(error: Exception, *runs: Path) -> BaseException:
     """Give runs to a command that ends with an error, and take what becomes of it."""
 
     @click.command(cls=RecordCommand)
-    @click.argument("first", type=click.Path(path_type=Path))
-    @click.argument("others", nargs=-1, type=click.Path(path_type=Path))
-    @click.option("--at", default="nowhere")
+    @click.argument("runs", nargs=-1, type=click.Path(path_type=Path))
     def fail(**_given: object) -> None:
         raise error
 
@@ -73,40 +54,21 @@ def failing(error: Exception, *runs: Path) -> BaseException:
     return caught.value
 
 
-@pytest.fixture
-def intact(tmp_path: Path) -> Path:
-    path, _, _ = write_sample(tmp_path)
-    return path
-
-
-@pytest.fixture
-def changed(intact: Path, tmp_path: Path) -> Path:
-    path = tmp_path / "changed.h5"
-    path.write_bytes(intact.read_bytes())
-    with h5py.File(path, "r+") as file:
+def test_a_failure_on_a_changed_record_is_that_records(tmp_path: Path) -> None:
+    intact, _, _ = write_sample(tmp_path)
+    changed = tmp_path / "changed.h5"
+    changed.write_bytes(intact.read_bytes())
+    with h5py.File(changed, "r+") as file:
         file.attrs["seed"] = type(file.attrs["seed"])(b"8")
-    return path
-
-
-def test_what_fails_on_an_intact_record_is_our_own_fault(intact: Path) -> None:
     error = KeyError("wall")
-    assert failing(error, intact) is error
     assert failing(error, intact, intact) is error
-
-
-def test_what_fails_on_a_changed_record_is_that_ones(intact: Path, changed: Path) -> None:
-    for runs in ((changed,), (intact, changed), (changed, intact), (intact, intact, changed)):
-        error = KeyError("wall")
-        told = failing(error, *runs)
-        assert isinstance(told, RecordError)
-        assert str(told).startswith(f"{changed} is not as it was written: ")
-        assert told.__cause__ is error
-
-
-@pytest.mark.parametrize("kind", [GeometryError, ProductError])
-def test_a_product_that_breaks_its_rules_is_the_records(
-    intact: Path, kind: type[Exception]
-) -> None:
-    told = failing(kind("no plane"), intact)
-    assert isinstance(told, RecordError)
-    assert str(told) == "a product of this run breaks its own rules: no plane"
+    for runs in ((changed,), (intact, intact, changed)):
+        raised = failing(error, *runs)
+        assert isinstance(raised, RecordError)
+        assert str(raised).startswith(f"{changed} is not as it was written: ")
+        assert raised.__cause__ is error
+    # A product that breaks its rules is the record's, too.
+    for kind in (GeometryError, ProductError):
+        raised = failing(kind("no plane"), intact)
+        assert isinstance(raised, RecordError)
+        assert str(raised) == "a product of this run breaks its own rules: no plane"

@@ -117,6 +117,8 @@ def test_later_rows_compute_nothing_again(folder: Path) -> None:
 def test_check_counts_the_datasets_and_names_every_missing_file(folder: Path) -> None:
     done = orthoflow(folder, "check", "rooms.yaml", "--datasets", "rooms.csv")
     assert done.stdout == "rooms is fine: 4 steps, 3 datasets, run 8 times in all\n"
+    graph = orthoflow(folder, "graph", "rooms.yaml", "--datasets", "rooms.csv").stdout
+    assert 'input0[/"number<br/>of 3 datasets"/]' in graph
     (folder / "gone.csv").write_text("name,number\nhall,data/hall.txt\na,a.txt\nb,b.txt\n")
     done = orthoflow(folder, "check", "rooms.yaml", "--datasets", "gone.csv")
     assert done.returncode == 2
@@ -158,16 +160,3 @@ def test_what_ran_on_no_datasets_is_not_split(folder: Path) -> None:
     assert done.returncode == 2
     assert "ran on no datasets, so there is nothing to split" in done.stderr
     assert not (folder / "plain" / "datasets").exists()
-
-
-def test_the_graph_says_which_inputs_are_of_datasets(folder: Path) -> None:
-    done = orthoflow(folder, "graph", "rooms.yaml", "--datasets", "rooms.csv")
-    assert 'input0[/"number<br/>of 3 datasets"/]' in done.stdout
-
-
-@pytest.mark.parametrize("form", ["csv", "ro-crate"])
-def test_a_run_on_datasets_is_exported(form: str, folder: Path) -> None:
-    done = orthoflow(folder, "export", "first", "--to", form, "-o", f"as-{form}")
-    assert done.returncode == 0, done.stderr
-    texts = [path.read_text() for path in (folder / f"as-{form}").rglob("*.csv")]
-    assert any("survey@data=hall" in text for text in texts)

@@ -38,14 +38,9 @@ def test_arrays_and_paths_are_what_a_workflow_would_say() -> None:
 @pytest.mark.parametrize(
     ("given", "where"),
     [
-        ({"set": ["a.b=1"]}, "set"),
         ({"set": {"a.b": object}}, "set.a.b"),
-        ({"inputs": {"scan": 5}}, "inputs.scan"),
         ({"set_files": {"a": 1}}, "set_files"),
-        ({"datasets": ["a"]}, "datasets"),
         ({"jobs": True}, "jobs"),
-        ({"embed": "no"}, "embed"),
-        ({"store": None}, "store"),
         ({"only_dataa": 1}, "only_dataa"),
     ],
 )

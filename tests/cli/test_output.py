@@ -96,6 +96,8 @@ COMMANDS = [
     "export first --to lax",
     "export first --to csv --scale 50",
     "export first --to csv --embed",
+    "export first --to csv --split",
+    "export first --to csv -o first",
     "new nowhere.e57",
     "doctor --stor x",
 ]

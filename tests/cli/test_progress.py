@@ -285,7 +285,6 @@ LEFT = [running(took_s=50.0), CellState(took_s=40.0), CellState(took_s=40.0)]
         # A few seconds of one cell would make a run of minutes look short; skipped and stored ones
         # predict nothing.
         ([*[CellState(took_s=0.0)] * 9, CellState(took_s=4.0), *[CellState()] * 2], 1, UNKNOWN),
-        ([CellState(), running()], 1, UNKNOWN),
         ([CellState(took_s=0.0), CellState(state="ok")], 1, ""),
     ],
 )

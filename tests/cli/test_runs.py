@@ -137,14 +137,18 @@ def test_what_cannot_be_read_is_a_row_with_its_reason(runs: Path) -> None:
     linked = write(runs / "linked", 13, 0.02, 1.0)
     with h5py.File(linked / "run.h5", "r+") as file:
         file["elsewhere"] = h5py.ExternalLink("/etc/passwd", "/")
-    (runs / "pipe").mkdir()
-    os.mkfifo(runs / "pipe" / "run.h5")
+    for name, file in (("pipe", "run.h5"), ("waiting", "journal.jsonl")):
+        (runs / name).mkdir()
+        os.mkfifo(runs / name / file)
+    (runs / "deep" / "loop").symlink_to(runs)  # links are not followed
     rows = {row["folder"]: row for row in json.loads(said("runs", "--json"))}
     assert {name for name, row in rows.items() if row["status"] == "damaged"} == {
-        "torn", "linked", "pipe",
+        "torn", "linked", "pipe", "waiting",
     }  # fmt: skip
     assert rows["torn"]["reason"].startswith("torn/run.h5 cannot be read, the file is damaged")
     assert all(rows[name]["reason"] for name in ("linked", "pipe"))
+    assert "its journal cannot be read: " in rows["waiting"]["reason"]
+    assert not [name for name in rows if "loop" in name]
     shown = asked("show", "torn")
     assert shown.exit_code == 3
     assert shown.output.startswith("error: torn/run.h5 cannot be read, the file is damaged: ")
@@ -155,31 +159,13 @@ def test_what_cannot_be_read_is_a_row_with_its_reason(runs: Path) -> None:
     assert "torn damaged: torn/run.h5 cannot be read" in said("runs")
 
 
-def test_a_pipe_in_the_place_of_a_journal_is_not_waited_for(runs: Path) -> None:
-    folder = runs / "runs" / "pipe"
-    folder.mkdir()
-    os.mkfifo(folder / "journal.jsonl")
-    reason = "runs/pipe damaged: it has no run.h5, and its journal cannot be read: "
-    for command in ("runs", "show"):
-        table = said(command, "runs")
-        assert reason in table
-        assert "it is a folder, a pipe or a device" in table
-
-
-def test_links_are_not_followed(runs: Path) -> None:
-    (runs / "deep" / "loop").symlink_to(runs)
-    assert folders("deep") == ["deep/er/c"]
-
-
 @pytest.mark.parametrize(
     "words",
     [
         ["nowhere"],
-        ["--where", "rmse_u_mm"],
         ["--where", "rmse_u_mm < 2 mm"],
         ["--where", "rmse_u < 2"],
         ["--where", "cell_m = 1"],
-        ["--sort", "zzz"],
         ["--metric", "zzz"],
     ],
     ids=" ".join,
@@ -206,3 +192,22 @@ def test_a_condition_is_a_name_a_sign_and_a_number(
     runs: Path, condition: str, found: list[str]
 ) -> None:
     assert folders("--where", condition) == found
+
+
+def test_a_comparison_groups_equal_differences_and_counts_rounding(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, snapshot: SnapshotAssertion
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, tiny_mm, rms_mm, angle_deg in (("a", 1e-13, 1.5, 10), ("b", 3e-13, 1.25, 14)):
+        cells = [
+            cell(
+                address,
+                metrics=metrics(tiny_mm=tiny_mm, rms_mm=rms_mm),
+                params={"angle_deg": angle_deg},
+            )
+            for address in ("plane@data=a", "plane@data=a#1", "plane@data=b")
+        ]
+        (tmp_path / name).mkdir()
+        write_record(tmp_path / name / "run.h5", record(cells, run_id=name), lambda _digest: None)
+    assert said("compare", "a", "b") == snapshot
+    assert said("compare", "a", "b", "--all").count("tiny_mm") == 3

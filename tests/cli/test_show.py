@@ -12,15 +12,6 @@ from orthoflow.cli import show as module
 from tests.report_runs import cell, compared_run
 
 
-def shown(part: Any, run: Any, capsys: pytest.CaptureFixture[str]) -> list[str]:
-    part(run)
-    return capsys.readouterr().out.splitlines()
-
-
-def run_of(*cells: Any, **known: Any) -> Any:
-    return SimpleNamespace(record=SimpleNamespace(cells=cells, **known))
-
-
 def test_of_a_comparison_a_row_per_combination_is_shown(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -32,4 +23,5 @@ def test_of_a_comparison_a_row_per_combination_is_shown(
     assert "1.10 ± 0.10" in rows["plane=fine"]
     assert rows["plane=broken"].split()[1:] == ["-"] * (len(told[1].split()) - 1)
     assert told[5].startswith("means of the repeats ± their standard deviation")
-    assert not module._print_comparison(run_of(cell("plane"), cell("a@data=b")))
+    alone: Any = SimpleNamespace(record=SimpleNamespace(cells=(cell("plane"), cell("a@data=b"))))
+    assert not module._print_comparison(alone)

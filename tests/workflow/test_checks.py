@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from orthoflow.catalog.catalog import Catalog
+from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.workflow.checks import lint_workflow
-from orthoflow.workflow.model import (
-    Reference,
-    StepVariant,
-    Workflow,
-    WorkflowInputSpec,
-    WorkflowStep,
-)
+from orthoflow.workflow.document import load_workflow
 from tests.laboratories import GOOD, load
 
 
@@ -44,34 +38,16 @@ def test_cells_that_cannot_be_meant_are_told(
     assert lint_workflow(load(text, tmp_path / "flow.yaml", catalog)) == ((said,) if said else ())
 
 
-@pytest.mark.parametrize("step", ["ties", "colours"])
-def test_a_crop_is_doubted_where_photos_are_matched_to_it(step: str) -> None:
-    """Who paints a scan's own colours loses nothing by a crop."""
-    method = {"ties": "match.sift", "colours": "ortho.pointcloud-direct"}[step]
-    wall = StepVariant(name="", method="raster.grid", params={"crop": [0, 0, 1, 1]})
-    steps = [
-        WorkflowStep(name="wall", variants=(wall,)),
-        WorkflowStep(
-            name=step,
-            variants=(StepVariant(name="", method=method),),
-            inputs={"walls": (Reference(source="wall", name="walls"),)},
-            unless="cameras",
-        ),
-    ]
-    flow = Workflow(
-        name="flow",
-        path=Path("flow.yaml"),
-        source="",
-        seed=1,
-        inputs={"cameras": WorkflowInputSpec(name="cameras")},
-        steps={one.name: one for one in steps},
-    )
-    told = lint_workflow(flow)
-    assert len(told) == (step == "ties")
-    assert all(text.startswith("wall.crop leaves ties less to match photos to: ") for text in told)
-    # Who hands cameras on has done what it says.
-    given = {"cameras": WorkflowInputSpec(name="cameras", files=("cameras.json",))}
-    assert lint_workflow(replace(flow, inputs=given)) == ()
+@pytest.mark.parametrize(("recipe", "n"), [("photos-on-scan", 1), ("direct", 0)])
+def test_a_crop_is_reported_where_photos_are_matched_to_it(recipe: str, n: int) -> None:
+    """A scan's own colours lose nothing by a crop."""
+    workflow = load_workflow(recipe, discover_catalog(), sets=["wall.crop=[0, 0, 1, 1]"])
+    reported = [text for text in lint_workflow(workflow) if text.startswith("wall.crop leaves ")]
+    assert len(reported) == n
+    # Cameras from elsewhere need no matches.
+    given = ["cameras=cameras.json"] if n else []
+    workflow = load_workflow(recipe, discover_catalog(), inputs=given, sets=["wall.crop=[0,0,1,1]"])
+    assert not [text for text in lint_workflow(workflow) if "crop" in text]
 
 
 def test_inputs_that_nothing_takes_are_told(catalog: Catalog, tmp_path: Path) -> None:

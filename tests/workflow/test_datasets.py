@@ -2,41 +2,21 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import pytest
-from syrupy.assertion import SnapshotAssertion
 
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.errors import ArgumentError, InputError, OrthoflowError, WorkflowError
 from orthoflow.workflow.checks import lint_workflow
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import Cell, derive_seed, expand_cells
-from orthoflow.workflow.inputs import read_rows, resolve_input_files
+from orthoflow.workflow.inputs import resolve_input_files
 from orthoflow.workflow.model import Workflow
-from orthoflow.workflow.source import InvalidWorkflowError, ProblemLog
+from orthoflow.workflow.source import InvalidWorkflowError
 from orthoflow.workflow.views import resolved_json, workflow_from_resolved
+from tests.laboratories import ROOMS
 
-ROOMS = """\
-orthoflow: 1
-name: rooms
-seed: 5
-inputs:
-  scan: {optional: true}
-  photos: {files: shared.jpg}
-steps:
-  shots: {use: read.photos, in: {files: inputs.photos}}
-  cloud: {use: read.scan, in: {files: inputs.scan}}
-  room: {use: simulate.room, unless: inputs.scan}
-  plane:
-    in: {cloud: [cloud.cloud, room.cloud]}
-    variants:
-      hough2d: {use: plane.hough2d, params: {cell_m: 0.02}}
-      ransac: {use: plane.ransac, repeat: 2}
-  wall: {use: raster.grid, in: {cloud: [cloud.cloud, room.cloud], planes: plane.planes}}
-  ties: {use: match.sift, in: {photos: shots.photos, walls: wall.walls}}
-"""
 MISTAKEN = """\
 orthoflow: 1
 inputs:
@@ -184,22 +164,18 @@ def test_paths_of_a_table_start_at_the_table(catalog: Catalog, folder: Path) -> 
 
 
 @pytest.mark.usefixtures("folder")
-def test_a_table_says_what_the_mapping_says(catalog: Catalog) -> None:
-    named = table(
+@pytest.mark.parametrize("mark", [",", ";", "\t"])
+def test_a_table_says_what_the_mapping_says(mark: str, catalog: Catalog) -> None:
+    text = (
         "\ufeffname; scan; wall.gsd_m; plane.normal\n# by hand\n\nhall;hall.e57;0.5;\n"
-        "stairs;;;[0, 0, 1]\n"
+        'stairs;;;"[0, 0, 1]"\n'
     )
+    named = table(text.replace(";", mark))
     mapping = (
         "datasets: {hall: {scan: hall.e57, set: {wall.gsd_m: 0.5}}, "
         "stairs: {set: {plane.normal: [0, 0, 1]}}}\n"
     )
     assert cells(ROOMS, catalog, datasets=named) == cells(ROOMS + mapping, catalog)
-
-
-def test_a_table_that_is_a_pipe_is_not_waited_for(catalog: Catalog, folder: Path) -> None:
-    os.mkfifo(folder / "rooms.csv")
-    said = refused(ROOMS + "datasets: rooms.csv\n", catalog)
-    assert "rooms.csv cannot be read: it is a folder, a pipe or a device" in said
 
 
 @pytest.mark.usefixtures("folder")
@@ -214,64 +190,6 @@ def test_a_resolved_workflow_keeps_its_datasets(catalog: Catalog) -> None:
     assert resolved_json(again) == resolved
 
 
-MAPPINGS = [
-    "datasets: {hall: {scans: a.e57}}",
-    "datasets: {hall: {wall.gsd_m: 0.5}}",
-    "datasets: {Hall: {}}",
-    "datasets: {}",
-    "datasets: [hall]",
-    "datasets: {hall: hall.e57}",
-    "datasets: {a: {}, a: {}}",
-    "datasets: {hall: {scan: 5}}",
-    "datasets: {hall: {set: {walls.gsd_m: 1}}}",
-    "datasets: {hall: {set: {wall.gsd: 1}}}",
-    "datasets: {hall: {set: {wall: 1}}}",
-    "datasets: {hall: {set: {wall.gsd_m: -1}}}",
-    "datasets: {hall: {set: {plane.hough2d.cell_m: 0.06}}}",
-    "datasets: {hall: {set: {plane.hough2d.cell_m.deep: 1}}}",
-    "datasets: nowhere.csv",
-    "datasets: {hall: {}}\ncompare: {exclude: [{data: hal}]}",
-    "datasets: {hall: {}}\ncompare: {baseline: {data: hall}}",
-]
-
-
-@pytest.mark.usefixtures("folder")
-@pytest.mark.parametrize("text", MAPPINGS)
-def test_a_mistake_of_the_section_is_reported_at_its_place(
-    text: str, catalog: Catalog, snapshot: SnapshotAssertion, folder: Path
-) -> None:
-    assert refused(f"{ROOMS}{text}\n", catalog).replace(str(folder), "FOLDER") == snapshot
-
-
-TABLES = [
-    "name,scans\nhall,a\nattic,b\n",
-    "name,wall.gsd\nhall,1\nattic,1\n",
-    "name,wall.gsd_m\nhall,1\nattic,-1\n",
-    "name,wall.gsd_m\nhall,[1\n",
-    "room,scan\nhall,a\n",
-    "hall: {set: {wall.gsd_m: 1}}\n",
-    "name,scan\n,a.e57\n",
-    "name,scan\nhall,a\nhall,b\n",
-    "name,scan\nGreat Hall,a\n",
-    "name,scan,scan\nhall,a,b\n",
-    "name,scan\nhall,a,b\n",
-    'name,scan\nhall,"a\n',
-    "# nothing\n",
-    "name,scan\n",
-]
-
-
-@pytest.mark.usefixtures("folder")
-@pytest.mark.parametrize("text", TABLES)
-def test_a_mistake_of_a_table_is_reported_once_at_its_place(
-    text: str, catalog: Catalog, snapshot: SnapshotAssertion
-) -> None:
-    message = refused(ROOMS, catalog, datasets=table(text))
-    assert message == snapshot
-    in_file = refused(ROOMS + "datasets: rooms.csv\n", catalog)
-    assert message.removeprefix("--datasets rooms.csv: ") in in_file
-
-
 @pytest.mark.usefixtures("folder")
 def test_a_table_has_a_largest_number_of_datasets(catalog: Catalog) -> None:
     text = "name\n" + "".join(f"r{index}\n" for index in range(10_001))
@@ -280,40 +198,11 @@ def test_a_table_has_a_largest_number_of_datasets(catalog: Catalog) -> None:
 
 
 @pytest.mark.usefixtures("folder")
-def test_options_that_do_not_fit_the_datasets_are_refused(catalog: Catalog) -> None:
-    assert refused(ROOMS + TWO, catalog, only_data=["hall,stair"]) == (
-        "--only-data hall,stair: there is no dataset stair (did you mean stairs?); datasets: "
-        "hall, stairs"
-    )
-    assert refused(ROOMS, catalog, only_data=["hall"]) == (
-        "--only-data hall: the workflow has no datasets"
-    )
-    assert refused(ROOMS + TWO, catalog, inputs=["scan=attic.e57"]) == (
-        "--input scan=attic.e57: every dataset has its own scan; name that of one of them, as in "
-        "--input scan@hall=PATH"
-    )
-    assert "there is no input scan@attic (did you mean scan@stairs?)" in refused(
-        ROOMS + TWO, catalog, inputs=["scan@attic=attic.e57"]
-    )
-
-
-@pytest.mark.usefixtures("folder")
-def test_a_dataset_without_files_that_nobody_else_names_is_refused(catalog: Catalog) -> None:
+def test_a_dataset_without_files_takes_those_of_the_workflow(catalog: Catalog) -> None:
     text = ROOMS.replace("scan: {optional: true}", "scan: {}").replace(", unless: inputs.scan", "")
-    said = "datasets.made: the dataset names no files for the input scan, and neither does the"
     datasets = "datasets: {hall: {scan: hall.e57}, made: {}}\n"
-    assert said in refused(text + datasets, catalog)
     shared = load(text + datasets, catalog, inputs=["scan=attic.e57"])
     assert set(shared.input_specs) == {"photos", "scan@hall", "scan"}
-
-
-@pytest.mark.usefixtures("folder")
-def test_a_step_cannot_be_called_data_beside_datasets(catalog: Catalog) -> None:
-    text = ROOMS.replace("shots", "data")
-    assert "data" in cells(text, catalog)
-    assert "datasets: a step is called data, which stands for the dataset" in refused(
-        text + TWO, catalog
-    )
 
 
 def test_a_changed_record_of_datasets_is_refused(catalog: Catalog, folder: Path) -> None:
@@ -343,47 +232,12 @@ def test_datasets_that_can_hardly_be_meant_are_doubted(catalog: Catalog) -> None
 # --- tables ---
 
 
-@pytest.mark.parametrize("mark", [",", ";", "\t"])
-def test_a_line_is_a_dataset_with_its_files_and_its_settings(mark: str) -> None:
-    text = "\n".join(
-        [
-            "# rooms",
-            "name,scan,plane.tolerance_m,plane.is_exact",
-            "hall,hall.e57,0.02,true",
-            "",
-            "attic, attic.laz ,3,",
-            "cellar,,,",
-        ]
-    ).replace(",", mark)
-    log = ProblemLog(file="rooms.csv", lines=tuple(text.split("\n")))
-    rows = read_rows(log)
-    log.raise_any()
-    assert rows.get(("datasets",)) == {
-        "hall": {"scan": "hall.e57", "set": {"plane.tolerance_m": 0.02, "plane.is_exact": True}},
-        "attic": {"scan": "attic.laz", "set": {"plane.tolerance_m": 3}},
-        "cellar": {},
-    }
-
-    def place(*location: str, at_key: bool = False) -> tuple[int, int]:
-        position = rows.position(("datasets", *location), at_key=at_key)
-        return position.line, position.column
-
-    lines = [place(name, at_key=True)[0] for name in ("hall", "attic", "cellar")]
-    assert lines == [3, 5, 6]
-    # Keys have the place of their column in the header, values their own.
-    assert (place("attic", "scan", at_key=True), place("attic", "scan")) == ((2, 6), (5, 7))
-    tolerance = ("attic", "set", "plane.tolerance_m")
-    assert (place(*tolerance, at_key=True), place(*tolerance)) == ((2, 11), (5, 19))
-
-
 # --- seeds ---
 
 
 @pytest.mark.usefixtures("folder")
 def test_seeds_of_datasets_reach_what_is_random_and_what_follows(catalog: Catalog) -> None:
-    text = ROOMS.replace("seed: 5", "seed: 5") + (
-        "datasets: {a: {set: {seed: 1}}, b: {set: {seed: {sweep: [2, 3]}}}, c: {}}\n"
-    )
+    text = ROOMS + ("datasets: {a: {set: {seed: 1}}, b: {set: {seed: {sweep: [2, 3]}}}, c: {}}\n")
     found = cells(text, catalog)
     rooms = [address for address in found if address.startswith("room")]
     assert rooms == [
@@ -396,17 +250,9 @@ def test_seeds_of_datasets_reach_what_is_random_and_what_follows(catalog: Catalo
     assert "shots" in found
     assert load(text, catalog).datasets["b"].seeds == (2, 3)
 
-
-@pytest.mark.usefixtures("folder")
-def test_a_column_of_seeds_is_a_factor(catalog: Catalog) -> None:
     named = table("name,seed\na,7\nb,8\n")
-    found = [address for address in cells(ROOMS, catalog, datasets=named) if "room" in address]
-    assert found == ["room@data=a,seed=7", "room@data=b,seed=8"]
-
-
-@pytest.mark.usefixtures("folder")
-@pytest.mark.parametrize("seed", ["-1", "one", "1.5", "{sweep: [1]}", "{sweep: [1, 1]}", "[1, 2]"])
-def test_a_seed_of_a_dataset_is_a_whole_number(seed: str, catalog: Catalog) -> None:
-    text = f"{ROOMS}datasets: {{a: {{set: {{seed: {seed}}}}}}}\n"
-    assert "rooms.yaml:18:" in refused(text, catalog)
-    assert "datasets.a.set.seed" in refused(text, catalog)
+    found = cells(ROOMS, catalog, datasets=named)
+    assert [name for name in found if "room" in name] == [
+        "room@data=a,seed=7",
+        "room@data=b,seed=8",
+    ]

@@ -132,16 +132,7 @@ def test_mistakes_get_a_sentence_and_no_file(
     assert (data / "notes.txt").read_text() == "1 2 3\n4 5 6\n"
 
 
-ODD = (
-    "\u2028steps: []",
-    "\x85name: evil",
-    "\u202egpj",
-    "\x7f\x9b2J",
-    "\n# x",
-    "\ufffe",
-    "\U000e0001",
-    '"#',
-)
+ODD = ("\u2028steps: []", "\x85name: evil\u202egpj\x7f\x9b2J\ufffe\U000e0001", '\n# x"#')
 
 
 @pytest.mark.parametrize("odd", ODD, ids=ascii)
@@ -172,7 +163,7 @@ def test_a_path_that_is_no_text_is_left_out(data: Path) -> None:
     assert "udcff" not in Path("workflow.yaml").read_text().partition("What follows")[2]
 
 
-@pytest.mark.parametrize("name", ["a.xyz", "a.yaml", "a.csv", "cameras.json", "a.las", "z.jpg"])
+@pytest.mark.parametrize("name", ["a.csv", "cameras.json", "a.las", "z.jpg"])
 def test_what_is_no_file_is_not_waited_for(data: Path, name: str) -> None:
     os.mkfifo(data / "photos" / name)
     zero = data.parent / f"link-{name}"
@@ -222,11 +213,11 @@ def test_the_unit_that_a_scan_states_is_used_and_degrees_are_refused(data: Path)
     assert "degrees.las states geographic coordinates in degrees" in result.output
 
 
-@pytest.mark.parametrize("up", ["x", "y", "z"])
+@pytest.mark.parametrize("up", ["x", "z"])
 def test_the_axis_that_surfaces_show_to_be_up_is_set_and_reported(data: Path, up: str) -> None:
     # Two slopes on one floor, as a roof: by no other axis they are level and upright.
     rng = np.random.default_rng(2)
-    u, v = rng.uniform(0.0, 4.0, (2, 60_000))
+    u, v = rng.uniform(0.0, 4.0, (2, 20_000))
     walls = np.array([[np.cos(a), np.sin(a), 0.0] for a in (0.4, 1.1, 1.8, 2.5)])
     height = np.stack([np.zeros_like(u), np.zeros_like(u), v]).T
     parts = [np.stack([u, v, 0.0 * u], axis=1), *(u[:, None] * wall + height for wall in walls)]
@@ -281,7 +272,10 @@ def test_photos_without_a_pose_in_a_scan_are_taken_when_asked_for() -> None:
 
 
 def test_an_orthoimage_is_taken_with_the_frame_beside_it(tmp_path: Path) -> None:
-    image = Recognised(kind="other", path=tmp_path / "wall.tif", summary="an orthoimage")
+    assert one(tmp_path / "wall.tif", b"II*\0").kind == "photos"
+    (tmp_path / "wall.json").write_text("{}")
+    (image,) = recognised([tmp_path / "wall.tif"])
+    assert (image.kind, image.summary) == ("other", "an orthoimage with its frame beside it")
     photos = [found("scan", "hall.laz"), found("photos", "a.jpg", "a photo", 1)]
     text = draft_workflow([*photos, image], tmp_path / "w.yaml", None).text
     assert "    files:\n      - wall.tif\n      - wall.json\n" in text
@@ -298,14 +292,6 @@ def one(path: Path, content: str | bytes = "") -> Recognised:
     (found,) = recognised([path])
     assert found.path == path
     return found
-
-
-def test_a_raster_with_its_frame_beside_it_is_an_orthoimage(tmp_path: Path) -> None:
-    alone = one(tmp_path / "wall.tif", b"II*\0")
-    assert alone.kind == "photos"
-    (tmp_path / "wall.json").write_text("{}")
-    (beside,) = recognised([tmp_path / "wall.tif"])
-    assert (beside.kind, beside.summary) == ("other", "an orthoimage with its frame beside it")
 
 
 def test_a_list_of_cameras_is_one_by_its_columns_and_its_ending(tmp_path: Path) -> None:

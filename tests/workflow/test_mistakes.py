@@ -1,4 +1,4 @@
-"""Every mistake that a workflow file can hold, as its user reads it.
+"""Every mistake that a user can make in a workflow, its options and its tables, as it is reported.
 
 The snapshots hold what is printed: place, path, message and the line. Review them as text.
 """
@@ -6,15 +6,18 @@ The snapshots hold what is printed: place, path, message and the line. Review th
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
+from pydantic import Field, field_validator
 from syrupy.assertion import SnapshotAssertion
 
 from orthoflow.catalog.catalog import Catalog
-from orthoflow.sdk import MetricSpec
+from orthoflow.errors import OrthoflowError
+from orthoflow.sdk import MethodParams, MetricSpec
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.source import InvalidWorkflowError
-from tests.laboratories import GOOD, with_steps
+from tests.laboratories import GOOD, ROOMS, SWEPT, load, with_steps
 
 # Behind `x: {use: plane.hough2d, in: {cloud: cloud.cloud}`.
 CALLS = [
@@ -132,51 +135,231 @@ UNREADABLE = {
 }
 
 
-@pytest.mark.parametrize("case", [*MISTAKES, *UNREADABLE])
+# Options of the command line, behind `--set`.
+BAD_SETS = [
+    "wal.gsd_m=1",
+    "wall.gsd=1",
+    "plane.ransak.iterations=1",
+    "plane.depth=1",
+    "wall.gsd_m",
+    "gsd_m=1",
+    "wall.gsd_m=",
+    "wall.gsd_m=[1",
+    "wall.gsd_m=-1",
+    'wall.gsd_m="1"',
+    "plane.ransac.tolerance_m.x=1",
+]
+# In the place of a sweep, and behind `--set` of the swept workflow.
+SWEEPS = [
+    "{sweep: [0.02]}",
+    "{sweep: 0.02}",
+    "{sweep: [0.02, wide]}",
+    "{sweep: [0.02, 0.05], step: 1}",
+    "{sweep: [1, 0.02, 1.0]}",
+    "[0.02, 0.05]",
+    "{sweep: [0.02, 0.001]}",
+]
+SET_SWEEPS = [
+    "plane.tolerance_m={sweep: [1]}",
+    "plane.tolerance_m={sweep: [1, 2], to: 3}",
+    "plane.tolerance_m={sweep: [1, 2, 1]}",
+    "plane.tolerance_m=[1, 2]",
+    "cloud.up={sweep: [x, z]}",
+]
+SEEDS = ["{sweep: [1, -2]}", "{sweep: [1, 2, 1]}", "{swep: [1, 2]}", "true"]
+# Files of parameters.
+SET_FILES = ["plane.celm: 1", "wall.gsd_m: fine", "wall: {gsd_m: 1}", "- 1", "wall.gsd_m: [1\n"]
+# Behind the workflow of rooms.
+MAPPINGS = [
+    "datasets: {hall: {scans: a.e57}}",
+    "datasets: {hall: {wall.gsd_m: 0.5}}",
+    "datasets: {Hall: {}}",
+    "datasets: {}",
+    "datasets: [hall]",
+    "datasets: {hall: hall.e57}",
+    "datasets: {a: {}, a: {}}",
+    "datasets: {hall: {scan: 5}}",
+    "datasets: {hall: {set: {walls.gsd_m: 1}}}",
+    "datasets: {hall: {set: {wall.gsd: 1}}}",
+    "datasets: {hall: {set: {wall: 1}}}",
+    "datasets: {hall: {set: {wall.gsd_m: -1}}}",
+    "datasets: {hall: {set: {plane.hough2d.cell_m: 0.06}}}",
+    "datasets: {hall: {set: {plane.hough2d.cell_m.deep: 1}}}",
+    "datasets: nowhere.csv",
+    "datasets: {hall: {}}\ncompare: {exclude: [{data: hal}]}",
+    "datasets: {hall: {}}\ncompare: {baseline: {data: hall}}",
+    *(f"datasets: {{a: {{set: {{seed: {seed}}}}}}}" for seed in ("-1", "1.5", "{sweep: [1, 1]}")),
+]
+TABLES = [
+    "name,scans\nhall,a\nattic,b\n",
+    "name,wall.gsd\nhall,1\nattic,1\n",
+    "name,wall.gsd_m\nhall,1\nattic,-1\n",
+    "name,wall.gsd_m\nhall,[1\n",
+    "room,scan\nhall,a\n",
+    "hall: {set: {wall.gsd_m: 1}}\n",
+    "name,scan\n,a.e57\n",
+    "name,scan\nhall,a\nhall,b\n",
+    "name,scan\nGreat Hall,a\n",
+    "name,scan,scan\nhall,a,b\n",
+    "name,scan\nhall,a,b\n",
+    'name,scan\nhall,"a\n',
+    "# nothing\n",
+    "name,scan\n",
+]
+SIX = """\
+orthoflow: 1
+name: flow
+sede: 4
+inputs:
+  scan: {files: a.e57}
+  scan: {files: b.e57}
+steps:
+  cloud: {use: read.scan, in: {files: inputs.scan}}
+  plane: {use: plane.hough2d, in: {cloud: cloud.cloud}, params: {cell_m: "0.003"}}
+  other: {use: plane.hugh2d, in: {cloud: cloud.cloud}}
+  wall: {use: raster.grid, in: {cloud: cloud.cloud}}
+  t: {use: match.guided, in: {photos: p.photos, walls: wall.walls, cameras: orient.cameras}}
+  p: {use: read.photos, in: {files: inputs.scan}}
+  orient: {use: orient.pnp, in: {photos: p.photos, ties: t.ties}}
+"""
+TWO = "datasets: {hall: {scan: hall.e57}, stairs: {scan: stairs.e57}}\n"
+NEEDED = ROOMS.replace("scan: {optional: true}", "scan: {}").replace(", unless: inputs.scan", "")
+# Name -> the workflow, the options that it is read with, and files beside it.
+CASES: dict[str, tuple[str, dict[str, Any], dict[str, str]]] = {
+    **{case: (text, {}, {}) for case, text in (MISTAKES | UNREADABLE).items()},
+    **{f"--set {one}": (GOOD, {"sets": [one]}, {}) for one in BAD_SETS},
+    **{f"swept --set {one}": (SWEPT, {"sets": [one]}, {}) for one in SET_SWEEPS},
+    **{
+        f"swept {one}": (SWEPT.replace("{sweep: [0.02, 0.05, 0.1]}", one), {}, {}) for one in SWEEPS
+    },
+    **{f"seed {one}": (f"orthoflow: 1\nseed: {one}\n{ROOM}", {}, {}) for one in SEEDS},
+    **{
+        f"file {one}": (SWEPT, {"set_files": ["fine.yaml"]}, {"fine.yaml": one})
+        for one in SET_FILES
+    },
+    **{one: (f"{ROOMS}{one}\n", {}, {}) for one in MAPPINGS},
+    **{f"table {one}": (ROOMS, {"datasets": "rooms.csv"}, {"rooms.csv": one}) for one in TABLES},
+    "table in the file": (f"{ROOMS}datasets: rooms.csv\n", {}, {"rooms.csv": TABLES[3]}),
+    "swept for a dataset": (
+        f"{SWEPT}datasets: {{a: {{set: {{plane.tolerance_m: 0.5}}}}}}\n",
+        {},
+        {},
+    ),
+    "a dataset without files": (
+        f"{NEEDED}datasets: {{hall: {{scan: hall.e57}}, made: {{}}}}\n",
+        {},
+        {},
+    ),
+    "a step called data": (ROOMS.replace("shots", "data") + TWO, {}, {}),
+    "a step called seed": (
+        SWEPT.replace("orthoflow: 1", "orthoflow: 1\nseed: {sweep: [1, 2]}").replace(
+            "wall:", "seed:"
+        ),
+        {},
+        {},
+    ),
+    "unknown dataset": (ROOMS + TWO, {"only_data": ["hall,stair"]}, {}),
+    "no datasets": (ROOMS, {"only_data": ["hall"]}, {}),
+    "input of every dataset": (ROOMS + TWO, {"inputs": ["scan=attic.e57"]}, {}),
+    "input of an unknown dataset": (ROOMS + TWO, {"inputs": ["scan@attic=attic.e57"]}, {}),
+    "all options": (
+        GOOD,
+        {"sets": ["wal.x=1", "wall.gsd=1"], "inputs": ["scam=a", "scan", "=b"]},
+        {},
+    ),
+    "no file of parameters": (SWEPT, {"set_files": ["nix.yaml"]}, {}),
+    "a device as parameters": (SWEPT, {"set_files": ["/dev/zero"]}, {}),
+    "six kinds at once": (SIX, {}, {}),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
 def test_each_mistake_is_reported_at_its_place(
     case: str, catalog: Catalog, write: Path, snapshot: SnapshotAssertion
 ) -> None:
-    text = (MISTAKES | UNREADABLE)[case]
+    text, options, files = CASES[case]
+    for name, content in files.items():
+        Path(name).write_text(content, encoding="utf-8")
     write.write_text(text, encoding="utf-8")
-    with pytest.raises(InvalidWorkflowError) as caught:
-        load_workflow(write, catalog)
-    lines = text.splitlines()
-    for problem in caught.value.problems:
-        assert problem.text == (lines[problem.line - 1] if lines else "")
+    with pytest.raises(OrthoflowError) as caught:
+        load_workflow(write, catalog, **options)
+    assert caught.value.exit_code == 2
+    assert str(caught.value).replace(str(Path.cwd()), "FOLDER") == snapshot
+
+
+class Params(MethodParams):
+    near: tuple[tuple[float, float, float], ...] = Field((), description="At [[x, y, z], ...].")
+    crop: tuple[float, float, float, float] | tuple[tuple[float, float], ...] | None = Field(
+        None, description="Part."
+    )
+    ink: dict[str, tuple[float, float]] = Field(default_factory=dict, description="Inks.")
+    height_m: float = Field(description="Height.")
+
+    @field_validator("height_m")
+    @classmethod
+    def _fails(cls, value: float) -> float:
+        if value == 13:
+            raise RuntimeError("the moon is full")
+        return value
+
+
+@pytest.mark.parametrize(
+    "params",
+    [
+        "{}",
+        "{height_m: 1, near: [1, 2, 3]}",
+        "{height_m: 1, near: [[1, 2, a]]}",
+        "{height_m: 1, crop: [0, 0, 2]}",
+        "{height_m: 1, ink: {a: 1}}",
+        "{height_m: 13}",
+    ],
+)
+def test_what_is_wrong_with_a_parameter_is_one_problem(
+    params: str,
+    catalog: Catalog,
+    write: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    snapshot: SnapshotAssertion,
+) -> None:
+    monkeypatch.setattr(catalog.method("plane.hough2d").load(), "Params", Params)
+    text = with_steps(f"x: {{use: plane.hough2d, in: {{cloud: cloud.cloud}}, params: {params}}}")
+    with pytest.raises(OrthoflowError) as caught:
+        load(text, write, catalog)
     assert str(caught.value) == snapshot
+
+
+def refused(text: str, path: Path, catalog: Catalog) -> list[str]:
+    """What is reported of a workflow; nothing where it is right."""
+    try:
+        load(text, path, catalog)
+    except InvalidWorkflowError as error:
+        return [
+            f"{item.path}: {item.message} at {item.text[item.column - 1 :]}"
+            for item in error.problems
+        ]
+    return []
 
 
 def test_metrics_that_no_method_of_a_step_declares_are_refused(
     write: Path, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def asked(metrics: str) -> list[str]:
-        text = GOOD.replace('[plane.rms_mm, "*.wall_s"]', metrics)
-        write.write_text(text)
-        try:
-            load_workflow(write, catalog)
-        except InvalidWorkflowError as error:
-            return [f"{item.path}: {item.message}" for item in error.problems]
-        return []
+        text = GOOD.replace('[plane.rms_mm, "*.wall_s"]', f"[{metrics}]")
+        return refused(text, write, catalog)
 
     # Where an author declares nothing, nothing is refused.
-    assert asked("[plane.rmse_mm]") == []
+    assert asked("plane.rmse_mm") == []
     declared = {"plane.hough2d": ("rms_mm", "wall_[0-9]*_mm"), "plane.ransac": ("own_mm",)}
     for method, metrics in declared.items():
         monkeypatch.setattr(catalog.method(method).load(), "metrics", metrics)
-    assert asked("[plane.own_mm, plane.wall_3_mm, plane.compile_s, 'plane.x_*']") == []
+    assert asked("plane.own_mm, plane.wall_3_mm, plane.compile_s, 'plane.x_*'") == []
     whose = "`orthoflow plugins show METHOD` lists those of plane.hough2d, plane.ransac"
-    assert asked("[plane.rsm_mm, 'plan*.depth', orient.rsm_mm]") == [
-        f"compare.metrics[0]: step plane reports no metric rsm_mm (did you mean rms_mm?); {whose}",
-        f"compare.metrics[1]: step plane reports no metric depth; {whose}",
+    assert asked("plane.rsm_mm, 'plan*.depth', orient.rsm_mm") == [
+        "compare.metrics[0]: step plane reports no metric rsm_mm (did you mean rms_mm?); "
+        f"{whose} at plane.rsm_mm, 'plan*.depth', orient.rsm_mm]",
+        f"compare.metrics[1]: step plane reports no metric depth; {whose} at 'plan*.depth', "
+        "orient.rsm_mm]",
     ]
-    # Each where it stands in the list.
-    text = GOOD.replace('"*.wall_s"]', "plane.rsm_mm, plane]")
-    write.write_text(text)
-    with pytest.raises(InvalidWorkflowError) as caught:
-        load_workflow(write, catalog)
-    lines = text.splitlines()
-    shown = [lines[item.line - 1][item.column - 1 :] for item in caught.value.problems]
-    assert shown == ["plane.rsm_mm, plane]", "plane]"]
 
 
 def test_metrics_that_the_wiring_cannot_produce_are_refused(
@@ -185,19 +368,14 @@ def test_metrics_that_the_wiring_cannot_produce_are_refused(
     declared = (MetricSpec("n_photos"), MetricSpec("lens_[xy]_px", needs=("calibration",)))
     monkeypatch.setattr(catalog.method("read.photos").load(), "metrics", declared)
 
-    def problem(metric: str, text: str = GOOD) -> str:
-        write.write_text(text.replace("plane.rms_mm", metric))
-        try:
-            load_workflow(write, catalog)
-        except InvalidWorkflowError as error:
-            return "\n".join(f"{one.path}: {one.message}" for one in error.problems)
-        return ""
+    def asked(metric: str, text: str = GOOD) -> str:
+        return "".join(refused(text.replace("plane.rms_mm", metric), write, catalog))
 
     alone = GOOD.replace(", calibration: inputs.calibration", "")
-    assert [problem(metric) for metric in ("shots.lens_x_px", "'shots.lens_*'")] == ["", ""]
+    assert [asked(metric) for metric in ("shots.lens_x_px", "'shots.lens_*'")] == ["", ""]
     for metric in ("lens_x_px", "lens_*"):
-        assert problem(f"'shots.{metric}'", alone).startswith(
+        assert asked(f"'shots.{metric}'", alone).startswith(
             f"compare.metrics[0]: step shots reports {metric} only with calibration wired"
         )
-    assert problem("'shots.*'", alone) == problem("'*.n_photos'", alone) == ""
-    assert "step shots reports no metric depth_mm" in problem("shots.depth_mm")
+    assert asked("'shots.*'", alone) == asked("'*.n_photos'", alone) == ""
+    assert "step shots reports no metric depth_mm" in asked("shots.depth_mm")

@@ -28,27 +28,9 @@ def test_every_recipe_comes_back_whole(path: Path) -> None:
     text = resolved_json(workflow)
     again = workflow_from_resolved(text, workflow.source)
     assert resolved_json(again) == text
-    assert (again.name, again.seed, again.source) == (workflow.name, workflow.seed, workflow.source)
-    assert again.path == Path(f"{workflow.name}.yaml")
+    assert (again.source, again.path) == (workflow.source, Path(f"{workflow.name}.yaml"))
+    assert again.compare == workflow.compare
     assert list(again.steps) == sorted(workflow.steps)
-    for name, step in workflow.steps.items():
-        found = again.steps[name]
-        assert found.inputs == step.inputs
-        assert (found.only_if, found.unless) == (step.only_if, step.unless)
-        assert found.is_varied == step.is_varied
-        assert [variant.method for variant in found.variants] == [
-            variant.method for variant in step.variants
-        ]
-        assert [variant.repeat for variant in found.variants] == [
-            variant.repeat for variant in step.variants
-        ]
-    for name, spec in workflow.inputs.items():
-        assert again.inputs[name].files == spec.files
-        assert again.inputs[name].optional == spec.optional
-    assert (again.compare is None) == (workflow.compare is None)
-    if again.compare is not None and workflow.compare is not None:
-        assert again.compare == workflow.compare
-    assert again.overrides == workflow.overrides == ()
 
 
 def changed(change: Callable[[dict[str, object]], object]) -> str:

@@ -125,7 +125,7 @@ def test_a_box_leaves_points_out_and_says_so(tmp_path: Path) -> None:
         exported(tmp_path, labelled(), box="5,5,5,6,6,6")
 
 
-@pytest.mark.parametrize("box", ["", "1,2,3,4,5", "1,2,3,4,5,6,7", "a,2,3,4,5,6", "1,2,nan,4,5,6"])
+@pytest.mark.parametrize("box", ["1,2,3,4,5", "1,2,3,4,5,6,7", "a,2,3,4,5,6", "1,2,nan,4,5,6"])
 def test_a_box_is_six_numbers(box: str) -> None:
     with pytest.raises(ArgumentError, match="--box takes six numbers in metres"):
         module._box(box)
@@ -213,30 +213,13 @@ def test_the_coordinate_system_is_written_where_all_walls_agree() -> None:
     assert module._crs_wkt(walls("EPSG:25832", "EPSG:25833")) == ""
 
 
-def test_points_that_no_photo_sees_stay_grey(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def colour_points(_cloud: object, oriented: object, colours: Any) -> None:
-        assert oriented == ("the photos",)
-        colours.rgb[0], colours.photo[0] = (1, 2, 3), 0
-
-    monkeypatch.setattr("orthoflow.cli.exports.clouds.colour_points", colour_points)
-    found: Any = SimpleNamespace(cloud=cloud(), oriented=("the photos",))
-    colours = module._photo_colours(found, tmp_path)
-    assert colours.photo is not None
-    assert colours.rgb[0].tolist() == [1, 2, 3]
-    assert (colours.rgb[1:] == 128).all()
-    assert colours.photo.tolist() == [0] + [-1] * (N_SIDE**2 - 1)
-    assert (colours.best == 0.0).all()
-    assert colours.rgb.shape == (N_SIDE**2, 3)
-
-
-@pytest.mark.parametrize("colour", [None, "photos", "intensity"])
-def test_photos_colour_a_cloud_where_any_is_oriented(
+@pytest.mark.parametrize("colour", [None, "intensity"])
+def test_photos_colour_what_they_see_and_the_rest_stays_grey(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, colour: str | None
 ) -> None:
-    def colour_points(_cloud: object, _oriented: object, colours: Any) -> None:
-        colours.rgb[:], colours.photo[:] = (9, 8, 7), 0
+    def colour_points(_cloud: object, given: object, colours: Any) -> None:
+        assert given == oriented
+        colours.rgb[0], colours.photo[0] = (1, 2, 3), 0
 
     monkeypatch.setattr("orthoflow.cli.exports.clouds.colour_points", colour_points)
     oriented = ((SimpleNamespace(name="a.jpg"), "its camera"),)
@@ -246,11 +229,14 @@ def test_photos_colour_a_cloud_where_any_is_oriented(
         assert (attributed.photo_colours, attributed.photo_names) == (None, ())
         return
     assert said == "cloud.toy: 144 points by photos, cloud of plane"
-    assert attributed.colouring == "photos"
-    assert attributed.photo_names == ("a.jpg",)
+    assert (attributed.colouring, attributed.photo_names) == ("photos", ("a.jpg",))
+    colours = attributed.photo_colours
+    assert colours is not None
+    assert colours.rgb[0].tolist() == [1, 2, 3]
+    assert (colours.rgb[1:] == 128).all()
     about = json.loads((tmp_path / "cloud.json").read_text())
-    assert about["points_of_the_cloud_by_photo"] == [N_SIDE**2]
-    assert about["points_of_the_cloud_unseen"] == 0
+    assert about["points_of_the_cloud_by_photo"] == [1]
+    assert about["points_of_the_cloud_unseen"] == N_SIDE**2 - 1
     # What was mapped for it is gone.
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cloud.json", "cloud.toy"]
 

@@ -75,7 +75,6 @@ def test_the_last_of_some_cells_gives_a_product(tmp_path: Path) -> None:
 def test_a_folder_is_made_with_those_above_it(tmp_path: Path) -> None:
     make_empty(tmp_path / "a" / "b")
     make_empty(tmp_path / "a" / "b")
-    assert (tmp_path / "a" / "b").is_dir()
-    (tmp_path / "file").touch()
+    (tmp_path / "a" / "b" / "file").touch()
     with pytest.raises(ArgumentError, match="file/c cannot be made: Not a directory"):
-        make_empty(tmp_path / "file" / "c")
+        make_empty(tmp_path / "a" / "b" / "file" / "c")

@@ -42,21 +42,14 @@ def test_figures_are_written_in_the_format_that_is_asked_for(tmp_path: Path) -> 
     ("choices", "lacking"),
     [
         ({}, "; it does not state what --license and --author would"),
-        ({"author": "A. Nobody"}, "; it does not state what --license would"),
         ({"license_text": "CC0-1.0", "author": "  "}, "; it does not state what --author would"),
-        ({"license_text": "CC0-1.0", "author": " A. Nobody "}, ""),
+        ({"license_text": "CC0-1.0", "author": " A. Nobody ", "embed": True}, ""),
     ],
 )
-@pytest.mark.parametrize("embed", [False, True])
 def test_a_crate_says_what_it_does_not_say(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    *,
-    choices: dict[str, str],
-    lacking: str,
-    embed: bool,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, choices: dict[str, Any], lacking: str
 ) -> None:
-    asked = {}
+    asked: dict[str, Any] = {}
 
     def write_crate(_run: object, folder: Path, **known: object) -> list[Path]:
         asked.update(known)
@@ -64,33 +57,10 @@ def test_a_crate_says_what_it_does_not_say(
 
     monkeypatch.setattr("orthoflow.records.archive.write_crate", write_crate)
     monkeypatch.setattr(module, "embedded", lambda *_args: "the record")
-    chosen = Choices(embed=embed, **choices)  # type: ignore[arg-type]
-    said = module.export_crate(Cells(), tmp_path / "out", chosen)  # type: ignore[arg-type]
+    said = module.export_crate(Cells(), tmp_path / "out", Choices(**choices))  # type: ignore[arg-type]
     assert said == f"2 files, described in ro-crate-metadata.json{lacking}"
-    assert asked["record"] == ("the record" if embed else None)
+    assert asked["record"] == ("the record" if choices.get("embed") else None)
     assert asked["author"] == choices.get("author", "").strip()
     # A crate without a license says that it has none.
     assert asked["license_text"] == choices.get("license_text", asked["license_text"])
     assert asked["license_text"]
-
-
-def test_items_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("orthoflow.records.stac.write_stac", lambda _run, _folder: 2)
-    said = module.export_stac(Cells(), tmp_path / "out", Choices())  # type: ignore[arg-type]
-    assert said == "collection.json and 2 items beside the orthoimages"
-    assert (tmp_path / "out").is_dir()
-
-
-def test_a_model_of_cameras_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    model = SimpleNamespace(n_images=3, n_cameras=1, n_points=20)
-    monkeypatch.setattr(module, "output_of", lambda *_args: ("orient", "cameras"))
-    monkeypatch.setattr("orthoflow.products.Cameras.from_payload", lambda payload: payload)
-    given = []
-    monkeypatch.setattr(
-        "orthoflow.files.colmap.write_colmap_model",
-        lambda folder, cameras: given.append((folder, cameras)) or model,
-    )
-    run: Any = SimpleNamespace(payload=lambda address, port: f"{address}.{port}")
-    said = module.export_colmap(run, tmp_path / "out", Choices())
-    assert said == "3 photos, 1 camera, 20 points of orient"
-    assert given == [(tmp_path / "out", "orient.cameras")]

@@ -40,9 +40,3 @@ def test_a_run_without_depths_says_so(run: Path) -> None:
     assert done.exit_code == 2
     assert f"--relief: the run has no depth of wall {WALL}" in " ".join(done.output.split())
     assert not (run.parent / "model").exists()
-
-
-def test_relief_is_of_models_only(run: Path) -> None:
-    done = CliRunner().invoke(program, ["export", str(run), "--to", "tiles", "--relief"])
-    assert done.exit_code == 2
-    assert "--relief belongs to --to gltf, not to --to tiles" in " ".join(done.output.split())
