@@ -8,7 +8,6 @@ import re
 import subprocess
 import sys
 from collections.abc import Collection
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -67,40 +66,23 @@ def test_geometry_keeps_only_what_two_kinds_or_the_framework_share() -> None:
         assert len(kinds) >= 2 or users > kinds, f"{module} belongs to {kinds}"
 
 
-@dataclass(frozen=True)
-class Reading:
-    """What the tests look for in the tree of a module.
-
-    Attributes:
-        imported: modules of ours.
-        details: lines that read the details of a product.
-        arrays_in_parts: lines of kernels that put an array into a part of one.
-    """
-
-    imported: set[str]
-    details: list[int]
-    arrays_in_parts: list[int]
-
-
 @cache
-def readings() -> dict[Path, Reading]:
-    """All modules, each parsed once: their trees would take hundreds of MiB."""
+def trees() -> dict[Path, tuple[set[str], list[int]]]:
+    """What each module imports of ours, and where it reads the details of a product."""
     known = {name_of(module) for module in MODULES}
-    found = {}
-    for module in MODULES:
-        tree = ast.parse((ROOT / module).read_text())
-        found[module] = Reading(
-            imported_modules(tree, known), _readings_of_details(tree), _arrays_put_into_parts(tree)
-        )
-    return found
+    return {
+        module: (imported_modules(tree, known), _readings_of_details(tree))
+        for module in MODULES
+        for tree in [ast.parse((ROOT / module).read_text())]
+    }
 
 
 def import_graph() -> nx.DiGraph[str]:
     """Modules and packages by name, an edge to each one that they import."""
     graph: nx.DiGraph[str] = nx.DiGraph()
-    for module, read in readings().items():
+    for module, (imported, _) in trees().items():
         name = name_of(module)
-        graph.add_edges_from((name, other) for other in read.imported - {name})
+        graph.add_edges_from((name, other) for other in imported - {name})
     return graph
 
 
@@ -141,18 +123,6 @@ def test_no_run_loads_a_library_for_the_mistakes_of_a_workflow() -> None:
     assert loaded.strip() == "[]"
 
 
-@pytest.mark.parametrize("command", [["--help"], ["plugins", "list"]], ids=" ".join)
-def test_listing_commands_load_no_numerical_library(command: list[str]) -> None:
-    loaded = run_python(
-        "from orthoflow.cli import main\n"
-        f"sys.argv = ['orthoflow', *{command!r}]\n"
-        "try:\n    main()\nexcept SystemExit as stop:\n    assert not stop.code, stop.code\n"
-        "slow = ('numpy', 'pydantic', 'networkx', 'h5py')\n"
-        "print('LOADED', [name for name in slow if name in sys.modules])"
-    )
-    assert loaded.splitlines()[-1] == "LOADED []"
-
-
 def test_import_contracts_hold() -> None:
     linter = Path(sys.executable).with_name("lint-imports")
     paths = ":".join(str(ROOT / part) for part in ("", "plugins", "provenance"))
@@ -181,7 +151,7 @@ def test_no_module_carries_doubts_or_leftovers(folder: str) -> None:
 
 def test_nobody_reads_the_details_of_a_product() -> None:
     """They are for people: what other code reads is a typed, documented field of the product."""
-    found = [f"{module}:{line}" for module, read in readings().items() for line in read.details]
+    found = [f"{module}:{line}" for module, (_, read) in trees().items() for line in read]
     templates = [path for package in PACKAGES for path in (ROOT / package).rglob("*.j2")]
     found += [
         f"{path.relative_to(ROOT)}:{number}"
@@ -190,69 +160,6 @@ def test_nobody_reads_the_details_of_a_product() -> None:
         if ".details" in line
     ]
     assert not found, "\n".join(found)
-
-
-def test_no_kernel_puts_an_array_into_a_part_of_one() -> None:
-    """Numba would compile the sentence about shapes that differ: seconds in each process."""
-    found = [
-        f"{module}:{line}" for module, read in readings().items() for line in read.arrays_in_parts
-    ]
-    assert not found, "\n".join(found)
-
-
-def _arrays_put_into_parts(tree: ast.Module) -> list[int]:
-    """Lines of kernels such as `part[2:] = array` and `part[2:] = array[:3]`."""
-    kernels = [
-        node
-        for node in ast.walk(tree)
-        if isinstance(node, ast.FunctionDef)
-        and any(
-            re.match(r"compiled|inlined|.*kernel_part", ast.unparse(how))
-            for how in node.decorator_list
-        )
-    ]
-    lines: list[int] = []
-    for kernel in kernels:
-        assigned = [node for node in ast.walk(kernel) if isinstance(node, ast.Assign)]
-        arrays = {
-            argument.arg
-            for argument in kernel.args.args
-            if argument.annotation and "NDArray" in ast.unparse(argument.annotation)
-        }
-        arrays |= {
-            ast.unparse(node.targets[0])
-            for node in assigned
-            if re.match(r"np\.(empty|zeros|ones|full)", ast.unparse(node.value))
-        }
-        lines += [
-            node.lineno
-            for node in assigned
-            if _is_part(node.targets[0])
-            and (_is_part(node.value) or ast.unparse(node.value) in arrays)
-        ]
-    return lines
-
-
-def _is_part(node: ast.expr) -> bool:
-    return isinstance(node, ast.Subscript) and any(
-        isinstance(item, ast.Slice) for item in ast.walk(node.slice)
-    )
-
-
-@pytest.mark.parametrize(
-    ("line", "is_array"),
-    [
-        ("fitted[0:3] = up", True),
-        ("fitted[:3] = up[:3]", True),
-        ("fitted[1, 4:] = made", True),
-        ("fitted[0:3] = up[0]", False),
-        ("fitted[0] = made[1]", False),
-    ],
-)
-def test_arrays_put_into_parts_are_seen(line: str, is_array: bool) -> None:
-    kernel = f"@compiled\ndef f(fitted: NDArray, up: NDArray):\n    made = np.empty(3)\n    {line}"
-    assert bool(_arrays_put_into_parts(ast.parse(kernel))) == is_array
-    assert not _arrays_put_into_parts(ast.parse(kernel.replace("@compiled\n", "")))
 
 
 def _readings_of_details(tree: ast.Module) -> list[int]:
@@ -277,23 +184,6 @@ def _readings_of_details(tree: ast.Module) -> list[int]:
     return sorted(
         item.lineno for item in read if isinstance(item, ast.Attribute) and item.attr == "details"
     )
-
-
-@pytest.mark.parametrize(
-    ("line", "is_reading"),
-    [
-        ('ties.details["walls"]', True),
-        ('ties.details.get("walls")', True),
-        ('"walls" in ties.details', True),
-        ("[name for name in ties.details]", True),
-        ("told = ties.details", True),
-        ('{**ties.details, "photos": 2}', False),
-        ("header = dict(count.details)", False),
-        ('metadata["details"]', False),
-    ],
-)
-def test_readings_of_details_are_seen(line: str, is_reading: bool) -> None:
-    assert bool(_readings_of_details(ast.parse(line))) == is_reading
 
 
 def test_what_is_optional_is_asked_for_in_one_place() -> None:

@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import subprocess
-import sys
-import venv
 from pathlib import Path
 
 import pytest
@@ -15,12 +11,11 @@ from click.testing import CliRunner
 
 from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.cli import program
-from orthoflow.sdk.hooks import ENTRY_POINT_GROUP
 from orthoflow.testing import conformance_cases
 from orthoflow.workflow.views import workflow_schema
+from tests.author_environments import ROOT, install, new_environment, succeed
 from tests.road.conftest import metrics_of
 
-ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
 
 
@@ -29,15 +24,7 @@ def cracks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The plugin with a kind of its own, installed."""
     site = tmp_path / "site"
     shutil.copytree(EXAMPLES / "orthoflow-cracks" / "orthoflow_cracks", site / "orthoflow_cracks")
-    info = site / "orthoflow_cracks-0.1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text(
-        "Metadata-Version: 2.1\nName: orthoflow-cracks\nVersion: 0.1.0\n"
-    )
-    (info / "entry_points.txt").write_text(
-        f"[{ENTRY_POINT_GROUP}]\ncracks = orthoflow_cracks.hooks\n"
-    )
-    monkeypatch.syspath_prepend(site)
+    install(site, "orthoflow-cracks", monkeypatch)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -82,29 +69,10 @@ def test_a_method_of_a_plugins_own_kind_keeps_the_rules(cracks: Path) -> None:
     assert [problem for problem in problems if problem] == []
 
 
-def environment(folder: Path) -> Path:
-    """The Python of a new environment with this checkout and what the tests' own has."""
-    venv.create(folder, with_pip=True)
-    (packages,) = (folder / "lib").glob("python*/site-packages")
-    paths = [str(ROOT / part) for part in ("", "plugins", "provenance")]
-    paths += [path for path in sys.path if path.endswith("-packages")]
-    (packages / "shared.pth").write_text("\n".join(paths))
-    return folder / "bin" / "python"
-
-
-def succeed(folder: Path, *command: str | Path) -> str:
-    variables = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    done = subprocess.run(
-        command, cwd=folder, env=variables, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-2000:]
-    return done.stdout
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["orthoflow-pyransac3d", "orthoflow-poselib", "orthoflow-cracks"])
 def test_an_example_installs_and_passes_its_tests(name: str, tmp_path: Path) -> None:
-    python = environment(tmp_path / "venv")
+    python = new_environment(tmp_path / "venv")
     folder = tmp_path / name
     shutil.copytree(EXAMPLES / name, folder)
     succeed(folder, python, "-m", "pip", "install", "-q", ".")
@@ -113,7 +81,7 @@ def test_an_example_installs_and_passes_its_tests(name: str, tmp_path: Path) -> 
 
 @pytest.mark.long
 def test_the_examples_stand_beside_our_own_methods(tmp_path: Path) -> None:
-    python = environment(tmp_path / "venv")
+    python = new_environment(tmp_path / "venv")
     for name in ("orthoflow-pyransac3d", "orthoflow-poselib"):
         shutil.copytree(EXAMPLES / name, tmp_path / name)
         succeed(tmp_path, python, "-m", "pip", "install", "-q", f"./{name}")

@@ -38,18 +38,14 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("spaced.part", "spaced/part"),
         ("spaced.part.hooks", "spaced/part"),
         ("spaced.single", "spaced/single.py"),
+        *((nothing, None) for nothing in ("nowhere_to_be_found", "spaced", "spaced.missing", "")),
     ],
 )
 def test_the_outermost_regular_package_is_found_and_not_imported(
-    folder: Path, module: str, place: str
+    folder: Path, module: str, place: str | None
 ) -> None:
-    assert package_path(module) == folder / place
+    assert package_path(module) == (place if place is None else folder / place)
     assert not {"regular", "alone", "spaced.part", "spaced.single"} & sys.modules.keys()
-
-
-@pytest.mark.parametrize("module", ["nowhere_to_be_found", "spaced", "spaced.missing", "", ".x"])
-def test_what_has_no_code_has_no_place(folder: Path, module: str) -> None:
-    assert package_path(module) is None
 
 
 @pytest.mark.parametrize(("module", "source"), [("regular.hooks", "regular"), ("alone", None)])

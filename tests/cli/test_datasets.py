@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import chdir
 from pathlib import Path
 
 import pytest
+from click.testing import Result
 
 from orthoflow.records.open import open_run
 from orthoflow.records.verify import verify_run
-from tests.workshop_runs import orthoflow
+from tests.studios import asked, open_studio
 
 ROOMS = """\
 orthoflow: 1
@@ -29,10 +32,17 @@ INLINE = ("--executor", "inline")
 NUMBERS = {"hall": "1.5", "attic": "", "stairs": "2.5"}
 
 
+def orthoflow(folder: Path, *arguments: str) -> Result:
+    with chdir(folder):
+        return asked(*arguments)
+
+
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A folder in which three rooms were run, one of them with an empty file."""
     folder = tmp_path_factory.mktemp("rooms")
+    patch = pytest.MonkeyPatch()
+    open_studio(folder, patch)
     (folder / "rooms.yaml").write_text(ROOMS)
     (folder / "rooms.csv").write_text(TABLE)
     (folder / "data").mkdir()
@@ -40,8 +50,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / "data" / f"{name}.txt").write_text(text)
     done = orthoflow(folder, "run", "rooms.yaml", "--datasets", "rooms.csv", "-o", "first", *INLINE)
     # Every root failure is that of an input.
-    assert done.returncode == 2, done.stderr
-    return folder
+    assert done.exit_code == 2, done.stderr
+    yield folder
+    patch.undo()
 
 
 def test_a_dataset_that_fails_keeps_its_place_and_the_others_go_on(folder: Path) -> None:
@@ -60,25 +71,18 @@ def test_a_dataset_that_fails_keeps_its_place_and_the_others_go_on(folder: Path)
     assert cells["paint@data=attic"].error_message == "needs survey@data=attic, which failed"
 
 
-def test_products_lie_below_the_address_of_their_dataset(folder: Path) -> None:
+def test_the_record_of_all_datasets_verifies_and_replays(folder: Path) -> None:
     found = {path.parent.name for path in (folder / "first" / "products").glob("*/*_ortho.tif")}
     assert found == {"paint@data=hall", "paint@data=stairs", "side"}
-
-
-def test_the_record_of_all_datasets_verifies_and_replays(folder: Path) -> None:
     record = open_run(folder / "first").record
     assert {entry.name: [file.name for file in entry.files] for entry in record.inputs} == {
-        "number@hall": ["hall.txt"],
-        "number@attic": ["attic.txt"],
-        "number@stairs": ["stairs.txt"],
+        f"number@{name}": [f"{name}.txt"] for name in NUMBERS
     }
-    done = orthoflow(folder, "verify", "first")
-    assert done.returncode == 0, done.stdout
+    assert orthoflow(folder, "verify", "first").exit_code == 0
     done = orthoflow(folder, "replay", "first", "-o", "again", "--json", *INLINE)
-    assert done.returncode == 0, done.stderr
+    assert done.exit_code == 0, done.stderr
     products = json.loads(done.stdout)["products"]
-    assert len(products) == 6
-    assert {product["verdict"] for product in products} == {"identical"}
+    assert [product["verdict"] for product in products] == ["identical"] * 6
 
 
 @pytest.mark.parametrize("given", ["number=moved", "number@hall=moved/hall.txt"])
@@ -91,11 +95,11 @@ def test_a_replay_takes_the_files_of_a_dataset_from_elsewhere(
         (moved / f"{name}.txt").write_text(text)
     (tmp_path / "run.h5").write_bytes((folder / "first" / "run.h5").read_bytes())
     done = orthoflow(tmp_path, "replay", "run.h5", "-o", "again")
-    assert done.returncode == 2
+    assert done.exit_code == 2
     assert "input number@hall: hall.txt" in done.stderr
     done = orthoflow(tmp_path, "replay", "run.h5", "-o", "again", "--input", given, *INLINE)
     if given == "number=moved":
-        assert done.returncode == 0, done.stderr
+        assert done.exit_code == 0, done.stderr
     else:
         assert "input number@hall" not in done.stderr
         assert "give it with --input number@stairs=PATH" in done.stderr
@@ -121,7 +125,7 @@ def test_check_counts_the_datasets_and_names_every_missing_file(folder: Path) ->
     assert 'input0[/"number<br/>of 3 datasets"/]' in graph
     (folder / "gone.csv").write_text("name,number\nhall,data/hall.txt\na,a.txt\nb,b.txt\n")
     done = orthoflow(folder, "check", "rooms.yaml", "--datasets", "gone.csv")
-    assert done.returncode == 2
+    assert done.exit_code == 2
     said = done.stderr
     assert "input number@a: there is no file a.txt beside the table gone.csv:3 (" in said
     at = "\ngone.csv:4:3: b.number: input number@b: "
@@ -130,7 +134,7 @@ def test_check_counts_the_datasets_and_names_every_missing_file(folder: Path) ->
 
 def test_each_dataset_becomes_a_run_folder_that_stands_alone(folder: Path, tmp_path: Path) -> None:
     done = orthoflow(folder, "export", "first", "--split", "-o", str(tmp_path / "split"))
-    assert done.returncode == 0, done.stderr
+    assert done.exit_code == 0, done.stderr
     assert done.stdout.endswith("3 run folders: hall, attic, stairs\n")
     assert {path.name for path in (tmp_path / "split").iterdir()} == {"hall", "attic", "stairs"}
     hall = open_run(tmp_path / "split" / "hall")
@@ -148,15 +152,14 @@ def test_each_dataset_becomes_a_run_folder_that_stands_alone(folder: Path, tmp_p
         assert found.findings == ()
         # The report is made anew from the record, so that no digest holds it.
         assert all(note.is_harmless for note in found.notes)
-    done = orthoflow(
-        tmp_path, "replay", "split/hall", "-o", "again", "--input", f"number={folder}/data"
-    )
-    assert done.returncode == 0, done.stderr
+    given = ("--input", f"number={folder}/data", *INLINE)
+    done = orthoflow(tmp_path, "replay", "split/hall", "-o", "again", *given)
+    assert done.exit_code == 0, done.stderr
 
 
 def test_what_ran_on_no_datasets_is_not_split(folder: Path) -> None:
-    assert orthoflow(folder, "run", "rooms.yaml", "-o", "plain").returncode == 0
+    assert orthoflow(folder, "run", "rooms.yaml", "-o", "plain", *INLINE).exit_code == 0
     done = orthoflow(folder, "export", "plain", "--split")
-    assert done.returncode == 2
+    assert done.exit_code == 2
     assert "ran on no datasets, so there is nothing to split" in done.stderr
     assert not (folder / "plain" / "datasets").exists()

@@ -134,9 +134,7 @@ def test_the_live_table_shows_every_state_and_keeps_warnings(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sys.stderr.isatty", lambda: True)
-    progress = Progress(planned("cloud", "plane", "wall", "other"))
-    with progress as entered:
-        assert entered is progress
+    with Progress(planned("cloud", "plane", "wall", "other")) as progress:
         for event in EVENTS[:6]:
             progress.take(event)
         columns = [[str(cell) for cell in column.cells] for column in progress.table().columns]

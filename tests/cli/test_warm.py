@@ -46,9 +46,8 @@ def test_what_was_compiled_beforehand_is_not_compiled_by_a_run(
 
 
 def test_shipped_workflows_are_tried_with_what_makes_them_small() -> None:
-    recipes = warm._recipes()
-    assert {path.stem for path in recipes} >= {"direct", "quickstart", "plane-methods"}
-    assert all(path.is_file() and sets for path, sets in recipes.items())
+    assert {path.stem for path in warm._recipes()} >= {"direct", "quickstart", "plane-methods"}
+    assert all(path.is_file() and sets for path, sets in warm._recipes().items())
 
 
 def test_the_conformance_suite_shares_the_kernels_of_runs(

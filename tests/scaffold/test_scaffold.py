@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
+import json
 import re
-import subprocess
 import sys
 import tomllib
-import venv
 from pathlib import Path
 
 import pytest
@@ -18,27 +16,20 @@ from orthoflow.catalog.discovery import discover_catalog
 from orthoflow.cli import program
 from orthoflow.errors import ArgumentError
 from orthoflow.scaffold import Project, unwritten, write_project
-from orthoflow.sdk.hooks import ENTRY_POINT_GROUP
 from orthoflow.testing import Trial, conformance_cases, example_inputs, run_trial
 from orthoflow.workflow.checks import lint_workflow
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.expand import expand_cells
+from tests.author_environments import install, new_environment, succeed
 from tests.long_loops import long_only
 
-ROOT = Path(__file__).resolve().parents[2]
 KINDS = sorted(discover_catalog().kinds)
 
 
-def install(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lay metadata beside a written plugin, as pip would, and put both on the path."""
-    package = folder.name.replace("-", "_")
-    info = folder / f"{package}-0.1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {folder.name}\nVersion: 0.1.0\n")
-    (info / "entry_points.txt").write_text(
-        f"[{ENTRY_POINT_GROUP}]\n{folder.name} = {package}.hooks\n", encoding="utf-8"
-    )
-    monkeypatch.syspath_prepend(folder)
+def write_installed(project: Project, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    write_project(project, folder, discover_catalog())
+    install(folder / project.name, project.name, monkeypatch)
+    return folder / project.name
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -46,9 +37,7 @@ def test_a_new_plugin_of_every_kind_loads_and_its_comparison_is_valid(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     project = Project(name=f"new-{kind}", kind=kind, citation="doi:10.1000/xyz")
-    write_project(project, tmp_path, discover_catalog())
-    folder = tmp_path / project.name
-    install(folder, monkeypatch)
+    folder = write_installed(project, tmp_path, monkeypatch)
     catalog = discover_catalog()
     method = catalog.method(project.method_id).load()
     assert method.citations == ("doi:10.1000/xyz",)
@@ -68,13 +57,11 @@ def test_a_new_plugin_of_every_kind_loads_and_its_comparison_is_valid(
         assert f"`{kind}: {{use: {project.method_id}}}`" in told
 
 
-@pytest.mark.parametrize("kind", ["simulate"])
 def test_a_new_plugin_passes_the_suite_as_it_is(
-    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    project = Project(name=f"fresh-{kind}", kind=kind)
-    write_project(project, tmp_path, discover_catalog())
-    install(tmp_path / project.name, monkeypatch)
+    project = Project(name="fresh-simulate", kind="simulate")
+    write_installed(project, tmp_path, monkeypatch)
     golden = tmp_path / "golden.json"
     problems = [case.problem() for case in conformance_cases(project.method_id, golden=golden)]
     assert [problem for problem in problems if problem] == []
@@ -88,8 +75,7 @@ def test_what_the_author_has_not_written_is_found(
         Project(name="left-kind", kind="left", product="lefts", takes=("cloud",)),
         Project(name="left-finder", kind="plane"),
     ):
-        write_project(project, tmp_path, discover_catalog())
-        install(tmp_path / project.name, monkeypatch)
+        write_installed(project, tmp_path, monkeypatch)
     assert unwritten("left.left-kind", discover_catalog()) == (
         "the summary of method left.left-kind",
         "the summary of kind left",
@@ -100,6 +86,14 @@ def test_what_the_author_has_not_written_is_found(
         "the summary of method plane.left-finder",
         "the docstring of LeftFinder",
     )
+    words = ["plugins", "check", "plane.left-finder", "--quick"]
+    checked = CliRunner().invoke(program, words)
+    assert checked.exit_code == 0, checked.output
+    assert checked.output.splitlines()[-1] == (
+        "warning: as `plugins new` wrote it, write your own: the summary of method "
+        "plane.left-finder, the docstring of LeftFinder"
+    )
+    assert len(json.loads(CliRunner().invoke(program, [*words, "--json"]).output)["unwritten"]) == 2
     hooks = tmp_path / "left-finder" / "left_finder" / "hooks.py"
     text = hooks.read_text(encoding="utf-8")
     hooks.write_text(text.replace("one line for `orthoflow plugins list`", "walls by chance"))
@@ -129,7 +123,7 @@ def test_a_new_kind_takes_and_gives_what_is_asked_and_passes_the_suite(
     done = CliRunner().invoke(program, ["plugins", "new", name, *asked])
     assert done.exit_code == 0, done.output
     folder = tmp_path / name
-    install(folder, monkeypatch)
+    install(folder, name, monkeypatch)
     catalog = discover_catalog()
     assert list(catalog.kinds[kind].spec.inputs) == takes.split(",")
     assert set(catalog.kinds[kind].spec.outputs) == set(gives.split(","))
@@ -157,8 +151,7 @@ def test_a_new_plugin_on_another_ones_product_requires_it_and_has_an_example(
         Project(name="first-again", kind="first"),
     )
     for project in projects:
-        write_project(project, tmp_path, discover_catalog())
-        install(tmp_path / project.name, monkeypatch)
+        write_installed(project, tmp_path, monkeypatch)
         # A workflow leads from a shipped recipe through what the other plugin makes of it.
         comparison = tmp_path / project.name / "compare.yaml"
         catalog = discover_catalog()
@@ -251,14 +244,7 @@ def test_a_name_that_cannot_be_used_is_refused(
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An environment with this checkout installed, and what it needs taken from the tests' own."""
-    folder = tmp_path_factory.mktemp("author")
-    venv.create(folder, with_pip=True)
-    (packages,) = (folder / "lib").glob("python*/site-packages")
-    paths = [str(ROOT / part) for part in ("", "plugins", "provenance")]
-    paths += [path for path in sys.path if path.endswith("-packages")]
-    (packages / "shared.pth").write_text("\n".join(paths))
-    return folder / "bin" / "python"
+    return new_environment(tmp_path_factory.mktemp("author"))
 
 
 @pytest.mark.long
@@ -266,19 +252,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_new_plugin_installs_and_passes_its_tests_at_once(
     kind: str, environment: Path, tmp_path: Path
 ) -> None:
-    run = [environment, "-m"]
-    named = ["orthoflow", "plugins", "new", f"own-{kind}", "--kind", kind]
-    steps = [
-        (tmp_path, [*run, *named]),
-        (
-            tmp_path / f"own-{kind}",
-            [*run, "pip", "install", "-q", "--no-deps", "-e", "."],
-        ),
-        (tmp_path / f"own-{kind}", [*run, "pytest", "-q", "-W", "error"]),
-    ]
-    variables = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    for folder, command in steps:
-        done = subprocess.run(
-            command, cwd=folder, env=variables, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-2000:]
+    run, name = (environment, "-m"), f"own-{kind}"
+    succeed(tmp_path, *run, "orthoflow", "plugins", "new", name, "--kind", kind)
+    succeed(tmp_path / name, *run, "pip", "install", "-q", "--no-deps", "-e", ".")
+    succeed(tmp_path / name, *run, "pytest", "-q", "-W", "error")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orthoflow.errors import ProductError
+from orthoflow.errors import CancelledStepError, ProductError
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext, StepEvent
 
 SVG = b'<svg xmlns="http://www.w3.org/2000/svg"/>'
@@ -21,21 +21,10 @@ def context(folder: Path, heard: list[StepEvent] | None = None) -> StepContext:
     return StepContext(rng=np.random.default_rng(1), cores=1, scratch=folder, listen=listen)
 
 
-@pytest.mark.parametrize("name", ["../x", "/tmp/x", "..", "", "nul", "a\nb", "x" * 253, "x" * 300])
-def test_a_picture_that_no_file_can_be_called_after_is_refused(tmp_path: Path, name: str) -> None:
-    scratch = tmp_path / "scratch"
-    scratch.mkdir()
-    with pytest.raises(ProductError, match="so it cannot be the name of a file here"):
-        context(scratch).figure(name, PNG)
-    with pytest.raises(ProductError, match="so it cannot be the name of a file here"):
-        context(scratch).allocate("walls", f"{name}/\0", (3,), np.uint8)
-    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
-
-
 @pytest.mark.parametrize(
     "content",
-    [b"no picture at all", b"", b"\x89PNG", SVG.replace(b"/>", b"><script/></svg>"), b"<svg"],
-    ids=["text", "nothing", "cut off", "script", "no XML"],
+    [b"no picture at all", b"\x89PNG", SVG.replace(b"/>", b"><script/></svg>"), b"<svg"],
+    ids=["text", "cut off", "script", "no XML"],
 )
 def test_what_is_no_picture_is_refused_where_it_is_drawn(tmp_path: Path, content: bytes) -> None:
     ctx = context(tmp_path)
@@ -62,12 +51,13 @@ def test_lines_and_fractions_are_heard_in_order(tmp_path: Path) -> None:
     ctx.log("reading")
     ctx.progress(0.25)
     ctx.warn("few points")
+    ctx.progress(0.1, "back")
     ctx.progress(7.0, "done")
     assert [(event.kind, event.text) for event in heard] == [
         *(("progress", "begun"), ("log", "reading"), ("progress", "")),
-        *(("diagnostic", "few points"), ("progress", "done")),
+        *(("diagnostic", "few points"), ("progress", "back"), ("progress", "done")),
     ]
-    assert [event.fraction for event in heard if event.kind == "progress"] == [0.0, 0.25, 1.0]
+    assert [event.fraction for event in heard if event.kind == "progress"] == [0.0, 0.25, 0.25, 1.0]
     assert ctx.warnings == ["few points"]
 
 
@@ -76,10 +66,12 @@ def test_a_step_can_ask_whether_it_is_to_stop(tmp_path: Path) -> None:
         rng=np.random.default_rng(1), cores=1, scratch=tmp_path, is_cancelled=lambda: True
     )
     assert asked.cancelled()
+    with pytest.raises(CancelledStepError):
+        asked.progress(0.1)
     assert not context(tmp_path).cancelled()
 
 
-@pytest.mark.parametrize("shape", [(0,), (0, 3), (5, 0)])
+@pytest.mark.parametrize("shape", [(0,), (5, 0)])
 def test_an_array_of_nothing_needs_no_file(tmp_path: Path, shape: tuple[int, ...]) -> None:
     array = context(tmp_path).allocate("cloud", "x", shape, np.float32)
     assert (array.shape, array.dtype) == (shape, np.float32)
@@ -129,6 +121,8 @@ def test_what_cannot_be_a_name_names_no_metric_and_no_figure(tmp_path: Path, nam
     )
     with pytest.raises(ProductError, match=refused):
         ctx.figure(name, PNG)
+    with pytest.raises(ProductError, match="so it cannot be the name of a file here"):
+        ctx.allocate("walls", f"{name}/\0", (3,), np.uint8)
     assert (ctx.metrics, ctx.figures, list(tmp_path.iterdir())) == ([], [], [])
 
 
@@ -140,35 +134,21 @@ def test_a_unit_is_a_word(tmp_path: Path, unit: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "value", ["three", None, 10**400, [1.0]], ids=["text", "None", "huge", "list"]
+    "value", ["three", None, 10**400, np.nan, np.inf], ids=["text", "None", "huge", "nan", "inf"]
 )
 def test_a_metric_is_a_number(tmp_path: Path, value: float) -> None:
-    with pytest.raises(ProductError, match=r"^metric length must be a number: "):
+    with pytest.raises(
+        ProductError, match=r"^metric length must be (a number: |finite, got .*: leave it out)"
+    ):
         context(tmp_path).metric("length", value, "m")
-
-
-def test_a_name_serves_once_and_there_are_only_so_many(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("orthoflow.sdk.context._MOST_METRICS", 2)
-    monkeypatch.setattr("orthoflow.sdk.context._MOST_FIGURES", 1)
-    ctx = context(tmp_path)
-    ctx.metric("a", 1.0, "m/s")
-    ctx.figure("a", PNG)
-    with pytest.raises(ProductError, match="metric a was reported twice"):
-        ctx.metric("a", 2.0, "m")
-    ctx.metric("b", 2.0, "m")
-    with pytest.raises(ProductError, match="a step may report 2 metrics, not more"):
-        ctx.metric("c", 3.0, "m")
-    with pytest.raises(ProductError, match="a step may report 1 figures, not more"):
-        ctx.figure("b", PNG)
-    assert [metric.name for metric in ctx.metrics] == ["a", "b"]
 
 
 def test_a_step_says_far_more_than_any_has_to_say_and_not_without_end(tmp_path: Path) -> None:
     ctx = context(tmp_path)
     for k in range(20_000):
         ctx.metric(f"m{k}", float(k), "1")
+    with pytest.raises(ProductError, match="metric m1 was reported twice"):
+        ctx.metric("m1", 2.0, "m")
     with pytest.raises(ProductError, match="a step may report 20000 metrics, not more"):
         ctx.metric("one_more", 1.0, "1")
     ctx.figure("first", PNG)

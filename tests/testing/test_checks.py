@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from orthoflow.engine.store import digest_of
 from orthoflow.products import (
     Planes,
     PointCloud,
@@ -47,33 +48,25 @@ def subject(method: type[Method] = Finding, **witness: object) -> Any:
     return SimpleNamespace(method=method, witness=SimpleNamespace(**witness))
 
 
-def given_out(outputs: dict[str, Product], *metrics: object) -> Any:
-    from orthoflow.engine.store import digest_of
-
-    run = SimpleNamespace(
-        outputs=outputs,
-        digests={name: digest_of(product) for name, product in outputs.items()},
-        metrics=metrics,
-    )
-    return subject(first=SimpleNamespace(run=run))
-
-
 def test_outputs_are_those_that_were_declared() -> None:
     cloud, planes = example_room(n_points=1000)
     labels = PointLabels(plane_index=np.zeros(3, dtype=np.int16))
-    counted = Metric(name="n_planes", value=6.0, unit="1")
-    checks.outputs_are_valid(given_out({"planes": planes}, counted))
-    checks.outputs_are_valid(given_out({"planes": planes, "labels": labels}))
+
+    def check(*metrics: object, **outputs: Product) -> None:
+        digests = {name: digest_of(product) for name, product in outputs.items()}
+        run = SimpleNamespace(outputs=outputs, digests=digests, metrics=metrics)
+        checks.outputs_are_valid(subject(first=SimpleNamespace(run=run)))
+
+    check(Metric(name="n_planes", value=6.0, unit="1"), planes=planes)
+    check(planes=planes, labels=labels)
     with pytest.raises(AssertionError, match="output planes is missing"):
-        checks.outputs_are_valid(given_out({"labels": labels}))
+        check(labels=labels)
     with pytest.raises(AssertionError, match="output planes is a cloud, declared is planes"):
-        checks.outputs_are_valid(given_out({"planes": cloud}))
-    nameless = SimpleNamespace(name="n_planes", unit="")
+        check(planes=cloud)
     with pytest.raises(AssertionError, match="metric n_planes has no unit"):
-        checks.outputs_are_valid(given_out({"planes": planes}, nameless))
-    other = Metric(name="n_walls", value=4.0, unit="1")
+        check(SimpleNamespace(name="n_planes", unit=""), planes=planes)
     with pytest.raises(AssertionError, match="metric n_walls is none of those that the method"):
-        checks.outputs_are_valid(given_out({"planes": planes}, other))
+        check(Metric(name="n_walls", value=4.0, unit="1"), planes=planes)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,16 +97,7 @@ def publish_nothing_but_an_error(product: Product, folder: Path, digest: str) ->
     raise ValueError("disk on fire")
 
 
-def publish_above(product: Product, folder: Path, digest: str) -> None:
-    (folder.parent / "marks.json").write_text(digest)
-
-
-def publish_here(product: Product, folder: Path, digest: str) -> None:
-    Path("marks.json").write_text(digest)
-
-
-def publish_a_link(product: Product, folder: Path, digest: str) -> None:
-    (folder / "marks.json").symlink_to("/etc/passwd")
+BESIDE = "the publisher of marks wrote beside its folder: "
 
 
 @pytest.mark.parametrize(
@@ -122,9 +106,12 @@ def publish_a_link(product: Product, folder: Path, digest: str) -> None:
         (None, ""),
         (publish_well, ""),
         (publish_nothing_but_an_error, r"publisher of marks raised ValueError: disk .*\(test_ch"),
-        (publish_above, "the publisher of marks wrote beside its folder: marks.json"),
-        (publish_here, "the publisher of marks wrote beside its folder: marks.json"),
-        (publish_a_link, "a marks publishes 'marks.json', which is a link or a device"),
+        (lambda _, folder, text: (folder.parent / "a.json").write_text(text), f"{BESIDE}a.json"),
+        (lambda *_: Path("b.json").write_text(""), f"{BESIDE}b.json"),
+        (
+            lambda _, folder, __: (folder / "marks.json").symlink_to("/etc/passwd"),
+            "a marks publishes 'marks.json', which is a link or a device",
+        ),
     ],
 )
 def test_publishers_write_into_their_folder_alone(

@@ -63,14 +63,15 @@ def test_photos_may_be_oriented_a_little_beside_their_true_pose() -> None:
 
 
 def test_a_photo_that_is_not_oriented_is_named() -> None:
-    subject = oriented(0.0)
-    lost = replace(subject.run_on_photographs().outputs["cameras"].cameras[1], status="too few")
-    run = SimpleNamespace(outputs={"cameras": photographed.cameras(lost)})
-    with pytest.raises(AssertionError, match=r"b\.png was not oriented: too few"):
-        physics.poses_are_recovered(SimpleNamespace(run_on_photographs=lambda: run))  # type: ignore[arg-type]
-    run = SimpleNamespace(outputs={"cameras": None})
-    with pytest.raises(AssertionError, match="cameras are missing"):
-        physics.poses_are_recovered(SimpleNamespace(run_on_photographs=lambda: run))  # type: ignore[arg-type]
+    lost = replace(oriented(0.0).run_on_photographs().outputs["cameras"].cameras[1], status="few")
+    for cameras, said in (
+        (photographed.cameras(lost), r"b\.png was not oriented: few"),
+        (None, "cameras are missing"),
+    ):
+        run = SimpleNamespace(outputs={"cameras": cameras})
+        subject: Any = SimpleNamespace(run_on_photographs=lambda run=run: run)
+        with pytest.raises(AssertionError, match=said):
+            physics.poses_are_recovered(subject)
 
 
 def layer(
@@ -93,27 +94,21 @@ def layer(
     )
 
 
-def judge(image: Layer) -> None:
-    scene = photographed.photographed_scene(0.01)
-    physics._check_cells(scene, image, "a.png", image.mask == LayerMask.PAINTED)
-
-
 @pytest.mark.parametrize(
     ("image", "message"),
     [
-        (
-            layer(columns=0.3),
-            r"a\.png at 0\.01 m: colours lie -0\.\d\d columns and [+-]0\.0\d rows",
-        ),
-        (layer(rows=-0.3), r"colours lie [+-]0\.0\d columns and \+0\.\d\d rows beside their place"),
-        (layer(share=0.25), r"only 25% of the wall is painted"),
-        (layer(lighter=24), r"half of the colours are off by 2\d grey or more"),
+        ({"columns": 0.3}, r"a\.png at 0\.01 m: colours lie -0\.\d\d columns and [+-]0\.0\d rows"),
+        ({"rows": -0.3}, r"colours lie [+-]0\.0\d columns and \+0\.\d\d rows beside their place"),
+        ({"share": 0.25}, r"only 25% of the wall is painted"),
+        ({"lighter": 24}, r"half of the colours are off by 2\d grey or more"),
     ],
-    ids=["shifted-columns", "shifted-rows", "a-quarter", "lighter"],
+    ids=str,
 )
-def test_cells_that_show_another_place_are_told(image: Layer, message: str) -> None:
+def test_cells_that_show_another_place_are_reported(image: dict[str, Any], message: str) -> None:
+    shown = layer(**image)
+    scene = photographed.photographed_scene(0.01)
     with pytest.raises(AssertionError, match=message):
-        judge(image)
+        physics._check_cells(scene, shown, "a.png", shown.mask == LayerMask.PAINTED)
 
 
 @pytest.mark.parametrize(("hidden", "passes"), [(0.02, True), (0.05, False)])

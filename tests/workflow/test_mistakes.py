@@ -355,10 +355,14 @@ def test_metrics_that_no_method_of_a_step_declares_are_refused(
     assert asked("plane.own_mm, plane.wall_3_mm, plane.compile_s, 'plane.x_*'") == []
     whose = "`orthoflow plugins show METHOD` lists those of plane.hough2d, plane.ransac"
     assert asked("plane.rsm_mm, 'plan*.depth', orient.rsm_mm") == [
-        "compare.metrics[0]: step plane reports no metric rsm_mm (did you mean rms_mm?); "
-        f"{whose} at plane.rsm_mm, 'plan*.depth', orient.rsm_mm]",
-        f"compare.metrics[1]: step plane reports no metric depth; {whose} at 'plan*.depth', "
-        "orient.rsm_mm]",
+        (
+            "compare.metrics[0]: step plane reports no metric rsm_mm (did you mean rms_mm?); "
+            f"{whose} at plane.rsm_mm, 'plan*.depth', orient.rsm_mm]"
+        ),
+        (
+            f"compare.metrics[1]: step plane reports no metric depth; {whose} at 'plan*.depth', "
+            "orient.rsm_mm]"
+        ),
     ]
 
 
