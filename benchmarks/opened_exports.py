@@ -170,7 +170,7 @@ def walk_sheets(walk: Walk) -> None:
                 is_right=bool(bar)
                 and is_round
                 and (fits or not is_whole)
-                and f"scale 1:{walk.scale}" in text,
+                and f"1:{walk.scale}" in text,
             )
         walk.drawn(path, path.stem)
 

@@ -48,13 +48,13 @@ def main() -> int:
         shutil.copytree(ROOT, copy, ignore=left_out)
         os.chdir(copy)
         paths = os.pathsep.join(str(copy / one) for one in (".", "plugins", "provenance"))
-        os.environ.update(PYTHONPATH=paths, PYTHONDONTWRITEBYTECODE="1")
+        # Kernels are found by the content of all that they call, so mutants share a folder.
+        kernels = str(Path(folder, "kernels"))
+        os.environ.update(PYTHONPATH=paths, PYTHONDONTWRITEBYTECODE="1", NUMBA_CACHE_DIR=kernels)
         alive = 0
         sound: dict[str, bool] = {}
         mutants = drawn(args.seed, args.n, args.package)
         for number, mutation in enumerate(mutants, 1):
-            # A kept kernel does not notice that a function which it calls has changed.
-            os.environ["NUMBA_CACHE_DIR"] = str(Path(folder, f"kernels-{number}"))
             command = shlex.join(test_command(mutation.module_path, golden=not args.no_golden))
             if command not in sound:
                 untouched = mutate_and_test([], command, args.timeout)
@@ -69,7 +69,6 @@ def main() -> int:
             print(f"{number:3} {'LIVES ' if lives else 'killed'} {place} {mutation.operator_name}")
             if lives:
                 print("\n".join(one for one in result.diff.splitlines() if one[:1] in "+-"))
-            shutil.rmtree(os.environ["NUMBA_CACHE_DIR"], ignore_errors=True)
     print(f"{len(mutants) - alive} of {len(mutants)} killed")
     return 0 if alive <= (1.0 - KILLED_SHARE) * len(mutants) else 1
 
