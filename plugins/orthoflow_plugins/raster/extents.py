@@ -56,6 +56,8 @@ _FAR_FRONT_MOST_M: Final = 3.0
 _FAR_SHARE_LEAST: Final = 0.03
 _HALFWAY: Final = 0.5
 _FACING_COSINE: Final = -0.7
+# Opposite walls of a room cover similar areas, objects in front of a wall a few per cent of it.
+_OPPOSITE_SHARE: Final = 0.25
 _UPRIGHT_SINE: Final = math.sin(math.radians(10.0))
 # This close to the lowest and the highest points in front of a wall, ground and ceiling connect
 # everything.
@@ -409,14 +411,24 @@ def _far_front_m(
 def free_before_m(planes: Planes, index: int, stations: NDArray[np.float64] | None) -> float:
     """Return half the distance from a wall to the nearest surface that faces it, or to a scanner.
 
-    Objects farther in front may belong to what faces it; infinite without any.
+    Objects farther in front may belong to that surface; infinite if there is none. Planes whose
+    visible side was guessed may be fronts of objects that belong to the wall, turned the wrong way.
+    They face it only where they, and nearer ones, cover enough area to be the other side of a room.
     """
     normal, offset_m = planes.normal[index], float(planes.offset[index])
+    facing = [
+        (float((planes.corners[other] @ normal - offset_m).max()), other)
+        for other in range(len(planes))
+        if float(planes.normal[other] @ normal) < _FACING_COSINE
+    ]
     distances_m = [math.inf]
-    for other in range(len(planes)):
-        if float(planes.normal[other] @ normal) < _FACING_COSINE:
-            depths_m = planes.corners[other] @ normal - offset_m
-            distances_m.append(float(depths_m.max()))
+    opposite_m2 = 0.0
+    for distance_m, other in sorted(one for one in facing if one[0] > 0.0):
+        opposite_m2 += _covered_m2(planes, other)
+        is_known = planes.side_source(other) != "guess"
+        if is_known or opposite_m2 >= _OPPOSITE_SHARE * _covered_m2(planes, index):
+            distances_m.append(distance_m)
+            break
     if stations is not None and len(stations):
         distances_m += (stations @ normal - offset_m).tolist()
     return _HALFWAY * min(distance_m for distance_m in distances_m if distance_m > 0.0)

@@ -614,7 +614,9 @@ def wall_behind_the_basin() -> NDArray:
     [
         ("joined to the wall", BASIN_M),
         ("apart from it", 0.0),
-        *long_only(("joined by the ground", 0.0), ("before a wall that faces it", 0.0)),
+        *long_only(("joined by the ground", 0.0)),
+        ("before a wall that faces it", 0.0),
+        ("behind a part of it that faces it, as guessed", BASIN_M),
         ("before a scanner", 0.0),
         *long_only(("set", 0.3)),
     ],
@@ -627,9 +629,9 @@ def test_what_stands_far_before_a_wall_belongs_to_it_where_it_hangs_together_wit
     if case == "joined by the ground":
         patches.append(patch((0.0, WIDTH_M), (0.0, 2.9), (0.0, 0.0)))
         patches.append(patch(BASIN_X, (BASIN_M, BASIN_M), (0.0, BASIN_Z[0])))
-    facing = np.array(
-        [[0, -3.0, HEIGHT_M], [0, -3.0, 0], [WIDTH_M, -3, 0], [WIDTH_M, -3, HEIGHT_M]]
-    )
+    # The other side of a room, or the step of a basin that was turned the wrong way.
+    y, height_m = (-0.5, 0.2) if "guessed" in case else (-3.0, HEIGHT_M)
+    facing = np.array([[0, y, height_m], [0, y, 0], [WIDTH_M, y, 0], [WIDTH_M, y, height_m]])
     others = [(np.array([0.0, 1.0, 0.0]), facing)] if "faces" in case else []
     planes = planes_of((0.0, WIDTH_M), (0.0, HEIGHT_M), *others)
     cloud = scanned(*patches)
