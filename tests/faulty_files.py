@@ -26,28 +26,13 @@ _BROKEN = (errno.EIO, errno.ESTALE, errno.EROFS)
 _READING = ("read", "look")
 _FREEING = ("unlink", "rmdir")
 _WRITING = os.O_WRONLY | os.O_RDWR
-_REAL = {
-    name: getattr(os, name)
-    for name in [
-        "open",
-        "write",
-        "pwrite",
-        "ftruncate",
-        "fsync",
-        "rename",
-        "replace",
-        "mkdir",
-        "unlink",
-        "rmdir",
-        "sendfile",
-        "utime",
-        "link",
-        "pread",
-        "scandir",
-        "posix_fallocate",
-    ]
-    if hasattr(os, name)
+# Operations that are counted and then done, with what they do to their first argument.
+_SIMPLE = {
+    **dict.fromkeys(("write", "pwrite", "ftruncate", "sendfile", "posix_fallocate"), "write"),
+    "pread": "read", "scandir": "look", "utime": "sync",
 }
+_NAMES = ("open", "fsync", "rename", "replace", "mkdir", "unlink", "rmdir", "link", *_SIMPLE)
+_REAL = {name: getattr(os, name) for name in _NAMES if hasattr(os, name)}
 _REAL_OPEN = io.open
 
 
@@ -127,7 +112,9 @@ class FaultyFiles:
         shutil.rmtree(self._volatile.kept, ignore_errors=True)  # of an earlier case
         self._volatile.kept.mkdir()
         for name in _REAL:
-            if hasattr(self, f"_{name}"):
+            if name in _SIMPLE:
+                setattr(os, name, self._counted(name))
+            elif hasattr(self, f"_{name}"):
                 setattr(os, name, getattr(self, f"_{name}"))
         builtins.open = io.open = self._open_file
         try:
@@ -211,44 +198,20 @@ class FaultyFiles:
         buffered: Any = kind(raw) if is_writing else io.BufferedReader(raw)
         return buffered if "b" in mode else io.TextIOWrapper(buffered, *rest, **more)
 
-    def _write(self, descriptor: int, data: Any) -> int:
-        self.step(_place_of(descriptor), "write", descriptor)
-        return int(_REAL["write"](descriptor, data))
+    # Any: the arguments are those of the operation.
+    def _counted(self, name: str) -> Callable[..., Any]:
+        def call(first: Any = ".", *rest: Any, **more: Any) -> Any:
+            path = _place(first)
+            self.step(path, _SIMPLE[name], first if isinstance(first, int) else -1)
+            return _REAL[name](first, *rest, **more)
 
-    def _pwrite(self, descriptor: int, data: Any, offset: int) -> int:
-        self.step(_place_of(descriptor), "write", descriptor)
-        return int(_REAL["pwrite"](descriptor, data, offset))
-
-    def _pread(self, descriptor: int, n_bytes: int, offset: int) -> bytes:
-        self.step(_place_of(descriptor), "read")
-        return bytes(_REAL["pread"](descriptor, n_bytes, offset))
-
-    def _posix_fallocate(self, descriptor: int, offset: int, n_bytes: int) -> None:
-        self.step(_place_of(descriptor), "write", descriptor)
-        _REAL["posix_fallocate"](descriptor, offset, n_bytes)
-
-    # Any: the iterator that is made here has no public name with a type.
-    def _scandir(self, path: Any = ".") -> Any:
-        self.step(_place(path), "look")
-        return _REAL["scandir"](path)
-
-    def _sendfile(self, out: int, source: int, offset: int, count: int) -> int:
-        self.step(_place_of(out), "write", out)
-        return int(_REAL["sendfile"](out, source, offset, count))
-
-    def _ftruncate(self, descriptor: int, size: int) -> None:
-        self.step(_place_of(descriptor), "write", descriptor)
-        _REAL["ftruncate"](descriptor, size)
+        return call
 
     def _fsync(self, descriptor: int) -> None:
         path = _place_of(descriptor)
         self.step(path, "sync")
         _REAL["fsync"](descriptor)
         self._volatile.sync(descriptor, path)
-
-    def _utime(self, path: Any, *rest: Any, **more: Any) -> None:
-        self.step(_place(path), "sync")
-        _REAL["utime"](path, *rest, **more)
 
     def _rename(
         self,

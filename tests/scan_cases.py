@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import struct
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
@@ -176,18 +176,11 @@ def csv_named(draw: Draw) -> Case:
     """A CSV file with header, a column of texts among the numbers."""
     scene = draw.scene
     axes = draw.one_of(
-        "x y z",
-        "X Y Z",
-        "Easting Northing Elevation",
-        "POINT_X POINT_Y POINT_Z",
+        *("x y z", "X Y Z", "Easting Northing Elevation", "POINT_X POINT_Y POINT_Z"),
         "Rechtswert Hochwert Höhe",
     )
     colours = draw.one_of(
-        "r g b",
-        "Red Green Blue",
-        "R G B",
-        "color_red color_green color_blue",
-        "Rot Grün Blau",
+        *("r g b", "Red Green Blue", "R G B", "color_red color_green color_blue"), "Rot Grün Blau"
     )
     separator = draw.one_of(",", ";", "\t", ", ")
     quote = draw.one_of(False, True) and separator != "\t"
@@ -335,9 +328,7 @@ def text_units(draw: Draw) -> Case:
     )
     path = _write_table(
         draw.folder / "a.csv",
-        _xyz(
-            Scene(points=scene.points / UNITS_M[unit], reflectance=scene.reflectance, rgb=scene.rgb)
-        ),
+        _xyz(replace(scene, points=scene.points / UNITS_M[unit])),
         separator=",",
         header=header,
     )
@@ -360,11 +351,8 @@ def pts_two_scanners(draw: Draw) -> Case:
 
 def joined(scenes: Sequence[Scene]) -> Scene:
     """Points of several scans, one after the other."""
-    return Scene(
-        points=np.concatenate([scene.points for scene in scenes]),
-        reflectance=np.concatenate([scene.reflectance for scene in scenes]),
-        rgb=np.concatenate([scene.rgb for scene in scenes]),
-    )
+    names = ("points", "reflectance", "rgb")
+    return Scene(**{name: np.concatenate([getattr(s, name) for s in scenes]) for name in names})
 
 
 # E57
@@ -601,7 +589,7 @@ def _write_las(
 def las_bounds_stale(draw: Draw) -> Case:
     """Bounds of another place, or fewer points stated than there are."""
     scene, shift = draw.scene, draw.shift()
-    moved = Scene(points=scene.points + shift, reflectance=scene.reflectance, rgb=scene.rgb)
+    moved = replace(scene, points=scene.points + shift)
     kind = draw.one_of("las", "laz")
     path = _write_las(draw.folder / f"a.{kind}", moved, offset=np.floor(shift), version="1.2")
     content = bytearray(path.read_bytes())
@@ -639,7 +627,7 @@ def colours_of_few_bits(draw: Draw) -> Case:
     deep = np.rint(scene.rgb / 255.0 * most).astype(np.uint16)
     path = draw.folder / draw.one_of("a.las", "a.ply", "a.xyz")
     if path.suffix == ".las":
-        deep_scene = Scene(points=scene.points, reflectance=scene.reflectance, rgb=deep)
+        deep_scene = replace(scene, rgb=deep)
         _write_las(path, deep_scene, offset=np.zeros(3), factor=1, intensity=np.zeros(len(scene)))
     else:
         colours = dict(zip(("red", "green", "blue"), deep.T, strict=True))
@@ -685,7 +673,7 @@ def las_feet(draw: Draw) -> Case:
         record = laspy.VLR("LASF_Projection", 2112, "", text.encode() + b"\0")
     scene = draw.scene
     metres = np.array([UNITS_M[level], UNITS_M[level], UNITS_M[height]])
-    in_feet = Scene(points=scene.points / metres, reflectance=scene.reflectance, rgb=scene.rgb)
+    in_feet = replace(scene, points=scene.points / metres)
     path = _write_las(
         draw.folder / draw.one_of("a.las", "a.laz"),
         in_feet,
@@ -831,9 +819,7 @@ def comment_units(draw: Draw) -> Case:
     }[unit]
     word = draw.one_of(*comment)
     scene = draw.scene
-    inside = Scene(
-        points=scene.points / UNITS_M[unit], reflectance=scene.reflectance, rgb=scene.rgb
-    )
+    inside = replace(scene, points=scene.points / UNITS_M[unit])
     kind = draw.one_of("ply", "pcd", "e57")
     path = draw.folder / f"a.{kind}"
     if kind == "ply":
@@ -950,33 +936,7 @@ def ptx_scans(draw: Draw) -> Case:
 
 
 CASES: Final[Mapping[str, Callable[[Draw], Case]]] = {
-    case.__name__: case
-    for case in (
-        csv_named,
-        text_header_unknown,
-        text_names_twice,
-        text_index_first,
-        text_not_a_number,
-        text_normals,
-        text_units,
-        pts_two_scanners,
-        e57_colour_invalid,
-        e57_colour_limit_wrong,
-        e57_scan_without,
-        e57_two_depths,
-        e57_two_intensity_limits,
-        points_at_zero,
-        points_at_one_place,
-        las_bounds_stale,
-        las_count_stale,
-        colours_of_few_bits,
-        las_feet,
-        las_degrees,
-        las_extra_intensity,
-        one_reflector,
-        ply_lists,
-        comment_units,
-        pcd_names,
-        ptx_scans,
-    )
+    name: function
+    for name, function in list(globals().items())
+    if getattr(function, "__annotations__", {}).get("return") == "Case"
 }

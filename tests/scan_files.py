@@ -180,12 +180,8 @@ def _add_image(libe57: Any, image: Any, picture: Mapping[str, Any]) -> None:
     node.set(f"{picture['kind']}Representation", shown)
     for name, value in picture.get("numbers", {}).items():
         is_count = name in ("imageWidth", "imageHeight")
-        shown.set(
-            name,
-            libe57.IntegerNode(image, int(value))
-            if is_count
-            else libe57.FloatNode(image, float(value)),
-        )
+        node_of, number = (libe57.IntegerNode, int) if is_count else (libe57.FloatNode, float)
+        shown.set(name, node_of(image, number(value)))
     content = picture["content"]
     blob = libe57.BlobNode(image, len(content))
     shown.set("jpegImage" if content.startswith(b"\xff\xd8") else "pngImage", blob)
@@ -255,30 +251,20 @@ def write_ply(
     before: str = "",
     before_data: bytes = b"",
 ) -> Path:
-    """Write vertices; `before` are header lines of elements that come before them."""
-    names = {"f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort", "i4": "int"}
-    count = len(next(iter(fields.values())))
-    lines = ["ply", f"format {encoding} 1.0", "comment made by hand"]
-    lines += before.split("\n") if before else []
-    lines += [f"element vertex {count}"]
-    lines += [f"property {names[array.dtype.str[1:]]} {name}" for name, array in fields.items()]
-    lines += ["element face 1", "property list uchar int vertex_indices", "end_header", ""]
-    header = "\n".join(lines).encode()
-    if encoding == "ascii":
-        rows = [
-            " ".join(repr(item.item()) for item in row)
-            for row in zip(*fields.values(), strict=True)
-        ]
-        path.write_bytes(header + before_data + "\n".join([*rows, "3 0 1 2", ""]).encode())
-        return path
+    """Write vertices and a face; `before` are header lines of elements that come before them."""
+    from plyfile import PlyData, PlyElement
+
+    kinds = [(name, array.dtype.str[1:]) for name, array in fields.items()]
+    table = np.array(list(zip(*fields.values(), strict=True)), dtype=kinds)
+    faces = np.array([([0, 1, 2],)], dtype=[("vertex_indices", "i4", (3,))])
+    elements = [PlyElement.describe(table, "vertex"), PlyElement.describe(faces, "face")]
     order = "<" if "little" in encoding else ">"
-    dtype = np.dtype([(name, order + array.dtype.str[1:]) for name, array in fields.items()])
-    table = np.zeros(count, dtype)
-    for name, array in fields.items():
-        table[name] = array
-    path.write_bytes(
-        header + before_data + table.tobytes() + struct.pack(order + "B3i", 3, 0, 1, 2)
-    )
+    file = PlyData(elements, encoding == "ascii", order, comments=["made by hand"])
+    file.write(str(path))
+    if before:
+        head, end, data = path.read_bytes().partition(b"end_header\n")
+        head = head.replace(b"element vertex", before.encode() + b"\nelement vertex")
+        path.write_bytes(head + end + before_data + data)
     return path
 
 
@@ -294,37 +280,35 @@ def write_pcd(
     arrays = list(fields.values())
     kinds = {"f": "F", "u": "U", "i": "I"}
     columns = width or count
-    header = "\n".join(
-        [
-            "# .PCD v0.7 - Point Cloud Data file format",
-            "VERSION 0.7",
-            f"FIELDS {' '.join(fields)}",
-            f"SIZE {' '.join(str(array.dtype.itemsize) for array in arrays)}",
-            f"TYPE {' '.join(kinds[array.dtype.kind] for array in arrays)}",
-            f"COUNT {' '.join('1' for _ in arrays)}",
-            f"WIDTH {columns}",
-            f"HEIGHT {count // columns}",
-            f"VIEWPOINT {viewpoint}",
-            f"POINTS {count}",
-            f"DATA {data}",
-            "",
-        ]
-    ).encode()
+    lines = {
+        "VERSION": "0.7",
+        "FIELDS": " ".join(fields),
+        "SIZE": " ".join(str(array.dtype.itemsize) for array in arrays),
+        "TYPE": " ".join(kinds[array.dtype.kind] for array in arrays),
+        "COUNT": " ".join("1" for _ in arrays),
+        "WIDTH": columns,
+        "HEIGHT": count // columns,
+        "VIEWPOINT": viewpoint,
+        "POINTS": count,
+        "DATA": data,
+    }
+    header = "# .PCD v0.7 - Point Cloud Data file format\n"
+    header += "".join(f"{key} {value}\n" for key, value in lines.items())
     if data == "ascii":
         rows = [" ".join(repr(item.item()) for item in row) for row in zip(*arrays, strict=True)]
-        path.write_bytes(header + "\n".join([*rows, ""]).encode())
+        path.write_text(header + "\n".join([*rows, ""]))
     elif data == "binary":
         dtype = np.dtype([(name, array.dtype) for name, array in fields.items()])
         table = np.zeros(count, dtype)
         for name, array in fields.items():
             table[name] = array
-        path.write_bytes(header + table.tobytes())
+        path.write_bytes(header.encode() + table.tobytes())
     else:
         plain = b"".join(array.tobytes() for array in arrays)
         # LZF of literals only: their number less one before up to 32 of them.
         parts = [plain[at : at + 32] for at in range(0, len(plain), 32)]
         packed = b"".join(bytes([len(part) - 1]) + part for part in parts)
-        path.write_bytes(header + struct.pack("<II", len(packed), len(plain)) + packed)
+        path.write_bytes(header.encode() + struct.pack("<II", len(packed), len(plain)) + packed)
     return path
 
 

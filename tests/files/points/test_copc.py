@@ -57,16 +57,20 @@ def test_a_copc_file_is_read_whole_unless_somebody_asks_for_less(path: Path) -> 
     for query in (None, PointQuery()):
         np.testing.assert_array_equal(read(path, query).round(4), all_points().round(4))
         assert not open_scan(path, query=query).is_chosen
+    # Without an octree there is nothing to choose from; and a spacing beyond all numbers asks
+    # for every level.
+    plain = scan_files.write_las(path.with_name("a.las"), all_points())
+    assert len(read(plain, PointQuery(spacing=0.5))) == len(all_points())
+    content = bytearray(path.read_bytes())
+    struct.pack_into("<d", content, 429 + 32, 1e308)
+    path.write_bytes(bytes(content))
+    assert len(read(path, PointQuery(spacing=0.1))) == len(all_points())
 
 
-@pytest.mark.parametrize(
-    ("spacing", "n_levels"), [(2.0, 1), (0.5, 1), (0.4, 2), (0.25, 2), (0.2, 3), (0.001, 3)]
-)
-def test_levels_are_read_down_to_the_spacing_asked_for(
-    path: Path, spacing: float, n_levels: int
-) -> None:
-    found = read(path, PointQuery(spacing=spacing))
-    np.testing.assert_array_equal(sorted_points(found), sorted_points(all_points(n_levels)))
+def test_levels_are_read_down_to_the_spacing_asked_for(path: Path) -> None:
+    for spacing, n_levels in ((2.0, 1), (0.5, 1), (0.4, 2), (0.25, 2), (0.2, 3), (0.001, 3)):
+        found = read(path, PointQuery(spacing=spacing))
+        np.testing.assert_array_equal(sorted_points(found), sorted_points(all_points(n_levels)))
 
 
 @pytest.mark.parametrize("block_points", [500_000, 700])
@@ -83,17 +87,9 @@ def test_only_nodes_that_meet_the_box_are_read_and_none_of_its_points_is_missing
         return sorted_points(points[((points >= box[0]) & (points <= box[1])).all(axis=1)])
 
     np.testing.assert_array_equal(inside(found), inside(all_points()))
-
-
-def test_a_box_beside_all_nodes_gives_the_root_which_tells_where_the_cloud_is(path: Path) -> None:
-    found = read(path, PointQuery(box=np.array([[90.0, 0.0, 0.0], [91.0, 1.0, 1.0]])))
-    np.testing.assert_array_equal(sorted_points(found), sorted_points(NODES[0][0, 0, 0]))
-
-
-@pytest.mark.parametrize("suffix", [".las", ".laz"])
-def test_files_without_an_octree_are_read_whole(tmp_path: Path, suffix: str) -> None:
-    plain = scan_files.write_las(tmp_path / f"a{suffix}", all_points())
-    assert len(read(plain, PointQuery(spacing=0.5))) == len(all_points())
+    # A box beside all nodes gives the root, which tells where the cloud is.
+    beside = read(path, PointQuery(box=np.array([[90.0, 0.0, 0.0], [91.0, 1.0, 1.0]])))
+    np.testing.assert_array_equal(sorted_points(beside), sorted_points(NODES[0][0, 0, 0]))
 
 
 def hierarchy(content: bytes) -> tuple[int, int]:
@@ -133,13 +129,6 @@ def test_a_damaged_octree_is_told_before_anything_is_decoded(
         open_scan(path, query=PointQuery(spacing=0.1))
     # Its points need no octree.
     assert len(read(path, None)) == len(all_points())
-
-
-def test_a_spacing_beyond_all_numbers_asks_for_every_level(path: Path) -> None:
-    content = bytearray(path.read_bytes())
-    struct.pack_into("<d", content, 429 + 32, 1e308)
-    path.write_bytes(bytes(content))
-    assert len(read(path, PointQuery(spacing=0.1))) == len(all_points())
 
 
 def test_pages_that_name_each_other_end(path: Path) -> None:

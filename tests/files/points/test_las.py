@@ -16,16 +16,6 @@ from tests.long_loops import seeds
 from tests.scan_files import read_all
 
 
-def test_las_leaves_out_points_marked_as_deleted(
-    tmp_path: Path, points: NDArray[np.float64]
-) -> None:
-    withheld = np.arange(40) % 4 == 0
-    path = scan_files.write_las(tmp_path / "a.laz", points, withheld=withheld)
-    (block,) = read_all(path)
-    np.testing.assert_allclose(block.points, points[~withheld], atol=1e-9)
-    assert (block.n_read, block.left_out, block.scan) == (40, {"withheld": 10}, 0)
-
-
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
 def test_only_the_classes_asked_for_are_given_and_the_rest_is_counted(
     suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -120,8 +110,10 @@ def chunk_table(path: Path) -> int:
         (96, b"\xff\xff\xff\x00", "its points begin outside the file, which is cut off"),
         (100, b"\xff\xff\xff\x7f", "its header states 2147483647 records that do not fit"),
         (243, b"\x05\x00\x00\x00", "records at its end are missing"),
+        # Of the chunk table: 3 thousand million chunks of 16 bytes each would end the process.
+        (4, b"\xff\xff\xff\xbf", "its chunk table states 3221225471 chunks"),
+        (247, struct.pack("<Q", 400_000), "its chunks hold 50000 points, its header states 400000"),
     ],
-    ids=["offset", "records", "extended-records"],
 )
 def test_a_damaged_las_header_is_found_before_a_library_believes_it(
     tmp_path: Path, points: NDArray[np.float64], position: int, content: bytes, message: str
@@ -129,34 +121,9 @@ def test_a_damaged_las_header_is_found_before_a_library_believes_it(
     path = scan_files.write_las(tmp_path / "a.laz", points)
     if position == 243:
         change(path, 235, struct.pack("<Q", path.stat().st_size))
-    with pytest.raises(InputError, match=rf"a\.laz cannot be read as LAS/LAZ: {message}"):
+    position += chunk_table(path) if position == 4 else 0
+    with pytest.raises(InputError, match=rf"a\.laz cannot be read as LAS/LAZ: .*{message}"):
         open_scan(change(path, position, content))
-
-
-def test_a_las_file_that_ends_within_its_header_is_refused(
-    tmp_path: Path, points: NDArray[np.float64]
-) -> None:
-    path = scan_files.write_las(tmp_path / "a.las", points)
     path.write_bytes(path.read_bytes()[:150])
     with pytest.raises(InputError, match="it ends within its header"):
-        open_scan(path)
-
-
-def test_a_damaged_chunk_table_is_found_before_the_decompressor_believes_it(
-    tmp_path: Path, points: NDArray[np.float64]
-) -> None:
-    path = scan_files.write_las(tmp_path / "a.laz", points)
-    table = chunk_table(path)
-    # 3 thousand million chunks of 16 bytes each would end the process.
-    change(path, table + 4, b"\xff\xff\xff\xbf")
-    with pytest.raises(InputError, match="its chunk table states 3221225471 chunks"):
-        open_scan(path)
-
-
-def test_a_number_of_points_that_the_chunks_do_not_hold_is_found(
-    tmp_path: Path, points: NDArray[np.float64]
-) -> None:
-    path = scan_files.write_las(tmp_path / "a.laz", points)
-    change(path, 247, struct.pack("<Q", 400_000))
-    with pytest.raises(InputError, match="its chunks hold 50000 points, its header states 400000"):
         open_scan(path)
