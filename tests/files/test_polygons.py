@@ -63,7 +63,6 @@ def test_polygons_come_in_their_order_with_their_holes_and_what_is_said_of_them(
         {"type": "Feature", "properties": {}, "geometry": None},
         7,
     ],
-    ids=["name", "line", "nothing", "far", "point", "no geometry", "no feature"],
 )
 def test_what_is_no_polygon_with_a_name_is_refused_with_its_number(
     tmp_path: Path, strange: Any

@@ -69,17 +69,16 @@ def test_normals_look_where_those_of_their_planes_do_else_up(sign: float) -> Non
 
 def test_a_station_is_known_where_the_files_say_one_for_every_scan() -> None:
     stations = ORIGIN + np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
-    cloud_of_two = with_attributes(corner(stations=stations, stations_source="file"))
-    assert cloud_of_two.scans == (0, 1)
-    np.testing.assert_array_equal([cloud_of_two.station(0), cloud_of_two.station(1)], stations)
-    assert (
-        with_attributes(corner(stations=stations, stations_source="view_from")).station(0) is None
-    )
-    assert with_attributes(corner(stations=stations[:1], stations_source="file")).station(0) is None
-    assert with_attributes().station(0) is None
+    both = with_attributes(corner(stations=stations, stations_source="file"))
+    assert both.scans == (0, 1)
+    np.testing.assert_array_equal([both.station(0), both.station(1)], stations)
     single = with_attributes(corner(scan=None, stations=stations[:1], stations_source="file"))
     assert single.scans == (0,)
     np.testing.assert_array_equal(single.station(0), stations[0])
+    guessed = corner(stations=stations, stations_source="view_from")
+    fewer = corner(stations=stations[:1], stations_source="file")
+    for cloud in (guessed, fewer, CORNER):
+        assert with_attributes(cloud).station(0) is None
 
 
 def test_what_no_colour_is_known_for_is_grey() -> None:

@@ -171,8 +171,9 @@ def test_other_files_are_left_out_and_counted(tmp_path: Path, read: PhotoReader)
     assert "and were left out: a.jpg.camera, Thumbs.db, a.CR2 and 1 more" in read.warnings
 
 
-@pytest.mark.parametrize("developed", [{}, {"a.jpg": encode_jpeg(made.picture())}])
-@pytest.mark.parametrize("suffix", [".CR2", ".nef", ".arw", ".DNG"])
+@pytest.mark.parametrize(
+    ("developed", "suffix"), [({}, ".nef"), ({"a.jpg": encode_jpeg(made.picture())}, ".DNG")]
+)
 def test_raw_photos_that_nobody_developed_are_refused_with_the_way_out(
     tmp_path: Path, read: PhotoReader, developed: dict[str, bytes], suffix: str
 ) -> None:
@@ -259,19 +260,19 @@ def test_what_is_transparent_is_masked(tmp_path: Path, read: PhotoReader, kind: 
 # Damage and other formats
 
 
-@pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp"])
-@pytest.mark.parametrize("share", [0.2, 0.6, 0.95])
-def test_a_photo_that_is_cut_off_is_named(
-    tmp_path: Path, read: PhotoReader, suffix: str, share: float
+@pytest.mark.parametrize("share", [0.2, 0.95])
+def test_all_photos_that_are_cut_off_are_named_at_once(
+    tmp_path: Path, read: PhotoReader, share: float
 ) -> None:
     image = made.picture(256, 192)
     writers = {"jpg": encode_jpeg, "png": encode_png, "tif": made.tiff, "webp": encode_webp}
-    whole = writers[suffix](image)
-    content = whole[: int(share * len(whole))]
-    with pytest.raises(
-        InputError, match=rf"photo a\.{suffix} (is damaged or cut off|cannot be decod)"
-    ):
-        read(*made.write(tmp_path, {"0.jpg": encode_jpeg(image), f"a.{suffix}": content}))
+    whole = {f"a.{suffix}": write(image) for suffix, write in writers.items()}
+    cut = {name: content[: int(share * len(content))] for name, content in whole.items()}
+    with pytest.raises(InputError) as caught:
+        read(*made.write(tmp_path, {"0.jpg": encode_jpeg(image), **cut}))
+    lines = str(caught.value).splitlines()
+    assert [line.split()[1] for line in lines] == sorted(cut)
+    assert all("is damaged or cut off" in line or "cannot be decoded" in line for line in lines)
 
 
 def test_bytes_that_a_decoder_passes_over_are_reported(tmp_path: Path, read: PhotoReader) -> None:
@@ -297,9 +298,7 @@ def test_a_photo_whose_blocks_are_shifted_is_named_with_the_row(
 @pytest.mark.parametrize(
     ("content", "named"),
     [
-        (b"", "is not a JPEG"),
         (b"<html>", "is not a JPEG"),
-        (b"\0" * 500, "is not a JPEG"),
         (b"\0\0\0\x18ftypcrx \0\0\0\1crx isom", r"is camera raw \(Canon CR3\).*develop to TIFF"),
         (b"%PDF-1.7", "is PDF, which is not read: convert it"),
         (b"\0\0\0\x1cftypheic\0\0\0\0mif1heic", r"is a HEIC file: install orthoflow-tls\[heic\]"),
@@ -310,17 +309,6 @@ def test_a_file_that_only_has_the_name_of_a_photo_is_named(
 ) -> None:
     with pytest.raises(InputError, match=rf"photo a\.jpg {named}"):
         read(*made.write(tmp_path, {"a.jpg": content}))
-
-
-def test_all_photos_that_cannot_be_read_are_named_at_once(
-    tmp_path: Path, read: PhotoReader
-) -> None:
-    whole = encode_jpeg(made.picture(256, 192))
-    files = {"a.jpg": whole, "b.jpg": whole[:5000], "c.jpg": b"", "d.tif": b"%PDF-1.7"}
-    with pytest.raises(InputError) as caught:
-        read(*made.write(tmp_path, files))
-    named = [line.split()[1] for line in str(caught.value).splitlines()]
-    assert named == ["b.jpg", "c.jpg", "d.tif"]
 
 
 # Calibration
