@@ -128,11 +128,6 @@ def _place(content: bytes, rng: Random) -> int:
     return rng.randrange(end + 1)
 
 
-def _piece(content: bytes, rng: Random) -> bytes:
-    start = _place(content, rng)
-    return content[start : start + int(2 ** rng.uniform(0.0, 12.0))]
-
-
 def _flip(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
     changed = bytearray(content)
     for _ in range(rng.choice((1, 1, 2, 8)) if content else 0):
@@ -147,23 +142,13 @@ def _overwrite(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
     return content[:at] + raw + content[at + len(raw) :]
 
 
-def _truncate(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
-    return content[: _place(content, rng)]
-
-
-def _double(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
-    at = _place(content, rng)
-    return content[:at] + _piece(content, rng) * rng.choice((1, 1, 3, 50)) + content[at:]
-
-
-def _drop(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
-    at = _place(content, rng)
-    return content[:at] + content[at + len(_piece(content, rng)) :]
-
-
 def _splice(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
-    at, piece = _place(content, rng), _piece(rng.choice(others), rng)
-    return content[:at] + piece + content[at + rng.choice((0, len(piece))) :]
+    """Put a piece in, over what is there, several times, or take one out; or cut the rest off."""
+    at, source = _place(content, rng), rng.choice(others)
+    start = _place(source, rng)
+    piece = source[start : start + int(2 ** rng.uniform(0.0, 12.0))]
+    rest = content[at + rng.choice((0, len(piece))) :]
+    return content[:at] + piece * rng.choice((0, 0, 1, 1, 3, 50)) + rest * (rng.random() < 0.8)
 
 
 def _number(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
@@ -182,25 +167,16 @@ def _fragment(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
 def _line(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
     lines = content.split(b"\n")
     place = rng.randrange(len(lines))
-    match rng.randrange(5):
-        case 0:
-            del lines[place]
-        case 1:
-            lines.insert(rng.randrange(len(lines)), lines[place])
-        case 2:
-            lines[place] = b"  " + lines[place]
-        case 3:
-            # No more than is kept: two thousand long lines are more than the process may hold.
-            times = min(rng.choice((2, 40, 2000)), _LARGEST // (len(lines[place]) + 1) + 1)
-            lines[place : place + 1] = [lines[place]] * times
-        case _:
-            lines[place] = lines[place].lstrip()
+    line = lines[place]
+    # No more than is kept: two thousand long lines are more than the process may hold.
+    many = min(rng.choice((2, 40, 2000)), _LARGEST // (len(line) + 1) + 1)
+    lines[place : place + 1] = rng.choice(
+        ([], [line] * many, [b"  " + line], [line.lstrip()], [line, rng.choice(lines)])
+    )
     return b"\n".join(lines)
 
 
-_BYTE_STEPS: Final[tuple[Mutate, ...]] = (
-    *(_flip, _flip, _overwrite, _overwrite, _truncate, _double, _drop, _splice),
-)
+_BYTE_STEPS: Final[tuple[Mutate, ...]] = (_flip, _overwrite, _splice)
 _TEXT_STEPS: Final[tuple[Mutate, ...]] = (_number, _number, _fragment, _line)
 
 
@@ -219,33 +195,28 @@ def _yaml_tree(content: bytes) -> str:
 # Any: a tree of JSON values, changed wherever it is.
 def _changed_tree(text: str, rng: Random) -> bytes:
     tree: Any = {"": json.loads(text)}
-    places = _places(tree)
     raws: list[bytes] = []
     for _ in range(rng.randint(1, 3)):
-        container, key = rng.choice(places)
-        match rng.randrange(7):
-            case 0 | 1 | 2:
-                raws.append(rng.choice(_NUMBERS) or b"0")
-                container[key] = f"@{len(raws) - 1}@"
-            case 3:
-                other, other_key = rng.choice(places)
-                container[key] = json.loads(json.dumps(other[other_key]))
-            case 4 if isinstance(container, dict) and key:
-                container[rng.choice(("", "..", "a/b", "\0", "x" * 5000, key + " "))] = container[
-                    key
-                ]
-            case 5:
-                raws.append(rng.choice((b"[" * 50_000 + b"]" * 50_000, b"[" * 70 + b"]" * 70)))
-                container[key] = f"@{len(raws) - 1}@"
-            case _:
-                # A thousand times a thousand times a thousand would be the harness's own end.
-                count = rng.choice((0, 1, 5, 1000))
-                container[key] = [container[key]] * (5 if len(places) > _MANY_PLACES else count)
         places = _places(tree)
+        container, key = rng.choice(places)
+        kind = rng.randrange(6)
+        if kind < 3:
+            deep = (b"[" * 50_000 + b"]" * 50_000, b"[" * 70 + b"]" * 70)
+            raws.append(rng.choice((*_NUMBERS, *deep)) or b"0")
+            container[key] = f"@{len(raws) - 1}@"
+        elif kind == 3:
+            other, other_key = rng.choice(places)
+            container[key] = json.loads(json.dumps(other[other_key]))
+        elif kind == 4 and isinstance(container, dict) and key:
+            name = rng.choice(("", "..", "a/b", "\0", "x" * 5000, key + " "))
+            container[name] = container[key]
+        else:
+            # A thousand times a thousand times a thousand would be the harness's own end.
+            count = 5 if len(places) > _MANY_PLACES else rng.choice((0, 1, 5, 1000))
+            container[key] = [container[key]] * count
     dumped = json.dumps(tree[""]).encode()
     for index, raw in enumerate(raws):
-        most = max(1, _LONGEST // len(raw))
-        dumped = dumped.replace(f'"@{index}@"'.encode(), raw, most)
+        dumped = dumped.replace(f'"@{index}@"'.encode(), raw, max(1, _LONGEST // len(raw)))
     return dumped
 
 
