@@ -29,7 +29,9 @@ _WRITING = os.O_WRONLY | os.O_RDWR
 # Operations that are counted and then done, with what they do to their first argument.
 _SIMPLE = {
     **dict.fromkeys(("write", "pwrite", "ftruncate", "sendfile", "posix_fallocate"), "write"),
-    "pread": "read", "scandir": "look", "utime": "sync",
+    "pread": "read",
+    "scandir": "look",
+    "utime": "sync",
 }
 _NAMES = ("open", "fsync", "rename", "replace", "mkdir", "unlink", "rmdir", "link", *_SIMPLE)
 _REAL = {name: getattr(os, name) for name in _NAMES if hasattr(os, name)}

@@ -225,11 +225,13 @@ def _set_points(libe57: Any, file: Any, node: Any, fields: Mapping[str, Any]) ->
     for name, values in fields.items():
         array = np.ascontiguousarray(values, dtype=np.float64)
         kept.append(array)
-        if name.startswith(("cartesianX", "cartesianY", "cartesianZ")):
+        is_number = name.startswith(("cartesian", "spherical", "intensity"))
+        if name.startswith("cartesian") and name[-1] in "XYZ" and np.isfinite(array).all():
             # Scaled integers, as most scanners write them.
             raw = libe57.ScaledIntegerNode(image, 0, -(2**44), 2**44, 1e-6, 0.0)
-        elif name.startswith(("spherical", "intensity")) and not name.endswith("State"):
-            raw = libe57.FloatNode(image, 0.0, libe57.E57_DOUBLE, -1e9, 1e9)
+        elif is_number and not name.endswith("State"):
+            limits = (-1e9, 1e9) if np.isfinite(array).all() else ()
+            raw = libe57.FloatNode(image, 0.0, libe57.E57_DOUBLE, *limits)
         else:
             raw = libe57.IntegerNode(image, 0, 0, 2**20)
         prototype.set(name, raw)
