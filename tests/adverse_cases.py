@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from orthoflow.files.images import encode_png
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
-from orthoflow.products import Intrinsics, Photo, Ties, TieWall
+from orthoflow.products import Intrinsics, Photo, Ties
 from tests import samples
 from tests.scenes import SURVEY_SHIFT_M
 
@@ -121,13 +121,7 @@ def _ties_of(draft: _Draft) -> Ties:
         points_world=draft.points + shift,
         sigma_px=np.full(n, NOISE_PX),
         sigma_m=np.full(n, NOISE_M),
-        walls=(
-            TieWall(
-                gsd_m=GSD_M,
-                normal_world=(0.0, -1.0, 0.0),
-                corners_world=tuple(map(tuple, (_CORNERS + shift).tolist())),
-            ),
-        ),
+        walls=(samples.tie_wall(_CORNERS + shift, GSD_M),),
     )
 
 

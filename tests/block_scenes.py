@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.products import Photos, Ties, TieWall
+from orthoflow.products import Photos, Ties
 from orthoflow.testing import photographed as ms
 from tests import samples
 
@@ -78,11 +78,5 @@ def scan_ties(
         points_world=np.vstack(points) + shift,
         sigma_px=np.full(n_all, noise_px),
         sigma_m=np.full(n_all, noise_m),
-        walls=(
-            TieWall(
-                gsd_m=ms.GSD_M,
-                normal_world=(0.0, -1.0, 0.0),
-                corners_world=tuple(map(tuple, (SCENE.frame.corners_world() + shift).tolist())),
-            ),
-        ),
+        walls=(samples.tie_wall(SCENE.frame.corners_world() + shift, ms.GSD_M),),
     )

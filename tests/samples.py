@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from orthoflow.products import (
     Planes,
     SurfaceMask,
     Ties,
+    TieWall,
     Wall,
     Walls,
 )
@@ -142,3 +144,18 @@ def ties(pixels_photo: NDArray[np.float64], **known: Any) -> Ties:
         "residual_px": np.full((count, 2), np.nan),
     }
     return Ties(pixels_photo=pixels_photo, **{**plain, **known})
+
+
+def tie_wall(corners_world: NDArray[np.float64], gsd_m: float) -> TieWall:
+    """The wall of ties that looks to -y."""
+    return TieWall(
+        gsd_m=gsd_m,
+        normal_world=(0.0, -1.0, 0.0),
+        corners_world=tuple(map(tuple, corners_world.tolist())),
+    )
+
+
+def taken(ties: Ties, chosen: NDArray[np.bool_] | NDArray[np.intp] | slice) -> Ties:
+    """Some of the ties."""
+    arrays = {name: value for name, value in vars(ties).items() if isinstance(value, np.ndarray)}
+    return replace(ties, **{name: array[chosen] for name, array in arrays.items()})

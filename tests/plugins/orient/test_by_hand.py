@@ -13,17 +13,16 @@ from numpy.typing import NDArray
 from orthoflow_plugins.orient.bundle import OrientColmapBundle
 from orthoflow_plugins.orient.photos import pose_by_hand
 from orthoflow_plugins.orient.pnp import OrientPnp
-from orthoflow_plugins.orient.pose import TiedPhoto
+from orthoflow_plugins.orient.pose import Estimate, Start
 
-from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.resection import SeenPoints
-from orthoflow.products import Camera, Cameras, Intrinsics, Photos, TieRole, Ties, TieWall
-from orthoflow.sdk import StepContext
+from orthoflow.products import Camera, Cameras, Photos, TieRole, Ties
 from orthoflow.testing import photographed as ms
 from tests import samples
-from tests.plugins.orient.test_pnp import PIXEL, known_ties
+from tests import tied_photos as tp
+from tests.tied_photos import known_ties
 
-SCENE = ms.textured_wall(0)
+SCENE = tp.SCENE
 CAMERA = ms.camera_before(SCENE, centre=(1.3, -2.6, 1.1))
 SIGMA_PX = 1.0
 # Two rows of clicks as a person spreads them, in shares of the photo; the points lie on a relief.
@@ -58,28 +57,16 @@ def clicked(
         sigma_px=np.full(n, SIGMA_PX),
         sigma_m=np.full(n, 1e-4),
         by_hand=np.ones(n, np.uint8),
-        walls=(
-            TieWall(
-                gsd_m=ms.GSD_M,
-                normal_world=(0.0, -1.0, 0.0),
-                corners_world=tuple(map(tuple, SCENE.frame.corners_world().tolist())),
-            ),
-        ),
+        walls=(samples.tie_wall(SCENE.frame.corners_world(), ms.GSD_M),),
     )
 
 
 def joined(first: Ties, second: Ties) -> Ties:
-    arrays = ("photo", "wall", "pixels_photo", "points_world", "sigma_px", "sigma_m", "role")
-    by_hand = [
-        np.zeros(len(ties.photo), np.uint8) if ties.by_hand is None else ties.by_hand
-        for ties in (first, second)
-    ]
-    return replace(
-        first,
-        by_hand=np.concatenate(by_hand),
-        residual_px=np.concatenate([first.residual_px, second.residual_px]),
-        **{name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in arrays},
-    )
+    """All ties of both, the second ones measured by hand."""
+    pair = (replace(first, by_hand=np.zeros(len(first.photo), np.uint8)), second)
+    arrays = (name for name, value in vars(second).items() if isinstance(value, np.ndarray))
+    both = {name: np.concatenate([getattr(ties, name) for ties in pair]) for name in arrays}
+    return replace(first, **both)
 
 
 Orient = Callable[[Ties, Photos], tuple[Cameras, list[str]]]
@@ -90,15 +77,13 @@ def orient(request: pytest.FixtureRequest, tmp_path: Path) -> Orient:
     method = {"pnp": OrientPnp, "bundle": OrientColmapBundle}[request.param]
 
     def run(ties: Ties, photos: Photos) -> tuple[Cameras, list[str]]:
-        ctx = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
-        inputs = method.In(ties=ties, photos=photos)
-        return method().run(inputs, method.Params(), ctx).cameras, list(ctx.warnings)
+        ctx = tp.context(tmp_path)
+        return tp.oriented(method, ties, photos, ctx), list(ctx.warnings)
 
     return run
 
 
-def calibrated(camera: ViewingCamera = CAMERA) -> Photos:
-    return ms.photos(replace(PIXEL, intrinsics=Intrinsics.of(camera)))
+CALIBRATED = ms.photos(tp.photo(CAMERA))
 
 
 def error_share(found: Camera) -> float:
@@ -110,7 +95,7 @@ def error_share(found: Camera) -> float:
 def test_six_ties_orient_a_photo_within_what_their_sigma_says(orient: Orient) -> None:
     shares = []
     for seed in range(8):
-        cameras, _ = orient(clicked(seed), calibrated())
+        cameras, _ = orient(clicked(seed), CALIBRATED)
         assert cameras.cameras[0].status == "ok", seed
         shares.append(error_share(cameras.cameras[0]))
         assert cameras.ties is not None
@@ -125,7 +110,7 @@ def test_a_gross_blunder_among_eight_is_left_out_or_refused(orient: Orient, size
     for seed in range(3):
         angle = seed * 2.1
         blunder = size_px * np.array([np.cos(angle), np.sin(angle)])
-        cameras, warnings = orient(clicked(seed, n=8, blunder=blunder), calibrated())
+        cameras, warnings = orient(clicked(seed, n=8, blunder=blunder), CALIBRATED)
         found = cameras.cameras[0]
         assert cameras.ties is not None
         if found.status == "ok":
@@ -142,18 +127,18 @@ def test_ties_that_hang_on_one_of_them_are_refused(orient: Orient) -> None:
     # Five in a corner and one far away: the error that they predict is small, but were that one
     # wrong, the pose without it would be worth little.
     corner = ((0.06, 0.1), (0.2, 0.1), (0.06, 0.3), (0.2, 0.3), (0.13, 0.2))
-    hanging = orient(clicked(3, places=(*corner, (0.95, 0.9))), calibrated())[0].cameras[0]
+    hanging = orient(clicked(3, places=(*corner, (0.95, 0.9))), CALIBRATED)[0].cameras[0]
     # The reason names the pixel of that tie.
     assert re.search(r"\(u 8\d\d, v 5\d\d\)", hanging.status)
     far = ((0.95, 0.9), (0.9, 0.2))
-    held = orient(clicked(3, places=(*corner, *far)), calibrated())[0].cameras[0]
+    held = orient(clicked(3, places=(*corner, *far)), CALIBRATED)[0].cameras[0]
     assert held.status == "ok"
 
 
 def test_ties_by_hand_join_those_that_matching_found(orient: Orient) -> None:
     matched = known_ties(CAMERA, 5, n=120, wrong_share=0.2)
-    alone = orient(clicked(1), calibrated())[0].cameras[0]
-    both, _ = orient(joined(matched, clicked(1)), calibrated())
+    alone = orient(clicked(1), CALIBRATED)[0].cameras[0]
+    both, _ = orient(joined(matched, clicked(1)), CALIBRATED)
     found = both.cameras[0]
     assert found.status == "ok"
     assert found.sigma_wall_m is not None
@@ -169,27 +154,16 @@ def test_ties_by_hand_join_those_that_matching_found(orient: Orient) -> None:
 def test_ties_by_hand_stand_against_a_repeated_motif(orient: Orient) -> None:
     # Matching took the next window for this one: 120 ties agree with a pose 0.4 m beside.
     beside = known_ties(CAMERA, 5, n=120, shift_m=np.array([0.4, 0.0, 0.0]))
-    wrong = orient(beside, calibrated())[0].cameras[0]
+    wrong = orient(beside, CALIBRATED)[0].cameras[0]
     assert wrong.status == "ok"
     assert ms.wall_error_m(SCENE, wrong.viewing(), CAMERA) > 0.2
-    cameras, _ = orient(joined(replace(beside, walls=clicked(1).walls), clicked(1)), calibrated())
+    cameras, _ = orient(joined(replace(beside, walls=clicked(1).walls), clicked(1)), CALIBRATED)
     assert cameras.cameras[0].status == "ok"
     assert error_share(cameras.cameras[0]) < 3.0
 
 
 def test_fewer_than_six_are_ordinary_ties(orient: Orient) -> None:
-    ties = clicked(1)
-    five = replace(
-        ties,
-        **{
-            name: getattr(ties, name)[:5]
-            for name in ("photo", "wall", "pixels_photo", "points_world", "sigma_px", "sigma_m")
-        },
-        role=ties.role[:5],
-        residual_px=ties.residual_px[:5],
-        by_hand=np.ones(5, np.uint8),
-    )
-    (found,) = orient(five, calibrated())[0].cameras
+    (found,) = orient(clicked(1, n=5), CALIBRATED)[0].cameras
     assert found.status.startswith("5 ties with the walls")
 
 
@@ -205,15 +179,9 @@ def by(points: NDArray[np.float64]) -> SeenPoints:
     )
 
 
-def tied(seen: SeenPoints, measured: np.ndarray) -> TiedPhoto:
-    return TiedPhoto(
-        photo=calibrated().photos[0],
-        chosen=np.arange(len(seen)),
-        seen=seen,
-        is_check=np.zeros(len(seen), dtype=np.bool_),
-        by_hand=measured,
-        seed=1,
-    )
+def by_hand(seen: SeenPoints) -> tuple[Estimate, Start] | str:
+    everyone = np.ones(len(seen), dtype=np.bool_)
+    return pose_by_hand(tp.tied(tp.photo(CAMERA), seen, by_hand=everyone))
 
 
 @pytest.mark.parametrize(("chance", "fits"), [(0.0012, True), (0.0008, False)])
@@ -227,13 +195,12 @@ def test_right_ties_are_called_contradictory_once_in_a_thousand_photos(
     points = rng.uniform([0.9, -0.2, 0.7], [1.8, 0.2, 1.5], (6, 3))
     seen = replace(by(points), sigma_m=np.zeros(6))
     seen.pixels_photo[:] += rng.normal(size=(6, 2))
-    everyone = np.ones(6, dtype=np.bool_)
-    found = pose_by_hand(tied(replace(seen, sigma_px=np.full(6, 3.0)), everyone))
+    found = by_hand(replace(seen, sigma_px=np.full(6, 3.0)))
     assert not isinstance(found, str)
     # In pixels, as none of the residuals is so small by luck that it is taken as larger.
     squares = float((found[0].fit.residuals_px ** 2).sum())
     sigma_px = np.full(6, np.sqrt(squares / stats.chi2.isf(chance, 6)))
-    found = pose_by_hand(tied(replace(seen, sigma_px=sigma_px), everyone))
+    found = by_hand(replace(seen, sigma_px=sigma_px))
     assert isinstance(found, str) != fits
 
 
@@ -247,7 +214,6 @@ def test_a_small_plate_seen_from_afar_may_be_turned_either_way(relief_m: float) 
     along = across * np.cos(turn) - relief * np.sin(turn)
     away = across * np.sin(turn) + relief * np.cos(turn)
     points = np.array([1.3, 0.0, 1.1]) + np.stack([along, away, up], axis=1)
-    seen = by(points)
-    reason = pose_by_hand(tied(seen, np.ones(9, dtype=np.bool_)))
+    reason = by_hand(by(points))
     assert isinstance(reason, str)
     assert reason.startswith("two poses")

@@ -75,14 +75,10 @@ def block_of(
 @pytest.mark.parametrize(
     ("names", "off", "distortion_off"),
     [
-        ((), {}, (0.0, 0.0, 0.0, 0.0)),
+        ((), {}, (0.0,) * 4),
         # The ratio of both focal lengths stays as it is believed.
-        (("focal",), {"fx": 1.02, "fy": 1.02}, (0.0, 0.0, 0.0, 0.0)),
-        (("focal", "aspect"), {"fx": 1.03, "fy": 0.99}, (0.0, 0.0, 0.0, 0.0)),
-        (("focal", "centre_px"), {"fx": 1.01, "fy": 1.01, "cx": 1.01, "cy": 0.98}, (0.0,) * 4),
+        (("focal",), {"fx": 1.02, "fy": 1.02}, (0.0,) * 4),
         (("k1",), {}, (0.02, 0.0, 0.0, 0.0)),
-        (("k1", "k2"), {}, (0.02, -0.02, 0.0, 0.0)),
-        (("tangential",), {}, (0.0, 0.0, 5e-4, -7e-4)),
         (
             ("focal", "aspect", "centre_px", "k1", "k2", "tangential"),
             {"fx": 1.02, "fy": 1.01, "cx": 1.01, "cy": 0.99},
@@ -105,22 +101,11 @@ def test_what_is_free_of_a_lens_is_found_and_the_rest_stays(
         np.testing.assert_allclose(found.rotation @ found.rotation.T, np.eye(3), atol=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("name", "off", "distortion_off"),
-    [
-        ("focal", {"fx": 1.02, "fy": 1.02}, (0.0,) * 4),
-        ("centre_px", {"cx": 1.02, "cy": 0.98}, (0.0,) * 4),
-        ("k1", {}, (0.02, 0.0, 0.0, 0.0)),
-        ("k2", {}, (0.0, 0.02, 0.0, 0.0)),
-        ("tangential", {}, (0.0, 0.0, 5e-4, 5e-4)),
-    ],
-)
-def test_what_is_known_of_a_lens_beforehand_holds_it(
-    name: str, off: dict[str, float], distortion_off: tuple[float, ...]
-) -> None:
-    believed = {key: off.get(key, 1.0) * value for key, value in TRUE.items()}
-    distortion = DISTORTION + np.array([*distortion_off, 0.0])
-    sure = freedom(name, times=1e-6)
+def test_what_is_known_of_a_lens_beforehand_holds_it() -> None:
+    off = {"fx": 1.02, "fy": 1.02, "cx": 1.02, "cy": 0.98}
+    believed = {key: off[key] * value for key, value in TRUE.items()}
+    distortion = DISTORTION + np.array([0.02, 0.02, 5e-4, 5e-4, 0.0])
+    sure = freedom("focal", "centre_px", "k1", "k2", "tangential", times=1e-6)
     found = solve(block_of(believed, distortion, sure), soft_limit=3.0).cameras[0]
     for key, value in believed.items():
         assert getattr(found, key) == pytest.approx(value, abs=0.01), key

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,100 +12,81 @@ from numpy.typing import NDArray
 from orthoflow_plugins.orient.dlt import (
     Distortion,
     OrientDlt,
+    direct_linear,
     estimate_dlt,
+    relief,
 )
 from orthoflow_plugins.orient.gates import known_walls, wall_error
-from orthoflow_plugins.orient.pose import Estimate, TiedPhoto
+from orthoflow_plugins.orient.pose import Estimate
 
+from orthoflow.errors import GeometryError
 from orthoflow.files.images import encode_png
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
+from orthoflow.geometry.frames import rotation_from_vector
 from orthoflow.geometry.resection import SeenPoints
-from orthoflow.products import Cameras, Photo, Photos, Ties, TieWall
-from orthoflow.sdk import StepContext
+from orthoflow.products import Photo, Ties
 from orthoflow.testing import photographed as ms
 from tests import samples
+from tests import tied_photos as tp
 from tests.long_loops import seeds
+from tests.tied_photos import context
 
 SIZE_PX = (4000, 3000)
 # A grey photo: what it shows is in the ties.
 ENCODED = encode_png(np.zeros((SIZE_PX[1] // 10, SIZE_PX[0] // 10), np.uint8))
+CENTRE = np.array([0.15, -2.6, 0.1])
+orient = partial(tp.oriented, OrientDlt)
 
 
-def camera(*, k1: float = -0.08, full: bool = False) -> ViewingCamera:
+def camera(*coefficients: float, skew: float = 0.0) -> ViewingCamera:
     """A wide camera 2.6 m before the middle of a wall in the plane y = 0."""
-    centre = np.array([0.15, -2.6, 0.1])
-    rotation = looking_at(centre, np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]))
     return samples.camera(
-        rotation,
-        centre,
+        looking_at(CENTRE, np.zeros(3), samples.UP),
+        CENTRE,
         width=SIZE_PX[0],
         height=SIZE_PX[1],
         fx=3200.0,
         fy=3204.0,
         cx=2012.0,
         cy=1490.0,
-        distortion=np.array([k1, 0.03, 4e-4, -3e-4, 0.0] if full else [k1, 0.0, 0.0, 0.0, 0.0]),
+        distortion=np.pad(np.array(coefficients, dtype=np.float64), (0, 5 - len(coefficients))),
+        skew=skew,
     )
 
 
-def points_in_view(
-    viewer: ViewingCamera, n: int, *, relief_m: float, rng: np.random.Generator
+DISTORTED = camera(-0.08)
+
+
+def photo(exif_focal_px: float = 3150.0) -> Photo:
+    return tp.photo(
+        encoded=ENCODED, width=SIZE_PX[0], height=SIZE_PX[1], exif_focal_px=exif_focal_px
+    )
+
+
+def points_behind(
+    viewer: ViewingCamera, pixels: NDArray[np.float64], depth_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Points all over the photo, up to `relief_m` before the wall."""
-    pixels = rng.uniform([0.0, 0.0], SIZE_PX, (n, 2))
+    """Points at pixels, so far before the wall."""
     rays = viewer.rays_world(pixels)
-    depth = -relief_m * rng.random(n)
-    reach = (depth - viewer.centre_world[1]) / rays[:, 1]
+    reach = (-depth_m - viewer.centre_world[1]) / rays[:, 1]
     return viewer.centre_world + reach[:, None] * rays
 
 
 def ties_of(
-    viewer: ViewingCamera,
-    seed: int,
-    *,
-    n: int = 300,
-    relief_m: float = 0.12,
-    noise_px: float = 1.5,
-    noise_m: float = 0.0,
+    viewer: ViewingCamera, seed: int, *, relief_m: float = 0.12, noise_px: float = 1.5
 ) -> Ties:
+    """Three hundred ties all over the photo, on a relief of the wall."""
     rng = np.random.default_rng(seed)
-    points = points_in_view(viewer, n, relief_m=relief_m, rng=rng)
-    pixels = viewer.project(points)[:, :2] + noise_px * rng.normal(size=(n, 2))
-    half = (1.9, 1.5)
+    pixels = rng.uniform([0.0, 0.0], SIZE_PX, (300, 2))
+    points = points_behind(viewer, pixels, relief_m * rng.random(300))
+    corners = np.array([[-1.9, 0, 1.5], [-1.9, 0, -1.5], [1.9, 0, -1.5], [1.9, 0, 1.5]])
     return samples.ties(
-        pixels,
-        points_world=points + noise_m * rng.normal(size=points.shape),
-        sigma_px=np.full(n, max(noise_px, 0.01)),
-        sigma_m=np.full(n, max(noise_m, 1e-5)),
-        walls=(
-            TieWall(
-                gsd_m=0.003,
-                normal_world=(0.0, -1.0, 0.0),
-                corners_world=(
-                    (-half[0], 0.0, half[1]),
-                    (-half[0], 0.0, -half[1]),
-                    (half[0], 0.0, -half[1]),
-                    (half[0], 0.0, half[1]),
-                ),
-            ),
-        ),
+        viewer.project(points)[:, :2] + noise_px * rng.normal(size=(300, 2)),
+        points_world=points,
+        sigma_px=np.full(300, noise_px),
+        sigma_m=np.full(300, 1e-5),
+        walls=(samples.tie_wall(corners, 0.003),),
     )
-
-
-def photos() -> Photos:
-    photo = Photo(
-        name="a.png", encoded=ENCODED, width=SIZE_PX[0], height=SIZE_PX[1], exif_focal_px=3150.0
-    )
-    return ms.photos(photo)
-
-
-def context(tmp_path: Path) -> StepContext:
-    return StepContext(rng=np.random.default_rng(1), cores=2, scratch=tmp_path)
-
-
-def orient(ties: Ties, ctx: StepContext, **params: object) -> Cameras:
-    inputs = OrientDlt.In(ties=ties, photos=photos())
-    return OrientDlt().run(inputs, OrientDlt.Params(**params), ctx).cameras
 
 
 def frame_errors_px(found: ViewingCamera, true: ViewingCamera) -> NDArray[np.float64]:
@@ -120,56 +102,42 @@ def frame_errors_px(found: ViewingCamera, true: ViewingCamera) -> NDArray[np.flo
 def test_eleven_parameters_miss_the_corners_of_a_distorted_photo_by_ten_pixels(
     tmp_path: Path, seed: int
 ) -> None:
-    true = camera()
     ctx = context(tmp_path)
     gates = {"max_sigma_wall_cells": 50.0, "max_sigma_corner_cells": 500.0}
-    found = orient(ties_of(true, seed), ctx, **gates).cameras[0]
+    found = orient(ties_of(DISTORTED, seed), ms.photos(photo()), ctx, **gates).cameras[0]
     assert found.status == "ok"
-    assert frame_errors_px(found.viewing(), true).max() >= 10.0
+    assert frame_errors_px(found.viewing(), DISTORTED).max() >= 10.0
     assert "dlt-without-distortion" in [each.code for each in ctx.diagnostics]
 
 
 @pytest.mark.parametrize("seed", seeds(3))
 @pytest.mark.parametrize(
-    ("distortion", "full", "most_px", "rms_px"),
-    [("k1", False, 4.0, 0.7), ("k1 k2 p1 p2", True, 4.0, 0.7)],
+    ("distortion", "true"),
+    [("k1", DISTORTED), ("k1 k2 p1 p2", camera(-0.08, 0.03, 4e-4, -3e-4))],
     ids=["k1", "k1 k2 p1 p2"],
 )
 def test_with_distortion_the_corners_are_right(
-    tmp_path: Path, seed: int, distortion: str, full: bool, most_px: float, rms_px: float
+    tmp_path: Path, seed: int, distortion: str, true: ViewingCamera
 ) -> None:
-    true = camera(full=full)
-    found = orient(ties_of(true, seed), context(tmp_path), distortion=distortion).cameras[0]
+    ties = ties_of(true, seed)
+    found = orient(ties, ms.photos(photo()), context(tmp_path), distortion=distortion).cameras[0]
     assert found.status == "ok"
     errors = frame_errors_px(found.viewing(), true)
-    assert errors.max() <= most_px
-    assert np.sqrt(np.mean(errors**2)) <= rms_px
+    assert errors.max() <= 4.0
+    assert np.sqrt(np.mean(errors**2)) <= 0.7
 
 
 @pytest.mark.parametrize("distortion", ["none", "k1"])
 def test_a_lens_with_more_distortion_than_the_model_has_is_stated_wider(
     distortion: Distortion,
 ) -> None:
-    true = replace(camera(), distortion=np.array([-0.08, 0.02, 0.0, 0.0, 0.0]))
+    true = camera(-0.08, 0.02)
     params = OrientDlt.Params(distortion=distortion)
     ratios, at_worst = [], []
     for seed in range(6):
         ties = ties_of(true, seed, noise_px=0.7)
-        seen = SeenPoints(
-            pixels_photo=ties.pixels_photo,
-            points_world=ties.points_world,
-            sigma_px=ties.sigma_px,
-            sigma_m=ties.sigma_m,
-        )
-        is_check = np.arange(len(seen)) % 5 == 0
-        tied = TiedPhoto(
-            photo=photos().photos[0],
-            chosen=np.arange(len(seen)),
-            seen=seen,
-            is_check=is_check,
-            by_hand=np.zeros(len(seen), dtype=np.bool_),
-            seed=1,
-        )
+        seen = tp.seen_of(ties)
+        tied = tp.tied(photo(), seen, is_check=np.arange(len(seen)) % 5 == 0)
         found = estimate_dlt(tied, params)
         assert isinstance(found, Estimate)
         stated = wall_error(found.resection, known_walls(ties, np.ones(len(seen), np.bool_)))
@@ -184,27 +152,131 @@ def test_a_lens_with_more_distortion_than_the_model_has_is_stated_wider(
 
 
 def test_control_points_in_a_plane_are_refused(tmp_path: Path) -> None:
-    found = orient(ties_of(camera(), 1, relief_m=0.0), context(tmp_path), distortion="k1")
+    flat = ties_of(DISTORTED, 1, relief_m=0.0)
+    found = orient(flat, ms.photos(photo()), context(tmp_path), distortion="k1")
     assert "within 0.0 mm (RMS) of one plane" in found.cameras[0].status
 
 
 def test_without_a_prior_what_exif_says_does_not_matter(tmp_path: Path) -> None:
-    ties = ties_of(camera(), 2)
-    found = {}
+    ties, found = ties_of(DISTORTED, 2), {}
     for prior in ("lens", "none"):
         for focal_px in (3150.0, 900.0):
-            photo = replace(photos().photos[0], exif_focal_px=focal_px)
-            (folder := tmp_path / f"{prior}-{focal_px:g}").mkdir()
-            inputs = OrientDlt.In(ties=ties, photos=ms.photos(photo))
-            params = OrientDlt.Params(distortion="k1", prior=prior)
-            cameras = OrientDlt().run(inputs, params, context(folder)).cameras
-            found[prior, focal_px] = cameras.cameras[0]
-    assert found["lens", 3150.0].status == "ok"
+            photos = ms.photos(photo(focal_px))
+            settings = {"distortion": "k1", "prior": prior}
+            cameras = orient(ties, photos, context(tmp_path), **settings).cameras
+            found[prior, focal_px] = cameras[0]
     # The ties contradict the wrong focal length, so it is not used.
-    assert found["lens", 900.0].status == "ok"
+    assert {camera.status for camera in found.values()} == {"ok"}
     first, second = found["none", 3150.0], found["none", 900.0]
-    assert first.status == "ok"
     np.testing.assert_array_equal(
         first.translation_camera_from_world, second.translation_camera_from_world
     )
-    assert frame_errors_px(first.viewing(), camera()).max() <= 4.0
+    assert frame_errors_px(first.viewing(), DISTORTED).max() <= 4.0
+
+
+# --- eleven parameters and how much control they need ---
+
+
+def seen_by(
+    viewer: ViewingCamera, n: int, *, relief_m: float = 0.3, sigma_m: float = 1e-5
+) -> SeenPoints:
+    """Exact ties all over the photo, on two planes so far apart."""
+    pixels = np.random.default_rng(1).uniform([100.0, 100.0], [3900.0, 2900.0], (n, 2))
+    depth = np.where(np.arange(n) % 2 == 0, 0.0, relief_m)
+    return SeenPoints(
+        pixels_photo=pixels,
+        points_world=points_behind(viewer, pixels, depth),
+        sigma_px=np.full(n, 0.5),
+        sigma_m=np.full(n, sigma_m),
+    )
+
+
+def estimated(
+    viewer: ViewingCamera,
+    seen: SeenPoints,
+    *,
+    distortion: Distortion = "none",
+    keeps_skew: bool = False,
+    is_check: NDArray[np.bool_] | None = None,
+) -> Estimate | str:
+    known = tp.photo(viewer, width=SIZE_PX[0], height=SIZE_PX[1])
+    params = OrientDlt.Params(distortion=distortion, skew=keeps_skew)
+    return estimate_dlt(tp.tied(known, seen, is_check=is_check), params)
+
+
+def test_a_projection_matrix_comes_apart_into_what_it_was_made_of() -> None:
+    rng = np.random.default_rng(0)
+    rotation = rotation_from_vector(rng.normal(size=3))
+    translation = rng.normal(size=3)
+    lens = np.array([[3000.0, 25.0, 2010.0], [0.0, 2800.0, 1480.0], [0.0, 0.0, 1.0]])
+    # In front of the camera, five metres away and more.
+    local = rng.uniform([-2.0, -2.0, 5.0], [2.0, 2.0, 9.0], (12, 3))
+    points = (local - translation) @ rotation
+    matrix = lens @ np.column_stack([rotation, translation])
+    pixels = (homogeneous := np.column_stack([points, np.ones(12)]) @ matrix.T)[:, :2]
+    pixels /= homogeneous[:, 2:]
+    found = direct_linear(pixels, points, SIZE_PX)[0]
+    np.testing.assert_allclose(found.rotation, rotation, atol=1e-7)
+    np.testing.assert_allclose(found.translation, translation, atol=1e-6)
+    assert (found.fx, found.fy) == pytest.approx((3000.0, 2800.0))
+    assert (found.cx, found.cy, found.skew) == pytest.approx((2010.0, 1480.0, 25.0))
+    assert (found.width, found.height) == SIZE_PX
+    # Mirrored in the projection centre, the points have the same pixels, and lie behind it.
+    behind = (-local - translation) @ rotation
+    with pytest.raises(GeometryError, match="puts the points behind the camera"):
+        direct_linear(pixels, behind, SIZE_PX)
+
+
+@pytest.mark.parametrize(
+    ("distortion", "keeps_skew", "least"),
+    [
+        ("none", False, 12),
+        ("none", True, 13),
+        ("k1", False, 16),
+        ("k1 k2 p1 p2", False, 24),
+        ("k1 k2 p1 p2", True, 25),
+    ],
+)
+def test_a_richer_lens_needs_more_control(
+    distortion: Distortion, keeps_skew: bool, least: int
+) -> None:
+    def found(n: int, n_check: int = 0) -> Estimate | str:
+        seen, is_check = seen_by(camera(), n), np.arange(n) < n_check
+        options = {"distortion": distortion, "keeps_skew": keeps_skew, "is_check": is_check}
+        return estimated(camera(), seen, **options)
+
+    assert isinstance(found(least), Estimate)
+    assert isinstance(found(least - 1), str)
+    # Check points are no control points.
+    assert isinstance(found(least, n_check=1), str)
+
+
+@pytest.mark.parametrize(("sigma_m", "is_enough"), [(0.0048, True), (0.0053, False)])
+def test_relief_must_be_ten_deviations_of_the_points(sigma_m: float, is_enough: bool) -> None:
+    viewer = camera()
+    # Two planes 10 cm apart: 5 cm from the one between them, nearly.
+    seen = seen_by(viewer, 80, relief_m=0.1, sigma_m=sigma_m)
+    assert relief(seen.points_world)[0] == pytest.approx(0.05, rel=0.02)
+    found = estimated(viewer, seen)
+    assert isinstance(found, Estimate) == is_enough
+    if isinstance(found, str):
+        assert "a DLT needs 10 times as much relief" in found
+
+
+def test_skew_is_given_whether_it_is_kept_or_not() -> None:
+    viewer = camera(skew=4.0)
+    seen = seen_by(viewer, 60)
+    for keeps_skew, kept_px in ((True, 4.0), (False, 0.0)):
+        found = estimated(replace(viewer, skew=0.0), seen, keeps_skew=keeps_skew)
+        assert isinstance(found, Estimate)
+        assert found.numbers["skew_px"] == pytest.approx(4.0, abs=0.1)
+        assert found.resection.camera.skew == pytest.approx(kept_px, abs=0.1)
+
+
+def test_five_points_and_points_in_one_place_determine_no_camera() -> None:
+    seen = seen_by(camera(), 6)
+    direct_linear(seen.pixels_photo, seen.points_world, SIZE_PX)
+    with pytest.raises(GeometryError, match="needs six points, got 5"):
+        direct_linear(seen.pixels_photo[:5], seen.points_world[:5], SIZE_PX)
+    with pytest.raises(GeometryError, match="lie in one place"):
+        direct_linear(seen.pixels_photo, np.ones((6, 3)), SIZE_PX)

@@ -6,7 +6,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -22,14 +21,7 @@ from orthoflow_plugins.orient.report import (
 from orthoflow.files.drawing import COLUMN_INCHES
 from orthoflow.files.images import decode_image, encode_png
 from orthoflow.products import Camera, Photo, TieRole
-from orthoflow.sdk import StepContext
-
-
-def of_residuals(name: str, values: NDArray[np.float64], role: NDArray[np.uint8]) -> Oriented:
-    chosen = np.arange(len(role))
-    return Oriented(
-        camera=Camera(photo=name, status="ok"), chosen=chosen, role=role, residuals_px=values
-    )
+from tests.tied_photos import context
 
 
 def residuals(name: str, n: int, seed: int, *, shift_px: float = 0.0) -> Oriented:
@@ -38,24 +30,11 @@ def residuals(name: str, n: int, seed: int, *, shift_px: float = 0.0) -> Oriente
     role[-1] = TieRole.REJECTED
     values = rng.normal(shift_px, 0.5, (n, 2))
     values[-1] = 1e6
-    return of_residuals(name, values, role)
+    camera = Camera(photo=name, status="ok")
+    return Oriented(camera=camera, chosen=np.arange(n), role=role, residuals_px=values)
 
 
 # --- ties on photos ---
-
-
-@pytest.fixture
-def pictures(monkeypatch: pytest.MonkeyPatch) -> list[NDArray[np.uint8]]:
-    """Pictures as they are before a frame is drawn around them."""
-    kept: list[NDArray[np.uint8]] = []
-    framed = report.picture_figure
-
-    def keep(picture: NDArray[np.uint8], **settings: Any) -> Any:
-        kept.append(picture)
-        return framed(picture, **settings)
-
-    monkeypatch.setattr(report, "picture_figure", keep)
-    return kept
 
 
 def photo_of(image: NDArray[np.uint8], name: str = "west/a b.jpg") -> Photo:
@@ -64,42 +43,38 @@ def photo_of(image: NDArray[np.uint8], name: str = "west/a b.jpg") -> Photo:
 
 @pytest.mark.parametrize("scale", [1.0, 0.5])
 def test_ties_are_marked_on_a_dimmed_photo_in_the_colour_of_their_role(
-    scale: float,
-    drawings: dict[str, Any],
-    pictures: list[NDArray[np.uint8]],
-    tmp_path: Path,
+    scale: float, drawings: dict[str, Any], tmp_path: Path
 ) -> None:
-    context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
     image = np.full((round(300 / scale), round(900 / scale), 3), 200, dtype=np.uint8)
     at = np.array([[100.5, 50.5], [400.5, 100.5], [700.5, 250.5]])
     role = np.array([TieRole.CONTROL, TieRole.CHECK, TieRole.REJECTED], dtype=np.uint8)
-    draw_ties(context, photo_of(image), at / scale, role, "ok")
-    drawn = decode_image(drawings["ties_west-a-b"](), "ties")
-    assert drawn.shape[1] == 1003
-    (shown,) = pictures
+    draw_ties(context(tmp_path), photo_of(image), at / scale, role, "ok")
+    drawn = drawings["ties_west-a-b"]
+    assert decode_image(drawn(), "ties").shape[1] == 1003
+    shown, counts = drawn.args
+    assert list(counts.values()) == [1, 1, 1]
     assert shown.shape == (300, 900, 3)
     colours = [(40, 200, 60), (250, 220, 40), (220, 40, 40)]
-    expected = np.full((300, 900, 3), 140, dtype=np.uint8)
     for (u, v), colour in zip(((100, 50), (400, 100), (700, 250)), colours, strict=True):
-        cv2.circle(expected, (u, v), 2, colour, -1, cv2.LINE_AA)
-        assert tuple(shown[v, u]) == colour
-        assert tuple(shown[v, u + 4]) == (140, 140, 140)
-    # Marks have sixteenths of a pixel, these stand on whole ones.
-    assert np.abs(shown.astype(int) - expected).max() <= 2
+        # Discs of two pixels about their centres.
+        for du, dv in ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)):
+            assert tuple(shown[v + dv, u + du]) == colour
+        for du, dv in ((4, 0), (-4, 0), (0, 4), (0, -4)):
+            assert tuple(shown[v + dv, u + du]) == (140, 140, 140)
 
 
 def test_photos_of_one_stem_have_figures_of_their_own_and_no_more_than_enough(
     tmp_path: Path,
 ) -> None:
-    context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
+    ctx = context(tmp_path)
     image = np.zeros((4, 6, 3), dtype=np.uint8)
     nothing = np.empty((0, 2)), np.empty(0, dtype=np.uint8)
     for name in ("a.jpg", "a.tif", "noending"):
-        draw_ties(context, photo_of(image, name), *nothing, "ok")
-    assert [figure.name for figure in context.figures] == ["ties_a", "ties_a-1", "ties_noending"]
+        draw_ties(ctx, photo_of(image, name), *nothing, "ok")
+    assert [figure.name for figure in ctx.figures] == ["ties_a", "ties_a-1", "ties_noending"]
     for k in range(30):
-        draw_ties(context, photo_of(image, f"{k}.jpg"), *nothing, "ok")
-    assert len(context.figures) == 24
+        draw_ties(ctx, photo_of(image, f"{k}.jpg"), *nothing, "ok")
+    assert len(ctx.figures) == 24
 
 
 # --- predicted errors ---
@@ -108,7 +83,6 @@ def test_photos_of_one_stem_have_figures_of_their_own_and_no_more_than_enough(
 def test_the_map_of_a_wall_shows_the_photo_that_knows_each_place_best(
     drawings: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
     corners = np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 0.0], [9.0, 0.0, 0.0], [9.0, 0.0, 2.0]])
     normal = np.array([0.0, -1.0, 0.0])
     wall = SimpleNamespace(index=3, number=8, name="floor 8", corners_world=corners, normal=normal)
@@ -127,7 +101,7 @@ def test_the_map_of_a_wall_shows_the_photo_that_knows_each_place_best(
     candidates: Any = [
         SimpleNamespace(known=(wall, hidden), estimate=SimpleNamespace(resection=k)) for k in (1, 2)
     ]
-    draw_wall_errors(context, candidates)
+    draw_wall_errors(context(tmp_path), candidates)
     # Nobody sees the other wall.
     assert list(drawings) == ["wall_8_predicted_error"]
     best = np.minimum(first, np.where(np.isnan(second), np.inf, second))
@@ -140,11 +114,6 @@ def test_the_map_of_a_wall_shows_the_photo_that_knows_each_place_best(
     assert drawn.keywords == {"low": 0.0, "high": 10.0}
     assert 5.0 < 1e3 * high <= 10.0
     assert decode_image(drawn(), "map").shape[1] == 1003
-    # No more pictures than enough.
-    drawings.clear()
-    monkeypatch.setattr(report, "_MAX_FIGURES", 0)
-    draw_wall_errors(context, candidates)
-    assert not drawings
 
 
 # --- where photos were taken ---
@@ -153,7 +122,6 @@ def test_the_map_of_a_wall_shows_the_photo_that_knows_each_place_best(
 def test_photos_stand_before_the_wall_and_look_at_it(
     drawings: dict[str, Any], tmp_path: Path
 ) -> None:
-    context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
     corners = np.array([[1.0, 0.0, 2.0], [1.0, 0.0, 0.0], [9.0, 0.0, 0.0], [9.0, 0.0, 2.0]])
     wall = SimpleNamespace(
         index=0, number=0, corners_world=corners, normal=np.array([0.0, -1.0, 0.0])
@@ -170,7 +138,7 @@ def test_photos_stand_before_the_wall_and_look_at_it(
             photo=SimpleNamespace(name="a.jpg"),
         )
     ]
-    draw_positions(context, candidates)
+    draw_positions(context(tmp_path), candidates)
     above, facing = drawings["positions"].axes
     (name,) = facing.texts
     assert name.get_text() == "a.jpg"
@@ -192,11 +160,10 @@ def test_photos_stand_before_the_wall_and_look_at_it(
 def test_residuals_of_all_photos_are_counted_by_role_and_coordinate(
     drawings: dict[str, Any], tmp_path: Path
 ) -> None:
-    context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
     photos = [residuals(f"{k}.jpg", 300, k, shift_px=k - 1.0) for k in range(3)]
     # Unknown ones are left out.
     photos[0].residuals_px[1] = np.nan
-    draw_residuals(context, photos)
+    draw_residuals(context(tmp_path), photos)
     pooled = drawings["residuals"]
     assert pooled.get_size_inches()[0] == pytest.approx(COLUMN_INCHES)
     panels = np.array(pooled.axes).reshape(2, 2)
@@ -221,9 +188,8 @@ def test_residuals_of_all_photos_are_counted_by_role_and_coordinate(
 
 
 def test_the_density_of_residuals_shows_lobes(drawings: dict[str, Any], tmp_path: Path) -> None:
-    context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
     photos = [residuals(f"{k}.jpg", 400, k, shift_px=3.0 * k) for k in range(2)]
-    draw_residuals(context, photos)
+    draw_residuals(context(tmp_path), photos)
     normal, density = drawings["residuals"].axes[0].lines
 
     def n_peaks(line: Any) -> int:

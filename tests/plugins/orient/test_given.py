@@ -13,22 +13,20 @@ from orthoflow_plugins.read.cameras import ReadCameras
 from orthoflow.errors import InputError, MethodError
 from orthoflow.files.colmap import write_colmap_model
 from orthoflow.files.publishing import publish_cameras
-from orthoflow.products import Camera, Cameras, InputFiles, Intrinsics, Photos, Ties
-from orthoflow.sdk import StepContext
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.products import Camera, Cameras, InputFiles, Intrinsics, Photo, Photos, Ties
 from orthoflow.testing import photographed as ms
+from tests import samples
 from tests.plugins.orient.test_by_hand import CAMERA, SCENE, clicked, error_share
-from tests.plugins.orient.test_pnp import PIXEL
+from tests.tied_photos import context, photo
 
 WALLS = ms.walls_of(SCENE)
-PHOTOS = ms.photos(PIXEL)
+PHOTO = photo()
+PHOTOS = ms.photos(PHOTO)
 
 
-def context(folder: Path) -> StepContext:
-    return StepContext(rng=np.random.default_rng(1), cores=1, scratch=folder)
-
-
-def oriented(camera: object = CAMERA, *, name: str = "a.png") -> Cameras:
-    return ms.cameras(ms.oriented(camera, name=name))  # type: ignore[arg-type]
+def oriented(camera: ViewingCamera = CAMERA, *, name: str = "a.png") -> Cameras:
+    return ms.cameras(ms.oriented(camera, name=name))
 
 
 def read(folder: Path, photos: Photos = PHOTOS, **params: object) -> tuple[Cameras, list[str]]:
@@ -56,7 +54,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_a_model_gives_the_poses_of_the_photos_by_name(folder: Path) -> None:
     write_colmap_model(folder / "given", oriented(name="A.JPG"))
-    photos = ms.photos(replace(PIXEL, name="a.jpg"), replace(PIXEL, name="b.jpg"))
+    photos = ms.photos(replace(PHOTO, name="a.jpg"), replace(PHOTO, name="b.jpg"))
     cameras, warnings = read(folder, photos)
     first, second = cameras.cameras
     assert first.status == "ok"
@@ -67,31 +65,26 @@ def test_a_model_gives_the_poses_of_the_photos_by_name(folder: Path) -> None:
     assert warnings == [f"photo b.jpg is not oriented: {second.status}"]
 
 
-@pytest.mark.parametrize("metres", [1e9, 1e300])
-def test_a_photo_taken_from_nowhere_on_earth_is_refused(folder: Path, metres: float) -> None:
-    far = replace(CAMERA, translation=np.array([0.0, metres, 0.0]))
-    write_colmap_model(folder / "given", oriented(far))
-    with pytest.raises(
-        InputError, match=r"m from the origin, according to its given camera; expected"
-    ):
-        read(folder)
-
-
-def test_photos_of_another_size_are_refused(folder: Path) -> None:
-    write_colmap_model(folder / "given", oriented())
-    small = ms.photos(replace(PIXEL, width=450, height=320))
-    with pytest.raises(
-        InputError, match=r"photo a\.png has 450 x 320 pixels, but its given camera"
-    ):
-        read(folder, small)
-
-
-def test_a_model_of_other_photos_is_refused(folder: Path) -> None:
-    publish_cameras(oriented(name="other.png"), folder / "given", "sha256:0")
-    with pytest.raises(
-        InputError, match=r"orients none of the 1 photos, such as a\.png: it speaks"
-    ):
-        read(folder)
+@pytest.mark.parametrize(
+    ("camera", "name", "photo", "reason"),
+    [
+        (
+            replace(CAMERA, translation=np.array([0.0, 1e9, 0.0])),
+            "a.png",
+            PHOTO,
+            r"from the origin",
+        ),
+        (CAMERA, "a.png", replace(PHOTO, width=450, height=320), r"a\.png has 450 x 320 pixels"),
+        (CAMERA, "other.png", PHOTO, r"orients none of the 1 photos, such as a\.png"),
+    ],
+    ids=["nowhere on earth", "another size", "another photo"],
+)
+def test_cameras_that_cannot_be_those_of_the_photos_are_refused(
+    folder: Path, camera: ViewingCamera, name: str, photo: Photo, reason: str
+) -> None:
+    write_colmap_model(folder / "given", oriented(camera, name=name))
+    with pytest.raises(InputError, match=reason):
+        read(folder, ms.photos(photo))
 
 
 def test_given_poses_are_taken_as_they_are(tmp_path: Path) -> None:
@@ -127,7 +120,7 @@ def test_six_ties_by_hand_correct_a_given_pose(tmp_path: Path) -> None:
 
 
 def test_fewer_ties_check_a_given_pose(tmp_path: Path) -> None:
-    three = first_of(clicked(4), 3)
+    three = samples.taken(clicked(4), slice(3))
     cameras, warnings = given(tmp_path, oriented(), three)
     assert not warnings
     off = ms.nudged(CAMERA, (0.02, -0.02, 0.01, 0.1, -0.05, 0.1))
@@ -141,17 +134,11 @@ def test_ties_by_hand_orient_a_photo_without_a_pose(tmp_path: Path) -> None:
     lost = Cameras(cameras=(Camera(photo="a.png", status="Metashape did not align it"),))
     (found,) = given(tmp_path, lost)[0].cameras
     assert found.status == "Metashape did not align it"
-    photos = ms.photos(replace(PIXEL, intrinsics=Intrinsics.of(CAMERA)))
+    photos = ms.photos(photo(CAMERA))
     inputs = OrientGiven.In(cameras=lost, photos=photos, walls=WALLS, ties=clicked(4))
     (found,) = OrientGiven().run(inputs, OrientGiven.Params(), context(tmp_path)).cameras.cameras
     assert found.status == "ok"
     assert error_share(found) < 3.0
-
-
-def first_of(ties: Ties, count: int) -> Ties:
-    names = ("photo", "wall", "pixels_photo", "points_world", "sigma_px", "sigma_m", "role")
-    arrays = {name: getattr(ties, name)[:count] for name in (*names, "residual_px", "by_hand")}
-    return replace(ties, **arrays)
 
 
 @pytest.mark.parametrize("n_by_hand", [0, 3], ids=["as they are", "checked by hand"])
@@ -167,13 +154,13 @@ def test_the_error_that_handed_on_cameras_carry_is_reported(folder: Path, n_by_h
         )
     )
     publish_cameras(handed_on, folder / "given", "sha256:0")
-    photos = ms.photos(*(replace(PIXEL, name=name) for name in names_mm))
+    photos = ms.photos(*(replace(PHOTO, name=name) for name in names_mm))
     files = InputFiles(name="cameras", paths=tuple(sorted((folder / "given").iterdir())))
     first, second = context(folder), context(folder)
     cameras = ReadCameras().run(
         ReadCameras.In(files=files, photos=photos), ReadCameras.Params(), first
     )
-    ties = first_of(clicked(4), n_by_hand) if n_by_hand else None
+    ties = samples.taken(clicked(4), slice(n_by_hand)) if n_by_hand else None
     inputs = OrientGiven.In(cameras=cameras.cameras, photos=photos, walls=WALLS, ties=ties)
     OrientGiven().run(inputs, OrientGiven.Params(), second)
     for ctx in (first, second):

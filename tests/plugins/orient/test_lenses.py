@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,21 +21,8 @@ CALIBRATED = Intrinsics(
 FREE = ("focal", "aspect", "cx", "cy", "k1", "k2", "p1", "p2")
 
 
-def photo(
-    name: str = "a.jpg",
-    *,
-    exif_px: float | None = None,
-    intrinsics: Intrinsics | None = None,
-    size: tuple[int, int] = (600, 400),
-) -> Photo:
-    return Photo(
-        name=name,
-        encoded=b"",
-        width=size[0],
-        height=size[1],
-        exif_focal_px=exif_px,
-        intrinsics=intrinsics,
-    )
+def photo(name: str = "a.jpg", size: tuple[int, int] = (600, 400), **known: Any) -> Photo:
+    return Photo(name=name, encoded=b"", width=size[0], height=size[1], **known)
 
 
 def oriented(*focal_px: float) -> list[ViewingCamera]:
@@ -43,7 +31,7 @@ def oriented(*focal_px: float) -> list[ViewingCamera]:
 
 
 def test_exif_is_believed_to_a_twentieth_and_tried_a_little_shorter_and_longer() -> None:
-    prior = lenses.lens_prior(photo(exif_px=500.0))
+    prior = lenses.lens_prior(photo(exif_focal_px=500.0))
     assert [guess.fx for guess in (prior.prior, *prior.guesses)] == pytest.approx(
         [500.0, 470.0, 530.0]
     )
@@ -53,7 +41,7 @@ def test_exif_is_believed_to_a_twentieth_and_tried_a_little_shorter_and_longer()
         assert not any(guess.distortion)
     assert prior.freedom.names == FREE
     # The principal point to a hundredth of the longer side.
-    assert prior.freedom.sigmas.tolist() == [0.05, 1e-3, 6.0, 6.0, 0.1, 0.1, 1e-3, 1e-3]
+    assert prior.freedom.sigmas.tolist() == OF_EXIF
 
 
 @pytest.mark.parametrize("size", [(600, 400), (400, 600)])
@@ -65,7 +53,7 @@ def test_without_exif_lenses_from_wide_to_long_are_tried(size: tuple[int, int]) 
         (size[0] / 2, size[1] / 2)
     }
     assert (prior.source, prior.freedom.names) == ("none", FREE)
-    assert prior.freedom.sigmas.tolist() == [0.35, 1e-3, 6.0, 6.0, 0.1, 0.1, 1e-3, 1e-3]
+    assert prior.freedom.sigmas.tolist() == [0.35, *OF_EXIF[1:]]
 
 
 @pytest.mark.parametrize(
@@ -81,12 +69,12 @@ def test_photos_share_a_lens_by_size_and_known_focal_length(
     sharing: Sharing, lens_of: tuple[int, ...]
 ) -> None:
     photos = [
-        photo("a", exif_px=500.0),
-        photo("b", exif_px=500.0),
-        photo("c", exif_px=700.0),
+        photo("a", exif_focal_px=500.0),
+        photo("b", exif_focal_px=500.0),
+        photo("c", exif_focal_px=700.0),
         photo("d"),
         photo("e"),
-        photo("f", exif_px=500.0, size=(400, 600)),
+        photo("f", exif_focal_px=500.0, size=(400, 600)),
     ]
     lens_of_photos, found = lenses.lens_groups(
         photos, oriented(*[500.0] * 6), sharing, "uncalibrated"
@@ -95,18 +83,16 @@ def test_photos_share_a_lens_by_size_and_known_focal_length(
     assert len(found) == max(lens_of) + 1
 
 
-@pytest.mark.parametrize("sharing", ["focal-group", "shared"])
-def test_photos_that_are_told_apart_share_no_lens(sharing: Sharing) -> None:
+def test_photos_that_are_set_apart_share_no_lens() -> None:
     # An index is no focal length.
-    photos = [photo("a"), photo("b"), photo("c"), photo("d", exif_px=1.0)]
-    lens_of_photos, _ = lenses.lens_groups(
-        photos, oriented(*[500.0] * 4), sharing, "uncalibrated", {1}
-    )
-    assert lens_of_photos == ((0, 1, 0, 2) if sharing == "focal-group" else (0, 1, 0, 0))
+    photos = [photo("a"), photo("b"), photo("c"), photo("d", exif_focal_px=1.0)]
+    cameras = oriented(*[500.0] * 4)
+    for sharing, lens_of in (("focal-group", (0, 1, 0, 2)), ("shared", (0, 1, 0, 0))):
+        assert lenses.lens_groups(photos, cameras, sharing, "uncalibrated", {1})[0] == lens_of
 
 
 def test_of_photos_that_share_a_lens_the_best_known_one_tells_it() -> None:
-    photos = [photo("a"), photo("b", exif_px=520.0), photo("c", intrinsics=CALIBRATED)]
+    photos = [photo("a"), photo("b", exif_focal_px=520.0), photo("c", intrinsics=CALIBRATED)]
     cameras = oriented(480.0, 500.0, 510.0)
     for n_photos, source, focal_px in ((3, "calibration", 510.0), (2, "exif", 520.0)):
         _, found = lenses.lens_groups(
@@ -116,22 +102,21 @@ def test_of_photos_that_share_a_lens_the_best_known_one_tells_it() -> None:
         assert (lens.source, lens.prior.fx) == (source, focal_px)
 
 
+OF_EXIF = [0.05, 1e-3, 6.0, 6.0, 0.1, 0.1, 1e-3, 1e-3]
+
+
 @pytest.mark.parametrize(
     ("refined", "exif_sigmas", "calibrated_sigmas"),
     [
-        ("uncalibrated", [0.05, 1e-3, 6.0, 6.0, 0.1, 0.1, 1e-3, 1e-3], []),
-        (
-            "all",
-            [0.05, 1e-3, 6.0, 6.0, 0.1, 0.1, 1e-3, 1e-3],
-            [0.01, 1.8, 1.8, 0.02, 0.04, 1e-3, 1e-3],
-        ),
+        ("uncalibrated", OF_EXIF, []),
+        ("all", OF_EXIF, [0.01, 1.8, 1.8, 0.02, 0.04, 1e-3, 1e-3]),
         ("none", [], []),
     ],
 )
 def test_lenses_are_refined_as_asked_for(
     refined: Refined, exif_sigmas: list[float], calibrated_sigmas: list[float]
 ) -> None:
-    photos = [photo("a", exif_px=500.0), photo("b", intrinsics=CALIBRATED)]
+    photos = [photo("a", exif_focal_px=500.0), photo("b", intrinsics=CALIBRATED)]
     _, found = lenses.lens_groups(photos, oriented(500.0, 510.0), "per-photo", refined)
     np.testing.assert_allclose(found[0].freedom.sigmas, exif_sigmas)
     np.testing.assert_allclose(found[1].freedom.sigmas, calibrated_sigmas)

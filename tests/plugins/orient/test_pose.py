@@ -11,7 +11,6 @@ from orthoflow_plugins.orient.pnp import estimate_by_opencv
 from orthoflow_plugins.orient.pose import (
     Estimate,
     OrientParams,
-    TiedPhoto,
     estimate_pose,
     expected_px,
     robust_start,
@@ -21,58 +20,18 @@ from orthoflow_plugins.orient.pose import (
 
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.resection import SeenPoints
-from orthoflow.products import Intrinsics, Photo
 from orthoflow.testing import photographed as ms
 from tests.scenes import SURVEY_SHIFT_M
+from tests.tied_photos import SCENE, photo, seen_by, tied
 
 PARAMS = OrientParams()
 
 
 def camera() -> ViewingCamera:
-    return ms.camera_before(ms.textured_wall(0))
+    return ms.camera_before(SCENE)
 
 
-def seen_by(
-    viewer: ViewingCamera, n: int, *, noise_px: float = 0.0, seed: int = 1, sigma_px: float = 0.5
-) -> SeenPoints:
-    rng = np.random.default_rng(seed)
-    points = rng.uniform([0.2, -0.3, 0.2], [2.8, 0.1, 1.8], (6 * n, 3))
-    pixels = viewer.project(points)[:, :2]
-    inside = np.flatnonzero(viewer.sees(pixels))[:n]
-    assert len(inside) == n
-    return SeenPoints(
-        pixels_photo=pixels[inside] + noise_px * rng.normal(size=(n, 2)),
-        points_world=points[inside],
-        sigma_px=np.full(n, sigma_px),
-        sigma_m=np.full(n, 1e-4),
-    )
-
-
-def photo_by(viewer: ViewingCamera) -> Photo:
-    """A photo that claims to be calibrated by a camera."""
-    return Photo(
-        name="a.png",
-        encoded=b"",
-        width=viewer.width,
-        height=viewer.height,
-        intrinsics=Intrinsics.of(viewer),
-    )
-
-
-def tied(photo: Photo, seen: SeenPoints, is_check: NDArray[np.bool_]) -> TiedPhoto:
-    nobody = np.zeros(len(seen), dtype=np.bool_)
-    return TiedPhoto(
-        photo=photo,
-        chosen=np.arange(len(seen)),
-        seen=seen,
-        is_check=is_check,
-        by_hand=nobody,
-        seed=1,
-    )
-
-
-@pytest.mark.parametrize("factor", [0.4, 2.5])
-def test_a_pose_depends_on_the_ratios_of_the_sigmas_of_its_ties_alone(factor: float) -> None:
+def test_a_pose_depends_on_the_ratios_of_the_sigmas_of_its_ties_alone() -> None:
     """What counts less as too far off follows how far ties are off, not what they state."""
     viewer = camera()
     rng = np.random.default_rng(7)
@@ -80,12 +39,12 @@ def test_a_pose_depends_on_the_ratios_of_the_sigmas_of_its_ties_alone(factor: fl
     # Longer tails than normal ones: many are beyond the limit.
     off_px = 0.35 * rng.standard_t(3, size=(200, 2))
     seen = replace(seen, pixels_photo=seen.pixels_photo + off_px)
-    scaled = replace(seen, sigma_px=factor * seen.sigma_px, sigma_m=factor * seen.sigma_m)
+    scaled = replace(seen, sigma_px=2.5 * seen.sigma_px, sigma_m=2.5 * seen.sigma_m)
     check = np.arange(200) % 5 == 0
     # The same ties are sampled first.
     params = OrientParams(threshold_px=4.0)
     found, other = (
-        estimate_pose(tied(photo_by(viewer), each, check), params) for each in (seen, scaled)
+        estimate_pose(tied(photo(viewer), each, is_check=check), params) for each in (seen, scaled)
     )
     assert isinstance(found, Estimate)
     assert isinstance(other, Estimate)
@@ -96,7 +55,7 @@ def test_a_pose_depends_on_the_ratios_of_the_sigmas_of_its_ties_alone(factor: fl
     np.testing.assert_allclose(found.resection.covariance, other.resection.covariance, rtol=1e-2)
 
 
-@pytest.mark.parametrize("scale", [0.2, 1.0, 2.9])
+@pytest.mark.parametrize("scale", [0.2, 2.9])
 def test_the_unit_deviation_is_that_of_normal_vectors(scale: float) -> None:
     rng = np.random.default_rng(3)
     lengths = np.hypot(*rng.normal(0.0, scale, (2, 40_000)))
@@ -122,7 +81,7 @@ def test_a_limit_holds_where_hardly_any_tie_within_it_is_there_by_chance() -> No
     assert without_chance(beyond, 3.5) == 3.5
 
 
-@pytest.mark.parametrize("n_wrong", [100, 1000, 4000])
+@pytest.mark.parametrize("n_wrong", [1000, 4000])
 def test_a_limit_is_tightened_until_chance_is_a_tenth(n_wrong: int) -> None:
     right = np.hypot(*np.random.default_rng(4).normal(0.0, 0.3, (2, 300)))
     lengths = np.append(right, ring(0.0, 30.0, n_wrong))
@@ -185,8 +144,7 @@ def test_a_calibration_more_than_three_percent_off_is_of_another_lens(
     claimed = replace(true, fx=(1.0 + off) * true.fx, fy=(1.0 + off) * true.fy)
     # Wide enough that no tie is rejected for the wrong focal length.
     seen = seen_by(true, n_ties, sigma_px=6.0)
-    is_check = np.zeros(n_ties, dtype=np.bool_)
-    found = estimate_pose(tied(photo_by(claimed), seen, is_check), PARAMS)
+    found = estimate_pose(tied(photo(claimed), seen), PARAMS)
     if not is_contradicted:
         assert isinstance(found, Estimate)
         return
@@ -198,8 +156,7 @@ def test_a_calibration_more_than_three_percent_off_is_of_another_lens(
 
 def test_opencv_refuses_a_lens_with_skew() -> None:
     """Which solvePnP cannot model."""
-    skewed = photo_by(replace(camera(), skew=2.5))
-    of = tied(skewed, seen_by(camera(), 40), np.zeros(40, dtype=np.bool_))
+    of = tied(photo(replace(camera(), skew=2.5)), seen_by(camera(), 40))
     assert isinstance(estimate_by_opencv(of, PARAMS), str)
 
 
@@ -208,7 +165,7 @@ def test_ties_at_four_places_make_no_pose() -> None:
     seen = seen_by(true, 5)
     for n_places in (4, 5):
         places = seen.take(np.arange(40) % n_places)
-        start = robust_start(tied(photo_by(true), places, np.zeros(40, dtype=np.bool_)), PARAMS)
+        start = robust_start(tied(photo(true), places), PARAMS)
         assert (start is not None) == (n_places == 5)
 
 
@@ -217,14 +174,14 @@ def test_withheld_ties_have_no_say_in_the_start() -> None:
     seen = seen_by(true, 60)
     is_check = np.arange(60) % 2 == 0
     wrong = replace(seen, pixels_photo=np.where(is_check[:, None], 10.0, seen.pixels_photo))
-    start = robust_start(tied(photo_by(true), wrong, is_check), PARAMS)
+    start = robust_start(tied(photo(true), wrong, is_check=is_check), PARAMS)
     assert start is not None
     np.testing.assert_array_equal(start.agreeing, ~is_check)
     assert start.lens.source == "calibration"
     np.testing.assert_allclose(start.camera.centre_world, true.centre_world, atol=1e-3)
 
 
-@pytest.mark.parametrize("times", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize("times", [0.5, 2.0])
 def test_ties_are_rejected_by_what_they_deviate_and_not_by_what_they_say(times: float) -> None:
     true = camera()
     # They say half a pixel each, and deviate by so many times as much; a tenth of them is wrong.
@@ -232,9 +189,8 @@ def test_ties_are_rejected_by_what_they_deviate_and_not_by_what_they_say(times: 
     wrong = np.arange(300) % 10 == 0
     pixels = seen.pixels_photo + wrong[:, None] * np.array([0.5 * times * 6.5, 0.0])
     is_check = np.arange(300) % 4 == 0
-    found = estimate_pose(
-        tied(photo_by(true), replace(seen, pixels_photo=pixels), is_check), PARAMS
-    )
+    spoilt = replace(seen, pixels_photo=pixels)
+    found = estimate_pose(tied(photo(true), spoilt, is_check=is_check), PARAMS)
     assert isinstance(found, Estimate)
     assert found.limit == pytest.approx(3.5 * times, rel=0.2)
     assert found.agreeing[~wrong].mean() > 0.98

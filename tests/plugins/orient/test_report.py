@@ -53,11 +53,6 @@ def test_shares_follow_their_three_conventions() -> None:
     assert found["u", "px"]["beyond_any"] == found["v", "px"]["beyond_any"] == 0.1
 
 
-def test_one_residual_and_none() -> None:
-    assert rows(np.array([[0.5, -0.5]]))["u", "px"]["shift_p"] is None
-    assert residual_rows("a", "check", np.empty((0, 2)), UNITS) == []
-
-
 # --- a whole photo ---
 
 CAMERA = replace(
@@ -164,8 +159,8 @@ def test_the_table_has_control_and_check_in_units_of_the_wall(gsd_m: float | Non
         assert by["check", "v", "cell"].max == pytest.approx(3.0 * PIXEL_MM / 2.0)
 
 
-def test_without_a_cell_there_is_no_share_beyond_cells() -> None:
-    found = rows(np.ones((3, 2)), {"px": 1.0})
-    assert found["u", "px"]["beyond_cells"] is None
-    assert found["u", "px"]["skewness"] is None
-    assert found["u", "px"]["shift_p"] == 0.0
+def test_numbers_that_nothing_determines_are_none() -> None:
+    found = rows(np.ones((3, 2)), {"px": 1.0})["u", "px"]
+    assert (found["beyond_cells"], found["skewness"], found["shift_p"]) == (None, None, 0.0)
+    assert rows(np.array([[0.5, -0.5]]))["u", "px"]["shift_p"] is None
+    assert residual_rows("a", "check", np.empty((0, 2)), UNITS) == []

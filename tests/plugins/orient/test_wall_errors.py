@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,40 +17,36 @@ from orthoflow_plugins.orient.gates import (
 
 from orthoflow.geometry.cameras import LensFreedom, ViewingCamera, looking_at
 from orthoflow.geometry.resection import Resection
-from orthoflow.products import TieWall
 from tests import samples
 
-UP = np.array([0.0, 0.0, 1.0])
 DISTANCE_M = 3.0
 SIZE_PX = (800, 600)
 
 
-def camera(*, focal_px: float = 600.0, turn_deg: float = 0.0) -> ViewingCamera:
+def camera(*, turn_deg: float = 0.0) -> ViewingCamera:
     """Before the middle of the wall y = 0, at y = -3, turned to the right."""
     centre = np.array([0.0, -DISTANCE_M, 0.0])
     turn = math.radians(turn_deg)
     ahead = centre + np.array([math.sin(turn), math.cos(turn), 0.0])
     return samples.camera(
-        looking_at(centre, ahead, UP),
+        looking_at(centre, ahead, samples.UP),
         centre,
         width=SIZE_PX[0],
         height=SIZE_PX[1],
-        fx=focal_px,
-        fy=focal_px,
+        fx=600.0,
+        fy=600.0,
         cx=400.0,
         cy=300.0,
     )
 
 
-def wall(
-    half_m: tuple[float, float] = (1.0, 0.5), *, index: int = 0, y_m: float = 0.0
-) -> KnownWall:
+def wall(half_m: tuple[float, float] = (1.0, 0.5)) -> KnownWall:
     across, up = half_m
-    corners = [[-across, y_m, up], [-across, y_m, -up], [across, y_m, -up], [across, y_m, up]]
+    corners = [[-across, 0.0, up], [-across, 0.0, -up], [across, 0.0, -up], [across, 0.0, up]]
     return KnownWall(
-        index=index,
-        number=index,
-        name=f"wall {index}",
+        index=0,
+        number=0,
+        name="wall 0",
         corners_world=np.array(corners),
         normal=np.array([0.0, -1.0, 0.0]),
         gsd_m=0.002,
@@ -135,9 +132,7 @@ def test_a_photo_that_shows_no_wall_has_no_error() -> None:
 def test_places_seen_flatter_than_one_in_ten_are_not_shown(aside_m: float, is_shown: bool) -> None:
     # A cosine of 0.1 is a slope of 9.95 to one.
     corners = np.array([[0, 0, 0.1], [0, 0, -0.1], [0.2, 0, -0.1], [0.2, 0, 0.1]])
-    strip = KnownWall(
-        **{**wall().__dict__, "corners_world": corners + np.array([aside_m - 0.1, 0, 0])}
-    )
+    strip = replace(wall(), corners_world=corners + np.array([aside_m - 0.1, 0, 0]))
     sideways = camera(turn_deg=84.0)
     found = wall_error(posed((0.001, 0.001, 0.001), sideways), [strip])
     assert (found is not None) == is_shown
@@ -148,14 +143,8 @@ def test_walls_are_as_ties_describe_them_or_through_their_points() -> None:
     places = rng.uniform(-1.0, 1.0, (40, 2)) * [2.0, 0.5]
     turn = math.radians(30.0)
     along = np.array([math.cos(turn), math.sin(turn), 0.0])
-    points = np.array([5.0, 7.0, 1.0]) + places[:, :1] * along + places[:, 1:] * UP
-    described = TieWall(
-        name="",
-        corners_world=tuple(map(tuple, wall().corners_world.tolist())),
-        normal_world=(0.0, -1.0, 0.0),
-        gsd_m=0.004,
-        plane_index=6,
-    )
+    points = np.array([5.0, 7.0, 1.0]) + places[:, :1] * along + places[:, 1:] * samples.UP
+    described = replace(samples.tie_wall(wall().corners_world, 0.004), plane_index=6)
     number = np.repeat([0, 1, 2, -1], [15, 20, 2, 3]).astype(np.int32)
     ties = samples.ties(
         np.zeros((40, 2)),
@@ -172,7 +161,7 @@ def test_walls_are_as_ties_describe_them_or_through_their_points() -> None:
     # Two points make no wall; of the twenty, the rectangle about them in their plane.
     assert (second.index, second.number, second.gsd_m, second.has_side) == (1, 1, None, False)
     own = points[15:35]
-    across = np.cross(along, UP)
+    across = np.cross(along, samples.UP)
     assert abs(second.normal @ across) == pytest.approx(1.0)
     np.testing.assert_allclose((second.corners_world - own[0]) @ across, 0.0, atol=1e-9)
     sides = second.corners_world[[1, 3]] - second.corners_world[0]
