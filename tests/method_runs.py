@@ -45,3 +45,9 @@ class Reader:
     @property
     def metrics(self) -> dict[str, float]:
         return {metric.name: metric.value for metric in self.ctx.metrics}
+
+
+# Any: ports and parameters differ by method.
+def run(method: Any, ctx: StepContext, inputs: Mapping[str, object], **params: Any) -> Any:
+    """What a method makes of its inputs."""
+    return method().run(method.In(**inputs), method.Params(**params), ctx)

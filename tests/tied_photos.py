@@ -16,6 +16,7 @@ from orthoflow.products import Cameras, Intrinsics, Photo, Photos, Ties
 from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
 from tests import samples
+from tests.method_runs import run
 
 SCENE = ms.textured_wall(0)
 SIZE_PX = (900, 640)
@@ -37,8 +38,7 @@ def photo(calibrated: ViewingCamera | None = None, **known: Any) -> Photo:
 
 def oriented(by: Any, ties: Ties, photos: Photos, ctx: StepContext, **params: Any) -> Cameras:
     """What a method makes of photos and ties."""
-    found = by().run(by.In(ties=ties, photos=photos), by.Params(**params), ctx)
-    cameras: Cameras = found.cameras
+    cameras: Cameras = run(by, ctx, {"ties": ties, "photos": photos}, **params).cameras
     return cameras
 
 

@@ -3,78 +3,41 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field, replace
+import pickle
+from collections.abc import Callable
 from typing import Any, Final
 
-import numpy as np
 import pytest
-from numpy.typing import NDArray
 from orthoflow_plugins.match import key_points as matching
+from orthoflow_plugins.match import placing, ties
 
 from orthoflow.geometry import key_points
-from orthoflow.geometry.key_points import Matches
 
 # Each holds some megabytes.
-_PICTURES_MOST: Final = 32
+MAX_KNOWN: Final = 60
 
 
-@dataclass
-class _Remembered:
-    """Key points and their descriptors by what they were asked of."""
+# Any: whatever a function takes and returns.
+def remembered(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function that looks at the same pictures or key points once."""
+    known: dict[bytes, Any] = {}
 
-    tiles: dict[tuple[object, ...], Any] = field(default_factory=dict)
-    described: dict[tuple[object, ...], NDArray[np.float32]] = field(default_factory=dict)
-    matched: dict[tuple[object, ...], Matches] = field(default_factory=dict)
-    find: Any = key_points._in_tile
-    describe: Any = key_points._described
-    match: Any = key_points.mutual_matches
+    def call(*given: Any, **settings: Any) -> Any:
+        key = hashlib.sha256(pickle.dumps((given, settings))).digest()
+        if key not in known:
+            if len(known) >= MAX_KNOWN:
+                known.clear()
+            known[key] = function(*given, **settings)
+        return known[key]
 
-    def in_tile(
-        self, sift: Any, picture: NDArray[np.uint8], corner: tuple[int, int], shift_px: float
-    ) -> Any:
-        """Give what OpenCV finds in a tile of a picture."""
-        digest = hashlib.sha256(np.ascontiguousarray(picture)).digest()
-        rule = (sift.getContrastThreshold(), sift.getEdgeThreshold(), shift_px)
-        key = (digest, picture.shape, corner, *rule)
-        if key not in self.tiles:
-            tile = self.find(sift, picture, corner, shift_px)
-            if len(self.tiles) >= _PICTURES_MOST:
-                # Both, since descriptors are known by the tiles that they are of.
-                self.described.clear()
-                self.tiles.clear()
-            self.tiles[key] = tile
-        return self.tiles[key]
-
-    def of_chosen(
-        self, sift: Any, picture: NDArray[np.uint8], tiles: list[Any], chosen: NDArray[np.intp]
-    ) -> NDArray[np.float32]:
-        """Give descriptors of chosen key points."""
-        if not all(any(tile is known for known in self.tiles.values()) for tile in tiles):
-            return self.describe(sift, picture, tiles, chosen)
-        key = (*map(id, tiles), chosen.tobytes())
-        if key not in self.described:
-            self.described[key] = self.describe(sift, picture, tiles, chosen)
-        return self.described[key].copy()
-
-    def matches(
-        self, first: NDArray[np.float32], second: NDArray[np.float32], **rule: Any
-    ) -> Matches:
-        """Give which of two sets of descriptors belong together."""
-        digests = [hashlib.sha256(np.ascontiguousarray(one)).digest() for one in (first, second)]
-        key = (*digests, *sorted(rule.items()))
-        if key not in self.matched:
-            self.matched[key] = self.match(first, second, **rule)
-        found = self.matched[key]
-        return replace(found, **{name: array.copy() for name, array in vars(found).items()})
+    return call
 
 
-_remembered = _Remembered()
+FIND, MATCH = remembered(key_points.find_features), remembered(key_points.mutual_matches)
 
 
 @pytest.fixture(autouse=True)
-def _key_points_found_once(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Look at each picture, and match two of them, once: tests look at the same few."""
-    if request.path.stem != "test_features":
-        monkeypatch.setattr(key_points, "_in_tile", _remembered.in_tile)
-        monkeypatch.setattr(key_points, "_described", _remembered.of_chosen)
-        monkeypatch.setattr(matching, "mutual_matches", _remembered.matches)
+def _key_points_found_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (matching, placing, ties):
+        monkeypatch.setattr(module, "find_features", FIND)
+    monkeypatch.setattr(matching, "mutual_matches", MATCH)

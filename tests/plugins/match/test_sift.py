@@ -17,40 +17,24 @@ from orthoflow.geometry.key_points import (
     find_features,
     mutual_matches_within,
 )
-from orthoflow.products import Photo, Photos, TieRole, Ties, Walls
-from orthoflow.sdk import StepContext
+from orthoflow.products import Photo, TieRole, Walls
 from orthoflow.testing import photographed as ms
+from tests import matched_walls as mw
 from tests.long_loops import seeds
+from tests.method_runs import run
 
-MAX_FEATURES = 3000
-
-
-def context(tmp_path: Path, *, seed: int = 1, cores: int = 2) -> StepContext:
-    return StepContext(rng=np.random.default_rng(seed), cores=cores, scratch=tmp_path)
+SCENE = ms.textured_wall(1)
 
 
-def ties_of(photos: Photos, walls: Walls, ctx: StepContext, **params: object) -> Ties:
-    inputs = MatchSift.In(photos=photos, walls=walls)
-    return MatchSift().run(inputs, MatchSift.Params(**params), ctx).ties
-
-
-@pytest.fixture(scope="module")
-def scene() -> ms.TexturedWall:
-    return ms.textured_wall(1)
-
-
-@pytest.fixture(scope="module")
-def walls(scene: ms.TexturedWall) -> Walls:
-    return ms.walls_of(scene)
+def inputs_of(photo: Photo, walls: Walls | None = None) -> dict[str, object]:
+    return {"photos": ms.photos(photo), "walls": walls or mw.walls(1)}
 
 
 @pytest.mark.parametrize("roll", [0.0, 1.57], ids=["level", "portrait"])
-def test_ties_lie_where_the_true_camera_sees_their_points(
-    scene: ms.TexturedWall, walls: Walls, tmp_path: Path, roll: float
-) -> None:
-    camera = ms.camera_before(scene, roll=roll)
-    ties = ties_of(ms.photos(ms.photo_of(scene, camera)), walls, context(tmp_path))
-    error = ties.pixels_photo - camera.project(ties.points_world)[:, :2]
+def test_ties_lie_where_the_true_camera_sees_their_points(tmp_path: Path, roll: float) -> None:
+    camera = ms.camera_before(SCENE, roll=roll)
+    ties = mw.ties_of(MatchSift, tmp_path, inputs_of(ms.photo_of(SCENE, camera)))
+    error = mw.off_px(ties, camera)
     length = np.linalg.norm(error, axis=1)
     right = error[length < 3.0]
     assert len(right) > 1000
@@ -63,15 +47,13 @@ def test_ties_lie_where_the_true_camera_sees_their_points(
     assert 0.3 < np.sqrt(np.mean((right / stated[:, None]) ** 2)) < 1.5
 
 
-def test_a_photo_of_nothing_known_is_warned_of(
-    scene: ms.TexturedWall, walls: Walls, tmp_path: Path
-) -> None:
-    photo = ms.photo_of(scene, ms.camera_before(scene))
-    blank = encode_png(np.full((photo.height, photo.width), 128, np.uint8))
-    ctx = context(tmp_path)
-    ties = ties_of(ms.photos(replace(photo, encoded=blank)), walls, ctx)
+def test_a_photo_of_nothing_known_is_warned_of(tmp_path: Path) -> None:
+    photo = ms.photo_of(SCENE, ms.camera_before(SCENE))
+    blank = replace(photo, encoded=encode_png(np.full((photo.height, photo.width), 128, np.uint8)))
+    ctx = mw.context(tmp_path)
+    ties = run(MatchSift, ctx, inputs_of(blank)).ties
     assert not (ties.role != TieRole.REJECTED).any()
-    assert ctx.warnings == ["photo a.png: no wall is recognised in it, so it gets no ties"]
+    assert [each.code for each in ctx.diagnostics] == ["photo-shows-no-wall"]
 
 
 @pytest.mark.parametrize("as_opencv", [False, True], ids=["precise", "as OpenCV sets it"])
@@ -82,14 +64,14 @@ def test_key_points_lie_where_they_are(*, as_opencv: bool) -> None:
     for u, v in places:
         picture += 120.0 * np.exp(-((columns - u) ** 2 + (rows - v) ** 2) / (2.0 * 4.0**2))
     grey = np.rint(picture).astype(np.uint8)
-    found = find_features(grey, MAX_FEATURES, as_opencv=as_opencv).pixels
+    found = find_features(grey, 3000, as_opencv=as_opencv).pixels
     nearest = found[np.linalg.norm(found[None] - places[:, None], axis=2).argmin(axis=1)]
     # OpenCV's default puts them a quarter of a pixel too far to the right and down.
     np.testing.assert_allclose(np.median(nearest - places, axis=0), 0.0, atol=0.03)
 
 
-def test_the_key_points_that_are_kept_are_described_as_if_all_were(walls: Walls) -> None:
-    rgb = walls.walls[0].rgb
+def test_the_key_points_that_are_kept_are_described_as_if_all_were() -> None:
+    rgb = mw.walls(1).walls[0].rgb
     assert rgb is not None
     grey = np.tile(rgb[..., 0], (1, 5))
     every, few = (find_features(grey, n) for n in (10**6, 100))
@@ -140,32 +122,30 @@ def test_neighbours_within_a_window_are_those_of_brute_force(seed: int) -> None:
     np.testing.assert_array_equal(found.second, nearest[expected])
 
 
-def test_a_mirrored_photo_is_recognised_as_such(
-    scene: ms.TexturedWall, walls: Walls, tmp_path: Path
-) -> None:
+def test_a_mirrored_photo_is_recognised_as_such(tmp_path: Path) -> None:
     # The right fifth of the wall is the mirror image of its left fifth.
-    wall = walls.walls[0]
+    (wall,) = mw.walls(1).walls
     assert wall.intensity is not None
     side = wall.frame.width // 5
     symmetric = wall.intensity.copy()
     symmetric[:, -side:] = symmetric[:, side - 1 :: -1]
     flat = np.where(np.isfinite(symmetric), 0.0, np.nan).astype(np.float32)
-    palace = replace(walls, walls=(replace(wall, intensity=symmetric, depth_m=flat),))
+    palace = replace(mw.walls(1), walls=(replace(wall, intensity=symmetric, depth_m=flat),))
     grey = np.nan_to_num(symmetric * 255.0).clip(0, 255).astype(np.uint8)
     size = {"width": grey.shape[1], "height": grey.shape[0]}
-    photos = ms.photos(Photo(name="a.png", encoded=encode_png(grey[:, ::-1].copy()), **size))
-    ctx = context(tmp_path)
-    ties = ties_of(photos, palace, ctx)
+    photo = Photo(name="a.png", encoded=encode_png(grey[:, ::-1].copy()), **size)
+    ctx = mw.context(tmp_path)
+    ties = run(MatchSift, ctx, inputs_of(photo, palace)).ties
     assert not (ties.role != TieRole.REJECTED).any()
     assert [each.code for each in ctx.diagnostics] == ["photo-mirrored"]
 
 
 @pytest.mark.parametrize("n_even", [0, 400], ids=["steps alone", "some elsewhere"])
 def test_where_few_cells_have_several_points_those_on_steps_decide_no_uncertainty(
-    scene: ms.TexturedWall, walls: Walls, n_even: int
+    n_even: int,
 ) -> None:
     # Cells half as wide as points lie apart: several fall into one on the step, hardly elsewhere.
-    wall = walls.walls[0]
+    (wall,) = mw.walls(1).walls
     depth, sigma = wall.depth_m.copy(), np.full_like(wall.sigma_m, np.nan)
     depth[:, 300:] += 0.2
     sigma[:, 299:301] = 0.1
