@@ -9,8 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
-from orthoflow.geometry import WallFrame, frame_over, scene_views
-from orthoflow.geometry.scene_rays import Hits
+from orthoflow.geometry import WallFrame, frame_over
 from orthoflow.geometry.scene_views import Rendering, render, render_frame
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind, Viewers
 from tests import scenes
@@ -56,23 +55,19 @@ def random_scene(seed: int, n_rectangles: int = 40) -> Scene:
     )
 
 
+def upright(y: float, extent: tuple[float, ...]) -> dict[str, object]:
+    """A rectangle in a plane of one y."""
+    return {"centre": (0, y, 0), "a": (1, 0, 0), "b": (0, 0, 1), "extent": extent}
+
+
+WALL = upright(0.0, (-2, 2, -1, 1))
+
+
 def wall_with_screen() -> Scene:
     """A wall in the plane y = 0 seen from y < 0, with a niche, and a screen 1 m before it."""
-    wall = {"centre": (0, 0, 0), "a": (1, 0, 0), "b": (0, 0, 1), "extent": (-2, 2, -1, 1)}
-    niche = {
-        "centre": (0, 0.2, 0),
-        "a": (1, 0, 0),
-        "b": (0, 0, 1),
-        "extent": (-1.5, -1.0, -0.5, 0.5),
-    }
-    screen = {
-        "centre": (0, -1, 0),
-        "a": (1, 0, 0),
-        "b": (0, 0, 1),
-        "extent": (0.2, 0.6, -2, 2),
-        "role": SurfaceRole.OBJECT,
-    }
-    return a_scene([wall, niche, screen], [(0, (-1.5, -1.0, -0.5, 0.5))])
+    niche = upright(0.2, (-1.5, -1.0, -0.5, 0.5))
+    screen = {**upright(-1.0, (0.2, 0.6, -2, 2)), "role": SurfaceRole.OBJECT}
+    return a_scene([WALL, niche, screen], [(0, (-1.5, -1.0, -0.5, 0.5))])
 
 
 def wall_frame(gsd_m: float = 0.05) -> WallFrame:
@@ -182,17 +177,6 @@ def test_viewers_see_only_their_elevations() -> None:
     np.testing.assert_array_equal(image.seen[:, column], z < limit)
 
 
-def test_cores_change_no_bit_of_a_true_orthoimage() -> None:
-    scene = random_scene(2)
-    frame = wall_frame(0.11)
-    one, two = (
-        render_frame(scene, frame, buffer_front_m=3.0, buffer_behind_m=3.0, cores=cores)
-        for cores in (1, 2)
-    )
-    np.testing.assert_array_equal(one.rgb, two.rgb)
-    np.testing.assert_array_equal(one.depth_m, two.depth_m)
-
-
 def test_a_part_of_a_true_orthoimage_is_that_part_of_the_whole() -> None:
     viewers = Viewers(positions_world=np.array([[0.0, -2.0, 0.0]]), up=scenes.UP_Z)
     scene, frame = wall_with_screen(), wall_frame()
@@ -252,8 +236,7 @@ def test_a_part_of_a_scene_keeps_its_holes() -> None:
 @pytest.mark.parametrize("supersample", [1, 3])
 def test_the_edge_of_a_surface_is_as_bright_as_its_middle(supersample: int) -> None:
     """Rays of a cell that miss it do not count, and the first rectangle is one as any other."""
-    wall = {"centre": (0, 0, 0), "a": (1, 0, 0), "b": (0, 0, 1), "extent": (-0.28, 2, -0.9, 1)}
-    scene = a_scene([wall], [])
+    scene = a_scene([upright(0.0, (-0.28, 2, -0.9, 1))], [])
     scene = replace(scene, texture_params=scene.texture_params * [1, 1, 1, 1, 0, 1, 1, 1])
     frame = wall_frame(0.25)
     image = render_frame(
@@ -270,25 +253,18 @@ def test_the_edge_of_a_surface_is_as_bright_as_its_middle(supersample: int) -> N
 
 @pytest.mark.parametrize("up", [1.0, -1.0])
 def test_straight_up_and_straight_down_are_seen(up: float) -> None:
-    wall = {"centre": (0, 0, 0), "a": (1, 0, 0), "b": (0, 0, 1), "extent": (-2, 2, -1, 1)}
     # Before the middle of a cell, which lies above its head or below its feet.
     viewers = Viewers(positions_world=np.array([[0.25, -2.0, 0.25]]), up=np.array([0.0, up, 0.0]))
-    image = render_frame(
-        a_scene([wall], []),
-        wall_frame(0.5),
-        buffer_front_m=0.1,
-        buffer_behind_m=0.1,
-        viewers=viewers,
-    )
-    assert image.seen.all()
+    scene, frame = a_scene([WALL], []), wall_frame(0.5)
+    assert render_frame(
+        scene, frame, buffer_front_m=0.1, buffer_behind_m=0.1, viewers=viewers
+    ).seen.all()
 
 
 @pytest.mark.parametrize(("gap_m", "is_seen"), [(0.0003, True), (0.0008, False)])
 def test_what_hides_a_wall_stands_half_a_millimetre_before_it(gap_m: float, is_seen: bool) -> None:
-    sides = {"a": (1, 0, 0), "b": (0, 0, 1)}
-    wall = {"centre": (0, 0, 0), "extent": (-2, 2, -1, 1), **sides}
-    film = {"centre": (0, -gap_m, 0), "extent": (-2, 2, -1, 1), "role": 3, **sides}
-    scene = a_scene([wall, film], [])
+    film = {**upright(-gap_m, (-2, 2, -1, 1)), "role": SurfaceRole.OBJECT}
+    scene = a_scene([WALL, film], [])
     viewers = Viewers(positions_world=np.array([[0.0, -2.0, 0.0]]), up=scenes.UP_Z)
     image = render_frame(
         scene, wall_frame(0.5), buffer_front_m=1e-4, buffer_behind_m=0.1, viewers=viewers
@@ -299,25 +275,21 @@ def test_what_hides_a_wall_stands_half_a_millimetre_before_it(gap_m: float, is_s
 
 
 @pytest.mark.parametrize("n_sub", [1, 2, 3])
-def test_rays_of_a_cell_cross_it_in_as_many_rows_and_columns_as_they_are(n_sub: int) -> None:
-    starts: list[NDArray[np.float64]] = []
-
-    class Misses:
-        def cast(self, begin: NDArray[np.float64], *_: object, within: float) -> Hits:
-            starts.append(begin[:2, 0].copy())
-            return Hits(t=np.full(1, np.inf), rectangle=np.full(1, -1, dtype=np.int32))
-
-        def colours(self, rectangle: NDArray[np.int32], _: object) -> NDArray[np.float32]:
-            return np.zeros((4, len(rectangle)), dtype=np.float32)
-
-    renderer = scene_views._Renderer.__new__(scene_views._Renderer)
-    renderer._rays, renderer._n_sub = Misses(), n_sub  # type: ignore[assignment]
-    renderer._normal, renderer._corner = np.array([[0.0], [0.0], [1.0]]), np.zeros((3, 1))
-    renderer._step_u, renderer._step_v = np.eye(3)[:, :1], np.eye(3)[:, 1:2]
-    renderer._width, renderer._reach_m = 5, 1.0
-    renderer._rgb = np.zeros((10, 3), dtype=np.float32)
-    renderer.colour(np.array([7]))
-    # The third cell of the second row; a position in each n^2-th of it, either way.
-    places = np.array(starts) - [2.0, 1.0]
-    evenly = (np.arange(n_sub**2) + 0.5) / n_sub**2
-    np.testing.assert_allclose(np.sort(places, axis=0), np.column_stack([evenly, evenly]))
+def test_a_cell_on_an_edge_shows_both_sides_by_their_shares(n_sub: int) -> None:
+    """Its rays cross it in as many different rows, and columns, as there are rays."""
+    shares = (np.arange(n_sub**2) + 0.5) / n_sub**2 < 0.4
+    expected = 100.0 + 100.0 * shares.mean()
+    # Two fifths of the fifth cell, from the left and from above.
+    x, z = -2.0 + 0.25 * 4.4, 1.0 - 0.25 * 4.4
+    for first, second, at in (
+        ((-2, x, -1, 1), (x, 2, -1, 1), (2, 4)),
+        ((-2, 2, z, 1), (-2, 2, -1, z), (4, 2)),
+    ):
+        scene = a_scene([upright(0.0, first), upright(0.0, second)], [])
+        params = scene.texture_params * [1, 1, 1, 1, 0, 1, 1, 1]
+        params[1, :3] = 100.0
+        scene = replace(scene, texture_params=params)
+        image = render_frame(
+            scene, wall_frame(0.25), buffer_front_m=0.1, buffer_behind_m=0.1, supersample=n_sub
+        )
+        assert image.rgb[at][0] == pytest.approx(expected, abs=1e-3)

@@ -33,14 +33,8 @@ def sparse_wall(spacing_cells: float, *, factor: int = 2) -> Wall:
     rasters["depth_m"][rows, columns] = np.where(columns < 150, STEP_M, 0.0) + noise_m
     count = np.zeros(SHAPE, dtype=np.uint32)
     count[rows, columns] = 1
-    return Wall(
-        frame=samples.facing_south(GSD_M, SHAPE[1], SHAPE[0]),
-        plane_index=0,
-        name="wall",
-        count=count,
-        mask=count.astype(np.uint8),
-        **rasters,
-    )
+    frame = samples.facing_south(GSD_M, SHAPE[1], SHAPE[0])
+    return samples.wall(frame, count=count, **rasters)
 
 
 @pytest.mark.parametrize(("spacing_cells", "factor"), [(2.2, 2), (3.3, 3)])

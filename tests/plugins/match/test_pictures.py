@@ -11,25 +11,18 @@ from numpy.typing import NDArray
 from orthoflow_plugins.match import pictures
 
 from orthoflow.errors import MethodError
-from orthoflow.files.images import encode_png
-from orthoflow.products import Photo, Photos, Wall, Walls
+from orthoflow.products import Photos, Wall
 from tests import samples
 
 GSD_M = 0.01
-UP = np.array([0.0, 0.0, 1.0])
 
 
 def wall(depth_m: NDArray[np.float32], *, intensity: NDArray[np.float32] | None = None) -> Wall:
-    rows, columns = depth_m.shape
-    frame = samples.facing_south(GSD_M, columns, rows)
-    return Wall(
-        frame=frame,
-        plane_index=0,
-        name="wall",
+    return samples.wall(
+        samples.facing_south(GSD_M, *depth_m.shape[::-1]),
         depth_m=depth_m,
         sigma_m=np.full(depth_m.shape, 0.002, dtype=np.float32),
         count=np.full(depth_m.shape, 4, dtype=np.uint32),
-        mask=np.ones(depth_m.shape, dtype=np.uint8),
         intensity=intensity,
     )
 
@@ -138,29 +131,16 @@ def test_a_wall_becomes_a_picture_of_its_inner_percentiles() -> None:
     assert usable[:38].all()
 
 
-def photo(width: int = 20) -> Photo:
-    red = np.zeros((10, 20, 3), dtype=np.uint8)
-    red[..., 0] = 200
-    return Photo(name="a.png", encoded=encode_png(red), width=width, height=10)
-
-
 def test_nothing_to_match_is_refused() -> None:
     with pytest.raises(MethodError, match="there are no photos to match"):
         pictures.require_photos(Photos(photos=()))
-    pictures.require_photos(Photos(photos=(photo(),)))
     silent = wall(np.zeros((2, 2), np.float32))
     shown = replace(silent, intensity=np.zeros((2, 2), np.float32))
-
-    def walls(*given: Wall) -> Walls:
-        return Walls(
-            walls=given, up=UP, intensity_source="none", buffer_front_m=0.1, buffer_behind_m=0.1
-        )
-
     with pytest.raises(MethodError, match="there are no walls to match photos with"):
-        pictures.require_intensity(walls())
+        pictures.require_intensity(samples.walls())
     with pytest.raises(MethodError, match="the scan has neither intensity nor colour"):
-        pictures.require_intensity(walls(silent))
-    pictures.require_intensity(walls(silent, shown))
+        pictures.require_intensity(samples.walls(silent))
+    pictures.require_intensity(samples.walls(silent, shown))
 
 
 def test_a_wall_that_shows_nothing_has_no_picture() -> None:

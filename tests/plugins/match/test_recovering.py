@@ -8,29 +8,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from orthoflow_plugins.match.tracing import (
     lens_of,
     painted_walls,
     pose_of_most,
 )
 
-from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.products import Camera, Photo
 from orthoflow.testing import photographed as ms
 from tests import samples
 from tests.scenes import SURVEY_SHIFT_M
+from tests.tied_photos import SCENE, photo, seen_by
 
-VIEW = ms.camera_before(ms.textured_wall(0))
-
-
-def photo(**known: Any) -> Photo:
-    return Photo(**{"name": "new.png", "encoded": b"", "width": 900, "height": 640, **known})
+VIEW = ms.camera_before(SCENE)
 
 
-def oriented(focal_px: float, *, width: int = 900, height: int = 640) -> Camera:
-    view = replace(VIEW, fx=focal_px, fy=focal_px, width=width, height=height)
-    return ms.oriented(view, name="old.png")
+OLD = {"old.png": ms.oriented(replace(VIEW, fx=1000.0, fy=1000.0), name="old.png")}
 
 
 @pytest.mark.parametrize(
@@ -40,15 +32,15 @@ def oriented(focal_px: float, *, width: int = 900, height: int = 640) -> Camera:
 def test_a_lens_is_taken_from_a_photo_of_the_same_size_and_nearly_the_same_focal_length(
     exif_px: float | None, is_known: bool
 ) -> None:
-    found = lens_of(photo(exif_focal_px=exif_px), {"old.png": oriented(1000.0)}, ms.photos())
+    found = lens_of(photo(name="new.png", exif_focal_px=exif_px), OLD, ms.photos())
     assert (found is not None) == is_known
     if found is not None:
         assert found.fx == 1000.0
 
 
 def test_a_lens_that_contradicts_exif_is_that_of_photos_with_the_same_exif() -> None:
-    old, new = photo(name="old.png", exif_focal_px=500.0), photo(exif_focal_px=500.0)
-    found = lens_of(new, {"old.png": oriented(1000.0)}, ms.photos(old, new))
+    old, new = (photo(name=name, exif_focal_px=500.0) for name in ("old.png", "new.png"))
+    found = lens_of(new, OLD, ms.photos(old, new))
     assert found is not None
     assert found.fx == 1000.0
 
@@ -86,37 +78,24 @@ def test_of_photos_the_one_that_shows_a_place_largest_paints_it() -> None:
         assert np.isnan(second[0].intensity).all()
 
 
-def ties(n: int, seed: int = 1) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    rng = np.random.default_rng(seed)
-    points = rng.uniform([0.2, -0.3, 0.2], [2.8, 0.1, 1.8], (6 * n, 3))
-    pixels = VIEW.project(points)[:, :2]
-    inside = np.flatnonzero(VIEW.sees(pixels))[:n]
-    return pixels[inside], points[inside]
+# The lens of the view, its pose forgotten.
+LENS = replace(VIEW, rotation=np.eye(3), translation=np.zeros(3))
 
 
-def lens() -> ViewingCamera:
-    """The lens of the view, its pose forgotten."""
-    return replace(VIEW, rotation=np.eye(3), translation=np.zeros(3))
-
-
-@pytest.mark.parametrize("shift_m", [np.zeros(3), SURVEY_SHIFT_M], ids=["near", "survey"])
-@pytest.mark.parametrize("wrong_share", [0.0, 0.4])
-def test_the_pose_is_the_one_that_most_points_agree_with(
-    wrong_share: float, shift_m: NDArray[np.float64]
-) -> None:
-    pixels, points = ties(80)
-    n_wrong = round(wrong_share * len(pixels))
-    wrong = pixels.copy()
-    wrong[:n_wrong] = np.random.default_rng(5).uniform([0, 0], [900, 640], (n_wrong, 2))
-    found = pose_of_most(wrong, points + shift_m, lens(), 2.0)
+def test_the_pose_is_the_one_that_most_points_agree_with() -> None:
+    seen = seen_by(VIEW, 80)
+    points, wrong = seen.points_world + SURVEY_SHIFT_M, seen.pixels_photo.copy()
+    wrong[:32] = np.random.default_rng(5).uniform([0, 0], [900, 640], (32, 2))
+    found = pose_of_most(wrong, points, LENS, 2.0)
     assert found is not None
-    np.testing.assert_allclose(found.centre_world, VIEW.centre_world + shift_m, atol=2e-3)
-    np.testing.assert_allclose(found.project(points + shift_m)[:, :2], pixels, atol=0.5)
+    np.testing.assert_allclose(found.centre_world, VIEW.centre_world + SURVEY_SHIFT_M, atol=2e-3)
+    np.testing.assert_allclose(found.project(points)[:, :2], seen.pixels_photo, atol=0.5)
     assert (found.fx, found.cx) == (VIEW.fx, VIEW.cx)
 
 
 @pytest.mark.parametrize(("n_right", "is_found"), [(23, False), (24, True)])
-def test_two_dozen_points_must_agree_with_apose_of_most(n_right: int, is_found: bool) -> None:
-    pixels, points = ties(40)
+def test_two_dozen_points_must_agree_with_a_pose(n_right: int, is_found: bool) -> None:
+    seen = seen_by(VIEW, 40)
+    pixels = seen.pixels_photo.copy()
     pixels[n_right:] = np.random.default_rng(6).uniform([0, 0], [900, 640], (40 - n_right, 2))
-    assert (pose_of_most(pixels, points, lens(), 0.5) is not None) == is_found
+    assert (pose_of_most(pixels, seen.points_world, LENS, 0.5) is not None) == is_found

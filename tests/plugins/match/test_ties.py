@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,9 +12,11 @@ from orthoflow_plugins.match.ties import TiePiece, key_point_ties, ties_of, with
 
 from orthoflow.files.images import encode_png
 from orthoflow.geometry.key_points import Features
-from orthoflow.products import TieRole
+from orthoflow.products import Photos, TieRole
+from orthoflow.testing import photographed as ms
 from tests import inspect_scenes
 from tests.inspect_scenes import GSD_M
+from tests.tied_photos import photo
 
 
 def piece(
@@ -32,6 +34,12 @@ def piece(
         sigma_m=np.array(sigma_m),
         role=given.get("role", TieRole.CONTROL),
     )
+
+
+def photos_of(*masks: bytes | None) -> Photos:
+    """Photos a, b, ... with masks of used pixels or without."""
+    named = zip("ab", masks, strict=False)
+    return ms.photos(*(photo(name=name, width=10, height=8, mask=mask) for name, mask in named))
 
 
 def kept(*pieces: TiePiece) -> list[list[float]]:
@@ -66,9 +74,7 @@ def test_ties_are_joined_in_the_order_of_their_pieces() -> None:
     first = piece([(1.0, 2.0), (3.0, 4.0)], [(0, 0, 0), (1, 1, 1)], [0.1, 0.2], photo=1)
     second = piece([(5.0, 6.0)], [(2, 2, 2)], [0.3], wall=0, role=TieRole.CHECK)
     walls = inspect_scenes.walls()
-    photos: Any = SimpleNamespace(
-        photos=tuple(SimpleNamespace(name=name, mask=None) for name in "ab")
-    )
+    photos = photos_of(None, None)
     ties = ties_of([first, second], photos, walls, {"said": 1}, search_radius_px=(4.0, None))
     assert ties.photo_names == ("a", "b")
     np.testing.assert_array_equal(ties.photo, [1, 1, 0])
@@ -91,17 +97,15 @@ def test_ties_in_masked_pixels_are_left_out() -> None:
     # In the mask; right beside it; and on the rim of the photo, which is nowhere.
     pixels = [(3.2, 5.9), (4.01, 5.9), (10.0, 8.0)]
     first = piece(pixels, [(k, k, k) for k in range(3)], [0.1, 0.2, 0.3])
-    photos: Any = SimpleNamespace(photos=(SimpleNamespace(name="a", mask=encode_png(used)),))
-    ties = ties_of([first], photos, inspect_scenes.walls(), {})
+    ties = ties_of([first], photos_of(encode_png(used)), inspect_scenes.walls(), {})
     np.testing.assert_array_equal(ties.sigma_m, [0.2, 0.3])
     np.testing.assert_array_equal(ties.pixels_photo, pixels[1:])
     # The first column and row are those that begin at 0.
     used[:, 0] = used[0] = 0
-    photos = SimpleNamespace(photos=(SimpleNamespace(name="a", mask=encode_png(used)),))
-    rim = piece(
-        [(0.4, 3.3), (3.3, 0.4), (1.2, 1.2)], [(k, k, k) for k in range(3)], [0.1, 0.2, 0.3]
-    )
-    assert ties_of([rim], photos, inspect_scenes.walls(), {}).sigma_m.tolist() == [0.3]
+    rim = replace(first, pixels_photo=np.array([(0.4, 3.3), (3.3, 0.4), (1.2, 1.2)]))
+    assert ties_of(
+        [rim], photos_of(encode_png(used)), inspect_scenes.walls(), {}
+    ).sigma_m.tolist() == [0.3]
 
 
 def features(pixels: NDArray[np.float64], sizes: list[float]) -> Features:
