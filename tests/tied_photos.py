@@ -99,12 +99,13 @@ def known_ties(
     *,
     n: int = 200,
     wrong_share: float = 0.0,
+    relief: float = 1.0,
     shift_m: NDArray[np.float64] | None = None,
 ) -> Ties:
     """Ties with 0.5 px of noise on the textured wall, a share of them at random places."""
     rng = np.random.default_rng(seed)
     cells = rng.uniform([5, 5], [495, 328], (8 * n, 2))
-    depth = SCENE.depth_m(cells[:, 0] * ms.GSD_M, cells[:, 1] * ms.GSD_M)
+    depth = relief * SCENE.depth_m(cells[:, 0] * ms.GSD_M, cells[:, 1] * ms.GSD_M)
     points = SCENE.frame.world_from_wall(cells, depth)
     pixels = camera.project(points)[:, :2]
     chosen = np.flatnonzero(camera.sees(pixels))[:n]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from orthoflow.geometry.key_points import (
     Matches,
@@ -17,6 +18,7 @@ from orthoflow.geometry.key_points import (
     root_sift,
     two_nearest,
 )
+from orthoflow.testing.photographed import textured_wall, walls_of
 
 
 def test_cells_take_turns_and_their_strongest_come_first() -> None:
@@ -106,55 +108,74 @@ def test_pairs_are_each_other_s_nearest_and_distinct() -> None:
     assert len(mutual_matches(first[:0], second, ratio=0.8)) == 0
 
 
-def window(
-    first_at: list[list[float]], second_at: list[list[float]], **more: list[float]
-) -> Window:
-    def of(name: str, count: int) -> NDArray[np.float32]:
-        return np.array(more.get(name, [0.0] * count), dtype=np.float32)
-
-    return Window(
-        first=np.array(first_at, dtype=np.float32),
-        second=np.array(second_at, dtype=np.float32),
-        radius=10.0,
-        first_log_size=of("first_log_size", len(first_at)),
-        second_log_size=of("second_log_size", len(second_at)),
-        first_angle_deg=of("first_angle_deg", len(first_at)),
-        second_angle_deg=of("second_angle_deg", len(second_at)),
-        max_log_size=0.5,
-        max_angle_deg=20.0,
-    )
-
-
-def test_a_window_knows_places_sizes_and_turns_across_north() -> None:
-    near = window([[0.0, 0.0]], [[9.0, -9.0], [11.0, 0.0], [0.0, 0.0], [0.0, 0.0], [1.0, 1.0]],
-        second_log_size=[0.4, 0.0, 0.6, 0.0, 0.0],
-        first_angle_deg=[355.0],
-        second_angle_deg=[10.0, 0.0, 0.0, 20.0, 340.0],
-    )  # fmt: skip
-    i, j = near.pairs()
-    assert sorted(zip(i.tolist(), j.tolist(), strict=True)) == [(0, 0), (0, 4)]
-
-
-def test_within_a_window_what_lies_outside_is_not_even_second_best() -> None:
-    second = descriptors(4, 7)
-    # Like the first of the second set, and as like the second, which is far away.
-    first = np.rint(0.5 * (second[:1] + second[1:2])) + np.float32(2.0) * np.sign(
-        second[:1] - second[1:2]
-    )
-    outside = window([[0.0, 0.0]], [[1.0, 1.0], [50.0, 0.0], [-1.0, 2.0], [60.0, 60.0]])
-    found = mutual_matches_within(first, second, outside, ratio=0.9)
-    assert paired(found) == [(0, 0)]
-    inside = window([[0.0, 0.0]], [[1.0, 1.0], [5.0, 0.0], [-1.0, 2.0], [60.0, 60.0]])
-    assert paired(mutual_matches_within(first, second, inside, ratio=0.9)) == []
-    # The only candidate is distinct from nothing.
-    alone = window([[0.0, 0.0]], [[1.0, 1.0], [50.0, 0.0], [50.0, 2.0], [60.0, 60.0]])
-    assert paired(mutual_matches_within(first, second, alone, ratio=0.9)) == []
-    assert paired(mutual_matches_within(first, second, alone, ratio=1.0)) == [(0, 0)]
-
-
 def test_of_two_that_are_the_same_none_is_distinct() -> None:
     second = descriptors(50, 8)
     second[7] = second[31]
     first = second[[7, 12]].copy()
     assert paired(mutual_matches(first, second, ratio=0.9)) == [(1, 12)]
     assert paired(best_matches(first, second, ratio=0.9)) == [(1, 12)]
+
+
+def test_neighbours_within_a_window_are_those_of_brute_force() -> None:
+    rng = np.random.default_rng(0)
+    first = rng.integers(0, 80, (600, 128)).astype(np.float32)
+    second = (first[:500] + rng.integers(-9, 10, (500, 128))).astype(np.float32)
+    places = [rng.uniform(0.0, 100.0, (n, 2)).astype(np.float32) for n in (600, 500)]
+    sizes = [rng.normal(size=n).astype(np.float32) for n in (600, 500)]
+    angles = [rng.uniform(0.0, 360.0, n).astype(np.float32) for n in (600, 500)]
+    window = Window(
+        first=places[0],
+        second=places[1],
+        radius=30.0,
+        first_log_size=sizes[0],
+        second_log_size=sizes[1],
+        first_angle_deg=angles[0],
+        second_angle_deg=angles[1],
+        max_log_size=0.7,
+        max_angle_deg=90.0,
+    )
+    found = mutual_matches_within(first, second, window, ratio=0.95)
+    distance = cdist(first.astype(np.float64), second.astype(np.float64))
+    turn = np.abs(angles[0][:, None] - angles[1]) % 360.0
+    distance[
+        (np.abs(places[0][:, None] - places[1]).max(axis=2) > 30.0)
+        | (np.abs(sizes[0][:, None] - sizes[1]) > 0.7)
+        | (np.minimum(turn, 360.0 - turn) > 90.0)
+    ] = np.inf
+    ordered = np.sort(distance, axis=1)
+    nearest = distance.argmin(axis=1)
+    mutual = distance.argmin(axis=0)[nearest] == np.arange(len(first))
+    # One that has no rival is distinct from nothing.
+    ratio = np.full(len(first), np.inf)
+    rivals = np.isfinite(ordered[:, 1])
+    ratio[rivals] = ordered[rivals, 0] / ordered[rivals, 1]
+    expected = np.flatnonzero(mutual & (ratio <= 0.95))
+    assert len(expected) > 10
+    np.testing.assert_array_equal(found.first, expected)
+    np.testing.assert_array_equal(found.second, nearest[expected])
+
+
+@pytest.mark.parametrize("as_opencv", [False, True], ids=["precise", "as OpenCV sets it"])
+def test_key_points_lie_where_they_are(*, as_opencv: bool) -> None:
+    places = np.array([(u, v) for u in np.linspace(30.3, 370.7, 7) for v in (40.1, 200.6, 360.4)])
+    columns, rows = np.meshgrid(np.arange(400) + 0.5, np.arange(400) + 0.5)
+    picture = np.full((400, 400), 60.0)
+    for u, v in places:
+        picture += 120.0 * np.exp(-((columns - u) ** 2 + (rows - v) ** 2) / (2.0 * 4.0**2))
+    grey = np.rint(picture).astype(np.uint8)
+    found = find_features(grey, 3000, as_opencv=as_opencv).pixels
+    nearest = found[np.linalg.norm(found[None] - places[:, None], axis=2).argmin(axis=1)]
+    # OpenCV's default puts them a quarter of a pixel too far to the right and down.
+    np.testing.assert_allclose(np.median(nearest - places, axis=0), 0.0, atol=0.03)
+
+
+def test_the_key_points_that_are_kept_are_described_as_if_all_were() -> None:
+    rgb = walls_of(textured_wall(1)).walls[0].rgb
+    assert rgb is not None
+    grey = np.tile(rgb[..., 0], (1, 5))
+    every, few = (find_features(grey, n) for n in (10**6, 100))
+    assert len(few) == 100 < len(every) / 10
+    # Some lie in the second tile.
+    assert (few.pixels[:, 0] > 2048).any()
+    for name in ("pixels", "sizes_px", "angles_deg", "descriptors"):
+        np.testing.assert_array_equal(getattr(few, name), getattr(every, name)[:100])

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
 from orthoflow.geometry import WallFrame, frame_over
+from orthoflow.geometry.scene_rays import Hits, points_on
 from orthoflow.geometry.scene_views import Rendering, render, render_frame
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind, Viewers
 from tests import scenes
@@ -293,3 +294,12 @@ def test_a_cell_on_an_edge_shows_both_sides_by_their_shares(n_sub: int) -> None:
             scene, wall_frame(0.25), buffer_front_m=0.1, buffer_behind_m=0.1, supersample=n_sub
         )
         assert image.rgb[at][0] == pytest.approx(expected, abs=1e-3)
+
+
+def test_points_lie_where_their_rays_end() -> None:
+    starts = np.array([[1.0, 1.0], [2.0, 2.0], [3.0, 3.0]])
+    ways = np.array([[0.5, 1.0], [0.0, 1.0], [-0.5, 1.0]])
+    hits = Hits(t=np.array([4.0, np.inf]), rectangle=np.array([3, -1], dtype=np.int32))
+    np.testing.assert_array_equal(
+        points_on(starts, ways, hits), [[3.0, 1.0], [2.0, 2.0], [1.0, 3.0]]
+    )

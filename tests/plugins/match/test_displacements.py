@@ -36,11 +36,6 @@ PLACES = np.array([[column, row] for row in (25, 40, 55) for column in (20, 40, 
 def test_noise_is_told_by_the_standard_deviation() -> None:
     first = texture()
     other = moved(first, 1.0, 0.0)
-    quiet, loud = (
-        measure(channels(first), channels(other + sigma * texture(seed=2)), PLACES)
-        for sigma in (0.05, 0.4)
-    )
-    assert np.median(loud.sigma_cells) > 3.0 * np.median(quiet.sigma_cells)
     ratios = []
     for seed in range(2, 8):
         noisy = channels(other + 0.4 * texture(seed=seed))

@@ -9,18 +9,11 @@ import numpy as np
 import pytest
 from orthoflow_plugins.match.pictures import points_on_wall
 from orthoflow_plugins.match.sift import MatchSift
-from scipy.spatial.distance import cdist
 
 from orthoflow.files.images import encode_png
-from orthoflow.geometry.key_points import (
-    Window,
-    find_features,
-    mutual_matches_within,
-)
 from orthoflow.products import Photo, TieRole, Walls
 from orthoflow.testing import photographed as ms
 from tests import matched_walls as mw
-from tests.long_loops import seeds
 from tests.method_runs import run
 
 SCENE = ms.textured_wall(1)
@@ -54,72 +47,6 @@ def test_a_photo_of_nothing_known_is_warned_of(tmp_path: Path) -> None:
     ties = run(MatchSift, ctx, inputs_of(blank)).ties
     assert not (ties.role != TieRole.REJECTED).any()
     assert [each.code for each in ctx.diagnostics] == ["photo-shows-no-wall"]
-
-
-@pytest.mark.parametrize("as_opencv", [False, True], ids=["precise", "as OpenCV sets it"])
-def test_key_points_lie_where_they_are(*, as_opencv: bool) -> None:
-    places = np.array([(u, v) for u in np.linspace(30.3, 370.7, 7) for v in (40.1, 200.6, 360.4)])
-    columns, rows = np.meshgrid(np.arange(400) + 0.5, np.arange(400) + 0.5)
-    picture = np.full((400, 400), 60.0)
-    for u, v in places:
-        picture += 120.0 * np.exp(-((columns - u) ** 2 + (rows - v) ** 2) / (2.0 * 4.0**2))
-    grey = np.rint(picture).astype(np.uint8)
-    found = find_features(grey, 3000, as_opencv=as_opencv).pixels
-    nearest = found[np.linalg.norm(found[None] - places[:, None], axis=2).argmin(axis=1)]
-    # OpenCV's default puts them a quarter of a pixel too far to the right and down.
-    np.testing.assert_allclose(np.median(nearest - places, axis=0), 0.0, atol=0.03)
-
-
-def test_the_key_points_that_are_kept_are_described_as_if_all_were() -> None:
-    rgb = mw.walls(1).walls[0].rgb
-    assert rgb is not None
-    grey = np.tile(rgb[..., 0], (1, 5))
-    every, few = (find_features(grey, n) for n in (10**6, 100))
-    assert len(few) == 100 < len(every) / 10
-    # Some lie in the second tile.
-    assert (few.pixels[:, 0] > 2048).any()
-    for name in ("pixels", "sizes_px", "angles_deg", "descriptors"):
-        np.testing.assert_array_equal(getattr(few, name), getattr(every, name)[:100])
-
-
-@pytest.mark.parametrize("seed", seeds(3))
-def test_neighbours_within_a_window_are_those_of_brute_force(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    first = rng.integers(0, 80, (600, 128)).astype(np.float32)
-    second = (first[:500] + rng.integers(-9, 10, (500, 128))).astype(np.float32)
-    places = [rng.uniform(0.0, 100.0, (n, 2)).astype(np.float32) for n in (600, 500)]
-    sizes = [rng.normal(size=n).astype(np.float32) for n in (600, 500)]
-    angles = [rng.uniform(0.0, 360.0, n).astype(np.float32) for n in (600, 500)]
-    window = Window(
-        first=places[0],
-        second=places[1],
-        radius=30.0,
-        first_log_size=sizes[0],
-        second_log_size=sizes[1],
-        first_angle_deg=angles[0],
-        second_angle_deg=angles[1],
-        max_log_size=0.7,
-        max_angle_deg=90.0,
-    )
-    found = mutual_matches_within(first, second, window, ratio=0.95)
-    distance = cdist(first.astype(np.float64), second.astype(np.float64))
-    turn = np.abs(angles[0][:, None] - angles[1]) % 360.0
-    distance[
-        (np.abs(places[0][:, None] - places[1]).max(axis=2) > 30.0)
-        | (np.abs(sizes[0][:, None] - sizes[1]) > 0.7)
-        | (np.minimum(turn, 360.0 - turn) > 90.0)
-    ] = np.inf
-    ordered = np.sort(distance, axis=1)
-    nearest = distance.argmin(axis=1)
-    mutual = distance.argmin(axis=0)[nearest] == np.arange(len(first))
-    # One that has no rival is distinct from nothing.
-    ratio = np.full(len(first), np.inf)
-    rivals = np.isfinite(ordered[:, 1])
-    ratio[rivals] = ordered[rivals, 0] / ordered[rivals, 1]
-    expected = np.flatnonzero(mutual & (ratio <= 0.95))
-    assert len(expected) > 10
-    np.testing.assert_array_equal(found.first, expected)
-    np.testing.assert_array_equal(found.second, nearest[expected])
 
 
 def test_a_mirrored_photo_is_recognised_as_such(tmp_path: Path) -> None:

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
-from types import SimpleNamespace
-from typing import Any
+from dataclasses import asdict
+from pathlib import Path
 
 import numpy as np
 import pytest
-from orthoflow_plugins.orient.report import (
-    numbers_json,
-    residual_rows,
-    residual_table,
-)
+from orthoflow_plugins.orient.pnp import OrientPnp
+from orthoflow_plugins.orient.report import residual_rows
 
-from orthoflow.geometry.cameras import LensFreedom
-from orthoflow.geometry.resection import Resection, SeenPoints
+from orthoflow.products import TieRole
 from orthoflow.testing import photographed as ms
+from tests import tied_photos as tp
 
 UNITS = {"px": 1.0, "mm": 2.5, "cell": 0.5}
 
@@ -53,110 +49,37 @@ def test_shares_follow_their_three_conventions() -> None:
     assert found["u", "px"]["beyond_any"] == found["v", "px"]["beyond_any"] == 0.1
 
 
-# --- a whole photo ---
-
-CAMERA = replace(
-    ms.camera_before(ms.textured_wall(0)), distortion=np.array([-0.09, 0.0, 0.0, 0.0, 0.0])
-)
-CONTROL = np.array([True, True, True, False, False, False])
-CHECKED = np.array([False, False, False, True, True, False])
-
-
-def candidate(**changes: Any) -> Any:
-    """Six ties 2 m before a camera: three control, two withheld, one rejected."""
-    lens = LensFreedom(focal_sigma=0.05, k1_sigma=0.1)
-    resection = Resection(
-        camera=CAMERA,
-        covariance=np.diag([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 4e-6, 9e-6]),
-        sigma0=1.25,
-        variance_factor=1.5,
-        lens=changes.pop("lens", lens),
-    )
-    residuals = np.array(
-        [[1.0, -1.0], [1.0, 1.0], [-2.0, 2.0], [3.0, 1.0], [1.0, 3.0], [90.0, 9.0]]
-    )
-    estimate = SimpleNamespace(
-        fit=SimpleNamespace(residuals_px=residuals),
-        resection=resection,
-        agreeing=CONTROL | CHECKED,
-        limit=4.5,
-        source="exif",
-        numbers={"skew_px": 0.3},
-    )
-    points = CAMERA.centre_world + 2.0 * np.tile(CAMERA.rotation[2], (6, 1))
-    # What does not determine the pose lies far away, where pixels are larger.
-    points[~CONTROL] += 50.0 * CAMERA.rotation[2]
-    usual: dict[str, Any] = {
-        "photo": SimpleNamespace(name="a.jpg"),
-        "seen": SeenPoints(
-            pixels_photo=np.zeros((6, 2)),
-            points_world=points,
-            sigma_px=np.ones(6),
-            sigma_m=np.zeros(6),
-        ),
-        "control": CONTROL,
-        "checked": CHECKED,
-        "estimate": estimate,
-        "hull_ratio": 0.7,
-        "gsd_m": 0.002,
-        "gsd_mm": 2.0,
-        "error": SimpleNamespace(
-            rms_mm=1.0, worst_mm=3.0, corners_m=np.array([0.004, np.nan, 0.002, 0.001])
-        ),
-    }
-    return SimpleNamespace(**{**usual, **changes})
-
-
-PIXEL_MM = 2000.0 / np.sqrt(CAMERA.fx * CAMERA.fy)
-
-
-def test_an_orientation_is_recorded_with_its_lens_and_errors() -> None:
-    of = candidate()
-    entry = numbers_json(of)
-    assert entry == {
-        "n_control": 3,
-        "n_check": 2,
-        "n_rejected": 1,
-        "pixel_mm": pytest.approx(PIXEL_MM),
-        "hull_ratio": 0.7,
-        "limit_sigma": 4.5,
-        "sigma0": 1.25,
-        "variance_factor": 1.5,
-        "lens": "exif",
-        "focal_px": CAMERA.fx,
-        "k1": -0.09,
-        "skew_px": 0.3,
-        "sigma_wall_mm": 1.0,
-        "sigma_wall_worst_mm": 3.0,
-        "sigma_image_corners_mm": [4.0, None, 2.0, 1.0],
-        # Of the logarithm of the focal length: two thousandths.
-        "focal_sigma_px": pytest.approx(0.002 * CAMERA.fx),
-    }
-    fixed = candidate(lens=LensFreedom(), error=None)
-    left = numbers_json(fixed)
-    assert set(entry) - set(left) == {
-        "sigma_wall_mm",
-        "sigma_wall_worst_mm",
-        "sigma_image_corners_mm",
-        "focal_sigma_px",
-    }
-
-
-@pytest.mark.parametrize("gsd_m", [0.002, None])
-def test_the_table_has_control_and_check_in_units_of_the_wall(gsd_m: float | None) -> None:
-    of = candidate(gsd_m=gsd_m)
-    table = residual_table(of)
-    units = ["px", "mm", *(["cell"] if gsd_m else [])]
-    assert [(row.role, row.axis, row.unit) for row in table] == [
-        (role, axis, unit) for role in ("control", "check") for axis in "uv" for unit in units
-    ]
-    assert {row.photo for row in table} == {"a.jpg"}
-    by = {(row.role, row.axis, row.unit): row for row in table}
-    assert (by["control", "u", "px"].n, by["check", "u", "px"].n) == (3, 2)
-    assert by["control", "u", "px"].max == 2.0
-    assert by["check", "v", "mm"].max == pytest.approx(3.0 * PIXEL_MM)
-    if gsd_m:
-        assert by["check", "v", "cell"].max == pytest.approx(3.0 * PIXEL_MM / 2.0)
+def test_an_orientation_is_recorded_with_its_lens_its_errors_and_its_residuals(
+    tmp_path: Path,
+) -> None:
+    camera = ms.camera_before(tp.SCENE)
+    photos = ms.photos(tp.photo(exif_focal_px=1.01 * camera.fx))
+    ties = tp.known_ties(camera, 2, wrong_share=0.2)
+    found = tp.oriented(OrientPnp, ties, photos, tp.context(tmp_path))
+    (oriented,), role = found.cameras, found.ties.role
+    viewing = oriented.viewing()
+    entry = found.details["photos"]["a.png"]
+    counts = [int((role == kind).sum()) for kind in TieRole]
+    assert [entry[name] for name in ("n_control", "n_check", "n_rejected")] == counts
+    assert counts[2] >= 40
+    depths_m, pixel_mm = viewing.project(ties.points_world[role == 0])[:, 2], entry["pixel_mm"]
+    assert pixel_mm == pytest.approx(1000.0 * np.median(depths_m) / viewing.fx, rel=0.03)
+    assert (entry["lens"], entry["focal_px"]) == ("exif", viewing.fx)
+    assert entry["k1"] == viewing.distortion[0]
+    assert entry["sigma_wall_mm"] == 1000.0 * oriented.sigma_wall_m < entry["sigma_wall_worst_mm"]
+    # Its ties stand for the variance that they have in common, too.
+    assert entry["variance_factor"] > entry["sigma0"] ** 2
+    assert abs(viewing.fx / camera.fx - 1.0) < 4.0 * entry["focal_sigma_px"] / viewing.fx < 0.1
+    table = {(row.role, row.axis, row.unit): row for row in found.residual_table}
+    factors = {"px": 1.0, "mm": pixel_mm, "cell": pixel_mm / (1000.0 * ms.GSD_M)}
+    for kind in (TieRole.CONTROL, TieRole.CHECK):
+        largest = np.abs(found.ties.residual_px[role == kind]).max(axis=0)
+        for axis, longest in zip("uv", largest, strict=True):
+            for unit, factor in factors.items():
+                row = table.pop((kind.name.lower(), axis, unit))
+                assert (row.photo, row.n) == ("a.png", counts[kind])
+                assert row.max == pytest.approx(longest * factor)
+    assert not table
 
 
 def test_numbers_that_nothing_determines_are_none() -> None:
