@@ -119,7 +119,7 @@ def main() -> None:
                 buffer_behind_m=0.15,
             )
             params = DsmBackward.Params()
-            surface = surface_of(walls, 0, params)
+            surface = surface_of(walls, 0)
         with measured("painting"):
             painting = paint(
                 photo,

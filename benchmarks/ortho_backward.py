@@ -209,7 +209,7 @@ def main() -> None:
 
         def task() -> object:
             hides = not is_seen_through
-            surface = surface_of(walls, 0, params, hides=hides, allocate=allocate)
+            surface = surface_of(walls, 0, hides=hides, allocate=allocate)
             return paint(
                 photo,
                 view_of(viewer, surface, params),

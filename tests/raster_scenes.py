@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import mkdtemp
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,9 @@ SURVEY = np.array([634512.347, 486215.781, 112.193])
 
 
 def context(folder: Path, *, cores: int = 2) -> StepContext:
-    return StepContext(rng=np.random.default_rng(7), cores=cores, scratch=folder)
+    """A context with a scratch folder of its own, as each step has one."""
+    scratch = Path(mkdtemp(dir=folder))
+    return StepContext(rng=np.random.default_rng(7), cores=cores, scratch=scratch)
 
 
 @dataclass(frozen=True, kw_only=True)

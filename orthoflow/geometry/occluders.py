@@ -38,6 +38,8 @@ _CORNER_SHARE: Final = 0.25
 # Share of the pairs of points: closer to 1 in 27 than to 1 in 9.
 _SPREAD_SHARE: Final = 0.07
 _SAMPLED_MOST: Final = 1 << 20
+# Points with fewer about them, themselves included, are outliers and hide nothing.
+POINTS_LEAST: Final = 6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +83,7 @@ def occluders_before(
     *,
     spacing_m: float,
     stations_world: NDArray[np.float64] | None,
-    n_least: int,
+    n_least: int = POINTS_LEAST,
     threads: int,
 ) -> Occluders:
     """Count the points between cameras and walls, to detect outliers and estimate point spacing.
@@ -111,7 +113,7 @@ def occluders_in(
     box: Box,
     stations_world: NDArray[np.float64] | None,
     *,
-    n_least: int,
+    n_least: int = POINTS_LEAST,
     threads: int,
 ) -> Occluders:
     """Count the points in a box, to detect outliers and estimate point spacing.

@@ -18,10 +18,8 @@ if TYPE_CHECKING:
     from orthoflow.geometry.occluders import Box
 
 UNSEEN_GREY: Final = 128
-# Default tolerance behind the nearest point, and minimum number of neighbours of points that hide
-# others.
-TOLERANCE_M: Final = 0.05
-OCCLUDER_POINTS_MIN: Final = 6
+# Points at most this far behind the nearest one are seen, too.
+_TOLERANCE_M: Final = 0.05
 # Towards the border of a photo its lens is less certain: quality decreases to 0 over this share.
 _BORDER_SHARE: Final = 0.05
 # OpenCV accepts pictures of fewer than 32,767 rows.
@@ -54,8 +52,6 @@ def colour_points(
     oriented: Sequence[tuple[Photo, ViewingCamera]],
     colours: PointColours,
     *,
-    tolerance_m: float = TOLERANCE_M,
-    occluder_points_min: int = OCCLUDER_POINTS_MIN,
     threads: int = 1,
     progress: Callable[[float, str], object] = lambda _share, _name: None,
 ) -> None:
@@ -69,8 +65,6 @@ def colour_points(
         cloud: the points.
         oriented: photos with their cameras.
         colours: output.
-        tolerance_m: points at most this far behind the nearest one are seen, too.
-        occluder_points_min: points with fewer neighbours, themselves included, hide nothing.
         threads: number of threads; it does not change the result.
         progress: called with the finished share and the photo's name before each photo.
     """
@@ -80,13 +74,12 @@ def colour_points(
         cloud,
         _box_of(cloud, [camera for _, camera in oriented]),
         cloud.stations,
-        n_least=occluder_points_min,
         threads=threads,
     )
     for place, (photo, camera) in enumerate(oriented):
         progress(place / len(oriented), photo.name)
         buffer = before_masks(depth_buffer(occluders, camera), photo)
-        _colour(cloud, photo, camera.shifted(cloud.origin), buffer, tolerance_m, colours, place)
+        _colour(cloud, photo, camera.shifted(cloud.origin), buffer, colours, place)
 
 
 def spacing_of(cloud: PointCloud) -> float:
@@ -99,7 +92,6 @@ def _colour(
     photo: Photo,
     camera: ViewingCamera,
     buffer: DepthBuffer,
-    tolerance_m: float,
     colours: PointColours,
     place: int,
 ) -> None:
@@ -110,7 +102,6 @@ def _colour(
         photo: the photo.
         camera: its camera, relative to the cloud's origin.
         buffer: its depths.
-        tolerance_m: points at most this far behind the nearest one are seen, too.
         colours: of the photos before it; replaced.
         place: number of the photo.
     """
@@ -127,7 +118,7 @@ def _colour(
         index = start + inside
         # No nearer surface hides them by more than the tolerance.
         cells = (pixels / buffer.reduction).astype(np.int64)
-        is_seen = depth_m <= buffer.nearest[cells[:, 1], cells[:, 0]] + tolerance_m
+        is_seen = depth_m <= buffer.nearest[cells[:, 1], cells[:, 0]] + _TOLERANCE_M
         # Pixels per metre squared, decreasing near the photo's border.
         rim = np.minimum(pixels, size - pixels).min(axis=1) / size.min()
         quality = (camera.fx / depth_m) ** 2 * np.clip(rim / _BORDER_SHARE, 1e-3, 1.0)

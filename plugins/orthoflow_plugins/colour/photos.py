@@ -10,8 +10,6 @@ from pydantic import Field
 
 from orthoflow.errors import MethodError
 from orthoflow.files.clouds.photo_colours import (
-    OCCLUDER_POINTS_MIN,
-    TOLERANCE_M,
     UNSEEN_GREY,
     PointColours,
     colour_points,
@@ -45,19 +43,8 @@ class ColourPhotos(Method):
     )
 
     class Params(MethodParams):
-        """When a point counts as seen, and the colour of points that no photo sees."""
+        """The colour of points that no photo sees."""
 
-        tolerance_m: float = Field(
-            TOLERANCE_M,
-            gt=0.0,
-            description="Points at most this far behind the nearest one are seen, too.",
-        )
-        occluder_points_min: int = Field(
-            OCCLUDER_POINTS_MIN,
-            ge=1,
-            description="Points with fewer neighbours, themselves "
-            "included, are outliers and hide nothing.",
-        )
         unseen: Literal["drop", "grey"] = Field(
             "drop", description="Points that no photo sees are left out, or are mid-grey."
         )
@@ -96,8 +83,6 @@ class ColourPhotos(Method):
             cloud,
             chosen,
             colours,
-            tolerance_m=params.tolerance_m,
-            occluder_points_min=params.occluder_points_min,
             threads=ctx.cores,
             progress=ctx.progress,
         )

@@ -41,6 +41,9 @@ _STEP_BAND_CELLS: Final = 2
 _GROSS_GREY: Final = 40.0
 # Whole patches of 32 cells, and blocks large enough that little is lost at their border.
 BLOCK_CELLS: Final = 96
+# Cells of all walls together whose colours are compared, and whose visibility is tested.
+_COLOUR_CELLS: Final = 250_000
+_SEEN_CELLS: Final = 600_000
 # Errors kept of all walls together, 32 bytes each: the standard error of a median of so many is a
 # two-thousandth of their spread.
 _KEPT_ERRORS: Final = 1 << 23
@@ -84,18 +87,16 @@ class SamplingRule:
     lattice_step: int
     error_step: int
 
-
-def sampling_rule(
-    images: Sequence[Orthoimage], *, colour_cells_most: int, seen_cells_most: int
-) -> SamplingRule:
-    """Find the share and the step that limit the number of cells of all images together."""
-    n_shown = sum(n_shown_of(image) for image in images)
-    n_cells = sum(image.mask.size for image in images)
-    return SamplingRule(
-        colour_share=min(1.0, colour_cells_most / max(1, n_shown)),
-        lattice_step=max(1, math.ceil(math.sqrt(n_cells / seen_cells_most))),
-        error_step=max(1, n_cells // _KEPT_ERRORS),
-    )
+    @classmethod
+    def of(cls, images: Sequence[Orthoimage]) -> SamplingRule:
+        """Limit the number of cells of all images together."""
+        n_shown = sum(n_shown_of(image) for image in images)
+        n_cells = sum(image.mask.size for image in images)
+        return cls(
+            colour_share=min(1.0, _COLOUR_CELLS / max(1, n_shown)),
+            lattice_step=max(1, math.ceil(math.sqrt(n_cells / _SEEN_CELLS))),
+            error_step=max(1, n_cells // _KEPT_ERRORS),
+        )
 
 
 def sampling(image: Orthoimage, rule: SamplingRule, first_row: int) -> Sampling:

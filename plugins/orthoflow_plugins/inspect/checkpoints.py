@@ -43,6 +43,7 @@ from orthoflow_plugins.inspect.findings import (
     LENGTHS,
     check_findings,
     length_findings,
+    lower,
     of_walls,
     prefixed,
     report,
@@ -96,13 +97,7 @@ class InspectCheckpoints(Method):
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_points", label="check points"),
         MetricSpec("n_3d", label="check points compared in space"),
-        MetricSpec(
-            "rms_3d_mm",
-            label="check points in space, RMS",
-            better="lower",
-            headline=True,
-            counted_by="n_3d",
-        ),
+        lower("rms_3d_mm", label="check points in space, RMS", headline=True, counted_by="n_3d"),
         MetricSpec("max_3d_mm", label="check points in space, largest error"),
         *(*CHECK_TABLE, *LENGTHS, *DISPLACEMENTS),
         # Metrics of a class of points have its name as prefix.

@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -21,6 +22,8 @@ from orthoflow.products import Finding
 from orthoflow.sdk import MetricSpec, StepContext
 
 _Samples = TypeVar("_Samples")
+
+lower, higher = (partial(MetricSpec, better=better) for better in ("lower", "higher"))
 
 _AXES: Final = ("x", "y")
 # Maximum share of the points that may be outliers.
@@ -35,10 +38,10 @@ _POINTS_MOST: Final = 1000
 CAPPED: Final = "_capped"
 # Statistics of displacements, check points and an orthoimage itself, as metrics.
 DISPLACEMENTS: Final = (
-    MetricSpec("rmse_[xy]_mm", label="displacement along {0}, RMS", better="lower"),
-    MetricSpec("rmse_[xy]_cells", label="displacement along {0}, RMS", better="lower"),
+    lower("rmse_[xy]_mm", label="displacement along {0}, RMS"),
+    lower("rmse_[xy]_cells", label="displacement along {0}, RMS"),
     MetricSpec("mean_[xy]_mm", label="displacement along {0}, mean"),
-    MetricSpec("nmad_[xy]_mm", label="typical displacement along {0} (NMAD)", better="lower"),
+    lower("nmad_[xy]_mm", label="typical displacement along {0} (NMAD)"),
     MetricSpec("max_[xy]_mm", label="largest displacement along {0}"),
     MetricSpec("beyond_2rmse_[xy]_share", label="beyond twice the RMS along {0}"),
     MetricSpec("beyond_2rmse_any_share", label="beyond twice the RMS along u or v"),
@@ -46,47 +49,30 @@ DISPLACEMENTS: Final = (
 )
 LENGTHS: Final = (
     MetricSpec("n_lengths", label="lengths compared"),
-    MetricSpec("length_error_rms_share", label="error of a length over it, RMS", better="lower"),
-    MetricSpec(
-        "length_error_max_share", label="error of a length over it, largest", better="lower"
-    ),
+    lower("length_error_rms_share", label="error of a length over it, RMS"),
+    lower("length_error_max_share", label="error of a length over it, largest"),
 )
 CHECK_TABLE: Final = (
     MetricSpec("n_found", label="check points found"),
-    MetricSpec(
-        "rms_mm", label="check points, RMS", better="lower", headline=True, counted_by="n_found"
-    ),
+    lower("rms_mm", label="check points, RMS", headline=True, counted_by="n_found"),
     MetricSpec("sd_mm", label="check points, standard deviation"),
     MetricSpec("mean_shift_mm", label="check points, mean shift"),
     MetricSpec("mean_shift_share", label="mean shift over the RMS"),
     MetricSpec("n_outliers_once", label="outliers, rule applied once"),
     MetricSpec("n_outliers_iterated", label="outliers, rule iterated"),
     MetricSpec("n_outliers_iterated_capped", label="outliers, rule iterated to the cap"),
-    MetricSpec(
-        "rms_after_once_mm", label="RMS without outliers, rule applied once", better="lower"
-    ),
-    MetricSpec(
-        "rms_after_iterated_mm", label="RMS without outliers, rule iterated", better="lower"
-    ),
-    MetricSpec(
-        "rms_after_iterated_capped_mm",
-        label="RMS without outliers, rule iterated to the cap",
-        better="lower",
-    ),
+    lower("rms_after_once_mm", label="RMS without outliers, rule applied once"),
+    lower("rms_after_iterated_mm", label="RMS without outliers, rule iterated"),
+    lower("rms_after_iterated_capped_mm", label="RMS without outliers, rule iterated to the cap"),
 )
 IMAGE_QUALITY: Final = (
-    MetricSpec(
-        "completeness",
-        label="painted or filled, of the scanned surface",
-        better="higher",
-        headline=True,
-    ),
+    higher("completeness", label="painted or filled, of the scanned surface", headline=True),
     MetricSpec("n_edges", label="edges whose sharpness was measured"),
     MetricSpec("edge_width_cells", label="width of an edge"),
     MetricSpec("mtf50_per_cell", label="sharpness (MTF50)"),
     MetricSpec("filled_share", label="cells filled from neighbours"),
-    MetricSpec("stretch_share", label="cells smeared over steep relief", better="lower"),
-    MetricSpec("smear_share", label="cells smeared along edges", better="lower"),
+    lower("stretch_share", label="cells smeared over steep relief"),
+    lower("smear_share", label="cells smeared along edges"),
 )
 # Metrics compared for every wall; the record has the rest.
 _OF_EACH_WALL: Final = ("rmse_u_mm", "rmse_v_mm", "completeness")

@@ -17,7 +17,7 @@ from orthoflow.geometry.scenes import Scene, SurfaceRole
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Finding, Inspection, Opening, Openings, OutlineSource, Truth, Walls
 from orthoflow.sdk import Determinism, Method, MethodParams, MetricSpec, Ports, StepContext
-from orthoflow_plugins.inspect.findings import rms
+from orthoflow_plugins.inspect.findings import higher, lower, rms
 
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras
@@ -54,29 +54,19 @@ class InspectOpenings(Method):
     determinism: ClassVar[Determinism] = "loose"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_true_openings", label="openings of the scene"),
-        MetricSpec(
-            "n_found_openings", label="openings of the scene that were found", better="higher"
-        ),
-        MetricSpec("n_false_openings", label="outlines of no opening", better="lower"),
-        MetricSpec(
-            "opening_iou_mean", label="overlap with the true openings, mean", better="higher"
-        ),
-        MetricSpec(
-            "opening_iou_min", label="overlap with the true openings, least", better="higher"
-        ),
-        MetricSpec(
-            "opening_depth_error_max_mm",
-            label="error of an opening's depth, largest",
-            better="lower",
-        ),
-        MetricSpec("side_rmse_mm", label="error of sides, RMS", better="lower"),
+        higher("n_found_openings", label="openings of the scene that were found"),
+        lower("n_false_openings", label="outlines of no opening"),
+        higher("opening_iou_mean", label="overlap with the true openings, mean"),
+        higher("opening_iou_min", label="overlap with the true openings, least"),
+        lower("opening_depth_error_max_mm", label="error of an opening's depth, largest"),
+        lower("side_rmse_mm", label="error of sides, RMS"),
         MetricSpec("side_mean_mm", label="openings too large (+) or small, mean of sides"),
         MetricSpec("side_max_mm", label="error of sides, largest"),
-        MetricSpec("side_rmse_cells", label="error of sides, RMS", better="lower"),
+        lower("side_rmse_cells", label="error of sides, RMS"),
         MetricSpec(
             "side_error_over_sigma", label="error of sides over the stated one", better="one"
         ),
-        MetricSpec("n_stray_sides", label="sides without a true one nearby", better="lower"),
+        lower("n_stray_sides", label="sides without a true one nearby"),
     )
 
     class Params(MethodParams):

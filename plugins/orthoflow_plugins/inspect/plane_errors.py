@@ -18,7 +18,8 @@ _FOUND_OFFSET_M: Final = 0.015
 # A wall farther away than this does not match a true plane.
 _SAME_ANGLE_DEG: Final = 3.0
 _SAME_OFFSET_M: Final = 0.03
-_LABEL_SCORES: Final = ("precision", "recall", "f1", "iou")
+# Scores of labels, as metrics and as people read them.
+LABEL_SCORES: Final = {"precision": "precision", "recall": "recall", "f1": "F1", "iou": "IoU"}
 MAIN_MISSED: Final = DiagnosticSpec(
     code="main-wall-missed",
     severity="error",
@@ -114,7 +115,7 @@ def _with_those_of_the_main_wall(scores: list[Finding], truth: Truth) -> list[Fi
     main = truth.planes.names[0]
     return scores + [
         Finding(name=f"label_{score}", value=values[f"label_{score}[{main}]"], unit="1")
-        for score in _LABEL_SCORES
+        for score in LABEL_SCORES
     ]
 
 
@@ -191,7 +192,7 @@ def label_findings(
             iou[index, column],
         )
     findings = []
-    for place, kind in enumerate(_LABEL_SCORES):
+    for place, kind in enumerate(LABEL_SCORES):
         findings.append(
             Finding(name=f"label_{kind}_mean", value=float(scores[:, place].mean()), unit="1")
         )

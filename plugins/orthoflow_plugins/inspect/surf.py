@@ -34,6 +34,7 @@ from orthoflow_plugins.inspect.findings import (
     DISPLACEMENTS,
     IMAGE_QUALITY,
     displacement_findings,
+    lower,
     of_walls,
     prefixed,
     report,
@@ -53,6 +54,8 @@ from orthoflow_plugins.inspect.placing import in_files, on_walls, wall_of
 _FLOOR_SHIFT_CELLS: Final = (0.5, 0.25)
 _FLOOR_CELLS: Final = 600
 _FEWEST_PAIRS: Final = 10
+# Largest displacement that is searched: large enough for gross errors.
+_RADIUS_CELLS: Final = 40.0
 UNFIT: Final = DiagnosticSpec(
     code="surf-not-inspected",
     severity="warning",
@@ -86,11 +89,7 @@ class InspectSurf(Method):
                 MetricSpec("n_key_points_intensity", label="key points of the intensity"),
                 MetricSpec("matched_kept_share", label="matches kept"),
                 MetricSpec("floor_n_pairs", label="pairs compared of intensity with itself"),
-                MetricSpec(
-                    "surf_rmse_[xy]_mm",
-                    label="displacement along {0} by SURF, RMS",
-                    better="lower",
-                ),
+                lower("surf_rmse_[xy]_mm", label="displacement along {0} by SURF, RMS"),
                 MetricSpec(
                     "surf_beyond_2rmse_[xy]_share", label="beyond twice the RMS along {0} by SURF"
                 ),
@@ -111,14 +110,8 @@ class InspectSurf(Method):
     )
 
     class Params(MethodParams):
-        """The radius of the search, and what happens if the comparison is meaningless."""
+        """What happens if the comparison is meaningless."""
 
-        radius_cells: float = Field(
-            40.0,
-            ge=30.0,
-            le=200.0,
-            description="Largest displacement that is searched: large enough for gross errors.",
-        )
         unfit: Literal["refuse", "warn"] = Field(
             "refuse",
             description="refuse: fail where there is no laser intensity or too little in common; "
@@ -147,9 +140,7 @@ class InspectSurf(Method):
         for place, image in enumerate(images if reason is None else ()):
             ctx.progress(place / len(images), image.name)
             wall = wall_of(image, inputs.walls, in_files(ctx, f"{place}.laid"))
-            verdicts.append(
-                _Comparison(inputs.cameras, params.radius_cells, ctx.cores).of(image, wall)
-            )
+            verdicts.append(_Comparison(inputs.cameras, ctx.cores).of(image, wall))
         fit = [item for item in verdicts if len(item.pairs) >= _FEWEST_PAIRS]
         if reason is None and not fit:
             most = max(len(item.pairs) for item in verdicts)
@@ -224,10 +215,9 @@ def _unfit(inputs: InspectSurf.In) -> str | None:
 
 @dataclass(frozen=True)
 class _Comparison:
-    """How walls are compared: their cameras, the radius in cells, and the number of threads."""
+    """How walls are compared: their cameras, and the number of threads."""
 
     cameras: Cameras | None
-    radius: float
     threads: int
 
     def of(self, image: Orthoimage, wall: Wall) -> _Verdict:
@@ -248,7 +238,7 @@ class _Comparison:
         )
 
     def _pairs(self, shown: GreyCells, reference: GreyCells) -> KeyPairs:
-        return find_key_pairs(shown, reference, radius_cells=self.radius, threads=self.threads)
+        return find_key_pairs(shown, reference, radius_cells=_RADIUS_CELLS, threads=self.threads)
 
     def _floor(self, intensity: GreyImage) -> KeyPairs:
         """Return pairs of the intensity with itself shifted, their errors as displacements."""

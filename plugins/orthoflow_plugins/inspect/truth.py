@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry.bands import Band, count_cells
@@ -45,7 +44,6 @@ from orthoflow_plugins.inspect.cell_errors import (
     WallSamples,
     sample_findings,
     sampling,
-    sampling_rule,
     wall_errors,
 )
 from orthoflow_plugins.inspect.figures import (
@@ -53,7 +51,14 @@ from orthoflow_plugins.inspect.figures import (
     depth_error_map,
     displacement_map,
 )
-from orthoflow_plugins.inspect.findings import IMAGE_QUALITY, of_walls, pooled, report
+from orthoflow_plugins.inspect.findings import (
+    IMAGE_QUALITY,
+    higher,
+    lower,
+    of_walls,
+    pooled,
+    report,
+)
 from orthoflow_plugins.inspect.image_quality import quality_findings
 from orthoflow_plugins.inspect.orientation_errors import (
     PoseError,
@@ -65,6 +70,7 @@ from orthoflow_plugins.inspect.orientation_errors import (
 from orthoflow_plugins.inspect.patches import PATCH_CELLS, PatchShifts
 from orthoflow_plugins.inspect.placing import in_files, on_walls, rows_of, wall_of
 from orthoflow_plugins.inspect.plane_errors import (
+    LABEL_SCORES,
     found_planes,
     inspect_planes,
     label_findings,
@@ -81,91 +87,61 @@ if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage
 
 _TRACED_POINTS: Final = 4000
+# True colours are means of this number squared of rays per cell.
+_SUPERSAMPLE: Final = 3
 # Larger walls are compared in bands of this many cells, which take a gigabyte.
 _BAND_CELLS: Final = 1 << 23
 # Number of drawn cells along the longest side of large walls, of which every nth cell is drawn.
 _DRAWN_CELLS: Final = 1800
 # Of each wall, from its cells and from what photos painted on it.
 _OF_WALLS: Final = (
-    MetricSpec("rmse_[uv]_mm", label="error along {0}, RMS", better="lower", headline=True),
+    lower("rmse_[uv]_mm", label="error along {0}, RMS", headline=True),
     MetricSpec("mean_[uv]_mm", label="shift along {0}, mean"),
-    MetricSpec(
-        "nmad_[uv]_mm", label="typical error along {0} (NMAD)", better="lower", headline=True
-    ),
+    lower("nmad_[uv]_mm", label="typical error along {0} (NMAD)", headline=True),
     MetricSpec("p99_[uv]_mm", label="error along {0}, 99th percentile"),
-    MetricSpec(
-        "step_rmse_[uv]_mm", label="error along {0} beside depth steps, RMS", better="lower"
-    ),
-    MetricSpec("patch_rmse_[uv]_mm", label="error along {0} from patches, RMS", better="lower"),
+    lower("step_rmse_[uv]_mm", label="error along {0} beside depth steps, RMS"),
+    lower("patch_rmse_[uv]_mm", label="error along {0} from patches, RMS"),
     MetricSpec("patch_mean_[uv]_mm", label="shift along {0} from patches"),
     MetricSpec("n_patches", label="patches compared with the truth"),
     MetricSpec("displaced_share", label="cells displaced by more than one cell"),
     MetricSpec("depth_median_mm", label="shift of the depth, median"),
-    MetricSpec("depth_nmad_mm", label="typical error of the depth (NMAD)", better="lower"),
-    MetricSpec(
+    lower("depth_nmad_mm", label="typical error of the depth (NMAD)"),
+    lower(
         "depth_rmse_mm",
         label="error of the depth, RMS",
-        better="lower",
         headline=True,
         description="cells at edges have two depths and dominate; depth_nmad_mm is typical",
     ),
-    MetricSpec("depth_step_rmse_mm", label="error of the depth beside steps, RMS", better="lower"),
+    lower("depth_step_rmse_mm", label="error of the depth beside steps, RMS"),
     MetricSpec("depth_within_3sigma", label="depths within three stated sigmas"),
-    MetricSpec("colour_rmse_grey", label="error of the colour, RMS", better="lower"),
-    MetricSpec(
-        "filled_colour_rmse_grey",
-        label="error of the colour of filled cells, RMS",
-        better="lower",
-    ),
-    MetricSpec(
-        "step_colour_rmse_grey",
-        label="error of the colour beside depth steps, RMS",
-        better="lower",
-    ),
+    lower("colour_rmse_grey", label="error of the colour, RMS"),
+    lower("filled_colour_rmse_grey", label="error of the colour of filled cells, RMS"),
+    lower("step_colour_rmse_grey", label="error of the colour beside depth steps, RMS"),
     MetricSpec("gross_colour_share", label="cells with a grossly wrong colour"),
     MetricSpec("ghost_colour_share", label="cells with the colour of an occluder"),
-    MetricSpec(
-        "ghost_share",
-        label="share of the cells painted through an occluder",
-        better="lower",
-    ),
-    MetricSpec(
-        "completeness",
-        label="painted, not filled, of the visible surface",
-        better="higher",
-        headline=True,
-    ),
-    MetricSpec(
-        "completeness_filled",
-        label="painted or filled, of the visible surface",
-        better="higher",
-    ),
-    MetricSpec(
+    lower("ghost_share", label="share of the cells painted through an occluder"),
+    higher("completeness", label="painted, not filled, of the visible surface", headline=True),
+    higher("completeness_filled", label="painted or filled, of the visible surface"),
+    higher(
         "completeness_seen_by_both",
         label="painted, of what both a station and a photo see",
-        better="higher",
         headline=True,
     ),
     MetricSpec("unseen_painted_share", label="painted cells that no photo sees"),
     MetricSpec("n_traced", label="cells traced back to their photo"),
-    MetricSpec("far_source_share", label="cells painted from a wrong place", better="lower"),
+    lower("far_source_share", label="cells painted from a wrong place"),
     MetricSpec("n_ghost_cells", label="cells painted through an occluder"),
     MetricSpec(
         "within_1_sigma_share", label="cells whose error is within what the orthoimage states"
     ),
     MetricSpec(
-        "within_2_sigma_share",
-        label="cells whose error is within twice what the orthoimage states",
+        "within_2_sigma_share", label="cells whose error is within twice what the orthoimage states"
     ),
 )
 # Of planes, also without orthoimages.
 _OF_PLANES: Final = (
-    MetricSpec(
-        "plane_angle_deg", label="direction of the main plane, error", better="lower", headline=True
-    ),
-    MetricSpec(
-        "plane_offset_mm", label="position of the main plane, error", better="lower", headline=True
-    ),
+    lower("plane_angle_deg", label="direction of the main plane, error", headline=True),
+    lower("plane_offset_mm", label="position of the main plane, error", headline=True),
     MetricSpec("plane_corner_max_mm", label="largest error of the main plane at its corners"),
 )
 NOT_COMPARED: Final = DiagnosticSpec(
@@ -221,7 +197,7 @@ class InspectTruth(Method):
         *_needing(
             ("cameras", "orthoimages", "walls"),
             MetricSpec("n_photos", label="photos"),
-            MetricSpec("n_oriented", label="photos oriented", better="higher"),
+            higher("n_oriented", label="photos oriented"),
             MetricSpec("n_misoriented", label="accepted photos with a wrong pose"),
             MetricSpec(
                 "pose_error_over_sigma",
@@ -229,66 +205,37 @@ class InspectTruth(Method):
                 better="one",
                 counted_by="n_oriented",
             ),
-            MetricSpec(
+            lower(
                 "pose_wall_rms_mm",
                 label="true error of the photos on the wall, RMS",
-                better="lower",
                 counted_by="n_oriented",
             ),
-            MetricSpec(
-                "pose_centre_max_mm",
-                label="error of the projection centre, worst",
-                counted_by="n_oriented",
+            *(
+                MetricSpec(name, label=f"{label}, {which}", counted_by="n_oriented")
+                for part, unit, label in (
+                    ("centre", "mm", "error of the projection centre"),
+                    ("wall", "mm", "true error of a photo on the wall"),
+                    ("rotation", "deg", "error of the viewing direction"),
+                )
+                for name, which in (
+                    (f"pose_{part}_max_{unit}", "worst"),
+                    (f"pose_{part}_median_{unit}", "median"),
+                )
             ),
-            MetricSpec(
-                "pose_centre_median_mm",
-                label="error of the projection centre, median",
-                counted_by="n_oriented",
-            ),
-            MetricSpec(
-                "pose_wall_max_mm",
-                label="true error on the wall, worst photo",
-                counted_by="n_oriented",
-            ),
-            MetricSpec(
-                "pose_wall_median_mm",
-                label="true error on the wall, median photo",
-                counted_by="n_oriented",
-            ),
-            MetricSpec(
-                "pose_rotation_max_deg",
-                label="error of the viewing direction, worst",
-                counted_by="n_oriented",
-            ),
-            MetricSpec(
-                "pose_rotation_median_deg",
-                label="error of the viewing direction, median",
-                counted_by="n_oriented",
-            ),
-            MetricSpec("match_wrong_share", label="matches that are wrong", better="lower"),
-            MetricSpec(
+            lower("match_wrong_share", label="matches that are wrong"),
+            lower(
                 "match_wrong_share_own_wall",
                 label="matches with the photo's own wall that are wrong",
-                better="lower",
             ),
             MetricSpec("n_ties_kept", label="ties that the orientation kept"),
-            MetricSpec("tie_wrong_share", label="kept ties that are wrong", better="lower"),
-            MetricSpec(
-                "tie_error_median_cells", label="error of a kept tie, median", better="lower"
-            ),
+            lower("tie_wrong_share", label="kept ties that are wrong"),
+            lower("tie_error_median_cells", label="error of a kept tie, median"),
         ),
         *_needing(
             ("planes",),
             MetricSpec("true_planes", label="true planes"),
-            MetricSpec(
-                "true_planes_found",
-                label="true planes that were found",
-                better="higher",
-                headline=True,
-            ),
-            MetricSpec(
-                "main_found", unit="yes/no", label="main wall found", better="higher", headline=True
-            ),
+            higher("true_planes_found", label="true planes that were found", headline=True),
+            higher("main_found", unit="yes/no", label="main wall found", headline=True),
         ),
         MetricSpec("worst_plane_angle_deg", label="direction of the worst plane, error"),
         MetricSpec("worst_plane_offset_mm", label="position of the worst plane, error"),
@@ -297,36 +244,13 @@ class InspectTruth(Method):
         ),
         *_needing(
             ("labels",),
-            MetricSpec(
-                "label_precision",
-                label="labels of the main plane, precision",
-                better="higher",
-            ),
-            MetricSpec(
-                "label_recall",
-                label="labels of the main plane, recall",
-                better="higher",
-            ),
-            MetricSpec("label_f1", label="labels of the main plane, F1", better="higher"),
-            MetricSpec(
-                "label_iou", label="labels of the main plane, IoU", better="higher", headline=True
-            ),
-            MetricSpec(
-                "label_precision_mean",
-                label="label precision, mean over planes",
-                better="higher",
-            ),
-            MetricSpec(
-                "label_recall_mean",
-                label="label recall, mean over planes",
-                better="higher",
-            ),
-            MetricSpec("label_f1_mean", label="label F1, mean over planes", better="higher"),
-            MetricSpec(
-                "label_iou_mean",
-                label="label IoU, mean over planes",
-                better="higher",
-                headline=True,
+            *(
+                higher(name, label=label, headline=score == "iou")
+                for score, word in LABEL_SCORES.items()
+                for name, label in (
+                    (f"label_{score}", f"labels of the main plane, {word}"),
+                    (f"label_{score}_mean", f"label {word}, mean over planes"),
+                )
             ),
         ),
     )
@@ -336,25 +260,7 @@ class InspectTruth(Method):
     )
 
     class Params(MethodParams):
-        """How finely, and how much of, the truth is rendered."""
-
-        supersample: int = Field(
-            3,
-            ge=1,
-            le=8,
-            description="True colours are means of this number squared of rays per cell.",
-        )
-        colour_cells_most: int = Field(
-            250_000,
-            ge=1,
-            description="Colours are compared in blocks of about this many cells of all walls.",
-        )
-        seen_cells_most: int = Field(
-            600_000,
-            ge=1,
-            description="Completeness is counted on every nth row and "
-            "column, about this many cells of all walls.",
-        )
+        """No parameters."""
 
     class In(Ports):
         """The products to judge, and the truth."""
@@ -381,18 +287,13 @@ class InspectTruth(Method):
         if not inputs.orthoimages.images:
             raise MethodError("there is no orthoimage to inspect, at least one is needed")
         orthoimages = on_walls(inputs.orthoimages, inputs.walls)
-        rule = sampling_rule(
-            orthoimages.images,
-            colour_cells_most=params.colour_cells_most,
-            seen_cells_most=params.seen_cells_most,
-        )
+        rule = SamplingRule.of(orthoimages.images)
         _warn_of_untraced(inputs.orthoimages, inputs.cameras, ctx)
         views = _views(inputs, ctx.cores)
         poses = _pose_errors(inputs, views)
         judge = _Judge(
             inputs=inputs,
             walls=inputs.walls,
-            params=params,
             rule=rule,
             views=views,
             ctx=ctx,
@@ -505,7 +406,6 @@ class _Judge:
 
     inputs: InspectTruth.In
     walls: Walls
-    params: InspectTruth.Params
     rule: SamplingRule
     views: SceneCameras | None
     ctx: StepContext
@@ -590,7 +490,7 @@ class _Judge:
             buffer_front_m=slab.front_m,
             buffer_behind_m=slab.behind_m,
             viewers=viewers,
-            supersample=self.params.supersample,
+            supersample=_SUPERSAMPLE,
             coloured=chosen.coloured,
             judged=chosen.coloured | chosen.lattice,
             cores=self.ctx.cores,

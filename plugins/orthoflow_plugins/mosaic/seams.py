@@ -57,8 +57,6 @@ from orthoflow_plugins.mosaic.joining import (
 )
 from orthoflow_plugins.mosaic.parameters import SeamsParams
 
-# Larger arrays are kept in files.
-_IN_MEMORY_MOST: Final = 1 << 24
 # The map of sources: its longest side, its colours, and their share relative to the grey.
 _LONGEST_PX: Final = 900
 # Sources that the picture names, and letters of a name that leave no room for three abreast.
@@ -152,23 +150,13 @@ class MosaicSeams(Method):
         ),
         MetricSpec("n_overlap_patches", label="patches compared where photos overlap"),
         MetricSpec(
-            "overlap_u_rms_cells",
-            label="offset of overlapping photos along u, RMS",
+            "overlap_[uv]_rms_cells",
+            label="offset of overlapping photos along {0}, RMS",
             better="lower",
         ),
         MetricSpec(
-            "overlap_v_rms_cells",
-            label="offset of overlapping photos along v, RMS",
-            better="lower",
-        ),
-        MetricSpec(
-            "overlap_u_rms_mm",
-            label="offset of overlapping photos along u, RMS on the wall",
-            better="lower",
-        ),
-        MetricSpec(
-            "overlap_v_rms_mm",
-            label="offset of overlapping photos along v, RMS on the wall",
+            "overlap_[uv]_rms_mm",
+            label="offset of overlapping photos along {0}, RMS on the wall",
             better="lower",
         ),
         MetricSpec("outvoted_share", label="cells whose colour contradicts the other photos"),
@@ -270,9 +258,6 @@ class _Joined:
 def _allocated(
     ctx: StepContext, wall: int, name: str, shape: tuple[int, ...], dtype: DTypeLike
 ) -> NDArray[np.generic]:
-    """Return memory for an orthoimage, in a file for a large one."""
-    if math.prod(shape) <= _IN_MEMORY_MOST:
-        return np.zeros(shape, dtype=dtype)
     return ctx.allocate("orthoimages", f"{wall}.{name}", shape, dtype).view(np.ndarray)
 
 
@@ -464,16 +449,14 @@ def _report(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:
     shifts_cells = np.concatenate([item.shifts_cells for item in verdicts])
     ctx.metric("n_overlap_patches", len(shifts_cells), "1")
     if len(shifts_cells):
-        rms = np.sqrt(np.mean(shifts_cells**2, axis=0))
-        ctx.metric("overlap_u_rms_cells", rms[0], "cells")
-        ctx.metric("overlap_v_rms_cells", rms[1], "cells")
         # Millimetres allow comparison of runs with different cell sizes.
         shifts_mm = np.concatenate(
             [1e3 * item.image.frame.gsd_m * item.shifts_cells for item in verdicts]
         )
-        rms_mm = np.sqrt(np.mean(shifts_mm**2, axis=0))
-        ctx.metric("overlap_u_rms_mm", rms_mm[0], "mm")
-        ctx.metric("overlap_v_rms_mm", rms_mm[1], "mm")
+        rms = np.sqrt(np.mean(np.hstack([shifts_cells, shifts_mm]) ** 2, axis=0))
+        names = ("u_rms_cells", "v_rms_cells", "u_rms_mm", "v_rms_mm")
+        for name, value in zip(names, rms, strict=True):
+            ctx.metric(f"overlap_{name}", value, name.rpartition("_")[2])
     grey = np.concatenate([item.steps[0] for item in verdicts])
     if len(grey):
         delta_e = np.concatenate([item.steps[1] for item in verdicts])

@@ -102,7 +102,7 @@ class DsmBackward(Method):
             )
             stack.add(layer)
 
-        out, seconds = project_photos(inputs, params, ctx, project, hides=hides)
+        out, seconds = project_photos(inputs, ctx, project, hides=hides)
         n_layers = sum(layer.source != NO_SOURCE for layer in out.layers.layers)
         n_surface, n_painted, n_hidden = count_shown(inputs.walls, out.layers)
         ctx.metric("n_layers", n_layers, "1")

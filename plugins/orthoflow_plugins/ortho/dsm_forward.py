@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.geometry.bands import (
-    IN_MEMORY_CELLS,
     bands_with_reach,
     count_cells,
-    in_memory,
 )
 from orthoflow.geometry.levels import level_of
 from orthoflow.products import Layer, LayerMask
@@ -79,7 +77,7 @@ class DsmForward(Method):
             if layer is not None:
                 stack.add(layer)
 
-        out, seconds = project_photos(inputs, params, ctx, project)
+        out, seconds = project_photos(inputs, ctx, project)
         painted = [layer for layer in out.layers.layers if layer.source != NO_SOURCE]
         filled = [layer.filled for layer in painted if layer.filled is not None]
         n_filled = sum(int(np.count_nonzero(values)) for values in filled)
@@ -114,8 +112,7 @@ def _layer(
     if not is_before(view, surface):
         return None
     shape, level = surface.frame.shape, level_of(photo.pixels)
-    is_large = math.prod(shape) > IN_MEMORY_CELLS
-    scratch = stack.scratch(wall) if is_large else in_memory
+    scratch = stack.scratch(wall)
     # Kernels accept plain arrays only, not mapped files.
     catch = Catch(
         pixel=np.asarray(scratch("pixel", shape, np.int32), np.int32).view(np.ndarray),
@@ -126,7 +123,7 @@ def _layer(
     lattice = _ray_lattice(photo.viewer, surface)
     if not throw_pixels(view, surface.relief, photo.buffer, lattice, catch):
         return None
-    new = stack.allocator(wall) if is_large else in_memory
+    new = stack.allocator(wall)
     filled = np.asarray(new("filled", shape, np.uint8), np.uint8)
     layer = Layer(
         frame=surface.frame,

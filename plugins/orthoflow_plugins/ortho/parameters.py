@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from pydantic import Field
 
 from orthoflow.sdk import MethodParams
 
 Resampling = Literal["nearest", "bilinear", "cubic", "lanczos"]
+# Points at most this far below the topmost one are on its surface.
+LAYER_M: Final = 0.02
+
 Inpainting = Literal["between", "telea", "navier-stokes", "none"]
 
 
@@ -17,27 +20,6 @@ class VisibilityParams(MethodParams):
 
     incidence_max_deg: float = Field(
         default=80.0, gt=0, lt=90, description="Cells seen more obliquely are not painted."
-    )
-    tolerance_sigma: float = Field(
-        default=3.0,
-        ge=0,
-        description="A surface hides a cell when it is above the ray by more than this many "
-        "standard deviations of depth, and tolerance_cells.",
-    )
-    tolerance_cells: float = Field(
-        default=0.5, ge=0, description="The same in cells, for detail finer than the raster."
-    )
-    occluder_points_min: int = Field(
-        default=6,
-        ge=1,
-        description="Points of the cloud with fewer about them, themselves included, are "
-        "outliers and hide nothing.",
-    )
-    border_share: float = Field(
-        default=0.05,
-        ge=0,
-        le=0.5,
-        description="Quality falls to 0 over this share of a photo's shorter side.",
     )
 
 
@@ -84,7 +66,7 @@ class DirectParams(MethodParams):
         default="topmost",
         description="Colour of a cell: of its topmost point; of the point nearest its centre "
         "on the topmost surface; gaussian mean of that surface by distance to the centre; "
-        "median of its n_top highest points.",
+        "median of its five highest points.",
     )
     skip_below_grey: Annotated[int, Field(ge=0, le=255)] | None = Field(
         default=None,
@@ -98,15 +80,6 @@ class DirectParams(MethodParams):
         default=True,
         description="Balance the colours of scans that differ in brightness or white balance "
         "where they overlap on the walls.",
-    )
-    layer_m: float = Field(
-        default=0.02,
-        gt=0,
-        description="Points at most this far below the topmost "
-        "one are on its surface (not with topmost).",
-    )
-    n_top: int = Field(
-        default=5, ge=1, le=50, description="Maximum number of points for the median."
     )
     inpaint: Inpainting = Field(
         default="between",

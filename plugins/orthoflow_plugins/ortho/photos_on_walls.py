@@ -18,7 +18,6 @@ from orthoflow.products import Camera, Cameras, Layers, Photo, Photos, PointClou
 from orthoflow.sdk import DiagnosticSpec, Ports, StepContext
 from orthoflow.untrusted_text import first_few
 from orthoflow_plugins.ortho.layers import LayerStack
-from orthoflow_plugins.ortho.parameters import VisibilityParams
 
 if TYPE_CHECKING:
     from orthoflow.geometry.cameras import ViewingCamera
@@ -102,7 +101,6 @@ class OpenedPhoto:
 
 def project_photos(
     inputs: PhotosOnWalls,
-    params: VisibilityParams,
     ctx: StepContext,
     project: Callable[[OpenedPhoto, Surface, LayerStack, int], None],
     *,
@@ -112,7 +110,6 @@ def project_photos(
 
     Args:
         inputs: walls and oriented photos.
-        params: when a photo counts as seeing a cell.
         ctx: of the step.
         project: projects a photo onto a wall, by its index, and adds the layer.
         hides: whether relief and cloud hide anything.
@@ -126,12 +123,12 @@ def project_photos(
     oriented = oriented_photos(inputs.walls, inputs.photos, inputs.cameras)
     photos = [photo for photo, _ in oriented]
     level = level_of_all(photos, ctx)
-    surfaces = surfaces_of(inputs.walls, params, ctx, hides=hides)
+    surfaces = surfaces_of(inputs.walls, ctx, hides=hides)
     seconds: defaultdict[str, float] = defaultdict(float)
     started = ctx.clock_s()
     # For all photos, whichever are painted: which points are outliers depends on all cameras.
     viewers = [camera.viewing() for _, camera in oriented]
-    occluders = _occluders(inputs, viewers, params, ctx) if hides else None
+    occluders = _occluders(inputs, viewers, ctx) if hides else None
     seconds["occluders_s"] = ctx.clock_s() - started
     stack = LayerStack(inputs.walls, ctx)
     for nth, ((photo, camera), viewer) in enumerate(zip(oriented, viewers, strict=True)):
@@ -164,10 +161,7 @@ def project_photos(
 
 
 def _occluders(
-    inputs: PhotosOnWalls,
-    viewers: Sequence[ViewingCamera],
-    params: VisibilityParams,
-    ctx: StepContext,
+    inputs: PhotosOnWalls, viewers: Sequence[ViewingCamera], ctx: StepContext
 ) -> Occluders | None:
     """Find objects in front of the walls; None, with a warning, without a cloud."""
     from orthoflow.geometry.occluders import occluders_before
@@ -183,7 +177,6 @@ def _occluders(
         viewers,
         spacing_m=walls.points_apart_m(),
         stations_world=cloud.stations,
-        n_least=params.occluder_points_min,
         threads=ctx.cores,
     )
 

@@ -30,11 +30,13 @@ from orthoflow.geometry.rastering import (
 from orthoflow.geometry.robust import least_absolute
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
-from orthoflow_plugins.ortho.parameters import DirectParams
+from orthoflow_plugins.ortho.parameters import LAYER_M, DirectParams
 
 # Sigma of the Gaussian in cells: a point in the corner of its cell has a weight of a seventh.
 _SIGMA_CELLS: Final = 0.36
 _NO_COLOUR: Final = 999
+# Points of which the median is taken, at most.
+_TOP_MOST: Final = 5
 # Number of points that the median sorts at once.
 _POINTS_AT_ONCE: Final = 1 << 24
 # Places at which colours of scans are compared: side of a square, points of each scan, levels that
@@ -98,7 +100,7 @@ def colours_of(
     cloud, colouring = painters.cloud, params.colouring
     winners = topmost_points(cloud, slab, threads=threads, is_left_out=painters.is_left_out)
     has_point = winners["point"] != NO_POINT
-    floors_m = winners["depth_m"] - np.float32(params.layer_m)
+    floors_m = winners["depth_m"] - np.float32(LAYER_M)
     rgb = np.zeros((slab.n_cells, 3), dtype=np.uint8)
     if colouring == "centre":
         winners = empty_winners(slab.n_cells)
@@ -120,7 +122,7 @@ def colours_of(
             end = int(np.searchsorted(totals, n_before + _POINTS_AT_ONCE, side="right"))
             cells = slice(first, max(first + 1, end))
             tops = list(_on_top(painters, slab, floors_m, threads=threads, cells=cells))
-            _set_medians(rgb, tops, painters.values, params.n_top)
+            _set_medians(rgb, tops, painters.values)
             first, n_before = cells.stop, int(totals[cells.stop - 1])
     else:
         rgb[:] = values_of_winners(winners, painters.values, 0)
@@ -223,9 +225,7 @@ def _on_top(
         )
 
 
-def _set_medians(
-    rgb: NDArray[np.uint8], tops: list[Entries], values: NDArray[np.uint8], n_top: int
-) -> None:
+def _set_medians(rgb: NDArray[np.uint8], tops: list[Entries], values: NDArray[np.uint8]) -> None:
     """Set `rgb` of cells to the median colour, channel by channel, of their highest points."""
     if not tops:
         return
@@ -233,9 +233,9 @@ def _set_medians(
     order = np.lexsort((points, -depths_m, cells))
     cells, points = cells[order], points[order]
     first = np.flatnonzero(np.append(True, cells[1:] != cells[:-1]))
-    sizes = np.minimum(np.diff(np.append(first, cells.size)), n_top)
-    shades = np.full((first.size, n_top, values.shape[1]), _NO_COLOUR, dtype=np.int16)
-    for rank in range(n_top):
+    sizes = np.minimum(np.diff(np.append(first, cells.size)), _TOP_MOST)
+    shades = np.full((first.size, _TOP_MOST, values.shape[1]), _NO_COLOUR, dtype=np.int16)
+    for rank in range(_TOP_MOST):
         has_rank = sizes > rank
         shades[has_rank, rank] = values[points[first[has_rank] + rank]]
     shades.sort(axis=1)

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry.bands import (
-    IN_MEMORY_CELLS,
     Allocate,
     Band,
     bands_with_reach,
     count_cells,
     holds_cells,
-    in_memory,
 )
 from orthoflow.geometry.levels import lit
 from orthoflow.geometry.slabs import Slab
@@ -32,7 +29,7 @@ from orthoflow_plugins.ortho.filling import (
     painted_between,
     reach_rows,
 )
-from orthoflow_plugins.ortho.parameters import DirectParams
+from orthoflow_plugins.ortho.parameters import LAYER_M, DirectParams
 
 if TYPE_CHECKING:
     from orthoflow_plugins.ortho.point_colours import CellColours, Painters
@@ -134,9 +131,7 @@ class PointcloudDirect(Method):
         for k, wall in enumerate(inputs.walls.walls):
             ctx.progress(k / len(inputs.walls.walls), wall.name)
             shape = wall.frame.shape
-            new: Allocate = in_memory
-            if wall.mask.size > IN_MEMORY_CELLS:
-                new = partial(_allocated, ctx, k)
+            new = _arrays_of(ctx, k)
             filled = np.asarray(new("filled", shape, np.uint8), np.uint8)
             layer = Layer(
                 frame=wall.frame,
@@ -272,10 +267,8 @@ def _left_out(
     return is_dark
 
 
-def _allocated(
-    ctx: StepContext, wall: int, name: str, shape: tuple[int, ...], dtype: DTypeLike
-) -> NDArray[np.generic]:
-    return ctx.allocate("layers", f"{wall}.{name}", shape, dtype)
+def _arrays_of(ctx: StepContext, wall: int) -> Allocate:
+    return lambda name, shape, dtype: ctx.allocate("layers", f"{wall}.{name}", shape, dtype)
 
 
 def _fill(
@@ -298,7 +291,7 @@ def _fill(
         is_filled = painted_between(
             np.flatnonzero(is_filled),
             rgb,
-            Surroundings(found.places, width, params.layer_m),
+            Surroundings(found.places, width, LAYER_M),
             found.depth_m,
             reach_cells=params.inpaint_radius_px,
             threads=threads,

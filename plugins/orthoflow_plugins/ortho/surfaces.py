@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
 from typing import Final
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.bands import Allocate, bands_with_reach, in_memory
@@ -27,8 +26,13 @@ from orthoflow_plugins.ortho.visibility_kernels import (
     look_at_cells,
 )
 
-# Surfaces of walls with more cells are kept in files, and computed in bands of so many.
-_IN_MEMORY_MOST: Final = 1 << 26
+# A surface hides a cell if it is above the ray by more than so many standard deviations of depth,
+# and so many cells, for detail finer than the raster.
+_TOLERANCE_SIGMAS: Final = 3.0
+_TOLERANCE_CELLS: Final = 0.5
+# Quality falls to 0 over this share of a photo's shorter side.
+_BORDER_SHARE: Final = 0.05
+# What hides is computed in bands of so many cells.
 _BAND_CELLS: Final = 1 << 17
 # A cell influences what hides others as far as this.
 _REACH_ROWS: Final = 4
@@ -53,23 +57,20 @@ class Surface:
     tolerance_m: float
 
 
-def surfaces_of(
-    walls: Walls, params: VisibilityParams, ctx: StepContext, *, hides: bool = True
-) -> list[Surface]:
-    """Each wall as the surface that rays hit; with `hides` false its relief hides nothing."""
+def surfaces_of(walls: Walls, ctx: StepContext, *, hides: bool = True) -> list[Surface]:
+    """Return each wall as the surface that rays hit; with `hides` false it hides nothing."""
     return [
-        surface_of(walls, index, params, hides=hides, allocate=partial(_allocated, ctx, index))
+        surface_of(walls, index, hides=hides, allocate=_in_file(ctx, index))
         for index in range(len(walls.walls))
     ]
 
 
+def _in_file(ctx: StepContext, index: int) -> Allocate:
+    return lambda name, shape, dtype: ctx.allocate("relief", f"{index}.{name}", shape, dtype)
+
+
 def surface_of(
-    walls: Walls,
-    index: int,
-    params: VisibilityParams,
-    *,
-    hides: bool = True,
-    allocate: Allocate = in_memory,
+    walls: Walls, index: int, *, hides: bool = True, allocate: Allocate = in_memory
 ) -> Surface:
     """Prepare one wall; `allocate` returns the array of the heights that hide."""
     wall = walls.walls[index]
@@ -78,17 +79,8 @@ def surface_of(
         frame=wall.frame,
         relief=relief_of(wall, hides=hides, allocate=allocate),
         front_m=walls.slab(index).front_m,
-        tolerance_m=params.tolerance_sigma * noise_m + params.tolerance_cells * wall.frame.gsd_m,
+        tolerance_m=_TOLERANCE_SIGMAS * noise_m + _TOLERANCE_CELLS * wall.frame.gsd_m,
     )
-
-
-def _allocated(
-    ctx: StepContext, wall: int, name: str, shape: tuple[int, ...], dtype: DTypeLike
-) -> NDArray[np.generic]:
-    """Prepare a wall, in a file if it is large."""
-    if math.prod(shape) <= _IN_MEMORY_MOST:
-        return np.empty(shape, dtype=dtype)
-    return ctx.allocate("relief", f"{wall}.{name}", shape, dtype)
 
 
 def view_of(camera: ViewingCamera, surface: Surface, params: VisibilityParams) -> WallView:
@@ -108,7 +100,7 @@ def view_of(camera: ViewingCamera, surface: Surface, params: VisibilityParams) -
         front_m=float(surface.front_m),
         tolerance_m=float(surface.tolerance_m),
         cosine_least=math.cos(math.radians(params.incidence_max_deg)),
-        border_px=max(1.0, params.border_share * min(camera.width, camera.height)),
+        border_px=max(1.0, _BORDER_SHARE * min(camera.width, camera.height)),
     )
 
 

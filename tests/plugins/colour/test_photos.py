@@ -35,7 +35,6 @@ def test_points_take_the_colour_of_what_the_photo_sees_there(tmp_path: Path) -> 
         ortho_scenes.cloud(where),
         photos,
         ortho_scenes.cameras(viewer),
-        tolerance_m=0.01,
     )
     assert cloud.rgb is not None
     points = cloud.points_world()
@@ -66,7 +65,7 @@ def test_unseen_points_may_stay_in_grey(tmp_path: Path) -> None:
     photos = ortho_scenes.photos(ortho_scenes.rendered())
     cameras = ortho_scenes.cameras(ortho_scenes.camera(where))
     bare = ortho_scenes.cloud(where)
-    kept, metrics = coloured(tmp_path, bare, photos, cameras, unseen="grey", tolerance_m=0.01)
+    kept, metrics = coloured(tmp_path, bare, photos, cameras, unseen="grey")
     assert len(kept) == len(bare)
     assert kept.rgb is not None
     grey = np.all(kept.rgb == 128, axis=1).mean()

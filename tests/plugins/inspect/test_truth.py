@@ -319,14 +319,15 @@ def test_a_large_wall_takes_the_memory_of_a_band(
     inputs = InspectTruth.In(**finer(6))
     assert inputs.orthoimages is not None
     n_cells = inputs.orthoimages.images[0].mask.size
-    params = InspectTruth.Params(colour_cells_most=20_000, supersample=1)
+    monkeypatch.setattr(module, "_SUPERSAMPLE", 1)
     monkeypatch.setattr(module, "_BAND_CELLS", 1000)
+    monkeypatch.setattr("orthoflow_plugins.inspect.cell_errors._COLOUR_CELLS", 20_000)
     monkeypatch.setattr("orthoflow_plugins.inspect.cell_errors._KEPT_ERRORS", 5000)
     monkeypatch.setattr("orthoflow_plugins.inspect.image_quality._TILE_CELLS", 128)
     context = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
     tracemalloc.start()
     try:
-        InspectTruth().run(inputs, params, context)
+        InspectTruth().run(inputs, InspectTruth.Params(), context)
         # A band with its surroundings has half of the cells; the whole took 174 bytes each.
         assert tracemalloc.get_traced_memory()[1] < 110 * n_cells
     finally:

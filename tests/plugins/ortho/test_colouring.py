@@ -13,7 +13,7 @@ from orthoflow.products import Layer, LayerMask
 from tests import raster_scenes as scenes
 from tests.plugins.ortho.test_direct import bare_walls
 
-N_TOP = 3
+N_TOP = 5
 
 
 def painted(
@@ -22,14 +22,12 @@ def painted(
     """A wall with two layers of random colours, and its points by cell."""
     known = scenes.leaning_wall(shape=(20, 30))
     rng = np.random.default_rng(8)
-    n_points = 2000
+    n_points = 6000
     places = rng.uniform([0, 0], [30, 20], (n_points, 2))
     depths_m = rng.choice([-0.06, 0.05], n_points) + rng.uniform(0.0, 0.009, n_points)
     rgb = rng.integers(0, 256, (n_points, 3), dtype=np.uint8)
     cloud = scenes.cloud_of(known.world(*places.T, depths_m), rgb=rgb)
-    chosen = PointcloudDirect.Params.model_validate(
-        {"colouring": colouring, "n_top": N_TOP, "inpaint": inpaint}
-    )
+    chosen = PointcloudDirect.Params.model_validate({"colouring": colouring, "inpaint": inpaint})
     inputs = PointcloudDirect.In(walls=bare_walls(known), cloud=cloud)
     ctx = scenes.context(folder)
     layer = PointcloudDirect().run(inputs, chosen, ctx).layers.layers[0]

@@ -35,7 +35,7 @@ def boxes(seed: int) -> tuple[WallView, Relief]:
         front_m=scenes.BUFFER_M,
         tolerance_m=TOLERANCE_M,
     )
-    params = VisibilityParams(incidence_max_deg=80.0, border_share=0.05)
+    params = VisibilityParams(incidence_max_deg=80.0)
     camera = scenes.camera(where, aside_m=rng.uniform(-0.5, 0.5))
     view = view_of(camera, surface, params)
     # So near that rays graze: they fall by less over a cell than boxes are high.

@@ -54,7 +54,7 @@ def test_a_footprint_is_that_of_the_middle_of_what_is_painted(aside_m: float) ->
     painted = np.zeros((20, 40), dtype=np.bool_)
     painted[13 - 10 : 16 - 10, 30 - 18 : 33 - 18] = True
     tile, inner = (slice(12, 30), slice(20, 58)), (slice(2, 20), slice(2, 40))
-    params = VisibilityParams(incidence_max_deg=80.0, border_share=0.05)
+    params = VisibilityParams(incidence_max_deg=80.0)
     found = footprint_of(view_of(camera, surface, params), surface, painted, tile, inner)
     at = np.array([[31.5, 14.5], [35.5, 14.5], [31.5, 18.5]])
     points = where.world_from_wall(at, 0.03)

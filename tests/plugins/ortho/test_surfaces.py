@@ -91,9 +91,7 @@ def test_bands_of_a_large_wall_do_not_show(monkeypatch: pytest.MonkeyPatch) -> N
     np.testing.assert_array_equal(relief_of(wall).occluding, whole)
 
 
-PARAMS = VisibilityParams(
-    incidence_max_deg=70.0, border_share=0.05, tolerance_sigma=4.0, tolerance_cells=0.25
-)
+PARAMS = VisibilityParams(incidence_max_deg=70.0)
 
 
 def surface_of(depths: NDArray[np.floating]) -> Surface:
@@ -118,9 +116,6 @@ def test_a_camera_is_the_same_in_the_axes_of_a_wall() -> None:
     assert (view.gsd_m, view.front_m, view.tolerance_m) == (where.gsd_m, 0.2, 0.007)
     assert view.cosine_least == pytest.approx(math.cos(math.radians(70.0)))
     assert view.border_px == 0.05 * min(camera.width, camera.height)
-    # A pixel at least, or none would fade.
-    borderless = PARAMS.model_copy(update={"border_share": 0.0})
-    assert view_of(camera, surface, borderless).border_px == 1.0
     # Points in metres right, down and before the wall are seen where the camera sees them.
     at = np.random.default_rng(2).uniform([0.0, 0.0, -0.1], [1.2, 0.9, 0.1], (20, 3))
     world = where.world_from_wall(at[:, :2] / where.gsd_m, at[:, 2])
@@ -150,27 +145,16 @@ def test_surfaces_tolerate_their_noise_and_what_cells_cannot_hold(tmp_path: Path
     wall = wall_of(depths)
     walls = samples.walls(wall, replace(wall, plane_index=0), buffer_m=0.15)
     ctx = context(tmp_path)
-    first, second = surfaces_of(walls, PARAMS, ctx)
+    first, second = surfaces_of(walls, ctx)
     noise_m = depth_noise_m(wall.depth_m)
     assert noise_m == pytest.approx(0.002, rel=0.1)
-    assert first.tolerance_m == pytest.approx(4.0 * noise_m + 0.25 * GSD_M)
+    assert first.tolerance_m == pytest.approx(3.0 * noise_m + 0.5 * GSD_M)
     assert first.front_m == 0.15
     assert first.frame is wall.frame
     assert first.relief.occluding.size == second.relief.occluding.size == 3600
-    (clear, _) = surfaces_of(walls, PARAMS, ctx, hides=False)
+    (clear, _) = surfaces_of(walls, ctx, hides=False)
     assert clear.relief.occluding.size == 0
-    assert clear.tolerance_m == 0.25 * GSD_M  # nothing to tell from noise
-
-
-@pytest.mark.parametrize(("most", "is_file"), [(11, True), (12, False)])
-def test_what_hides_of_a_large_wall_lies_in_a_file(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, most: int, is_file: bool
-) -> None:
-    monkeypatch.setattr(surfaces, "_IN_MEMORY_MOST", most)
-    ctx = context(tmp_path)
-    given = surfaces._allocated(ctx, 3, "occluding", (3, 4), np.int16)
-    assert (given.shape, given.dtype) == ((3, 4), np.int16)
-    assert isinstance(given, np.memmap) == is_file
+    assert clear.tolerance_m == 0.5 * GSD_M  # nothing to tell from noise
 
 
 @pytest.mark.parametrize(("step_cells", "is_edge"), [(4.9, False), (5.1, True)])

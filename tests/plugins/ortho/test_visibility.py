@@ -28,7 +28,7 @@ from tests import ortho_scenes as scenes
 from tests import samples
 from tests.raster_scenes import context
 
-PARAMS = VisibilityParams(incidence_max_deg=80.0, border_share=0.05)
+PARAMS = VisibilityParams(incidence_max_deg=80.0)
 
 
 def noisy_depths() -> NDArray[np.float32]:
