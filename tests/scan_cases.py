@@ -475,6 +475,25 @@ def e57_two_intensity_limits(draw: Draw) -> Case:
     return Case(scene=joined(scenes), paths=[path], rgb=True, intensity="equal")
 
 
+def e57_not_finite(draw: Draw) -> Case:
+    """Coordinates that are not finite, with or without a pose of the scan."""
+    scene = draw.scene
+    lost = draw.chosen(draw.one_of(0.1, 0.5))
+    fields = _e57_fields(scene, -STATION)
+    for name in draw.one_of(("cartesianY",), ("cartesianX", "cartesianY", "cartesianZ")):
+        fields[name] = np.where(lost, draw.one_of(np.nan, np.inf, -np.inf), fields[name])
+    scan = {"fields": fields, "intensity_limits": (0.0, 1.0), "rgb_limit": 255}
+    scan |= {"rotation": (1.0, 0.0, 0.0, 0.0), "translation": STATION}
+    return Case(
+        scene=scene.part(~lost),
+        paths=[scan_files.write_e57(draw.folder / "a.e57", [scan])],
+        rgb=True,
+        intensity="equal",
+        left_out={"not_finite": int(lost.sum())},
+        warnings=("not finite",),
+    )
+
+
 # Points without a return, in any format
 
 

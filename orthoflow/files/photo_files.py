@@ -257,7 +257,7 @@ def tiff_pixels(encoded: bytes) -> Colours:
 
 
 def _tiff_alpha(encoded: bytes) -> NDArray[np.bool_] | None:
-    """Return the opaque pixels of a TIFF file, from its alpha or from a mask page."""
+    """Return the opaque pixels of a TIFF file, from its alpha, its nodata value or a mask page."""
     from rasterio.enums import ColorInterp
 
     found = photo_page(encoded)
@@ -282,6 +282,9 @@ def _tiff_alpha(encoded: bytes) -> NDArray[np.bool_] | None:
             full = np.iinfo(alpha.dtype).max
             if is_stated or np.isin(alpha, (0, full)).all():
                 opaque = alpha > full // 2
+        if opaque is None and page.nodata is not None:
+            # GDAL's tag, e.g. for the margins of undistorted photos.
+            opaque = page.dataset_mask() > 0
     for at in masks:
         with _tiff_page(encoded, at) as page:
             shown: NDArray[np.bool_] = page.read(1) > 0

@@ -145,6 +145,13 @@ def transparent(kind: str) -> bytes:
         with memory.open(driver="GTiff", **options, **size) as out:
             out.write(np.moveaxis(np.dstack([PICTURE, alpha]), -1, 0))
         return bytes(memory.getbuffer())
+    if kind == "nodata":
+        memory = rasterio.MemoryFile()
+        bands = np.where(alpha > 0, np.moveaxis(np.maximum(PICTURE, 1), -1, 0), 0)
+        options = {"count": 3, "dtype": "uint8", "nodata": 0, "transform": Affine.scale(2, -2)}
+        with memory.open(driver="GTiff", height=96, width=128, **options) as out:
+            out.write(bands)
+        return bytes(memory.getbuffer())
     if kind == "palette":
         image = Image.fromarray(np.where(alpha > 0, 7, 3).astype(np.uint8)).convert("P")
         stream = io.BytesIO()
@@ -153,7 +160,7 @@ def transparent(kind: str) -> bytes:
     return saved(kind, np.dstack([PICTURE, alpha]), lossless=True)
 
 
-@pytest.mark.parametrize("kind", ["PNG", "TIFF", "WEBP", "palette"])
+@pytest.mark.parametrize("kind", ["PNG", "TIFF", "nodata", "WEBP", "palette"])
 def test_what_is_transparent_is_known_in_every_format(kind: str) -> None:
     opaque = opaque_pixels(transparent(kind))
     assert opaque is not None

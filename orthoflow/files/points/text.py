@@ -227,6 +227,13 @@ def _labels(header: str) -> list[str]:
 
 def _first_lines(path: Path) -> list[str]:
     with path.open("rb") as file:
+        start = file.read(MOST_LINE_BYTES)
+        if b"\r" in start and b"\n" not in start:
+            raise InputError(
+                f"{path.name} ends its lines with a carriage return only (CR, as old Macintosh "
+                "programs do): save it with line feeds (LF, or CR LF)"
+            )
+        file.seek(0)
         raw = take_lines(file, _HEADER_LINES + _SAMPLE_LINES)
     if raw and raw[0].startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise InputError(f"{path.name} is UTF-16 text: save it as UTF-8 or plain ASCII")

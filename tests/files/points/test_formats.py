@@ -135,6 +135,7 @@ REFUSED: list[tuple[Make, str]] = [
       in ("1 2 3 10 20 30 40\n", "1 2 3 10 20 30 22\n", "1 2 3 4 5\n", "1 2 3 4 5 6 7 8\n")),
     (text("a.xyz", "1 2 3\n4 5 6\n7 eight 9\n"), "a.xyz, line 3: expected 3 .* got '7 eight 9'"),
     (text("a.xyz", "1 2 3\n4 5 6 7 8\n"), r"a\.xyz, line 2: expected 3 numbers"),
+    (text("a.xyz", "1 2 3\r4 5 6\r"), r"a\.xyz ends its lines with a carriage return only"),
     (text("a.xyz", "# only\n# comments\n"), r"no line with three numbers among its first 2"),
     (text("a.xyz", "5\n1 2 3\n4 5 6\n"), "a.xyz is cut off: its list holds 2 points, .* states 5"),
     # E57
