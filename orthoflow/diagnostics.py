@@ -11,7 +11,7 @@ import re
 import string
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, Literal, Protocol
+from typing import Any, Final, Literal
 
 from orthoflow_provenance.document import RecordedDiagnostic as Diagnostic
 
@@ -192,36 +192,8 @@ def warning_texts(reported: Iterable[Diagnostic]) -> tuple[str, ...]:
     )
 
 
-class ReportingCell(Protocol):
-    """A cell with its outcome, of a run or a record."""
-
-    @property
-    def address(self) -> str:
-        """Of the cell."""
-
-    @property
-    def method(self) -> str:
-        """Id of its method."""
-
-    @property
-    def status(self) -> str:
-        """`ok`, `failed` or `skipped`."""
-
-    @property
-    def diagnostics(self) -> Sequence[Diagnostic]:
-        """What it reported."""
-
-    # Any: a mapping of protocols is not one of classes that fulfil them.
-    @property
-    def inputs(self) -> Mapping[str, Any]:
-        """Products that it took, with a `digest`."""
-
-    @property
-    def outputs(self) -> Mapping[str, Any]:
-        """Products that it made, with a `digest`."""
-
-
-def standing(cells: Iterable[ReportingCell]) -> tuple[tuple[str, Diagnostic], ...]:
+# Any: cells of a run or of a record, with their outcome.
+def standing(cells: Iterable[Any]) -> tuple[tuple[str, Diagnostic], ...]:
     """Return address and diagnostic of all that no later step has settled."""
     cells = tuple(cells)
     settled = {

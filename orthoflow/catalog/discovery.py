@@ -173,19 +173,8 @@ def _describe_failure(
         entry_point=entry.name,
         module=entry.value,
         distribution=distribution,
-        error=f"{describe_error(error)}{_way_out(entry, error)}",
+        error=describe_error(error),
         traceback="".join(traceback.format_exception(error)),
-    )
-
-
-def _way_out(entry: EntryPoint, error: BaseException) -> str:
-    """State who names a module that does not exist; nothing of any other failure."""
-    missing = error.name if isinstance(error, ModuleNotFoundError) else None
-    if missing is None or not f"{entry.module}.".startswith(f"{missing}."):
-        return ""
-    return (
-        f'; its entry point in pyproject.toml names it: mend {entry.name} = "{entry.value}" in '
-        f'[project.entry-points."{ENTRY_POINT_GROUP}"], and install it again'
     )
 
 

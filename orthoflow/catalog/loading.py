@@ -44,24 +44,15 @@ def import_target(target: str, what: str, distribution: DistributionInfo) -> obj
     except UserInterrupt:
         raise
     except BaseException as error:
-        problem, way_out = describe_error(error), _way_out(error, target, distribution)
+        problem = describe_error(error)
         lacks_it = isinstance(error, AttributeError) and error.obj is module
         if lacks_it and module is not None:
             near = did_you_mean(name, vars(module))
             problem = f"{module_name} has no {name}{near}"
         raise PluginError(
-            f"{what} of {distribution} cannot be loaded from {target}: {problem}; {way_out}"
+            f"{what} of {distribution} cannot be loaded from {target}: {problem}; install what is "
+            f"missing or another version of {distribution.name}, or correct its source"
         ) from error
-
-
-def _way_out(error: BaseException, target: str, distribution: DistributionInfo) -> str:
-    """What helps: something that is missing, another release, or mending one's own source."""
-    package = target.partition(":")[0].partition(".")[0]
-    missing = (error.name or "") if isinstance(error, ImportError) else ""
-    other = f"another version of {distribution.name}"
-    if missing and missing.partition(".")[0] != package:
-        return f"install what is missing, or {other}"
-    return f"mend its source or the hooks, or install {other}"
 
 
 def load_method(

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
 from orthoflow.cli.commands import RecordCommand, code_for, echo_error, input_option, store_option
 from orthoflow.cli.exports.choices import Choices
-from orthoflow.cli.exports.formats import FORMATS, Format, check_choices
+from orthoflow.cli.exports.formats import FORMATS, Format, FormatOption, check_choices
 from orthoflow.cli.exports.products import make_empty
 from orthoflow.cli.tables import counted, echo
 from orthoflow.errors import ArgumentError, RecordError
@@ -17,6 +18,7 @@ from orthoflow.errors import ArgumentError, RecordError
 if TYPE_CHECKING:
     from orthoflow.records.runs import Run
 
+_Command = TypeVar("_Command", bound=Callable[..., Any] | click.Command)
 # In the run's folder, with a folder per format.
 _EXPORT_FOLDER: Final = "export"
 
@@ -28,6 +30,20 @@ class _Scale(click.IntRange):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
         text: Any = value.replace(" ", "").removeprefix("1:") if isinstance(value, str) else value
         return int(super().convert(text, param, ctx))
+
+
+_CLOUDS: Final = "laz copc ply e57"
+_DRAWN: Final = "plan section elevation sheet"
+_STEPWISE: Final = (
+    f"colmap dxf figures geojson layers {_CLOUDS} gltf tiles {_DRAWN} relief qgis iiif"
+)
+
+
+# Any: an option takes what click takes.
+def _for(formats: str, *names: str, help: str, **more: Any) -> Callable[[_Command], _Command]:
+    """Add an option that belongs to some formats only."""
+    text = f"{formats.replace(' ', ', ')}: {help}"
+    return click.option(*names, cls=FormatOption, formats=formats.split(), help=text, **more)
 
 
 _HELP: Final = "\n\n".join(
@@ -64,138 +80,149 @@ _HELP: Final = "\n\n".join(
 )
 @input_option
 @store_option
-@click.option(
+@_for(
+    _STEPWISE,
     "--step",
     "--cell",
     "cell",
     metavar="ADDRESS",
-    help="colmap: the step with the orientations; by default the last one that oriented photos. "
-    "laz, copc, ply, e57: the step that found the planes; by default the last one that did. "
-    "layers: the step that projected photos onto walls, likewise. figures: only those of this "
-    "step. gltf, tiles, sheet, dxf, geojson: the step of the orthoimages, likewise.",
+    help="the step whose results are written; by default the last one that has them (figures: all "
+    "steps).",
 )
-@click.option(
+@_for(
+    "ro-crate",
     "--license",
     "license_text",
     metavar="URL",
-    help="ro-crate: the license of the results, its URL or name.",
+    help="the license of the results, its URL or name.",
 )
-@click.option(
+@_for(
+    "ro-crate",
     "--author",
     metavar="NAME",
-    help="ro-crate: who made the results: a name, https://orcid.org/..., or both, the name first.",
+    help="who made the results: a name, https://orcid.org/..., or both, the name first.",
 )
-@click.option(
+@_for(
+    _DRAWN,
     "--scale",
     type=_Scale(min=1, max=100_000),
     metavar="N",
-    help="sheet: draw at 1:N (50 or 1:50); by default the largest usual scale at which each wall "
-    "fits onto one sheet.",
+    help="draw at 1:N (50 or 1:50); by default the largest usual scale at which each drawing fits "
+    "onto one sheet.",
 )
-@click.option(
+@_for(
+    _DRAWN,
     "--paper",
     metavar="PAPER",
-    help="sheet: A0 to A4, a long one as A3.1 (297 x 841 mm), or width x height in mm as "
-    "700x500; by default the smallest that takes each wall on one sheet (without --scale at most "
-    "A3).",
+    help="A0 to A4, a long one as A3.1 (297 x 841 mm), or width x height in mm as 700x500; by "
+    "default the smallest that takes each drawing on one sheet (without --scale at most A3).",
 )
-@click.option(
+@_for(
+    "plan section sheet",
     "--grid",
     type=click.FloatRange(min=0.0),
     metavar="DISTANCE",
-    help="sheet: distance of the crosses with coordinates in --units, 0 for none; by default "
-    "about 2 cm on the paper.",
+    help="distance of the crosses with coordinates in --units, 0 for none; by default about 2 cm "
+    "on the paper.",
 )
-@click.option(
+@_for(
+    "sheet",
     "--units",
     type=click.Choice(["m", "ft"]),
-    help="sheet: unit of coordinates, heights and the scale bar; m by default. With ft the usual "
-    "scales are 1:48 (1/4 inch to the foot) and so on.",
+    help="unit of coordinates, heights and the scale bar; m by default. With ft the usual scales "
+    "are 1:48 (1/4 inch to the foot) and so on.",
 )
-@click.option(
+@_for(
+    _DRAWN,
     "--title-block",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="sheet: YAML file with any of project, title, site, client, organisation, author, "
-    "checked_by, date, drawing, revision, note, logo, fields, revisions, layout (column or "
-    "strip).",
+    help="YAML file with any of project, title, site, client, organisation, author, checked_by, "
+    "date, drawing, revision, note, logo, fields, revisions, layout (column or strip).",
 )
-@click.option(
+@_for(
+    "sheet",
     "--beside",
     multiple=True,
     type=click.Choice(["depth", "intensity"]),
-    help="sheet: show depth as contours, or the laser intensity, beside the orthoimage; can be "
-    "given twice.",
+    help="show depth as contours, or the laser intensity, beside the orthoimage; can be given "
+    "twice.",
 )
-@click.option(
+@_for(
+    "plan",
     "--height",
     "heights_m",
     type=float,
     multiple=True,
     metavar="METRES",
-    help="plan: height of the cut above the floor, 1.2 by default; can be given several times.",
+    help="height of the cut above the floor, 1.2 by default; can be given several times.",
 )
-@click.option(
+@_for(
+    "section",
     "--through",
     multiple=True,
     metavar="X,Y,X,Y",
-    help="section: two places of the plan, metres in the coordinates of the scan; the viewer has "
-    "the first on the left; can be given several times.",
+    help="two points of the plan, metres in the coordinates of the scan; the viewer has the first "
+    "on the left; can be given several times.",
 )
-@click.option("--dimensions", is_flag=True, help="plan, section: write lengths beside the lines.")
-@click.option(
+@_for("plan section", "--dimensions", is_flag=True, help="write lengths beside the lines.")
+@_for(
+    _DRAWN,
     "--language",
     type=click.Choice(["en", "de", "fr", "pl", "es"]),
-    help="sheet, plan, section, elevation: language of labels; en by default.",
+    help="language of labels; en by default.",
 )
-@click.option(
+@_for(
+    "relief",
     "--light",
     metavar="AZIMUTH,ALTITUDE",
-    help="relief: direction of the light in degrees: clockwise from the top on the wall, and "
-    "altitude above its plane; 315,25 (top left) by default.",
+    help="direction of the light in degrees: clockwise from the top on the wall, and altitude "
+    "above its plane; 315,25 (top left) by default.",
 )
-@click.option(
+@_for(
+    "iiif",
     "--base-url",
     metavar="URL",
-    help="iiif: where the folder will be published, e.g. https://example.org/room; "
+    help="where the folder will be published, e.g. https://example.org/room; "
     "http://localhost:8000 by default.",
 )
-@click.option(
+@_for(
+    "figures",
     "--format",
     "figure_format",
     type=click.Choice(["pdf", "svg", "png"]),
-    help="figures: format of charts and drawings, png at 300 dpi; svg by default. Pictures "
-    "become pages of a PDF, and stay PNG otherwise.",
+    help="format of charts and drawings, png at 300 dpi; svg by default. Pictures become pages of "
+    "a PDF, and stay PNG otherwise.",
 )
-@click.option(
+@_for(
+    _CLOUDS,
     "--colour",
     type=click.Choice(["photos", "rgb", "intensity", "plane", "deviation"]),
-    help="laz, copc, ply, e57: the colours are of the oriented photos (grey where none sees the "
-    "point), of the scan, its intensity, a colour per plane, or blue behind and red in front of "
-    "the plane; by default the first of these that is available.",
+    help="the colours are of the oriented photos (grey where none sees the point), of the scan, "
+    "its intensity, a colour per plane, or blue behind and red in front of the plane; by default "
+    "the first of these that is available.",
 )
-@click.option(
+@_for(
+    f"{_CLOUDS} dxf geojson gltf tiles relief iiif sheet",
     "--wall",
     type=click.IntRange(min=0),
     metavar="K",
-    help="laz, copc, ply, e57: only points over the raster of wall K, as its files are numbered. "
-    "gltf, tiles, sheet, dxf, geojson: only that wall.",
+    help="only wall K, as its files are numbered; of a cloud only the points over its raster.",
 )
-@click.option(
+@_for(
+    _CLOUDS,
     "--box",
     metavar="X,Y,Z,X,Y,Z",
-    help="laz, copc, ply, e57: only points between two corners, in the coordinates of the scan, "
-    "metres.",
+    help="only points between two corners, in the coordinates of the scan, metres.",
 )
-@click.option(
+@_for(
+    _CLOUDS,
     "--clean",
     is_flag=True,
-    help="laz, copc, ply, e57: without points that have fewer than ten neighbours.",
+    help="without points that have fewer than ten neighbours.",
 )
-@click.option(
-    "--relief",
-    is_flag=True,
-    help="gltf: walls with the relief of their depths, not as planes.",
+@_for(
+    "gltf", "--relief", is_flag=True, help="walls with the relief of their depths, not as planes."
 )
 @click.option(
     "-o",
@@ -213,7 +240,7 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     from orthoflow.records.verify import broken_seal
 
     chosen = Choices(**choices)
-    check_choices(chosen, target, flags())
+    check_choices(chosen, target, format_options())
     opened = open_run(run)
     name = target or ("datasets" if chosen.split else "embedded")
     folder = output or _folder_inside(opened, *((_EXPORT_FOLDER,) if target else ()), name)
@@ -232,9 +259,9 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     return code_for([finding], f"do not use anything in {folder}")
 
 
-def flags() -> dict[str, str]:
-    """Return the options as users write them, by the name of their field."""
-    return {str(option.name): option.opts[0] for option in export.params}
+def format_options() -> list[FormatOption]:
+    """Return the options that belong to some formats only."""
+    return [option for option in export.params if isinstance(option, FormatOption)]
 
 
 def _export_to(target: Format, run: Run, folder: Path, chosen: Choices) -> str:

@@ -8,9 +8,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from typing import Final, TypeAlias
@@ -146,27 +144,6 @@ def derive_seed(workflow_seed: int, method_id: str, repeat: int) -> int:
 # The graph of steps -------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class StepGraph:
-    """Which steps take products of which.
-
-    Attributes:
-        sources: step -> steps whose products it takes.
-        users: step -> steps that take its products.
-    """
-
-    sources: Mapping[str, AbstractSet[str]]
-    users: Mapping[str, AbstractSet[str]]
-
-    def before(self, name: str) -> set[str]:
-        """Return all steps that a step needs, directly or not."""
-        return _reached(self.sources, [name])
-
-    def after(self, name: str) -> set[str]:
-        """Return all steps that need a step, directly or not."""
-        return _reached(self.users, [name])
-
-
 def _reached(edges: Mapping[str, Collection[str]], starts: Iterable[str]) -> set[str]:
     reached: set[str] = set()
     waiting = [name for start in starts for name in edges[start]]
@@ -178,22 +155,12 @@ def _reached(edges: Mapping[str, Collection[str]], starts: Iterable[str]) -> set
     return reached
 
 
-def step_graph(steps: Mapping[str, WorkflowStep]) -> StepGraph:
-    """Return the graph of steps."""
-    sources = {name: set(step.upstream()) for name, step in steps.items()}
-    users: dict[str, set[str]] = {name: set() for name in steps}
-    for name, needed in sources.items():
-        for source in needed:
-            users[source].add(name)
-    return StepGraph(sources, users)
-
-
 def topological_steps(steps: Mapping[str, WorkflowStep]) -> tuple[str, ...]:
     """Sort steps so that each follows all it needs, otherwise in the order of the file."""
-    sources, waiting = step_graph(steps).sources, list(steps)
+    waiting = list(steps)
     ordered: dict[str, None] = {}
     while waiting:
-        name = next(name for name in waiting if ordered.keys() >= sources[name])
+        name = next(name for name in waiting if ordered.keys() >= {*steps[name].upstream()})
         waiting.remove(name)
         ordered[name] = None
     return tuple(ordered)
@@ -257,12 +224,13 @@ def select_cells(
     """
     for option, names in selection.by_option.items():
         check_step_names(workflow, names, option)
-    graph = step_graph(workflow.steps)
+    graph = {name: step.upstream() for name, step in workflow.steps.items()}
+    before = {name: {name, *_reached(graph, [name])} for name in graph}
     chosen = set(workflow.steps)
     if selection.from_:
-        chosen &= {step for name in selection.from_ for step in (name, *graph.after(name))}
+        chosen = {name for name in chosen if not before[name].isdisjoint(selection.from_)}
     if selection.until:
-        chosen &= {step for name in selection.until for step in (name, *graph.before(name))}
+        chosen &= {step for name in selection.until for step in before[name]}
     if selection.only:
         chosen &= set(selection.only)
     if not chosen:
@@ -304,29 +272,13 @@ def combinations(workflow: Workflow, steps: Sequence[str]) -> Iterator[Assignmen
                     yield {**baseline, step: name}
 
 
-def _count(workflow: Workflow, steps: Sequence[str]) -> int:
-    """Count the cells of a step and its repeats, without building them."""
-    *before, name = steps
-    step = workflow.steps[name]
-    repeats = {variant.name: variant.repeat for variant in step.variants}
-    first = repeats[workflow.baseline[name] if step.is_varied else step.variants[0].name]
-    if workflow.compare is None:
-        return first
-    others = [
-        len(workflow.steps[other].variants) for other in before if workflow.steps[other].is_varied
-    ]
-    if workflow.compare.design == "product":
-        return math.prod(others) * sum(repeats.values())
-    return sum(count - 1 for count in others) * first + sum(repeats.values())
-
-
 def _require_few(workflow: Workflow, count: int) -> None:
     """Refuse more cells than are practical.
 
     Raises:
         WorkflowError: there are too many.
     """
-    if count <= MOST_CELLS:
+    if count < MOST_CELLS:
         return
     factors, fewer = "combinations", "fewer variants"
     if workflow.has_seeds:
@@ -334,9 +286,8 @@ def _require_few(workflow: Workflow, count: int) -> None:
     if workflow.chosen_data:
         factors, fewer = f"datasets, {factors}", f"fewer datasets (--only-data), {fewer}"
     raise WorkflowError(
-        f"the comparison of {workflow.name} runs its steps {count} times ({factors} of "
-        f"variants, and repeats), more than {MOST_CELLS}; use design: one-at-a-time, {fewer} "
-        "or a smaller repeat"
+        f"the comparison of {workflow.name} runs its steps {MOST_CELLS} times or more ({factors} "
+        f"of variants, and repeats); use design: one-at-a-time, {fewer} or a smaller repeat"
     )
 
 
@@ -410,25 +361,18 @@ class _Expansion:
     def expand(self) -> tuple[Cell, ...]:
         """Return all cells in topological order, the first of each repeat before the others."""
         workflow = self.workflow
-        graph = step_graph(workflow.steps)
-        relevant = {
-            name: sorted(graph.before(name) | {name}, key=self.rank.__getitem__)
-            for name in self.rank
-        }
-        outer = {name: self._outer(steps) for name, steps in relevant.items()}
-        _require_few(
-            workflow,
-            sum(_count(workflow, steps) * len(outer[name]) for name, steps in relevant.items()),
-        )
+        graph = {name: step.upstream() for name, step in workflow.steps.items()}
         compared = _compared_steps(workflow, self.methods)
-        repeated = compared | _reached(graph.sources, compared)
+        repeated = compared | _reached(graph, compared)
         cells: dict[str, Cell] = {}
-        for name, steps in relevant.items():
+        for name in self.rank:
             step = workflow.steps[name]
+            steps = sorted({name, *_reached(graph, [name])}, key=self.rank.__getitem__)
             made: dict[frozenset[tuple[str, str]], _Node] = {}
             self.nodes[name] = made
-            for fixed in outer[name]:
-                for varied in combinations(workflow, steps):
+            for fixed in self._outer(steps):
+                for n_before, varied in enumerate(combinations(workflow, steps)):
+                    _require_few(workflow, max(n_before, len(cells)))
                     assignment = {**fixed, **varied}
                     try:
                         node = self._node(step, assignment)
@@ -439,7 +383,7 @@ class _Expansion:
                         cells[node.cell.address] = node.cell
                         for cell in self._repeats(node.cell, cells, is_reached=name in repeated):
                             cells[cell.address] = cell
-                        _require_few(workflow, len(cells))
+        _require_few(workflow, len(cells))
         # Cells that only lead to a skipped inspection need no repeats.
         judged = [cell.address for cell in cells.values() if cell.step in compared and cell.repeat]
         needed = {*judged, *_reached({name: cell.sources for name, cell in cells.items()}, judged)}

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeAlias
 
 from pydantic import AfterValidator, BaseModel, Field, TypeAdapter, ValidationError
+from pydantic.json_schema import GenerateJsonSchema
 
 from orthoflow.catalog.catalog import Catalog
 from orthoflow.catalog.discovery import NAME_PATTERN
@@ -39,6 +40,13 @@ _SWEEP: Final = {"$ref": "#/$defs/SweepSection"}
 _SHOWN: Final = ("description", "default")
 
 
+class _Untitled(GenerateJsonSchema):
+    """Without titles made of the names of fields, which are of no use to an editor."""
+
+    def field_title_should_be_set(self, schema: object) -> bool:
+        return False
+
+
 def workflow_schema(catalog: Catalog) -> dict[str, JsonValue]:
     """Return the schema, JSON Schema 2020-12, for editors and other programs.
 
@@ -46,11 +54,11 @@ def workflow_schema(catalog: Catalog) -> dict[str, JsonValue]:
     cannot know whether references and ports fit together.
     """
     methods = list(_loadable(catalog))
-    schema = WorkflowFile.model_json_schema(by_alias=True)
+    schema = WorkflowFile.model_json_schema(by_alias=True, schema_generator=_Untitled)
     defs: Schema = schema["$defs"]
-    defs["SweepSection"] = SweepSection.model_json_schema()
+    defs["SweepSection"] = SweepSection.model_json_schema(schema_generator=_Untitled)
     for info in methods:
-        params = info.Params.model_json_schema()
+        params = info.Params.model_json_schema(schema_generator=_Untitled)
         defs |= {
             f"{info.id}.{name}": _renamed(inner, info)
             for name, inner in params.pop("$defs", {}).items()
@@ -98,7 +106,6 @@ def workflow_schema(catalog: Catalog) -> dict[str, JsonValue]:
         if choice.get("type") == "object":
             _name_keys(choice, is_needed=True)
     schema["required"] = ["orthoflow", "steps"]
-    _tidy(schema)
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "orthoflow workflow",
@@ -157,20 +164,6 @@ def _name_keys(schema: Schema, *, is_needed: bool = False, taken: str = "") -> N
     schema["propertyNames"] = names
     if is_needed:
         schema["minProperties"] = 1
-
-
-def _tidy(schema: Any) -> None:
-    """Drop what is of no use to an editor: titles made of names, `null` for absent keys."""
-    if isinstance(schema, list):
-        for item in schema:
-            _tidy(item)
-        return
-    if not isinstance(schema, dict):
-        return
-    if isinstance(schema.get("title"), str):
-        del schema["title"]
-    for value in schema.values():
-        _tidy(value)
 
 
 # Flowchart ----------------------------------------------------------------------------------------

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,92 +36,14 @@ from orthoflow.products import Cameras, Photo, Photos, Planes, PointCloud, Point
 from orthoflow.records.runs import Run
 
 
-def export_laz(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write `cloud.laz` and what it holds as `cloud.json`."""
-    return _export(run, folder, chosen, ("cloud.laz", write_laz))
-
-
-def export_copc(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write `cloud.copc.laz` and what it holds as `cloud.json`."""
-    return _export(run, folder, chosen, ("cloud.copc.laz", write_copc))
-
-
-def export_ply(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write `cloud.ply` and what it holds as `cloud.json`."""
-    return _export(run, folder, chosen, ("cloud.ply", write_ply))
-
-
-def export_e57(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write `cloud.e57` and what it holds as `cloud.json`."""
-    return _export(run, folder, chosen, ("cloud.e57", write_e57))
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Found:
-    """What a run has of its cloud.
-
-    Attributes:
-        address: the cell that labelled it, else that gave it.
-        digest: of the cloud.
-        oriented: photos with their cameras; empty where nobody asked for their colours.
-        can_show: the colourings that there is something for, the best first.
-    """
-
-    address: str
-    digest: str
-    cloud: PointCloud
-    planes: Planes | None
-    labels: PointLabels | None
-    walls: Walls | None
-    oriented: Sequence[tuple[Photo, ViewingCamera]]
-    can_show: Sequence[Colouring]
-
-
 def _export(
+    name: str,
+    write: Callable[[Path, AttributedCloud], int],
     run: Run,
     folder: Path,
     chosen: Choices,
-    target: tuple[str, Callable[[Path, AttributedCloud], int]],
 ) -> str:
-    name, write = target
-    found = _found(run, chosen)
-    colouring = chosen.colour or found.can_show[0]
-    if colouring not in found.can_show:
-        raise ArgumentError(
-            f"--colour {colouring}: the run has nothing for it ({found.address}); it has what is "
-            f"needed for {', '.join(found.can_show)}"
-        )
-    wall, wall_plane = _wall(found.walls, chosen.wall)
-    box_world = _box(chosen.box)
-    attributed = AttributedCloud(
-        cloud=found.cloud,
-        colouring=colouring,
-        neighbourhoods=neighbourhoods_of(found.cloud),
-        planes=found.planes,
-        labels=found.labels,
-        photo_names=tuple(photo.name for photo, _ in found.oriented),
-        wall=wall,
-        wall_plane=wall_plane,
-        box_world=box_world,
-        is_cleaned=chosen.clean,
-        crs_wkt=_crs_wkt(found.walls),
-        name=found.digest,
-    )
-    if attributed.is_empty:
-        raise ArgumentError(
-            f"no point of the cloud of {found.address} is left: choose another --wall or --box"
-        )
-    make_empty(folder)
-    with tempfile.TemporaryDirectory(dir=folder) as scratch:
-        if colouring == "photos":
-            attributed = replace(attributed, photo_colours=_photo_colours(found, Path(scratch)))
-        n_written = write(folder / name, attributed)
-        describe_cloud(folder / "cloud.json", attributed, name, n_written)
-    of_all = "" if n_written == len(found.cloud) else f" of {len(found.cloud)}"
-    return f"{name}: {counted(n_written, 'point')}{of_all} by {colouring}, cloud of {found.address}"
-
-
-def _found(run: Run, chosen: Choices) -> _Found:
+    """Write the cloud to a file of that name, and what it holds as `cloud.json`."""
     is_labelled = chosen.cell is not None or any(
         output.type_name == "labels"
         for cell in run.cells.values()
@@ -150,26 +73,57 @@ def _found(run: Run, chosen: Choices) -> _Found:
     # Read only where their colours may be wanted; a refusal names them all the same.
     is_wanted = chosen.colour in {None, "photos"}
     oriented = _oriented(run, cells, chosen) if is_wanted else ()
-    has = {
+    has: dict[Colouring, bool] = {
         "photos": bool(oriented) if is_wanted else bool(_makers_of_cameras(cells)),
         "rgb": cloud.rgb is not None,
         "intensity": cloud.intensity is not None,
         "plane": labels is not None,
         "deviation": planes is not None or chosen.wall is not None,
     }
-    can_show: list[Any] = [name for name, is_there in has.items() if is_there]
+    can_show = [name for name, is_there in has.items() if is_there]
     if not can_show:
         raise ArgumentError(f"the cloud of {address} has no colours, intensities or planes to show")
-    return _Found(
-        address=address,
-        digest=digest,
+    colouring = chosen.colour or can_show[0]
+    if colouring not in can_show:
+        raise ArgumentError(
+            f"--colour {colouring}: the run has nothing for it ({address}); it has what is needed "
+            f"for {', '.join(can_show)}"
+        )
+    walls = last_product(run, cells, Walls, chosen.store)
+    wall, wall_plane = _wall(walls, chosen.wall)
+    attributed = AttributedCloud(
         cloud=cloud,
+        colouring=colouring,
+        neighbourhoods=neighbourhoods_of(cloud),
         planes=planes,
         labels=labels,
-        walls=last_product(run, cells, Walls, chosen.store),
-        oriented=oriented,
-        can_show=can_show,
+        photo_names=tuple(photo.name for photo, _ in oriented),
+        wall=wall,
+        wall_plane=wall_plane,
+        box_world=_box(chosen.box),
+        is_cleaned=chosen.clean,
+        crs_wkt=_crs_wkt(walls),
+        name=digest,
     )
+    if attributed.is_empty:
+        raise ArgumentError(
+            f"no point of the cloud of {address} is left: choose another --wall or --box"
+        )
+    make_empty(folder)
+    with tempfile.TemporaryDirectory(dir=folder) as scratch:
+        if colouring == "photos":
+            colours = _photo_colours(cloud, oriented, Path(scratch))
+            attributed = replace(attributed, photo_colours=colours)
+        n_written = write(folder / name, attributed)
+        describe_cloud(folder / "cloud.json", attributed, name, n_written)
+    of_all = "" if n_written == len(cloud) else f" of {len(cloud)}"
+    return f"{name}: {counted(n_written, 'point')}{of_all} by {colouring}, cloud of {address}"
+
+
+export_laz = partial(_export, "cloud.laz", write_laz)
+export_copc = partial(_export, "cloud.copc.laz", write_copc)
+export_ply = partial(_export, "cloud.ply", write_ply)
+export_e57 = partial(_export, "cloud.e57", write_e57)
 
 
 def _makers_of_cameras(cells: Any) -> dict[str, Any]:
@@ -197,9 +151,11 @@ def _oriented(run: Run, cells: Any, chosen: Choices) -> tuple[tuple[Photo, Viewi
     )
 
 
-def _photo_colours(found: _Found, scratch: Path) -> PointColours:
+def _photo_colours(
+    cloud: PointCloud, oriented: Sequence[tuple[Photo, ViewingCamera]], scratch: Path
+) -> PointColours:
     """Colours in files that are mapped, so that memory does not follow the points."""
-    n_points = len(found.cloud)
+    n_points = len(cloud)
 
     def mapped(name: str, kind: type[np.generic], *more: int) -> NDArray[Any]:
         return np.memmap(scratch / name, dtype=kind, mode="w+", shape=(n_points, *more))
@@ -209,7 +165,7 @@ def _photo_colours(found: _Found, scratch: Path) -> PointColours:
     rgb = mapped("rgb", np.uint8, 3)
     rgb[:] = UNSEEN_GREY
     colours = PointColours(rgb=rgb, best=mapped("best", np.float32), photo=photo)
-    colour_points(found.cloud, found.oriented, colours)
+    colour_points(cloud, oriented, colours)
     return colours
 
 

@@ -6,7 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+import click
 
 from orthoflow.errors import ArgumentError
 
@@ -22,20 +24,18 @@ class Writer(Protocol):
         """Make a folder with `make_empty` once all is there, fill it, and say what was written."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Format:
     """One format of `--to`.
 
     Attributes:
         writer: import string `module:function` below `orthoflow.cli.exports`, of a `Writer`.
         summary: what it holds, for the help.
-        options: the fields of `Choices` that belong to it.
         takes_rasters: it reads GeoTIFFs that the run published.
     """
 
     writer: str
     summary: str
-    options: frozenset[str] = frozenset()
     takes_rasters: bool = False
 
     def load(self) -> Writer:
@@ -45,162 +45,139 @@ class Format:
         return writer
 
 
-_CLOUD_OPTIONS: Final = frozenset({"cell", "colour", "wall", "box", "clean"})
-
-_SECTION_OPTIONS: Final = frozenset(
-    {"cell", "scale", "paper", "grid", "title_block", "dimensions", "language"}
-)
-
 FORMATS: Final[Mapping[str, Format]] = {
     "colmap": Format(
-        writer="results:export_colmap",
-        summary="the oriented photos with their lenses and ties as a text model that COLMAP opens",
-        options=frozenset({"cell"}),
+        "results:export_colmap",
+        "the oriented photos with their lenses and ties as a text model that COLMAP opens",
     ),
     "csv": Format(
-        writer="results:export_csv",
-        summary="tables of steps, metrics, parameters, inputs, products and environments",
+        "results:export_csv",
+        "tables of steps, metrics, parameters, inputs, products and environments",
     ),
     "dxf": Format(
-        writer="drawings:export_dxf",
-        summary="each wall in its own coordinates with its orthoimage to scale, and the room in "
+        "drawings:export_dxf",
+        "each wall in its own coordinates with its orthoimage to scale, and the room in "
         "space: planes, where they meet, outline, check points",
-        options=frozenset({"cell", "wall"}),
         takes_rasters=True,
     ),
     "figures": Format(
-        writer="results:export_figures",
-        summary="all figures, the plan of the photos and the curves of sweeps, for publication: "
+        "results:export_figures",
+        "all figures, the plan of the photos and the curves of sweeps, for publication: "
         "--format pdf, svg or png",
-        options=frozenset({"cell", "figure_format"}),
     ),
     "tables": Format(
-        writer="results:export_tables",
-        summary="tables of results as CSV, LaTeX and Markdown, and the citations as BibTeX",
+        "results:export_tables",
+        "tables of results as CSV, LaTeX and Markdown, and the citations as BibTeX",
     ),
     "geojson": Format(
-        writer="drawings:export_geojson",
-        summary="outlines of walls and lines in which planes meet, from above and in the "
+        "drawings:export_geojson",
+        "outlines of walls and lines in which planes meet, from above and in the "
         "coordinates of each wall",
-        options=frozenset({"cell", "wall"}),
         takes_rasters=True,
     ),
     "layers": Format(
-        writer="results:export_layers",
-        summary="the part of each photo on each wall, as GeoTIFFs, from the store unless "
+        "results:export_layers",
+        "the part of each photo on each wall, as GeoTIFFs, from the store unless "
         "the run was made with --embed",
-        options=frozenset({"cell"}),
     ),
     "laz": Format(
-        writer="clouds:export_laz",
-        summary="the registered cloud as LAZ 1.4 with colours, normals, plane, deviation from it "
+        "clouds:export_laz",
+        "the registered cloud as LAZ 1.4 with colours, normals, plane, deviation from it "
         "and scan of each point",
-        options=_CLOUD_OPTIONS,
     ),
     "copc": Format(
-        writer="clouds:export_copc",
-        summary="the same as COPC, a LAZ with an octree: viewers load what they show",
-        options=_CLOUD_OPTIONS,
+        "clouds:export_copc",
+        "the same as COPC, a LAZ with an octree: viewers load what they show",
     ),
     "ply": Format(
-        writer="clouds:export_ply",
-        summary="the same as binary PLY with double coordinates",
-        options=_CLOUD_OPTIONS,
+        "clouds:export_ply",
+        "the same as binary PLY with double coordinates",
     ),
     "e57": Format(
-        writer="clouds:export_e57",
-        summary="the same as E57, one scan each with its pose",
-        options=_CLOUD_OPTIONS,
+        "clouds:export_e57",
+        "the same as E57, one scan each with its pose",
     ),
     "gltf": Format(
-        writer="viewers:export_gltf",
-        summary="the walls of the room with their orthoimages as a model that browsers open, "
-        "room.glb",
-        options=frozenset({"cell", "wall", "relief"}),
+        "viewers:export_gltf",
+        "the walls of the room with their orthoimages as a model that browsers open, room.glb",
         takes_rasters=True,
     ),
     "tiles": Format(
-        writer="viewers:export_tiles",
-        summary="each orthoimage as Deep Zoom tiles, with a page that measures on them without a "
-        "server",
-        options=frozenset({"cell", "wall"}),
+        "viewers:export_tiles",
+        "each orthoimage as Deep Zoom tiles, with a page that measures on them without a server",
         takes_rasters=True,
     ),
     "plan": Format(
-        writer="sections:export_plans",
-        summary=(
-            "the room cut horizontally at --height above the floor, as DXF, SVG and PDF to scale"
-        ),
-        options=_SECTION_OPTIONS | {"heights_m"},
+        "sections:export_plans",
+        ("the room cut horizontally at --height above the floor, as DXF, SVG and PDF to scale"),
         takes_rasters=True,
     ),
     "section": Format(
-        writer="sections:export_sections",
-        summary="the room cut vertically through two points of the plan, likewise",
-        options=_SECTION_OPTIONS | {"through"},
+        "sections:export_sections",
+        "the room cut vertically through two points of the plan, likewise",
         takes_rasters=True,
     ),
     "elevation": Format(
-        writer="sheets:export_elevations",
-        summary="the walls of the room unfolded on one sheet, at their true heights, as PDF",
-        options=frozenset({"cell", "scale", "paper", "title_block", "language"}),
+        "sheets:export_elevations",
+        "the walls of the room unfolded on one sheet, at their true heights, as PDF",
         takes_rasters=True,
     ),
     "relief": Format(
-        writer="drawings:export_relief",
-        summary="each wall as shaded relief, with contour lines and depths in colour",
-        options=frozenset({"cell", "wall", "light"}),
+        "drawings:export_relief",
+        "each wall as shaded relief, with contour lines and depths in colour",
         takes_rasters=True,
     ),
     "qgis": Format(
-        writer="drawings:export_qgis",
-        summary="a QGIS project in which the walls stand side by side at their heights",
-        options=frozenset({"cell"}),
+        "drawings:export_qgis",
+        "a QGIS project in which the walls stand side by side at their heights",
         takes_rasters=True,
     ),
     "iiif": Format(
-        writer="viewers:export_iiif",
-        summary="an IIIF manifest with the pictures of each wall as layers, and their tiles",
-        options=frozenset({"cell", "wall", "base_url"}),
+        "viewers:export_iiif",
+        "an IIIF manifest with the pictures of each wall as layers, and their tiles",
         takes_rasters=True,
     ),
     "prov": Format(
-        writer="results:export_prov",
-        summary=(
+        "results:export_prov",
+        (
             "W3C PROV-JSON: which products were derived from which, by which method of "
             "which software"
         ),
     ),
     "stac": Format(
-        writer="results:export_stac",
-        summary="the orthoimages with a STAC item beside each, and a collection",
+        "results:export_stac",
+        "the orthoimages with a STAC item beside each, and a collection",
         takes_rasters=True,
     ),
     "ro-crate": Format(
-        writer="results:export_crate",
-        summary="record, report and products as a Provenance Run Crate, for archives",
-        options=frozenset({"license_text", "author"}),
+        "results:export_crate",
+        "record, report and products as a Provenance Run Crate, for archives",
         takes_rasters=True,
     ),
     "sheet": Format(
-        writer="sheets:export_sheets",
-        summary="each wall on paper in exact scale, as PDF, with coordinates, title block, "
+        "sheets:export_sheets",
+        "each wall on paper in exact scale, as PDF, with coordinates, title block, "
         "legend, accuracy and the seal of the record",
-        options=frozenset(
-            {"cell", "scale", "paper", "wall", "grid", "units", "title_block", "beside", "language"}
-        ),
         takes_rasters=True,
     ),
 }
 
 
-def check_choices(chosen: Choices, target: str | None, flags: Mapping[str, str]) -> None:
-    """Refuse options that do not belong to the format.
+class FormatOption(click.Option):
+    """An option that belongs to some formats only.
 
-    Args:
-        chosen: the options.
-        target: the format.
-        flags: field of `Choices` -> the option as users write it, in the order of the help.
+    Attributes:
+        formats: those that it belongs to.
+    """
+
+    # Any: the arguments are click's.
+    def __init__(self, *args: Any, formats: Sequence[str], **more: Any) -> None:
+        super().__init__(*args, **more)
+        self.formats = formats
+
+
+def check_choices(chosen: Choices, target: str | None, options: Sequence[FormatOption]) -> None:
+    """Refuse options that do not belong to the format.
 
     Raises:
         ArgumentError: one does not, or no format is named.
@@ -209,18 +186,20 @@ def check_choices(chosen: Choices, target: str | None, flags: Mapping[str, str])
         raise ArgumentError(
             f"choose what to write: --to {listed(tuple(FORMATS))}, or --embed or --split"
         )
-    said = f"--to {target}" if target else "--split" if chosen.split else "--embed"
+    beside = f"--to {target}" if target else "--embed"
     if chosen.split and (target or chosen.embed):
         raise ArgumentError(
-            f"--split writes records of its own, so it cannot be combined with "
-            f"{f'--to {target}' if target else '--embed'}: split first, then export each, as "
-            f"orthoflow export RUN/datasets/NAME {f'--to {target}' if target else '--embed'}"
+            f"--split writes records of its own, so it cannot be combined with {beside}: split "
+            f"first, then export each, as orthoflow export RUN/datasets/NAME {beside}"
         )
-    taken = FORMATS[target].options if target else ()
-    for name, flag in flags.items():
-        owners = [owner for owner, entry in FORMATS.items() if name in entry.options]
-        if owners and name not in taken and _is_given(getattr(chosen, name)):
-            raise ArgumentError(f"{flag} belongs to --to {listed(owners)}, not to {said}")
+    said = "--split" if chosen.split else beside
+    for option in options:
+        value = getattr(chosen, str(option.name))
+        # A grid of 0 and wall 0 are given; a flag that nobody set is False.
+        is_given = value is not None and value is not False and value != ()
+        if is_given and target not in option.formats:
+            owners = [name for name in FORMATS if name in option.formats]
+            raise ArgumentError(f"{option.opts[0]} belongs to --to {listed(owners)}, not to {said}")
     if chosen.embed and target not in {None, "ro-crate"}:
         raise ArgumentError(f"{said} writes no record, so nothing can be embedded with --embed")
     if chosen.inputs and not chosen.embed:
@@ -230,7 +209,3 @@ def check_choices(chosen: Choices, target: str | None, flags: Mapping[str, str])
 def listed(names: Sequence[str]) -> str:
     """Give names as a sentence has them: `a, b or c`."""
     return " or ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
-
-
-def _is_given(value: object) -> bool:
-    return value is not None and value is not False and value != ()

@@ -55,23 +55,19 @@ def labels(n_points: int = N_SIDE**2) -> PointLabels:
     return PointLabels(plane_index=np.zeros(n_points, np.int16))
 
 
-class ToyRun:
-    """Cells of products that lie in its record."""
+class ToyRun(SimpleNamespace):
+    """Cells of products that lie in its record: address -> inputs by port, and what it made."""
 
     def __init__(self, cells: dict[str, tuple[dict[str, str], dict[str, Product]]]) -> None:
-        """Make one.
-
-        Args:
-            cells: address -> the cell that gave each input, and the outputs.
-        """
-        self.record = SimpleNamespace(run_id="r1")
-        self._products: dict[tuple[str, str], Product] = {}
-        self.cells: dict[str, Any] = {}
-        for address, (taken, given) in cells.items():
-            outputs = {}
-            for port, product in given.items():
-                self._products[address, port] = product
-                outputs[port] = self._named(address, port)
+        super().__init__(record=SimpleNamespace(run_id="r1"), cells={}, made={})
+        for address, (taken, made) in cells.items():
+            self.made[address] = made
+            outputs = {
+                port: SimpleNamespace(
+                    digest=f"{address}.{port}", type_name=product.type_name, embedded=True
+                )
+                for port, product in made.items()
+            }
             inputs = {
                 port: self.cells[source].outputs[port.rstrip("2")] for port, source in taken.items()
             }
@@ -79,18 +75,11 @@ class ToyRun:
                 outputs=outputs, inputs=inputs, assignment={}, repeat=0
             )
 
-    def _named(self, address: str, port: str) -> Any:
-        return SimpleNamespace(
-            digest=f"{address}.{port}",
-            type_name=self._products[address, port].type_name,
-            embedded=True,
-        )
-
     def cell(self, address: str) -> Any:
         return self.cells[address]
 
     def payload(self, address: str, port: str) -> Any:
-        return self._products[address, port].to_payload()
+        return self.made[address][port].to_payload()
 
 
 def labelled(of: PointCloud | None = None, marks: PointLabels | None = None) -> Any:
@@ -111,7 +100,7 @@ def exported(folder: Path, run: Any, **choices: Any) -> tuple[str, AttributedClo
         path.touch()
         return sum(len(block) for block in attributed.blocks())
 
-    said = module._export(run, folder, Choices(**choices), ("cloud.toy", write))
+    said = module._export("cloud.toy", write, run, folder, Choices(**choices))
     (attributed,) = kept
     return said, attributed
 
@@ -154,21 +143,21 @@ def test_the_best_colours_that_there_are_come_first(
     )
 
 
-def test_a_refusal_names_the_photos_that_the_run_oriented(tmp_path: Path) -> None:
-    run = ToyRun(
+def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    bare = replace(cloud(), intensity=None)
+    made: dict[str, Product] = {"planes": planes(), "labels": labels()}
+    turned = ToyRun(
         {
-            "scan": ({}, {"cloud": replace(cloud(), intensity=None)}),
-            "plane": ({"cloud": "scan"}, {"planes": planes(), "labels": labels()}),
+            "scan": ({}, {"cloud": bare}),
+            "plane": ({"cloud": "scan"}, made),
             "orient": ({}, {"cameras": cameras_product()}),
         }
     )
+    # Photos that the run oriented are named, though they were not read.
     with pytest.raises(ArgumentError, match=r"needed for photos, plane, deviation$"):
-        exported(tmp_path, run, colour="intensity")
-
-
-def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
-    folder = tmp_path / "out"
-    grey = ToyRun({"scan": ({}, {"cloud": replace(cloud(), intensity=None)})})
+        exported(folder, turned, colour="intensity")
+    grey = ToyRun({"scan": ({}, {"cloud": bare})})
     with pytest.raises(ArgumentError, match="of scan has no colours, intensities or planes"):
         exported(folder, grey)
     none = np.zeros(0, np.float32)

@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import fields
 from importlib import import_module
 from typing import Final
 
 import pytest
 
-from orthoflow.cli.export import flags
+from orthoflow.cli.export import format_options
 from orthoflow.cli.exports.choices import Choices
-from orthoflow.cli.exports.formats import FORMATS, check_choices, listed
+from orthoflow.cli.exports.formats import FORMATS, FormatOption, check_choices, listed
 from orthoflow.errors import ArgumentError
 
-FLAGS: Final = flags()
-# Some value of each option; 0 is the first wall, and a grid of none.
-GIVEN: Final[Mapping[str, object]] = {
-    name: {"wall": 0, "grid": 0.0}.get(name, ("x",))
-    for entry in FORMATS.values()
-    for name in entry.options
-}
+OPTIONS: Final = format_options()
 
 
-def test_every_option_is_one_of_the_choices_and_has_a_flag() -> None:
-    assert GIVEN.keys() <= FLAGS.keys() & {field.name for field in fields(Choices)}
+def test_every_option_is_one_of_the_choices_and_belongs_to_formats_that_there_are() -> None:
+    assert {str(option.name) for option in OPTIONS} <= {field.name for field in fields(Choices)}
+    assert all({*option.formats} <= FORMATS.keys() for option in OPTIONS)
 
 
 @pytest.mark.parametrize("target", FORMATS)
@@ -33,26 +27,28 @@ def test_every_format_has_its_writer(target: str) -> None:
     assert callable(getattr(import_module(f"orthoflow.cli.exports.{module}"), name))
 
 
-@pytest.mark.parametrize("name", GIVEN)
-def test_an_option_goes_with_the_formats_that_it_belongs_to(name: str) -> None:
-    chosen = Choices(**{name: GIVEN[name]})  # type: ignore[arg-type]
-    owners = [target for target, entry in FORMATS.items() if name in entry.options]
+@pytest.mark.parametrize("option", OPTIONS, ids=lambda option: option.name)
+def test_an_option_goes_with_the_formats_that_it_belongs_to(option: FormatOption) -> None:
+    # 0 is the first wall, and a grid of none.
+    value = 0 if option.name in ("wall", "grid") else ("x",)
+    chosen = Choices(**{str(option.name): value})  # type: ignore[arg-type]
+    owners = [target for target in FORMATS if target in option.formats]
     for target in FORMATS:
         if target in owners:
-            check_choices(chosen, target, FLAGS)
+            check_choices(chosen, target, OPTIONS)
             continue
         with pytest.raises(ArgumentError) as caught:
-            check_choices(chosen, target, FLAGS)
-        said = f"{FLAGS[name]} belongs to --to {listed(owners)}, not to --to {target}"
+            check_choices(chosen, target, OPTIONS)
+        said = f"{option.opts[0]} belongs to --to {listed(owners)}, not to --to {target}"
         assert str(caught.value) == said
 
 
 def test_nothing_else_is_refused() -> None:
     for target in FORMATS:
-        check_choices(Choices(), target, FLAGS)
-    check_choices(Choices(embed=True), "ro-crate", FLAGS)
-    check_choices(Choices(embed=True, inputs=("scan=a.laz",)), None, FLAGS)
-    check_choices(Choices(split=True), None, FLAGS)
+        check_choices(Choices(), target, OPTIONS)
+    check_choices(Choices(embed=True), "ro-crate", OPTIONS)
+    check_choices(Choices(embed=True, inputs=("scan=a.laz",)), None, OPTIONS)
+    check_choices(Choices(split=True), None, OPTIONS)
 
 
 @pytest.mark.parametrize(
@@ -70,5 +66,5 @@ def test_nothing_else_is_refused() -> None:
 )
 def test_what_contradicts_itself_is_refused(chosen: Choices, target: str | None, said: str) -> None:
     with pytest.raises(ArgumentError) as caught:
-        check_choices(chosen, target, FLAGS)
+        check_choices(chosen, target, OPTIONS)
     assert said in str(caught.value)
