@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import mkdtemp
 
@@ -88,6 +88,13 @@ def cloud_of(
         rgb=rgb,
         intensity=intensity,
     )
+
+
+def part_of(cloud: PointCloud, index: NDArray[np.intp]) -> PointCloud:
+    """Some points of a cloud with their colours and intensities."""
+    names = ("x", "y", "z", "rgb", "intensity")
+    columns = {name: getattr(cloud, name) for name in names}
+    return replace(cloud, **{k: None if v is None else v[index] for k, v in columns.items()})
 
 
 def cell_centres(shape: tuple[int, int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -14,7 +14,6 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
-from orthoflow_plugins.ortho.dsm_forward import DsmForward
 from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
 from orthoflow_plugins.raster.grid import RasterGrid
 
@@ -41,8 +40,7 @@ def small_bands(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("orthoflow_plugins.mosaic.agreement._ROWS_AT_ONCE", 64)
     monkeypatch.setattr("orthoflow_plugins.mosaic.joining._BAND_CELLS", BAND_CELLS)
     monkeypatch.setattr("orthoflow_plugins.mosaic.seams._LONGEST_PX", 100)
-    for place in ("ortho.dsm_forward", "ortho.pointcloud_direct"):
-        monkeypatch.setattr(f"orthoflow_plugins.{place}._BAND_CELLS", BAND_CELLS)
+    monkeypatch.setattr("orthoflow_plugins.ortho.pointcloud_direct._BAND_CELLS", BAND_CELLS)
     monkeypatch.setattr("orthoflow_plugins.raster.walls._BAND_CELLS", 2 * BAND_CELLS)
     monkeypatch.setattr("orthoflow_plugins.raster.reporting._CELLS_ASKED", BAND_CELLS)
 
@@ -86,24 +84,20 @@ def large_inputs(folder: Path, n: int = 7) -> DsmBackward.In:
     )
 
 
-@pytest.mark.parametrize("method", [DsmBackward, *long_only(DsmForward)])
 @pytest.mark.usefixtures("small_bands")
 def test_layers_are_painted_and_reported_without_memory_per_cell(
-    tmp_path: Path, method: type[DsmBackward | DsmForward]
+    tmp_path: Path,
 ) -> None:
     (tmp_path / "small").mkdir()
-    small, inputs = (
-        method.In(walls=made.walls, photos=made.photos, cameras=made.cameras)
-        for made in (large_inputs(tmp_path / "small", 2), large_inputs(tmp_path))
-    )
-    n_cells = inputs.walls.walls[0].mask.size
+    small, inputs = large_inputs(tmp_path / "small", 2), large_inputs(tmp_path)
+    method, n_cells = DsmBackward, inputs.walls.walls[0].mask.size
     method().run(small, method.Params(), context(tmp_path))  # compiled and loaded, in files too
     with peak_bytes() as peak_of_small:
         method().run(small, method.Params(), context(tmp_path))
         of_bands = peak_of_small()
     with peak_bytes() as peak:
         layers = method().run(inputs, method.Params(), context(tmp_path)).layers
-        # A layer holds eight bytes per cell, what hides cells two more, and forward eight besides.
+        # A layer holds eight bytes per cell, what hides cells two more.
         assert peak() - of_bands < 0.5 * n_cells, (peak(), of_bands)
     assert len(layers.layers) == 2
     assert all(holds_cells(layer.mask, LayerMask.PAINTED) for layer in layers.layers)
@@ -222,18 +216,17 @@ def mosaic(layers: tuple[Layer, ...], folder: Path, **params: object) -> MosaicS
     return MosaicSeams().run(inputs, chosen, context(folder))
 
 
-@pytest.mark.parametrize("seams", ["graph-cut", *long_only("best-view", "priority", "voronoi")])
 @pytest.mark.usefixtures("small_bands")
 def test_mosaics_are_joined_and_reported_without_memory_per_cell(
-    tmp_path: Path, seams: str
+    tmp_path: Path,
 ) -> None:
     layers = large_layers(tmp_path, SHAPE)
-    params = {"seams": seams, "priority": ["photo 1"]}
+    params: dict[str, object] = {"seams": "graph-cut"}
     mosaic(tuple(crop(layer, 100) for layer in layers), tmp_path, **params)  # libraries loaded
     with peak_bytes() as peak:
         mosaic(layers, tmp_path, **params)
         # The layers hold sixteen bytes per cell, the orthoimage six; a cut is that of 30 000 cells.
-        assert peak() < 4.0 * N_CELLS + (30e6 if seams == "graph-cut" else 0.0), peak()
+        assert peak() < 4.0 * N_CELLS + 30e6, peak()
 
 
 def crop(layer: Layer, n_rows: int) -> Layer:
@@ -307,26 +300,6 @@ def test_a_net_of_triangles_is_laid_over_a_large_wall_in_bands(
     assert (banded.mask[395:445, 135:165] == SurfaceMask.RECOVERED).all()
     wider = [text for text in ctx.warnings if "wider than" in text]
     assert wider == []
-
-
-def test_a_raster_of_several_megacells_lies_in_files(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    known = raster_scenes.leaning_wall(shape=(60, 50))
-    places = np.random.default_rng(7).uniform([0, 0], [50, 60], (9_000, 2))
-    points = known.world(*places.T, np.zeros(len(places)))
-    rgb = np.full((len(places), 3), 90, dtype=np.uint8)
-    cloud = raster_scenes.cloud_of(points, rgb=rgb)
-    inputs = RasterGrid.In(cloud=cloud, planes=known.planes())
-    found = []
-    for n_cells in (1 << 22, 100):
-        monkeypatch.setattr("orthoflow_plugins.raster.walls.IN_MEMORY_CELLS", n_cells)
-        params = RasterGrid.Params(gsd_m=known.gsd_m, buffer_m=0.3, percentiles=(50.0,))
-        found.append(RasterGrid().run(inputs, params, context(tmp_path)).walls.walls[0])
-    for name in ("depth_m", "sigma_m", "count", "mask", "intensity", "rgb", "percentiles_m"):
-        one, other = (getattr(wall, name) for wall in found)
-        np.testing.assert_array_equal(one, other, err_msg=name)
-        assert list(tmp_path.glob(f"*/allocated/walls.0.{name}"))
 
 
 def test_cells_are_counted_in_bands_as_in_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -46,20 +46,6 @@ def test_walls_may_take_three_quarters_of_the_memory(monkeypatch: pytest.MonkeyP
         require_memory([one])
 
 
-def test_each_wall_is_kept_and_the_largest_is_worked_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    small, large = frame(1000, 1000), frame(2000, 2000)
-    one, other, both, twice = (
-        needed_bytes(monkeypatch, *frames)
-        for frames in ((small,), (large,), (small, large), (large, large))
-    )
-    assert other == pytest.approx(4.0 * one, rel=0.01)
-    kept_of_large = twice - other
-    assert both - other == pytest.approx(kept_of_large / 4.0, rel=0.05)
-    # What a finished wall holds: its depth, deviation, count, mask, intensity and colours.
-    assert 21.0 <= kept_of_large / 4e6 <= 32.0
-    assert other - kept_of_large > kept_of_large
-
-
 def test_a_wall_in_bands_takes_the_memory_of_a_band(monkeypatch: pytest.MonkeyPatch) -> None:
     huge, larger = frame(8000, 20_000), frame(8000, 40_000)
     assert huge.width * huge.height > IN_MEMORY_CELLS

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.segment import outlines as module
 from orthoflow_plugins.segment.areas import Area, Relief
 from orthoflow_plugins.segment.outlines import Outline, outline_of
 
@@ -28,18 +29,10 @@ def block(
     return cells
 
 
-def outline(
-    cells: NDArray[np.bool_], *, is_face: NDArray[np.bool_] | None = None, spacing_m: float = GSD_M
-) -> Outline:
-    """The outline of cells of a relief; the wall's face is all around unless given."""
-    found = drawn(cells, is_face=is_face, spacing_m=spacing_m)
-    assert found is not None
-    return found
-
-
 def drawn(
     cells: NDArray[np.bool_], *, is_face: NDArray[np.bool_] | None = None, spacing_m: float = GSD_M
-) -> Outline | None:
+) -> Any:
+    """The outline of cells of a relief; the wall's face is all around unless given."""
     rows, columns = (np.flatnonzero(cells.any(axis=axis)) for axis in (1, 0))
     part = cells[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     area = Area(
@@ -73,7 +66,7 @@ def assert_corners(
 
 
 def test_sides_of_a_rectangle_are_the_borders_of_its_cells() -> None:
-    found = outline(block(), spacing_m=3.0 * GSD_M)
+    found = drawn(block(), spacing_m=3.0 * GSD_M)
     assert_corners(found, CORNERS)
     np.testing.assert_allclose(np.sort(found.lengths), [70.0, 70.0, 100.0, 100.0], atol=1e-6)
     # A border lies anywhere in two cells, and between two points, three cells apart.
@@ -102,7 +95,7 @@ def within(corners: NDArray[np.float64]) -> NDArray[np.bool_]:
 @pytest.mark.parametrize("degrees", [3.0, 17.0, 45.0, -30.0])
 def test_turned_sides_lie_where_they_are_to_a_fraction_of_a_cell(degrees: float) -> None:
     corners = turned(np.array([[45.2, 35.1], [45.2, 84.7], [113.9, 84.7], [113.9, 35.1]]), degrees)
-    found = outline(within(corners))
+    found = drawn(within(corners))
     assert_corners(found, corners, within_cells=0.45)
     # Cells' own staircase scatters, by a third of a cell at most, and along a side that averages.
     assert np.all(found.sigma >= UNIFORM * np.hypot(2.0, 1.0))
@@ -120,7 +113,7 @@ def test_steps_of_two_cells_are_no_corners_and_of_three_are(
     outwards = height if at_row == BOTTOM else -height
     low, high = sorted((at_row, at_row + outwards))
     cells[low:high, 60:100] = height > 0
-    assert (len(outline(cells).corners) > 4) == is_corner
+    assert (len(drawn(cells).corners) > 4) == is_corner
 
 
 def test_what_sticks_out_of_a_side_a_little_does_not_move_it() -> None:
@@ -130,7 +123,7 @@ def test_what_sticks_out_of_a_side_a_little_does_not_move_it() -> None:
     # Nor do bites of two cells out of the corners.
     for row in (TOP, TOP + 1, BOTTOM - 2, BOTTOM - 1):
         cells[row, [LEFT, LEFT + 1, RIGHT - 2, RIGHT - 1]] = False
-    assert_corners(outline(cells), CORNERS, within_cells=0.06)
+    assert_corners(drawn(cells), CORNERS, within_cells=0.06)
 
 
 @pytest.mark.parametrize(("cut", "is_corner"), [(4, False), (5, False), (7, True), (15, True)])
@@ -138,7 +131,7 @@ def test_a_corner_cut_short_is_put_back_and_a_long_cut_is_a_side(cut: int, is_co
     cells = block()
     rows, columns = np.indices(SHAPE)
     cells[(rows - TOP) + (columns - LEFT) < cut] = False
-    found = outline(cells)
+    found = drawn(cells)
     if not is_corner:
         assert_corners(found, CORNERS)
     else:
@@ -151,7 +144,7 @@ def test_a_side_is_the_less_exact_the_more_it_scatters_and_the_fewer_points_it_h
     cells = block()
     cells[TOP - 1, LEFT + 1 : RIGHT - 1 : 2] = True
     for spacing in (1.0, 4.0, 25.0, 400.0):
-        found = outline(cells, spacing_m=spacing * GSD_M)
+        found = drawn(cells, spacing_m=spacing * GSD_M)
         at_top = int(np.abs(found.corners[:, 1] + np.roll(found.corners[:, 1], -1)).argmin())
         scatter = np.sqrt(0.125) / np.sqrt(max(1.0, found.lengths[at_top] / spacing))
         expected = np.sqrt((UNIFORM * 2.0) ** 2 + (UNIFORM * spacing) ** 2 + scatter**2)
@@ -164,7 +157,7 @@ def test_what_is_far_off_even_for_a_rough_side_does_not_move_it() -> None:
     cells = block()
     cells[TOP - 1, LEFT + 1 : RIGHT - 1 : 2] = True
     cells[TOP - 2 : TOP, 70:80] = True
-    found = outline(cells)
+    found = drawn(cells)
     begin = int(np.linalg.norm(found.corners - CORNERS[0], axis=1).argmin())
     ends = np.roll(found.corners, -begin, axis=0)[[0, -1], 1]
     np.testing.assert_allclose(ends, TOP - 0.5, atol=0.06)
@@ -178,7 +171,7 @@ def test_cells_that_do_not_hang_together_are_no_area() -> None:
     cells = block()
     cells[:, 70:80] = False
     with pytest.raises(MethodError, match="must be connected, got 2 parts"):
-        outline(cells)
+        drawn(cells)
 
 
 @pytest.mark.parametrize("cells_off", range(1, 8))
@@ -188,84 +181,9 @@ def test_a_side_is_seen_where_there_is_face_two_to_four_cells_beside_it(cells_of
         LEFT - cells_off - 1, TOP - cells_off - 1, RIGHT + cells_off + 1, BOTTOM + cells_off + 1
     )
     ring = grown & ~block(LEFT - cells_off, TOP - cells_off, RIGHT + cells_off, BOTTOM + cells_off)
-    found = outline(block(), is_face=ring)
+    found = drawn(block(), is_face=ring)
     begin = int(np.linalg.norm(found.corners - CORNERS[0], axis=1).argmin())
     left, bottom, right, top = np.roll(found.seen_share, -begin)
     # Borders lie between cells: the cell on one is the one below or right of it.
     assert {left, top} == {1.0 if 1 <= cells_off <= 3 else 0.0}
     assert {right, bottom} == {1.0 if 2 <= cells_off <= 4 else 0.0}
-
-
-def side_at(degrees: float, middle: tuple[float, float]) -> module._Side:
-    turn = np.radians(degrees)
-    none = np.zeros(2)
-    return module._Side(
-        first=0,
-        last=9,
-        begin=none,
-        end=none,
-        scatter=0.0,
-        middle=np.array(middle),
-        direction=np.array([np.cos(turn), np.sin(turn)]),
-    )
-
-
-@pytest.mark.parametrize(("degrees", "meets"), [(20.0, True), (90.0, True), (12.0, False)])
-def test_sides_that_hardly_turn_keep_the_corner_between_them(degrees: float, meets: bool) -> None:
-    level = side_at(0.0, (5.0, 2.0))
-    met = module._meeting(level, side_at(degrees, (30.0, 7.0)))
-    assert (met is not None) is meets
-    if met is not None:
-        expected = [30.0 - 5.0 / np.tan(np.radians(degrees)), 2.0]
-        np.testing.assert_allclose(met, expected, atol=1e-9)
-
-
-@pytest.mark.parametrize("length", [0.25, 0.75, 1.0])
-def test_a_side_shorter_than_a_cell_is_seen_too(length: float) -> None:
-    """A side that has no length at all has nothing beside it, and its neighbours keep theirs."""
-    corners = np.array([[30.5, 20.5], [30.5, 20.5 + length], [30.5, 20.5 + length]])
-    shares = module._seen_shares(corners, np.ones(SHAPE, dtype=np.bool_))
-    np.testing.assert_array_equal(shares, [1.0, 0.0, 1.0])
-
-
-@pytest.mark.parametrize("corners", [CORNERS, CORNERS[:3]], ids=["rectangle", "triangle"])
-@pytest.mark.parametrize(("off_cells", "is_corner"), [(0.9, False), (1.1, True)])
-def test_sides_between_which_a_corner_stands_out_by_a_cell_at_most_are_one(
-    corners: NDArray[np.float64], off_cells: float, *, is_corner: bool
-) -> None:
-    ring = np.insert(corners, 2, [80.0, BOTTOM + off_cells], axis=0)
-    sides = [
-        module._Side(first=k, last=(k + 1) % len(ring), begin=begin, end=end, scatter=2.0)
-        for k, (begin, end) in enumerate(zip(ring, np.roll(ring, -1, axis=0), strict=True))
-    ]
-    found = module._joined(ring, sides)
-    left = ring if is_corner else corners
-    np.testing.assert_array_equal([side.begin for side in found], left)
-    np.testing.assert_array_equal([side.end for side in found], np.roll(left, -1, axis=0))
-
-
-def test_where_the_search_for_corners_began_none_is_left() -> None:
-    # Of a step of one cell OpenCV leaves the end that it began with.
-    for width in (31, 34, 37):
-        cells = block(10, 10, 60, 40)
-        cells[9, 28 : 28 + width] = True
-        ring = module._ring(cells)
-        found = ring[module._corner_places(ring)]
-        assert len(found) == 4
-        for corner in ((10, 10), (10, 40), (60, 40), (60, 10)):
-            assert np.linalg.norm(found - corner, axis=1).min() < 2.0
-
-
-@pytest.mark.parametrize(
-    ("n_others", "cut", "is_cut"), [(1, 7.9, True), (1, 8.1, False), (0, 3.0, False)]
-)
-def test_a_short_side_that_cuts_a_corner_goes_unless_only_three_are_left(
-    n_others: int, cut: float, is_cut: bool
-) -> None:
-    # Two sides that meet in the origin, and a short one that ends on them.
-    for ends in ([[-cut, 0.0], [0.0, 1.0]], [[-1.0, 0.0], [0.0, cut]]):
-        begin, end = np.array(ends)
-        short = module._Side(first=0, last=1, begin=begin, end=end, scatter=2.0)
-        far = [side_at(30.0, (99.0, 50.0))] * n_others
-        sides = [side_at(0.0, (-20.0, 0.0)), short, side_at(90.0, (0.0, 20.0)), *far]
-        assert (short not in module._without_short_cuts(sides)) == is_cut

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.segment import areas as module
-from orthoflow_plugins.segment.areas import SightLines, sight_lines
+from orthoflow_plugins.segment.areas import sight_lines
 
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
@@ -131,25 +129,6 @@ def test_large_clouds_are_followed_part_by_part(monkeypatch: pytest.MonkeyPatch)
     np.testing.assert_array_equal(parts.stopped, whole.stopped)
 
 
-@pytest.mark.parametrize("n_most", [99, 100, 1000])
-def test_of_larger_clouds_one_point_of_every_few_is_asked(
-    monkeypatch: pytest.MonkeyPatch, n_most: int
-) -> None:
-    # Rays through the wall in one tile, whose number tells how many of 1000 were asked.
-    ends = np.tile([0.02, 0.02, -1.0], (1000, 1))
-    ends[:, 2] -= np.arange(1000) / 1000.0
-    monkeypatch.setattr(module, "_POINTS_MOST", n_most)
-    monkeypatch.setattr(module, "_BLOCK", 7)
-    asked = np.concatenate([points for points, _ in module._rays(cloud(ends))])
-    places = np.round(1000.0 * ((asked[:, 1] - CORNER[1]) - 1.0)).astype(int)
-    every = -(-1000 // n_most)
-    # One of each row of so many, and not always the same.
-    assert len(places) == -(-1000 // every)
-    rows = places // every
-    assert rows.tolist() == list(range(len(places)))
-    assert len(set((places % every).tolist())) == every
-
-
 @pytest.mark.parametrize(
     ("n_other", "n_met", "is_told"),
     [(1, 0, False), (2, 0, True), (2, 8, True), (2, 9, False), (3, 12, True)],
@@ -162,13 +141,3 @@ def test_so_many_rays_must_agree(depth_m: float, n_other: int, n_met: int, is_to
     told = found.crossed if depth_m < 0.0 else found.stopped
     assert bool(told[2, 2]) == is_told
     assert np.count_nonzero(found.crossed | found.stopped) == is_told
-
-
-def test_tiles_are_told_by_the_cells_in_them() -> None:
-    tiles = np.array([[True, False, True], [False, True, False]])
-    lines = SightLines(side=4, crossed=tiles, stopped=~tiles)
-    whole = np.repeat(np.repeat(tiles, 4, axis=0), 4, axis=1)[:7, :11]
-    np.testing.assert_array_equal(lines.over(tiles, (7, 11), 1), whole)
-    np.testing.assert_array_equal(lines.over(tiles, (7, 11), 3), whole[::3, ::3])
-    turned = replace(lines, side=1)
-    np.testing.assert_array_equal(turned.over(tiles, (2, 3), 1), tiles)

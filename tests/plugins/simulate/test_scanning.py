@@ -117,14 +117,10 @@ def deviations_m(distance_m: float, incidence_deg: float, kind: TextureKind) -> 
     ("distance_m", "incidence_deg", "kind", "expected"),
     [
         pytest.param(3.0, 0.0, TextureKind.PLAIN, 1.0, id="square on at 3 m"),
-        pytest.param(3.0, 48.1896851, TextureKind.PLAIN, 1.225, id="spot half longer"),
         pytest.param(3.0, 60.0, TextureKind.PLAIN, 1.45, id="spot twice as long"),
-        pytest.param(3.0, 75.5224878, TextureKind.PLAIN, 2.35, id="spot four times as long"),
         pytest.param(3.0, 80.4059318, TextureKind.PLAIN, 2.8, id="spot six times as long"),
-        pytest.param(3.0, 84.0, TextureKind.PLAIN, 2.8, id="nearly along the surface"),
         pytest.param(1.5, 0.0, TextureKind.PLAIN, math.sqrt(0.625), id="near"),
         pytest.param(9.0, 0.0, TextureKind.PLAIN, math.sqrt(5.0), id="far"),
-        pytest.param(3.0, 0.0, TextureKind.TEXTILE, 1.4, id="cloth"),
         pytest.param(9.0, 60.0, TextureKind.TEXTILE, 1.4 * 1.45 * math.sqrt(5.0), id="all of it"),
     ],
 )
