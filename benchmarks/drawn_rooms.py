@@ -350,9 +350,9 @@ def main() -> None:
     newest_s = max(path.stat().st_mtime for path in options.folder.glob("*/numbers.json"))
     counts = ", ".join(f"{part} {len(one)} and {len(two)}" for part, (one, two) in rooms.items())
     made = (
-        f"Measured {datetime.fromtimestamp(newest_s, UTC):%Y-%m-%d} on {platform.machine()}, "
-        f"{os.cpu_count()} cores, Python {platform.python_version()}; rooms of the first and the "
-        f"second set of seeds: {counts}"
+        f"Measured on {datetime.fromtimestamp(newest_s, UTC):%Y-%m-%d} ({platform.machine()}, "
+        f"{os.cpu_count()} cores, Python {platform.python_version()}). Numbers of rooms in the first "
+        f"and second set of seeds: {counts}"
     )
     for page in sorted(PAGES.glob("*.md")):
         text = page.read_text().replace("{{made}}", made)
