@@ -351,8 +351,8 @@ def main() -> None:
     counts = ", ".join(f"{part} {len(one)} and {len(two)}" for part, (one, two) in rooms.items())
     made = (
         f"Measured on {datetime.fromtimestamp(newest_s, UTC):%Y-%m-%d} ({platform.machine()}, "
-        f"{os.cpu_count()} cores, Python {platform.python_version()}). Numbers of rooms in the first "
-        f"and second set of seeds: {counts}"
+        f"{os.cpu_count()} cores, Python {platform.python_version()}). Numbers of rooms in the "
+        f"first and second set of seeds: {counts}"
     )
     for page in sorted(PAGES.glob("*.md")):
         text = page.read_text().replace("{{made}}", made)
