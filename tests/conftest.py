@@ -22,7 +22,6 @@ from tests.kept_memory import KEPT_MEMORY
 from tests.long_loops import IS_LONG
 from tests.memory_folder import has_room, in_memory
 from tests.optional import REASONS, is_allowed, skip
-from tests.shared_bytecode import write_share
 from tests.undrawn_charts import FIGURE, keep_dot
 
 if TYPE_CHECKING:
@@ -73,14 +72,6 @@ def pytest_xdist_auto_num_workers() -> int | None:
     if os.environ.get("PYTEST_XDIST_AUTO_NUM_WORKERS"):
         return None
     return len(os.sched_getaffinity(0)) + 1 if sys.platform == "linux" else None
-
-
-def pytest_sessionstart(session: pytest.Session) -> None:
-    """Make bytecode of all tests together, before each process imports them all."""
-    config = session.config
-    worker = os.environ.get("PYTEST_XDIST_WORKER")
-    if worker and [*config.args] == config.getini("testpaths"):
-        write_share(config, int(worker[2:]), int(os.environ["PYTEST_XDIST_WORKER_COUNT"]))
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -6,7 +6,6 @@ import re
 
 MISCHIEF = """
 import os
-import resource
 import subprocess
 import sys
 import threading
@@ -17,13 +16,6 @@ import numpy as np
 from orthoflow.errors import MethodError
 from orthoflow.sdk.context import StepContext
 from toy_plugin.works import Numbers, Work, work
-
-SLEEPER = [sys.executable, "-c", "import time; time.sleep(600)"]
-
-
-@work("exact")
-def daemon(values, params, ctx):
-    return np.array([float(subprocess.Popen(SLEEPER, start_new_session=True).pid)])
 
 
 # The process that starts it is gone before the step is.
@@ -43,12 +35,6 @@ def hidden():
 def hides(values, params, ctx):
     ctx.log(f"hidden {hidden()}")
     return values
-
-
-@work("exact")
-def hides_and_stops(values, params, ctx):
-    ctx.log(f"hidden {hidden()}")
-    time.sleep(600)
 
 
 @work("exact")
@@ -80,9 +66,6 @@ def closes_streams(values, params, ctx):
     return values
 
 
-
-
-
 @work("exact")
 def stops(values, params, ctx):
     os.killpg(0, 19)
@@ -92,17 +75,6 @@ def stops(values, params, ctx):
 def kills_server(values, params, ctx):
     os.kill(os.getppid(), 9)
     time.sleep(600)
-
-
-@work("exact")
-def opens_nothing_more(values, params, ctx):
-    resource.setrlimit(resource.RLIMIT_NOFILE, (0, 0))
-    return values
-
-@work("exact")
-def writes_nothing_more(values, params, ctx):
-    resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
-    return values
 
 
 class Speechless(Exception):
@@ -121,9 +93,6 @@ def raises_interrupt(values, params, ctx):
 def raises_speechless(values, params, ctx):
     raise Speechless
 
-@work("exact")
-def raises_nothing(values, params, ctx):
-    raise MethodError
 
 @work("exact")
 def raises_lines(values, params, ctx):

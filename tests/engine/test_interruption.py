@@ -81,16 +81,6 @@ def test_a_run_killed_at_any_moment_resumes_with_the_same_digests(
     assert len(world.run(STEPS, into="after").cached) == 4
 
 
-def test_a_finished_step_is_not_computed_again_after_a_kill(world: World) -> None:
-    process = start_coordinator(world, STEPS, "run")
-    wait_for(world, "run", "started", "second")
-    process.kill()
-    process.communicate()
-    outcome = world.run(STEPS)
-    assert outcome.resumed == {"first"}
-    assert [event["event"] for event in events(world, "run")].count("resumed") == 1
-
-
 def test_steps_and_what_they_started_die_with_their_coordinator(world: World) -> None:
     steps = STEPS.replace("work.slow", "work.spawns_and_waits")
     process = start_coordinator(world, steps, "run")
@@ -165,3 +155,6 @@ def test_a_run_folder_in_use_is_refused_and_so_is_garbage_collection(world: Worl
         process.kill()
         process.communicate()
     assert not is_running(world.folder / "run")
+    # What had ended is not computed again.
+    assert world.run(STEPS).resumed == {"first"}
+    assert [event["event"] for event in events(world, "run")].count("resumed") == 1

@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import errno
 import re
-from pathlib import Path
 
 import pytest
 
 from orthoflow.engine.results import CellResult
 from orthoflow.engine.scheduler import RunOutcome
 from tests.engine_world import World, has_ended, start_fork_server
-from tests.long_loops import long_only
 
 WHO = "method work.{} of toy-plugin 1.0"
 
 
 def all_of(world: World, *names: str, **options: object) -> RunOutcome:
     """Run methods side by side, each on the same numbers; those that never end, for 2 s."""
-    endless = ("never_silent", "stops", "hides_and_stops")
-    limits = dict.fromkeys(endless, ", timeout: 2s")
+    limits = dict.fromkeys(("never_silent", "stops"), ", timeout: 2s")
     variants = "".join(f"      {n}: {{use: work.{n}{limits.get(n, '')}}}\n" for n in names)
     steps = (
         "steps:\n  first: {use: make.range}\n  bad:\n    in: {numbers: first.numbers}\n"
@@ -36,20 +33,12 @@ def result_of(outcome: RunOutcome, name: str) -> CellResult:
     return found[0]
 
 
-def test_what_a_step_started_ends_with_it(world: World) -> None:
-    digest = result_of(all_of(world, "daemon"), "daemon").outputs["numbers"].digest
-    from toy_plugin.products import Numbers
-
-    assert has_ended(int(world.store.get_product(digest, Numbers).values[0]))
-
-
-@pytest.mark.parametrize("name", ["hides", *long_only("hides_and_stops")])
 def test_what_was_started_in_another_session_by_a_process_that_is_gone_ends_too(
-    world: World, name: str
+    world: World,
 ) -> None:
     # As in a program that had started the server of steps for purposes of its own.
     start_fork_server()
-    log = result_of(all_of(world, name), name).log
+    log = result_of(all_of(world, "hides"), "hides").log
     found = re.search(r"hidden (\d+)", log)
     assert found, log
     assert has_ended(int(found[1]))
@@ -76,16 +65,6 @@ def test_a_machine_without_room_for_a_process_fails_the_step_alone(
     assert "needs first, which failed" in result.error_message
 
 
-def test_limits_of_a_step_are_its_own(world: World) -> None:
-    outcome = all_of(world, "opens_nothing_more", "writes_nothing_more")
-    said = result_of(outcome, "opens_nothing_more").error_message
-    assert "Too many open files" in said
-    said = result_of(outcome, "writes_nothing_more").error_message
-    assert "File too large" in said
-    again = all_of(world, "closes_streams", into="next")
-    assert result_of(again, "closes_streams").error_message == ""
-
-
 def test_the_process_that_a_method_forked_gives_no_result(world: World) -> None:
     outcome = all_of(world, "forks")
     address = next(a for a, result in outcome.results.items() if result.method == "work.forks")
@@ -93,36 +72,28 @@ def test_the_process_that_a_method_forked_gives_no_result(world: World) -> None:
     assert result_of(outcome, "forks").cpu_s >= 0.0
 
 
-def test_what_a_method_says_is_bounded(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_how_much_and_how_long_a_method_reports_is_bounded(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
     # One that never ends shall not go on long.
     monkeypatch.setattr("orthoflow.engine.local._GRACE_S", 0.3)
-    outcome = all_of(world, "never_silent", "prints_much")
-    flood = result_of(outcome, "never_silent")
-    assert "ran past its timeout of 2 s" in flood.error_message
-    assert flood.wall_s < 30
+    outcome = all_of(world, "never_silent", "prints_much", "stops", "raises_interrupt", jobs=2)
+    for name in ("never_silent", "stops"):
+        endless = result_of(outcome, name)
+        assert "ran past its timeout of 2 s" in endless.error_message
+        assert endless.wall_s < 30
+    assert result_of(outcome, "raises_interrupt").error_message == (
+        f"{WHO.format('raises_interrupt')} failed unexpectedly: KeyboardInterrupt"
+    )
     printed = result_of(outcome, "prints_much")
     assert printed.log.startswith("... (")
     assert printed.log.endswith("the end\n")
     assert len(printed.log) < 300_000
 
 
-def test_a_step_that_stands_still_is_killed(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("orthoflow.engine.local._GRACE_S", 0.3)
-    stopped = result_of(all_of(world, "stops"), "stops")
-    assert "ran past its timeout of 2 s" in stopped.error_message
-
-
-def test_a_step_says_that_an_interrupt_was_its_own(world: World) -> None:
-    result = result_of(all_of(world, "raises_interrupt"), "raises_interrupt")
-    assert result.error_message == (
-        f"{WHO.format('raises_interrupt')} failed unexpectedly: KeyboardInterrupt"
-    )
-
-
 FAILED = {
     "raises_base": "failed unexpectedly: BaseException: of no kind",
     "raises_speechless": "failed unexpectedly: Speechless: a Speechless without words",
-    "raises_nothing": "failed without a message",
     "raises_lines": r"failed unexpectedly: ValueError: one two \x1b[31m \udcff \x00",
 }
 
@@ -141,14 +112,3 @@ def test_warnings_are_lines_and_the_first_ones_are_kept(world: World) -> None:
     warnings = result_of(all_of(world, "warns_much", executor="inline"), "warns_much").warnings
     assert len(warnings) == 1000
     assert warnings[7] == r"7 \x1b[31m\udcff"
-
-
-def test_no_descriptor_is_left_open_by_a_run(world: World) -> None:
-    all_of(world, "raises_nothing")
-    before = n_open()
-    all_of(world, "raises_nothing", "raises_lines", into="again")
-    assert n_open() == before
-
-
-def n_open() -> int:
-    return len(list(Path("/proc/self/fd").iterdir()))

@@ -48,10 +48,17 @@ def test_layers_are_written_when_asked_for(road: Shell) -> None:
     mosaic = read_raster(road.folder / "run" / "products" / "mosaic" / "wall_0_ortho.tif")
     np.testing.assert_array_equal(layer.values[layer.shown], mosaic.values[layer.shown])
     assert layer.shown.sum() == mosaic.shown.sum()
+    # The record only names the layers.
+    lost = road("export", "run", "--to", "layers", "--store", "elsewhere", "-o", "lost")
+    assert lost.code == 2
+    assert "neither its record nor the store elsewhere" in lost.said
 
 
-def test_the_record_verifies_and_reads_back(road: Shell) -> None:
+def test_the_record_verifies_and_a_second_run_comes_from_the_cache(road: Shell) -> None:
     assert road("verify", "run").code == 0
+    again = road("run", "direct.yaml", *SMALL_WALL, "-o", "again")
+    assert again.code == 0, again.said
+    assert "all 6 steps were cached" in again.out
     run = orthoflow.open_run(road.folder / "run")
     assert set(run.cells) == {
         "cloud",

@@ -165,19 +165,3 @@ def test_the_sidecar_places_the_map(plan: Path) -> None:
     assert content["u_world"] == [1.0, 0.0, 0.0]
     assert content["v_world"] == [0.0, -1.0, 0.0]
     assert content["raster"]["geotiff"].startswith("X = x_of_left_m + gsd_m * column (east)")
-
-
-def test_a_system_in_degrees_and_one_that_is_none_are_refused(shell: Shell) -> None:
-    points, rgb = site(2)
-    write_las(shell.folder / "site.laz", points[::50], rgb=rgb[::50])
-    for crs, said in (
-        ("EPSG:4326", "not a coordinate system in metres"),
-        ("EPSG:9999", "there is no"),
-    ):
-        ended = shell(
-            *("run", "plan.yaml", "--input", "scan=site.laz", "--set", f"wall.crs={crs}"),
-            *("--until", "wall", "-o", f"run-{crs[5:]}", "--executor", "inline"),
-        )
-        assert ended.code != 0
-        assert said in ended.said
-        assert "Traceback" not in ended.said
