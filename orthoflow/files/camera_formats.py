@@ -108,12 +108,12 @@ def _photo_list(path: Path, paths: Sequence[Path]) -> list[str]:
     """Return the names of the photos of a Bundler file, from a list beside it with as many entries.
 
     A line is a name, which may contain spaces or be quoted, or a name, 0 and a focal length in
-    pixels. Of several lists the one named like the file is used, then `list.txt`; lists of other
-    files are ignored if there is one of photos.
+    pixels. Of several lists the one named like the file is used, then `list.txt`; else lists of
+    photos must state the same.
     """
     n_cameras = bundler_count(path)
     lists = {
-        other.name: [
+        other.name.lower(): [
             photo_path(_FOCAL_BEHIND.sub("", line.strip()).strip("\"'"))
             for line in text_of(other).splitlines()
             if line.strip() and not line.startswith("#")
@@ -122,21 +122,16 @@ def _photo_list(path: Path, paths: Sequence[Path]) -> list[str]:
         if other.suffix.lower() == ".txt" and other.parent == path.parent
     }
     fitting = {name: names for name, names in lists.items() if len(names) == n_cameras}
+    usual = (f"{path.name}.list.txt".lower(), f"{path.stem}.list.txt".lower(), "list.txt")
+    if called := next((name for name in usual if name in fitting), None):
+        return fitting[called]
     of_photos = {
-        name: names
-        for name, names in fitting.items()
-        if all(each.lower().endswith(PHOTO_SUFFIXES) for each in names)
+        tuple(names)
+        for names in fitting.values()
+        if len(fitting) == 1 or all(name.lower().endswith(PHOTO_SUFFIXES) for name in names)
     }
-    fitting = of_photos or fitting
-    called = (f"{path.name}.list.txt".lower(), f"{path.stem}.list.txt".lower(), "list.txt")
-
-    def rank(name: str) -> int:
-        lower = name.lower()
-        return called.index(lower) if lower in called else len(called) + ("list" not in lower)
-
-    best = [name for name in fitting if rank(name) == min(map(rank, fitting))]
-    if len({tuple(fitting[name]) for name in best}) == 1:
-        return fitting[best[0]]
+    if len(of_photos) == 1:
+        return list(of_photos.pop())
     counts = ", ".join(f"{name} ({len(names)} lines)" for name, names in lists.items())
     raise InputError(
         f"{path.name} has {n_cameras} cameras without names: give the folder with it and one "

@@ -189,7 +189,7 @@ KNOWN: Final = {
     "E57 with 60,000 elements in a structure": ("E57", "a.e57",
         _with_xml(b"</e57Root>",
             b"".join(b'<b%d type="Integer"/>' % i for i in range(60_000)) + b"</e57Root>"),
-        "a structure in it has more than 500 elements"),
+        "elements have more than 500 names"),
     # The engine's own files.
     "a journal of brackets": ("JOURNAL_FILE", "journal.jsonl", "[" * 50_000 + "\n", "damaged"),
     "a resolved workflow of brackets": ("RESOLVED", "r.json", "[" * 50_000,

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from orthoflow.errors import InputError
 from orthoflow.files.points.fields import Columns
@@ -19,62 +18,38 @@ from orthoflow.files.points.scan_file import PointQuery, ScanFile
 MOST_POINTS_PER_BYTE: Final = 8
 
 
-@dataclass(frozen=True, kw_only=True)
-class Format:
+class Format(NamedTuple):
     """One family of point files.
 
     Attributes:
         name: its usual name.
         suffixes: lower case, with the dot.
+        reader: module and function that open its files.
         signature: first bytes of its files, matched; None for plain text.
         beginning: what its files begin with, for messages.
-        reader: module and function that open its files.
     """
 
     name: str
     suffixes: tuple[str, ...]
+    reader: tuple[str, str]
     signature: re.Pattern[bytes] | None = None
     beginning: str = ""
-    reader: tuple[str, str]
 
 
-E57: Final = Format(
-    name="E57",
-    suffixes=(".e57",),
-    signature=re.compile(b"ASTM-E57"),
-    beginning="ASTM-E57",
-    reader=("e57", "open_e57"),
-)
-LAS: Final = Format(
-    name="LAS/LAZ",
-    suffixes=(".las", ".laz"),
-    signature=re.compile(b"LASF"),
-    beginning="LASF",
-    reader=("las", "open_las"),
-)
-PLY: Final = Format(
-    name="PLY",
-    suffixes=(".ply",),
-    signature=re.compile(rb"ply[\n\r ]", re.IGNORECASE),
-    beginning="ply",
-    reader=("records", "open_ply"),
-)
+_PLY_START: Final = re.compile(rb"ply[\n\r ]", re.IGNORECASE)
 # Programs write first lines of their own, or none.
-PCD: Final = Format(
-    name="PCD",
-    suffixes=(".pcd",),
-    signature=re.compile(
-        rb"# \.PCD|(?:.*\n)*?[ \t]*(?:fields|columns)[ \t].*\n(?:.*\n)?[ \t]*size[ \t]",
-        re.IGNORECASE,
-    ),
-    reader=("records", "open_pcd"),
+_PCD_START: Final = re.compile(
+    rb"# \.PCD|(?:.*\n)*?[ \t]*(?:fields|columns)[ \t].*\n(?:.*\n)?[ \t]*size[ \t]", re.IGNORECASE
 )
-PTX: Final = Format(name="PTX", suffixes=(".ptx",), reader=("ptx", "open_ptx"))
-TEXT: Final = Format(
-    name="text",
-    suffixes=(".xyz", ".txt", ".csv", ".asc", ".pts", ".xyzi", ".xyzn", ".xyzrgb", ".tsv"),
-    reader=("text", "open_text"),
+_TEXT_SUFFIXES: Final = (
+    *(".xyz", ".txt", ".csv", ".asc", ".pts", ".xyzi", ".xyzn", ".xyzrgb", ".tsv"),
 )
+E57: Final = Format("E57", (".e57",), ("e57", "open_e57"), re.compile(b"ASTM-E57"), "ASTM-E57")
+LAS: Final = Format("LAS/LAZ", (".las", ".laz"), ("las", "open_las"), re.compile(b"LASF"), "LASF")
+PLY: Final = Format("PLY", (".ply",), ("records", "open_ply"), _PLY_START, "ply")
+PCD: Final = Format("PCD", (".pcd",), ("records", "open_pcd"), _PCD_START)
+PTX: Final = Format("PTX", (".ptx",), ("ptx", "open_ptx"))
+TEXT: Final = Format("text", _TEXT_SUFFIXES, ("text", "open_text"))
 FORMATS: Final = (E57, LAS, PLY, PCD, PTX, TEXT)
 _SNIFFED_BYTES: Final = 4096
 

@@ -162,7 +162,13 @@ class ContactSheet:
         self.n_shown = min(n_photos, _MOST)
         self._columns = math.ceil(math.sqrt(self.n_shown))
         self._cell_px = min(_CELL_PX, _SHEET_SIDE_PX // self._columns)
-        self._cells: list[NDArray[np.uint8]] = []
+        shape = (
+            -(-self.n_shown // self._columns) * self._cell_px,
+            self._columns * self._cell_px,
+            3,
+        )
+        self._sheet = np.full(shape, _PAPER, dtype=np.uint8)
+        self._count = 0
 
     @property
     def caption(self) -> str:
@@ -180,33 +186,22 @@ class ContactSheet:
         """Put the next photo (rows, cols, 3) RGB on the sheet, if there is room left."""
         import cv2
 
-        if len(self._cells) == self.n_shown:
+        if self._count == self.n_shown:
             return
+        row, column = divmod(self._count, self._columns)
+        self._count += 1
+        top, left = (place * self._cell_px + _GAP_PX for place in (row, column))
         room_px = self._cell_px - 2 * _GAP_PX
         scale = min(room_px / image.shape[1], (room_px - _LABEL_PX) / image.shape[0])
         width, height = (max(1, int(side * scale)) for side in (image.shape[1], image.shape[0]))
-        shape = (height + _LABEL_PX + 2 * _GAP_PX, self._cell_px, 3)
-        cell = np.full(shape, _PAPER, dtype=np.uint8)
-        cell[_GAP_PX : _GAP_PX + height, _GAP_PX : _GAP_PX + width] = cv2.resize(
-            image, (width, height), interpolation=cv2.INTER_AREA
-        )
-        place = (_GAP_PX, _GAP_PX + height + _LABEL_PX - 8)
-        label = _shortened(name, room_px // _LETTER_PX)
-        cv2.putText(cell, label, place, cv2.FONT_HERSHEY_SIMPLEX, 0.8, _INK, 1, cv2.LINE_AA)
-        self._cells.append(cell)
+        small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        self._sheet[top : top + height, left : left + width] = small
+        label, place = _shortened(name, room_px // _LETTER_PX), (left, top + height + _LABEL_PX - 8)
+        cv2.putText(self._sheet, label, place, cv2.FONT_HERSHEY_SIMPLEX, 0.8, _INK, 1, cv2.LINE_AA)
 
     def encoded(self) -> bytes:
         """Encode the sheet as WebP; no side is longer than 1004 pixels."""
-        starts = range(0, len(self._cells), self._columns)
-        rows = [_in_a_row(self._cells[start : start + self._columns]) for start in starts]
-        width = max(row.shape[1] for row in rows)
-        height = sum(row.shape[0] for row in rows)
-        sheet = np.full((height, width, 3), _PAPER, dtype=np.uint8)
-        top = 0
-        for row in rows:
-            sheet[top : top + row.shape[0], : row.shape[1]] = row
-            top += row.shape[0]
-        return encode_webp(sheet)
+        return encode_webp(self._sheet)
 
 
 def _largest_scan(cloud: PointCloud) -> tuple[int, NDArray[np.int64]]:
@@ -283,16 +278,6 @@ def _ways_of_grid(
     azimuth = np.arctan2(north, east)[np.bincount(column) > 0]
     steps = (np.diff(azimuth) + np.pi) % (2.0 * np.pi) - np.pi
     return upward, bool(len(steps)) and float(np.median(steps)) > 0.0
-
-
-def _in_a_row(cells: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    height = max(cell.shape[0] for cell in cells)
-    row = np.full((height, sum(cell.shape[1] for cell in cells), 3), _PAPER, dtype=np.uint8)
-    left = 0
-    for cell in cells:
-        row[: cell.shape[0], left : left + cell.shape[1]] = cell
-        left += cell.shape[1]
-    return row
 
 
 def _shortened(name: str, n_letters: int) -> str:

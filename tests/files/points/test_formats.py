@@ -367,20 +367,20 @@ def vector(n_children: int) -> str:
     return f'<v type="Vector">{"<a/>" * n_children}</v>'
 
 
+def named(count: int) -> str:
+    return "<a>" + "".join(f"<b{k}/>" for k in range(count - 1)) + "</a>"
+
+
 @pytest.mark.parametrize(
     ("most", "more", "reason"),
     [
-        (f"<a>{'<a/>' * 500}</a>", f"<a>{'<a/>' * 501}</a>", "a structure in it has more than 500"),
+        (named(500), named(501), "its elements have more than 500 names"),
         ("<a>" * 64 + "</a>" * 64, "<a>" * 65 + "</a>" * 65, "it is nested deeper than 64 element"),
-        (f"<a>{vector(100_000)}{vector(99_997)}</a>", f"<a>{vector(100_000)}{vector(99_998)}</a>",
-         "it has more than 200000 elements"),
-        ('<?xml version="1.0" encoding="utf-8"?><a/>',
-         '<?xml version="1.0" encoding="latin-1"?><a/>', "it is in b'latin-1', expected UTF-8"),
+        (vector(199_999), vector(200_000), "it has more than 200000 elements"),
         ("<a/>", "<!DOCTYPE a><a/>", "it declares a document type or entities"),
-        (vector(20_000), "<a>", "it is not XML"),
     ],
-    ids=["wide", "deep", "many", "encoding", "document type", "no XML"],
-)  # fmt: skip
+    ids=["names", "deep", "many", "document type"],
+)
 def test_the_xml_of_an_e57_file_is_read_up_to_its_limits(
     most: str, more: str, reason: str, tmp_path: Path
 ) -> None:
