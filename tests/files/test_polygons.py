@@ -9,10 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from orthoflow.errors import InputError
 from orthoflow.files.geotiff import GridPlace, read_raster, write_raster
 from orthoflow.files.polygons import (
-    NamedPolygon,
     filled,
     read_polygons,
     write_features,
@@ -30,10 +28,8 @@ def feature(coordinates: Any, *, kind: str = "Polygon", **properties: Any) -> di
     }
 
 
-def read(folder: Path, *features: Any) -> list[NamedPolygon]:
-    path = folder / "masks.geojson"
-    path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
-    return read_polygons(path, name="photo", what="a mask of photos")
+def features(*found: Any) -> str:
+    return json.dumps({"type": "FeatureCollection", "features": found})
 
 
 def test_polygons_come_in_their_order_with_their_holes_and_what_is_said_of_them(
@@ -41,39 +37,14 @@ def test_polygons_come_in_their_order_with_their_holes_and_what_is_said_of_them(
 ) -> None:
     # Heights are left out.
     high = [[*corner, 7.0] for corner in SQUARE]
-    first, second, third = read(
-        tmp_path,
-        feature([high, HOLE], note="window"),
-        feature([[SQUARE], [HOLE]], kind="MultiPolygon", photo="b.jpg"),
-    )
+    path = tmp_path / "masks.geojson"
+    several = feature([[SQUARE], [HOLE]], kind="MultiPolygon", photo="b.jpg")
+    path.write_text(features(feature([high, HOLE], note="window"), several))
+    first, second, third = read_polygons(path, name="photo", what="a mask of photos")
     assert [one.name for one in (first, second, third)] == ["a.jpg", "b.jpg", "b.jpg"]
     assert first.properties == {"photo": "a.jpg", "note": "window"}
     for one, rings in ((first, [SQUARE, HOLE]), (second, [SQUARE]), (third, [HOLE])):
         assert [ring.tolist() for ring in one.rings] == rings
-
-
-@pytest.mark.parametrize(
-    "strange",
-    [
-        feature([SQUARE], photo=5),
-        feature([SQUARE[:2]]),
-        feature([]),
-        feature([[[0.0, 0.0], [1e9, 0.0], [4.0, 3.0]]]),
-        feature([SQUARE], kind="Point"),
-        {"type": "Feature", "properties": {}, "geometry": None},
-        7,
-    ],
-)
-def test_what_is_no_polygon_with_a_name_is_refused_with_its_number(
-    tmp_path: Path, strange: Any
-) -> None:
-    told = (
-        r"masks\.geojson is not a mask of photos: expected a GeoJSON FeatureCollection of polygons,"
-        r' each with the property "photo" \(feature 1\)$'
-    )
-    with pytest.raises(InputError, match=told):
-        read(tmp_path, feature([SQUARE]), strange)
-    assert len(read(tmp_path, feature([SQUARE[:3]]))) == 1
 
 
 def test_cells_are_filled_whose_centres_lie_inside_and_in_no_hole() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import pytest
 
@@ -65,17 +64,3 @@ def test_a_map_lies_where_its_coordinates_are() -> None:
 def test_what_makes_no_frame_is_told(changes: dict[str, object], message: str) -> None:
     with pytest.raises(InputError, match=message):
         placed(vectors(**changes))
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"\xff", r"a\.json is not UTF-8 text"),
-        (b"{", r"a\.json: no JSON, "),
-        (b"[]", r"a\.json: expected a JSON object with origin_world"),
-    ],
-)
-def test_what_is_no_sidecar_is_told(tmp_path: Path, content: bytes, message: str) -> None:
-    (tmp_path / "a.json").write_bytes(content)
-    with pytest.raises(InputError, match=message):
-        sidecars.read_sidecar(tmp_path / "a.json")

@@ -52,11 +52,6 @@ def test_ties_come_out_with_our_pixels_and_the_sigmas_that_are_said(tmp_path: Pa
         ("A.jpg,1,2,3,4,5\n", r"photo A.jpg among those given \(did you mean a.jpg\?\)"),
         ("a.jpg,64,2,3,4,5\n", r"ties0.csv:1: \(u 64, v 2\) lies outside photo a.jpg, which"),
         ("a.jpg,1,47.6,3,4,5\n", "photo a.jpg, which is 64 x 48 pixels as it is stored"),
-        ("photo,u_px,v_px,x,y,z\na.jpg,1,2,3,4\n", "ties0.csv:2: expected 6 columns, got 5"),
-        ("photo,u_px,v_px,x,y,z,sigma_px\na.jpg,1,2,3,4,5,0\n", "sigma_px must be positive, got 0"),
-        ("photo,u,v,x,y,z\n", r"unknown column u; known are photo, u_px|unknown column u \("),
-        ("a.jpg,1,2,3\n", r"photo,u_px,v_px,x,y,z\[,sigma_px\], got 4 values without names"),
-        ("", "holds no ties: expected photo,u_px,v_px,x,y,z per line"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_said_with_its_line(tmp_path: Path, text: str, message: str) -> None:
