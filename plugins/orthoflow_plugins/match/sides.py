@@ -50,6 +50,8 @@ _MIN_POINTS: Final = 3
 # symmetric facade matches its mirror image in part.
 _MIN_AGREEING: Final = 16
 _MIN_MARGIN_RATIO: Final = 2.0
+# Planes within 45 degrees of the opposite direction face the other way.
+_OPPOSITE_COSINE: Final = -math.sqrt(0.5)
 SIDES_GUESSED: Final = DiagnosticSpec(
     code="plane-sides-guessed",
     severity="warning",
@@ -66,8 +68,9 @@ class FaceByPhotos(Method):
     A wall seen from behind is a mirror image of what photos show. If no scanner station determines
     the side of a plane, the cloud is rastered coarsely on it, and photos are matched with that
     picture as they are and mirrored, in mixtures of their colours if grey decides no plane; the
-    side with clearly more inliers is taken. Planes whose side is known, floors and ceilings are
-    left unchanged.
+    side with clearly more inliers is taken. A plane that photos do not decide is turned if it lies
+    between two planes of known sides that both face the other way. Planes whose side is known,
+    floors and ceilings are left unchanged.
     """
 
     id: ClassVar[str] = "face.photos"
@@ -131,6 +134,11 @@ class FaceByPhotos(Method):
                     f"{planes.names[index]}: turned, {behind} matches of the photos agree on its "
                     f"other side, {front} on the guessed one"
                 )
+        for index in asked:
+            if sources[index] == "guess" and _is_turned_away(planes, index, sources):
+                planes = planes.turned(index)
+                n_turned += 1
+                ctx.log(f"{planes.names[index]}: turned like the planes in front of and behind it")
         ctx.metric("n_planes_turned", n_turned, "1")
         ctx.metric("n_planes_seen", sources.count("photos"), "1")
         _warn_of_guesses(planes, sources, ctx)
@@ -178,6 +186,19 @@ def _is_decided(front: int, behind: int) -> bool:
     """Whether the numbers of inliers decide the side of a plane."""
     least = max(_MIN_AGREEING, _MIN_MARGIN_RATIO * min(front, behind))
     return max(front, behind) >= least
+
+
+def _is_turned_away(planes: Planes, index: int, sources: Sequence[SideSource]) -> bool:
+    """Whether a plane lies between planes of known sides that both face the other way.
+
+    Who sees the front one stands beyond the plane. So the step of a fountain is seen from where its
+    facade is, although most points of the cloud, those of the facade, are on its other side.
+    """
+    known = np.array([source != "guess" for source in sources])
+    opposite = known & (planes.normal @ planes.normal[index] < _OPPOSITE_COSINE)
+    centre = planes.corners[index].mean(axis=0)
+    in_front_m = planes.normal[opposite] @ centre - planes.offset[opposite]
+    return bool((in_front_m > 0.0).any() and (in_front_m < 0.0).any())
 
 
 def _warn_of_guesses(planes: Planes, sources: Sequence[SideSource], ctx: StepContext) -> None:

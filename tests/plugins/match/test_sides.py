@@ -80,3 +80,28 @@ def test_points_with_colour_alone_show_the_side_too(tmp_path: Path) -> None:
     coloured = replace(CLOUD, intensity=None)
     found, _ = faced(planes().turned(0), tmp_path, cloud=coloured)
     np.testing.assert_array_equal(found.normal, planes().normal)
+
+
+@pytest.mark.parametrize(("moved_m", "is_turned"), [(1.0, True), (3.0, False)])
+def test_a_plane_between_two_that_face_the_other_way_is_turned(
+    tmp_path: Path, moved_m: float, is_turned: bool
+) -> None:
+    normal = SCENE.frame.normal_world
+    offset_m = SCENE.frame.plane.offset_m
+    # The facade, a step turned towards it by the guess, and an object farther in front.
+    places_m = np.array([0.0, moved_m, 2.0])
+    corners = SCENE.frame.corners_world() + places_m[:, None, None] * normal
+    corners[1] = corners[1][[3, 2, 1, 0]]
+    given = samples.planes(
+        normal=np.array([normal, -normal, normal]),
+        offset=np.array([offset_m, -(offset_m + moved_m), offset_m + 2.0]),
+        corners=corners,
+        n_points=np.array([len(CLOUD), 10, 10]),
+        names=("wall 0", "wall 1", "wall 2"),
+        side_from=("stations", "guess", "stations"),
+        tolerance_m=0.3,
+    )
+    found, metrics = faced(given, tmp_path, shown=ms.textured_wall(2))
+    assert metrics["n_planes_turned"] == is_turned
+    np.testing.assert_allclose(found.normal[1], normal if is_turned else -normal)
+    assert found.side_source(1) == "guess"
