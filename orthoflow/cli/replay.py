@@ -7,7 +7,6 @@ import dataclasses
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -30,10 +29,7 @@ from orthoflow.errors import CancelledStepError, ClusterError
 from orthoflow.untrusted_text import first_few
 
 if TYPE_CHECKING:
-    from orthoflow.engine.store import Store
-    from orthoflow.records.compare import ProductDistance
-    from orthoflow.records.replay import Replay, ReplayedMetric
-    from orthoflow.records.runs import Run
+    from orthoflow.records.replay import ReplayedMetric
 
 _METRICS_MOST: Final = 5
 
@@ -76,12 +72,15 @@ def replay(
     from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.engine.journal import new_run_folder, new_run_id
     from orthoflow.engine.plan import RunOptions
-    from orthoflow.engine.store import Store
+    from orthoflow.engine.store import Store, stores_at
+    from orthoflow.records.compare import RunProducts, product_distances
     from orthoflow.records.inputs import embedded_inputs
     from orthoflow.records.open import open_run
-    from orthoflow.records.replay import plan_replay
+    from orthoflow.records.replay import DIFFERING, plan_replay, replayed_metrics
+    from orthoflow.records.runs import REPORT_FILE
+    from orthoflow.report import write_report
 
-    options = RunOptions(**choices)
+    options, catalog = RunOptions(**choices), discover_catalog()
     original = open_run(run)
     run_id = new_run_id()
     folder = output or new_run_folder(f"{original.record.name}-replay", run_id)
@@ -92,23 +91,54 @@ def replay(
         opened = Store(store_folder)
         planned = plan_replay(
             original,
-            discover_catalog(),
+            catalog,
             opened,
             options,
             inputs=inputs,
             placed=placed,
-            earlier=_earlier_stores(),
-        )
-        call = _Call(
-            original=original,
-            replay=planned,
-            store=opened,
-            folder=folder,
-            run_id=run_id,
-            as_json=as_json,
+            earlier=stores_at(DEFAULT_STORE),
         )
         with opened.in_use():
-            return call.go()
+            for note in planned.notes:
+                echo(f"note: {note}", err=as_json)
+            _, made = executed(
+                planned.plan,
+                planned.workflow,
+                opened,
+                folder,
+                run_id,
+                embed=planned.is_embedded,
+                report=lambda made: write_report([made], folder / REPORT_FILE),
+            )
+            distances = product_distances(
+                RunProducts(run=original, stores=stores_at(DEFAULT_STORE)),
+                RunProducts(run=made, stores=(opened,)),
+                [address for address in original.cells if address in made.cells],
+                catalog,
+            )
+    metrics = replayed_metrics(original, made, distances, planned.changed_methods)
+    differs = any(item.verdict == "different" for item in distances) or any(
+        item.verdict in DIFFERING for item in metrics
+    )
+    if as_json:
+        echo_json(
+            {
+                "record": str(original.path),
+                "replay": str(made.path),
+                "ok": not differs,
+                "notes": list(planned.notes),
+                "products": [dataclasses.asdict(item) for item in distances],
+                "metrics": [dataclasses.asdict(item) for item in metrics],
+            }
+        )
+    else:
+        echo()
+        echo_distances(distances)
+        echo(*_metric_lines(metrics))
+        echo(f"record of the replay: {made.path}", f"report: {folder / REPORT_FILE}")
+    if differs:
+        echo_error(f"error: the replay of {original.path} differs, see above")
+    return EXIT_RECORD_DIFFERS if differs else EXIT_GOOD
 
 
 @contextmanager
@@ -134,77 +164,6 @@ def _store_folder(given: Path | None, folder: Path) -> Iterator[Path]:
                 # `runs`, where nothing was run after all.
                 for place in made:
                     place.rmdir()
-
-
-def _earlier_stores() -> tuple[Store, ...]:
-    """The store of runs made here: it has products, and remembers where input files were."""
-    from orthoflow.engine.store import stores_at
-
-    return stores_at(DEFAULT_STORE)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Call:
-    """One call of the command, ready to go."""
-
-    original: Run
-    replay: Replay
-    store: Store
-    folder: Path
-    run_id: str
-    as_json: bool
-
-    def go(self) -> int:
-        """Execute, record, report, compare, and print how far the products differ."""
-        from orthoflow.records.replay import DIFFERING, replayed_metrics
-        from orthoflow.records.runs import REPORT_FILE
-        from orthoflow.report import write_report
-
-        for note in self.replay.notes:
-            echo(f"note: {note}", err=self.as_json)
-        _, made = executed(
-            self.replay.plan,
-            self.replay.workflow,
-            self.store,
-            self.folder,
-            self.run_id,
-            embed=self.replay.is_embedded,
-            report=lambda made: write_report([made], self.folder / REPORT_FILE),
-        )
-        distances = self._distances(made)
-        metrics = replayed_metrics(self.original, made, distances, self.replay.changed_methods)
-        differs = any(item.verdict == "different" for item in distances) or any(
-            item.verdict in DIFFERING for item in metrics
-        )
-        content = {
-            "record": str(self.original.path),
-            "replay": str(made.path),
-            "ok": not differs,
-            "notes": list(self.replay.notes),
-            "products": [dataclasses.asdict(item) for item in distances],
-            "metrics": [dataclasses.asdict(item) for item in metrics],
-        }
-        if self.as_json:
-            echo_json(content)
-        else:
-            echo()
-            echo_distances(distances)
-            echo(*_metric_lines(metrics))
-            echo(f"record of the replay: {made.path}", f"report: {self.folder / REPORT_FILE}")
-        if differs:
-            echo_error(f"error: the replay of {self.original.path} differs, see above")
-        return EXIT_RECORD_DIFFERS if differs else EXIT_GOOD
-
-    def _distances(self, made: Run) -> tuple[ProductDistance, ...]:
-        from orthoflow.catalog.discovery import discover_catalog
-        from orthoflow.records.compare import RunProducts, product_distances
-
-        return product_distances(
-            RunProducts(run=self.original, stores=_earlier_stores()),
-            RunProducts(run=made, stores=(self.store,)),
-            [address for address in self.original.cells if address in made.cells],
-            discover_catalog(),
-        )
 
 
 def _metric_lines(metrics: Sequence[ReplayedMetric]) -> list[str]:

@@ -329,12 +329,6 @@ def _cached_text(cells: Iterable[RecordedCell], kept: Collection[str]) -> str:
     counted_cells = [cell for cell in cells if cell.status != "skipped"]
     n_cells = len(counted_cells)
     n_cached = sum(bool(cell.cached_from) for cell in counted_cells)
-    if n_cells and n_cached == n_cells:
-        return (
-            f"all {counted(n_cells, 'step')} were cached"
-            if n_cells > 1
-            else ("the only step was cached")
-        )
     n_kept = sum(cell.address in kept for cell in counted_cells)
     before = f", {n_kept} kept from before the interruption" if n_kept else ""
     return f"{n_cached} of {counted(n_cells, 'step')} cached{before}"

@@ -51,7 +51,7 @@ _START_S: Final = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunOptions:
+class RunOptions(Selection):
     """Options of plan and run.
 
     Attributes:
@@ -60,9 +60,6 @@ class RunOptions:
             `dask` (a child process per cell, on the workers of a cluster).
         scheduler: address of dask's scheduler; empty for own workers, as many as `jobs`.
         retries: how often a cell is repeated after its worker was lost.
-        only: run these steps and what they need, from the store if it is there.
-        from_: run these steps, what follows from them, and what all these need.
-        until: run these steps and what they need.
         force: run these steps although their results are in the store.
         cores: total number of processors; None for all that this process may use.
     """
@@ -71,9 +68,6 @@ class RunOptions:
     executor: ExecutorName = "local"
     scheduler: str = ""
     retries: int = 2
-    only: tuple[str, ...] = ()
-    from_: tuple[str, ...] = ()
-    until: tuple[str, ...] = ()
     force: tuple[str, ...] = ()
     cores: int | None = None
 
@@ -88,11 +82,6 @@ class RunOptions:
             raise ArgumentError("--scheduler is for --executor dask")
         if self.retries < 0:
             raise ArgumentError(f"--retries must be 0 or more, got {self.retries}")
-
-    @property
-    def selection(self) -> Selection:
-        """Which steps to run."""
-        return Selection(only=self.only, from_=self.from_, until=self.until)
 
     @property
     def all_cores(self) -> int:
@@ -180,7 +169,7 @@ def plan_run(
     """
     options = options or RunOptions()
     check_step_names(workflow, options.force, "--force")
-    selected = select_cells(workflow, tuple(cells), options.selection)
+    selected = select_cells(workflow, tuple(cells), options)
     methods = {
         method: method_facts(method, catalog)
         for method in dict.fromkeys(cell.method for cell in selected if not cell.skip_reason)

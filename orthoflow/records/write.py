@@ -433,7 +433,7 @@ def build_record(
         DamageError: the store lost a picture of the run.
     """
     # Deliberate omissions are not differences of the results; the record states them.
-    overrides = (*workflow.overrides, *plan.options.selection.options)
+    overrides = (*workflow.overrides, *plan.options.words)
     workflow = dataclasses.replace(workflow, overrides=overrides)
     results = outcome.results
     embedded = _embedded_types(plan, embed=embed)

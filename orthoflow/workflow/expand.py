@@ -191,13 +191,10 @@ class Selection:
         return {"--only": self.only, "--from": self.from_, "--until": self.until}
 
     @property
-    def options(self) -> tuple[str, ...]:
+    def words(self) -> tuple[str, ...]:
         """Return the options as given; empty if nothing is omitted."""
         named = self.by_option.items()
         return tuple(f"{option} {name}" for option, names in named for name in names)
-
-
-EVERYTHING: Final = Selection()
 
 
 def check_step_names(workflow: Workflow, names: Iterable[str], option: str) -> None:
@@ -235,7 +232,7 @@ def select_cells(
         chosen &= set(selection.only)
     if not chosen:
         raise ArgumentError(
-            f"no step of workflow {workflow.name} is left by {' '.join(selection.options)} together"
+            f"no step of workflow {workflow.name} is left by {' '.join(selection.words)} together"
         )
     sources = {cell.address: cell.sources for cell in cells}
     wanted = [cell.address for cell in cells if cell.step in chosen]
@@ -300,15 +297,12 @@ def _is_excluded(workflow: Workflow, assignment: Mapping[str, str]) -> bool:
 # Expansion ----------------------------------------------------------------------------------------
 
 
-def expand_cells(
-    workflow: Workflow, catalog: Catalog, *, selection: Selection = EVERYTHING
-) -> tuple[Cell, ...]:
+def expand_cells(workflow: Workflow, catalog: Catalog) -> tuple[Cell, ...]:
     """Expand a workflow into cells, each after all it needs.
 
     Checks the files of optional inputs, because absent data decide which cells can run.
 
     Raises:
-        ArgumentError: the selection names unknown steps, or leaves nothing.
         InputError: an optional input was named on the command line and is missing.
         PluginError: a method cannot be loaded.
     """
@@ -322,7 +316,7 @@ def expand_cells(
         },
         rank={name: index for index, name in enumerate(topological_steps(workflow.steps))},
     )
-    return select_cells(workflow, expansion.expand(), selection)
+    return expansion.expand()
 
 
 @dataclass(frozen=True, kw_only=True)

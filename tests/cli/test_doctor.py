@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import subprocess
 import tomllib
 from pathlib import Path
 from types import SimpleNamespace
@@ -129,15 +128,6 @@ def test_a_library_that_does_not_import_costs_what_it_is_used_for(
     entry = findings(code=exit_code)[name]
     assert (entry["verdict"], entry["found"], entry["cost"]) == described
     assert entry["core"] is (exit_code == 4)
-
-
-@pytest.mark.usefixtures("libraries")
-def test_an_import_that_takes_too_long_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    def wait(command: list[str], *, timeout: float, **_: object) -> None:
-        raise subprocess.TimeoutExpired(command, timeout)
-
-    monkeypatch.setattr(subprocess, "run", wait)
-    assert findings(code=4)["click"]["found"].endswith("its import takes longer than 120 s")
 
 
 @pytest.mark.usefixtures("libraries")

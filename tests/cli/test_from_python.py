@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from orthoflow.cli import from_python as module
-from orthoflow.errors import ArgumentError
+from orthoflow.errors import ArgumentError, WorkflowError
 from tests.studios import Studio, open_studio
 
 
@@ -20,35 +21,26 @@ def studio(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Studio:
 
 def test_arrays_and_paths_are_what_a_workflow_would_say() -> None:
     swept = {"sweep": np.array([0.25, 0.5]), "ranks": [np.int64(3)], "file": Path("a/b")}
-    datasets = {"hall": {"scan": Path("a/b"), "photos": ("c", Path("d"))}}
-    known = module._Arguments(
-        workflow="w",
-        set={"a.b": swept},
-        inputs={"scan": Path("a/b"), "photos": (path for path in [Path("a")])},
-        datasets=datasets,
-        jobs=np.int64(2),
-        only="wall",
-    )
-    assert known.set == {"a.b": {"sweep": [0.25, 0.5], "ranks": [3], "file": "a/b"}}
-    assert known.inputs == {"scan": ("a/b",), "photos": ("a",)}
-    assert known.datasets == {"hall": {"scan": "a/b", "photos": ["c", "d"]}}
-    assert (known.jobs, known.only) == (2, ("wall",))
+    found = json.loads(module._json("set", swept))
+    assert found == {"sweep": [0.25, 0.5], "ranks": [3], "file": "a/b"}
 
 
 @pytest.mark.parametrize(
-    ("given", "where"),
+    ("given", "said"),
     [
-        ({"set": {"a.b": object}}, "set.a.b"),
-        ({"set_files": {"a": 1}}, "set_files"),
-        ({"jobs": True}, "jobs"),
-        ({"only_dataa": 1}, "only_dataa"),
+        ({"set": {"a.b": object()}}, "set.a.b: expected a path"),
+        ({"jobs": True}, "Invalid value for '--jobs': 'True' is not a valid integer"),
+        ({"only_dataa": 1}, r"there is no option only_dataa \(did you mean only_data\?\)"),
+        ({"set_files": ["a.yaml"]}, None),
     ],
 )
 def test_an_argument_of_another_form_is_refused_in_a_sentence(
-    given: dict[str, Any], where: str
+    given: dict[str, Any], said: str | None
 ) -> None:
-    with pytest.raises(ArgumentError, match=f"^orthoflow.run: {where}: "):
-        module.run(**{"workflow": "nothing.yaml", **given})
+    # What is right goes on, to a workflow that is not there.
+    error, begins = (ArgumentError, "orthoflow.run: ") if said else (WorkflowError, "there is no")
+    with pytest.raises(error, match=f"^{begins}{said or ''}"):
+        module.run("nothing.yaml", **given)
 
 
 def test_a_run_from_python_is_one_of_the_command(studio: Studio) -> None:
@@ -59,6 +51,7 @@ def test_a_run_from_python_is_one_of_the_command(studio: Studio) -> None:
         set={"paint.grey": 7},
         output="r",
         only="survey",
+        jobs=np.int64(1),
         executor="inline",
     )
     record = opened.record

@@ -83,7 +83,7 @@ def test_a_second_run_is_cached_and_a_forced_step_runs_again(
     arguments = ("run", "studio.yaml", "--set", "survey.offset_m=-3", *INLINE)
     again = orthoflow(folder, *arguments)
     assert again.returncode == 0, again.stderr
-    assert "all 2 steps were cached" in again.stdout.splitlines()
+    assert "2 of 2 steps cached" in again.stdout.splitlines()
     [named] = (folder / "runs").glob("studio-*")
     run, original = open_run(named), open_run(folder / "good")
     assert named.name == f"studio-{run.record.run_id}"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from orthoflow.errors import CancelledStepError, ProductError
-from orthoflow.sdk import Method, MethodParams, Ports, StepContext, StepEvent
+from orthoflow.sdk import StepContext, StepEvent
 
 SVG = b'<svg xmlns="http://www.w3.org/2000/svg"/>'
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(20)
@@ -96,19 +96,7 @@ def test_an_allocated_array_is_zero_and_a_file_of_its_size(
     assert not other.any()
 
 
-def test_a_method_that_does_nothing_says_what_it_lacks(tmp_path: Path) -> None:
-    class Idle(Method):
-        id = "plane.idle"
-        Params = MethodParams
-        In = Ports
-        Out = Ports
-
-    with pytest.raises(AssertionError, match="Idle must implement run"):
-        Idle().run(Ports(), MethodParams(), context(tmp_path))
-    assert Idle.tools() == {}
-
-
-NOT_NAMES = ["", "..", "../up", "/abs", "two\nlines", "red \x1b[31m", "half \udcff", "n" * 300, 5]
+NOT_NAMES = ["", "..", "../up", "two\nlines", "half \udcff", "n" * 300, 5]
 
 
 @pytest.mark.parametrize("name", NOT_NAMES, ids=ascii)

@@ -107,7 +107,6 @@ BESIDE = "the publisher of marks wrote beside its folder: "
         (publish_well, ""),
         (publish_nothing_but_an_error, r"publisher of marks raised ValueError: disk .*\(test_ch"),
         (lambda _, folder, text: (folder.parent / "a.json").write_text(text), f"{BESIDE}a.json"),
-        (lambda *_: Path("b.json").write_text(""), f"{BESIDE}b.json"),
         (
             lambda _, folder, __: (folder / "marks.json").symlink_to("/etc/passwd"),
             "a marks publishes 'marks.json', which is a link or a device",

@@ -126,15 +126,6 @@ CHEATS: dict[str, tuple[str, str, str]] = {
             lift_m: float = Field(0.0, description="Raises the plane.")
         """,
     ),
-    "unmeasured": (
-        "outputs-are-valid",
-        "the unit of metric height must be a word",
-        """
-        def lift_m(self, cloud, ctx):
-            ctx.metric("height", 1.0, "")
-            return 0.0
-        """,
-    ),
     "faultless": (
         "no-covariance-is-zero",
         "the covariance of plane 0 is zero, which means that it is without error: put in what",
@@ -313,22 +304,6 @@ STOPPED: dict[str, tuple[str, str, str]] = {
         """
         def look_at(self, cloud):
             return {}["tolerance"]
-        """,
-    ),
-    "wrong_output": (
-        "outputs-are-valid",
-        r".*raised ProductError: labels\.plane_index must be .* \(floors\.py:\d+\)",
-        """
-        def look_at(self, cloud):
-            PointLabels(plane_index=np.zeros(len(cloud), dtype=np.int64))
-        """,
-    ),
-    "wrong_metric": (
-        "outputs-are-valid",
-        r".*raised ProductError: metric height must be finite, got nan.* \(floors.*\)",
-        """
-        def listen(self, ctx):
-            ctx.metric("height", float("nan"), "m")
         """,
     ),
     "no_figure": (

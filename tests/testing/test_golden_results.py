@@ -88,18 +88,12 @@ def test_what_other_numbers_went_into_is_held_to_its_tolerances_alone(tmp_path: 
     assert file.read_text() == before
 
 
-def test_an_output_that_appears_is_noticed(file: Path) -> None:
+def test_an_output_that_appears_and_another_file_are_noticed(file: Path) -> None:
     problem = golden_problem(file, trial(), {"planes": planes(), "walls": planes()})
     assert problem.startswith("output walls is another one than golden.json has (one of them has")
-
-
-def test_another_file_is_refused_in_a_sentence(tmp_path: Path) -> None:
-    path = tmp_path / "golden.json"
-    path.write_text('{"plane.mine": {"1": {}}}')
-    with pytest.raises(
-        InputError, match=r"golden.json is not a file of golden results .*: remove it"
-    ):
-        golden_problem(path, trial(), {"planes": planes()})
+    file.write_text('{"plane.mine": {"1": {}}}')
+    with pytest.raises(InputError, match=r"is not a file of golden results .*: remove it"):
+        golden_problem(file, trial(), {"planes": planes()})
 
 
 @pytest.mark.parametrize(("factor", "is_noticed"), [(0.9, False), (1.2, True)])

@@ -17,6 +17,7 @@ from orthoflow.workflow.expand import (
     check_step_names,
     derive_seed,
     expand_cells,
+    select_cells,
 )
 from orthoflow.workflow.views import resolved_json, workflow_from_resolved
 from tests.laboratories import GOOD, load
@@ -66,7 +67,7 @@ def cells_of(
 ) -> dict[str, Cell]:
     write.write_text(text)
     workflow = load_workflow(write, catalog, inputs=inputs)
-    cells = expand_cells(workflow, catalog, selection=selection or Selection())
+    cells = select_cells(workflow, expand_cells(workflow, catalog), selection or Selection())
     addresses = [cell.address for cell in cells]
     assert len(set(addresses)) == len(addresses)
     for index, cell in enumerate(cells):
@@ -342,10 +343,10 @@ def test_a_selected_cell_brings_only_the_variants_it_uses(catalog: Catalog, writ
 def test_an_unknown_step_of_a_selection_is_refused(catalog: Catalog, write: Path) -> None:
     workflow = load(GOOD, write, catalog)
     with pytest.raises(ArgumentError, match=r"--until wal: .* has no step wal \(did you mean wall"):
-        expand_cells(workflow, catalog, selection=Selection(until=("wal",)))
+        select_cells(workflow, (), Selection(until=("wal",)))
     with pytest.raises(ArgumentError, match=r"--force plan: .* \(did you mean plane\?\)"):
         check_step_names(workflow, ["plan"], "--force")
 
     message = "no step of workflow palace-room is left by --from ortho --until wall together"
     with pytest.raises(ArgumentError, match=message):
-        expand_cells(workflow, catalog, selection=Selection(from_=("ortho",), until=("wall",)))
+        select_cells(workflow, (), Selection(from_=("ortho",), until=("wall",)))

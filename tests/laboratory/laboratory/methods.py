@@ -94,22 +94,16 @@ class Hough2d(Idle):
         labels: PointLabels
 
 
-class Ransac(Idle):
+class Ransac(Hough2d):
     id = "plane.ransac"
+    result_version = 1
     determinism = "seeded"
 
-    class Params(MethodParams):
+    class Params(MethodParams):  # type: ignore[assignment]
         tolerance_m: Annotated[float, Field(gt=0)] | Literal["auto"] = Field(
             0.05, description="Distance that counts as on the plane."
         )
         iterations: int = Field(2000, ge=1, description="Trials.")
-
-    class In(Ports):
-        cloud: PointCloud
-
-    class Out(Ports):
-        planes: Planes
-        labels: PointLabels
 
 
 class Grid(Idle):
@@ -137,16 +131,11 @@ class Sift(Idle):
         ties: Ties
 
 
-class Guided(Idle):
+class Guided(Sift):
     id = "match.guided"
 
-    class In(Ports):
-        photos: Photos
-        walls: Walls
+    class In(Sift.In):
         cameras: Cameras
-
-    class Out(Ports):
-        ties: Ties
 
 
 class Pnp(Idle):
@@ -160,16 +149,9 @@ class Pnp(Idle):
         cameras: Cameras
 
 
-class Bundle(Idle):
+class Bundle(Pnp):
     id = "orient.bundle"
     determinism = "loose"
-
-    class In(Ports):
-        ties: Ties
-        photos: Photos
-
-    class Out(Ports):
-        cameras: Cameras
 
 
 class Backward(Idle):
@@ -184,15 +166,12 @@ class Backward(Idle):
         layers: Layers
 
 
-class Direct(Idle):
+class Direct(Backward):
     id = "ortho.direct"
 
-    class In(Ports):
+    class In(Ports):  # type: ignore[assignment]
         walls: Walls
         cloud: PointCloud
-
-    class Out(Ports):
-        layers: Layers
 
 
 class Seams(Idle):
