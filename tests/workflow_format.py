@@ -66,8 +66,8 @@ compare:
 HEAD = f"""\
 # The workflow file
 
-Every key of a workflow file. `{COMMAND}` generates this page from `orthoflow/workflow/model.py`,
-the models behind the checks and `orthoflow schema`.
+`{COMMAND}` generates this page from `orthoflow/workflow/model.py`,
+which also defines the checks and `orthoflow schema`.
 
 ```yaml
 {EXAMPLE}```
@@ -105,8 +105,8 @@ def _table(section: type[BaseModel]) -> Iterator[str]:
         yield f"| `{key}` | `{example}` | {info.description} |"
     if section is DatasetSection:
         yield (
-            "| `<input>` | `data/hall/*.jpg` | Files of the input of "
-            "that name, which have to be there. |"
+            "| `<input>` | `data/hall/*.jpg` | Files of the input with that name; they must "
+            "exist. |"
         )
 
 

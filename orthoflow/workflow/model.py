@@ -232,14 +232,14 @@ class FileSection(BaseModel):
 
 
 class InputSection(FileSection):
-    """A folder means all files in it and its subfolders, a pattern the files that it matches (`**`:
-    folders at any depth). A file that is not optional must exist.
+    """A folder stands for all files in it and its subfolders; a pattern stands for the files that
+    it matches (`**`: folders at any depth). The files of an input must exist unless it is optional.
     """  # noqa: D205 - the text of the reference
 
     files: _Files = Field(
         (),
-        description="A file, a folder, a pattern, or a list of them, relative to the workflow. "
-        "Without it, pass `--input NAME=PATH`.",
+        description="A file, a folder, a pattern, or a list of these, relative to the workflow. "
+        "If it is missing, pass `--input NAME=PATH`.",
         examples=["data/photos/*.jpg"],
     )
     optional: _Flag = Field(
@@ -250,38 +250,38 @@ class InputSection(FileSection):
 
 
 class ResourcesSection(FileSection):
-    """What a method may use of the machine."""
+    """The resources that a method may use."""
 
     cores: _Positive | None = Field(
         None,
-        description="Number of cores that the method may use; by default all, shared by the steps "
-        "that run at the same time.",
+        description="Number of cores that the method may use; by default all cores, shared by the "
+        "steps that run at the same time.",
         examples=[2],
     )
 
 
 class SweepSection(FileSection):
-    """A parameter may have several values: `tolerance_m: {sweep: [0.02, 0.05]}` makes the variants
-    `tolerance_m-0_02` and `tolerance_m-0_05` of the step. In a variant its name comes first, and
-    `baseline` and `exclude` accept that name. Values that do not fit into a name get an index
-    (`sweep-1`) that `orthoflow plan` explains. Several swept parameters make all combinations. The
-    report draws the metrics over the parameter. `--set STEP.PARAM=VALUE` replaces a sweep,
-    `--set 'STEP.PARAM={sweep: [...]}'` makes one.
+    """A parameter can have several values: `tolerance_m: {sweep: [0.02, 0.05]}` makes the variants
+    `tolerance_m-0_02` and `tolerance_m-0_05` of the step. If a variant contains the sweep, their
+    names begin with its name, which `baseline` and `exclude` accept. If values cannot be part of a
+    name, variants are numbered (`sweep-1`); `orthoflow plan` lists them. Sweeps of several
+    parameters make all combinations. The report plots the metrics against the parameter.
+    `--set STEP.PARAM=VALUE` replaces a sweep, `--set 'STEP.PARAM={sweep: [...]}'` makes one.
     """  # noqa: D205
 
     sweep: Annotated[list[Any], Field(min_length=2, max_length=MOST_SWEPT)] = Field(
-        description="Values of the parameter; each makes a variant.",
+        description="Values of the parameter; each becomes a variant.",
         examples=[[0.02, 0.05, 0.1]],
     )
 
 
 class CallSection(FileSection):
-    """How one method is called. All variants of a step share its wiring (`in`, `if`, `unless`)."""
+    """All variants of a step have the same inputs and conditions (`in`, `if`, `unless`)."""
 
     use: _Text | None = Field(
         None,
-        description="The method, as `kind.method`; `orthoflow plugins list` shows all. Required "
-        "unless the step has variants.",
+        description="The method, as `kind.method`; `orthoflow plugins list` shows all. It is "
+        "required unless the step has variants.",
         examples=["plane.hough2d"],
     )
     params: dict[str, Any] = Field(
@@ -291,60 +291,61 @@ class CallSection(FileSection):
     )
     repeat: _Repeats = Field(
         1,
-        description="Number of runs with different seeds; of a method without randomness, to time "
-        "it. Steps that the comparison names in `metrics` (by default every inspection) and those "
-        "between run once per repeat; all others use the first repeat.",
+        description="Number of runs with different seeds; for a method without randomness, "
+        "repeats measure times. Steps listed in `compare.metrics` (by default all inspections) "
+        "and the steps in between run once per repeat; all others use the first repeat.",
         examples=[10],
     )
     resources: ResourcesSection = Field(
         ResourcesSection(),
-        description="What the method may use of the machine.",
+        description="The resources that the method may use.",
         examples=[{"cores": 2}],
     )
     timeout: _Seconds | None = Field(
         None,
-        description="A step that takes longer is stopped and fails. Without it there is no limit.",
+        description="A step that takes longer is stopped and fails; by default there is no limit.",
         examples=["30min"],
     )
 
 
 class StepSection(CallSection):
-    """A step calls one method, or has variants that each call one; the keys of a call are then in
-    the variants. A step that lacks a required product because optional data is absent is skipped,
-    with all steps that need it. The order of steps is free.
+    """A step calls one method, or has variants that each call one and contain the keys of the call.
+    A step that lacks a required product because optional data is missing is skipped, together with
+    all steps that need it. Steps can be in any order.
     """  # noqa: D205
 
     in_: dict[str, _Sources] = Field(
         {},
         alias="in",
-        description="Source of each port's product; of a list, the first that is present.",
+        description="Source of the product for each port; from a list, the first available one is "
+        "used.",
         examples=[{"cloud": "cloud.cloud", "planes": ["given.planes", "plane.planes"]}],
     )
     if_: _InputSource | None = Field(
         None,
         alias="if",
-        description="The step is skipped unless this input is given, even if no port needs it.",
+        description="The step runs only if this input is given, even if no port needs it.",
         examples=["inputs.other"],
     )
     unless: _InputSource | None = Field(
         None,
-        description="The step is skipped when this input is given.",
+        description="The step is skipped if this input is given.",
         examples=["inputs.scan"],
     )
     variants: dict[_Name, CallSection] | None = Field(
         None,
-        description="Alternatives of one kind with their own parameters, instead of `use`.",
+        description="Alternative methods of one kind with their own parameters, instead of `use`.",
         examples=[{"fine": {"use": "plane.hough2d"}, "quick": {"use": "plane.ransac"}}],
     )
 
 
 class DatasetSection(BaseModel):
-    """Steps that depend on the data run once per dataset, with `data=<name>` first in their
-    address; all others run once. Inputs that a dataset does not name are those of the workflow.
-    Instead of the mapping, a CSV file may have a line per dataset: a column `name`, one per input,
-    and columns such as `room.noise_m` for parameters; an empty field sets nothing, and paths are
-    relative to the file. `--datasets FILE` replaces the section, `--only-data A,B` selects
-    datasets.
+    """Steps that depend on the data run once per dataset, and their addresses begin with
+    `data=<name>`; all others run once. Inputs that a dataset does not list are those of the
+    workflow. You can list the datasets in a CSV file instead, one per line: a column `name`, one
+    per input, and columns such as `room.noise_m` for parameters. An empty field leaves the
+    parameter unchanged; paths are relative to the file. `--datasets FILE` replaces the section,
+    `--only-data A,B` selects datasets.
     """  # noqa: D205
 
     model_config = ConfigDict(extra="allow", frozen=True)
@@ -352,8 +353,8 @@ class DatasetSection(BaseModel):
 
     set: dict[str, Any] = Field(
         {},
-        description="Parameters of this dataset, named as for `--set`, which overrides them; and "
-        "`seed`, a number or a sweep.",
+        description="Parameters of this dataset, with names as for `--set`, which overrides them; "
+        "and `seed`, a number or a sweep.",
         examples=[{"room.noise_m": 0.004, "plane.ransac.tolerance_m": 0.03, "seed": 7}],
     )
 
@@ -365,34 +366,34 @@ class DatasetsSection(FileSection):
 
 
 class Comparison(FileSection):
-    """Every step behind variants runs once per combination that differs. Tables list each of these
-    runs by its address: step, dataset, seed, variants and repeat, such as
-    `ortho@plane=ransac,orient=pnp#2`; columns and keys of files call it `cell`. Without `compare`
-    only the baseline runs, the first variant of each step.
+    """Every step after variants runs once per combination that affects it. Tables list each of
+    these cells by its address: step, dataset, seed, variants and repeat, such as
+    `ortho@plane=ransac,orient=pnp#2`. Without `compare`, only the baseline runs: the first variant
+    of each step.
     """  # noqa: D205
 
     design: Design = Field(
         "product",
-        description="All combinations of variants, or the baseline and every single deviation "
-        "from it.",
+        description="`product`: all combinations of variants; `one-at-a-time`: the baseline and "
+        "every combination that differs from it in one step.",
         examples=["one-at-a-time"],
     )
     baseline: _Assignment = Field(
         {},
-        description="The variant of each step with which others are compared and which the report "
-        "shows; by default the first.",
+        description="The variant of each step that the report shows and compares with the others; "
+        "by default the first.",
         examples=[{"plane": "hough2d", "orient": "bundle"}],
     )
     exclude: tuple[Annotated[_Assignment, Field(min_length=1)], ...] = Field(
         (),
         max_length=MOST_EXCLUDED,
-        description="Combinations that are left out.",
+        description="Combinations that do not run.",
         examples=[[{"plane": "ransac", "orient": "pnp"}]],
     )
     metrics: _Metrics = Field(
         (),
         description="Metrics in the report's tables, as `step.metric`, with `*` as wildcard; "
-        "by default those of quality.",
+        "by default all quality metrics.",
         examples=[["plane.rms_mm", "*.wall_s"]],
     )
 
@@ -417,8 +418,8 @@ class SeedSection(FileSection):
 
 
 class WorkflowFile(FileSection):
-    """A workflow file is YAML 1.2 and data only: no templates, no expressions, no environment
-    variables, no tags. Every key and every name occurs once.
+    """A workflow file is YAML 1.2 and contains only data: no templates, expressions, environment
+    variables or tags. Every key and every name occurs only once.
     """  # noqa: D205
 
     orthoflow: Annotated[
@@ -428,14 +429,14 @@ class WorkflowFile(FileSection):
     ] = Field(FORMAT, description="Version of this format.", examples=[FORMAT])
     name: _Name | None = Field(
         None,
-        description="Name of the workflow, with which the folder of a run begins; by default the "
-        "file's name.",
+        description="Name of the workflow, with which the names of run folders begin; by default "
+        "the file name.",
         examples=["palace-room"],
     )
     seed: _Seed | SeedSweep = Field(
         0,
-        description="Root of all seeds; a step's seed follows from it, the method and the repeat. "
-        "A sweep runs everything random once per seed.",
+        description="Seed from which the seeds of steps are derived, with the method and the "
+        "repeat. A sweep runs every random step once per seed.",
         examples=[1729],
     )
     inputs: dict[_Name, InputSection] = Field(
@@ -455,7 +456,7 @@ class WorkflowFile(FileSection):
     )
     compare: Comparison | None = Field(
         None,
-        description="Which combinations of variants run and what is compared.",
+        description="The combinations of variants to run and the metrics to compare.",
         examples=[{"design": "product", "baseline": {"plane": "hough2d"}}],
     )
 
