@@ -1,4 +1,4 @@
-"""What balancing does to colours: steps along seams, colours against one exposure, sharpness.
+"""Measure colour balancing: steps along seams, deviation from constant exposure, and sharpness.
 
     orthoflow run quickstart.yaml -o one --store store --set room.photo_vignetting_share=0
     orthoflow run quickstart.yaml -o many --store store \\
@@ -7,13 +7,15 @@
     python benchmarks/balanced_colours.py --room 9021
     python benchmarks/balanced_colours.py RUN --exposure 0.3 --store store
 
-The second is that of a smaller room, drawn by a seed, from true planes and cameras. The third gives
-real photos 0.7 to 1.3 times their light, and compares with the same photos balanced without that.
+The second use draws a smaller room by a seed, with true planes and cameras. The third multiplies
+the brightness of real photos by 0.7 to 1.3 and compares the result with the balanced original
+photos.
 
-Joins the layers of a run anew, untouched and balanced. A step is told between the means of two
-cells on either side of a seam, averaged over stretches of 24 cells along it. Of that, the wall
-itself changes by what either photo alone shows between the same four cells, on average of both.
-What is left, the excess, is what comes of two photos: by how much they differ in these cells.
+The layers of a run are joined again, without and with balancing. A step is the difference between
+the means of two cells on either side of a seam, averaged over stretches of 24 cells along it. Part
+of it is the change of the wall itself, measured as the difference that each photo alone shows
+between the same four cells, averaged over both photos. The excess is the remaining part, which is
+caused by using two photos.
 """
 
 from __future__ import annotations

@@ -1,15 +1,16 @@
-"""From LAZ files to orthoimages: time per point and memory, for one room and for many beside it.
+"""Measure time per point and memory from LAZ files to orthoimages, for one room and for many.
 
     python benchmarks/great_room.py room
     python benchmarks/billion_points.py --npy room/room.npy --tiles 1 21 --folder FOLDER
     python benchmarks/billion_points.py --npy room/room.npy --tiles 21 --gsd-m 0.01 --folder FOLDER
 
-Each file holds the great room, moved along its main wall: 21 files are a suite of 180 m and a
-billion points. They are read, planes found, walls rastered, and the points laid onto them, through
-the engine. Memory is the largest sum of RssAnon over all processes, sampled; files that are mapped
-do not count. The folder takes 18 bytes of store and 4 of files per point, and some 55 for each cell
-of the rasters (21 rooms have 660 million of 5 mm): 60 GB in all. `--gsd-m 0.01` has a fourth of the
-cells. What the folder held is removed in the end.
+Each file contains the great room, shifted along its main wall: 21 files form a suite of rooms 180 m
+long with a billion points. The engine reads them, finds the planes, computes the rasters of the
+walls and projects the points onto them. Memory is the maximum sampled sum of RssAnon over all
+processes, which excludes memory-mapped files. The folder needs 18 bytes of store and 4 bytes of
+files per point, and about 55 bytes per raster cell (21 rooms have 660 million cells of 5 mm): 60 GB
+in all. `--gsd-m 0.01` reduces the number of cells to a quarter. The contents of the folder are
+removed at the end.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
-"""How long many rooms would take on a cluster, reckoned from the record of one that was run.
+"""Estimate how long many rooms would take on a cluster, from the record of one room.
 
     python benchmarks/cluster_on_paper.py RUN --rooms 200 --points-m 48 --photos 40 \\
         --measured-points-m 16 --measured-photos 6 --workers 1 16 256
 
-Each step of the record becomes a task per room. Its seconds and what it stores grow with the points
-or with the photos, whichever it has among its inputs, photos before points; what it reads is all
-that the steps before it stored. A worker is a machine like the one that was measured, and does one
-task at a time; those that transfer share the server, and none is faster than its own link. Ready
-tasks run in the order of the rooms.
+Each step of the record becomes one task per room. Its time and the size of its products grow with
+the number of points or of photos: whichever is among its inputs, points if both are. It reads
+everything that the preceding steps stored. A worker is a machine like the measured one and runs one
+task at a time. Workers that transfer data share the bandwidth of the server, and none exceeds that
+of its own link. Ready tasks run in the order of the rooms.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Processor time that each kernel takes to compile, in a run that finds none compiled.
+"""Measure the processor time for compiling each kernel, in a run without compiled kernels.
 
 python benchmarks/compile_times.py WORKFLOW [--set STEP.PARAM=VALUE ...] [--top 25]
 
-All steps run in this process, so that numba's own functions, which it keeps nowhere, are compiled
-once; a run compiles those that a step needs in each step's process.
+All steps run in this process, so numba's own functions, which it does not cache, are compiled once;
+a normal run compiles those that a step needs in the process of each step.
 """
 
 from __future__ import annotations

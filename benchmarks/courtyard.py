@@ -1,14 +1,15 @@
-"""A courtyard whose four facades repeat one window: which photos are oriented, and where.
+"""Orient photos of a courtyard whose four facades repeat one window, and check their positions.
 
     python benchmarks/courtyard.py [--seeds 1 2 3] [--photos 16]
 
-Four plastered facades stand around 12 x 10 m, each with rows of equal windows 0.25 m deep, scanned
-from one station; a seed draws stains, viewpoints and noise. Photos stand 4 to 6 m before a facade
-and show two or three windows a row, so that what tells one window from the next is stains alone.
-Photos go through the steps of `photos-on-scan.yaml`, with a focal length from EXIF: `match.sift`, a
-bundle with loose gates, `match.guided`, a bundle. Printed are the facades found, photos oriented
-with their errors (centre, and a coordinate on the wall beside the stated one), the reasons of the
-others, and how many are `ok` in a wrong place.
+Four plastered facades stand around a courtyard of 12 x 10 m, each with rows of identical windows
+0.25 m deep, scanned from one station. A seed draws stains, viewpoints and noise. Photos are taken
+4 to 6 m in front of a facade and show two or three windows per row, so only the stains distinguish
+the windows. Photos are processed by the steps of `photos-on-scan.yaml`, with a focal length from
+EXIF: `match.sift`, a bundle adjustment with relaxed gates, `match.guided`, a bundle adjustment. The
+output lists the facades found, the oriented photos with their errors (of the centre, and per
+coordinate on the wall, next to the expected one), the reasons for rejecting the others, and the
+number of accepted photos with a wrong position.
 """
 
 from __future__ import annotations

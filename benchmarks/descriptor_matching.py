@@ -1,10 +1,10 @@
-"""Pairing descriptors: ours against OpenCV's brute force.
+"""Compare our descriptor matching with OpenCV's brute force.
 
     python benchmarks/descriptor_matching.py [--photo 8000] [--wall 8000] [--threads 2] [--repeat 5]
 
-Both give mutual nearest neighbours that pass the ratio test of 0.85, and agree on them; OpenCV's
-does it with two nearest neighbours one way and the nearest the other way. Times are the least of
-interleaved runs.
+Both return mutual nearest neighbours that pass the ratio test of 0.85, and their results agree.
+OpenCV's version searches two nearest neighbours in one direction and one in the other. Times are
+the minimum over interleaved runs.
 """
 
 from __future__ import annotations

@@ -4,21 +4,22 @@
     python benchmarks/drawn_rooms.py FOLDER --part surfaces --rooms 5
     orthoflow runs FOLDER --table numbers.csv
 
-Directions, leans and distances of all planes, decoration, scanner stations, photos and lens are
-drawn from a room's seed: ten rooms from 1 on, and five others from 101 on, by which rankings are
-checked. Each room is measured four times: `planes` (plane-methods.yaml, paper_planes.yaml),
-`orient` (orient-methods.yaml), `ortho` (ortho-methods.yaml) and `surfaces` (matched_surface.yaml),
-where orthoimages are made from photos on a surface (backward) and from points (direct), on the scan
-and on points that are matched in the photos, as skarlatos2012 had. Check points are compared over
-those that all orthoimages of a room show, poses over the photos that all methods orient.
+The seed of a room draws the directions, tilts and distances of all planes, the decoration, scanner
+stations, photos and lens: ten rooms have seeds from 1, and five other rooms, which verify rankings,
+have seeds from 101. Each room is measured in four parts: `planes` (plane-methods.yaml,
+paper_planes.yaml), `orient` (orient-methods.yaml), `ortho` (ortho-methods.yaml) and `surfaces`
+(matched_surface.yaml). The last compares orthoimages from photos projected onto a surface
+(backward) with those from points (direct), for the scan and for points matched in the photos, as in
+skarlatos2012. Check points are compared over those that all orthoimages of a room show, poses over
+the photos that all methods orient.
 
-A room's runs are recorded in `FOLDER/<part>-<seed>/`, with the numbers of the pages beside them in
-`numbers.json`, and are not made again; products go when the room is measured. From these files
-and the pages of benchmarks/pages docs/papers.md and docs/choosing.md are written: a place
-`{{part: cell metric}}` becomes mean±standard deviation of the first ten rooms,
-`{{part: cell metric < cell metric ? text | other text}}` the text where the ranking holds and the
-other where it does not (see `ranking_holds`), with the counts of rooms. Combinations of variants
-that no page names are not run.
+The runs of a room are recorded in `FOLDER/<part>-<seed>/`, together with the numbers for the pages
+in `numbers.json`; they are not repeated. Products are deleted after the room is measured.
+docs/papers.md and docs/choosing.md are written from these files and the templates in
+benchmarks/pages. `{{part: cell metric}}` is replaced by mean±standard deviation over the first ten
+rooms. `{{part: cell metric < cell metric ? text | other text}}` is replaced by the text if the
+ranking holds (see `ranking_holds`), otherwise by the other text, with the counts of rooms.
+Combinations of variants that no page uses do not run.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""How true the expected error of an orthoimage is: shares of coordinates within one and two sigma.
+"""Measure how often errors of an orthoimage are within one and two expected standard deviations.
 
     python benchmarks/expected_errors.py [--rooms 6] [--first 11] [--fountain] [--store FOLDER]
 
-Each drawn room goes the whole way of `quickstart.yaml`, from points and photos, and is compared
-with the simulation's truth (`inspect.truth`). `--fountain` takes five photos of
+Each drawn room runs through all steps of `quickstart.yaml`, from points and photos, and is compared
+with the truth of the simulation (`inspect.truth`). `--fountain` uses five photos in
 ../shared/data/fountain-p11 instead and compares with their reference poses, at the depths that were
-found: what depths err by is not in that. A normal distribution has 0.68 and 0.95.
+found, so depth errors are not included. A normal distribution has 0.68 and 0.95.
 """
 
 from __future__ import annotations

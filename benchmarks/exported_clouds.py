@@ -1,8 +1,8 @@
-"""How long an export of a cloud takes and how much memory it needs, by number of points.
+"""Measure the time and memory of cloud exports by number of points.
 
 `python -m benchmarks.exported_clouds --points 50` writes 50 million points of a simulated room as
-LAZ, COPC, PLY and E57, each in a process of its own, and prints seconds and the largest memory of
-each, with mapped files and without.
+LAZ, COPC, PLY and E57, each in its own process, and prints the time and the peak memory of each,
+with and without memory-mapped files.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
-"""Whether a plane detector's times hang on compiling: processor seconds of fresh processes.
+"""Test whether the times of a plane detector depend on compilation.
 
     python benchmarks/repeated_times.py FOLDER --runs 1
     python benchmarks/first_detection.py FOLDER [--methods plane.ransac ...] [--warm 2]
 
-Each method looks at the cloud of `FOLDER/1`, in a process that loads and compiles everything itself
-and then in processes that find its kernels compiled. Printed are `first_plane_s` and `detection_s`
-as `StepContext.clock_s` gives them, but by the processor's clock: other work on the machine hardly
-moves that.
+Each method processes the cloud of `FOLDER/1`, first in a process that loads and compiles everything
+itself, then in processes that find compiled kernels. The output contains `first_plane_s` and
+`detection_s` as given by `StepContext.clock_s`, but in processor time, which other load on the
+machine hardly affects.
 """
 
 from __future__ import annotations

@@ -1,17 +1,18 @@
-"""How many photos are oriented as laser and camera see ever less alike: the curve over the gap.
+"""Count the oriented photos as laser intensity and photos become less similar.
 
     python benchmarks/gap_curve.py --rooms 6 --first 301
     python benchmarks/gap_curve.py --rooms 40 --first 301 --photo-gsd-m 0.00085
     # the gap spread evenly over the rooms, half of them from EXIF, half with drawn mouldings:
     python benchmarks/gap_curve.py --rooms 40 --first 7001 --mixed
 
-Each room draws from its seed how much of the contrast that its laser sees is inverted (0 to 1),
-besides scan noise, camera and viewpoints: the rooms of `orientation_truth.py`, six photos of the
-main wall, 4 mm cells, a scan step of 2.6 mm. Photos go the way of `photos-on-scan.yaml`:
-`match.sift`, a bundle with loose gates, `match.guided`, a bundle. `wall` is the error of a
-coordinate on the wall, `wrong` a photo that is called oriented and off by more than five stated
-deviations or two cells. Seconds are CPU seconds of both matchers per photo. Photos that are not
-oriented or off by more than 0.5 mm are named, with the area of the wall that they truly show.
+The seed of a room draws the share of the contrast that is inverted in the laser intensity (0 to 1),
+besides scan noise, camera and viewpoints. Rooms are those of `orientation_truth.py`: six photos of
+the main wall, 4 mm cells, a point spacing of 2.6 mm. Photos are processed as in
+`photos-on-scan.yaml`: `match.sift`, a bundle adjustment with relaxed gates, `match.guided`, a
+bundle adjustment. `wall` is the error per coordinate on the wall; `wrong` counts accepted photos
+whose error exceeds five expected standard deviations or two cells. Seconds are CPU seconds of both
+matchers per photo. Photos that are rejected or have an error above 0.5 mm are listed with the area
+of the wall that they truly show.
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
-"""Golden runs: make them with the code that is installed, and see what moved between two makings.
+"""Make golden runs with the installed code, and list the differences between two sets of them.
 
     python benchmarks/golden_runs.py make FOLDER [--only quickstart,hall]
     python benchmarks/golden_runs.py compare BEFORE AFTER
 
-`make` runs the quickstart, the quickstart of two other seeds, `plane-methods.yaml` and, where the
-real data lie in ../shared/data, the hall (coloured scan alone) and the fountain with and without a
-calibration; it keeps what each command printed and, with Chromium, a picture of each report.
-`compare` prints, per run, planes, poses and orthoimages that moved, and metrics that moved by more
-than rounding. Runs of an earlier commit are made in a worktree of it: nothing of the real data is
-kept in the repository.
+`make` runs the quickstart with three seeds, `plane-methods.yaml` and, if the real data are in
+../shared/data, the hall (coloured scan alone) and the fountain with and without a calibration. It
+keeps the output of each command and, if Chromium is installed, a picture of each report. `compare`
+prints, per run, the planes, poses and orthoimages that changed, and the metrics that changed by
+more than rounding. Make the runs of an earlier commit in a worktree of that commit: the repository
+contains no real data.
 """
 
 from __future__ import annotations

@@ -1,11 +1,10 @@
-"""The room that the plane detectors are measured on: a palace hall, scanned by ray casting.
+"""Build the room for measuring the plane detectors: a palace hall, scanned by ray casting.
 
-After markiewicz2015: 8.6 x 4.2 x 5 m, a leaning main wall, a niche 25 cm deep, a fireplace,
-pilasters, mouldings, windows, furniture, and a leaning mirror behind which the scanner sees the
-room again. A panorama and a detail scan of the main wall, points in the order
-of the scan. Built and scanned with the parts that `simulate.room` is made of. How the room is
-turned, tilted and shifted in the world is drawn by a seed, so that no wall lies on the steps of a
-search.
+The room follows markiewicz2015: 8.6 x 4.2 x 5 m, a leaning main wall, a niche 25 cm deep, a
+fireplace, pilasters, mouldings, windows, furniture, and a leaning mirror that shows the scanner a
+reflected copy of the room. The scan consists of a panorama and a detail scan of the main wall, with
+points in scan order. The room is built and scanned with the same code as `simulate.room`. A seed
+draws the rotation, tilt and shift of the room, so that no wall coincides with a search grid.
 
     python benchmarks/great_room.py FOLDER        # room.npy, labels.npy and truth.json for others
 """

@@ -1,14 +1,15 @@
-"""What is wrongly taken to stand before a wall: cells that a photo shows and that are not painted.
+"""Count wall cells that are visible in a photo but treated as hidden, and the reverse.
 
     python benchmarks/hidden_cells.py --rooms 2 --first 551
-    # 16 million points a room; and without stations, as LAZ has them:
+    # 16 million points a room; and without stations, as in LAZ files:
     python benchmarks/hidden_cells.py --rooms 2 --first 551 --panorama-step-m 0.0022
     python benchmarks/hidden_cells.py --rooms 2 --first 551 --panorama-step-m 0.0022 --no-stations
 
-The rooms of `scan_formats.py`: one station, points 4.4 mm apart on the main wall, one ray in 250
-astray. `ortho.dsm-backward` paints it from the true poses of six photos. Of the cells that lie in a
-photo, `missed` are those that it shows and that are called hidden, and `through` those that
-something hides and that are painted; both from the true scene, all photos together.
+Rooms are those of `scan_formats.py`: one station, points 4.4 mm apart on the main wall, one stray
+point in 250. `ortho.dsm-backward` projects six photos with their true poses onto the wall. Of the
+cells inside a photo, `missed` are those that it shows and that are treated as hidden, `through` are
+those that something hides and that are coloured. Both are determined from the true scene, over all
+photos.
 """
 
 from __future__ import annotations

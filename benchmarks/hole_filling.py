@@ -1,11 +1,11 @@
-"""The narrow gaps of a raster found and filled, against OpenCV's nearest known cell.
+"""Find and fill narrow gaps of a raster, compared with OpenCV's nearest known cell.
 
     python benchmarks/hole_filling.py [--repeat 7] [--threads 2]
 
-The peer, `cv2.distanceTransformWithLabels`, gives the nearest known cell for every void one, those
-of windows included, and tells no gap from a window. Ours tells them apart and interpolates. The
-raster has the size of a wall of 9 x 5 m in cells of 3 mm; 8 % of its cells are void here and there,
-and windows take a sixth of it. Times are medians of interleaved runs.
+`cv2.distanceTransformWithLabels` returns the nearest known cell for every void cell, including
+those of windows, and does not distinguish gaps from windows. Our code distinguishes them and
+interpolates. The raster has the size of a 9 x 5 m wall with 3 mm cells; 8 % of its cells are
+scattered void cells, and windows cover a sixth of it. Times are medians of interleaved runs.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""What an installation weighs: megabytes of each distribution that orthoflow brings.
+"""Print the size of an installation: megabytes of each distribution that orthoflow installs.
 
 python benchmarks/install_size.py [--without open3d-cpu]
 
-Names those that nothing else needs than the one that is left out.
+`--without` lists the distributions that only the given one needs.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
-"""How much memory exports of a large orthoimage take.
+"""Measure the memory of exports of a large orthoimage.
 
-`python -m benchmarks.large_exports --side 20000` writes a run with one wall of 400 million cells as
-a run leaves it (cloud-optimised GeoTIFF, layer in the store), then exports it in a process of its
-own for each format, and prints seconds of the processor and the largest memory of that process,
-with mapped files and without.
-`--to sheet` and others choose formats.
+`python -m benchmarks.large_exports --side 20000` writes a finished run with one wall of 400 million
+cells (cloud-optimised GeoTIFF, layer in the store), then exports it in a separate process for each
+format, and prints the processor time and the peak memory of that process, with and without
+memory-mapped files. `--to sheet` and similar options select formats.
 """
 
 from __future__ import annotations

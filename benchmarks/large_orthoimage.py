@@ -1,10 +1,10 @@
-"""A large orthoimage from a photo to its file: how much memory it takes, and how long.
+"""Measure the time and memory of making a large orthoimage file from one photo.
 
     python benchmarks/large_orthoimage.py [--side 20000] [--megapixels 24] [--threads 2]
 
-The depths of the wall, as simulated as in `ortho_backward.py`, and the layer lie in files that are
-mapped into memory, as between steps; so does nothing else. Memory is what is not backed by files
-(RssAnon), at most, sampled every 20 ms.
+The depths of the wall, simulated as in `ortho_backward.py`, and the layer are in memory-mapped
+files, as between steps; nothing else is. Memory is the maximum of the memory not backed by files
+(RssAnon), sampled every 20 ms.
 """
 
 from __future__ import annotations

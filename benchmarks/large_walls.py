@@ -1,13 +1,13 @@
-"""What large walls take: the surface `tin` of a wall, and inspections of an orthoimage.
+"""Measure the processing of large walls: the surface `tin`, and inspections of an orthoimage.
 
     python benchmarks/large_walls.py FOLDER [--side 10000] [--only tin surf checkpoints openings]
 
-makes a wall of side x side cells in FOLDER, with a point in two of three of them, a window of 400
-cells and one of 900, and an orthoimage and an intensity with the same waves on it, displaced by
-half a cell; and one with a niche, which is found (`segment.openings`) and judged
-(`inspect.openings`). Each method runs in a process of its own on files that are mapped. Prints
-processor seconds and the anonymous memory of each, and exits with 1 where a number is not what was
-put in.
+makes a wall of side x side cells in FOLDER, with points in two of three cells, a window of 400
+cells and one of 900, and an orthoimage and an intensity with the same waves, displaced by half a
+cell. A second wall has a niche, which is detected (`segment.openings`) and inspected
+(`inspect.openings`). Each method runs in its own process on memory-mapped files. The output is the
+processor time and the anonymous memory of each; the exit code is 1 if a number differs from its
+true value.
 """
 
 from __future__ import annotations

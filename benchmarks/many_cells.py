@@ -1,8 +1,8 @@
-"""What a run costs besides its methods: cells that do nothing, by an executor.
+"""Measure the overhead of a run besides its methods: cells that do nothing, by executor.
 
     python -m benchmarks.many_cells [--cells 1000] [--executor local] [--jobs 2]
 
-Prints the time on the clock, whole and per cell, and the coordinator's largest memory.
+Prints the elapsed time, in total and per cell, and the peak memory of the coordinator.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
-"""Rooms times detectors, by two executors: the same digests cell by cell, and how long each takes.
+"""Run many rooms with several detectors by two executors; compare digests and times.
 
     python benchmarks/many_rooms.py FOLDER [--rooms 24] [--photos]
 
 Runs a workflow of simulated rooms, four plane detectors, rasters, orthoimages and their comparison
-with the truth through `--executor local --jobs 2` and through `--executor dask --jobs 4`, each with
-a store of its own, after one room has compiled what there is to compile. With `--photos` walls
-are painted from photos that are oriented on the way, else from points. Prints wall time and
-processor time of both, and exits with 1 where a digest differs or a cell failed.
+with the truth with `--executor local --jobs 2` and with `--executor dask --jobs 4`, each with its
+own store, after one room has compiled all code. With `--photos`, orthoimages are made from photos
+that the workflow orients, otherwise from points. Prints the elapsed and processor time of both; the
+exit code is 1 if a digest differs or a cell failed.
 """
 
 from __future__ import annotations

@@ -1,11 +1,12 @@
-"""How much memory match.sift takes for one large photo of a wall of 3 million cells.
+"""Measure the memory of match.sift for one large photo of a wall of 3 million cells.
 
     python benchmarks/matching_memory.py [--megapixels 24] [--longest-side-px 6000] [--other-wall]
 
-The photo shows a wall of random texture, square to it, and is matched at the size of its cells;
-with --other-wall it shows none of the wall, and is searched at all sizes up to the full one. It is
-made beforehand, so that the child process that matches holds nothing else. Told is that process's
-largest resident memory, with Python and all libraries; asked for 24 megapixels are 1.5 GB at most.
+The photo shows a wall of random texture, perpendicular to it, and is matched at the size of its
+cells. With --other-wall, it does not show the wall and is searched at all sizes up to the full one.
+The photo is made beforehand, so that the child process does nothing but match. The output is the
+peak resident memory of that process, including Python and all libraries; the limit for 24
+megapixels is 1.5 GB.
 """
 
 from __future__ import annotations

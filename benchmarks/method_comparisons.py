@@ -2,14 +2,14 @@
 
     python benchmarks/method_comparisons.py runs/comparisons
     python benchmarks/method_comparisons.py runs/comparisons --recipe plane-methods
-    # the variants of markiewicz2015, as the header of orient-methods.yaml has them:
+    # the variants of markiewicz2015, as in the header of orient-methods.yaml:
     python benchmarks/method_comparisons.py runs/variants --recipe variant1 --recipe variant2
 
-Each recipe runs into `FOLDER/<recipe>` on its simulated room, as `orthoflow run <recipe>.yaml` does
-it, unless that folder holds a finished run; a single report of all of them goes to
-`FOLDER/report.html`. Nothing is bold where one run stands; of metrics with repeats the best value
-is, and what is not told apart from it. docs/choosing.md compares over many rooms. Processor seconds
-are without loading and compiling; docs/performance.md has times.
+Each recipe runs with its simulated room into `FOLDER/<recipe>`, like `orthoflow run <recipe>.yaml`,
+unless that folder contains a finished run. One report of all recipes is written to
+`FOLDER/report.html`. Values of single runs are not bold; of metrics with repeats, the best value is
+bold, with all values that do not differ from it significantly. docs/choosing.md compares methods
+over many rooms. Processor seconds exclude loading and compiling; docs/performance.md has times.
 """
 
 from __future__ import annotations

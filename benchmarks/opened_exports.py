@@ -1,13 +1,13 @@
-"""What programs of others say of everything that a run exports, with pictures to look at.
+"""Open every exported file of a run with other programs, and keep pictures of them.
 
     python -m benchmarks.opened_exports RUN FOLDER --store STORE --scale 50
 
-Exports RUN in every format, clouds in every colouring, and opens each file with a program that is
-not orthoflow: pdfplumber and poppler, ezdxf and LibreCAD, laspy, open3d, pye57, trimesh and the
-validator of Khronos (`npm install gltf-validator` in the folder where this is started), Pillow,
-QGIS, prov, pystac, rasterio, pycolmap, roc-validator, Chromium. A line per file says what it found;
-a program that is not installed is said. It ends with 1 where a file is refused or says something
-else than the record. Pictures are in FOLDER/pictures.
+Exports RUN in every format, clouds in every colouring, and opens each file with another program:
+pdfplumber and poppler, ezdxf and LibreCAD, laspy, open3d, pye57, trimesh and the Khronos validator
+(`npm install gltf-validator` in the folder where this is started), Pillow, QGIS, prov, pystac,
+rasterio, pycolmap, roc-validator, Chromium. The output has a line per file with the findings, and
+lists programs that are not installed. The exit code is 1 if a file is rejected or contradicts the
+record. Pictures are in FOLDER/pictures.
 """
 
 from __future__ import annotations

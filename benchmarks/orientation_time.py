@@ -1,10 +1,11 @@
-"""How long six photos of 6 MP take to be oriented on a wall of 3 million cells, step by step.
+"""Measure the orientation of six 6 MP photos on a wall of 3 million cells, step by step.
 
     python benchmarks/orientation_time.py [--cores 2] [--gap easy] [--exif] [--gsd-m 0.00215]
 
-A simulated room, made before the clock starts; then what the shipped recipes do: `match.sift`, a
-bundle with wide gates, `match.guided`, the bundle that counts. The first run with an empty cache of
-numba compiles some seconds more. Wall time needs an idle machine, CPU seconds do not.
+A simulated room is made before the clock starts. Then the steps of the shipped recipes run:
+`match.sift`, a bundle adjustment with relaxed gates, `match.guided`, the final bundle adjustment.
+The first run with an empty numba cache takes some seconds longer for compilation. Elapsed times
+require an idle machine, CPU times do not.
 """
 
 from __future__ import annotations

@@ -1,18 +1,17 @@
-"""Photos of simulated rooms oriented from scratch, against the truth: ties, poses, stated errors.
+"""Orient photos of simulated rooms; compare ties, poses and expected errors with the truth.
 
     python benchmarks/orientation_truth.py [--rooms 5] [--gaps easy hard] [--layout quick]
     # six photos of 6 MP on a wall of 3 million cells:
     python benchmarks/orientation_truth.py --rooms 1 --gsd-m 0.0026 --photo-gsd-m 0.00085
-    # ties matched as markiewicz2015 did, of which most are wrong:
+    # ties matched as in markiewicz2015, most of them wrong:
     python benchmarks/orientation_truth.py --ties unmasked masked
 
-Each room has its own scan noise, camera and viewpoints: 4 mm cells, a scan step of 2.6 mm, 2 mm
-range noise, photos of 2 mm pixels, textile over a third of the main wall. Photos are matched
-(`match.sift`), oriented by a bundle, matched again (`match.guided`) and oriented by both
-estimators, with calibration and from EXIF alone. `wrong` is the share of kept ties that are off
-by more than 1.5 cells; `wall` the error of a coordinate on the wall, RMS over the photos; `ratio`
-that error over the stated one, pooled: 1 where the estimator is honest. Seconds are CPU seconds
-per room.
+Each room has its own scan noise, camera and viewpoints: 4 mm cells, a point spacing of 2.6 mm, 2 mm
+range noise, photos with 2 mm pixels, textile on a third of the main wall. Photos are matched
+(`match.sift`), oriented by a bundle adjustment, matched again (`match.guided`) and oriented by both
+estimators, with calibration and with EXIF data only. `wrong` is the share of kept ties that are off
+by more than 1.5 cells; `wall` is the error per coordinate on the wall, RMS over the photos; `ratio`
+is that error divided by the expected one, pooled (ideally 1). Seconds are CPU seconds per room.
 """
 
 from __future__ import annotations

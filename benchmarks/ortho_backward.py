@@ -1,15 +1,15 @@
-"""Photos laid onto a wall: ours, with visibility, against bare cv2.remap with ready maps.
+"""Compare our projection of photos onto a wall, with visibility, with plain cv2.remap.
 
     python benchmarks/ortho_backward.py [--megacells 4] [--megapixels 6] [--threads 2]
                                         [--repeat 5] [--fresh]
 
-Times are medians of interleaved runs, decoding left out; the peer gets its maps for nothing and
-looks for nothing in the way. Both write into arrays that are there already; with `--fresh` both get
-new ones each time, of which the layer needs two and a half times as much (quality and mask): on a
-virtual machine that gives unused memory back to its host, new memory may take longer than painting.
-Each task runs twice in a row, and the second run counts.
-`layer` is one photo on one wall with everything: relief, cloud, erosion, anti-aliasing, quality.
-`cloud` is what looking at the cloud adds per photo.
+Times are medians of interleaved runs and exclude decoding. cv2.remap gets precomputed maps, whose
+time is not counted, and does not test visibility. Both write into existing arrays. With `--fresh`,
+both allocate new arrays each time, two and a half times as much for the layer (quality and mask):
+on a virtual machine that returns unused memory to its host, allocation may take longer than
+projection. Each task runs twice in a row, and the second run counts. `layer` is one photo on one
+wall with everything: relief, cloud, erosion, anti-aliasing, quality. `cloud` is the additional time
+per photo for examining the cloud.
 """
 
 from __future__ import annotations

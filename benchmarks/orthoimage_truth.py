@@ -1,13 +1,14 @@
-"""Orthoimages of a simulated room from photos up to 35 degrees oblique, against the truth.
+"""Compare orthoimages of a simulated room, from photos up to 35 degrees oblique, with the truth.
 
     python benchmarks/orthoimage_truth.py [--gsd-m 0.003] [--surfaces nearest denoised]
 
-A scan with steps of 2 mm and 2 mm of noise, six photos of 2 mm pixels, one wall in cells of 3 mm,
-by several rules of the surface. `true` lays the photos by their true orientations, `estimated` by
-those found on the last surface (sift, bundle, guided, bundle as in `photos-on-scan.yaml`). `u`, `v`
-are RMSE over all cells away from depth steps, `step` those within two cells of one, in mm; `far` is
-the share of cells painted from a place more than three cells away; `ghosts` counts cells painted
-from what stands free before the wall; `surf` is of `inspect.surf`, in mm. Seconds are CPU time.
+The scan has 2 mm point spacing and 2 mm noise, six photos have 2 mm pixels, one wall has 3 mm
+cells, and several surface rules are used. `true` projects the photos with their true orientations,
+`estimated` with those found on the last surface (sift, bundle, guided, bundle as in
+`photos-on-scan.yaml`). `u` and `v` are RMSE over all cells away from depth steps, `step` over those
+within two cells of one, in mm. `far` is the share of cells whose colour comes from a point more
+than three cells away; `ghosts` counts cells coloured from free-standing objects in front of the
+wall; `surf` comes from `inspect.surf`, in mm. Seconds are CPU time.
 """
 
 from __future__ import annotations

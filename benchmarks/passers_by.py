@@ -1,9 +1,10 @@
-"""How many cells show a passer-by where another photo shows the wall, over simulated rooms.
+"""Count cells that show a passer-by although another photo shows the wall, over simulated rooms.
 
     python benchmarks/passers_by.py [--rooms 10] [--first 1] [--people 3] [--layout variant2]
 
-Each room is photographed twice from the same places, with people before the main wall and without;
-what differs is people. Photos are laid with their true cameras, so that nothing else is measured.
+Each room is photographed twice from the same positions, with and without people in front of the
+main wall; the differences are people. Photos are projected with their true cameras, so that nothing
+else is measured.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
-"""What a run of `photos-on-scan.yaml` takes, step by step, on a room as large as one wants.
+"""Measure a run of `photos-on-scan.yaml` step by step, on a simulated room of any size.
 
     python benchmarks/photos_on_scan.py FOLDER [--points 16e6] [--photo-gsd-m 0.00085]
         [--gsd-m 0.004] [--runs 1]
 
-Makes a simulated room once, with seconds that count nowhere: `scan.e57`, from one station, `photos`
-(six of 6 MP by default) and `calibration.yaml`. Then `orthoflow warm photos-on-scan.yaml`, and as
-many runs as asked, each with a new store. Printed are the seconds of each step, by the
-clock and by the processor, its compiling, and what is left of the run: starting processes, keeping
-what they gave, record and report. Processor seconds are those of the command and all its processes.
+First makes a simulated room, which is not timed: `scan.e57`, from one station, `photos` (by default
+six of 6 MP) and `calibration.yaml`. Then runs `orthoflow warm photos-on-scan.yaml` and the workflow
+as often as requested, each time with a new store. The output contains elapsed and processor time of
+each step, its compilation, and the remaining time of the run: starting processes, storing products,
+record and report. Processor times include the command and all its processes.
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
-"""A coloured cloud of its own frame as a plan in a survey's coordinates: do its borders lie right?
+"""Map a coloured cloud in survey coordinates, and check the borders of the map.
 
     python benchmarks/plan_of_cloud.py FOLDER --scan CLOUD.laz --up -z [--scale 1] [--mirrored]
 
-Some points of the cloud are picked, and their survey coordinates made by a turn, a scale and a
-shift to (634512, 486215, 112); with these pairs `orthoflow run plan.yaml` runs as from the command
-line, whole (`plane.part_min_share=0`) and in EPSG:32635. Four more points are check points,
-measured in the map 13 mm east and 8 mm south of where they are. Printed are how far the borders of
-the map lie from the outermost points, in cells, but for points that it leaves out, and what the
-check points and the scale came to. `--mirrored` gives survey coordinates whose east is turned
-round.
+Some points of the cloud are picked, and their survey coordinates are computed by a rotation, a
+scale and a shift to (634512, 486215, 112). With these pairs, `orthoflow run plan.yaml` runs as from
+the command line, for the whole cloud (`plane.part_min_share=0`) and in EPSG:32635. Four more points
+are check points, measured in the map 13 mm east and 8 mm south of their true positions. The output
+contains the distances of the borders of the map from the outermost points, in cells, ignoring
+points that the map leaves out, and the results for the check points and the scale. `--mirrored`
+reverses the sign of the survey eastings.
 """
 
 from __future__ import annotations

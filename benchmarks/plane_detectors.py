@@ -1,13 +1,14 @@
-"""Time, memory and accuracy of the plane detectors and of other programs, on one room.
+"""Measure time, memory and accuracy of the plane detectors and of other programs, on one room.
 
     python benchmarks/plane_detectors.py                          # the room of 48 million points
     python benchmarks/plane_detectors.py --points 5000000 --method ransac --no-peers
     python benchmarks/plane_detectors.py --npy room.npy --truth truth.json --labels labels.npy
 
-F is one pass over separate x, y, z arrays at memory speed, measured in the same run: seconds of
-different machines do not compare, seconds over F do. Code is warm, points are in memory. Detection
-and labels are measured, statistics apart; figures and files are not. Processor seconds are those of
-both threads together: on a machine that does nothing else a run takes half of them or more.
+F is the time of one pass over separate x, y and z arrays at memory speed, measured in the same run:
+seconds on different machines cannot be compared, but multiples of F can. Code is compiled, and
+points are in memory. Detection and labelling are measured, and statistics separately; figures and
+files are not measured. Processor seconds are the sum over both threads: on an idle machine, the
+elapsed time is at least half of it.
 """
 
 from __future__ import annotations

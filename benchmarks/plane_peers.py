@@ -1,4 +1,4 @@
-"""How other programs find the main wall; each is skipped with a sentence where it is missing."""
+"""Find the main wall with other programs; programs that are missing are skipped with a message."""
 
 from __future__ import annotations
 

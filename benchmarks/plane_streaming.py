@@ -1,15 +1,15 @@
-"""From a LAZ file to labelled planes: time beside laspy's reading alone, and anonymous memory.
+"""Measure time and anonymous memory from a LAZ file to labelled planes, compared with laspy.
 
     python benchmarks/plane_streaming.py                           # a room of 10 million points
     python benchmarks/plane_streaming.py --points 48000000 --npy room.npy --repeats 3
     python benchmarks/plane_streaming.py --points 48000000 --npy room.npy --tiled 5
 
-Measured, each in a process of its own: laspy decoding all chunks and keeping nothing; laspy reading
-(`laspy.read`, then coordinates and intensities as arrays), which the others are compared with;
-`read.scan` and a detector in one process; the same two steps through the engine.
-Memory is the largest sum of RssAnon over a process and its children, sampled: files that are mapped
-do not count, because the system may drop them. `--tiled n` detects planes in the points n times
-over, from files that are mapped, and compares the time per point with that of the points once.
+Each of these is measured in its own process: laspy decoding all chunks and keeping nothing; laspy
+reading the file (`laspy.read`, then coordinates and intensities as arrays), which is the reference;
+`read.scan` and a detector in one process; the same two steps through the engine. Memory is the
+maximum sampled sum of RssAnon over a process and its children, which excludes memory-mapped files,
+because the system can drop their pages. `--tiled n` detects planes in n copies of the points, from
+memory-mapped files, and compares the time per point with that of a single copy.
 """
 
 from __future__ import annotations

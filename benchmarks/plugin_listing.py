@@ -1,4 +1,4 @@
-"""How long `orthoflow --help` and `orthoflow plugins list` take with many plugins installed.
+"""Measure `orthoflow --help` and `orthoflow plugins list` with many plugins installed.
 
 python benchmarks/plugin_listing.py [--plugins 30] [--runs 7]
 """

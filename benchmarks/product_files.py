@@ -1,7 +1,7 @@
-"""How fast products of scan size are digested, written and read back.
+"""Measure how fast products as large as a scan are digested, written and read.
 
-Run with `python benchmarks/product_files.py [POINTS]`; the default is 50 million points. Files go
-to a temporary folder in the working directory.
+Run with `python benchmarks/product_files.py [POINTS]`; the default is 50 million points. Files are
+written to a temporary folder in the working directory.
 """
 
 from __future__ import annotations

@@ -1,12 +1,13 @@
-"""Topmost raster of a scan-ordered wall: our passes against numpy's, in one run.
+"""Compare our computation of the topmost raster of a scan-ordered wall with numpy's.
 
     python benchmarks/raster_top.py [--millions 48] [--threads 2] [--repeat 5]
 
-Times are medians of interleaved runs. F is one streaming pass over the coordinates measured in the
-same run, the floor of anything that reads the cloud once. Goals: at most 20 F, at least four times
-as fast as `np.maximum.at`, depths identical to those of `np.lexsort`. numpy's way has less to do:
-it knows that the wall is upright along x, counts no points, and leaves open which of several
-topmost points gives its intensity. The whole of `raster.grid` is timed beside it.
+Times are medians of interleaved runs. F is the time of one streaming pass over the coordinates,
+measured in the same run: the minimum for any method that reads the cloud once. Goals: at most 20 F,
+at least four times as fast as `np.maximum.at`, depths identical to those of `np.lexsort`. numpy's
+version has less to do: it assumes that the wall is vertical along x, does not count points, and
+does not define which of several topmost points gives its intensity. The complete `raster.grid` is
+also timed.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
-"""Readers of point files beside the libraries that read the same formats: time and memory.
+"""Compare time and memory of our point file readers with those of the formats' libraries.
 
     python benchmarks/reader_peers.py FOLDER [--points 10000000] [--formats ply las laz e57 pcd xyz]
 
-Each format's own library writes a file of points with intensity and colours. A new process reads it
-with the library into arrays of coordinates, intensity and colours; others read it block by block
-as `open_scan` does, and as a whole cloud as `read.scan` does, which also measures its quality and
-draws it. Prints the fastest of `--repeats`, without imports, and anonymous memory; ratios are of
-processor time, which other work on the machine moves little.
+The library of each format writes a file of points with intensity and colours. A new process reads
+the file with the library into arrays of coordinates, intensity and colours. Other processes read it
+block by block with `open_scan`, and as a whole cloud with `read.scan`, which also measures its
+quality and draws it. Prints the fastest of `--repeats` runs, without imports, and the anonymous
+memory. Ratios compare processor times, which other load on the machine hardly affects.
 """
 
 from __future__ import annotations

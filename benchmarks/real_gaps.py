@@ -1,13 +1,14 @@
-"""A real scan's colours as photos, its intensity as the wall: what camera and laser see apart.
+"""Orient photos rendered from a real scan's colours on its intensity, to measure their differences.
 
     python benchmarks/real_gaps.py SCAN --gsd-m 0.006 --ranks 0
     python benchmarks/real_gaps.py FOLDER/T1.1.txt --paper --gsd-m 0.0013
 
-The points of a scan with colours and intensity show the same places in both. Each wall is laid
-flat, five photos of its colours are rendered from up to 25 degrees aside, and go the way of
-`photos-on-scan.yaml`, from EXIF: `match.sift`, a bundle with loose gates, `match.guided`, a
-bundle. What the wall lacks is grey in the photos. `wall` is the error of a coordinate on the wall
-over what a photo shows, in cells, `stated` what the pose says of it.
+A scan with colours and intensity shows the same points in both. Each wall is flattened, and five
+photos are rendered from its colours at angles of up to 25 degrees. They are processed as in
+`photos-on-scan.yaml`, with EXIF data: `match.sift`, a bundle adjustment with relaxed gates,
+`match.guided`, a bundle adjustment. Parts missing from the wall are grey in the photos. `wall` is
+the error per coordinate on the wall over the area that a photo shows, in cells; `stated` is the
+expected error of the pose.
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
-"""How far the times of a comparison move when it is measured again.
+"""Measure how far the times of a comparison differ between repeated runs.
 
     python benchmarks/repeated_times.py FOLDER [--recipe plane-methods] [--step plane] [--runs 2]
 
-`orthoflow run RECIPE` into `FOLDER/1` with a new store and nothing compiled, then into `FOLDER/2`,
-`FOLDER/3` ... with the step forced; runs that are there already are taken as they are. Each run is
-laid beside the one before it: every `*_s` of the step's cells but `compile_s`, where one of the two
-exceeds 0.2 s. Printed are those that differ by more than 30 %, and for each time in which order it
-puts the variants, medians of their repeats, and which of them change places: what differs by less
-is not told apart, neither here nor by a report. On a machine that does other things too, only
-`cpu_s` and `*_cpu_s` say something of the methods: the load is printed beside.
+Runs `orthoflow run RECIPE` into `FOLDER/1` with a new store and no compiled code, then into
+`FOLDER/2`, `FOLDER/3` ... with the step forced; existing runs are reused. Each run is compared with
+the previous one: every `*_s` of the step's cells except `compile_s`, if one of both exceeds 0.2 s.
+The output lists times that differ by more than 30 %. For each time, it gives the order of the
+variants by the medians of their repeats, and the pairs that change order: smaller differences are
+not significant, neither here nor in a report. On a machine with other load, only `cpu_s` and
+`*_cpu_s` describe the methods; the load is also printed.
 """
 
 from __future__ import annotations

@@ -1,14 +1,15 @@
-"""Poses from ties of which most may be wrong: ours against OpenCV, pycolmap and PoseLib.
+"""Compare our pose estimation from mostly wrong ties with OpenCV, pycolmap and PoseLib.
 
     python benchmarks/robust_pose.py [--photos 100] [--ties 600]
 
-Photos of a wall with 12 cm of relief, right ties with 1.5 px of noise and a share at random
-pixels; lens known. `found` counts poses whose centre is within 50 mm of the truth, `centre` is
-the RMS error of those that all programs found, `over best` ours over the best other one's, `time`
-the median per photo and `over usac` ours over OpenCV's. Ours is the robust search with the
-adjustment and rejection that follow it in `orient.pnp`. The others are as their manuals advise:
-USAC with MAGSAC and a Levenberg-Marquardt refinement on the inliers, LO-RANSAC with refinement.
-PoseLib takes part where it is installed (`pip install poselib`).
+Photos show a wall with 12 cm of relief; correct ties have 1.5 px of noise, and a share of the ties
+is at random pixels; the lens is known. `found` counts poses whose centre is within 50 mm of the
+truth; `centre` is the RMS error of those that all programs found; `over best` is our error divided
+by that of the best other program; `time` is the median per photo, and `over usac` our time divided
+by OpenCV's. Ours is the robust search with the adjustment and rejection that follow it in
+`orient.pnp`. The others are used as their manuals advise: USAC with MAGSAC and a
+Levenberg-Marquardt refinement on the inliers, LO-RANSAC with refinement. PoseLib is included if it
+is installed (`pip install poselib`).
 """
 
 from __future__ import annotations

@@ -1,17 +1,17 @@
-"""One room as several files: bias of what is matched, and whether stated errors hold.
+"""Read one room from several file formats; measure the bias of ties and check expected errors.
 
     python benchmarks/scan_formats.py --rooms 2 --first 501
     # the other walls scanned finely too, 16 million points a room:
     python benchmarks/scan_formats.py --rooms 4 --first 501 --panorama-step-m 0.0022
 
-A room is scanned from one station, points 4.4 mm apart on its main wall (median), and written as
-E57 with rows and columns, E57 without, LAZ, and E57 without whose points stand in random order.
-Each file goes its own way: `read.scan`, `plane.hough2d`, `raster.grid` in cells of 2, 4 and 8 mm,
+A room is scanned from one station, with points 4.4 mm apart on its main wall (median), and written
+as E57 with rows and columns, E57 without them, LAZ, and E57 without them in random order. Each file
+is processed separately: `read.scan`, `plane.hough2d`, `raster.grid` with cells of 2, 4 and 8 mm,
 ties of the six photos (`match.guided` from the true poses) and `orient.colmap-bundle`. `u` and `v`
-are how far the ties lie from where their pixels truly look, in cells to the right and down, means
-over all photos: what the raster is displaced by, and any photo with it. `wall` is the error of a
-coordinate on the wall, RMS over the photos, `stated` what the poses say of it, `ratio` the first
-over the second, RMS.
+are the mean offsets of the ties from the true positions of their pixels, in cells to the right and
+down, over all photos: the displacement of the raster, and of any photo with it. `wall` is the error
+per coordinate on the wall, RMS over the photos; `stated` is the expected error of the poses;
+`ratio` is the first divided by the second, RMS.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Reading large scans with one core and with two: time, memory, and the same cloud.
+"""Measure the reading of large scans with one and two cores: time, memory, and equal clouds.
 
     python benchmarks/scan_reading.py FOLDER [--points 12000000] [--files 2]
 
-writes files of points with intensity, as E57 and as PLY, and reads those of each format through
-`read.scan`, in turns, each time in a new process. Prints the time on the clock, that of all
-processors and the anonymous memory of all processes, of the fastest of `--repeats` runs.
+writes files of points with intensity, as E57 and as PLY, and reads the files of each format with
+`read.scan`, alternately, each time in a new process. Prints the elapsed time, the processor time
+and the anonymous memory of all processes, of the fastest of `--repeats` runs.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
-"""Targets of a real scan, found in intensity orthoimages and carried back into space.
+"""Find the targets of a real scan in intensity orthoimages and back-project them into space.
 
     python benchmarks/scan_targets.py FOLDER [--targets T1 T2 T3] [--gsd-m 0.0013]
 
-FOLDER holds patches about scanner targets, `T1.1.txt` and so on (x y z r g b intensity, metres),
-and `target_centers_SP1.json`, the centres that operators measured: of each target a list with one
-point per patch. For each patch a plane is fitted, then `scan_targets.yaml` runs as from the command
-line: intensity orthoimage, crossing of the quadrants, place on the surface. Printed are the
-distances to the operators' centres in the plane and in space, RMS and largest.
+FOLDER contains scan patches around targets, `T1.1.txt` and so on (x y z r g b intensity, metres),
+and `target_centers_SP1.json`, the centres measured by operators: for each target, a list with one
+point per patch. For each patch, a plane is fitted, then `scan_targets.yaml` runs as from the
+command line: intensity orthoimage, intersection of the quadrants, position on the surface. The
+output is the distances from the operators' centres in the plane and in space, RMS and maximum.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""How long a line of the live table stands still: records a terminal while a workflow runs.
+"""Record a terminal during a run and measure how long lines of the live table do not change.
 
     python benchmarks/standing_lines.py -o terminal.txt --most 2 -- orthoflow run quickstart.yaml
 
-prints, per step, how long it ran, the longest time in which its line did not change, and when that
-ended; and the same for the whole screen, from the start of the command. Ends with 1 where one stood
-still for longer than `--most` seconds, or the command failed. The recording has a frame per change,
-each with its second.
+prints, for each step, its duration, the longest time in which its line did not change, and the end
+of that time; and the same for the whole screen, from the start of the command. The exit code is 1
+if a line did not change for longer than `--most` seconds, or if the command failed. The recording
+has a frame per change, each with its time in seconds.
 """
 
 from __future__ import annotations

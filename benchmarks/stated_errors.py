@@ -1,20 +1,21 @@
-"""Errors that photos state on clouds whose points err together, against the truth.
+"""Compare expected errors of photos with the truth, for clouds with correlated point errors.
 
     python benchmarks/stated_errors.py [--rooms 3] [--clouds plain bent ...]
     python benchmarks/stated_errors.py --entry FOLDER --fountain FOLDER   # real photos, see below
 
-Drawn rooms: of each kind of cloud some rooms with scan noise, camera and viewpoints of their own,
-six photos of which no file says the focal length. The scans are registered to 5 mm, the cloud is
-bent by 8 mm at the ends of the room, or its points err together over half a metre as those of
-stereo do. Photos are matched at their true poses (`match.guided`), and oriented by a bundle. `true`
-is the error of a coordinate on the wall relative to the scan, RMS over all photos, `stated` that of
-what they state; `wrong` counts photos that are `ok` and off by more than five of their stated
-deviations. `cloud` is how far the points that a photo shows are off on the average, which nothing
-in that scan can show: `true` is without it, as stated errors are.
+Drawn rooms: for each type of cloud, there are some rooms with their own scan noise, camera and
+viewpoints, and six photos without a known focal length. Scans are registered to 5 mm, or the cloud
+is bent by 8 mm at the ends of the room, or its points have errors correlated over half a metre, as
+in stereo matching. Photos are matched at their true poses (`match.guided`) and oriented by bundle
+adjustment. `true` is the error per coordinate on the wall relative to the scan, RMS over all
+photos; `stated` is the expected error; `wrong` counts accepted photos whose error exceeds five
+expected standard deviations. `cloud` is the mean offset of the points that a photo shows. Nothing
+in the scan can reveal it, so `true` and `stated` exclude it.
 
 Real photos: folders of the benchmark of Strecha et al. 2008 (entry-P10, fountain-P11) with
-`images/NNNN.jpg`, `images/NNNN.jpg.camera` and a cloud `cloud_from_photos.laz` in the same frame.
-Each is run by `photos-on-scan.yaml` in cells of 10 mm, with and without its calibration.
+`images/NNNN.jpg`, `images/NNNN.jpg.camera` and a cloud `cloud_from_photos.laz` in the same
+coordinate system. Each runs with `photos-on-scan.yaml` and 10 mm cells, with and without its
+calibration.
 """
 
 from __future__ import annotations

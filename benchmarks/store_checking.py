@@ -1,11 +1,11 @@
-"""What it costs that a run checks what it takes from the store, as a share of the whole run.
+"""Measure the time for checking stored data, as a share of the whole run.
 
     python benchmarks/store_checking.py [WORKFLOW] [--set STEP.PARAM=VALUE ...] [--force STEP ...]
 
 Runs a workflow in this process, in a temporary folder of the working directory: computed, twice
-with everything cached, and with the steps of --force computed again from what is cached, so that
-their inputs are checked. Checking is looking at results and objects, reading their bytes, and
-noting the digests of what is stored; `synced` is bringing the run folder to the disk.
+from the cache, and with the steps of --force recomputed from cached inputs, which are then checked.
+Checking includes looking up results and objects, reading their bytes, and recording the digests of
+stored data; `synced` is the time for flushing the run folder to disk.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""How long tiles of a large orthoimage take and how much memory.
+"""Measure the time and memory of making tiles of a large orthoimage.
 
 `python benchmarks/tiled_orthoimage.py --side 20000` writes a simulated orthoimage of 400 million
-cells as an export finds it (a cloud-optimised GeoTIFF with its sidecar), then its tiles in a
-process of their own, and prints seconds and the largest memory.
+cells as an export would find it (a cloud-optimised GeoTIFF with its sidecar), then its tiles in a
+separate process, and prints the time and the peak memory.
 """
 
 from __future__ import annotations

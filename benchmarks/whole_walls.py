@@ -1,16 +1,17 @@
-"""How much of the true wall an orthoimage paints, in rooms whose walls are drawn by seeds.
+"""Measure the share of the true wall that an orthoimage covers, in rooms drawn by seeds.
 
     python benchmarks/whole_walls.py --rooms 12 --first 1001
     python benchmarks/whole_walls.py --rooms 12 --first 1001 --rectangle points
 
-`simulate.room` with `decoration: drawn`: cornices, pilasters, niches and doors set back differ from
-seed to seed. The true wall reaches from corner to corner and from floor to ceiling; a cell of it
-counts where the first surface before it, looked at square to the wall, runs along the wall and a
-station sees it. `scanned` is the share of these that the raster shows, `painted` that of those
-which a photo sees too and the orthoimage paints (planes by `plane.hough2d`, `raster.grid` with
-nothing set but cells of 4 mm, the photos' true poses). `front` and `behind` are the buffer that was
-found, beside what the true relief needs. `lost` says where what is not painted lies: `out`side the
-raster, beyond the `buf`fer, in a `void` cell of the raster, or in a cell that shows a depth.
+`simulate.room` with `decoration: drawn` draws cornices, pilasters, niches and recessed doors by the
+seed. The true wall extends from corner to corner and from floor to ceiling. One of its cells counts
+if the first surface in front of it, seen perpendicular to the wall, is parallel to the wall and
+visible from a station. `scanned` is the share of these cells that the raster shows. `painted` is
+the share of those also visible in a photo that the orthoimage shows (planes by `plane.hough2d`,
+`raster.grid` with default settings and 4 mm cells, true poses of the photos). `front` and `behind`
+are the buffer found, next to the buffer that the true relief needs. `lost` gives the location of
+missing cells: `out`side the raster, beyond the `buf`fer, in a `void` cell of the raster, or in a
+cell with a depth.
 """
 
 from __future__ import annotations
