@@ -61,7 +61,7 @@ def measured(folder: Path, method: str) -> str:
     room = open_run(folder / "1").cell("room")
     given = {"cloud": Store(folder / "store").get_product(room.outputs["cloud"].digest, PointCloud)}
     cls = discover_catalog().method(method).load()
-    meter = LoadingMeter(sets_aside=True)
+    meter = LoadingMeter()
     with meter, tempfile.TemporaryDirectory() as scratch:
         ctx = StepContext(
             rng=np.random.default_rng(7),

@@ -55,10 +55,6 @@ class StepFailedError(OrthoflowError, RuntimeError):
     """A step ended without a result: crashed, killed, out of memory, or past its timeout."""
 
 
-class DiskSpaceError(StepFailedError):
-    """A step wanted more room on the disk than there was; given more, the same run goes on."""
-
-
 class ClusterError(OrthoflowError, RuntimeError):
     """The scheduler of a run was lost, or its workers; the same command goes on."""
 

@@ -18,7 +18,6 @@ from orthoflow import errors
         ("ProductError", 1),
         ("MethodError", 1),
         ("StepFailedError", 1),
-        ("DiskSpaceError", 1),
         ("ClusterError", 1),
         ("RecordError", 3),
         ("PluginError", 4),

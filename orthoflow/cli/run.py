@@ -36,7 +36,6 @@ from orthoflow.errors import (
     ArgumentError,
     CancelledStepError,
     ClusterError,
-    DiskSpaceError,
     OrthoflowError,
     StoreError,
 )
@@ -156,8 +155,6 @@ class Call:
             if failed.is_bug:
                 log = folder / LOGS / f"{cell_file_name(address)}.log"
                 echo_error(f"{address}: traceback: {log}")
-        if any(DiskSpaceError.__name__ == cell.error_type for cell in run.record.cells):
-            echo_error(f"with more disk space, the same command with -o {folder} goes on")
         try:
             _print_summary(run, report, outcome.resumed)
         except BrokenPipeError:

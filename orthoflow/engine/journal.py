@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
@@ -20,7 +20,7 @@ from pydantic import TypeAdapter
 from orthoflow.engine.durability import is_locked, lock_file, sync_folder, writing_to
 from orthoflow.engine.environment import now, time_in_a_name
 from orthoflow.engine.results import CellResult, CellStatus
-from orthoflow.errors import ArgumentError, DiskSpaceError, RecordError, StoreError
+from orthoflow.errors import ArgumentError, RecordError, StoreError
 
 if TYPE_CHECKING:
     from orthoflow.sdk.context import StepEvent
@@ -141,8 +141,8 @@ class Journal:
             run_id: id of a new run, generated if empty; a resumed run keeps its own.
 
         Raises:
-            ArgumentError: the folder is in use by another run, or holds a finished run without lack
-                of disk space, another workflow's run, or other files.
+            ArgumentError: the folder is in use by another run, or holds a finished run, another
+                workflow's run, or other files.
             StoreError: the disk cannot be written.
         """
         self._folder = folder
@@ -184,8 +184,9 @@ class Journal:
         if not lock_file(self._path, self._descriptor):
             raise _is_in_use(self._folder)
         lines = self._read_lines()
+        # The run may have finished since the folder was checked.
         if (self._folder / RECORD_FILE).exists():
-            self._reopen(lines)
+            raise _is_finished(self._folder)
         self.is_resumed = bool(lines)
         first = next((line for line in lines if line.event == "run"), None)
         if lines and first is None:
@@ -204,14 +205,6 @@ class Journal:
         self.write("run", time=self.started, format=_FORMAT, run_id=self.run_id, workflow=name)
         with writing_to(self._folder):
             sync_folder(self._folder)
-
-    def _reopen(self, lines: Sequence[JournalLine]) -> None:
-        """Remove the name of a finished run from a record; the next one replaces it."""
-        if not _lacked_room(lines):
-            raise _is_finished(self._folder)
-        record = self._folder / RECORD_FILE
-        with writing_to(self._folder):
-            record.replace(self._folder / f".{RECORD_FILE}.earlier")
 
     def _read_lines(self) -> list[JournalLine]:
         """Read complete lines; an incomplete last one is removed."""
@@ -300,12 +293,6 @@ def _is_finished(folder: Path) -> ArgumentError:
     )
 
 
-def _lacked_room(lines: Sequence[JournalLine]) -> bool:
-    """Whether a cell failed because the disk was full: with more space, the run continues."""
-    ends = {line.address: line for line in lines if line.event == "finished"}
-    return any(end.error_type == DiskSpaceError.__name__ for end in ends.values())
-
-
 def _check_folder(folder: Path) -> None:
     if files := [place for place in (folder, *folder.parents) if place.is_file()]:
         raise ArgumentError(
@@ -317,7 +304,7 @@ def _check_folder(folder: Path) -> None:
             raise ArgumentError(
                 f"{folder} holds {what}, {path.name}, as no run makes them; {_ANOTHER}"
             )
-    if (folder / RECORD_FILE).exists() and not _lacked_room(readable_lines(folder)):
+    if (folder / RECORD_FILE).exists():
         raise _is_finished(folder)
     if not folder.is_dir():
         return

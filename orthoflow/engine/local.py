@@ -40,7 +40,6 @@ from orthoflow.engine.measuring import (
 from orthoflow.engine.results import CellResult, result_from_json
 from orthoflow.engine.worker import EVENT, RESULT, Task, failed_result, run_step, run_task
 from orthoflow.errors import CancelledStepError, OrthoflowError, StepFailedError, StoreError
-from orthoflow.geometry.threads import address_space
 from orthoflow.sdk.context import StepEvent
 from orthoflow.sdk.lines import one_line
 from orthoflow.untrusted_text import open_file, shown
@@ -76,16 +75,10 @@ _GRACE_S: Final = 5.0
 _MOST_MESSAGES: Final = 256
 _LARGEST_MESSAGE: Final = 64 << 20
 _LONGEST_LAST_LINE: Final = 300
+_FROM_OUTSIDE: Final = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
 # The end of a long log is kept in the record: errors are at the end.
 _KEPT_BYTES: Final = 256 << 10
 _MOST_LINES: Final = 2000
-_CRASHES: Final = {
-    signal.SIGSEGV: "segmentation fault",
-    signal.SIGBUS: "bus error, as when the disk is full under a memory-mapped file",
-    signal.SIGABRT: "abort",
-    signal.SIGFPE: "arithmetic error",
-    signal.SIGILL: "illegal instruction",
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -519,12 +512,9 @@ def describe_exit(who: str, code: int, n_bytes: int, tail: str) -> str:
     if code >= 0:
         last = f"; its log ends with: {tail}" if tail else ""
         return f"{who} ended its process without a result (exit status {code}){last}"
-    name = _signal_name(-code)
-    if -code in _CRASHES:
-        limit = address_space()
-        room = f"; a process may take {limit / MIB:.0f} MiB of memory here" if limit else ""
-        return f"{who} crashed ({_CRASHES[signal.Signals(-code)]}, {name}){room}"
-    return f"{who} was killed from outside ({name}) while it held {n_bytes / GIB:.1f} GiB of memory"
+    kind = "was killed from outside" if -code in _FROM_OUTSIDE else "crashed"
+    reason = signal.strsignal(-code) or f"signal {-code}"
+    return f"{who} {kind} ({reason.lower()}) while it held {n_bytes / GIB:.1f} GiB of memory"
 
 
 def describe_memory(who: str, n_bytes: int) -> StepFailedError:
@@ -550,10 +540,3 @@ def duration(seconds: float) -> str:
         if seconds >= length and seconds % length == 0:
             return f"{seconds / length:g} {unit}"
     return f"{seconds:g} s"
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import gc
 import importlib
 import sys
 import threading
@@ -81,8 +80,6 @@ _IMPORTS: Final = ("_find_and_load", "_lock_unlock_module")
 _NUMBA_EVENTS: Final = "numba.core.event"
 # Held while a kernel is compiled, or read from its file.
 _COMPILER_LOCK: Final = "numba:compiler_lock"
-# A longer load leaves many objects; garbage collection over them takes a few hundredths of it.
-_LONG_S: Final = 0.25
 _SAMPLE_S: Final = 0.05
 
 
@@ -93,14 +90,8 @@ class LoadingMeter:
     nobody: its seconds stop no clock, only its processor time is counted.
     """
 
-    def __init__(self, *, sets_aside: bool = False) -> None:
-        """Start at zero.
-
-        Args:
-            sets_aside: whether garbage collection ignores everything loaded so far: only for a
-                process that ends with the step.
-        """
-        self._sets_aside = sets_aside
+    def __init__(self) -> None:
+        """Start at zero."""
         self._lock = threading.RLock()
         self._own = threading.local()
         self._n_open = 0
@@ -166,10 +157,6 @@ class LoadingMeter:
         own.depth = depth - 1
         if own.depth:
             return
-        if self._sets_aside and time.thread_time() - own.processor_s > _LONG_S:
-            if not threading.current_thread().daemon:
-                gc.collect()
-            gc.freeze()
         with self._lock:
             self._processor_s += time.thread_time() - own.processor_s
             if threading.current_thread().daemon:

@@ -53,7 +53,6 @@ from orthoflow.engine.results import (
 )
 from orthoflow.engine.store import Publisher, Store
 from orthoflow.errors import (
-    DiskSpaceError,
     InputError,
     MethodError,
     OrthoflowError,
@@ -283,7 +282,7 @@ def run_task(
     """
     started = now()
     sampler, progress = MemorySampler(), _ProgressWithCompiling(listen)
-    meter = LoadingMeter(sets_aside=has_own_process)
+    meter = LoadingMeter()
     call = _Call(task, progress.listen, is_cancelled, meter, sampler)
     try:
         with sampler, meter, on_compiling(progress.compiling):
@@ -365,8 +364,7 @@ def explain_failure(task: Task, error: BaseException) -> OrthoflowError:
 def _disk_failure(error: OSError, store: Path) -> OrthoflowError | None:
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         # Not a StoreError: the method needed more than is available, and is recorded as failed.
-        kind = StepFailedError if error.errno == errno.EFBIG else DiskSpaceError
-        return kind(str(store_error(error, store)))
+        return StepFailedError(str(store_error(error, store)))
     return store_error(error, store) if is_broken(error, store) else None
 
 

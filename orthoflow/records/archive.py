@@ -8,19 +8,19 @@ import json
 import mimetypes
 import re
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 from urllib.parse import quote
 
 from orthoflow_provenance.document import (
-    PublishedFile,
     RecordedCell,
     RecordedFile,
     RecordedProduct,
     RunRecord,
     cost_metrics,
 )
+from orthoflow_provenance.record import plain_fields
 from prov.constants import PROV, PROV_ROLE
 from prov.identifier import Identifier, Namespace, QualifiedName
 from prov.model import ProvDocument
@@ -613,33 +613,16 @@ def prov_document(record: RunRecord) -> ProvDocument:
 
 
 def _add_workflow(document: ProvDocument, record: RunRecord) -> None:
-    document.entity(
-        _name("workflow", "plan"),
-        _attributes(
-            PROV["Plan"],
-            record.name,
-            source=record.workflow_source,
-            sourceSha256=_sha256(record.workflow_source),
-            resolved=record.workflow_resolved,
-            overrides=" ".join(record.overrides),
-            seed=record.seed,
-        ),
-    )
+    source, resolved = record.workflow_source, record.workflow_resolved
+    facts = {"source": source, "resolved": resolved, "source_sha256": _sha256(source)}
+    facts |= {"overrides": " ".join(record.overrides), "seed": str(record.seed)}
+    plan = _attributes(PROV["Plan"], record.name, facts)
+    document.entity(_name("workflow", "plan"), plan)
     for environment in record.environments:
-        document.entity(
-            _name("environment", environment.id),
-            _attributes(
-                _type("Environment"),
-                "",
-                python=environment.python,
-                os=environment.os,
-                cpu=environment.cpu,
-                cores=environment.cores,
-                threads=environment.threads,
-                gitCommit=environment.git_commit,
-                packages=json.dumps(dict(environment.packages), sort_keys=True),
-            ),
-        )
+        packages = json.dumps(dict(environment.packages), sort_keys=True)
+        stated = {**plain_fields(environment), "packages": packages}
+        name = _name("environment", environment.id)
+        document.entity(name, _attributes(_type("Environment"), "", stated))
 
 
 def _add_inputs(document: ProvDocument, record: RunRecord) -> None:
@@ -649,12 +632,13 @@ def _add_inputs(document: ProvDocument, record: RunRecord) -> None:
         if not entry.files:
             continue
         name = _name("input", entry.name)
-        document.entity(name, _attributes(PROV["Collection"], entry.name))
+        document.entity(name, _attributes(PROV["Collection"], entry.name, {}))
         for file in entry.files:
             member = _name("file", file.sha256)
             if member not in known:
                 known.add(member)
-                document.entity(member, _file("InputFile", file.name, file))
+                facts = _attributes(_type("InputFile"), file.name, plain_fields(file))
+                document.entity(member, facts)
             document.membership(name, member)
 
 
@@ -664,7 +648,7 @@ def _add_software(document: ProvDocument, record: RunRecord, cells: Iterable[Rec
     for name in dict.fromkeys([program, *map(_distribution, cells)]):
         title, _, version = name.rpartition(" ")
         facts = {"name": title or name, "version": version if title else ""}
-        document.agent(_name("software", name), _attributes(PROV["SoftwareAgent"], name, **facts))
+        document.agent(_name("software", name), _attributes(PROV["SoftwareAgent"], name, facts))
         if name != program:
             document.delegation(_name("software", name), _name("software", program))
 
@@ -672,21 +656,7 @@ def _add_software(document: ProvDocument, record: RunRecord, cells: Iterable[Rec
 def _add_activity(document: ProvDocument, cell: RecordedCell) -> None:
     """Add the activity of a cell, with its inputs and outputs."""
     name = _name("cell", cell.address)
-    attributes = _attributes(
-        _type("Cell"),
-        cell.address,
-        step=cell.step,
-        status=cell.status,
-        method=cell.method,
-        distribution=cell.distribution,
-        distributionVersion=cell.distribution_version,
-        resultVersion=cell.result_version,
-        determinism=cell.determinism,
-        seed=None if cell.seed is None else str(cell.seed),
-        cachedFromRun=cell.cached_from,
-        key=cell.key,
-        error=cell.error_message,
-    )
+    attributes = _attributes(_type("Cell"), cell.address, plain_fields(cell))
     attributes += [(_name("parameter", key), _literal(value)) for key, value in cell.params.items()]
     measured = [*cell.metrics, *cost_metrics(cell)]
     attributes += [(_name("metric", item.name), item.value) for item in measured]
@@ -701,14 +671,7 @@ def _add_activity(document: ProvDocument, cell: RecordedCell) -> None:
         document.usage(name, source, other_attributes={PROV_ROLE: role})
     for port, product in cell.outputs.items():
         made = _name("product", f"{cell.address}.{port}")
-        facts = _attributes(
-            _type("Product"),
-            product.type_name,
-            type=product.type_name,
-            encodingVersion=product.encoding_version,
-            digest=product.digest,
-            isEmbedded=product.embedded,
-        )
+        facts = _attributes(_type("Product"), product.type_name, plain_fields(product))
         document.entity(made, facts)
         document.generation(made, name, cell.ended or None, other_attributes={PROV_ROLE: port})
         for source in dict.fromkeys(_source(product) for product in cell.inputs.values()):
@@ -722,14 +685,11 @@ def _add_published(
     owners = {f"{PRODUCTS_FOLDER}/{cell_file_name(cell.address)}": cell.address for cell in cells}
     for file in record.published:
         name = _name("published", file.path)
-        document.entity(name, _file("PublishedFile", file.path, file))
+        facts = _attributes(_type("PublishedFile"), file.path, plain_fields(file))
+        document.entity(name, facts)
         owner = owners.get(file.path.rpartition("/")[0])
         if owner is not None:
             document.generation(name, _name("cell", owner))
-
-
-def _file(kind: str, label: str, file: RecordedFile | PublishedFile) -> Attributes:
-    return _attributes(_type(kind), label, sha256=file.sha256, sizeBytes=file.size_bytes)
 
 
 def _source(product: RecordedProduct) -> str:
@@ -751,9 +711,9 @@ def _name(part: str, name: str) -> str:
     return f"{part}:{quote(name, safe='') or '_'}"
 
 
-def _attributes(kind: QualifiedName, label: str, **facts: bool | float | str | None) -> Attributes:
+def _attributes(kind: QualifiedName, label: str, facts: Mapping[str, str | float]) -> Attributes:
     known = [("prov:label", label), *((_name("orthoflow", key), facts[key]) for key in facts)]
-    return [("prov:type", kind), *(item for item in known if item[1] not in (None, ""))]
+    return [("prov:type", kind), *(item for item in known if item[1] != "")]
 
 
 def _literal(value: JsonValue) -> JsonValue:

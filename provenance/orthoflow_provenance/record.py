@@ -242,7 +242,7 @@ def expected_nodes(record: RunRecord, text: str) -> dict[str, Node]:
         record: of the document.
         text: the document.
     """
-    stated = _attributes(record)
+    stated = plain_fields(record)
     root = {"format": RUN_FORMAT, "format_version": FORMAT_VERSION, **stated}
     nodes = {
         "/": _node({**root, CONTENT_SHA256: sha256_text(text)}),
@@ -259,7 +259,7 @@ def expected_nodes(record: RunRecord, text: str) -> dict[str, Node]:
         nodes[f"/inputs/{entry.name}"] = _node(data=_table(entry.files, columns))
     for environment in record.environments:
         nodes[f"/environments/{environment.id}"] = _node(
-            _attributes(environment),
+            plain_fields(environment),
             _table(
                 [{"name": name, "version": one} for name, one in environment.packages.items()],
                 ("name", "version"),
@@ -267,7 +267,7 @@ def expected_nodes(record: RunRecord, text: str) -> dict[str, Node]:
         )
     for cell in record.cells:
         place = f"/{CELLS}/{cell.address}"
-        nodes[place] = _node(_attributes(cell))
+        nodes[place] = _node(plain_fields(cell))
         for name, data in _cell_tables(cell).items():
             nodes[f"{place}/{name}"] = _node(data=data)
     return nodes
@@ -408,8 +408,8 @@ def _node(
     )
 
 
-def _attributes(entry: object) -> dict[str, str | float]:
-    """Return the fields of a dataclass that one sees at a glance."""
+def plain_fields(entry: object) -> dict[str, str | float]:
+    """Return the numbers and short texts among the fields of a dataclass."""
     found: dict[str, str | float] = {}
     for item in dataclasses.fields(entry):  # type: ignore[arg-type] # any dataclass
         value = getattr(entry, item.name)

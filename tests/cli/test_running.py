@@ -189,24 +189,6 @@ def test_an_interrupted_run_ends_with_130_and_goes_on_with_the_same_folder(
     assert "not finished" not in (tmp_path / "r" / "report.html").read_text()
 
 
-def test_a_run_that_failed_for_want_of_room_goes_on_with_the_same_folder(tmp_path: Path) -> None:
-    write_studio(tmp_path, "paint.room")
-    arguments = ("run", "studio.yaml", "-o", "r", *INLINE)
-    failed = orthoflow(tmp_path, *arguments, environment={"WORKSHOP_DISK_IS_FULL": "1"})
-    assert failed.returncode == 1
-    assert "with more disk space, the same command with -o r goes on" in failed.stderr
-    assert open_run(tmp_path / "r").cells["paint"].error_type == "DiskSpaceError"
-    page = (tmp_path / "r" / "report.html").read_text()
-    assert re.search(r'<li>Failed: [^<]+<span class="soft">\(paint\)</span>', page)
-    again = orthoflow(tmp_path, *arguments)
-    assert again.returncode == 0, again.stderr
-    assert "0 of 2 steps cached, 1 kept from before the interruption" in again.stdout.splitlines()
-    assert open_run(tmp_path / "r").record.status == "ok"
-    assert orthoflow(tmp_path, "verify", "r").returncode == 0
-    assert not list((tmp_path / "r").glob(".run.h5*"))
-    assert orthoflow(tmp_path, *arguments).returncode == 2
-
-
 def test_a_terminal_gets_a_live_table_that_leaves_nothing_behind(tmp_path: Path) -> None:
     write_studio(tmp_path)
     controlling, terminal = pty.openpty()

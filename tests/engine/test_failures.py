@@ -124,8 +124,8 @@ def test_what_a_method_raises_becomes_one_sentence(world: World, bad: str) -> No
 
 # What the disk refuses: the kind of error, of what lies in the scratch folder and elsewhere.
 REFUSED = {
-    errno.ENOSPC: ("DiskSpaceError", "DiskSpaceError"),
-    errno.EDQUOT: ("DiskSpaceError", "DiskSpaceError"),
+    errno.ENOSPC: ("StepFailedError", "StepFailedError"),
+    errno.EDQUOT: ("StepFailedError", "StepFailedError"),
     errno.EFBIG: ("StepFailedError", "StepFailedError"),
     errno.EIO: ("StoreError", "MethodError"),
     errno.ESTALE: ("StoreError", "MethodError"),
@@ -145,7 +145,7 @@ def test_what_disk_and_memory_refuse_is_an_error_of_whoever_is_at_fault(world: W
     for number, (own, other) in REFUSED.items():
         for address, kind in ((f"e{number}-1", own), (f"e{number}-0", other)):
             assert results[address].error_type == kind, (address, results[address].error_message)
-            if kind in ("StoreError", "DiskSpaceError"):
+            if kind in ("StoreError", "StepFailedError"):
                 expected = f"cannot write to {world.store.folder}: "
                 assert results[address].error_message.startswith(expected)
     assert results["none"].error_type == "StepFailedError"
@@ -155,8 +155,8 @@ def test_what_disk_and_memory_refuse_is_an_error_of_whoever_is_at_fault(world: W
 
 
 CRASHES = {
-    "segfault": f"method work.segfault {TOYS} crashed (segmentation fault, SIGSEGV)",
-    "abort": f"method work.abort {TOYS} crashed (abort, SIGABRT)",
+    "segfault": f"method work.segfault {TOYS} crashed (segmentation fault) while it held ",
+    "abort": f"method work.abort {TOYS} crashed (aborted) while it held ",
     "quit": (
         f"method work.quit {TOYS} ended its process without a result (exit status 7); its log ends "
         "with: last words"
@@ -173,7 +173,7 @@ def test_crashes_fail_their_cells_alone(world: World) -> None:
     for bad, message in CRASHES.items():
         result = results[f"second@second={bad}"]
         assert (result.status, result.error_type) == ("failed", "StepFailedError")
-        assert result.error_message == message
+        assert result.error_message.startswith(message)
         assert result.started < result.ended
         behind = results[f"third@second={bad}"].error_message
         assert behind == f"needs second@second={bad}, which failed"

@@ -83,37 +83,14 @@ def test_a_line_that_was_cut_off_is_removed_and_a_damaged_one_is_told(tmp_path: 
         assert not is_running(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("ends", "goes_on"),
-    [
-        ([ended("a")], False),
-        ([ended("a", "failed", error="MethodError")], False),
-        ([ended("a", "failed", error="DiskSpaceError"), ended("b")], True),
-        # It had room in the end.
-        ([ended("a", "failed", error="DiskSpaceError"), ended("a")], False),
-    ],
-    ids=["ok", "failed", "no room", "room at last"],
-)
-def test_a_finished_run_goes_on_only_where_the_disk_was_full(
-    tmp_path: Path, ends: list[Facts], goes_on: bool
-) -> None:
+def test_a_finished_run_is_not_continued(tmp_path: Path) -> None:
     with Journal(tmp_path, "hall", run_id="r1") as journal:
-        for line in ends:
-            journal.write("finished", **line)
+        journal.write("finished", **ended("a", "failed", error="MethodError"))
         journal.write("ended")
     (tmp_path / RECORD_FILE).write_text("the record")
-    if not goes_on:
-        with pytest.raises(
-            ArgumentError, match=r"holds a finished run \(run\.h5\); choose another"
-        ):
-            Journal(tmp_path, "hall")
-        assert (tmp_path / RECORD_FILE).exists()
-        return
-    with Journal(tmp_path, "hall") as journal:
-        assert (journal.run_id, journal.is_resumed) == ("r1", True)
-    # It is a record no more, and is still there until the next one replaces it.
-    assert not (tmp_path / RECORD_FILE).exists()
-    assert (tmp_path / f".{RECORD_FILE}.earlier").read_text() == "the record"
+    with pytest.raises(ArgumentError, match=r"holds a finished run \(run\.h5\); choose another"):
+        Journal(tmp_path, "hall")
+    assert (tmp_path / RECORD_FILE).read_text() == "the record"
 
 
 def test_a_folder_of_something_else_is_refused_as_it_is(tmp_path: Path) -> None:

@@ -26,7 +26,6 @@ def orthoflow_methods() -> list[MethodSpec]:
         "paint.fail": ("PaintFail", "finds no result"),
         "paint.kernel": ("PaintKernel", "computes with compiled code"),
         "paint.lacking": ("PaintLacking", "needs a library that is not there"),
-        "paint.room": ("PaintRoom", "wants room on the disk"),
         "paint.slow": ("PaintSlow", "takes its time"),
     }
     return [

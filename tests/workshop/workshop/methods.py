@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
 import time
 
 import numpy as np
@@ -124,17 +122,6 @@ class PaintLacking(PaintPlain):
         import no_such_library  # noqa: F401
 
         return None
-
-
-class PaintRoom(PaintPlain):
-    """Finds the disk full as long as the environment says so."""
-
-    id = "paint.room"
-
-    def run(self, inputs: PaintPlain.In, params: PaintPlain.Params, ctx: StepContext) -> object:
-        if "WORKSHOP_DISK_IS_FULL" in os.environ:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(ctx.scratch / "paint"))
-        return super().run(inputs, params, ctx)
 
 
 class PaintSlow(PaintPlain):
