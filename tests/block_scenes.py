@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import Photos, Ties
@@ -32,6 +34,16 @@ def viewers() -> tuple[ViewingCamera, ...]:
 
 def names() -> tuple[str, ...]:
     return tuple(f"{letter}.png" for letter in "abcd")
+
+
+def observed(
+    cameras: Sequence[ViewingCamera], points: NDArray[np.float64]
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
+    """Photo, point and pixel of each point in each photo that shows it, photo by photo."""
+    pixels = np.array([camera.project(points)[:, :2] for camera in cameras])
+    shown = [camera.sees(own) for camera, own in zip(cameras, pixels, strict=True)]
+    photo, point = np.nonzero(shown)
+    return photo, point, pixels[photo, point]
 
 
 @cache

@@ -198,20 +198,6 @@ def test_a_part_of_a_true_orthoimage_is_that_part_of_the_whole() -> None:
     assert 0 < np.count_nonzero(part.behind_object) < np.count_nonzero(whole.behind_object)
 
 
-def test_a_finer_rendering_averages_to_the_coarser_one() -> None:
-    scene = wall_with_screen()
-    coarse = render_frame(
-        scene, wall_frame(0.05), buffer_front_m=0.1, buffer_behind_m=0.3, supersample=24
-    )
-    fine = render_frame(
-        scene, wall_frame(0.0125), buffer_front_m=0.1, buffer_behind_m=0.3, supersample=6
-    )
-    mean = fine.rgb.reshape(40, 4, 80, 4, 3).mean(axis=(1, 3))
-    # Grey levels; rays are 2 mm apart and cracks 2 to 4 mm wide, so a mean is good to a small part
-    # of their contrast.
-    np.testing.assert_allclose(mean, coarse.rgb, atol=1.0)
-
-
 def test_a_scene_with_arrays_that_disagree_is_refused() -> None:
     scene = wall_with_screen()
     with pytest.raises(GeometryError, match=r"scene.extent must have shape \(3, 4\), got \(2, 4\)"):

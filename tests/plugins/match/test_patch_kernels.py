@@ -100,22 +100,6 @@ def known(value: float = 1.0) -> NDArray[np.float32]:
     return np.full((SIDE, SIDE), value, dtype=np.float32)
 
 
-@pytest.mark.parametrize("shift", [(0.3, -0.45), (-1.2, 2.4)])
-@pytest.mark.parametrize("gain", [1.0, 0.4])
-def test_a_shift_is_found_whatever_gain_and_offsets_are(
-    shift: tuple[float, float], gain: float
-) -> None:
-    offsets = np.array([3.0, -2.0], dtype=np.float32)
-    first = Channels(picture(), known())
-    second = Channels(np.float32(gain) * picture(shift) + offsets, known())
-    start = (round(shift[0] + 0.3), round(shift[1] - 0.3))
-    across, down, sigma, score = matched(first, second, (float(start[0]), float(start[1])))
-    # Cubic convolution of waves of a dozen cells.
-    np.testing.assert_allclose([across, down], shift, atol=0.004)
-    assert score > 0.9995
-    assert 0.0 <= sigma < 0.002
-
-
 def keys(t: float) -> NDArray[np.float64]:
     """Weights of cubic convolution by its definition: of distances 1 + t, t, 1 - t, 2 - t."""
     away = np.array([1.0 + t, t, 1.0 - t, 2.0 - t])

@@ -40,13 +40,7 @@ def block_of(
     """Exact observations, by cameras of one lens that is believed to be another, stood aside."""
     true = true_cameras()
     points = np.random.default_rng(3).uniform([0.4, -0.6, 0.3], [2.6, 0.1, 1.7], (90, 3))
-    photo, point, pixels = [], [], []
-    for at, camera in enumerate(true):
-        found = camera.project(points)[:, :2]
-        inside = np.flatnonzero(camera.sees(found))
-        photo += [at] * len(inside)
-        point += inside.tolist()
-        pixels.append(found[inside])
+    photo, point, pixels = bs.observed(true, points)
     # Each point of the scan is seen once: a point of its own for every observation.
     own = np.arange(len(photo))
     cameras = tuple(
@@ -64,9 +58,9 @@ def block_of(
         lenses=(Lens(prior=cameras[0], freedom=free, source="exif"),),
         points=Points(now=known, known=known, sigma_m=np.full(len(own), 1e-5)),
         seen=Observations(
-            photo=np.array(photo, dtype=np.intp),
-            point=own.astype(np.intp),
-            pixels=np.vstack(pixels),
+            photo=photo,
+            point=own,
+            pixels=pixels,
             sigma_px=np.full(len(own), 0.1),
         ),
     )

@@ -165,27 +165,25 @@ def test_each_gate_refuses_what_is_beyond_its_bound(
     assert refusal(candidate(**bad))[1]
 
 
-def test_check_ties_must_agree_half_as_often_as_the_control() -> None:
-    is_check = candidate().is_check
+@pytest.mark.parametrize(("n_agree", "refused_by"), [(8, None), (7, "check-share")])
+def test_check_ties_must_agree_half_as_often_as_the_control(
+    n_agree: int, refused_by: str | None
+) -> None:
     # 80 % of the control points agree: of 20 check points 8 must.
-    for n_agree, is_fine in ((8, True), (7, False)):
-        agreeing = candidate().estimate.agreeing.copy()
-        agreeing[is_check] = np.arange(20) < n_agree
-        found = gated(agreeing=agreeing, normalised=np.where(agreeing, 0.5, 8.0))
-        assert found == (None if is_fine else "check-share")
+    agrees = agreeing(64, n_agree)
+    assert gated(agreeing=agrees, normalised=np.where(agrees, 0.5, 8.0)) == refused_by
 
 
-def test_check_ties_may_deviate_twice_as_much_as_the_control() -> None:
+@pytest.mark.parametrize(("factor", "refused_by"), [(1.95, None), (2.05, "check-rms")])
+def test_check_ties_may_deviate_twice_as_much_as_the_control(
+    factor: float, refused_by: str | None
+) -> None:
     good = candidate()
-    for factor, is_fine in ((1.95, True), (2.05, False)):
-        lengths = np.where(good.is_check, 0.5 * factor, 0.5)
-        found = gated(normalised=np.where(good.estimate.agreeing, lengths, 8.0))
-        assert found == (None if is_fine else "check-rms")
+    lengths = np.where(good.is_check, 0.5 * factor, 0.5)
+    assert gated(normalised=np.where(good.estimate.agreeing, lengths, 8.0)) == refused_by
     # Four are too few to compare.
-    few = np.zeros(N_TIES, dtype=np.bool_)
-    few[[6, 7, 8, 9]] = True
-    lengths = np.where(few, 2.0, 0.5)
-    loose = np.where(good.estimate.agreeing, lengths, 8.0)
+    few = np.isin(np.arange(N_TIES), [6, 7, 8, 9])
+    loose = np.where(good.estimate.agreeing, np.where(few, 2.0, 0.5), 8.0)
     assert gated(is_check=few, normalised=loose) != "check-rms"
 
 

@@ -104,16 +104,15 @@ def test_a_camera_that_may_stand_nearer_is_worst_far_from_the_middle() -> None:
     assert found.worst_m == pytest.approx(float(found.sigmas_m.max()))
 
 
-@pytest.mark.parametrize("half_m", [(2.5, 2.0), (2.5, 1.3), (1.7, 2.0)])
-def test_corners_of_the_photo_count_where_they_show_a_wall(half_m: tuple[float, float]) -> None:
-    found = wall_error(posed((0.0, 0.0, 0.006)), [wall(half_m)])
-    assert found is not None
+def test_corners_of_the_photo_count_where_they_show_a_wall() -> None:
     # 2 m and 1.5 m from the middle, but for half a pixel.
-    shows = half_m[0] > 2.0 and half_m[1] > 1.5
-    if not shows:
+    for half_m in ((2.5, 1.3), (1.7, 2.0)):
+        found = wall_error(posed((0.0, 0.0, 0.006)), [wall(half_m)])
+        assert found is not None
         assert np.isnan(found.corners_m).all()
         assert found.worst_m == pytest.approx(float(found.sigmas_m.max()))
-        return
+    found = wall_error(posed((0.0, 0.0, 0.006)), [wall((2.5, 2.0))])
+    assert found is not None
     aside = math.hypot(399.5, 299.5) / 600.0 * DISTANCE_M
     expected = 0.006 * aside / DISTANCE_M / math.sqrt(2.0)
     np.testing.assert_allclose(found.corners_m, expected, rtol=1e-6)
@@ -168,9 +167,6 @@ def test_walls_are_as_ties_describe_them_or_through_their_points() -> None:
     shares = (own - second.corners_world[0]) @ sides.T / (sides**2).sum(axis=1)
     np.testing.assert_allclose(
         [shares.min(axis=0), shares.max(axis=0)], [[0, 0], [1, 1]], atol=1e-9
-    )
-    np.testing.assert_allclose(
-        second.corners_world[2], second.corners_world[[1, 3]].sum(axis=0) - second.corners_world[0]
     )
     # Only chosen ties count.
     assert [item.index for item in known_walls(ties, number == 1)] == [1]
