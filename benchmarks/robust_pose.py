@@ -117,7 +117,7 @@ def opencv(seen: TiedPhoto) -> NDArray[np.float64] | None:
     params.confidence = 0.99999
     params.score = cv2.SCORE_METHOD_MAGSAC
     params.loMethod = cv2.LOCAL_OPTIM_SIGMA
-    pixels, matrix = to_opencv(seen.pixels), opencv_matrix(LENS)
+    pixels, matrix = to_opencv(seen.pixels), opencv_matrix(LENS.posed())
     call: Any = cv2.solvePnPRansac
     ok, _, turn, shift, inliers = call(seen.points, pixels, matrix.copy(), None, params=params)
     if not ok or inliers is None:

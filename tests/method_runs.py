@@ -48,6 +48,6 @@ class Reader:
 
 
 # Any: ports and parameters differ by method.
-def run(method: Any, ctx: StepContext, inputs: Mapping[str, object], **params: Any) -> Any:
+def run(method: Any, ctx: StepContext, inputs: Mapping[str, object], /, **params: Any) -> Any:
     """What a method makes of its inputs."""
     return method().run(method.In(**inputs), method.Params(**params), ctx)

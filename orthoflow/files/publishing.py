@@ -415,7 +415,7 @@ def _camera_json(camera: Camera) -> JsonValue:
     entry: dict[str, JsonValue] = {"status": camera.status}
     inner = camera.intrinsics
     if inner is not None:
-        entry["K"] = numbers(opencv_matrix(inner))
+        entry["K"] = numbers(opencv_matrix(inner.posed()))
         entry["distortion"] = list(inner.distortion)
         entry["width"] = inner.width
         entry["height"] = inner.height

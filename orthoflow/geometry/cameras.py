@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,21 +21,6 @@ from orthoflow.geometry.frames import rotation_from_vector
 HALF_PIXEL: Final = 0.5
 
 
-class Lens(Protocol):
-    """The elements of a camera matrix: pixels, first pixel centre at (0.5, 0.5)."""
-
-    @property
-    def fx(self) -> float: ...  # noqa: D102 - as `Intrinsics` has it
-    @property
-    def fy(self) -> float: ...  # noqa: D102
-    @property
-    def cx(self) -> float: ...  # noqa: D102
-    @property
-    def cy(self) -> float: ...  # noqa: D102
-    @property
-    def skew(self) -> float | None: ...  # noqa: D102
-
-
 def to_opencv(pixels: NDArray[Any]) -> NDArray[Any]:
     """Convert our pixel coordinates to OpenCV's; the type is kept."""
     return pixels - HALF_PIXEL
@@ -44,17 +29,6 @@ def to_opencv(pixels: NDArray[Any]) -> NDArray[Any]:
 def from_opencv(pixels: NDArray[Any]) -> NDArray[Any]:
     """Convert OpenCV's pixel coordinates to ours; the type is kept."""
     return pixels + HALF_PIXEL
-
-
-def opencv_matrix(lens: Lens) -> NDArray[np.float64]:
-    """Return the camera matrix (3, 3) for OpenCV, whose own functions ignore the skew in it."""
-    return np.array(
-        [
-            [lens.fx, lens.skew or 0.0, lens.cx - HALF_PIXEL],
-            [0.0, lens.fy, lens.cy - HALF_PIXEL],
-            [0.0, 0.0, 1.0],
-        ]
-    )
 
 
 _ITERATIONS: Final = 30
@@ -128,6 +102,20 @@ class ViewingCamera:
         t of large numbers would lose the precision of float32 offsets.
         """
         return replace(self, translation=self.rotation @ origin_world + self.translation)
+
+    def at_opencv_pose(
+        self, turn: NDArray[Any], shift: NDArray[Any], middle: NDArray[np.float64]
+    ) -> ViewingCamera:
+        """Return the same lens at a pose of OpenCV.
+
+        Args:
+            turn: rotation vector, (3,) or (3, 1).
+            shift: translation, likewise.
+            middle: (3,) metres, subtracted from the points given to OpenCV.
+        """
+        rotation = rotation_from_vector(np.asarray(turn, dtype=np.float64).ravel())
+        local = replace(self, rotation=rotation, translation=np.asarray(shift).ravel())
+        return local.shifted(-middle)
 
     def project(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
         """Pixels and depth (n, 3) = (u, v, depth in metres) of world points (n, 3).
@@ -256,6 +244,12 @@ def looking_at(
         raise GeometryError("a camera that looks straight up or down has no level orientation")
     right = right / length
     return np.vstack([right, np.cross(forward, right), forward])
+
+
+def opencv_matrix(lens: ViewingCamera) -> NDArray[np.float64]:
+    """Return the camera matrix (3, 3) for OpenCV, whose own functions ignore the skew in it."""
+    cx, cy = lens.cx - HALF_PIXEL, lens.cy - HALF_PIXEL
+    return np.array([[lens.fx, lens.skew, cx], [0.0, lens.fy, cy], [0.0, 0.0, 1.0]])
 
 
 POSE_PARAMETERS: Final = 6

@@ -40,53 +40,33 @@ def search_shifts(
 ) -> None:
     """Find the whole-cell shift of each patch with the highest correlation.
 
+    If the first picture has one channel and the second three, each patch is compared with the
+    combination of the second's channels that fits it best.
+
     Args:
         first: (rows, cols, c) float32.
-        second: likewise.
+        second: likewise, or (rows, cols, 3).
         places: (n, 2) int64 (column, row), at least half + radius cells from the border.
         reach: half, radius: patches are 2 half + 1 cells wide, shifts up to the radius are tried.
         found: (n, 4) float64, filled with the shift (across, down), its correlation, and its lead
-            over the best of the others, -1 if it lies on the border of the search.
+            over the best of the others, -1 if it lies on the border of the search; for
+            combinations (n, 7), with the gains of the three channels at the best shift.
     """
-    side = 2 * reach[1] + 1
-    scores = np.empty(side * side)
+    side, is_mixed = 2 * reach[1] + 1, found.shape[1] == 7
+    scores, gains = np.empty(side * side), np.empty(3)
     for i in range(places.shape[0]):
         at = (places[i, 1], places[i, 0])
         for k in range(side * side):
             to = (at[0] + k // side - reach[1], at[1] + k % side - reach[1])
-            scores[k] = _correlation(first, second, at, to, reach[0])
-        _take_best(scores, found[i])
-
-
-@compiled
-def search_mixtures(
-    first: NDArray[np.float32],
-    second: NDArray[np.float32],
-    places: NDArray[np.int64],
-    reach: tuple[int, int],
-    found: NDArray[np.float64],
-) -> None:
-    """Like `search_shifts`, with the combination of the second's channels that fits best.
-
-    Args:
-        first: (rows, cols, 1) float32.
-        second: (rows, cols, 3) float32.
-        places: as in `search_shifts`.
-        reach: as in `search_shifts`.
-        found: (n, 7) float64, as there, and the gains of the three channels at the best shift.
-    """
-    side = 2 * reach[1] + 1
-    scores = np.empty(side * side)
-    gains = np.empty(3)
-    for i in range(places.shape[0]):
-        at = (places[i, 1], places[i, 0])
-        for k in range(side * side):
-            to = (at[0] + k // side - reach[1], at[1] + k % side - reach[1])
-            scores[k] = _mixed(first, second, (at, to, reach[0]), gains)
+            if is_mixed:
+                scores[k] = _mixed(first, second, (at, to, reach[0]), gains)
+            else:
+                scores[k] = _correlation(first, second, at, to, reach[0])
         _take_best(scores, found[i, :4])
-        to = (at[0] + int(found[i, 1]), at[1] + int(found[i, 0]))
-        _mixed(first, second, (at, to, reach[0]), gains)
-        found[i, 4], found[i, 5], found[i, 6] = gains[0], gains[1], gains[2]
+        if is_mixed:
+            to = (at[0] + int(found[i, 1]), at[1] + int(found[i, 0]))
+            _mixed(first, second, (at, to, reach[0]), gains)
+            found[i, 4:] = gains
 
 
 @kernel_part
@@ -395,12 +375,11 @@ def measure(
     """
     places = _well_known(first, second, places, radius_cells)
     is_mixed = (first.values.shape[2], second.values.shape[2]) == (1, 3)
-    kernel = search_mixtures if is_mixed else search_shifts
     found = np.zeros((len(places), 7 if is_mixed else 4))
     reach = (HALF_PATCH_CELLS, radius_cells)
     in_threads(
         [
-            partial(kernel, first.values, second.values, places[part], reach, found[part])
+            partial(search_shifts, first.values, second.values, places[part], reach, found[part])
             for part in even_parts(len(places), threads)
         ]
     )

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal
+from typing import TYPE_CHECKING, ClassVar, Final, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from orthoflow.errors import MethodError
 from orthoflow.products import Camera, Cameras, JsonValue, Photos, PointCloud, Ties, Walls
@@ -16,7 +16,6 @@ from orthoflow_plugins.match.ties import (
     paper_ties,
     ties_by_hand_alone,
     ties_of,
-    with_paper_ratio,
     with_ties_by_hand,
 )
 
@@ -94,7 +93,7 @@ class MatchGuided(Method):
             gt=0,
             le=1,
             description="Only with preset: paper: largest distance of the best match over the "
-            "second best, 0.8 unless given, as in openMVG; null for any.",
+            "second best, 1 for any; 0.8 unless given, as in openMVG.",
         )
         channels: Literal["auto", "gradients", "grey", "colours"] = Field(
             default="auto",
@@ -107,11 +106,6 @@ class MatchGuided(Method):
         max_ties: int = Field(
             default=1200, ge=50, description="Places measured per photo, spread evenly."
         )
-
-        @model_validator(mode="before")
-        @classmethod
-        def _preset_fills_in(cls, given: Any) -> Any:
-            return with_paper_ratio(given)
 
     class In(Ports):
         """Photos, walls, approximate orientations, the cloud, and ties measured by hand."""

@@ -40,6 +40,7 @@ _VOID_MARGIN_CELLS: Final = 3
 MIN_AGREEING: Final = 8
 """Fewest matches with a common homography by which a wall is recognised."""
 _SEED: Final = 1
+_MAX_RATIO: Final = 0.85
 # Matches in one square of this side count once.
 _PLACE_PX: Final = 2.0
 
@@ -73,11 +74,11 @@ class PairingParams(MethodParams):
         default=8000, ge=50, description="Key points per photo and per wall, spread evenly."
     )
     ratio: float | None = Field(
-        default=0.85,
+        default=None,
         gt=0,
         le=1,
-        description="Largest distance of the best match over the second best; null for any. "
-        "With preset: paper 0.8 unless given, as its openMVG has it.",
+        description="Largest distance of the best match over the second best, 1 for any; 0.85 "
+        "unless given, and with preset: paper 0.8, as its openMVG has it.",
     )
     max_side_px: int = Field(
         default=4000,
@@ -90,7 +91,7 @@ class PairingParams(MethodParams):
     @property
     def max_ratio(self) -> float:
         """Largest ratio of a match; 1 allows any."""
-        return 1.0 if self.ratio is None else self.ratio
+        return _MAX_RATIO if self.ratio is None else self.ratio
 
 
 @dataclass(frozen=True, kw_only=True)

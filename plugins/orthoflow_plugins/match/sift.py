@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal
+from typing import TYPE_CHECKING, ClassVar, Final, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from orthoflow.geometry.key_points import Features
 from orthoflow.products import JsonValue, Photo, Photos, TieRole, Ties, Walls
@@ -29,7 +29,6 @@ from orthoflow_plugins.match.ties import (
     paper_ties,
     ties_by_hand_alone,
     ties_of,
-    with_paper_ratio,
     with_ties_by_hand,
     without_twins,
 )
@@ -107,11 +106,6 @@ class MatchSift(Method):
             "are correlated, so the error stated by an orientation from them is too small: "
             "match.guided measures them again.",
         )
-
-        @model_validator(mode="before")
-        @classmethod
-        def _preset_fills_in(cls, given: Any) -> Any:
-            return with_paper_ratio(given)
 
     class In(Ports):
         """The photos, the rastered walls, and ties measured by hand."""

@@ -145,7 +145,7 @@ def paper_ties(
         walls: the walls.
         cameras: by photo; key points outside the photo by its pose are not matched, nor photos
             without a pose. None matches everything.
-        ratio: largest distance of the best match over the second best; None for any.
+        ratio: largest distance of the best match over the second best; None for that of openMVG.
         ctx: the context, for progress.
 
     Returns:
@@ -172,19 +172,11 @@ def paper_ties(
             if chosen is None or not len(chosen) or not len(in_photo):
                 continue
             best = best_matches(
-                chosen.descriptors, in_photo.descriptors, ratio=1.0 if ratio is None else ratio
+                chosen.descriptors, in_photo.descriptors, ratio=ratio or _PAPER_RATIO
             )
             pairs = in_photo.take(best.second), chosen.take(best.first)
             pieces.append(key_point_ties((index, place), wall, pairs))
     return pieces, on_walls
-
-
-# Any: what a user wrote, before it is checked.
-def with_paper_ratio(given: Any) -> Any:
-    """Fill in the ratio of `preset: paper` if none is given."""
-    if isinstance(given, dict) and given.get("preset") == "paper":
-        return {"ratio": _PAPER_RATIO, **given}
-    return given
 
 
 def _within(features: Features, shown: Projection | None, wall: Wall) -> Features | None:

@@ -64,7 +64,6 @@ from orthoflow_plugins.orient.pose import (
     OrientIn,
     OrientOut,
     OrientParams,
-    Refined,
     Sharing,
     TiedPhoto,
     estimate_pose,
@@ -146,10 +145,6 @@ class OrientColmapBundle(Method):
             "or of one size without any if their ties do not contradict (focal-group), all of "
             "one size (shared), or none (per-photo).",
         )
-        refine: Refined = Field(
-            default="uncalibrated",
-            description="Which lenses the adjustment refines: uncalibrated, all, or none.",
-        )
         photo_ties: bool = Field(
             default=True, description="Tie overlapping photos to each other as well."
         )
@@ -216,7 +211,7 @@ def _adjusted(
     apart: Set[int] = frozenset()
     try:
         while True:
-            groups = lens_groups(photos, cameras, params.intrinsics, params.refine, apart)
+            groups = lens_groups(photos, cameras, params.intrinsics, apart)
             adjusted = adjust_block(block, between, groups, params)
             others = of_another_lens(block, adjusted) if params.intrinsics == _TESTED else apart
             if others <= apart:
@@ -278,8 +273,7 @@ class Adjusted:
     """A block after its adjustment.
 
     Attributes:
-        block: cameras, lenses and points, in a world shifted to `middle`.
-        middle: (3,) metres.
+        block: cameras, lenses and points, in a world with its origin nearby.
         covariance: of all unknowns.
         estimates: one per photo, in the world.
         tie_sigma_px: standard deviation of a coordinate of a tie between photos, in pixels of the
@@ -290,7 +284,6 @@ class Adjusted:
     """
 
     block: Block
-    middle: NDArray[np.float64]
     covariance: BlockCovariance
     estimates: tuple[Estimate, ...]
     tie_sigma_px: float
@@ -370,7 +363,6 @@ def adjust_block(
     kept_px = lengths_px[used.tie_active]
     return Adjusted(
         block=block,
-        middle=middle,
         covariance=covariance,
         estimates=tuple(
             replace(

@@ -7,9 +7,9 @@ a refusal.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Final
 
 import numpy as np
@@ -79,16 +79,6 @@ class WallError:
     corners_m: NDArray[np.float64]
     footprint_px: NDArray[np.float64]
     sigmas_m: NDArray[np.float64]
-
-    @property
-    def rms_mm(self) -> float:
-        """The same in mm."""
-        return 1000.0 * self.rms_m
-
-    @property
-    def worst_mm(self) -> float:
-        """The same in mm."""
-        return 1000.0 * self.worst_m
 
 
 def known_walls(ties: Ties, chosen: NDArray[np.bool_]) -> list[KnownWall]:
@@ -323,46 +313,6 @@ class Candidate:
         return min((wall.gsd_m for wall in self.known if wall.gsd_m is not None), default=None)
 
     @property
-    def gsd_mm(self) -> float:
-        """The same in mm."""
-        return 1000.0 * (self.gsd_m or math.nan)
-
-    @property
-    def n_ties(self) -> int:
-        """All its ties."""
-        return len(self.seen)
-
-    @property
-    def n_control(self) -> int:
-        """Inliers among the control points."""
-        return int(self.control.sum())
-
-    @property
-    def n_for_control(self) -> int:
-        """Control points."""
-        return int((~self.is_check).sum())
-
-    @property
-    def n_agree(self) -> int:
-        """Inliers among the check points."""
-        return int(self.withheld.sum())
-
-    @property
-    def n_check(self) -> int:
-        """Check points."""
-        return int(self.is_check.sum())
-
-    @property
-    def agreeing_share(self) -> float:
-        """Share of inliers among all ties."""
-        return float(self.estimate.agreeing.mean())
-
-    @property
-    def control_share(self) -> float:
-        """Share of inliers among the control points."""
-        return self.n_control / self.n_for_control
-
-    @property
     def chance(self) -> float:
         """Probability that as many check points agree with a wrong pose (binomial)."""
         from scipy.special import bdtrc  # scipy.stats would take seconds to import
@@ -380,23 +330,32 @@ class Candidate:
             places = np.floor(self.seen.pixels_photo[near] / _PLACE_PX)
             by_chance = min(0.5, math.pi * (share * limit * px) ** 2 / area)
             n_places = len(np.unique(places, axis=0))
-            found.append(float(bdtrc(n_places - 1, self.n_check, by_chance)))
+            found.append(float(bdtrc(n_places - 1, self.is_check.sum(), by_chance)))
         return len(found) * min(found)
+
+    @property
+    def control_share(self) -> float:
+        """Share of inliers among the control points."""
+        return float(self.estimate.agreeing[~self.is_check].mean())
 
     @property
     def check_over_control(self) -> float | None:
         """Ratio of the shares of inliers among check and control points."""
-        if self.n_check < _MIN_CHECKS:
+        if self.is_check.sum() < _MIN_CHECKS:
             return None
-        return self.n_agree / self.n_check / self.control_share
+        return float(self.estimate.agreeing[self.is_check].mean()) / self.control_share
 
     @property
     def check_rms_over_control(self) -> float | None:
         """Ratio of the RMS residuals of check and control points."""
-        if self.n_agree < _MIN_CHECKS:
+        if self.withheld.sum() < _MIN_CHECKS:
             return None
         squares = self.estimate.fit.normalised**2
         return math.sqrt(squares[self.withheld].mean() / squares[self.control].mean())
+
+    def in_cells(self, length_m: float) -> float | None:
+        """Convert a length on the wall to cells of its raster; None if these are unknown."""
+        return length_m / self.gsd_m if self.gsd_m else None
 
     @cached_property
     def poor_quarter(self) -> tuple[int, str] | None:
@@ -428,11 +387,6 @@ class Candidate:
         return None
 
     @property
-    def n_in_poor_quarter(self) -> int | None:
-        """Number of ties in a quarter with too few."""
-        return None if self.poor_quarter is None else self.poor_quarter[0]
-
-    @property
     def before_wall_m(self) -> float | None:
         """Smallest distance before a wall with control points and a known side."""
         centre = self.estimate.resection.camera.centre_world
@@ -446,11 +400,6 @@ class Candidate:
             default=None,
         )
 
-    @property
-    def shows_wall(self) -> bool:
-        """Whether it shows a wall at all."""
-        return self.error is not None
-
     @cached_property
     def hull_ratio(self) -> float:
         """Area of the control's hull over that of its walls in the photo; 0 without walls."""
@@ -458,16 +407,6 @@ class Candidate:
             return 0.0
         footprint = hull_area(self.error.footprint_px)
         return hull_area(self.seen.pixels_photo[self.control]) / max(footprint, 1.0)
-
-    @property
-    def sigma_cells(self) -> float | None:
-        """Predicted error on the wall, in its cells."""
-        return self.error.rms_m / self.gsd_m if self.error and self.gsd_m else None
-
-    @property
-    def worst_cells(self) -> float | None:
-        """Predicted error at the worst place of the wall, in its cells."""
-        return self.error.worst_m / self.gsd_m if self.error and self.gsd_m else None
 
     @cached_property
     def needed_tie(self) -> tuple[float, NDArray[np.float64]] | None:
@@ -483,11 +422,6 @@ class Candidate:
         pixels = self.seen.pixels_photo[self.estimate.agreeing]
         return float(np.nan_to_num(cells[worst], nan=math.inf)), to_opencv(pixels[worst])
 
-    @property
-    def cells_without_one(self) -> float | None:
-        """Largest predicted error, in cells, without one of few ties."""
-        return None if self.needed_tie is None else self.needed_tie[0]
-
     def _quarters(self, pixels: NDArray[np.float64]) -> NDArray[np.intp]:
         return image_cells(pixels, (self.photo.width, self.photo.height), 2)
 
@@ -498,117 +432,143 @@ class Gate:
 
     Attributes:
         name: for the record.
-        value: attribute of a `Candidate`; None passes.
-        at_least: smallest value that passes, or the parameter with it.
-        at_most: largest one, likewise.
+        value: that is tested; None passes.
+        limit: the smallest value that passes, or the parameter with it.
+        is_upper: whether the limit is the largest value instead.
         source: of the limit.
-        text: reason of a refusal, a template of the candidate `c` and the `limit`.
+        reason: of a refusal, by the candidate, its value and the limit.
     """
 
     name: str
-    value: str
-    at_least: float | str | None = None
-    at_most: float | str | None = None
+    value: Callable[[Candidate], float | None]
+    limit: float | str
+    is_upper: bool = False
     source: str
-    text: str
+    reason: Callable[[Candidate, float, float], str]
+
+
+def _checks(c: Candidate) -> str:
+    return f"{c.withheld.sum()} of {c.is_check.sum()} check points agree with the pose"
 
 
 CONTROL_GATES: Final = (
     Gate(
         name="control",
-        value="n_control",
-        at_least=12,
+        value=lambda c: int(c.control.sum()),
+        limit=12,
         source="twice the unknowns of a pose",
-        text="only {c.n_control} of {c.n_for_control} control points agree with one pose, at least "
-        "{limit} must",
+        reason=lambda c, value, limit: (
+            f"only {value} of {(~c.is_check).sum()} control points agree with one pose, at least "
+            f"{limit} must"
+        ),
     ),
     Gate(
         name="share",
-        value="agreeing_share",
-        at_least=0.04,
+        value=lambda c: float(c.estimate.agreeing.mean()),
+        limit=0.04,
         source="robust sampling finds a pose among these outliers (benchmarks/robust_pose.py)",
-        text="only {c.agreeing_share:.1%} of {c.n_ties} ties agree with one pose, at least "
-        "{limit:.1%} must",
+        reason=lambda c, value, limit: (
+            f"only {value:.1%} of {len(c.seen)} ties agree with one pose, at least {limit:.1%} must"
+        ),
     ),
     Gate(
         name="chance",
-        value="chance",
-        at_most=1e-5,
+        value=lambda c: c.chance,
+        limit=1e-5,
+        is_upper=True,
         source="one wrong pose in a hundred thousand passes (binomial test)",
-        text="{c.n_agree} of {c.n_check} check points agree with the pose, as many as with a wrong "
-        "pose by chance",
+        reason=lambda c, *_: f"{_checks(c)}, as many as with a wrong pose by chance",
     ),
     Gate(
         name="check-share",
-        value="check_over_control",
-        at_least=0.5,
+        value=lambda c: c.check_over_control,
+        limit=0.5,
         source="with a right pose, check points agree as often as control points",
-        text="{c.n_agree} of {c.n_check} check points agree with the pose, but "
-        "{c.control_share:.0%} of the control points: the pose was fitted to chance",
+        reason=lambda c, *_: (
+            f"{_checks(c)}, but {c.control_share:.0%} of the control points: the pose was fitted "
+            "to chance"
+        ),
     ),
     Gate(
         name="check-rms",
-        value="check_rms_over_control",
-        at_most=2.0,
+        value=lambda c: c.check_rms_over_control,
+        limit=2.0,
+        is_upper=True,
         source="with a right pose, check points deviate as much as control points",
-        text="the check points deviate {c.check_rms_over_control:.1f} times as much as the control "
-        "points, at most {limit:g} times is plausible",
+        reason=lambda _, value, limit: (
+            f"the check points deviate {value:.1f} times as much as the control points, at most "
+            f"{limit:g} times is plausible"
+        ),
     ),
 )
 """Agreement of the ties."""
 
 _SIDE: Final = Gate(
     name="side",
-    value="before_wall_m",
-    at_least=0.0,
+    value=lambda c: c.before_wall_m,
+    limit=0.0,
     source="a photo shows the front of a wall",
-    text="the pose lies behind the wall it would show, so it must be wrong",
+    reason=lambda *_: "the pose lies behind the wall it would show, so it must be wrong",
 )
+
+
+def _too_inexact(of: str, c: Candidate, value: float, limit: float) -> str:
+    gsd_mm = 1000.0 * (c.gsd_m or math.nan)
+    return (
+        f"its predicted error {of} is {value * gsd_mm:.1f} mm, at most {limit:g} cells of "
+        f"{gsd_mm:g} mm are allowed"
+    )
+
+
 _ON_WALLS: Final = (
     Gate(
         name="accuracy",
-        value="sigma_cells",
-        at_most="max_sigma_wall_cells",
+        value=lambda c: c.in_cells(c.error.rms_m) if c.error else None,
+        limit="max_sigma_wall_cells",
+        is_upper=True,
         source="the job",
-        text="its predicted error on the wall is {c.error.rms_mm:.1f} mm, at most {limit:g} cells "
-        "of {c.gsd_mm:g} mm are allowed",
+        reason=partial(_too_inexact, "on the wall"),
     ),
     Gate(
         name="accuracy-at-worst",
-        value="worst_cells",
-        at_most="max_sigma_corner_cells",
+        value=lambda c: c.in_cells(c.error.worst_m) if c.error else None,
+        limit="max_sigma_corner_cells",
+        is_upper=True,
         source="the job",
-        text="its predicted error at the worst place of the wall is {c.error.worst_mm:.1f} mm, at "
-        "most {limit:g} cells of {c.gsd_mm:g} mm are allowed",
+        reason=partial(_too_inexact, "at the worst place of the wall"),
     ),
 )
 _SHOWN: Final = Gate(
     name="shown",
-    value="shows_wall",
-    at_least=True,
+    value=lambda c: c.error is not None,
+    limit=1.0,
     source="a photo that shows no wall paints nothing",
-    text="with this pose the photo would show no wall that its ties lie on",
+    reason=lambda *_: "with this pose the photo would show no wall that its ties lie on",
 )
 
 GATES: Final = (
     *CONTROL_GATES,
     Gate(
         name="quarters",
-        value="n_in_poor_quarter",
-        at_least="min_quadrant_ties",
+        value=lambda c: c.poor_quarter[0] if c.poor_quarter else None,
+        limit="min_quadrant_ties",
         source="markiewicz2015, 4.3",
-        text="a quarter of the photo has {c.poor_quarter[0]} ties, each needs "
-        "{limit}{c.poor_quarter[1]}",
+        reason=lambda c, value, limit: (
+            f"a quarter of the photo has {value} ties, each needs {limit:g}"
+            f"{c.poor_quarter[1] if c.poor_quarter else ''}"
+        ),
     ),
     _SIDE,
     _SHOWN,
     Gate(
         name="hull",
-        value="hull_ratio",
-        at_least="min_hull_ratio",
+        value=lambda c: c.hull_ratio,
+        limit="min_hull_ratio",
         source="the job",
-        text="the control covers {c.hull_ratio:.1%} of the part of the photo that shows the walls, "
-        "at least {limit:.1%} is required",
+        reason=lambda _, value, limit: (
+            f"the control covers {value:.1%} of the part of the photo that shows the walls, at "
+            f"least {limit:.1%} is required"
+        ),
     ),
     *_ON_WALLS,
 )
@@ -617,19 +577,27 @@ GATES: Final = (
 GATES_BEFORE_BLOCK: Final = (*CONTROL_GATES, _SIDE)
 """Gates before a bundle adjustment, in which other photos may improve the accuracy."""
 
+
+def _unchecked_tie(c: Candidate, value: float, limit: float) -> str:
+    u, v = (math.nan, math.nan) if c.needed_tie is None else c.needed_tie[1]
+    return (
+        f"without the tie at (u {u:.0f}, v {v:.0f}) its predicted error on the wall would be "
+        f"{value:.1f} cells of {1000.0 * (c.gsd_m or math.nan):g} mm, at most {limit:g} are "
+        "allowed: an error of that tie could not be detected; measure more, farther apart"
+    )
+
+
 GATES_BY_HAND: Final = (
     _SIDE,
     _SHOWN,
     *_ON_WALLS,
     Gate(
         name="each-other",
-        value="cells_without_one",
-        at_most="max_sigma_corner_cells",
+        value=lambda c: c.needed_tie[0] if c.needed_tie else None,
+        limit="max_sigma_corner_cells",
+        is_upper=True,
         source="the job",
-        text="without the tie at (u {c.needed_tie[1][0]:.0f}, v {c.needed_tie[1][1]:.0f}) its "
-        "predicted error on the wall would be {c.cells_without_one:.1f} cells of {c.gsd_mm:g} mm, "
-        "at most {limit:g} are allowed: an error of that tie could not be detected; measure more, "
-        "farther apart",
+        reason=_unchecked_tie,
     ),
 )
 """Gates of a pose from ties measured by hand."""
@@ -648,12 +616,11 @@ def refusal(candidate: Candidate, gates: Sequence[Gate] | None = None) -> tuple[
     if gates is None:
         gates = GATES_BY_HAND if candidate.estimate.without_one else GATES
     for gate in gates:
-        limit = gate.at_most if gate.at_least is None else gate.at_least
+        limit, value = gate.limit, gate.value(candidate)
         if isinstance(limit, str):
-            limit = getattr(candidate.params, limit)
-        value = getattr(candidate, gate.value)
-        if value is not None and (value > limit if gate.at_least is None else value < limit):
-            return gate.name, gate.text.format(c=candidate, limit=limit)
+            limit = float(getattr(candidate.params, limit))
+        if value is not None and (value > limit if gate.is_upper else value < limit):
+            return gate.name, gate.reason(candidate, value, limit)
     return None
 
 

@@ -204,12 +204,11 @@ def _starts(seen: SeenPoints, lens: ViewingCamera) -> list[ViewingCamera]:
             )
         except cv2.error:  # the points have no such solution
             continue
-        for turn, shift in zip(turns[:n_found], shifts[:n_found], strict=True):
-            rotation = np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64)
-            if not np.isfinite(rotation).all():
-                continue
-            local = replace(lens, rotation=rotation, translation=np.asarray(shift).ravel())
-            starts.append(local.shifted(-middle))
+        starts += [
+            lens.at_opencv_pose(turn, shift, middle)
+            for turn, shift in zip(turns[:n_found], shifts[:n_found], strict=True)
+            if np.isfinite(turn).all()
+        ]
     return starts
 
 

@@ -127,6 +127,4 @@ def _solved(seen: SeenPoints, lens: ViewingCamera) -> ViewingCamera:
         raise GeometryError(f"solvePnP gave up ({error.err})") from error
     if not found:
         raise GeometryError("solvePnP finds no pose")
-    rotation = np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64)
-    posed = replace(lens, rotation=rotation, translation=np.asarray(shift).ravel())
-    return posed.shifted(-middle)
+    return lens.at_opencv_pose(turn, shift, middle)

@@ -150,7 +150,6 @@ class OrientParams(MethodParams):
 
 
 Sharing = Literal["focal-group", "shared", "per-photo"]
-Refined = Literal["uncalibrated", "all", "none"]
 UNKNOWN: Final = "none"
 """Source of a lens with neither calibration nor EXIF."""
 MAX_ROUNDS: Final = 8
@@ -185,11 +184,6 @@ _MANY_MORE: Final = 1.2
 _OTHER_LENS: Final = LensFreedom(focal_sigma=0.35, k1_sigma=0.1)
 _EXIF_FACTORS: Final = (1.0, 0.94, 1.06)
 _UNKNOWN_FACTORS: Final = (0.75, 0.9375, 1.1875, 1.5, 2.0, 2.75)
-# Prior standard deviations of a calibration that is refined.
-_CALIBRATED: Final = LensFreedom(
-    focal_sigma=0.01, k1_sigma=0.02, k2_sigma=0.04, tangential_sigma=1e-3
-)
-_CALIBRATED_CENTRE_SHARE: Final = 0.003
 _UNDONE: Final = 1e-9
 
 
@@ -228,7 +222,6 @@ def lens_groups(
     photos: Sequence[Photo],
     cameras: Sequence[ViewingCamera],
     sharing: Sharing,
-    refined: Refined,
     apart: Set[int] = frozenset(),
 ) -> tuple[tuple[int, ...], tuple[Lens, ...]]:
     """Group photos by lens.
@@ -238,7 +231,6 @@ def lens_groups(
         cameras: oriented photo by photo; the start of lenses without a prior.
         sharing: `focal-group`: photos of one size and one stated focal length share a lens, or
             those of one size without any; `shared`: all of one size; `per-photo`: none.
-        refined: which lenses are adjusted.
         apart: photos with a lens of their own in any case.
 
     Returns:
@@ -254,16 +246,10 @@ def lens_groups(
     for index, some in enumerate(members.values()):
         priors = [lens_prior(photos[at]) for at in some]
         lens = min(priors, key=lambda each: each.freedom.focal_sigma)
-        prior, freedom = lens.prior, lens.freedom
         if lens.source == UNKNOWN:
             focal_px = float(np.median([cameras[at].fx for at in some]))
-            prior = replace(prior, fx=focal_px, fy=focal_px)
-        if not freedom.sigmas.size and refined == "all":
-            centre_px = _CALIBRATED_CENTRE_SHARE * max(prior.width, prior.height)
-            freedom = replace(_CALIBRATED, centre_sigma_px=centre_px)
-        elif refined == "none":
-            freedom = LensFreedom()
-        lenses.append(Lens(prior=prior, freedom=freedom, source=lens.source))
+            lens = replace(lens, prior=replace(lens.prior, fx=focal_px, fy=focal_px))
+        lenses.append(lens)
         for at in some:
             lens_of[at] = index
     return tuple(lens_of), tuple(lenses)
@@ -595,8 +581,6 @@ def _robust_pose(
         return None
     if not found or agreed is None:
         return None
-    rotation = np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64)
-    local = replace(lens, rotation=rotation, translation=np.asarray(shift).ravel())
     agreeing = np.zeros(len(inside), dtype=np.bool_)
     agreeing[np.flatnonzero(inside)[np.asarray(agreed).ravel()]] = True
-    return local.shifted(-middle), agreeing
+    return lens.at_opencv_pose(turn, shift, middle), agreeing

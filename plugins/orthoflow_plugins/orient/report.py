@@ -133,8 +133,8 @@ def numbers_json(candidate: Candidate) -> dict[str, JsonValue]:
         **estimate.numbers,
     }
     if error is not None:
-        entry["sigma_wall_mm"] = error.rms_mm
-        entry["sigma_wall_worst_mm"] = error.worst_mm
+        entry["sigma_wall_mm"] = 1000.0 * error.rms_m
+        entry["sigma_wall_worst_mm"] = 1000.0 * error.worst_m
         corners_mm = (1000.0 * error.corners_m).tolist()
         entry["sigma_image_corners_mm"] = [mm if math.isfinite(mm) else None for mm in corners_mm]
     if result.lens.focal_sigma > 0.0:
@@ -146,7 +146,7 @@ def residual_table(candidate: Candidate) -> list[ResidualRow]:
     """Return the rows of the table of residuals, control and check apart."""
     units = {"px": 1.0, "mm": pixel_mm(candidate)}
     if candidate.gsd_m is not None:
-        units["cell"] = units["mm"] / candidate.gsd_mm
+        units["cell"] = units["mm"] / (1000.0 * candidate.gsd_m)
     residuals_px, name = candidate.estimate.fit.residuals_px, candidate.photo.name
     return [
         *residual_rows(name, "control", residuals_px[candidate.control], units),

@@ -179,7 +179,7 @@ def test_the_papers_mask_keeps_best_matches_from_going_astray(tmp_path: Path) ->
     camera = ms.camera_before(SCENE, centre=(1.0, -1.3, 1.0), towards=(1.0, 0.0, 1.0))
     inputs = {"photos": ms.photos(ms.photo_of(SCENE, camera)), "walls": mw.walls(2)}
     wrong, n_right = {}, {}
-    for ratio in (None, 0.8):
+    for ratio in (1.0, 0.8):
         settings = {"preset": "paper", "ratio": ratio}
         plain = mw.ties_of(MatchSift, tmp_path, inputs, **settings)
         masked = guided(*inputs.values(), rough(camera), tmp_path, **settings)
@@ -188,12 +188,12 @@ def test_the_papers_mask_keeps_best_matches_from_going_astray(tmp_path: Path) ->
             is_wrong = ~(np.linalg.norm(off, axis=1) < 6.0)
             wrong[name, ratio], n_right[name, ratio] = is_wrong.mean(), int((~is_wrong).sum())
     # Measured: 587 right ones of any ratio, and 542 with one, in both ways.
-    assert n_right["masked", None] > 0.9 * n_right["plain", None] > 100
-    assert n_right["masked", 0.8] > 0.9 * n_right["plain", 0.8] > 0.8 * n_right["plain", None]
+    assert n_right["masked", 1.0] > 0.9 * n_right["plain", 1.0] > 100
+    assert n_right["masked", 0.8] > 0.9 * n_right["plain", 0.8] > 0.8 * n_right["plain", 1.0]
     # Measured: 83 % and 33 % wrong without a ratio, 7 % and 1 % with that of openMVG.
-    assert wrong["plain", None] > 0.5
-    assert wrong["masked", None] < 0.6 * wrong["plain", None]
-    assert wrong["plain", 0.8] < 0.2 * wrong["plain", None]
+    assert wrong["plain", 1.0] > 0.5
+    assert wrong["masked", 1.0] < 0.6 * wrong["plain", 1.0]
+    assert wrong["plain", 0.8] < 0.2 * wrong["plain", 1.0]
     assert wrong["masked", 0.8] < 0.6 * wrong["plain", 0.8]
     right = np.linalg.norm(off, axis=1) < 2.0
     np.testing.assert_allclose(off[right].mean(axis=0), 0.0, atol=0.1)

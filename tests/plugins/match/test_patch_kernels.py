@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from orthoflow_plugins.match.channels import Channels
 from orthoflow_plugins.match.displacements import (
     match_patches,
-    search_mixtures,
     search_shifts,
 )
 
@@ -195,7 +194,7 @@ def test_gains_are_ridge_regression_and_the_score_is_corrected_for_what_they_fit
     wall = colours @ [0.8, -0.5, 0.3] + noise * rng.normal(size=(SIDE, SIDE)) + 7.0
     first, second = wall[..., None].astype(np.float32), colours.astype(np.float32)
     found = np.zeros((1, 7))
-    search_mixtures(first, second, np.array([[21, 23]]), (half, 0), found)
+    search_shifts(first, second, np.array([[21, 23]]), (half, 0), found)
     # Every second cell of the patch.
     cells = np.ix_(23 + np.arange(-half, half + 1, 2), 21 + np.arange(-half, half + 1, 2))
     a = first[cells].reshape(-1).astype(np.float64)

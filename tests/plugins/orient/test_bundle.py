@@ -207,7 +207,7 @@ def test_the_noise_of_ties_between_photos_is_found() -> None:
     )
     known = [item for item in trusted if isinstance(item, Trusted)]
     cameras = [item.estimate.resection.camera for item in known]
-    groups = lens_groups(shots, cameras, "focal-group", "uncalibrated")
+    groups = lens_groups(shots, cameras, "focal-group")
     found = adjust_block(known, between, groups, params)
     assert found.tie_sigma_px == pytest.approx(0.8, rel=0.1)
 

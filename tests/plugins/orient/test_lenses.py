@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from orthoflow_plugins.orient import pose as lenses
-from orthoflow_plugins.orient.pose import Refined, Sharing
+from orthoflow_plugins.orient.pose import Sharing
 
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import Intrinsics, Photo
@@ -18,6 +18,7 @@ CALIBRATED = Intrinsics(
     width=600, height=400, fx=510.0, fy=512.0, cx=303.0, cy=197.0,
     distortion=(-0.1, 0.02, 1e-4, 2e-4, 0.0),
 )  # fmt: skip
+OF_EXIF = [0.05, 1e-3, 6.0, 6.0, 0.1, 0.1, 1e-3, 1e-3]
 FREE = ("focal", "aspect", "cx", "cy", "k1", "k2", "p1", "p2")
 
 
@@ -76,9 +77,7 @@ def test_photos_share_a_lens_by_size_and_known_focal_length(
         photo("e"),
         photo("f", exif_focal_px=500.0, size=(400, 600)),
     ]
-    lens_of_photos, found = lenses.lens_groups(
-        photos, oriented(*[500.0] * 6), sharing, "uncalibrated"
-    )
+    lens_of_photos, found = lenses.lens_groups(photos, oriented(*[500.0] * 6), sharing)
     assert lens_of_photos == lens_of
     assert len(found) == max(lens_of) + 1
 
@@ -88,38 +87,22 @@ def test_photos_that_are_set_apart_share_no_lens() -> None:
     photos = [photo("a"), photo("b"), photo("c"), photo("d", exif_focal_px=1.0)]
     cameras = oriented(*[500.0] * 4)
     for sharing, lens_of in (("focal-group", (0, 1, 0, 2)), ("shared", (0, 1, 0, 0))):
-        assert lenses.lens_groups(photos, cameras, sharing, "uncalibrated", {1})[0] == lens_of
+        assert lenses.lens_groups(photos, cameras, sharing, {1})[0] == lens_of
 
 
 def test_of_photos_that_share_a_lens_the_best_known_one_tells_it() -> None:
     photos = [photo("a"), photo("b", exif_focal_px=520.0), photo("c", intrinsics=CALIBRATED)]
     cameras = oriented(480.0, 500.0, 510.0)
     for n_photos, source, focal_px in ((3, "calibration", 510.0), (2, "exif", 520.0)):
-        _, found = lenses.lens_groups(
-            photos[:n_photos], cameras[:n_photos], "shared", "uncalibrated"
-        )
+        _, found = lenses.lens_groups(photos[:n_photos], cameras[:n_photos], "shared")
         (lens,) = found
         assert (lens.source, lens.prior.fx) == (source, focal_px)
 
 
-OF_EXIF = [0.05, 1e-3, 6.0, 6.0, 0.1, 0.1, 1e-3, 1e-3]
-
-
-@pytest.mark.parametrize(
-    ("refined", "exif_sigmas", "calibrated_sigmas"),
-    [
-        ("uncalibrated", OF_EXIF, []),
-        ("all", OF_EXIF, [0.01, 1.8, 1.8, 0.02, 0.04, 1e-3, 1e-3]),
-        ("none", [], []),
-    ],
-)
-def test_lenses_are_refined_as_asked_for(
-    refined: Refined, exif_sigmas: list[float], calibrated_sigmas: list[float]
-) -> None:
+def test_calibrated_lenses_are_held() -> None:
     photos = [photo("a", exif_focal_px=500.0), photo("b", intrinsics=CALIBRATED)]
-    _, found = lenses.lens_groups(photos, oriented(500.0, 510.0), "per-photo", refined)
-    np.testing.assert_allclose(found[0].freedom.sigmas, exif_sigmas)
-    np.testing.assert_allclose(found[1].freedom.sigmas, calibrated_sigmas)
+    _, found = lenses.lens_groups(photos, oriented(500.0, 510.0), "per-photo")
+    assert [lens.freedom.sigmas.tolist() for lens in found] == [OF_EXIF, []]
 
 
 def test_a_pixel_beyond_what_a_lens_bends_has_no_ray() -> None:
