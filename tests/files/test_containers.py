@@ -258,7 +258,7 @@ def test_flipped_bits_that_no_decoder_notices_shift_what_is_behind_them() -> Non
     for kind in ("baseline", "optimised", "grey", "cmyk"):
         whole = decode_image(JPEGS[kind])
         assert shifted_row(JPEGS[kind], whole) is None
-        for seed in range(25):
+        for seed in range(15):
             encoded = flipped(JPEGS[kind], seed)
             if damage(encoded)[0]:
                 continue
@@ -268,7 +268,7 @@ def test_flipped_bits_that_no_decoder_notices_shift_what_is_behind_them() -> Non
                 visible += 1
                 row = shifted_row(encoded, image)
                 found += row is not None and abs(row - np.argmax(is_off.any(axis=1))) <= 32
-    assert visible >= 10
+    assert visible >= 6
     assert found >= 0.8 * visible
 
 

@@ -156,14 +156,6 @@ def rename(file: h5py.File, random: Random) -> None:
     group.id.links.move(name, group.id, random.choice(NAMES))
 
 
-def copy(file: h5py.File, random: Random) -> None:
-    source, target = random.choice(objects(file)[1:]), random.choice(groups(file))
-    if f"{target.name}/".startswith(f"{source.name}/"):
-        # The library would never come to an end.
-        return
-    file.copy(source, target, name=random.choice(("copy", "survey", "paint", "0001", "content")))
-
-
 def remove(file: h5py.File, random: Random) -> None:
     del file[random.choice(objects(file)[1:]).name]
 
@@ -195,7 +187,7 @@ def publish(file: h5py.File, random: Random) -> None:
 CHANGES: tuple[Callable[[h5py.File, Random], None], ...] = (
     *(change_attribute,) * 4,
     *(change_dataset,) * 5,
-    *(rename, copy, remove),
+    *(rename, remove),
     *(change_document,) * 8,
     publish,
     flood,

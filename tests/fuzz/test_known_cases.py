@@ -133,7 +133,7 @@ KNOWN: Final = {
         "expected at most 1000 entries, got 2001"),
     "a merge loop": ("CALIBRATION", "c.yaml", "cameras:\n  a: &a\n    <<: *a\n    width: 1\n",
         "contains itself"),
-    "300,000 check points": ("CHECKPOINTS", "p.csv", "a,1,2,3\n" * 300_000,
+    "100,001 check points": ("CHECKPOINTS", "p.csv", "a,1,2,3\n" * 100_001,
         "more than 100000 points: split it"),
     # Sidecars.
     "deep JSON": ("SIDECAR", "wall.json", "[" * 50_000, "no JSON, it is nested"),

@@ -34,11 +34,10 @@ def level_of(folder: Path, number: int) -> np.ndarray:
     return np.vstack([np.hstack([tiles[r, c] for c in range(columns)]) for r in range(rows)])
 
 
-@pytest.mark.parametrize("tile_px", [512, 128])
 def test_every_level_shows_the_whole_orthoimage(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tile_px: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pyramid, "TILE_PX", tile_px)
+    monkeypatch.setattr(pyramid, "TILE_PX", 300)
     wall, _ = room(tmp_path / "files")
     n_tiles = write_tiles(tmp_path, "wall", wall)
     folder = tmp_path / "wall_files"
@@ -65,6 +64,7 @@ def test_every_level_shows_the_whole_orthoimage(
         assert np.abs(part - whole).mean() < 4.0
 
 
+@pytest.mark.long
 def test_the_page_shows_and_measures_without_a_server(
     new_page: Callable[[], Page], tiled: Path, tmp_path: Path
 ) -> None:
