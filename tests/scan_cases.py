@@ -85,11 +85,12 @@ class Case:
 class Draw:
     """Choices of a case by seed; of seed 0 the first of everything."""
 
-    def __init__(self, seed: int, folder: Path) -> None:
+    def __init__(self, seed: int, folder: Path, n_points: int | None = None) -> None:
         self.folder = folder
         self.rng = np.random.default_rng(seed)
         self.is_first = seed == 0
-        self.scene = paint(self.rng, 900 if self.is_first else int(self.rng.integers(500, 1500)))
+        drawn = 900 if self.is_first else int(self.rng.integers(500, 1500))
+        self.scene = paint(self.rng, n_points or drawn)
 
     def one_of(self, *choices: T) -> T:
         return choices[0] if self.is_first else choices[int(self.rng.integers(len(choices)))]

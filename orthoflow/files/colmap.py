@@ -49,6 +49,9 @@ _FISHEYES: Final = frozenset(
 COLMAP_PARTS: Final = ("cameras", "images", "rigs", "frames")
 _OBSERVATION_BYTES: Final = 24
 _POSE_BYTES: Final = 64
+_DATUM_BYTES: Final = 16
+_SENSOR_BYTES: Final = 8
+_RIGID_BYTES: Final = 56
 _WORDS_OF_IMAGE: Final = 10
 _MAX_SAID: Final = 90
 _UNDISTORT: Final = "undistort the model with COLMAP (image_undistorter), or refine it as OPENCV"
@@ -176,7 +179,8 @@ def read_colmap_model(parts: Sequence[Path]) -> tuple[GivenCamera, ...]:
         with reading(path, MOST_MODEL_BYTES, "a file of cameras"):
             pass
     if suffix == ".bin":
-        _require_whole(images)
+        for path in parts:
+            _require_whole(path)
     with tempfile.TemporaryDirectory() as folder:
         for path in parts:
             (Path(folder) / f"{path.stem.lower()}{suffix}").symlink_to(path.absolute())
@@ -205,24 +209,41 @@ def read_colmap_model(parts: Sequence[Path]) -> tuple[GivenCamera, ...]:
     )
 
 
-def _require_whole(images: Path) -> None:
-    """Refuse binary images that end early, or state more points than their bytes can hold.
+def _require_whole(path: Path) -> None:
+    """Refuse a binary part that ends early, or states more than its bytes can hold.
 
-    pycolmap allocates memory for as many as are stated.
+    pycolmap allocates memory for as many as are stated, and loops over them past the end.
     """
-    content = images.read_bytes()
-    at, count = 8, int.from_bytes(content[:8], "little")
-    for _ in range(min(count, len(content))):
-        at = content.find(b"\0", at + _POSE_BYTES) + 1
-        if at <= 0:
-            break
-        at += 8 + _OBSERVATION_BYTES * int.from_bytes(content[at : at + 8], "little")
+    end_of = {"images": _end_of_image, "rigs": _end_of_rig, "frames": _end_of_frame}
+    content, at = path.read_bytes(), 8
+    count = int.from_bytes(content[:at], "little")
+    if path.stem.lower() in end_of:
+        for _ in range(min(count, len(content))):
+            at = end_of[path.stem.lower()](content, at)
+            if at > len(content):
+                break
+    if at > len(content) or count > len(content):
+        raise damaged(path, "it ends too early, it is cut off")
+
+
+def _end_of_image(content: bytes, at: int) -> int:
+    at = content.find(b"\0", at + _POSE_BYTES) + 1 or len(content)
+    return at + 8 + _OBSERVATION_BYTES * int.from_bytes(content[at : at + 8], "little")
+
+
+def _end_of_frame(content: bytes, at: int) -> int:
+    at += _POSE_BYTES
+    return at + 4 + _DATUM_BYTES * int.from_bytes(content[at : at + 4], "little")
+
+
+def _end_of_rig(content: bytes, at: int) -> int:
+    n_sensors = int.from_bytes(content[at + 4 : at + 8], "little")
+    at += 8 + _SENSOR_BYTES * min(n_sensors, 1)
+    for _ in range(n_sensors - 1):
+        at += _SENSOR_BYTES + 1 + _RIGID_BYTES * any(content[at + _SENSOR_BYTES :][:1])
         if at > len(content):
             break
-    else:
-        if len(content) >= 8 and count <= len(content):
-            return
-    raise damaged(images, "it ends too early, it is cut off")
+    return at
 
 
 def _whole_names(images: Path) -> dict[int, str]:

@@ -338,8 +338,6 @@ CAMERA = f"1 PINHOLE {WIDTH} {HEIGHT} 500 500 320 240\n"
         ({"cameras.txt": CAMERA, "images.txt": "1 0 0 0 0 0 0 0 1 a.jpg\n\n"}, "a.jpg"),
         ({"cameras.txt": CAMERA, "images.txt": "# none\n"}, "the model has no images"),
         ({"cameras.txt": CAMERA, "images.txt": b"1 1 0 0 0 0 0 0 1 \xab.jpg\n\n"}, "is not UTF-8"),
-        ({"cameras.bin": b"\0" * 8, "images.bin": b"\1" + b"\0" * 7 + b"x" * 64},
-         "images.bin: it ends too early"),
     ],
 )  # fmt: skip
 def test_colmap_models_that_make_no_sense_are_refused(
@@ -348,6 +346,27 @@ def test_colmap_models_that_make_no_sense_are_refused(
     with pytest.raises(InputError, match=message) as caught:
         read_given_cameras(write(tmp_path, files))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("part", ["images", "rigs", "frames"])
+@pytest.mark.parametrize("is_first", [True, False])
+def test_binary_models_that_state_more_than_they_hold_are_refused(
+    tmp_path: Path, part: str, is_first: bool
+) -> None:
+    paths, _ = colmap_model(tmp_path, "PINHOLE", PARAMS["PINHOLE"], "bin")
+    damaged = next(path for path in paths if path.stem == part)
+    content = bytearray(damaged.read_bytes())
+    # Of all, then those of the first: sensors, data; an image ends within its pose.
+    if is_first:
+        content[:4] = bytes([255] * 4)
+    elif part == "images":
+        del content[60:]
+    else:
+        at = {"rigs": 12, "frames": 72}[part]
+        content[at : at + 4] = bytes([255] * 4)
+    damaged.write_bytes(content)
+    with pytest.raises(InputError, match=f"{part}.bin: it ends too early, it is cut off"):
+        read_given_cameras(paths)
 
 
 @pytest.mark.parametrize("turned", [1e-5, 1e-3])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import struct
 import tempfile
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -12,6 +11,7 @@ from random import Random
 from typing import Final
 
 import numpy as np
+import pycolmap
 from orthoflow_plugins.read.cameras import ReadCameras
 from orthoflow_plugins.read.photos import ReadPhotos
 from orthoflow_plugins.read.ties import ReadTies
@@ -26,12 +26,12 @@ from orthoflow.sdk import Method
 from orthoflow.testing.trials import Trial, run_trial
 from orthoflow.workflow.draft import draft_workflow, recognised
 from tests import photo_files, scan_files
+from tests.files import test_metashape as agisoft
 from tests.fuzz.harness import Target
 from tests.fuzz.mutation import mutate_bytes, mutate_e57, mutate_json, mutate_png, mutate_text
 
 _WIDTH, _HEIGHT = 64, 48
 _PHOTOS: Final = ("a.jpg", "b.jpg")
-_POSE: Final = (*np.eye(4)[:3].ravel(), 0.0, 0.0, 0.0, 1.0)
 
 
 def _photos() -> Photos:
@@ -50,32 +50,23 @@ def _read(method: type[Method], paths: Sequence[Path], **more: Product) -> objec
 
 # Cameras ------------------------------------------------------------------------------------------
 
-_METASHAPE: Final = f"""\
-<?xml version="1.0" encoding="UTF-8"?>
-<document version="1.5.0"><chunk label="Chunk 1">
-<sensors>
-<sensor id="0" label="NIKON" type="frame"><resolution width="64" height="48"/>
-<calibration type="frame" class="adjusted"><resolution width="64" height="48"/>
-<f>60.5</f><cx>0.5</cx><cy>-0.25</cy><k1>-0.1</k1><p1>0.001</p1><b1>0.01</b1></calibration></sensor>
-<sensor id="1" label="360" type="spherical"><resolution width="256" height="128"/></sensor>
-</sensors>
-<components><component id="0"><transform><rotation>1 0 0 0 1 0 0 0 1</rotation>
-<translation>4e5 5e6 100</translation><scale>1.5</scale></transform></component></components>
-<cameras>
-<camera id="0" sensor_id="0" component_id="0" label="a.jpg">
-<transform>{" ".join(map(str, _POSE))}</transform></camera>
-<group><camera id="1" sensor_id="1" label="b.jpg">
-<transform>{" ".join(map(str, _POSE))}</transform></camera></group>
-</cameras></chunk></document>
-"""
+_OF_FIRST, _OF_SECOND = 'sensor_id="0"', 'sensor_id="1"'
+_METASHAPE: Final = agisoft.document(
+    sensors=agisoft.sensor_of(agisoft.TERMS)
+    + '<sensor id="1" label="360" type="spherical"><resolution width="256" height="128"/></sensor>',
+    chunk="<components><component id='0'><transform><rotation>1 0 0 0 1 0 0 0 1</rotation>"
+    "<translation>4e5 5e6 100</translation><scale>1.5</scale></transform></component></components>",
+    cameras=agisoft.posed("a.jpg", more=' component_id="0"')
+    + f"<group>{agisoft.posed('b.jpg').replace(_OF_FIRST, _OF_SECOND)}</group>",
+).replace('width="640" height="480"', 'width="64" height="48"')
 _BUNDLER: Final = (
     "# Bundle file v0.3\n2 0\n60.5 -0.1 0.01\n1 0 0\n0 1 0\n0 0 1\n0.5 1.5 2.5\n" + 5 * "0 0 0\n"
 )
-_REALITYCAPTURE: Final = """\
-#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2
-a.jpg,1.5,2.5,3.5,90,85,0.5,34.0,0.001,-0.002,-0.05,0.01,0,0,0,0
-b.jpg,2.5,2.5,3.5,-90,85,0.5,34.0,0.001,-0.002,-0.05,0.01,0,0,0,0
-"""
+_REALITYCAPTURE: Final = (
+    "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n"
+    "a.jpg,1.5,2.5,3.5,90,85,0.5,34.0,0.001,-0.002,-0.05,0.01,0,0,0,0\n"
+    "b.jpg,2.5,2.5,3.5,-90,85,0.5,34.0,0.001,-0.002,-0.05,0.01,0,0,0,0\n"
+)
 
 
 def _given() -> Cameras:
@@ -91,20 +82,12 @@ def _given() -> Cameras:
     return Cameras(cameras=(first, Camera(photo=_PHOTOS[1], status="no wall is recognised in it")))
 
 
-def _binary_model() -> tuple[bytes, bytes]:
-    lens = struct.pack("<IiQQ8d", 7, 4, _WIDTH, _HEIGHT, 60.5, 61.0, 32, 24, -0.1, 0.01, 0, 0)
-    pose = struct.pack("<I7dI", 1, 1.0, 0.0, 0.0, 0.0, 0.5, 1.5, 2.5, 7)
-    observed = struct.pack("<Q", 2) + struct.pack("<ddq", 1.5, 2.5, -1) * 2
-    count = struct.pack("<Q", 1)
-    return count + lens, count + pose + _PHOTOS[0].encode() + b"\0" + observed
-
-
 def _camera_files(folder: Path) -> None:
     publish_cameras(_given(), folder, "sha256:0")
     write_colmap_model(folder, _given())
-    (folder / "points3D.txt").unlink()
-    for name, content in zip(("cameras.bin", "images.bin"), _binary_model(), strict=True):
-        (folder / name).write_bytes(content)
+    pycolmap.Reconstruction(str(folder)).write_binary(str(folder))
+    for suffix in ("txt", "bin"):
+        (folder / f"points3D.{suffix}").unlink()
     (folder / "metashape.xml").write_text(_METASHAPE)
     (folder / "bundle.out").write_text(_BUNDLER)
     (folder / "list.txt").write_text("walls/a.jpg 0 60.5\nwalls/b.jpg\n")
@@ -114,7 +97,7 @@ def _camera_files(folder: Path) -> None:
 # What must lie beside a file for it to be read.
 _TOGETHER: Final = (
     ("cameras.txt", "images.txt", "rigs.txt", "frames.txt"),
-    ("cameras.bin", "images.bin"),
+    ("cameras.bin", "images.bin", "rigs.bin", "frames.bin"),
     ("bundle.out", "list.txt"),
 )
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
+import tempfile
+from collections.abc import Callable
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Final
 
@@ -47,6 +51,7 @@ from tests.fuzz.mutation import (
     mutate_yaml,
 )
 from tests.report_runs import environment
+from tests.scan_cases import CASES, Draw
 
 _N: Final = 40
 
@@ -84,12 +89,6 @@ def _rgb() -> NDArray[np.int64]:
 
 def _intensity() -> NDArray[np.int64]:
     return np.random.default_rng(3).integers(0, 65536, _N)
-
-
-def _fields() -> dict[str, NDArray[np.generic]]:
-    named = dict(zip("xyz", _points().T.astype(np.float32), strict=True))
-    channels = zip(("red", "green", "blue"), _rgb().T.astype(np.uint8), strict=True)
-    return {**named, "intensity": _intensity().astype(np.float32), **dict(channels)}
 
 
 def _e57_files(folder: Path) -> None:
@@ -131,51 +130,31 @@ def _copc_files(folder: Path) -> None:
     (folder / "two.las").unlink()
 
 
-def _ply_files(folder: Path) -> None:
-    for encoding in ("ascii", "binary_little_endian", "binary_big_endian"):
-        scan_files.write_ply(folder / f"{encoding}.ply", _fields(), encoding=encoding)
-    scan_files.write_ply(
-        folder / "faces_first.ply",
-        _fields(),
-        before="element strip 2\nproperty list uchar int vertex_indices",
-        before_data=b"\x01\0\0\0\0\x02\0\0\0\0\0\0\0\0",
-    )
+def _cases(*names: str) -> Callable[[Path], None]:
+    """Writes small files of `scan_cases`, four of each, as the seeds draw them."""
+
+    def write(folder: Path) -> None:
+        for name, seed in product(names, range(4)):
+            with tempfile.TemporaryDirectory() as made:
+                case = CASES[name](Draw(seed, Path(made), n_points=_N))
+                for k, path in enumerate(case.paths):
+                    shutil.copy(path, folder / f"{name}_{seed}_{k}{path.suffix}")
+
+    return write
 
 
-def _pcd_files(folder: Path) -> None:
-    fields = {name: _fields()[name] for name in ("x", "y", "z", "intensity")}
-    fields["rgb"] = np.arange(_N, dtype=np.uint32)
-    for data in ("ascii", "binary", "binary_compressed"):
-        scan_files.write_pcd(folder / f"{data}.pcd", fields, data=data, width=8)
-
-
-def _ptx_files(folder: Path) -> None:
-    shade = np.linspace(0.0, 1.0, _N)[:, None]
-    table = np.hstack([_points(), shade, _rgb().astype(np.float64)])
-    matrix = np.eye(4)
-    matrix[:3, 3] = (1.0, 2.0, 3.0)
-    scan_files.write_ptx(folder / "two.ptx", [(table, 8, matrix), (table, 5, np.eye(4))])
-
-
-def _text_files(folder: Path) -> None:
-    rows = np.hstack([_points(), _rgb(), _intensity()[:, None]]).tolist()
-    for name, separator in (("plain.xyz", " "), ("table.csv", ";"), ("tabs.txt", "\t")):
-        lines = [separator.join(f"{value:g}" for value in row) for row in rows]
-        head = separator.join(("X", "Y", "Z", "R", "G", "B", "Intensity"))
-        (folder / name).write_text("\n".join([head, *lines, ""]))
-    counted = [" ".join(f"{value:g}" for value in row[:3]) for row in rows]
-    (folder / "counted.pts").write_text("\n".join([str(_N), *counted, ""]))
-    commas = ["\t".join(f"{value:.3f}".replace(".", ",") for value in row[:3]) for row in rows]
-    (folder / "commas.asc").write_text("\n".join(["# made by hand", *commas, ""]))
-
-
+_TEXTS: Final = ("csv_named", "text_units", "text_not_a_number", "text_normals", "pts_two_scanners")
 E57 = Target(seeds=_e57_files, read=_read_scan, mutate=mutate_e57)
 LAS = Target(seeds=_las_files, read=_read_scan)
 COPC = Target(seeds=_copc_files, read=_read_part)
-PLY = Target(seeds=_ply_files, read=_read_scan, mutate=mutate_text)
-PCD = Target(seeds=_pcd_files, read=_read_scan, mutate=mutate_text)
-PTX = Target(seeds=_ptx_files, read=_read_scan, mutate=mutate_text)
-TEXT = Target(seeds=_text_files, read=_read_scan, mutate=mutate_text)
+PLY = Target(
+    seeds=_cases("ply_lists", "comment_units", "points_at_one_place"),
+    read=_read_scan,
+    mutate=mutate_text,
+)
+PCD = Target(seeds=_cases("pcd_names"), read=_read_scan, mutate=mutate_text)
+PTX = Target(seeds=_cases("ptx_scans"), read=_read_scan, mutate=mutate_text)
+TEXT = Target(seeds=_cases(*_TEXTS), read=_read_scan, mutate=mutate_text)
 
 
 # Photos, and other pictures -----------------------------------------------------------------------
@@ -247,8 +226,6 @@ def _write_image(path: Path) -> None:
 
 @cache
 def _image() -> bytes:
-    import tempfile
-
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "wall.tif"
         _write_image(path)
@@ -438,8 +415,6 @@ def _product_files(folder: Path) -> None:
     path = store.product_file(ref.digest)
     assert path is not None
     path.rename(folder / "product.h5")
-    import shutil
-
     shutil.rmtree(folder / "store")
 
 

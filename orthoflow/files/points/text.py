@@ -225,14 +225,18 @@ def _labels(header: str) -> list[str]:
     return _fields_of(stripped)[0]
 
 
+def _ended_by_returns(path: Path) -> InputError:
+    return InputError(
+        f"{path.name} ends lines with a carriage return only (CR, as old Macintosh programs do): "
+        "save it with line feeds (LF, or CR LF)"
+    )
+
+
 def _first_lines(path: Path) -> list[str]:
     with path.open("rb") as file:
         start = file.read(MOST_LINE_BYTES)
         if b"\r" in start and b"\n" not in start:
-            raise InputError(
-                f"{path.name} ends its lines with a carriage return only (CR, as old Macintosh "
-                "programs do): save it with line feeds (LF, or CR LF)"
-            )
+            raise _ended_by_returns(path)
         file.seek(0)
         raw = take_lines(file, _HEADER_LINES + _SAMPLE_LINES)
     if raw and raw[0].startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
@@ -397,7 +401,10 @@ def read_tables(
             table = _table(block, layout, wanted)
         except ValueError as error:
             raise _unread_line(Path(file.name), start, block, layout, wanted) from error
-        n_left = None if n_left is None else n_left - len(table[0])
+        if n_left is not None:
+            n_left -= len(table[0])
+            if n_left < 0:  # the parser ends lines at these too
+                raise _ended_by_returns(Path(file.name))
         yield table
 
 

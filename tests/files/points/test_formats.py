@@ -93,6 +93,7 @@ def flipped_e57(folder: Path) -> Path:
     return path
 
 
+PCD = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 3\nPOINTS 3\nDATA ascii\n"
 PLY = "ply\nformat ascii 1.0\n"
 EMPTY = "".join(f"property float {axis}\n" for axis in "xyz")
 REFUSED: list[tuple[Make, str]] = [
@@ -121,6 +122,7 @@ REFUSED: list[tuple[Make, str]] = [
     (changed(pcd, b"FIELDS x y", b"FIELDS u v"), "its fields are u v z rgb intensity, expected x"),
     (changed(pcd, b"COUNT 1 1 1", b"COUNT 1 1 0"), "its fields are x y z .*, expected x, y and z"),
     (changed(pcd, b"VIEWPOINT 0 0 0 1 0 0 0", b"VIEWPOINT 1"), "VIEWPOINT has 1 numbers"),
+    (text("a.pcd", f"{PCD}1 2 3\r4 5 6\n7 8 9\r1 1 1\n2 2 2\n"), "a.pcd ends lines with a car"),
     (damaged_pcd, r"a\.pcd cannot be unpacked: 40 points need 800 bytes"),
     # PTX
     (text("a.ptx", "this is text"), "a.ptx, line 1: expected the ten header lines"),
@@ -135,7 +137,7 @@ REFUSED: list[tuple[Make, str]] = [
       in ("1 2 3 10 20 30 40\n", "1 2 3 10 20 30 22\n", "1 2 3 4 5\n", "1 2 3 4 5 6 7 8\n")),
     (text("a.xyz", "1 2 3\n4 5 6\n7 eight 9\n"), "a.xyz, line 3: expected 3 .* got '7 eight 9'"),
     (text("a.xyz", "1 2 3\n4 5 6 7 8\n"), r"a\.xyz, line 2: expected 3 numbers"),
-    (text("a.xyz", "1 2 3\r4 5 6\r"), r"a\.xyz ends its lines with a carriage return only"),
+    (text("a.xyz", "1 2 3\r4 5 6\r"), r"a\.xyz ends lines with a carriage return only"),
     (text("a.xyz", "# only\n# comments\n"), r"no line with three numbers among its first 2"),
     (text("a.xyz", "5\n1 2 3\n4 5 6\n"), "a.xyz is cut off: its list holds 2 points, .* states 5"),
     # E57
