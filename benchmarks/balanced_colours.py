@@ -60,7 +60,7 @@ Cells: TypeAlias = NDArray[np.int64]
 
 
 def product(run: Run, store: Store, step: str, cls: type) -> object:
-    """The product of a type that a step of a run gave."""
+    """Return the product of a type from a step of a run."""
     return next(
         store.get_product(output.digest, cls)
         for output in run.cells[step].outputs.values()
@@ -69,19 +69,19 @@ def product(run: Run, store: Store, step: str, cls: type) -> object:
 
 
 def lab(rgb: NDArray[np.floating]) -> NDArray[np.float32]:
-    """CIE L*a*b* of levels 0 to 1."""
+    """Convert levels 0 to 1 to CIE L*a*b*."""
     return np.asarray(cv2.cvtColor(rgb.astype(np.float32), cv2.COLOR_RGB2Lab), np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Mosaic:
-    """An orthoimage, and what each photo shows of the wall, as balanced.
+    """An orthoimage, and the balanced photos on its wall.
 
     Attributes:
         image: the orthoimage.
-        painters: what its sources count.
-        balance: of these, or None.
-        metrics: of the step.
+        painters: layers in the order of its sources.
+        balance: balance of the layers, or None.
+        metrics: metrics of the step.
     """
 
     image: Orthoimage
@@ -95,7 +95,7 @@ class Mosaic:
     def is_painted(
         self, photo: NDArray[np.int16], rows: Cells, columns: Cells, *, turned: bool
     ) -> NDArray[np.bool_]:
-        """Whether photos (n,) show cells (n,); turned, rows and columns are exchanged."""
+        """Return whether photos (n,) show cells (n,); `turned` exchanges rows and columns."""
         found = np.zeros(len(rows), dtype=np.bool_)
         places = (columns, rows) if turned else (rows, columns)
         for index, layer in enumerate(self.painters):
@@ -106,7 +106,7 @@ class Mosaic:
     def colours(
         self, photo: NDArray[np.int16], rows: Cells, columns: Cells, *, turned: bool
     ) -> NDArray[np.float32]:
-        """CIE L*a*b* (n, 3) of what photos show in cells, as `is_painted` takes them."""
+        """Return the colours (n, 3) of cells in photos, CIE L*a*b*; see `is_painted`."""
         found = np.zeros((len(rows), 3), dtype=self.image.rgb.dtype)
         down, right = (columns, rows) if turned else (rows, columns)
         for index, layer in enumerate(self.painters):
@@ -123,9 +123,9 @@ class Steps:
     """Steps (n, 3) in CIE L*a*b* of stretches along seams.
 
     Attributes:
-        seen: from one photo to the other.
-        wall: what either photo alone shows across the same line, on average of both.
-        share: of the cells of seams, those about which both photos show two cells on either side.
+        seen: steps from one photo to the other.
+        wall: steps that each photo alone shows across the same line, mean of both.
+        share: share of seam cells where both photos show two cells on either side.
     """
 
     seen: NDArray[np.float64]
@@ -144,7 +144,7 @@ class Steps:
 
 
 def steps(mosaic: Mosaic) -> Steps:
-    """Steps where both photos show two cells on either side of a seam."""
+    """Measure steps where both photos show two cells on either side of a seam."""
     seen, wall = [], []
     n_seam = n_counted = 0
     for turned in (False, True):
@@ -183,20 +183,20 @@ def steps(mosaic: Mosaic) -> Steps:
 
 
 def blocks(values: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Means of blocks of 8 x 8 cells (rows, cols, channels)."""
+    """Average blocks of 8 x 8 cells (rows, cols, channels)."""
     rows, columns = (size // BLOCK for size in values.shape[:2])
     cut = values[: rows * BLOCK, : columns * BLOCK]
     return np.asarray(cut.reshape(rows, BLOCK, columns, BLOCK, -1).mean((1, 3)), np.float64)
 
 
 def levels(light: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Levels 0 to 1 of light."""
+    """Convert light to levels 0 to 1."""
     bright = np.clip(light, 0.0, 1.0)
     return np.where(bright <= 0.0031308, 12.92 * bright, 1.055 * bright ** (1 / 2.4) - 0.055)
 
 
 def against(image: Orthoimage, reference: Orthoimage) -> str:
-    """Colours of blocks up to one factor per channel, and gradients near seams and elsewhere."""
+    """Compare block colours up to a factor per channel, and gradients near seams and elsewhere."""
     both = (image.mask == OrthoMask.PAINTED) & (reference.mask == OrthoMask.PAINTED)
     whole = blocks(both[..., None].astype(float))[..., 0] == 1.0
     table = light_of_levels(255)
@@ -222,7 +222,7 @@ def against(image: Orthoimage, reference: Orthoimage) -> str:
 
 
 def exposed(layers: Layers, share: float) -> Layers:
-    """Layers of photos that had so much more or less light, neighbours as unlike as can be."""
+    """Change the exposure of the photos of layers, with the largest contrast between neighbours."""
     factors = 1.0 + share * np.linspace(-1.0, 1.0, len(layers.layers))
     factors = np.concatenate([factors[::2], factors[1::2]])
     table = light_of_levels(255)
@@ -234,7 +234,7 @@ def exposed(layers: Layers, share: float) -> Layers:
 
 
 def inputs_of_run(folder: Path, store: Store, exposure: float) -> MosaicSeams.In:
-    """What a run joined, its photos with so much more or less light."""
+    """Return the inputs of a run's mosaic, with changed exposures."""
     run = open_run(folder)
     return MosaicSeams.In(
         layers=exposed(product(run, store, "ortho", Layers), exposure),
@@ -244,7 +244,7 @@ def inputs_of_run(folder: Path, store: Store, exposure: float) -> MosaicSeams.In
 
 
 def inputs_of_room(seed: int, share: float) -> MosaicSeams.In:
-    """A room drawn by a seed, from true planes and cameras; light and corners differ by a share."""
+    """Draw a room by a seed, with true planes and cameras, varied exposure and vignetting."""
     with tempfile.TemporaryDirectory() as folder:
 
         def ctx() -> StepContext:
@@ -278,7 +278,7 @@ def inputs_of_room(seed: int, share: float) -> MosaicSeams.In:
 
 
 def mosaic(inputs: MosaicSeams.In, **chosen: object) -> Mosaic:
-    """The first wall, and what each photo shows of it, balanced as the method did."""
+    """Return the mosaic of the first wall and the photos on it, balanced as by the method."""
     params = MosaicSeams.Params.model_validate(chosen)
     with tempfile.TemporaryDirectory() as folder:
         ctx = StepContext(rng=np.random.default_rng(0), cores=2, scratch=Path(folder))
@@ -300,7 +300,7 @@ def mosaic(inputs: MosaicSeams.In, **chosen: object) -> Mosaic:
 
 
 def main() -> None:
-    """Print a line for untouched, balanced, and balanced along graph cuts."""
+    """Print a line each for no balancing, balancing, and balancing along graph cuts."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, nargs="?")
     parser.add_argument("--room", type=int, metavar="SEED")

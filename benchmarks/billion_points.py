@@ -90,7 +90,7 @@ def main() -> None:
 
 
 def run_small(folder: Path, workflow: Path, points: np.ndarray) -> None:
-    """Run the chain on few points, so that nothing is compiled in what is measured."""
+    """Run the chain on few points first, so that no compilation is measured."""
     small, store, out = folder / "small.laz", folder / "small-store", folder / "small-out"
     write_laz(small, points[:: max(1, len(points) // 300_000)])
     measured(run_command(workflow, [small], store, out))
@@ -100,7 +100,7 @@ def run_small(folder: Path, workflow: Path, points: np.ndarray) -> None:
 
 
 def beside(first: Path, tile: int) -> Path:
-    """Copy a file, so many rooms farther: what moves are the offsets and bounds of its header."""
+    """Copy a file shifted by a number of rooms: change the offsets and bounds in its header."""
     path = first.with_name(f"room_{tile:02}.laz")
     if path.exists():
         return path
@@ -117,14 +117,14 @@ def beside(first: Path, tile: int) -> Path:
 
 
 def run_command(workflow: Path, files: list[Path], store: Path, out: Path) -> list[str]:
-    """The command that runs the chain."""
+    """Return the command that runs the chain."""
     pattern = files[0].parent / ("room_*.laz" if len(files) > 1 else files[0].name)
     run = ["run", str(workflow), "--input", f"scan={pattern}", "--store", str(store)]
     return [sys.executable, "-m", "orthoflow", *run, "-o", str(out)]
 
 
 def print_steps(table: Path) -> None:
-    """Print what each step cost, and what it found."""
+    """Print the cost and the results of each step."""
     wanted = {"cpu_s", "wall_s", "peak_rss_mib", "n_points", "n_planes", "n_walls", "compile_s"}
     with table.open(encoding="utf-8") as file:
         rows = [row for row in csv.DictReader(file) if row["metric"] in wanted]

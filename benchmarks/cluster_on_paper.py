@@ -29,11 +29,11 @@ class Task:
     """A step of every room.
 
     Attributes:
-        address: of its cell.
-        seconds: of work, with starting it.
-        read_mb: from the server.
-        written_mb: to the server.
-        needs: addresses.
+        address: address of its cell.
+        seconds: duration, including its start.
+        read_mb: data read from the server.
+        written_mb: data written to the server.
+        needs: addresses of the tasks that it needs.
     """
 
     address: str
@@ -45,13 +45,13 @@ class Task:
 
 @dataclass
 class Simulated:
-    """What came out.
+    """Result of a simulation.
 
     Attributes:
-        hours: until the last task has ended.
-        busy: share of the workers' time that they compute in.
-        server: share of the time that the server gives all that it can.
-        moved_tb: over the network.
+        hours: time until the last task has ended.
+        busy: share of the workers' time in which they compute.
+        server: share of the time in which the server is saturated.
+        moved_tb: data moved over the network.
     """
 
     hours: float
@@ -61,9 +61,9 @@ class Simulated:
 
 
 def tasks_of(run: str, points: float, photos: float, cores: float | None = None) -> list[Task]:
-    """Give the tasks of one room, with seconds and sizes for so many times the points or photos.
+    """Return the tasks of one room, with times and sizes scaled to its points or photos.
 
-    Of a record that was made beside other work `cores` share the processor seconds.
+    For a record made under other load, the processor seconds are divided among `cores`.
     """
     stored: dict[str, float] = {}
     found: list[Task] = []
@@ -95,14 +95,14 @@ def tasks_of(run: str, points: float, photos: float, cores: float | None = None)
 
 @dataclass
 class Cluster:
-    """Workers that take tasks of many rooms, and a server that they share.
+    """Workers that run the tasks of many rooms, and a server that they share.
 
     Attributes:
-        tasks: of one room, each behind those that it needs.
-        n_rooms: rooms.
-        n_free: workers without a task.
-        server_mb_s: what the server gives.
-        link_mb_s: what a worker's own link gives.
+        tasks: tasks of one room, each after those that it needs.
+        n_rooms: number of rooms.
+        n_free: number of workers without a task.
+        server_mb_s: bandwidth of the server.
+        link_mb_s: bandwidth of a worker's own link.
     """
 
     tasks: list[Task]
@@ -149,7 +149,7 @@ class Cluster:
         )
 
     def _next_ends(self) -> list[tuple[int, int]]:
-        """Go on to the next event; give the tasks that end with it."""
+        """Advance to the next event; return the tasks that end with it."""
         rate = min(self.link_mb_s, self.server_mb_s / max(1, len(self._transfers)))
         steps = [left / rate for left in self._transfers.values()]
         steps += [end - self._clock for end, _, _ in self._computing[:1]]

@@ -35,11 +35,11 @@ from orthoflow.workflow.source import shipped_workflow  # noqa: E402
 
 @dataclass
 class Compilations(event.Listener):
-    """Hears which kernels numba compiles.
+    """Records which kernels numba compiles.
 
     Attributes:
         cpu_s: kernel -> its own processor time, without that of kernels it calls.
-        versions: kernel -> how often it was compiled.
+        versions: kernel -> number of compilations.
     """
 
     cpu_s: Counter[str] = field(default_factory=Counter)
@@ -47,11 +47,11 @@ class Compilations(event.Listener):
     _begun: list[tuple[float, float]] = field(default_factory=list)
 
     def on_start(self, event: event.Event) -> None:
-        """Take the time."""
+        """Record the start time."""
         self._begun.append((time.thread_time(), 0.0))
 
     def on_end(self, event: event.Event) -> None:
-        """Count what passed, and keep it from whoever needed the kernel."""
+        """Add the elapsed time, and subtract it from the calling kernel."""
         begun, inner_s = self._begun.pop()
         whole_s = time.thread_time() - begun
         if self._begun:
@@ -64,7 +64,7 @@ class Compilations(event.Listener):
 
 
 def run(workflow: str, sets: list[str]) -> float:
-    """Run a workflow in a store that goes away; give its processor time in seconds."""
+    """Run a workflow in a temporary store; return its processor time in seconds."""
     before = time.process_time()
     with tempfile.TemporaryDirectory(prefix="orthoflow-compile-times-") as folder:
         catalog, store = discover_catalog(), Store(Path(folder) / "store")

@@ -58,7 +58,7 @@ _GSD_M: Final = 0.01
 
 @dataclass(frozen=True, kw_only=True)
 class Courtyard:
-    """What was built, scanned and photographed."""
+    """A courtyard, its scan and its photos."""
 
     cloud: PointCloud
     photos: Photos
@@ -69,9 +69,9 @@ def courtyard(seed: int, n_photos: int, coarser: float = 1.0) -> Courtyard:
     """Build a courtyard, scan it once and photograph its facades in turn.
 
     Args:
-        seed: of stains, viewpoints and noise.
-        n_photos: a quarter of them of each facade.
-        coarser: so many times as far apart are points, and pixels.
+        seed: seed of stains, viewpoints and noise.
+        n_photos: number of photos, a quarter of them of each facade.
+        coarser: factor of the spacing of points and pixels.
     """
     rng = np.random.default_rng(seed)
     draft = SceneDraft()
@@ -120,7 +120,7 @@ def courtyard(seed: int, n_photos: int, coarser: float = 1.0) -> Courtyard:
 
 
 def _build_facade(side: Side, name: str, half_m: float, rng: np.random.Generator) -> None:
-    """Build plaster of its own stains, and windows that are all the same."""
+    """Build a plastered facade with its own stains and identical windows."""
     plaster = Paint(
         kind=TextureKind.PLAIN,
         rgb=(188, 176, 150),
@@ -178,7 +178,7 @@ def _shot(nth: int, side: Side, coarser: float, rng: np.random.Generator) -> Sho
 
 
 def n_found(planes: Planes) -> int:
-    """Count the facades that some plane lies on, within a degree and 2 cm at their middle."""
+    """Count the facades with a detected plane, within one degree and 2 cm at the centre."""
     count = 0
     for omega, away in zip(np.radians(_OMEGA_DEG), _AWAY_M, strict=True):
         inwards = -np.array([math.cos(omega), math.sin(omega), 0.0])
@@ -189,7 +189,7 @@ def n_found(planes: Planes) -> int:
 
 
 def oriented(built: Courtyard, coarser: float = 1.0) -> tuple[int, tuple[PoseError, ...]]:
-    """Return how many facades are found, and how far each photo is off, or why it is refused."""
+    """Return the number of facades found, and each photo's error or reason for rejection."""
     cloud, photos = built.cloud, built.photos
     planes = Hough2d().run(Hough2d.In(cloud=cloud), Hough2d.Params(), context(1)).planes
     rule = RasterGrid.Params(gsd_m=coarser * _GSD_M)

@@ -22,7 +22,7 @@ RATIO = 0.85
 
 
 def descriptors(n: int, seed: int) -> NDArray[np.float32]:
-    """RootSIFT-like rows of whole numbers; every tenth one is nearly the same in all sets."""
+    """Return RootSIFT-like integer rows; every tenth row is almost the same in all sets."""
     rng, shared = np.random.default_rng(seed), np.random.default_rng(0)
     raw = rng.gamma(0.6, size=(n, 128))
     common = shared.gamma(0.6, size=(n // 10, 128))

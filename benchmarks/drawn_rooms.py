@@ -121,7 +121,7 @@ def measure(folder: Path, part: str, seed: int) -> Iterator[tuple[str, float]]:
 def errors_of_orientation(
     run: OpenedRun, address: str, store: Path
 ) -> tuple[list[Any], tuple[PoseError, ...]]:
-    """Return findings on poses and ties, and errors of poses, also of photos that were refused."""
+    """Return findings on poses and ties, and pose errors, also for rejected photos."""
     cameras = run.product(address, "cameras", store=store)
     walls, truth = (
         run.product(*place, store=store) for place in (("wall", "walls"), ("room", "truth"))
@@ -150,7 +150,7 @@ def common_poses(poses: Mapping[str, Sequence[PoseError]]) -> Iterator[tuple[str
 
 
 def reduced(part: str, name: str, seed: int) -> dict[str, Any]:
-    """Return a recipe in a room, with the steps and combinations that the pages name."""
+    """Return a recipe for a room, with only the steps and combinations that the pages use."""
     tree: dict[str, Any] = YAML(typ="safe").load((ROOT / name).read_text())
     steps = tree["steps"]
     named = [assignment_of(address) for address in cells_named(part)]
@@ -195,7 +195,7 @@ def combinations(
 
 
 def needed(step: str, steps: Mapping[str, Any]) -> set[str]:
-    """Return a step and all on which it depends."""
+    """Return a step and all steps on which it depends."""
     found = {step}
     for sources in steps[step].get("in", {}).values():
         for source in [sources] if isinstance(sources, str) else sources:
@@ -215,7 +215,7 @@ def assignment_of(address: str) -> dict[str, str]:
 
 
 def cells_named(part: str) -> set[str]:
-    """Return the addresses of cells of which the pages state a metric."""
+    """Return the addresses of cells whose metrics are on the pages."""
     places = [
         place[2]
         for page in PAGES.glob("*.md")
@@ -230,7 +230,7 @@ def on_common(points: Mapping[str, Residuals], gsd_m: float) -> Iterator[tuple[s
 
     Args:
         points: cell -> residuals of its orthoimage.
-        gsd_m: side of a cell.
+        gsd_m: cell size.
     """
     if not points:
         return
@@ -247,7 +247,7 @@ def on_common(points: Mapping[str, Residuals], gsd_m: float) -> Iterator[tuple[s
 
 
 def by_point(inspection: Inspection) -> Residuals:
-    """Return residuals (2,) in metres, by class and place."""
+    """Return residuals (2,) in metres by class and position."""
     places = np.round(inspection.points_world, 3)
     return {
         (inspection.kinds[kind], *place.tolist()): shift_m
@@ -258,7 +258,7 @@ def by_point(inspection: Inspection) -> Residuals:
 
 
 def measured(folder: Path, part: str, seed: int) -> None:
-    """Measure a room, unless its numbers are there."""
+    """Measure a room, unless its numbers exist."""
     room = folder / f"{part}-{seed}"
     if (room / "numbers.json").is_file():
         return
@@ -274,11 +274,11 @@ Sets = Mapping[str, Sequence[Sequence[Mapping[str, float]]]]
 
 
 def filled_in(text: str, sets: Sets) -> str:
-    """Put the numbers of rooms into the places of a text.
+    """Replace the placeholders of a text by the numbers of rooms.
 
     Args:
-        text: with places `{{part: cell metric}}`, `{{part: cell metric : share}}` for per cent,
-            `: mean` without scatter, `: median`, and
+        text: text with placeholders `{{part: cell metric}}`, `{{part: cell metric : share}}` for
+            per cent, `: mean` without scatter, `: median`, and
             `{{part: cell metric < cell metric ? text | other text}}`.
         sets: part -> sets -> rooms -> numbers by `cell metric`.
     """
@@ -305,16 +305,16 @@ def _text_of(place: str, sets: Sequence[Sequence[Mapping[str, float]]]) -> str:
 
 
 def counted(first: str, second: str, rooms: Sequence[Mapping[str, float]]) -> tuple[int, int]:
-    """Return in how many rooms the first is smaller, and how many have both."""
+    """Return the number of rooms in which the first value is smaller, and of rooms with both."""
     both = [(abs(room[first]), abs(room[second])) for room in rooms if {first, second} <= set(room)]
     return sum(a < b for a, b in both), len(both)
 
 
 def ranking_holds(counts: Sequence[tuple[int, int]]) -> bool:
-    """Report whether a ranking may be stated: it holds in both sets of seeds, not by chance.
+    """Return whether a ranking is significant: it holds in both sets of seeds, not by chance.
 
     Args:
-        counts: of each set, in how many rooms it holds, and how many there are.
+        counts: for each set, the number of rooms where it holds, and of all rooms.
     """
     n_true, n_both = (sum(column) for column in zip(*counts, strict=True))
     if not all(n and true >= RANKING_SHARE * n for true, n in counts):
@@ -361,7 +361,7 @@ def main() -> None:
 
 
 def _read(folder: Path, part: str, seed: int) -> dict[str, float]:
-    """Return the numbers of a room, with shares of planes found; none of one not measured."""
+    """Return the numbers of a room with shares of found planes; empty if it was not measured."""
     path = folder / f"{part}-{seed}" / "numbers.json"
     room: dict[str, float] = json.loads(path.read_text()) if path.is_file() else {}
     for key in [key for key in room if key.endswith(" true_planes_found")]:

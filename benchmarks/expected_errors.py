@@ -111,7 +111,7 @@ def fountain(folder: Path, store: Path) -> None:
 
 
 def last(run: Run, kind: type) -> object:
-    """The last product of a type that the record holds."""
+    """Return the last product of a type in the record."""
     for address in reversed(list(run.cells)):
         for port, output in run.cells[address].outputs.items():
             if output.type_name == kind.type_name and output.embedded:
@@ -122,7 +122,7 @@ def last(run: Run, kind: type) -> object:
 def moved_m(
     frame: WallFrame, places: NDArray[np.float64], depths_m: NDArray[np.float64], camera: Camera
 ) -> NDArray[np.float64]:
-    """How far (n, 2) what a photo shows at cells lies beside them by its reference pose."""
+    """Return the displacements (n, 2) of a photo's content at cells, by its reference pose."""
     points = frame.world_from_wall(places, depths_m)
     pixels = camera.viewing().project(points)[:, :2] - 0.5
     words = (FOUNTAIN / "images" / f"{camera.photo}.camera").read_text(encoding="utf-8").split()

@@ -29,7 +29,7 @@ ROOM_M = (12.0, 8.0, 4.0)
 
 
 def mapped_room(folder: Path, n_points: int) -> PointCloud:
-    """Points on six walls with 1 mm of noise, in files that are mapped as those of a store are."""
+    """Return points on six walls with 1 mm of noise, in memory-mapped files as in a store."""
     random = np.random.default_rng(7)
     arrays = {
         axis: np.memmap(folder / axis, dtype=np.float32, mode="w+", shape=(n_points,))
@@ -55,7 +55,7 @@ def mapped_room(folder: Path, n_points: int) -> PointCloud:
 
 
 def export(name: str, folder: Path, n_points: int) -> None:
-    """Open the room's files, write them, print what it took."""
+    """Open the files of the room, export them, and print time and memory."""
     names = {"x": "x", "y": "y", "z": "z", "intensity": "i"}
     arrays = {
         field: np.memmap(folder / file, dtype=np.float32, mode="r", shape=(n_points,))

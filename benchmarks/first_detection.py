@@ -57,7 +57,7 @@ def main() -> None:
 
 
 def measured(folder: Path, method: str) -> str:
-    """Run a method here; its processor seconds, and those of loading and compiling."""
+    """Run a method in this process; return processor seconds with and without loading."""
     room = open_run(folder / "1").cell("room")
     given = {"cloud": Store(folder / "store").get_product(room.outputs["cloud"].digest, PointCloud)}
     cls = discover_catalog().method(method).load()

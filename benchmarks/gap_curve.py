@@ -38,13 +38,13 @@ _ASKED_MM = {True: 0.5, False: 0.8}
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What came of one room.
+    """Result of one room.
 
     Attributes:
-        share: of the contrast that is inverted.
-        n_photos: taken.
-        n_wrong: called oriented and far off.
-        walls_mm: errors on the wall, of the photos oriented.
+        share: share of the contrast that is inverted.
+        n_photos: number of photos taken.
+        n_wrong: number of photos accepted with a wrong pose.
+        walls_mm: errors of the accepted photos on the wall.
         photo_s: CPU seconds of both matchers per photo.
     """
 
@@ -101,7 +101,7 @@ def outcome(share: float, photos: Photos, walls: Walls, truth: Truth, *, structu
 
 
 def _name_unplaced(cameras: Cameras, when: str, walls: Walls, truth: Truth) -> None:
-    """Print the photos without an orientation and how much of the main wall they truly show."""
+    """Print the rejected photos and the area of the main wall that they truly show."""
     for camera in cameras.cameras:
         if camera.status == "ok":
             continue
@@ -112,7 +112,7 @@ def _name_unplaced(cameras: Cameras, when: str, walls: Walls, truth: Truth) -> N
 
 
 def _shares(outcomes: list[Outcome]) -> None:
-    """Print what is asked for, calibrated and from EXIF: photos oriented, and near enough."""
+    """Print the shares of photos oriented and accurate enough, calibrated and from EXIF."""
     for is_calibrated, asked_mm in _ASKED_MM.items():
         some = [each for each in outcomes if each.is_calibrated is is_calibrated]
         walls_mm = np.array([value for each in some for value in each.walls_mm])

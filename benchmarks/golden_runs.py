@@ -42,7 +42,7 @@ ROUNDING = 1e-6
 
 
 def runs(folder: Path) -> dict[str, list[str]]:
-    """Words behind `orthoflow run` for each golden run that can be made here."""
+    """Return the arguments of `orthoflow run` for each golden run possible here."""
     quickstart = (ROOT / "workflows" / "quickstart.yaml").read_text()
     found = {"quickstart": ["quickstart.yaml"], "planes": ["plane-methods.yaml"]}
     for seed in (41, 42):
@@ -92,7 +92,7 @@ def make(folder: Path, only: set[str]) -> None:
 
 
 def compare(before: Path, after: Path) -> None:
-    """Print what moved between two makings."""
+    """Print the differences between two sets of golden runs."""
     for folder in sorted(path.parent for path in after.glob("*/run.h5")):
         name = folder.name
         if not (before / name / "run.h5").exists():
@@ -115,7 +115,7 @@ def compare(before: Path, after: Path) -> None:
 
 
 def of_product(first: Path, second: Path) -> str:
-    """Say how far a product moved; empty where it did not."""
+    """Describe how much a product changed; empty if it did not."""
     if first.name.endswith(".tif"):
         with rasterio.open(first) as one, rasterio.open(second) as other:
             if one.shape != other.shape:
@@ -145,7 +145,7 @@ def of_product(first: Path, second: Path) -> str:
 
 
 def of_planes(old: list[dict[str, object]], new: list[dict[str, object]]) -> str:
-    """Say how planes moved, each against the nearest one of before."""
+    """Describe how much planes changed, each against the nearest earlier one."""
     if old == new:
         return ""
     lines = [f"{len(old)} -> {len(new)} planes"] if len(old) != len(new) else []
@@ -162,13 +162,13 @@ def of_planes(old: list[dict[str, object]], new: list[dict[str, object]]) -> str
 
 
 def centre(camera: dict[str, object]) -> np.ndarray:
-    """Where a photo was taken, world."""
+    """Return the position of the camera of a photo, world."""
     rotation = np.asarray(camera["R_camera_from_world"])
     return -rotation.T @ np.asarray(camera["t_camera_from_world"])
 
 
 def metrics(run: Path) -> dict[tuple[str, str], float]:
-    """Numbers of a run by cell and metric, without costs."""
+    """Return the metrics of a run by cell and name, without costs."""
     with (run / "products" / "metrics.csv").open(newline="") as file:
         return {
             (row["cell"], row["metric"]): float(row["value"])
@@ -178,7 +178,7 @@ def metrics(run: Path) -> dict[tuple[str, str], float]:
 
 
 def of_metrics(old: dict[tuple[str, str], float], new: dict[tuple[str, str], float]) -> None:
-    """Print metrics that moved, and those that one run alone has."""
+    """Print metrics that changed, and those in only one of the runs."""
     moved = [
         f"  {cell} {name}: {old[cell, name]:.6g} -> {new[cell, name]:.6g}"
         for cell, name in sorted(old.keys() & new.keys())

@@ -60,7 +60,7 @@ class GreatRoom:
     """A scanned room.
 
     Attributes:
-        x: (n,) float32 metres; y and z alike.
+        x: (n,) float32 metres; y and z are the same.
         y: see x.
         z: see x.
         plane_index: (n,) int8 true plane of each point, -1 for none.
@@ -99,7 +99,7 @@ def main() -> None:
 
 
 def great_room(n_points: int, *, cores: int, seed: int = 1) -> GreatRoom:
-    """Build the room, scan it with about so many rays, and lay it where a seed says."""
+    """Build the room, scan it with about the given number of rays, and move it by a seed."""
     draft = SceneDraft()
     mirror = _build(draft)
     scene = draft.finished(spectral_gap=0.0)
@@ -138,7 +138,7 @@ def great_room(n_points: int, *, cores: int, seed: int = 1) -> GreatRoom:
 
 
 def _moved(room: GreatRoom, turn: NDArray[np.float64], shift_m: NDArray[np.float64]) -> GreatRoom:
-    """Turn and shift a room; its points are changed in place."""
+    """Rotate and shift a room; its points are changed in place."""
     for first in range(0, len(room.x), RAYS_AT_ONCE):
         part = slice(first, first + RAYS_AT_ONCE)
         points = np.column_stack([room.x[part], room.y[part], room.z[part]]).astype(np.float64)
@@ -153,7 +153,7 @@ def _moved(room: GreatRoom, turn: NDArray[np.float64], shift_m: NDArray[np.float
 
 
 def _sweeps(n_points: int) -> list[Sweep]:
-    """A panorama from beside the origin, and the main wall from the origin."""
+    """Return a panorama from near the origin, and the main wall from the origin."""
     sweeps = []
     for number, (station, azimuths, elevations, share) in enumerate(
         (
@@ -178,7 +178,7 @@ def _sweeps(n_points: int) -> list[Sweep]:
 
 
 def _mirrored(scene: Scene, mirror: int, sweep: Sweep, points: Scanned) -> None:
-    """Move most points on the mirror to where the scanner sees what the mirror shows."""
+    """Move most points on the mirror to the positions of their reflections."""
     index = np.flatnonzero(points.rectangle == mirror)
     states = cell_states(index // sweep.n_rows, index % sweep.n_rows, sweep.seed + 77)
     index = index[uniforms(states, 0) < MIRROR_SHARE]
@@ -197,7 +197,7 @@ def _mirrored(scene: Scene, mirror: int, sweep: Sweep, points: Scanned) -> None:
 
 
 def _build(draft: SceneDraft) -> int:
-    """Build the room; gives the number of the mirror's rectangle."""
+    """Build the room; return the number of the mirror's rectangle."""
     wide: Extent = (-6.0, 6.0, FLOOR_M - 0.5, CEILING_M + 0.5)
     main = wall_side(draft, omega_deg=102.0, phi_deg=0.8, distance_m=3.7)
     mirror = _build_main_wall(main, wide)
@@ -272,7 +272,7 @@ def _build_wall(
 
 
 def _add_mouldings(wall: Side, half_m: float) -> None:
-    """A cornice of two steps under the ceiling and a skirting."""
+    """Add a cornice of two steps under the ceiling, and a skirting."""
     wall.box((-half_m, half_m, 3.1, 3.6), 0.08, _PLASTER)
     wall.box((-half_m, half_m, 3.28, 3.6), 0.16, _PLASTER)
     wall.box((-half_m, half_m, FLOOR_M - 0.1, FLOOR_M + 0.2), 0.03, _PLASTER)

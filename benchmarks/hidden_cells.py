@@ -33,7 +33,7 @@ _BEFORE_SURFACE_M = 0.01
 
 
 def counted(walls: Walls, cloud: PointCloud, room: SimulateRoom.Out) -> NDArray[np.int64]:
-    """Cells that are missed, painted through what hides them, and that lie in a photo."""
+    """Count cells that are missed, coloured through an obstacle, and inside a photo."""
     cameras = room.truth.cameras
     if cameras is None:
         raise SystemExit("the room has no photos")

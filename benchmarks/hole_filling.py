@@ -27,7 +27,7 @@ RADII_CELLS = (1, 2, 3, 5, 10)
 
 
 def raster() -> NDArray[np.bool_]:
-    """Which cells are known."""
+    """Return which cells are known."""
     is_known = np.random.default_rng(2).random(SHAPE, dtype=np.float32) > 0.08
     for row in range(200, SHAPE[0] - 300, 700):
         for column in range(150, SHAPE[1] - 250, 500):
@@ -36,7 +36,7 @@ def raster() -> NDArray[np.bool_]:
 
 
 def filled(is_known: NDArray[np.bool_], radius: int, *, threads: int) -> NDArray[np.float32]:
-    """Depths with their gaps interpolated."""
+    """Return depths with interpolated gaps."""
     depth_m = np.where(is_known, np.float32(1.0), np.float32(np.nan)).ravel()
     places = np.repeat(depth_m[:, None] - np.float32(1.0), 2, axis=1)
     values = cell_values(depth_m)

@@ -15,7 +15,7 @@ from packaging.utils import canonicalize_name
 
 
 def needed(root: str, without: str = "") -> set[str]:
-    """Installed distributions that one needs, itself among them, as if another were none."""
+    """Return installed distributions that one needs, including itself, if another were missing."""
     found: set[str] = set()
     waiting = [root]
     while waiting:
@@ -35,7 +35,7 @@ def needed(root: str, without: str = "") -> set[str]:
 
 
 def megabytes(name: str) -> float:
-    """Size of the files of a distribution."""
+    """Return the size of the files of a distribution."""
     paths = [file.locate() for file in metadata.files(name) or []]
     return sum(path.stat().st_size for path in paths if path.exists()) / 1e6  # type: ignore[attr-defined]
 

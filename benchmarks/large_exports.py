@@ -31,7 +31,7 @@ FORMATS = ("sheet", "dxf", "tiles", "stac", "layers")
 
 
 def write_large_run(folder: Path, side: int) -> None:
-    """Write a run of one orthoimage, and its one layer into a store."""
+    """Write a run with one orthoimage, and its only layer to a store."""
     run, store = folder / "run", Store(folder / "store")
     published = run / "products" / "mosaic"
     published.mkdir(parents=True)
@@ -72,20 +72,20 @@ def write_large_run(folder: Path, side: int) -> None:
 
 
 def own_mib() -> float:
-    """Memory of this process that no file is behind; mapped files can go at any time."""
+    """Return this process's memory without mapped files, which the system can drop."""
     lines = Path("/proc/self/status").read_text().splitlines()
     (found,) = [line for line in lines if line.startswith("RssAnon")]
     return int(found.split()[1]) / 1024
 
 
 def watch(peaks: list[float], is_over: threading.Event) -> None:
-    """Note the largest of it, asked twenty times a second."""
+    """Record the maximum memory, sampled twenty times per second."""
     while not is_over.wait(0.05):
         peaks[0] = max(peaks[0], own_mib())
 
 
 def export(folder: Path, target: str) -> None:
-    """Export and say what it took."""
+    """Export, and print time and memory."""
     peaks, is_over = [own_mib()], threading.Event()
     watcher = threading.Thread(target=watch, args=(peaks, is_over))
     watcher.start()
@@ -97,7 +97,7 @@ def export(folder: Path, target: str) -> None:
 
 
 def run_export(folder: Path, target: str, peaks: list[float]) -> None:
-    """Export, and say the largest memory of its own so far."""
+    """Export, and print the peak memory so far."""
     words = ["export", str(folder / "run"), "--to", target, "-o", str(folder / "out" / target)]
     first = time.process_time()
     try:
@@ -116,7 +116,7 @@ def run_export(folder: Path, target: str, peaks: list[float]) -> None:
 
 
 def main() -> None:
-    """Write the run, then each export."""
+    """Write the run, then run each export."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--side", type=int, default=20_000, help="cells of a side")
     parser.add_argument("--to", action="append", choices=FORMATS, help="formats, all of them else")

@@ -35,12 +35,12 @@ BAND_ROWS = 256
 
 
 def mapped(path: Path, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
-    """A zeroed array in a file."""
+    """Return a zeroed array in a file."""
     return np.memmap(path, dtype=np.dtype(dtype), mode="w+", shape=shape)
 
 
 def wall(side: int, folder: Path) -> Wall:
-    """A square wall with frames of 5 cm, 2 mm noise, one cell in a thousand void."""
+    """Return a square wall with 5 cm frames, 2 mm noise, and one void cell in a thousand."""
     rng = np.random.default_rng(1)
     depth = mapped(folder / "depth", (side, side), np.float32)
     steps = (0.05 * ((np.arange(side) // 90) % 4 == 0)).astype(np.float32)
@@ -70,7 +70,7 @@ def wall(side: int, folder: Path) -> Wall:
 
 
 def anonymous_mib() -> float:
-    """Memory that is not backed by files."""
+    """Return the memory that is not backed by files."""
     for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
         if line.startswith("RssAnon"):
             return int(line.split()[1]) / 1024
@@ -79,7 +79,7 @@ def anonymous_mib() -> float:
 
 @contextmanager
 def measured(what: str) -> Iterator[None]:
-    """Print how long something takes, and the most memory meanwhile beyond that before."""
+    """Print the duration of a call, and its peak memory above the initial level."""
     before, most, is_over = anonymous_mib(), [0.0], threading.Event()
 
     def watch() -> None:

@@ -53,7 +53,7 @@ PAINT = Paint(kind=TextureKind.PLAIN, rgb=(200, 200, 200), reflectance=0.5)
 
 
 def main() -> None:
-    """Run each method in a process of its own; with --run, run one in this."""
+    """Run each method in its own process; with --run, run one in this process."""
     methods = {
         "tin": run_tin,
         "surf": run_surf,
@@ -84,7 +84,7 @@ def main() -> None:
 
 
 def run_tin(folder: Path, side: int) -> None:
-    """Lay the net over the wall; the narrow window is closed, the wide one is not."""
+    """Triangulate the wall; the narrow window is closed, the wide one is not."""
     windows = [(side // 4, 400), (side // 2, 900)]
     axes = [new(folder, axis, (side * side,), np.float32) for axis in "xyz"]
     rng, count = np.random.default_rng(3), 0
@@ -156,7 +156,7 @@ def run_checkpoints(folder: Path, side: int) -> None:
 
 
 def run_openings(folder: Path, side: int) -> None:
-    """Find a niche, and compare it with the scene."""
+    """Detect a niche, and compare it with the scene."""
     half_m = 0.5 * GSD_M * side
     full, niche = (-half_m, half_m, -half_m, half_m), (-0.2 * half_m, 0.3 * half_m) * 2
     draft = SceneDraft()
@@ -192,7 +192,7 @@ def run_openings(folder: Path, side: int) -> None:
 
 
 def made_wall(cells: WallFrame, depth_m: NDArray, count: NDArray, mask: NDArray) -> Wall:
-    """A wall of these cells."""
+    """Return a wall with the given cells."""
     return Wall(
         frame=cells,
         plane_index=0,
@@ -205,7 +205,7 @@ def made_wall(cells: WallFrame, depth_m: NDArray, count: NDArray, mask: NDArray)
 
 
 def pictures(folder: Path, side: int) -> tuple[Orthoimage, Walls]:
-    """An orthoimage and the wall it is of."""
+    """Return an orthoimage and its wall."""
     allocate = partial(new, folder)
     rgb, intensity = allocate("rgb", (side, side, 3), np.uint8), allocate("intensity", (side,) * 2)
     depth_m, count = allocate("depth", (side,) * 2), allocate("count", (side,) * 2, np.uint32)
@@ -239,7 +239,7 @@ def pictures(folder: Path, side: int) -> tuple[Orthoimage, Walls]:
 
 
 def waves(right: NDArray[np.float64], down: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Grey levels that repeat nowhere: waves of many lengths and directions."""
+    """Return grey levels without repetition: waves of many lengths and directions."""
     rng = np.random.default_rng(11)
     total = np.zeros(np.broadcast_shapes(right.shape, down.shape))
     for length in np.geomspace(6.0, 60.0, 14):
@@ -249,12 +249,12 @@ def waves(right: NDArray[np.float64], down: NDArray[np.float64]) -> NDArray[np.f
 
 
 def new(folder: Path, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> NDArray:
-    """A zeroed array in a file."""
+    """Return a zeroed array in a file."""
     return np.memmap(folder / name, dtype=dtype, mode="w+", shape=shape).view(np.ndarray)
 
 
 def frame(side: int) -> WallFrame:
-    """A wall that faces -y, its lower left corner at the origin."""
+    """Return the frame of a wall that faces -y, with its lower left corner at the origin."""
     return WallFrame(
         origin_world=np.array([0.0, 0.0, GSD_M * side]),
         u_world=np.array([1.0, 0.0, 0.0]),
@@ -267,7 +267,7 @@ def frame(side: int) -> WallFrame:
 
 
 def plane(side: int) -> Planes:
-    """The plane of the wall."""
+    """Return the plane of the wall."""
     return Planes(
         normal=np.array([[0.0, -1.0, 0.0]]),
         offset=np.zeros(1),
@@ -281,7 +281,7 @@ def plane(side: int) -> Planes:
 
 
 def expect(what: str, *, is_met: bool) -> None:
-    """End where a number is not what it should be."""
+    """Exit if a number differs from the expected one."""
     if not is_met:
         sys.exit(f"not met: {what}")
 

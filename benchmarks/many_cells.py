@@ -17,7 +17,7 @@ from tests.engine_world import toy_world
 
 
 def main() -> None:
-    """Run that many cells in a new store."""
+    """Run the given number of cells in a new store."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cells", type=int, default=1000)
     parser.add_argument("--executor", default="local")

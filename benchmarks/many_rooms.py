@@ -69,7 +69,7 @@ FROM_PHOTOS = """\
 
 
 def main() -> None:
-    """Run both ways and compare."""
+    """Run with both executors and compare."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
@@ -96,7 +96,7 @@ def main() -> None:
 
 
 def write_workflow(folder: Path, *, n_rooms: int, has_photos: bool) -> None:
-    """Write the workflow, and a table of rooms of different design, noise and stations."""
+    """Write the workflow and a table of rooms with different design, noise and stations."""
     scan = "{scan_step_m: 0.02, panorama_step_m: 0.03, decoration: drawn}"
     shot = "{scan_step_m: 0.008, panorama_step_m: 0.03, photo_layout: quick, photo_gsd_m: 0.006}"
     text = WORKFLOW.replace("{ROOM}", shot if has_photos else scan)
@@ -112,7 +112,7 @@ def write_workflow(folder: Path, *, n_rooms: int, has_photos: bool) -> None:
 
 
 def run(folder: Path, name: str, chosen: tuple[str, ...]) -> float:
-    """Run the workflow; give the seconds on the clock."""
+    """Run the workflow; return the elapsed seconds."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     started_s = time.monotonic()
     command = [sys.executable, "-m", "orthoflow", "run", "rooms.yaml", "--datasets", "rooms.csv"]

@@ -52,7 +52,7 @@ def main() -> None:
 
 
 def texture(megapixels: float, *, seed: int) -> NDArray[np.uint8]:
-    """Random grey with detail of all sizes, three to two."""
+    """Return random grey levels with detail of all sizes, in the ratio 3:2."""
     height = round((megapixels * 1e6 / 1.5) ** 0.5)
     rng, total = np.random.default_rng(seed), np.zeros((height, height * 3 // 2), np.float32)
     for step in (3, 8, 24, 80, 240):
@@ -64,7 +64,7 @@ def texture(megapixels: float, *, seed: int) -> NDArray[np.uint8]:
 
 
 def match(folder: Path, longest_side_px: int) -> None:
-    """Match, and tell how long it took and how much memory the process ever had."""
+    """Match, and print the time and the peak memory of the process."""
     encoded = (folder / "photo.jpg").read_bytes()
     intensity = np.load(folder / "wall.npy").astype(np.float32)
     height, width = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE).shape

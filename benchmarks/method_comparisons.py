@@ -117,7 +117,7 @@ def main() -> None:
 
 
 def finished_run(folder: Path, recipe: str) -> Run:
-    """Run a recipe, or take the run that is there."""
+    """Run a recipe, or open its existing run."""
     target = folder / recipe
     if not (target / "run.h5").is_file():
         workflow = "orient-methods" if recipe in VARIANTS else recipe
@@ -130,7 +130,7 @@ def finished_run(folder: Path, recipe: str) -> Run:
 
 
 def markdown(combinations: Sequence[Combination], names: Mapping[str, str]) -> list[str]:
-    """Print a table: a row per combination, a column per metric, the best and its like in bold."""
+    """Print a table with a row per combination and a column per metric, best values in bold."""
     steps = tuple(dict.fromkeys(step for one in combinations for step in one.assignment))
     declared = {
         f"{row.step}.{row.metric}": (row.better, row.unit)

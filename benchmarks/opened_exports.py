@@ -75,7 +75,7 @@ for path in sys.argv[1:]:
 
 
 class Walk:
-    """One run, the folder of its exports, and what went wrong so far."""
+    """A run, the folder of its exports, and the faults found so far."""
 
     def __init__(self, chosen: argparse.Namespace) -> None:
         self.run, self.folder, self.store = chosen.run, chosen.folder.resolve(), chosen.store
@@ -86,13 +86,13 @@ class Walk:
         self.environment = os.environ | {"QT_QPA_PLATFORM": "offscreen"}
 
     def say(self, file: Path | str, text: str, *, is_right: bool = True) -> None:
-        """Print what was found."""
+        """Print a finding."""
         self.n_wrong += not is_right
         name = file.relative_to(self.folder) if isinstance(file, Path) else file
         print(f"{'      ' if is_right else 'WRONG '}{name}: {text}", flush=True)
 
     def export(self, target: str, *more: str, name: str = "") -> Path | None:
-        """Export as a user does; None where the run has nothing for it, which is said."""
+        """Export as a user would; None, with a message, if the run has no such content."""
         folder = self.folder / (name or target)
         shutil.rmtree(folder, ignore_errors=True)
         words = ["export", str(self.run), "--to", target, "-o", str(folder), *more]
@@ -104,7 +104,7 @@ class Walk:
         return folder if done.exit_code == 0 else None
 
     def started(self, words: list[str], folder: Path) -> subprocess.CompletedProcess[str] | None:
-        """Start a program; None, and a line, where it is not installed."""
+        """Start a program; None, with a message, if it is not installed."""
         if shutil.which(words[0]) is None:
             self.say(words[0], "not installed")
             return None
@@ -119,7 +119,7 @@ class Walk:
         )
 
     def drawn(self, pdf: Path, name: str) -> None:
-        """A PDF as a picture, by poppler."""
+        """Return an image of a PDF, drawn by poppler."""
         picture = self.pictures / name
         words = ["pdftoppm", "-scale-to", "1600", "-png", "-singlefile", str(pdf), str(picture)]
         done = self.started(words, self.folder)
@@ -128,14 +128,14 @@ class Walk:
             self.say(pdf, f"poppler: {said}", is_right=not done.returncode and not done.stderr)
 
     def frames(self) -> Iterator[tuple[int, float, float]]:
-        """Number, width and height in metres of the walls that have orthoimages."""
+        """Return number, width and height in metres of the walls with orthoimages."""
         for path in sorted((self.run / "products").glob("*/wall_*_ortho.json")):
             told = json.loads(path.read_text())
             yield told["wall"], told["gsd_m"] * told["width"], told["gsd_m"] * told["height"]
 
 
 def walk_sheets(walk: Walk) -> None:
-    """Scale and text by pdfplumber, pictures by poppler."""
+    """Check scale and text with pdfplumber, images with poppler."""
     more = ("--scale", str(walk.scale), "--paper", "A1", "--grid", "1", "--beside", "depth")
     folder = walk.export("sheet", *more)
     if folder is None:
@@ -176,7 +176,7 @@ def walk_sheets(walk: Walk) -> None:
 
 
 def walk_cad(walk: Walk) -> None:
-    """Audit by ezdxf, pictures by LibreCAD."""
+    """Audit with ezdxf, draw with LibreCAD."""
     folder = walk.export("dxf")
     if folder is None:
         return
@@ -196,20 +196,20 @@ def walk_cad(walk: Walk) -> None:
 
 
 def laz_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Places and colours by laspy."""
+    """Return positions and colours, read by laspy."""
     read = laspy.read(path)
     colours = np.stack([read.red, read.green, read.blue], axis=1)
     return np.asarray(read.xyz), (np.asarray(colours) >> 8).astype(np.uint8)
 
 
 def ply_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Places and colours by open3d."""
+    """Return positions and colours, read by open3d."""
     read = load_open3d("looking at clouds").io.read_point_cloud(str(path))
     return np.asarray(read.points), np.rint(255 * np.asarray(read.colors)).astype(np.uint8)
 
 
 def e57_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Places and colours of all scans by pye57."""
+    """Return positions and colours of all scans, read by pye57."""
     file = pye57.E57(str(path))
     scans = [
         file.read_scan(k, colors=True, ignore_missing_fields=True) for k in range(file.scan_count)
@@ -222,7 +222,7 @@ def e57_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def copc_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Places and colours by laspy, which asks the octree."""
+    """Return positions and colours, read by laspy through the octree."""
     with CopcReader.open(path) as file:
         read = file.query()
     colours = np.stack([read.red, read.green, read.blue], axis=1)
@@ -238,7 +238,7 @@ READERS: Final[dict[str, tuple[str, str, Callable[[Path], tuple[np.ndarray, np.n
 
 
 def walk_clouds(walk: Walk) -> None:
-    """The same points and colours in four formats and each colouring; a picture of each."""
+    """Check for equal points and colours in four formats and all colourings; draw each."""
     for colour in COLOURS:
         seen: list[tuple[np.ndarray, ...]] = []
         for target, (name, reader, read) in READERS.items():
@@ -264,7 +264,7 @@ def walk_clouds(walk: Walk) -> None:
 
 
 def draw_points(xyz: np.ndarray, rgb: np.ndarray, up: np.ndarray, path: Path) -> None:
-    """The points as seen along their thinnest level direction, the nearest before others."""
+    """Draw the points along their thinnest horizontal direction, the nearest on top."""
     flat = xyz - xyz.mean(0)
     flat = flat - np.outer(flat @ up, up)
     across, along = np.linalg.eigh(np.cov(flat[:: max(1, len(flat) // 100_000)].T))[1].T[1:]
@@ -278,7 +278,7 @@ def draw_points(xyz: np.ndarray, rgb: np.ndarray, up: np.ndarray, path: Path) ->
 
 
 def walk_viewers(walk: Walk) -> None:
-    """The model by trimesh and Khronos' validator, the pages by Chromium."""
+    """Check the model with trimesh and the Khronos validator, the pages with Chromium."""
     for name, more in (("gltf", ()), ("gltf_relief", ("--relief",))):
         folder = walk.export("gltf", *more, name=name)
         if folder is None:
@@ -304,7 +304,7 @@ def walk_viewers(walk: Walk) -> None:
 
 
 def photographed(walk: Walk, path: Path, name: str) -> None:
-    """A page as Chromium shows it, without complaints and without asking for anything else."""
+    """Return a screenshot by Chromium, without errors and further requests."""
     if not IS_HERE:
         walk.say("chromium", "not installed")
         return
@@ -321,7 +321,7 @@ def photographed(walk: Walk, path: Path, name: str) -> None:
 
 
 def walk_vectors(walk: Walk) -> None:
-    """GeoJSON, orthoimages and layers by QGIS."""
+    """Check GeoJSON, orthoimages and layers with QGIS."""
     folder = walk.export("geojson")
     layers = walk.export("layers")
     files = sorted((walk.run / "products").glob("*/wall_*_ortho.tif"))
@@ -341,7 +341,7 @@ def walk_vectors(walk: Walk) -> None:
 
 
 def walk_records(walk: Walk) -> None:
-    """PROV by prov, the catalogue by pystac, tables by csv, figures by Pillow and so on."""
+    """Check PROV with prov, the catalogue with pystac, tables with csv, figures with Pillow."""
     if folder := walk.export("prov"):
         document = prov.model.ProvDocument.deserialize(str(folder / "prov.json"))
         n_records = len(list(document.get_records()))
@@ -392,7 +392,7 @@ PARTS: Final = {
 
 
 def main() -> None:
-    """Walk through all of it, or the named parts."""
+    """Check all exports, or the given parts."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path)
     parser.add_argument("folder", type=Path)

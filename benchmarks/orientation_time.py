@@ -34,7 +34,7 @@ T = TypeVar("T")
 
 
 class Clock:
-    """Prints how long each step took, and sums it up."""
+    """Prints the duration of each step and the total."""
 
     def __init__(self) -> None:
         self.wall_s = self.cpu_s = 0.0

@@ -53,7 +53,7 @@ ESTIMATORS: dict[str, Estimator] = {"pnp": OrientPnp, "bundle": OrientColmapBund
 
 @dataclass(kw_only=True)
 class Score:
-    """What all rooms of one kind gave."""
+    """Results of all rooms of one type."""
 
     n_photos: int = 0
     errors_m: list[float] = field(default_factory=list)
@@ -112,7 +112,7 @@ def orient(method: Estimator, ties: Ties, photos: Photos, **params: float) -> Ca
 
 
 def chains(photos: Photos, walls: Walls, kinds: list[str]) -> Iterator[tuple[str, float, Cameras]]:
-    """Every chain's name, CPU seconds and cameras."""
+    """Return the name, CPU seconds and cameras of each chain."""
     from_exif = Photos(photos=tuple(replace(photo, intrinsics=None) for photo in photos.photos))
     started = time.process_time()
     ties = sifted(photos, walls)

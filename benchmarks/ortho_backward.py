@@ -45,7 +45,7 @@ MOST_POINTS = 10_000_000
 
 
 def wall(megacells: float) -> Walls:
-    """A 3 : 2 wall with frames of 5 cm, 2 mm noise, one cell in a thousand void."""
+    """Return a 3:2 wall with 5 cm frames, 2 mm noise, and one void cell in a thousand."""
     rng = np.random.default_rng(1)
     rows = round(math.sqrt(megacells * 1e6 / 1.5))
     columns = round(1.5 * rows)
@@ -76,7 +76,7 @@ def wall(megacells: float) -> Walls:
 
 
 def cloud(walls: Walls) -> PointCloud:
-    """Cells of the wall as points, all or some, and a tenth as many on a board before it."""
+    """Return all or some wall cells as points, and a tenth as many on a board in front of it."""
     frame, depth = walls.walls[0].frame, walls.walls[0].depth_m
     points, step = [], max(1, depth.size // MOST_POINTS)
     for first in range(0, frame.height, BAND_ROWS):
@@ -95,7 +95,7 @@ def cloud(walls: Walls) -> PointCloud:
 
 
 def camera(frame: WallFrame, megapixels: float, oblique_deg: float) -> ViewingCamera:
-    """A distorted camera that shows the whole wall."""
+    """Return a camera with distortion that shows the whole wall."""
     height = round(math.sqrt(megapixels * 1e6 / 1.5))
     width = round(1.5 * height)
     target = frame.world_from_wall(np.array([[frame.width / 2, frame.height / 2]]))[0]
@@ -119,14 +119,14 @@ def camera(frame: WallFrame, megapixels: float, oblique_deg: float) -> ViewingCa
 
 
 def seconds(task: Callable[[], object]) -> tuple[float, float]:
-    """Wall time, and processor time of all threads together, which other programs move less."""
+    """Return elapsed time and processor time of all threads; other load affects the latter less."""
     started, used = time.perf_counter(), time.process_time()
     task()
     return time.perf_counter() - started, time.process_time() - used
 
 
 def peak_bytes(task: Callable[[], object]) -> int:
-    """Most memory that arrays took at once while a task ran; OpenCV's own is left out."""
+    """Return the peak memory of arrays while a task ran, without OpenCV's own."""
     tracemalloc.start()
     task()
     peak = tracemalloc.get_traced_memory()[1]
@@ -148,7 +148,7 @@ def maps(walls: Walls, viewer: ViewingCamera) -> tuple[NDArray[np.float32], NDAr
 
 
 class KeptArrays:
-    """Gives the same array for a name every time, as it was left."""
+    """Returns the same array for a name every time, with its previous content."""
 
     def __init__(self) -> None:
         self._arrays: dict[str, NDArray[np.generic]] = {}

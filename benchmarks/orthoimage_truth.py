@@ -62,7 +62,7 @@ SURF_COLUMNS = (
 
 @dataclass(frozen=True, kw_only=True)
 class Bench:
-    """The room, and how it is judged."""
+    """The room and its evaluation."""
 
     room: SimulateRoom.Out
     seed: int
@@ -116,7 +116,7 @@ class Bench:
 
 
 def numbers(inspection: Inspection) -> dict[str, float]:
-    """Findings of the first wall, and those of all that no wall has."""
+    """Return the findings for the first wall, and those that belong to no wall."""
     told = {finding.name: finding.value for finding in inspection.findings if finding.wall < 0}
     return told | {
         finding.name: finding.value for finding in inspection.findings if finding.wall == 0

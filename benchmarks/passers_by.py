@@ -29,7 +29,7 @@ _LEVELS = 30
 
 
 def main() -> None:
-    """Print a row per room, with and without the robust choice."""
+    """Print a row per room, with and without the robust selection."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rooms", type=int, default=10)
     parser.add_argument("--first", type=int, default=1)
@@ -56,13 +56,13 @@ def main() -> None:
 
 
 def context(seed: int, folder: Path) -> StepContext:
-    """A step of its own."""
+    """Return a context for a step."""
     scratch = Path(tempfile.mkdtemp(dir=folder))
     return StepContext(rng=np.random.default_rng(seed), cores=2, scratch=scratch)
 
 
 def laid(seed: int, n_people: int, given: argparse.Namespace, folder: Path) -> tuple[Walls, Layers]:
-    """The main wall of a room, and its photos laid onto it."""
+    """Return the main wall of a room and its photos projected onto it."""
     params = SimulateRoom.Params(
         scan_step_m=0.8 * given.gsd,
         panorama_step_m=0.05,
@@ -84,7 +84,7 @@ def laid(seed: int, n_people: int, given: argparse.Namespace, folder: Path) -> t
 
 
 def joined(layers: Layers, walls: Walls, folder: Path, *, robust: bool) -> Orthoimages:
-    """The orthoimage of the wall."""
+    """Return the orthoimage of the wall."""
     inputs = MosaicSeams.In(layers=layers, walls=walls)
     params = MosaicSeams.Params(robust=robust)
     return MosaicSeams().run(inputs, params, context(1, folder)).orthoimages
@@ -93,7 +93,7 @@ def joined(layers: Layers, walls: Walls, folder: Path, *, robust: bool) -> Ortho
 def shown(
     images: Orthoimages, layers: Layers, people: list[NDArray[np.bool_]]
 ) -> tuple[float, float]:
-    """Shares of cells that show people: in the only photo, and though another shows the wall."""
+    """Return the shares of cells that show people: in the only photo, or despite another photo."""
     image = images.images[0]
     painters = {layer.source: place for place, layer in enumerate(layers.layers)}
     shows = np.zeros(image.mask.shape, dtype=np.bool_)

@@ -69,7 +69,7 @@ def main() -> None:
 
 
 def make(folder: Path, options: argparse.Namespace) -> None:
-    """Write the inputs; the calibration last, so that it says that all are there."""
+    """Write the inputs; the calibration last, as a sign that all are complete."""
 
     def room(step_m: float, **more: object) -> SimulateRoom.Out:
         params = {"scan_step_m": step_m, "n_stations": 1, **more}
@@ -103,13 +103,13 @@ def make(folder: Path, options: argparse.Namespace) -> None:
 
 
 def processor_s() -> float:
-    """Processor seconds of all processes that ended."""
+    """Return the processor seconds of all finished child processes."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
 
 def tell(run: Path, wall_s: float, cpu_s: float) -> None:
-    """Print a run's steps, the longest first, and what lies between them."""
+    """Print the steps of a run, longest first, and the time between them."""
     cells = [cell for cell in open_run(run).cells.values() if cell.status == "ok"]
     print(f"\n{'':10s} {'clock':>7s} {'processor':>9s} {'compiling':>9s}")
     for cell in sorted(cells, key=lambda cell: -cell.wall_s):

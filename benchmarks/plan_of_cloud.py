@@ -57,7 +57,7 @@ def main() -> None:
 
 
 def turn(up: UpDirection) -> NDArray[np.float64]:
-    """Turn (3, 3) that brings a cloud's up to z, and 40 degrees about it."""
+    """Return the rotation (3, 3) that makes the cloud's up axis z and turns it by 40 degrees."""
     return Rotation.from_euler("z", 40, degrees=True).as_matrix() @ basis_from_up(up_vector(up))
 
 

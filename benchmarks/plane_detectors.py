@@ -54,7 +54,7 @@ def _pass(x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32]
 
 
 def times_s(task: Callable[[], object], repeats: int) -> tuple[float, float, float]:
-    """Fastest and slowest of some runs, and the processor time of the fastest; seconds."""
+    """Return minimum and maximum times of some runs, and the processor time of the fastest."""
     runs = []
     for _ in range(repeats):
         start, cpu = time.perf_counter(), time.process_time()
@@ -66,7 +66,7 @@ def times_s(task: Callable[[], object], repeats: int) -> tuple[float, float, flo
 def detect(
     method: str, cloud: PointCloud, *, most: int, cores: int
 ) -> tuple[PreparedCloud, list[FoundPlane]]:
-    """What a method does up to its labels, without statistics, files and figures."""
+    """Run a method up to its labels, without statistics, files and figures."""
     params = {"n_planes_max": most, "min_share": SHARE}
     plan_cell_m = CELL_M if method == "hough2d" else None
     prepared = prepare(cloud, parts=cores, plan_cell_m=plan_cell_m)
@@ -96,7 +96,7 @@ def proposer_of(method: str, search: Search, params: dict[str, float]) -> Propos
 
 @dataclass(frozen=True, kw_only=True)
 class Room:
-    """What is measured on.
+    """The measured room.
 
     Attributes:
         cloud: the points.
@@ -139,7 +139,7 @@ def main() -> None:
 
 
 def _room(cloud: PointCloud, planes: list[tuple[str, NDArray, float]], labels: NDArray) -> Room:
-    """Join a cloud and its truth; labels count in planes."""
+    """Join a cloud with its truth; labels are plane indices."""
     truth = []
     for number, (name, normal, offset) in enumerate(planes):
         mine = np.flatnonzero(labels == number)[::7]
@@ -171,13 +171,13 @@ def _cloud(x: NDArray, y: NDArray, z: NDArray) -> PointCloud:
 
 
 def pass_s(cloud: PointCloud) -> float:
-    """Seconds of the fastest of some passes over the points."""
+    """Return the minimum time of some passes over the points, in seconds."""
     _pass(cloud.x, cloud.y, cloud.z)
     return times_s(lambda: _pass(cloud.x, cloud.y, cloud.z), 5)[0]
 
 
 def report_method(method: str, room: Room, options: argparse.Namespace) -> Room:
-    """Print times, memory and accuracy of a method; gives the room with the fastest pass so far."""
+    """Print times, memory and accuracy of a method; return the room with the fastest pass."""
     cloud, cores = room.cloud, options.cores
     detect(method, cloud, most=2, cores=cores)  # warm
     before_mib = forget_peak()
@@ -207,7 +207,7 @@ def report_method(method: str, room: Room, options: argparse.Namespace) -> Room:
 
 
 def accuracy(room: Room, prepared: PreparedCloud, found: list[FoundPlane]) -> tuple[str, str]:
-    """How near the planes come to the true ones: of the main wall, and the worst of the others."""
+    """Return the errors of planes: of the main wall, and the maximum of the others."""
     nearest = [_nearest(normal, offset, centre, found) for _, normal, offset, centre in room.truth]
     hits = [item for item in nearest if item is not None]
     others = [item for item in nearest[1:] if item is not None]
@@ -239,7 +239,7 @@ def _nearest(
     centre: NDArray[np.float64],
     found: list[FoundPlane],
 ) -> tuple[float, float, int] | None:
-    """Angle, distance at the true centroid in millimetres, and number of the nearest plane."""
+    """Return the nearest plane: angle, distance at the true centroid (mm) and number."""
     best = None
     for index, item in enumerate(found):
         plane = item.raster.plane
@@ -252,7 +252,7 @@ def _nearest(
 
 
 def report_peers(room: Room) -> None:
-    """Print what other programs take for the main wall, on the same points."""
+    """Print the main walls found by other programs in the same points."""
     print("| peer | points | time | main wall | planes |")
     print("|---|---|---|---|---|")
     _, normal, offset, centre = room.truth[0]
@@ -279,13 +279,13 @@ def report_peers(room: Room) -> None:
 
 
 def forget_peak() -> float:
-    """Let the peak of this process's memory start anew; gives its memory now, MiB."""
+    """Reset the peak memory of this process; return its current memory, MiB."""
     Path("/proc/self/clear_refs").write_text("5")
     return peak_mib()
 
 
 def peak_mib() -> float:
-    """Largest resident memory since the peak was forgotten, MiB."""
+    """Return the peak resident memory since the reset, MiB."""
     status = Path("/proc/self/status").read_text()
     return int(re.search(r"VmHWM:\s+(\d+)", status)[1]) / 1024
 

@@ -19,13 +19,13 @@ DENSEST_SHARE = 0.03
 
 @dataclass(frozen=True, kw_only=True)
 class PeerPlane:
-    """What a peer found first.
+    """The first plane found by another program.
 
     Attributes:
-        seconds: that it took, loading apart.
+        seconds: time without loading.
         normal: (3,) unit vector.
-        offset_m: of the plane.
-        n_planes: how many it found in that time.
+        offset_m: offset of the plane.
+        n_planes: number of planes found in that time.
     """
 
     seconds: float
@@ -39,9 +39,9 @@ class Peer:
     """Another program.
 
     Attributes:
-        name: what it is and how it is asked.
+        name: name of the program and its call.
         every: it gets every n-th point.
-        run: finds the first plane of (n, 3) points, or the plane that lies nearest to the wall's.
+        run: finds the first plane of (n, 3) points, or the plane nearest to the wall's.
     """
 
     name: str
@@ -76,7 +76,7 @@ def _open3d_patches(points: Points, wall: NDArray[np.float64]) -> PeerPlane:
 
 
 def _densest(points: Points) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """The densest plan cells as an image of 0 and 255, and where its corner lies."""
+    """Return the densest plan cells as an image of 0 and 255, and the position of its corner."""
     low, high = np.percentile(points[:: max(1, len(points) // 100_000), :2], (0.5, 99.5), axis=0)
     places = ((points[:, :2] - low.astype(np.float32)) * np.float32(1.0 / CELL_M)).astype(np.int32)
     shape = np.ceil((high - low) / CELL_M).astype(int)
@@ -153,7 +153,7 @@ PEERS = (
 
 
 def measured(peer: Peer, points: Points, wall: NDArray[np.float64]) -> PeerPlane | str:
-    """What a peer finds in every n-th point, or a sentence that says why it was not asked.
+    """Run a program on every n-th point; return its plane, or the reason why it cannot run.
 
     Args:
         peer: the program.

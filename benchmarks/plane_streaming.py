@@ -44,7 +44,7 @@ steps:
 
 @dataclass(frozen=True)
 class Cost:
-    """What a process cost: wall and processor seconds, largest anonymous memory."""
+    """Cost of a process: elapsed and processor seconds, peak anonymous memory."""
 
     wall_s: float
     cpu_s: float
@@ -74,7 +74,7 @@ def main() -> None:
 
 
 def report_file(folder: Path, options: argparse.Namespace) -> None:
-    """Print what reading a LAZ file and finding its planes costs."""
+    """Print the cost of reading a LAZ file and finding its planes."""
     path, points = folder / "room.laz", room(options)
     if not path.exists():
         write_laz(path, points)
@@ -112,7 +112,7 @@ def report_file(folder: Path, options: argparse.Namespace) -> None:
 
 
 def report_tiles(folder: Path, options: argparse.Namespace) -> None:
-    """Print what finding planes costs per point, once and many times over, from mapped files."""
+    """Print the cost per point of finding planes in one and many copies, from mapped files."""
     points = room(options)
     for name in ("once", "tiled"):
         copies = 1 if name == "once" else options.tiled
@@ -139,7 +139,7 @@ def report_tiles(folder: Path, options: argparse.Namespace) -> None:
 
 
 def room(options: argparse.Namespace) -> NDArray[np.float32]:
-    """The points, (n, 3), made or mapped."""
+    """Return the points (n, 3), generated or memory-mapped."""
     if options.npy:
         stored: NDArray[np.float32] = np.load(options.npy, mmap_mode="r")[: options.points]
         options.points = len(stored)
@@ -152,7 +152,7 @@ def room(options: argparse.Namespace) -> NDArray[np.float32]:
 
 
 def write_laz(path: Path, points: NDArray[np.float32]) -> None:
-    """Write points as a scanner's software does: format 6, a tenth of a millimetre, intensity."""
+    """Write points as scanner software does: format 6, a tenth of a millimetre, intensity."""
     import laspy
 
     header = laspy.LasHeader(point_format=6, version="1.4")
@@ -181,7 +181,7 @@ def engine_command(method: str, path: Path, folder: Path) -> list[str]:
 
 
 def run_child(arguments: list[str]) -> None:
-    """Do one of the things that are measured."""
+    """Run one of the measured tasks."""
     task, *rest = arguments
     if task in {"decode", "read"}:
         read_with_laspy(Path(rest[0]), keeps=task == "read")
@@ -241,7 +241,7 @@ def method_of(name: str):  # a class; which one is known when it is run
 
 
 def measured(command: list[str]) -> Cost:
-    """Run a command and measure it and all that it starts."""
+    """Run a command and measure it with all its child processes."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     start_s = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
@@ -265,7 +265,7 @@ def measured(command: list[str]) -> Cost:
 
 
 def anonymous_bytes(pid: int) -> int:
-    """Anonymous memory of a process and of all that it started; 0 for what has ended."""
+    """Return the anonymous memory of a process and its children; 0 if they have ended."""
     total, waiting = 0, [pid]
     while waiting:
         folder = Path("/proc") / str(waiting.pop())
@@ -280,7 +280,7 @@ def anonymous_bytes(pid: int) -> int:
 
 
 def fastest(costs: list[Cost]) -> Cost:
-    """The least of each."""
+    """Return the minimum of each cost."""
     return Cost(
         min(cost.wall_s for cost in costs),
         min(cost.cpu_s for cost in costs),

@@ -26,14 +26,14 @@ def orthoflow_methods():
 
 @dataclass(frozen=True)
 class Took:
-    """Seconds of one run."""
+    """Times of one run, in seconds."""
 
     wall_s: float
     cpu_s: float
 
 
 def install(site: Path, n_plugins: int) -> None:
-    """Lay that many distributions into a folder, as pip would."""
+    """Write the given number of distributions into a folder, as pip would."""
     for n in range(n_plugins):
         package, info = site / f"many{n}", site / f"many_{n}-1.0.dist-info"
         package.mkdir()
@@ -46,7 +46,7 @@ def install(site: Path, n_plugins: int) -> None:
 
 
 def run(command: list[str], site: Path) -> Took:
-    """Run a command of orthoflow once."""
+    """Run an orthoflow command once."""
     path = os.pathsep.join([str(site), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
     started = time.perf_counter()
     process = subprocess.Popen(
@@ -63,7 +63,7 @@ def run(command: list[str], site: Path) -> Took:
 
 
 def main() -> None:
-    """Print the median of some runs."""
+    """Print the medians of some runs."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--plugins", type=int, default=30)
     parser.add_argument("--runs", type=int, default=7)

@@ -26,7 +26,7 @@ def timed(what: str, n_bytes: int, work: Callable[[], object]) -> None:
 
 
 def anonymous_mib() -> float:
-    """Memory that is not backed by files."""
+    """Return the memory that is not backed by files."""
     for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
         if line.startswith("RssAnon"):
             return int(line.split()[1]) / 1024

@@ -36,7 +36,7 @@ SIZE_M = (9.2, 5.2)
 
 
 def scan(n_points: int) -> PointCloud:
-    """Columns of a scan of a room corner; half of the points lie on the wall, in scan order."""
+    """Return the columns of a scan of a room corner, half of it on the wall, in scan order."""
     rng = np.random.default_rng(20150807)
     n_columns = int(np.sqrt(2 * n_points))
     per_column = n_points // n_columns
@@ -86,7 +86,7 @@ def with_ours(cloud: PointCloud, slab: Slab, threads: int) -> tuple[NDArray, NDA
 
 
 def laid_out(cloud: PointCloud, slab: Slab) -> tuple[NDArray, NDArray, NDArray]:
-    """Cell, depth and intensity of the points inside, as numpy finds them."""
+    """Return cell, depth and intensity of the points inside, as found with numpy."""
     frame = slab.frame
     depth = -cloud.y
     near = np.abs(depth) <= np.float32(BUFFER_M)
@@ -126,7 +126,7 @@ def whole_method(cloud: PointCloud, surface: str, threads: int) -> None:
 def interleaved(
     contestants: dict[str, Callable[[], object]], repeat: int
 ) -> tuple[dict[str, list[float]], dict[str, list[float]]]:
-    """Wall times, and processor times of all threads, which a loaded machine moves less."""
+    """Return elapsed times, and processor times, which other load affects less."""
     seconds: dict[str, list[float]] = {name: [] for name in contestants}
     processor: dict[str, list[float]] = {name: [] for name in contestants}
     for round_number in range(repeat + 1):

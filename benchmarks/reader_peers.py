@@ -29,7 +29,7 @@ WAYS = ("library", "reader", "read.scan")
 
 
 def fields_of(n_points: int) -> Fields:
-    """Points on the walls of a room, to a tenth of a millimetre."""
+    """Return points on the walls of a room, rounded to a tenth of a millimetre."""
     rng = np.random.default_rng(1)
     points = np.round(rng.uniform(0.0, 20.0, (n_points, 3)), 4)
     points[np.arange(n_points), np.arange(n_points) % 3] = 20.0
@@ -40,7 +40,7 @@ def fields_of(n_points: int) -> Fields:
 
 
 def write_ply(path: Path, fields: Fields) -> None:
-    """Write binary PLY by plyfile."""
+    """Write binary PLY with plyfile."""
     from plyfile import PlyData, PlyElement
 
     table = np.rec.fromarrays(
@@ -51,7 +51,7 @@ def write_ply(path: Path, fields: Fields) -> None:
 
 
 def read_ply(path: Path) -> list[Any]:
-    """Read it by plyfile, memory-mapped."""
+    """Read PLY with plyfile, memory-mapped."""
     from plyfile import PlyData
 
     data = PlyData.read(str(path), mmap="r")["vertex"].data
@@ -62,7 +62,7 @@ def read_ply(path: Path) -> list[Any]:
 
 
 def write_las(path: Path, fields: Fields) -> None:
-    """Write LAS or LAZ by laspy."""
+    """Write LAS or LAZ with laspy."""
     import laspy
 
     header = laspy.LasHeader(point_format=7, version="1.4")
@@ -76,7 +76,7 @@ def write_las(path: Path, fields: Fields) -> None:
 
 
 def read_las(path: Path) -> list[Any]:
-    """Read it by laspy, whole."""
+    """Read a complete LAS or LAZ file with laspy."""
     import laspy
 
     las = laspy.read(str(path))
@@ -85,7 +85,7 @@ def read_las(path: Path) -> list[Any]:
 
 
 def write_e57(path: Path, fields: Fields) -> None:
-    """Write one scan by pye57."""
+    """Write one scan with pye57."""
     import pye57
 
     names = dict(zip("xyz", ("cartesianX", "cartesianY", "cartesianZ"), strict=True))
@@ -96,7 +96,7 @@ def write_e57(path: Path, fields: Fields) -> None:
 
 
 def read_e57(path: Path) -> list[Any]:
-    """Read it by pye57, whole."""
+    """Read a complete E57 file with pye57."""
     import pye57
 
     with pye57.E57(str(path)) as file:
@@ -106,7 +106,7 @@ def read_e57(path: Path) -> list[Any]:
 
 
 def write_pcd(path: Path, fields: Fields) -> None:
-    """Write binary PCD by open3d, without intensity, which it does not keep."""
+    """Write binary PCD with open3d, without intensity, which it does not support."""
     open3d = load_open3d("the benchmark")
     cloud = open3d.geometry.PointCloud()
     cloud.points = open3d.utility.Vector3dVector(np.column_stack([fields[a] for a in "xyz"]))
@@ -116,20 +116,20 @@ def write_pcd(path: Path, fields: Fields) -> None:
 
 
 def read_pcd(path: Path) -> list[Any]:
-    """Read it by open3d, whole."""
+    """Read a complete PCD file with open3d."""
     cloud = load_open3d("the benchmark").io.read_point_cloud(str(path))
     return [np.asarray(cloud.points), np.asarray(cloud.colors)]
 
 
 def write_xyz(path: Path, fields: Fields) -> None:
-    """Write text by pandas."""
+    """Write text with pandas."""
     import pandas as pd
 
     pd.DataFrame(fields).to_csv(path, sep=" ", index=False, float_format="%.4f")
 
 
 def read_xyz(path: Path) -> list[Any]:
-    """Read it by pandas, whole."""
+    """Read a complete text file with pandas."""
     import pandas as pd
 
     frame = pd.read_csv(path, sep=" ")
@@ -148,7 +148,7 @@ FORMATS: dict[str, tuple[Callable[[Path, Fields], None], Callable[[Path], list[A
 
 
 def read(path: Path, way: str) -> tuple[float, float]:
-    """Read a file and return seconds, on the clock and of all processors."""
+    """Read a file; return elapsed and processor seconds."""
     import laspy  # noqa: F401 - what imports take is no reader's time
     import pandas as pd  # noqa: F401
     import pye57  # noqa: F401
@@ -176,7 +176,7 @@ def read(path: Path, way: str) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Write the files, read each in every way, print a table."""
+    """Write the files, read each with every method, print a table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )

@@ -49,13 +49,13 @@ _CELLS_LEAST = 400
 
 
 def flat(wall: Wall) -> Wall:
-    """A wall without its relief, so that its colours can be rendered exactly."""
+    """Return a wall without relief, so that its colours can be rendered exactly."""
     depth = np.where(np.isfinite(wall.depth_m), np.float32(0.0), np.float32(np.nan))
     return replace(wall, depth_m=depth)
 
 
 def cameras_before(wall: Wall) -> list[ViewingCamera]:
-    """Cameras that see most of what is known of a wall."""
+    """Return cameras that show most of the known part of a wall."""
     frame = wall.frame
     rows, columns = np.nonzero(np.isfinite(wall.depth_m))
     low, high = np.percentile(np.column_stack([columns, rows]), (2.0, 98.0), axis=0)
@@ -91,7 +91,7 @@ def cameras_before(wall: Wall) -> list[ViewingCamera]:
 
 
 def photo_of(wall: Wall, camera: ViewingCamera, name: str) -> Photo:
-    """What a camera would see of a flat wall's colours."""
+    """Render the colours of a flat wall as a camera would see them."""
     import cv2
 
     if wall.rgb is None or wall.rgb_mask is None:
@@ -114,7 +114,7 @@ def photo_of(wall: Wall, camera: ViewingCamera, name: str) -> Photo:
 
 
 def whole_photo(step: int) -> NDArray[np.float64]:
-    """Pixels (n, 2), every step-th along both sides."""
+    """Return every step-th pixel (n, 2) in both directions."""
     across, down = (np.arange(0, side, step) + 0.5 for side in _SIZE_PX)
     return np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
 
@@ -122,7 +122,7 @@ def whole_photo(step: int) -> NDArray[np.float64]:
 def landed(
     wall: Wall, camera: ViewingCamera, pixels: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Cells (n, 2) of a flat wall that pixels look at, and whether the wall is before them."""
+    """Return the cells (n, 2) of a flat wall in view of pixels, and whether they are in front."""
     frame = wall.frame
     rays = camera.rays_world(pixels)
     towards = camera.centre_world - frame.origin_world
@@ -134,7 +134,7 @@ def landed(
 
 
 def error_cells(wall: Wall, truth: ViewingCamera, found: ViewingCamera) -> float:
-    """RMS error of a coordinate on the wall, over the known cells that a photo shows."""
+    """Return the RMS error per coordinate on the wall, over the known cells in a photo."""
     pixels = whole_photo(20)
     cells, known = landed(wall, truth, pixels)
     inside = known & ((cells >= 0) & (cells < wall.frame.shape[::-1])).all(axis=1)
@@ -145,7 +145,7 @@ def error_cells(wall: Wall, truth: ViewingCamera, found: ViewingCamera) -> float
 
 
 def oriented(photos: Photos, walls: Walls, structure: str) -> Sequence[Camera]:
-    """Cameras as the shipped workflow finds them."""
+    """Return the cameras found by the shipped workflow."""
     first = orient(
         OrientColmapBundle, sifted(photos, walls, structure=structure), photos, **ROUGHLY
     )
@@ -161,7 +161,7 @@ def walls_in(cloud: PointCloud) -> Planes:
 
 
 def paper(cloud: PointCloud) -> Planes:
-    """The plane that a small patch lies on, seen from the origin of its file."""
+    """Return the plane of a small patch, seen from the origin of its file."""
     normal, offset_m = paper_plane(cloud.points_world(np.arange(len(cloud))))
     params = GivenPlane.Params(normal=tuple(normal.tolist()), offset_m=offset_m)
     return GivenPlane().run(GivenPlane.In(cloud=cloud), params, context(1)).planes

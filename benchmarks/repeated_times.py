@@ -51,7 +51,7 @@ def main() -> None:
 
 
 def measured(folder: Path, recipe: str, step: str, number: int) -> Times:
-    """Run a recipe, or take the run that is there; its seconds by cell and name."""
+    """Run a recipe, or open its existing run; return its times by cell and name."""
     target = folder / str(number)
     if not (target / "run.h5").is_file():
         command = [sys.executable, "-m", "orthoflow", "run", recipe, "-o", str(target)]
@@ -72,7 +72,7 @@ def measured(folder: Path, recipe: str, step: str, number: int) -> Times:
 
 
 def print_pairs(before: Times, after: Times) -> None:
-    """Print what moved by more than it may, and how many of each time did."""
+    """Print times that changed by more than the limit, and their number per name."""
     compared: defaultdict[str, list[bool]] = defaultdict(list)
     for (cell, name), first in before.items():
         second = after.get((cell, name), first)
@@ -87,7 +87,7 @@ def print_pairs(before: Times, after: Times) -> None:
 
 
 def print_orders(before: Times, after: Times) -> None:
-    """Print the variants from the quickest to the slowest, and which changed places, how far."""
+    """Print the variants from fastest to slowest, and those that changed order, with ratios."""
     for name in dict.fromkeys(name for _, name in before):
         first, second = medians(before, name), medians(after, name)
         print(f"{name}: {' < '.join(sorted(first, key=lambda one: first[one]))}")
@@ -108,7 +108,7 @@ def print_orders(before: Times, after: Times) -> None:
 
 
 def medians(times: Times, name: str) -> dict[str, float]:
-    """Variant -> median over its repeats."""
+    """Return variant -> median over its repeats."""
     of: defaultdict[str, list[float]] = defaultdict(list)
     for (cell, metric), value in times.items():
         if metric == name:
@@ -117,7 +117,7 @@ def medians(times: Times, name: str) -> dict[str, float]:
 
 
 def apart(values: Mapping[str, float], pair: tuple[str, str]) -> float:
-    """The larger of two over the smaller."""
+    """Return the larger of two numbers divided by the smaller."""
     return max(values[one] for one in pair) / min(values[one] for one in pair)
 
 

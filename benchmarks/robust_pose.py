@@ -45,7 +45,7 @@ LENS: Final = Intrinsics(
 
 @dataclass(frozen=True, kw_only=True)
 class TiedPhoto:
-    """A photo's ties and its true place."""
+    """The ties of a photo and its true pose."""
 
     pixels: NDArray[np.float64]
     points: NDArray[np.float64]

@@ -54,7 +54,7 @@ _WRONG_CELLS = 1.5
 
 @dataclass(kw_only=True)
 class Score:
-    """What a format and a size of cells gave in all rooms; displacements in cells."""
+    """Results of a format and a cell size in all rooms; displacements in cells."""
 
     biases: list[NDArray[np.float64]] = field(default_factory=list)
     errors_m: list[float] = field(default_factory=list)
@@ -109,7 +109,7 @@ def write_laz(path: Path, cloud: PointCloud) -> None:
 
 
 def written(room: SimulateRoom.Out, folder: Path) -> Iterator[tuple[str, Path]]:
-    """All files of a room."""
+    """Write all files of a room."""
     cloud = room.cloud
     straight = np.arange(len(cloud))
     mixed = np.random.default_rng(7).permutation(len(cloud))
@@ -126,7 +126,7 @@ def written(room: SimulateRoom.Out, folder: Path) -> Iterator[tuple[str, Path]]:
 def scanned_room(
     seed: int, panorama_step_m: float, photo_gsd_m: float = 0.0025
 ) -> SimulateRoom.Out:
-    """A room from one station, its main wall at one density."""
+    """Simulate a room scanned from one station, with uniform density on its main wall."""
     drawn = np.random.default_rng(seed).uniform(1.0 - _STEP_SHARE, 1.0 + _STEP_SHARE)
     params = SimulateRoom.Params.model_validate(
         {
@@ -143,7 +143,7 @@ def scanned_room(
 
 
 def scanned_apart(cloud: PointCloud, truth: Truth) -> tuple[PointCloud, Truth]:
-    """The cloud without what the panorama saw of the main wall: one density there."""
+    """Return the cloud without the panorama's points on the main wall, for uniform density."""
     main = truth.planes.names.index("main wall")
     off_m = cloud.points_world() @ truth.planes.normal[main] - truth.planes.offset[main]
     is_kept = np.abs(off_m) > _BEFORE_WALL_M
@@ -155,7 +155,7 @@ def scanned_apart(cloud: PointCloud, truth: Truth) -> tuple[PointCloud, Truth]:
 
 
 def main_wall_found(cloud: PointCloud, truth: Truth) -> tuple[Planes, int]:
-    """Planes of a cloud and which is the main wall; it faces the room, which LAZ does not know."""
+    """Find planes and the main wall; turn it to the room, because LAZ has no stations."""
     planes = Hough2d().run(Hough2d.In(cloud=cloud), Hough2d.Params(), context(1)).planes
     main = truth.planes.names.index("main wall")
     middle = truth.planes.corners[main].mean(axis=0)
@@ -167,7 +167,7 @@ def main_wall_found(cloud: PointCloud, truth: Truth) -> tuple[Planes, int]:
 
 
 def displacements_cells(ties: Ties, walls: Walls, truth: Truth) -> NDArray[np.float64]:
-    """How far the points of ties lie to the right of and below where their pixels look."""
+    """Return the offsets of tie points, right and down, from where their pixels look."""
     frame = walls.walls[0].frame
     parts = []
     for photo in np.unique(ties.photo):
@@ -223,7 +223,7 @@ def main() -> None:
 def judge(
     score: Score, seen: tuple[Walls, PointCloud], room: SimulateRoom.Out, views: SceneCameras
 ) -> None:
-    """Add what the photos of a room give on a raster of a cloud."""
+    """Add the results of a room's photos on a raster of a cloud."""
     walls, cloud = seen
     cameras = room.truth.cameras
     if cameras is None:

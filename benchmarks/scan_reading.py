@@ -82,7 +82,7 @@ def write(folder: Path, n_points: int, n_files: int) -> None:
 
 
 def read(folder: Path, name: str, cores: int) -> str:
-    """Read all files of a format; give the cloud's digest."""
+    """Read all files of a format; return the digest of the cloud."""
     scratch = folder / f"scratch-{name}-{cores}"
     scratch.mkdir(exist_ok=True)
     ctx = StepContext(rng=np.random.default_rng(0), cores=cores, scratch=scratch)

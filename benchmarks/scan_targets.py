@@ -51,7 +51,7 @@ def main() -> None:
 
 
 def _metrics(patch: Path, centre: list[float], runs: Path, gsd_m: float) -> dict[str, float]:
-    """Run the workflow for one patch; give what was measured at its check point."""
+    """Run the workflow for one patch; return the metrics of its check point."""
     run = runs / patch.stem
     survey = runs / f"{patch.stem}.csv"
     survey.write_text("name,x,y,z\n" + ",".join([patch.stem, *map(repr, centre)]) + "\n")
@@ -70,7 +70,7 @@ def _metrics(patch: Path, centre: list[float], runs: Path, gsd_m: float) -> dict
 
 
 def paper_plane(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Normal towards the scanner at the origin, and offset, of the paper alone, not its holder."""
+    """Fit the plane of the paper without its holder: normal towards the scanner, and offset."""
     near = np.ones(len(points), dtype=np.bool_)
     for _ in range(10):
         middle = points[near].mean(axis=0)

@@ -30,14 +30,14 @@ _SEQUENCE = re.compile(r"\x1b\[([0-9;?]*)([A-Za-z])")
 
 @dataclass
 class Screen:
-    """As much of a terminal as rich asks for: text, line ends, cursor up, lines cleared."""
+    """The subset of a terminal that rich uses: text, line ends, cursor up, clearing lines."""
 
     lines: list[str] = field(default_factory=lambda: [""])
     row: int = 0
     column: int = 0
 
     def feed(self, text: str) -> None:
-        """Take what a program writes."""
+        """Process the output of a program."""
         place = 0
         while place < len(text):
             found = _SEQUENCE.match(text, place)
@@ -66,13 +66,13 @@ class Screen:
             self.lines[self.row] = "" if number == "2" else self.lines[self.row][: self.column]
 
     def text(self) -> tuple[str, ...]:
-        """The last lines, as many as fit."""
+        """Return as many of the last lines as fit."""
         return tuple(line.rstrip() for line in self.lines[-_ROWS:])
 
 
 @dataclass
 class Stillness:
-    """How long something was watched, and the longest time in which it stayed as it was."""
+    """How long something was observed, and the longest time without a change."""
 
     began_s: float
     changed_s: float
@@ -82,7 +82,7 @@ class Stillness:
     longest_until_s: float = 0.0
 
     def see(self, content: str, now_s: float) -> None:
-        """Look at it once more."""
+        """Observe it once more."""
         if now_s - self.changed_s > self.longest_s:
             self.longest_s, self.longest_until_s = now_s - self.changed_s, now_s
         self.ended_s = now_s
@@ -91,10 +91,10 @@ class Stillness:
 
 
 def record(command: list[str], frames: Path | None) -> tuple[dict[str, Stillness], int]:
-    """Run a command on a terminal of its own; watch the lines of what runs, and the whole.
+    """Run a command in its own terminal; observe the lines of running steps, and the whole screen.
 
     Returns:
-        Line -> how it stood; and the exit code.
+        Line -> its stillness; and the exit code.
     """
     controlling, terminal = pty.openpty()
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", _ROWS, _COLUMNS, 0, 0))
@@ -139,7 +139,7 @@ def _watch(watched: dict[str, Stillness], shown: tuple[str, ...], now_s: float) 
 
 
 def main() -> None:
-    """Record and say."""
+    """Record and print the result."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, help="file for the frames")
     parser.add_argument("--most", type=float, default=float("inf"), help="seconds")

@@ -64,7 +64,7 @@ def context(folder: str, seed: int) -> StepContext:
 
 @dataclass(frozen=True, kw_only=True)
 class Oriented:
-    """Photos of one room: true and stated errors, reasons of those refused, and wrong ones."""
+    """Photos of one room: true and expected errors, reasons for rejection, wrong ones."""
 
     errors_m: list[tuple[float, float]]
     refused: list[str]
@@ -73,7 +73,7 @@ class Oriented:
 
 
 def simulated(cloud: str, seed: int, folder: str) -> SimulateRoom.Out:
-    """Build a room, its cloud off as `CLOUDS` has it, or exact but for noise where that is none."""
+    """Build a room with the cloud errors given in `CLOUDS`, or only noise if there are none."""
     chosen: dict[str, object] = {"scan_step_m": 0.004, "panorama_step_m": 0.02, "noise_m": 0.002}
     chosen |= {"photo_gsd_m": 0.003, "photo_layout": "quick", "textile_share": 0.33}
     params = SimulateRoom.Params.model_validate(chosen | CLOUDS[cloud])
@@ -83,7 +83,7 @@ def simulated(cloud: str, seed: int, folder: str) -> SimulateRoom.Out:
 def cloud_shifts(
     off: PointCloud, exact: PointCloud, wall: Wall, cameras: Cameras
 ) -> list[NDArray[np.float64]]:
-    """Mean (3,) of how far the points are off that each photo shows of a wall, metres."""
+    """Return the mean offset (3,) of the wall points that each photo shows, metres."""
     some = np.arange(0, len(off), _EVERY)
     points, true = off.points_world(some), exact.points_world(some)
     near = np.abs(wall.frame.wall_from_world(points)[:, 2]) < _BUFFER_M
@@ -157,7 +157,7 @@ def room(cloud: str, seed: int, folder: str) -> Oriented:
 
 
 def moved(camera: Camera, by_m: NDArray[np.float64]) -> Camera:
-    """Return a camera elsewhere in the world."""
+    """Return a camera moved to another position in the world."""
     if camera.status != "ok":
         return camera
     return replace(
@@ -186,7 +186,7 @@ def drawn(chosen: argparse.Namespace) -> None:
 
 
 def real(folder: Path, names: tuple[str, ...]) -> None:
-    """Run photos on their cloud, with and without calibration, and compare the cameras."""
+    """Orient photos on their cloud, with and without calibration, and compare the cameras."""
     import laspy
 
     cloud = np.asarray(laspy.read(folder / "cloud_from_photos.laz").xyz)[::_EVERY]
@@ -232,7 +232,7 @@ def real(folder: Path, names: tuple[str, ...]) -> None:
 
 
 def read_camera(written: dict[str, Any]) -> ViewingCamera:
-    """A camera as `cameras.json` has it."""
+    """Read a camera from `cameras.json`."""
     lens = np.array(written["K"])
     return ViewingCamera(
         width=written["width"],
@@ -248,7 +248,7 @@ def read_camera(written: dict[str, Any]) -> ViewingCamera:
 
 
 def reference_camera(folder: Path, name: str, lens: list[float]) -> ViewingCamera:
-    """A camera as the benchmark of Strecha et al. has it; `lens` is K row by row."""
+    """Read a camera of the benchmark of Strecha et al.; `lens` is K row by row."""
     lines = (folder / "images" / f"{name}.jpg.camera").read_text().splitlines()
     # Written with few digits: the nearest rotation.
     left, _, right = np.linalg.svd([[float(word) for word in row.split()] for row in lines[4:7]])
@@ -268,7 +268,7 @@ def reference_camera(folder: Path, name: str, lens: list[float]) -> ViewingCamer
 
 
 def error_on_wall(found: ViewingCamera, true: ViewingCamera, points: NDArray[np.float64]) -> float:
-    """RMS of a coordinate, square to the view, of where points appear that a photo shows."""
+    """Return the RMS error per coordinate, perpendicular to the view, of points in a photo."""
     seen = true.project(points)
     shown = true.sees(seen[:, :2])
     off = found.project(points[shown])[:, :2] - seen[shown, :2]

@@ -36,7 +36,7 @@ SYNCING = ((record_writing, "sync_tree"),)
 
 
 class Clock:
-    """Adds up what calls take, those within another not twice."""
+    """Sums up the times of calls; nested calls count once."""
 
     def __init__(self, *places: tuple[Any, str]) -> None:
         self.wall_s = self.cpu_s = 0.0
@@ -61,7 +61,7 @@ class Clock:
 
 
 def run(workflow: Workflow, folder: Path, into: str, *, force: tuple[str, ...]) -> None:
-    """Plan, execute and record, as the command line does, but in this process."""
+    """Plan, execute and record in this process, as the command line does."""
     catalog = discover_catalog()
     opened = Store(folder / "store")
     options = RunOptions(executor="inline", force=force)

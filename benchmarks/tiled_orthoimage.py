@@ -55,7 +55,7 @@ def large_orthoimage(folder: Path, side: int, n_rows: int) -> Path:
 
 
 def export(path: Path, target: Path) -> None:
-    """Write the tiles and the page, print what it took."""
+    """Write the tiles and the page, and print time and memory."""
     before, first = time.perf_counter(), time.process_time()
     (ortho,) = ortho_files([path])
     n_tiles = write_tiles(target, "wall_0_ortho", ortho)
@@ -69,14 +69,14 @@ def export(path: Path, target: Path) -> None:
 
 
 def largest_mib() -> float:
-    """Largest memory of this process; getrusage would tell that of the one that started it."""
+    """Return the peak memory of this process; getrusage would return that of its parent."""
     lines = Path("/proc/self/status").read_text().splitlines()
     (found,) = [line for line in lines if line.startswith("VmHWM")]
     return int(found.split()[1]) / 1024
 
 
 def main() -> None:
-    """Write image and tiles."""
+    """Write the image and the tiles."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--side", type=int, default=20_000, help="cells of a side")
     parser.add_argument("--rows", type=int, help="rows, where they are not as many")

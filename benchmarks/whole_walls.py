@@ -49,8 +49,8 @@ class TrueWall:
 
     Attributes:
         points: (n, 3) world.
-        depth_m: (n,) before the true plane.
-        in_photo: (n,) whether a photo sees it too.
+        depth_m: (n,) in front of the true plane.
+        in_photo: (n,) whether a photo also shows the cell.
     """
 
     points: NDArray[np.float64]
@@ -58,7 +58,7 @@ class TrueWall:
     in_photo: NDArray[np.bool_]
 
     def reach_m(self) -> tuple[float, float]:
-        """How far its relief stands out and goes in."""
+        """Return how far its relief extends in front of and behind the plane."""
         low, high = np.quantile(self.depth_m, [_RELIEF_LEAST, 1.0 - _RELIEF_LEAST])
         return float(high), float(-low)
 
@@ -94,7 +94,7 @@ def true_wall(truth: Truth, name: str) -> TrueWall:
 
 
 def row(seed: int, truth: Truth, walls: Walls, image: Orthoimage) -> tuple[float, float]:
-    """Print what became of a wall; give the shares scanned and painted."""
+    """Print the results for a wall; return the shares scanned and covered."""
     raster, slab = walls.walls[image.wall], walls.slab(image.wall)
     normals = truth.planes.normal
     facing = normals @ raster.frame.normal_world

@@ -353,7 +353,7 @@ class DatasetSection(BaseModel):
 
     set: dict[str, Any] = Field(
         {},
-        description="Parameters of this dataset, with names as for `--set`, which overrides them; "
+        description="Parameters of this dataset, with names as in `--set`, which overrides them, "
         "and `seed`, a number or a sweep.",
         examples=[{"room.noise_m": 0.004, "plane.ransac.tolerance_m": 0.03, "seed": 7}],
     )
