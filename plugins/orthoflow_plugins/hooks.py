@@ -1,4 +1,4 @@
-"""What the built-in plugin announces: kinds, product types and methods, by import string."""
+"""Hooks of the built-in plugin: its kinds, product types and methods, as import strings."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from typing import Final
 
 from orthoflow.sdk.hooks import FILES, KindSpec, MethodSpec, ProductSpec, hookimpl
 
-# Module and class of each method -> its line in listings. The id of a method is the name of its
-# module, with a hyphen where that has an underscore.
+# Module and class of each method -> summary. The id of a method is the name of its module, with
+# hyphens instead of underscores.
 _METHODS: Final = {
     "read.scan:ReadScan": "E57, LAS/LAZ, PLY, PCD, PTX and text scans -> cloud",
     "read.photos:ReadPhotos": "JPEG, PNG and TIFF photos as they are, with EXIF and calibration",
     "read.checkpoints:ReadCheckpoints": "surveyed points from CSV files",
-    "read.ties:ReadTies": "points of photos that a person measured, from CSV files",
-    "read.cameras:ReadCameras": "orientations that other programs found, in the frame of the scan",
-    "read.orthoimage:ReadOrthoimage": "GeoTIFF orthoimages of other programs, with the frame of "
+    "read.ties:ReadTies": "points measured by hand in photos, from CSV files",
+    "read.cameras:ReadCameras": "orientations from other programs, in the frame of the scan",
+    "read.orthoimage:ReadOrthoimage": "GeoTIFF orthoimages from other programs, with the frame of "
     "their wall",
     "simulate.room:SimulateRoom": "a scanned and photographed room with relief and obstacle, and "
     "its truth",
@@ -29,7 +29,7 @@ _METHODS: Final = {
     ),
     "plane.comparators:Open3dRansac": "open3d's segment_plane, plane after plane, for comparison",
     "plane.comparators:Open3dPatches": "open3d's detect_planar_patches, for comparison",
-    "plane.given:GivenPlane": "a reference plane that the user gives",
+    "plane.given:GivenPlane": "a reference plane given by the user",
     "raster.grid:RasterGrid": "depth, intensity and colour per cell of each wall",
     "match.sift:MatchSift": "key points of the photos and of the walls, RootSIFT, mutual and "
     "distinct",
@@ -37,15 +37,15 @@ _METHODS: Final = {
     "show",
     "match.guided:MatchGuided": "photos matched with the walls again from a first pose",
     "orient.pnp:OrientPnp": "each photo separately from its ties, with "
-    "its accuracy or the reason for its refusal",
+    "its accuracy or the reason why it is refused",
     "orient.dlt:OrientDlt": "each photo by a direct linear transform, with or without distortion",
     "orient.bundle:OrientColmapBundle": "all photos at once, tied to the walls and to each other, "
     "lenses refined",
-    "orient.given:OrientGiven": "poses of other programs, unchanged or "
+    "orient.given:OrientGiven": "poses from other programs, unchanged or "
     "corrected by ties measured by hand",
     "dense.sgm:DenseSgm": "the surface that neighbouring photos show, by semi-global matching",
     "colour.photos:ColourPhotos": "each point takes the colour of the photo that shows it best",
-    "ortho.pointcloud_direct:PointcloudDirect": "the topmost point colours its cell",
+    "ortho.pointcloud_direct:PointcloudDirect": "each cell takes the colour of its topmost point",
     "ortho.dsm_backward:DsmBackward": "each cell of a wall takes its "
     "colour from the photos that see it",
     "ortho.dsm_forward:DsmForward": "each pixel of a photo is projected onto the wall it shows",
@@ -59,7 +59,7 @@ _METHODS: Final = {
     "inspect.checkpoints:InspectCheckpoints": "compare orthoimages with surveyed points: "
     "residuals, outliers, classes",
 }
-# Modules that are not called as their method is.
+# Ids of methods that differ from the name of their module.
 _IDS: Final = {
     "match.sides": "face.photos",
     "orient.bundle": "orient.colmap-bundle",
@@ -70,7 +70,7 @@ _IDS: Final = {
 
 @hookimpl
 def orthoflow_kinds() -> list[KindSpec]:
-    """Give the built-in kinds, in the order of the road from scan to inspection."""
+    """Return the built-in kinds, in the order from scan to inspection."""
     return [
         KindSpec(name="read", summary="files -> products", is_source=True),
         KindSpec(name="simulate", summary="scenes with exact truth", is_source=True),
@@ -157,7 +157,7 @@ def _ports(named_as_their_products: str, **others: str) -> dict[str, str]:
 
 @hookimpl
 def orthoflow_products() -> list[ProductSpec]:
-    """Give the built-in product types with what publishes their files."""
+    """Return the built-in product types with the functions that publish their files."""
     return [
         _product(
             "cloud",
@@ -165,7 +165,7 @@ def orthoflow_products() -> list[ProductSpec]:
             "points with intensity and colour",
             publisher="publishing",
         ),
-        _product("photos", "photographs:Photos", "photographs as they were taken"),
+        _product("photos", "photographs:Photos", "photographs as files"),
         _product("calibration", "photographs:Calibration", "calibrated cameras"),
         _product("checkpoints", "inspections:CheckPoints", "surveyed check points"),
         _product("truth", "inspections:Truth", "the truth of a simulated scene"),
@@ -206,7 +206,7 @@ def orthoflow_products() -> list[ProductSpec]:
 
 
 def _product(name: str, where: str, summary: str, *, publisher: str = "") -> ProductSpec:
-    """Describe one of `orthoflow.products`; its publisher is in a module of `orthoflow.files`."""
+    """Return the spec of a type in `orthoflow.products`; `publisher` is in `orthoflow.files`."""
     return ProductSpec(
         type_name=name,
         target=f"orthoflow.products.{where}",
@@ -217,7 +217,7 @@ def _product(name: str, where: str, summary: str, *, publisher: str = "") -> Pro
 
 @hookimpl
 def orthoflow_methods() -> list[MethodSpec]:
-    """Give the built-in methods."""
+    """Return the built-in methods."""
     return [
         MethodSpec(
             id=_IDS.get(where)

@@ -21,18 +21,18 @@ from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 class ColourPhotos(Method):
     """Assign each point the colour of the photo that shows it best.
 
-    A point is seen if no nearer point of the whole cloud hides it, outliers excluded (the depth
-    buffer of `ortho.dsm-backward`). Of several photos that see it, the one with the most pixels per
-    metre is used, away from its border; the colour is interpolated between four pixels. So a cloud
-    without colours can be used for direct orthoimages (`ortho.pointcloud-direct`) with the same
-    photos as the other methods.
+    A point is visible unless a nearer point of the cloud hides it; outliers are ignored (the depth
+    buffer of `ortho.dsm-backward`). If several photos see it, the one with the most pixels per
+    metre is used, with a lower weight near its border; the colour is interpolated between four
+    pixels. This makes it possible to create direct orthoimages (`ortho.pointcloud-direct`) of a
+    cloud without colours from the same photos as with the other methods.
     """
 
     id: ClassVar[str] = "colour.photos"
     result_version: ClassVar[int] = 2
     determinism = "loose"
     metrics = (
-        MetricSpec("coloured_share", label="points that got a colour"),
+        MetricSpec("coloured_share", label="points with a colour"),
         MetricSpec("n_photos", label="photos"),
     )
     citations: ClassVar[tuple[str, ...]] = (
@@ -46,7 +46,7 @@ class ColourPhotos(Method):
         """The colour of points that no photo sees."""
 
         unseen: Literal["drop", "grey"] = Field(
-            "drop", description="Points that no photo sees are left out, or are mid-grey."
+            "drop", description="Drop points that no photo sees, or colour them in medium grey."
         )
 
     class In(Ports):
@@ -72,7 +72,7 @@ class ColourPhotos(Method):
         ]
         if not chosen:
             raise MethodError(
-                "none of the photos is oriented: wire cameras of the same photos (colour.photos)"
+                "none of the photos is oriented: connect cameras of these photos (colour.photos)"
             )
         cloud = inputs.cloud
         colours = PointColours(
@@ -92,8 +92,8 @@ class ColourPhotos(Method):
         ctx.metric("coloured_share", n_seen / max(1, len(cloud)), "1")
         if n_seen == 0:
             raise MethodError(
-                "no photo sees any point of the cloud: cloud and cameras must have one coordinate "
-                "system (colour.photos)"
+                "no photo sees any point of the cloud: cloud and cameras must use the same "
+                "coordinate system (colour.photos)"
             )
         coloured = replace(cloud, rgb=colours.rgb, has_rgb=None)
         return self.Out(cloud=coloured.selected(seen) if params.unseen == "drop" else coloured)

@@ -1,9 +1,8 @@
 """Comparison of an orthoimage and its wall with the truth, cell by cell.
 
-All cells of small walls are compared, a sample of large ones. The comparison itself is exact; an
-evenly spread sample gives the same statistics as the whole. Colours are rendered in whole blocks,
-since patches need neighbours; visibility is tested on a lattice, so that nothing wider than its
-step is missed.
+All cells of small walls are compared, and an evenly spread sample of the cells of large walls.
+Colours are rendered in whole blocks, since patches need neighbouring cells; visibility is tested on
+a regular lattice, which misses nothing wider than its spacing.
 """
 
 from __future__ import annotations
@@ -34,20 +33,20 @@ from orthoflow_plugins.inspect.patches import GreyImage, PatchShifts, measure_sh
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import TrueOrthoimage
 
-# Neighbouring cells whose true depths differ by more form a step, reported separately.
+# Neighbouring cells whose true depths differ by more are a depth step, reported separately.
 _STEP_M: Final = 0.004
 _STEP_BAND_CELLS: Final = 2
-# A colour this far outside the range of true colours within one cell is wrong.
+# A colour is grossly wrong if it is this far outside the range of the true colours within one cell.
 _GROSS_GREY: Final = 40.0
-# Whole patches of 32 cells, and blocks large enough that little is lost at their border.
+# A multiple of the patch size (32 cells), large enough that little is lost at the borders.
 BLOCK_CELLS: Final = 96
-# Cells of all walls together whose colours are compared, and whose visibility is tested.
+# Limits for all walls together: cells with a colour comparison, and with a visibility test.
 _COLOUR_CELLS: Final = 250_000
 _SEEN_CELLS: Final = 600_000
-# Errors kept of all walls together, 32 bytes each: the standard error of a median of so many is a
-# two-thousandth of their spread.
+# Maximum number of errors kept of all walls together, 32 bytes each; the standard error of the
+# median of so many values is 1/2000 of their spread.
 _KEPT_ERRORS: Final = 1 << 23
-# Multiples of these, modulo 1, fill a square most evenly (Roberts 2018, the R2 sequence).
+# Multiples of these numbers, modulo 1, are spread evenly (R2 sequence, Roberts 2018).
 _SPREAD: Final = (0.7548776662466927, 0.5698402909980532)
 _NAMES_BESIDE_TRACED: Final = {
     "rmse_u_mm": "patch_rmse_u_mm",
@@ -75,12 +74,12 @@ class Sampling:
 
 @dataclass(frozen=True, kw_only=True)
 class SamplingRule:
-    """How much of all walls is compared.
+    """How densely the walls are sampled.
 
     Attributes:
         colour_share: share of blocks whose colours are compared.
-        lattice_step: visibility is tested in every row and column of this step.
-        error_step: errors of depths and of traced cells are kept in steps of this.
+        lattice_step: visibility is tested in every nth row and column.
+        error_step: every nth error of a depth or traced cell is kept.
     """
 
     colour_share: float
@@ -89,7 +88,7 @@ class SamplingRule:
 
     @classmethod
     def of(cls, images: Sequence[Orthoimage]) -> SamplingRule:
-        """Limit the number of cells of all images together."""
+        """Choose the densities so that the limits for all images together are kept."""
         n_shown = sum(n_shown_of(image) for image in images)
         n_cells = sum(image.mask.size for image in images)
         return cls(
@@ -103,9 +102,9 @@ def sampling(image: Orthoimage, rule: SamplingRule, first_row: int) -> Sampling:
     """Choose cells of an image; blocks that show nothing have no colours to compare.
 
     Args:
-        image: of a wall, or some rows of one.
-        rule: how many are chosen.
-        first_row: for a part, its first row within its wall, a multiple of `BLOCK_CELLS`.
+        image: orthoimage of a wall, or a band of it.
+        rule: the sampling densities.
+        first_row: row of the wall where the band starts, a multiple of `BLOCK_CELLS`.
     """
     shows = is_shown(image.mask)
     coloured = np.zeros(shows.shape, dtype=np.bool_)
@@ -131,22 +130,22 @@ class WallSamples:
     """Errors of one wall, or of several together.
 
     Attributes:
-        depth_m: (n,) measured - true depth, away from true depth steps.
-        sigma_m: (n,) standard deviation that the wall states for each; NaN if it states none.
+        depth_m: (n,) measured minus true depth, away from true depth steps.
+        sigma_m: (n,) predicted standard deviation of each; NaN if unknown.
         step_depth_m: (m,) the same error within 2 cells of a true depth step.
         colour: (c,) mean square error of a painted cell over the three channels, away from steps.
         filled_colour: (f,) the same for filled cells.
         step_colour: (s,) the same for painted cells at steps.
-        shift_m: (p, 2) displacement of patches along u and v, shown - true.
+        shift_m: (p, 2) displacement of patches along u and v, measured minus true position.
         shift_cells: (p, 2) the same in cells.
-        n_painted: painted cells among those whose visibility is tested.
-        n_seen: of these cells, those whose true surface a viewer sees.
-        n_seen_painted: those of them that are painted.
-        n_seen_shown: those of them that are painted or filled.
-        n_unseen_painted: painted cells whose true surface no viewer sees, away from steps.
-        n_coloured: painted cells whose colour is compared with their surroundings.
-        n_gross: those of them with a colour far from any nearby in the truth, away from steps.
-        n_ghost: those of them where an object is in front of the wall.
+        n_painted: painted cells among those with a visibility test.
+        n_seen: cells with a visibility test whose true surface is seen from a station.
+        n_seen_painted: painted cells among `n_seen`.
+        n_seen_shown: painted or filled cells among `n_seen`.
+        n_unseen_painted: painted cells whose true surface no station sees, away from steps.
+        n_coloured: painted cells whose colour is compared with the true colours around them.
+        n_gross: cells among `n_coloured` with a grossly wrong colour, away from steps.
+        n_ghost: cells among `n_gross` that have an object in front of the wall.
     """
 
     depth_m: NDArray[np.float64]
@@ -169,12 +168,12 @@ class WallSamples:
 
 @dataclass(frozen=True, kw_only=True)
 class WallErrors:
-    """Errors of one wall at their positions.
+    """Errors of one wall, cell by cell.
 
     Attributes:
-        samples: the errors as numbers.
-        patches: where displacements were measured.
-        depth_m: (rows, cols) measured - true depth, NaN where either is missing.
+        samples: the errors for statistics.
+        patches: patches whose displacement was measured.
+        depth_m: (rows, cols) measured minus true depth, NaN where either is missing.
         grey: (rows, cols) root mean square colour error, NaN where not compared.
         steps: (rows, cols) cells within 2 cells of a true depth step.
     """
@@ -196,15 +195,15 @@ def wall_errors(
 ) -> WallErrors:
     """Compare an orthoimage and its wall, both on the frame of `true`, with the truth.
 
-    Depths are compared everywhere, the rest in the chosen cells.
+    Depths are compared in all cells, colours and visibility in the chosen ones.
 
     Args:
         image: the orthoimage.
         wall: the wall.
-        true: the truth.
-        chosen: cells whose colour is compared, and those whose visibility is tested.
-        inner: rows that are compared; the others surround them. A multiple of patches.
-        error_step: depth errors are kept in steps of this.
+        true: the true orthoimage.
+        chosen: cells whose colour is compared, and cells with a visibility test.
+        inner: rows to compare, whole patches; the other rows are a margin.
+        error_step: every nth depth error is kept.
     """
     known = true.rectangle >= 0
     steps = depth_step_band(true.depth_m)
@@ -251,13 +250,12 @@ def depth_step_band(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Return cells within 2 cells of a true depth step or of the border of the surface."""
     import cv2
 
-    # A very distant depth instead of a missing one, so that the border of the surface is a step
-    # too.
+    # Replace missing depths by a very large one, so that the border of the surface is a step, too.
     depth = np.where(np.isfinite(depth_m), depth_m, np.float32(1e3))
     edge = np.zeros(depth.shape, dtype=np.uint8)
     down = np.abs(np.diff(depth, axis=0)) > _STEP_M
     right = np.abs(np.diff(depth, axis=1)) > _STEP_M
-    # The cells next to the edge are its first cells on each side.
+    # Mark the cells on both sides of each edge.
     edge[1:] |= down
     edge[:-1] |= down
     edge[:, 1:] |= right
@@ -267,10 +265,10 @@ def depth_step_band(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def sample_findings(samples: WallSamples, wall: int, *, sources_are_traced: bool) -> list[Finding]:
-    """Return metrics of the cells of one wall, or of all with wall -1; none without samples.
+    """Return metrics of the cells of one wall, or of all walls (wall -1); empty without samples.
 
-    Displacements and ghosts have a longer name if they also follow from the photos' cameras, which
-    is more accurate.
+    Displacements and ghosts get a prefix if they are also computed from the cameras, which is more
+    accurate.
     """
     renamed = _NAMES_BESIDE_TRACED if sources_are_traced else {}
     return [
@@ -287,7 +285,7 @@ def sample_findings(samples: WallSamples, wall: int, *, sources_are_traced: bool
 def _square_errors(
     image: Orthoimage, true: TrueOrthoimage, chosen: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Mean square error (rows, cols) over the channels of the chosen cells; NaN elsewhere."""
+    """Return mean square errors (rows, cols) over the channels; NaN in cells not chosen."""
     square = np.full(chosen.shape, np.nan)
     difference = eight_bits(image.rgb[chosen]).astype(np.float64) - true.rgb[chosen]
     square[chosen] = np.mean(difference**2, axis=1)
@@ -295,7 +293,7 @@ def _square_errors(
 
 
 def _shifts(image: Orthoimage, true: TrueOrthoimage, known: NDArray[np.bool_]) -> PatchShifts:
-    """Return displacements of patches, from known cells away from steps."""
+    """Return displacements of patches, measured with known cells away from steps."""
     painted = is_painted(image.mask)
     filled = image.mask == OrthoMask.FILLED
     # Two centimetres is far beyond any plausible error; larger ones are reported as gross colour.
@@ -314,7 +312,7 @@ def _gross_colours(image: Orthoimage, true: TrueOrthoimage) -> NDArray[np.bool_]
     """Return cells whose colour is outside the range of the true colours within one cell."""
     import cv2
 
-    # NaN where the colour is unknown.
+    # An unknown colour is NaN.
     missing = np.isnan(true.rgb)
     window = np.ones((3, 3), dtype=np.uint8)
     low = cv2.erode(np.where(missing, np.float32(np.inf), true.rgb), window)
@@ -325,7 +323,7 @@ def _gross_colours(image: Orthoimage, true: TrueOrthoimage) -> NDArray[np.bool_]
 
 
 def _inner(coloured: NDArray[np.bool_], known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return cells that are compared and whose neighbours within one cell are, too."""
+    """Return compared cells whose direct neighbours are compared as well."""
     import cv2
 
     whole = cv2.erode((coloured | ~known).view(np.uint8), np.ones((3, 3), dtype=np.uint8))
@@ -378,7 +376,7 @@ def _shift_numbers(samples: WallSamples) -> list[_Number]:
 
 
 def _kept_shifts(samples: WallSamples) -> NDArray[np.bool_]:
-    """Return patches that are no outliers: within 4 robust deviations, at least 1/4 cell."""
+    """Return patches within 4 robust standard deviations (at least 1/4 cell) of the median."""
     cells = samples.shift_cells
     if len(cells) == 0:
         return np.zeros(0, dtype=np.bool_)

@@ -1,4 +1,4 @@
-"""`inspect.checkpoints`: orthoimages against surveyed points."""
+"""`inspect.checkpoints`: compare orthoimages with surveyed points."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ from orthoflow_plugins.inspect.placing import in_files, on_walls, wall_of
 from orthoflow_plugins.inspect.point_doubts import doubts, is_own, missed_points, with_reasons
 from orthoflow_plugins.inspect.point_places import Picture, PointFinder, ShownPoint
 
-# Number of points whose residuals are logged.
+# Maximum number of points whose residuals are logged.
 _TOLD: Final = 200
 MISSED: Final = DiagnosticSpec(
     code="check-points-missed",
@@ -71,25 +71,27 @@ MISSED: Final = DiagnosticSpec(
 CAPPED_RULE: Final = DiagnosticSpec(
     code="outlier-rule-capped",
     severity="warning",
-    text="the iterated rule for outliers ends at its cap, a quarter of the points ({numbers}), "
-    "though more lie beyond twice the RMS of the rest: the residuals are of two kinds, which the "
-    "rule cannot separate",
-    remedy="compare n_outliers_once",
+    text="the iterated outlier rule stopped at its cap of a quarter of the points ({numbers}), "
+    "although more exceed twice the RMS of the remaining points: there seem to be two kinds of "
+    "points, which the rule cannot separate",
+    remedy="use n_outliers_once instead",
 )
 
 
 class InspectCheckpoints(Method):
     """Measure the displacement of surveyed points in the orthoimages (skarlatos2012, Table 1).
 
-    A point is used if it was measured (in cells or in metres, see `read.checkpoints`), if a black
-    and white quadrant target is recognised, or, in a simulated room, if its surroundings are found
-    with the truth of the scene. Without orthoimages the intensity of the walls is the picture. RMS
-    and standard deviation are of the lengths of residuals; outliers are those beyond twice the RMS,
-    of all (`once`, the one to compare) or of the remaining points (`iterated`, a quarter of the
-    points at most; `iterated_capped` if that limit is reached). Classes of points (flat, vertical
-    ...) are distinguished by a prefix. `x` is along u, to the right, `y` along v, down, shown -
-    surveyed. `length_error_..._share` are relative errors of lengths between points of a wall.
-    Targets are back-projected into space, onto the plane through the depths around them (`3d`).
+    A point is used if its position was measured (in cells or in metres, see `read.checkpoints`), if
+    a black and white quadrant target is recognised there, or, in a simulated room, if its
+    surroundings are found by means of the true scene. Without orthoimages, the points are searched
+    in the intensity of the walls. RMS and standard deviation are those of the lengths of the
+    residuals. A point is an outlier if its residual exceeds twice the RMS of all points (`once`,
+    the rule to compare) or of the remaining points (`iterated`, which removes at most a quarter of
+    the points; `iterated_capped` if it reaches that limit). Metrics of a class of points (flat,
+    vertical ...) have the class as a prefix. `x` points right along u, `y` down along v; residuals
+    are the shown minus the surveyed position. `length_error_..._share` are relative errors of
+    distances between points of a wall. Targets are also compared in space (`3d`): they are
+    projected onto the plane through the depths around them.
     """
 
     id: ClassVar[str] = "inspect.checkpoints"
@@ -100,7 +102,7 @@ class InspectCheckpoints(Method):
         lower("rms_3d_mm", label="check points in space, RMS", headline=True, counted_by="n_3d"),
         MetricSpec("max_3d_mm", label="check points in space, largest error"),
         *(*CHECK_TABLE, *LENGTHS, *DISPLACEMENTS),
-        # Metrics of a class of points have its name as prefix.
+        # Metrics of a class of points have the name of the class as a prefix.
         *prefixed((*CHECK_TABLE, *DISPLACEMENTS), "*_", "{0}"),
         *of_walls(IMAGE_QUALITY),
     )
@@ -112,17 +114,20 @@ class InspectCheckpoints(Method):
     )
 
     class Params(MethodParams):
-        """How points that were not measured are found."""
+        """How points without a measured position are found."""
 
         search_m: float = Field(
-            0.03, gt=0.0, le=1.0, description="Radius in which a point is searched."
+            0.03, gt=0.0, le=1.0, description="Radius within which a point is searched."
         )
         target_radius_m: float = Field(
-            0.04, gt=0.0, le=1.0, description="Radius of quadrant targets that is used."
+            0.04,
+            gt=0.0,
+            le=1.0,
+            description="Radius of the quadrant targets, or of the part to use.",
         )
 
     class In(Ports):
-        """The pictures, and the points."""
+        """The surveyed points, and the images in which they are searched."""
 
         checkpoints: CheckPoints
         walls: Walls
@@ -139,9 +144,9 @@ class InspectCheckpoints(Method):
         """Find every point, then compute the statistics."""
         if is_own(inputs.checkpoints).all():
             raise MethodError(
-                "x, y, z of all check points are those of the orthoimage in which they were "
-                "clicked, so that there is nothing to compare: put the surveyed coordinates into "
-                "their file, and leave shown_x,shown_y,shown_z as they are (inspect.checkpoints)"
+                "x, y, z of all check points were taken from the orthoimage in which they were "
+                "clicked, so there is nothing to compare: enter the surveyed coordinates "
+                "in their file and keep shown_x, shown_y, shown_z (inspect.checkpoints)"
             )
         pictures = _pictures(inputs, ctx)
         finder = PointFinder(
@@ -165,16 +170,16 @@ class InspectCheckpoints(Method):
             raise MethodError(
                 f"none of the {len(points)} check points was found in an orthoimage: "
                 f"{with_reasons(missed)}; measure them (columns wall, u_px, v_px or map_x, map_y), "
-                "or check that scan and points have one unit and one coordinate system "
+                "or check that scan and points use the same unit and coordinate system "
                 "(inspect.checkpoints)"
             )
         for doubt, name, values in doubts(points, inputs.checkpoints, pictures):
             ctx.report(doubt, subject=name, **values)
-        # In a simulated room points are hidden on purpose.
+        # In a simulated room, some points are hidden on purpose.
         if missed and not is_simulated:
             ways = ["measure them in an orthoimage"]
             if any(point.is_beside for point in missed.values()):
-                ways.append("let {step[raster.grid]}.margin_m make walls larger")
+                ways.append("enlarge the walls by {step[raster.grid]}.margin_m")
             ctx.report(
                 MISSED,
                 n_missed=len(missed),
@@ -237,7 +242,7 @@ def _pictures(inputs: InspectCheckpoints.In, ctx: StepContext) -> list[Picture]:
         ]
     if not pictures:
         raise MethodError(
-            "there is no picture to find check points in: wire orthoimages, or walls with "
+            "there is no image in which to find check points: connect orthoimages, or walls with "
             "intensity (inspect.checkpoints)"
         )
     return pictures
@@ -288,7 +293,7 @@ def _findings(shift_m: NDArray[np.float64], classes: Sequence[str], gsd_m: float
 def _findings_in_space(
     points: Sequence[ShownPoint], surveyed: CheckPoints, found: Sequence[int]
 ) -> list[Finding]:
-    """Compute the distances of the points that were back-projected into space."""
+    """Compute errors of the targets that were located in space."""
     apart = np.array(
         [
             np.linalg.norm(point.point_world - surveyed.points_world[k])
@@ -317,7 +322,7 @@ def _findings_of_images(pictures: Sequence[Picture], cameras: Cameras | None) ->
 
 
 def _warn_of_cap(findings: Sequence[Finding], ctx: StepContext) -> None:
-    """Report that a rule for outliers reached its limit."""
+    """Report that the iterated outlier rule reached its cap."""
     capped = [item for item in findings if item.name.endswith(f"n_outliers_iterated{CAPPED}")]
     if capped:
         numbers = ", ".join(f"{item.name} {item.value:.0f}" for item in capped)
@@ -325,7 +330,7 @@ def _warn_of_cap(findings: Sequence[Finding], ctx: StepContext) -> None:
 
 
 def _tell(shift_m: NDArray[np.float64], names: Sequence[str], ctx: StepContext) -> None:
-    """Log the residual of each point, the largest first."""
+    """Log the residuals, the largest first."""
     for k in np.argsort(-np.linalg.norm(shift_m, axis=1), kind="stable")[:_TOLD]:
         u_mm, v_mm = 1e3 * shift_m[k]
         ctx.log(f"check point {names[k]}: u {u_mm:+.2f} mm, v {v_mm:+.2f} mm")
@@ -348,9 +353,10 @@ def _draw(
         ctx.figure(
             f"wall_{picture.image.number}_residuals",
             partial(vector_map, picture.image, places, shifts, [names[k] for k in own]),
-            f"{picture.image.name}: check points, shown - surveyed, {times:g} times enlarged; "
-            "green up to the median, yellow beyond, red over twice the median. Short arrows to all "
-            "sides are noise; neighbours that point the same way are a real shift of the image.",
+            f"{picture.image.name}: residuals of check points (shown minus surveyed position), "
+            f"enlarged {times:g} times; green up to the median, yellow up to twice the "
+            "median, red beyond. Short arrows in all directions are noise; neighbouring arrows in "
+            "the same direction are a real shift of the image.",
         )
 
 

@@ -1,4 +1,4 @@
-"""Figures of an inspection: errors over a wall as colours, displacements as arrows."""
+"""Figures of inspections: maps of errors, and displacements as arrows."""
 
 from __future__ import annotations
 
@@ -23,32 +23,32 @@ DEPTH_SPAN_MM: Final = 10.0
 COLOUR_SPAN_GREY: Final = 60.0
 DISPLACEMENT_SPAN_CELLS: Final = 1.0
 _LONGEST_PX: Final = 1000
-# In larger images squares of cells are averaged before drawing.
+# In larger images, squares of cells are averaged before drawing.
 _WHOLE_CELLS: Final = 1 << 24
-# Length of the longest usual arrow, as a share of the longer side of the image.
+# Drawn length of the 95th percentile of displacements, as a share of the longer image side.
 _ARROW_SHARE: Final = 0.06
 _NAMES_MOST: Final = 60
 _ARROWS_MOST: Final = 1500
 _ENLARGED_MOST: Final = 500.0
-# Up to the median length, up to twice that, beyond.
+# Colours for lengths up to the median, up to twice the median, and beyond.
 _ARROW_COLOURS: Final = ("#1a8a1a", "#d09000", "#d01c1c")
 
 
 def depth_error_map(depth_m: NDArray[np.float64], frame: WallFrame) -> bytes:
-    """Return a picture of depth errors: blue behind the truth, red in front."""
-    label = "measured - true depth [mm]"
+    """Draw a map of depth errors: blue behind the truth, red in front of it."""
+    label = "measured minus true depth [mm]"
     high = DEPTH_SPAN_MM
     return map_chart(1e3 * depth_m, label, frame, low=-high, high=high, cmap="RdBu_r")
 
 
 def colour_error_map(error_grey: NDArray[np.float64], frame: WallFrame) -> bytes:
-    """Return a picture of colour errors: bright if large."""
+    """Draw a map of colour errors, bright where large."""
     label = "colour error [grey levels]"
     return map_chart(error_grey, label, frame, low=0.0, high=COLOUR_SPAN_GREY)
 
 
 def displacement_map(displacement_cells: NDArray[np.float64], frame: WallFrame) -> bytes:
-    """Return a picture of displacements (rows, cols): bright if large."""
+    """Draw a map of displacements (rows, cols), bright where large."""
     high = DISPLACEMENT_SPAN_CELLS
     return map_chart(displacement_cells, "displacement [cells]", frame, low=0.0, high=high)
 
@@ -62,14 +62,14 @@ def vector_map(
 ) -> bytes:
     """Draw an orthoimage in pale grey, and arrows from true to shown positions.
 
-    Arrows are green up to the median length, yellow up to twice that, red beyond; below them lies
-    one of known length. Of many pairs an evenly spread part is drawn.
+    Arrows are green up to the median length, yellow up to twice the median, and red beyond; a
+    reference arrow is drawn below the image. If there are many pairs, every nth is drawn.
 
     Args:
         image: the inspected orthoimage.
         places: (n, 2) shown positions (column, row).
-        shift_cells: (n, 2) shown - true.
-        names: n labels of the arrows, omitted if there are many; empty for none.
+        shift_cells: (n, 2) shown minus true positions.
+        names: n labels of the arrows, drawn unless there are many; empty for no labels.
     """
     import cv2
 
@@ -116,9 +116,9 @@ def vector_map(
 
 
 def _grey_means(image: Orthoimage) -> NDArray[np.float32]:
-    """Return mean colours of cells; in a large image those of squares of cells.
+    """Return grey levels, averaged over squares of cells if the image is large.
 
-    Cells beyond a whole number of squares are omitted.
+    Incomplete squares at the right and bottom are omitted.
     """
     factor = 1
     if image.mask.size > _WHOLE_CELLS:
@@ -135,10 +135,10 @@ def _grey_means(image: Orthoimage) -> NDArray[np.float32]:
 
 
 def enlargement(shift_cells: NDArray[np.float64], image: Orthoimage) -> float:
-    """Return the magnification with which `vector_map` draws displacements (n, 2)."""
+    """Return the factor by which `vector_map` enlarges displacements (n, 2)."""
     if not len(shift_cells):
         return 1.0
     usual = float(np.percentile(np.linalg.norm(shift_cells, axis=1), 95))
     wanted = _ARROW_SHARE * max(image.frame.shape) / max(usual, 1e-9)
-    # 1, 2 or 5 times a power of ten: figures that are compared mostly have one scale.
+    # Use 1, 2 or 5 times a power of ten, so that figures to be compared mostly have the same scale.
     return float(np.clip(1.0 / round_scale(1.0 / wanted), 1.0, _ENLARGED_MOST))

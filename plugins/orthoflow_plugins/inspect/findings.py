@@ -1,7 +1,7 @@
-"""Statistics of displacements, and which numbers of an inspection have plain names.
+"""Statistics of displacements, and how an inspection reports them as metrics.
 
-The numbers are those of markiewicz2015, and the table of skarlatos2012: lengths of residuals,
-outliers by two rules, and the remainder.
+The statistics are those of markiewicz2015 and of Table 1 in skarlatos2012: lengths of residuals,
+outliers by two rules, and the RMS without outliers.
 """
 
 from __future__ import annotations
@@ -26,38 +26,38 @@ _Samples = TypeVar("_Samples")
 lower, higher = (partial(MetricSpec, better=better) for better in ("lower", "higher"))
 
 _AXES: Final = ("x", "y")
-# Maximum share of the points that may be outliers.
+# Largest share of the points that the iterated rule may remove.
 _OUTLIERS_MOST: Final = 0.25
-# If more than half exceed the limit, there are no outliers.
+# Largest share that the rule without the cap may remove.
 _MOST_WITHOUT_CAP: Final = 0.5
-# Shorter lengths between check points depend on single points more than on a scale.
+# Shorter distances between check points depend on single points more than on the scale.
 _LENGTH_LEAST_SHARE: Final = 0.25
-# Of more points of a wall every nth is used, because there are millions of pairs.
+# If a wall has more points, every nth is used, since the number of pairs grows with the square.
 _POINTS_MOST: Final = 1000
-# Suffix of the rule in the name of a number that was limited.
+# Suffix of metrics of the iterated rule where it reached the cap.
 CAPPED: Final = "_capped"
-# Statistics of displacements, check points and an orthoimage itself, as metrics.
+# Metrics of displacements, check points, and the orthoimage itself.
 DISPLACEMENTS: Final = (
     lower("rmse_[xy]_mm", label="displacement along {0}, RMS"),
     lower("rmse_[xy]_cells", label="displacement along {0}, RMS"),
     MetricSpec("mean_[xy]_mm", label="displacement along {0}, mean"),
     lower("nmad_[xy]_mm", label="typical displacement along {0} (NMAD)"),
     MetricSpec("max_[xy]_mm", label="largest displacement along {0}"),
-    MetricSpec("beyond_2rmse_[xy]_share", label="beyond twice the RMS along {0}"),
-    MetricSpec("beyond_2rmse_any_share", label="beyond twice the RMS along u or v"),
+    MetricSpec("beyond_2rmse_[xy]_share", label="share beyond twice the RMS along {0}"),
+    MetricSpec("beyond_2rmse_any_share", label="share beyond twice the RMS along u or v"),
     MetricSpec("p95_mm", label="displacement, 95th percentile"),
 )
 LENGTHS: Final = (
-    MetricSpec("n_lengths", label="lengths compared"),
-    lower("length_error_rms_share", label="error of a length over it, RMS"),
-    lower("length_error_max_share", label="error of a length over it, largest"),
+    MetricSpec("n_lengths", label="distances compared"),
+    lower("length_error_rms_share", label="relative error of a distance, RMS"),
+    lower("length_error_max_share", label="relative error of a distance, largest"),
 )
 CHECK_TABLE: Final = (
     MetricSpec("n_found", label="check points found"),
     lower("rms_mm", label="check points, RMS", headline=True, counted_by="n_found"),
     MetricSpec("sd_mm", label="check points, standard deviation"),
     MetricSpec("mean_shift_mm", label="check points, mean shift"),
-    MetricSpec("mean_shift_share", label="mean shift over the RMS"),
+    MetricSpec("mean_shift_share", label="mean shift divided by the RMS"),
     MetricSpec("n_outliers_once", label="outliers, rule applied once"),
     MetricSpec("n_outliers_iterated", label="outliers, rule iterated"),
     MetricSpec("n_outliers_iterated_capped", label="outliers, rule iterated to the cap"),
@@ -66,7 +66,7 @@ CHECK_TABLE: Final = (
     lower("rms_after_iterated_capped_mm", label="RMS without outliers, rule iterated to the cap"),
 )
 IMAGE_QUALITY: Final = (
-    higher("completeness", label="painted or filled, of the scanned surface", headline=True),
+    higher("completeness", label="painted or filled share of the scanned surface", headline=True),
     MetricSpec("n_edges", label="edges whose sharpness was measured"),
     MetricSpec("edge_width_cells", label="width of an edge"),
     MetricSpec("mtf50_per_cell", label="sharpness (MTF50)"),
@@ -74,23 +74,24 @@ IMAGE_QUALITY: Final = (
     lower("stretch_share", label="cells smeared over steep relief"),
     lower("smear_share", label="cells smeared along edges"),
 )
-# Metrics compared for every wall; the record has the rest.
+# Metrics that are reported for every wall; the record contains all others.
 _OF_EACH_WALL: Final = ("rmse_u_mm", "rmse_v_mm", "completeness")
 
 
 def displacement_findings(
     shift_m: NDArray[np.float64], gsd_m: float, wall: int, *, prefix: str = ""
 ) -> list[Finding]:
-    """Compute statistics of displacements (n, 2) along u (`x`) and v (`y`, down), shown - true.
+    """Compute statistics of displacements (n, 2), shown minus true position.
 
-    Root mean squares, means, robust and plain standard deviations, maxima, and the shares beyond
-    twice the RMSE (markiewicz2015, Table 2; 4.6 % per axis for normal errors, and never over 25 %).
+    `x` is along u, to the right, and `y` along v, down. The statistics are RMSE, mean, NMAD,
+    maximum, and the shares beyond twice the RMSE (markiewicz2015, Table 2; 4.6 % per axis for
+    normal errors, and never over 25 %).
 
     Args:
-        shift_m: metres, at least one.
-        gsd_m: side of a cell, for the numbers in cells.
-        wall: index in the findings, -1 for all together.
-        prefix: prefix of their names.
+        shift_m: displacements in metres, at least one.
+        gsd_m: side of a cell, to convert to cells.
+        wall: index of the wall, -1 for all walls together.
+        prefix: prefix of the names.
     """
     findings = []
 
@@ -117,12 +118,13 @@ def displacement_findings(
 def check_findings(
     shift_m: NDArray[np.float64], gsd_m: float, *, prefix: str = ""
 ) -> list[Finding]:
-    """Compute statistics of displacements (n, 2) of check points: Table 1 and more.
+    """Compute statistics of displacements (n, 2) of check points, including Table 1.
 
-    `rms_mm`, `sd_mm` are of lengths; `mean_shift_share` is the share of a common shift in the RMS.
+    `rms_mm` and `sd_mm` are those of the lengths; `mean_shift_share` is the length of the mean
+    displacement divided by the RMS.
 
     Args:
-        shift_m: metres along u and v, shown - surveyed.
+        shift_m: metres along u and v, shown minus surveyed position.
         gsd_m: side of a cell.
         prefix: prefix of the names, for a class of points.
     """
@@ -153,15 +155,15 @@ def check_findings(
 def length_findings(
     surveyed_m: NDArray[np.float64], shift_m: NDArray[np.float64], wall: NDArray[np.int32]
 ) -> list[Finding]:
-    """Compute relative errors of lengths between check points (markiewicz2015, 5: 0.2 %).
+    """Compute relative errors of distances between check points (markiewicz2015, 5: 0.2 %).
 
-    The lengths are those between points of one wall, from a quarter of its longest on; empty if
-    there are none.
+    Only distances between points of the same wall count, if they are at least a quarter of the
+    longest one; the result is empty if there is none.
 
     Args:
         surveyed_m: (n, 2) metres along u and v, surveyed positions.
         shift_m: (n, 2) shown minus surveyed position.
-        wall: (n,) wall of each point.
+        wall: (n,) index of the wall of each point.
     """
     errors = [np.empty(0)]
     for mine in (np.flatnonzero(wall == number) for number in np.unique(wall)):
@@ -181,22 +183,22 @@ def length_findings(
 
 
 def outliers_at_once(length_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Report which lengths (n,) exceed twice the RMS of all."""
+    """Return which lengths (n,) exceed twice the RMS of all."""
     return length_m > 2.0 * rms(length_m)
 
 
 def outliers_iterated(length_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Report which lengths (n,) exceed twice the RMS of the others that do not.
+    """Return which lengths (n,) exceed twice the RMS of the lengths that do not.
 
-    The largest set of longest lengths, a quarter at most, each beyond twice the RMS of the rest.
-    With lengths of two kinds, at edges and on flat parts, the iteration goes on to remove the
-    longer kind; `cap_binds` reports this. The rule of all points is therefore the one to compare.
+    At most a quarter of the lengths are removed. If there are two kinds of points, such as points
+    at edges and points on flat parts, the iteration would continue until it has removed the worse
+    kind; `cap_binds` detects this. The rule that is applied once is therefore the one to compare.
     """
     return _iterated(length_m, _OUTLIERS_MOST)
 
 
 def cap_binds(length_m: NDArray[np.float64]) -> bool:
-    """Whether the iterated rule is limited to fewer outliers (n,) than it would find."""
+    """Return whether the cap stops the iterated rule before it would end."""
     n_most = math.floor(_OUTLIERS_MOST * len(length_m))
     n_capped, n_all = (
         int(np.count_nonzero(_iterated(length_m, share)))
@@ -206,7 +208,7 @@ def cap_binds(length_m: NDArray[np.float64]) -> bool:
 
 
 def of_walls(specs: Sequence[MetricSpec]) -> tuple[MetricSpec, ...]:
-    """Return metrics as `report` reports them: of the main wall, of each wall, and of all."""
+    """Return the metrics that `report` reports: for the main wall, for each wall and for all."""
     of_each = [spec for spec in specs if fnmatch.filter(_OF_EACH_WALL, spec.name)]
     return (
         *specs,
@@ -216,12 +218,12 @@ def of_walls(specs: Sequence[MetricSpec]) -> tuple[MetricSpec, ...]:
 
 
 def prefixed(specs: Sequence[MetricSpec], prefix: str, what: str) -> tuple[MetricSpec, ...]:
-    """Return the same metrics of something else; those without prefix are headlines.
+    """Return copies of metrics for another subject; the copies are no headlines.
 
     Args:
         specs: the metrics.
-        prefix: prefix of their names, possibly with wildcards.
-        what: suffix of their labels, with the text that wildcards match.
+        prefix: prefix of the new names, possibly with wildcards.
+        what: suffix of the new labels; `{0}` stands for the text that a wildcard matches.
     """
     n_wildcards = len(re.findall(r"\*|\[[^\]]+\]", prefix))
     return tuple(
@@ -237,7 +239,7 @@ def prefixed(specs: Sequence[MetricSpec], prefix: str, what: str) -> tuple[Metri
 
 
 def pooled(samples: Sequence[_Samples]) -> _Samples:
-    """Put samples of several walls, or of parts of one, together: arrays joined, counts added."""
+    """Combine samples of several walls or bands: concatenate arrays and add counts."""
     together: dict[str, Any] = {}
     for name, value in vars(samples[0]).items():
         parts = [getattr(item, name) for item in samples]
@@ -246,7 +248,7 @@ def pooled(samples: Sequence[_Samples]) -> _Samples:
 
 
 def count_true(mask: NDArray[np.bool_]) -> int:
-    """Return how many are true."""
+    """Return the number of true cells."""
     return int(np.count_nonzero(mask))
 
 
@@ -258,16 +260,16 @@ def rms(values: ArrayLike) -> float:
 def report(
     findings: Sequence[Finding], main: int, numbers: Mapping[int, int], ctx: StepContext
 ) -> None:
-    """Report the main wall by plain names, all walls with `all_`, the rest with its prefix.
+    """Report findings as metrics: those of the main wall under their own names.
 
-    Displacements and completeness of the other walls are reported too, with `wall_1_` etc., by the
-    place of the plane in `planes.json`.
+    Findings of all walls together get the prefix `all_`. Displacements and completeness of the
+    other walls get a prefix such as `wall_1_`, with the position of the plane in `planes.json`.
 
     Args:
-        findings: of walls, and of all together (wall -1).
-        main: the wall whose numbers have plain names.
-        numbers: index of a wall -> place of its plane.
-        ctx: context that receives them.
+        findings: findings of walls, and of all walls together (wall -1).
+        main: index of the main wall.
+        numbers: index of a wall -> position of its plane.
+        ctx: context that receives the metrics.
     """
     per_wall = {finding.name for finding in findings if finding.wall >= 0}
     for finding in findings:

@@ -1,12 +1,12 @@
 """Properties of an orthoimage that every inspection reports.
 
-Completeness, share of filled cells, sharpness, and where photos are stretched.
+These are completeness, the share of filled cells, sharpness, and the shares of stretched areas.
 
-Sharpness is measured at the image's own edges: their width, and the MTF that follows from it. A
-surface that a photo sees at a grazing angle has few pixels there, however many cells it has: the
-stretches and smears that skarlatos2012 describes along vertical surfaces. Which pixel a cell takes
-follows from the wall's depths and the photo's camera, so the distance between the pixels of
-neighbouring cells is known exactly, whatever the picture shows.
+Sharpness is measured at edges in the image: their width, and the MTF that follows from their
+profile. A photo covers a surface that it sees at a grazing angle with few pixels, which are then
+stretched over many cells, as skarlatos2012 describes for vertical surfaces. The pixel of a cell
+follows from the depths of the wall and the camera, so the distance between the pixels of
+neighbouring cells is known exactly, independent of the image content.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ from orthoflow.products import (
 )
 from orthoflow_plugins.inspect.patches import GreyCells, GreyImage
 
-# A pixel drawn over more cells than this, in the direction where it is widest.
+# A pixel is stretched, or smeared, if it covers more cells than this in its longest direction.
 _STRETCHED_CELLS: Final = 2.0
 _SMEARED_CELLS: Final = 5.0
-# Number of cells per photo that are tested; more do not change the result.
+# Maximum number of cells per photo that are tested.
 _ASKED_MOST: Final = 200_000
 _REACH_CELLS: Final = 8
 _STEP_CELLS: Final = 0.25
 _ALONG: Final = np.arange(-_REACH_CELLS, _REACH_CELLS + 0.5 * _STEP_CELLS, _STEP_CELLS)
 _PEAKS_MOST: Final = 4000
 _EDGES_MOST: Final = 400
-# Interpolated between valid cells only, apart from rounding.
+# An interpolated validity of at least this means that all cells involved are valid.
 _WHOLE: Final = 0.999
 _TILE_CELLS: Final = 2048
 _EDGES_LEAST: Final = 20
 _CONTRAST_GREY: Final = 30.0
-# Each side of an edge must be this even, as a share of its contrast.
+# On either side of an edge, grey levels may vary by this share of its contrast.
 _EVEN_SHARE: Final = 0.15
 _END_CELLS: Final = 3.0
 _LOW, _HIGH = 0.1, 0.9
@@ -66,19 +66,19 @@ class OrthoimageGrey(GreyCells):
         return self.image.frame.shape
 
     def cut(self, part: tuple[slice, slice]) -> GreyImage:
-        """Some rows and columns, all of them within the image."""
+        """Return a part of the image."""
         shows = is_shown(self.image.mask[part])
         grey = np.where(shows, eight_bits(self.image.rgb[part]) @ REC_601, 0.0)
         return GreyImage(grey=grey, valid=shows, region=shows)
 
 
 def n_shown(image: Orthoimage) -> int:
-    """How many cells are painted or filled."""
+    """Return the number of cells that are painted or filled."""
     return sum(count_cells(image.mask, state) for state in SHOWN_STATES)
 
 
 def completeness(image: Orthoimage, wall: Wall) -> Finding:
-    """Compute the share of the scanned surface that the image shows; both have the same cells."""
+    """Compute the share of the scanned surface that the image shows; both have the same grid."""
     n_surface = n_both = 0
     for rows in row_bands(image.mask.shape):
         surface = np.isfinite(wall.depth_m[rows])
@@ -93,8 +93,8 @@ def quality_findings(image: Orthoimage, wall: Wall, cameras: Cameras | None) -> 
 
     Args:
         image: the orthoimage.
-        wall: its wall, on the same cells.
-        cameras: cameras of its photos; without them stretches are not computed.
+        wall: its wall, on the same grid.
+        cameras: cameras of its photos; without them, stretched areas are not computed.
     """
     share = count_cells(image.mask, OrthoMask.FILLED) / max(1, n_shown(image))
     return [
@@ -105,11 +105,11 @@ def quality_findings(image: Orthoimage, wall: Wall, cameras: Cameras | None) -> 
 
 
 def sharpness_findings(image: GreyCells, wall: int) -> list[Finding]:
-    """Compute the width of edges from 10 to 90 %, and the frequency at half contrast.
+    """Compute the 10 to 90 % width of edges, and the frequency at which the MTF is one half.
 
-    Profiles across the steepest places with even sides are normalised in contrast and centred; the
-    median profile is the edge spread, the spectrum of its derivative the MTF (ISO 12233). Nothing
-    with fewer than 20 such edges.
+    Profiles across the steepest edges between uniform areas are normalised and centred; their
+    median is the edge spread function, and the spectrum of its derivative is the MTF (ISO 12233).
+    The result is empty if there are fewer than 20 such edges.
 
     Args:
         image: grey levels, and valid cells.
@@ -130,14 +130,14 @@ def sharpness_findings(image: GreyCells, wall: int) -> list[Finding]:
 
 
 def stretch_findings(image: Orthoimage, wall: Wall, cameras: Cameras | None) -> list[Finding]:
-    """Compute the shares of painted cells with stretched or smeared photos; none without cameras.
+    """Compute the shares of stretched and smeared cells; empty without cameras.
 
-    `stretch_share` is the share of cells of which one pixel covers more than two in some direction,
-    `smear_share` where it covers more than five, or the surface is seen from behind.
+    In stretched cells (`stretch_share`), a pixel of the photo covers more than two cells in some
+    direction; in smeared ones (`smear_share`) more than five, or the surface is seen from behind.
 
     Args:
         image: the orthoimage.
-        wall: its wall, on the same cells.
+        wall: its wall, on the same grid.
         cameras: cameras of its photos.
     """
     if cameras is None:
@@ -161,22 +161,22 @@ def stretch_findings(image: Orthoimage, wall: Wall, cameras: Cameras | None) -> 
 def cells_per_pixel(
     image: Orthoimage, wall: Wall, camera: tuple[str, ViewingCamera]
 ) -> NDArray[np.float64]:
-    """Return how many cells one pixel of a photo covers where it is widest, at painted cells.
+    """Return how many cells a pixel covers in its longest direction, for cells of one photo.
 
     Args:
         image: the orthoimage.
-        wall: its wall, on the same cells.
-        camera: name of the photo, and its camera.
+        wall: its wall, on the same grid.
+        camera: name and camera of the photo.
 
     Returns:
-        (n,) cells per pixel, of at most some hundred thousand evenly spread cells; infinite where
-        the surface is seen from behind.
+        (n,) cells per pixel for a sample of the cells coloured by the photo; infinite where the
+        surface is seen from behind.
     """
     name, viewing = camera
     if name not in image.sources:
         return np.zeros(0)
     rows, columns = np.divmod(_asked_cells(image, wall, name), image.frame.width)
-    # Survey coordinates would lose digits.
+    # Compute relative to the frame: float64 loses digits at survey coordinates.
     near = replace(image.frame, origin_world=np.zeros(3))
     moved = viewing.shifted(image.frame.origin_world)
     depth = wall.depth_m[rows, columns].astype(np.float64)
@@ -189,13 +189,13 @@ def cells_per_pixel(
     jacobian = np.stack(along, axis=2)
     with np.errstate(divide="ignore", invalid="ignore"):
         spread = 1.0 / np.linalg.svd(np.nan_to_num(jacobian), compute_uv=False)[:, 1]
-        # The image of a surface seen from the front is oriented as the wall: u right, v down.
+        # A surface seen from the front has the same orientation in photo and wall.
         spread[np.linalg.det(jacobian) <= 0.0] = np.inf
     return spread[np.isfinite(jacobian).all(axis=(1, 2))]
 
 
 def _asked_cells(image: Orthoimage, wall: Wall, name: str) -> NDArray[np.int64]:
-    """Return every nth of the cells (row * width + column) that a photo painted."""
+    """Return every nth of the cells (row * width + column) that were coloured by a photo."""
     source, width = image.sources.index(name), image.frame.width
 
     def painted(rows: slice) -> NDArray[np.bool_]:
@@ -217,12 +217,12 @@ def _edge_profiles(cells: GreyCells) -> NDArray[np.float64]:
     """Return profiles (n, steps) across edges, 0 on the dark side and 1 on the bright one."""
     from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter
 
-    # A few million cells have enough edges.
+    # A tile of a few million cells has enough edges.
     image = cells.fullest_part(_TILE_CELLS)
     # A single row or column has no gradient.
     if not image.valid.any() or min(image.valid.shape) < 2:
         return np.zeros((0, _ALONG.size))
-    # Voids are filled with the nearest value: they neither make edges nor ring into profiles.
+    # Fill voids with the nearest value, so that they create no edges and do not affect profiles.
     grey = _closed(image)
     smooth = gaussian_filter(grey, 1.0)
     down, right = (np.asarray(part) for part in np.gradient(smooth))
@@ -250,7 +250,7 @@ def _edge_profiles(cells: GreyCells) -> NDArray[np.float64]:
 
 
 def _closed(image: GreyImage) -> NDArray[np.float64]:
-    """Return grey levels in which every void cell has that of the nearest valid one."""
+    """Return grey levels with void cells set to the level of the nearest valid cell."""
     from scipy.ndimage import distance_transform_edt
 
     grey = np.asarray(image.grey, dtype=np.float64)
@@ -265,7 +265,7 @@ def _closed(image: GreyImage) -> NDArray[np.float64]:
 
 def _centred(profiles: NDArray[np.float64], along: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return profiles shifted so that their middle is centred."""
-    # The area above an edge gives its position from all samples, not from the two in the middle.
+    # The area above the profile gives the edge position from all samples, not just the middle two.
     reach = along[-1]
     offset = reach - np.sum(profiles[:, :-1] + profiles[:, 1:], axis=1) * 0.5 * _STEP_CELLS
     moved = [
@@ -276,7 +276,7 @@ def _centred(profiles: NDArray[np.float64], along: NDArray[np.float64]) -> NDArr
 
 
 def _width_cells(spread: NDArray[np.float64]) -> float:
-    """Return the distance between the last sample below 10 % and the first above 90 %."""
+    """Return the 10 to 90 % width of an edge spread function."""
     steps = np.arange(len(spread))
     above = int(np.argmax(spread >= _HIGH))
     below = int(np.flatnonzero(spread[: above + 1] <= _LOW)[-1])
@@ -286,13 +286,13 @@ def _width_cells(spread: NDArray[np.float64]) -> float:
 
 
 def _mtf50(spread: NDArray[np.float64]) -> float:
-    """Return the frequency in cycles per cell at which the spectrum of the slope is halved."""
+    """Return the frequency in cycles per cell at which the MTF is one half."""
     slope = np.diff(spread)
     n_padded = 4096
     spectrum = np.abs(np.fft.rfft(slope, n_padded))
     contrast = spectrum / spectrum[0]
     frequency = np.fft.rfftfreq(n_padded, _STEP_CELLS)
-    # A step within one sample never falls to half below the last frequency.
+    # For a step within one sample, the MTF stays above one half.
     place = int(np.argmax(contrast < 0.5)) or len(contrast) - 1
     return float(
         np.interp(-0.5, -contrast[place - 1 : place + 1], frequency[place - 1 : place + 1])
@@ -310,10 +310,10 @@ def _neighbours(
     depth: NDArray[np.float64],
     step: tuple[int, int],
 ) -> NDArray[np.float64]:
-    """Return the points one cell further (column, row) on the surface.
+    """Return the points on the surface one cell further in a direction (column, row).
 
-    The surface is extended with the smaller of the slopes on both sides: at a depth step the other
-    is that of the step.
+    The surface is extended with the smaller of the slopes on both sides, since the larger one may
+    be a depth step.
     """
     rows, columns = (places[:, 1] - 0.5).astype(np.int64), (places[:, 0] - 0.5).astype(np.int64)
     after = _depth_at(wall, rows + step[1], columns + step[0]) - depth

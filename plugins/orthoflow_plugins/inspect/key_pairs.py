@@ -1,4 +1,4 @@
-"""Pairs of SURF key points in two pictures of one surface on one grid, refined to sub-pixel."""
+"""Pair SURF key points of two images on the same grid, and refine them to sub-pixel accuracy."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ from orthoflow_plugins.inspect.patches import (
     unrefined,
 )
 
-# Minimum cells per key point: more key points are noise.
+# At most one key point is used per this many cells: weaker key points are noise.
 _CELLS_PER_POINT: Final = 200
 _POINTS_LEAST, _POINTS_MOST = 500, 40_000
 _SCALES_DIFFER_MOST: Final = 1.5
 _PAIRS_AT_ONCE: Final = 1 << 16
 _RATIO_MOST: Final = 0.9
-# Half of the box that normalises contrast, which is applied twice.
+# Half width of the box filter that normalises contrast; it is applied twice.
 _LEVEL_REACH: Final = 12
 _LEAST_CONTRAST_GREY: Final = 2.0
 _LEAST_VALID_SHARE: Final = 0.6
 _LEAST_CORRELATION: Final = 0.6
 _SIGMA_MOST_CELLS: Final = 0.5
-# A pair is accepted if this many of its nearest ones agree with it.
+# A pair is accepted if enough of its nearest neighbours agree with it.
 _NEIGHBOURS: Final = 16
 _WITNESS_CELLS: Final = 8.0
 _AGREEING: Final = 2
 _AGREEING_SHARE: Final = 0.25
 _AGREE_CELLS: Final = 1.0
 _SURF_THRESHOLD: Final = 0.1
-# Larger pictures are processed in tiles, which take two gigabytes with their margin: the support of
-# the widest key points and their descriptors, or a patch wherever it may be displaced to.
+# Larger images are processed in tiles, each needing about 2 GB with its margin. The margin holds
+# the support of the widest key points, or a patch with its largest displacement.
 _WHOLE_CELLS: Final = 1 << 24
 _TILE_CELLS: Final = 3072
 _SURF_RIM_CELLS: Final = 512
@@ -51,14 +51,14 @@ _RIM_CELLS: Final = 96
 
 @dataclass(frozen=True, kw_only=True)
 class KeyPairs:
-    """Corresponding positions in two pictures.
+    """Corresponding positions in two images.
 
     Attributes:
-        places: (n, 2) float64 (column, row) in the shown picture.
-        shift: (n, 2) float64 cells along u and v, shown - reference, refined.
-        found: (n, 2) float64 the same as found by SURF alone.
-        n_points: number of key points of the two pictures.
-        n_matched: number of matched descriptors, right or wrong.
+        places: (n, 2) float64 column and row in the shown image.
+        shift: (n, 2) float64 refined displacement along u and v in cells, shown minus reference.
+        found: (n, 2) float64 displacement before the refinement, as SURF found it.
+        n_points: numbers of key points of the two images.
+        n_matched: number of matched descriptors, including wrong matches.
     """
 
     places: NDArray[np.float64]
@@ -72,7 +72,7 @@ class KeyPairs:
 
 
 def no_pairs() -> KeyPairs:
-    """Return an empty result for pictures that were not searched."""
+    """Return an empty result."""
     nothing = np.zeros((0, 2))
     return KeyPairs(places=nothing, shift=nothing, found=nothing, n_points=(0, 0), n_matched=0)
 
@@ -90,26 +90,26 @@ class _KeyPoints:
 def find_key_pairs(
     shown: GreyCells, reference: GreyCells, *, radius_cells: float, threads: int = 1
 ) -> KeyPairs:
-    """Find pairs within a radius.
+    """Find pairs of key points within a radius.
 
-    Both pictures are first normalised to the local contrast, because laser and camera see different
-    brightness. Descriptors are matched mutually among key points of similar scale and sign; patches
-    of 32 x 32 cells around a pair are then matched by least squares, and pairs whose patches do not
-    correlate, or that disagree with their neighbours, are dropped. Large pictures are processed
-    tile by tile.
+    The local contrast of both images is normalised first, because laser and camera record different
+    brightness. Descriptors of key points with similar scale and equal sign are matched mutually.
+    Patches of 32 x 32 cells around each pair are then matched by least squares; a pair is dropped
+    if its patches do not correlate or if it disagrees with its neighbours. Large images are
+    processed tile by tile.
 
     Args:
-        shown: the picture to judge.
-        reference: the picture to compare with.
-        radius_cells: maximum distance of a pair.
-        threads: number of threads, which does not change the pairs.
+        shown: the image to inspect.
+        reference: the image to compare it with.
+        radius_cells: maximum displacement.
+        threads: number of threads; it does not change the pairs.
     """
     first: GreyCells = _Levelled(shown)
     second: GreyCells = _Levelled(reference)
     is_whole = len([*_tiles(shown.shape)]) == 1
     if is_whole:
         first, second = in_order(GreyCells.whole, (first, second), threads=threads)
-    # Large pictures one after the other: a tile takes the memory of both.
+    # Process large images one after the other, since tiles of both would need too much memory.
     points = tuple(in_order(_key_points, (first, second), threads=threads if is_whole else 1))
     matches = _matches(points[0], points[1], radius_cells)
     places = points[0].places[matches[:, 0]]
@@ -130,7 +130,7 @@ def find_key_pairs(
 
 
 def _agreed(places: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Report which pairs agree with some of their nearest ones, as chance matches do not."""
+    """Return which pairs agree with enough of their nearest neighbours; chance matches do not."""
     from scipy.spatial import cKDTree
 
     n_near = min(_NEIGHBOURS, len(places) - 1)
@@ -138,13 +138,13 @@ def _agreed(places: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[
         return np.zeros(len(places), dtype=np.bool_)
     away, near = cKDTree(places).query(places, k=n_near + 1)
     apart = np.linalg.norm(shift[near] - shift[:, None], axis=2)
-    # The same place found at several scales counts once.
+    # Very close pairs are the same point found at several scales, and do not count.
     agrees = (apart <= _AGREE_CELLS) & (away > _WITNESS_CELLS)
-    # A repeated motif can make two or three pairs wrong in the same way, but not a quarter of a
-    # neighbourhood.
+    # Repeated texture can make two or three neighbours wrong in the same way, but not a quarter of
+    # them.
     needed = max(_AGREEING, _AGREEING_SHARE * n_near)
     agreed = np.ones(len(places), dtype=np.bool_)
-    # Only accepted pairs support others.
+    # Repeat until only accepted pairs support each other.
     while True:
         kept: NDArray[np.bool_] = np.count_nonzero(agrees & agreed[near], axis=1) >= needed
         if np.array_equal(kept, agreed):
@@ -155,7 +155,7 @@ def _agreed(places: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[
 def _refined(
     first: GreyCells, second: GreyCells, start: PatchShifts, *, rim: int, threads: int
 ) -> PatchShifts:
-    """Refine shifts, those of each tile with a margin around it."""
+    """Refine displacements tile by tile, each tile with a margin."""
     parts = [unrefined(*np.zeros((2, 0, 2)))]
     for tile in _tiles(first.shape):
         own = _lies_in(tile, start.centre)
@@ -176,7 +176,7 @@ def _refined(
 
 
 def _tiles(shape: tuple[int, int]) -> Iterator[tuple[slice, slice]]:
-    """Return the tiles in which a picture is processed: one unless it is large."""
+    """Yield the tiles in which an image is processed: a single one unless it is large."""
     return tiles(shape, max(shape) if math.prod(shape) <= _WHOLE_CELLS else _TILE_CELLS)
 
 
@@ -189,7 +189,7 @@ def _widened(tile: tuple[slice, slice], rim: int, shape: tuple[int, int]) -> tup
 
 
 def _lies_in(tile: tuple[slice, slice], places: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Report which positions (n, 2) = (column, row) lie in a tile."""
+    """Return which positions (n, 2) = (column, row) are in a tile."""
     rows, columns = tile
     low, end = (columns.start, rows.start), (columns.stop, rows.stop)
     inside: NDArray[np.bool_] = np.all((places >= low) & (places < end), axis=1)
@@ -198,7 +198,7 @@ def _lies_in(tile: tuple[slice, slice], places: NDArray[np.float64]) -> NDArray[
 
 @dataclass(frozen=True)
 class _Levelled(GreyCells):
-    """Return a picture with local mean 128 and standard deviation 40 where valid; elsewhere 128."""
+    """An image normalised to local mean 128 and standard deviation 40; invalid cells are 128."""
 
     cells: GreyCells
 
@@ -233,7 +233,7 @@ def _levelled(image: GreyImage) -> GreyImage:
 def _smooth(values: NDArray[np.float32]) -> NDArray[np.float32]:
     import cv2
 
-    # Two passes of a box approximate a Gaussian at the same cost for any width.
+    # Two passes of a box filter approximate a Gaussian; the cost does not depend on the width.
     side = 2 * _LEVEL_REACH + 1
     once = cv2.blur(values, (side, side), borderType=cv2.BORDER_CONSTANT)
     twice = cv2.blur(once, (side, side), borderType=cv2.BORDER_CONSTANT)
@@ -241,12 +241,12 @@ def _smooth(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _key_points(cells: GreyCells) -> _KeyPoints:
-    """Return key points whose patch is inside the picture and mostly valid."""
+    """Return key points whose patch is inside the image and mostly valid."""
     rows, columns = cells.shape
     half, parts = PATCH_CELLS // 2, []
     for image, corner, found in _strongest(cells):
-        # mahotas returns y, x, scale, score, sign of the Laplacian, angle and 64 numbers; it counts
-        # cells from their centres, as OpenCV does.
+        # mahotas returns y, x, scale, score, sign of the Laplacian, angle and 64 descriptor values;
+        # as in OpenCV, coordinates refer to the centres of cells.
         places = from_opencv(found[:, 1::-1])
         inside = np.all(
             (places + corner > half) & (places + corner < (columns - half, rows - half)), axis=1
@@ -266,11 +266,11 @@ def _key_points(cells: GreyCells) -> _KeyPoints:
 def _strongest(
     cells: GreyCells,
 ) -> Iterator[tuple[GreyImage, NDArray[np.int64], NDArray[np.float64]]]:
-    """Yield the strongest key points of a picture, tile by tile.
+    """Yield the strongest key points of an image, tile by tile.
 
     Yields:
-        The tile with its margin, the (column, row) of its corner, and the key points (n, 70) of the
-        tile, with positions relative to it.
+        The tile with its margin, the first column and row of that part, and the key points (n, 70)
+        of the tile, with positions relative to the part.
     """
     from mahotas.features import surf
 
@@ -309,7 +309,7 @@ def _patch_means(values: NDArray[np.float32], places: NDArray[np.float64]) -> ND
 
 
 def _matches(first: _KeyPoints, second: _KeyPoints, radius: float) -> NDArray[np.int64]:
-    """Pairs (m, 2) of rows, mutually best by descriptor and clearly better than the second."""
+    """Return index pairs (m, 2) of mutually best descriptors that pass the ratio test."""
     from scipy.spatial import cKDTree
 
     nothing = np.zeros((0, 2), dtype=np.int64)
@@ -338,7 +338,7 @@ def _descriptor_distances(
     one: NDArray[np.int64],
     other: NDArray[np.int64],
 ) -> NDArray[np.float64]:
-    """Return distances of pairs, in parts, so that many pairs need little memory."""
+    """Return descriptor distances of pairs; computed in parts to limit memory."""
     apart = np.empty(len(one))
     for start in range(0, len(one), _PAIRS_AT_ONCE):
         part = slice(start, start + _PAIRS_AT_ONCE)
@@ -349,7 +349,7 @@ def _descriptor_distances(
 def _clear_winners(
     owner: NDArray[np.int64], apart: NDArray[np.float64], n_owners: int
 ) -> NDArray[np.bool_]:
-    """Report which pairs are the nearest of their point, nearer than its second by the ratio."""
+    """Return which pairs are the nearest of their point and pass the ratio test."""
     order = np.lexsort((apart, owner))
     starts = np.flatnonzero(np.diff(owner[order], prepend=-1))
     nearest = np.full(n_owners, np.inf)

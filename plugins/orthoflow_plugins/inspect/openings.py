@@ -1,4 +1,4 @@
-"""`inspect.openings`: outlines of windows, doors and niches against a simulated scene."""
+"""`inspect.openings`: compare outlines of windows, doors and niches with a simulated scene."""
 
 from __future__ import annotations
 
@@ -22,68 +22,70 @@ from orthoflow_plugins.inspect.findings import higher, lower, rms
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras
 
-# Larger walls are sampled in coarser cells; rays to the borders of openings keep their spacing.
+# Walls with more cells are sampled more coarsely, except along the borders of openings.
 _CELLS_TOLD: Final = 1 << 24
-# Maximum depth of a recess in a scene.
+# Maximum depth of a recess in the scene.
 _BEHIND_MOST_M: Final = 2.0
-# Of the cells within two cells of a recess, this share must be the face of its wall.
+# A recess belongs to a wall if this share of the cells around it is the face of the wall.
 _RIM_CELLS: Final = 5
 _RIM_LEAST: Final = 0.5
-# An outline matches an opening if their intersection is this share of their union.
+# An outline matches an opening if their intersection over union (IoU) is at least this.
 _SAME_IOU: Final = 0.5
-# Range of the search for the true border to both sides of a found one, in steps, and number of
-# lines.
+# The true border is searched this far on both sides of an outline, in these steps, along this
+# number of lines.
 _REACH_CELLS: Final = 10.0
 _STEP_CELLS: Final = 1.0 / 16.0
 _LINES: Final = 33
-# The ends of a side belong to its corners.
+# Share of a side at either end that is ignored, because corners influence it.
 _ENDS_SHARE: Final = 0.1
 
 
 class InspectOpenings(Method):
     """Compare outlines of openings with the recesses of a simulated scene.
 
-    True openings are the connected parts of a wall that show, seen perpendicularly, a sufficiently
-    deep surface of a recess. An outline matches the opening with which it shares more than half of
-    their union, cell by cell; a wall of more than 17 million cells is sampled in coarser ones. Each
-    side that was seen is compared with the border of the recess on rays perpendicular to the wall,
-    a sixteenth of a cell apart; positive errors are outwards.
+    True openings are the connected areas of a wall where rays perpendicular to it hit a surface
+    deep enough behind it. An outline matches the opening with which its IoU is at least one half;
+    walls with more than 17 million cells are sampled more coarsely for this. Each side that the
+    scan saw is compared with the border of the recess along rays a sixteenth of a cell apart; an
+    error is positive if the outline is too large.
     """
 
     id: ClassVar[str] = "inspect.openings"
     determinism: ClassVar[Determinism] = "loose"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
-        MetricSpec("n_true_openings", label="openings of the scene"),
-        higher("n_found_openings", label="openings of the scene that were found"),
-        lower("n_false_openings", label="outlines of no opening"),
-        higher("opening_iou_mean", label="overlap with the true openings, mean"),
-        higher("opening_iou_min", label="overlap with the true openings, least"),
+        MetricSpec("n_true_openings", label="true openings"),
+        higher("n_found_openings", label="true openings that were found"),
+        lower("n_false_openings", label="outlines without a true opening"),
+        higher("opening_iou_mean", label="IoU with the true openings, mean"),
+        higher("opening_iou_min", label="IoU with the true openings, smallest"),
         lower("opening_depth_error_max_mm", label="error of an opening's depth, largest"),
         lower("side_rmse_mm", label="error of sides, RMS"),
-        MetricSpec("side_mean_mm", label="openings too large (+) or small, mean of sides"),
+        MetricSpec("side_mean_mm", label="error of sides, mean (+: too large)"),
         MetricSpec("side_max_mm", label="error of sides, largest"),
         lower("side_rmse_cells", label="error of sides, RMS"),
         MetricSpec(
-            "side_error_over_sigma", label="error of sides over the stated one", better="one"
+            "side_error_over_sigma",
+            label="error of sides divided by the predicted one",
+            better="one",
         ),
-        lower("n_stray_sides", label="sides without a true one nearby"),
+        lower("n_stray_sides", label="sides without a true side nearby"),
     )
 
     class Params(MethodParams):
-        """Which recesses are used."""
+        """Which recesses count as openings."""
 
         behind_m: float = Field(
             default=0.05,
             gt=0.0,
             le=2.0,
-            description="Recesses at least this deep are openings.",
+            description="Smallest depth of an opening.",
         )
         area_least_m2: float = Field(
-            default=0.1, gt=0.0, le=10_000.0, description="Smaller ones are ignored."
+            default=0.1, gt=0.0, le=10_000.0, description="Smaller openings are ignored."
         )
 
     class In(Ports):
-        """The openings to judge, their walls, and the truth."""
+        """The openings to compare, their walls, and the truth."""
 
         truth: Truth
         openings: Openings
@@ -102,8 +104,9 @@ class InspectOpenings(Method):
         missing = [number for number in inputs.openings.walls if number not in places]
         if missing:
             raise MethodError(
-                f"openings of wall {missing[0]} are given, but the walls are "
-                f"{', '.join(map(str, places)) or 'none'}: wire the walls they were found on"
+                f"there are openings on wall {missing[0]}, but the walls are "
+                f"{', '.join(map(str, places)) or 'none'}: connect the walls on which they "
+                "were found"
             )
         views = SceneCameras(inputs.truth.scene, cores=ctx.cores)
         verdicts = []
@@ -123,14 +126,14 @@ class _TrueWall:
     """The truth of a wall.
 
     Attributes:
-        slab: its raster.
-        place: its index in `Walls`.
-        step: cells of the raster along the side of a cell of `labels`.
-        labels: (rows, cols) openings, from 1; 0 elsewhere.
-        face_m: depth of its face.
-        deep_m: depth from which on recesses are openings.
-        scene: the scene that contains it.
-        views: prepared views of the scene.
+        slab: raster and depth range of the wall.
+        place: index of the wall in `Walls`.
+        step: number of raster cells along the side of a cell of `labels`.
+        labels: (rows, cols) number of the opening, from 1; 0 elsewhere.
+        face_m: depth of the face of the wall.
+        deep_m: smallest depth of an opening.
+        scene: the simulated scene.
+        views: the scene, prepared for many rays.
     """
 
     slab: Slab
@@ -144,11 +147,11 @@ class _TrueWall:
 
     @property
     def frame(self) -> WallFrame:
-        """Return the frame of its cells."""
+        """Return the frame of the raster."""
         return self.slab.frame
 
     def depths_m(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the depth (n,) of the opening at positions (n, 2) = (column, row), or NaN."""
+        """Return depths (n,) of openings at positions (n, 2) = (column, row); NaN elsewhere."""
         frame, front_m = self.frame, self.slab.front_m
         starts = frame.world_from_wall(places, front_m) - self.scene.origin
         hits = self.views.cast(starts, np.broadcast_to(-frame.normal_world, starts.shape))
@@ -160,7 +163,7 @@ class _TrueWall:
 
 @dataclass(frozen=True, kw_only=True)
 class _SideError:
-    """One side: its middle, its error outwards, and its stated deviation."""
+    """One side: its middle, its outward error, and its predicted standard deviation."""
 
     point_world: NDArray[np.float64]
     outwards: NDArray[np.float64]
@@ -170,7 +173,7 @@ class _SideError:
 
 @dataclass(frozen=True, kw_only=True)
 class _Verdict:
-    """The findings on one wall; shares have an entry per true opening, 0 if it was not found."""
+    """The findings on one wall; `ious` has an entry per true opening, 0 if it was not found."""
 
     place: int
     gsd_m: float
@@ -203,7 +206,7 @@ def _true_wall(
         cores=cores,
     )
     true = render(scene, told, rendering)
-    # Without a surface there is no depth either.
+    # Rays that hit nothing have no depth.
     role = scene.role[true.rectangle]
     of_face = true.depth_m[(role == SurfaceRole.WALL) & (true.depth_m >= -slab.behind_m)]
     face_m = float(np.median(of_face)) if of_face.size else 0.0
@@ -224,7 +227,7 @@ def _true_wall(
 
 
 def _step(n_cells: int) -> int:
-    """Return how many cells are joined along each side, so that a wall does not have too many."""
+    """Return how many raster cells to merge along each side, to limit the number of samples."""
     step = 1
     while n_cells // step**2 > _CELLS_TOLD:
         step += 1
@@ -240,10 +243,10 @@ def _labelled(
     n_areas, labels, boxes, _ = cv2.connectedComponentsWithStats(
         is_open.astype(np.uint8), connectivity=4
     )
-    # A recess of another wall, seen beyond the edge of this one, is not an opening of it.
+    # Exclude recesses of other walls that are visible beyond the edge of this one.
     about = np.ones((_RIM_CELLS, _RIM_CELLS), dtype=np.uint8)
     names = np.zeros(n_areas, dtype=np.int32)
-    # Label 0 is no area.
+    # Label 0 is the background.
     for label in 1 + np.flatnonzero(boxes[1:, cv2.CC_STAT_AREA] >= n_least):
         left, top, width, height, _ = boxes[label]
         part = (
@@ -304,7 +307,7 @@ def _verdict(wall: _TrueWall, openings: Sequence[Opening]) -> _Verdict:
 
 
 def _cells_of(opening: Opening, frame: WallFrame) -> NDArray[np.float64]:
-    """Return corners (n, 2) as (column, row)."""
+    """Return the corners (n, 2) of an outline as (column, row)."""
     return frame.wall_from_world(opening.outline_world)[:, :2]
 
 
@@ -313,13 +316,13 @@ def _side_error(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float] | None:
     """Return middle (3,), outward direction (2,) and error in metres of a side.
 
-    None if no true border is near most of it.
+    The result is None if most lines across the side meet no true border.
     """
     way = end - begin
     length = float(np.linalg.norm(way))
     if length <= 0.0:
         return None
-    # Counter-clockwise for the viewer, with rows counted downwards.
+    # Outlines are counter-clockwise for the viewer; rows count downwards.
     outwards = np.array([-way[1], way[0]]) / length
     along = np.linspace(_ENDS_SHARE, 1.0 - _ENDS_SHARE, _LINES)
     offsets = np.arange(-_REACH_CELLS, _REACH_CELLS + _STEP_CELLS / 2, _STEP_CELLS)

@@ -1,7 +1,6 @@
 """True errors of estimated cameras and their ties, which residuals cannot show.
 
-Cameras are compared in position, in angle and on the wall; ties with the true target of their
-pixels.
+Cameras are compared by position, by angle and on the wall; ties by the true target of their pixels.
 """
 
 from __future__ import annotations
@@ -35,13 +34,13 @@ if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras, SeenPoints
 
 _GRID: Final = (24, 18)
-# Surfaces with another direction than the wall, such as the sides of mouldings, are ignored.
+# Surfaces that are not parallel to the wall, such as the sides of mouldings, are ignored.
 _LEAST_COSINE: Final = 0.9
-# An orientation called `ok` whose error exceeds this many stated deviations is wrong.
+# An accepted orientation is wrong if its error exceeds this many predicted standard deviations.
 _WRONG_SIGMAS: Final = 5.0
-# A tie whose error exceeds this many cells of the wall is wrong.
+# A tie is wrong if its error exceeds this many cells of the wall.
 _WRONG_CELLS: Final = 1.5
-# Number of rays along the longer side of a photo that decide which wall it shows most.
+# Number of rays along the longer side of a photo when finding the wall that covers most of it.
 _RAYS: Final = 32
 
 
@@ -50,13 +49,13 @@ class PoseError:
     """The errors of one photo's orientation.
 
     Attributes:
-        photo: name.
-        status: `ok`, or why it has no orientation; then the rest is None.
-        centre_m: distance of the projection centres.
-        rotation_deg: angle between the orientations.
-        wall_m: error of one coordinate on the walls, RMS over what the photo shows of them; None if
-            it shows none of them, infinite if the estimated camera does not look there.
-        sigma_wall_m: stated value of the same, or None.
+        photo: name of the photo.
+        status: `ok`, or why it is not oriented; then all other attributes are None.
+        centre_m: distance between estimated and true projection centre.
+        rotation_deg: angle between estimated and true orientation.
+        wall_m: error of one coordinate on the walls, RMS over the visible area; None if the photo
+            shows no wall, infinite if the estimated camera does not look at it.
+        sigma_wall_m: predicted value of `wall_m`, or None.
     """
 
     photo: str
@@ -68,7 +67,7 @@ class PoseError:
 
     @property
     def is_wrong(self) -> bool:
-        """Whether it is called `ok`, but has an error of more than 5 stated standard deviations."""
+        """Return whether an accepted pose is off by over 5 predicted standard deviations."""
         if self.status != "ok" or self.wall_m is None:
             return False
         stated = math.inf if self.sigma_wall_m is None else self.sigma_wall_m
@@ -79,15 +78,15 @@ def true_camera(truth: Truth, photo: str) -> ViewingCamera:
     """Return the true camera of a photo.
 
     Raises:
-        MethodError: the truth has no such photo.
+        MethodError: the truth does not contain the photo.
     """
     cameras = () if truth.cameras is None else truth.cameras.cameras
     for camera in cameras:
         if camera.photo == photo:
             return camera.viewing()
     raise MethodError(
-        f"the truth holds no photo {photo}, it has {len(cameras)} photos: wire the cameras of the "
-        "simulated room's own photos"
+        f"the truth does not contain the photo {photo}, only {len(cameras)} others: connect the "
+        "cameras of the simulated photos"
     )
 
 
@@ -108,7 +107,7 @@ def pose_errors(
 
 
 def pose_findings(errors: Sequence[PoseError]) -> list[Finding]:
-    """Compute statistics of all photos; worst and median over those that are `ok`."""
+    """Compute statistics of all photos; maxima and medians cover oriented photos only."""
     good = [error for error in errors if error.status == "ok"]
     centres = [1e3 * error.centre_m for error in good if error.centre_m is not None]
     angles = [error.rotation_deg for error in good if error.rotation_deg is not None]
@@ -157,7 +156,7 @@ def pose_details(errors: Sequence[PoseError]) -> list[JsonValue]:
 
 
 def tie_findings(cameras: Cameras, walls: Walls, truth: Truth) -> list[Finding]:
-    """Report how many ties are wrong: of all that were matched, and of those that photos kept."""
+    """Compute the shares of wrong ties among all ties and among those the orientation kept."""
     ties = cameras.ties
     if ties is None or not len(ties.photo) or not _of_these(ties, walls.walls):
         return []
@@ -182,13 +181,13 @@ def tie_findings(cameras: Cameras, walls: Walls, truth: Truth) -> list[Finding]:
 
 
 def tie_errors_cells(ties: Ties, walls: Walls, truth: Truth) -> NDArray[np.float64]:
-    """Distances (n,) in the wall's plane of tie points from the true targets of their pixels.
+    """Return distances (n,) of ties from the true targets of their pixels, in cells of the wall.
 
-    To first order of the true camera, in cells of the wall; infinite if the true camera does not
-    look towards the point at all.
+    They are measured in the plane of the wall, by the linearised true camera, and are infinite if
+    the true camera does not look towards the point.
 
     Raises:
-        MethodError: the truth has no such photo.
+        MethodError: the truth does not contain a photo.
     """
     errors = np.full(len(ties.photo), np.inf)
     for photo in np.unique(ties.photo):
@@ -208,7 +207,7 @@ def tie_errors_cells(ties: Ties, walls: Walls, truth: Truth) -> NDArray[np.float
 
 
 def most_shown(camera: ViewingCamera, walls: Sequence[Wall]) -> int:
-    """Return the index of the wall whose rectangle covers most of a photo, -1 without one."""
+    """Return the index of the wall that covers most of a photo, or -1 if it shows no wall."""
     step = max(camera.width, camera.height) / _RAYS
     grid = np.meshgrid(
         np.arange(0.5 * step, camera.width, step), np.arange(0.5 * step, camera.height, step)
@@ -247,7 +246,7 @@ def _pose_error(
 
 
 def _angle_deg(rotation: NDArray[np.float64]) -> float:
-    """Angle of a rotation; the sine preserves small angles that the cosine would lose."""
+    """Return the angle of a rotation; the sine keeps the precision of small angles."""
     axis = np.array(
         [
             rotation[2, 1] - rotation[1, 2],
@@ -261,7 +260,7 @@ def _angle_deg(rotation: NDArray[np.float64]) -> float:
 def _error_on_walls(
     found: ViewingCamera, true: ViewingCamera, walls: Walls, scene: Scene, views: SceneCameras
 ) -> float | None:
-    """Compare the projections of a pixel grid by both cameras onto the true surfaces."""
+    """Compare where both cameras project a grid of pixels onto the true surfaces."""
     columns, rows = ((np.arange(n) + 0.5) / n for n in _GRID)
     grid = np.stack(np.meshgrid(columns * true.width, rows * true.height), axis=-1).reshape(-1, 2)
     seen = views.trace(true, grid)
@@ -279,12 +278,12 @@ def _error_on_walls(
     if np.any(facing * ahead <= 0.0):
         return math.inf
     off = camera.centre_world + (ahead / facing)[:, None] * rays - points
-    # Two coordinates in each surface: half of the squared length is the square of one.
+    # The squared length is that of two coordinates; half of it is that of one.
     return float(np.sqrt(np.mean(np.sum(off**2, axis=1)) / 2.0))
 
 
 def _on_walls(seen: SeenPoints, walls: Walls, scene: Scene) -> NDArray[np.bool_]:
-    """Which points lie on a wall: in its raster and buffer, on a surface that faces like it."""
+    """Return points on a wall: within its raster and buffer, on a surface parallel to it."""
     on_walls = np.zeros(len(seen.points), dtype=np.bool_)
     hit = seen.rectangle >= 0
     for index in range(len(walls.walls)):
@@ -311,7 +310,7 @@ def _scaled(metres: float | None) -> float | None:
 
 
 def _with_own_wall(ties: Ties, walls: Walls, truth: Truth) -> NDArray[np.bool_]:
-    """Return ties (n,) of photos with the wall that each truly shows most."""
+    """Return ties (n,) on the wall that covers most of their photo."""
     most = [
         most_shown(true_camera(truth, name), walls.walls) if (ties.photo == index).any() else -1
         for index, name in enumerate(ties.photo_names)
@@ -320,5 +319,5 @@ def _with_own_wall(ties: Ties, walls: Walls, truth: Truth) -> NDArray[np.bool_]:
 
 
 def _of_these(ties: Ties, walls: tuple[Wall, ...]) -> bool:
-    """Whether the ties may belong to these walls."""
+    """Return whether all wall indices of the ties are valid."""
     return int(ties.wall.min()) >= 0 and int(ties.wall.max()) < len(walls)

@@ -1,4 +1,4 @@
-"""Displacements between two images: least squares matching to hundredths of a cell."""
+"""Displacements between two images by least squares matching, to hundredths of a cell."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ _LEAST_REGION: Final = 0.8
 _LEAST_WEIGHT: Final = 0.25
 _ROUNDS: Final = 12
 _AT_ONCE: Final = 2048
-# A patch that least squares move this far was found at the wrong place.
+# A patch that moves this far during the refinement was found at a wrong position.
 _STRAYED_CELLS: Final = 2.0
 _CONVERGED_CELLS: Final = 0.002
-# Smoothing correlates neighbouring cells; this many count as one in the precision.
+# Smoothing correlates neighbouring cells: this many count as one independent observation.
 _CELLS_PER_SAMPLE: Final = 4.0 * np.pi * _SMOOTH_CELLS**2
 _SIGMA_LIMIT_CELLS: Final = 0.15
 
 
 class GreyCells(ABC):
-    """A grey image with valid cells, of which parts are computed on request."""
+    """A grey image with valid cells whose parts are computed on request."""
 
     @property
     @abstractmethod
@@ -39,14 +39,14 @@ class GreyCells(ABC):
 
     @abstractmethod
     def cut(self, part: tuple[slice, slice]) -> GreyImage:
-        """Return some rows and columns, all of them within the image."""
+        """Return a part of the image."""
 
     def whole(self) -> GreyImage:
-        """Return all rows and columns."""
+        """Return the whole image."""
         return self.cut((slice(0, self.shape[0]), slice(0, self.shape[1])))
 
     def fullest_part(self, side: int) -> GreyImage:
-        """Return the tile of limited size with the most valid cells."""
+        """Return the tile with the most valid cells, of at most `side` rows and columns."""
 
         def n_valid(tile: tuple[slice, slice]) -> int:
             return int(np.count_nonzero(self.cut(tile).valid))
@@ -54,7 +54,7 @@ class GreyCells(ABC):
         return self.cut(max(tiles(self.shape, side), key=n_valid))
 
     def square(self, corner: NDArray[np.int64], side: int) -> GreyImage:
-        """Return a square from a corner (2,) = column, row; 0 and not valid beyond the border."""
+        """Return a square from its first (column, row); cells outside the image are invalid."""
         grey, valid = np.zeros((side, side)), np.zeros((side, side), dtype=np.bool_)
         first = np.clip(corner[::-1], 0, self.shape)
         end = np.clip(corner[::-1] + side, first, self.shape)
@@ -73,7 +73,7 @@ class GreyImage(GreyCells):
 
     Attributes:
         grey: (rows, cols) float64.
-        valid: (rows, cols) bool, cells that count.
+        valid: (rows, cols) bool, cells with a grey level.
         region: (rows, cols) bool, the whole surface, including missing cells.
     """
 
@@ -88,18 +88,18 @@ class GreyImage(GreyCells):
         return rows, columns
 
     def cut(self, part: tuple[slice, slice]) -> GreyImage:
-        """Return some rows and columns, all of them within the image."""
+        """Return a part of the image."""
         return GreyImage(grey=self.grey[part], valid=self.valid[part], region=self.region[part])
 
 
 @dataclass(frozen=True, kw_only=True)
 class IntensityGrey(GreyCells):
-    """An intensity as grey levels, 0 where unknown.
+    """An intensity raster as grey levels, 0 where unknown.
 
     Attributes:
         intensity: (rows, cols) float32 from 0 to 1, NaN where unknown.
-        of_roots: use square roots: laser intensity spans decades, and its roots are closer to what
-            a camera sees.
+        of_roots: use square roots, since laser intensities span several orders of magnitude and
+            their roots are more similar to a photo.
     """
 
     intensity: NDArray[np.float32]
@@ -112,7 +112,7 @@ class IntensityGrey(GreyCells):
         return rows, columns
 
     def cut(self, part: tuple[slice, slice]) -> GreyImage:
-        """Return some rows and columns, all of them within the wall."""
+        """Return a part of the raster."""
         values = self.intensity[part]
         known = np.isfinite(values)
         level = np.where(known, values, np.float32(0.0))
@@ -124,7 +124,7 @@ class IntensityGrey(GreyCells):
 
 
 def tiles(shape: tuple[int, int], side: int) -> Iterator[tuple[slice, slice]]:
-    """Cut a raster into tiles of limited size, row by row."""
+    """Cut a raster into tiles of at most `side` rows and columns, row by row."""
     for row in range(0, shape[0], side):
         for column in range(0, shape[1], side):
             yield (
@@ -135,14 +135,14 @@ def tiles(shape: tuple[int, int], side: int) -> Iterator[tuple[slice, slice]]:
 
 @dataclass(frozen=True, kw_only=True)
 class PatchShifts(Rows):
-    """Displacements of the patches that have enough texture in both directions.
+    """Displacements of patches with enough texture in both directions.
 
     Attributes:
-        centre: (p, 2) float64 (column, row) of the patch's centre.
-        shift: (p, 2) float64 cells along u and v, shown - true.
-        sigma: (p, 2) float64 cells, standard deviations.
-        found: (p, 2) float64 cells, the displacement before it was refined.
-        correlation: (p,) float64 -1..1 of the two patches, NaN before they are refined.
+        centre: (p, 2) float64 column and row of the patch centre.
+        shift: (p, 2) float64 displacement along u and v in cells, shown minus true position.
+        sigma: (p, 2) float64 standard deviation of `shift` in cells.
+        found: (p, 2) float64 displacement in cells before the refinement.
+        correlation: (p,) float64 correlation coefficient of the patches; NaN before the refinement.
     """
 
     centre: NDArray[np.float64]
@@ -152,7 +152,7 @@ class PatchShifts(Rows):
     correlation: NDArray[np.float64]
 
     def within(self, rows: slice) -> PatchShifts:
-        """Return those whose centre lies in some rows, counted from the first of these."""
+        """Return the patches with their centre in a band of rows, relative to its first row."""
         first = rows.start or 0
         end = np.inf if rows.stop is None else rows.stop
         own = (self.centre[:, 1] >= first) & (self.centre[:, 1] < end)
@@ -161,7 +161,7 @@ class PatchShifts(Rows):
 
 
 def unrefined(centre: NDArray[np.float64], shift: NDArray[np.float64]) -> PatchShifts:
-    """Return patches at (p, 2) whose displacements (p, 2) are known approximately."""
+    """Return patches at `centre` (p, 2) with approximate displacements (p, 2)."""
     return PatchShifts(
         centre=centre,
         shift=shift,
@@ -172,7 +172,7 @@ def unrefined(centre: NDArray[np.float64], shift: NDArray[np.float64]) -> PatchS
 
 
 class _Patches(NamedTuple):
-    """Cells of the current patches: arrays (p, 32 * 32)."""
+    """Cells of patches, as arrays (p, 32 * 32)."""
 
     rows: NDArray[np.float64]
     columns: NDArray[np.float64]
@@ -183,14 +183,14 @@ class _Patches(NamedTuple):
 def measure_shifts(shown: GreyImage, true: GreyImage, *, reach_cells: int) -> PatchShifts:
     """Measure where the content of `true` appears in `shown`, patch by patch.
 
-    A patch is 32 x 32 cells. It is found to a whole cell by the smallest mean square difference
-    within the reach, then by Gauss-Newton steps for shift and brightness. Patches with too few
-    valid cells, too little texture for 0.15 cells, or without convergence are omitted.
+    A patch has 32 x 32 cells. It is first located to a whole cell by the smallest mean square
+    difference, then refined by Gauss-Newton steps for shift and brightness. Patches are omitted if
+    they have too few valid cells, do not converge, or have a standard deviation over 0.15 cells.
 
     Args:
-        shown: the image to judge.
+        shown: the image to inspect.
         true: the reference image.
-        reach_cells: maximum displacement that is searched.
+        reach_cells: maximum displacement.
     """
     first, second = _smoothed(shown), _smoothed(true)
     start = _whole_cell_shifts(first, second, reach_cells)
@@ -211,13 +211,12 @@ def refine_shifts(
     """Refine displacements that are known to a cell or two, patch by patch.
 
     Args:
-        shown: the image to judge, with about the contrast of the other.
+        shown: the image to inspect, with about the contrast of the reference.
         true: the reference image.
-        start: positions of patches of 32 x 32 cells, wholly inside the image, and their approximate
-            displacements.
+        start: patches that are fully inside the image, with approximate displacements.
         sigma_most_cells: patches with a larger standard deviation are omitted.
-        focus_cells: width of the Gaussian weight around the patch's middle.
-        threads: number of parts of the patches that are refined at once, independently.
+        focus_cells: standard deviation of the Gaussian weight around the patch centre.
+        threads: number of threads.
 
     Returns:
         The patches that converge within two cells of the start.
@@ -238,10 +237,10 @@ def refine_shifts(
 
 
 def _smoothed(image: GreyImage) -> GreyImage:
-    """Smooth by a Gaussian of one cell over valid cells only.
+    """Smooth by a Gaussian of one cell, over valid cells only.
 
-    At the border of the region the mean is shifted to one side by the region and not by the
-    content; such cells are not valid. Scattered holes do no harm.
+    Cells at the border of the region become invalid, since their neighbours are on one side only,
+    which shifts the mean. Scattered holes do not matter.
     """
     inside = _gauss(image.region) > _LEAST_REGION
     weight = _gauss(image.valid)
@@ -257,11 +256,11 @@ def _gauss(values: NDArray[np.float64] | NDArray[np.bool_]) -> NDArray[np.float6
 
 
 def _whole_cell_shifts(shown: GreyImage, true: GreyImage, reach: int) -> PatchShifts:
-    """Find each patch to a whole cell, among those that have enough valid cells."""
+    """Locate each patch with enough valid cells to a whole cell."""
     row, column = np.nonzero(_patch_counts(shown.valid) >= _LEAST_SHARE * PATCH_CELLS**2)
     grey = _windows(shown.grey, row, column, 0)
     valid = _windows(shown.valid, row, column, 0)
-    # Cells from beyond the border are not valid.
+    # Cells outside the image are invalid.
     true_grey = _windows(np.pad(true.grey, reach), row, column, reach)
     true_valid = _windows(np.pad(true.valid, reach), row, column, reach)
     best, shift = np.full(len(row), np.inf), np.zeros((len(row), 2))
@@ -301,7 +300,7 @@ _Value = TypeVar("_Value", bound=np.generic)
 def _windows(
     values: NDArray[_Value], row: NDArray[np.int64], column: NDArray[np.int64], rim: int
 ) -> NDArray[_Value]:
-    """Return patches (p, n, n) with a margin around each; `values` has the margin around it."""
+    """Return patches (p, n, n) with a margin around each; `values` includes the margin."""
     side = PATCH_CELLS + 2 * rim
     cells = np.arange(side)
     rows = row[:, None, None] * PATCH_CELLS + cells[:, None]
@@ -347,7 +346,7 @@ def _refined(
         weight = part.weight * inside
         step[active], sigma[active] = _normal_step(design, part.grey - expected, weight)
         correlation[active] = _correlations(part.grey, expected, weight)
-        # Half a cell at most: the linear model is not valid further.
+        # Move by at most half a cell, the range of the linear model.
         shift[active] += np.clip(step[active], -0.5, 0.5)
     good = (
         (np.abs(step).max(axis=1) < 5.0 * _CONVERGED_CELLS)
@@ -378,7 +377,7 @@ def _correlations(
 class _Sampler:
     """The true image interpolated by cubic B-splines (Unser 1999), with validity.
 
-    All cells of a patch have the same fractional position, so four weights per axis suffice.
+    All cells of a patch have the same fractional position, so four weights per axis are enough.
     """
 
     def __init__(self, true: GreyImage) -> None:
@@ -390,7 +389,7 @@ class _Sampler:
     def at(
         self, patches: _Patches, shift: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Expected grey (p, n), its derivatives (p, n, 3), and where the truth is valid (p, n)."""
+        """Return expected grey (p, n), its derivatives (p, n, 3), and valid cells (p, n)."""
         first = np.column_stack([patches.rows[:, 0], patches.columns[:, 0]]) - shift[:, ::-1]
         whole = np.floor(first)
         part = first - whole
@@ -400,16 +399,16 @@ class _Sampler:
         expected, slope_u = (_filtered(rows, weights, 2) for weights in right)
         slope_v = _filtered(row_slopes, right[0], 2)
         flat = (len(shift), -1)
-        # The derivative of true(x - shift) by the shift is minus the slope.
+        # The derivative of true(x - shift) with respect to the shift is the negative gradient.
         design = np.empty((*expected.reshape(flat).shape, 3))
         design[..., 0], design[..., 1] = -slope_u.reshape(flat), -slope_v.reshape(flat)
         design[..., 2] = 1.0
         return expected.reshape(flat), design, valid.reshape(flat)
 
     def _windows(self, corner: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Coefficients (p, 35, 35) around patches from their corners, and valid cells (p, 32, 32).
+        """Return coefficients (p, 35, 35) around patches, and valid cells (p, 32, 32).
 
-        An interpolated cell is valid if all four neighbours are.
+        An interpolated cell is valid if its four neighbours are valid.
         """
         steps = np.arange(-1, PATCH_CELLS + 2)
         rows, columns = corner[:, :1] + steps, corner[:, 1:] + steps
@@ -424,7 +423,7 @@ class _Sampler:
 
 
 def _spline_weights(part: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return weights (2, p, 4) of the coefficients for the value and its derivative."""
+    """Return weights (2, p, 4) of four coefficients for the value and for its derivative."""
     t = part
     s = 1.0 - t
     value = [s**3, 4.0 - 6.0 * t**2 + 3.0 * t**3, 4.0 - 6.0 * s**2 + 3.0 * s**3, t**3]
@@ -435,7 +434,7 @@ def _spline_weights(part: NDArray[np.float64]) -> NDArray[np.float64]:
 def _filtered(
     window: NDArray[np.float64], weights: NDArray[np.float64], axis: int
 ) -> NDArray[np.float64]:
-    """Sum four neighbours along an axis of (p, rows, columns), weights (p, 4)."""
+    """Return weighted sums of four neighbours along an axis of (p, rows, columns)."""
     size = window.shape[axis] - 3
     parts = (
         window[:, tap : tap + size] if axis == 1 else window[:, :, tap : tap + size]
@@ -450,7 +449,7 @@ def _filtered(
 def _normal_step(
     design: NDArray[np.float64], residual: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Solve every patch's normal equations: steps (p, 2) and standard deviations (p, 2)."""
+    """Solve the normal equations of all patches: steps (p, 2) and standard deviations (p, 2)."""
     weighted = design * weight[:, :, None]
     normal = np.einsum("pni,pnj->pij", weighted, design) + 1e-9 * np.eye(3)
     right = np.einsum("pni,pn->pi", weighted, residual)

@@ -1,4 +1,4 @@
-"""The wall of an orthoimage, on the orthoimage's own cells."""
+"""Walls resampled to the grids of orthoimages."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _Framed = TypeVar("_Framed", Orthoimage, Wall, "TrueOrthoimage")
 def on_walls(images: Orthoimages, walls: Walls) -> Orthoimages:
     """Return orthoimages whose `wall` is an index of these walls.
 
-    Orthoimages of other programs, and of walls rastered in another step, state the plane only.
+    Orthoimages from other programs, and of walls rastered in another step, only refer to a plane.
 
     Raises:
         MethodError: there is no such wall.
@@ -37,9 +37,9 @@ def on_walls(images: Orthoimages, walls: Walls) -> Orthoimages:
         index = image.wall if image.plane_index is None else places.get(image.plane_index, -1)
         if not 0 <= index < len(walls.walls):
             raise MethodError(
-                f"orthoimage {image.name} is of wall {image.number}, but the walls are "
-                f"{', '.join(str(place) for place in sorted(places)) or 'none'}: wire the walls "
-                "that the orthoimages were made from"
+                f"orthoimage {image.name} shows wall {image.number}, but the walls are "
+                f"{', '.join(str(place) for place in sorted(places)) or 'none'}: connect the "
+                "walls that the orthoimages were made from"
             )
         number = walls.walls[index].plane_index
         placed.append(replace(image, wall=index, plane_index=number))
@@ -47,7 +47,7 @@ def on_walls(images: Orthoimages, walls: Walls) -> Orthoimages:
 
 
 def rows_of(raster: _Framed, rows: slice) -> _Framed:
-    """Return some rows of an orthoimage, a wall or a truth, with a frame of their own."""
+    """Return a band of rows of a raster, with the frame of that band."""
     frame = raster.frame
     corner = frame.origin_world + rows.start * frame.gsd_m * frame.v_world
     part = replace(frame, origin_world=corner, height=rows.stop - rows.start)
@@ -61,7 +61,7 @@ def rows_of(raster: _Framed, rows: slice) -> _Framed:
 
 
 def in_files(ctx: StepContext, name: str) -> Allocate:
-    """Return arrays in files, for errors or values of many cells."""
+    """Return a function that allocates arrays in files of the scratch folder."""
 
     def allocate(field: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
         return ctx.allocate("inspection", f"{name}.{field}", shape, dtype).view(np.ndarray)
@@ -70,19 +70,19 @@ def in_files(ctx: StepContext, name: str) -> Allocate:
 
 
 def wall_of(image: Orthoimage, walls: Walls, allocate: Allocate = in_memory) -> Wall:
-    """Return the wall of one of `on_walls`, resampled if its cells differ from the image's.
+    """Return the wall of an orthoimage from `on_walls`, resampled to the grid of the image.
 
-    Orthoimages of other programs have grids of their own. Each of their cells takes the values of
-    the nearest cell of the wall, its depth relative to the image's own plane, and an intensity
-    interpolated between the four nearest.
+    Orthoimages from other programs have different grids. Each of their cells takes the values of
+    the nearest cell of the wall, with the depth relative to the plane of the image; the intensity
+    is interpolated between the four nearest cells.
 
     Args:
         image: the orthoimage.
-        walls: all of them.
-        allocate: returns arrays for resampled values of a large image, by name.
+        walls: all walls.
+        allocate: allocates the resampled arrays by name.
 
     Raises:
-        MethodError: it is elsewhere.
+        MethodError: the image is not on the wall.
     """
     wall = walls.walls[image.wall]
     if wall.frame.has_cells_of(image.frame):
@@ -98,18 +98,18 @@ def _require_nearness(image: Orthoimage, wall: Wall, walls: Walls) -> None:
     slab = walls.slab(image.wall)
     if angle > _SAME_DIRECTION_DEG or not (-slab.behind_m <= aside <= slab.front_m):
         raise MethodError(
-            f"orthoimage {image.name} lies {aside:.3f} m before {wall.name} and "
-            f"{angle:.2f} deg askew: wire the walls that the orthoimages are of"
+            f"orthoimage {image.name} is {aside:.3f} m in front of {wall.name} and rotated by "
+            f"{angle:.2f} deg: connect the walls that the orthoimages show"
         )
 
 
 def _laid_onto(image: Orthoimage, wall: Wall, allocate: Allocate) -> Wall:
-    """Return the wall on the image's cells, row by row, so that large images need little memory."""
+    """Resample the wall row by row, so that large images need little memory."""
     import cv2
 
     frame = image.frame
     columns = np.arange(frame.width) + 0.5
-    # Fields of a cell, and their values beyond the wall.
+    # Fields of the wall, and their values outside of it.
     given: dict[str, tuple[NDArray[Any], float]] = {
         "depth_m": (wall.depth_m, np.nan),
         "sigma_m": (wall.sigma_m, np.nan),

@@ -1,4 +1,4 @@
-"""Planes and labels against the truth: errors of walls, and scores of detectors."""
+"""Errors of planes, and scores of their labels, against the truth."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from orthoflow.sdk import DiagnosticSpec, StepContext
 
 _FOUND_ANGLE_DEG: Final = 1.0
 _FOUND_OFFSET_M: Final = 0.015
-# A wall farther away than this does not match a true plane.
+# A wall that differs by more does not match a true plane.
 _SAME_ANGLE_DEG: Final = 3.0
 _SAME_OFFSET_M: Final = 0.03
-# Scores of labels, as metrics and as people read them.
+# Scores of labels: their name in metrics and in texts.
 LABEL_SCORES: Final = {"precision": "precision", "recall": "recall", "f1": "F1", "iou": "IoU"}
 MAIN_MISSED: Final = DiagnosticSpec(
     code="main-wall-missed",
     severity="error",
-    text="the main wall of the scene is none of the {n_planes} planes that were found within "
-    "{angle_deg:g} deg and {offset_m:g} m: errors of planes are reported without it",
+    text="none of the {n_planes} detected planes matches the main wall of the scene within "
+    "{angle_deg:g} deg and {offset_m:g} m: the errors of the other planes are reported",
 )
 
 LABELS_NOT_COMPARED: Final = DiagnosticSpec(
     code="labels-not-compared",
     severity="warning",
-    text="labels are not compared with the truth: they are of {n_labels:,} points, the simulated "
-    "cloud has {n_true:,}, and which of them these are is unknown",
-    remedy="wire the cloud that was labelled to {step}; a filter keeps track of points with "
+    text="labels are not compared with the truth: there are {n_labels:,} labels for {n_true:,} "
+    "simulated points, and it is unknown to which points they belong",
+    remedy="connect the labelled cloud to {step}; filters keep track of points with "
     "`cloud.selected(...)`",
 )
 POINTS_LEFT_OUT: Final = DiagnosticSpec(
     code="points-left-out-before-labels",
     severity="note",
-    text="labels are compared for {n_labels:,} of {n_true:,} simulated points; a step before "
-    "{step} left out the others",
+    text="labels are compared for {n_labels:,} of {n_true:,} simulated points: an earlier step "
+    "removed the others",
 )
 
 
@@ -50,10 +50,11 @@ def inspect_planes(
     truth: Truth,
     ctx: StepContext,
 ) -> Inspection:
-    """Compare planes, and labels if there are any, with the truth.
+    """Compare planes, and labels if given, with the truth.
 
-    Metrics without prefix are of the truth's first plane, its main wall; `worst_` are the largest
-    of all true planes that were found; `label_..._mean` are means over all true planes.
+    Metrics without a prefix describe the main wall, which is the first plane of the truth; `worst_`
+    is the largest error of all true planes that were found; `label_..._mean` is the mean over all
+    true planes.
     """
     nearest = [
         _nearest(
@@ -108,7 +109,7 @@ def inspect_planes(
 
 
 def _with_those_of_the_main_wall(scores: list[Finding], truth: Truth) -> list[Finding]:
-    """Add the scores of the truth's first plane without its name."""
+    """Add the scores of the main wall under names without the plane's name."""
     if not scores:
         return []
     values = {item.name: item.value for item in scores}
@@ -120,14 +121,14 @@ def _with_those_of_the_main_wall(scores: list[Finding], truth: Truth) -> list[Fi
 
 
 def wall_plane_findings(plane: Plane, wall: int, true: Planes) -> list[Finding]:
-    """Return metrics of the plane of one wall; none if it matches no true plane."""
+    """Return the errors of the plane of one wall; empty if it matches no true plane."""
     distances = (_plane_distance(plane, true, index) for index in range(len(true)))
     nearest = _nearest(distances, angle_deg=_SAME_ANGLE_DEG, offset_m=_SAME_OFFSET_M)
     return [] if nearest is None else _plane_findings(nearest, wall)
 
 
 def worst_plane_findings(findings: Sequence[Finding]) -> list[Finding]:
-    """Return the largest error of any wall's plane, as metrics of all walls."""
+    """Return the largest errors over the planes of all walls."""
     worst = []
     for name in ("plane_angle_deg", "plane_offset_mm", "plane_corner_max_mm"):
         values = [finding for finding in findings if finding.name == name]
@@ -152,16 +153,16 @@ def found_planes(planes: Planes, true: Planes) -> list[Finding]:
 def label_findings(
     labels: PointLabels, cloud: PointCloud | None, truth: Truth, ctx: StepContext
 ) -> list[Finding]:
-    """Precision, recall, F1 and IoU of the labels per true plane, matched one to one.
+    """Compute precision, recall, F1 and IoU of the labels per true plane, matched one to one.
 
-    None where it is unknown to which points the labels belong. Points that a filter left out count
-    neither for nor against a detector.
+    The result is empty if it is unknown to which points the labels belong. Points that a filter
+    removed before the detection are ignored.
 
     Args:
-        labels: of a detector.
-        cloud: that the detector had; None for the simulated one.
-        truth: of the simulated cloud.
-        ctx: takes diagnostics.
+        labels: labels from a detector.
+        cloud: the labelled cloud; None for the whole simulated cloud.
+        truth: truth of the simulated cloud.
+        ctx: context that receives diagnostics.
     """
     from scipy.optimize import linear_sum_assignment
 
@@ -208,9 +209,9 @@ class _PlaneDistance:
     """Differences between a plane and a true one.
 
     Attributes:
-        angle_deg: between the normals.
-        offset_m: signed distance at the centroid of the true rectangle, + towards the viewer.
-        corner_m: largest distance at its corners.
+        angle_deg: angle between the normals.
+        offset_m: distance at the centroid of the true rectangle, positive towards the viewer.
+        corner_m: largest distance at the corners of the true rectangle.
     """
 
     angle_deg: float
@@ -218,12 +219,12 @@ class _PlaneDistance:
     corner_m: float
 
     def is_within(self, angle_deg: float, offset_m: float) -> bool:
-        """Whether neither angle nor offset is larger."""
+        """Return whether angle and offset are within limits."""
         return self.angle_deg <= angle_deg and abs(self.offset_m) <= offset_m
 
     @property
     def score(self) -> float:
-        """Return what selects the nearest plane: angle and offset in units of the limits."""
+        """Return the sum of angle and offset in units of their limits; smaller is nearer."""
         return self.angle_deg / _FOUND_ANGLE_DEG + abs(self.offset_m) / _FOUND_OFFSET_M
 
 
@@ -239,14 +240,14 @@ def _plane_distance(found: Plane, true: Planes, index: int) -> _PlaneDistance:
 
 
 def _distances(found: Planes, true: Planes, index: int) -> list[_PlaneDistance]:
-    """Return the differences of each of the found planes from a true one."""
+    """Return the differences of all detected planes from a true plane."""
     return [_plane_distance(found.plane(k), true, index) for k in range(len(found))]
 
 
 def _nearest(
     distances: Iterable[_PlaneDistance], *, angle_deg: float, offset_m: float
 ) -> _PlaneDistance | None:
-    """Return the smallest of those differences that are within the limits."""
+    """Return the smallest difference within the limits."""
     near = (distance for distance in distances if distance.is_within(angle_deg, offset_m))
     return min(near, key=lambda distance: distance.score, default=None)
 
@@ -263,7 +264,7 @@ def _plane_findings(distance: _PlaneDistance, wall: int) -> list[Finding]:
 def _joint_counts(
     found: NDArray[np.int16], true: NDArray[np.int16], n_true: int
 ) -> NDArray[np.int64]:
-    """Return counts of points by (true + 1, found + 1)."""
+    """Return the numbers of points by (true label + 1, detected label + 1)."""
     n_found = int(found.max(initial=-1)) + 2
     joint = (true.astype(np.int64) + 1) * n_found + (found.astype(np.int64) + 1)
     return np.bincount(joint, minlength=(n_true + 1) * n_found).reshape(n_true + 1, n_found)

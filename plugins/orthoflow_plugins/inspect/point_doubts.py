@@ -1,4 +1,4 @@
-"""Check points that no picture shows, or that refer to another raster, unit or system."""
+"""Check points that no image shows, or that refer to another raster, unit or system."""
 
 from __future__ import annotations
 
@@ -13,56 +13,56 @@ from orthoflow.sdk import DiagnosticSpec
 from orthoflow_plugins.inspect.findings import rms
 from orthoflow_plugins.inspect.point_places import Picture, ShownPoint
 
-# A spec, its subject, and its values.
+# A diagnostic: its spec, its subject, and its values.
 Doubt: TypeAlias = tuple[DiagnosticSpec, str, dict[str, Any]]
-# Errors of an orthoimage are cells, not tens of cells.
+# An orthoimage is off by a few cells, not by tens of cells.
 _OFF_CELLS: Final = 20.0
-# A different cell size, beyond what a photo's pose or a scan's scale can explain.
+# A larger deviation from scale 1 cannot be explained by poses or by the scale of the scan.
 _SCALE_OFF: Final = 0.02
-# Share of the total error that all points have in common.
+# The shift that all points have in common is reported if it is this share of the RMS.
 _ALIKE_SHARE: Final = 0.9
 _ALIKE_LEAST: Final = 3
-# Unused points that a message names, and the distance from which it states metres.
+# Number of unused points listed in a message, and the distance from which it uses metres.
 _NAMED: Final = 4
 _NEAR_M: Final = 1.0
 _ANY_CELLS: Final = (
-    "measure them in this orthoimage, or give what holds for any cell size: shown_x,shown_y,"
-    "shown_z as the report saves them, or map_x,map_y of a map"
+    "measure them in this orthoimage, or enter coordinates that do not depend on the cell size: "
+    "shown_x, shown_y, shown_z as saved by the report, or map_x, map_y"
 )
 OWN_POINTS: Final = DiagnosticSpec(
     code="check-points-of-the-image",
     severity="warning",
-    text="x, y, z of {n} of {n_points} check points are those of the orthoimage in which they "
-    "were clicked, so that nothing is compared",
-    remedy="put the surveyed ones there",
+    text="the coordinates x, y, z of {n} of {n_points} check points were taken from the orthoimage "
+    "in which they were clicked, so nothing is compared",
+    remedy="enter the surveyed coordinates instead",
     rank_by="n",
 )
 FAR_POINTS: Final = DiagnosticSpec(
     code="check-points-far",
     severity="warning",
-    text="{n} of {n_points} check points lie farther from their wall than it is long{how_far}",
-    remedy="check `unit` of read.checkpoints, and that points and scan have one coordinate system",
+    text="{n} of {n_points} check points are farther from their wall than it is long{how_far}",
+    remedy="check `unit` of read.checkpoints, and the coordinate systems of points and scan",
     rank_by="n",
 )
 OTHER_CELLS: Final = DiagnosticSpec(
     code="check-points-of-other-cells",
     severity="warning",
-    text="{subject}: its {n_points} check points were measured on cells of about {measured_m:.3g} "
-    "m, but its own are {gsd_m:.3g} m",
+    text="{subject}: its {n_points} check points seem to have been measured in an image with cells "
+    "of {measured_m:.3g} m; its own cells are {gsd_m:.3g} m",
     remedy="{any_cells}",
 )
 SHIFTED_POINTS: Final = DiagnosticSpec(
     code="check-points-shifted",
     severity="warning",
-    text="{subject}: all of its {n_points} check points are shown {right_m:+.4g} m right and "
-    "{down_m:+.4g} m down of the survey: was the raster cut or placed otherwise where they were "
-    "measured?",
+    text="{subject}: all of its {n_points} check points are shown {right_m:+.4g} m to the right of "
+    "and {down_m:+.4g} m below the survey; perhaps they were measured in a raster with another "
+    "origin",
     remedy="{any_cells}",
 )
 
 
 def is_own(surveyed: CheckPoints) -> NDArray[np.bool_]:
-    """Report points (n,) whose surveyed coordinates are those shown where they were clicked."""
+    """Return points (n,) whose surveyed coordinates equal those where they were clicked."""
     if surveyed.shown_world is None:
         return np.zeros(len(surveyed.names), dtype=np.bool_)
     return np.asarray((surveyed.shown_world == surveyed.points_world).all(axis=1), dtype=np.bool_)
@@ -74,9 +74,9 @@ def doubts(
     """Return diagnostics of implausible check points.
 
     Args:
-        points: expected and shown position of each.
-        surveyed: the points.
-        pictures: the pictures that show them.
+        points: expected and shown position of each point.
+        surveyed: the check points.
+        pictures: the images that show them.
     """
     if n_own := int(np.count_nonzero(is_own(surveyed))):
         yield OWN_POINTS, "", {"n": n_own, "n_points": len(points)}
@@ -96,7 +96,7 @@ def doubts(
 
 
 def _beyond_m(point: ShownPoint, picture: Picture | None) -> float:
-    """Return how far a point is from its wall if that exceeds the wall's length; else 0."""
+    """Return the distance of a point from its wall if it exceeds the length of the wall, else 0."""
     if picture is None:
         return 0.0
     frame = picture.frame
@@ -106,7 +106,7 @@ def _beyond_m(point: ShownPoint, picture: Picture | None) -> float:
 
 
 def _doubts_of_places(points: Sequence[ShownPoint], picture: Picture) -> Iterator[Doubt]:
-    """Return measured positions that differ by another cell size, or all by the same shift."""
+    """Yield a diagnostic if measured positions differ by a scale or by a common shift."""
     if len(points) < 2:
         return
     expected = np.array([point.expected for point in points])
@@ -143,16 +143,16 @@ def missed_points(
     *,
     is_simulated: bool = False,
 ) -> dict[str, Missed]:
-    """Return the points that are not used, by name, in the order of the survey.
+    """Return the reasons why points are not used, by name, in the order of the survey.
 
     Args:
-        points: expected and shown position of each.
-        surveyed: the points.
-        pictures: the pictures that were searched; at least one.
-        walls: those of the pictures.
-        is_simulated: points were searched with the scene's truth, not as targets.
+        points: expected and shown position of each point.
+        surveyed: the check points.
+        pictures: the images that were searched; at least one.
+        walls: the walls of these images.
+        is_simulated: whether points were searched by the true scene, not as targets.
     """
-    sought = "nothing like it" if is_simulated else "no black and white quadrant target"
+    sought = "nothing similar" if is_simulated else "no black and white quadrant target"
     names = {picture.wall: picture.image.name for picture in pictures}
     found: dict[str, Missed] = {}
     for index, point in enumerate(points):
@@ -172,7 +172,7 @@ def missed_points(
 
 
 def with_reasons(missed: Mapping[str, Missed]) -> str:
-    """Name the first few results of `missed_points`, each with its reason."""
+    """List the first few results of `missed_points` with their reasons."""
     named = [f"{name} ({point.reason})" for name, point in list(missed.items())[:_NAMED]]
     more = f" and {len(missed) - _NAMED} more, see the log" if len(missed) > _NAMED else ""
     return f"{', '.join(named)}{more}"
@@ -181,7 +181,7 @@ def with_reasons(missed: Mapping[str, Missed]) -> str:
 def _beside(
     surveyed: CheckPoints, index: int, picture: Picture, walls: Walls
 ) -> tuple[float, Missed]:
-    """Return how far a point is outside a picture in metres, and on which side."""
+    """Return how far a point is outside an image, in metres, and the reason in words."""
     frame, slab = picture.frame, walls.slab(picture.wall)
     column, row, depth_m = frame.wall_from_world(surveyed.points_world[index][None])[0]
     off_m = {

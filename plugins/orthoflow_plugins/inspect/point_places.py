@@ -1,4 +1,4 @@
-"""Where check points are shown: measured, recognised as targets, or found with the truth."""
+"""Find where images show check points: measured, recognised as targets, or by the truth."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ from orthoflow_plugins.inspect.targets import find_crossing
 
 How = Literal["measured", "target", "truth", "not found", "outside"]
 
-# The surroundings of a point are a few cells, not the texture farther away.
+# Width of the Gaussian weight: the patch around a point counts, not the texture farther away.
 _FOCUS_CELLS: Final = 5.0
 _LEAST_VALID: Final = 0.6
 _LEAST_CORRELATION: Final = 0.6
 _SIGMA_MOST_CELLS: Final = 1.0
-# Targets are not quite flat: only this share of their radius is used for the depth of the centre.
+# Targets are not quite flat: the depth of the centre is taken from this share of their radius.
 _DEPTH_SHARE: Final = 0.5
 _NOWHERE: Final = np.full(3, np.nan)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ShownPoint:
-    """A check point in a picture.
+    """A check point in an image.
 
     Attributes:
         how: how it was found, or why not.
-        wall: index of the wall in `Walls`, -1 outside of all.
-        expected: (2,) column, row of the surveyed position.
-        place: (2,) column, row where it is shown, NaN if not found.
-        point_world: (3,) metres, the shown position on the surface; NaN if unknown.
+        wall: index of the wall in `Walls`; -1 if the point is on no wall.
+        expected: (2,) column and row of the surveyed position.
+        place: (2,) column and row where the image shows it; NaN if not found.
+        point_world: (3,) metres, that position on the surface; NaN if unknown.
     """
 
     how: How
@@ -55,14 +55,14 @@ class ShownPoint:
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """A picture in which points are searched.
+    """An image in which points are searched.
 
     Attributes:
         wall: index of the wall in `Walls`.
-        frame: the cells.
-        grey: their grey levels.
-        surface: the wall on the same cells.
-        image: background of drawn residuals.
+        frame: grid of the cells.
+        grey: grey levels of the cells.
+        surface: the wall on the same grid.
+        image: background of the figure of residuals.
     """
 
     wall: int
@@ -74,15 +74,15 @@ class Picture:
 
 @dataclass(frozen=True, kw_only=True)
 class PointFinder:
-    """Finds one check point after the other.
+    """Finds check points one by one.
 
     Attributes:
-        pictures: pictures that may show points.
-        checkpoints: the points.
-        walls: those of the pictures.
-        truth: of a simulated room, or None; then targets are searched.
-        search_m: radius of the search for a point.
-        target_radius_m: radius of a target that is used.
+        pictures: images that may show points.
+        checkpoints: the surveyed points.
+        walls: walls of the images.
+        truth: truth of a simulated room, or None to search for targets.
+        search_m: search radius.
+        target_radius_m: radius of the targets, or of the part to use.
     """
 
     pictures: Sequence[Picture]
@@ -93,7 +93,7 @@ class PointFinder:
     target_radius_m: float
 
     def find(self, index: int) -> ShownPoint:
-        """Return where a point is shown, and how that is known."""
+        """Return where an image shows a point, and how it was found."""
         points = self.checkpoints
         world = points.points_world[index]
         wall = int(points.wall[index])
@@ -123,7 +123,7 @@ class PointFinder:
         return self._target(picture, expected)
 
     def _picture_of(self, world: NDArray[np.float64], wall: int | None) -> Picture | None:
-        """Return the picture of a wall by number, or of the nearest wall behind the point."""
+        """Return the image of a wall by number, or of the wall nearest to the point."""
         best, nearest = None, np.inf
         for picture in self.pictures:
             if wall is not None and picture.image.number == wall:
@@ -192,18 +192,18 @@ def find_by_truth(
     buffers_m: tuple[float, float],
     search_cells: int,
 ) -> NDArray[np.float64] | None:
-    """Find where the surroundings of a point are shown, known from a simulated scene.
+    """Find where an image shows the surroundings of a point, which are rendered from the scene.
 
     Args:
-        picture: the picture to judge.
-        frame: its cells.
-        expected: (2,) column, row of the point.
-        truth: the scene.
-        buffers_m: depths in front of the wall and behind it that belong to the wall.
-        search_cells: radius of the search.
+        picture: the image to inspect.
+        frame: its grid.
+        expected: (2,) column and row of the surveyed position.
+        truth: the simulated scene.
+        buffers_m: depths in front of and behind the wall that belong to the wall.
+        search_cells: search radius.
 
     Returns:
-        (2,) column, row, or None without correlation.
+        (2,) column and row, or None if nothing correlates.
     """
     from orthoflow.geometry.scene_views import render_frame
 
@@ -227,7 +227,7 @@ def find_by_truth(
     whole = _whole_shift(shown, reference, rim, search_cells)
     if whole is None:
         return None
-    # The patch is centred where the point is shown, so that the point is what is measured.
+    # Centre the patch on the shown position, so that the displacement is that of the point.
     centre = np.full(2, side // 2) + whole
     found = refine_shifts(
         shown,
@@ -244,7 +244,7 @@ def find_by_truth(
 def point_on_surface(
     wall: Wall, place: NDArray[np.float64], radius_m: float
 ) -> NDArray[np.float64] | None:
-    """Return the world point (3,) of a position, on the plane through nearby depths, or None.
+    """Return the world point (3,) of a position on the plane through nearby depths, or None.
 
     The plane is fitted robustly: a target on its holder is flat even if the wall around it is not.
     """
@@ -274,7 +274,7 @@ def point_on_surface(
 def _whole_shift(
     shown: GreyImage, true: GreyImage, rim: int, search: int
 ) -> NDArray[np.int64] | None:
-    """Return whole cells (right, down) by which the middle of `true` is displaced in `shown`."""
+    """Return the displacement (right, down) of the middle of `true` in `shown`, in whole cells."""
     middle = slice(rim, rim + PATCH_CELLS)
     down, right = np.mgrid[:PATCH_CELLS, :PATCH_CELLS] - 0.5 * (PATCH_CELLS - 1)
     focus = np.exp(-0.5 * (down**2 + right**2) / _FOCUS_CELLS**2)

@@ -18,24 +18,24 @@ from orthoflow_plugins.inspect.orientation_errors import true_camera
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage
 
-# A cell coloured from farther away shows another place.
+# A cell whose colour comes from farther away shows something else.
 _FAR_CELLS: Final = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class SourceErrors:
-    """The true sources of the colours of a wall's painted cells.
+    """The true origin of the colours of a wall's painted cells.
 
     Attributes:
-        frame: where the cells lie.
-        displacement_m: (rows, cols, 2) along u and v, cell - true target of its pixel; NaN where no
-            oriented photo painted or the pixel has no target.
-        traced: (rows, cols) bool, cells that an oriented photo painted.
-        expected_m: (rows, cols) stated error of the orthoimage; None if it states none.
-        ghosts: (rows, cols) bool, the pixel shows a free-standing object.
-        n_seen_by_both: of the cells whose visibility is tested, those whose true surface a station
-            and a photo see.
-        n_seen_painted: those of them that are painted.
+        frame: grid of the cells.
+        displacement_m: (rows, cols, 2) position of the cell minus the true target of its pixel,
+            along u and v; NaN if no oriented photo coloured the cell or the pixel has no target.
+        traced: (rows, cols) bool, cells coloured by an oriented photo.
+        expected_m: (rows, cols) predicted error of the orthoimage; None if it has no prediction.
+        ghosts: (rows, cols) bool, cells whose pixel shows a free-standing object.
+        n_seen_by_both: cells with a visibility test whose true surface is seen from a station and
+            by a photo.
+        n_seen_painted: painted cells among `n_seen_by_both`.
     """
 
     frame: WallFrame
@@ -47,11 +47,11 @@ class SourceErrors:
     expected_m: NDArray[np.float32] | None = None
 
     def samples(self, steps: NDArray[np.bool_], error_step: int = 1) -> SourceSamples:
-        """Return the errors as numbers.
+        """Return the errors for statistics.
 
         Args:
-            steps: (rows, cols) within 2 cells of a true depth step.
-            error_step: displacements are kept in steps of this.
+            steps: (rows, cols) cells within 2 cells of a true depth step.
+            error_step: every nth displacement is kept.
         """
         known = self.traced & np.isfinite(self.displacement_m).all(axis=2)
         counted = known & ~self.ghosts
@@ -77,20 +77,20 @@ class SourceErrors:
 
 @dataclass(frozen=True, kw_only=True)
 class SourceSamples:
-    """Errors of traced cells as numbers, of a wall or of several put together.
+    """Errors of traced cells for statistics, of one wall or of several together.
 
     Attributes:
         away_m: (n, 2) displacements along u and v of cells that show no free-standing object, away
             from true depth steps.
         step_m: (m, 2) the same within 2 cells of a true depth step.
-        n_traced: cells that an oriented photo painted.
-        n_far: those whose colour is of a place more than 3 cells away, or of nothing.
-        n_ghosts: those whose pixel looks at a free-standing object.
-        n_stated: coordinates away from steps whose error the orthoimage states.
-        n_within_1_sigma: those whose error is at most that.
-        n_within_2_sigma: those whose error is at most twice that.
-        n_seen_by_both: see `SourceErrors`.
-        n_seen_painted: likewise.
+        n_traced: cells coloured by an oriented photo.
+        n_far: traced cells whose pixel has its target more than 3 cells away, or no target.
+        n_ghosts: traced cells whose pixel shows a free-standing object.
+        n_stated: coordinates away from steps with a predicted error.
+        n_within_1_sigma: coordinates whose error is at most the predicted one.
+        n_within_2_sigma: coordinates whose error is at most twice the predicted one.
+        n_seen_by_both: as in `SourceErrors`.
+        n_seen_painted: as in `SourceErrors`.
     """
 
     away_m: NDArray[np.float64]
@@ -114,20 +114,20 @@ def trace_sources(
     truth: Truth,
     views: SceneCameras,
 ) -> SourceErrors:
-    """Trace every cell that a photo painted back to the true target of its pixel.
+    """Trace every cell that was coloured by a photo back to the true target of its pixel.
 
-    The cell's point on the found surface is projected with the estimated camera, as in painting;
-    the pixel's ray through the true camera meets the true scene, and that place on the wall is
-    compared with the cell's own.
+    The cell's point on the measured surface is projected with the estimated camera, as when the
+    orthoimage was made; the ray of that pixel through the true camera meets the true scene, and the
+    position of that point on the wall is compared with that of the cell.
 
     Args:
         image: the orthoimage.
         wall: its wall.
-        true: its truth.
-        lattice: (rows, cols) cells whose visibility is tested.
-        cameras: the estimated ones.
+        true: the true orthoimage.
+        lattice: (rows, cols) cells with a visibility test.
+        cameras: the estimated cameras.
         truth: the simulated room.
-        views: its scene, prepared for many rays.
+        views: the scene, prepared for many rays.
 
     Raises:
         MethodError: a photo is not one of the simulated ones.
@@ -165,14 +165,14 @@ def trace_sources(
 
 
 def source_findings(samples: SourceSamples, wall: int) -> list[Finding]:
-    """Sum up one wall, or several together (wall -1); nothing when no photo painted anything.
+    """Compute statistics of one wall or of all (wall -1); empty if no photo coloured a cell.
 
-    Displacements are of all painted cells that show no free-standing object; those within 2 cells
-    of true depth steps are separate.
+    They cover all cells that show no free-standing object; cells within 2 cells of true depth
+    steps are reported separately.
 
     Args:
-        samples: of the wall, or of all.
-        wall: of the findings.
+        samples: errors of the wall, or of all walls.
+        wall: index of the wall.
     """
     if not samples.n_traced:
         return []
@@ -204,14 +204,14 @@ def source_findings(samples: SourceSamples, wall: int) -> list[Finding]:
 
 
 def _near_frame(frame: WallFrame, truth: Truth) -> WallFrame:
-    """Return the frame relative to the scene's origin: survey coordinates would lose digits."""
+    """Return the frame relative to the scene's origin, where float64 keeps its precision."""
     return replace(frame, origin_world=frame.origin_world - truth.scene.origin)
 
 
 def _seen_by_photos(
     true: TrueOrthoimage, asked: NDArray[np.bool_], truth: Truth, views: SceneCameras
 ) -> NDArray[np.bool_]:
-    """Return those of the tested cells whose true surface some photo sees, oriented or not."""
+    """Return the tested cells whose true surface is seen by any photo, oriented or not."""
     rows, columns = np.nonzero(asked)
     places = np.column_stack([columns + 0.5, rows + 0.5])
     depths = true.depth_m[rows, columns].astype(np.float64)

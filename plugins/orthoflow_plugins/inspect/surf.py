@@ -1,4 +1,4 @@
-"""`inspect.surf`: an orthoimage against the laser's intensity, by SURF key points."""
+"""`inspect.surf`: compare orthoimages with the laser intensity by SURF key points."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ from orthoflow_plugins.inspect.key_pairs import KeyPairs, find_key_pairs, no_pai
 from orthoflow_plugins.inspect.patches import GreyCells, GreyImage, IntensityGrey
 from orthoflow_plugins.inspect.placing import in_files, on_walls, wall_of
 
-# Shift of the intensity against itself, which shows the accuracy of the comparison; some hundred
-# pairs suffice.
+# The intensity is compared with a copy of itself shifted by this much, in a tile of limited size,
+# to find the accuracy of the comparison.
 _FLOOR_SHIFT_CELLS: Final = (0.5, 0.25)
 _FLOOR_CELLS: Final = 600
 _FEWEST_PAIRS: Final = 10
-# Largest displacement that is searched: large enough for gross errors.
+# Radius within which a pair is searched, large enough for gross errors.
 _RADIUS_CELLS: Final = 40.0
 UNFIT: Final = DiagnosticSpec(
     code="surf-not-inspected",
@@ -66,16 +66,18 @@ UNFIT: Final = DiagnosticSpec(
 class InspectSurf(Method):
     """Measure displacements of an orthoimage from the laser's intensity of the same wall.
 
-    The inspection of markiewicz2015: SURF key points of both images are paired, and the distances
-    of pairs are the error (Table 2), drawn as a map (Figure 25). Both images have one grid, so a
-    pair is searched within a radius only; each pair is then refined by least squares, because SURF
-    alone is accurate to a cell, no better than what it should measure. The intensity compared with
-    itself, shifted by half a cell, gives the best possible accuracy of the comparison: its floor.
-    `x` is along u, to the right, `y` along v, down; displacements are shown - true. Metrics of the
-    first wall have no prefix, `all_` is of all walls; `surf_` are of the pairs before refinement.
+    This is the inspection of markiewicz2015: SURF key points of both images are paired, and the
+    displacements of the pairs are the errors (Table 2), drawn as a map (Figure 25). Both images
+    have the same grid, so pairs are searched within a radius only. Each pair is then refined by
+    least squares, because SURF alone is accurate to about a cell, which is as large as the errors
+    to be measured. Comparing the intensity with a shifted copy of itself gives the best accuracy
+    that the comparison can reach (`floor_`). `x` points right along u, `y` down along v;
+    displacements are the position in the orthoimage minus that in the intensity. Metrics without a
+    prefix describe the first wall, `all_` all walls together, and `surf_` the pairs before the
+    refinement.
 
-    If the intensity is missing, the grey of colours is used; if these come from the same photos,
-    the comparison is meaningless: then it is refused, or reported with a warning.
+    Without laser intensity the comparison is meaningless, since the colours of the scan may come
+    from the same photos: it is then refused or skipped with a warning.
     """
 
     id: ClassVar[str] = "inspect.surf"
@@ -88,10 +90,11 @@ class InspectSurf(Method):
                 MetricSpec("n_key_points", label="key points of the orthoimage"),
                 MetricSpec("n_key_points_intensity", label="key points of the intensity"),
                 MetricSpec("matched_kept_share", label="matches kept"),
-                MetricSpec("floor_n_pairs", label="pairs compared of intensity with itself"),
+                MetricSpec("floor_n_pairs", label="pairs compared, intensity with itself"),
                 lower("surf_rmse_[xy]_mm", label="displacement along {0} by SURF, RMS"),
                 MetricSpec(
-                    "surf_beyond_2rmse_[xy]_share", label="beyond twice the RMS along {0} by SURF"
+                    "surf_beyond_2rmse_[xy]_share",
+                    label="share beyond twice the RMS along {0} by SURF",
                 ),
                 MetricSpec(
                     "surf_floor_rmse_[xy]_mm",
@@ -110,16 +113,16 @@ class InspectSurf(Method):
     )
 
     class Params(MethodParams):
-        """What happens if the comparison is meaningless."""
+        """What to do if a comparison is meaningless."""
 
         unfit: Literal["refuse", "warn"] = Field(
             "refuse",
-            description="refuse: fail where there is no laser intensity or too little in common; "
-            "warn: continue without these numbers.",
+            description="refuse: fail if there is no laser intensity or too few pairs; warn: "
+            "continue without this inspection.",
         )
 
     class In(Ports):
-        """The orthoimages, their walls, and the cameras for stretches."""
+        """The orthoimages, their walls, and the cameras to find stretched areas."""
 
         orthoimages: Orthoimages
         walls: Walls
@@ -134,7 +137,7 @@ class InspectSurf(Method):
         """Compare wall by wall, then combine all walls."""
         images = on_walls(inputs.orthoimages, inputs.walls).images
         if not images:
-            raise MethodError("there is no orthoimage to inspect, at least one is needed")
+            raise MethodError("no orthoimage to inspect: at least one is needed")
         reason = _unfit(inputs)
         verdicts: list[_Verdict] = []
         for place, image in enumerate(images if reason is None else ()):
@@ -145,12 +148,14 @@ class InspectSurf(Method):
         if reason is None and not fit:
             most = max(len(item.pairs) for item in verdicts)
             reason = (
-                f"orthoimage and intensity have too little in common: {most} pairs of SURF key "
-                f"points in one wall, at least {_FEWEST_PAIRS} are needed"
+                f"orthoimage and intensity are too different: at most {most} pairs of SURF key "
+                f"points were found on one wall, at least {_FEWEST_PAIRS} are needed"
             )
         if reason is not None:
             if params.unfit == "refuse":
-                raise MethodError(f"{reason} (inspect.surf; `unfit: warn` goes on without)")
+                raise MethodError(
+                    f"{reason} (set `unfit: warn` in inspect.surf to continue without it)"
+                )
             ctx.report(UNFIT, reason=reason)
         findings = [finding for item in fit for finding in item.findings()]
         if fit:
@@ -165,7 +170,7 @@ class InspectSurf(Method):
 
 @dataclass(frozen=True, kw_only=True)
 class _Verdict:
-    """The pairs of one wall, and those of its intensity with itself."""
+    """Pairs of one wall, and pairs of its intensity with itself."""
 
     image: Orthoimage
     pairs: KeyPairs = field(default_factory=no_pairs)
@@ -195,33 +200,33 @@ class _Verdict:
         ctx.figure(
             f"wall_{self.image.number}_displacements",
             partial(vector_map, self.image, self.pairs.places, self.pairs.shift),
-            f"{self.image.name}: orthoimage against intensity, displacements {times:g} times "
-            "enlarged; yellow over the median, red over twice the median. Short arrows to all "
-            "sides are noise; neighbours that point the same way are a real shift.",
+            f"{self.image.name}: displacements between orthoimage and intensity, enlarged "
+            f"{times:g} times; yellow over the median, red over twice the median. Short arrows in "
+            "all directions are noise; neighbouring arrows in the same direction are a real shift.",
         )
 
 
 def _unfit(inputs: InspectSurf.In) -> str | None:
-    """Return why the walls cannot be compared with, or None."""
+    """Return why a comparison with the walls is meaningless, or None."""
     if inputs.walls.intensity_source == "laser":
         return None
     if inputs.walls.intensity_source == "luminance":
         return (
-            "the walls have no laser intensity: the grey of the scan's colours stands in for it, "
-            "and what was coloured by the same photos agrees with them however wrong they lie"
+            "the walls have no laser intensity, so the grey of the scan's colours is used instead; "
+            "if the scan was coloured from the same photos, wrong orientations do not show"
         )
     return "the walls have neither intensity nor colour to compare with"
 
 
 @dataclass(frozen=True)
 class _Comparison:
-    """How walls are compared: their cameras, and the number of threads."""
+    """Compares walls one by one."""
 
     cameras: Cameras | None
     threads: int
 
     def of(self, image: Orthoimage, wall: Wall) -> _Verdict:
-        """Return the pairs of a wall; nothing more if they are too few."""
+        """Return the pairs of a wall; the rest is computed only if there are enough of them."""
         if wall.intensity is None:
             raise MethodError(f"{wall.name} has no intensity to compare with")
         if not n_shown(image):
@@ -241,13 +246,13 @@ class _Comparison:
         return find_key_pairs(shown, reference, radius_cells=_RADIUS_CELLS, threads=self.threads)
 
     def _floor(self, intensity: GreyImage) -> KeyPairs:
-        """Return pairs of the intensity with itself shifted, their errors as displacements."""
+        """Compare the intensity with a shifted copy of itself; errors are the displacements."""
         import cv2
 
         right, down = _FLOOR_SHIFT_CELLS
         rows, columns = intensity.grey.shape
         move = np.array([[1.0, 0.0, right], [0.0, 1.0, down]])
-        # The mean of two of four cells would smooth one image only; cubic interpolation keeps most
+        # Linear interpolation would smooth one of the two images; cubic interpolation keeps most
         # of the detail.
         grey = cv2.warpAffine(
             intensity.grey.astype(np.float32), move, (columns, rows), flags=cv2.INTER_CUBIC

@@ -1,4 +1,4 @@
-"""Centres of black and white quadrant targets, found in a picture to hundredths of a cell."""
+"""Find centres of black and white quadrant targets to a few hundredths of a cell."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from orthoflow_plugins.inspect.patches import GreyCells, GreyImage
 _ROUNDS: Final = 20
 _CONVERGED_CELLS: Final = 1e-3
 _LEAST_VALID_SHARE: Final = 0.5
-# A quarter turn must swap dark and bright, half a turn must change nothing.
+# Least correlation with the image rotated by 180 deg, and with its negative rotated by 90 deg.
 _LEAST_ALIKE: Final = 0.6
 _SMOOTH_CELLS: Final = 1.2
 _LEAST_WEIGHT: Final = 0.2
@@ -24,19 +24,19 @@ def find_crossing(
 ) -> NDArray[np.float64] | None:
     """Find the centre of a target near a position.
 
-    The crossing is a saddle of the smoothed picture, found to a cell where the determinant of the
-    Hessian is lowest. Least squares then move it until the picture, rotated by half a turn about
-    it, equals itself: every part of the four edges contributes, and their direction does not
-    matter.
+    The centre is a saddle point of the smoothed image, first located to a cell where the
+    determinant of the Hessian is lowest. Least squares then move it until the image is symmetric
+    under a rotation by 180 degrees about it: all four edges contribute, and their direction does
+    not matter.
 
     Args:
-        picture: grey, with valid cells.
-        near: (2,) column, row.
-        search_cells: radius of the search.
-        radius_cells: radius of the target, or of the part of it to use.
+        picture: grey levels with valid cells.
+        near: (2,) column and row.
+        search_cells: search radius.
+        radius_cells: radius of the target, or of the part to use.
 
     Returns:
-        (2,) float64 column, row where the quadrants meet, or None without a target.
+        (2,) float64 column and row where the quadrants meet, or None if there is no target.
     """
     margin = int(np.ceil(search_cells + radius_cells)) + 3
     corner = np.floor(near).astype(np.int64) - margin
@@ -53,15 +53,15 @@ def find_crossing(
 
 
 def _window(picture: GreyCells, corner: NDArray[np.int64], side: int) -> GreyImage:
-    """Square part, not valid beyond the border, with voids filled from their surroundings."""
+    """Return a square, invalid beyond the border, with voids filled from their surroundings."""
     part = picture.square(corner, side)
     return _closed(np.where(part.valid, part.grey, 0.0), part.valid)
 
 
 def _closed(grey: NDArray[np.float64], valid: NDArray[np.bool_]) -> GreyImage:
-    """Smooth a picture by planes fitted around each cell to the valid ones.
+    """Smooth an image by fitting a plane to the valid cells around each cell.
 
-    Means alone would be biased towards the side of an edge that has fewer holes (Knutsson and
+    A mean would be biased towards the side of an edge with fewer holes (Knutsson and
     Westin 1993, normalised convolution of first order).
     """
     from scipy.ndimage import correlate1d
@@ -83,7 +83,7 @@ def _closed(grey: NDArray[np.float64], valid: NDArray[np.bool_]) -> GreyImage:
     right_side = np.stack([moment(weight * grey, *order) for order in orders], axis=-1)
     total = normal[..., 0, 0]
     enough = total > _LEAST_WEIGHT * gauss.sum() ** 2
-    # A little of the identity keeps cells far from all others solvable.
+    # Regularise, so that cells far from all valid cells remain solvable.
     normal += 1e-6 * np.eye(3)
     level = np.linalg.solve(normal, right_side[..., None])[..., 0, 0]
     return GreyImage(grey=np.where(enough, level, 0.0), valid=enough, region=valid)
@@ -92,7 +92,7 @@ def _closed(grey: NDArray[np.float64], valid: NDArray[np.bool_]) -> GreyImage:
 def _saddle(
     window: GreyImage, near: NDArray[np.float64], search: float, radius: float
 ) -> NDArray[np.float64] | None:
-    """Return the strongest saddle (2,) = column, row within the search, to a cell."""
+    """Return column and row (2,) of the strongest saddle within the search radius, to a cell."""
     from scipy.ndimage import gaussian_filter
 
     width = max(1.5, 0.3 * radius)
@@ -113,14 +113,14 @@ def _saddle(
 def _symmetric(
     window: GreyImage, start: NDArray[np.float64], radius: float
 ) -> NDArray[np.float64] | None:
-    """Move the centre until half a turn about it changes least; None if it diverges."""
+    """Move the centre to the point of best 180 degree symmetry; None if it diverges."""
     from scipy.ndimage import map_coordinates
 
     aside = _disc(radius)
     slopes = [np.gradient(window.grey, axis=axis) for axis in (1, 0)]
     place = start.copy()
     for _ in range(_ROUNDS):
-        # scipy counts cells from their centres, as OpenCV does.
+        # As in OpenCV, coordinates in scipy refer to the centres of cells.
         ways = [to_opencv(place + sign * aside).T[::-1] for sign in (1.0, -1.0)]
         greys = [map_coordinates(window.grey, way, order=3, mode="nearest") for way in ways]
         valid = [
@@ -162,7 +162,7 @@ def _turned_correlation(
 
 
 def _disc(radius: float) -> NDArray[np.float64]:
-    """Return offsets (n, 2) of a disc; half of it would do, but the whole has symmetric weights."""
+    """Return offsets (n, 2) within a disc."""
     side = np.arange(-np.floor(radius), np.floor(radius) + 1.0)
     columns, rows = np.meshgrid(side, side)
     inside = np.hypot(columns, rows) <= radius

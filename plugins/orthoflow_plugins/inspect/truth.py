@@ -1,4 +1,4 @@
-"""`inspect.truth`: orthoimages, cameras, walls, planes and labels against a simulated scene."""
+"""`inspect.truth`: compare a run's products with the truth of a simulated scene."""
 
 from __future__ import annotations
 
@@ -87,13 +87,13 @@ if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage
 
 _TRACED_POINTS: Final = 4000
-# True colours are means of this number squared of rays per cell.
+# The true colour of a cell is the mean of this number squared of rays.
 _SUPERSAMPLE: Final = 3
-# Larger walls are compared in bands of this many cells, which take a gigabyte.
+# Walls with more cells are compared in bands of this size; a band needs about 1 GB of memory.
 _BAND_CELLS: Final = 1 << 23
-# Number of drawn cells along the longest side of large walls, of which every nth cell is drawn.
+# Figures of large walls show every nth row and column, about this many along the longer side.
 _DRAWN_CELLS: Final = 1800
-# Of each wall, from its cells and from what photos painted on it.
+# Metrics of each wall.
 _OF_WALLS: Final = (
     lower("rmse_[uv]_mm", label="error along {0}, RMS", headline=True),
     MetricSpec("mean_[uv]_mm", label="shift along {0}, mean"),
@@ -113,32 +113,37 @@ _OF_WALLS: Final = (
         description="cells at edges have two depths and dominate; depth_nmad_mm is typical",
     ),
     lower("depth_step_rmse_mm", label="error of the depth beside steps, RMS"),
-    MetricSpec("depth_within_3sigma", label="depths within three stated sigmas"),
+    MetricSpec("depth_within_3sigma", label="depths within three predicted standard deviations"),
     lower("colour_rmse_grey", label="error of the colour, RMS"),
     lower("filled_colour_rmse_grey", label="error of the colour of filled cells, RMS"),
     lower("step_colour_rmse_grey", label="error of the colour beside depth steps, RMS"),
     MetricSpec("gross_colour_share", label="cells with a grossly wrong colour"),
     MetricSpec("ghost_colour_share", label="cells with the colour of an occluder"),
-    lower("ghost_share", label="share of the cells painted through an occluder"),
-    higher("completeness", label="painted, not filled, of the visible surface", headline=True),
-    higher("completeness_filled", label="painted or filled, of the visible surface"),
+    lower("ghost_share", label="share of the cells that show an occluder"),
     higher(
-        "completeness_seen_by_both",
-        label="painted, of what both a station and a photo see",
+        "completeness",
+        label="painted share of the visible surface, without filled cells",
         headline=True,
     ),
-    MetricSpec("unseen_painted_share", label="painted cells that no photo sees"),
+    higher("completeness_filled", label="painted or filled share of the visible surface"),
+    higher(
+        "completeness_seen_by_both",
+        label="painted share of the surface seen by a station and a photo",
+        headline=True,
+    ),
+    MetricSpec("unseen_painted_share", label="painted cells whose surface no station sees"),
     MetricSpec("n_traced", label="cells traced back to their photo"),
-    lower("far_source_share", label="cells painted from a wrong place"),
-    MetricSpec("n_ghost_cells", label="cells painted through an occluder"),
+    lower("far_source_share", label="cells coloured from a wrong position"),
+    MetricSpec("n_ghost_cells", label="cells that show an occluder"),
     MetricSpec(
-        "within_1_sigma_share", label="cells whose error is within what the orthoimage states"
+        "within_1_sigma_share", label="cells whose error is within the predicted standard deviation"
     ),
     MetricSpec(
-        "within_2_sigma_share", label="cells whose error is within twice what the orthoimage states"
+        "within_2_sigma_share",
+        label="cells whose error is within twice the predicted standard deviation",
     ),
 )
-# Of planes, also without orthoimages.
+# Metrics of planes, which do not need orthoimages.
 _OF_PLANES: Final = (
     lower("plane_angle_deg", label="direction of the main plane, error", headline=True),
     lower("plane_offset_mm", label="position of the main plane, error", headline=True),
@@ -147,21 +152,21 @@ _OF_PLANES: Final = (
 NOT_COMPARED: Final = DiagnosticSpec(
     code="truth-not-compared",
     severity="warning",
-    text="not compared with the truth: {dropped}, without {missing}; only the planes and "
-    "their labels are",
-    remedy="wire {missing} to {step}",
+    text="{dropped} cannot be compared with the truth without {missing}: only planes and "
+    "labels are compared",
+    remedy="connect {missing} to {step}",
 )
 NOT_TRACED: Final = DiagnosticSpec(
     code="truth-not-traced",
     severity="warning",
-    text="displacements are not traced where {names} painted: the cameras have no oriented photo "
-    "of that name",
+    text="displacements of cells coloured by {names} are not traced: the cameras contain no "
+    "oriented photo of that name",
     rank_by="n",
 )
 
 
 def _needing(ports: tuple[str, ...], *specs: MetricSpec) -> tuple[MetricSpec, ...]:
-    """Return metrics that are reported only if these ports are wired."""
+    """Return metrics that are reported only if these ports are connected."""
     return tuple(replace(spec, needs=ports) for spec in specs)
 
 
@@ -169,24 +174,25 @@ class InspectTruth(Method):
     """Compare with the truth of a simulated scene, cell by cell and patch by patch.
 
     The true orthoimage is rendered on each wall's own frame: the first surface within the buffer,
-    seen square to the wall. Depths and colours are compared away from true depth steps; a band of
-    2 cells at the steps is reported apart. Displacements come from patches of 32 x 32 painted
-    cells, matched to the truth by least squares. Metrics without prefix are of the first wall;
-    those with `all_` are of all walls together. Of large walls, colours and patches are compared
-    in whole blocks of 96 x 96 cells, and who sees a cell is asked on a lattice, both spread evenly;
-    depths and displacements that follow from cameras are compared in every cell. Statistics
-    of more than eight million errors are those of an evenly spread sample.
+    seen square to the wall. Depths and colours are compared away from true depth steps; a band of 2
+    cells along the steps is reported separately. Displacements come from patches of 32 x 32 painted
+    cells, matched to the truth by least squares. Metrics without a prefix describe the first wall,
+    those with `all_` all walls together. On large walls, colours and patches are compared in evenly
+    spread blocks of 96 x 96 cells, and visibility is tested on a regular lattice of cells; depths
+    and displacements that follow from cameras are compared in every cell. If there are more than
+    eight million errors, statistics are computed from an evenly spread sample.
 
     With cameras, each photo's orientation is compared with the true one, and the displacement of
-    every cell that a photo painted is exact: its point on the found surface is projected with the
-    estimated camera, and the ray of that pixel through the true camera meets the true scene at the
-    place from which the colour comes. The displacements of patches are then named `patch_`. Ties
-    that come with the cameras are compared, too: `tie_wrong_share` of those that photos kept,
-    `match_wrong_share` of all, are more than 1.5 cells of the wall from the true target of their
-    pixel; `match_wrong_share_own_wall` is that of the matches with the wall that each photo shows
-    most.
+    each cell coloured by a photo is computed exactly: the cell's point on the measured surface is
+    projected with the estimated camera, and the ray of that pixel through the true camera meets the
+    true scene at the point whose colour the cell shows. Displacements of patches then have the
+    prefix `patch_`. Ties that come with the cameras are compared, too: a tie is wrong if it is more
+    than 1.5 cells of the wall from the true target of its pixel. `match_wrong_share` is the share
+    of wrong ties among all, `tie_wrong_share` among those that the orientation kept, and
+    `match_wrong_share_own_wall` among those on the wall that covers most of their photo.
 
-    Without orthoimages only planes and labels are compared, as in a comparison of detectors.
+    Without orthoimages, only planes and labels are compared, which suffices to compare plane
+    detectors.
     """
 
     id: ClassVar[str] = "inspect.truth"
@@ -201,7 +207,7 @@ class InspectTruth(Method):
             MetricSpec("n_misoriented", label="accepted photos with a wrong pose"),
             MetricSpec(
                 "pose_error_over_sigma",
-                label="true error over the stated one",
+                label="true error divided by the predicted one",
                 better="one",
                 counted_by="n_oriented",
             ),
@@ -263,7 +269,7 @@ class InspectTruth(Method):
         """No parameters."""
 
     class In(Ports):
-        """The products to judge, and the truth."""
+        """The products to compare, and the truth."""
 
         truth: Truth
         orthoimages: Orthoimages | None = None
@@ -285,7 +291,7 @@ class InspectTruth(Method):
         if inputs.orthoimages is None or inputs.walls is None:
             return self.Out(inspection=_inspect_planes(inputs, ctx))
         if not inputs.orthoimages.images:
-            raise MethodError("there is no orthoimage to inspect, at least one is needed")
+            raise MethodError("no orthoimage to inspect: at least one is needed")
         orthoimages = on_walls(inputs.orthoimages, inputs.walls)
         rule = SamplingRule.of(orthoimages.images)
         _warn_of_untraced(inputs.orthoimages, inputs.cameras, ctx)
@@ -332,15 +338,15 @@ class _Verdict:
     """All errors of one wall.
 
     Attributes:
-        samples: the errors as numbers.
-        sources: those of traced cells; None where no photo painted.
-        patches: where displacements were measured.
-        depth_m: measured - true depth in every `_draw_step`-th row and column, for the picture.
-        grey: root mean square colour error, likewise.
-        length_m: displacements of traced cells, likewise.
-        cells: (n, 2) row and column of some traced cells.
-        cell_shift_m: (n, 2) their displacements along u and v.
-        quality: findings that every orthoimage has.
+        samples: errors of depths, colours and patches.
+        sources: errors of traced cells; None if no photo coloured a cell.
+        patches: patches whose displacement was measured.
+        depth_m: measured minus true depth in every `_draw_step`-th row and column, for the figure.
+        grey: root mean square colour error of the same cells.
+        length_m: length of the displacement of the same cells.
+        cells: (n, 2) row and column of a sample of the traced cells.
+        cell_shift_m: (n, 2) displacements of these cells along u and v.
+        quality: findings that need no truth.
     """
 
     samples: WallSamples
@@ -355,7 +361,7 @@ class _Verdict:
 
 
 def _findings(verdicts: Sequence[_Verdict], wall: int) -> list[Finding]:
-    """Numbers of one wall, or of several together (wall -1)."""
+    """Return the findings of one wall, or of several walls together (wall -1)."""
     sources = [item.sources for item in verdicts if item.sources is not None]
     samples = pooled([item.samples for item in verdicts])
     findings = sample_findings(samples, wall, sources_are_traced=bool(sources))
@@ -365,7 +371,7 @@ def _findings(verdicts: Sequence[_Verdict], wall: int) -> list[Finding]:
 def _inspect_planes(inputs: InspectTruth.In, ctx: StepContext) -> Inspection:
     if inputs.planes is None:
         raise MethodError(
-            "there is nothing to inspect: wire orthoimages and walls, or planes (inspect.truth)"
+            "there is nothing to inspect: connect orthoimages and walls, or planes (inspect.truth)"
         )
     given = ("orthoimages", "walls", "cameras")
     dropped = [name for name in given if getattr(inputs, name) is not None]
@@ -376,7 +382,7 @@ def _inspect_planes(inputs: InspectTruth.In, ctx: StepContext) -> Inspection:
 
 
 def _warn_of_untraced(images: Orthoimages, cameras: Cameras | None, ctx: StepContext) -> None:
-    """Report which cells are not traced to their pixels although cameras are wired."""
+    """Report sources whose cells cannot be traced because their photo is not oriented."""
     if cameras is None:
         return
     known = {camera.photo for camera in cameras.cameras if camera.status == "ok"}
@@ -402,7 +408,7 @@ def _pose_errors(inputs: InspectTruth.In, views: SceneCameras | None) -> tuple[P
 
 @dataclass(frozen=True, kw_only=True)
 class _Judge:
-    """What walls are judged with; `views` is None without cameras."""
+    """Compares walls one by one; `views` is None without cameras."""
 
     inputs: InspectTruth.In
     walls: Walls
@@ -411,7 +417,7 @@ class _Judge:
     ctx: StepContext
 
     def verdict_on(self, image: Orthoimage) -> _Verdict:
-        """Compare one wall, a large one in bands of whole blocks with a block about them."""
+        """Compare one wall, a large one in bands of whole blocks with a margin of one block."""
         wall = wall_of(image, self.walls, in_files(self.ctx, f"{image.wall}.laid"))
         n_painted = sum(count_cells(image.mask, state) for state in PAINTED_STATES)
         cell_step = max(1, n_painted // _TRACED_POINTS)
@@ -431,13 +437,13 @@ class _Judge:
         )
 
     def _of_band(self, image: Orthoimage, wall: Wall, band: Band, cell_step: int) -> _Verdict:
-        """Compare some rows of a wall; what is kept of them does not grow with the wall.
+        """Compare a band of rows; the result has a limited size however large the wall is.
 
         Args:
-            image: of the whole wall.
-            wall: on the same cells.
-            band: the rows.
-            cell_step: traced cells are kept in steps of this.
+            image: orthoimage of the whole wall.
+            wall: the wall, on the same grid.
+            band: rows to compare.
+            cell_step: every nth traced cell is kept.
         """
         part, surface = rows_of(image, band.around), rows_of(wall, band.around)
         chosen = sampling(part, self.rule, band.around.start)
@@ -502,22 +508,22 @@ def _draw(image: Orthoimage, verdict: _Verdict, ctx: StepContext) -> None:
     ctx.figure(
         f"wall_{image.number}_depth_error",
         partial(depth_error_map, verdict.depth_m, image.frame),
-        f"{image.name}: measured - true depth. Fine grain is noise of the scanner; whole areas of "
-        "one colour are a plane or a surface in the wrong place.",
+        f"{image.name}: measured minus true depth. Fine grain is scanner noise; a uniform area "
+        "shows a plane or surface at the wrong depth.",
     )
     ctx.figure(
         f"wall_{image.number}_colour_error",
         partial(colour_error_map, verdict.grey, image.frame),
         f"{image.name}: colour error. Bright "
-        "outlines are displaced edges, bright areas wrong paint or light of another photo.",
+        "outlines are displaced edges; bright areas have wrong content or a different exposure.",
     )
     if verdict.sources is not None:
         ctx.figure(
             f"wall_{image.number}_displacement",
             partial(displacement_map, verdict.length_m / image.frame.gsd_m, image.frame),
-            f"{image.name}: true displacement of cells of {1e3 * image.frame.gsd_m:g} mm that "
-            f"photos painted. Dark is good; a "
-            "bright area with a sharp border is a photo oriented worse than its neighbours.",
+            f"{image.name}: true displacement of the {1e3 * image.frame.gsd_m:g} mm cells "
+            "coloured by photos. Dark is good; a bright area with a sharp border comes from a "
+            "photo that is oriented less accurately than its neighbours.",
         )
 
 
@@ -528,7 +534,7 @@ def _inspection(
     findings: list[Finding],
     details: dict[str, JsonValue],
 ) -> Inspection:
-    """Combine the displacements of all patches and of a few thousand painted cells."""
+    """Collect the displacements of all patches and of a few thousand traced cells."""
     walls, points, shifts, kinds = [], [], [], []
     for image, item in zip(orthoimages.images, verdicts, strict=True):
         places = np.concatenate([item.patches.centre, item.cells[:, ::-1] + 0.5])
@@ -550,7 +556,7 @@ def _inspection(
 
 
 def _draw_step(image: Orthoimage) -> int:
-    """Return the step of the rows and columns that are drawn; 1 unless the wall is large."""
+    """Return n if the figures show every nth row and column; 1 unless the wall is large."""
     return max(1, max(image.frame.shape) // _DRAWN_CELLS) if _is_large(image) else 1
 
 
@@ -559,7 +565,7 @@ def _is_large(image: Orthoimage) -> bool:
 
 
 def _bands(image: Orthoimage) -> Iterator[Band]:
-    """Bands of whole blocks with a margin of one block; a single one unless the image is large."""
+    """Yield bands of whole blocks with a margin of one block; a small image is a single band."""
     height, width = image.frame.shape
     rows = height
     if _is_large(image):

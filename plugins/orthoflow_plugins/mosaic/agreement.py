@@ -1,4 +1,4 @@
-"""Agreement of the sources of a wall: in position in overlaps, in colour along seams."""
+"""Agreement of the sources of a wall: positions in overlaps, and colours along seams."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 PATCH_CELLS: Final = 64
 _PATCHES_MOST: Final = 200
-# Flat patches show no displacement, and weak peaks are due to chance.
+# Patches without texture show no displacement, and weak peaks are due to chance.
 _CONTRAST_LEAST_GREY: Final = 3.0
 _RESPONSE_LEAST: Final = 0.15
 _ROWS_AT_ONCE: Final = 1024
@@ -31,9 +31,9 @@ class Overlaps:
     """Displacements between pairs of photos that show the same part of a wall.
 
     Attributes:
-        shifts_cells: (n, 2) displacements (u, v) of the second against the first photo.
-        centres: (n, 2) column and row of the middle of each patch.
-        photos: names of both photos of each patch.
+        shifts_cells: (n, 2) displacements (u, v) of the second photo relative to the first.
+        centres: (n, 2) column and row of the centre of each patch.
+        photos: names of the two photos of each patch.
     """
 
     shifts_cells: NDArray[np.float64]
@@ -44,12 +44,12 @@ class Overlaps:
 def overlaps_of(layers: Sequence[Layer], *, of_all_pairs: bool = False) -> Overlaps:
     """Measure the displacements between layers in patches of a wall.
 
-    Patches of 64 x 64 cells that both layers paint completely are compared by phase correlation,
+    Patches of 64 x 64 cells that both layers show completely are compared by phase correlation,
     which is accurate to about a tenth of a cell.
 
     Args:
         layers: photos of one wall.
-        of_all_pairs: compare every two layers of a patch, not only the best two.
+        of_all_pairs: compare all pairs of layers of a patch instead of only the best two.
     """
     import cv2
 
@@ -75,7 +75,7 @@ def overlaps_of(layers: Sequence[Layer], *, of_all_pairs: bool = False) -> Overl
 
 
 def _pairs(layers: Sequence[Layer], *, of_all_pairs: bool) -> list[tuple[int, int, int, int]]:
-    """Yield row and column of patches, and two layers that paint them completely."""
+    """Yield row and column of a patch, and two layers that show it completely."""
     n_rows, n_columns = (side // PATCH_CELLS for side in layers[0].frame.shape)
     if len(layers) < 2 or not n_rows or not n_columns:
         return []
@@ -90,7 +90,7 @@ def _pairs(layers: Sequence[Layer], *, of_all_pairs: bool) -> list[tuple[int, in
 
 
 def _patch_qualities(layer: Layer, shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Return the mean quality of each patch, 0 if the layer does not paint all of it."""
+    """Return the mean quality of each patch; 0 if the layer does not show all of it."""
     qualities: list[NDArray[np.float64]] = []
     columns = shape[1] * PATCH_CELLS
     for rows in row_bands((shape[0] * PATCH_CELLS, columns), multiple=PATCH_CELLS):
@@ -109,15 +109,15 @@ def _grey(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
 def seam_steps(
     source: NDArray[np.int16], layers: Sequence[Layer], balance: Balance | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Compare both sources in the cells on the left of or above seams that both paint.
+    """Compare the two sources in cells to the left of or above seams, if both show them.
 
     Args:
-        source: (rows, cols) index of the layer that paints each cell, -1 for none.
+        source: (rows, cols) index of the layer of each cell, -1 if none.
         layers: the layers to which the index refers.
         balance: the colour balance, or None.
 
     Returns:
-        (n,) differences in luminance of both sources in cells at seams, and the distances of their
+        (n,) differences in luminance of the two sources in seam cells, and the distances of their
         colours in CIE L*a*b* (1976).
     """
 
@@ -149,7 +149,7 @@ def seam_steps(
 def _before_seams(
     source: NDArray[np.int16], axis: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Yield rows and columns of the cells above seams (axis 0) or left of them, strip by strip."""
+    """Yield rows and columns of cells above (axis 0) or to the left of seams, by strips."""
     found: list[NDArray[np.int64]] = []
     for first in range(0, source.shape[0], _ROWS_AT_ONCE):
         strip = source[first : first + _ROWS_AT_ONCE + (axis == 0)]
@@ -162,10 +162,10 @@ def _before_seams(
 
 
 def count_seams(source: NDArray[np.int16], depth_m: NDArray[np.float32] | None) -> tuple[int, int]:
-    """Count cells at seams, and those of them at depth edges; some rows at a time."""
+    """Count seam cells, and seam cells on depth edges, a few rows at a time."""
     n_seam = n_edge_seam = 0
     for first in range(0, source.shape[0], _ROWS_AT_ONCE):
-        # The row below decides about the last one.
+        # Whether the last row has a seam depends on the row below it.
         rows = slice(first, first + _ROWS_AT_ONCE + 1)
         seam = is_seam(source[rows])[:_ROWS_AT_ONCE]
         n_seam += int(np.count_nonzero(seam))
@@ -175,7 +175,7 @@ def count_seams(source: NDArray[np.int16], depth_m: NDArray[np.float32] | None) 
 
 
 def is_seam(source: NDArray[np.int16]) -> NDArray[np.bool_]:
-    """Return cells whose right or lower neighbour comes from another source."""
+    """Return the cells whose right or lower neighbour has a different source."""
     seam = np.zeros(source.shape, dtype=np.bool_)
     for into, one, other in (
         (seam[:, :-1], source[:, :-1], source[:, 1:]),

@@ -1,11 +1,11 @@
-"""Colour balance of layers: corrections of their light, smooth over each wall.
+"""Colour balance of layers by smooth corrections of their light.
 
-Only changes that are smooth over blocks of cells are made. Two layers are therefore never mixed:
-detail comes from one photo everywhere, and there are no double contours, whatever parallax remains.
+Corrections are smooth over blocks of cells, and layers are never mixed: detail always comes from
+one photo, so there are no double contours even if some parallax remains.
 
-The model is an exposure per photo, the vignetting of its lens, and a smooth field per photo, in
-logarithms, so that factors add up. Where two photos show the same blocks of a wall, the difference
-of their corrections must equal their observed difference.
+The model consists of an exposure per photo, the vignetting of its lens, and a smooth field per
+photo, as logarithms, so that factors become sums. Where two photos show the same blocks of a wall,
+the difference of their corrections must equal their observed difference.
 """
 
 from __future__ import annotations
@@ -39,31 +39,32 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 
-# Maximum side of blocks in cells, and the approximate number of blocks of a small wall.
+# Maximum side of a block in cells, and approximate number of blocks on a small wall.
 _BLOCK_CELLS_MOST: Final = 16
 _BLOCKS_LEAST: Final = 4_000
-# Photos that need no correction by more than this factor do not differ.
+# Photos whose corrections are all below this (a logarithm) are left unchanged.
 _ALIKE: Final = 0.02
-# Smoothing radius of differences in blocks; with less known than this they fade.
+# Smoothing radius of differences in blocks, and regularisation where few blocks are known.
 _SMOOTH_BLOCKS: Final = 1.5
 _KNOWN_LEAST: Final = 0.02
-# Larger differences of two balanced photos are due to different objects, not to light.
+# Larger differences between balanced photos are due to different objects, not to light.
 _SAME_THING: Final = 0.15
-# Focal lengths of one lens differ by less than about this factor.
+# Focal lengths of the same lens differ by less than about this (a logarithm).
 _SAME_ZOOM: Final = 0.1
-# A smaller overlap in blocks is not used, and a larger one is sampled.
+# Overlaps with fewer blocks are ignored, larger ones are sampled, and this many blocks count as
+# independent.
 _LEAST_BLOCKS: Final = 4
 _BLOCKS_MOST: Final = 200
 _INDEPENDENT: Final = 50.0
-# Minimum additional difference of two photos in a block.
+# Smallest standard deviation of the difference of two photos in a block.
 _SPREAD_LEAST: Final = 0.01
 # Prior standard deviations of exposures, lens terms and nodes of fields, in logarithms.
 _EXPOSURE_PRIOR: Final = 1.0
 _LENS_PRIOR: Final = 0.5
 _FIELD_PRIOR: Final = 0.05
-# Fixes fields at 0.
+# Prior that fixes the fields at 0.
 _NO_FIELD: Final = 1e-9
-# Nodes along each side of a field.
+# Number of nodes along each side of a field.
 _NODES: Final = 4
 _SWEEPS: Final = 6
 _OUTLIER: Final = 2.0
@@ -71,14 +72,14 @@ _OUTLIER: Final = 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class Balance:
-    """The correction of the logarithm of the light of each layer of a wall.
+    """Corrections of the layers of a wall, as logarithms of factors on light.
 
     Attributes:
-        blocks: of the wall.
-        lights: of each layer, uncorrected.
-        logs: (rows, cols, 3) float32 in the blocks of each layer's box; bilinear between their
-            centres.
-        exposures: the model they come from.
+        blocks: blocks of the wall.
+        lights: uncorrected light of each layer.
+        logs: (rows, cols, 3) float32 correction in the blocks of each layer; bilinear between the
+            block centres.
+        exposures: model from which the corrections were computed.
     """
 
     blocks: Blocks
@@ -89,13 +90,13 @@ class Balance:
     def shown(
         self, index: int, colours: Colours, rows: NDArray[np.int64], columns: NDArray[np.int64]
     ) -> Colours:
-        """Return balanced colours (n, 3) of a layer, in its cells at rows and columns (n,)."""
+        """Return balanced colours (n, 3) of a layer at rows and columns (n,)."""
         return lit(colours, self.log_gains(index, rows, columns))
 
     def log_gains(
         self, index: int, rows: NDArray[np.int64], columns: NDArray[np.int64]
     ) -> NDArray[np.float32]:
-        """Return the correction (n, 3) of the logarithm of a layer's light in cells."""
+        """Return the corrections (n, 3) of a layer at rows and columns (n,)."""
         logs, box = self.logs[index], self.lights[index].box
         row, down = _between(rows, self.blocks.rows, box[0])
         column, right = _between(columns, self.blocks.columns, box[1])
@@ -114,10 +115,10 @@ class Balance:
 def _between(
     cells: NDArray[np.int64], edges: NDArray[np.int64], part: slice
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Blocks between which cells (n,) are: the first of two (n,), and the weight (n, 1)."""
+    """Return the first of the two blocks around each cell (n,), and the weight of the second."""
     n_blocks = part.stop - part.start
     middles = 0.5 * (edges[part] + edges[part.start + 1 : part.stop + 1])
-    # Cells of one row or column share the lookup.
+    # Look up rows or columns once instead of all cells.
     at = np.interp(np.arange(edges[-1]) + 0.5, middles, np.arange(n_blocks))
     first = np.minimum(at.astype(np.int64), max(0, n_blocks - 2))
     return first[cells], (at - first).astype(np.float32)[cells][:, None]
@@ -130,13 +131,13 @@ def balance_of(
     *,
     is_local: bool,
 ) -> Balance | None:
-    """Find the corrections that make layers of a wall equal; None if they already are.
+    """Find corrections that equalise the layers of a wall; None if they already agree.
 
     Args:
-        layers: that paint something, at least one.
-        wall: its surface, or None.
-        cameras: of each layer, if it is a photo with a known camera.
-        is_local: also find smooth fields, not only exposures.
+        layers: layers with painted cells, at least one.
+        wall: the wall, or None.
+        cameras: camera of each layer, or None if unknown.
+        is_local: whether to estimate vignetting and smooth fields, too.
     """
     shape = layers[0].frame.shape
     blocks = Blocks.over(shape, _block_cells(shape))
@@ -154,7 +155,7 @@ def balance_of(
 
 
 def _block_cells(shape: tuple[int, int]) -> int:
-    """Return the side of the blocks of a wall, cells."""
+    """Return the side of the blocks of a wall in cells."""
     return int(np.clip(np.sqrt(shape[0] * shape[1] / _BLOCKS_LEAST), 2, _BLOCK_CELLS_MOST))
 
 
@@ -165,7 +166,7 @@ def _radii(
     blocks: Blocks,
     lights: Sequence[BlockLight],
 ) -> list[Radii | None]:
-    """Return where in their photos the blocks of layers are."""
+    """Return the distance of the blocks of each layer from the centre of its photo."""
     lenses: dict[tuple[int, int, int], int] = {}
     found: list[Radii | None] = []
     down, right = blocks.centres()
@@ -174,7 +175,7 @@ def _radii(
             found.append(None)
             continue
         lens = camera.intrinsics
-        # Adjusted photo by photo, focal lengths of one lens differ slightly.
+        # If photos are adjusted separately, focal lengths of the same lens differ slightly.
         key = (lens.width, lens.height, round(math.log(lens.fx) / _SAME_ZOOM))
         rows, columns = down[light.box[0]], right[light.box[1]]
         middles = np.stack(np.broadcast_arrays(columns, rows[:, None]), axis=-1).reshape(-1, 2)
@@ -182,7 +183,7 @@ def _radii(
         pixels = camera.viewing().project(frame.world_from_wall(middles, depths_m))[:, :2]
         half = np.array([0.5 * lens.width, 0.5 * lens.height])
         radii = np.linalg.norm(pixels - half, axis=1) / np.linalg.norm(half)
-        # Nothing is painted beyond the photo; the corner represents what cannot be projected.
+        # Painted cells are inside the photo; others, and NaN, are set to the corner.
         radii = np.fmin(radii, 1.0).astype(np.float32)
         values = radii.reshape(len(rows), len(columns))
         found.append(Radii(values=values, lens=lenses.setdefault(key, len(lenses))))
@@ -198,16 +199,16 @@ def _depths_at(wall: Wall, middles: NDArray[np.float64]) -> NDArray[np.float64]:
 def with_seams(
     balance: Balance, source: NDArray[np.int16], wall: Wall | None, *, feather_cells: int
 ) -> Balance:
-    """Blend the layers near their seams by the remaining differences.
+    """Add corrections that blend the remaining differences of layers near their seams.
 
-    Over a width, each layer changes to the mean of the layers at a seam, weighted by the share of
-    each in the neighbourhood. Blocks with depth edges, and those in which two layers show different
-    objects, are not used for the difference; where nothing is known it fades to none.
+    Towards a seam, each layer changes to the mean of the layers on both sides, weighted by their
+    shares of the neighbourhood. Blocks with depth edges, and blocks where two layers show different
+    objects, do not contribute; where nothing is known, the correction fades to zero.
 
     Args:
-        balance: of the layers.
-        source: (rows, cols) index of the layer that paints each cell, -1 for none.
-        wall: its surface, or None.
+        balance: the colour balance of the layers.
+        source: (rows, cols) index of the layer used in each cell, -1 for none.
+        wall: the wall, or None.
         feather_cells: distance from a seam within which colours change.
     """
     blocks = balance.blocks
@@ -220,7 +221,7 @@ def with_seams(
         says[edges > 0.0] = 0.0
     logs = [values.copy() for values in balance.logs]
     for i, j, shared in pairs(balance.lights):
-        # One of the two may end at the seam: the other blends beyond it.
+        # One of the two layers may end at the seam: extend the difference beyond it.
         around = _grown(shared, _reach(_SMOOTH_BLOCKS), blocks.shape)
         apart = _apart(balance, (i, j), shared, around, says)
         if apart is None:
@@ -242,11 +243,11 @@ def _apart(
     """Return the smooth difference (rows, cols, 3), second less first, of two balanced layers.
 
     Args:
-        balance: of all layers.
-        pair: the two.
-        shared: blocks in the boxes of both.
-        around: these with a margin, for which the difference is returned.
-        says: (rows, cols) 0 in blocks of the wall that are not used, else 1.
+        balance: the colour balance of all layers.
+        pair: indices of the two layers.
+        shared: blocks in the boxes of both layers.
+        around: the shared blocks with a margin, for which the difference is returned.
+        says: (rows, cols) 1 in blocks of the wall that may be used, else 0.
     """
     parts = [inside(shared, balance.lights[k].box) for k in pair]
     first, second = (
@@ -267,12 +268,12 @@ def _apart(
 
 @dataclass(frozen=True, kw_only=True)
 class _Shares:
-    """The share of each layer in what is painted around a block.
+    """The share of each layer in the cells around a block.
 
     Attributes:
-        boxes: of each layer, with the margin within which it counts.
-        values: (rows, cols) float32 in them.
-        total: (rows, cols) float32 of all layers together, over the wall.
+        boxes: box of each layer, with a margin.
+        values: (rows, cols) float32 smoothed share of each layer, within its box.
+        total: (rows, cols) float32 sum over all layers, for the whole wall.
     """
 
     boxes: tuple[Box, ...]
@@ -300,7 +301,7 @@ class _Shares:
         return cls(boxes=tuple(boxes), values=tuple(values), total=total)
 
     def within(self, index: int, part: Box) -> NDArray[np.float32]:
-        """Return the share of a layer in the blocks of a part of its box."""
+        """Return the relative share of a layer in a part of its box."""
         value = self.values[index][inside(part, self.boxes[index])]
         return np.asarray(value / np.maximum(self.total[part], np.float32(1e-6)), np.float32)
 
@@ -331,11 +332,11 @@ def _grown(box: Box, reach: int, shape: tuple[int, int]) -> Box:
 
 @dataclass(frozen=True, kw_only=True)
 class Radii:
-    """The distance from the middle of its photo of each block of a layer's box.
+    """Distance of the blocks of a layer from the centre of its photo.
 
     Attributes:
         values: (rows, cols) float32, 1 in the corners of the photo.
-        lens: number of the lens; photos of one lens have the same vignetting.
+        lens: number of the lens; photos with the same lens have the same vignetting.
     """
 
     values: NDArray[np.float32]
@@ -344,12 +345,12 @@ class Radii:
 
 @dataclass(frozen=True, kw_only=True)
 class Exposures:
-    """The model of the correction of the logarithm of the light of each layer.
+    """Parameters of the corrections of all layers.
 
     Attributes:
-        exposures: (k, 3) per layer and channel.
-        lenses: (lenses, 2) of r^2 and r^4, r being 1 in the corners of a photo.
-        nodes: (k, 4, 4, 3) of the smooth fields, bilinear over the box of each layer.
+        exposures: (k, 3) logarithm per layer and channel.
+        lenses: (lenses, 2) coefficients of r^2 and r^4, where r is 1 in the corners of a photo.
+        nodes: (k, 4, 4, 3) nodes of the smooth fields, bilinear over the box of each layer.
     """
 
     exposures: NDArray[np.float64]
@@ -357,7 +358,7 @@ class Exposures:
     nodes: NDArray[np.float64]
 
     def logs(self, index: int, light: BlockLight, radii: Radii | None) -> NDArray[np.float64]:
-        """Return the correction (rows, cols, 3) in the blocks of a layer's box."""
+        """Return the corrections (rows, cols, 3) in the blocks of a layer."""
         rows, columns = (_hats(np.arange(size), size) for size in light.log_light.shape[:2])
         logs: NDArray[np.float64] = self.exposures[index] + np.einsum(
             "ri,cj,ijk->rck", rows, columns, self.nodes[index], optimize=True
@@ -372,9 +373,9 @@ class _Overlap:
     """Blocks that two layers show.
 
     Attributes:
-        layers: the two.
-        places: (n, 2) row and column of each block in the box of the first, and of the second.
-        apart: (n, 3) logarithm of the light of the second less that of the first.
+        layers: indices of the two layers.
+        places: (n, 2) row and column of each block in the box of the first and of the second layer.
+        apart: (n, 3) logarithm of the light of the second layer minus that of the first.
     """
 
     layers: tuple[int, int]
@@ -385,15 +386,15 @@ class _Overlap:
 def estimate(
     lights: Sequence[BlockLight], radii: Sequence[Radii | None], *, is_local: bool = True
 ) -> Exposures:
-    """Find the most equal overlaps, robustly: moved objects and glare have little weight.
+    """Estimate the corrections that equalise overlaps, robust against moved objects and glare.
 
-    Exposures and lenses come first, from what all channels have in common; exposures of channels
-    and fields absorb the rest, the fields as little as possible.
+    Exposures and vignetting are first estimated from the mean of the channels; exposures per
+    channel and smooth fields then model the remaining differences, with the fields kept small.
 
     Args:
-        lights: of the layers of a wall.
-        radii: of the same layers; None if a layer's camera is unknown.
-        is_local: also find fields.
+        lights: light of the layers of a wall.
+        radii: radii of the same layers; None if the camera of a layer is unknown.
+        is_local: whether to estimate smooth fields, too.
     """
     count = len(lights)
     n_lenses = 1 + max((item.lens for item in radii if item is not None), default=-1)
@@ -449,7 +450,7 @@ def _corner(part: Box) -> NDArray[np.int64]:
 
 
 def _exposure_columns(overlaps: Sequence[_Overlap], count: int) -> csr_array:
-    """Return one column per layer: correction of the first less that of the second."""
+    """Return the columns of the exposures: 1 for the first layer, -1 for the second."""
     from scipy.sparse import csr_array
 
     layers = np.repeat(
@@ -464,7 +465,7 @@ def _exposure_columns(overlaps: Sequence[_Overlap], count: int) -> csr_array:
 def _lens_columns(
     overlaps: Sequence[_Overlap], radii: Sequence[Radii | None], n_lenses: int
 ) -> csr_array:
-    """Return two columns per lens."""
+    """Return the columns of the lenses, two per lens."""
     from scipy.sparse import csr_array
 
     columns = np.zeros((sum(len(item.apart) for item in overlaps), 2 * n_lenses))
@@ -481,7 +482,7 @@ def _lens_columns(
 
 
 def _field_columns(overlaps: Sequence[_Overlap], lights: Sequence[BlockLight]) -> csr_array:
-    """Return a column per node of each layer's field."""
+    """Return the columns of the fields, one per node and layer."""
     from scipy.sparse import csr_array
 
     n_nodes = _NODES**2
@@ -501,7 +502,7 @@ def _field_columns(overlaps: Sequence[_Overlap], lights: Sequence[BlockLight]) -
 
 
 def _hats(places: NDArray[np.int64], size: int) -> NDArray[np.float64]:
-    """Weights (n, nodes) of the nodes along a side of this many blocks, linear in between."""
+    """Return the weights (n, nodes) of the nodes along a side, linear in between."""
     at = (places + 0.5) / size * (_NODES - 1)
     return np.maximum(0.0, 1.0 - np.abs(at[:, None] - np.arange(_NODES)))
 
@@ -517,9 +518,9 @@ def _solved(
     priors: NDArray[np.float64],
     overlaps: Sequence[_Overlap],
 ) -> NDArray[np.float64]:
-    """Solve robust least squares (unknowns, channels) with priors of 0.
+    """Solve a robust least squares problem (unknowns, channels) with zero-mean priors.
 
-    Weights are those of Cauchy, with the scatter of each pair's residuals.
+    It uses Cauchy weights, scaled by the scatter of the residuals of each pair of layers.
     """
     from scipy.sparse import diags_array, hstack
     from scipy.sparse.linalg import spsolve
@@ -534,7 +535,7 @@ def _solved(
         for part in np.split(np.arange(len(apart)), ends[:-1]):
             spread = max(_SPREAD_LEAST, median_deviation(residuals[part], 0.0))
             counted = min(1.0, _INDEPENDENT / len(part)) / spread**2
-            # Exposures are unknown at first, and large differences are not outliers.
+            # In the first iteration exposures are unknown, so large differences are not outliers.
             limit = np.inf if sweep == 0 else _OUTLIER * spread
             weights[part] = counted / (1.0 + (residuals[part] / limit) ** 2)
         weighted = matrix.T @ diags_array(weights)

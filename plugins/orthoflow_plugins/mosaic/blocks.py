@@ -1,4 +1,4 @@
-"""Blocks of cells over which colours, light and depths are averaged, for seams and balances."""
+"""Blocks of cells over which colours, brightness and depths are averaged."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from orthoflow.geometry.bands import row_bands
 from orthoflow.geometry.levels import Colours, light_of_levels
 from orthoflow.products import Layer, LayerMask
 
-# Clipped and almost black pixels are useless for exposure; this share of a block may be so.
+# Exposure is not measured in blocks with more clipped or almost black pixels than this share.
 _DARKEST: Final = 10.0 / 255.0
 _BRIGHTEST: Final = 245.0 / 255.0
 _SAYING_LEAST: Final = 0.95
-# Photos differ by parallax at depth edges of a wall.
+# Photos differ by parallax at the depth edges of a wall.
 _DEPTH_EDGE_M: Final = 0.03
 
 # Rows and columns of blocks.
@@ -27,10 +27,10 @@ Box: TypeAlias = tuple[slice, slice]
 
 @dataclass(frozen=True, kw_only=True)
 class Blocks:
-    """Blocks of about equal numbers of cells, symmetric from either end of each side.
+    """Blocks with about the same number of cells, arranged symmetrically.
 
     Attributes:
-        rows: first row of each block, and the row after the last one.
+        rows: first row of each row of blocks, and the number of rows.
         columns: the same for columns.
     """
 
@@ -39,17 +39,17 @@ class Blocks:
 
     @classmethod
     def over(cls, shape: tuple[int, int], side_cells: int) -> Blocks:
-        """Cut a raster into blocks with sides of about this many cells, one more at most."""
+        """Divide a raster into blocks with sides of `size` cells, or one more."""
         rows, columns = (_symmetric_edges(length, side_cells) for length in shape)
         return cls(rows=rows, columns=columns)
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of blocks."""
+        """Numbers of rows and columns of blocks."""
         return len(self.rows) - 1, len(self.columns) - 1
 
     def cells(self, box: Box) -> tuple[slice, slice]:
-        """Return rows and columns of the cells of a box of blocks."""
+        """Return the rows and columns of cells in a box of blocks."""
         rows, columns = box
         return (
             slice(int(self.rows[rows.start]), int(self.rows[rows.stop])),
@@ -63,7 +63,7 @@ class Blocks:
         return Blocks(rows=rows - rows[0], columns=columns - columns[0])
 
     def centres(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return row and column, in cells, of the centre of each row and column of blocks."""
+        """Return the centres of the rows and columns of blocks, in cells."""
         rows, columns = (
             np.asarray(0.5 * (edges[1:] + edges[:-1]), np.float64)
             for edges in (self.rows, self.columns)
@@ -73,24 +73,24 @@ class Blocks:
 
 def _symmetric_edges(length: int, part: int) -> NDArray[np.int64]:
     n_parts = -(-length // part)
-    # A single middle cell belongs to neither half: it becomes a part of its own.
+    # A middle cell that belongs to neither half is a block of its own.
     n_parts += length % 2 * (1 - n_parts % 2)
     half = np.arange(n_parts // 2 + 1) * length // n_parts
     return np.concatenate([half, (length - half[::-1])[1 - n_parts % 2 :]])
 
 
 def raster_means(raster: Colours | NDArray[np.float32], blocks: Blocks) -> NDArray[np.float64]:
-    """Return means (rows, cols) of the cells of each block of a raster (rows, cols)."""
+    """Return the mean (rows, cols) of each block of a raster (rows, cols)."""
     return block_means(lambda rows: raster[rows], blocks)
 
 
 def block_means(
     values: Callable[[slice], NDArray[np.generic]], blocks: Blocks
 ) -> NDArray[np.float64]:
-    """Return means (rows, cols) of the cells of each block; `values` returns those of some rows."""
+    """Return the mean (rows, cols) of each block; `values` returns the cells of given rows."""
     rows, columns = blocks.rows, blocks.columns
     means = np.empty((len(rows) - 1, len(columns) - 1))
-    # Rows of blocks processed at once, about a band.
+    # Rows of blocks that are processed together, about as many cells as a band.
     for some in row_bands((len(means), int(columns[-1] * np.diff(rows).max()))):
         first, last = rows[some.start], rows[some.stop]
         known = values(slice(int(first), int(last))).astype(np.float64)
@@ -101,7 +101,7 @@ def block_means(
 
 
 def depth_edges(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return cells whose right or lower neighbour is 3 cm nearer or farther."""
+    """Return the cells whose depth differs from the right or lower neighbour by 3 cm."""
     edges = np.zeros(depth_m.shape, dtype=np.bool_)
     edges[:, :-1] |= np.abs(np.diff(depth_m, axis=1)) > _DEPTH_EDGE_M
     edges[:-1] |= np.abs(np.diff(depth_m, axis=0)) > _DEPTH_EDGE_M
@@ -109,7 +109,7 @@ def depth_edges(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def depth_edges_in(depth_m: NDArray[np.float32], rows: slice) -> NDArray[np.bool_]:
-    """Return cells of some rows on either side of a depth edge; neighbouring rows are included."""
+    """Return the cells of the given rows on either side of a depth edge."""
     first = max(0, rows.start - 1)
     around = depth_m[first : rows.stop + 1]
     beside = depth_edges(around) | depth_edges(around[::-1, ::-1])[::-1, ::-1]
@@ -118,12 +118,12 @@ def depth_edges_in(depth_m: NDArray[np.float32], rows: slice) -> NDArray[np.bool
 
 @dataclass(frozen=True, kw_only=True)
 class BlockLight:
-    """Mean light of the blocks that a layer paints completely, in the box around its painted cells.
+    """Mean brightness of the blocks that a layer shows completely, in the box around its cells.
 
     Attributes:
         box: rows and columns of blocks.
-        log_light: (rows, cols, 3) float32 natural logarithm of the mean light; NaN where the layer
-            does not paint all of a block, or much of it is black or white.
+        log_light: (rows, cols, 3) float32 natural logarithm of the mean brightness; NaN if the
+            layer does not show all of a block, or too much of it is black or white.
     """
 
     box: Box
@@ -131,12 +131,12 @@ class BlockLight:
 
     @property
     def is_known(self) -> NDArray[np.bool_]:
-        """Return blocks (rows, cols) whose light is known."""
+        """Return the blocks (rows, cols) with known brightness."""
         return ~np.isnan(self.log_light[..., 0])
 
 
 def block_light(layer: Layer, blocks: Blocks) -> BlockLight:
-    """Measure the light over blocks of a layer with painted cells."""
+    """Measure the brightness of the blocks of a layer that has coloured cells."""
     painted = block_means(lambda rows: layer.mask[rows] == LayerMask.PAINTED, blocks)
     down, right = (np.flatnonzero((painted > 0.0).any(axis=axis)) for axis in (1, 0))
     box = slice(int(down[0]), int(down[-1]) + 1), slice(int(right[0]), int(right[-1]) + 1)
@@ -166,7 +166,7 @@ def _light_in(
 
 
 def common(one: Box, other: Box) -> Box | None:
-    """Return the blocks in both boxes; None if they share none."""
+    """Return the intersection of two boxes; None if it is empty."""
     parts = [
         slice(max(a.start, b.start), min(a.stop, b.stop)) for a, b in zip(one, other, strict=True)
     ]
@@ -174,7 +174,7 @@ def common(one: Box, other: Box) -> Box | None:
 
 
 def inside(part: Box, box: Box) -> Box:
-    """Return where a part of a box is in arrays of that box."""
+    """Return the slices of a part in the arrays of its box."""
     rows, columns = (
         slice(inner.start - outer.start, inner.stop - outer.start)
         for inner, outer in zip(part, box, strict=True)
@@ -185,7 +185,7 @@ def inside(part: Box, box: Box) -> Box:
 def pairs(
     lights: Sequence[BlockLight],
 ) -> list[tuple[int, int, Box]]:
-    """Return pairs of layers whose boxes overlap, and where, by index, the lower first."""
+    """Return the pairs of layers (lower index first) with overlapping boxes, and the overlap."""
     found = []
     for i, one in enumerate(lights):
         for j in range(i + 1, len(lights)):

@@ -1,9 +1,9 @@
-"""Contradictions between photos: people and vehicles are replaced by what other photos show.
+"""Contradictions between photos: people and vehicles are replaced from other photos.
 
-Photos of one place, and the scan's own colours, are independent observations of light over blocks
-of some centimetres, after smooth differences between them (light, exposure) are removed. A photo
-does not paint a region where another photo contradicts it that more observations confirm. Gloss
-differs, too; there, as everywhere, only another photo's colours replace a photo's.
+Photos of the same area, and the colours of the scan, are independent observations of brightness in
+blocks of a few centimetres, once smooth differences (lighting, exposure) are removed. A photo is
+not used in a region where it contradicts another photo that more observations confirm. Reflections
+also cause contradictions; in all cases colours are replaced only by those of another photo.
 """
 
 from __future__ import annotations
@@ -26,32 +26,34 @@ from orthoflow_plugins.mosaic.blocks import Blocks, Box, block_means, common, in
 if TYPE_CHECKING:
     from orthoflow.geometry.levels import Colours
 
-# Sides of blocks: wider than the displacement of photos, narrower than a limb.
+# Side of a block: larger than the displacements between photos, narrower than a limb.
 _BLOCK_M: Final = 0.025
 _BLOCK_CELLS: Final = (4, 32)
 _LEAST_PAINTED: Final = 0.5
-# Added to light, so that noise of almost black cells is not a difference.
+# Added to brightness, so that noise in almost black cells does not count as a difference.
 _DARK: Final = 0.02
-# Two observations contradict each other if they differ by this much in the logarithm of light, and
-# by this many deviations of all blocks; a region has a core in which they differ by twice as much.
+# Two observations contradict each other if the logarithms of their brightness differ by at least
+# this much and by this many standard deviations of all blocks. Each region must contain a core in
+# which they differ by twice as much.
 _APART: Final = 0.18
 _DEVIATIONS: Final = 5.0
 _CORE_TIMES: Final = 2.0
 _LEAST_CORE_BLOCKS: Final = 6
-# Differences that are smooth over this many blocks are due to light.
+# Differences that are smooth over this many blocks are attributed to lighting.
 _SMOOTH_BLOCKS: Final = 40.0
-# Regions: thinner ones are misaligned edges; gaps of this many blocks close, and borders grow.
+# Regions that are thinner are misaligned edges; gaps up to this many blocks are closed, and regions
+# are extended at their borders.
 _OPENING_BLOCKS: Final = 2
 _CLOSING_BLOCKS: Final = 9
 _GROWTH_BLOCKS: Final = 2
-# The grey of a laser is used if its correlation with that of a photo is at least this.
+# The intensity of the laser is used if its correlation with the grey of a photo is at least this.
 _LEAST_CORRELATION: Final = 0.6
 _LEAST_BLOCKS: Final = 100
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Witness:
-    """Logarithm of the light (r, c, 3) of the blocks in a box, NaN without an observation."""
+    """Logarithm of the brightness (r, c, 3) of the blocks in a box; NaN if not observed."""
 
     box: Box
     log_light: NDArray[np.float64]
@@ -61,17 +63,17 @@ class _Witness:
 def consensus(
     layers: Sequence[Layer], wall: Wall | None, *, allocate: Allocate
 ) -> tuple[list[Layer], int, NDArray[np.bool_] | None]:
-    """Remove from each photo the regions in which better confirmed photos contradict it.
+    """Exclude from each photo the regions where better confirmed photos contradict it.
 
     Args:
-        layers: photos of one wall, unmodified, each with painted cells.
-        wall: the wall as scanned; None if unknown.
-        allocate: returns the masks of changed layers, by name.
+        layers: photos of one wall, not modified; each shows some cells.
+        wall: the scanned wall; None if unknown.
+        allocate: creates the masks of changed layers, given a name.
 
     Returns:
-        The layers, in which cells that they must not paint are marked as hidden; the number of
-        cells that a photo shows differently from the one that paints them now; and (rows, cols)
-        cells that a single photo shows, and the scan differently, None without colours of the scan.
+        The layers, with excluded cells marked as hidden; the number of cells in which an excluded
+        photo differs from the one used instead; and the cells (rows, cols) that only one photo
+        shows and that contradict the scan, None if the scan has no colours.
     """
     shape, gsd_m = layers[0].frame.shape, layers[0].frame.gsd_m
     side = int(np.clip(math.ceil(_BLOCK_M / gsd_m), *_BLOCK_CELLS))
@@ -79,8 +81,8 @@ def consensus(
     witnesses = [_witness(layer.rgb, layer.mask == LayerMask.PAINTED, blocks) for layer in layers]
     scan = None if wall is None else _scan(wall, blocks, witnesses)
     if scan is not None:
-        # A photo has more in common with the scan than with any other photo, so passers-by matter
-        # less.
+        # Passers-by affect this comparison less than one with another photo, because a photo and
+        # the scan share more cells.
         witnesses = [_in_light_of(scan, item) for item in witnesses]
     everyone = [*witnesses, *([] if scan is None else [scan])]
     supports, apart = _compared(everyone, len(layers), blocks)
@@ -100,9 +102,9 @@ def _compared(
     """Count the observations that confirm each photo in each block, and compare all pairs.
 
     Args:
-        everyone: the photos, and the scan after them if it is used.
-        n_photos: how many of them are photos.
-        blocks: of the wall.
+        everyone: the photos, followed by the scan if it is used.
+        n_photos: number of photos.
+        blocks: blocks of the wall.
     """
     supports = np.zeros((n_photos, *blocks.shape), dtype=np.int8)
     apart: dict[tuple[int, int], NDArray[np.float64]] = {}
@@ -117,7 +119,7 @@ def _compared(
                 supports[i] += agrees
                 supports[j] += agrees
             else:
-                # A person may be in two photos in the same way, but in no photo as in the scan.
+                # A person may look the same in two photos, but not in a photo and in the scan.
                 supports[i] += agrees * np.int8(1 if everyone[j].is_grey else n_photos)
     return supports, apart
 
@@ -128,7 +130,7 @@ def _contradicted(
     apart: dict[tuple[int, int], NDArray[np.float64]],
     blocks: Blocks,
 ) -> NDArray[np.float64]:
-    """How far a photo differs, in each block, from better confirmed photos; 0 without any."""
+    """Difference of a photo from better confirmed photos in each block; 0 if there are none."""
     worst = np.zeros(blocks.shape)
     for other in range(len(supports)):
         ratio = apart.get((min(photo, other), max(photo, other)))
@@ -143,7 +145,7 @@ def _alone(
     apart: dict[tuple[int, int], NDArray[np.float64]],
     blocks: Blocks,
 ) -> NDArray[np.bool_]:
-    """Return the blocks that a single photo shows, differently from the scan."""
+    """Return the blocks that only one photo shows and that contradict the scan."""
     shown = np.array([_known(item, blocks) for item in photos])
     is_alone = shown.sum(axis=0) == 1
     found = np.zeros(blocks.shape, dtype=np.bool_)
@@ -156,7 +158,7 @@ def _alone(
 
 
 def _of_cells(region: NDArray[np.bool_], blocks: Blocks) -> NDArray[np.bool_]:
-    """Cells (rows, cols) of some blocks."""
+    """Cells (rows, cols) of the given blocks."""
     by_row = np.repeat(region, np.diff(blocks.rows), axis=0)
     return np.repeat(by_row, np.diff(blocks.columns), axis=1)
 
@@ -183,7 +185,7 @@ def _witness(rgb: Colours, is_painted: NDArray[np.bool_], blocks: Blocks) -> _Wi
 
 
 def _scan(wall: Wall, blocks: Blocks, photos: Sequence[_Witness]) -> _Witness | None:
-    """Return the scan's colours, or its grey if it correlates with that of the photos."""
+    """Return the colours of the scan, or its intensity if it correlates with the photos."""
     if wall.rgb is not None and wall.rgb_mask is not None:
         return _witness(wall.rgb, wall.rgb_mask > 0, blocks)
     if wall.intensity is None:
@@ -199,7 +201,7 @@ def _scan(wall: Wall, blocks: Blocks, photos: Sequence[_Witness]) -> _Witness | 
 
 
 def _fitted(grey: _Witness, photos: Sequence[_Witness]) -> _Witness | None:
-    """Return a grey scaled to the photos' light; None if it does not correlate."""
+    """Return the intensity scaled to the brightness of the photos; None if uncorrelated."""
     given, shown = [np.empty(0)], [np.empty(0)]
     for photo in photos:
         box = common(grey.box, photo.box)
@@ -212,7 +214,7 @@ def _fitted(grey: _Witness, photos: Sequence[_Witness]) -> _Witness | None:
         return None
     x, y = x[known] - x[known].mean(), y[known]
     slope = float(x @ (y - y.mean()) / (x @ x))
-    # Passers-by do not belong to the scale.
+    # Passers-by must not influence the scale.
     near = np.abs(y - np.median(y) - slope * x) <= _CORE_TIMES * _APART
     if near.sum() < _LEAST_BLOCKS or np.corrcoef(x[near], y[near])[0, 1] < _LEAST_CORRELATION:
         return None
@@ -221,7 +223,7 @@ def _fitted(grey: _Witness, photos: Sequence[_Witness]) -> _Witness | None:
 
 
 def _in_light_of(scan: _Witness, photo: _Witness) -> _Witness:
-    """Return a photo without the smooth difference of its light from the scan's."""
+    """Return a photo without its smooth difference in brightness from the scan."""
     box = common(scan.box, photo.box)
     if box is None:
         return photo
@@ -241,7 +243,7 @@ def _known(witness: _Witness, blocks: Blocks) -> NDArray[np.bool_]:
 def _difference(
     one: _Witness, other: _Witness, box: Box
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Difference of two (r, c, 3) in a box, in grey if one of them is, and where both exist."""
+    """Difference of two observations in a box, in grey if one is grey; and where both exist."""
     difference = one.log_light[inside(box, one.box)] - other.log_light[inside(box, other.box)]
     if one.is_grey or other.is_grey:
         difference = np.repeat(difference.mean(axis=2, keepdims=True), 3, axis=2)
@@ -249,7 +251,7 @@ def _difference(
 
 
 def _light_between(difference: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the smooth part (r, c, 3) of the difference of two observations, NaN where unknown."""
+    """Return the smooth part (r, c, 3) of the difference of two observations; NaN if unknown."""
     known = np.asarray(np.isfinite(difference).all(axis=2), dtype=np.bool_)
     if not known.any():
         return np.zeros(difference.shape)
@@ -262,9 +264,9 @@ def _light_between(difference: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _apart(one: _Witness, other: _Witness, blocks: Blocks) -> NDArray[np.float64] | None:
-    """Return the difference of two observations in each block, 1 where a contradiction begins.
+    """Return the difference of two observations in each block, in units of the threshold.
 
-    NaN where one is missing; None if they share no block.
+    NaN where one is missing; None if they have no block in common.
     """
     box = common(one.box, other.box)
     if box is None:
@@ -282,7 +284,7 @@ def _apart(one: _Witness, other: _Witness, blocks: Blocks) -> NDArray[np.float64
 
 
 def _smooth(values: NDArray[np.float64], is_used: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return means (r, c, 3) of the used values around each block."""
+    """Return the mean (r, c, 3) of the used values around each block."""
     import cv2
 
     weights = cv2.GaussianBlur(is_used.astype(np.float64), (0, 0), _SMOOTH_BLOCKS)
@@ -291,7 +293,7 @@ def _smooth(values: NDArray[np.float64], is_used: NDArray[np.bool_]) -> NDArray[
 
 
 def _regions(ratio: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return whole regions with a contradiction that has a core."""
+    """Return the regions of contradiction that contain a core."""
     import cv2
 
     square = cv2.getStructuringElement(cv2.MORPH_RECT, (_OPENING_BLOCKS, _OPENING_BLOCKS))
@@ -306,7 +308,7 @@ def _regions(ratio: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _grown(region: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return a region with its border, where its content is mixed with the background."""
+    """Return a region extended by its border, where it is mixed with the background."""
     import cv2
 
     side = 2 * _GROWTH_BLOCKS + 1
@@ -317,7 +319,7 @@ def _grown(region: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _any_left(
     painted: Sequence[NDArray[np.bool_]], is_out: Sequence[NDArray[np.bool_]]
 ) -> NDArray[np.bool_]:
-    """Return cells that some layer paints that must not lose them."""
+    """Return the cells shown by any layer that is not excluded there."""
     left = [shows & ~out for shows, out in zip(painted, is_out, strict=True)]
     return np.asarray(np.logical_or.reduce(left), dtype=np.bool_)
 
@@ -328,7 +330,7 @@ def _without(
     blocks: Blocks,
     allocate: Allocate,
 ) -> tuple[list[Layer], int]:
-    """Layers without their outvoted blocks where another paints, and their cell count."""
+    """Exclude outvoted blocks where another layer remains; return layers and cell count."""
     changed = [index for index, region in enumerate(outvoted) if region.any()]
     if not changed:
         return list(layers), 0
@@ -346,7 +348,7 @@ def _without(
         painted = [layer.mask[rows] == LayerMask.PAINTED for layer in layers]
         is_out = [region[at] & shows for region, shows in zip(grown, painted, strict=True)]
         stays = _any_left(painted, is_out)
-        # Between two people the border of one is better than the other.
+        # Between two people, use the border of one rather than the other person.
         is_out = [out & (stays | region[at]) for out, region in zip(is_out, outvoted, strict=True)]
         stays = _any_left(painted, is_out)
         for index in changed:

@@ -1,4 +1,4 @@
-"""Areas that a person assigns to photos, regardless of the rule for seams."""
+"""Areas assigned to photos by hand, which override the rule for seams."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from orthoflow.products import InputFiles
 
 @dataclass(frozen=True, kw_only=True)
 class DrawnSeams:
-    """Polygons of one wall, each for one of its layers; of overlapping ones the last counts.
+    """Polygons of one wall, each assigned to a layer; where they overlap, the last one counts.
 
     Attributes:
-        rings: of each polygon, (n, 2) corners as (column, row).
-        layers: index of the layer of each.
-        n_columns: of the wall.
+        rings: (n, 2) corners of each polygon as (column, row).
+        layers: index of the layer of each polygon.
+        n_columns: number of columns of the wall.
     """
 
     rings: tuple[tuple[NDArray[np.float64], ...], ...]
@@ -29,7 +29,7 @@ class DrawnSeams:
     n_columns: int
 
     def chosen(self, rows: slice) -> NDArray[np.int16]:
-        """Return the layer (rows, cols) that a person chose in some rows; -1 without a choice."""
+        """Return the assigned layer (rows, cols) in the given rows; -1 if none is assigned."""
         chosen = np.full((rows.stop - rows.start, self.n_columns), -1, dtype=np.int16)
         for rings, layer in zip(self.rings, self.layers, strict=True):
             moved = tuple(ring - [0.0, rows.start] for ring in rings)
@@ -41,10 +41,10 @@ class DrawnSeams:
 
 
 def read_seams(files: InputFiles | None, sources: Collection[str]) -> list[NamedPolygon]:
-    """Read the polygons of all walls, with the properties `photo` and `wall`, its number.
+    """Read the polygons of all walls, with the properties `photo` and `wall` (a number).
 
     Raises:
-        InputError: a file has other content, or names something that is not a layer.
+        InputError: a file has a different format, or refers to a photo that is not a layer.
     """
     if files is None:
         return []
@@ -56,14 +56,14 @@ def read_seams(files: InputFiles | None, sources: Collection[str]) -> list[Named
     for polygon in polygons:
         if polygon.name not in sources:
             raise InputError(
-                f"seams of the input {files.name} name the photo {polygon.name}, but the layers "
-                f"are of {', '.join(sorted(sources))}"
+                f"seams in the input {files.name} refer to the photo {polygon.name}, but the "
+                f"layers are of {', '.join(sorted(sources))}"
             )
         wall = polygon.properties.get("wall")
         if not isinstance(wall, int) or isinstance(wall, bool):
             raise InputError(
-                f'seams of the input {files.name} need the property "wall", the number of a wall, '
-                f"beside every photo, got {wall!r}"
+                f'each seam in the input {files.name} needs the property "wall", the number of a '
+                f"wall; got {wall!r}"
             )
     return polygons
 
@@ -71,13 +71,13 @@ def read_seams(files: InputFiles | None, sources: Collection[str]) -> list[Named
 def seams_of(
     polygons: Sequence[NamedPolygon], number: int, frame: WallFrame, sources: Sequence[str]
 ) -> DrawnSeams | None:
-    """Return the polygons of a wall in its cells; None if it has none.
+    """Return the polygons of a wall in cell coordinates; None if it has none.
 
     Args:
-        polygons: of all walls, in the metres of their GeoTIFFs.
-        number: of the wall.
-        frame: of the wall.
-        sources: of its layers, in their order.
+        polygons: polygons of all walls, in the coordinates of their GeoTIFFs (metres).
+        number: number of the wall.
+        frame: frame of the wall.
+        sources: sources of the layers of the wall, in order.
     """
     mine = [
         polygon

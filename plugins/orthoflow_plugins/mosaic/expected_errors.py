@@ -1,9 +1,10 @@
-"""The expected error of a point measured in an orthoimage, cell by cell.
+"""Expected error of a point measured in an orthoimage, per cell.
 
-Three independent causes displace the content of a cell along the wall: the photo's pose (its
-covariance, propagated to the wall), the depth of the cell (times the tangent of the view), and the
-displacements of photos in overlaps that neither explains. Overlaps separate the last two: photos
-that see a place from different sides are displaced by its depth, all others by their poses.
+Three independent causes displace the content of a cell along the wall: errors of the pose of the
+photo (its covariance, propagated to the wall), errors of the depth of the cell (times the tangent
+of the angle of view), and displacements between overlapping photos that neither explains. Overlaps
+distinguish the last two: a depth error displaces photos taken from different sides in different
+directions.
 """
 
 from __future__ import annotations
@@ -22,29 +23,31 @@ from orthoflow_plugins.mosaic.agreement import Overlaps
 if TYPE_CHECKING:
     from orthoflow.geometry import WallFrame
 
-# Errors of poses are smooth: they are computed at this many nodes per side and interpolated
+# Pose errors vary smoothly: they are computed at this many nodes per side, and interpolated
 # linearly.
 _NODES: Final = 48
-# Noise of phase correlation: 0.06 and 0.07 cells in a drawn room whose poses have errors of 0.01
+# Noise of phase correlation: 0.06 and 0.07 cells in a simulated room with pose errors of 0.01
 # cells.
 _PARALLAX_NOISE_CELLS: Final = 0.065
 _LEAST_OVERLAPS: Final = 10
-# A view flatter than 84 degrees paints nothing.
+# No cell is viewed at more than 84 degrees from the normal.
 _MOST_TANGENT: Final = 10.0
-# Interpolated depths are worse by this factor than measured neighbours (`docs/accuracy.md`).
+# Interpolated depths have larger errors than measured ones, by this factor (`docs/accuracy.md`).
 _RECOVERED_TIMES: Final = 2.0
-# Spreads of few points scatter; only larger ones, as at edges, add to the value of the whole
-# raster.
+# The spread of a few points is uncertain; it counts only if larger than that of the whole raster,
+# as at edges.
 _SPREAD_TIMES: Final = 2.0
-# Depths a few centimetres apart differ by more than neighbours if a cloud has errors in patches, as
-# clouds from photos do. Relief of rooms explains up to a factor of 1.35 (0.98 and 1.3 mm in the
-# simulated room, 1.2 and 2.4 mm in a stuccoed hall, 1.7 and 5.2 mm in a fountain's stereo cloud).
+# Clouds from photos have depth errors that are correlated over a few centimetres: depths at that
+# distance differ by more than neighbouring ones. The relief of rooms explains a factor of up to
+# 1.35 (neighbouring and distant cells differ by 0.98 and 1.3 mm in the simulated room, 1.2 and 2.4
+# mm in a stuccoed hall, 1.7 and 5.2 mm in a stereo cloud of a fountain).
 _PATCH_M: Final = 0.05
 _PATCHY_TIMES: Final = 1.5
-# Overlaps show errors of depths if tangents of views differ by this much, in this many patches.
+# Overlaps reveal depth errors if the tangents of the views differ by this much in this many
+# patches.
 _LEAST_TANGENTS: Final = 0.3
 _LEAST_SLANTED: Final = 20
-# Displacements of more than this many deviations are false matches.
+# Displacements of more than this many standard deviations are false matches.
 _OUTLIER: Final = 3.0
 _ROUNDS: Final = 8
 
@@ -53,8 +56,8 @@ def ties_on(cameras: Cameras | None, number: int) -> tuple[int, int]:
     """Count the control and check points of the photos on a wall.
 
     Args:
-        cameras: orientations, with the ties that they kept.
-        number: of the wall.
+        cameras: orientations with the ties they are based on.
+        number: number of the wall.
     """
     ties = None if cameras is None else cameras.ties
     if ties is None:
@@ -78,18 +81,18 @@ def expected_errors_m(
     *,
     allocate: Allocate,
 ) -> NDArray[np.float32]:
-    """Predict the error of cells: one standard deviation of u and of v, metres.
+    """Predict the errors of cells: standard deviations of u and v, in metres.
 
     Args:
-        wall: its surface.
-        source: (rows, cols) index of the photo that paints each cell, -1 for none.
+        wall: surface of the wall.
+        source: (rows, cols) index of the photo used for each cell, -1 if none.
         sources: names of the photos.
-        cameras: of oriented photos, by name; only those with a covariance have an error.
-        overlaps: displacements between photos where two show the wall.
-        allocate: returns the array.
+        cameras: oriented photos by name; a photo without a covariance has no expected error.
+        overlaps: displacements between overlapping photos.
+        allocate: creates the array.
 
     Returns:
-        (rows, cols), NaN where nothing is painted, or the error of the photo is unknown.
+        (rows, cols), NaN where no photo is used or the error of the photo is unknown.
     """
     frame = wall.frame
     errors_m = np.asarray(allocate("error_m", frame.shape, np.float32), np.float32)
@@ -106,7 +109,7 @@ def expected_errors_m(
     excess = _excess_of_overlaps(wall, cameras, overlaps)
     position_m, depth_m = (0.0, None) if excess is None else excess
     if depth_m is not None:
-        # Relief of five centimetres looks like errors of that size; overlaps distinguish them.
+        # Relief over five centimetres looks like correlated errors; overlaps distinguish the two.
         patchy_m = depth_m
     for index, name in enumerate(sources):
         camera = cameras.get(name)
@@ -129,7 +132,7 @@ def expected_errors_m(
 
 
 def _node_places(frame: WallFrame, step: int) -> NDArray[np.float64]:
-    """Return columns and rows (r, c, 2) of the nodes: the centres of blocks of cells."""
+    """Return the columns and rows (r, c, 2) of the nodes, which are centres of blocks."""
     rows, columns = ((np.arange(-(-size // step)) + 0.5) * step for size in frame.shape)
     return np.stack(np.meshgrid(columns, rows), axis=-1)
 
@@ -137,14 +140,15 @@ def _node_places(frame: WallFrame, step: int) -> NDArray[np.float64]:
 def _pose_variances(
     camera: Camera, frame: WallFrame, nodes: NDArray[np.float64], depths_m: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
-    """Variances (r, c) of a coordinate on the wall by a photo's orientation, metres squared."""
+    """Variances (r, c) of a wall coordinate due to the orientation of a photo, in m²."""
     from orthoflow.geometry.cameras import LensFreedom, linearised
     from orthoflow.geometry.resection import moved_origin, pixels_by_point
 
     if camera.covariance is None:
         return None
     viewing, middle = camera.viewing(), frame.origin_world
-    # Relative to the wall: at survey coordinates rotations and shifts would cancel each other.
+    # Relative to the wall: in survey coordinates, effects of rotations and shifts would almost
+    # cancel, and lose digits.
     to_local = np.linalg.inv(moved_origin(viewing, middle, 6))
     covariance = to_local @ camera.covariance @ to_local.T
     near = viewing.shifted(middle)
@@ -162,7 +166,7 @@ def _pose_variances(
     variances[shown] = 0.5 * np.einsum("nij,jk,nik->n", by_pose, covariance, by_pose)
     inside = near.sees(pixels) & shown
     if camera.sigma_wall_m is not None and inside.any():
-        # An estimated lens adds to the pose; its effect on the wall is stated with it.
+        # The covariance includes the parameters of a lens that was estimated with the pose.
         stated = camera.sigma_wall_m**2 / float(np.median(variances[inside]))
         variances *= max(1.0, stated)
     known = np.isfinite(variances)
@@ -173,7 +177,7 @@ def _pose_variances(
 def _between(
     values: NDArray[np.float64], rows: NDArray[np.intp], columns: NDArray[np.intp], step: int
 ) -> NDArray[np.float64]:
-    """Return values (n,) at cells, linear between the nodes, constant beyond the outermost."""
+    """Interpolate values (n,) at cells linearly between nodes; constant beyond the outermost."""
     places, shares = [], []
     for cells, size in zip((rows, columns), values.shape, strict=True):
         place = np.clip((cells + 0.5) / step - 0.5, 0.0, size - 1.0)
@@ -188,7 +192,7 @@ def _between(
 
 
 def _depth_noises_m(wall: Wall) -> tuple[float, float]:
-    """Noise of the depths of single cells, and the error common to neighbours; 0 without."""
+    """Noise of the depths of single cells, and the error shared by neighbours (0 if none)."""
     noise_m = depth_noise_m(wall.depth_m)
     step = max(1, round(_PATCH_M / wall.frame.gsd_m))
     apart_m = depth_noise_m(wall.depth_m[::step, ::step])
@@ -204,9 +208,9 @@ def _depth_variances(
     centre: NDArray[np.float64],
     noises_m: tuple[float, float],
 ) -> NDArray[np.float64]:
-    """Return variances (n,) of a coordinate by the depth of cells, seen from a centre (3,).
+    """Return variances (n,) of a coordinate due to the depths of cells viewed from a centre (3,).
 
-    The first noise is that of single cells, the second common to neighbours.
+    The first noise is that of single cells, the second is shared by neighbouring cells.
     """
     noise_m, patchy_m = noises_m
     gsd_m = wall.frame.gsd_m
@@ -225,15 +229,16 @@ def _depth_variances(
 def _excess_of_overlaps(
     wall: Wall, cameras: Mapping[str, Camera], overlaps: Overlaps
 ) -> tuple[float, float | None] | None:
-    """Split displacements into those of poses and of depths; None if there are too few.
+    """Separate errors of poses and of depths by displacements; None if there are too few.
 
-    Squares of displacements are sums of the variances of both poses, of twice the unstated variance
-    of poses, and of the variance of the depth times the squared difference of the tangents of both
-    views: a weighted least squares fit, without negative variances and outliers.
+    A squared displacement is the sum of the variances of both poses, twice the additional variance
+    of a pose, and the variance of the depth times the squared difference of the tangents of both
+    views. The two unknown variances are fitted by weighted least squares, without outliers, and
+    cannot be negative.
 
     Returns:
-        Standard deviation of a coordinate of one photo, and that of depths over a patch, None if
-        views differ too little.
+        The additional standard deviation of a coordinate in one photo, and the standard deviation
+        of depths over a patch, None if the views differ too little.
     """
     from scipy.optimize import nnls
 
@@ -263,7 +268,7 @@ def _excess_of_overlaps(
         columns.append((apart**2).ravel())
     matrix, wanted = np.column_stack(columns), squares.ravel()
     known_part = np.broadcast_to(fixed, squares.shape).ravel()
-    # Half of all displacements are below 0.67 deviations.
+    # Half of all displacements are below 0.67 standard deviations.
     predicted = np.full(len(wanted), max(float(np.median(wanted)) * NMAD_FACTOR**2, 1e-12))
     found = np.zeros(len(columns))
     for _ in range(_ROUNDS):
@@ -280,7 +285,7 @@ def _excess_of_overlaps(
 def _views_of(
     wall: Wall, camera: Camera, centres: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return variances (n,) that a pose states at positions, and tangents (n, 2) of its views."""
+    """Return variances (n,) due to a pose at positions, and tangents (n, 2) of the views."""
     frame = wall.frame
     depths_m = np.nan_to_num(
         wall.depth_m[centres[:, 1].astype(np.intp), centres[:, 0].astype(np.intp)].astype(float)

@@ -1,4 +1,4 @@
-"""Seams by graph cuts: where two photos look similar, and not along depth edges."""
+"""Seams by graph cuts, where two photos look similar and away from depth edges."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from orthoflow_plugins.mosaic.blocks import Blocks, block_means, depth_edges_in,
 if TYPE_CHECKING:
     from orthoflow_plugins.mosaic.balance import Balance
 
-# Cuts are computed on a smaller picture of about this many cells.
+# Cuts are computed at a reduced scale with about this many cells.
 _CELLS_MOST: Final = 30_000
 _SWEEPS_MOST: Final = 2
-# A seam across a depth edge costs as much as one between black and white.
+# A seam on a depth edge costs as much as one between black and white.
 _DEPTH_EDGE_COST: Final = 1.0
-# Even where layers are equal a long seam costs more than a short one.
+# Even where layers are identical, a long seam costs more than a short one.
 _LENGTH_COST: Final = 0.01
 _VIEW_WEIGHT: Final = 0.1
-# Cost of a cell that a layer does not paint.
+# Cost of assigning a cell to a layer that does not show it.
 _FORBIDDEN: Final = 1e3
 _UNITS: Final = 1000.0
 
@@ -35,7 +35,7 @@ _UNITS: Final = 1000.0
 class _Scene:
     """The reduced layers: colours (k, rows, cols, 3) 0..1, views (k, rows, cols), edges.
 
-    `views` is the cost of a layer in a cell, `edges` the additional cost of a seam there.
+    `views` is the cost of a layer in a cell, `edges` the additional cost of a seam in it.
     """
 
     colours: NDArray[np.float32]
@@ -45,18 +45,18 @@ class _Scene:
 
 @dataclass(frozen=True, kw_only=True)
 class CutLabels:
-    """The layer that a cut assigns to each cell.
+    """Layer assigned to each cell by a graph cut.
 
     Attributes:
-        small: (rows, cols) int16 of the blocks, -1 where no layer paints.
-        blocks: which cells they are made of.
+        small: (rows, cols) int16 layer of each block, -1 if no layer shows it.
+        blocks: the cells of each block.
     """
 
     small: NDArray[np.int16]
     blocks: Blocks
 
     def in_rows(self, rows: slice) -> NDArray[np.int16]:
-        """Return the layer (rows, cols) of the cells in some rows of the wall."""
+        """Return the layers (rows, cols) of the cells in the given rows of the wall."""
         first_rows, first_columns = self.blocks.rows, self.blocks.columns
         wanted = np.arange(*rows.indices(int(first_rows[-1])))
         blocks = np.searchsorted(first_rows, wanted, side="right") - 1
@@ -66,16 +66,16 @@ class CutLabels:
 def cut_labels(
     layers: Sequence[Layer], wall: Wall | None, balance: Balance | None = None
 ) -> CutLabels:
-    """Assign each cell the layer that a graph cut chooses, -1 where none paints it.
+    """Assign a layer to each cell by a graph cut; -1 if no layer shows the cell.
 
-    Boykov, Veksler and Zabih 2001: each layer in turn may take over cells of the others where that
-    lowers the sum of seam costs (colour difference of both layers on both sides, Kwatra et al.
-    2003, plus depth edges) and of view costs. The cut is made at a reduced scale.
+    Boykov, Veksler and Zabih 2001: each layer in turn takes over cells of the others where this
+    lowers the total of seam costs (colour differences of both layers on both sides, Kwatra et al.
+    2003, plus depth edges) and view costs. The cut is computed at a reduced scale.
 
     Args:
-        layers: of one wall.
-        wall: its surface, for depth edges, or None.
-        balance: the colour balance of the layers before they are compared, if any.
+        layers: layers of one wall.
+        wall: surface of the wall, for depth edges, or None.
+        balance: colour balance applied to the layers before they are compared, or None.
     """
     shape = layers[0].frame.shape
     factor = max(1, math.ceil(math.sqrt(shape[0] * shape[1] / _CELLS_MOST)))
@@ -125,7 +125,7 @@ def _painted_in(mask: NDArray[np.uint8], rows: slice) -> NDArray[np.bool_]:
 
 
 def _expanded(scene: _Scene, labels: NDArray[np.int64], alpha: int) -> NDArray[np.int64]:
-    """Let one layer take over cells: the best of all such moves, by a minimum cut."""
+    """Let one layer take over cells: the optimal move, by a minimum cut."""
     from scipy.sparse import coo_array, csr_array
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
@@ -133,8 +133,8 @@ def _expanded(scene: _Scene, labels: NDArray[np.int64], alpha: int) -> NDArray[n
     source, sink = count, count + 1
     flat = labels.ravel()
     cells = np.arange(count)
-    # Unary costs of keeping (0) and of taking alpha (1). Integers, so that sums are exact and it
-    # does not matter which of two neighbours is p.
+    # Unary costs of keeping the label (0) and of changing to alpha (1). Integers, so that sums are
+    # exact, and the order of two neighbours does not matter.
     views = np.rint(_UNITS * scene.views)
     keep = views.reshape(len(views), -1)[flat, cells]
     take = views[alpha].ravel().copy()
@@ -144,8 +144,7 @@ def _expanded(scene: _Scene, labels: NDArray[np.int64], alpha: int) -> NDArray[n
         p, q = one.ravel(), other.ravel()
         right = _seam_cost(scene, p, q, flat[p], np.full(len(p), alpha))
         left = _seam_cost(scene, p, q, np.full(len(p), alpha), flat[q])
-        # Where a detour over alpha costs less than the seam, the move is not representable, and the
-        # seam is set to the cost of the detour.
+        # The triangle inequality must hold: a seam costs at most as much as both seams with alpha.
         kept = np.minimum(_seam_cost(scene, p, q, flat[p], flat[q]), right + left)
         # Kolmogorov and Zabih 2004: A + (C - A) p - C q + (B + C - A) (1 - p) q.
         np.add.at(take, p, left - kept)
@@ -156,9 +155,9 @@ def _expanded(scene: _Scene, labels: NDArray[np.int64], alpha: int) -> NDArray[n
     low = np.minimum(keep, take)
     starts += [np.full(count, source), cells]
     ends += [cells, np.full(count, sink)]
-    # A cell on the sink's side takes alpha and cuts its link from the source.
+    # A cell on the side of the sink changes to alpha, which cuts its edge from the source.
     between += [take - low, keep - low]
-    # Edges from p to q are cut where p keeps and q takes: p on the source's side.
+    # An edge from p to q is cut where p keeps its label (source side) and q changes.
     capacity = np.minimum(np.concatenate(between), 4.0 * _FORBIDDEN * _UNITS)
     graph = coo_array(
         (
@@ -185,14 +184,14 @@ def _seam_cost(
     label_p: NDArray[np.int64],
     label_q: NDArray[np.int64],
 ) -> NDArray[np.float64]:
-    """Return the cost (n,) of neighbours with these labels, integers: 0 for equal ones."""
+    """Return the integer seam cost (n,) of neighbours with these labels; 0 if they are equal."""
     colours = scene.colours.reshape(len(scene.colours), -1, 3)
     views = scene.views.reshape(len(scene.views), -1)
     edges = scene.edges.ravel()
     cost = _LENGTH_COST + edges[p] + edges[q]
     for cell in (p, q):
         apart = np.abs(colours[label_p, cell] - colours[label_q, cell]).mean(axis=1)
-        # Where only one of them paints there is nothing to compare, and no visible step.
+        # Where only one layer shows the cells, there is nothing to compare and no visible step.
         both = (views[label_p, cell] < _FORBIDDEN) & (views[label_q, cell] < _FORBIDDEN)
         cost = cost + np.where(both, apart, 0.0)
     return np.where(label_p == label_q, 0.0, np.rint(_UNITS * cost))

@@ -1,4 +1,4 @@
-"""Which layer paints each cell of a wall: by a rule, in patches rather than in specks."""
+"""Selection of the layer for each cell of a wall, by a rule and without small patches."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
     from orthoflow_plugins.mosaic.balance import Balance
     from orthoflow_plugins.mosaic.drawn_seams import DrawnSeams
 
-# Preference (rows, cols) of a layer in some rows of its wall, computed during joining: those of a
-# large wall would not fit into memory.
+# Preference (rows, cols) of a layer in some rows of the wall. Computed band by band, because
+# preferences of a large wall would not fit into memory.
 Preference = Callable[[slice], NDArray[np.float32]]
 
 NOBODY: Final = -1
-# Walls with more cells are joined in bands of this many.
+# Walls with more cells are processed in bands of about this many cells.
 _BAND_CELLS: Final = 1 << 25
-# Balancing colours takes more than a hundred bytes per cell temporarily.
+# Balancing colours temporarily takes more than a hundred bytes per cell.
 _BALANCED_AT_ONCE: Final = 1 << 20
-# A cell takes the highest state of any layer. Occluded: no source paints it, although at least one
-# faces it. A filled cell ranks below a painted one.
+# In ascending order; a cell takes the highest state of any layer. It is occluded if at least one
+# source faces it, but none shows it.
 _RANKED: Final = (
     OrthoMask.NONE,
     OrthoMask.NO_SURFACE,
@@ -54,12 +54,13 @@ def preferences(
     wall: Wall | None = None,
     balance: Balance | None = None,
 ) -> list[Preference]:
-    """Return by a rule how much each layer is preferred in rows of the wall; larger is better.
+    """Return the preference of each layer by a rule, for rows of the wall; the largest wins.
 
-    `best-view` is the layers' own quality: incidence, resolution, distance to the photo's border.
-    `voronoi` prefers the layer whose painted area ends farthest away, so that seams are in the
-    middle of overlaps. `priority` takes photos in the given order, the others by their quality.
-    `graph-cut` puts seams where the layers look similar and away from depth edges of the wall.
+    `best-view` is the quality of the layers: angle of incidence, resolution and distance from the
+    border of the photo. `voronoi` prefers the layer whose area ends farthest away, so that seams
+    are in the middle of overlaps. `priority` takes photos in the given order, followed by all
+    others by quality. `graph-cut` puts seams where the layers look similar and away from depth
+    edges of the wall.
     """
     if params.seams == "voronoi":
         return [_depth_inside(layer) for layer in layers]
@@ -87,9 +88,9 @@ def _cut_off(
 
 
 def _depth_inside(layer: Layer) -> Preference:
-    """Return the distance in cells to the nearest unpainted cell, or to the border.
+    """Return the distance in cells to the nearest cell without a colour, or to the border.
 
-    On a large wall only every so many cells are looked at, and distances are linear between them.
+    On a large wall, distances are computed for every n-th cell and interpolated linearly.
     """
     import cv2
 
@@ -102,7 +103,7 @@ def _depth_inside(layer: Layer) -> Preference:
         return lambda rows: inside[1:-1, 1:-1][rows]
 
     def preference(rows: slice) -> NDArray[np.float32]:
-        # The first cell that was looked at is the second of the padded picture.
+        # The first sampled cell is the second cell of the padded picture.
         row, column = (
             (np.arange(*part.indices(size)) - step // 2) / step + 1.0
             for part, size in zip((rows, slice(None)), shape, strict=True)
@@ -116,10 +117,10 @@ def _depth_inside(layer: Layer) -> Preference:
 
 
 def require_sources(layers: Sequence[Layer], priority: Sequence[str]) -> None:
-    """Refuse names in `priority` that no layer has.
+    """Refuse names in `priority` that are not names of layers.
 
     Raises:
-        MethodError: there is such a name.
+        MethodError: a name is unknown.
     """
     sources = {layer.source for layer in layers}
     unknown = [name for name in priority if name not in sources]
@@ -134,14 +135,14 @@ def require_one_raster(layers: Sequence[Layer], name: str) -> None:
     """Refuse layers of a wall that do not share one frame.
 
     Raises:
-        MethodError: they do not.
+        MethodError: they differ.
     """
     first = layers[0]
     for layer in layers[1:]:
         if not layer.frame.has_cells_of(first.frame):
             raise MethodError(
-                f"the layers {first.source} and {layer.source} of {name} lie on different rasters: "
-                "all layers of a wall must come from the same walls"
+                f"the layers {first.source} and {layer.source} of {name} have different rasters: "
+                "all layers must be made from the same walls"
             )
 
 
@@ -155,20 +156,20 @@ def joined(
     balance: Balance | None,
     allocate: Allocate,
 ) -> tuple[NDArray[np.uint8], NDArray[np.int16]]:
-    """Determine the state of each cell of a wall, a large one band by band.
+    """Determine the state and the layer of each cell of a wall, band by band if it is large.
 
     Args:
-        painters: layers of the wall that paint something.
-        others: layers that paint nothing, but state what is hidden.
-        params: where seams are preferred.
-        drawn: areas that a person assigns to photos, which precede all rules where those photos
-            paint them.
-        wall: its surface, for seams off its depth edges, or None.
-        balance: the colour balance of the painters, or None.
-        allocate: returns the arrays of the orthoimage, by name.
+        painters: layers of the wall with coloured cells.
+        others: layers without any, whose masks tell which cells are occluded.
+        params: the rule for seams.
+        drawn: areas assigned to photos by hand, which override the rule where the photo shows
+            them.
+        wall: the surface, to keep seams away from its depth edges, or None.
+        balance: the colour balance of `painters`, or None.
+        allocate: creates the arrays of the orthoimage, given a name.
 
     Returns:
-        (rows, cols) `OrthoMask`, and the index of the painter of each cell, `NOBODY` without one.
+        (rows, cols) `OrthoMask`, and the index of the layer of each cell, `NOBODY` if it has none.
     """
     preferred: list[Preference] = []
     if painters:
@@ -176,7 +177,7 @@ def joined(
     shape = [*painters, *others][0].frame.shape
     mask = np.asarray(allocate("mask", shape, np.uint8), np.uint8)
     source = np.asarray(allocate("source", shape, np.int16), np.int16)
-    # How many rows away a cell may influence who paints another.
+    # Cells up to this many rows apart influence each other.
     cells_min = params.island_cells_min
     reach = cells_min + math.ceil(math.sqrt(cells_min)) + 1 if cells_min > 1 else 0
     for band in bands_with_reach(shape, cells_most=_BAND_CELLS, reach_rows=reach):
@@ -207,13 +208,13 @@ def coloured(
     *,
     allocate: Allocate,
 ) -> Colours:
-    """Return the colour (rows, cols, 3) of each cell from its layer, a large wall band by band.
+    """Return the colours (rows, cols, 3) of cells from their layers, by bands if many.
 
     Args:
-        painters: layers of the wall that paint something.
-        source: (rows, cols) index of the painter of each cell, `NOBODY` without one.
-        balance: their colour balance; None leaves colours unchanged.
-        allocate: returns the array.
+        painters: layers of the wall with coloured cells.
+        source: (rows, cols) index of the layer of each cell, `NOBODY` if it has none.
+        balance: colour balance of the layers; None leaves colours unchanged.
+        allocate: creates the array.
     """
     is_deep = any(layer.rgb.dtype == np.uint16 for layer in painters)
     level: Level = np.uint16 if is_deep else np.uint8
@@ -232,7 +233,7 @@ def coloured(
 
 
 def _part(layer: Layer, rows: slice) -> Layer:
-    """Return some rows of a layer, without a copy."""
+    """Return a view of the given rows of a layer."""
     return replace(
         layer,
         frame=replace(layer.frame, height=rows.stop - rows.start),
@@ -246,11 +247,10 @@ def _part(layer: Layer, rows: slice) -> Layer:
 def best_views(
     layers: Sequence[Layer], preferences: Sequence[NDArray[np.float32]]
 ) -> tuple[NDArray[np.uint8], NDArray[np.int16]]:
-    """Assign each cell to the layer that is preferred there, the first of equals.
+    """Assign each cell to the layer with the highest preference, the first of equal ones.
 
     Returns:
-        (rows, cols) position of the cell's state in the order of states, and the layer that paints
-        it, `NOBODY` without one.
+        (rows, cols) rank of the state of each cell, and its layer, `NOBODY` if it has none.
     """
     shape = layers[0].frame.shape
     best = np.zeros(shape, dtype=np.float32)
@@ -269,10 +269,10 @@ def best_views(
 def without_islands(
     rank: NDArray[np.uint8], owner: NDArray[np.int16], layers: Sequence[Layer], cells_min: int
 ) -> NDArray[np.int16]:
-    """Return small patches to the source that surrounds them, if it shows them as well.
+    """Reassign small patches to the source that surrounds them, if it also shows them.
 
-    A patch is connected over sides of cells. The source with the most cells around a cell takes it;
-    cells that no larger patch's source shows are unchanged.
+    Cells of a patch are connected by their sides. A cell takes the source of most surrounding
+    cells; it is unchanged if no source of a larger patch shows it.
     """
     import cv2
 

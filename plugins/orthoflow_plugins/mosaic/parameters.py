@@ -10,44 +10,43 @@ from orthoflow.sdk import MethodParams
 
 
 class SeamsParams(MethodParams):
-    """How the layer of a cell is chosen, and how specks are avoided."""
+    """How the layer of a cell is chosen, and how colours are balanced."""
 
     seams: Literal["best-view", "voronoi", "graph-cut", "priority"] = Field(
-        "best-view", description="Which layer paints what several of them show."
+        "best-view", description="Rule that selects among several layers of a cell."
     )
     priority: tuple[str, ...] = Field(
         (), description="Names of photos, highest priority first, for `seams: priority`."
     )
     gains: Literal["none", "global"] = Field(
         "global",
-        description="none: colours stay as the photos have them, and nothing below changes "
-        "them; global: where photos differ, the light of each is multiplied by one number per "
-        "channel, so that overlaps agree.",
+        description="none: colours are those of the photos, and the next two parameters have no "
+        "effect; global: if photos differ, the light of each is multiplied by a factor per "
+        "channel so that overlaps agree.",
     )
     local_balance: bool = Field(
         default=True,
-        description="Also balance vignetting and other differences that are "
-        "smooth over a photo, as measured in overlaps.",
+        description="Also balance vignetting and other smooth differences, as measured in "
+        "overlaps.",
     )
     feather_cells: int = Field(
         64,
         ge=0,
         le=4096,
-        description="Remaining differences at a seam are blended within this many cells "
-        "on either side; only smooth differences, so that nothing is mixed. 0: a step may "
-        "remain.",
+        description="Blend the remaining smooth differences within this many cells on either side "
+        "of a seam; photos are not mixed. 0: do not blend.",
     )
     island_cells_min: int = Field(
         default=100,
         ge=1,
-        description="Smaller patches from one source are painted from the one around them, "
-        "where it sees them too; 1 keeps the best view of every cell.",
+        description="Patches with fewer cells are assigned to the source around them if that "
+        "source shows them, too; 1 keeps the best view of every cell.",
     )
 
     robust: bool = Field(
         default=True,
-        description="Where photos contradict each other over a region, as with people and "
-        "vehicles that pass, one that most others and the scan confirm paints it.",
+        description="If photos contradict each other over a region, as with passing people and "
+        "vehicles, use the photo that most others and the scan confirm.",
     )
     publish_layers: bool = Field(
         default=False,

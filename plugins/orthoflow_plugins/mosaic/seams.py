@@ -57,13 +57,14 @@ from orthoflow_plugins.mosaic.joining import (
 )
 from orthoflow_plugins.mosaic.parameters import SeamsParams
 
-# The map of sources: its longest side, its colours, and their share relative to the grey.
+# Figure of the sources: length of its longer side in pixels.
 _LONGEST_PX: Final = 900
-# Sources that the picture names, and letters of a name that leave no room for three abreast.
+# Maximum number of sources in the legend, which has two columns instead of three if a name has at
+# least this many characters; weight of the source colours over the grey image.
 _NAMED_MOST: Final = 24
 _LONG_NAME: Final = 16
 _TINT: Final = 0.45
-# Share of empty cells of a wall, and share of a cause in it, before a warning.
+# Empty cells of a wall are reported from this share on, as are contradicted cells and causes.
 _EMPTY_WORTH_WORDS: Final = 0.1
 _CONTRADICTED_WORTH_WORDS: Final = 0.002
 _CAUSE_LEAST: Final = 0.01
@@ -72,24 +73,24 @@ _CAUSE_LEAST: Final = 0.01
 CONTRADICTED: Final = DiagnosticSpec(
     code="photo-against-scan",
     severity="warning",
-    text="{subject}: {share:.1%} of its cells are shown by one photo alone, and the scan has "
-    "another colour there: a passer-by may be painted",
-    remedy="take a second photo of it, or give the input seams",
+    text="{subject}: {share:.1%} of its cells are shown by a single photo that contradicts the "
+    "colour of the scan: the orthoimage may show a passer-by",
+    remedy="take a second photo of this area, or use the input seams",
     rank_by="share",
 )
 PLAIN: Final = DiagnosticSpec(
     code="orthoimage-of-one-tone",
     severity="warning",
-    text="{subject}: {share:.0%} of its orthoimage is {tone}: as are its sources there ({sources})",
-    remedy="look at these photos, or at the colours of the scan",
+    text="{subject}: {share:.0%} of its orthoimage is {tone}, as are its sources ({sources})",
+    remedy="check these photos, or the colours of the scan",
     rank_by="share",
 )
 UNCHECKED: Final = DiagnosticSpec(
     code="accuracy-not-checked",
     severity="note",
-    text="{subject}: the accuracy of its orthoimage is not checked: no tie of a photo lies on it",
-    remedy="measure points on it in a photo (input ties), or take a photo that shows it beside a "
-    "wall with ties",
+    text="{subject}: the accuracy of its orthoimage is unknown, since no photo has a tie on it",
+    remedy="measure points of this wall in a photo (input ties), or take a photo that shows it "
+    "together with a wall that has ties",
 )
 EMPTY_IMAGE: Final = DiagnosticSpec(
     code="orthoimage-empty",
@@ -107,22 +108,24 @@ EMPTY_CELLS: Final = DiagnosticSpec(
 class MosaicSeams(Method):
     """Take each cell from the layer that shows it best; balance photos where they differ.
 
-    A single layer passes through. Of several the one that `seams` prefers paints a cell, the first
-    among equals; a cell that one layer measured is never taken from another's filling. Small
-    patches from one source are assigned to the source around them if that one sees them too.
+    A single layer is used unchanged. If there are several, each cell is taken from the layer that
+    the rule `seams` prefers; of equal layers, the first. Filled cells are used only where no layer
+    has a measured colour. Small patches are assigned to the source around them if that source shows
+    them, too.
 
-    `best-view` decides by incidence, resolution and distance to the photo's border, cell by cell;
-    `voronoi` puts seams into the middle of overlaps, `graph-cut` where photos look similar and,
-    with the walls wired, off their depth edges; `priority` uses a given order of photos. The
-    displacements between photos in overlaps, and the colour steps along the seams, are reported.
+    `best-view` decides cell by cell, by angle of incidence, resolution and distance from the border
+    of the photo; `voronoi` puts seams in the middle of overlaps; `graph-cut` puts them where photos
+    look similar and, if the walls are connected, away from depth edges; `priority` uses a given
+    order of photos. Displacements between overlapping photos and colour differences along seams are
+    reported.
 
-    If photos contradict each other over a region, a photo that others and the scan's colours
-    confirm paints it (`robust`): people who pass by in one photo are left out.
+    If photos contradict each other over a region, the photo confirmed by other photos and by the
+    colours of the scan is used (`robust`), so that people who pass by in one photo disappear.
 
-    Colours are balanced unless `gains: none`: an exposure per photo, the vignetting of its lens
-    (with the cameras wired), a smooth field per photo, and the remaining differences near seams.
-    All of this is smooth over cells; detail comes from one photo everywhere, so that nothing is
-    mixed. Photos that agree within 2 % are unchanged.
+    Colours are balanced unless `gains` is none: by an exposure per photo, the vignetting of its
+    lens (if the cameras are connected), a smooth field per photo, and a blend of the remaining
+    differences near seams. These corrections are smooth, and each cell is taken from one photo
+    only, so photos are never mixed. Photos that agree within 2 % are unchanged.
     """
 
     id: ClassVar[str] = "mosaic.seams"
@@ -140,7 +143,7 @@ class MosaicSeams(Method):
         MetricSpec("gain_max", label="largest gain of a photo"),
         MetricSpec("lens_loss_share", label="vignetting, largest"),
         MetricSpec("seam_share", label="cells along seams"),
-        MetricSpec("seam_on_depth_edge_share", label="seams that lie on depth edges"),
+        MetricSpec("seam_on_depth_edge_share", label="seams on depth edges"),
         MetricSpec(
             "seam_step_rms_grey", label="brightness difference at seams, RMS", better="lower"
         ),
@@ -160,10 +163,8 @@ class MosaicSeams(Method):
             better="lower",
         ),
         MetricSpec("outvoted_share", label="cells whose colour contradicts the other photos"),
-        MetricSpec(
-            "contradicted_share", label="cells of one photo alone that the scan contradicts"
-        ),
-        # Of all checked walls together.
+        MetricSpec("contradicted_share", label="cells of a single photo that contradict the scan"),
+        # Metrics of all walls with an accuracy.
         MetricSpec(
             "expected_mm_median",
             label="expected error of a point measured in the orthoimages, median",
@@ -181,7 +182,7 @@ class MosaicSeams(Method):
     Params = SeamsParams
 
     class In(Ports):
-        """Layers of all walls; walls for depth edges, cameras for lenses, seams from a person."""
+        """The layers; optionally walls, cameras (for lenses) and hand-drawn seams."""
 
         layers: Layers
         walls: Walls | None = None
@@ -197,9 +198,7 @@ class MosaicSeams(Method):
         """Join wall by wall."""
         layers = sorted(inputs.layers.layers, key=lambda layer: layer.wall)
         if not layers:
-            raise MethodError(
-                "there is no layer to make an orthoimage from, at least one is needed"
-            )
+            raise MethodError("no layer to make an orthoimage from: at least one is needed")
         require_sources(layers, params.priority)
         polygons = read_seams(inputs.seams, {layer.source for layer in layers})
         verdicts: list[_Joined] = []
@@ -232,17 +231,17 @@ class MosaicSeams(Method):
 
 @dataclass(frozen=True, kw_only=True)
 class _Joined:
-    """One wall, and how well its sources agree.
+    """The orthoimage of one wall, and how well its sources agree.
 
     Attributes:
         image: the orthoimage.
-        shifts_cells: (n, 2) displacements between the two best photos of places.
+        shifts_cells: (n, 2) displacements between the two best photos at sampled positions.
         steps: differences in luminance and in colour along seams.
-        n_seam: cells of seams.
-        n_edge_seam: cells of seams at depth edges, None if the surface is unknown.
-        untouched: `steps` of the unbalanced photos.
-        balance: the colour balance, None if colours are unchanged.
-        n_outvoted: cells that another photo showed differently from the one that paints them.
+        n_seam: number of cells on seams.
+        n_edge_seam: number of these on depth edges; None if the surface is unknown.
+        untouched: `steps` before colour balancing.
+        balance: the colour balance; None if colours are unchanged.
+        n_outvoted: number of cells where another photo disagreed with the one used.
     """
 
     image: Orthoimage
@@ -272,12 +271,12 @@ def _join(
     """Join the layers of one wall.
 
     Args:
-        inputs: of the step.
-        group: the layers.
-        params: how.
-        polygons: areas that a person assigns to photos, of all walls.
-        ctx: of the step.
-        allocate: returns the arrays of the orthoimage, by name.
+        inputs: inputs of the step.
+        group: layers of the wall.
+        params: parameters of the step.
+        polygons: hand-drawn areas of all walls.
+        ctx: context of the step.
+        allocate: allocates the arrays of the orthoimage by name.
     """
     frame, index = group[0].frame, group[0].wall
     name, number = inputs.layers.name(index), inputs.layers.number(index)
@@ -285,12 +284,12 @@ def _join(
     wall = walls[index] if index < len(walls) else None
     cameras = {} if inputs.cameras is None else _oriented(inputs.cameras)
     require_one_raster(group, name)
-    # A layer that paints nothing is no source, but states what is hidden.
+    # A layer without painted cells is no source, but it shows which cells are hidden.
     painters = [layer for layer in group if holds_cells(layer.mask, LayerMask.PAINTED)]
     others = [layer for layer in group if all(layer is not painter for painter in painters)]
     n_outvoted, contradicted = 0, None
     if params.robust and painters:
-        # Before colours are balanced: passers-by are useless for light.
+        # Remove passers-by before colours are balanced.
         painters, n_outvoted, contradicted = consensus(painters, wall, allocate=allocate)
     sources = [layer.source for layer in painters]
     balance = None
@@ -321,7 +320,7 @@ def _join(
         overlaps = overlaps_of(group, of_all_pairs=True)
         error_m = expected_errors_m(wall, source, sources, cameras, overlaps, allocate=allocate)
     elif wall is not None and cameras:
-        # Without ties on the wall nothing is known of it.
+        # Without ties on the wall, its accuracy is unknown.
         error_m = np.asarray(allocate("error_m", frame.shape, np.float32), np.float32)
         error_m[...] = np.nan
         ctx.report(UNCHECKED, subject=name)
@@ -369,11 +368,11 @@ def _show(ctx: StepContext, image: Orthoimage, cameras: Cameras | None) -> None:
 
 
 def _report_empty(ctx: StepContext, image: Orthoimage, cameras: Cameras | None) -> None:
-    """Report why cells are empty, if photos are missing."""
+    """Report the causes of empty cells, unless they only lack a surface."""
     words = {
-        OrthoMask.NONE: f"lie in no oriented photo ({_way_to_a_photo(cameras)})",
-        OrthoMask.OCCLUDED: "are hidden in every photo that looks there, or seen too "
-        "obliquely (take one from another side)",
+        OrthoMask.NONE: f"are in no oriented photo ({_way_to_a_photo(cameras)})",
+        OrthoMask.OCCLUDED: "are hidden in all photos, or seen too obliquely (take a "
+        "photo from another side)",
         OrthoMask.NO_SURFACE: "have no surface (see the step that rastered the wall)",
     }
     shares = {state: count_cells(image.mask, state) / image.mask.size for state in words}
@@ -387,19 +386,19 @@ def _report_empty(ctx: StepContext, image: Orthoimage, cameras: Cameras | None) 
 
 
 def _way_to_a_photo(cameras: Cameras | None) -> str:
-    """Report what would fill cells of no oriented photo; a refused one may show them."""
+    """Return a hint how to fill cells in no oriented photo; refused photos may show them."""
     if cameras is None:
-        return "see which are refused, or take one there"
+        return "check which photos are refused, or take another one"
     n_photos = len(cameras.cameras)
     n_refused = n_photos - len(_oriented(cameras))
-    return f"{n_refused} of {n_photos} photos are not oriented" if n_refused else "take one there"
+    return f"{n_refused} of {n_photos} photos are not oriented" if n_refused else "take another one"
 
 
 @in_column_style()
 def _source_map(image: Orthoimage) -> bytes:
-    """Return a picture of an orthoimage tinted by source, seams in white, empty cells in black.
+    """Draw an orthoimage tinted by source, with white seams and black empty cells.
 
-    After markiewicz2015, Figure 24.
+    This is Figure 24 of markiewicz2015.
     """
     from matplotlib.patches import Patch
 
@@ -410,7 +409,7 @@ def _source_map(image: Orthoimage) -> bytes:
     grey = eight_bits(image.rgb[::step, ::step]).mean(axis=2, keepdims=True)
     picture = np.where(source[..., None] >= 0, _TINT * tint + (1.0 - _TINT) * grey, 0.0)
     picture[is_seam(source)] = 255.0
-    # Of photos that paint anything, those with most cells.
+    # List the photos with the most cells.
     counts = np.bincount(source[source >= 0], minlength=len(image.sources))
     named = sorted(np.argsort(-counts, kind="stable")[:_NAMED_MOST].tolist())
     handles = [Patch(color=colours[k], label=image.sources[k]) for k in named if counts[k]]
@@ -427,8 +426,9 @@ def _caption(image: Orthoimage) -> str:
     n_more = max(0, len(image.sources) - _NAMED_MOST)
     more = f", of which {n_more} with few cells are not named" if n_more else ""
     return (
-        f"{image.name}, coloured by source{more}; seams in white. Large even areas are good; "
-        "crumbs of many colours are places that no photo shows well, where edges may be doubled."
+        f"{image.name}, coloured by source{more}; seams in white. Large uniform areas are good; "
+        "small patches of many colours mark areas that no photo shows well, where edges may appear "
+        "twice."
     )
 
 
@@ -449,7 +449,7 @@ def _report(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:
     shifts_cells = np.concatenate([item.shifts_cells for item in verdicts])
     ctx.metric("n_overlap_patches", len(shifts_cells), "1")
     if len(shifts_cells):
-        # Millimetres allow comparison of runs with different cell sizes.
+        # Millimetres allow runs with different cell sizes to be compared.
         shifts_mm = np.concatenate(
             [1e3 * item.image.frame.gsd_m * item.shifts_cells for item in verdicts]
         )

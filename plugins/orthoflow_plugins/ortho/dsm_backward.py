@@ -1,4 +1,4 @@
-"""`ortho.dsm-backward`: every cell of a wall takes its colour from the photos that see it."""
+"""`ortho.dsm-backward`: project every cell of a wall into the photos to find its colour."""
 
 from __future__ import annotations
 
@@ -25,21 +25,23 @@ if TYPE_CHECKING:
 VISIBILITY_OFF: Final = DiagnosticSpec(
     code="visibility-not-tested",
     severity="warning",
-    text="visibility none: cells that a photo cannot see are painted as well",
+    text="visibility none: cells hidden from a photo are painted from it as well",
 )
 
 
 class DsmBackward(Method):
-    """Project each cell of a wall into the photos and take the colour there.
+    """Project each cell of a wall into the photos and take the colour from there.
 
-    A cell with a depth is a point in the world; the photo's camera with distortion gives its
-    position in the photo. It is painted unless something hides it: the wall's own relief (the ray
-    to the camera is followed over the raster), or points of the cloud in front of the slab of the
-    raster (a depth buffer in the photo; single points are taken for outliers). Where the photo is
-    finer than the wall, colours are averaged over the cell.
+    The depth of a cell gives its point in the world, and the camera with its distortion gives the
+    position of that point in the photo. The cell is painted unless it is hidden by the relief of
+    the wall (the ray to the camera is traced over the raster) or by points of the cloud in front of
+    the depth range of the wall (a depth buffer in the photo; isolated points are treated as
+    outliers). If the photo has a higher resolution than the wall, colours are averaged over the
+    cell.
 
-    The quality of a cell is the number of photo pixels that it covers: the cosine of incidence
-    times the square of cell size over photo GSD, decreasing to 0 at the border of the photo.
+    The quality of a cell is the number of photo pixels that it covers: the cosine of the angle of
+    incidence times the squared ratio of cell size to photo GSD, decreasing to 0 at the border of
+    the photo.
     """
 
     id: ClassVar[str] = "ortho.dsm-backward"
@@ -47,8 +49,8 @@ class DsmBackward(Method):
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_layers", label="photos projected onto walls"),
         MetricSpec("painted_share", label="cells painted"),
-        MetricSpec("occluded_share", label="cells hidden from the photo"),
-        MetricSpec("photo_gsd_mm", label="size of a photo's pixel on the wall"),
+        MetricSpec("occluded_share", label="cells hidden from the photos"),
+        MetricSpec("photo_gsd_mm", label="photo pixel size on the wall"),
         MetricSpec("obliquity_deg", label="obliquity of the views"),
         MetricSpec("occluders_s", label="time of the occlusion test", better="lower"),
         MetricSpec("decoding_s", label="time of decoding photos", better="lower"),
@@ -65,7 +67,7 @@ class DsmBackward(Method):
     def run(
         self, inputs: PhotosOnWalls, params: BackwardParams, ctx: StepContext
     ) -> LayersOfPhotos:
-        """Project the photos onto all walls, and sort their layers."""
+        """Project the photos onto all walls."""
         from orthoflow_plugins.ortho.painting import CellFootprint, paint
         from orthoflow_plugins.ortho.surfaces import is_before, view_of
 
@@ -119,7 +121,7 @@ class DsmBackward(Method):
 
 
 def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.int64]) -> float:
-    """Return the value below which half of the weight lies."""
+    """Return the weighted median."""
     order = np.argsort(values, kind="stable")
     totals = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(totals, totals[-1] / 2.0)])

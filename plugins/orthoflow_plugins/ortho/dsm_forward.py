@@ -1,4 +1,4 @@
-"""`ortho.dsm-forward`: every pixel of a photo is projected onto the wall that it shows."""
+"""`ortho.dsm-forward`: project every pixel of a photo onto the wall that it shows."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ if TYPE_CHECKING:
     from orthoflow.geometry.cameras import ViewingCamera
     from orthoflow_plugins.ortho.surfaces import Surface
 
-# Larger layers are coloured in bands of this many cells: about 600 MB.
+# Larger layers are coloured in bands of this many cells; a band needs about 600 MB.
 _BAND_CELLS: Final = 1 << 23
 
 
 class DsmForward(Method):
-    """Follow the ray of each pixel to its first intersection with the surface, and paint that cell.
+    """Trace the ray of each pixel to its first intersection with the surface, and paint that cell.
 
-    Of the pixels that hit the same cell, the one closest to its centre is used unchanged: nothing
-    is interpolated. Objects in front of the slab of the raster hide the wall as in
-    `ortho.dsm-backward`. A photo that is coarser than the wall leaves cells between its pixels;
-    narrow gaps take the colour of the nearest painted cell and are marked as filled.
+    If several pixels hit the same cell, the one closest to the cell centre is used unchanged;
+    colours are not interpolated. Objects in front of the depth range of the wall hide it as in
+    `ortho.dsm-backward`. If the photo has a lower resolution than the wall, no pixel hits some of
+    the cells; narrow gaps are filled from the surrounding cells and marked as filled.
     """
 
     id: ClassVar[str] = "ortho.dsm-forward"
@@ -56,21 +56,21 @@ class DsmForward(Method):
     )
 
     class Params(VisibilityParams):
-        """When a pixel is used, and which gaps between pixels are filled."""
+        """Which pixels are used, and which gaps between them are filled."""
 
         fill_gap_cells: int = Field(
             default=1,
             ge=0,
             le=20,
-            description="Cells that no pixel met are filled where no disc of this radius fits into "
-            "the gap; 0 fills nothing.",
+            description="Gaps between pixels are filled if no disc of this radius fits into "
+            "them; 0 fills none.",
         )
 
     In = PhotosOnWalls
     Out = LayersOfPhotos
 
     def run(self, inputs: PhotosOnWalls, params: Params, ctx: StepContext) -> LayersOfPhotos:
-        """Project the photos onto all walls, and sort their layers."""
+        """Project the photos onto all walls."""
 
         def project(photo: OpenedPhoto, surface: Surface, stack: LayerStack, wall: int) -> None:
             layer = _layer(photo, surface, stack, wall, params, threads=ctx.cores)
@@ -134,10 +134,10 @@ def _layer(
         quality=np.asarray(new("quality", shape, np.float32), np.float32),
         filled=filled,
     )
-    # Which cells are in the photo, whatever hides them.
+    # Find the cells inside the photo, ignoring occlusion.
     from_anywhere, empty = view._replace(cosine_least=-1.0), nothing_in_the_way(photo.viewer)
     free = surface.relief._replace(bottoms=np.full_like(surface.relief.bottoms, np.inf))
-    # Whether a gap is narrow depends on cells two discs away, and its colour on those one farther.
+    # A gap is narrow depending on cells up to two discs away; its colour depends on one more.
     reach_rows = 2 * params.fill_gap_cells + 2
     for band in bands_with_reach(shape, cells_most=_BAND_CELLS, reach_rows=reach_rows):
         inner, width = band.inner, surface.frame.width
@@ -145,7 +145,7 @@ def _layer(
         visible = cells_seen(from_anywhere, free, empty, band.rows, slice(0, width))
         seen = visible.mask == LayerMask.PAINTED
         quality = np.maximum(visible.quality, np.float32(0.0))
-        # Twelve bytes per cell, which are not needed beside those of the gaps.
+        # Release 12 bytes per cell before the gaps need memory.
         del visible
         is_painted = pixel != NO_PIXEL
         gaps = narrow_gaps(is_painted, params.fill_gap_cells)
@@ -155,7 +155,7 @@ def _layer(
         rgb = photo.pixels.reshape(-1, 3)[np.maximum(pixel, 0).ravel()].reshape(*pixel.shape, 3)
         rgb[~is_painted] = 0
         nowhere = np.where(is_painted, np.float32(0.0), np.float32(np.nan))
-        # A gap takes the colours painted around it, of whatever surface.
+        # A gap takes the colours around it, from any surface.
         is_filled = painted_between(
             gaps,
             rgb,
@@ -175,13 +175,13 @@ def _layer(
 
 
 def _ray_lattice(viewer: ViewingCamera, surface: Surface) -> NDArray[np.float64]:
-    """Return rays (n, m, 3) of every sixteenth pixel: columns, rows, metres of height per metre."""
+    """Return rays (n, m, 3) of every 16th pixel as (columns, rows, metres along the normal)."""
     from orthoflow_plugins.ortho.forward_kernels import RAY_STEP_PX
 
     frame = surface.frame
     counts = (viewer.height // RAY_STEP_PX + 2, viewer.width // RAY_STEP_PX + 2)
     rows, columns = np.indices(counts) * float(RAY_STEP_PX)
-    # The last row and column are outside the image, where a lens model may fold back.
+    # The last row and column would be outside the image, where a lens model may fold back.
     places = np.column_stack(
         [np.minimum(columns.ravel(), viewer.width), np.minimum(rows.ravel(), viewer.height)]
     )
@@ -189,7 +189,7 @@ def _ray_lattice(viewer: ViewingCamera, surface: Surface) -> NDArray[np.float64]
         [frame.u_world / frame.gsd_m, frame.v_world / frame.gsd_m, frame.normal_world]
     )
     rays = (viewer.rays_camera(places) @ viewer.rotation @ axes).reshape(*counts, 3)
-    # The rays at the image's border are extrapolated to the last position of the lattice.
+    # Extrapolate the rays at the image border to the last row and column of the lattice.
     for lines, size_px in ((rays, viewer.height), (rays.transpose(1, 0, 2), viewer.width)):
         border = size_px / RAY_STEP_PX
         whole = math.ceil(border)

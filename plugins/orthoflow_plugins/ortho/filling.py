@@ -1,6 +1,6 @@
-"""Gaps between painted cells: which may be filled, their colours, and a picture of them.
+"""Gaps between painted cells: which to fill, their colours, and a figure of the result.
 
-After skarlatos2012, section 3; the picture is the pair of its Figure 5.
+The rule and the figure follow skarlatos2012 (section 3, Figure 5).
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 
 _WINDOWS: Final = (3, 5, 7)
-# Radius around a gap within which the positions of points in painted cells are needed.
+# Painted cells within this distance of a gap need the position of their point.
 _BESIDE_CELLS: Final = 2
-# OpenCV's fronts continue through successive gaps; more distant influence is below 8 bits.
+# OpenCV propagates colours through successive gaps; beyond this, the effect is below 8 bits.
 _FRONT_CELLS: Final = 64
-# The picture: side of the part that is shown, its magnification, and the colour of void cells.
+# The figure: side of the area shown, its magnification, its gutter, and the colour of voids.
 _SIDE_CELLS: Final = 240
 _ZOOM: Final = 3
 _GUTTER_PX: Final = 12
@@ -32,7 +32,7 @@ _VOID_RGB: Final = (255, 0, 255)
 
 
 def reach_rows(inpainting: Inpainting, radius_px: float) -> int:
-    """Return how many rows away a cell may influence how a gap is filled."""
+    """Return the distance in rows up to which a cell may influence how a gap is filled."""
     if inpainting == "none":
         return 0
     reach = max(_WINDOWS) // 2 + math.ceil(radius_px) + 1 + _BESIDE_CELLS
@@ -42,14 +42,14 @@ def reach_rows(inpainting: Inpainting, radius_px: float) -> int:
 def fillable_gaps(is_void: NDArray[np.bool_], limits: tuple[int, int, int]) -> NDArray[np.bool_]:
     """Return void cells with few void cells around them.
 
-    The void cells in the 3 x 3, 5 x 5 and 7 x 7 windows around a void cell are counted, the cell
-    itself included; all three counts must be within their limit. Cells outside the image count as
-    void, because nothing is known there; so the border of an image is filled less readily than its
-    interior and never extrapolated. The rule is applied once.
+    The void cells in the 3 x 3, 5 x 5 and 7 x 7 windows around a void cell are counted, including
+    the cell itself; all three counts must be within their limits. Cells outside the image count as
+    void, so fewer cells are filled along its border and the image is never extrapolated. The rule
+    is applied once.
 
     Args:
         is_void: (rows, cols).
-        limits: largest counts in the three windows.
+        limits: maximum counts in the three windows.
 
     Returns:
         (rows, cols).
@@ -61,7 +61,7 @@ def fillable_gaps(is_void: NDArray[np.bool_], limits: tuple[int, int, int]) -> N
 
 
 def void_counts(is_void: NDArray[np.bool_], window: int) -> NDArray[np.uint8]:
-    """Count void cells (rows, cols) in the window around each cell; outside counts as void."""
+    """Count void cells (rows, cols) in a window around each cell; cells outside count as void."""
     import cv2
 
     reach = window // 2
@@ -85,9 +85,9 @@ def inpainted(
     Args:
         rgb: (rows, cols, 3); values of void cells have no influence.
         is_void: (rows, cols) cells without a colour.
-        is_fillable: (rows, cols) the void cells to paint.
+        is_fillable: (rows, cols) void cells to fill.
         method: method of `cv2.inpaint`.
-        radius_px: neighbourhood from which a cell takes its colour.
+        radius_px: radius from which a cell takes its colour.
 
     Returns:
         (rows, cols, 3) colours, 0 in void cells that are not filled.
@@ -98,8 +98,7 @@ def inpainted(
     if is_void.all() or not is_fillable.any():
         return painted
     # cv2.inpaint treats every cell outside its mask as known, so the black of large voids would
-    # bleed into the gaps next to them. Void cells have the colour of their nearest painted cell
-    # while it runs.
+    # bleed into adjacent gaps. Give all void cells the colour of the nearest painted cell first.
     _, labels = cv2.distanceTransformWithLabels(
         is_void.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
@@ -122,18 +121,18 @@ def painted_between(
     reach_cells: float,
     threads: int,
 ) -> NDArray[np.bool_]:
-    """Paint gaps in place by interpolation between the painted cells around them.
+    """Fill gaps in place by interpolation between the painted cells around them.
 
     Args:
-        gaps: (n,) flat indices of cells that are not painted.
-        rgb: (rows, cols, 3) colours of 8 or 16 bits, written in the gaps.
+        gaps: (n,) flat indices of the cells to fill.
+        rgb: (rows, cols, 3) 8-bit or 16-bit colours; the gaps are overwritten.
         around: the painted cells.
-        depth_m: (cells,) of the surface; NaN if unknown.
+        depth_m: (cells,) depth of the surface; NaN if unknown.
         reach_cells: gaps without a painted cell within this distance are unchanged.
         threads: number of threads.
 
     Returns:
-        (rows, cols) which gaps were painted.
+        (rows, cols) gaps that were filled.
     """
     from orthoflow.geometry.interpolation import cell_values, interpolate
 
@@ -146,14 +145,14 @@ def painted_between(
 
 
 def filling_preview(layer: Layer) -> bytes:
-    """Return a PNG of the part of a layer with most filling: left before, right after, enlarged."""
+    """Return an enlarged PNG of the part with most filled cells, before and after filling."""
     import cv2
 
     filled = np.zeros((1, 1), dtype=np.uint8) if layer.filled is None else layer.filled
     part = _busiest_part(np.broadcast_to(filled, layer.mask.shape))
     is_shown, after = layer.mask[part] == LayerMask.PAINTED, eight_bits(layer.rgb[part]).copy()
     after[~is_shown] = _VOID_RGB
-    # Filled cells were void before; all others are unchanged.
+    # Before filling, only the filled cells were void.
     before = after.copy()
     if layer.filled is not None:
         before[layer.filled[part] > 0] = _VOID_RGB
@@ -164,7 +163,7 @@ def filling_preview(layer: Layer) -> bytes:
 
 
 def _busiest_part(filled: NDArray[np.uint8]) -> tuple[slice, slice]:
-    """Return the tile of `_SIDE_CELLS` with the most filled cells; the first among equals."""
+    """Return the tile with the most filled cells; of several, the first."""
     rows, columns = filled.shape
     tiles = [
         (slice(row, row + _SIDE_CELLS), slice(column, column + _SIDE_CELLS))

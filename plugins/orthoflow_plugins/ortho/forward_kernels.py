@@ -1,4 +1,4 @@
-"""Compiled pass that projects the pixels of a photo onto the surface of a wall."""
+"""Compiled function that projects the pixels of a photo onto the surface of a wall."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from orthoflow.geometry.compiling import compiled
 from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 from orthoflow_plugins.ortho.visibility_kernels import Relief, WallView
 
-# Pixels between two exact rays, which are interpolated. With lenses of a thousand pixels focal
-# length or more the error is below a hundredth of a pixel.
+# Rays are exact at every nth pixel and interpolated in between. With focal lengths of 1000 pixels
+# or more, the error is below a hundredth of a pixel.
 RAY_STEP_PX: Final = 16
 NO_PIXEL: Final = -1
 _NEAREST_M: Final = 0.05
 
 
 class Catch(NamedTuple):
-    """The pixel that each cell of a wall took.
+    """The pixel chosen for each cell of a wall.
 
     Attributes:
-        pixel: (rows, cols) int32 index row * width + column in the photo, `NO_PIXEL` for none.
-        square: (rows, cols) float32 squared distance to the centre of the cell, in cells.
+        pixel: (rows, cols) int32 index row * width + column in the photo, or `NO_PIXEL`.
+        square: (rows, cols) float32 squared distance from the cell centre, in cells.
     """
 
     pixel: NDArray[np.int32]
@@ -35,18 +35,18 @@ class Catch(NamedTuple):
 def throw_pixels(
     view: WallView, relief: Relief, buffer: DepthBuffer, rays: NDArray[np.float64], catch: Catch
 ) -> int:
-    """Follow the ray of each pixel to its first intersection, and offer the pixel to that cell.
+    """Trace the ray of each pixel to its first intersection, and offer the pixel to that cell.
 
-    The cell takes the pixel that hits the surface closest to its centre; among equals the first. A
-    ray past the edge of a step hits the side of it, which no cell shows.
+    A cell takes the pixel that hits it closest to its centre; of several, the first. A ray that
+    hits the side of a depth step is ignored, since no cell shows that side.
 
     Args:
         view: the camera in front of the wall.
-        relief: the surface; without a known cell nothing is projected.
+        relief: the surface, with at least one known depth.
         buffer: depth buffer of other objects.
-        rays: (n, m, 3) directions at the pixel positions `RAY_STEP_PX` * (row, column), columns,
-            rows and metres of height per metre along the optical axis.
-        catch: updated.
+        rays: (n, m, 3) directions at the pixel positions `RAY_STEP_PX` * (row, column), as columns,
+            rows and metres along the normal per metre along the optical axis.
+        catch: the chosen pixels, updated.
 
     Returns:
         The number of pixels that hit the surface.
@@ -106,15 +106,15 @@ def throw_pixels(
 def _first_meeting(
     view: WallView, relief: Relief, dc: float, dr: float, dn: float, lowest: float
 ) -> float:
-    """Return the distance along the axis at which a ray hits the surface, -1 without a hit.
+    """Return the distance along the axis at which a ray hits the surface, or -1.
 
-    The ray is followed from cell to cell, each a level patch, from the highest surface down to the
-    lowest. A ray that enters a cell below its surface has hit a side: a small difference is due to
-    noise of the depths or a slope, and the patch counts as hit; a larger one is an edge.
+    The ray is traced from cell to cell, each a flat patch, from the highest surface down to the
+    lowest. A ray that enters a cell below its surface has hit the side of a step: a small height
+    difference is due to noise or a slope, and the cell counts as hit; a larger one is an edge.
     """
     rows, columns = relief.depth.shape
     begin = max(_NEAREST_M, (view.height_m - relief.highest_m) / -dn)
-    # Slightly farther than the lowest cell, to allow for rounding.
+    # Continue slightly beyond the lowest cell, to allow for rounding.
     end = (view.height_m - lowest + view.tolerance_m) / -dn
     t = begin
     u, v = view.column + 0.5 + t * dc, view.row + 0.5 + t * dr
@@ -130,7 +130,7 @@ def _first_meeting(
         if 0 <= column < columns and 0 <= row < rows:
             depth = float(relief.depth[row, column])
             height = view.height_m + t * dn
-            # Void is NaN, and no comparison with it is true.
+            # Void cells are NaN, so the comparison is false.
             if view.height_m + leaves * dn <= depth:
                 if height >= depth:
                     return t + (height - depth) / -dn

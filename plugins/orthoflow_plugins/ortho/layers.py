@@ -1,4 +1,4 @@
-"""The layers of photos on walls: collected during painting, and joined."""
+"""Collects the layers that photos paint on walls."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from orthoflow.sdk import DiagnosticSpec, StepContext
 
 NO_SOURCE: Final = "no photo"
 UNSEEN_WALLS: Final = (
-    "no oriented photo sees a wall: their cameras are behind the walls, look past them, "
-    "or something hides the walls; check cameras.json and planes.json"
+    "no oriented photo sees a wall: the cameras are behind the walls, look past them, or "
+    "something hides the walls; check cameras.json and planes.json"
 )
 NO_PHOTO: Final = DiagnosticSpec(
     code="wall-without-photo",
     severity="error",
-    text="no photo shows {walls}: the orthoimage stays empty",
+    text="no photo shows {walls}: the orthoimage is empty",
     rank_by="n_walls",
 )
 
@@ -30,35 +30,35 @@ class LayerStack:
     """Layers of walls, added photo by photo.
 
     Attributes:
-        painted: layers of photos, in the order of addition.
+        painted: layers of photos, in the order in which they were added.
     """
 
     def __init__(self, walls: Walls, ctx: StepContext) -> None:
         self.painted: list[Layer] = []
         self._walls, self._ctx = walls, ctx
-        # Visibility of walls that no photo has painted so far.
+        # Visibility masks of walls that no photo has painted so far.
         self._reached: dict[int, NDArray[np.uint8]] = {}
 
     def allocator(self, wall: int) -> Allocate:
-        """Return a function that allocates the arrays of the next layer; a large one in files."""
+        """Return a function that allocates the arrays of the next layer, in files."""
         prefix = f"{wall}.{len(self.painted)}"
         return lambda name, shape, dtype: self._new(f"{prefix}.{name}", shape, dtype)
 
     def scratch(self, wall: int) -> Allocate:
-        """Return a function that allocates arrays in files, reused for the next layer of a wall."""
+        """Return a function that allocates temporary arrays, shared by the layers of a wall."""
         return lambda name, shape, dtype: self._new(f"{wall}.scratch.{name}", shape, dtype)
 
     def add(self, layer: Layer) -> None:
-        """Add the layer of a photo that paints something."""
+        """Add the layer of a photo that paints at least one cell."""
         self._reached.pop(layer.wall, None)
         self.painted.append(layer)
 
     def note_reached(self, wall: int, mask: NDArray[np.uint8]) -> None:
-        """Record the visibility of a wall on which a photo paints nothing.
+        """Record the visibility of a wall on which a photo paints no cell.
 
         Args:
-            wall: its index.
-            mask: (rows, cols) `LayerMask`; the next layer's may be in the same file.
+            wall: index of the wall.
+            mask: (rows, cols) `LayerMask`; it is copied, since the next layer may reuse its file.
         """
         if any(layer.wall == wall for layer in self.painted):
             return
@@ -72,10 +72,10 @@ class LayerStack:
         self._reached[wall] = kept
 
     def joined(self, level: Level) -> Layers:
-        """Sort the layers by wall, and add an empty one for each unpainted wall.
+        """Sort the layers by wall, and add an empty layer for each wall without one.
 
         Args:
-            level: bits of the colours.
+            level: numpy type of the colours.
 
         Raises:
             MethodError: no photo paints any wall.
@@ -95,7 +95,7 @@ class LayerStack:
         )
 
     def _bare_layer(self, place: int, level: Level) -> Layer:
-        """Return the layer of a wall that no photo paints, from what parts of photos reach it."""
+        """Return an empty layer of a wall, with the visibility that was recorded."""
         wall = self._walls.walls[place]
         shape, prefix = wall.frame.shape, f"{place}.bare"
         mask = self._reached.get(place)
@@ -118,7 +118,7 @@ class LayerStack:
 
 
 def count_shown(walls: Walls, layers: Layers) -> tuple[int, int, int]:
-    """Count cells of all walls: with a depth, painted by a photo, and hidden without being so."""
+    """Count cells of all walls: with a depth, painted, and hidden but not painted."""
     n_surface = n_painted = n_hidden = 0
     for place, wall in enumerate(walls.walls):
         masks = [layer.mask for layer in layers.layers if layer.wall == place]

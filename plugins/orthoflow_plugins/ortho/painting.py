@@ -1,4 +1,4 @@
-"""One photo projected onto one wall, tile by tile: the cells it sees, and their colours."""
+"""Project a photo onto a wall, tile by tile: find visible cells and sample their colours."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from orthoflow_plugins.ortho.visibility_kernels import (
 Tile = tuple[slice, slice]
 
 TILE_CELLS: Final = 512
-# The part of a photo for a tile stays below 27 MB; cv2.remap takes sides below 32767.
+# The part of a photo that covers a tile stays below 27 MB; cv2.remap needs sides below 32767.
 _CROP_MOST_PX: Final = 3_000
-# Lanczos reaches 4 pixels; it is limited so that a tile's result does not depend on its crop.
+# Margin of that part: Lanczos needs 4 pixels, so the result does not depend on the cropping.
 _REACH_PX: Final = 5
-# A weaker filter changes less than the resolution of 8 or 16 bits.
+# A weaker filter changes colours by less than one level.
 _SIGMA_LEAST_PX: Final = 0.2
 _BASE_CELLS: Final = 4.0
-# Twenty bits resolve views well enough, and compress to half the size.
+# Twenty bits are enough to rank photos by quality, and compress to half the size.
 _QUALITY_BITS: Final = np.uint32(0xFFFFF000)
 
 
@@ -46,11 +46,11 @@ class CellFootprint:
     """How a photo sees the middle of a tile.
 
     Attributes:
-        pixels_across: photo pixels (u) that one cell covers.
-        pixels_down: photo pixels (v) that one cell covers.
-        photo_gsd_m: size of a photo pixel, perpendicular to the ray.
-        obliquity_deg: angle between the ray and the wall's normal.
-        n_cells: painted cells.
+        pixels_across: length of a cell along u in photo pixels.
+        pixels_down: length of a cell along v in photo pixels.
+        photo_gsd_m: size of a photo pixel perpendicular to the ray.
+        obliquity_deg: angle between the ray and the normal of the wall.
+        n_cells: number of painted cells.
     """
 
     pixels_across: float
@@ -66,9 +66,9 @@ class Painting:
 
     Attributes:
         mask: (rows, cols) uint8 `LayerMask`.
-        rgb: (rows, cols, 3) in the photo's bits, None when nothing was painted.
-        quality: (rows, cols) float32, None when nothing was painted.
-        footprints: of the painted tiles, by their first cell.
+        rgb: (rows, cols, 3) in the bit depth of the photo; None if no cell is painted.
+        quality: (rows, cols) float32; None if no cell is painted.
+        footprints: footprint of each painted tile, by its first row and column.
     """
 
     mask: NDArray[np.uint8]
@@ -90,21 +90,21 @@ def paint(
     """Project a photo onto a wall.
 
     Args:
-        photo: (height, width, 3), 8 or 16 bits, which the result has, too.
-        view: its camera in front of the wall.
+        photo: (height, width, 3), 8 or 16 bits; the result has the same bit depth.
+        view: camera of the photo in the axes of the wall.
         surface: the wall.
-        buffer: depth buffer of other objects.
+        buffer: depth buffer of objects in front of the wall.
         params: which cells are painted, and how colours are sampled.
-        allocate: returns the arrays of a layer, zeroed: the mask, and the others once something is
+        allocate: allocates zeroed arrays of the layer; colours and quality only if a cell is
             painted.
-        threads: number of tiles painted at once; it does not change the result.
+        threads: number of tiles processed at once; it does not change the result.
     """
     import cv2
 
     shape, lock = surface.frame.shape, Lock()
     painting = Painting(mask=np.asarray(allocate("mask", shape, np.uint8), np.uint8))
     erosion_cells = params.erosion_cells if params.visibility == "full" else 0
-    # What is a patch shows one cell farther out.
+    # Patches of 2 x 2 hidden cells need one more cell.
     margin = erosion_cells + 1 if erosion_cells else 0
 
     def paint_tile(tile: Tile) -> None:
@@ -165,7 +165,7 @@ def paint(
 def _visible(
     view: WallView, surface: Surface, buffer: DepthBuffer, tile: Tile, margin: int
 ) -> tuple[TileVisibility, Tile]:
-    """Determine the visibility of a tile with its margin; return the tile's position in it."""
+    """Return the visibility of a tile with its margin, and the position of the tile in it."""
     rows, columns = (
         slice(max(0, part.start - margin), min(size, part.stop + margin))
         for part, size in zip(tile, surface.frame.shape, strict=True)
@@ -179,14 +179,14 @@ def _visible(
 
 
 def near_patches(is_hidden: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
-    """Return cells within a reach of hidden patches of 2 x 2 cells or more.
+    """Return cells near hidden patches of at least 2 x 2 cells.
 
-    A single hidden cell has a wrong depth of its own; its neighbours are unaffected.
+    A single hidden cell usually has a wrong depth, which does not affect its neighbours.
     """
     import cv2
 
     lowest = cv2.erode(is_hidden.view(np.uint8), np.ones((2, 2), dtype=np.uint8), anchor=(0, 0))
-    # The patches from their upper left cells, and their surroundings, in one dilation.
+    # One dilation restores the patches from their upper left cells and adds the margin.
     window = np.ones((2 * reach + 2,) * 2, dtype=np.uint8)
     return np.asarray(cv2.dilate(lowest, window, anchor=(reach + 1,) * 2) > 0, dtype=np.bool_)
 
@@ -210,14 +210,14 @@ def footprint_of(
     tile: Tile,
     inner: Tile,
 ) -> CellFootprint:
-    """Measure the middle of the painted cells of a tile that has some.
+    """Measure the footprint at the middle of the painted cells of a tile.
 
     Args:
-        view: the camera in front of the wall.
+        view: the camera in the axes of the wall.
         surface: the wall.
-        is_painted: (rows, cols) cells of the tile with its margin, some of them true.
-        tile: its rows and columns on the wall.
-        inner: the same within `is_painted`.
+        is_painted: (rows, cols) painted cells of the tile with its margin, at least one.
+        tile: rows and columns of the tile on the wall.
+        inner: rows and columns of the tile within `is_painted`.
     """
     import cv2
 
@@ -241,7 +241,7 @@ def footprint_of(
     )
     aside = view.gsd_m * math.hypot(view.column - column, view.row - row)
     return CellFootprint(
-        # NaN beyond the lens model, where a neighbour of a painted cell may be.
+        # A neighbour of a painted cell may be beyond the lens model, which gives NaN.
         pixels_across=across if math.isfinite(across) else 1.0,
         pixels_down=down if math.isfinite(down) else 1.0,
         photo_gsd_m=centre[2] / math.sqrt(view.camera[12] * view.camera[13]),
@@ -260,16 +260,16 @@ def sample(
     *,
     into: Colours,
 ) -> None:
-    """Set the colours of cells; those that are not painted are black.
+    """Sample the colours of a tile; cells that are not painted become black.
 
     Args:
         photo: (height, width, 3), 8 or 16 bits.
-        visible: cells of a tile and around it, with finite positions.
-        inner: rows and columns of the tile in it.
-        bounds: first and last column, first and last row of the pixels of painted cells.
-        footprint: number of pixels that a cell covers.
+        visible: the tile with its margin, with finite positions.
+        inner: rows and columns of the tile in `visible`.
+        bounds: first and last column, first and last row of the pixels needed.
+        footprint: size of a cell in pixels.
         params: how colours are interpolated and averaged.
-        into: (rows, cols, 3) overwritten.
+        into: (rows, cols, 3), overwritten.
     """
     import cv2
 
@@ -297,11 +297,11 @@ def sample(
         sample_bilinear(crop, (first_column, first_row), visible, inner, into)
         return
     if is_nearest:
-        # Whole positions: the pixel that contains a cell's, so that OpenCV rounds nothing.
+        # Use the pixel that contains the position, so that OpenCV has nothing to round.
         u, v = (np.floor(places[inner]) for places in (visible.u, visible.v))
         u, v = u - np.float32(first_column), v - np.float32(first_row)
     else:
-        # From the centre of the first pixel.
+        # OpenCV counts from the centre of the first pixel.
         u = visible.u[inner] - np.float32(first_column + 0.5)
         v = visible.v[inner] - np.float32(first_row + 0.5)
     flags = {
@@ -320,20 +320,21 @@ def sample_bilinear(
     inner: Tile,
     colours: Colours,
 ) -> None:
-    """Set colours at positions of a photo, whose border is extended; others than painted are black.
+    """Sample colours bilinearly; cells that are not painted become black.
 
-    `cv2.remap` knows positions to a 32nd of a pixel only, and takes twice as long.
+    The border of the photo is replicated. `cv2.remap` would round positions to 1/32 pixel and take
+    twice as long.
 
     Args:
-        photo: (height, width, 3), a part of the whole.
-        corner: column and row of its first pixel.
-        visible: cells of a tile and around it, with positions in the whole photo.
-        inner: rows and columns of the tile in it.
+        photo: (height, width, 3), a part of the photo.
+        corner: column and row of its first pixel in the whole photo.
+        visible: the tile with its margin, with positions in the whole photo.
+        inner: rows and columns of the tile in `visible`.
         colours: (rows, cols, 3) of the tile, overwritten.
     """
     import cv2
 
-    # A pixel is one number, and has neighbours to the right and below.
+    # The kernel reads each pixel as one number and needs at least 2 x 2 pixels.
     if min(photo.shape[:2]) < 2:
         photo = cv2.copyMakeBorder(photo, 0, 1, 0, 1, cv2.BORDER_REPLICATE)  # type: ignore[assignment]
     four = np.asarray(cv2.cvtColor(photo, cv2.COLOR_RGB2RGBA), dtype=photo.dtype)
@@ -353,17 +354,17 @@ def _mix_pixels(
     first: tuple[int, int],
     mixed: NDArray[np.uint32 | np.uint64],
 ) -> None:
-    """Interpolate between pixels of four channels in one number; the fourth is left out.
+    """Interpolate between pixels that hold four channels in one number; ignore the fourth.
 
-    Each loop has no branches and writes one array only, so that compilers take many cells at once,
-    but for those that fetch pixels.
+    Each loop has no branches and writes to one array only, so that the compiler can vectorise it,
+    except for the loops that fetch pixels.
 
     Args:
-        pixels: (rows, cols) of a photo, at least two of each.
-        centre: of the first pixel, column and row in the photo.
-        visible: positions of cells.
-        first: row and column in it of the first cell.
-        mixed: (rows, cols) of the cells, overwritten.
+        pixels: (rows, cols), at least 2 x 2.
+        centre: column and row of the centre of the first pixel.
+        visible: positions of the cells.
+        first: row and column of the first cell in `visible`.
+        mixed: (rows, cols) colours of the cells, overwritten.
     """
     f, word, n_columns = np.float32, pixels.dtype.type, mixed.shape[1]
     bits = word(2 * pixels.itemsize)

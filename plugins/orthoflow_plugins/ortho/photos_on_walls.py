@@ -1,4 +1,4 @@
-"""Common parts of methods that project photos: ports, visibility, photos with cameras."""
+"""Common parts of the methods that project photos: ports, visibility, photos with cameras."""
 
 from __future__ import annotations
 
@@ -26,43 +26,43 @@ if TYPE_CHECKING:
     from orthoflow_plugins.ortho.surfaces import Surface
 
 _PLAIN_BITS: Final = 8
-# Cosine between a photo's top and up, beyond which it was held upright, or upside down.
+# A photo is upright, or upside down, if the cosine between its top and the vertical exceeds this.
 _UPRIGHT: Final = 0.5
 NO_CLOUD: Final = DiagnosticSpec(
     code="occluders-unknown",
     severity="warning",
-    text="no cloud is wired to {step}: objects in front of a wall hide "
-    "nothing, and photos paint them onto it",
-    remedy="wire the cloud to {step}",
+    text="no cloud is connected to {step}: objects in front of a wall are not recognised and "
+    "appear on it",
+    remedy="connect the cloud to {step}",
 )
 UPSIDE_DOWN: Final = DiagnosticSpec(
     code="photos-upside-down",
     severity="warning",
-    text="{n_down} of {n_photos} photos are upside down: if the scan's vertical axis points down, "
-    "so do walls, orthoimages and the names of floor and ceiling",
-    remedy="set up of read.scan to {opposite}",
+    text="{n_down} of {n_photos} photos are upside down: if the vertical axis of the scan points "
+    "down, walls and orthoimages are upside down and floor and ceiling are swapped",
+    remedy="set `up` of read.scan to {opposite}",
 )
 MIXED_BITS: Final = DiagnosticSpec(
     code="photos-of-mixed-depth",
     severity="warning",
     text="{n} of {n_photos} photos ({names}) have 8 bits per channel, the others 16: the "
-    "orthoimages have 16, levels of 8 bits are multiplied by 257",
+    "orthoimages have 16 bits, and 8-bit levels are multiplied by 257",
     rank_by="n",
 )
 MIXED_PROFILES: Final = DiagnosticSpec(
     code="photos-of-mixed-profiles",
     severity="warning",
-    text="the photos have {n} different colour profiles, or some have none: the orthoimages get "
-    "none, and colours may change abruptly where photos meet",
-    remedy="export all photos with one colour profile",
+    text="the photos have {n} different colour profiles, or some have none: the orthoimages have "
+    "no profile, and colours may change abruptly between photos",
+    remedy="export all photos with the same colour profile",
     rank_by="n",
 )
 WITHOUT_WALL: Final = DiagnosticSpec(
     code="photos-show-no-wall",
     severity="warning",
-    text="{n} of {n_photos} oriented photos show none of the walls ({names})",
-    remedy="if they show a surface to be delivered, let the plane detector find more planes "
-    "(min_share) and raster.grid take its plane (near, n_walls_max)",
+    text="{n} of {n_photos} oriented photos show no wall ({names})",
+    remedy="if they show a surface that you need, detect more planes (min_share) and select "
+    "its plane in raster.grid (near, n_walls_max)",
     rank_by="n",
 )
 
@@ -87,9 +87,9 @@ class OpenedPhoto:
     """A photo prepared for projection onto walls.
 
     Attributes:
-        name: of the photo.
-        pixels: (height, width, 3) uint8, or uint16 if a photo of the block is deep.
-        viewer: its camera.
+        name: name of the photo.
+        pixels: (height, width, 3) uint8, or uint16 if any photo has 16 bits.
+        viewer: camera of the photo.
         buffer: depth buffer of objects in front of the camera.
     """
 
@@ -106,16 +106,16 @@ def project_photos(
     *,
     hides: bool = True,
 ) -> tuple[LayersOfPhotos, dict[str, float]]:
-    """Project photo by photo onto every wall, and sort their layers by wall.
+    """Project all photos onto all walls, and sort the layers by wall.
 
     Args:
         inputs: walls and oriented photos.
-        ctx: of the step.
-        project: projects a photo onto a wall, by its index, and adds the layer.
-        hides: whether relief and cloud hide anything.
+        ctx: context of the step.
+        project: projects a photo onto a wall and adds the layer.
+        hides: whether relief and cloud can hide cells.
 
     Returns:
-        The layers, and the seconds that each part took.
+        The layers, and the seconds spent on each part.
     """
     from orthoflow.geometry.occluders import depth_buffer, nothing_in_the_way
     from orthoflow_plugins.ortho.surfaces import surfaces_of
@@ -126,7 +126,7 @@ def project_photos(
     surfaces = surfaces_of(inputs.walls, ctx, hides=hides)
     seconds: defaultdict[str, float] = defaultdict(float)
     started = ctx.clock_s()
-    # For all photos, whichever are painted: which points are outliers depends on all cameras.
+    # Prepare occluders once for all photos, since the outliers depend on all cameras.
     viewers = [camera.viewing() for _, camera in oriented]
     occluders = _occluders(inputs, viewers, ctx) if hides else None
     seconds["occluders_s"] = ctx.clock_s() - started
@@ -144,11 +144,11 @@ def project_photos(
         for index, surface in enumerate(surfaces):
             project(opened, surface, stack, index)
         names = [inputs.walls.walls[layer.wall].name for layer in stack.painted[n_before:]]
-        ctx.log(f"{photo.name}: paints {', '.join(names) or 'no wall'}")
+        ctx.log(f"{photo.name}: projected onto {', '.join(names) or 'no wall'}")
         seconds["decoding_s"] += decoded - started
         seconds["occluders_s"] += looked - decoded
         seconds["painting_s"] += ctx.clock_s() - looked
-        # The next photo is decoded after this one is released.
+        # Release this photo before the next one is decoded.
         del pixels, free, buffer, opened
     warn_of_heads(inputs.walls.up, oriented, ctx)
     profile = shared_profile(photos, ctx)
@@ -163,7 +163,7 @@ def project_photos(
 def _occluders(
     inputs: PhotosOnWalls, viewers: Sequence[ViewingCamera], ctx: StepContext
 ) -> Occluders | None:
-    """Find objects in front of the walls; None, with a warning, without a cloud."""
+    """Find objects in front of the walls; warn and return None if there is no cloud."""
     from orthoflow.geometry.occluders import occluders_before
 
     cloud, walls = inputs.cloud, inputs.walls
@@ -182,13 +182,13 @@ def _occluders(
 
 
 def oriented_photos(walls: Walls, photos: Photos, cameras: Cameras) -> list[tuple[Photo, Camera]]:
-    """The photos that have a pose, with their cameras.
+    """Return the oriented photos with their cameras.
 
     Raises:
-        MethodError: there is none, there are no walls, or a camera has no photo.
+        MethodError: no photo is oriented, there are no walls, or a camera has no photo.
     """
     if not walls.walls:
-        raise MethodError("there are no walls to project photos onto: choose planes to raster")
+        raise MethodError("there are no walls to project photos onto: select planes to raster")
     by_name = {photo.name: photo for photo in photos.photos}
     posed = [camera for camera in cameras.cameras if camera.status == "ok"]
     if not posed:
@@ -197,8 +197,8 @@ def oriented_photos(walls: Walls, photos: Photos, cameras: Cameras) -> list[tupl
     missing = [camera.photo for camera in posed if camera.photo not in by_name]
     if missing:
         raise MethodError(
-            f"the cameras include {', '.join(missing)}, which are not among the photos: wire the "
-            "photos that were oriented"
+            f"the cameras include {', '.join(missing)}, which are not among the photos: "
+            "connect the photos that were used for the orientation"
         )
     return [(by_name[camera.photo], camera) for camera in posed]
 
@@ -206,14 +206,14 @@ def oriented_photos(walls: Walls, photos: Photos, cameras: Cameras) -> list[tupl
 def warn_of_heads(
     up: NDArray[np.float64], oriented: Sequence[tuple[Photo, Camera]], ctx: StepContext
 ) -> None:
-    """Warn if most photos were taken upside down, which suggests that the scan's up is down.
+    """Warn if most photos seem upside down, which suggests that the vertical axis is inverted.
 
     Args:
-        up: (3,) unit vector of the scan's up direction.
+        up: (3,) unit vector, vertical axis of the scan.
         oriented: the photos and their poses.
         ctx: context of the step.
     """
-    # Rows of a photo count downwards.
+    # Rows of a photo count downwards, so its top is the negative second axis.
     tops = [-camera.viewing().rotation[1] @ up for _, camera in oriented]
     n_down = sum(float(top) < -_UPRIGHT for top in tops)
     if 2 * n_down <= len(tops):
@@ -224,14 +224,14 @@ def warn_of_heads(
 
 
 def level_of_all(photos: Sequence[Photo], ctx: StepContext) -> Level:
-    """Return the number of bits in which photos are projected: 16 if any has more than 8.
+    """Return the numpy type in which photos are projected: 16 bits if any photo has more than 8.
 
-    The others are then multiplied by 257, so that white stays white and nothing is lost.
+    8-bit levels are then multiplied by 257, so that white stays white and no level is lost.
     """
     plain = [photo.name for photo in photos if (stated_bits(photo.encoded) or 0) <= _PLAIN_BITS]
     if len(plain) == len(photos):
         return np.uint8
-    ctx.log("photos have 16 bits per channel, and so have layers and orthoimages")
+    ctx.log("photos have 16 bits per channel; so do layers and orthoimages")
     if plain:
         names = ", ".join(plain[:3]) + (" ..." if len(plain) > 3 else "")
         ctx.report(MIXED_BITS, n=len(plain), n_photos=len(photos), names=names)
@@ -239,10 +239,10 @@ def level_of_all(photos: Sequence[Photo], ctx: StepContext) -> Level:
 
 
 def pixels_of(photo: Photo, camera: Camera, level: Level) -> Colours:
-    """Decode a photo (height, width, 3) in 8 or 16 bits.
+    """Decode a photo (height, width, 3) to 8 or 16 bits.
 
     Raises:
-        MethodError: the camera belongs to a photo of another size.
+        MethodError: the camera has another image size.
     """
     deep = level is np.uint16
     pixels = (decode_levels if deep else decode_image)(photo.encoded, photo.name)
@@ -250,13 +250,13 @@ def pixels_of(photo: Photo, camera: Camera, level: Level) -> Colours:
     if pixels.shape[:2] != (viewing.height, viewing.width):
         raise MethodError(
             f"{photo.name} has {pixels.shape[1]} x {pixels.shape[0]} pixels, but its camera "
-            f"{viewing.width} x {viewing.height}: wire the photos that were oriented"
+            f"{viewing.width} x {viewing.height}: connect the photos that were oriented"
         )
     return in_levels(pixels, level)
 
 
 def shared_profile(photos: Sequence[Photo], ctx: StepContext) -> bytes | None:
-    """Return the ICC profile that all photos have; None without one, or if they differ."""
+    """Return the ICC profile shared by all photos; None if there is none or if they differ."""
     profiles = {icc_profile(photo.encoded) for photo in photos}
     if len(profiles) > 1:
         ctx.report(MIXED_PROFILES, n=len(profiles))

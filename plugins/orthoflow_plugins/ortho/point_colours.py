@@ -1,7 +1,7 @@
-"""The colour of a cell from the points on its topmost surface.
+"""Colours of cells from the points of their topmost surface.
 
-skarlatos2012 takes the topmost point and proposes as future work to weight points by their distance
-from the centre of the cell; the other rules are that proposal, and two averages.
+skarlatos2012 uses the topmost point, and proposes weighting points by their distance from the
+cell centre as future work; the other rules are variants of that.
 """
 
 from __future__ import annotations
@@ -32,32 +32,32 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
 from orthoflow_plugins.ortho.parameters import LAYER_M, DirectParams
 
-# Sigma of the Gaussian in cells: a point in the corner of its cell has a weight of a seventh.
+# Standard deviation of the weight in cells: a point in a corner of its cell has a weight of 1/7.
 _SIGMA_CELLS: Final = 0.36
 _NO_COLOUR: Final = 999
-# Points of which the median is taken, at most.
+# Maximum number of points for the median.
 _TOP_MOST: Final = 5
-# Number of points that the median sorts at once.
+# Maximum number of points sorted at once for the median.
 _POINTS_AT_ONCE: Final = 1 << 24
-# Places at which colours of scans are compared: side of a square, points of each scan, levels that
-# are neither clipped nor almost black, and number of places that judge a scan.
+# Colours of scans are compared in squares of this size, with this number of points per scan, using
+# levels that are neither clipped nor almost black, if a scan has this number of squares.
 _PLACE_M: Final = 0.05
 _POINTS_LEAST: Final = 4
 _DARKEST: Final = 10
 _BRIGHTEST: Final = 245
 _PLACES_LEAST: Final = 20
-# Share of the points of a place that may be clipped or almost black.
+# Maximum share of clipped or almost black points in a square.
 _USELESS_MOST: Final = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
 class Painters:
-    """The points that paint.
+    """The points that colour cells.
 
     Attributes:
         cloud: all points.
-        values: (n, 3) uint8 their colours, or (n, 1) their greys.
-        is_left_out: (n,) points without a colour; None if all have one.
+        values: (n, 3) uint8 colours, or (n, 1) grey levels.
+        is_left_out: (n,) points without a colour; None if all points have one.
     """
 
     cloud: PointCloud
@@ -67,16 +67,18 @@ class Painters:
 
 @dataclass(frozen=True, kw_only=True)
 class CellColours:
-    """Colours of the cells of a wall, flat.
+    """Colours of the cells of a wall, flattened.
+
+    A cell is represented by the point that gives its colour, or by the topmost point if several
+    are averaged.
 
     Attributes:
         rgb: (cells, 3) uint8, 0 where void.
-        has_point: (cells,).
-        distance_cells: (cells,) distance from the centre of the point that represents the cell: the
-            coloured one, or the topmost one of those averaged; infinite where void.
-        places: (cells, 2) float32, position of the coloured point right of and below the centre, in
-            cells, 0 if several are averaged; NaN where void.
-        depth_m: (cells,) float32, of the point that represents the cell; NaN where void.
+        has_point: (cells,) whether the cell contains a point.
+        distance_cells: (cells,) distance of that point from the cell centre; infinite where void.
+        places: (cells, 2) float32 position of that point to the right of and below the centre, in
+            cells; 0 if several points are averaged, NaN where void.
+        depth_m: (cells,) float32 depth of that point; NaN where void.
     """
 
     rgb: NDArray[np.uint8]
@@ -93,8 +95,8 @@ def colours_of(
 
     Args:
         painters: the points.
-        slab: the wall, and the depths of its points.
-        params: how.
+        slab: the wall with its depth range.
+        params: the rule for colours.
         threads: number of threads.
     """
     cloud, colouring = painters.cloud, params.colouring
@@ -116,7 +118,7 @@ def colours_of(
         means = totals[:, :-1] / np.maximum(totals[:, -1:], 1e-300)
         rgb[has_point] = np.rint(means[has_point])
     elif colouring == "median":
-        # Some cells with a limited number of points at once, or one cell.
+        # Process as many cells at once as have a limited number of points, at least one.
         totals, first, n_before = np.cumsum(winners["n_points"], dtype=np.int64), 0, 0
         while first < totals.size:
             end = int(np.searchsorted(totals, n_before + _POINTS_AT_ONCE, side="right"))
@@ -139,19 +141,19 @@ def colours_of(
 
 
 def scan_gains(painters: Painters, slabs: Sequence[Slab], *, threads: int) -> NDArray[np.float64]:
-    """Find the logarithms (scans, 3) of the factors on light that take casts of scans away.
+    """Find the logarithms (scans, 3) of the factors on light that remove colour casts of scans.
 
-    Two scans that show a place show one surface: differences of their mean colours over places are
-    those of exposure and white balance, apart from edges of texture and objects, to which the L1
-    norm is robust. Of several scans that overlap, the median one keeps its colours.
+    Where two scans overlap they show the same surface, so differences of their mean colours are due
+    to exposure and white balance, except at edges of texture and objects; the L1 norm is robust to
+    these. Among scans that overlap, the median keeps its colours.
 
     Args:
-        painters: coloured points with numbers of scans.
-        slabs: of walls on which the scans overlap.
+        painters: coloured points with scan numbers.
+        slabs: walls on which the scans overlap.
         threads: number of threads.
 
     Returns:
-        0 for scans that do not overlap with others.
+        The logarithms; 0 for scans without overlap.
     """
     scans, light = painters.cloud.scan, light_of_levels(255)
     n_scans = 0 if scans is None or not len(scans) else int(scans.max()) + 1
@@ -177,16 +179,17 @@ def scan_gains(painters: Painters, slabs: Sequence[Slab], *, threads: int) -> ND
             shades = np.column_stack([light[values], is_useless, np.ones(len(values))])
             for channel in range(5):
                 sums[:, channel] += np.bincount(key, shades[:, channel], len(sums))
-        # Places, not points: of two scans the darker one would lose more of them.
+        # Exclude whole squares, not points: otherwise the darker scan would lose more of its
+        # points.
         is_known = (sums[:, 4] >= _POINTS_LEAST) & (sums[:, 3] <= _USELESS_MOST * sums[:, 4])
         known = np.flatnonzero(is_known)
         logs = np.log(sums[known, :3] / sums[known, 4:])
-        # Scans of one place are adjacent.
+        # Scans of the same square are adjacent.
         first = np.flatnonzero(known[1:] // n_scans == known[:-1] // n_scans)
         pairs.append(np.column_stack([known[first], known[first + 1]]) % n_scans)
         apart.append(logs[first + 1] - logs[first])
     scan_pairs, differences = np.concatenate(pairs), np.concatenate(apart)
-    # A scan with few places is not judged by them.
+    # Ignore scans with few squares.
     counts = np.bincount(scan_pairs.ravel(), minlength=n_scans)
     is_kept = (counts[scan_pairs] >= _PLACES_LEAST).all(axis=1)
     scan_pairs, differences = scan_pairs[is_kept], differences[is_kept]
@@ -208,7 +211,7 @@ def _on_top(
     threads: int,
     cells: slice | None = None,
 ) -> Iterator[Entries]:
-    """Yield the points on the topmost surface, of all cells or of the requested ones."""
+    """Yield the points of the topmost surface, in all cells or in some of them."""
     cells, width = cells or slice(0, slab.n_cells), slab.frame.width
     rows = slice(cells.start // width, -(-cells.stop // width))
     is_left_out = painters.is_left_out
@@ -226,7 +229,7 @@ def _on_top(
 
 
 def _set_medians(rgb: NDArray[np.uint8], tops: list[Entries], values: NDArray[np.uint8]) -> None:
-    """Set `rgb` of cells to the median colour, channel by channel, of their highest points."""
+    """Set the colours of cells to the median of their highest points, channel by channel."""
     if not tops:
         return
     cells, depths_m, _, points = (np.concatenate(parts) for parts in zip(*tops, strict=True))

@@ -1,4 +1,4 @@
-"""`ortho.pointcloud-direct`: the topmost coloured points paint their cells (skarlatos2012)."""
+"""`ortho.pointcloud-direct`: colour each cell from the points nearest to the viewer."""
 
 from __future__ import annotations
 
@@ -34,56 +34,56 @@ from orthoflow_plugins.ortho.parameters import LAYER_M, DirectParams
 if TYPE_CHECKING:
     from orthoflow_plugins.ortho.point_colours import CellColours, Painters
 
-# Larger walls are painted in bands of this many cells: about 600 MB.
+# Larger walls are processed in bands of this many cells; a band needs about 600 MB.
 _BAND_CELLS: Final = 1 << 22
 _POINTS_AT_ONCE: Final = 1 << 22
-# Pure black points are reported from this share on; real colours have hardly any.
+# Pure black points are reported above this share; real surfaces have hardly any.
 _BLACK_WORTH_WORDS: Final = 0.001
-# Files with black points also have some that are almost black.
+# Points below this level are almost black.
 _ALMOST_BLACK_GREY: Final = 10
-# Scans that differ by less are not balanced: a cast of 3 % is hardly seen.
+# Scans that differ by less are not balanced: a cast of 3 % is hardly visible.
 _CAST_LEAST: Final = 0.03
-# In clouds with more black points black is a colour.
+# If more points are pure black, black is taken for a real colour.
 _MOST_SPECKS: Final = 0.1
 
 SPECKS: Final = DiagnosticSpec(
     code="black-points-left-out",
     severity="note",
-    text="{n_points:,} points of {subject} ({share:.1%}) are pure black, as points without a "
-    "colour are in many files: they paint no pixel",
-    remedy="{step}.skip_below_grey=0 paints them, 10 leaves out almost black ones, too",
+    text="{n_points:,} points of {subject} ({share:.1%}) are pure black, which many files use for "
+    "points without a colour: they are not used for colours",
+    remedy="set {step}.skip_below_grey to 0 to use them, or to 10 to ignore almost black points, "
+    "too",
 )
 SCANS_BALANCED: Final = DiagnosticSpec(
     code="scans-balanced",
     severity="note",
     text="{n} of {n_scans} scans differ in brightness or white balance from the others where they "
     "overlap, by up to {share:.0%}: their colours are balanced",
-    remedy="{step}.balance_scans=false paints them as they are",
+    remedy="set {step}.balance_scans to false to keep the original colours",
     rank_by="share",
 )
 NO_COLOUR: Final = DiagnosticSpec(
     code="cloud-without-colour",
     severity="warning",
-    text="the cloud has no colours: its intensity is painted as grey",
+    text="the cloud has no colours: its intensity is used as grey",
 )
 BLACK_POINTS: Final = DiagnosticSpec(
     code="points-black",
     severity="warning",
-    text="{n_black} points of the cloud ({share:.1%}) are pure black, as points without a colour "
-    "are in many files, and {n_almost} almost; they are painted as they are",
-    remedy="if black specks in the image do not belong to the wall, set "
-    "{step}.skip_below_grey={grey} (1 for pure black alone), so that they keep their "
-    "depth and paint no cell",
+    text="{n_black} points of the cloud ({share:.1%}) are pure black, which many files use for "
+    "points without a colour, and {n_almost} are almost black; all of them are used",
+    remedy="if the orthoimage has black specks that do not belong to the wall, set "
+    "{step}.skip_below_grey={grey} (1 for pure black only) to ignore the colours of these points",
     rank_by="share",
 )
 
 
 class PointcloudDirect(Method):
-    """Paint each cell of a wall with the colour of its topmost point; fill small gaps.
+    """Colour each cell of a wall from its topmost point; fill small gaps.
 
-    Of the points inside the wall's buffer the one with the largest depth is used, ties go to the
-    point nearer the centre of the cell, then to the lower index; `colouring` has other rules. Gaps
-    are void cells with few void cells around them; filled cells are marked as filled.
+    The topmost point is the one nearest to the viewer within the buffer of the wall; of several,
+    the one nearest to the cell centre, then the one with the lowest index. `colouring` offers other
+    rules. Gaps are void cells with few void cells around them; filled cells are marked as filled.
     """
 
     id: ClassVar[str] = "ortho.pointcloud-direct"
@@ -105,7 +105,7 @@ class PointcloudDirect(Method):
     Params = DirectParams
 
     class In(Ports):
-        """Walls, whose frames and buffers are used, and the coloured cloud."""
+        """The walls, of which frames and buffers are used, and the coloured cloud."""
 
         walls: Walls
         cloud: PointCloud
@@ -148,7 +148,7 @@ class PointcloudDirect(Method):
                 projected = ctx.clock_s()
                 _fill(found, layer, band, params, threads=ctx.cores)
                 seconds += (projected - started, ctx.clock_s() - projected)
-                # The next band is projected after this one is released.
+                # Release this band before the next one is projected.
                 del found
             layers.append(layer)
             n_here = int(np.count_nonzero(filled))
@@ -157,8 +157,8 @@ class PointcloudDirect(Method):
             n_filled.append(n_here)
         if not any(holds_cells(layer.mask, LayerMask.PAINTED) for layer in layers):
             raise MethodError(
-                "no point of the cloud lies within the buffer of a wall: the walls were not made "
-                "from this cloud, or wall.buffer_m is too small"
+                "no point of the cloud is within the buffer of a wall: the walls were made from "
+                "another cloud, or wall.buffer_m is too small"
             )
         names = tuple(wall.name for wall in inputs.walls.walls)
         ctx.metric("projection_s", seconds[0], "s")
@@ -167,8 +167,8 @@ class PointcloudDirect(Method):
         ctx.figure(
             "filling",
             preview,
-            "Before and after filling; magenta is void. Fine magenta dots fill well; large "
-            "areas of it are extrapolated from their border.",
+            "Before and after filling; void cells are magenta. Single cells are filled well; "
+            "large areas would be extrapolated from their border.",
         )
         places = tuple(wall.plane_index for wall in inputs.walls.walls)
         return self.Out(layers=Layers(layers=tuple(layers), names=names, plane_indices=places))
@@ -183,8 +183,8 @@ def _painters(cloud: PointCloud, params: DirectParams, ctx: StepContext) -> Pain
         return Painters(cloud=cloud, values=rgb, is_left_out=_left_out(cloud, rgb, params, ctx))
     if cloud.intensity is None:
         raise MethodError(
-            "the cloud has neither colours nor intensity, so no orthoimage can be painted from it: "
-            "give a coloured scan, or paint the walls from photos"
+            "the cloud has neither colours nor intensity, so no orthoimage can be made from it: "
+            "use a coloured scan, or make the orthoimage from photos"
         )
     ctx.report(NO_COLOUR)
     n_points = len(cloud)
@@ -201,7 +201,7 @@ def _painters(cloud: PointCloud, params: DirectParams, ctx: StepContext) -> Pain
 
 
 def _balanced(painters: Painters, slabs: list[Slab], ctx: StepContext) -> Painters:
-    """Return the points with the casts of single scans taken away, if there are any."""
+    """Return the points with colour casts of single scans removed, if there are any."""
     from orthoflow_plugins.ortho.point_colours import scan_gains
 
     gains, scans = scan_gains(painters, slabs, threads=ctx.cores), painters.cloud.scan
@@ -226,9 +226,9 @@ def _mask(ctx: StepContext, n_points: int) -> NDArray[np.bool_]:
 def _left_out(
     cloud: PointCloud, rgb: NDArray[np.uint8], params: DirectParams, ctx: StepContext
 ) -> NDArray[np.bool_] | None:
-    """Find the points (n,) without a colour, or too dark to have one; None if there are none.
+    """Return points (n,) without a colour, or too dark to have one; None if all have a colour.
 
-    They paint no cell, and keep their depth. Black points that are painted are reported.
+    These points keep their depth and colour no cell. Black points that are used are reported.
     """
     n_points, has_rgb = len(rgb), cloud.has_rgb
     counts = np.zeros(256, dtype=np.int64)
@@ -252,7 +252,7 @@ def _left_out(
     if params.skip_below_grey:
         ctx.log(
             f"{n_dark} points of the cloud ({n_dark / n_points:.1%}) have no channel that reaches "
-            f"skip_below_grey = {least}; they paint no cell"
+            f"skip_below_grey = {least}; they colour no cell"
         )
     elif least > 0:
         ctx.report(SPECKS, subject="the cloud", n_points=n_dark, share=n_dark / n_points)
@@ -279,7 +279,7 @@ def _fill(
     *,
     threads: int,
 ) -> None:
-    """Fill the gaps of some rows, and write these into the layer of the wall."""
+    """Fill the gaps of a band, and write the band into the layer of the wall."""
     from orthoflow.geometry.interpolation import Surroundings
 
     width = layer.frame.width
@@ -301,8 +301,8 @@ def _fill(
             rgb, is_void, is_filled, method=params.inpaint, radius_px=params.inpaint_radius_px
         )
     shown, inner = ~is_void | is_filled, band.inner
-    # 1 at the centre of the cell, 0.5 in its corner: how well the point represents the cell. A
-    # filled cell has a lower quality than any painted one.
+    # The quality falls linearly from 1 for a point at the cell centre to 0.5 in a corner, so that
+    # filled cells have a lower quality than any other.
     distance_cells = found.distance_cells.reshape(-1, width)
     quality = np.where(is_void, np.float32(0.0), 1.0 - distance_cells / np.sqrt(2.0))
     quality[is_filled] = 0.25
@@ -314,7 +314,7 @@ def _fill(
 
 
 def _report(ctx: StepContext, layers: list[Layer], names: Sequence[str], n_filled: int) -> None:
-    """Report how much is painted, filled and void, and what would fill more of each wall."""
+    """Report the painted, filled and void shares, and how to fill more cells."""
     n_cells = sum(layer.mask.size for layer in layers)
     n_shown = [count_cells(layer.mask, LayerMask.PAINTED) for layer in layers]
     ctx.metric("painted_share", (sum(n_shown) - n_filled) / n_cells, "1")
@@ -324,7 +324,7 @@ def _report(ctx: StepContext, layers: list[Layer], names: Sequence[str], n_fille
         n_void = layer.mask.size - n_shown_here
         if n_void:
             ctx.log(
-                f"{names[layer.wall]}: {n_void / layer.mask.size:.1%} of its cells have no point "
-                "of the cloud within the buffer and lie in no small gap; larger void_limits and "
-                "inpaint_radius_px fill larger ones, whatever recover_gap_cells does to the depth"
+                f"{names[layer.wall]}: {n_void / layer.mask.size:.1%} of its cells contain no "
+                "point and are not part of a small gap; increase void_limits and inpaint_radius_px "
+                "to fill larger gaps (recover_gap_cells affects only depths)"
             )

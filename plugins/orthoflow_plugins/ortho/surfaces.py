@@ -1,4 +1,4 @@
-"""Walls as photos see them: which parts of a surface hide others, and cameras in its axes."""
+"""Walls prepared for visibility tests, and cameras in the axes of a wall."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from orthoflow_plugins.ortho.visibility_kernels import (
     look_at_cells,
 )
 
-# A surface hides a cell if it is above the ray by more than so many standard deviations of depth,
-# and so many cells, for detail finer than the raster.
+# A surface hides a cell if it is above the ray by more than this number of standard deviations of
+# depth plus this number of cells, which allows for detail finer than the raster.
 _TOLERANCE_SIGMAS: Final = 3.0
 _TOLERANCE_CELLS: Final = 0.5
-# Quality falls to 0 over this share of a photo's shorter side.
+# Quality decreases to 0 at the border of a photo over this share of its shorter side.
 _BORDER_SHARE: Final = 0.05
-# What hides is computed in bands of so many cells.
+# The occluding surface is computed in bands of this many cells.
 _BAND_CELLS: Final = 1 << 17
-# A cell influences what hides others as far as this.
+# A cell influences the occluding surface up to this distance in rows.
 _REACH_ROWS: Final = 4
-# Cells this much lower than a neighbour, in cells, are at an edge: steeper than 79 degrees.
+# A height difference between neighbours of more than this many cells (79 degrees) is an edge.
 _EDGE_CELLS: Final = 5.0
 
 
@@ -45,10 +45,10 @@ class Surface:
     """A wall prepared for visibility tests.
 
     Attributes:
-        frame: where the cells lie.
-        relief: their depths, and which of them hide others.
-        front_m: up to this depth the relief holds all points.
-        tolerance_m: how far a surface must be above a ray to hide it.
+        frame: grid of the cells.
+        relief: depths of the cells, and the surface that hides other cells.
+        front_m: largest depth of the relief; the depth buffer contains only points beyond it.
+        tolerance_m: how far the surface must be above a ray to block it.
     """
 
     frame: WallFrame
@@ -58,7 +58,7 @@ class Surface:
 
 
 def surfaces_of(walls: Walls, ctx: StepContext, *, hides: bool = True) -> list[Surface]:
-    """Return each wall as the surface that rays hit; with `hides` false it hides nothing."""
+    """Prepare all walls; with `hides` false they do not hide parts of themselves."""
     return [
         surface_of(walls, index, hides=hides, allocate=_in_file(ctx, index))
         for index in range(len(walls.walls))
@@ -72,7 +72,7 @@ def _in_file(ctx: StepContext, index: int) -> Allocate:
 def surface_of(
     walls: Walls, index: int, *, hides: bool = True, allocate: Allocate = in_memory
 ) -> Surface:
-    """Prepare one wall; `allocate` returns the array of the heights that hide."""
+    """Prepare one wall; `allocate` allocates the occluding surface."""
     wall = walls.walls[index]
     noise_m = depth_noise_m(wall.depth_m) if hides else 0.0
     return Surface(
@@ -84,7 +84,7 @@ def surface_of(
 
 
 def view_of(camera: ViewingCamera, surface: Surface, params: VisibilityParams) -> WallView:
-    """Return a camera in the axes of a wall, without loss of precision at survey coordinates."""
+    """Return a camera in the axes of a wall, with full precision at survey coordinates."""
     frame = surface.frame
     axes = np.column_stack([frame.u_world, frame.v_world, frame.normal_world])
     near = camera.shifted(frame.origin_world)
@@ -107,7 +107,7 @@ def view_of(camera: ViewingCamera, surface: Surface, params: VisibilityParams) -
 def cells_seen(
     view: WallView, relief: Relief, buffer: DepthBuffer, rows: slice, columns: slice
 ) -> TileVisibility:
-    """Determine which cells of a part of a wall a photo sees, and where."""
+    """Find the cells of a part of a wall that a photo sees, and their photo positions."""
     size = (rows.stop - rows.start, columns.stop - columns.start)
     u, v, quality = np.empty((3, *size), dtype=np.float32)
     visible = TileVisibility(u=u, v=v, mask=np.empty(size, dtype=np.uint8), quality=quality)
@@ -116,17 +116,17 @@ def cells_seen(
 
 
 def is_before(view: WallView, surface: Surface) -> bool:
-    """Whether a camera is in front of any of a wall; from behind nothing is seen."""
+    """Return whether a camera is in front of any part of a wall."""
     return view.height_m > float(surface.relief.bottoms.min())
 
 
 def relief_of(wall: Wall, *, hides: bool = True, allocate: Allocate = in_memory) -> Relief:
-    """Prepare a wall for views from anywhere.
+    """Prepare the surface of a wall for visibility tests from any position.
 
     Args:
-        wall: its depths.
-        hides: whether the surface hides other parts of itself.
-        allocate: returns the array of the heights that hide.
+        wall: the wall.
+        hides: whether the surface can hide parts of itself.
+        allocate: allocates the occluding surface.
     """
     depth = np.asarray(wall.depth_m, dtype=np.float32).view(np.ndarray)[:]
     side = FINE_CELLS if hides else BLOCK_CELLS
@@ -140,7 +140,7 @@ def relief_of(wall: Wall, *, hides: bool = True, allocate: Allocate = in_memory)
             occluding[band.rows] = _hiding(depth[band.around], edge_m)[band.inner]
         tops = _of_blocks(occluding, np.maximum, side)
     occluding = occluding.view(np.ndarray)
-    # Kernels are compiled once, for read-only arrays.
+    # Kernels are compiled for read-only arrays only.
     depth.flags.writeable = occluding.flags.writeable = False
     return Relief(
         depth,
@@ -154,13 +154,12 @@ def relief_of(wall: Wall, *, hides: bool = True, allocate: Allocate = in_memory)
 
 
 def _hiding(depth: NDArray[np.float32], edge_m: float) -> NDArray[np.float32]:
-    """Return the surface (rows, cols) that hides other cells: no spikes, and full edges.
+    """Return the occluding surface (rows, cols): without spikes, and with complete edges.
 
-    Voids of one cell are closed, then cells higher than all 2 x 2 patches that contain them are
-    lowered: a single outlier in front of a wall would cast a long shadow, which no real object
-    casts. The position of an edge within its cell is unknown, and the cell's own points are on
-    either side of it or between; so next to a step of more than `edge_m` the lower cell counts as
-    high as the higher.
+    Voids of one cell are closed. Cells higher than all 2 x 2 patches that contain them are lowered,
+    since a single outlier in front of a wall would hide a long strip. The position of an edge
+    within its cell is unknown; next to a step of more than `edge_m`, the lower cell is therefore
+    raised to the height of the higher one.
     """
     import cv2
 
@@ -182,9 +181,9 @@ def _hiding(depth: NDArray[np.float32], edge_m: float) -> NDArray[np.float32]:
 def _of_blocks(
     values: NDArray[np.float32], reduce: np.ufunc, side_cells: int
 ) -> NDArray[np.float32]:
-    """Return the extreme of each block of cells; the last ones may be smaller."""
+    """Return the extreme value of each block of cells; the last blocks may be smaller."""
     rows, columns = (range(0, size, side_cells) for size in values.shape)
-    # Bands of rows: `reduceat` along the first axis goes through the whole array cell by cell.
+    # Process bands of rows, since `reduceat` along the first axis is slow on a large array.
     bands = [reduce.reduce(values[row : row + side_cells], axis=0) for row in rows]
     reduced = reduce.reduceat(np.array(bands), columns, axis=1)
     return np.asarray(reduced, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Compiled pass that determines which cells of a wall a photo sees, and their photo positions."""
+"""Compiled function that finds the cells of a wall that a photo sees, and their positions."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from orthoflow.geometry.compiling import compiled, kernel_part
 from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 
-# Sides of the square blocks of cells that share one bound on the height up to which rays are
-# followed: small ones are looked at where it matters within large ones.
+# Rays from all cells of a block are traced up to a common height. Bounds of small blocks are only
+# computed where that of the large block does not exclude occlusion.
 BLOCK_CELLS: Final = 32
 FINE_CELLS: Final = 8
 
-# Cells of a row that are projected together, from a multiple of this: in float32 from the first of
-# them, so that a cell has the same result in every tile.
+# Cells of a row are projected in runs of this length, relative to the first cell of the run, in
+# float32. Runs begin at multiples of it, so that results do not depend on the tile.
 _RUN_CELLS: Final = 512
 _N_QUANTITIES: Final = 6
 
@@ -29,20 +29,18 @@ NO_SURFACE: Final = 3
 
 
 class WallView(NamedTuple):
-    """A photo's camera in front of a wall, in the wall's axes.
+    """A camera in the axes of a wall.
 
     Attributes:
         camera: (25,) flat camera (see `camera_kernels`) for points (u, v, n) in metres from the
             wall frame's origin.
-        column: foot of the projection centre on the wall, in cell indices; 0 is the centre of
-            the first cell. row likewise.
-        height_m: projection centre above the plane.
+        column: column of the projection centre, 0 at the centre of the first cell; row likewise.
+        height_m: height of the projection centre above the plane.
         gsd_m: side of a cell.
-        front_m: up to this depth the raster itself decides what is hidden; only points in front of
-            it are in the depth buffer.
-        tolerance_m: how far a surface must be above a ray to hide it.
-        cosine_least: cells seen at a smaller cosine of incidence count as hidden.
-        border_px: quality decreases to 0 over this distance from the image border.
+        front_m: largest depth of the relief; the depth buffer contains only points beyond it.
+        tolerance_m: how far the surface must be above a ray to block it.
+        cosine_least: smallest cosine of the angle of incidence of visible cells.
+        border_px: distance from the image border over which quality decreases to 0.
     """
 
     camera: NDArray[np.float64]
@@ -57,17 +55,17 @@ class WallView(NamedTuple):
 
 
 class Relief(NamedTuple):
-    """The surface of a wall, and which parts of it hide other cells.
+    """The surface of a wall, and the surface that hides other cells.
 
     Attributes:
         depth: (rows, cols) float32 metres, NaN where void.
-        occluding: (rows, cols) float32 the same without spikes, minus infinity where void: void
-            hides nothing, nor do interpolations with it. Empty if the surface hides nothing.
-        tops: (blocks, blocks) float32, the highest `occluding` in a block, or minus infinity.
-        bottoms: (blocks, blocks) float32, the lowest depth in a block, infinite in a void one.
-        fine_tops: the same for blocks of `FINE_CELLS` if the surface hides anything; fine_bottoms
+        occluding: (rows, cols) float32 depth without spikes, minus infinity where void, so that
+            voids block no ray; empty if the surface hides nothing.
+        tops: (blocks, blocks) float32 largest `occluding` in a block, or minus infinity.
+        bottoms: (blocks, blocks) float32 smallest depth in a block, infinite if it is void.
+        fine_tops: `tops` for blocks of `FINE_CELLS`, if the surface hides anything; fine_bottoms
             likewise.
-        highest_m: the highest of `tops`.
+        highest_m: largest value of `tops`.
     """
 
     depth: NDArray[np.float32]
@@ -80,14 +78,14 @@ class Relief(NamedTuple):
 
 
 class TileVisibility(NamedTuple):
-    """What a photo sees of a tile of cells, filled by `look_at_cells`.
+    """Visibility of a tile of cells in a photo, filled by `look_at_cells`.
 
     Attributes:
-        u: (rows, cols) float32 photo pixels, first centre at 0.5; 0 where not painted.
-        v: likewise.
-        mask: (rows, cols) uint8 states.
-        quality: (rows, cols) float32 photo pixels per cell times the decrease at the border; 0
-            where not painted.
+        u: (rows, cols) float32 photo column, first pixel centre at 0.5; 0 where not painted.
+        v: (rows, cols) float32 photo row likewise.
+        mask: (rows, cols) uint8 state of the cell.
+        quality: (rows, cols) float32 photo pixels per cell, reduced at the border; 0 where not
+            painted.
     """
 
     u: NDArray[np.float32]
@@ -105,15 +103,15 @@ def look_at_cells(
     first_row: int,
     first_column: int,
 ) -> None:
-    """Project the cells of a tile into a photo and determine which of them it sees.
+    """Project the cells of a tile into a photo and find those that it sees.
 
     Args:
-        view: the camera in front of the wall.
-        relief: the whole wall.
-        buffer: depth buffer of other objects.
-        visible: output; its shape is the tile's.
-        first_row: row of the wall where the tile begins.
-        first_column: column likewise.
+        view: the camera in the axes of the wall.
+        relief: the surface of the whole wall.
+        buffer: depth buffer of objects in front of the wall.
+        visible: output, in the shape of the tile.
+        first_row: first row of the tile on the wall.
+        first_column: first column of the tile on the wall.
     """
     n_rows, n_columns = visible.mask.shape
     end_column, first_block = first_column + n_columns, first_column // FINE_CELLS
@@ -156,23 +154,23 @@ def _project_run(
     steps: NDArray[np.float32],
     projected: NDArray[np.float32],
 ) -> None:
-    """Project cells of a row, void or not: the formula of `camera_kernels.project_point`.
+    """Project cells of a row, void or not, as `camera_kernels.project_point` does.
 
-    Each loop has no branches and writes one array only, so that compilers take many cells at once;
-    constants of another type would make them take fewer.
+    Each loop has no branches and writes to one array only, so that the compiler can vectorise it;
+    constants of another type would prevent that.
 
     Args:
-        view: the camera in front of the wall.
-        depths: (n,) of the cells.
-        place: row of the cells, and the column from which they are counted.
-        steps: (n,) columns from there.
-        projected: (_N_QUANTITIES, n or more) overwritten with u, v, inverse distance along the
-            axis, cosine of incidence, the least distance at which nothing is in the way, and
-            quality; u is -1 behind the camera and beyond the lens model.
+        view: the camera in the axes of the wall.
+        depths: (n,) depths of the cells.
+        place: row of the cells, and first column of their run.
+        steps: (n,) columns relative to the first one.
+        projected: (_N_QUANTITIES, n or more), overwritten with u, v, inverse distance along the
+            axis, cosine of the angle of incidence, the distance beyond which other objects must be,
+            and quality; u is -1 behind the camera and beyond the lens model.
     """
     row, first_column = place
     c, gsd_m, f = view.camera, view.gsd_m, np.float32
-    # The first cell in float64: survey coordinates and large walls lose nothing.
+    # Compute the first cell in float64, to keep the precision on large walls.
     x, y = (first_column + 0.5) * gsd_m, (row + 0.5) * gsd_m
     x0, y0 = f(c[0] * x + c[1] * y + c[9]), f(c[3] * x + c[4] * y + c[10])
     z0 = f(c[6] * x + c[7] * y + c[11])
@@ -187,7 +185,7 @@ def _project_run(
         nears[j] = one / (z0 + zu * steps[j] + zn * depths[j])
     for j in range(depths.size):
         us[j] = (x0 + xu * steps[j] + xn * depths[j]) * nears[j]
-    # Rows of other quantities hold b and the distorted b until they are computed.
+    # Use the rows of other quantities for b and the distorted b until these are computed.
     bs = cosines
     for j in range(depths.size):
         bs[j] = (y0 + yu * steps[j] + yn * depths[j]) * nears[j]
@@ -228,14 +226,14 @@ def _set_states(
     places: NDArray[np.int32],
     mask: NDArray[np.uint8],
 ) -> None:
-    """Determine which cells a photo sees if the relief hides none of them.
+    """Set the states of cells, ignoring occlusion by the relief.
 
     Args:
-        view: the camera in front of the wall.
-        buffer: depth buffer of other objects.
-        depths: (n,) of the cells.
-        projected: from `_project_run`; the inverse distances are overwritten.
-        places: (n or more,) overwritten.
+        view: the camera in the axes of the wall.
+        buffer: depth buffer of objects in front of the wall.
+        depths: (n,) depths of the cells.
+        projected: result of `_project_run`; the inverse distances are overwritten.
+        places: (n or more,) work array.
         mask: (n,) states, output.
     """
     f = np.float32
@@ -249,7 +247,7 @@ def _set_states(
         u, v = us[j], vs[j]
         is_inside = (u >= zero) & (u < width) & (v >= zero) & (v < height)
         at_row, at_column = v * per_pixel, u * per_pixel
-        # Just before the border, quotients may round up to the next pixel of the buffer.
+        # Close to the border, the quotient may be rounded up beyond the last pixel of the buffer.
         down = min(np.int32(at_row if is_inside else zero), last_row)
         places[j] = down * stride + min(np.int32(at_column if is_inside else zero), last_column)
     for j in range(mask.size):
@@ -268,7 +266,7 @@ def _set_states(
 def _keep_painted(
     mask: NDArray[np.uint8], values: NDArray[np.float32], kept: NDArray[np.float32]
 ) -> None:
-    """Copy the values of painted cells, and 0 for others."""
+    """Copy the values of painted cells; set the others to 0."""
     painted, zero = np.uint8(PAINTED), np.float32(0.0)
     for j in range(mask.size):
         kept[j] = values[j] if mask[j] == painted else zero
@@ -284,17 +282,17 @@ def _hide_low_cells(
     depths: NDArray[np.float32],
     mask: NDArray[np.uint8],
 ) -> None:
-    """Follow the rays from painted cells of a row to the camera, up to a height.
+    """Trace the rays from painted cells of a row towards the camera, up to a height.
 
-    A ray is followed one row or column at a time, whichever it crosses more of.
+    A ray advances by one row or column at a time, whichever direction it runs along more.
 
     Args:
-        surface: (cells of the wall,) that hides.
+        surface: (cells of the wall,) occluding surface, flattened.
         eye: row, column and height of the projection centre.
-        tolerance_m: how far the surface must be above a ray.
-        top: nothing above this height hides any of the cells.
-        place: row and first column of the cells, rows and columns of the wall.
-        depths: (n,) of the cells.
+        tolerance_m: how far the surface must be above a ray to block it.
+        top: height above which nothing can hide the cells.
+        place: row and first column of the cells, numbers of rows and columns of the wall.
+        depths: (n,) depths of the cells.
         mask: (n or more,) states, updated.
     """
     row, first_column, n_rows, n_columns = place
@@ -321,8 +319,8 @@ def _hide_low_cells(
         start = here * stride
         for _ in range(n_steps):
             start, at, level = start + step, at + move, level + rise
-            # The surface is linear between the two cells beside the ray, which may be the same.
-            # At the border rounding must not lead beyond it.
+            # Interpolate the surface between the two cells on either side of the ray.
+            # Rounding must not lead outside the wall.
             first = int(at)
             share, second = np.float32(at - first), min(first + 1, n_beside - 1)
             one = surface[np.uintp(start + first * side)]
@@ -336,13 +334,13 @@ def _hide_low_cells(
 def _bound_rays(
     view: WallView, relief: Relief, row: int, first_column: int, highest: NDArray[np.float64]
 ) -> None:
-    """Bound the height up to which rays from fine blocks must be followed; -inf without rays.
+    """Bound the height up to which rays from fine blocks must be traced; -inf if not at all.
 
     Args:
-        view: the camera in front of the wall.
-        relief: the wall.
-        row: of the blocks.
-        first_column: of the first block.
+        view: the camera in the axes of the wall.
+        relief: the surface of the wall.
+        row: row of the blocks.
+        first_column: column of the first block.
         highest: (blocks,) output.
     """
     per_block, large, top = BLOCK_CELLS // FINE_CELLS, -1, -math.inf
@@ -371,23 +369,23 @@ def _highest_in_the_way(
     block: tuple[int, int],
     top: float,
 ) -> float:
-    """Bound the height up to which rays from the cells of a block must be followed.
+    """Bound the height up to which rays from the cells of a block must be traced.
 
-    On the way to the camera a block shrinks towards the camera's foot, and no ray is lower than
-    that of its lowest cell. So what hides any of it lies on the part of the way on which that ray
-    is below the highest surface of all; the highest surface there bounds a shorter part.
+    The rays from a block converge towards the camera, and none is lower than the ray from its
+    lowest cell. A surface can only hide the block where that lowest ray is below the highest
+    surface of the wall; the highest surface along that part gives a tighter bound.
 
     Args:
-        view: the camera in front of the wall.
-        tops: (blocks, blocks) highest surface in each.
-        bottom: lowest depth in the block.
-        side_cells: of a block.
-        block: its row and column.
-        top: nothing higher hides any of its cells.
+        view: the camera in the axes of the wall.
+        tops: (blocks, blocks) largest height in each block.
+        bottom: smallest depth in the block.
+        side_cells: side of a block in cells.
+        block: row and column of the block.
+        top: height above which nothing can hide its cells.
     """
     row, column = block
-    # From the middle of a block to the centre of its last cell, in blocks; a ray is met by the
-    # cells on either side of it, which are half a cell away at most.
+    # Distance from the middle of a block to the centre of its last cell, in blocks, plus half a
+    # cell, since a ray is tested against the cells on either side of it.
     half = 0.5 - 0.5 / side_cells
     bottom += view.tolerance_m
     down = (view.row + 0.5) / side_cells - row - 0.5

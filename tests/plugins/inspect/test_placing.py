@@ -49,11 +49,11 @@ def test_an_image_is_of_the_wall_of_its_plane() -> None:
     assert placed(wall=8, plane_index=8) == (1, 8)
     assert placed(wall=0, plane_index=8) == (1, 8)
     assert placed(wall=0, plane_index=None) == (0, 3)
-    with pytest.raises(MethodError, match="is of wall 2, but the walls are 3, 8: wire"):
+    with pytest.raises(MethodError, match="shows wall 2, but the walls are 3, 8: connect"):
         placed(wall=2, plane_index=None)
-    with pytest.raises(MethodError, match="is of wall 1, but the walls are 3, 8: wire"):
+    with pytest.raises(MethodError, match="shows wall 1, but the walls are 3, 8: connect"):
         placed(wall=1, plane_index=1)
-    with pytest.raises(MethodError, match="is of wall -1"):
+    with pytest.raises(MethodError, match="shows wall -1"):
         placed(wall=-1, plane_index=None)
 
 
@@ -128,7 +128,7 @@ def test_images_that_lie_elsewhere_or_askew_are_refused(
     other = frame_over(turned, turn @ frame.normal_world, gsd_m=2.0 * frame.gsd_m)
     image = image_of(np.full(other.shape, 100.0), other)
     if is_refused:
-        with pytest.raises(MethodError, match="wire the walls that the orthoimages are of"):
+        with pytest.raises(MethodError, match="connect the walls that the orthoimages show"):
             wall_of(image, walls)
     else:
         assert wall_of(image, walls).frame is other

@@ -52,14 +52,14 @@ def test_three_points_tell_another_raster_where_nine_tenths_of_what_they_are_off
     off = np.array([24.0, -32.0]) + 40.0 * np.sqrt(1.0 / share**2 - 1.0) / size * turned
     warnings, metrics = said(tmp_path, points_at(surveyed()[:n_points], pixels=places + off))
     assert metrics["rms_mm"] == pytest.approx(1e3 * GSD_M * 40.0 / share)
-    assert [("placed otherwise" in warning) for warning in warnings] == [True] * is_told
+    assert [("below the survey" in warning) for warning in warnings] == [True] * is_told
 
 
 def test_points_in_another_unit_are_told(tmp_path: Path) -> None:
     far = inspect_scenes.frame().world_from_wall(100.0 * PLACES, 0.0)
     warnings, _ = said(tmp_path, points_at(far, pixels=PLACES))
     assert len(warnings) == 1
-    assert warnings[0].startswith("4 of 4 check points lie farther from their wall than it is long")
+    assert warnings[0].startswith("4 of 4 check points are farther from their wall than it is long")
     assert "check `unit`" in warnings[0]
 
 
@@ -77,21 +77,23 @@ def test_what_was_shown_holds_for_cells_of_any_size(tmp_path: Path) -> None:
 def test_clicked_points_that_nobody_surveyed_are_no_check(tmp_path: Path) -> None:
     points = points_at(surveyed(), pixels=np.full((4, 2), np.nan))
     own = surveyed()
-    with pytest.raises(MethodError, match="put the surveyed coordinates into their file"):
+    with pytest.raises(MethodError, match="enter the surveyed coordinates"):
         said(tmp_path, replace(points, shown_world=own))
     own[3, 0] += 0.001
     (warning,), metrics = said(tmp_path, replace(points, shown_world=own))
-    assert warning.startswith("x, y, z of 3 of 4 check points are those of the orthoimage")
+    assert warning.startswith(
+        "the coordinates x, y, z of 3 of 4 check points were taken from the orthoimage"
+    )
     assert metrics["n_found"] == 4
 
 
 @pytest.mark.parametrize(
     ("factor", "aside", "told"),
     [
-        (1.03, 30.0, "measured on cells of about"),
-        (1.015, 30.0, "placed otherwise"),
-        (0.97, 30.0, "measured on cells of about"),
-        (1.0, 15.0, "placed otherwise"),
+        (1.03, 30.0, "measured in an image with cells"),
+        (1.015, 30.0, "below the survey"),
+        (0.97, 30.0, "measured in an image with cells"),
+        (1.0, 15.0, "below the survey"),
     ],
 )
 def test_cells_of_another_size_are_so_by_two_hundredths(

@@ -78,7 +78,7 @@ def test_walls_without_laser_intensity_are_refused_or_passed_over(
 
 def test_an_image_of_something_else_has_too_little_in_common(tmp_path: Path) -> None:
     other = np.random.default_rng(5).uniform(30.0, 220.0, inspect_scenes.SHAPE)
-    with pytest.raises(MethodError, match="too little in common"):
+    with pytest.raises(MethodError, match="are too different"):
         inspect(tmp_path, inspect_scenes.image_of(other))
 
 
@@ -89,7 +89,7 @@ def test_an_image_on_cells_of_its_own_is_compared_there(tmp_path: Path) -> None:
     assert metrics["rmse_x_mm"] < 0.2e3 * GSD_M
     assert metrics["rmse_y_mm"] < 0.2e3 * GSD_M
     elsewhere = replace(coarse, origin_world=coarse.origin_world + 0.5 * coarse.normal_world)
-    with pytest.raises(MethodError, match=r"lies 0\.500 m before wall 0"):
+    with pytest.raises(MethodError, match=r"is 0\.500 m in front of wall 0"):
         inspect(tmp_path, inspect_scenes.image_of(means, elsewhere))
 
 

@@ -162,7 +162,7 @@ def test_what_cannot_be_compared_is_refused_in_one_sentence(tmp_path: Path, trut
         truth=truth,
     )
     context = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
-    with pytest.raises(MethodError, match="there is no orthoimage to inspect"):
+    with pytest.raises(MethodError, match="no orthoimage to inspect"):
         InspectTruth().run(empty, InspectTruth.Params(), context)
 
 
@@ -217,7 +217,7 @@ def test_a_displaced_main_wall_has_that_offset_and_a_lost_one_is_said(
     assert lost["main_found"] == 0.0
     assert lost["true_planes_found"] == len(true) - 1
     assert "plane_angle_deg" not in lost
-    with pytest.raises(MethodError, match="nothing to inspect: wire orthoimages and walls, or pla"):
+    with pytest.raises(MethodError, match="nothing to inspect: connect orthoimages and walls, or"):
         inspect_planes(tmp_path, truth, None)
 
 
@@ -225,14 +225,14 @@ def test_what_is_wired_and_not_compared_is_told(tmp_path: Path, truth: Truth) ->
     context = StepContext(rng=np.random.default_rng(1), cores=2, scratch=tmp_path)
     inputs = InspectTruth.In(truth=truth, planes=truth.planes, cameras=Cameras(cameras=()))
     InspectTruth().run(inputs, InspectTruth.Params(), context)
-    (said,) = context.warnings
-    assert said.startswith("not compared with the truth: cameras, without orthoimages and walls")
+    (one,) = context.diagnostics
+    assert (one.code, one.values["dropped"]) == ("truth-not-compared", "cameras")
     image = rendered(truth)
     _, _, context = inspect(
         tmp_path, truth, painted(image), walled(image), cameras=Cameras(cameras=())
     )
-    (said,) = context.warnings
-    assert said.startswith("displacements are not traced where truth painted: the cameras have no")
+    (one,) = context.diagnostics
+    assert (one.code, one.values["names"]) == ("truth-not-traced", "truth")
 
 
 def finer(times: int) -> dict[str, Any]:

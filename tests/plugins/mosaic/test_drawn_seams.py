@@ -86,8 +86,8 @@ def test_an_area_takes_the_photo_that_is_drawn_where_it_paints(
 @pytest.mark.parametrize(
     ("photo", "wall", "said"),
     [
-        ("photo 9", 0, "name the photo photo 9, but the layers are of photo 0, photo 1, photo 2"),
-        ("photo 1", "west", 'need the property "wall", the number of a wall, beside every photo'),
+        ("photo 9", 0, "refer to the photo photo 9, but the layers are of photo 0, photo 1"),
+        ("photo 1", "west", 'needs the property "wall", the number of a wall; got'),
     ],
 )
 def test_seams_that_fit_no_layer_are_refused(

@@ -242,8 +242,8 @@ def test_layers_of_a_wall_share_its_raster() -> None:
         with pytest.raises(MethodError) as caught:
             module.require_one_raster(layers, "wall 0")
         assert str(caught.value) == (
-            "the layers a.jpg and b.jpg of wall 0 lie on different rasters: all layers of a wall "
-            "must come from the same walls"
+            "the layers a.jpg and b.jpg of wall 0 have different rasters: all layers must be "
+            "made from the same walls"
         )
     with pytest.raises(
         MethodError, match=r"^priority names c\.jpg, but the layers are of a\.jpg, b"

@@ -87,7 +87,7 @@ def test_every_wall_of_the_layers_gets_an_orthoimage(tmp_path: Path) -> None:
 
 
 def test_no_layers_give_a_sentence(tmp_path: Path) -> None:
-    with pytest.raises(MethodError, match="there is no layer"):
+    with pytest.raises(MethodError, match="no layer to make"):
         joined(Layers(layers=()), tmp_path)
 
 
@@ -196,11 +196,11 @@ def test_a_wall_that_nothing_paints_is_empty_and_that_is_said(tmp_path: Path) ->
     ("missing", "n_rows", "no_surface", "n_refused", "causes"),
     [
         # Causes of a hundredth of the cells are named.
-        (LayerMask.OUTSIDE, 10, 15, None, ["25% lie in no oriented photo (see which are refused"]),
-        (LayerMask.OCCLUDED, 10, 17, None, ["25% are hidden in every photo", "1% have no surface"]),
+        (LayerMask.OUTSIDE, 10, 15, None, ["25% are in no oriented photo (check which"]),
+        (LayerMask.OCCLUDED, 10, 17, None, ["25% are hidden in all photos", "1% have no surface"]),
         # A new photo is asked for only where none was refused.
-        (LayerMask.OUTSIDE, 10, 0, 0, ["25% lie in no oriented photo (take one there)"]),
-        (LayerMask.OUTSIDE, 10, 0, 2, ["25% lie in no oriented photo (2 of 3 photos are not"]),
+        (LayerMask.OUTSIDE, 10, 0, 0, ["25% are in no oriented photo (take another"]),
+        (LayerMask.OUTSIDE, 10, 0, 2, ["25% are in no oriented photo (2 of 3 photos are not"]),
         # A tenth at least is missing, apart from what has no surface.
         (LayerMask.OUTSIDE, 3, 800, None, None),
     ],

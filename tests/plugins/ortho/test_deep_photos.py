@@ -110,9 +110,8 @@ def test_a_block_of_both_depths_has_sixteen_bits_and_says_so(tmp_path: Path) -> 
     assert [layer.rgb.dtype for layer in layers.layers] == [np.uint16, np.uint16]
     assert alone.layers[0].rgb.dtype == np.uint8
     np.testing.assert_array_equal(layers.layers[1].rgb, sixteen_bits(alone.layers[0].rgb))
-    assert (
-        "1 of 2 photos (1.png) have 8 bits per channel, the others 16: the orthoimages have 16, "
-        "levels of 8 bits are multiplied by 257" in ctx.warnings
-    )
+    assert [(one.code, one.values["n"]) for one in ctx.diagnostics] == [
+        ("photos-of-mixed-depth", 1)
+    ]
     images, _ = joined(tmp_path, layers, seams="graph-cut")
     assert images.images[0].rgb.dtype == np.uint16

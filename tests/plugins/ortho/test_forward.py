@@ -86,7 +86,7 @@ def test_a_coarse_photo_leaves_gaps_that_are_filled_and_marked(tmp_path: Path) -
     (tmp_path / "closed").mkdir()
     ctx = context(tmp_path)
     holed = thrown(given, ctx, fill_gap_cells=0)
-    assert any("no cloud is wired" in warning for warning in ctx.warnings)
+    assert "occluders-unknown" in [one.code for one in ctx.diagnostics]
     assert holed.filled is not None
     assert not holed.filled.any()
     # Pixels of 5 mm and more on cells of 4 mm.

@@ -87,7 +87,7 @@ def test_a_wall_that_no_photo_paints_is_bare_but_states_what_is_hidden(tmp_path:
     found = stack.joined(np.uint16)
     first, second, third = found.layers
     assert first is shown
-    assert ctx.warnings == ["no photo shows wall 1, wall 2: the orthoimage stays empty"]
+    assert [one.values["walls"] for one in ctx.diagnostics] == ["wall 1, wall 2"]
     assert (second.wall, second.source, third.wall, third.source) == (1, NO_SOURCE, 2, NO_SOURCE)
     np.testing.assert_array_equal(second.mask, mask_of(a=HIDDEN, b=HIDDEN, c=OUTSIDE))
     np.testing.assert_array_equal(third.mask, mask_of(a=OUTSIDE, b=OUTSIDE, c=OUTSIDE))
