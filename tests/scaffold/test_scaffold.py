@@ -7,6 +7,7 @@ import re
 import sys
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
@@ -200,46 +201,32 @@ def test_no_class_has_the_name_of_another_one_beside_it(
     assert (project.class_name, project.product_class) == names
 
 
-@pytest.mark.parametrize(
-    ("kind", "product", "takes", "sentence"),
-    [
-        ("plane", "parts", ("cloud",), "kind plane is announced by an installed plugin already"),
-        (
-            "my-parts",
-            "parts",
-            ("cloud",),
-            "lower-case letters, digits and underscores, got 'my-parts'",
-        ),
-        ("part", "planes", ("cloud",), "product planes is announced already"),
-        ("part", "parts", ("clouds",), r"no product type clouds \(did you mean cloud\?\)"),
-    ],
-)
-def test_a_new_kind_that_cannot_be_is_refused(
-    kind: str, product: str, takes: tuple[str, ...], sentence: str, tmp_path: Path
-) -> None:
-    project = Project(name="mine", kind=kind, product=product, takes=takes)
-    with pytest.raises(ArgumentError, match=sentence):
-        write_project(project, tmp_path, discover_catalog())
-    assert list(tmp_path.iterdir()) == []
+PARTS = {"kind": "part", "product": "parts", "takes": ("cloud",)}
 
 
 @pytest.mark.parametrize(
-    ("name", "kind", "sentence"),
+    ("project", "sentence"),
     [
-        ("My Detector", "plane", "a plugin's name must be 2 to 32 lower-case letters"),
-        ("x", "plane", "a plugin's name must be 2 to 32 lower-case letters"),
-        ("mine", "plain", r"no installed plugin announces kind plain \(did you mean plane\?\)"),
-        ("hough2d", "plane", "method plane.hough2d is brought by orthoflow-tls"),
-        ("numpy", "plane", "a Python package numpy is installed already"),
-        ("taken", "plane", "taken exists already"),
+        ({**PARTS, "kind": "plane"}, "kind plane is announced by an installed plugin already"),
+        ({**PARTS, "kind": "my-parts"}, "lower-case letters, digits and underscores, got 'my-par"),
+        ({**PARTS, "product": "planes"}, "product planes is announced already"),
+        ({**PARTS, "takes": ("clouds",)}, r"no product type clouds \(did you mean cloud\?\)"),
+        ({"name": "My Detector"}, "a plugin's name must be 2 to 32 lower-case letters"),
+        ({"name": "x"}, "a plugin's name must be 2 to 32 lower-case letters"),
+        ({"kind": "plain"}, r"no installed plugin announces kind plain \(did you mean plane\?\)"),
+        ({"name": "hough2d"}, "method plane.hough2d is brought by orthoflow-tls"),
+        ({"name": "numpy"}, "a Python package numpy is installed already"),
+        ({"name": "taken"}, "taken exists already"),
     ],
 )
-def test_a_name_that_cannot_be_used_is_refused(
-    name: str, kind: str, sentence: str, tmp_path: Path
+def test_a_project_that_cannot_be_is_refused(
+    project: dict[str, Any], sentence: str, tmp_path: Path
 ) -> None:
     (tmp_path / "taken").mkdir()
+    wanted = Project(**{"name": "mine", "kind": "plane", **project})
     with pytest.raises(ArgumentError, match=sentence):
-        write_project(Project(name=name, kind=kind), tmp_path, discover_catalog())
+        write_project(wanted, tmp_path, discover_catalog())
+    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
 
 
 @pytest.fixture(scope="module")

@@ -22,25 +22,20 @@ from orthoflow.workflow.source import InvalidWorkflowError
 from orthoflow.workflow.views import resolved_json
 from tests.laboratories import GOOD, SWEPT, load
 
+LIMITS = {"low_m": 0.5, "high_m": 1.0}
 SETS = {
     "plain": ("wall.gsd_m=0.002", "wall", "", "gsd_m", 0.002),
     "method name of a step without variants": ("wall.grid.gsd_m=2", "wall", "", "gsd_m", 2.0),
     "variant": ("plane.ransac.iterations=7", "plane", "ransac", "iterations", 7),
     "list": ("plane.hough2d.normal=[1, 0, 0]", "plane", "hough2d", "normal", [1.0, 0.0, 0.0]),
     "text that YAML 1.1 takes for a flag": ("cloud.up=y", "cloud", "", "up", "y"),
-    "inside a mapping": (
-        "plane.hough2d.limits.low_m=0.5",
-        "plane",
-        "hough2d",
-        "limits",
-        {"low_m": 0.5, "high_m": 1.0},
-    ),
-    "inside a mapping of whoever has it": (
+    "inside a mapping": ("plane.hough2d.limits.low_m=0.5", "plane", "hough2d", "limits", LIMITS),
+    "inside a mapping of either": (
         "plane.limits.low_m=0.5",
         "plane",
         "hough2d",
         "limits",
-        {"low_m": 0.5, "high_m": 1.0},
+        LIMITS,
     ),
 }
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -33,81 +32,39 @@ def test_every_recipe_comes_back_whole(path: Path) -> None:
     assert list(again.steps) == sorted(workflow.steps)
 
 
-def changed(change: Callable[[dict[str, object]], object]) -> str:
+FIRST = "steps.0.variants.0"
+# Where a document is changed (a number is the place of an entry), the value there, the sentence.
+CHANGES: list[tuple[str, object, str]] = [
+    ("steps.../x", {"variants": [{"name": "", "use": "a.b"}]}, "'../x' cannot be a name"),
+    (f"{FIRST}.repeat", "2", r"variants\.0\.repeat: Input should be a valid integer"),
+    (f"{FIRST}.repeat", 10**9, r"variants\.0\.repeat: Input should be less than or equal to 10000"),
+    ("steps.0.variants", [], "has 0 variants"),
+    (f"{FIRST}.name", "other", "has a variant, but is stated to have none"),
+    (f"{FIRST}.use", ["a"], r"variants\.0\.use: Input should be a valid string"),
+    ("steps.0.in.cloud", ["nowhere.cloud"], "takes nowhere.cloud, which is not there"),
+    ("steps.0.in.cloud", ["NAME.cloud"], "need each other in a circle"),
+    (f"{FIRST}.timeout_s", -1.0, r"timeout_s: Input should be greater than 0"),
+    ("steps.0.unless", "no", "an unknown input"),
+    ("steps.0.if", "no", "an unknown input"),
+    ("inputs.0.optional", 1, "optional: Input should be a valid bool"),
+    ("seed", True, "seed: Input should be a valid integer"),
+    ("inputs.0.files", [1], r"files\.0: Input should be a valid string"),
+    ("compare", {"design": "all"}, r"compare\.design: Input should be"),
+    ("compare", {"baseline": {"NAME": "no"}}, "has no variant of the comparison"),
+]
+
+
+@pytest.mark.parametrize(("place", "value", "words"), CHANGES)
+def test_what_the_checks_of_a_file_would_refuse_is_refused(
+    place: str, value: object, words: str
+) -> None:
     document = json.loads(resolved_json(loaded(RECIPES[0])))
-    change(document)
-    return json.dumps(document)
-
-
-def _first(document: Any, key: str) -> Any:
-    return next(iter(document[key].values()))
-
-
-CHANGES: dict[str, tuple[Callable[[Any], object], str]] = {
-    "a step that leaves its folder": (
-        lambda d: d["steps"].update({"../x": _first(d, "steps")}),
-        "'../x' cannot be a name",
-    ),
-    "a repeat that is text": (
-        lambda d: _first(d, "steps")["variants"][0].update(repeat="2"),
-        r"variants\.0\.repeat: Input should be a valid integer",
-    ),
-    "a billion repeats": (
-        lambda d: _first(d, "steps")["variants"][0].update(repeat=10**9),
-        r"variants\.0\.repeat: Input should be less than or equal to 10000",
-    ),
-    "no variants": (lambda d: _first(d, "steps").update(variants=[]), "has 0 variants"),
-    "a hidden variant": (
-        lambda d: _first(d, "steps")["variants"][0].update(name="other"),
-        "has a variant, but is stated to have none",
-    ),
-    "a method that is a list": (
-        lambda d: _first(d, "steps")["variants"][0].update(use=["a"]),
-        r"variants\.0\.use: Input should be a valid string",
-    ),
-    "a reference to nothing": (
-        lambda d: _first(d, "steps")["in"].update(cloud=["nowhere.cloud"]),
-        "takes nowhere.cloud, which is not there",
-    ),
-    "a circle": (
-        lambda d: _first(d, "steps")["in"].update(cloud=[f"{next(iter(d['steps']))}.cloud"]),
-        "need each other in a circle",
-    ),
-    "an endless time limit": (
-        lambda d: _first(d, "steps")["variants"][0].update(timeout_s=-1.0),
-        r"timeout_s: Input should be greater than 0",
-    ),
-    "an unknown input": (lambda d: _first(d, "steps").update(unless="no"), "an unknown input"),
-    "no such input": (lambda d: _first(d, "steps").update({"if": "no"}), "an unknown input"),
-    "a flag that is a number": (
-        lambda d: _first(d, "inputs").update(optional=1),
-        "optional: Input should be a valid bool",
-    ),
-    "a seed that is true": (lambda d: d.update(seed=True), "seed: Input should be a valid integer"),
-    "files that are numbers": (
-        lambda d: _first(d, "inputs").update(files=[1]),
-        r"files\.0: Input should be a valid string",
-    ),
-    "an unknown design": (
-        lambda d: d.update(compare={"design": "all", "baseline": {}, "exclude": [], "metrics": []}),
-        r"compare\.design: Input should be",
-    ),
-    "a baseline of nothing": (
-        lambda d: d.update(
-            compare={
-                "design": "product",
-                "baseline": {next(iter(d["steps"])): "no"},
-                "exclude": [],
-                "metrics": [],
-            }
-        ),
-        "has no variant of the comparison",
-    ),
-}
-
-
-@pytest.mark.parametrize("change", CHANGES)
-def test_what_the_checks_of_a_file_would_refuse_is_refused(change: str) -> None:
-    act, words = CHANGES[change]
+    name = next(iter(document["steps"]))
+    *outer, last = place.split(".", 1) if "../x" in place else place.split(".")
+    found: Any = document
+    for key in outer:
+        values = found if isinstance(found, list) else list(found.values())
+        found = values[0] if key == "0" else found[key]
+    found[last] = json.loads(json.dumps(value).replace("NAME", name))
     with pytest.raises(WorkflowError, match=words):
-        workflow_from_resolved(changed(act), "")
+        workflow_from_resolved(json.dumps(document), "")
