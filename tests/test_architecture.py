@@ -67,22 +67,13 @@ def test_geometry_keeps_only_what_two_kinds_or_the_framework_share() -> None:
 
 
 @cache
-def trees() -> dict[Path, tuple[set[str], list[int]]]:
-    """What each module imports of ours, and where it reads the details of a product."""
-    known = {name_of(module) for module in MODULES}
-    return {
-        module: (imported_modules(tree, known), _readings_of_details(tree))
-        for module in MODULES
-        for tree in [ast.parse((ROOT / module).read_text())]
-    }
-
-
 def import_graph() -> nx.DiGraph[str]:
     """Modules and packages by name, an edge to each one that they import."""
     graph: nx.DiGraph[str] = nx.DiGraph()
-    for module, (imported, _) in trees().items():
-        name = name_of(module)
-        graph.add_edges_from((name, other) for other in imported - {name})
+    known = {name_of(module) for module in MODULES}
+    for module in MODULES:
+        name, tree = name_of(module), ast.parse((ROOT / module).read_text())
+        graph.add_edges_from((name, other) for other in imported_modules(tree, known) - {name})
     return graph
 
 
@@ -147,43 +138,6 @@ def test_no_module_carries_doubts_or_leftovers(folder: str) -> None:
         if word in path.read_text()
     ]
     assert found == []
-
-
-def test_nobody_reads_the_details_of_a_product() -> None:
-    """They are for people: what other code reads is a typed, documented field of the product."""
-    found = [f"{module}:{line}" for module, (_, read) in trees().items() for line in read]
-    templates = [path for package in PACKAGES for path in (ROOT / package).rglob("*.j2")]
-    found += [
-        f"{path.relative_to(ROOT)}:{number}"
-        for path in templates
-        for number, line in enumerate(path.read_text().splitlines(), start=1)
-        if ".details" in line
-    ]
-    assert not found, "\n".join(found)
-
-
-def _readings_of_details(tree: ast.Module) -> list[int]:
-    """Lines that take an entry out of an attribute named `details`, ask for one, or walk it.
-
-    Handing all of it on (`{**product.details, ...}`, `dict(count.details)`) reads nothing.
-    """
-    readers = {"get", "items", "keys", "pop", "setdefault", "values"}
-    read: list[ast.AST] = []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Subscript | ast.Attribute) and (
-            isinstance(node, ast.Subscript) or node.attr in readers
-        ):
-            read.append(node.value)
-        elif isinstance(node, ast.Compare):
-            read.extend(node.comparators)
-        elif isinstance(node, ast.For | ast.comprehension):
-            read.append(node.iter)
-        elif isinstance(node, ast.Assign | ast.AnnAssign | ast.NamedExpr) and node.value:
-            # Under another name it would be read unseen.
-            read.append(node.value)
-    return sorted(
-        item.lineno for item in read if isinstance(item, ast.Attribute) and item.attr == "details"
-    )
 
 
 def test_what_is_optional_is_asked_for_in_one_place() -> None:

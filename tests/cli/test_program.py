@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -136,17 +135,3 @@ def test_an_interrupt_ends_with_130_and_says_how_to_go_on(error: BaseException) 
     result = invoke_failing(interrupted)
     assert result.exit_code == 130
     assert result.stderr.strip() == "interrupted; repeat the command with -o runs/x"
-
-
-def test_a_closed_pipe_makes_no_noise() -> None:
-    reading, writing = os.pipe()
-    os.close(reading)
-    with os.fdopen(writing, "wb") as closed:
-        done = subprocess.run(
-            [sys.executable, "-m", "orthoflow", "plugins", "list"],
-            stdout=closed,
-            stderr=subprocess.PIPE,
-            text=True,
-            check=False,
-        )
-    assert (done.returncode, done.stderr) == (0, "")

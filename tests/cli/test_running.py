@@ -14,7 +14,6 @@ from pathlib import Path
 import pytest
 
 from orthoflow.records.open import open_run
-from tests.laboratories import write_distribution
 from tests.long_loops import long_only
 from tests.workshop_runs import command, orthoflow, workshop_environment, write_studio
 
@@ -234,48 +233,3 @@ def test_a_reader_that_leaves_does_not_stop_the_run(tmp_path: Path) -> None:
     assert "Traceback" not in done.stderr
     assert "Exception" not in done.stderr
     assert open_run(tmp_path / "r").record.status == "ok"
-
-
-def test_a_truncated_record_ends_with_3_everywhere(
-    finished: tuple[Path, str, str], tmp_path: Path
-) -> None:
-    content = (finished[0] / "good" / "run.h5").read_bytes()
-    (tmp_path / "run.h5").write_bytes(content[: len(content) // 2])
-    for verb in ("show", "verify", "report"):
-        done = orthoflow(tmp_path, verb, "run.h5")
-        assert (verb, done.returncode) == (verb, 3)
-        assert "Traceback" not in done.stderr
-        assert "run.h5" in done.stdout + done.stderr
-
-
-PAINTS = """
-from orthoflow.sdk import MethodSpec, hookimpl
-
-@hookimpl
-def orthoflow_methods():
-    return [MethodSpec(id="paint.twin", target="paints:Twin", summary="claimed twice")]
-"""
-
-
-def test_plugins_that_cannot_be_used_are_named_and_harm_nobody(tmp_path: Path) -> None:
-    fails = "import no_such_library\nid = 'paint.fallen'\n"
-    sources = {"fallen": fails, "one": PAINTS, "two": PAINTS}
-    plugins = [
-        write_distribution(tmp_path / name, name, {f"{name}_hooks.py": text})
-        for name, text in sources.items()
-    ]
-    twins = "paint.twin"
-    fallen = "plugin fallen of fallen 1.0 fails to load: ModuleNotFoundError: No module named"
-    listed = orthoflow(tmp_path, "plugins", "list", plugins=plugins)
-    assert listed.returncode == 0
-    named = [line for line in listed.stdout.splitlines() if "paint.twin" in line]
-    assert any("one 1.0" in line and "two 1.0" in line for line in named)
-    assert f"- {fallen}" in listed.stdout
-    for method, sentence in (("paint.twin", twins), ("paint.fallen", fallen)):
-        write_studio(tmp_path, method)
-        checked = orthoflow(tmp_path, "check", "studio.yaml", plugins=plugins)
-        assert checked.returncode == 4
-        assert sentence in checked.stderr
-        assert "Traceback" not in checked.stderr
-    write_studio(tmp_path)
-    assert orthoflow(tmp_path, "check", "studio.yaml", plugins=plugins).returncode == 0
