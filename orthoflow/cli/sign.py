@@ -20,7 +20,7 @@ from orthoflow.untrusted_text import shown
     required=True,
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="Your private Ed25519 key, OpenSSH or PEM; you are asked for its password.",
+    help="Your private Ed25519 key in OpenSSH format; you are asked for its password.",
 )
 def sign(run: Path, key: Path) -> int:
     """Sign the record of RUN, a run folder or its run.h5, with your key.

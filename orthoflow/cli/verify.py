@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     "--signer",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="The public key, OpenSSH or PEM, that the record must be signed with.",
+    help="The public key, in OpenSSH format, that the record must be signed with.",
 )
 @click.option(
     "--strict",

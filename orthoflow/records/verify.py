@@ -83,7 +83,7 @@ def sign_record(path: Path, key_file: Path, password: Callable[[], str]) -> Sign
 
     Args:
         path: the record file.
-        key_file: private Ed25519 key, OpenSSH or PEM.
+        key_file: private Ed25519 key in OpenSSH format.
         password: called if the key is protected.
 
     Raises:
@@ -131,7 +131,7 @@ def check_signature(record: Path, signer: Path) -> Signature:
 
     Args:
         record: the record file.
-        signer: the public Ed25519 key that it must be signed with, OpenSSH or PEM.
+        signer: the public Ed25519 key that it must be signed with, in OpenSSH format.
 
     Raises:
         RecordError: it is missing, another's, or does not fit the record.
@@ -188,13 +188,12 @@ def _private_key(path: Path, password: Callable[[], str]) -> Ed25519PrivateKey:
     from cryptography.hazmat.primitives import serialization  # noqa: PLC0415 - as above
     from cryptography.hazmat.primitives.asymmetric import ed25519  # noqa: PLC0415
 
-    if data.startswith((b"ssh-", b"-----BEGIN PUBLIC")):
+    if data.startswith(b"ssh-"):
         raise InputError(
             f"{path} is the public half of a key, by which others check: sign with the private one"
             f", {path.with_suffix('')}"
         )
-    is_openssh = b"OPENSSH PRIVATE KEY" in data
-    load = serialization.load_ssh_private_key if is_openssh else serialization.load_pem_private_key
+    load = serialization.load_ssh_private_key
     with _key_errors(path, "private", "or the password is wrong: {}"):
         try:
             key = load(data, password=None)
@@ -211,10 +210,8 @@ def _public_key(path: Path) -> Ed25519PublicKey:
     from cryptography.hazmat.primitives import serialization  # noqa: PLC0415 - as above
     from cryptography.hazmat.primitives.asymmetric import ed25519  # noqa: PLC0415
 
-    is_pem = data.lstrip().startswith(b"-----")
-    load = serialization.load_pem_public_key if is_pem else serialization.load_ssh_public_key
     with _key_errors(path, "public", "{}; the signer's file ends with .pub"):
-        key = load(data)
+        key = serialization.load_ssh_public_key(data)
     if not isinstance(key, ed25519.Ed25519PublicKey):
         raise InputError(f"{path} must be an Ed25519 key, as records are signed with these")
     return key
@@ -227,7 +224,7 @@ def _key_errors(path: Path, kind: str, reason: str) -> Iterator[None]:
     try:
         yield
     except (ValueError, TypeError, UnsupportedAlgorithm) as error:
-        what = f"{path} is not a {kind} key in OpenSSH or PEM format, {reason.format(error)}"
+        what = f"{path} is not a {kind} key in OpenSSH format, {reason.format(error)}"
         raise InputError(what) from error
 
 

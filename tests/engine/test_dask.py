@@ -28,7 +28,6 @@ from orthoflow.errors import ArgumentError, CancelledStepError, ClusterError, Pl
 from tests.engine_world import (
     World,
     digests,
-    has_ended,
     start_fork_server,
     toy_world,
 )
@@ -190,38 +189,6 @@ def test_an_interrupted_run_stops_its_workers_and_goes_on_with_any_executor(
         execute(office.plan(own=own), folder, world.store, interrupt)
     outcome = execute(world.plan(STEPS, force=("second",)), folder, world.store)
     assert digests(outcome) == office.quiet
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("own", [False, True], ids=["workers", "own workers"])
-def test_a_step_that_nobody_waits_for_is_stopped(office: Office, own: bool) -> None:
-    steps: list[int] = []
-
-    def leave(event: RunEvent) -> None:
-        if is_under_way(event):
-            steps.extend(
-                int(path.parent.name)
-                for path in Path("/proc").glob("[0-9]*/cwd")
-                if "/attempt-" in _target(path)
-            )
-            raise _GoneError
-
-    plan = office.plan(own=own, sets=["second.steps=100000"])
-    with pytest.raises(_GoneError):
-        execute(plan, office.world.folder / f"left-{own}", office.world.store, leave)
-    assert len(steps) == 1
-    assert all(has_ended(process) for process in steps)
-
-
-class _GoneError(Exception):
-    """The coordinator goes without a word."""
-
-
-def _target(link: Path) -> str:
-    try:
-        return str(link.readlink())
-    except OSError:
-        return ""
 
 
 @pytest.mark.long

@@ -133,6 +133,15 @@ def test_a_product_without_one_of_its_parts_is_refused(tmp_path: Path) -> None:
             read_product_file(tmp_path / "a.h5")
 
 
+def test_a_file_is_not_written_through_a_link(tmp_path: Path) -> None:
+    path, link = tmp_path / "a", tmp_path / "link"
+    path.write_bytes(b"before")
+    link.symlink_to(path)
+    with pytest.raises(OSError, match="symbolic links"):
+        write_product_file(link, Given())
+    assert path.read_bytes() == b"before"
+
+
 FULL_DISK = """
 import resource, sys
 from pathlib import Path

@@ -147,39 +147,18 @@ def test_a_product_that_left_the_store_cannot_be_embedded(tmp_path: Path) -> Non
         write_record(path, record, lambda _: shelf.find(other))
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (
-            lambda record: dataclasses.replace(record, cells=record.cells[:1] * 2),
-            "the cell 'cloud' is given twice",
-        ),
-        (
-            lambda record: dataclasses.replace(
-                record, cells=(dataclasses.replace(record.cells[0], address="a/b"),)
-            ),
-            "the cell 'a/b' cannot be a name in a record",
-        ),
-        (
-            lambda record: dataclasses.replace(
-                record,
-                inputs=(
-                    RecordedInput(
-                        name="scan",
-                        files=(RecordedFile(name="/home/jane/a.laz", size_bytes=1, sha256=""),),
-                    ),
-                ),
-            ),
-            "'/home/jane/a.laz' of the input scan must be named without its folder",
-        ),
-    ],
-)
-def test_impossible_records_are_refused(
-    tmp_path: Path, change: Callable[[RunRecord], RunRecord], message: str
-) -> None:
+def test_impossible_records_are_refused(tmp_path: Path) -> None:
     _, record, shelf = write_sample(tmp_path)
-    with pytest.raises(RecordFormatError, match=message):
-        write_record(tmp_path / "other.h5", change(record), shelf.find)
+    cell, path = record.cells[0], "/home/jane/a.laz"
+    file = RecordedFile(name=path, size_bytes=1, sha256="")
+    changes: tuple[tuple[dict[str, Any], str], ...] = (
+        ({"cells": (cell, cell)}, "the cell 'cloud' is given twice"),
+        ({"cells": (dataclasses.replace(cell, address="a/b"),)}, "the cell 'a/b' cannot be a name"),
+        ({"inputs": (RecordedInput(name="scan", files=(file,)),)}, f"'{path}' of the input scan"),
+    )
+    for change, message in changes:
+        with pytest.raises(RecordFormatError, match=message):
+            write_record(tmp_path / "other.h5", dataclasses.replace(record, **change), shelf.find)
     assert not (tmp_path / "other.h5").exists()
 
 

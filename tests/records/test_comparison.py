@@ -13,7 +13,6 @@ from orthoflow.engine.store import Store
 from orthoflow.records.compare import Pair, compare_runs
 from orthoflow.records.open import open_run
 from orthoflow.records.runs import Run
-from orthoflow.report.pages import write_report
 from tests.compared_runs import compared, number
 from tests.report_runs import HeldRun, cell, record
 from tests.studios import Studio, open_studio
@@ -167,19 +166,6 @@ def test_arrays_beside_the_record_are_found_in_a_store_or_not_measured(studio: S
     assert {item.verdict for item in compare_runs(left, right).products} == {"not measured"}
     measured = compare_runs(left, right, stores=[Store(studio.folder / ".orthoflow")]).products
     assert {item.verdict for item in measured} == {"within tolerance"}
-
-
-def test_a_page_of_two_runs_looks_into_the_store_as_the_command_does(
-    studio: Studio, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("orthoflow.records.open.open_run", lambda path: unembedded(open_run(path)))
-    # Studios write empty pages.
-    monkeypatch.setattr("orthoflow.report.write_report", write_report)
-    told = "in no record and no store at hand"
-    for more, is_told in (((), False), (("--store", "nowhere"), True)):
-        done = studio("report", "first", "near", "-o", "both.html", *more)
-        assert done.exit_code == 0, done.output
-        assert (told in (studio.folder / "both.html").read_text(encoding="utf-8")) is is_told
 
 
 def test_what_was_skipped_has_no_versions_to_differ_in() -> None:

@@ -131,29 +131,10 @@ def graph(crate: dict[str, Any]) -> Any:
             id="2-how-much-memory-and-time",
         ),
         pytest.param(
-            """SELECT ?start ?end WHERE { ?action a s:CreateAction; s:instrument ?tool;
-                s:startTime ?start; s:endTime ?end. ?tool a s:SoftwareApplication }""",
-            3,
-            id="5-how-long-did-each-method-take",
-        ),
-        pytest.param(
             """SELECT ?file WHERE { ?action a s:CreateAction; s:instrument ?workflow;
                 s:object ?file. ?workflow a bs:ComputationalWorkflow. ?file a s:MediaObject }""",
             2,
             id="8-what-went-in",
-        ),
-        pytest.param(
-            """SELECT ?what WHERE { ?action a s:CreateAction; s:instrument ?workflow;
-                s:result ?what. ?workflow a bs:ComputationalWorkflow. ?what a s:CreativeWork }""",
-            1,
-            id="8-what-came-out",
-        ),
-        pytest.param(
-            """SELECT ?tool ?version WHERE { ?action a s:CreateAction; s:instrument ?tool.
-                ?tool a s:SoftwareApplication; s:softwareRequirements ?needs; s:mainEntity ?needs.
-                ?needs s:version ?version }""",
-            3,
-            id="10-what-does-a-method-need",
         ),
         pytest.param(
             """SELECT ?name ?value WHERE {

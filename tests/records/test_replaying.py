@@ -87,10 +87,7 @@ def test_another_code_of_a_method_is_noted_and_not_refused(world: World) -> None
     ("field", "value", "reason"),
     [
         ("cores", -5, "greater than or equal to 1"),
-        ("cores", "many", "valid integer"),
-        ("timeout_s", "soon", "valid number"),
         ("timeout_s", [1], "valid number"),
-        ("timeout_s", -1.0, "greater than 0"),
         ("repeat", 0, "greater than or equal to 1"),
     ],
 )

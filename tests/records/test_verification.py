@@ -171,15 +171,12 @@ def test_a_file_of_another_program_or_version_cannot_be_checked(
 @pytest.mark.parametrize(
     ("name", "value", "unit", "is_found"),
     [
-        ("rmse_u_mm", 1.25, "mm", False),
         ("all_rmse_u_mm", 2.5, "mm", False),
         ("wall_3_rmse_u_mm", 1.25, "mm", False),
         # Of what the inspection does not have, nothing is known.
         ("n_points", 7.0, "1", False),
-        ("rmse_u_mm", 1.0, "mm", True),
         ("rmse_u_mm", 1.25, "m", True),
         ("wall_3_rmse_u_mm", 0.25, "mm", True),
-        ("all_rmse_u_mm", 9.0, "mm", True),
     ],
 )
 def test_metrics_of_an_inspection_are_those_of_its_product(

@@ -100,13 +100,3 @@ def test_sixteen_bits_come_from_tiff_to_geotiff(site: Shell) -> None:
     assert (np.abs(colours[shown].astype(int) - taken) <= [90, 110, 2]).all()
     assert np.isin(colours[shown][:, 0], ramp(straight_camera())[0, :, 0]).all()
     assert len(np.unique(colours[shown][:, 0])) > 256
-
-
-def test_camera_raw_among_the_photos_is_refused(site: Shell) -> None:
-    (site.folder / "photos" / "b.CR2").write_bytes(b"II*\0")
-    ended = site("run", "deep.yaml", "-o", "run", "--until", "shots")
-    assert ended.code == 2
-    assert "camera raw, which is not read: photo b.CR2; develop to TIFF of 16 bits" in " ".join(
-        ended.said.split()
-    )
-    assert "Traceback" not in ended.said

