@@ -209,21 +209,14 @@ class Catalog:
 
         entry = self._product(type_name)
         cls = import_target(entry.spec.target, f"product type {type_name}", entry.distribution)
+        broken = f"product type {type_name} of {entry.distribution} breaks a rule: "
         if not (isinstance(cls, type) and issubclass(cls, Product)):
-            raise PluginError(
-                f"product type {type_name} of {entry.distribution} breaks a rule: "
-                f"{entry.spec.target} must be a subclass of Product"
-            )
+            raise PluginError(f"{broken}{entry.spec.target} must be a subclass of Product")
         own = getattr(cls, "type_name", None)
         if own != type_name:
-            raise PluginError(
-                f"product type {type_name} of {entry.distribution} breaks a rule: it is announced "
-                f"as {type_name}, but the type_name of {entry.spec.target} is {own!r}"
-            )
+            raise PluginError(f"{broken}the type_name of {entry.spec.target} is {own!r}")
         if complaint := product_complaint(cls):
-            raise PluginError(
-                f"product type {type_name} of {entry.distribution} breaks a rule: {complaint}"
-            )
+            raise PluginError(broken + complaint)
         return cls
 
     def publisher(self, type_name: str) -> Publisher | None:

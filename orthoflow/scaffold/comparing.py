@@ -55,9 +55,7 @@ def comparison_text(method_id: str, name: str, catalog: Catalog) -> str:
         if not of_kind:
             continue
         _vary(steps[of_kind[-1]], name, method_id)
-        document["name"] = f"compare-{name}"[:_NAME_MOST].rstrip("_-")
-        document["compare"] = {"design": "product", **_judged(kind, steps, catalog)}
-        return _dumped(document)
+        return _dumped(document, name, _judged(kind, steps, catalog))
     sibling = loadable_method(catalog, kind)
     if sibling is None:
         return ""
@@ -67,22 +65,13 @@ def comparison_text(method_id: str, name: str, catalog: Catalog) -> str:
         name: {"use": method_id},
     }
     takes = {port.name: port.type_name for port in ports}
-    document = _behind_a_recipe(kind, takes, variants, catalog)
-    if not document:
-        return ""
-    document["name"] = f"compare-{name}"[:_NAME_MOST].rstrip("_-")
     # A pattern may have none that fits; a name is reported.
-    metrics = [one.name for one in sibling.load().metric_specs() if one.name.isidentifier()][
-        :_METRICS_MOST
-    ]
-    asked = {"metrics": [f"{kind}.{one}" for one in metrics]} if metrics else {}
-    document["compare"] = {"design": "product", **asked}
-    return _dumped(document)
+    metrics = [one.name for one in sibling.load().metric_specs() if one.name.isidentifier()]
+    asked = [f"{kind}.{one}" for one in metrics[:_METRICS_MOST]]
+    return _dumped(_behind_a_recipe(kind, takes, variants, catalog), name, asked)
 
 
-def _judged(
-    kind: str, steps: Mapping[str, Mapping[str, Any]], catalog: Catalog
-) -> dict[str, list[str]]:
+def _judged(kind: str, steps: Mapping[str, Mapping[str, Any]], catalog: Catalog) -> list[str]:
     """The numbers that show which method is better, of a recipe that measures them."""
     wanted = _JUDGED.get(kind, ())
     measured = {
@@ -91,8 +80,7 @@ def _judged(
         if "use" in node
         for metric in catalog.method(node["use"]).load().metric_specs()
     }
-    found = [measured[metric] for metric in wanted if metric in measured]
-    return {"metrics": found} if found else {}
+    return [measured[metric] for metric in wanted if metric in measured]
 
 
 def own_comparison_text(method_id: str, takes: Sequence[str], catalog: Catalog) -> str:
@@ -112,11 +100,7 @@ def own_comparison_text(method_id: str, takes: Sequence[str], catalog: Catalog) 
         "double": {"use": method_id, "params": {"factor": 2.0}},
     }
     document = _behind_a_recipe(kind, dict(zip(takes, takes, strict=True)), variants, catalog)
-    if not document:
-        return ""
-    document["name"] = f"compare-{kind}"[:_NAME_MOST].rstrip("_-")
-    document["compare"] = {"design": "product", "metrics": [f"{kind}.n_items"]}
-    return _dumped(document)
+    return _dumped(document, kind, [f"{kind}.n_items"])
 
 
 def _behind_a_recipe(
@@ -231,7 +215,13 @@ def _vary(node: dict[str, Any], name: str, method_id: str) -> None:
     node["variants"] = {sibling: ours, name: {"use": method_id}}
 
 
-def _dumped(document: dict[str, Any]) -> str:
+def _dumped(document: dict[str, Any], name: str, metrics: Sequence[str]) -> str:
+    """The document as a comparison of that name; empty where there is none."""
+    if not document:
+        return ""
+    document["name"] = f"compare-{name}"[:_NAME_MOST].rstrip("_-")
+    asked = {"metrics": [*metrics]} if metrics else {}
+    document["compare"] = {"design": "product", **asked}
     yaml = YAML()
     yaml.default_flow_style = None
     yaml.width = 4096

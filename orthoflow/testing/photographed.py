@@ -364,16 +364,6 @@ def _calibration() -> Calibration:
 
 
 @cache
-def _walls() -> Walls:
-    return walls_of(photographed_scene())
-
-
-@cache
-def _cloud() -> PointCloud:
-    return cloud_of(photographed_scene(), spacing_m=0.01)
-
-
-@cache
 def _checkpoints() -> CheckPoints:
     frame = photographed_scene().frame
     pixels = np.array([[50.0, 60.0], [440.0, 70.0], [250.0, 170.0], [60.0, 280.0], [430.0, 270.0]])
@@ -445,7 +435,7 @@ PHOTOGRAPHED: Final[Mapping[str, Callable[[], Product]]] = {
     "cameras": _cameras,
     "calibration": _calibration,
     "ties": example_ties,
-    "walls": _walls,
-    "cloud": _cloud,
+    "walls": cache(lambda: walls_of(photographed_scene())),
+    "cloud": cache(lambda: cloud_of(photographed_scene(), spacing_m=0.01)),
     "checkpoints": _checkpoints,
 }

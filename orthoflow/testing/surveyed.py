@@ -88,18 +88,8 @@ def _room() -> tuple[PointCloud, Truth]:
 
 
 @cache
-def _cloud() -> PointCloud:
-    return _room()[0]
-
-
-@cache
-def _truth() -> Truth:
-    return _room()[1]
-
-
-@cache
 def _planes() -> Planes:
-    true = _truth().planes
+    true = _room()[1].planes
     chosen = slice(0, _N_PLANES)
     return Planes(
         normal=true.normal[chosen],
@@ -116,7 +106,7 @@ def _planes() -> Planes:
 
 @cache
 def _labels() -> PointLabels:
-    true = _truth().labels
+    true = _room()[1].labels
     return PointLabels(plane_index=np.where(true < _N_PLANES, true, -1).astype(np.int16))
 
 
@@ -280,8 +270,8 @@ def _openings() -> Openings:
 
 
 SURVEYED: Final[Mapping[str, Callable[[], Product]]] = {
-    "cloud": _cloud,
-    "truth": _truth,
+    "cloud": lambda: _room()[0],
+    "truth": lambda: _room()[1],
     "planes": _planes,
     "labels": _labels,
     "walls": _walls,

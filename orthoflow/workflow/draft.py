@@ -459,15 +459,6 @@ def _drafted(by_kind: _ByKind, target: Path, recipe: Recipe) -> Draft:
 
 def _advice(by_kind: _ByKind) -> list[str]:
     advice = [text for items in by_kind.values() for item in items for text in item.advice]
-    equals: dict[int, list[str]] = {}
-    for scan in by_kind["scan"]:
-        equals.setdefault(scan.n_points, []).append(scan.path.name)
-    advice += [
-        f"{_some(names)} have {n_points:,} points each: name only one of them where they are "
-        "the same scan"
-        for n_points, names in equals.items()
-        if n_points and len(names) > 1
-    ]
     photos = [item for item in by_kind.get("photos", ()) if item.kind == "photos"]
     without = [item.path.name for item in photos if not item.lens]
     if without and not {"calibration", "cameras"} & by_kind.keys():

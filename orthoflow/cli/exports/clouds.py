@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -18,6 +17,7 @@ from orthoflow.cli.exports.products import (
     branch_of,
     last_product,
     make_empty,
+    numbers_of,
     output_of,
     product_of,
     wanted_wall,
@@ -181,17 +181,8 @@ def _wall(walls: Walls | None, number: int | None) -> tuple[Slab | None, int]:
 def _box(text: str | None) -> NDArray[np.float64] | None:
     if text is None:
         return None
-    try:
-        values = [float(word) for word in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) != 6 or not all(math.isfinite(value) for value in values):
-        raise ArgumentError(
-            f"--box takes six numbers in metres with commas between, X,Y,Z of two corners, got "
-            f"{text!r}"
-        )
-    corners = np.array(values).reshape(2, 3)
-    return np.sort(corners, axis=0)
+    values = numbers_of(text, 6, "--box takes six numbers in metres, X,Y,Z of two corners,")
+    return np.sort(np.array(values).reshape(2, 3), axis=0)
 
 
 def _crs_wkt(walls: Walls | None) -> str:

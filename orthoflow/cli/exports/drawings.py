@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
 from orthoflow.cli.exports.choices import Choices
-from orthoflow.cli.exports.products import make_empty, wanted_wall
+from orthoflow.cli.exports.products import make_empty, numbers_of, wanted_wall
 from orthoflow.cli.tables import counted
 from orthoflow.errors import ArgumentError
 from orthoflow.files.drawings.cad_pictures import write_cad_picture
@@ -97,15 +96,13 @@ def export_relief(run: Run, folder: Path, chosen: Choices) -> str:
 def _light(text: str | None) -> Light:
     if text is None:
         return Light()
-    try:
-        azimuth, altitude = (float(word) for word in text.split(","))
-    except ValueError:
-        azimuth = altitude = math.nan
+    expected = (
+        "--light takes two numbers in degrees, the azimuth on the wall clockwise from above and "
+        "the altitude over its plane (0 to 90),"
+    )
+    azimuth, altitude = numbers_of(text, 2, expected)
     if not (-360.0 <= azimuth <= 360.0 and 0.0 < altitude <= 90.0):
-        raise ArgumentError(
-            f"--light takes two numbers in degrees with a comma between, the azimuth on the wall "
-            f"clockwise from above and the altitude over its plane (0 to 90), got {text!r}"
-        )
+        raise ArgumentError(f"{expected} got {text!r}")
     return Light(azimuth_deg=azimuth, altitude_deg=altitude)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
@@ -101,6 +102,26 @@ def wanted_wall(number: int, known: Mapping[int, _Wall], who: str, does: str) ->
             f"{', '.join(str(name) for name in known) or 'none'}"
         )
     return known[number]
+
+
+def numbers_of(text: str, count: int, expected: str) -> list[float]:
+    """Read numbers with commas between.
+
+    Args:
+        text: as an option gives it.
+        count: how many there have to be.
+        expected: the option and what it takes, for the error.
+
+    Raises:
+        ArgumentError: there are others.
+    """
+    try:
+        values = [float(word) for word in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count or not all(map(math.isfinite, values)):
+        raise ArgumentError(f"{expected} with commas between, got {text!r}")
+    return values
 
 
 def make_empty(folder: Path) -> None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
 from orthoflow.cli.exports.choices import Choices
-from orthoflow.cli.exports.products import branch_of, last_product, product_of
+from orthoflow.cli.exports.products import branch_of, last_product, numbers_of, product_of
 from orthoflow.cli.exports.sheets import grid_of, origin_of, text_of, write_drawings
 from orthoflow.cli.tables import counted
 from orthoflow.errors import ArgumentError
@@ -20,6 +19,7 @@ from orthoflow.records.runs import Run
 from orthoflow.records.walls import RoomResults, room_results
 
 _USUAL_HEIGHT_M = 1.2
+_THROUGH = "--through takes four numbers in metres, X,Y,X,Y of two points,"
 
 
 def export_plans(run: Run, folder: Path, chosen: Choices) -> str:
@@ -40,21 +40,11 @@ def export_sections(run: Run, folder: Path, chosen: Choices) -> str:
             "(`--to plan` shows the coordinates)"
         )
     results, planes = _room(run, chosen)
-    cuts = [section_cut(planes, _places(text), chosen.language or "en") for text in chosen.through]
+    cuts = [
+        section_cut(planes, numbers_of(text, 4, _THROUGH), chosen.language or "en")
+        for text in chosen.through
+    ]
     return _write(run, folder, chosen, "section", (results, planes), cuts)
-
-
-def _places(text: str) -> list[float]:
-    try:
-        values = [float(word) for word in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) != 4 or not all(map(math.isfinite, values)):
-        raise ArgumentError(
-            f"--through takes four numbers in metres with commas between, X,Y,X,Y of two places, "
-            f"got {text!r}"
-        )
-    return values
 
 
 def _room(run: Run, chosen: Choices) -> tuple[RoomResults, Planes]:
