@@ -57,11 +57,6 @@ from orthoflow.report.tidy_tables import over_table
 if TYPE_CHECKING:
     from orthoflow.engine.store import Store
 
-# Pages that exports write where no other folder is named.
-_VIEWERS: Final = {
-    "model of the room": Path("export/gltf/room.html"),
-    "orthoimages to measure on": Path("export/tiles/index.html"),
-}
 # Columns of what holds over all datasets.
 _OVER_SHOWN: Final = (
     *("combination", "datasets", "failed", "absent", "partly", "median", "spread", "pairs"),
@@ -288,11 +283,6 @@ def _section(
         diagram=graph_picture(run),
         record_file=(from_page / run.file_name).as_posix(),
         citations=citations(run),
-        viewers={
-            text: (from_page / page).as_posix()
-            for text, page in _VIEWERS.items()
-            if (run.folder / page).is_file()
-        },
         files=_files(run, from_page),
         datasets=None,
         over=(),

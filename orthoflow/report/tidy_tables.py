@@ -7,9 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from orthoflow.records import RecordedCell
-from orthoflow.records.runs import Run, cell_metrics
-from orthoflow.report.combinations import Combination, combinations_of
+from orthoflow.records.runs import Run
 from orthoflow.report.curves import sweeps
 from orthoflow.report.paired import MetricOverDatasets
 from orthoflow.report.tables import Column, Table
@@ -60,33 +58,6 @@ class Varied:
         numbers = (values.get(assignment.get(step, "")) for (step, _), values in self.swept.items())
         methods = (named.get(assignment.get(step, "")) for step, named in self.methods.items())
         return (*variants, *methods, *numbers)
-
-
-def combination_table(run: Run) -> Table:
-    """Return a row per combination and repeat with every number of its cells.
-
-    What is not repeated is in the row of the first repeat only.
-    """
-    varied = Varied.of(run)
-    metrics = dict.fromkeys(
-        (row.step, row.metric) for cell in run.record.cells for row in cell_metrics(cell)
-    )
-    rows = []
-    for one in combinations_of(run):
-        for repeat in sorted({cell.repeat for cell in one.cells}):
-            cells = [cell for cell in one.cells if cell.repeat == repeat]
-            found = {
-                (row.step, row.metric): row.value for cell in cells for row in cell_metrics(cell)
-            }
-            values = (found.get(metric) for metric in metrics)
-            rows.append((*varied.values(one.assignment), repeat, _status(one, cells), *values))
-    names = (*varied.names, "repeat", "status", *(".".join(metric) for metric in metrics))
-    return Table(
-        name="combinations",
-        caption="",
-        columns=tuple(Column(name, name) for name in names),
-        rows=tuple(rows),
-    )
 
 
 _OVER: Final = (
@@ -151,9 +122,3 @@ def over_table(over: Sequence[MetricOverDatasets]) -> Table:
 def _known(value: float) -> float | None:
     # No difference where more is better is -0.0.
     return None if math.isnan(value) else value + 0.0
-
-
-def _status(one: Combination, cells: Sequence[RecordedCell]) -> str:
-    if any(cell.status == "failed" for cell in cells):
-        return "failed"
-    return "not computed" if one.missing else "ok"

@@ -9,13 +9,13 @@ from orthoflow.cli.exports.choices import Choices
 from orthoflow.cli.exports.products import make_empty, numbers_of, wanted_wall
 from orthoflow.cli.tables import counted
 from orthoflow.errors import ArgumentError
-from orthoflow.files.drawings.cad_pictures import write_cad_picture
 from orthoflow.files.drawings.dxf import write_room_dxf, write_wall_dxf
 from orthoflow.files.drawings.geojson import (
     write_room_geojson,
     write_seams_geojson,
     write_wall_geojson,
 )
+from orthoflow.files.drawings.printed_pictures import write_cad_picture
 from orthoflow.files.drawings.qgis import PROJECT, ProjectLayer, write_project
 from orthoflow.files.drawings.relief import (
     Light,

@@ -34,14 +34,12 @@ def export_csv(run: Run, folder: Path, _chosen: Choices) -> str:
     from orthoflow.records.runs import parts_of
     from orthoflow.records.tables import write_csv_tables
     from orthoflow.report.paired import over_datasets
-    from orthoflow.report.tidy_tables import combination_table, over_table
+    from orthoflow.report.tidy_tables import over_table
 
     make_empty(folder)
     written = [path.name for path in write_csv_tables(run, folder)]
-    tables = [combination_table(run)]
-    if over := over_datasets(parts_of(run)):
-        tables.append(over_table(over))
-    files = {f"{table.name}.csv": table.csv() for table in tables}
+    over = over_datasets(parts_of(run))
+    files = {"datasets.csv": over_table(over).csv()} if over else {}
     _write_texts(folder, files)
     return ", ".join([*written, *files])
 

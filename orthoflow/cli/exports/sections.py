@@ -93,7 +93,7 @@ def _write(
             for number, drawing in enumerate(at(scale), start=1)
         ]
 
-    scale, _, _ = write_drawings(folder, drawn, chosen, alone="{stem}")
+    scale, _ = write_drawings(folder, drawn, chosen, alone="{stem}")
     said = []
     for number, drawing in enumerate(at(scale), start=1):
         section = drawing.section

@@ -23,7 +23,7 @@ from orthoflow.files.drawings.sheet_contents import (
     axes_of,
     north_of,
 )
-from orthoflow.files.drawings.sheet_layout import fitting_scale, lay_out, paper_for_one
+from orthoflow.files.drawings.sheet_layout import fitting_scale, lay_out
 from orthoflow.files.drawings.sheets import write_sheet
 from orthoflow.files.drawings.title_blocks import TitleBlock, read_title_block
 from orthoflow.files.drawings.wall_drawings import Area, wall_picture
@@ -46,7 +46,7 @@ def write_drawings(
     *,
     alone: str = "{stem}_sheet_{number}",
     several: str = "{stem}_sheet_{number}",
-) -> tuple[int, int, Sequence[Drawing]]:
+) -> tuple[int, int]:
     """Choose scale and paper of drawings, and write their sheets into a new folder.
 
     Args:
@@ -57,7 +57,7 @@ def write_drawings(
         several: where it takes several.
 
     Returns:
-        n of 1 : n, the number of sheets, and the drawings at this scale.
+        n of 1 : n, and the number of sheets.
     """
     given = [paper_of(chosen.paper)] if chosen.paper else []
     usual = SCALES_FT if chosen.units == "ft" else SCALES
@@ -70,7 +70,7 @@ def write_drawings(
             pattern = alone if len(sheets) == 1 else several
             name = pattern.format(stem=drawing.stem, number=sheet.number)
             write_sheet(folder / f"{name}.pdf", drawing, sheet, furniture)
-    return scale, sum(map(len, laid)), drawings
+    return scale, sum(map(len, laid))
 
 
 def text_of(run: Run, name: str, chosen: Choices, notes: tuple[Phrase, ...] = ()) -> SheetText:
@@ -118,11 +118,8 @@ def export_sheets(run: Run, folder: Path, chosen: Choices) -> str:
         pairs = zip(drawings, walls, strict=True)
         return [_scaled(drawing, wall, chosen, scale) for drawing, wall in pairs]
 
-    scale, n_sheets, sized = write_drawings(folder, drawn, chosen)
+    scale, n_sheets = write_drawings(folder, drawn, chosen)
     said = f"{counted(n_sheets, 'sheet')} of {counted(len(walls), 'wall')} at 1:{scale}"
-    if n_sheets > len(walls):
-        larger = paper_for_one(sized)
-        said += f" (on {larger} each wall takes one)" if larger else ""
     return said + _coarse(walls, scale)
 
 
@@ -163,7 +160,7 @@ def export_elevations(run: Run, folder: Path, chosen: Choices) -> str:
         return [replace(plain, grid=nice_step(1e-3 * _GRID_MM * scale))]
 
     pattern = "{stem}_{number}"
-    scale, n_sheets, _ = write_drawings(folder, drawn, chosen, alone=pattern, several=pattern)
+    scale, n_sheets = write_drawings(folder, drawn, chosen, alone=pattern, several=pattern)
     side = "inside" if is_inside else "outside"
     return f"{counted(len(walls), 'wall')} as seen from {side} at 1:{scale} on " + counted(
         n_sheets, "sheet"

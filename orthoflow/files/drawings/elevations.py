@@ -11,14 +11,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.files.drawings import pens
 from orthoflow.files.drawings.papers import Part, View
-from orthoflow.files.drawings.pens import (
-    TEXT_MM,
-    THIN_MM,
-    line,
-    text_width_mm,
-    write_on_white,
-)
 from orthoflow.files.drawings.sheet_contents import (
     Axes,
     Drawing,
@@ -138,20 +132,18 @@ def elevation(
                 continue
             corner = placed.on_paper([(left + own.left_m, down + own.bottom_m)])[0]
             view = View(kind="", part=own, corner_mm=(float(corner[0]), float(corner[1])))
-            scratch = placed.scratch.with_name(f"{placed.scratch.name}_{number}")
-            inner = replace(placed, view=view, scratch=scratch)
-            draw_raster(inner, wall.raster)
+            draw_raster(replace(placed, view=view), wall.raster)
             outline = placed.on_paper([(left + x, down + y) for x, y in own.corners_m])
-            line(placed.canvas, outline, width_mm=THIN_MM, is_closed=True)
+            pens.line(placed.canvas, outline, width_mm=pens.THIN_MM, is_closed=True)
             # Names of narrow walls take turns in two rows, inside the frame.
-            long = text_width_mm(wall.name) + 2.0
+            long = pens.text_width_mm(wall.name) + 2.0
             x, y = placed.on_paper([(left + own.left_m, top - low)])[0].tolist()
             x = min(x, placed.edges_mm[2] - long)
             row = 0 if x >= ends[0] else 1
             if part.bottom_m > top - low and x >= ends[row]:
                 ends[row] = x + long
-                middle = (x + 0.5 * long, y - 3.0 - 2.2 * TEXT_MM * row)
-                write_on_white(placed.canvas, wall.name, middle)
+                middle = (x + 0.5 * long, y - 3.0 - 2.2 * pens.TEXT_MM * row)
+                pens.write_on_white(placed.canvas, wall.name, middle)
 
     # Walls that end nearly level share a mark.
     levels: list[float] = []

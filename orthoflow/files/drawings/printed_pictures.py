@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import cmath
 import math
+import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,16 +13,16 @@ from typing import Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.errors import StoreError
 from orthoflow.files.drawings.papers import Part, nice_step
 from orthoflow.files.geotiff import RasterParts
-from orthoflow.files.images import encode_png
 from orthoflow.geometry.levels import Colours, eight_bits
 from orthoflow.geometry.robust import median_deviation
 
 PRINT_DPI: Final = 400.0
 _MM_PER_INCH: Final = 25.4
 # Cells read at a time.
-_BAND_CELLS: Final = 1 << 24
+_BAND_CELLS: Final = 1 << 23
 # A picture of up to this many pixels is lossless; beyond, a sheet would be too large to send.
 _LOSSLESS_PX: Final = 8_000_000
 _JPEG_QUALITY: Final = 95
@@ -61,34 +63,39 @@ class Stretch:
         return nice_step(max((self.high - self.low) / 12.0, 1e-3, _CLEAR_OF_NOISE * self.noise))
 
 
-def write_picture(
-    raster: Path, part: Part, path: Path, *, scale: int, is_flipped: bool = False
-) -> Path:
-    """Write a part of a wall's raster as a picture, white where empty.
+def encode_part(raster: Path, part: Part, *, scale: int, is_flipped: bool = False) -> bytes:
+    """Encode a part of a wall's raster as a picture, white where empty.
 
     Cells are unchanged if print resolves them, otherwise averaged to 400 pixels per inch.
 
     Args:
         raster: GeoTIFF of one band, which is stretched to grey, or of three.
         part: of the raster.
-        path: output file without its suffix: PNG, or JPEG if large.
         scale: n of 1 : n.
         is_flipped: the rows of the raster go up the paper; `part` refers to the drawing.
 
     Returns:
-        The file.
+        PNG, or JPEG if large.
     """
+    import cv2
+
     with RasterParts(raster) as source:
         part = _flipped(part, source) if is_flipped else part
         cells = np.array([part.left_m, part.top_m, part.right_m, part.bottom_m]) / source.gsd_m
         cells = np.clip(cells, 0.0, [*source.shape[::-1], *source.shape[::-1]])
         shape = _printed_shape(part, cells, scale)
         stretch = stretch_of(raster) if source.bands == 1 else None
+        # Blue first, as OpenCV has it: a copy of an A0 sheet would take 750 MB.
         picture = np.full((*shape, 3), 255, dtype=np.uint8)
         for rows, values, shown in _bands(source, cells, shape):
             colours = _grey(values, stretch) if stretch else eight_bits(cast("Colours", values))
-            picture[rows][shown] = colours[shown]
-    return _written(path, np.ascontiguousarray(picture[::-1]) if is_flipped else picture)
+            picture[rows][shown] = colours[shown][:, ::-1]
+    picture = np.ascontiguousarray(picture[::-1]) if is_flipped else picture
+    if shape[0] * shape[1] <= _LOSSLESS_PX:
+        return cv2.imencode(".png", picture)[1].tobytes()
+    sampling = (cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
+    options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY, *sampling]
+    return cv2.imencode(".jpg", picture, options)[1].tobytes()
 
 
 def _flipped(part: Part, source: RasterParts) -> Part:
@@ -218,31 +225,23 @@ def label_place(
         wide_mm: width of the number.
         placed_mm: centres of other numbers, (2,) each.
     """
-    steps = np.linalg.norm(np.diff(points_mm, axis=0), axis=1)
-    along = np.concatenate([[0.0], np.cumsum(steps)])
+    # Right and up as real and imaginary parts.
+    line = points_mm[:, 0] + 1j * points_mm[:, 1]
+    along = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(line)))])
     if along[-1] < _LEAST_WIDTHS * wide_mm:
         return None
     for share in _TRIED:
         middle = share * along[-1]
-        ends = np.array(
-            [
-                [
-                    np.interp(middle + side * 0.5 * wide_mm, along, points_mm[:, axis])
-                    for axis in (0, 1)
-                ]
-                for side in (-1.0, 1.0)
-            ]
-        )
-        chord = ends[1] - ends[0]
-        place = ends.mean(axis=0)
-        if float(np.linalg.norm(chord)) < _STRAIGHT * wide_mm:
+        ends = np.interp([middle - 0.5 * wide_mm, middle + 0.5 * wide_mm], along, line)
+        chord, place = complex(ends[1] - ends[0]), complex(ends.mean())
+        if abs(chord) < _STRAIGHT * wide_mm:
             continue
-        if any(float(np.linalg.norm(place - other)) < _APART_MM for other in placed_mm):
+        if any(abs(place - complex(*other)) < _APART_MM for other in placed_mm):
             continue
-        turned_deg = math.degrees(math.atan2(chord[1], chord[0]))
+        turned_deg = math.degrees(cmath.phase(chord))
         if not -90.0 < turned_deg <= 90.0:
             turned_deg -= math.copysign(180.0, turned_deg)
-        return (float(place[0]), float(place[1])), turned_deg
+        return (place.real, place.imag), turned_deg
     return None
 
 
@@ -275,21 +274,32 @@ def _grey(values: NDArray[np.generic], stretch: Stretch) -> NDArray[np.uint8]:
     return np.repeat(grey[:, :, None], 3, axis=2)
 
 
-def _written(path: Path, picture: NDArray[np.uint8]) -> Path:
-    import cv2
+def write_cad_picture(raster: Path, path: Path) -> None:
+    """Write an orthoimage as PNG, one pixel per cell, transparent where empty.
 
-    if picture.shape[0] * picture.shape[1] <= _LOSSLESS_PX:
-        path = path.with_suffix(".png")
-        path.write_bytes(encode_png(picture))
-        return path
-    # Flipped in place: a copy of an A0 sheet would take 750 MB.
-    for row in picture:
-        row[:] = row[:, ::-1].copy()
-    options = [
-        *(cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY),
-        *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
-    ]
-    _, encoded = cv2.imencode(".jpg", picture, options)
-    path = path.with_suffix(".jpg")
-    path.write_bytes(encoded.tobytes())
-    return path
+    Raises:
+        StoreError: the file cannot be written.
+    """
+    import rasterio
+    from rasterio.shutil import copy
+    from rasterio.windows import Window
+
+    with RasterParts(raster) as source, tempfile.TemporaryDirectory() as folder:
+        rows, columns = source.shape
+        # GDAL's PNG driver only copies, row by row.
+        aside = Path(folder) / "picture.tif"
+        profile = {"count": 4, "dtype": "uint8", "transform": rasterio.Affine(2, 0, 0, 0, -2, 0)}
+        whole = np.array([0.0, 0.0, columns, rows])
+        try:
+            with rasterio.open(aside, "w", width=columns, height=rows, **profile) as target:
+                for band, values, shown in _bands(source, whole, source.shape):
+                    # White behind transparency, for programs that do not support it.
+                    pixels = np.full((*shown.shape, 4), 255, dtype=np.uint8)
+                    pixels[..., :3][shown] = eight_bits(cast("Colours", values))[shown]
+                    pixels[..., 3] = np.where(shown, 255, 0)
+                    window = Window(0, band.start, columns, len(shown))
+                    target.write(pixels.transpose(2, 0, 1), window=window)
+            with rasterio.Env(GDAL_PAM_ENABLED="NO"):
+                copy(aside, path, driver="PNG", ZLEVEL="4")
+        except (OSError, rasterio.errors.RasterioError) as error:
+            raise StoreError(f"{path.name} cannot be written: {error}; free some space") from error

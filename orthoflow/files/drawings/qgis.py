@@ -11,6 +11,8 @@ import os
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Final
 from uuid import NAMESPACE_URL, uuid5
@@ -19,9 +21,9 @@ import numpy as np
 
 from orthoflow.files.geotiff import RasterParts
 from orthoflow.files.sidecars import write_text
+from orthoflow.untrusted_text import shown
 
 PROJECT: Final = "walls.qgs"
-_VERSION: Final = "3.22.0"
 _GAP_M: Final = 1.0
 
 
@@ -51,55 +53,32 @@ def write_project(folder: Path, title: str, layers: Sequence[ProjectLayer]) -> N
         InputError: a raster cannot be read.
         StoreError: a file cannot be written.
     """
+    import jinja2
+
     places = _places(layers)
-    root = ET.Element("qgis", {"projectname": title, "version": _VERSION})
-    ET.SubElement(root, "title").text = title
-    tree = ET.SubElement(root, "layer-tree-group")
-    holder = ET.SubElement(root, "projectlayers")
-    groups: dict[str, ET.Element] = {}
-    boxes = []
+    boxes, described = [], []
     for number, layer in enumerate(layers):
         vrt = folder / f"{number:02d}_{layer.raster.stem}.vrt"
         boxes.append(_write_virtual(vrt, layer.raster, places[layer.wall]))
         # Ids must be unique in the project; the same run gives the same project.
         identity = f"{layer.raster.stem}_{uuid5(NAMESPACE_URL, vrt.name).hex}"
-        group = groups.get(layer.wall)
-        if group is None:
-            group = ET.SubElement(tree, "layer-tree-group", {"name": layer.wall})
-            groups[layer.wall] = group
-        ET.SubElement(
-            group,
-            "layer-tree-layer",
-            {
-                "id": identity,
-                "name": f"{layer.wall}: {layer.kind}",
-                "checked": "Qt::Checked" if layer.is_shown else "Qt::Unchecked",
-                "providerKey": "gdal",
-                "source": f"./{vrt.name}",
-            },
-        )
-        described = ET.SubElement(holder, "maplayer", {"type": "raster"})
-        for name, text in (
-            ("id", identity),
-            ("datasource", f"./{vrt.name}"),
-            ("layername", f"{layer.wall}: {layer.kind}"),
-            ("provider", "gdal"),
-            ("abstract", layer.about),
-        ):
-            ET.SubElement(described, name).text = text
+        described.append({**vars(layer), "file": vrt.name, "identity": identity})
     extent = np.array(boxes)
-    canvas = ET.SubElement(root, "mapcanvas", {"name": "theMapCanvas"})
-    ET.SubElement(canvas, "units").text = "meters"
-    box = ET.SubElement(canvas, "extent")
     corners = (*extent[:, :2].min(axis=0), *extent[:, 2:].max(axis=0))
-    for name, value in zip(("xmin", "ymin", "xmax", "ymax"), corners, strict=True):
-        ET.SubElement(box, name).text = f"{value:.6f}"
-    properties = ET.SubElement(root, "properties")
-    paths = ET.SubElement(properties, "Paths")
-    ET.SubElement(paths, "Absolute", {"type": "bool"}).text = "false"
-    ET.indent(root)
-    head = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
-    write_text(folder / PROJECT, head + ET.tostring(root, encoding="unicode") + "\n")
+    environment = jinja2.Environment(
+        autoescape=True,
+        trim_blocks=True,
+        keep_trailing_newline=True,
+        finalize=lambda value: shown(value) if isinstance(value, str) else value,
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+    )
+    text = environment.get_template("walls.qgs.j2").render(
+        title=title,
+        layers=described,
+        walls=[(wall, list(own)) for wall, own in groupby(described, itemgetter("wall"))],
+        extent=zip(("xmin", "ymin", "xmax", "ymax"), corners, strict=True),
+    )
+    write_text(folder / PROJECT, text)
 
 
 def _places(layers: Sequence[ProjectLayer]) -> dict[str, float]:

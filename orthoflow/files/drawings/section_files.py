@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.files.drawings import pens
 from orthoflow.files.drawings.dxf import DIMENSION_STYLE, Layers, new_document, save_document
 from orthoflow.files.drawings.key_plans import is_map_crs, marked_plan, up_label
-from orthoflow.files.drawings.pens import FINE_MM, box, fill, line
 from orthoflow.files.drawings.sections import CutLine, Section
 from orthoflow.files.drawings.sheet_contents import (
     Axes,
@@ -170,19 +170,23 @@ def _draw(drawing: SectionDrawing, placed: Placed) -> None:
             if isinstance(record, recorder.FilledPathsRecord):
                 filled = [on_paper(path.flattening(drawing.mm(0.05))) for path in record.paths]
             elif isinstance(record, recorder.PathRecord):
-                line(canvas, on_paper(record.path.flattening(drawing.mm(0.05))), width_mm=width_mm)
+                pens.line(
+                    canvas, on_paper(record.path.flattening(drawing.mm(0.05))), width_mm=width_mm
+                )
             elif isinstance(record, recorder.SolidLinesRecord):
                 for ends in on_paper(record.lines.vertices()).reshape(-1, 2, 2):
-                    line(canvas, ends, width_mm=width_mm)
+                    pens.line(canvas, ends, width_mm=width_mm)
             elif isinstance(record, recorder.PointsRecord):
                 points = on_paper(record.points.vertices())
                 if len(points) == 1:
-                    box(canvas, (*(points[0] - 0.5 * FINE_MM), FINE_MM, FINE_MM))
+                    pens.box(
+                        canvas, (*(points[0] - 0.5 * pens.FINE_MM), pens.FINE_MM, pens.FINE_MM)
+                    )
                 elif len(points) == 2:
-                    line(canvas, points, width_mm=width_mm)
+                    pens.line(canvas, points, width_mm=width_mm)
                 else:
                     filled = [points]
-            fill(canvas, filled)
+            pens.fill(canvas, filled)
 
 
 def _render(document: Document, backend: Any) -> None:

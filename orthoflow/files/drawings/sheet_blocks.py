@@ -18,31 +18,9 @@ from numpy.typing import NDArray
 from reportlab.lib.colors import Color
 from reportlab.platypus import Flowable, Image, Table
 
+from orthoflow.files.drawings import pens
 from orthoflow.files.drawings.key_plans import NORTH, KeyPlan
 from orthoflow.files.drawings.papers import MARGIN_MM, SCALES_FT, Paper, round_below
-from orthoflow.files.drawings.pens import (
-    BLACK,
-    FRAME_MM,
-    GREY,
-    HEADING_MM,
-    MATCH_DASHES_MM,
-    MEDIUM_MM,
-    POINTS_PER_MM,
-    RED,
-    TEXT_MM,
-    THIN_MM,
-    TITLE_MM,
-    WIDE_MM,
-    arrow,
-    box,
-    cross,
-    height_mark,
-    line,
-    paragraph,
-    text_width_mm,
-    write_on_white,
-    write_text,
-)
 from orthoflow.files.drawings.sheet_contents import Drawing, LegendRow, Sheet
 from orthoflow.files.drawings.words import label
 
@@ -85,11 +63,11 @@ class _Picture(Flowable):  # type: ignore[misc] # reportlab has no types
     def wrap(self, wide: float, _high: float) -> tuple[float, float]:
         """Return its size in points."""
         self.width = wide
-        return wide, self.high_mm * POINTS_PER_MM
+        return wide, self.high_mm * pens.POINTS_PER_MM
 
     def draw(self) -> None:
         """Draw it."""
-        self.draw_mm(self.canv, self.width / POINTS_PER_MM)
+        self.draw_mm(self.canv, self.width / pens.POINTS_PER_MM)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,16 +86,16 @@ class Furniture:
         """Draw all blocks, and the frame of the sheet."""
         paper = self.paper
         for flowable, (left, bottom, wide) in self.placed:
-            flowable.wrapOn(canvas, wide * POINTS_PER_MM, paper.height_mm * POINTS_PER_MM)
-            flowable.drawOn(canvas, left * POINTS_PER_MM, bottom * POINTS_PER_MM)
+            flowable.wrapOn(canvas, wide * pens.POINTS_PER_MM, paper.height_mm * pens.POINTS_PER_MM)
+            flowable.drawOn(canvas, left * pens.POINTS_PER_MM, bottom * pens.POINTS_PER_MM)
         right, top = paper.width_mm - MARGIN_MM, paper.height_mm - MARGIN_MM
         corners = [(MARGIN_MM, MARGIN_MM), (right, MARGIN_MM), (right, top), (MARGIN_MM, top)]
-        line(canvas, corners, width_mm=FRAME_MM, is_closed=True)
+        pens.line(canvas, corners, width_mm=pens.FRAME_MM, is_closed=True)
         split = [(right - paper.block_mm, MARGIN_MM), (right - paper.block_mm, top)]
         if paper.layout == "strip":
             height = MARGIN_MM + paper.block_mm
             split = [(MARGIN_MM, height), (right, height)]
-        line(canvas, split, width_mm=MEDIUM_MM)
+        pens.line(canvas, split, width_mm=pens.MEDIUM_MM)
 
 
 def furnished(
@@ -160,7 +138,7 @@ def furnished(
 
 
 def _high_mm(flowable: Any, wide_mm: float) -> float:
-    return float(flowable.wrap(wide_mm * POINTS_PER_MM, 1e5)[1]) / POINTS_PER_MM
+    return float(flowable.wrap(wide_mm * pens.POINTS_PER_MM, 1e5)[1]) / pens.POINTS_PER_MM
 
 
 def _packed(
@@ -203,8 +181,8 @@ def _notes(drawing: Drawing, sheet: Sheet, *, is_brief: bool) -> list[Any]:
         digits = f"{drawing.grid:.6g}"
         axes = drawing.axes.phrase.text(language)
         grid = label("grid_note", language, step=digits, unit=drawing.unit, axes=axes)
-        found.append(paragraph(grid))
-    found += [paragraph(note.text(language)) for note in drawing.text.notes]
+        found.append(pens.paragraph(grid))
+    found += [pens.paragraph(note.text(language)) for note in drawing.text.notes]
     found += _legend(drawing, sheet)
     if is_brief:
         return found
@@ -225,18 +203,20 @@ def _scale_bar(drawing: Drawing) -> _Picture:
         count = max(1, min(_MOST_SEGMENTS, int((wide_mm - 14.0) / segment)))
         for place in range(count):
             left = 4.0 + place * segment
-            box(canvas, (left, 0.5, segment, 2.0), BLACK if place % 2 == 0 else (1.0, 1.0, 1.0))
+            pens.box(
+                canvas, (left, 0.5, segment, 2.0), pens.BLACK if place % 2 == 0 else (1.0, 1.0, 1.0)
+            )
             sides = [(left, 0.5), (left + segment, 0.5), (left + segment, 2.5), (left, 2.5)]
-            line(canvas, sides, is_closed=True)
+            pens.line(canvas, sides, is_closed=True)
         step, end = 1, -math.inf
-        widest = text_width_mm(f"{count * length:g} {drawing.unit}")
+        widest = pens.text_width_mm(f"{count * length:g} {drawing.unit}")
         while step * segment < widest + 1.0:
             step += 1
         for place in range(0, count + 1, step):
             text = f"{place * length:g}" + (f" {drawing.unit}" if place == count else "")
             at = (4.0 + place * segment, 4.2)
             if at[0] > end:
-                write_text(canvas, text, at, is_centred=True)
+                pens.write_text(canvas, text, at, is_centred=True)
                 end = at[0]
 
     return _Picture(8.0, draw)
@@ -246,11 +226,11 @@ def _legend(drawing: Drawing, sheet: Sheet) -> Iterator[Any]:
     language = drawing.language
     rows: list[LegendRow] = []
     if drawing.grid > 0.0 and drawing.axes.across is not None:
-        rows.append((lambda canvas: cross(canvas, 7.0, 2.0), label("legend_cross", language)))
+        rows.append((lambda canvas: pens.cross(canvas, 7.0, 2.0), label("legend_cross", language)))
     if drawing.heights:
         rows.append(
             (
-                lambda canvas: height_mark(canvas, (4.0, 0.6), ""),
+                lambda canvas: pens.height_mark(canvas, (4.0, 0.6), ""),
                 f"{label('legend_height', language)}, {drawing.unit}",
             )
         )
@@ -258,7 +238,7 @@ def _legend(drawing: Drawing, sheet: Sheet) -> Iterator[Any]:
         up = np.array([[7.0, -0.5], [7.0, 4.5]])
         meaning = "legend_north" if drawing.up_label == NORTH else "legend_axis"
         text = f"{drawing.up_label}: {label(meaning, language)}"
-        rows.append((lambda canvas: arrow(canvas, up), text))
+        rows.append((lambda canvas: pens.arrow(canvas, up), text))
     # What several pictures have in common once.
     own = {row[1]: row for view in sheet.views for row in drawing.pictures[view.kind].legend}
     rows += own.values()
@@ -266,18 +246,22 @@ def _legend(drawing: Drawing, sheet: Sheet) -> Iterator[Any]:
         ends = [(1.0, 2.0), (13.0, 2.0)]
         rows.append(
             (
-                lambda canvas: line(canvas, ends, width_mm=WIDE_MM, dashes_mm=MATCH_DASHES_MM),
+                lambda canvas: pens.line(
+                    canvas, ends, width_mm=pens.WIDE_MM, dashes_mm=pens.MATCH_DASHES_MM
+                ),
                 label("legend_match", language),
             )
         )
     for place, (draw, text) in enumerate(rows):
         # The heading is never separated from the first row.
-        heading = [[paragraph(label("legend", language), is_bold=True), ""]] if place == 0 else []
+        heading = (
+            [[pens.paragraph(label("legend", language), is_bold=True), ""]] if place == 0 else []
+        )
         spans = [("SPAN", (0, 0), (-1, 0))] if heading else []
         symbol = _Picture(4.3, partial(_draw_symbol, draw))
         yield Table(
-            [*heading, [symbol, paragraph(text)]],
-            colWidths=[_SYMBOL_MM * POINTS_PER_MM, "*"],
+            [*heading, [symbol, pens.paragraph(text)]],
+            colWidths=[_SYMBOL_MM * pens.POINTS_PER_MM, "*"],
             style=[*_PLAIN, *spans],
         )
 
@@ -296,11 +280,11 @@ class _Plan(_Picture):
         draw: Callable[[Canvas, Callable[[NDArray[np.float64]], NDArray[np.float64]], float], None],
     ) -> None:
         super().__init__(_PLAN_MM[0], self._draw_plan)
-        self.heading, self.points, self.draw_lines = paragraph(heading), points, draw
+        self.heading, self.points, self.draw_lines = pens.paragraph(heading), points, draw
 
     def _draw_plan(self, canvas: Canvas, wide_mm: float) -> None:
         heading_mm = _high_mm(self.heading, wide_mm)
-        self.heading.drawOn(canvas, 0.0, (self.high_mm - heading_mm) * POINTS_PER_MM)
+        self.heading.drawOn(canvas, 0.0, (self.high_mm - heading_mm) * pens.POINTS_PER_MM)
         low = self.points.min(axis=0)
         size = np.maximum(self.points.max(axis=0) - low, 1e-6)
         # The arrow that points up is on the right.
@@ -320,26 +304,28 @@ def _key_plan(drawing: Drawing, plan: KeyPlan) -> tuple[str, NDArray[np.float64]
 
     def draw(canvas: Canvas, place: Any, wide_mm: float) -> None:
         for wall in plan.walls:
-            line(canvas, place(wall), colour=GREY)
+            pens.line(canvas, place(wall), colour=pens.GREY)
         for outline in plan.outlines:
-            line(canvas, place(outline), width_mm=MEDIUM_MM)
+            pens.line(canvas, place(outline), width_mm=pens.MEDIUM_MM)
         is_area = len(plan.marked) > 2
-        line(canvas, place(plan.marked), width_mm=FRAME_MM, colour=RED, is_closed=is_area)
+        pens.line(
+            canvas, place(plan.marked), width_mm=pens.FRAME_MM, colour=pens.RED, is_closed=is_area
+        )
         if plan.arrow is not None:
-            arrow(canvas, place(plan.arrow), RED)
+            pens.arrow(canvas, place(plan.arrow), pens.RED)
         right = wide_mm - 4.0
-        arrow(canvas, np.array([[right, 2.0], [right, 10.0]]))
-        write_text(canvas, plan.up_label, (right, 11.0), is_centred=True)
+        pens.arrow(canvas, np.array([[right, 2.0], [right, 10.0]]))
+        pens.write_text(canvas, plan.up_label, (right, 11.0), is_centred=True)
         # The marked one first: where walls are close together, not all numbers fit.
         placed = {n: place(wall) for n, wall in zip(plan.numbers, plan.walls, strict=True)}
         numbered: list[NDArray[np.float64]] = []
         for number in sorted(placed, key=lambda n: (n != plan.number, -_length(placed[n]))):
             middle = placed[number].mean(axis=0)
-            room = 1.5 * text_width_mm(str(number)) + TEXT_MM
+            room = 1.5 * pens.text_width_mm(str(number)) + pens.TEXT_MM
             is_close = any(float(np.linalg.norm(middle - other)) < room for other in numbered)
             if _length(placed[number]) >= room and not is_close:
                 numbered.append(middle)
-                write_on_white(canvas, str(number), (float(middle[0]), float(middle[1])))
+                pens.write_on_white(canvas, str(number), (float(middle[0]), float(middle[1])))
 
     heading = "key_plan"
     if plan.arrow is None or plan.number < 0:
@@ -360,11 +346,14 @@ def _sheet_key(drawing: Drawing, sheet: Sheet) -> tuple[str, NDArray[np.float64]
             on_paper = place(corners)
             (left, bottom), (right, top) = on_paper.min(axis=0), on_paper.max(axis=0)
             if number == sheet.number:
-                box(canvas, (left, bottom, right - left, top - bottom), (1.0, 0.75, 0.75))
-            line(canvas, on_paper, is_closed=True)
-            if min(right - left - text_width_mm(str(number)), top - bottom - TEXT_MM) > 0.6:
-                middle = (0.5 * (left + right), 0.5 * (bottom + top - TEXT_MM))
-                write_text(canvas, str(number), middle, is_centred=True)
+                pens.box(canvas, (left, bottom, right - left, top - bottom), (1.0, 0.75, 0.75))
+            pens.line(canvas, on_paper, is_closed=True)
+            if (
+                min(right - left - pens.text_width_mm(str(number)), top - bottom - pens.TEXT_MM)
+                > 0.6
+            ):
+                middle = (0.5 * (left + right), 0.5 * (bottom + top - pens.TEXT_MM))
+                pens.write_text(canvas, str(number), middle, is_centred=True)
 
     heading = label("key_sheets", drawing.language, wall=drawing.text.name)
     return heading, np.vstack(list(boxes.values())), draw
@@ -376,18 +365,20 @@ def _sheet_key(drawing: Drawing, sheet: Sheet) -> tuple[str, NDArray[np.float64]
 def _title_block(drawing: Drawing, sheet: Sheet, wide_mm: float) -> Any:
     tables = [_revisions(drawing, wide_mm)] if drawing.text.block.revisions else []
     tables.append(_title_table(drawing, sheet, wide_mm))
-    return Table([[table] for table in tables], colWidths=[wide_mm * POINTS_PER_MM], style=_PLAIN)
+    return Table(
+        [[table] for table in tables], colWidths=[wide_mm * pens.POINTS_PER_MM], style=_PLAIN
+    )
 
 
 def _revisions(drawing: Drawing, wide_mm: float) -> Any:
     """The table of revisions, the newest on top."""
     rows = [
-        [paragraph(text) for text in (one.mark, one.date, one.text, one.by)]
+        [pens.paragraph(text) for text in (one.mark, one.date, one.text, one.by)]
         for one in reversed(drawing.text.block.revisions)
     ]
     shares = (0.12, 0.28, 0.42, 0.18)
     return Table(
-        rows, colWidths=[share * wide_mm * POINTS_PER_MM for share in shares], style=_style()
+        rows, colWidths=[share * wide_mm * pens.POINTS_PER_MM for share in shares], style=_style()
     )
 
 
@@ -403,14 +394,19 @@ def _title_table(drawing: Drawing, sheet: Sheet, wide_mm: float) -> Any:
         cells.append(([_bold(block.project)], True))
     title = [_bold(block.title or drawing.text.name)]
     if block.title:
-        title.append(paragraph(drawing.text.name))
+        title.append(pens.paragraph(drawing.text.name))
     cells.append(
-        ([*title, paragraph(", ".join(dict.fromkeys(view.kind for view in sheet.views)))], True)
+        (
+            [*title, pens.paragraph(", ".join(dict.fromkeys(view.kind for view in sheet.views)))],
+            True,
+        )
     )
-    cells += [([_small(name), paragraph(value)], False) for name, value in _named(drawing, sheet)]
+    cells += [
+        ([_small(name), pens.paragraph(value)], False) for name, value in _named(drawing, sheet)
+    ]
     cells += list(_scale_and_sheet(drawing, sheet))
     if block.note:
-        cells.append(([_small(label("note", drawing.language)), paragraph(block.note)], True))
+        cells.append(([_small(label("note", drawing.language)), pens.paragraph(block.note)], True))
     if block != type(block)():
         room = _Picture(_SIGNATURE_MM - 5.0, lambda _canvas, _wide: None)
         cells.append(([_small(label("signature", drawing.language)), room], True))
@@ -418,7 +414,7 @@ def _title_table(drawing: Drawing, sheet: Sheet, wide_mm: float) -> Any:
     cells.append(([_seal(drawing, seal_mm)], True))
     n_columns = 2 if wide_mm < _FOUR_COLUMNS_MM else 4
     rows, spans = _rows(cells, n_columns)
-    widths = [wide_mm / n_columns * POINTS_PER_MM] * n_columns
+    widths = [wide_mm / n_columns * pens.POINTS_PER_MM] * n_columns
     return Table(rows, colWidths=widths, style=_style(*spans))
 
 
@@ -444,12 +440,12 @@ def _scale_and_sheet(drawing: Drawing, sheet: Sheet) -> Iterator[tuple[list[Any]
     is_ruler = drawing.unit == "ft" and 12 <= drawing.scale <= 192 and drawing.scale in SCALES_FT
     inches = Fraction(12, drawing.scale) if is_ruler else None
     text = f"1:{drawing.scale}" + (f' ({inches}" = 1\'-0")' if inches else "")
-    high_mm = TITLE_MM if inches is None else HEADING_MM
-    large = paragraph(text, high_mm=high_mm, is_bold=True)
+    high_mm = pens.TITLE_MM if inches is None else pens.HEADING_MM
+    large = pens.paragraph(text, high_mm=high_mm, is_bold=True)
     yield [_small(label("scale", language)), large], False
     said = label("sheet_of", language, number=sheet.number, count=sheet.count)
     size = sheet.paper.name or f"{sheet.paper.width_mm:g} x {sheet.paper.height_mm:g} mm"
-    yield [paragraph(said), paragraph(f"{label('paper', language)} {size}")], False
+    yield [pens.paragraph(said), pens.paragraph(f"{label('paper', language)} {size}")], False
 
 
 def _rows(
@@ -479,28 +475,29 @@ def _style(*more: Any) -> list[Any]:
     black = Color(0, 0, 0)
     whole = ((0, 0), (-1, -1))
     return [
-        ("GRID", *whole, THIN_MM * POINTS_PER_MM, black),
-        ("BOX", *whole, WIDE_MM * POINTS_PER_MM, black),
+        ("GRID", *whole, pens.THIN_MM * pens.POINTS_PER_MM, black),
+        ("BOX", *whole, pens.WIDE_MM * pens.POINTS_PER_MM, black),
         ("VALIGN", *whole, "TOP"),
-        *((f"{side}PADDING", *whole, 1.2 * POINTS_PER_MM) for side in ("LEFT", "RIGHT")),
-        *((f"{side}PADDING", *whole, 0.6 * POINTS_PER_MM) for side in ("TOP", "BOTTOM")),
+        *((f"{side}PADDING", *whole, 1.2 * pens.POINTS_PER_MM) for side in ("LEFT", "RIGHT")),
+        *((f"{side}PADDING", *whole, 0.6 * pens.POINTS_PER_MM) for side in ("TOP", "BOTTOM")),
         *more,
     ]
 
 
 def _bold(text: str) -> Any:
-    return paragraph(text, high_mm=HEADING_MM, is_bold=True)
+    return pens.paragraph(text, high_mm=pens.HEADING_MM, is_bold=True)
 
 
 def _small(text: str) -> Any:
     """The name of a field, grey over its value."""
-    return paragraph(text, colour=GREY)
+    return pens.paragraph(text, colour=pens.GREY)
 
 
 def _logo(path: str, most_mm: float) -> Any:
     logo = Image(path, hAlign="LEFT")
     factor = min(
-        _LOGO_MM * POINTS_PER_MM / logo.imageHeight, most_mm * POINTS_PER_MM / logo.imageWidth
+        _LOGO_MM * pens.POINTS_PER_MM / logo.imageHeight,
+        most_mm * pens.POINTS_PER_MM / logo.imageWidth,
     )
     logo.drawHeight, logo.drawWidth = factor * logo.imageHeight, factor * logo.imageWidth
     return logo
@@ -512,15 +509,15 @@ def _seal(drawing: Drawing, wide_mm: float) -> Any:
     from reportlab.graphics.shapes import Drawing
 
     digest = drawing.text.digest
-    side = _QR_MM * POINTS_PER_MM
+    side = _QR_MM * pens.POINTS_PER_MM
     code = QrCodeWidget(
         f"sha256:{digest}", barLevel="M", barWidth=side, barHeight=side, barBorder=4
     )
     rows = [
-        paragraph(label("record", drawing.language)),
-        *(paragraph(digest[k : k + 16]) for k in (0, 16, 32, 48)),
-        paragraph(drawing.text.run),
+        pens.paragraph(label("record", drawing.language)),
+        *(pens.paragraph(digest[k : k + 16]) for k in (0, 16, 32, 48)),
+        pens.paragraph(drawing.text.run),
     ]
-    left = side + 1.0 * POINTS_PER_MM
+    left = side + 1.0 * pens.POINTS_PER_MM
     cells = [[Drawing(side, side, code), rows]]
-    return Table(cells, colWidths=[left, (wide_mm - 2.4) * POINTS_PER_MM - left], style=_PLAIN)
+    return Table(cells, colWidths=[left, (wide_mm - 2.4) * pens.POINTS_PER_MM - left], style=_PLAIN)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -35,13 +34,11 @@ class Placed:
         canvas: the page.
         view: the picture's part, and its place.
         scale: n of 1 : n.
-        scratch: path without a suffix for a file of the picture.
     """
 
     canvas: Canvas
     view: View
     scale: int
-    scratch: Path
 
     @property
     def edges_mm(self) -> tuple[float, float, float, float]:

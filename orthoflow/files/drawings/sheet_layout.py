@@ -42,15 +42,6 @@ def fitting_scale(
     return scales[-1]
 
 
-def paper_for_one(drawings: Sequence[Drawing]) -> str:
-    """Return the name of the smallest usual paper that fits each drawing on one sheet, or ""."""
-    fitting = (
-        paper for paper in usual_papers() if all(_on_one(drawing, [paper]) for drawing in drawings)
-    )
-    found = next(fitting, None)
-    return found.name if found else ""
-
-
 def lay_out(drawing: Drawing, given: Sequence[Paper] = ()) -> tuple[LaidOut, ...]:
     """Place a wall on one sheet, or divide it into several of the same size.
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
@@ -16,21 +15,8 @@ from typing import Final
 import numpy as np
 
 from orthoflow.errors import StoreError
+from orthoflow.files.drawings import pens
 from orthoflow.files.drawings.papers import View
-from orthoflow.files.drawings.pens import (
-    FINE_MM,
-    MATCH_DASHES_MM,
-    MEDIUM_MM,
-    TEXT_MM,
-    WIDE_MM,
-    arrow,
-    cross,
-    height_mark,
-    line,
-    sheet_canvas,
-    text_width_mm,
-    write_text,
-)
 from orthoflow.files.drawings.sheet_blocks import Furniture
 from orthoflow.files.drawings.sheet_contents import Drawing, Placed, Sheet
 from orthoflow.files.drawings.words import label
@@ -50,16 +36,12 @@ def write_sheet(path: Path, drawing: Drawing, sheet: Sheet, furniture: Furniture
         InputError: no font has a letter of its texts.
     """
     try:
-        with (
-            tempfile.TemporaryDirectory(dir=path.parent) as folder,
-            sheet_canvas(path, sheet.paper) as canvas,
-        ):
+        with pens.sheet_canvas(path, sheet.paper) as canvas:
             canvas.setTitle(shown(f"{drawing.text.block.project} {drawing.text.name}".strip()))
             canvas.setAuthor(shown(drawing.text.block.author))
             canvas.setSubject(f"1:{drawing.scale}; record sha256:{drawing.text.digest}")
-            for place, view in enumerate(sheet.views):
-                scratch = Path(folder) / f"picture_{place}"
-                placed = Placed(canvas=canvas, view=view, scale=drawing.scale, scratch=scratch)
+            for view in sheet.views:
+                placed = Placed(canvas=canvas, view=view, scale=drawing.scale)
                 drawing.pictures[view.kind].draw(placed)
                 _draw_around(placed, drawing, _neighbours(sheet, view))
             furniture.draw(canvas)
@@ -76,7 +58,7 @@ def _draw_around(placed: Placed, drawing: Drawing, neighbours: dict[str, int]) -
     if drawing.grid > 0.0:
         _draw_grid(placed, drawing)
     corners = [(left, bottom), (right, bottom), (right, top), (left, top)]
-    line(canvas, corners, width_mm=MEDIUM_MM, is_closed=True)
+    pens.line(canvas, corners, width_mm=pens.MEDIUM_MM, is_closed=True)
     _draw_match_lines(placed, drawing, neighbours)
     if drawing.heights and "right" not in neighbours:
         _draw_heights(placed, drawing)
@@ -84,10 +66,10 @@ def _draw_around(placed: Placed, drawing: Drawing, neighbours: dict[str, int]) -
         foot = np.array([right + 12.0, top - 14.0])
         middle = foot + np.array([0.0, 6.0])
         direction = np.array(drawing.north)
-        arrow(canvas, middle + np.outer([-6.0, 6.0], direction))
+        pens.arrow(canvas, middle + np.outer([-6.0, 6.0], direction))
         # The middle of its label lies 3.2 mm before its tip, clear of a descender.
-        at = tuple(middle + 9.2 * direction - [0.0, 0.5 * TEXT_MM])
-        write_text(canvas, drawing.up_label, at, is_centred=True)
+        at = tuple(middle + 9.2 * direction - [0.0, 0.5 * pens.TEXT_MM])
+        pens.write_text(canvas, drawing.up_label, at, is_centred=True)
 
 
 def _draw_grid(placed: Placed, drawing: Drawing) -> None:
@@ -112,22 +94,22 @@ def _draw_grid(placed: Placed, drawing: Drawing) -> None:
     # A quarter of a metre needs two digits.
     digits = len(f"{drawing.grid:.4f}".rstrip("0").partition(".")[2])
     for x in columns.values():
-        line(canvas, [(x, bottom), (x, bottom - _TICK_MM)])
-        line(canvas, [(x, top), (x, top + _TICK_MM)])
+        pens.line(canvas, [(x, bottom), (x, bottom - _TICK_MM)])
+        pens.line(canvas, [(x, top), (x, top + _TICK_MM)])
     for y in rows.values():
-        line(canvas, [(left, y), (left - _TICK_MM, y)])
-        line(canvas, [(right, y), (right + _TICK_MM, y)])
+        pens.line(canvas, [(left, y), (left - _TICK_MM, y)])
+        pens.line(canvas, [(right, y), (right + _TICK_MM, y)])
         if not columns:
-            line(canvas, [(left, y), (right, y)], width_mm=FINE_MM)
+            pens.line(canvas, [(left, y), (right, y)], width_mm=pens.FINE_MM)
     for text, x in _with_room(columns, digits, (left - 4.0, right + 4.0)):
-        at = (x, bottom - _TICK_MM - 1.0 - TEXT_MM)
-        write_text(canvas, text, at, is_centred=True)
+        at = (x, bottom - _TICK_MM - 1.0 - pens.TEXT_MM)
+        pens.write_text(canvas, text, at, is_centred=True)
     # Beside the picture, not overlapping those below it.
     for text, y in _with_room(rows, digits, (bottom, top)):
-        write_text(canvas, text, (left - _TICK_MM - 1.0, y), turned_deg=90.0, is_centred=True)
+        pens.write_text(canvas, text, (left - _TICK_MM - 1.0, y), turned_deg=90.0, is_centred=True)
     for x in columns.values():
         for y in rows.values():
-            cross(canvas, x, y)
+            pens.cross(canvas, x, y)
 
 
 def _with_room(
@@ -148,7 +130,7 @@ def _with_room(
         for value in values:
             if round(value / step) % every == 0:
                 text = f"{value:.{digits}f}"
-                half = 0.5 * text_width_mm(text)
+                half = 0.5 * pens.text_width_mm(text)
                 low, high = limits_mm[0] + half, max(limits_mm[1] - half, limits_mm[0] + half)
                 middle = min(max(places[value], low), high)
                 found.append((text, middle))
@@ -193,8 +175,8 @@ def _draw_heights(placed: Placed, drawing: Drawing) -> None:
         places[k] = min(places[k], limit)
         limit = places[k] - _MARK_ROW_MM
     for place, (level, value) in zip(places, levels, strict=True):
-        line(canvas, [(right + _TICK_MM, level), (right + 4.0, place)])
-        height_mark(canvas, (right + 6.0, place), f"{value:+.2f}")
+        pens.line(canvas, [(right + _TICK_MM, level), (right + 4.0, place)])
+        pens.height_mark(canvas, (right + 6.0, place), f"{value:+.2f}")
 
 
 def _neighbours(sheet: Sheet, view: View) -> dict[str, int]:
@@ -228,6 +210,6 @@ def _draw_match_lines(placed: Placed, drawing: Drawing, neighbours: dict[str, in
         ("above", [(left - 5.0, top), (right + 5.0, top)], (middle[0], top + 3.0), 0.0),
     ):
         if side in neighbours:
-            line(canvas, ends, width_mm=WIDE_MM, dashes_mm=MATCH_DASHES_MM)
+            pens.line(canvas, ends, width_mm=pens.WIDE_MM, dashes_mm=pens.MATCH_DASHES_MM)
             text = label("match_line", drawing.language, number=neighbours[side])
-            write_text(canvas, text, at, turned_deg=turned_deg, is_centred=True)
+            pens.write_text(canvas, text, at, turned_deg=turned_deg, is_centred=True)

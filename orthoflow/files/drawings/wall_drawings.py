@@ -3,34 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.drawings.pens import (
-    BEFORE,
-    BEHIND,
-    FINE_MM,
-    GREY,
-    MEDIUM_MM,
-    OPENING,
-    POINTS_PER_MM,
-    TEXT_MM,
-    THIN_MM,
-    WHITE,
-    box,
-    line,
-    text_width_mm,
-    write_on_white,
-    write_text,
-)
+from orthoflow.files.drawings import pens
 from orthoflow.files.drawings.printed_pictures import (
     contours,
+    encode_part,
     label_place,
     stretch_of,
-    write_picture,
 )
 from orthoflow.files.drawings.sheet_contents import LegendRow, Picture, Placed
 from orthoflow.files.drawings.words import Language, label
@@ -74,8 +59,8 @@ def wall_picture(
     if areas:
         legend.append(
             (
-                lambda canvas: line(
-                    canvas, _BOX, width_mm=MEDIUM_MM, colour=OPENING, is_closed=True
+                lambda canvas: pens.line(
+                    canvas, _BOX, width_mm=pens.MEDIUM_MM, colour=pens.OPENING, is_closed=True
                 ),
                 label("legend_opening", language),
             )
@@ -86,11 +71,15 @@ def wall_picture(
         low, high = (f"{1e3 * value:+.0f}" for value in (stretch.low, stretch.high))
         legend += [
             (
-                lambda canvas: line(canvas, _MIDDLE, width_mm=THIN_MM, colour=BEFORE),
+                lambda canvas: pens.line(
+                    canvas, _MIDDLE, width_mm=pens.THIN_MM, colour=pens.BEFORE
+                ),
                 label("legend_before", language, interval=interval),
             ),
             (
-                lambda canvas: line(canvas, _MIDDLE, width_mm=THIN_MM, colour=BEHIND),
+                lambda canvas: pens.line(
+                    canvas, _MIDDLE, width_mm=pens.THIN_MM, colour=pens.BEHIND
+                ),
                 label("legend_behind", language, interval=interval),
             ),
             (
@@ -100,7 +89,7 @@ def wall_picture(
         ]
     legend.append(
         (
-            lambda canvas: line(canvas, _BOX, colour=GREY, is_closed=True),
+            lambda canvas: pens.line(canvas, _BOX, colour=pens.GREY, is_closed=True),
             label("legend_empty", language),
         )
     )
@@ -109,17 +98,18 @@ def wall_picture(
 
 def _grey_ramp(canvas: Canvas) -> None:
     for step in range(24):
-        box(canvas, (1.0 + 0.5 * step, 0.5, 0.5, 3.0), (step / 23.0,) * 3)
+        pens.box(canvas, (1.0 + 0.5 * step, 0.5, 0.5, 3.0), (step / 23.0,) * 3)
 
 
 def draw_raster(placed: Placed, raster: Path, *, is_flipped: bool = False) -> None:
     """Draw the part of a raster that a picture shows, white where empty."""
-    part = placed.view.part
-    file = write_picture(raster, part, placed.scratch, scale=placed.scale, is_flipped=is_flipped)
+    from reportlab.lib.utils import ImageReader
+
+    picture = encode_part(raster, placed.view.part, scale=placed.scale, is_flipped=is_flipped)
     left, bottom, right, top = placed.edges_mm
     placed.canvas.drawImage(
-        str(file),
-        *(POINTS_PER_MM * number for number in (left, bottom, right - left, top - bottom)),
+        ImageReader(BytesIO(picture)),
+        *(pens.POINTS_PER_MM * number for number in (left, bottom, right - left, top - bottom)),
     )
 
 
@@ -133,15 +123,17 @@ def _draw_contours(placed: Placed, raster: Path, *, is_flipped: bool) -> None:
     )
     labelled: list[NDArray[np.float64]] = []
     for level, points in found:
-        colour = BEFORE if level > 0.0 else BEHIND
+        colour = pens.BEFORE if level > 0.0 else pens.BEHIND
         on_paper = placed.on_paper(points)
-        line(placed.canvas, on_paper, width_mm=FINE_MM, colour=colour)
+        pens.line(placed.canvas, on_paper, width_mm=pens.FINE_MM, colour=colour)
         text = f"{round(1e3 * level, 6):+g}"
-        place = label_place(on_paper, text_width_mm(text), labelled)
+        place = label_place(on_paper, pens.text_width_mm(text), labelled)
         if place is not None:
             middle_mm, turned_deg = place
             labelled.append(np.array(middle_mm))
-            write_on_white(placed.canvas, text, middle_mm, turned_deg=turned_deg, colour=colour)
+            pens.write_on_white(
+                placed.canvas, text, middle_mm, turned_deg=turned_deg, colour=colour
+            )
 
 
 def _draw_areas(placed: Placed, areas: Sequence[Area]) -> None:
@@ -151,16 +143,18 @@ def _draw_areas(placed: Placed, areas: Sequence[Area]) -> None:
         for text, outline_m in areas:
             outline = placed.on_paper(outline_m)
             # White below, so that the line is visible on any picture.
-            line(canvas, outline, width_mm=1.0, colour=WHITE, is_closed=True)
-            line(canvas, outline, width_mm=MEDIUM_MM, colour=OPENING, is_closed=True)
+            pens.line(canvas, outline, width_mm=1.0, colour=pens.WHITE, is_closed=True)
+            pens.line(canvas, outline, width_mm=pens.MEDIUM_MM, colour=pens.OPENING, is_closed=True)
             low = np.maximum(outline.min(axis=0), (left, bottom))
             high = np.minimum(outline.max(axis=0), (right, top))
             # The parts of the text on white, from the top, if there is room.
             rows = shown(text).split(", ")
-            wide_mm = max(text_width_mm(row) for row in rows) + 2.0
-            high_mm = 1.7 * TEXT_MM * len(rows) + 1.0
+            wide_mm = max(pens.text_width_mm(row) for row in rows) + 2.0
+            high_mm = 1.7 * pens.TEXT_MM * len(rows) + 1.0
             if high[0] - low[0] >= wide_mm + 2.0 and high[1] - low[1] >= high_mm + 2.0:
-                box(canvas, (low[0] + 1.0, high[1] - 1.0 - high_mm, wide_mm, high_mm), WHITE)
+                pens.box(
+                    canvas, (low[0] + 1.0, high[1] - 1.0 - high_mm, wide_mm, high_mm), pens.WHITE
+                )
                 for place, row in enumerate(rows):
-                    at = (low[0] + 2.0, high[1] - 1.2 - 1.7 * TEXT_MM * (place + 0.8))
-                    write_text(canvas, row, at, colour=OPENING)
+                    at = (low[0] + 2.0, high[1] - 1.2 - 1.7 * pens.TEXT_MM * (place + 0.8))
+                    pens.write_text(canvas, row, at, colour=pens.OPENING)

@@ -12,8 +12,8 @@ from orthoflow.files.drawings import printed_pictures
 from orthoflow.files.drawings.papers import Part
 from orthoflow.files.drawings.printed_pictures import (
     contours,
+    encode_part,
     stretch_of,
-    write_picture,
 )
 from orthoflow.files.geotiff import GridPlace, RasterParts, write_orthoimage, write_raster
 from orthoflow.files.images import decode_image
@@ -27,9 +27,7 @@ def ramp(rows: int, columns: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uin
 
 
 def pictured(folder: Path, part: Part, scale: int) -> NDArray[np.uint8]:
-    return decode_image(
-        write_picture(folder / "a.tif", part, folder / "p", scale=scale).read_bytes()
-    )
+    return decode_image(encode_part(folder / "a.tif", part, scale=scale))
 
 
 def test_cells_are_kept_as_they_are_where_print_shows_them(tmp_path: Path) -> None:
@@ -76,11 +74,11 @@ def test_large_pictures_are_jpeg_with_the_colours_they_had(
         tmp_path / "a.tif", rgb, np.ones((300, 400), np.bool_), place=GridPlace(gsd_m=0.1), tags={}
     )
     part = Part(left_m=0.0, top_m=0.0, right_m=40.0, bottom_m=30.0)
-    for lossless_px, suffix in ((120_000, ".png"), (119_999, ".jpg")):
+    for lossless_px, magic in ((120_000, b"\x89PNG"), (119_999, b"\xff\xd8")):
         monkeypatch.setattr(printed_pictures, "_LOSSLESS_PX", lossless_px)
-        file = write_picture(tmp_path / "a.tif", part, tmp_path / "p", scale=50)
-        assert file.suffix == suffix
-    picture = decode_image(file.read_bytes()).astype(int)
+        encoded = encode_part(tmp_path / "a.tif", part, scale=50)
+        assert encoded.startswith(magic)
+    picture = decode_image(encoded).astype(int)
     assert picture.shape == (300, 400, 3)
     # No chroma is thinned out: beside the edge too colours are right to JPEG's rounding.
     assert np.abs(picture[:, :190] - (200, 40, 90)).max() <= 3
