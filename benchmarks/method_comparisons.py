@@ -24,7 +24,7 @@ from orthoflow.records.open import open_run
 from orthoflow.records.runs import Run, cell_metrics
 from orthoflow.report import write_report
 from orthoflow.report.combinations import Combination, combinations_of
-from orthoflow.report.numbers import number, number_with_spread
+from orthoflow.report.rankings import number, number_with_spread
 from orthoflow.report.rankings import Mark, Value, rank
 
 RECIPES = ("plane-methods", "orient-methods", "ortho-methods")

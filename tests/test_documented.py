@@ -23,7 +23,7 @@ from orthoflow.cli.commands import Changes
 from orthoflow.cli.program import program
 from orthoflow.errors import OrthoflowError
 from orthoflow.files.calibration import lens_for, read_calibration
-from orthoflow.files.drawings.title_blocks import read_title_block
+from orthoflow.files.drawings.sheet_contents import read_title_block
 from orthoflow.workflow.document import load_workflow
 from orthoflow.workflow.source import shipped_workflow
 from tests.documented import (

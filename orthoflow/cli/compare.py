@@ -155,7 +155,7 @@ def _print_pairs(
         step_of: the step of each cell.
         whose: of which steps the rows are, if not of all.
     """
-    from orthoflow.report.differences import grouped_rows, grouped_texts
+    from orthoflow.report.differences import RowGroup, grouped_rows
 
     different = [row for row in rows if not row.is_same]
     if not different:
@@ -163,9 +163,9 @@ def _print_pairs(
         return
     echo("", f"{title}: {_counts(rows)}{whose}")
     kept = (
-        grouped_rows(different, id)
+        [RowGroup(pair=row, n=1) for row in different]
         if most is None
-        else grouped_texts(different, text, step_of or {})
+        else grouped_rows(different, text, step_of or {})
     )
     echo_table(
         ("", "A", "B"),
@@ -225,22 +225,22 @@ def _parameter_text(parameter: ParameterValue) -> str:
 
 def _print_metrics(comparison: RunComparison, most: int | None) -> None:
     """Print metrics that differ by more than rounding; times and memory apart and last."""
-    from orthoflow.report.differences import grouped_rows, grouped_texts, moved_first
+    from orthoflow.report.differences import RowGroup, grouped_rows, moved_first
 
     measured, step_of = comparison.measured, comparison.step_of
     echo("", f"metrics: {_counts(measured)}{comparison.of_shared_steps}")
     different = moved_first([row for row in measured if not row.is_same], step_of)
     if most is None:
-        _print_numbers(grouped_rows(different, id), step_of)
+        _print_numbers([RowGroup(pair=row, n=1) for row in different], step_of)
     else:
         moved = [row for row in different if row.is_moved]
-        kept = grouped_texts(moved, lambda side: f"{side.value} {side.unit}", step_of)
+        kept = grouped_rows(moved, lambda side: f"{side.value} {side.unit}", step_of)
         _print_numbers(kept[:most], step_of)
         echo_left_out(len(kept), most)
     costs = [row for row in comparison.shared(comparison.metrics) if row.either.is_cost]
     different = [row for row in costs if not row.is_same]
     echo("", f"times and memory: {_counts(costs)}")
-    _print_numbers(grouped_rows(different, id)[:most], step_of)
+    _print_numbers([RowGroup(pair=row, n=1) for row in different[:most]], step_of)
     echo_left_out(len(different), most)
 
 

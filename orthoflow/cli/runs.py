@@ -65,13 +65,6 @@ _SIGNS: Final[Mapping[str, Callable[[float, float], bool]]] = {
     "--metric", "metrics", metavar="NAME", multiple=True, help="Show this number.  [default: some]"
 )
 @click.option(
-    "--html",
-    "page",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE",
-    help="Write a page with links to the report of each run.",
-)
-@click.option(
     "--table",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
@@ -85,7 +78,7 @@ def runs(
     as_json: bool,
     sort: str,
     metrics: tuple[str, ...],
-    # Any: where to write, and which runs to choose, whose types click has checked.
+    # Any: which runs to choose, whose types click has checked.
     **chosen: Any,
 ) -> int:
     """List the runs in and below each FOLDER, by default the working directory.
@@ -98,7 +91,7 @@ def runs(
     per cell and metric: what was computed with the same methods, parameters, seeds and data in
     several of them is one cell, and `environments` counts the machines.
     """
-    table, page = chosen.pop("table"), chosen.pop("page")
+    table = chosen.pop("table")
     if table is not None:
         return _write_table(folders, table)
     found = list_runs(folders or (Path(),))
@@ -107,12 +100,6 @@ def runs(
         echo_json(runs_json(kept, found))
     else:
         print_runs(kept, found, metrics=metrics)
-    if page is not None:
-        from orthoflow.report.browsing import write_run_table
-
-        write_run_table(kept, page, among=found)
-        if not as_json:
-            echo(f"page: {page}")
     return EXIT_GOOD
 
 
@@ -168,9 +155,9 @@ def print_runs(
     kept: Sequence[RunSummary], found: Sequence[RunSummary], *, metrics: Sequence[str] = ()
 ) -> None:
     """Print a table of runs of those found, what went wrong in them, and how many there are."""
-    from orthoflow.report.browsing import differing_facts, distinguishing, key_metrics
+    from orthoflow.report.browsing import differing_facts, key_metrics
 
-    names = list(metrics) or list(distinguishing(key_metrics(kept, most=_METRICS_MOST), kept))
+    names = list(metrics) or key_metrics(kept, most=_METRICS_MOST)
     _require_known(names, kept)
     facts = differing_facts(found)
     echo_table(
@@ -283,6 +270,6 @@ def _row_json(
 ) -> dict[str, object]:
     values = dataclasses.asdict(run) | {"folder": str(run.folder)}
     values["status"] = values.pop("state")
-    for name in ("labels", "n_values", "parameters"):
+    for name in ("n_values", "parameters"):
         del values[name]
     return values | {"facts": dict(facts), "differs": dict(differs)}

@@ -181,7 +181,7 @@ def _print_comparison(run: Run) -> bool:
 
 
 def _median(one: MethodOverDatasets | None) -> str:
-    from orthoflow.report import numbers
+    from orthoflow.report import rankings as numbers
 
     if one is None or math.isnan(one.median):
         return _NOTHING

@@ -240,7 +240,7 @@ def write_raster(
         "predictor": 3 if values.dtype == np.float32 else 2,
         "nodata": _NOTHING[str(values.dtype)],
     }
-    with _writing(path):
+    with writing(path):
         _write(path, values[:, :, None], None, profile | _placed(values.shape, place), tags)
         _require_written(path, values[:, :, None])
 
@@ -282,7 +282,7 @@ def write_orthoimage(
     plain = path.with_name(f"{path.name}.plain")
     profile = {"count": 3, "dtype": rgb.dtype.name} | _placed(shown.shape, place)
     try:
-        with _writing(path):
+        with writing(path):
             _write(plain, rgb, shown, profile, tags, icc_profile)
             copy(plain, path, driver="COG", BIGTIFF="IF_SAFER", **_COG_OPTIONS)
             _require_written(path, rgb)
@@ -558,7 +558,7 @@ def _write(
 
 
 @contextmanager
-def _writing(path: Path) -> Iterator[None]:
+def writing(path: Path) -> Iterator[None]:
     """Convert messages of GDAL or the disk while a file is written into a sentence.
 
     Raises:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from orthoflow.files.calibration import write_calibration
 from orthoflow.files.drawings.geojson import opening_feature
-from orthoflow.files.drawings.room_lines import numbered_openings
+from orthoflow.files.drawings.key_plans import numbered_openings
 from orthoflow.files.geotiff import (
     SITE_CRS,
     GridPlace,

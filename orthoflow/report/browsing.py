@@ -12,13 +12,12 @@ from typing import Final, Literal, TypeAlias
 
 import numpy as np
 
-from orthoflow.engine.durability import write_whole
 from orthoflow.engine.journal import JOURNAL, RECORD_FILE, is_running
 from orthoflow.errors import ArgumentError, OrthoflowError
 from orthoflow.products import JsonValue
 from orthoflow.records import RecordedCell
 from orthoflow.records.open import open_run
-from orthoflow.records.runs import REPORT_FILE, Run, cell_metrics, parts_of
+from orthoflow.records.runs import Run, cell_metrics, parts_of
 from orthoflow.records.verify import broken_seal
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.paired import middle_of
@@ -35,9 +34,6 @@ _NO_RUNS: Final = frozenset({"products", "logs", "pages", "node_modules", "__pyc
 # In the folder of a run: parts of it, and what was exported.
 _OF_A_RUN: Final = frozenset({"datasets", "export"})
 _FIRST_LINE_BYTES: Final = 1 << 16
-_PICTURE_PX: Final = 180
-_PICTURES_MOST: Final = 200  # about 8 kB each
-_KEYS_MOST: Final = 6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +52,6 @@ class RunSummary:
             has it; of several datasets the median, of what is yes or no the share.
         n_datasets: that it ran on; 0 for a run on none.
         n_values: how many of these have each of the numbers; empty for a run on none.
-        labels: what each of these is, in words.
         headlines: the headline numbers, most important first.
         flags: those that are 1 where something is so and 0 where not.
         facts: what may differ between runs beside parameters: `seed`, `orthoflow` (its version),
@@ -73,7 +68,6 @@ class RunSummary:
     metrics: Mapping[str, float] = field(default_factory=dict)
     n_datasets: int = 0
     n_values: Mapping[str, int] = field(default_factory=dict)
-    labels: Mapping[str, str] = field(default_factory=dict)
     headlines: tuple[str, ...] = ()
     flags: tuple[str, ...] = ()
     facts: Mapping[str, JsonValue] = field(default_factory=dict)
@@ -151,21 +145,6 @@ def key_metrics(runs: Iterable[RunSummary], *, most: int) -> list[str]:
     return [name for name in counts if name in chosen]
 
 
-def distinguishing(names: Iterable[str], runs: Sequence[RunSummary]) -> Iterator[str]:
-    """Replace names of different metrics in different runs by `step.metric`."""
-    for name in names:
-        labels = {run.labels[name] for run in runs if name in run.labels}
-        if len(labels) < 2:
-            yield name
-            continue
-        yield from dict.fromkeys(
-            own
-            for run in runs
-            for own, label in run.labels.items()
-            if own.endswith(f".{name}") and label in labels
-        )
-
-
 def _below(folder: Path) -> Iterator[Path]:
     for place, folders, files in os.walk(folder):
         if RECORD_FILE in files or JOURNAL in files:
@@ -191,10 +170,9 @@ def _summary(folder: Path) -> RunSummary:
         if doubt := broken_seal(run):
             return RunSummary(folder=folder, state="damaged", reason=doubt)
         return _of_run(folder, run)
-    except OrthoflowError as error:
-        return RunSummary(folder=folder, state="damaged", reason=str(error))
     except Exception as error:  # noqa: BLE001 - a record may contain anything; the others are still listed
-        reason = f"the record is not as one was written: {type(error).__name__}: {error}"
+        unforeseen = f"the record is not as one was written: {type(error).__name__}: "
+        reason = f"{'' if isinstance(error, OrthoflowError) else unforeseen}{error}"
         return RunSummary(folder=folder, state="damaged", reason=reason)
 
 
@@ -208,7 +186,6 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
     for given in record.inputs:
         facts[f"input {given.name}"] = [f"{file.name} {file.sha256[:8]}" for file in given.files]
     values: dict[str, list[float]] = {}
-    labels: dict[str, str] = {}
     flags: dict[str, None] = {}
     of_parts = [baseline_cells(part) for part in parts.values() or (run,)]
     for cells in of_parts:
@@ -221,7 +198,6 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
                 is_size = len(parts) > 1 and row.better == "lower"
                 for name in (f"{row.step}.{row.metric}", row.metric):
                     own[name] = abs(row.value) if is_size else row.value
-                    labels[name] = row.title
                     flags |= {name: None} if is_flag(row.unit) else {}
         for name, value in own.items():
             values.setdefault(name, []).append(value)
@@ -238,10 +214,7 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
         },
         n_datasets=len(parts),
         n_values={name: len(found) for name, found in values.items()} if parts else {},
-        labels=labels,
-        headlines=tuple(
-            name for _, name in headline_keys(cell for cells in of_parts for cell in cells)
-        ),
+        headlines=tuple(map(".".join, headline_keys(cell for cells in of_parts for cell in cells))),
         flags=tuple(flags),
         facts=facts,
         parameters=_parameters(record.cells),
@@ -267,68 +240,13 @@ def _unfinished(folder: Path) -> RunSummary:
     except (OSError, ValueError) as error:
         reason = f"it has no {RECORD_FILE}, and its journal cannot be read: {error}"
         return RunSummary(folder=folder, state="damaged", reason=reason)
-    labels = first if isinstance(first, dict) else {}
+    stated = first if isinstance(first, dict) else {}
     is_under_way = is_running(folder)
     return RunSummary(
         folder=folder,
         state="running" if is_under_way else "unfinished",
         reason="" if is_under_way else f"continues with the same command and -o {folder}",
-        workflow=str(labels.get("workflow", "")),
-        run_id=str(labels.get("run_id", "")),
-        started=str(labels.get("time", "")),
+        workflow=str(stated.get("workflow", "")),
+        run_id=str(stated.get("run_id", "")),
+        started=str(stated.get("time", "")),
     )
-
-
-def write_run_table(runs: Sequence[RunSummary], path: Path, *, among: Sequence[RunSummary]) -> None:
-    """Write a page with a row per run.
-
-    Args:
-        runs: in the order of the rows.
-        path: file to write.
-        among: those from which they were chosen, and against which differences are stated.
-
-    Raises:
-        StoreError: it cannot be written.
-    """
-    from orthoflow.report.rendering import environment  # noqa: PLC0415 - few ask
-
-    facts = differing_facts(among)
-    known = dict.fromkeys(name for run in runs for name in run.metrics if "." not in name)
-    names = {
-        name: next(run.labels[name] for run in runs if name in run.labels)
-        for name in distinguishing(known, runs)
-    }
-    rows = []
-    for index, run in enumerate(runs):
-        report = run.folder / REPORT_FILE
-        link = Path(os.path.relpath(report, path.parent)).as_posix() if report.is_file() else ""
-        picture = _picture(run.folder) if index < _PICTURES_MOST else ""
-        differs = ", ".join(
-            f"{name}={json.dumps(value, ensure_ascii=False)}"
-            for name, value in facts[run.folder].items()
-        )
-        rows.append({"run": run, "link": link, "picture": picture, "differs": differs})
-    page = (
-        environment()
-        .get_template("runs.html.j2")
-        .render(
-            title=f"{len(runs)} runs",
-            rows=rows,
-            names=names,
-            key_names=set(distinguishing(key_metrics(runs, most=_KEYS_MOST), runs)),
-            reasons={str(run.folder): run.reason for run in runs if run.reason},
-        )
-    )
-    write_whole(path, page.encode("utf-8"))
-
-
-def _picture(folder: Path) -> str:
-    """The first orthoimage of a run; none where its record cannot be read."""
-    from orthoflow.report.pictures import thumbnail  # noqa: PLC0415 - few ask
-
-    try:
-        run = open_run(folder)
-        made = {cell.address for cell in baseline_cells(run)}
-        return thumbnail(run, made, longest_side_px=_PICTURE_PX)
-    except (OrthoflowError, OSError, KeyError, ValueError):
-        return ""

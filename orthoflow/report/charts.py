@@ -84,7 +84,10 @@ def line_chart(
             axes.set_xscale("log")
         for index, (name, points) in enumerate(lines.items()):
             _draw_line(axes, points, index, name=shown(name), bounds=bounds)
-        _limit(axes, every, bounds)
+        axes.margins(y=0.08)
+        low, high = (end([point.y for point in every]) for end in (min, max))
+        if 0.0 <= low < _NEAR_ZERO * high:
+            axes.set_ylim(bottom=0.0)
         axes.set_xlabel(shown(f"{below}{' (logarithmic)' if is_logarithmic else ''}"))
         axes.set_ylabel(shown(beside), wrap=True)
         if any(lines):
@@ -120,20 +123,11 @@ def _draw_line(
     axes.scatter(x, y, c=fills, edgecolors=colour, s=16, zorder=3)
 
 
-def _limit(axes: Axes, points: Sequence[ChartPoint], bounds: tuple[float, float]) -> None:
-    spreads = [point.spread if math.isfinite(point.spread) else 0.0 for point in points]
-    low = max(min(p.y - s for p, s in zip(points, spreads, strict=True)), bounds[0])
-    high = min(max(p.y + s for p, s in zip(points, spreads, strict=True)), bounds[1])
-    margin = 0.08 * (high - low) or 0.1 * abs(high) or 1.0
-    begin = 0.0 if 0.0 <= low < _NEAR_ZERO * high else low - margin
-    axes.set_ylim(begin, high + margin)
-
-
 def plan_chart(
     walls: Sequence[PlanWall],
     photos: Sequence[PlanPhoto],
     *,
-    labels: tuple[str, str],
+    labels: Sequence[str],
     suffix: ChartFormat = "svg",
 ) -> bytes:
     """Draw walls and photos from above, to scale.
@@ -167,13 +161,8 @@ def plan_chart(
             width=0.004,
         )
         axes.scatter(feet[:, 0], feet[:, 1], s=14, color=COLOURS[5], zorder=3)
-        # Names lie on no other one's; of many photos none is named.
-        named: list[NDArray[np.float64]] = []
         for name, foot_m, _ in photos if len(photos) <= _NAMED_PHOTOS else ():
-            room_m = np.array([0.16, 0.03]) * span
-            if all(np.any(np.abs(foot_m - other) > room_m) for other in named):
-                named.append(foot_m)
-                _name(axes, name, foot_m, colour=COLOURS[5], above=False)
+            _name(axes, name, foot_m, colour=COLOURS[5], above=False)
         axes.set_aspect("equal", adjustable="datalim")
         axes.margins(0.08)
         axes.set_xlabel(labels[0])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -13,20 +15,32 @@ from orthoflow.records import COSTS, RunRecord
 from orthoflow.records.runs import MetricRow, Run, cell_metrics, is_rounding
 from orthoflow.report.combinations import (
     Combination,
+    EnvironmentGroups,
     Measured,
+    baseline_cells,
+    baseline_of,
     combinations_of,
+    group_environments,
+    is_missing,
     wanted_metrics,
 )
-from orthoflow.report.environments import EnvironmentGroups, group_environments
-from orthoflow.report.numbers import number, number_with_spread
-from orthoflow.report.rankings import BETTER, Mark, Value, cost_share, rank
-from orthoflow.report.summaries import headline_keys
+from orthoflow.report.pictures import thumbnail
+from orthoflow.report.rankings import (
+    Mark,
+    Value,
+    cost_share,
+    number,
+    number_with_spread,
+    rank,
+)
+from orthoflow.report.summaries import headline_keys, limits
+from orthoflow.untrusted_text import first_few
+from orthoflow.workflow.expand import variants_text
 from orthoflow.workflow.model import DATA
 
 _NOTHING: Final = "-"
 # A machine that does nothing else moves the times of short steps by so much.
 _TIMED_S: Final = 0.1
-_LEADS: Final = (Mark.BEST, Mark.NEAR)
 _MAX_DESCRIBED: Final = 12  # metrics that are shown where none of quality differs
 _MAX_NAMED: Final = 3  # numbers that a combination is best in
 # Cost of the steps in which combinations differ; processor time hardly depends on other programs.
@@ -52,7 +66,7 @@ class Row:
         failure: where and why it failed, empty when it did not.
         missing: addresses that the run was interrupted before.
         values: one per column.
-        remark: what was cached and what else to know, in words.
+        remark: how many of its repeats failed.
     """
 
     run: str
@@ -63,11 +77,6 @@ class Row:
     missing: tuple[str, ...]
     values: tuple[Value, ...]
     remark: str
-
-    @property
-    def time(self) -> Value:
-        """Processor seconds of the cells that the variants have a part in."""
-        return self.values[-2]
 
     @property
     def groups(self) -> tuple[str, ...]:
@@ -94,7 +103,6 @@ class ComparisonTable:
         rows: in the order of the runs and their graphs.
         shows_runs: rows come from more than one run.
         groups: letter -> what environment and data it stands for; empty when all is of one kind.
-        forced: options that measure all again in one environment; empty if there is only one.
     """
 
     steps: tuple[str, ...]
@@ -102,29 +110,12 @@ class ComparisonTable:
     rows: tuple[Row, ...]
     shows_runs: bool
     groups: Mapping[str, str]
-    forced: str = ""
-
-    @property
-    def n_whole(self) -> int:
-        """How many combinations came to their end."""
-        return sum(not row.shortfall for row in self.rows)
 
     @property
     def baseline(self) -> str:
         """The combination that the others are compared with; empty where there is none, or two."""
         found = [row.name for row in self.rows if row.is_baseline]
         return found[0] if len(found) == 1 else ""
-
-    @property
-    def n_judged(self) -> int:
-        """How many of the columns have a good side, time and memory included."""
-        return sum(column.better in BETTER for column in self.columns)
-
-    @property
-    def n_undecided(self) -> int:
-        """In how many of these no combination leads, so that they count for nobody."""
-        places = zip(*(row.values for row in self.rows), strict=True)
-        return self.n_judged - sum(any(one.mark in _LEADS for one in place) for place in places)
 
     @property
     def glance(self) -> tuple[Row, ...]:
@@ -135,14 +126,14 @@ class ComparisonTable:
 
         return tuple(sorted(self.rows, key=place))
 
-    def best_in(self, row: Row) -> tuple[str, ...]:
-        """Name what a row is clearly best in, at most three."""
+    def best_in(self, row: Row) -> str:
+        """Name what a row is clearly best in, at most three; empty if nothing."""
         found = [
             ": ".join(filter(None, (column.step, column.titled)))
             for column, value in zip(self.columns, row.values, strict=True)
             if value.mark is Mark.BEST
         ]
-        return (*found[:_MAX_NAMED], *(["..."] if len(found) > _MAX_NAMED else []))
+        return first_few(found, most=_MAX_NAMED)
 
 
 def comparison_table(runs: Sequence[Run]) -> ComparisonTable | None:
@@ -177,20 +168,16 @@ def comparison_table(runs: Sequence[Run]) -> ComparisonTable | None:
             failure=f"{one.failure.address}: {one.failure.error_message}" if one.failure else "",
             missing=tuple(cell.address for cell in one.missing),
             values=own,
-            remark=_remark(one),
+            remark=f"{one.n_failed_repeats} repeats failed" if one.n_failed_repeats else "",
         )
         for one, own in zip(combinations, zip(*ranked, strict=True), strict=True)
     )
-    forced = dict.fromkeys((*steps, *(column.step for column in metrics)))
     return ComparisonTable(
         steps=steps,
         columns=columns,
         rows=rows,
         shows_runs=len(runs) > 1,
         groups=origins.legend,
-        forced=" ".join(f"--force {step}" for step in forced if step != DATA)
-        if len(origins.environments.words) > 1 and origins.letters
-        else "",
     )
 
 
@@ -209,15 +196,18 @@ def comparison_columns(combinations: Sequence[Combination]) -> tuple[MetricRow, 
     if patterns:
         wanted = _matching(patterns, first)
     else:
-        # A later step of the chain improves on an earlier one: first and final orientation.
-        last: dict[tuple[str, str], None] = {}
-        for one in combinations:
-            steps = {row.metric: row.step for cell in one.cells for row in cell_metrics(cell)}
-            last |= dict.fromkeys((step, metric) for metric, step in steps.items())
         wanted = headline_keys(cell for one in combinations for cell in one.cells)
         if not any(_differs(key, combinations) for key in wanted):
-            others = [key for key in last if key not in wanted and not cost_share(first[key].unit)]
-            described = _described(others, combinations)
+            # Of a metric of several steps the last step's, which improves on the earlier ones.
+            last = {metric: (step, metric) for step, metric in first}
+            order = {step: place for place, (step, _) in enumerate(first)}
+            described = [
+                key
+                for key in sorted(last.values(), key=lambda key: -order[key[0]])
+                if key not in wanted
+                and not cost_share(first[key].unit)
+                and _differs(key, combinations)
+            ][:_MAX_DESCRIBED]
     return (
         *(first[key] for key in dict.fromkeys(wanted)),
         *(replace(first[key], better="") for key in described),
@@ -226,20 +216,8 @@ def comparison_columns(combinations: Sequence[Combination]) -> tuple[MetricRow, 
 
 def _differs(key: tuple[str, str], combinations: Sequence[Combination]) -> bool:
     """Whether a metric is not the same in all combinations that have it."""
-    found = [one.measured(*key) for one in combinations]
-    values = [one.value for one in found if one is not None]
+    values = [value.value for one in combinations if (value := one.measured(*key))]
     return any(not is_rounding(values[0], value) for value in values[1:])
-
-
-def _described(
-    keys: Iterable[tuple[str, str]], combinations: Sequence[Combination]
-) -> list[tuple[str, str]]:
-    """Metrics that differ, those of the last step first."""
-    by_step: dict[str, list[tuple[str, str]]] = {}
-    for key in keys:
-        if _differs(key, combinations):
-            by_step.setdefault(key[0], []).append(key)
-    return [key for own in reversed(by_step.values()) for key in own][:_MAX_DESCRIBED]
 
 
 def _matching(patterns: Iterable[str], known: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
@@ -270,18 +248,12 @@ def _costs(one: Combination, origins: Origins) -> tuple[Value, Value]:
 def _run_labels(runs: Sequence[Run]) -> dict[tuple[Path, str], str]:
     """The workflow with the options that not all runs have, the run's folder and its id."""
     shared = frozenset.intersection(*(frozenset(run.record.overrides) for run in runs))
-    return {
-        (run.path, run.record.run_id): ", ".join(
-            (
-                " ".join(
-                    (run.record.name, *(one for one in run.record.overrides if one not in shared))
-                ),
-                run.path.absolute().parent.name,
-                run.record.run_id,
-            )
-        )
-        for run in runs
-    }
+    labels = {}
+    for run in runs:
+        own = [option for option in run.record.overrides if option not in shared]
+        words = (" ".join([run.record.name, *own]), run.path.absolute().parent.name)
+        labels[run.path, run.record.run_id] = ", ".join((*words, run.record.run_id))
+    return labels
 
 
 def measured_text(measured: Measured) -> str:
@@ -311,20 +283,6 @@ def _value(one: Combination, origins: Origins, column: MetricRow) -> Value:
         note=of_what if measured.n_repeats > 1 else "",
         n_items=one.n_items(column.step, column.counted_by),
     )
-
-
-def _remark(one: Combination) -> str:
-    cached = [cell for cell in one.varied_cells if cell.cached_from]
-    parts = []
-    if cached:
-        sources = ", ".join(dict.fromkeys(cell.cached_from for cell in cached))
-        n_computed = sum(cell.status != "skipped" for cell in one.varied_cells)
-        parts.append(
-            f"{len(cached)} of {n_computed} steps cached, with their time in run {sources}"
-        )
-    if one.n_failed_repeats:
-        parts.append(f"{one.n_failed_repeats} repeats failed")
-    return "; ".join(parts)
 
 
 # Environment, the first of its equivalent ones, and digests of data.
@@ -359,15 +317,14 @@ class Origins:
             name = one.assignment.get(DATA, "")
             if _place(one) not in data:
                 data[_place(one)] = _data_of(one.run.record, name)
-            place = f"{one.run.record.run_id}{f', dataset {name}' if name else ''}"
-            for cell in one.cells:
-                if cell.status == "ok":
-                    first = groups.first.get(cell.environment, cell.environment)
-                    places.setdefault((first, data[_place(one)]), {})[place] = None
+            text = f"{one.run.record.run_id}{f', dataset {name}' if name else ''}"
+            for cell in (cell for cell in one.cells if cell.status == "ok"):
+                first = groups.first.get(cell.environment, cell.environment)
+                places.setdefault((first, data[_place(one)]), {})[text] = None
         if len(places) < 2:
             return Origins(environments=groups, data=data, letters={}, legend={})
-        n_environments, n_data = (len(set(parts)) for parts in zip(*places, strict=True))
         letters = {origin: _letter(index) for index, origin in enumerate(places)}
+        n_environments, n_data = (len(set(parts)) for parts in zip(*places, strict=True))
         legend = {
             letters[origin]: "; ".join(
                 [groups.words.get(origin[0], origin[0])] * (n_environments > 1)
@@ -409,3 +366,121 @@ def _letter(index: int) -> str:
     # 27 environments in one report: AA follows Z.
     first, last = divmod(index, len(ascii_uppercase))
     return (ascii_uppercase[first - 1] if first else "") + ascii_uppercase[last]
+
+
+_MOST_COLUMNS: Final = 6
+# Pictures of a page with many rooms get smaller, until they show nothing any more.
+_PICTURES_PX: Final = 2_000_000
+_LARGEST_PX: Final = 220
+_SMALLEST_PX: Final = 64
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetRow:
+    """One dataset, as the baseline has it.
+
+    Attributes:
+        name: of the dataset.
+        page: where its own page lies, relative to this one; empty without one.
+        picture: data URI of its first orthoimage, empty without one.
+        failed: its failed cells and why they did, without those that were skipped behind them.
+        missing: its cells that the run was interrupted before.
+        values: one per column.
+        limit: what limits it most, and how much more does.
+    """
+
+    name: str
+    page: str
+    picture: str
+    failed: tuple[str, ...]
+    missing: tuple[str, ...]
+    values: tuple[Value, ...]
+    limit: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetTable:
+    """The datasets of a run.
+
+    Attributes:
+        columns: what is measured of each: step, and metric with its unit.
+        rows: in the order of the run.
+        baseline: the variants that the numbers are of; empty where nothing varies.
+    """
+
+    columns: tuple[tuple[str, str], ...]
+    rows: tuple[DatasetRow, ...]
+    baseline: str = ""
+
+
+def dataset_table(parts: Mapping[str, Run], pages: Mapping[str, str]) -> DatasetTable:
+    """Put the datasets of a run below each other.
+
+    Args:
+        parts: dataset -> its part of the run.
+        pages: dataset -> its own page, relative to the one that is made.
+    """
+    own = {
+        name: {cell.address for cell in part.record.cells if DATA in cell.assignment}
+        for name, part in parts.items()
+    }
+    measured = {name: _measured(part, own[name]) for name, part in parts.items()}
+    units = {key: row for values in measured.values() for key, row in values.items()}
+    # Those of the comparison, which the workflow may have asked for.
+    columns = comparison_columns([one for part in parts.values() for one in combinations_of(part)])
+    wanted = [(column.step, column.metric) for column in columns]
+    chosen = [key for key in wanted if key in units][:_MOST_COLUMNS]
+    return DatasetTable(
+        columns=tuple((row.step, row.titled) for row in (units[key] for key in chosen)),
+        rows=tuple(
+            DatasetRow(
+                name=name,
+                page=pages.get(name, ""),
+                picture=_picture(part, own[name], len(parts)),
+                failed=tuple(
+                    f"{cell.address}: {cell.error_message}"
+                    for cell in part.record.cells
+                    if cell.status == "failed"
+                ),
+                missing=tuple(cell.address for cell in part.record.cells if is_missing(cell)),
+                values=tuple(_dataset_value(measured[name].get(key)) for key in chosen),
+                limit=_limit(part, own[name]),
+            )
+            for name, part in parts.items()
+        ),
+        baseline=variants_text(baseline_of(next(iter(parts.values())))) if parts else "",
+    )
+
+
+_Measured = Mapping[tuple[str, str], MetricRow]
+
+
+def _measured(part: Run, own: AbstractSet[str]) -> _Measured:
+    """What the baseline's cells of this dataset measured: (step, metric) -> the number."""
+    return {
+        (row.step, row.metric): row
+        for cell in baseline_cells(part)
+        if cell.address in own
+        for row in cell_metrics(cell)
+    }
+
+
+def _picture(part: Run, own: AbstractSet[str], n_rows: int) -> str:
+    addresses = [cell.address for cell in baseline_cells(part) if cell.address in own]
+    side_px = math.isqrt(_PICTURES_PX // n_rows)
+    return thumbnail(part, addresses, longest_side_px=min(_LARGEST_PX, max(_SMALLEST_PX, side_px)))
+
+
+def _dataset_value(measured: MetricRow | None) -> Value:
+    return Value(text=number(measured.value), sort=measured.value) if measured else Value()
+
+
+def _limit(part: Run, own: AbstractSet[str]) -> str:
+    """What the baseline's steps of this dataset warn of; failures stand beside it."""
+    baseline = {cell.address for cell in baseline_cells(part)} & own
+    texts = [
+        limit.text
+        for limit in limits(part)
+        if not baseline.isdisjoint(limit.cells) and not limit.is_failure
+    ]
+    return f"{texts[0]} (and {len(texts) - 1} more)" if len(texts) > 1 else "".join(texts)

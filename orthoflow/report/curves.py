@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from typing import Final, NamedTuple
@@ -180,20 +180,7 @@ def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
             }
             first = dict([one for one in lines.items() if one[1]][:_MOST_LINES])
             if any(len(line) >= _FEWEST_VALUES for line in first.values()):
-                caveat = _unequal_photos(combinations, column)
-                yield _curve(f"{step}.{parameter}", column, first, len(parts), caveat)
-
-
-def _unequal_photos(combinations: Iterable[Combination], column: MetricRow) -> str:
-    """Return where combinations sum up unequal numbers of photos of a dataset; else empty."""
-    counts: dict[str, set[float]] = {}
-    for one in combinations:
-        n_photos = one.n_items(column.step, column.counted_by)
-        if one.failure is None and n_photos > 0.0:
-            counts.setdefault(one.assignment.get(DATA, ""), set()).add(n_photos)
-    if all(len(found) < 2 for found in counts.values()):
-        return ""
-    return " Not all sum up as many photos: without difficult ones errors are smaller."
+                yield _curve(f"{step}.{parameter}", column, first, len(parts))
 
 
 def _lines(
@@ -223,9 +210,7 @@ def _lines(
     return lines
 
 
-def _curve(
-    parameter: str, column: MetricRow, lines: Mapping[str, _Line], n_datasets: int, caveat: str
-) -> Curve:
+def _curve(parameter: str, column: MetricRow, lines: Mapping[str, _Line], n_datasets: int) -> Curve:
     drawn = {
         name: [_point(x, found, column, is_over=n_datasets > 1) for x, found in line.items()]
         for name, line in lines.items()
@@ -242,7 +227,7 @@ def _curve(
     return Curve(
         name=f"{column.step}.{column.metric}_over_{parameter}",
         title=f"{column.titled} ({column.step}) over {parameter}",
-        caption=f"Points are {'; '.join(notes)}.{caveat}",
+        caption=f"Points are {'; '.join(notes)}.",
         lines=drawn,
         below=parameter,
         beside=column.titled,
@@ -272,8 +257,8 @@ def _points_text(lines: Mapping[str, _Line], unit: str, n_datasets: int) -> str:
         if any(math.isfinite(one.spread) for values in found for one in values):
             return "means of the repeats, bars their standard deviation"
         return "single values without repeats"
-    least, most = min(map(len, found)), max(map(len, found))
-    counted = f"{least}" if least == most else f"{least} to {most}"
+    counts = sorted({len(values) for values in found})
+    counted = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
     if is_flag(unit):
         return f"shares of {counted} of {n_datasets} datasets, and of their repeats"
     return (

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Generic, TypeVar
@@ -17,7 +16,7 @@ from orthoflow.records.compare import (
     RunComparison,
 )
 from orthoflow.records.compare import Difference as DifferenceCounts
-from orthoflow.report.numbers import number, number_with_unit
+from orthoflow.report.rankings import number, number_with_unit
 
 Side = TypeVar("Side")
 _DIGEST_LETTERS: Final = 12
@@ -73,7 +72,7 @@ def differences(comparison: RunComparison) -> tuple[DifferenceTable, ...]:
         _table(
             "Metrics, time and memory left aside",
             comparison.measured,
-            _metric_text,
+            lambda metric: number_with_unit(metric.value, metric.unit),
             step_of,
             different=moved,
             change=_change,
@@ -122,13 +121,9 @@ def _table(
                 right=_NOTHING if one.pair.right is None else text(one.pair.right),
                 change=change(one.pair),
             )
-            for one in grouped_texts(different, text, steps)
+            for one in grouped_rows(different, text, steps)
         ),
     )
-
-
-def _metric_text(metric: ComparedMetric) -> str:
-    return number_with_unit(metric.value, metric.unit)
 
 
 def _change(pair: Pair[ComparedMetric]) -> str:
@@ -164,9 +159,10 @@ class RowGroup(Generic[Side]):
     def label(self, step_of: Mapping[str, str]) -> str:
         """Name what they are of: a cell, or else a step and how many cells of it.
 
-        >>> rows = [Pair(cell=f"wall@{name}", name="cell_m", left=1, right=2) for name in "ab"]
-        >>> [row] = grouped_rows(rows, key=lambda pair: pair.name)
-        >>> row.label({"wall@a": "wall"})
+        >>> steps = {"wall@a": "wall", "wall@b": "wall"}
+        >>> rows = [Pair(cell=cell, name="cell_m", left=1, right=2) for cell in steps]
+        >>> [row] = grouped_rows(rows, str, steps)
+        >>> row.label(steps)
         'wall.cell_m, 2 steps'
         """
         cell, name = self.pair.cell, self.pair.name
@@ -179,28 +175,15 @@ class RowGroup(Generic[Side]):
 
 
 def grouped_rows(
-    pairs: Iterable[Pair[Side]], key: Callable[[Pair[Side]], Hashable]
-) -> list[RowGroup[Side]]:
-    """Put pairs together whose keys are equal, in the order of the first ones."""
-    first: dict[Hashable, Pair[Side]] = {}
-    counts: Counter[Hashable] = Counter()
-    for pair in pairs:
-        text = key(pair)
-        first.setdefault(text, pair)
-        counts[text] += 1
-    return [RowGroup(pair=pair, n=counts[text]) for text, pair in first.items()]
-
-
-def grouped_texts(
     pairs: Iterable[Pair[Side]], text: Callable[[Side], str], step_of: Mapping[str, str]
 ) -> list[RowGroup[Side]]:
-    """Group pairs with equal texts for one step."""
-
-    def key(pair: Pair[Side]) -> Hashable:
+    """Put pairs of one step whose sides have equal texts together, in the order of the first."""
+    found: dict[Hashable, list[Pair[Side]]] = {}
+    for pair in pairs:
         sides = (None if side is None else text(side) for side in (pair.left, pair.right))
-        return (step_of.get(pair.cell, pair.cell), pair.name, *sides)
-
-    return grouped_rows(pairs, key)
+        key = (step_of.get(pair.cell, pair.cell), pair.name, *sides)
+        found.setdefault(key, []).append(pair)
+    return [RowGroup(pair=same[0], n=len(same)) for same in found.values()]
 
 
 def moved_first(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -21,18 +21,19 @@ from orthoflow.geometry import WallFrame
 from orthoflow.geometry.levels import Colours, eight_bits
 from orthoflow.products import Orthoimage, Orthoimages, Product, is_shown
 from orthoflow.records import RecordedFigure
-from orthoflow.records.compare import Difference, RunComparison, compare_runs
+from orthoflow.records.compare import Difference, RunComparison, RunProducts, compare_runs
 from orthoflow.records.open import open_run as open_plain_run
 from orthoflow.records.runs import Run, cell_metrics, parts_of
 from orthoflow.records.tables import RunSet, join_runs
 from orthoflow.records.verify import Verification, broken_seal, verify_run
 from orthoflow.report.combinations import baseline_cells, combinations_of, unequal_walls
+from orthoflow.report.curves import sweeps
 from orthoflow.report.differences import moved_first
 from orthoflow.report.pictures import data_uri, embedded_products, thumbnail
 from orthoflow.report.rendering import environment
 from orthoflow.report.summaries import answers
-from orthoflow.report.tidy_tables import Varied
 from orthoflow.untrusted_text import first_few, shown
+from orthoflow.workflow.model import DATA
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -41,6 +42,50 @@ _THUMBNAIL_PX: Final = 640
 _FIGURES_MOST: Final = 24  # shown at once: a notebook keeps them all in its file
 _ROWS_MOST: Final = 60  # of a table of what differs
 _PARAMETERS_MOST: Final = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class Varied:
+    """What varies in a run.
+
+    Attributes:
+        steps: the steps with variants; `data` for datasets.
+        methods: step -> variant -> method, of steps that sweep parameters.
+        swept: (step, parameter) -> variant -> value, of parameters that are swept.
+    """
+
+    steps: tuple[str, ...]
+    methods: Mapping[str, Mapping[str, str]]
+    swept: Mapping[tuple[str, str], Mapping[str, float]]
+
+    @classmethod
+    def of(cls, run: Run) -> Varied:
+        """Look through the cells of a run."""
+        swept: dict[tuple[str, str], dict[str, float]] = {}
+        for sweep in sweeps(run.record.cells):
+            swept.setdefault((sweep.step, sweep.parameter), {}).update(sweep.values)
+        steps = dict.fromkeys(step for cell in run.record.cells for step in cell.assignment)
+        methods: dict[str, dict[str, str]] = {}
+        for cell in run.record.cells:
+            if any(cell.step == step for step, _ in swept) and cell.step in cell.assignment:
+                methods.setdefault(cell.step, {})[cell.assignment[cell.step]] = cell.method
+        return cls(steps=tuple(steps), methods=methods, swept=swept)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Name the columns, those of steps as in tables of several runs."""
+        return (
+            *("dataset" if step == DATA else f"variant.{step}" for step in self.steps),
+            *(f"{step}.use" for step in self.methods),
+            *(".".join(parameter) for parameter in self.swept),
+        )
+
+    def values(self, assignment: Mapping[str, str]) -> tuple[str | float | None, ...]:
+        """Return the columns of a cell or combination; None where it has no part in one."""
+        variants = (assignment.get(step) for step in self.steps)
+        numbers = (values.get(assignment.get(step, "")) for (step, _), values in self.swept.items())
+        methods = (named.get(assignment.get(step, "")) for step, named in self.methods.items())
+        return (*variants, *methods, *numbers)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -53,7 +98,7 @@ class OpenedRun(Run):
         Returns:
             Columns `cell`, `step`, `method`, `dataset` of several, `variant.<step>` of each step
             that varies (missing where the cell does not have it), the method of each step that
-            sweeps parameters of several (`plane.use`), each swept parameter (`plane.tolerance_m`,
+            sweeps parameters (`plane.use`), each swept parameter (`plane.tolerance_m`,
             a number), `repeat`, `metric`, `value`, `unit`.
         """
         import pandas as pd  # noqa: PLC0415 - takes a second, and few ask
@@ -82,7 +127,7 @@ class OpenedRun(Run):
         """All pictures of the methods, by `step/name`; a notebook shows them."""
         return Figures(
             {
-                f"{cell.address}/{figure.name}": figure
+                f"{cell.address}/{figure.name}": ShownFigure(**vars(figure))
                 for cell in self.record.cells
                 for figure in cell.figures
             }
@@ -103,20 +148,19 @@ class OpenedRun(Run):
             DamageError: the output was damaged in the store.
         """
         from orthoflow.catalog.discovery import discover_catalog  # noqa: PLC0415 - loads plugins
-        from orthoflow.engine.store import Store  # noqa: PLC0415 - few ask
+        from orthoflow.engine.store import stores_at  # noqa: PLC0415 - few ask
 
         output = self.cell(address).outputs.get(port)
         if output is None or output.embedded:
             return super().product(address, port)
-        # Asking makes the folder of a store that is not there.
-        stored = Store(Path(store)) if Path(store).is_dir() else None
-        if stored is None or stored.product_file(output.digest) is None:
+        cls = discover_catalog().product_class(output.type_name)
+        payload = RunProducts(run=self, stores=stores_at(store)).payload(address, port, cls)
+        if payload is None:
             raise RecordError(
-                f"{self.path} names {address}.{port} only by its digest, and "
-                + (f"there is no store {store}" if stored is None else f"{store} has it not")
-                + ": name the store of the run, as store='FOLDER/.orthoflow'"
+                f"{self.path} has only the digest of {address}.{port}, and the store {store} does "
+                "not have the product: name the store of the run, as store='FOLDER/.orthoflow'"
             )
-        return stored.get_product(output.digest, discover_catalog().product_class(output.type_name))
+        return cls.from_payload(payload)
 
     def verify(self) -> Verification:
         """Check all of the record and the published files beside it, as `orthoflow verify` does."""
@@ -264,38 +308,20 @@ class ShownComparison(RunComparison):
         )
 
 
-class NoFigureError(ArgumentError, KeyError):
-    """A run has no figure of a name; a `KeyError` as of every mapping, which lists those it has."""
-
-    __str__ = Exception.__str__  # KeyError would put the sentence between quotes
-
-
-class Figures(Mapping[str, RecordedFigure]):
+class Figures(dict[str, "ShownFigure"]):
     """Pictures by name."""
 
-    def __init__(self, figures: Mapping[str, RecordedFigure]) -> None:
-        self._figures = dict(figures)
-
-    def __getitem__(self, name: str) -> ShownFigure:
-        figure = self._figures.get(name)
-        if figure is None:
-            raise NoFigureError(
-                f"the run has no figure {name}{did_you_mean(name, self._figures)}; it has "
-                f"{first_few(list(self._figures), most=_FIGURES_MOST) or 'none'}"
-            )
-        return ShownFigure(**vars(figure))
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._figures)
-
-    def __len__(self) -> int:
-        return len(self._figures)
+    def __missing__(self, name: str) -> ShownFigure:
+        raise ArgumentError(
+            f"the run has no figure {name}{did_you_mean(name, self)}; it has "
+            f"{first_few(list(self), most=_FIGURES_MOST) or 'none'}"
+        )
 
     def __repr__(self) -> str:
-        return "\n".join(shown(f"{name}: {one.caption}") for name, one in self._figures.items())
+        return "\n".join(shown(f"{name}: {one.caption}") for name, one in self.items())
 
     def _repr_html_(self) -> str:
-        named = list(self._figures.items())
+        named = list(self.items())
         pictures = [
             (data_uri(one.data, one.media_type), f"{name}: {one.caption}")
             for name, one in named[:_FIGURES_MOST]

@@ -10,12 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.drawing import COLUMN_INCHES, encode_chart, picture_figure, styled
-from orthoflow.files.drawings.papers import round_below
+from orthoflow.files.drawings.sheet_contents import round_below
 from orthoflow.files.images import decode_image
 from orthoflow.geometry import WallFrame
 from orthoflow.products import Camera, Cameras, Inspection, TieRole
 from orthoflow.records.runs import Run
-from orthoflow.report.pictures import Picture, data_uri, embedded_products, frame_of, side_px
+from orthoflow.report.pictures import (
+    Picture,
+    data_uri,
+    embedded_products,
+    frame_of,
+    products_of,
+    side_px,
+)
 
 _MAX_MARKS: Final = 600  # in one drawing
 # Drawn length of a vector of RMS length, and of the reference, as shares of the longer side.
@@ -50,12 +57,9 @@ def overlays(run: Run, walls: Sequence[Picture], *, share: float = 1.0) -> Itera
                 known.setdefault(product.digest, {}).setdefault(picture.wall, picture)
     n_drawings = (len(cameras) + len(inspections)) * max(map(len, known.values()), default=1)
     side = side_px(n_drawings / share)
-    for (address, _), payload in zip(cameras, run.payloads(cameras), strict=True):
-        yield from _of_ties(
-            address, Cameras.from_payload(payload), _walls_before(run, address, known), side
-        )
-    for (address, _), payload in zip(inspections, run.payloads(inspections), strict=True):
-        found = Inspection.from_payload(payload)
+    for address, oriented in products_of(run, Cameras):
+        yield from _of_ties(address, oriented, _walls_before(run, address, known), side)
+    for address, found in products_of(run, Inspection):
         for wall, ground in _walls_before(run, address, known).items():
             here = (found.wall == wall) & np.isfinite(found.displacement_m).all(axis=1)
             if here.any():

@@ -6,12 +6,12 @@ import os
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType, SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final
 
 from orthoflow.engine.durability import write_whole
-from orthoflow.errors import StoreError
 from orthoflow.products import Cameras
 from orthoflow.records.compare import compare_runs
 from orthoflow.records.runs import (
@@ -22,6 +22,7 @@ from orthoflow.records.runs import (
     figure_files,
     pages_of,
     parts_of,
+    write_files,
 )
 from orthoflow.records.tables import common_points
 from orthoflow.records.verify import sealed_page
@@ -33,26 +34,23 @@ from orthoflow.report.combinations import (
     is_missing,
     ways,
 )
-from orthoflow.report.comparisons import comparison_table
+from orthoflow.report.comparisons import comparison_table, dataset_table
 from orthoflow.report.curves import curves
-from orthoflow.report.dataset_tables import dataset_table
-from orthoflow.report.diagrams import graph_picture
 from orthoflow.report.differences import differences
-from orthoflow.report.figures import figure_groups, write_figures
+from orthoflow.report.figures import figure_groups, graph_picture, write_figures
 from orthoflow.report.overlays import overlays
-from orthoflow.report.paired import over_datasets, who_leads
+from orthoflow.report.paired import over_datasets, over_table, who_leads
 from orthoflow.report.photo_plans import photo_plan
 from orthoflow.report.pictures import (
     cursor_places,
-    embedded_products,
     orthoimage_pictures,
+    products_of,
     sliders,
     wall_pictures,
 )
 from orthoflow.report.rendering import environment
 from orthoflow.report.summaries import answers, citations, has_measured_lengths, limits, results
 from orthoflow.report.tables import plane_tables
-from orthoflow.report.tidy_tables import over_table
 
 if TYPE_CHECKING:
     from orthoflow.engine.store import Store
@@ -98,20 +96,19 @@ def write_page(
     # Before the page is written: a record with such names gets none.
     figure_files(run, addresses)
     pages = pages_of(run)
-    for folder in {(path.parent / page).parent for page in pages.values()}:
-        _make_folder(folder)
     with run.held_open() as opened:
         parts = parts_of(opened)
         for name, page in pages.items():
-            target = path.parent / page
-            section = _section(parts[name], "r1-", target.parent, broken_seals)
+            folder = (path.parent / page).parent
+            section = _section(parts[name], "r1-", folder, broken_seals)
             section.title, section.whole = f"{run.record.name}: {name}", f"../{path.name}"
-            _write([parts[name]], [section], target, section.title)
+            content = _content([parts[name]], [section], section.title)
+            write_files(path.parent, {page: partial(bytes, content)})
         if pages:
             section = _overview(opened, "r1-", path.parent, pages)
         else:
             section = _section(opened, "r1-", path.parent, broken_seals, with_files=True)
-        _write([opened], [section], path, run.record.name, go_on=go_on)
+        write_whole(path, _content([opened], [section], run.record.name, go_on=go_on))
     write_figures(run, path.parent, addresses, inside=FIGURES_FOLDER)
 
 
@@ -143,28 +140,17 @@ def write_report(
         for index, run in enumerate(runs, start=1)
     ]
     title = ", ".join(dict.fromkeys(run.record.name for run in runs))
-    _write(runs, sections, path, title, go_on=go_on, stores=stores)
+    write_whole(path, _content(runs, sections, title, go_on=go_on, stores=stores))
 
 
-def _make_folder(folder: Path) -> None:
-    # A link would lead the pages to where nobody wants them.
-    if folder.is_symlink():
-        raise StoreError(f"{folder} is a link, so no pages are written there: remove it")
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise StoreError(f"{folder} cannot be made: {error.strerror}") from error
-
-
-def _write(
+def _content(
     runs: Sequence[Run],
     sections: Sequence[SimpleNamespace],
-    path: Path,
     title: str,
     *,
     go_on: str = "",
     stores: Sequence[Store] = (),
-) -> None:
+) -> bytes:
     compared = compare_runs(*runs, stores=stores) if len(runs) == 2 else None
     text = (
         environment()
@@ -178,7 +164,7 @@ def _write(
             go_on=go_on,
         )
     )
-    write_whole(path, sealed_page(text, runs).encode("utf-8"))
+    return sealed_page(text, runs).encode("utf-8")
 
 
 def _overview(run: Run, prefix: str, folder: Path, pages: Mapping[str, str]) -> SimpleNamespace:
@@ -252,11 +238,9 @@ def _section(
     }
     main = baseline_addresses(run)
     shown = _part(every, main)
-    on_show = next((picture.name for picture in shown.orthoimages), "")
     is_measured = has_measured_lengths(run)
     comparison = comparison_table([run])
-    places = embedded_products(run, "cameras")
-    photographed = [Cameras.from_payload(payload) for payload in run.payloads(places)]
+    photographed = [product for _, product in products_of(run, Cameras)]
     return SimpleNamespace(
         run=run,
         prefix=prefix,
@@ -266,9 +250,9 @@ def _section(
         answers=answers(run),
         is_measured=is_measured,
         is_unfinished=any(is_missing(cell) for cell in run.record.cells),
-        uncounted=uncounted_points(run) if on_show and not is_measured else None,
-        limits=limits(run, on_show),
-        delivered=delivered_walls(run.folder / PRODUCTS_FOLDER) if on_show else (),
+        uncounted=uncounted_points(run) if shown.orthoimages and not is_measured else None,
+        limits=limits(run),
+        delivered=delivered_walls(run.folder / PRODUCTS_FOLDER) if shown.orthoimages else (),
         results=results(run),
         comparison=comparison,
         curves=curves([run]) if comparison else (),

@@ -14,15 +14,17 @@ from orthoflow.geometry.robust import median_deviation
 from orthoflow.records.runs import MetricRow, Run, is_rounding
 from orthoflow.report.combinations import (
     Combination,
+    EnvironmentGroups,
     Measured,
     baseline_of,
     combination_of,
     combinations_of,
+    group_environments,
 )
 from orthoflow.report.comparisons import comparison_columns
-from orthoflow.report.environments import EnvironmentGroups, group_environments
 from orthoflow.report.rankings import BETTER, badness, is_flag
-from orthoflow.untrusted_text import first_few
+from orthoflow.report.tables import Column, Table
+from orthoflow.untrusted_text import Value, first_few
 from orthoflow.workflow.expand import variants_text
 from orthoflow.workflow.model import DATA
 
@@ -357,27 +359,27 @@ def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
     leads, level = [], []
     for name in dict.fromkeys(one.name for _, one in rows):
         own = [(metric, one.paired) for metric, one in rows if one.name == name]
-        shown = [(metric, pair) for metric, pair in own if pair and pair.p_holm < _SHOWN_P]
+        shown = [(metric.column.title, pair) for metric, pair in own if pair]
+        shown = [(title, pair) for title, pair in shown if pair.p_holm < _SHOWN_P]
         sides = {
-            "better": [metric.column.title for metric, pair in shown if pair.effect > 0],
-            "worse": [metric.column.title for metric, pair in shown if pair.effect <= 0],
+            "better": [title for title, pair in shown if pair.effect > 0],
+            "worse": [title for title, pair in shown if pair.effect <= 0],
         }
-        how = " and ".join(
-            f"{word} in {len(labels)} of {len(own)} numbers ({', '.join(labels)})"
-            for word, labels in sides.items()
-            if labels
-        )
-        if how:
-            leads.append(f"{name} {how}")
+        words = [
+            f"{side} in {len(titles)} of {len(own)} numbers ({', '.join(titles)})"
+            for side, titles in sides.items()
+            if titles
+        ]
+        if words:
+            leads.append(f"{name} {' and '.join(words)}")
         else:
             level.append(name)
     if not leads:
         return f"No difference is shown in any of {len(judged)} numbers ({_TEST})"
-    more = f"; and {len(leads) - _MAX_NAMED} more" if len(leads) > _MAX_NAMED else ""
     rest = f". No difference is shown of {first_few(level, most=_MAX_NAMED)}" if level else ""
     return (
         f"Shown over the datasets against {judged[0].reference.name} ({_TEST}): "
-        f"{'; '.join(leads[:_MAX_NAMED])}{more}{rest}"
+        f"{first_few(leads, most=_MAX_NAMED)}{rest}"
     )
 
 
@@ -423,3 +425,67 @@ def paired_differences(worse: NDArray[np.float64], better: str, unit: str = "1")
         effect=effect,
         interval=(float(low), float(high)),
     )
+
+
+_OVER: Final = (
+    Column("step", "step", is_numeric=False),
+    Column("metric", "metric", is_numeric=False),
+    Column("what", "label", is_numeric=False),
+    Column("unit", "unit", is_numeric=False),
+    Column("good side", "better", is_numeric=False),
+    Column("combination", "combination", is_numeric=False),
+    Column("datasets", "datasets"),
+    Column("failed", "failed"),
+    Column("absent", "absent"),
+    Column("some repeats", "partly"),
+    Column("median", "median"),
+    Column("±", "spread", digits=2),
+    Column("compared", "pairs"),
+    Column("not compared", "apart"),
+    Column("better", "wins"),
+    Column("worse", "losses"),
+    Column("difference", "median_difference", digits=3),
+    Column("95 % from", "interval_low", digits=3),
+    Column("to", "interval_high", digits=3),
+    Column("p", "p", digits=2),
+    Column("p (Holm)", "p_holm", digits=2),
+    Column("effect", "effect", digits=2),
+)
+
+
+def over_table(over: Sequence[MetricOverDatasets]) -> Table:
+    """Return a row per metric and combination of what holds over all datasets.
+
+    Unknown values, such as p for two datasets, are empty.
+    """
+    rows = []
+    for metric in over:
+        column = metric.column
+        for one in metric.methods:
+            paired = one.paired
+            differences: tuple[Value, ...] = (None,) * 8
+            if paired is not None:
+                differences = (
+                    *(paired.wins, paired.losses, _known(paired.median)),
+                    *map(_known, (*paired.interval, paired.p, paired.p_holm, paired.effect)),
+                )
+            rows.append(
+                (
+                    *(column.step, column.metric, column.titled, column.unit, column.better),
+                    *(one.name or "all", one.n, one.n_failed, one.n_absent, one.n_partly),
+                    *(_known(one.median), _known(one.spread) if one.n > 1 else None),
+                    *(None if paired is None else paired.n, one.n_apart, *differences),
+                )
+            )
+    return Table(
+        name="datasets",
+        caption="Medians over the datasets, median differences from the reference with their 95 % "
+        "confidence intervals, and p of Wilcoxon's signed-rank test after Holm's correction.",
+        columns=_OVER,
+        rows=tuple(rows),
+    )
+
+
+def _known(value: float) -> float | None:
+    # No difference where more is better is -0.0.
+    return None if math.isnan(value) else value + 0.0

@@ -7,13 +7,12 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
 
-from orthoflow.records.runs import MetricRow, Run, parts_of
+from orthoflow.records.runs import Run, parts_of
 from orthoflow.report.combinations import Combination, combinations_of
 from orthoflow.report.comparisons import comparison_columns, measured_text
-from orthoflow.report.paired import over_datasets
+from orthoflow.report.paired import over_datasets, over_table
 from orthoflow.report.summaries import citations
 from orthoflow.report.tables import Column, Table, escaped_latex
-from orthoflow.report.tidy_tables import over_table
 from orthoflow.untrusted_text import shown
 from orthoflow.workflow.model import DATA
 
@@ -48,7 +47,7 @@ def paper_files(run: Run) -> dict[str, str]:
 
 def _values(run: Run) -> Table:
     """Return a row per combination and metric, with unit and better side."""
-    combinations, columns = _compared(run)
+    columns = comparison_columns(combinations := combinations_of(run))
     factors = _factors(combinations)
     names = (
         *(factor if factor != DATA else "dataset" for factor in factors),
@@ -75,7 +74,7 @@ def _values(run: Run) -> Table:
 
 def _results(run: Run) -> Table:
     """The comparison: metrics as rows where combinations are few, combinations as rows else."""
-    combinations, columns = _compared(run)
+    columns = comparison_columns(combinations := combinations_of(run))
     factors = _factors(combinations)
     texts = [
         [
@@ -119,11 +118,6 @@ def _results(run: Run) -> Table:
             for one, values in zip(combinations, texts, strict=True)
         ),
     )
-
-
-def _compared(run: Run) -> tuple[tuple[Combination, ...], tuple[MetricRow, ...]]:
-    combinations = combinations_of(run)
-    return combinations, comparison_columns(combinations)
 
 
 def _factors(combinations: Iterable[Combination]) -> tuple[str, ...]:

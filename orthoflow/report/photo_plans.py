@@ -15,7 +15,7 @@ from orthoflow.products import Camera, Cameras, Planes, TieRole, Ties
 from orthoflow.records.runs import Run
 from orthoflow.report.charts import ChartFormat, PlanPhoto, PlanWall, as_image, plan_chart
 from orthoflow.report.combinations import baseline_cells
-from orthoflow.report.pictures import Picture, embedded_products
+from orthoflow.report.pictures import Picture, embedded_products, products_of
 from orthoflow.report.tables import Column, Table
 from orthoflow.untrusted_text import Value, first_few
 
@@ -29,8 +29,8 @@ class PhotoPlan:
         photos: likewise, those that are oriented.
         caption: what it shows, and which photos are missing, in words.
         cell: address of the orientation.
-        table: how well each photo is oriented; without rows where only poses are known.
-        axes: names of the axes of the scan to the right and upwards.
+        table: how well each photo is oriented.
+        axes: labels of the axes of the scan to the right and upwards.
     """
 
     walls: tuple[PlanWall, ...]
@@ -38,7 +38,7 @@ class PhotoPlan:
     caption: str
     cell: str
     table: Table
-    axes: tuple[str, str] = ("x", "y")
+    axes: tuple[str, ...]
 
     @property
     def picture(self) -> Picture:
@@ -51,9 +51,7 @@ class PhotoPlan:
 
     def file(self, suffix: ChartFormat) -> bytes:
         """The drawing as a file."""
-        right, upwards = self.axes
-        labels = (f"{right} / m", f"{upwards} / m")
-        return plan_chart(self.walls, self.photos, labels=labels, suffix=suffix)
+        return plan_chart(self.walls, self.photos, labels=self.axes, suffix=suffix)
 
 
 def photo_plan(run: Run, walls: Sequence[Picture]) -> PhotoPlan | None:
@@ -64,10 +62,9 @@ def photo_plan(run: Run, walls: Sequence[Picture]) -> PhotoPlan | None:
         walls: pictures of its walls.
     """
     baseline = {cell.address for cell in baseline_cells(run)}
-    every = embedded_products(run, "cameras")
-    places = [place for place in every if place[0] in baseline][-1:] or list(every[-1:])
-    for (address, _), payload in zip(places, run.payloads(places), strict=True):
-        orientation = Cameras.from_payload(payload)
+    every = [cell for cell, _ in embedded_products(run, "cameras")]
+    chosen = [cell for cell in every if cell in baseline][-1:] or every[-1:]
+    for address, orientation in products_of(run, Cameras, chosen):
         cameras = orientation.cameras
         oriented = [one for one in cameras if one.status == "ok"]
         if oriented:
@@ -82,7 +79,7 @@ def photo_plan(run: Run, walls: Sequence[Picture]) -> PhotoPlan | None:
             return PhotoPlan(
                 walls=drawn_walls,
                 photos=photos,
-                axes=(axis_words(basis_from_up(up)[0]), axis_words(basis_from_up(up)[1])),
+                axes=tuple(f"{axis_words(axis)} / m" for axis in basis_from_up(up)[:2]),
                 caption=_caption(address, cameras, oriented),
                 cell=address,
                 table=_table(orientation),
@@ -96,11 +93,9 @@ def _table(orientation: Cameras) -> Table:
         if (residual.role, residual.unit) == ("check", "mm"):
             squares.setdefault(residual.photo, []).append(residual.rmse**2)
     cameras, ties = orientation.cameras, orientation.ties
-    is_known = bool(squares) or ties is not None
-    is_known |= any(camera.sigma_wall_m is not None for camera in cameras)
     control, check = (_counts(ties, role) for role in (TieRole.CONTROL, TieRole.CHECK))
     rows = []
-    for camera in cameras if is_known else ():
+    for camera in cameras:
         values: list[Value] = [None] * 4
         if camera.status == "ok":
             if camera.sigma_wall_m is not None:
@@ -135,10 +130,8 @@ def _counts(ties: Ties | None, role: TieRole) -> dict[str, int]:
 
 
 def _up(run: Run) -> NDArray[np.float64]:
-    places = embedded_products(run, "planes")[:1]
-    for payload in run.payloads(places):
-        return np.asarray(Planes.from_payload(payload).up, dtype=np.float64)
-    return np.array([0.0, 0.0, 1.0])
+    planes = next((product for _, product in products_of(run, Planes)), None)
+    return np.array([0.0, 0.0, 1.0] if planes is None else planes.up, dtype=np.float64)
 
 
 def _caption(address: str, cameras: Sequence[Camera], oriented: Sequence[Camera]) -> str:
@@ -159,19 +152,14 @@ def _drawn(
 ) -> tuple[tuple[PlanWall, ...], tuple[PlanPhoto, ...]]:
     """Return walls, by number, and photos in the view from above."""
     axes = basis_from_up(up)[:2].T
-    photos = []
-    for camera in oriented:
-        rotation, translation = (
-            camera.rotation_camera_from_world,
-            camera.translation_camera_from_world,
-        )
-        if rotation is not None and translation is not None:
-            # Where the middle of the photo looks.
-            photos.append((camera.photo, -rotation.T @ translation @ axes, rotation[2] @ axes))
+    viewing = {camera.photo: camera.viewing() for camera in oriented}
     return (
         tuple(
             (name, number, np.asarray(frame.corners_world(), dtype=np.float64) @ axes)
             for number, (name, frame) in walls.items()
         ),
-        tuple(photos),
+        # The middle of a photo looks along the third axis of its camera.
+        tuple(
+            (name, one.centre_world @ axes, one.rotation[2] @ axes) for name, one in viewing.items()
+        ),
     )

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.drawings.papers import round_below
+from orthoflow.files.drawings.sheet_contents import round_below
 from orthoflow.files.images import Part, cells_webp, grey_cells, sampled_rows
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.bands import count_cells
@@ -21,6 +21,7 @@ from orthoflow.products import (
     Orthoimage,
     Orthoimages,
     OrthoMask,
+    Product,
     SurfaceMask,
     Wall,
     Walls,
@@ -30,6 +31,7 @@ from orthoflow.records.runs import Run
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.untrusted_text import shown
 
+T = TypeVar("T", bound=Product)
 LONGEST_SIDE_PX: Final = 1000
 SHORTEST_SIDE_PX: Final = 320
 # Pictures of the full size that a page holds; of more, each becomes smaller. A picture of 1000 px
@@ -130,23 +132,21 @@ def orthoimage_pictures(run: Run, *, share: float = 1.0) -> Iterator[Picture]:
         run: the run.
         share: which part of a page's bytes they may take.
     """
-    places = embedded_products(run, "orthoimages")
+    n_products = len(embedded_products(run, "orthoimages"))
     baseline = {cell.address for cell in baseline_cells(run)}
-    # One product at a time: those of a large building fill the memory together.
-    for (address, _), payload in zip(places, run.payloads(places), strict=True):
-        product = Orthoimages.from_payload(payload)
+    for address, product in products_of(run, Orthoimages):
         yield from _drawn(
             [_orthoimage(run, address, image) for image in product.images],
-            n_products=len(places) / share,
+            n_products=n_products / share,
             close_cells=share * _CLOSE_CELLS / len(product.images) if address in baseline else 0.0,
         )
 
 
 def thumbnail(run: Run, addresses: Collection[str], *, longest_side_px: int) -> str:
     """Give the first orthoimage of some cells as a small picture, a data URI; empty without any."""
-    places = [place for place in embedded_products(run, "orthoimages") if place[0] in addresses]
-    for (address, _), payload in zip(places[-1:], run.payloads(places[-1:]), strict=True):
-        for image in Orthoimages.from_payload(payload).images:
+    places = [cell for cell, _ in embedded_products(run, "orthoimages") if cell in addresses]
+    for address, product in products_of(run, Orthoimages, places[-1:]):
+        for image in product.images:
             draw, _ = _orthoimage(run, address, image)
             return data_uri(draw(longest_side_px), "image/webp")
     return ""
@@ -159,16 +159,15 @@ def wall_pictures(run: Run, *, share: float = 1.0) -> Iterator[Picture]:
         run: the run.
         share: which part of a page's bytes they may take.
     """
-    places = embedded_products(run, "walls")
-    for (address, _), payload in zip(places, run.payloads(places), strict=True):
-        product = Walls.from_payload(payload)
+    n_products = len(embedded_products(run, "walls"))
+    for address, product in products_of(run, Walls):
         drawings: list[_Drawing] = []
         for index, wall in enumerate(product.walls):
             if wall.intensity is not None:
                 source = product.intensity_source
                 drawings.append(_intensity(run, address, index, wall, wall.intensity, source))
             drawings.append(_depth(run, address, index, wall))
-        yield from _drawn(drawings, n_products=len(places) / share)
+        yield from _drawn(drawings, n_products=n_products / share)
 
 
 # What gives the file, so many pixels long, and the picture of it, which has a frame.
@@ -316,6 +315,24 @@ def embedded_products(run: Run, type_name: str) -> tuple[tuple[str, str], ...]:
             if product.type_name == type_name and product.embedded and cell.repeat == 0:
                 found.setdefault(product.digest, (address, port))
     return tuple(found.values())
+
+
+def products_of(
+    run: Run, cls: type[T], addresses: Container[str] | None = None
+) -> Iterator[tuple[str, T]]:
+    """Yield the products of a type that the record holds, each with the address of its cell.
+
+    One at a time: those of a large building fill the memory together.
+
+    Args:
+        run: the run.
+        cls: class of the products.
+        addresses: of their cells; None for all.
+    """
+    every = embedded_products(run, cls.type_name)
+    places = [place for place in every if addresses is None or place[0] in addresses]
+    for (address, _), payload in zip(places, run.payloads(places), strict=True):
+        yield address, cls.from_payload(payload)
 
 
 def _depth_limit_m(depth_m: NDArray[np.float32]) -> float:

@@ -15,10 +15,9 @@ import jinja2
 from markupsafe import Markup, escape
 
 from orthoflow.records import COSTS
-from orthoflow.report.environments import distinct_words
-from orthoflow.report.numbers import number, number_with_unit
+from orthoflow.report.combinations import distinct_words
 from orthoflow.report.pictures import DIVERGING
-from orthoflow.report.rankings import BETTER, Mark
+from orthoflow.report.rankings import BETTER, Mark, number, number_with_unit
 from orthoflow.untrusted_text import shown
 from orthoflow.version import __version__
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from orthoflow.diagnostics import DiagnosticGroup, grouped, standing
-from orthoflow.products import Cameras, Orthoimages, Walls
+from orthoflow.products import Cameras, Walls
 from orthoflow.records import RecordedCell
 from orthoflow.records.runs import Run, cell_metrics
 from orthoflow.report.combinations import (
@@ -19,8 +19,7 @@ from orthoflow.report.combinations import (
     is_check,
     unequal_walls,
 )
-from orthoflow.report.numbers import number, number_with_unit
-from orthoflow.report.rankings import is_flag
+from orthoflow.report.rankings import is_flag, number, number_with_unit
 from orthoflow.workflow.expand import NOT_ASKED_FOR
 
 _MOST_ANSWERS: Final = 12
@@ -75,10 +74,6 @@ def answers(run: Run) -> tuple[Answer, ...]:
     cells = {cell.step: cell for cell in baseline_cells(run)}
     rows = {step: {row.metric: row for row in cell_metrics(cell)} for step, cell in cells.items()}
     keys = [key for key in headline_keys(cells.values()) if key[1] in rows[key[0]]]
-    # Own orthoimages stand before those of others, whatever the order of the steps.
-    keys.sort(
-        key=lambda key: 1 + _is_of_others(run, cells[key[0]]) if is_check(cells[key[0]]) else 3
-    )
     chosen = [rows[step][metric] for step, metric in keys]
     found = []
     # What is not as it should be stands first; what is so is no news.
@@ -108,26 +103,11 @@ def has_measured_lengths(run: Run) -> bool:
     )
 
 
-def _is_of_others(run: Run, cell: RecordedCell) -> bool:
-    """Whether a cell looks at orthoimages that were read from files."""
-    makers = (
-        run.cells.get(given.source.rpartition(".")[0])
-        for given in cell.inputs.values()
-        if given.type_name == Orthoimages.type_name
-    )
-    return any(maker is not None and not maker.inputs for maker in makers)
-
-
-def limits(run: Run, on_show: str = "") -> tuple[Limit, ...]:
+def limits(run: Run) -> tuple[Limit, ...]:
     """What limits the results: failures, combinations of different walls, then diagnostics by code.
 
-    Of the diagnostics that no later step has settled errors stand first. Behind the others stands
-    what is only about other planes than the one on show, last what is only about planes of which
-    no orthoimage was made.
-
-    Args:
-        run: the run.
-        on_show: name of the plane whose picture stands beside them; empty where there is none.
+    Of the diagnostics that no later step has settled errors stand first, and last those that are
+    only about planes of which no orthoimage was made.
     """
     failures: dict[str, list[str]] = {}
     for cell in run.record.cells:
@@ -138,7 +118,6 @@ def limits(run: Run, on_show: str = "") -> tuple[Limit, ...]:
     imaged = {
         found[1] for file in run.record.published if (found := _IMAGE.search(file.path)) is not None
     }
-    shown = set(_PLANE.findall(on_show))
     # A later orientation reports by itself which photos it leaves open.
     oriented = [
         cell.address
@@ -155,7 +134,6 @@ def limits(run: Run, on_show: str = "") -> tuple[Limit, ...]:
         key=lambda group: (
             group.worst.severity != "error",
             _is_of_others_than(imaged, group),
-            _is_of_others_than(shown, group),
         ),
     )
     apart = unequal_walls(combinations_of(run))

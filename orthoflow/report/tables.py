@@ -12,8 +12,8 @@ import numpy as np
 from orthoflow.geometry import omega_phi_deg
 from orthoflow.products import Planes
 from orthoflow.records.runs import Run
-from orthoflow.report.numbers import number
-from orthoflow.report.pictures import embedded_products
+from orthoflow.report.pictures import products_of
+from orthoflow.report.rankings import number
 from orthoflow.untrusted_text import Value, csv_text, shown
 
 _LATEX: Final = {
@@ -139,18 +139,14 @@ class PlaneTables:
 def plane_tables(run: Run) -> tuple[PlaneTables, ...]:
     """The planes of every cell that found some; equal products once."""
     found = []
-    places = embedded_products(run, "planes")
-    for (address, _), payload in zip(places, run.payloads(places), strict=True):
-        planes = Planes.from_payload(payload)
+    for address, planes in products_of(run, Planes):
         # Of several sources of sides, how many planes each has.
         counts = Counter(planes.side_source(index) for index in range(len(planes)))
+        sources = [f"{source} ({count})" for source, count in counts.items()]
         found.append(
             PlaneTables(
                 cell=address,
-                viewpoint=", ".join(
-                    f"{source} ({count})" if len(counts) > 1 else source
-                    for source, count in counts.items()
-                )
+                viewpoint=", ".join(sources)
                 if planes.side_from
                 else planes.viewpoint.replace("_", " "),
                 planes=_plane_table(planes),

@@ -112,23 +112,6 @@ def test_a_folder_of_runs_is_shown_as_their_table(runs: Path) -> None:
     assert asked("show", "runs/going").exit_code == 2
 
 
-def test_a_page_leads_to_the_report_of_each_run(runs: Path) -> None:
-    (runs / "runs" / "a" / "report.html").write_text("the report")
-    (runs / "runs" / "<b>").mkdir()
-    (runs / "runs" / "<b>" / "journal.jsonl").write_text("spoilt")
-    (runs / "out").mkdir()
-    assert said("runs", "runs", "deep", "--html", "out/all.html").endswith("page: out/all.html\n")
-    page = (runs / "out" / "all.html").read_text()
-    assert page.count('href="../runs/a/report.html"') == 1
-    assert "../runs/b/report.html" not in page
-    assert "error along u" in page
-    assert 'data-value="1.5"' in page
-    assert "plane.cell_m=0.05" in page
-    assert "&lt;b&gt;" in page
-    assert "<b>/" not in page
-    assert "cannot write" in asked("runs", "runs", "--html", "no/folder.html").output
-
-
 def test_what_cannot_be_read_is_a_row_with_its_reason(runs: Path) -> None:
     (runs / "torn").mkdir()
     (runs / "torn" / "run.h5").write_bytes((runs / "runs/a/run.h5").read_bytes()[:2000])

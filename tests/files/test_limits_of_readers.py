@@ -23,7 +23,7 @@ from orthoflow.files import (
     survey_points,
 )
 from orthoflow.files.camera_formats import read_given_cameras
-from orthoflow.files.drawings import title_blocks
+from orthoflow.files.drawings import sheet_contents
 from orthoflow.files.images import encode_png
 
 LENS = "cameras: {a.jpg: {width: 640, height: 480, fx: 500, fy: 500, cx: 319.5, cy: 239.5}}"
@@ -96,8 +96,8 @@ REALITYCAPTURE = "#name,x,y,alt,heading,pitch,roll,f\n" + "a.jpg,1,2,3,0,0,0,24\
 BLOCK = "project: Hall\ntitle: West wall\n"
 LIMITS = [
     limit(calibration, "MOST_BYTES", LENS, None, calibration.read_calibration),
-    limit(title_blocks, "MOST_BYTES", BLOCK, None, title_blocks.read_title_block),
-    limit(title_blocks, "MOST_LETTERS", BLOCK, len("West wall"), title_blocks.read_title_block),
+    limit(sheet_contents, "MOST_BYTES", BLOCK, None, sheet_contents.read_title_block),
+    limit(sheet_contents, "MOST_LETTERS", BLOCK, len("West wall"), sheet_contents.read_title_block),
     limit(survey_points, "MOST_BYTES", CSV, None, survey_points.read_survey_points),
     limit(survey_points, "MOST_LINE", CSV, 24, survey_points.read_survey_points),
     limit(survey_points, "MOST_POINTS", CSV, 3, survey_points.read_survey_points),
@@ -139,7 +139,7 @@ def test_what_is_as_large_as_allowed_is_read_and_nothing_larger(
     ("name", "most_bytes", "read"),
     [
         ("calibration.yaml", 400_000, calibration.read_calibration),
-        ("block.yaml", 100_000, title_blocks.read_title_block),
+        ("block.yaml", 100_000, sheet_contents.read_title_block),
         ("points.csv", 20_000_000, survey_points.read_survey_points),
         ("ties.csv", 20_000_000, survey_points.read_measured_ties),
         ("wall_0_depth.json", 1_048_576, sidecars.read_sidecar),

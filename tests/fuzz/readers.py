@@ -28,7 +28,7 @@ from orthoflow.engine.results import (
     result_to_json,
 )
 from orthoflow.engine.store import Store, list_results
-from orthoflow.files.drawings.title_blocks import read_title_block
+from orthoflow.files.drawings.sheet_contents import read_title_block
 from orthoflow.files.geotiff import GridPlace, write_orthoimage
 from orthoflow.files.images import encode_webp, shrunk_webp
 from orthoflow.files.photo_files import damage, focal_length, icc_profile, read_exif

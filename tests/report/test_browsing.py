@@ -15,7 +15,6 @@ from orthoflow.report import browsing as module
 from orthoflow.report.browsing import (
     RunSummary,
     differing_facts,
-    distinguishing,
     key_metrics,
     run_folders,
     summaries,
@@ -67,20 +66,6 @@ def test_the_headlines_that_most_runs_have_come_first() -> None:
     assert key_metrics([], most=2) == []
 
 
-def test_a_name_that_is_not_the_same_thing_in_all_runs_is_told_with_its_step() -> None:
-    def labelled(**labels: str) -> RunSummary:
-        return replace(summary("x"), labels={k.replace("__", "."): v for k, v in labels.items()})
-
-    runs = [
-        labelled(rms_mm="of the plane", plane__rms_mm="of the plane", n="points"),
-        labelled(rms_mm="of the check", check__rms_mm="of the check", plane__rms_mm="of the plane"),
-        labelled(other__rms_mm="of something that nobody shows", n="points"),
-    ]
-    assert list(distinguishing(["n", "rms_mm", "unknown"], runs)) == [
-        *("n", "plane.rms_mm", "check.rms_mm", "unknown"),
-    ]
-
-
 def written(folder: Path, *cells: object, **more: object) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     write_record(folder / "run.h5", record(cells, **more), lambda _digest: None)  # type: ignore[arg-type]
@@ -111,11 +96,6 @@ def test_a_run_is_summed_up_by_its_baseline(tmp_path: Path) -> None:
     # A later step has the plain name.
     wanted = {"plane.rms_mm": 3.0, "check.rms_mm": 1.0, "rms_mm": 1.0, "omega_deg": 4.0}
     assert {name: recorded.metrics[name] for name in wanted} == wanted
-    assert (
-        recorded.labels["check.rms_mm"]
-        == recorded.labels["rms_mm"]
-        == "points to the first plane, RMS"
-    )
     assert recorded.n_datasets == 0
     assert recorded.all_facts == {
         "seed": 1,
@@ -150,8 +130,6 @@ def test_of_several_datasets_the_median_counts(tmp_path: Path) -> None:
     of_one = module._of_run(tmp_path, replace(run, record=alone))
     assert of_one.metrics["plane_offset_mm"] == -2.0
     assert (summary.n_datasets, summary.n_values["rms_mm"]) == (3, 3)
-    labels = summary.labels
-    assert labels["rms_mm"] == labels["check.rms_mm"] == "points to the first plane, RMS"
     assert summary.all_facts["check.tries"] == "0|1|2"
 
 

@@ -211,22 +211,3 @@ def test_a_drawing_stands_alone_as_a_file(tmp_path: Path) -> None:
     for suffix, begin in (("pdf", b"%PDF"), ("png", b"\x89PNG")):
         [(name, data)] = curve_files(held(tmp_path, cells), suffix).items()
         assert (name.rpartition(".")[2], data[:4]) == (suffix, begin)
-
-
-@pytest.mark.parametrize(("fewest", "is_said"), [(2.0, True), (3.0, False)])
-def test_errors_over_unequal_numbers_of_photos_are_drawn_with_a_word_of_that(
-    tmp_path: Path, fewest: float, is_said: bool
-) -> None:
-    cells = [
-        cell(
-            f"orient@orient=limit-{value:g}",
-            params={"limit": value},
-            metrics=metrics(n_oriented=n_photos, check_rmse_mm_worst=value),
-        )
-        for value, n_photos in ((1.0, fewest), (2.0, 3.0))
-    ]
-    said = {
-        curve.title: "Not all sum up as many photos" in curve.caption
-        for curve in curves([held(tmp_path, cells)])
-    }
-    assert any(said.values()) is is_said

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from orthoflow_provenance.document import RecordedCell
 
-from orthoflow.report.diagrams import graph_file, run_graph
+from orthoflow.report.figures import graph_file, run_graph
 from tests.report_runs import HeldRun, cell, given, record
 
 CLOUD = given("scan.cloud", "1", "cloud")

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from orthoflow.records import RecordedEnvironment
-from orthoflow.report import environments as module
-from orthoflow.report.environments import group_environments
+from orthoflow.report import combinations as module
+from orthoflow.report.combinations import group_environments
 from tests.report_runs import HeldRun, cell, environment, record
 
 FIRST = environment()

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from orthoflow.records.compare import ComparedMetric, Pair
-from orthoflow.report.differences import grouped_texts, moved_first
+from orthoflow.report.differences import grouped_rows, moved_first
 
 
 def metric(value: float, unit: str = "mm") -> ComparedMetric:
@@ -72,7 +72,7 @@ def test_a_parameter_of_many_cells_that_changes_equally_is_one_row() -> None:
     cells = [f"plane@data={room}#{repeat}" for room in "ab" for repeat in (1, 2)]
     pairs = [Pair(cell=cell, name="angle_deg", left=10, right=14) for cell in (*cells, "wall")]
     step_of = dict.fromkeys(cells, "plane")
-    rows = grouped_texts(pairs, str, step_of)
+    rows = grouped_rows(pairs, str, step_of)
     assert [(row.label(step_of), row.n) for row in rows] == [
         ("plane.angle_deg, 4 steps", 4),
         ("wall.angle_deg", 1),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +19,6 @@ from orthoflow.errors import ArgumentError, OrthoflowError, RecordError, Workflo
 from orthoflow.products import Orthoimages, PointCloud
 from orthoflow.records.compare import ComparedMetric, Pair
 from orthoflow.report.notebooks import Figures, OpenedRun, ShownComparison
-from orthoflow.report.tidy_tables import combination_table
 from tests.compared_runs import compared, number
 from tests.provenance_records import write_sample
 from tests.report_runs import cell, compared_resolved, given, metrics, record
@@ -142,44 +139,22 @@ def test_a_swept_parameter_is_a_column_of_numbers(tmp_path: Path) -> None:
     assert {"unit", "variant.unit"} <= set(table.columns)
 
 
-def test_the_rows_of_the_report_are_a_table_of_their_own(tmp_path: Path) -> None:
-    named = list(csv.DictReader(io.StringIO(combination_table(swept_run(tmp_path)).csv())))
-    wanted = (
-        "dataset",
-        "variant.plane",
-        "plane.tolerance_m",
-        "repeat",
-        "status",
-        "check.rms_mm",
-    )
-    assert [tuple(row[name] for name in wanted) for row in named] == [
-        ("hall", "tolerance_m-0_02", "0.02", "0", "ok", "2.0"),
-        ("hall", "tolerance_m-0_05", "0.05", "0", "ok", "5.0"),
-        ("hall", "tolerance_m-0_05", "0.05", "1", "ok", ""),
-        ("hall", "tolerance_m-0_1", "0.1", "0", "ok", "10.0"),
-    ]
-    assert [row["plane.wall_s"] for row in named] == ["1.0"] * 4
-
-
-def test_rows_state_what_failed_and_which_of_several_swept_methods_they_are_of(
-    tmp_path: Path,
-) -> None:
+def test_rows_state_which_of_several_swept_methods_they_are_of(tmp_path: Path) -> None:
     cells = [
         cell(
             f"plane@plane={kind}-{value}",
             method=f"plane.{kind}",
             params={"tolerance_m": value},
-            status="failed" if (kind, value) == ("hough", 3) else "ok",
+            metrics=metrics(rms_mm=1.0),
         )
         for kind in ("hough", "region")
         for value in (2, 3)
     ]
-    run = OpenedRun(path=tmp_path / "run.h5", record=record(cells))
-    rows = csv.DictReader(io.StringIO(combination_table(run).csv()))
-    wanted = ("plane.use", "plane.tolerance_m", "status")
-    assert [tuple(row[name] for name in wanted) for row in rows] == [
-        *(("plane.hough", "2.0", "ok"), ("plane.hough", "3.0", "failed")),
-        *(("plane.region", "2.0", "ok"), ("plane.region", "3.0", "ok")),
+    table = OpenedRun(path=tmp_path / "run.h5", record=record(cells)).metrics()
+    rows = table[table.metric == "rms_mm"][["plane.use", "plane.tolerance_m"]]
+    assert rows.to_numpy().tolist() == [
+        *(["plane.hough", 2.0], ["plane.hough", 3.0]),
+        *(["plane.region", 2.0], ["plane.region", 3.0]),
     ]
 
 
@@ -329,14 +304,14 @@ def test_products_that_a_record_only_names_come_from_the_store(tmp_path: Path) -
         path=tmp_path / "run.h5", record=record([cell("scan", outputs={"cloud": output})])
     )
     assert len(run.product("scan", "cloud", store=tmp_path / "store")) == 3
-    with pytest.raises(RecordError, match=r"by its digest, and there is no store .*, as store='F"):
+    with pytest.raises(RecordError, match=r"only the digest of .*, as store='F"):
         run.product("scan", "cloud", store=tmp_path / "none")
     Store(tmp_path / "other").put_product(other)
     with pytest.raises(
-        RecordError, match=r"other has it not: name the store of the run, as store="
+        RecordError, match=r"other does not have the product: name the store of the run, as store="
     ):
         run.product("scan", "cloud", store=tmp_path / "other")
-    with pytest.raises(KeyError, match=r"^the run has no figure scan/plan; it has none$"):
+    with pytest.raises(ArgumentError, match=r"^the run has no figure scan/plan; it has none$"):
         run.figures["scan/plan"]
     assert run.figures.get("scan/plan") is None
     assert not (tmp_path / "none").exists()

@@ -15,8 +15,8 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from orthoflow.files.images import decode_image
+from orthoflow.report.combinations import environment_words
 from orthoflow.report.comparisons import comparison_table
-from orthoflow.report.environments import environment_words
 from orthoflow.report.overlays import magnification_for, overlays, residuals_on_wall
 from orthoflow.report.pictures import Picture, sliders, wall_pictures
 from orthoflow.report.rankings import Mark
@@ -193,9 +193,8 @@ def test_rows_of_a_comparison_stand_beside_each_other(tmp_path: Path) -> None:
     assert {value.mark for row in (fine, coarse) for value in row.values} == {Mark.NONE}
     assert fine.values[0].note == "mean and standard deviation of 3 repeats"
     assert coarse.values[0].note == ""
-    assert (fine.time.text, coarse.time.text) == ("5.0", "4.2")
+    assert (fine.values[-2].text, coarse.values[-2].text) == ("5.0", "4.2")
     assert fine.values[-1].text == "0"
-    assert fine.remark == "1 of 5 steps cached, with their time in run r0"
 
 
 def test_each_environment_and_set_of_data_has_a_letter() -> None:

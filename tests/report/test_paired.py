@@ -219,7 +219,7 @@ def test_what_is_shown_to_lead_is_stated_of_six_at_most() -> None:
     assert both.endswith("No difference is shown of plane=level0")
     six, seven = (who_leads([leading(n, 0)], 12) for n in (6, 7))
     assert (six.count(" better in "), "more" in six) == (6, False)
-    assert (seven.count(" better in "), seven.endswith("; and 1 more")) == (6, True)
+    assert (seven.count(" better in "), seven.endswith(" and 1 more")) == (6, True)
 
 
 def test_p_is_corrected_for_all_comparisons_of_a_run() -> None:

@@ -124,13 +124,6 @@ def test_each_photo_has_a_row_with_its_error_on_the_wall(tmp_path: Path) -> None
     )
 
 
-def test_photos_of_which_only_poses_are_known_have_no_rows(tmp_path: Path) -> None:
-    run = oriented(compared_run(tmp_path), ties=None)
-    plan = photo_plan(run, list(wall_pictures(run)))
-    assert plan is not None
-    assert plan.table.rows == ()
-
-
 def test_the_page_has_a_table_of_photos(tmp_path: Path) -> None:
     one = replace(ours(compared_run(tmp_path)), sigma_wall_m=0.001_234)
     run = run_with(tmp_path, one, Camera(photo="gone.jpg", status="too few <ties>"))

@@ -146,23 +146,6 @@ def test_a_picture_that_cannot_be_decoded_costs_its_place_not_the_page(
     ]
 
 
-def test_check_points_of_the_own_orthoimage_are_told_before_those_of_others() -> None:
-    made = given("mosaic.orthoimages", "1", "orthoimages")
-    read = given("theirs.orthoimages", "2", "orthoimages")
-    checks = {"method": "inspect.checkpoints", "metrics": metrics(rms_mm=5.9)}
-    own = cell("points", inputs={"orthoimages": made}, **checks)
-    theirs = cell("points_theirs", inputs={"orthoimages": read}, **checks)
-    makers = (
-        cell("mosaic", inputs={"layers": given("ortho.layers", "3", "layers")}),
-        cell("theirs", method="read.orthoimage"),
-    )
-    for order in ((own, theirs), (theirs, own)):
-        told = answers(run(*makers, *order))
-        assert [answer.cell for answer in told] == ["points", "points_theirs"]
-    (answer,) = answers(run(*makers, theirs))
-    assert answer.cell == "points_theirs"
-
-
 def rastered(omega_deg: float, area_m2: float, place: str) -> RecordedCell:
     """A raster of a wall, upright but for its last millidegrees."""
     told = metrics(omega_deg=omega_deg, phi_deg=0.001, area_m2=area_m2)
@@ -295,7 +278,7 @@ def test_processor_times_are_ranked_whatever_the_clock_says() -> None:
     def marks(wall_s: float, cpu_s: float) -> list[Mark]:
         table = comparison_table([run(row("hough", 2.0, 1.0), row("ransac", wall_s, cpu_s))])
         assert table is not None
-        return [one.time.mark for one in table.rows]
+        return [one.values[-2].mark for one in table.rows]
 
     assert marks(9.0, 6.0) == [Mark.BEST, Mark.NONE]
     assert marks(0.5, 6.0) == [Mark.BEST, Mark.NONE]
@@ -303,7 +286,7 @@ def test_processor_times_are_ranked_whatever_the_clock_says() -> None:
     # Either may be wrong by a tenth of a second.
     short = comparison_table([run(row("hough", 2.0, 0.08), row("ransac", 2.0, 0.11))])
     assert short is not None
-    assert [(one.time.text, one.time.mark) for one in short.rows] == [
+    assert [(one.values[-2].text, one.values[-2].mark) for one in short.rows] == [
         ("0.08", Mark.NONE),
         ("0.11", Mark.NONE),
     ]
@@ -369,7 +352,7 @@ def test_what_a_run_was_broken_off_before_has_no_time_and_is_not_counted(
     fine, coarse = table.rows
     assert ([cost.text for cost in fine.values[-2:]], fine.shortfall) == (["", ""], "not computed")
     assert coarse.missing[0] == "wall@plane=coarse"
-    assert table.n_whole == 0
+    assert all(row.shortfall for row in table.rows)
     assert [one.shortfall for one in table.glance] == ["not computed"] * 2
     write_report([broken_off], tmp_path / "report.html", go_on="orthoflow run x")
     page = (tmp_path / "report.html").read_text()
@@ -418,13 +401,13 @@ def test_a_glance_states_which_lead_and_names_three_at_most(compared: Run) -> No
     first, _, last = table.glance
     assert (first.name, first.is_baseline) == ("plane=fine", True)
     # The other one was run once only, and single runs are not ranked.
-    assert table.best_in(first) == ()
+    assert table.best_in(first) == ""
     assert (last.name, last.shortfall, last.count(Mark.BEST)) == ("plane=broken", "failed", 0)
-    for n_best, named in ((3, 3), (4, 4)):
+    for n_best in (3, 4):
         values = tuple(
             Value(mark=Mark.BEST if index < n_best else Mark.NONE)
             for index in range(len(table.columns))
         )
         leader = replace(first, values=values)
-        assert (leader.count(Mark.BEST), len(table.best_in(leader))) == (n_best, named)
-        assert (table.best_in(leader)[-1] == "...") is (n_best == 4)
+        assert leader.count(Mark.BEST) == n_best
+        assert table.best_in(leader).endswith(" and 1 more") is (n_best == 4)

@@ -11,19 +11,21 @@ from orthoflow.cli.tables import counted
 from orthoflow.errors import ArgumentError
 from orthoflow.files.drawings.dxf import write_room_dxf, write_wall_dxf
 from orthoflow.files.drawings.geojson import (
+    PROJECT,
+    ProjectLayer,
+    write_project,
     write_room_geojson,
     write_seams_geojson,
     write_wall_geojson,
 )
-from orthoflow.files.drawings.printed_pictures import write_cad_picture
-from orthoflow.files.drawings.qgis import PROJECT, ProjectLayer, write_project
-from orthoflow.files.drawings.relief import (
+from orthoflow.files.drawings.key_plans import DrawnWall, RoomLines
+from orthoflow.files.drawings.printed_pictures import (
     Light,
+    write_cad_picture,
     write_contours,
     write_depth_figure,
     write_relief,
 )
-from orthoflow.files.drawings.room_lines import DrawnWall, RoomLines, room_lines
 from orthoflow.files.sidecars import placed_raster
 from orthoflow.products import Orthoimage, Orthoimages
 from orthoflow.records.runs import Run
@@ -141,7 +143,9 @@ def _images(run: Run, address: str) -> Sequence[Orthoimage]:
 def _lines(results: RoomResults) -> RoomLines | None:
     if results.planes is None:
         return None
-    return room_lines(results.planes, results.checkpoints, results.openings)
+    return RoomLines(
+        planes=results.planes, checkpoints=results.checkpoints, openings=results.openings
+    )
 
 
 def _drawn(results: RoomResults, wall: WallResult, image: str) -> DrawnWall:

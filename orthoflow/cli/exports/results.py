@@ -33,8 +33,7 @@ def export_csv(run: Run, folder: Path, _chosen: Choices) -> str:
     """Write all tables."""
     from orthoflow.records.runs import parts_of
     from orthoflow.records.tables import write_csv_tables
-    from orthoflow.report.paired import over_datasets
-    from orthoflow.report.tidy_tables import over_table
+    from orthoflow.report.paired import over_datasets, over_table
 
     make_empty(folder)
     written = [path.name for path in write_csv_tables(run, folder)]

@@ -11,8 +11,15 @@ from orthoflow.cli.exports.products import branch_of, last_product, numbers_of, 
 from orthoflow.cli.exports.sheets import grid_of, origin_of, text_of, write_drawings
 from orthoflow.cli.tables import counted
 from orthoflow.errors import ArgumentError
-from orthoflow.files.drawings.section_files import SectionDrawing, section_sheet, write_section
-from orthoflow.files.drawings.sections import Cut, plan_cut, section_cut, section_of
+from orthoflow.files.drawings.sections import (
+    Cut,
+    SectionDrawing,
+    plan_cut,
+    section_cut,
+    section_of,
+    section_sheet,
+    write_section,
+)
 from orthoflow.files.drawings.sheet_contents import Drawing
 from orthoflow.products import Planes, PointCloud, PointLabels
 from orthoflow.records.runs import Run

@@ -13,20 +13,29 @@ from orthoflow.cli.exports.drawings import chosen_walls
 from orthoflow.cli.exports.products import make_empty
 from orthoflow.cli.tables import counted
 from orthoflow.errors import ArgumentError
-from orthoflow.files.drawings.elevations import ElevationWall, elevation, unfolded
 from orthoflow.files.drawings.key_plans import key_plan
-from orthoflow.files.drawings.papers import FOOT_M, SCALES, SCALES_FT, nice_step, paper_of
+from orthoflow.files.drawings.printed_pictures import (
+    Area,
+    ElevationWall,
+    elevation,
+    unfolded,
+    wall_picture,
+)
 from orthoflow.files.drawings.sheet_contents import (
+    FOOT_M,
+    SCALES,
+    SCALES_FT,
     Drawing,
     Picture,
     SheetText,
+    TitleBlock,
     axes_of,
+    nice_step,
     north_of,
+    paper_of,
+    read_title_block,
 )
-from orthoflow.files.drawings.sheet_layout import fitting_scale, lay_out
-from orthoflow.files.drawings.sheets import write_sheet
-from orthoflow.files.drawings.title_blocks import TitleBlock, read_title_block
-from orthoflow.files.drawings.wall_drawings import Area, wall_picture
+from orthoflow.files.drawings.sheets import fitting_scale, lay_out, write_sheet
 from orthoflow.files.drawings.words import Phrase, label, surface_name
 from orthoflow.products import Opening
 from orthoflow.records.runs import Run

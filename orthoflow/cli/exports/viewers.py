@@ -17,7 +17,7 @@ from orthoflow.cli.exports.products import (
 )
 from orthoflow.cli.tables import counted
 from orthoflow.errors import ArgumentError
-from orthoflow.files.drawings.relief import Light, write_relief
+from orthoflow.files.drawings.printed_pictures import Light, write_relief
 from orthoflow.files.gltf import write_page, write_room
 from orthoflow.files.sidecars import OrthoFile, ortho_files, placed_raster
 from orthoflow.files.tiles.iiif import MANIFEST, Canvas, Layer, write_manifest

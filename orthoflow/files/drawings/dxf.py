@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.errors import StoreError
-from orthoflow.files.drawings.regular_openings import regular_opening
-from orthoflow.files.drawings.room_lines import DrawnWall, RoomLines, edges_of
+from orthoflow.files.drawings.key_plans import DrawnWall, RoomLines, edges_of
+from orthoflow.files.drawings.sheet_contents import nice_step
+from orthoflow.files.sidecars import write_text
 from orthoflow.untrusted_text import shown
 
 if TYPE_CHECKING:
     from ezdxf.document import Drawing
     from ezdxf.layouts.layout import Modelspace
-
 
 # Layers with names of the US National CAD Standard: content, AutoCAD colour, and line weight in
 # hundredths of a millimetre, as in ISO 128.
@@ -47,7 +48,6 @@ _METRES: Final = 6
 _VERSION: Final = "R2010"
 # For programs that do not show attributes the same is written as text beside the mark.
 _UNSEEN: Final = {"flags": 1}
-_GRID_STEPS_M: Final = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 50.0, 100.0)
 _MOST_LINES: Final = 12
 DIMENSION_STYLE: Final = "ORTHOFLOW"
 _POINT_BLOCK: Final = "SURVEY-POINT"
@@ -189,7 +189,7 @@ def _add_blocks(document: Drawing) -> None:
 def _add_grid(space: Modelspace, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
     """Add lines at round coordinates, each with its number outside the picture."""
     longest = float((high - low).max())
-    step = next(s for s in _GRID_STEPS_M if longest / s <= _MOST_LINES or s == _GRID_STEPS_M[-1])
+    step = nice_step(longest / _MOST_LINES)
     for axis in (0, 1):
         first = math.ceil(low[axis] / step - 1e-9)
         for k in range(first, math.floor(high[axis] / step + 1e-9) + 1):
@@ -313,7 +313,114 @@ def save_document(document: Drawing, path: Path) -> None:
     Raises:
         StoreError: it cannot be written.
     """
-    try:
-        document.saveas(path)
-    except OSError as error:
-        raise StoreError(f"{path.name} cannot be written: {error}; free some space") from error
+    stream = StringIO()
+    document.write(stream)
+    write_text(path, stream.getvalue())
+
+
+_SAMPLE_M: Final = 0.01
+# Permitted deviation of a side from a straight line: stones and outlines are about this accurate.
+_TOLERANCE_M: Final = 0.02
+_SPRINGINGS: Final = 40
+_ARC_POINTS: Final = 33
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegularOpening:
+    """An opening of a wall in regular form.
+
+    Attributes:
+        kind: `rectangle`, `arch` (a rectangle under a circular segment), or `outline` if neither
+            fits.
+        outline_m: (n, 2) X and Y, counter-clockwise, not closed; an arch has its arc as a polygon.
+        deviation_m: largest distance of the found outline from this one.
+    """
+
+    kind: Literal["rectangle", "arch", "outline"]
+    outline_m: NDArray[np.float64]
+    deviation_m: float
+
+
+def regular_opening(outline_m: NDArray[np.float64], sigma_m: float | None) -> RegularOpening:
+    """Fit a rectangle, or else an arch, to an outline.
+
+    Args:
+        outline_m: (n, 2) X and Y of an upright wall, counter-clockwise.
+        sigma_m: standard deviation of its sides, None if unknown.
+
+    A form is accepted if 95 % of the outline is within three sigma, at least 20 mm, of it.
+    """
+    limit_m = max(_TOLERANCE_M, 3.0 * (sigma_m or 0.0))
+    samples, directions = _sampled(outline_m)
+    left, bottom, right, top = _sides(samples, directions)
+    forms: dict[Literal["rectangle", "arch"], list[NDArray[np.float64]]] = {}
+    if right > left and top > bottom:
+        box = np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
+        forms = {"rectangle": [box], "arch": _arches(samples, left, bottom, right)}
+    for kind, candidates in forms.items():
+        distances = [_distances(samples, form) for form in candidates]
+        best = int(np.argmin(np.percentile(distances, 95.0, axis=1)))
+        if np.percentile(distances[best], 95.0) <= limit_m:
+            largest_m = float(distances[best].max())
+            return RegularOpening(kind=kind, outline_m=candidates[best], deviation_m=largest_m)
+    return RegularOpening(kind="outline", outline_m=outline_m, deviation_m=0.0)
+
+
+def _sampled(outline_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return points along an outline, and the direction of the side of each."""
+    points, directions = [], []
+    for begin, end in zip(outline_m, np.roll(outline_m, -1, axis=0), strict=True):
+        length = float(np.linalg.norm(end - begin))
+        if length > 0.0:
+            count = max(2, int(length / _SAMPLE_M))
+            shares = (np.arange(count) + 0.5) / count
+            points.append(begin + shares[:, None] * (end - begin))
+            directions.append(np.tile((end - begin) / length, (count, 1)))
+    return np.concatenate(points), np.concatenate(directions)
+
+
+def _sides(
+    samples: NDArray[np.float64], directions: NDArray[np.float64]
+) -> tuple[float, float, float, float]:
+    """Return left, bottom, right and top, each the median of the samples of that side.
+
+    In a counter-clockwise outline the left side goes down, the lower one right, and so on.
+    """
+    found = []
+    for axis, direction in ((0, (0.0, -1.0)), (1, (1.0, 0.0)), (0, (0.0, 1.0)), (1, (-1.0, 0.0))):
+        own = samples[directions @ np.array(direction) > 0.9, axis]
+        is_low = direction in ((0.0, -1.0), (1.0, 0.0))
+        edge = samples[:, axis].min() if is_low else samples[:, axis].max()
+        found.append(float(np.median(own)) if len(own) else float(edge))
+    return found[0], found[1], found[2], found[3]
+
+
+def _arches(
+    samples: NDArray[np.float64], left: float, bottom: float, right: float
+) -> list[NDArray[np.float64]]:
+    """Rectangles under circular segments with the apex of the outline, for springing heights."""
+    apex = float(samples[:, 1].max())
+    half = 0.5 * (right - left)
+    rises = np.linspace(0.0, min(half, apex - bottom), _SPRINGINGS + 1)[1:]
+    found = []
+    for rise in rises.tolist():
+        radius = (half**2 + rise**2) / (2.0 * rise)
+        middle = np.array([left + half, apex - radius])
+        angle = np.arcsin(min(1.0, half / radius))
+        turns = np.linspace(angle, -angle, _ARC_POINTS)
+        arc = middle + radius * np.column_stack([np.sin(turns), np.cos(turns)])
+        found.append(np.vstack([[left, bottom], [right, bottom], arc]))
+    return found
+
+
+def _distances(points: NDArray[np.float64], outline: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return distances (n,) of points from a closed outline."""
+    nearest = np.full(len(points), np.inf)
+    for begin, end in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+        side = end - begin
+        square = float(side @ side)
+        if square > 0.0:
+            share = np.clip((points - begin) @ side / square, 0.0, 1.0)
+            away = points - begin - share[:, None] * side
+            nearest = np.minimum(nearest, np.linalg.norm(away, axis=1))
+    return nearest

@@ -3,36 +3,42 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+import os
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Final
+from uuid import NAMESPACE_URL, uuid5
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.drawings.room_lines import DrawnWall, RoomLines, edges_of, numbered_openings
-from orthoflow.files.geotiff import SITE_CRS
+from orthoflow.files.drawings.key_plans import DrawnWall, RoomLines, edges_of, numbered_openings
+from orthoflow.files.geotiff import SITE_CRS, RasterParts
 from orthoflow.files.polygons import Feature, outlines, write_features
-from orthoflow.files.sidecars import numbers
+from orthoflow.files.sidecars import numbers, write_text
 from orthoflow.geometry.outlines import Edge
 from orthoflow.products import JsonValue, Opening, Orthoimage, OutlineSource
+from orthoflow.untrusted_text import shown
 
 _DIGITS: Final = 6
+_ROUNDED: Final = (
+    *("depth_m", "width_m", "height_m", "sill_m", "area_m2", "edge_sigma_m", "seen_share"),
+)
 _SEAM_CELLS_MOST: Final = 16_000_000
 
 
 def write_wall_geojson(path: Path, wall: DrawnWall, lines: RoomLines | None) -> None:
-    """Write a wall in the coordinates of its GeoTIFF: raster, rectangle, parts, edges, points."""
+    """Write a wall in the coordinates of its GeoTIFF: raster, rectangle, edges, points."""
     own: dict[str, JsonValue] = {"wall": wall.number, "name": wall.name}
     features = [_polygon(wall.place_m(wall.frame.corners_world()), {"kind": "frame", **own})]
     if lines is not None:
         if wall.plane_index is not None:
             corners = lines.planes.corners[wall.plane_index]
             features.append(_polygon(wall.place_m(corners), {"kind": "rectangle", **own}))
-            features += [
-                _polygon(wall.place_m(part), {"kind": "part", **own})
-                for part in lines.surfaces[wall.plane_index].rectangles_world
-            ]
         features += [
             _feature("LineString", wall.place_m(edge.ends_world), _about(edge, lines))
             for edge in edges_of(lines, wall.plane_index)
@@ -107,15 +113,9 @@ def opening_feature(opening: Opening, place: int, *, in_world: bool = False) -> 
         "wall": opening.wall,
         "name": opening.wall_name,
         "number": place,
-        "depth_m": _rounded(opening.depth_m),
-        "width_m": _rounded(opening.width_m),
-        "height_m": _rounded(opening.height_m),
-        "sill_m": _rounded(opening.sill_m),
-        "area_m2": _rounded(opening.area_m2),
-        "edge_sigma_m": _rounded(opening.edge_sigma_m),
+        **{name: _rounded(getattr(opening, name)) for name in _ROUNDED},
         "side_sigma_mm": numbers(np.round(1e3 * opening.side_sigma_m, 3)),
         "side_source": list(sources),
-        "seen_share": _rounded(opening.seen_share),
     }
     return _polygon(opening.outline_world if in_world else opening.outline_m, about)
 
@@ -151,3 +151,94 @@ def _feature(
     places: JsonValue = np.round(coordinates, _DIGITS).tolist()
     geometry: dict[str, JsonValue] = {"type": kind, "coordinates": places}
     return {"type": "Feature", "properties": dict(about), "geometry": geometry}
+
+
+PROJECT: Final = "walls.qgs"
+_GAP_M: Final = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProjectLayer:
+    """A raster of a wall.
+
+    Attributes:
+        wall: name of the wall.
+        kind: content of the raster: `ortho`, `intensity`, `depth`, `error`.
+        raster: its GeoTIFF.
+        about: one line on it, e.g. its accuracy.
+        is_shown: it is visible when the project opens.
+    """
+
+    wall: str
+    kind: str
+    raster: Path
+    about: str
+    is_shown: bool
+
+
+def write_project(folder: Path, title: str, layers: Sequence[ProjectLayer]) -> None:
+    """Write `walls.qgs` and a virtual raster per layer, with the walls from left to right.
+
+    Raises:
+        InputError: a raster cannot be read.
+        StoreError: a file cannot be written.
+    """
+    import jinja2
+
+    places = _places(layers)
+    boxes, described = [], []
+    for number, layer in enumerate(layers):
+        vrt = folder / f"{number:02d}_{layer.raster.stem}.vrt"
+        boxes.append(_write_virtual(vrt, layer.raster, places[layer.wall]))
+        # Ids must be unique in the project; the same run gives the same project.
+        identity = f"{layer.raster.stem}_{uuid5(NAMESPACE_URL, vrt.name).hex}"
+        described.append({**vars(layer), "file": vrt.name, "identity": identity})
+    extent = np.array(boxes)
+    corners = (*extent[:, :2].min(axis=0), *extent[:, 2:].max(axis=0))
+    environment = jinja2.Environment(
+        autoescape=True,
+        trim_blocks=True,
+        keep_trailing_newline=True,
+        finalize=lambda value: shown(value) if isinstance(value, str) else value,
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+    )
+    text = environment.get_template("walls.qgs.j2").render(
+        title=title,
+        layers=described,
+        walls=[(wall, list(own)) for wall, own in groupby(described, itemgetter("wall"))],
+        extent=zip(("xmin", "ymin", "xmax", "ymax"), corners, strict=True),
+    )
+    write_text(folder / PROJECT, text)
+
+
+def _places(layers: Sequence[ProjectLayer]) -> dict[str, float]:
+    """Return the offset of X of each wall."""
+    found: dict[str, float] = {}
+    right = 0.0
+    for layer in layers:
+        if layer.wall not in found:
+            with RasterParts(layer.raster) as raster:
+                found[layer.wall] = right - raster.corner_m[0]
+                right += raster.shape[1] * raster.gsd_m + _GAP_M
+    return found
+
+
+def _write_virtual(path: Path, raster: Path, shift_m: float) -> tuple[float, float, float, float]:
+    """Write a virtual raster that shifts X; return left, bottom, right and top."""
+    from rasterio.shutil import copy
+
+    with RasterParts(raster) as parts:
+        rows, columns = parts.shape
+        left, top, gsd_m = parts.corner_m[0] + shift_m, parts.corner_m[1], parts.gsd_m
+    copy(raster, path, driver="VRT")
+    root = ET.parse(path).getroot()
+    # Coordinate systems of walls cannot be transformed into each other.
+    for element in root.findall("SRS"):
+        root.remove(element)
+    for element in root.iter("GeoTransform"):
+        element.text = f"{left!r}, {gsd_m!r}, 0, {top!r}, 0, {-gsd_m!r}"
+    for element in root.iter("SourceFilename"):
+        element.text = os.path.relpath(raster, path.parent)
+        element.set("relativeToVRT", "1")
+    write_text(path, ET.tostring(root, encoding="unicode") + "\n")
+    return left, top - rows * gsd_m, left + columns * gsd_m, top

@@ -1,9 +1,11 @@
-"""A small plan of a room with one wall marked, to show which wall a sheet is of."""
+"""The lines of a room, computed once for all formats, and a small plan with one wall marked."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -11,8 +13,17 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
 from orthoflow.geometry.frames import LEVEL_LIMIT_DEG, WallFrame, basis_from_up
-from orthoflow.geometry.outlines import RoomOutline, Surface, room_outline
-from orthoflow.products import Planes
+from orthoflow.geometry.outlines import (
+    REACH_M,
+    Corner,
+    Edge,
+    RoomOutline,
+    Surface,
+    corners_between,
+    edges_between,
+    room_outline,
+)
+from orthoflow.products import CheckPoints, Opening, Planes
 
 # Every pair and some triples are compared, and a record may state any number.
 #: planes of a drawn room (`--to dxf`, `geojson`, `sheet`)
@@ -157,3 +168,80 @@ def axis_words(direction: NDArray[np.float64]) -> str:
     """Return the scan's axis that a direction (3,) is nearest to, with its sign."""
     axis = int(np.argmax(np.abs(direction)))
     return f"{'-' if direction[axis] < 0.0 else ''}{'xyz'[axis]}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoomLines:
+    """The drawn elements of a room.
+
+    Attributes:
+        planes: the planes.
+        checkpoints: surveyed points, or None.
+        openings: openings of walls.
+    """
+
+    planes: Planes
+    checkpoints: CheckPoints | None
+    openings: tuple[Opening, ...] = ()
+
+    @cached_property
+    def surfaces(self) -> tuple[Surface, ...]:
+        """Return the planes, each with the rectangles of its parts."""
+        return surfaces_of(self.planes)
+
+    @cached_property
+    def edges(self) -> tuple[Edge, ...]:
+        """Return the intersections of two planes."""
+        return edges_between(self.surfaces)
+
+    @cached_property
+    def corners(self) -> tuple[Corner, ...]:
+        """Return the intersections of three planes."""
+        return corners_between(self.surfaces, self.edges)
+
+    @cached_property
+    def outline(self) -> RoomOutline:
+        """Return the outline of the room."""
+        return outline_of(self.planes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DrawnWall:
+    """A wall in its own coordinates: X and Y of its GeoTIFF.
+
+    Attributes:
+        number: of the wall.
+        name: what it is called.
+        plane_index: its plane, None if unknown.
+        frame: of its raster.
+        image: file name of its picture, beside the drawing; empty without one.
+        openings: its openings, from the left.
+    """
+
+    number: int
+    name: str
+    plane_index: int | None
+    frame: WallFrame
+    image: str = ""
+    openings: tuple[Opening, ...] = ()
+
+    def place_m(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return X and Y (n, 2) of points (n, 3)."""
+        return self.frame.raster_from_wall(self.frame.wall_from_world(points_world)[:, :2])
+
+    def near(self, points_world: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Report which points (n, 3) are on the raster's rectangle, or near it."""
+        return self.frame.distances_m(points_world) <= REACH_M
+
+
+def edges_of(lines: RoomLines, plane_index: int | None) -> Sequence[Edge]:
+    """Return the edges that lie on a plane."""
+    return [edge for edge in lines.edges if plane_index in (edge.first, edge.second)]
+
+
+def numbered_openings(openings: Sequence[Opening]) -> Iterator[tuple[int, Opening]]:
+    """Yield openings with their indices among those of their wall, in order."""
+    counts: dict[int, int] = {}
+    for opening in openings:
+        counts[opening.wall] = counts.get(opening.wall, -1) + 1
+        yield counts[opening.wall], opening

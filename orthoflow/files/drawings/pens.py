@@ -24,7 +24,7 @@ from orthoflow.untrusted_text import shown
 if TYPE_CHECKING:
     from reportlab.pdfgen.canvas import Canvas
 
-    from orthoflow.files.drawings.papers import Paper
+    from orthoflow.files.drawings.sheet_contents import Paper
 
 POINTS_PER_MM: Final = 72.0 / 25.4
 FONT: Final = "DejaVuSans"
@@ -55,7 +55,7 @@ Colour = tuple[float, float, float]
 
 
 @contextmanager
-def sheet_canvas(path: Path, paper: Paper) -> Iterator[Canvas]:
+def sheet_canvas(stream: BytesIO, paper: Paper) -> Iterator[Canvas]:
     """Open a PDF page whose unit is the millimetre."""
     from reportlab import rl_config
     from reportlab.pdfgen.canvas import Canvas
@@ -64,7 +64,7 @@ def sheet_canvas(path: Path, paper: Paper) -> Iterator[Canvas]:
     rl_config.useA85 = 0
     register_fonts()
     size = (paper.width_mm * POINTS_PER_MM, paper.height_mm * POINTS_PER_MM)
-    canvas = Canvas(str(path), pagesize=size, pageCompression=1, invariant=1)
+    canvas = Canvas(stream, pagesize=size, pageCompression=1, invariant=1)
     canvas.setCreator("orthoflow")
     yield canvas
 

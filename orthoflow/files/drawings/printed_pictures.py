@@ -7,17 +7,40 @@ import math
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from io import BytesIO
 from pathlib import Path
-from typing import Final, cast
+from typing import TYPE_CHECKING, Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.errors import StoreError
-from orthoflow.files.drawings.papers import Part, nice_step
-from orthoflow.files.geotiff import RasterParts
+from orthoflow.files.drawing import in_column_style, picture_figure
+from orthoflow.files.drawings import pens
+from orthoflow.files.drawings.sheet_contents import (
+    Axes,
+    Drawing,
+    LegendRow,
+    Part,
+    Picture,
+    Placed,
+    SheetText,
+    View,
+    nice_step,
+    up_words,
+    whole_of,
+)
+from orthoflow.files.drawings.words import Language, Phrase, label
+from orthoflow.files.geotiff import RasterParts, writing
+from orthoflow.files.polygons import Feature, write_features
+from orthoflow.geometry import WallFrame
+from orthoflow.geometry.frames import basis_from_up
 from orthoflow.geometry.levels import Colours, eight_bits
 from orthoflow.geometry.robust import median_deviation
+from orthoflow.untrusted_text import shown
+
+if TYPE_CHECKING:
+    from reportlab.pdfgen.canvas import Canvas
 
 PRINT_DPI: Final = 400.0
 _MM_PER_INCH: Final = 25.4
@@ -284,22 +307,434 @@ def write_cad_picture(raster: Path, path: Path) -> None:
     from rasterio.shutil import copy
     from rasterio.windows import Window
 
-    with RasterParts(raster) as source, tempfile.TemporaryDirectory() as folder:
+    with RasterParts(raster) as source, tempfile.TemporaryDirectory() as folder, writing(path):
         rows, columns = source.shape
         # GDAL's PNG driver only copies, row by row.
         aside = Path(folder) / "picture.tif"
         profile = {"count": 4, "dtype": "uint8", "transform": rasterio.Affine(2, 0, 0, 0, -2, 0)}
         whole = np.array([0.0, 0.0, columns, rows])
-        try:
-            with rasterio.open(aside, "w", width=columns, height=rows, **profile) as target:
-                for band, values, shown in _bands(source, whole, source.shape):
-                    # White behind transparency, for programs that do not support it.
-                    pixels = np.full((*shown.shape, 4), 255, dtype=np.uint8)
-                    pixels[..., :3][shown] = eight_bits(cast("Colours", values))[shown]
-                    pixels[..., 3] = np.where(shown, 255, 0)
-                    window = Window(0, band.start, columns, len(shown))
-                    target.write(pixels.transpose(2, 0, 1), window=window)
-            with rasterio.Env(GDAL_PAM_ENABLED="NO"):
-                copy(aside, path, driver="PNG", ZLEVEL="4")
-        except (OSError, rasterio.errors.RasterioError) as error:
-            raise StoreError(f"{path.name} cannot be written: {error}; free some space") from error
+        with rasterio.open(aside, "w", width=columns, height=rows, **profile) as target:
+            for band, values, shown in _bands(source, whole, source.shape):
+                # White behind transparency, for programs that do not support it.
+                pixels = np.full((*shown.shape, 4), 255, dtype=np.uint8)
+                pixels[..., :3][shown] = eight_bits(cast("Colours", values))[shown]
+                pixels[..., 3] = np.where(shown, 255, 0)
+                window = Window(0, band.start, columns, len(shown))
+                target.write(pixels.transpose(2, 0, 1), window=window)
+        with rasterio.Env(GDAL_PAM_ENABLED="NO"):
+            copy(aside, path, driver="PNG", ZLEVEL="4")
+
+
+# An area outlined on a picture: a text, written into it if it is wide enough, its parts (", ")
+# below each other; and its outline (n, 2) in metres right and down from the top-left corner.
+Area = tuple[str, NDArray[np.float64]]
+_MIDDLE: Final = [(1.0, 2.0), (13.0, 2.0)]
+_BOX: Final = [(3.0, 0.3), (11.0, 0.3), (11.0, 3.7), (3.0, 3.7)]
+
+
+def wall_picture(
+    raster: Path,
+    *,
+    is_depth: bool = False,
+    is_flipped: bool = False,
+    areas: Sequence[Area] = (),
+    language: Language = "en",
+) -> Picture:
+    """Return a picture of a wall.
+
+    Args:
+        raster: GeoTIFF.
+        is_depth: it has depths, which are drawn with contours.
+        is_flipped: its rows go up the paper, as those of ceilings do.
+        areas: openings of the wall.
+        language: of the legend.
+    """
+
+    def draw(placed: Placed) -> None:
+        draw_raster(placed, raster, is_flipped=is_flipped)
+        if is_depth:
+            _draw_contours(placed, raster, is_flipped=is_flipped)
+        _draw_areas(placed, areas)
+
+    legend: list[LegendRow] = []
+    if areas:
+        symbol = partial(_box, width_mm=pens.MEDIUM_MM, colour=pens.OPENING)
+        legend.append((symbol, label("legend_opening", language)))
+    if is_depth:
+        stretch = stretch_of(raster)
+        interval = f"{1e3 * stretch.interval:g}"
+        low, high = (f"{1e3 * value:+.0f}" for value in (stretch.low, stretch.high))
+        for key, colour in (("legend_before", pens.BEFORE), ("legend_behind", pens.BEHIND)):
+            symbol = partial(pens.line, points_mm=_MIDDLE, width_mm=pens.THIN_MM, colour=colour)
+            legend.append((symbol, label(key, language, interval=interval)))
+        legend.append((_grey_ramp, label("legend_grey", language, low=low, high=high)))
+    legend.append((partial(_box, colour=pens.GREY), label("legend_empty", language)))
+    return Picture(draw=draw, legend=tuple(legend))
+
+
+_box: Final = partial(pens.line, points_mm=_BOX, is_closed=True)
+
+
+def _grey_ramp(canvas: Canvas) -> None:
+    for step in range(24):
+        pens.box(canvas, (1.0 + 0.5 * step, 0.5, 0.5, 3.0), (step / 23.0,) * 3)
+
+
+def draw_raster(placed: Placed, raster: Path, *, is_flipped: bool = False) -> None:
+    """Draw the part of a raster that a picture shows, white where empty."""
+    from reportlab.lib.utils import ImageReader
+
+    picture = encode_part(raster, placed.view.part, scale=placed.scale, is_flipped=is_flipped)
+    left, bottom, right, top = placed.edges_mm
+    placed.canvas.drawImage(
+        ImageReader(BytesIO(picture)),
+        *(pens.POINTS_PER_MM * number for number in (left, bottom, right - left, top - bottom)),
+    )
+
+
+def _draw_contours(placed: Placed, raster: Path, *, is_flipped: bool) -> None:
+    found = contours(
+        raster,
+        placed.view.part,
+        scale=placed.scale,
+        interval_m=stretch_of(raster).interval,
+        is_flipped=is_flipped,
+    )
+    labelled: list[NDArray[np.float64]] = []
+    for level, points in found:
+        colour = pens.BEFORE if level > 0.0 else pens.BEHIND
+        on_paper = placed.on_paper(points)
+        pens.line(placed.canvas, on_paper, width_mm=pens.FINE_MM, colour=colour)
+        text = f"{round(1e3 * level, 6):+g}"
+        place = label_place(on_paper, pens.text_width_mm(text), labelled)
+        if place is not None:
+            middle_mm, turned_deg = place
+            labelled.append(np.array(middle_mm))
+            pens.write_on_white(
+                placed.canvas, text, middle_mm, turned_deg=turned_deg, colour=colour
+            )
+
+
+def _draw_areas(placed: Placed, areas: Sequence[Area]) -> None:
+    """Outline openings, clipped to the picture."""
+    left, bottom, right, top = placed.edges_mm
+    with placed.clipped() as canvas:
+        for text, outline_m in areas:
+            outline = placed.on_paper(outline_m)
+            # White below, so that the line is visible on any picture.
+            pens.line(canvas, outline, width_mm=1.0, colour=pens.WHITE, is_closed=True)
+            pens.line(canvas, outline, width_mm=pens.MEDIUM_MM, colour=pens.OPENING, is_closed=True)
+            low = np.maximum(outline.min(axis=0), (left, bottom))
+            high = np.minimum(outline.max(axis=0), (right, top))
+            # The parts of the text on white, from the top, if there is room.
+            rows = shown(text).split(", ")
+            wide_mm = max(pens.text_width_mm(row) for row in rows) + 2.0
+            high_mm = 1.7 * pens.TEXT_MM * len(rows) + 1.0
+            if high[0] - low[0] >= wide_mm + 2.0 and high[1] - low[1] >= high_mm + 2.0:
+                pens.box(
+                    canvas, (low[0] + 1.0, high[1] - 1.0 - high_mm, wide_mm, high_mm), pens.WHITE
+                )
+                for place, row in enumerate(rows):
+                    at = (low[0] + 2.0, high[1] - 1.2 - 1.7 * pens.TEXT_MM * (place + 0.8))
+                    pens.write_text(canvas, row, at, colour=pens.OPENING)
+
+
+_GAP_MM: Final = 8.0
+# Below the walls, for their names.
+_NAMES_MM: Final = 12.0
+# Between heights that have marks of their own.
+_LEVELS_MM: Final = 1.5
+# Walls this close to parallel follow each other along one facade.
+_PARALLEL_DEG: Final = 10.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ElevationWall:
+    """A wall of an elevation.
+
+    Attributes:
+        name: what it is called.
+        frame: frame of its picture.
+        raster: GeoTIFF of the picture.
+    """
+
+    name: str
+    frame: WallFrame
+    raster: Path
+
+    @property
+    def size_m(self) -> tuple[float, float]:
+        """Width and height."""
+        return self.frame.width * self.frame.gsd_m, self.frame.height * self.frame.gsd_m
+
+
+def unfolded(
+    walls: Sequence[ElevationWall], up: NDArray[np.float64]
+) -> tuple[tuple[ElevationWall, ...], bool]:
+    """Sort walls in the order in which a viewer who turns or walks to the right sees them.
+
+    Inside a room the viewer turns clockwise, seen from above; around a building the facades follow
+    each other counter-clockwise. The order begins after the widest gap of directions.
+
+    Returns:
+        The walls, and whether they form a room seen from inside.
+    """
+    e1, e2, _ = basis_from_up(up)
+    middles = np.array([wall.frame.corners_world().mean(axis=0) for wall in walls])
+    normals = np.array([wall.frame.normal_world for wall in walls])
+    outwards = np.einsum("wi,wi->w", middles - middles.mean(axis=0), normals)
+    is_inside = bool(outwards.sum() <= 0.0)
+    looks = -normals
+    turn = -1.0 if is_inside else 1.0
+    angles = turn * np.degrees(np.arctan2(looks @ e2, looks @ e1)) % 360.0
+    order = np.argsort(angles)
+    gaps = np.diff(np.append(angles[order], angles[order[0]] + 360.0))
+    order = np.roll(order, -(int(np.argmax(gaps)) + 1))
+    groups: list[list[int]] = []
+    for k in order.tolist():
+        first = groups[-1][0] if groups else None
+        turned_deg = 0.0 if first is None else math.remainder(angles[k] - angles[first], 360.0)
+        if first is not None and abs(turned_deg) <= _PARALLEL_DEG:
+            groups[-1].append(k)
+        else:
+            groups.append([k])
+    for group in groups:
+        right = walls[group[0]].frame.u_world
+        group.sort(key=lambda k: float(middles[k] @ right))
+    return tuple(walls[k] for group in groups for k in group), is_inside
+
+
+def elevation(
+    walls: Sequence[ElevationWall],
+    up: NDArray[np.float64],
+    text: SheetText,
+    scale: int,
+    language: Language = "en",
+) -> Drawing:
+    """Return walls side by side, each at its height, with level lines at round heights.
+
+    Args:
+        walls: from left to right.
+        up: (3,) unit vector of the scan.
+        text: of its sheets.
+        scale: n of 1 : n.
+        language: of labels.
+    """
+    mm = 1e-3 * scale
+    heights = np.array([wall.frame.corners_world() @ up for wall in walls])
+    top, low = float(heights.max()), float(heights.min())
+    lefts = np.cumsum([0.0, *(wall.size_m[0] + mm * _GAP_MM for wall in walls)])
+
+    def draw(placed: Placed) -> None:
+        part = placed.view.part
+        end = -math.inf
+        for number, (wall, left) in enumerate(zip(walls, lefts.tolist(), strict=False)):
+            down = top - float(heights[number].max())
+            wide, high = wall.size_m
+            # What of the wall lies on this part of the drawing.
+            own = Part(
+                left_m=max(part.left_m - left, 0.0),
+                top_m=max(part.top_m - down, 0.0),
+                right_m=min(part.right_m - left, wide),
+                bottom_m=min(part.bottom_m - down, high),
+            )
+            if min(own.size_m) <= 1e-9:
+                continue
+            corner = placed.on_paper([(left + own.left_m, down + own.bottom_m)])[0]
+            view = View(kind="", part=own, corner_mm=(float(corner[0]), float(corner[1])))
+            draw_raster(replace(placed, view=view), wall.raster)
+            outline = placed.on_paper([(left + x, down + y) for x, y in own.corners_m])
+            pens.line(placed.canvas, outline, width_mm=pens.THIN_MM, is_closed=True)
+            # A name that would lie on another is left out: the title block has all of them.
+            long = pens.text_width_mm(wall.name) + 2.0
+            x, y = placed.on_paper([(left + own.left_m, top - low)])[0].tolist()
+            x = min(x, placed.edges_mm[2] - long)
+            if part.bottom_m > top - low and x >= end:
+                end = x + long
+                pens.write_on_white(placed.canvas, wall.name, (x + 0.5 * long, y - 3.0))
+
+    # Walls that end nearly level share a mark.
+    levels: list[float] = []
+    for down in sorted({*(top - heights.max(axis=1)), *(top - heights.min(axis=1))}):
+        if not levels or down - levels[-1] >= mm * _LEVELS_MM:
+            levels.append(float(down))
+    return Drawing(
+        stem="elevation",
+        size_m=(float(lefts[-1]) - mm * _GAP_MM, top - low + mm * _NAMES_MM),
+        pictures={label("elevation", language): Picture(draw=draw)},
+        axes=Axes(
+            across=None,
+            down=(top, -1.0),
+            phrase=Phrase(key="axes_elevation", values={"up": up_words(up)}),
+        ),
+        text=text,
+        scale=scale,
+        language=language,
+        heights=tuple(levels),
+    )
+
+
+NOTHING: Final = 0
+_BAND_ROWS: Final = 1024
+_AROUND_ROWS: Final = 8
+# Noise is estimated from so many rows on either side of the middle.
+_SAMPLED_ROWS: Final = 128
+_FIGURE_PX: Final = 1600
+_FIGURE_DPI: Final = 450
+# Contours as in a drawing at this scale: smoothed over half a millimetre of its paper.
+_CONTOUR_SCALE: Final = 20
+# In front of the plane, behind it.
+_CONTOUR_COLOURS: Final = ("#5a0014", "#00204a")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Light:
+    """The direction of a distant light in front of a wall.
+
+    Attributes:
+        azimuth_deg: its direction on the wall, clockwise from the top; 315 is top left.
+        altitude_deg: angle between its rays and the wall's plane; small ones emphasise relief.
+    """
+
+    azimuth_deg: float = 315.0
+    altitude_deg: float = 25.0
+
+
+def shaded(
+    depths_m: NDArray[np.floating], gsd_m: float, light: Light, noise_m: float = 0.0
+) -> NDArray[np.uint8]:
+    """Shade a depth raster, 1 to 255 by Lambert's cosine law; 0 without a depth.
+
+    Args:
+        depths_m: (rows, cols) metres towards the viewer, NaN without data.
+        gsd_m: side of a cell.
+        light: direction of the light.
+        noise_m: standard deviation of depths, which are averaged with those that differ by it.
+
+    A surface parallel to the wall's plane has the sine of the light's altitude.
+    """
+    depths = calmed(np.asarray(depths_m, dtype=np.float32), noise_m)
+    down, right = (_slope(depths, axis) / np.float32(gsd_m) for axis in (0, 1))
+    azimuth, altitude = np.radians([light.azimuth_deg, light.altitude_deg])
+    # Towards the light: right and up on the wall, and towards the viewer.
+    towards = (np.sin(azimuth), np.cos(azimuth))
+    slope = -right * np.float32(towards[0]) + down * np.float32(towards[1])
+    cosine = np.cos(altitude) * slope + np.sin(altitude)
+    cosine /= np.sqrt(1.0 + right**2 + down**2)
+    grey = 1.0 + 254.0 * np.clip(cosine, 0.0, 1.0)
+    known = np.isfinite(depths)
+    return np.where(known, np.nan_to_num(grey), NOTHING).astype(np.uint8)
+
+
+def _slope(depths: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
+    """Return the change per cell: the mean to both neighbours, to one beside a hole, or zero."""
+    steps = np.diff(depths, axis=axis)
+    before = np.concatenate([np.full_like(depths.take([0], axis), np.nan), steps], axis=axis)
+    behind = np.concatenate([steps, np.full_like(depths.take([0], axis), np.nan)], axis=axis)
+    n_known = np.isfinite(before).astype(np.float32) + np.isfinite(behind)
+    total = np.nan_to_num(before) + np.nan_to_num(behind)
+    return np.asarray(total / np.maximum(n_known, 1.0))
+
+
+def write_relief(depth: Path, path: Path, light: Light) -> None:
+    """Write the shaded relief of a depth raster as a GeoTIFF with the same position, band by band.
+
+    Raises:
+        InputError: the depth raster cannot be read.
+    """
+    import rasterio
+    from rasterio.windows import Window
+
+    with RasterParts(depth) as source, rasterio.open(depth) as placed:
+        rows, columns = source.shape
+        noise_m = _noise_m(source)
+        profile = {**placed.profile, "dtype": "uint8", "nodata": NOTHING, "predictor": 2}
+        with rasterio.open(path, "w", **profile) as target:
+            for first in range(0, rows, _BAND_ROWS):
+                last = min(rows, first + _BAND_ROWS)
+                # Slopes and means need more rows on either side.
+                top, bottom = max(0, first - _AROUND_ROWS), min(rows, last + _AROUND_ROWS)
+                box = (0.0, float(top), float(columns), float(bottom))
+                depths, _ = source.read(box, (bottom - top, columns))
+                band = shaded(np.asarray(depths, np.float32), source.gsd_m, light, noise_m)
+                kept = band[first - top : first - top + last - first]
+                target.write(kept, 1, window=Window(0, first, columns, last - first))
+            target.update_tags(
+                light_azimuth_deg=f"{light.azimuth_deg:g}",
+                light_altitude_deg=f"{light.altitude_deg:g}",
+            )
+
+
+def _noise_m(source: RasterParts) -> float:
+    """Return the noise of depths from cell to cell, of the rows in the middle of the raster."""
+    rows, columns = source.shape
+    top, bottom = max(0, rows // 2 - _SAMPLED_ROWS), min(rows, rows // 2 + _SAMPLED_ROWS)
+    box = (0.0, float(top), float(columns), float(bottom))
+    depths, shown = source.read(box, (bottom - top, columns))
+    return noise_of(np.where(shown, depths, np.nan).astype(np.float32))
+
+
+def write_contours(depth: Path, frame: WallFrame, path: Path) -> float:
+    """Write contour lines as GeoJSON in X and Y of the raster's GeoTIFF; return their interval.
+
+    Each line has `depth_mm`, positive towards the viewer.
+    """
+    interval_m = stretch_of(depth).interval
+    features: list[Feature] = [
+        {
+            "type": "Feature",
+            "properties": {"depth_mm": round(1e3 * level, 3)},
+            "geometry": {"type": "LineString", "coordinates": np.round(points, 4).tolist()},
+        }
+        for level, points in _contours(depth, frame, interval_m)
+    ]
+    write_features(path, features, frame.crs)
+    return interval_m
+
+
+def _contours(
+    depth: Path, frame: WallFrame, interval_m: float
+) -> list[tuple[float, NDArray[np.float64]]]:
+    """Return contours in X and Y (n, 2) of the raster's GeoTIFF."""
+    size_m = frame.width * frame.gsd_m, frame.height * frame.gsd_m
+    found = contours(depth, whole_of(size_m), scale=_CONTOUR_SCALE, interval_m=interval_m)
+    return [(level, frame.raster_from_wall(points / frame.gsd_m)) for level, points in found]
+
+
+def write_depth_figure(depth: Path, frame: WallFrame, path: Path, light: Light) -> None:
+    """Write a PNG: coloured depths with shading, contours, and a legend in millimetres."""
+    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import CenteredNorm
+
+    with RasterParts(depth) as source:
+        rows, columns = source.shape
+        factor = max(1.0, max(rows, columns) / _FIGURE_PX)
+        shape = (max(2, round(rows / factor)), max(2, round(columns / factor)))
+        depths, shown = source.read((0.0, 0.0, float(columns), float(rows)), shape)
+        gsd_m = source.gsd_m * factor
+    values = np.where(shown, np.asarray(depths, np.float32), np.nan)
+    stretch = stretch_of(depth)
+    # The plane is white; equal depths in front of it (red) and behind it (blue) are equally dark.
+    norm = CenteredNorm(0.0, halfrange=max(1.0, 1e3 * max(-stretch.low, stretch.high)))
+    grey = shaded(values, gsd_m, light, noise_of(values))
+    colours = colormaps["RdBu_r"](norm(1e3 * np.nan_to_num(values)))[..., :3]
+    mixed = np.clip(colours * (0.35 + 0.65 * grey[..., None] / grey.max(initial=1)), 0.0, 1.0)
+    mixed[grey == NOTHING] = 1.0
+    with in_column_style():
+        figure, axes = picture_figure(
+            np.rint(255.0 * mixed).astype(np.uint8), extra_inches=0.45, frame=frame
+        )
+        for level, points in _contours(depth, frame, stretch.interval):
+            cells = frame.wall_from_raster(points)
+            axes.plot(*cells.T, color=_CONTOUR_COLOURS[level < 0.0], linewidth=0.3)
+        figure.colorbar(
+            ScalarMappable(norm, "RdBu_r"),
+            ax=axes,
+            label="depth towards the viewer, mm; contour lines every "
+            f"{1e3 * stretch.interval:g} mm",
+            location="bottom",
+            aspect=40,
+            extend="both",
+        )
+        figure.savefig(path, dpi=_FIGURE_DPI, metadata={"Software": None})

@@ -6,7 +6,6 @@ column on the right of the sheet or a strip along its lower edge.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -20,8 +19,15 @@ from reportlab.platypus import Flowable, Image, Table
 
 from orthoflow.files.drawings import pens
 from orthoflow.files.drawings.key_plans import NORTH, KeyPlan
-from orthoflow.files.drawings.papers import MARGIN_MM, SCALES_FT, Paper, round_below
-from orthoflow.files.drawings.sheet_contents import Drawing, LegendRow, Sheet
+from orthoflow.files.drawings.sheet_contents import (
+    MARGIN_MM,
+    SCALES_FT,
+    Drawing,
+    LegendRow,
+    Paper,
+    Sheet,
+    round_below,
+)
 from orthoflow.files.drawings.words import label
 
 if TYPE_CHECKING:
@@ -56,9 +62,11 @@ _PLAIN: Final = [
 class _Picture(Flowable):  # type: ignore[misc] # reportlab has no types
     """Something drawn in millimetres from its bottom-left corner, with the available width."""
 
-    def __init__(self, high_mm: float, draw: Callable[[Canvas, float], None]) -> None:
+    def __init__(
+        self, high_mm: float, draw: Callable[[Canvas, float], None], *, can_grow: bool = False
+    ) -> None:
         super().__init__()
-        self.high_mm, self.draw_mm = high_mm, draw
+        self.high_mm, self.draw_mm, self.can_grow = high_mm, draw, can_grow
 
     def wrap(self, wide: float, _high: float) -> tuple[float, float]:
         """Return its size in points."""
@@ -155,7 +163,7 @@ def _packed(
     placed: list[tuple[Any, tuple[float, float, float]]] = []
     column, used = 0, 0.0
     for place, flowable in enumerate(flowables):
-        is_plan = isinstance(flowable, _Plan)
+        is_plan = getattr(flowable, "can_grow", False)
         high = _PLAN_MM[0] if is_plan else _high_mm(flowable, wide_mm)
         if used and used + high > high_mm:
             column, used = column + 1, 0.0
@@ -187,9 +195,9 @@ def _notes(drawing: Drawing, sheet: Sheet, *, is_brief: bool) -> list[Any]:
     if is_brief:
         return found
     if sheet.numbered:
-        found.append(_Plan(*_sheet_key(drawing, sheet)))
+        found.append(_plan(*_sheet_key(drawing, sheet)))
     if drawing.plan is not None:
-        found.append(_Plan(*_key_plan(drawing, drawing.plan)))
+        found.append(_plan(*_key_plan(drawing, drawing.plan)))
     return found
 
 
@@ -208,16 +216,9 @@ def _scale_bar(drawing: Drawing) -> _Picture:
             )
             sides = [(left, 0.5), (left + segment, 0.5), (left + segment, 2.5), (left, 2.5)]
             pens.line(canvas, sides, is_closed=True)
-        step, end = 1, -math.inf
-        widest = pens.text_width_mm(f"{count * length:g} {drawing.unit}")
-        while step * segment < widest + 1.0:
-            step += 1
-        for place in range(0, count + 1, step):
-            text = f"{place * length:g}" + (f" {drawing.unit}" if place == count else "")
+        for place, text in ((0, "0"), (count, f"{count * length:g} {drawing.unit}")):
             at = (4.0 + place * segment, 4.2)
-            if at[0] > end:
-                pens.write_text(canvas, text, at, is_centred=True)
-                end = at[0]
+            pens.write_text(canvas, text, at, is_centred=True)
 
     return _Picture(8.0, draw)
 
@@ -226,32 +227,25 @@ def _legend(drawing: Drawing, sheet: Sheet) -> Iterator[Any]:
     language = drawing.language
     rows: list[LegendRow] = []
     if drawing.grid > 0.0 and drawing.axes.across is not None:
-        rows.append((lambda canvas: pens.cross(canvas, 7.0, 2.0), label("legend_cross", language)))
+        rows.append((partial(pens.cross, x=7.0, y=2.0), label("legend_cross", language)))
     if drawing.heights:
-        rows.append(
-            (
-                lambda canvas: pens.height_mark(canvas, (4.0, 0.6), ""),
-                f"{label('legend_height', language)}, {drawing.unit}",
-            )
-        )
+        symbol = partial(pens.height_mark, at_mm=(4.0, 0.6), text="")
+        rows.append((symbol, f"{label('legend_height', language)}, {drawing.unit}"))
     if drawing.north is not None:
-        up = np.array([[7.0, -0.5], [7.0, 4.5]])
+        symbol = partial(pens.arrow, ends_mm=np.array([[7.0, -0.5], [7.0, 4.5]]))
         meaning = "legend_north" if drawing.up_label == NORTH else "legend_axis"
-        text = f"{drawing.up_label}: {label(meaning, language)}"
-        rows.append((lambda canvas: pens.arrow(canvas, up), text))
+        rows.append((symbol, f"{drawing.up_label}: {label(meaning, language)}"))
     # What several pictures have in common once.
     own = {row[1]: row for view in sheet.views for row in drawing.pictures[view.kind].legend}
     rows += own.values()
-    if len(sheet.numbered) > 1:
-        ends = [(1.0, 2.0), (13.0, 2.0)]
-        rows.append(
-            (
-                lambda canvas: pens.line(
-                    canvas, ends, width_mm=pens.WIDE_MM, dashes_mm=pens.MATCH_DASHES_MM
-                ),
-                label("legend_match", language),
-            )
+    if sheet.numbered:
+        symbol = partial(
+            pens.line,
+            points_mm=[(1.0, 2.0), (13.0, 2.0)],
+            width_mm=pens.WIDE_MM,
+            dashes_mm=pens.MATCH_DASHES_MM,
         )
+        rows.append((symbol, label("legend_match", language)))
     for place, (draw, text) in enumerate(rows):
         # The heading is never separated from the first row.
         heading = (
@@ -270,30 +264,29 @@ def _draw_symbol(draw: Callable[[Canvas], None], canvas: Canvas, _wide_mm: float
     draw(canvas)
 
 
-class _Plan(_Picture):
+def _plan(
+    heading: str,
+    points: NDArray[np.float64],
+    draw_lines: Callable[
+        [Canvas, Callable[[NDArray[np.float64]], NDArray[np.float64]], float], None
+    ],
+) -> _Picture:
     """A heading, and lines (n, 2) in metres below it, as large as the space permits."""
+    title = pens.paragraph(heading)
 
-    def __init__(
-        self,
-        heading: str,
-        points: NDArray[np.float64],
-        draw: Callable[[Canvas, Callable[[NDArray[np.float64]], NDArray[np.float64]], float], None],
-    ) -> None:
-        super().__init__(_PLAN_MM[0], self._draw_plan)
-        self.heading, self.points, self.draw_lines = pens.paragraph(heading), points, draw
-
-    def _draw_plan(self, canvas: Canvas, wide_mm: float) -> None:
-        heading_mm = _high_mm(self.heading, wide_mm)
-        self.heading.drawOn(canvas, 0.0, (self.high_mm - heading_mm) * pens.POINTS_PER_MM)
-        low = self.points.min(axis=0)
-        size = np.maximum(self.points.max(axis=0) - low, 1e-6)
+    def draw(canvas: Canvas, wide_mm: float) -> None:
+        title_mm = _high_mm(title, wide_mm)
+        title.drawOn(canvas, 0.0, (plan.high_mm - title_mm) * pens.POINTS_PER_MM)
+        low = points.min(axis=0)
+        size = np.maximum(points.max(axis=0) - low, 1e-6)
         # The arrow that points up is on the right.
-        limits = np.array([wide_mm - 14.0, self.high_mm - heading_mm - 5.0])
+        limits = np.array([wide_mm - 14.0, plan.high_mm - title_mm - 5.0])
         mm_per_m = float((limits / size).min())
         corner = np.array([2.0, 0.5 * (limits[1] - mm_per_m * size[1]) + 2.0])
-        self.draw_lines(
-            canvas, lambda points: np.asarray(corner + mm_per_m * (points - low)), wide_mm
-        )
+        draw_lines(canvas, lambda some: np.asarray(corner + mm_per_m * (some - low)), wide_mm)
+
+    plan = _Picture(_PLAN_MM[0], draw, can_grow=True)
+    return plan
 
 
 def _key_plan(drawing: Drawing, plan: KeyPlan) -> tuple[str, NDArray[np.float64], Any]:
@@ -413,9 +406,8 @@ def _title_table(drawing: Drawing, sheet: Sheet, wide_mm: float) -> Any:
     seal_mm = wide_mm if wide_mm < _FOUR_COLUMNS_MM else 0.5 * wide_mm
     cells.append(([_seal(drawing, seal_mm)], True))
     n_columns = 2 if wide_mm < _FOUR_COLUMNS_MM else 4
-    rows, spans = _rows(cells, n_columns)
-    widths = [wide_mm / n_columns * pens.POINTS_PER_MM] * n_columns
-    return Table(rows, colWidths=widths, style=_style(*spans))
+    width = wide_mm * pens.POINTS_PER_MM
+    return Table([*_rows(cells, n_columns, wide_mm)], colWidths=[width], style=_PLAIN)
 
 
 def _named(drawing: Drawing, sheet: Sheet) -> Iterator[tuple[str, str]]:
@@ -449,8 +441,8 @@ def _scale_and_sheet(drawing: Drawing, sheet: Sheet) -> Iterator[tuple[list[Any]
 
 
 def _rows(
-    cells: Sequence[tuple[list[Any], bool]], n_columns: int
-) -> tuple[list[list[Any]], list[Any]]:
+    cells: Sequence[tuple[list[Any], bool]], n_columns: int, wide_mm: float
+) -> Iterator[list[Any]]:
     """Arrange cells in rows: wide ones take two columns, and the last of a row the rest of it."""
     rows: list[list[tuple[list[Any], int]]] = [[]]
     for content, is_wide in cells:
@@ -458,20 +450,14 @@ def _rows(
         if sum(taken for _, taken in rows[-1]) + span > n_columns:
             rows.append([])
         rows[-1].append((content, span))
-    table, spans = [], []
-    for number, row in enumerate(rows):
-        texts: list[Any] = [""] * n_columns
-        column = 0
-        for place, (content, span) in enumerate(row):
-            end = n_columns if place == len(row) - 1 else column + span
-            texts[column] = content
-            spans.append(("SPAN", (column, number), (end - 1, number)))
-            column = end
-        table.append(texts)
-    return table, spans
+    column = wide_mm * pens.POINTS_PER_MM / n_columns
+    for row in rows:
+        widths = [column * span for _, span in row]
+        widths[-1] += column * n_columns - sum(widths)
+        yield [Table([[content for content, _ in row]], colWidths=widths, style=_style())]
 
 
-def _style(*more: Any) -> list[Any]:
+def _style() -> list[Any]:
     black = Color(0, 0, 0)
     whole = ((0, 0), (-1, -1))
     return [
@@ -480,7 +466,6 @@ def _style(*more: Any) -> list[Any]:
         ("VALIGN", *whole, "TOP"),
         *((f"{side}PADDING", *whole, 1.2 * pens.POINTS_PER_MM) for side in ("LEFT", "RIGHT")),
         *((f"{side}PADDING", *whole, 0.6 * pens.POINTS_PER_MM) for side in ("TOP", "BOTTOM")),
-        *more,
     ]
 
 

@@ -8,18 +8,32 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 
-from orthoflow.errors import StoreError
+from orthoflow.errors import ArgumentError
 from orthoflow.files.drawings import pens
-from orthoflow.files.drawings.papers import View
-from orthoflow.files.drawings.sheet_blocks import Furniture
-from orthoflow.files.drawings.sheet_contents import Drawing, Placed, Sheet
+from orthoflow.files.drawings.sheet_blocks import Furniture, furnished
+from orthoflow.files.drawings.sheet_contents import (
+    Drawing,
+    Layout,
+    Paper,
+    Placed,
+    Sheet,
+    View,
+    cut_up,
+    paper_of,
+    placed,
+    usual_papers,
+    whole_of,
+)
 from orthoflow.files.drawings.words import label
+from orthoflow.files.sidecars import write_bytes
 from orthoflow.untrusted_text import shown
 
 _TICK_MM: Final = 1.5
@@ -35,23 +49,22 @@ def write_sheet(path: Path, drawing: Drawing, sheet: Sheet, furniture: Furniture
         StoreError: it cannot be written.
         InputError: no font has a letter of its texts.
     """
-    try:
-        with pens.sheet_canvas(path, sheet.paper) as canvas:
-            canvas.setTitle(shown(f"{drawing.text.block.project} {drawing.text.name}".strip()))
-            canvas.setAuthor(shown(drawing.text.block.author))
-            canvas.setSubject(f"1:{drawing.scale}; record sha256:{drawing.text.digest}")
-            for view in sheet.views:
-                placed = Placed(canvas=canvas, view=view, scale=drawing.scale)
-                drawing.pictures[view.kind].draw(placed)
-                _draw_around(placed, drawing, _neighbours(sheet, view))
-            furniture.draw(canvas)
-            canvas.showPage()
-            canvas.save()
-    except OSError as error:
-        raise StoreError(f"{path.name} cannot be written: {error}; free some space") from error
+    stream = BytesIO()
+    with pens.sheet_canvas(stream, sheet.paper) as canvas:
+        canvas.setTitle(shown(f"{drawing.text.block.project} {drawing.text.name}".strip()))
+        canvas.setAuthor(shown(drawing.text.block.author))
+        canvas.setSubject(f"1:{drawing.scale}; record sha256:{drawing.text.digest}")
+        for view in sheet.views:
+            placed = Placed(canvas=canvas, view=view, scale=drawing.scale)
+            drawing.pictures[view.kind].draw(placed)
+            _draw_around(placed, drawing, sheet)
+        furniture.draw(canvas)
+        canvas.showPage()
+        canvas.save()
+    write_bytes(path, stream.getvalue())
 
 
-def _draw_around(placed: Placed, drawing: Drawing, neighbours: dict[str, int]) -> None:
+def _draw_around(placed: Placed, drawing: Drawing, sheet: Sheet) -> None:
     """Draw the frame of a picture, crosses, coordinates, heights, match lines and north arrow."""
     canvas = placed.canvas
     left, bottom, right, top = placed.edges_mm
@@ -59,8 +72,8 @@ def _draw_around(placed: Placed, drawing: Drawing, neighbours: dict[str, int]) -
         _draw_grid(placed, drawing)
     corners = [(left, bottom), (right, bottom), (right, top), (left, top)]
     pens.line(canvas, corners, width_mm=pens.MEDIUM_MM, is_closed=True)
-    _draw_match_lines(placed, drawing, neighbours)
-    if drawing.heights and "right" not in neighbours:
+    _draw_match_lines(placed, drawing, sheet)
+    if drawing.heights and placed.view.part.right_m == drawing.size_m[0]:
         _draw_heights(placed, drawing)
     if drawing.north is not None:
         foot = np.array([right + 12.0, top - 14.0])
@@ -179,37 +192,124 @@ def _draw_heights(placed: Placed, drawing: Drawing) -> None:
         pens.height_mark(canvas, (right + 6.0, place), f"{value:+.2f}")
 
 
-def _neighbours(sheet: Sheet, view: View) -> dict[str, int]:
-    """Return sheets on which a part continues: side of the picture -> number."""
-    found: dict[str, int] = {}
-    part = view.part
-    for number, other in sheet.numbered:
-        is_level = (other.top_m, other.bottom_m) == (part.top_m, part.bottom_m)
-        is_below = (other.left_m, other.right_m) == (part.left_m, part.right_m)
-        if is_level and other.left_m == part.right_m:
-            found["right"] = number
-        elif is_level and other.right_m == part.left_m:
-            found["left"] = number
-        elif is_below and other.top_m == part.bottom_m:
-            found["below"] = number
-        elif is_below and other.bottom_m == part.top_m:
-            found["above"] = number
-    return found
-
-
-def _draw_match_lines(placed: Placed, drawing: Drawing, neighbours: dict[str, int]) -> None:
+def _draw_match_lines(placed: Placed, drawing: Drawing, sheet: Sheet) -> None:
     """Draw dash-dotted lines where the drawing continues, each with the number of the sheet."""
-    canvas = placed.canvas
-    left, bottom, right, top = placed.edges_mm
-    middle = (0.5 * (left + right), 0.5 * (bottom + top))
-    # Left and below they are beyond the coordinates.
-    for side, ends, at, turned_deg in (
-        ("left", [(left, bottom - 5.0), (left, top + 5.0)], (left - 6.8, middle[1]), 90.0),
-        ("right", [(right, bottom - 5.0), (right, top + 5.0)], (right + 6.0, middle[1]), 90.0),
-        ("below", [(left - 5.0, bottom), (right + 5.0, bottom)], (middle[0], bottom - 9.5), 0.0),
-        ("above", [(left - 5.0, top), (right + 5.0, top)], (middle[0], top + 3.0), 0.0),
-    ):
-        if side in neighbours:
-            pens.line(canvas, ends, width_mm=pens.WIDE_MM, dashes_mm=pens.MATCH_DASHES_MM)
-            text = label("match_line", drawing.language, number=neighbours[side])
-            pens.write_text(canvas, text, at, turned_deg=turned_deg, is_centred=True)
+    own = np.array(placed.view.part.corners_m)[[0, 2]]
+    for number, part in sheet.numbered:
+        other = np.array(part.corners_m)[[0, 2]]
+        edge = np.array([np.maximum(own[0], other[0]), np.minimum(own[1], other[1])])
+        # Neighbours share an edge, which has a length and no width.
+        along = int(np.argmax(edge[1] - edge[0]))
+        if edge[1, along] <= edge[0, along] or edge[1, 1 - along] != edge[0, 1 - along]:
+            continue
+        (left, bottom), (right, top) = np.sort(placed.on_paper(edge), axis=0).tolist()
+        middle = (0.5 * (left + right), 0.5 * (bottom + top))
+        is_before = bool(other[0, 1 - along] < own[0, 1 - along])
+        # Left and below the number is beyond the coordinates.
+        if along == 1:
+            ends, turned_deg = [(left, bottom - 5.0), (left, top + 5.0)], 90.0
+            at = (left + (-6.8 if is_before else 6.0), middle[1])
+        else:
+            ends, turned_deg = [(left - 5.0, bottom), (right + 5.0, bottom)], 0.0
+            at = (middle[0], bottom + (3.0 if is_before else -9.5))
+        pens.line(placed.canvas, ends, width_mm=pens.WIDE_MM, dashes_mm=pens.MATCH_DASHES_MM)
+        text = label("match_line", drawing.language, number=number)
+        pens.write_text(placed.canvas, text, at, turned_deg=turned_deg, is_centred=True)
+
+
+# A wall that fits on no paper is divided into sheets of this one.
+_CUT_PAPER: Final = "A1"
+#: a sheet with its pictures, and the blocks beside them
+LaidOut: TypeAlias = tuple[Sheet, Furniture]
+
+
+def fitting_scale(
+    drawn: Callable[[int], Sequence[Drawing]], scales: Sequence[int], papers: Sequence[Paper]
+) -> int:
+    """Return n of the largest scale 1 : n at which each wall fits on one sheet.
+
+    Args:
+        drawn: returns the drawings at a scale.
+        scales: largest first.
+        papers: available papers.
+    """
+    for scale in scales:
+        if all(_on_one(drawing, papers) for drawing in drawn(scale)):
+            return scale
+    return scales[-1]
+
+
+def lay_out(drawing: Drawing, given: Sequence[Paper] = ()) -> tuple[LaidOut, ...]:
+    """Place a wall on one sheet, or divide it into several of the same size.
+
+    Args:
+        drawing: the drawing.
+        given: permitted papers; without any the smallest usual one that fits the wall.
+
+    Raises:
+        ArgumentError: the title block does not fit on the paper, or the wall needs too many sheets.
+    """
+    # Key plans are omitted only if the office's paper has no room for them.
+    for is_brief in (False, True) if given else (False,):
+        if alone := _on_one(drawing, given or usual_papers(), is_brief=is_brief):
+            return (alone,)
+    paper = given[0] if given else paper_of(_CUT_PAPER)
+    for is_brief in (False, True):
+        divided = (_cut(drawing, way, is_brief=is_brief) for way in _ways(drawing, [paper]))
+        if fitting := [sheets for sheets in divided if sheets]:
+            return min(fitting, key=len)
+    raise ArgumentError(
+        f"--paper {paper.name or f'{paper.width_mm:g}x{paper.height_mm:g}'} has no room for "
+        "the title block, the legend and notes beside a picture: take a larger one, or shorten "
+        "the title block"
+    )
+
+
+def _ways(drawing: Drawing, papers: Sequence[Paper]) -> Iterator[Paper]:
+    """Yield papers, landscape before portrait, with the title block in each permitted position."""
+    given = drawing.text.block.layout
+    layouts: tuple[Layout, ...] = (given,) if given else ("column", "strip")
+    for paper in papers:
+        for turned in (paper, paper.turned):
+            yield from (replace(turned, layout=layout) for layout in layouts)
+
+
+def _on_one(drawing: Drawing, papers: Sequence[Paper], *, is_brief: bool = False) -> LaidOut | None:
+    """Return all pictures of a wall on one sheet of the first of some papers that fits."""
+    content = (tuple(drawing.pictures), whole_of(drawing.size_m))
+    for paper in _ways(drawing, papers):
+        if views := placed(*content, paper, drawing.scale):
+            sheet = Sheet(paper=paper, views=views)
+            furniture = furnished(paper, drawing, sheet, is_brief=is_brief)
+            if furniture and (views := placed(*content, furniture.paper, drawing.scale)):
+                return Sheet(paper=furniture.paper, views=views), furniture
+    return None
+
+
+def _cut(drawing: Drawing, paper: Paper, *, is_brief: bool) -> tuple[LaidOut, ...]:
+    """Return the sheets of a divided wall; none if the paper has no room for them."""
+    kinds, whole = tuple(drawing.pictures), whole_of(drawing.size_m)
+    # As much text as on any of them: with a key of several sheets.
+    view = View(kind=max(kinds, key=len), part=whole, corner_mm=(0.0, 0.0))
+    longest = Sheet(paper=paper, views=(view,), count=99, numbered=((1, whole), (2, whole)))
+    first = furnished(paper, drawing, longest, is_brief=is_brief)
+    if first is None:
+        return ()
+    grid_m = drawing.grid * drawing.unit_m
+    parts = cut_up(drawing.size_m, first.paper, scale=drawing.scale, grid_m=grid_m)
+    found = []
+    for place, kind in enumerate(kinds):
+        numbered = tuple(enumerate(parts, start=1 + place * len(parts)))
+        for number, part in numbered:
+            sheet = Sheet(
+                paper=first.paper,
+                views=placed([kind], part, first.paper, drawing.scale),
+                number=number,
+                count=len(kinds) * len(parts),
+                numbered=numbered if len(parts) > 1 else (),
+            )
+            furniture = furnished(first.paper, drawing, sheet, is_brief=is_brief)
+            if furniture is None or not sheet.views:
+                return ()
+            found.append((sheet, furniture))
+    return tuple(found)

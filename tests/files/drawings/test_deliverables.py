@@ -15,16 +15,17 @@ from click.testing import CliRunner
 from PIL import Image
 
 from orthoflow.cli.program import program
-from orthoflow.files.drawings.elevations import ElevationWall, elevation, unfolded
-from orthoflow.files.drawings.relief import (
+from orthoflow.files.drawings.printed_pictures import (
     NOTHING,
+    ElevationWall,
     Light,
+    elevation,
     shaded,
+    unfolded,
     write_depth_figure,
     write_relief,
 )
-from orthoflow.files.drawings.sheet_contents import SheetText
-from orthoflow.files.drawings.title_blocks import TitleBlock
+from orthoflow.files.drawings.sheet_contents import SheetText, TitleBlock
 from orthoflow.files.sidecars import placed_raster
 from orthoflow.geometry.frames import frame_over
 from orthoflow.records.open import open_run

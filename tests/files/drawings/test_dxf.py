@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthoflow.files.drawings.regular_openings import regular_opening
+from orthoflow.files.drawings.dxf import regular_opening
 from tests.long_loops import seeds
 
 

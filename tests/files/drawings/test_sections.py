@@ -13,12 +13,18 @@ import pdfplumber
 import pytest
 
 from orthoflow.errors import ArgumentError
-from orthoflow.files.drawings.section_files import SectionDrawing, section_sheet, write_section
-from orthoflow.files.drawings.sections import CutLine, Section, plan_cut, section_cut, section_of
-from orthoflow.files.drawings.sheet_contents import SheetText
-from orthoflow.files.drawings.sheet_layout import lay_out
-from orthoflow.files.drawings.sheets import write_sheet
-from orthoflow.files.drawings.title_blocks import TitleBlock
+from orthoflow.files.drawings.sections import (
+    CutLine,
+    Section,
+    SectionDrawing,
+    plan_cut,
+    section_cut,
+    section_of,
+    section_sheet,
+    write_section,
+)
+from orthoflow.files.drawings.sheet_contents import SheetText, TitleBlock
+from orthoflow.files.drawings.sheets import lay_out, write_sheet
 from orthoflow.products import PointCloud
 from tests.drawing_runs import AXES, CORNER, SIZE_M, box_planes, box_points
 
@@ -203,8 +209,8 @@ def test_the_files_of_a_plan_show_the_same_lines_in_scale(tmp_path: Path) -> Non
     drawn = list(document.modelspace().query("LINE[layer=='A-SECT-MCUT']"))
     lengths = sorted(line.dxf.start.distance(line.dxf.end) for line in drawn)
     assert lengths[-1] == pytest.approx(SIZE_M[0], abs=1e-6)
-    texts = " ".join(entity.dxf.text for entity in document.modelspace().query("TEXT"))
-    assert "Rzut" in texts
+    stated = dict(document.header.custom_vars.properties)
+    assert stated == {"Title": section.cut.title, "Origin": "a box"}
     # Dimensions run to the right or upwards, so that none stands on its head, beyond what is cut.
     middle = np.mean([(*line.dxf.start, *line.dxf.end) for line in drawn], axis=0)
     middle = 0.5 * (middle[:3] + middle[3:])
@@ -216,4 +222,4 @@ def test_the_files_of_a_plan_show_the_same_lines_in_scale(tmp_path: Path) -> Non
         assert outside * ((0.5 * (begin + end) - middle) @ across) > 0.0
     svg = (tmp_path / "plan_1.svg").read_text()
     left, _, right, _ = drawing.bounds_m
-    assert f'width="{max(1000 * (right - left) / 50, 160.0):g}mm"' in svg
+    assert f'width="{1000 * (right - left) / 50:.1f}mm"' in svg

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from orthoflow.errors import InputError
-from orthoflow.files.drawings.title_blocks import TitleBlock, read_title_block
+from orthoflow.files.drawings.sheet_contents import TitleBlock, read_title_block
 
 
 def read(folder: Path, text: str) -> TitleBlock:
