@@ -24,8 +24,7 @@ from orthoflow.records.open import open_run
 from orthoflow.records.runs import Run, cell_metrics
 from orthoflow.report import write_report
 from orthoflow.report.combinations import Combination, combinations_of
-from orthoflow.report.rankings import number, number_with_spread
-from orthoflow.report.rankings import Mark, Value, rank
+from orthoflow.report.rankings import Mark, Value, number, number_with_spread, rank
 
 RECIPES = ("plane-methods", "orient-methods", "ortho-methods")
 COARSE = {"room.scan_step_m": "0.004", "room.photo_gsd_m": "0.003", "wall.gsd_m": "0.006"}
