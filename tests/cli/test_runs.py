@@ -55,10 +55,9 @@ def folders(*arguments: object) -> list[str]:
 
 def test_the_table_says_when_how_good_and_in_what_runs_differ(runs: Path) -> None:
     lines = said("runs").splitlines()
-    rows = [line.split(maxsplit=7) for line in lines[1:6]]
-    assert lines[0].split() == (
-        ["folder", "started", "workflow", "status", "rmse_u_mm", "rms_mm", "differs", "in"]
-    )
+    rows = [line.split(maxsplit=8) for line in lines[1:6]]
+    shown = ["check.rmse_u_mm", "check.rms_mm", "plane.rms_mm"]
+    assert lines[0].split() == ["folder", "started", "workflow", "status", *shown, "differs", "in"]
     assert [row[0] for row in rows] == [
         "runs/other", "runs/b", "runs/a", "deep/er/c", "runs/going",
     ]  # fmt: skip
@@ -70,10 +69,11 @@ def test_the_table_says_when_how_good_and_in_what_runs_differ(runs: Path) -> Non
         "ok",
         "2.5",
         "2",
+        "9",
         "plane.cell_m=0.05",
     ]
     # Of the other workflow there is one run: nothing that it differs from.
-    assert rows[0] == ["runs/other", "2026-01-02", "07:04", "court", "ok", "4", "2"]
+    assert rows[0] == ["runs/other", "2026-01-02", "07:04", "court", "ok", "4", "2", "9"]
     assert rows[4] == ["runs/going", "2026-01-02", "11:00", "hall", "unfinished"]
     assert lines[6].startswith("runs/going unfinished: continues with the same command and -o ")
     assert lines[-1] == "5 runs"
