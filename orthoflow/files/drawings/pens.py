@@ -24,8 +24,6 @@ from orthoflow.untrusted_text import shown
 if TYPE_CHECKING:
     from reportlab.pdfgen.canvas import Canvas
 
-    from orthoflow.files.drawings.sheet_contents import Paper
-
 POINTS_PER_MM: Final = 72.0 / 25.4
 FONT: Final = "DejaVuSans"
 # ISO 128-2: each about the square root of two wider than the one before.
@@ -55,7 +53,7 @@ Colour = tuple[float, float, float]
 
 
 @contextmanager
-def sheet_canvas(stream: BytesIO, paper: Paper) -> Iterator[Canvas]:
+def sheet_canvas(stream: BytesIO, size_mm: tuple[float, float]) -> Iterator[Canvas]:
     """Open a PDF page whose unit is the millimetre."""
     from reportlab import rl_config
     from reportlab.pdfgen.canvas import Canvas
@@ -63,7 +61,7 @@ def sheet_canvas(stream: BytesIO, paper: Paper) -> Iterator[Canvas]:
     # Pictures as binary data: as text they would be a quarter larger, and slow to write.
     rl_config.useA85 = 0
     register_fonts()
-    size = (paper.width_mm * POINTS_PER_MM, paper.height_mm * POINTS_PER_MM)
+    size = tuple(POINTS_PER_MM * edge for edge in size_mm)
     canvas = Canvas(stream, pagesize=size, pageCompression=1, invariant=1)
     canvas.setCreator("orthoflow")
     yield canvas

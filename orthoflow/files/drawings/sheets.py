@@ -50,7 +50,8 @@ def write_sheet(path: Path, drawing: Drawing, sheet: Sheet, furniture: Furniture
         InputError: no font has a letter of its texts.
     """
     stream = BytesIO()
-    with pens.sheet_canvas(stream, sheet.paper) as canvas:
+    size_mm = (sheet.paper.width_mm, sheet.paper.height_mm)
+    with pens.sheet_canvas(stream, size_mm) as canvas:
         canvas.setTitle(shown(f"{drawing.text.block.project} {drawing.text.name}".strip()))
         canvas.setAuthor(shown(drawing.text.block.author))
         canvas.setSubject(f"1:{drawing.scale}; record sha256:{drawing.text.digest}")
