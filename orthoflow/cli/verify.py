@@ -44,7 +44,7 @@ def verify(run: Path, signer: Path | None, *, strict: bool, as_json: bool) -> in
 
     verification = verify_run(run, signer=signer)
     notes = verification.notes
-    failing = [note for note in notes if strict and not note.is_harmless]
+    failing = notes if strict else ()
     findings = (*verification.findings, *(f"{note.code}: {note.text}" for note in failing))
     if as_json:
         echo_json(

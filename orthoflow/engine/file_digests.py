@@ -95,22 +95,15 @@ class FileDigests:
         )
 
     def note_place(self, sha256: str, path: Path) -> None:
-        """Record where a run found a file, unless it is still at an earlier path."""
-        earlier, place = self.place(sha256), path.absolute()
-        if earlier is None or (earlier != place and not self._is_known(earlier, sha256)):
-            self._places[sha256] = str(place)
-            self._is_dirty = True
+        """Record where a run found a file."""
+        place = str(path.absolute())
+        self._is_dirty |= self._places.get(sha256) != place
+        self._places[sha256] = place
 
     def place(self, sha256: str) -> Path | None:
         """Return where a file of that digest was, which may be gone or changed since."""
         place = self._places.get(sha256)
         return None if place is None else Path(place)
-
-    def _is_known(self, path: Path, sha256: str) -> bool:
-        try:
-            return self._known.get(file_identity(path)) == sha256
-        except (OSError, ValueError):
-            return False
 
     def save(self) -> None:
         """Save new digests for the next run.

@@ -33,7 +33,6 @@ from orthoflow.engine.measuring import (
     GIB,
     MIB,
     memory_shortage,
-    oom_kills,
     process_memory,
     tree_memory,
 )
@@ -313,7 +312,7 @@ class _Step:
         opened = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW
         with writing_to(Path(task.log).parent):
             os.close(os.open(task.log, opened, 0o666))
-        self._started, self._oom_kills = now(), oom_kills()
+        self._started = now()
         self.clock = time.monotonic()
         self.reason: OrthoflowError | None = None
         self.is_victim = False
@@ -375,8 +374,6 @@ class _Step:
 
     def _reason_of_silence(self, log: str) -> OrthoflowError:
         code = self.process.exitcode or 0
-        if code == -signal.SIGKILL and oom_kills() > self._oom_kills:
-            return describe_memory(self.task.who, self.peak_bytes)
         tail = one_line(log.strip().rpartition("\n")[2], _LONGEST_LAST_LINE)
         return StepFailedError(describe_exit(self.task.who, code, self.peak_bytes, tail))
 

@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Callable
 from functools import wraps
-from pathlib import Path
 from typing import Any, Final, Self, cast
 
 import psutil
@@ -49,15 +48,6 @@ def memory_shortage() -> int:
     memory = psutil.virtual_memory()
     floor = min(max(512 * MIB, memory.total * 3 // 100), memory.total // 8)
     return floor if memory.available <= floor else 0
-
-
-def oom_kills() -> int:
-    """Return how often the kernel has killed processes for lack of memory since it started."""
-    try:
-        lines = Path("/proc/vmstat").read_text(encoding="ascii").splitlines()
-    except OSError:
-        return 0
-    return sum(int(line.split()[1]) for line in lines if line.startswith("oom_kill "))
 
 
 def is_for_want_of_memory(error: BaseException) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -429,37 +430,18 @@ class RunComparison:
     products: tuple[ProductDistance, ...]
 
     def __repr__(self) -> str:
-        counted = {
+        rows = {
             "inputs": Difference.of(self.inputs),
             "parameters": Difference.of(self.shared(self.parameters)),
             "metrics": Difference.of(self.measured),
         }
-        differing = [
-            f"{one.n_different} of {one.n_shared} {name}"
-            + (f" ({one.n_rounded} more by rounding)" if one.n_rounded else "")
-            for name, one in counted.items()
-            if one.n_shared
-        ]
-        apart = [
-            name
-            for name, one in counted.items()
-            if not one.n_shared and (name != "inputs" or self.inputs)
-        ]
-        n_products = sum(item.verdict == "different" for item in self.products)
-        n_unknown = sum(item.verdict == "not measured" for item in self.products)
-        unknown = f" ({n_unknown} more not measured)" if n_unknown else ""
-        if self.products:
-            differing.append(f"{n_products}{unknown} of {len(self.products)} products")
-        else:
-            apart.append("products")
-        n_alone = sum(not row.is_shared for row in self.cells)
-        parts = (
-            f"{', '.join(differing)} differ" if differing else "",
-            f"no {', '.join(apart)} in common" if apart else "",
-            f"{n_alone} steps in one of them only" if n_alone else "",
-        )
+        parts = [f"{one.n_different} of {one.n_shared} {name}" for name, one in rows.items()]
+        verdicts = Counter(item.verdict for item in self.products)
+        parts.append(f"{verdicts['different']} of {len(self.products)} products differ")
+        parts.append(f"{verdicts['not measured']} products not measured")
+        parts.append(f"{sum(not row.is_shared for row in self.cells)} steps in one run only")
         runs = f"{self.left.run_id!r} and {self.right.run_id!r}"
-        return f"<RunComparison of {runs}: {'; '.join(filter(None, parts))}>"
+        return f"<RunComparison of {runs}: {', '.join(parts)}>"
 
     @property
     def measured(self) -> tuple[Pair[ComparedMetric], ...]:

@@ -26,13 +26,11 @@ from orthoflow_provenance.record import OpenRecord, open_record
 from orthoflow_provenance.verify import verify_record
 from pydantic import BaseModel, ValidationError
 
-from orthoflow.engine.journal import JOURNAL, LOGS
 from orthoflow.errors import ArgumentError, InputError, PluginError, RecordError
 from orthoflow.geometry.threads import in_order
 from orthoflow.products import Inspection
 from orthoflow.products.product import Payload
 from orthoflow.records.runs import (
-    FIGURES_FOLDER,
     PAGES_FOLDER,
     PRODUCTS_FOLDER,
     REPORT_FILE,
@@ -245,12 +243,8 @@ def _key_bytes(path: Path) -> bytes:
         raise InputError(f"the key file {path} cannot be read: {error.strerror}") from error
 
 
-# Pages that show the record; its digests would have to be in it.
-_VIEWS: Final = (REPORT_FILE, PAGES_FOLDER, FIGURES_FOLDER)
 # Contradictions within a record: it may have been written like that.
 _OWN_FAULTS: Final = frozenset({"field", "name", "key", "reference"})
-# A crate has its description, two files of the workflow and one per environment.
-_UNCOVERED_MOST: Final = 8
 # Before the names of findings in metrics.
 _OF_WALLS: Final = re.compile(r"(all|(wall|floor|ceiling)_\d+)_")
 # Before the digests at the end of a page.
@@ -269,17 +263,12 @@ class Note:
 
     Attributes:
         code: `missing` or `foreign` published files, a `page` that is not of this record or was
-            changed, a `signature` that was not checked; or `uncovered` files of other programs.
+            changed, or a `signature` that was not checked.
         text: one sentence.
     """
 
-    code: Literal["missing", "foreign", "page", "signature", "uncovered"]
+    code: Literal["missing", "foreign", "page", "signature"]
     text: str
-
-    @property
-    def is_harmless(self) -> bool:
-        """Whether a strict check ignores it."""
-        return self.code == "uncovered"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -496,23 +485,17 @@ def _published_notes(path: Path, record: RunRecord, missing: list[str]) -> Itera
         if len(missing) == n_published:
             # A record that is passed on alone is among unrelated files.
             return
-    unnamed, others = _unnamed(path, record)
-    if unnamed:
-        rest = first_few(unnamed, most=_UNCOVERED_MOST)
+    if unnamed := _unnamed(path, record):
+        rest = first_few(unnamed)
         yield Note(
             code="foreign", text=f"the record does not name {rest}, among its published files"
         )
-    if others:
-        rest = first_few(others, most=_UNCOVERED_MOST)
-        yield Note(code="uncovered", text=f"not covered by the record: {rest}")
 
 
-def _unnamed(path: Path, record: RunRecord) -> tuple[list[str], list[str]]:
-    """Return files that a record does not name: below `products/`, and beside it; sorted."""
-    known = {path.name, f"{path.name}{SIGNATURE_SUFFIX}", PRODUCTS_FOLDER, JOURNAL, LOGS, *_VIEWS}
-    _, folders, files = next(os.walk(path.parent), ("", [], []))
+def _unnamed(path: Path, record: RunRecord) -> list[str]:
+    """Return the files below `products/` that a record does not name, sorted."""
     named = {file.path for file in record.published}
     unnamed: set[str] = set()
     for place, _, below in os.walk(path.parent / PRODUCTS_FOLDER):
         unnamed |= {Path(place, name).relative_to(path.parent).as_posix() for name in below}
-    return sorted(unnamed - named), sorted({*folders, *files} - known)
+    return sorted(unnamed - named)

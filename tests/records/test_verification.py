@@ -89,8 +89,6 @@ def test_files_beside_a_record_are_counted_and_named(folder: Path) -> None:
     # A record that travels alone.
     (note,) = checked(folder, "gone").notes
     assert note.code == "missing"
-    (folder / "notes.txt").touch()
-    assert {note.code for note in checked(folder, "same").notes} == {"foreign", "uncovered"}
 
 
 def test_a_page_is_of_one_record_and_as_it_was_written(tmp_path: Path) -> None:
