@@ -29,7 +29,6 @@ from orthoflow_provenance.document import (
     sha256_text,
 )
 from orthoflow_provenance.hdf5 import (
-    check_format,
     create_file,
     create_group,
     fixed_text,
@@ -229,8 +228,7 @@ def read_product_file(path: Path, *, map_arrays: bool = True) -> StoredPayload:
         RecordFormatError: the file is damaged, of another format or a newer one.
         OSError: the file cannot be opened.
     """
-    with safe_open(path) as file:
-        check_format(file, PRODUCT_FORMAT)
+    with safe_open(path, PRODUCT_FORMAT) as file:
         return read_payload(open_group(file, PRODUCT_GROUP), map_arrays=map_arrays)
 
 

@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 
 from orthoflow_provenance.document import (
     FORMAT_VERSION,
-    PRODUCT_FORMAT,
-    RUN_FORMAT,
     LockedFileError,
     RecordFormatError,
     UnknownFormatError,
@@ -59,7 +57,7 @@ _LARGEST_RATIO: Final = 1100
 _ALWAYS_ALLOWED_BYTES: Final = 64 << 20
 _LARGEST_CHUNK_BYTES: Final = 64 << 20
 _LARGEST_ATTRIBUTE_BYTES: Final = 1 << 20
-_LONGEST_FORMAT_BYTES: Final = 256
+_LONGEST_NAME: Final = 256
 # Nobody packs what is this small and read at once; more would be a flood from a few bytes.
 _PACKED_BYTES_MOST: Final = 4 << 20
 # Groups, datasets and attributes; a cell with its products has some fifty.
@@ -314,12 +312,12 @@ def create_group(parent: h5py.Group, name: str) -> h5py.Group:
 
 
 @contextmanager
-def safe_open(path: Path) -> Iterator[h5py.File]:
-    """Open an HDF5 file for reading after looking at every object in it.
+def safe_open(path: Path, format_name: str) -> Iterator[h5py.File]:
+    """Open a file of a format for reading, after a check of every object in it.
 
     Raises:
-        UnknownFormatError: the file is no HDF5 file, or something of the following is so because
-            another program or another version wrote it.
+        UnknownFormatError: the file is no HDF5 file, or another program or another version of the
+            format wrote it.
         LockedFileError: the file is open for writing elsewhere, or was left so by a crash.
         RecordFormatError: the file is damaged, or holds links other than hard links, an object
             that is reached twice or has an impossible name, external or virtual storage, filters
@@ -331,11 +329,8 @@ def safe_open(path: Path) -> Iterator[h5py.File]:
     with reading(path.name):
         file = h5py.File(path, "r", locking=False)
     try:
-        try:
-            _Inspection(file, path).run()
-        except RecordFormatError as error:
-            # What a file is comes before what is forbidden in it.
-            raise _unknown(file) or error from error
+        _require_format(file, path.name, format_name)
+        _Inspection(file, path).run()
         yield file
     finally:
         file.close()
@@ -361,21 +356,14 @@ def bytes_behind_end(path: Path) -> int:
     return path.stat().st_size - int.from_bytes(start[28:36], "little")
 
 
-def check_format(file: h5py.File, name: str) -> None:
-    """Refuse files of another format, or of another version of this one.
-
-    Raises:
-        UnknownFormatError: the file is such a one.
-    """
-    file_name = Path(file.filename).name
-    try:
-        found = text_attribute(file, "format")
-        version = text_attribute(file, "format_version")
-    except RecordFormatError as error:
+def _require_format(file: h5py.File, file_name: str, name: str) -> None:
+    """Refuse a file of another program, or of another version of the format."""
+    with reading(file_name):
+        found, version = (_short_text(file, one) for one in ("format", "format_version"))
+    if found is None or version is None:
         raise UnknownFormatError(
-            f"{file_name} must be of format {name}, but it names no format: it was not written by "
-            "orthoflow, or it is damaged"
-        ) from error
+            f"{file_name} is not a record of orthoflow: it does not name that format; give a run.h5"
+        )
     if found != name:
         raise UnknownFormatError(f"{file_name} must be of format {name}, got {found!r}")
     if version != FORMAT_VERSION:
@@ -385,33 +373,14 @@ def check_format(file: h5py.File, name: str) -> None:
         )
 
 
-def _unknown(file: h5py.File) -> UnknownFormatError | None:
-    """Return that a refused file is of another program or version; None for one of ours."""
-    try:
-        if not all(_is_short_text(file, name) for name in (b"format", b"format_version")):
-            name = Path(file.filename).name
-            return UnknownFormatError(
-                f"{name} is not a record of orthoflow: it does not name that format; give a run.h5"
-            )
-        is_product = text_attribute(file, "format") == PRODUCT_FORMAT
-        check_format(file, PRODUCT_FORMAT if is_product else RUN_FORMAT)
-    except UnknownFormatError as error:
-        return error
-    except (RecordFormatError, *HDF5_ERRORS):
+def _short_text(file: h5py.File, name: str) -> str | None:
+    """Read an attribute that nobody has checked: None unless it is a short text as we write it."""
+    if not h5py.h5a.exists(file.id, name.encode()):
         return None
-    return None
-
-
-def _is_short_text(file: h5py.File, name: bytes) -> bool:
-    """Whether an attribute is text as records have it: of fixed length, so that it may be read."""
-    if not h5py.h5a.exists(file.id, name):
-        return False
-    kind = h5py.h5a.open(file.id, name).get_type()
-    return (
-        kind.get_class() == h5py.h5t.STRING
-        and _is_plain(kind)
-        and kind.get_size() <= _LONGEST_FORMAT_BYTES
-    )
+    attribute = h5py.h5a.open(file.id, name.encode())
+    kind = attribute.get_type()
+    is_text = kind.get_class() == h5py.h5t.STRING and _is_plain(kind) and attribute.shape == ()
+    return text_attribute(file, name) if is_text and kind.get_size() <= _LONGEST_NAME else None
 
 
 class _Inspection:

@@ -30,6 +30,7 @@ from orthoflow_provenance.arrays import (
 from orthoflow_provenance.document import (
     DIGEST_PREFIX,
     FORMAT_VERSION,
+    PRODUCT_FORMAT,
     RUN_FORMAT,
     InputFileError,
     RecordedCell,
@@ -44,7 +45,6 @@ from orthoflow_provenance.document import (
 )
 from orthoflow_provenance.hdf5 import (
     attribute_value,
-    check_format,
     create_file,
     create_group,
     dataset_of,
@@ -165,7 +165,7 @@ def write_record(
     _check_names(written)
     text = document_text(written)
     with ExitStack() as stack:
-        before = stack.enter_context(safe_open(earlier)) if earlier else None
+        before = stack.enter_context(safe_open(earlier, RUN_FORMAT)) if earlier else None
         file = stack.enter_context(create_file(part))
         for name, node in expected_nodes(written, text).items():
             _write_node(file, name, node)
@@ -207,8 +207,7 @@ def open_record(path: Path) -> Iterator[OpenRecord]:
         RecordFormatError: the file is no record, damaged, incomplete, or of another format.
         OSError: the file cannot be opened.
     """
-    with safe_open(path) as file:
-        check_format(file, RUN_FORMAT)
+    with safe_open(path, RUN_FORMAT) as file:
         yield OpenRecord(
             record=record_of(file), content_sha256=text_attribute(file, CONTENT_SHA256), file=file
         )
@@ -327,7 +326,7 @@ def extract_files(
         OSError: a file cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    with safe_open(path) as opened:
+    with safe_open(path, RUN_FORMAT) as opened:
         return {
             entry.name: tuple(_extracted(opened, entry, folder))
             for entry in inputs
@@ -510,7 +509,7 @@ def _embed_product(
         raise RecordFormatError(
             f"the product {digest} is not in the store any more: run the workflow again"
         )
-    with safe_open(path) as source:
+    with safe_open(path, PRODUCT_FORMAT) as source:
         _copy_product(products, digest, open_group(source, PRODUCT_GROUP))
 
 

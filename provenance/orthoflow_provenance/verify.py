@@ -30,7 +30,6 @@ from orthoflow_provenance.document import (
 from orthoflow_provenance.hdf5 import (
     HDF5_ERRORS,
     bytes_behind_end,
-    check_format,
     dataset_of,
     open_group,
     read_text,
@@ -90,8 +89,7 @@ def verify_record(path: Path, *, with_arrays: bool = True) -> tuple[Finding, ...
         What was found, in the order of the checks; empty when the record is whole and unchanged.
     """
     try:
-        with safe_open(path) as file:
-            check_format(file, RUN_FORMAT)
+        with safe_open(path, RUN_FORMAT) as file:
             found = list(_document_findings(file, with_arrays=with_arrays))
             # Last: what was changed has been named where it can be.
             found += _seal_findings(file, path) if with_arrays else ()

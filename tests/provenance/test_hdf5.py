@@ -142,7 +142,7 @@ def test_forbidden_files_are_refused_with_a_sentence(
     with h5py.File(path, "w", libver=("v110", "v110")) as file:
         make(file)
         set_attributes(file, **NAMED)
-    with pytest.raises(RecordFormatError) as refusal, safe_open(path):
+    with pytest.raises(RecordFormatError) as refusal, safe_open(path, RUN_FORMAT):
         pass
     assert str(refusal.value).startswith("stranger.h5")
     assert message in str(refusal.value)
@@ -163,7 +163,10 @@ def test_datasets_that_share_their_bytes_are_refused(tmp_path: Path) -> None:
     for old, new in ((other, start), (len(content), length)):
         content = content.replace(old.to_bytes(8, "little"), new.to_bytes(8, "little"))
     path.write_bytes(content[:length])
-    with pytest.raises(RecordFormatError, match="declare more than the file can"), safe_open(path):
+    with (
+        pytest.raises(RecordFormatError, match="declare more than the file can"),
+        safe_open(path, RUN_FORMAT),
+    ):
         pass
 
 
@@ -173,8 +176,9 @@ def test_well_packed_data_of_any_size_is_allowed(tmp_path: Path) -> None:
         file.create_dataset(
             "a", data=np.zeros(80 << 20, dtype=np.uint8), chunks=(1 << 20,), compression=9
         )
+        set_attributes(file, **NAMED)
         assert file["a"].nbytes > 500 * file["a"].id.get_storage_size()
-    with safe_open(path) as file:
+    with safe_open(path, RUN_FORMAT) as file:
         assert file["a"].shape == (80 << 20,)
 
 
@@ -186,11 +190,11 @@ def test_more_objects_than_any_record_has_are_refused(
             file.create_group(str(index)).attrs["a"] = index
         set_attributes(file, **NAMED)
     monkeypatch.setattr("orthoflow_provenance.hdf5.MAX_OBJECTS", 23)
-    with safe_open(tmp_path / "a.h5"):
+    with safe_open(tmp_path / "a.h5", RUN_FORMAT):
         pass
     monkeypatch.setattr("orthoflow_provenance.hdf5.MAX_OBJECTS", 22)
     refused = pytest.raises(RecordFormatError, match="more than 22 groups and attributes")
-    with refused, safe_open(tmp_path / "a.h5"):
+    with refused, safe_open(tmp_path / "a.h5", RUN_FORMAT):
         pass
 
 
@@ -200,7 +204,8 @@ def test_tables_and_texts_that_unpack_to_much_are_not_read(tmp_path: Path) -> No
     with h5py.File(path, "w") as file:
         file.create_dataset("packed", data=rows, chunks=(1 << 20,), compression=9)
         file.create_dataset("plain", data=rows[:1000], chunks=(1000,), compression=9)
-    with safe_open(path) as file:
+        set_attributes(file, **NAMED)
+    with safe_open(path, RUN_FORMAT) as file:
         with pytest.raises(RecordFormatError, match=r"/packed unpacks to 5242880 bytes: texts, ta"):
             read_whole(file["packed"])
         assert np.shape(read_whole(file["plain"])) == (1000,)
@@ -233,11 +238,12 @@ def test_a_file_is_refused_from_just_beyond_each_limit_on(
     for over in (0, 1):
         with h5py.File(path, "w", libver=("v110", "v110")) as file:
             make(file, over)
+            set_attributes(file, **NAMED)
         if over:
-            with pytest.raises(RecordFormatError), safe_open(path):
+            with pytest.raises(RecordFormatError), safe_open(path, RUN_FORMAT):
                 pass
         else:
-            with safe_open(path):
+            with safe_open(path, RUN_FORMAT):
                 pass
 
 
@@ -248,7 +254,10 @@ def test_a_file_open_for_writing_or_left_so_is_locked_and_not_damaged(tmp_path: 
         for state in ("open", "left"):
             if state == "left":
                 content = path.read_bytes()
-            with pytest.raises(LockedFileError, match=r"h5clear -s run\.h5"), safe_open(path):
+            with (
+                pytest.raises(LockedFileError, match=r"h5clear -s run\.h5"),
+                safe_open(path, RUN_FORMAT),
+            ):
                 pass
             file.flush()
     path.write_bytes(content)

@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from orthoflow_provenance import record as module
 from orthoflow_provenance.arrays import payload_digest
 from orthoflow_provenance.document import (
+    RUN_FORMAT,
     InputFileError,
     PublishedFile,
     RecordedCell,
@@ -99,7 +100,7 @@ def test_equal_runs_give_equal_files(tmp_path: Path) -> None:
     path, record, shelf = write_sample(tmp_path)
     seal = write_record(tmp_path / "again.h5", record, shelf.find)
     assert (tmp_path / "again.h5").read_bytes() == path.read_bytes()
-    with safe_open(path) as file:
+    with safe_open(path, RUN_FORMAT) as file:
         assert file.attrs["content_sha256"] == seal.encode()
 
 
