@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.metadata import version
 from typing import TYPE_CHECKING, ClassVar, Final, Literal
 
 import numpy as np
@@ -11,7 +12,7 @@ from orthoflow.errors import MethodError
 from orthoflow.products import Camera, Cameras, JsonValue, Photos, PointCloud, Ties, Walls
 from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, MetricSpec, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
-from orthoflow_plugins.match.pictures import one_by_one, opencv_version, require_photos
+from orthoflow_plugins.match.pictures import one_by_one, require_photos
 from orthoflow_plugins.match.ties import (
     paper_ties,
     ties_by_hand_alone,
@@ -146,7 +147,7 @@ class MatchGuided(Method):
     @classmethod
     def tools(cls) -> dict[str, str]:
         """OpenCV warps and filters."""
-        return opencv_version()
+        return {"opencv-python-headless": version("opencv-python-headless")}
 
 
 def _traced(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from typing import Final, TypeVar
 
 import numpy as np
@@ -13,7 +12,6 @@ from orthoflow.errors import MethodError
 from orthoflow.geometry.threads import in_order
 from orthoflow.products import Photos, Wall, Walls
 
-_OPENCV: Final = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless")
 # Each thread takes up to a gigabyte for its picture.
 _MAX_AT_ONCE: Final = 4
 CLIP_LIMIT: Final = 3.0
@@ -213,13 +211,3 @@ def one_by_one(
     workers = max(1, min(cores, _MAX_AT_ONCE))
     cv2.setNumThreads(max(1, cores // workers))
     yield from in_order(function, items, threads=workers)
-
-
-def opencv_version() -> dict[str, str]:
-    """Return name and version of the installed distribution of OpenCV."""
-    for name in _OPENCV:
-        try:
-            return {name: version(name)}
-        except PackageNotFoundError:
-            continue
-    return {}

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from importlib.metadata import version
 from typing import ClassVar, Final
 
 import numpy as np
@@ -37,7 +38,6 @@ from orthoflow_plugins.match.key_points import (
 from orthoflow_plugins.match.pictures import (
     filled_smoothly,
     one_by_one,
-    opencv_version,
     require_photos,
 )
 
@@ -179,7 +179,7 @@ class FaceByPhotos(Method):
     @classmethod
     def tools(cls) -> dict[str, str]:
         """OpenCV detects and describes key points."""
-        return opencv_version()
+        return {"opencv-python-headless": version("opencv-python-headless")}
 
 
 def _is_decided(front: int, behind: int) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from importlib.metadata import version
 from typing import TYPE_CHECKING, ClassVar, Final, Literal
 
 import numpy as np
@@ -22,7 +23,7 @@ from orthoflow_plugins.match.key_points import (
     pair_in_colours,
     wall_features,
 )
-from orthoflow_plugins.match.pictures import one_by_one, opencv_version, require_photos
+from orthoflow_plugins.match.pictures import one_by_one, require_photos
 from orthoflow_plugins.match.ties import (
     TiePiece,
     key_point_ties,
@@ -142,7 +143,7 @@ class MatchSift(Method):
     @classmethod
     def tools(cls) -> dict[str, str]:
         """OpenCV detects and describes key points."""
-        return opencv_version()
+        return {"opencv-python-headless": version("opencv-python-headless")}
 
 
 def _matched(

@@ -253,8 +253,10 @@ def _report_block(
     ctx.metric("sigma0", covariance.sigma0, "1")
     ctx.metric("redundancy", covariance.redundancy, "1")
     ctx.metric("n_photo_points", adjusted.n_tie_points, "1")
-    if math.isfinite(adjusted.tie_rmse_px):
-        ctx.metric("photo_tie_rmse_px", adjusted.tie_rmse_px, "px")
+    n_ties = len(adjusted.ties_px)
+    if n_ties:
+        rmse_px = math.sqrt(float(np.mean(adjusted.ties_px**2)) / 2.0)
+        ctx.metric("photo_tie_rmse_px", rmse_px, "px")
     return {
         "sigma0": covariance.sigma0,
         "redundancy": covariance.redundancy,
@@ -262,8 +264,8 @@ def _report_block(
         "lens_statistics": lens_statistics(block),
         "photo_ties": {
             "n_points": adjusted.n_tie_points,
-            "n_observations": adjusted.n_tie_observations,
-            "sigma_px": adjusted.tie_sigma_px if np.isfinite(adjusted.tie_sigma_px) else None,
+            "n_observations": n_ties,
+            "sigma_px": adjusted.tie_sigma_px if n_ties else None,
         },
     }
 
@@ -277,19 +279,17 @@ class Adjusted:
         covariance: of all unknowns.
         estimates: one per photo, in the world.
         tie_sigma_px: standard deviation of a coordinate of a tie between photos, in pixels of the
-            picture in which it was found; NaN without ties.
-        tie_rmse_px: root mean square of their residual coordinates, photo pixels; NaN without ties.
+            picture in which it was found.
+        ties_px: (m,) lengths of the residuals of these ties, photo pixels.
         n_tie_points: points that the scan does not contain.
-        n_tie_observations: observations of these points.
     """
 
     block: Block
     covariance: BlockCovariance
     estimates: tuple[Estimate, ...]
     tie_sigma_px: float
-    tie_rmse_px: float
+    ties_px: NDArray[np.float64]
     n_tie_points: int
-    n_tie_observations: int
 
 
 @dataclass(kw_only=True)
@@ -360,7 +360,6 @@ def adjust_block(
         ):
             break
     covariance = block_covariance(block, soft_limit=SOFT_LIMIT)
-    kept_px = lengths_px[used.tie_active]
     return Adjusted(
         block=block,
         covariance=covariance,
@@ -375,10 +374,9 @@ def adjust_block(
             )
             for at, (item, fit, limit) in enumerate(zip(photos, fits, weights.limits, strict=True))
         ),
-        tie_sigma_px=used.tie_sigma if len(kept_px) else math.nan,
-        tie_rmse_px=float(np.sqrt(np.mean(kept_px**2) / 2.0)) if len(kept_px) else math.nan,
+        tie_sigma_px=used.tie_sigma,
+        ties_px=lengths_px[used.tie_active],
         n_tie_points=len(np.unique(ties.point[used.tie_active])),
-        n_tie_observations=int(used.tie_active.sum()),
     )
 
 

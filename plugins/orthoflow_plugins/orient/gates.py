@@ -22,7 +22,7 @@ from orthoflow.geometry.resection import (
     pixels_by_point,
     predicted_covariances,
 )
-from orthoflow.products import Photo, Ties, plane_name
+from orthoflow.products import Photo, Ties, TieWall, plane_name
 from orthoflow.sdk import DiagnosticSpec
 from orthoflow_plugins.orient.pose import (
     UNKNOWN,
@@ -83,15 +83,25 @@ class WallError:
 
 def known_walls(ties: Ties, chosen: NDArray[np.bool_]) -> list[KnownWall]:
     """Describe the walls of some ties, by their matcher if it does, else by the points."""
-    walls = []
-    for index in np.unique(ties.wall[chosen & (ties.wall >= 0)]):
-        if int(index) < len(ties.walls):
-            walls.append(_described(int(index), ties))
-        else:
-            points = ties.points_world[chosen & (ties.wall == index)]
-            if len(points) >= 3:
-                walls.append(_fitted(int(index), points))
-    return walls
+    known = []
+    for index in np.unique(ties.wall[chosen & (ties.wall >= 0)]).tolist():
+        has_side = index < len(ties.walls)
+        points = ties.points_world[chosen & (ties.wall == index)]
+        if not has_side and len(points) < 3:
+            continue
+        wall, number = ties.walls[index] if has_side else _about(points), ties.number(index)
+        known.append(
+            KnownWall(
+                index=index,
+                number=number,
+                name=wall.name or plane_name("wall", number),
+                corners_world=np.array(wall.corners_world, dtype=np.float64),
+                normal=np.array(wall.normal_world, dtype=np.float64),
+                gsd_m=wall.gsd_m,
+                has_side=has_side,
+            )
+        )
+    return known
 
 
 def wall_error(resection: Resection, walls: Sequence[KnownWall]) -> WallError | None:
@@ -193,34 +203,16 @@ def _seen(
     return pixels
 
 
-def _described(index: int, ties: Ties) -> KnownWall:
-    wall, number = ties.walls[index], ties.number(index)
-    return KnownWall(
-        index=index,
-        number=number,
-        name=wall.name or plane_name("wall", number),
-        corners_world=np.array(wall.corners_world, dtype=np.float64),
-        normal=np.array(wall.normal_world, dtype=np.float64),
-        gsd_m=wall.gsd_m,
-        has_side=True,
-    )
-
-
-def _fitted(index: int, points: NDArray[np.float64]) -> KnownWall:
-    """Return the bounding rectangle of points in their own plane, the side unknown."""
+def _about(points: NDArray[np.float64]) -> TieWall:
+    """Describe the bounding rectangle of points in their own plane."""
     middle = points.mean(axis=0)
     axes = np.linalg.svd(points - middle, full_matrices=False)[2]
     local = (points - middle) @ axes[:2].T
     low, high = local.min(axis=0), local.max(axis=0)
     order = np.array([[low[0], low[1]], [low[0], high[1]], high, [high[0], low[1]]])
-    return KnownWall(
-        index=index,
-        number=index,
-        name=plane_name("wall", index),
-        corners_world=middle + order @ axes[:2],
-        normal=axes[2],
-        gsd_m=None,
-        has_side=False,
+    return TieWall(
+        corners_world=tuple(map(tuple, (middle + order @ axes[:2]).tolist())),
+        normal_world=tuple(axes[2].tolist()),
     )
 
 

@@ -151,12 +151,6 @@ def test_a_lens_with_more_distortion_than_the_model_has_is_stated_wider(
     assert np.sqrt(np.mean(np.square(at_worst))) < 2.5
 
 
-def test_control_points_in_a_plane_are_refused(tmp_path: Path) -> None:
-    flat = ties_of(DISTORTED, 1, relief_m=0.0)
-    found = orient(flat, ms.photos(photo()), context(tmp_path), distortion="k1")
-    assert "within 0.0 mm (RMS) of one plane" in found.cameras[0].status
-
-
 def test_without_a_prior_what_exif_says_does_not_matter(tmp_path: Path) -> None:
     ties, found = ties_of(DISTORTED, 2), {}
     for prior in ("lens", "none"):

@@ -52,19 +52,6 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_model_gives_the_poses_of_the_photos_by_name(folder: Path) -> None:
-    write_colmap_model(folder / "given", oriented(name="A.JPG"))
-    photos = ms.photos(replace(PHOTO, name="a.jpg"), replace(PHOTO, name="b.jpg"))
-    cameras, warnings = read(folder, photos)
-    first, second = cameras.cameras
-    assert first.status == "ok"
-    assert first.intrinsics is not None
-    assert first.intrinsics.source == "given"
-    assert ms.wall_error_m(SCENE, first.viewing(), CAMERA) < 1e-9
-    assert second.status == "the files of given cameras do not mention it"
-    assert warnings == [f"photo b.jpg is not oriented: {second.status}"]
-
-
 @pytest.mark.parametrize(
     ("camera", "name", "photo", "reason"),
     [
