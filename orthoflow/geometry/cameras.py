@@ -200,24 +200,16 @@ def undistorted(
         (3, n) rows: x / z, y / z, and the last step, which stays large where the distortion cannot
         be undone.
     """
-    k1, k2, p1, p2, k3 = distortion
     found = np.empty((3, len(wanted_a)))
     a, b, last_step = found
     a[:], b[:], last_step[:] = wanted_a, wanted_b, 0.0
     with np.errstate(all="ignore"):
         for _ in range(_ITERATIONS):
-            aa, ab, bb = a * a, a * b, b * b
-            r2 = aa + bb
-            radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-            slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))  # d radial / d r2, times 2
-            error_a = a * radial + 2.0 * p1 * ab + p2 * (r2 + 2.0 * aa) - wanted_a
-            error_b = b * radial + p1 * (r2 + 2.0 * bb) + 2.0 * p2 * ab - wanted_b
-            slope_a = radial + aa * slope + 2.0 * p1 * b + 6.0 * p2 * a
-            slope_b = radial + bb * slope + 6.0 * p1 * b + 2.0 * p2 * a
-            mixed = ab * slope + 2.0 * p1 * a + 2.0 * p2 * b
-            determinant = slope_a * slope_b - mixed * mixed
-            step_a = (slope_b * error_a - mixed * error_b) / determinant
-            step_b = (slope_a * error_b - mixed * error_a) / determinant
+            bent = _bent(a, b, distortion)
+            error_a, error_b = bent.a - wanted_a, bent.b - wanted_b
+            determinant = bent.a_by_a * bent.b_by_b - bent.a_by_b**2
+            step_a = (bent.b_by_b * error_a - bent.a_by_b * error_b) / determinant
+            step_b = (bent.a_by_a * error_b - bent.a_by_b * error_a) / determinant
             a -= step_a
             b -= step_b
             np.maximum(np.abs(step_a), np.abs(step_b), out=last_step)
@@ -455,15 +447,16 @@ def _bent(a: NDArray[np.float64], b: NDArray[np.float64], distortion: NDArray[np
     if not distortion.any():
         return _Bent(a=a, b=b, a_by_a=1.0, a_by_b=0.0, b_by_b=1.0)
     k1, k2, p1, p2, k3 = distortion
-    r2 = a * a + b * b
+    aa, ab, bb = a * a, a * b, b * b
+    r2 = aa + bb
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))
+    slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))  # d radial / d r2, times 2
     return _Bent(
-        a=a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a),
-        b=b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b,
-        a_by_a=radial + a * a * slope + 2.0 * p1 * b + 6.0 * p2 * a,
-        a_by_b=a * b * slope + 2.0 * p1 * a + 2.0 * p2 * b,
-        b_by_b=radial + b * b * slope + 6.0 * p1 * b + 2.0 * p2 * a,
+        a=a * radial + 2.0 * p1 * ab + p2 * (r2 + 2.0 * aa),
+        b=b * radial + p1 * (r2 + 2.0 * bb) + 2.0 * p2 * ab,
+        a_by_a=radial + aa * slope + 2.0 * p1 * b + 6.0 * p2 * a,
+        a_by_b=ab * slope + 2.0 * p1 * a + 2.0 * p2 * b,
+        b_by_b=radial + bb * slope + 6.0 * p1 * b + 2.0 * p2 * a,
     )
 
 

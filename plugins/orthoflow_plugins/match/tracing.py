@@ -179,15 +179,8 @@ def trace_photo(
         # The pose of one content is the start of the next.
         start = (view, _FIRST_RADIUS_CELLS) if found is None else (found[1], _MIN_RADIUS)
         tried = _traced(start, setup, content, lens)
-        if found is not None:
-            new, old = tried[0], found[0]
-            if new.held_out_px and old.held_out_px:
-                is_better = _promised(new) < _promised(old)
-            else:
-                is_better = new.n_ties > old.n_ties
-            if not is_better:
-                continue
-        found = tried
+        if found is None or _rank(tried[0]) < _rank(found[0]):
+            found = tried
     assert found is not None  # noqa: S101 - there is at least one content
     return replace(found[0], camera=camera)
 
@@ -203,13 +196,13 @@ def estimated_lens(photo: Photo, found: Intrinsics | None) -> LensFreedom | None
     return photo.lens_prior()[1]
 
 
-def _promised(trace: Trace) -> float:
-    """Return the held-out error over the root of the number of ties and over their spread."""
-    pixels = joined(trace.pieces).pixels_photo
-    if len(pixels) < _LEAST:
-        return math.inf
-    spread_px = math.sqrt(math.sqrt(max(float(np.linalg.det(np.cov(pixels.T))), 1.0)))
-    return min(trace.held_out_px) / (math.sqrt(len(pixels)) * spread_px)
+def _rank(trace: Trace) -> tuple[float, int]:
+    """Rank by the held-out error over the root of the number of ties and over their spread."""
+    pixels, error = joined(trace.pieces).pixels_photo, math.inf
+    if len(pixels) >= _LEAST and trace.held_out_px:
+        spread_px = math.sqrt(math.sqrt(max(float(np.linalg.det(np.cov(pixels.T))), 1.0)))
+        error = min(trace.held_out_px) / (math.sqrt(len(pixels)) * spread_px)
+    return error, -len(pixels)
 
 
 def _traced(

@@ -226,8 +226,6 @@ def _places(pixels: NDArray[np.float64] | Sequence[NDArray[np.float64]]) -> str:
 
 
 _SEED_LIMIT: Final = 2**31 - 1
-# More ties of a photo do not improve its pose.
-_MAX_TIES: Final = 20_000
 # Check points are drawn evenly from a grid with this many cells a side.
 _STRATA: Final = 6
 # Photos of a lens by which its EXIF is tested.
@@ -308,7 +306,8 @@ def tied_photo(
     """Choose the ties of a photo and split them into control and check."""
     # Drawn for every photo, so that its samples do not depend on the ties of others.
     own = np.random.default_rng(int(rng.integers(_SEED_LIMIT)))
-    chosen = _usable(ties, photo.name)
+    chosen = ties_of_photo(ties, photo.name)
+    chosen = chosen[ties.role[chosen] != TieRole.REJECTED]
     seen = SeenPoints(
         pixels_photo=ties.pixels_photo[chosen],
         points_world=ties.points_world[chosen],
@@ -580,16 +579,3 @@ def refused(tied: TiedPhoto, reason: str) -> Oriented:
         role=np.full(n_ties, TieRole.REJECTED, dtype=np.uint8),
         residuals_px=np.full((n_ties, 2), np.nan),
     )
-
-
-def _usable(ties: Ties, name: str) -> NDArray[np.intp]:
-    """Return the ties of a photo that the matcher did not reject, thinned evenly."""
-    mine = ties_of_photo(ties, name)
-    mine = np.asarray(mine[ties.role[mine] != TieRole.REJECTED], dtype=np.intp)
-    if len(mine) <= _MAX_TIES:
-        return mine
-    thinned = np.floor(np.arange(_MAX_TIES) * len(mine) / _MAX_TIES).astype(np.intp)
-    kept = np.asarray(mine[thinned], dtype=np.intp)
-    if ties.by_hand is not None:
-        kept = np.union1d(kept, mine[ties.by_hand[mine] > 0])
-    return kept
