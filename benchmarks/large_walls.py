@@ -1,13 +1,12 @@
-"""Measure the processing of large walls: the surface `tin`, and inspections of an orthoimage.
+"""Measure the processing of large walls: inspections of an orthoimage and of openings.
 
-    python benchmarks/large_walls.py FOLDER [--side 10000] [--only tin surf checkpoints openings]
+    python benchmarks/large_walls.py FOLDER [--side 10000] [--only surf checkpoints openings]
 
-makes a wall of side x side cells in FOLDER, with points in two of three cells, a window of 400
-cells and one of 900, and an orthoimage and an intensity with the same waves, displaced by half a
-cell. A second wall has a niche, which is detected (`segment.openings`) and inspected
-(`inspect.openings`). Each method runs in its own process on memory-mapped files. The output is the
-processor time and the anonymous memory of each; the exit code is 1 if a number differs from its
-true value.
+makes a wall of side x side cells in FOLDER, an orthoimage and an intensity with the same waves,
+displaced by half a cell. A second wall has a niche, which is detected (`segment.openings`) and
+inspected (`inspect.openings`). Each method runs in its own process on memory-mapped files. The
+output is the processor time and the anonymous memory of each; the exit code is 1 if a number
+differs from its true value.
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ from numpy.typing import DTypeLike, NDArray
 from orthoflow_plugins.inspect.checkpoints import InspectCheckpoints
 from orthoflow_plugins.inspect.openings import InspectOpenings
 from orthoflow_plugins.inspect.surf import InspectSurf
-from orthoflow_plugins.raster.grid import RasterGrid
 from orthoflow_plugins.segment.openings import SegmentOpenings
 from orthoflow_plugins.simulate.building import Paint, SceneDraft, wall_side
 from plane_streaming import measured
@@ -35,8 +33,6 @@ from orthoflow.products import (
     CheckPoints,
     Orthoimage,
     Orthoimages,
-    Planes,
-    PointCloud,
     SurfaceMask,
     Wall,
     Walls,
@@ -54,12 +50,7 @@ PAINT = Paint(kind=TextureKind.PLAIN, rgb=(200, 200, 200), reflectance=0.5)
 
 def main() -> None:
     """Run each method in its own process; with --run, run one in this process."""
-    methods = {
-        "tin": run_tin,
-        "surf": run_surf,
-        "checkpoints": run_checkpoints,
-        "openings": run_openings,
-    }
+    methods = {"surf": run_surf, "checkpoints": run_checkpoints, "openings": run_openings}
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
@@ -81,40 +72,6 @@ def main() -> None:
             f"{cost.cpu_s:.0f} s, anonymous {cost.anonymous_mib:.0f} MiB",
             flush=True,
         )
-
-
-def run_tin(folder: Path, side: int) -> None:
-    """Triangulate the wall; the narrow window is closed, the wide one is not."""
-    windows = [(side // 4, 400), (side // 2, 900)]
-    axes = [new(folder, axis, (side * side,), np.float32) for axis in "xyz"]
-    rng, count = np.random.default_rng(3), 0
-    for first in range(0, side, ROWS_AT_ONCE):
-        rows, columns = np.mgrid[first : min(first + ROWS_AT_ONCE, side), :side]
-        has_point = rng.random(rows.shape) < 0.67
-        for corner, width in windows:
-            inside = [(corner <= place) & (place < corner + width) for place in (rows, columns)]
-            has_point &= ~(inside[0] & inside[1])
-        down, right = (place[has_point] + rng.random(has_point.sum()) for place in (rows, columns))
-        part = slice(count, count + len(down))
-        depth_m = 0.01 * np.sin(right / 90.0)
-        for array, values in zip(
-            axes, (GSD_M * right, -depth_m, GSD_M * (side - down)), strict=True
-        ):
-            array[part] = values
-        count = part.stop
-    x, y, z = (axis[:count] for axis in axes)
-    cloud = PointCloud(origin=np.zeros(3), x=x, y=y, z=z, up=UP)
-    inputs = RasterGrid.In(cloud=cloud, planes=plane(side))
-    params = RasterGrid.Params(gsd_m=GSD_M, buffer_m=0.05, surface="tin", rectangle="points")
-    ctx = StepContext(rng=rng, cores=2, scratch=folder)
-    (wall,) = RasterGrid().run(inputs, params, ctx).walls.walls
-    middles = [wall.mask[corner + width // 2, corner + width // 2] for corner, width in windows]
-    expect("the window of 400 cells is closed", is_met=bool(middles[0] == SurfaceMask.RECOVERED))
-    if count > 2_000_000:
-        expect("the window of 900 cells stays open", is_met=bool(middles[1] == SurfaceMask.VOID))
-    row = wall.depth_m[side // 8]
-    apart = np.nanmax(np.abs(row - 0.01 * np.sin((np.arange(side) + 0.5) / 90.0)))
-    expect(f"depths are within 0.1 mm, not {1e3 * apart:.3f}", is_met=bool(apart < 1e-4))
 
 
 def run_surf(folder: Path, side: int) -> None:
@@ -263,20 +220,6 @@ def frame(side: int) -> WallFrame:
         gsd_m=GSD_M,
         width=side,
         height=side,
-    )
-
-
-def plane(side: int) -> Planes:
-    """Return the plane of the wall."""
-    return Planes(
-        normal=np.array([[0.0, -1.0, 0.0]]),
-        offset=np.zeros(1),
-        covariance=np.zeros((1, 4, 4)),
-        corners=frame(side).corners_world()[np.newaxis],
-        n_points=np.array([1]),
-        rms_m=np.zeros(1),
-        names=("wall",),
-        up=UP,
     )
 
 

@@ -38,7 +38,6 @@ from orthoflow_plugins.raster.reporting import (
     report_tones,
     warn,
     warn_of_covered,
-    warn_of_wide_gaps,
 )
 from orthoflow_plugins.raster.selection import (
     chosen_planes,
@@ -90,6 +89,7 @@ class RasterGrid(Method):
 
     id: ClassVar[str] = "raster.grid"
     determinism: ClassVar[Determinism] = "exact"
+    result_version: ClassVar[int] = 2
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_walls", label="walls"),
         # Which wall is the first.
@@ -148,7 +148,7 @@ class RasterGrid(Method):
             )
             for index, frame in frames.items()
         }
-        require_memory(list(frames.values()))
+        require_memory(list(frames.values()), is_tin=params.surface == "tin")
         walls: list[Wall] = []
         empty: list[Emptiness] = []
         sight = Sight(points=points, stations=cloud.stations)
@@ -182,8 +182,6 @@ class RasterGrid(Method):
             )
         steps_m = [scan_step_m(wall.count, gsd_m=wall.frame.gsd_m) for wall in walls]
         warn(ctx, walls, steps_m, source)
-        if params.surface == "tin":
-            warn_of_wide_gaps(ctx, walls)
         report(ctx, walls, steps_m[0], planes.up)
         report_empty(ctx, walls, empty)
         report_tones(ctx, walls, cloud)

@@ -31,8 +31,6 @@ _LEFT_OUT_WORTH_WORDS: Final = 0.05
 _SHARE_LEAST: Final = 0.0005
 # If cells with points have this many, no cell is empty because cells are too small.
 _DENSE_POINTS: Final = 4.0
-# A triangulation leaves a few void cells along the border of every wall.
-_VOID_WORTH_WORDS: Final = 0.01
 
 FRONT_LEFT_OUT: Final = DiagnosticSpec(
     code="wall-front-left-out",
@@ -120,13 +118,6 @@ CLOSE_CELLS: Final = DiagnosticSpec(
     "{measured:.0%} of the cells have a point, {interpolated:.0%} are interpolated{empty}",
     remedy="{remedy}",
     rank_by="interpolated",
-)
-WIDE_GAPS: Final = DiagnosticSpec(
-    code="surface-with-wide-gaps",
-    severity="warning",
-    text="{subject}: surface tin spans no gap wider than about {n_cells} cells ({gap_m:.3g} m) "
-    "where more than {n_most} cells of a wall have points, here {n_measured}",
-    remedy="raise {step}.gsd_m to close wider ones",
 )
 _CAUSES: Final = {
     "behind": BEHIND_BUFFER,
@@ -234,24 +225,6 @@ def warn_of_covered(ctx: StepContext, names: Sequence[str], covered: Mapping[int
     for wall in sorted(set(covered.values())):
         left_out = [names[index] for index, shown_by in covered.items() if shown_by == wall]
         ctx.report(COVERED, subject=names[wall], included=", ".join(left_out))
-
-
-def warn_of_wide_gaps(ctx: StepContext, walls: Sequence[Wall]) -> None:
-    """Report which gaps the surface tin leaves open on large walls."""
-    from orthoflow_plugins.raster.nets import SPAN_MOST_CELLS, VERTICES_MOST
-
-    for wall in walls:
-        n_measured = int(np.count_nonzero(wall.count))
-        n_void = count_cells(wall.mask, SurfaceMask.VOID)
-        if n_measured > VERTICES_MOST and n_void >= _VOID_WORTH_WORDS * wall.mask.size:
-            ctx.report(
-                WIDE_GAPS,
-                subject=wall.name,
-                n_cells=SPAN_MOST_CELLS,
-                gap_m=SPAN_MOST_CELLS * wall.frame.gsd_m,
-                n_most=VERTICES_MOST,
-                n_measured=n_measured,
-            )
 
 
 def report(ctx: StepContext, walls: Sequence[Wall], step_m: float, up: NDArray[np.float64]) -> None:

@@ -30,7 +30,7 @@ from orthoflow.geometry.slabs import Slab, read_only
 from orthoflow.geometry.threads import in_parts
 from orthoflow.products import PointCloud, SurfaceMask
 from orthoflow_plugins.raster import kernels
-from orthoflow_plugins.raster.nets import NO_POINT, Net, Vertices, interpolate_net
+from orthoflow_plugins.raster.nets import NO_POINT, interpolate_net
 from orthoflow_plugins.raster.parameters import RasterParams
 
 # A cell takes the values of one of its points, not the mean of several.
@@ -97,25 +97,17 @@ class CellSurface:
     has_rgb: NDArray[np.bool_] | None = None
 
 
-def surface_of(
-    cloud: PointCloud,
-    slab: Slab,
-    params: RasterParams,
-    net: Net | None = None,
-    *,
-    threads: int,
-) -> CellSurface:
+def surface_of(cloud: PointCloud, slab: Slab, params: RasterParams, *, threads: int) -> CellSurface:
     """Bin a cloud into the raster of a wall.
 
     Args:
         cloud: the points.
         slab: of the wall, or of a part of it.
         params: how depths follow from points.
-        net: triangulation for the surface tin over these cells, if the slab is a part.
         threads: number of threads.
     """
     if params.surface in ONE_POINT:
-        surface = _surface_of_winners(cloud, slab, params, net, threads=threads)
+        surface = _surface_of_winners(cloud, slab, params, threads=threads)
     else:
         surface = _surface_of_all(cloud, slab, params, threads=threads)
     if not params.percentiles:
@@ -156,7 +148,7 @@ def carried_to_centres(
 
 
 def _surface_of_winners(
-    cloud: PointCloud, slab: Slab, params: RasterParams, net: Net | None, *, threads: int
+    cloud: PointCloud, slab: Slab, params: RasterParams, *, threads: int
 ) -> CellSurface:
     """One pass: the winning point gives depth, intensity and colour."""
     winners = empty_winners(slab.n_cells)
@@ -184,7 +176,8 @@ def _surface_of_winners(
     )
     if params.surface != "tin":
         return surface
-    net = net or interpolate_net(cloud, slab, _vertices(winners, slab))
+    vertices = np.where(winners["n_points"] > 0, winners["point"], NO_POINT)
+    net = interpolate_net(cloud, slab, vertices, winners["depth_m"])
     # The values of the triangulation at the centres replace those of points in cells.
     is_known = np.isfinite(net.depth_m)[:, np.newaxis]
     places = np.where(is_known, np.float32(0.0), np.float32(np.nan)).repeat(2, 1)
@@ -211,22 +204,6 @@ def _contest(
         )
     keep = keep_topmost if params.surface == "topmost" else keep_nearest
     return partial(keep, entries, winners)
-
-
-def vertices_of(cloud: PointCloud, slab: Slab, params: RasterParams, *, threads: int) -> Vertices:
-    """Return the points nearest to the centres of their cells, the vertices of the surface tin."""
-    winners = empty_winners(slab.n_cells)
-    for entries in entries_inside(cloud, slab, threads=threads):
-        share_cells(threads, _contest(cloud, slab, params, entries, winners))
-    return _vertices(winners, slab)
-
-
-def _vertices(winners: NDArray[np.void], slab: Slab) -> Vertices:
-    has_point = winners["n_points"] > 0
-    return Vertices(
-        point=np.where(has_point, winners["point"], NO_POINT).reshape(slab.frame.shape),
-        depth_m=winners["depth_m"].reshape(slab.frame.shape),
-    )
 
 
 def _surface_of_all(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import Any, Final, cast
 
 import numpy as np
 import psutil
@@ -17,12 +17,11 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Planes, PointCloud, SurfaceMask, Wall
 from orthoflow_plugins.raster.parameters import RasterParams
 
-if TYPE_CHECKING:
-    from orthoflow_plugins.raster.nets import Net
-
 # Bytes per cell: of a finished wall, and additionally during the passes over one wall.
 _BYTES_KEPT: Final = 25
 _BYTES_WORKING: Final = 90
+# Per vertex of a triangulation, which has no bands.
+_BYTES_VERTEX: Final = 700
 _MEMORY_SHARE: Final = 0.75
 # Larger walls are rastered in bands of this many cells: 1.5 GB of memory.
 _BAND_CELLS: Final = 1 << 24
@@ -30,7 +29,7 @@ _BAND_CELLS: Final = 1 << 24
 _REACH_OF_OUTLIERS: Final = 32
 
 
-def require_memory(frames: Sequence[WallFrame]) -> None:
+def require_memory(frames: Sequence[WallFrame], *, is_tin: bool = False) -> None:
     """Refuse cells that are too fine for the machine.
 
     Raises:
@@ -39,8 +38,9 @@ def require_memory(frames: Sequence[WallFrame]) -> None:
     sizes = [frame.width * frame.height for frame in frames]
     # A large wall is kept in files when finished; processed in bands it takes the memory of a band.
     kept = sum(size for size in sizes if size <= IN_MEMORY_CELLS)
-    working = min(max(sizes), _BAND_CELLS)
-    needed = _BYTES_KEPT * kept + _BYTES_WORKING * working
+    needed = _BYTES_KEPT * kept + _BYTES_WORKING * min(max(sizes), _BAND_CELLS)
+    if is_tin:
+        needed = _BYTES_KEPT * kept + (_BYTES_WORKING + _BYTES_VERTEX) * max(sizes)
     memory = psutil.virtual_memory().total
     # Cells are numbered with 32 bits.
     if needed > _MEMORY_SHARE * memory or max(sizes) > np.iinfo(np.int32).max:
@@ -76,22 +76,17 @@ def rastered_wall(
     from orthoflow_plugins.raster.surfaces import SPAN_GAPS
 
     frame, width = slab.frame, slab.frame.width
-    is_large = slab.n_cells > _BAND_CELLS
-    net = None
-    if is_large and params.surface == "tin":
-        net = _net_in_bands(cloud, slab, params, allocate, threads=threads)
+    cells_most = _BAND_CELLS + (slab.n_cells if params.surface == "tin" else 0)
     # Noise is filtered twice, and a gap is as wide as what spans it plus a disc on either side and
     # a margin, between which it is interpolated.
     reach_rows = _REACH_OF_OUTLIERS + 2 * params.denoise_cells
     reach_rows += (SPAN_GAPS + 2) * params.recover_gap_cells + 2
     whole: dict[str, NDArray[np.generic]] = {}
-    for band in bands_with_reach(frame.shape, cells_most=_BAND_CELLS, reach_rows=reach_rows):
-        around = slice(band.around.start * width, band.around.stop * width)
-        part = None if net is None else net.part(around)
-        found = _rastered(cloud, slab.over(band.around), params, part, threads=threads)
+    for band in bands_with_reach(frame.shape, cells_most=cells_most, reach_rows=reach_rows):
+        found = _rastered(cloud, slab.over(band.around), params, threads=threads)
         for name, values in found.items():
             shape = (*frame.shape, *values.shape[1:])
-            if slab.n_cells <= min(IN_MEMORY_CELLS, _BAND_CELLS):
+            if slab.n_cells <= min(IN_MEMORY_CELLS, cells_most):
                 whole[name] = values.reshape(shape)
                 continue
             if name not in whole:
@@ -107,14 +102,13 @@ def _rastered(
     cloud: PointCloud,
     slab: Slab,
     params: RasterParams,
-    net: Net | None,
     *,
     threads: int,
 ) -> dict[str, NDArray[np.generic]]:
     """Return the arrays of a `Wall` over a slab, flat over the cells."""
     from orthoflow_plugins.raster.surfaces import carried_to_centres, close_gaps, surface_of
 
-    surface = surface_of(cloud, slab, params, net, threads=threads)
+    surface = surface_of(cloud, slab, params, threads=threads)
     mask = close_gaps(cloud, slab, surface, params, threads=threads)
     surface = carried_to_centres(surface, slab, params, threads=threads)
     intensity, rgb, rgb_mask = surface.intensity, surface.rgb, None
@@ -136,27 +130,3 @@ def _rastered(
         "percentiles_m": surface.percentiles_m,
     }
     return {name: values for name, values in found.items() if values is not None}
-
-
-def _net_in_bands(
-    cloud: PointCloud,
-    slab: Slab,
-    params: RasterParams,
-    allocate: Allocate,
-    *,
-    threads: int,
-) -> Net:
-    """Triangulate a large wall: its vertices are found band by band, and are kept in files."""
-    from orthoflow_plugins.raster.nets import Vertices, interpolate_net
-    from orthoflow_plugins.raster.surfaces import vertices_of
-
-    shape = slab.frame.shape
-    vertices = Vertices(
-        point=np.asarray(allocate("net_point", shape, np.uint32), np.uint32),
-        depth_m=np.asarray(allocate("net_corner_m", shape, np.float32), np.float32),
-    )
-    for band in bands_with_reach(shape, cells_most=_BAND_CELLS, reach_rows=0):
-        found = vertices_of(cloud, slab.over(band.rows), params, threads=threads)
-        vertices.point[band.rows] = found.point
-        vertices.depth_m[band.rows] = found.depth_m
-    return interpolate_net(cloud, slab, vertices, allocate)

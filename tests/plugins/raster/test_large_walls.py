@@ -20,7 +20,7 @@ from orthoflow_plugins.raster.grid import RasterGrid
 from orthoflow.files import geotiff, images, publishing
 from orthoflow.geometry import bands
 from orthoflow.geometry.bands import count_cells, count_known, holds_cells
-from orthoflow.products import Layer, LayerMask, Layers, SurfaceMask, Walls
+from orthoflow.products import Layer, LayerMask, Layers, Walls
 from tests import inspect_scenes, ortho_scenes, raster_scenes
 from tests.long_loops import long_only
 from tests.plugins.ortho.test_direct import bare_walls
@@ -272,34 +272,6 @@ def test_walls_are_rastered_and_reported_in_the_memory_of_a_band(tmp_path: Path)
         walls = RasterGrid().run(inputs, params, context(tmp_path)).walls
         # A wall keeps 13 bytes per cell without colours, and a band has a fifteenth of the cells.
         assert peak() < 10.0 * walls.walls[0].mask.size, peak()
-
-
-def test_a_net_of_triangles_is_laid_over_a_large_wall_in_bands(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    known = raster_scenes.leaning_wall(shape=(900, 300))
-    places = np.random.default_rng(7).uniform([0, 0], [300, 900], (60_000, 2))
-    # A window over the border of two bands.
-    places = places[(np.abs(places - [150, 420]) > [20, 30]).any(axis=1)]
-    points = known.world(*places.T, 0.01 * np.sin(places[:, 0] / 7.0))
-    rgb = np.full((len(places), 3), 90, dtype=np.uint8)
-    inputs = RasterGrid.In(cloud=raster_scenes.cloud_of(points, rgb=rgb), planes=known.planes())
-    params = RasterGrid.Params(gsd_m=known.gsd_m, buffer_m=0.3, surface="tin")
-    whole = RasterGrid().run(inputs, params, context(tmp_path)).walls.walls[0]
-    monkeypatch.setattr("orthoflow_plugins.raster.walls._BAND_CELLS", 1 << 16)
-    monkeypatch.setattr("orthoflow_plugins.raster.nets.VERTICES_MOST", 1 << 13)
-    monkeypatch.setattr("orthoflow_plugins.raster.nets._TILE_CELLS", 256)
-    ctx = context(tmp_path)
-    with peak_bytes() as peak:
-        banded = RasterGrid().run(inputs, params, ctx).walls.walls[0]
-        # A band of 65 000 cells takes 90 bytes of each, a tile some hundred of its corners.
-        assert peak() < 40e6, peak()
-    for name in ("count", "mask", "rgb"):
-        np.testing.assert_array_equal(getattr(banded, name), getattr(whole, name), err_msg=name)
-    np.testing.assert_allclose(banded.depth_m, whole.depth_m, rtol=0, atol=1e-7)
-    assert (banded.mask[395:445, 135:165] == SurfaceMask.RECOVERED).all()
-    wider = [text for text in ctx.warnings if "wider than" in text]
-    assert wider == []
 
 
 def test_cells_are_counted_in_bands_as_in_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:

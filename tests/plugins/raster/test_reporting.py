@@ -203,17 +203,3 @@ def test_larger_cells_are_advised_only_where_cells_lack_points(
     (one,) = ctx.diagnostics
     assert ("gsd_m" in one.remedy) != is_dense
     assert "recover_gap_cells" in one.remedy
-
-
-def test_gaps_that_a_net_of_triangles_leaves_open_are_told(
-    ctx: StepContext, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("orthoflow_plugins.raster.nets.VERTICES_MOST", 3)
-    large = wall([[1, 1], [1, 1], [0, 0]])
-    closed = wall([[1, 1], [1, 1], [0, 0]], mask=[[1, 1], [1, 1], [2, 2]])
-    small = wall([[1, 1], [1, 0]])
-    # A hundredth of a wall may stay open.
-    nearly = wall([[0] + [1] * 199])
-    reporting.warn_of_wide_gaps(ctx, [large, closed, small, nearly])
-    (said,) = ctx.diagnostics
-    assert (said.subject, said.values["gap_m"], said.values["n_measured"]) == ("wall 0", 0.64, 4)

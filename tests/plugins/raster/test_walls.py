@@ -26,11 +26,13 @@ def with_memory(monkeypatch: pytest.MonkeyPatch, n_bytes: float) -> None:
     monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)
 
 
-def needed_bytes(monkeypatch: pytest.MonkeyPatch, *frames: WallFrame) -> float:
+def needed_bytes(
+    monkeypatch: pytest.MonkeyPatch, *frames: WallFrame, is_tin: bool = False
+) -> float:
     """What some walls are said to need."""
     with_memory(monkeypatch, 4096.0)
     with pytest.raises(MethodError, match="raise gsd_m, or lower n_walls_max") as caught:
-        require_memory(frames)
+        require_memory(frames, is_tin=is_tin)
     found = re.search(r"which need ([0-9.e+-]+) GiB", str(caught.value))
     assert found is not None
     return float(found[1]) * 2.0**30
@@ -50,6 +52,8 @@ def test_a_wall_in_bands_takes_the_memory_of_a_band(monkeypatch: pytest.MonkeyPa
     huge, larger = frame(8000, 20_000), frame(8000, 40_000)
     assert huge.width * huge.height > IN_MEMORY_CELLS
     assert needed_bytes(monkeypatch, huge) == needed_bytes(monkeypatch, larger)
+    tins = [needed_bytes(monkeypatch, one, is_tin=True) for one in (huge, larger)]
+    assert tins[1] - tins[0] == pytest.approx(790 * 8000 * 20_000, rel=0.01)
 
 
 def test_no_wall_has_more_cells_than_32_bits_count(monkeypatch: pytest.MonkeyPatch) -> None:
