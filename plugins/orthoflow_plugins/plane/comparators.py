@@ -28,6 +28,13 @@ if TYPE_CHECKING:
 
 # Minimum number of points of a candidate as a share of those that a plane needs.
 PART_SHARE: Final = 0.2
+# open3d's defaults: spread of the normals in a patch, its flatness (90 is flat) and its share of
+# points off the plane.
+_NORMAL_VARIANCE_DEG: Final = 60.0
+_COPLANARITY_DEG: Final = 75.0
+_OUTLIER_SHARE: Final = 0.75
+# Neighbours for normals and growing.
+_NEIGHBOURS: Final = 30
 
 
 # Any: the library has no types.
@@ -165,23 +172,9 @@ class Open3dPatches(_Open3dMethod):
         ),
     )
 
-    class Params(DetectorParams):
-        """Parameters; the last three have the meaning that open3d gives them."""
+    Params = DetectorParams
 
-        n_neighbours: int = Field(
-            30, ge=3, le=1000, description="Points of a neighbourhood, for normals and growing."
-        )
-        normal_variance_deg: float = Field(
-            60.0, gt=0.0, lt=90.0, description="Maximum spread of the normals in a patch."
-        )
-        coplanarity_deg: float = Field(
-            75.0, gt=0.0, lt=90.0, description="How flat a patch must be; 90 is perfectly flat."
-        )
-        outlier_share: float = Field(
-            0.75, gt=0.0, lt=1.0, description="Maximum share of points off the plane of a patch."
-        )
-
-    def run(self, inputs: DetectorIn, params: Params, ctx: StepContext) -> DetectorOut:
+    def run(self, inputs: DetectorIn, params: DetectorParams, ctx: StepContext) -> DetectorOut:
         """Detect the planes of a cloud."""
         from orthoflow_plugins.plane.search import detect
 
@@ -193,7 +186,7 @@ class PatchProposer:
     """Proposes the patches of `detect_planar_patches`, by the number of points in their boxes."""
 
     # Any: the library has no types.
-    def __init__(self, search: Search, params: Open3dPatches.Params, open3d: Any) -> None:
+    def __init__(self, search: Search, params: DetectorParams, open3d: Any) -> None:
         """Find all patches at once.
 
         Raises:
@@ -202,20 +195,20 @@ class PatchProposer:
         points_m = search.cloud.sample.offsets_m
         cloud = open3d.geometry.PointCloud()
         cloud.points = open3d.utility.Vector3dVector(points_m)
-        neighbours = open3d.geometry.KDTreeSearchParamKNN(knn=params.n_neighbours)
+        neighbours = open3d.geometry.KDTreeSearchParamKNN(knn=_NEIGHBOURS)
         try:
             cloud.estimate_normals(neighbours)
             boxes = cloud.detect_planar_patches(
-                normal_variance_threshold_deg=params.normal_variance_deg,
-                coplanarity_deg=params.coplanarity_deg,
-                outlier_ratio=params.outlier_share,
+                normal_variance_threshold_deg=_NORMAL_VARIANCE_DEG,
+                coplanarity_deg=_COPLANARITY_DEG,
+                outlier_ratio=_OUTLIER_SHARE,
                 min_num_points=max(10, int(PART_SHARE * search.least_points)),
                 search_param=neighbours,
             )
         except RuntimeError as error:
             raise MethodError(
                 f"open3d's detect_planar_patches failed on the {len(points_m)} points "
-                f"({str(error).splitlines()[0]}): try another n_neighbours or thinning"
+                f"({str(error).splitlines()[0]}): try another thinning"
             ) from error
         self._candidates = []
         for box in boxes:

@@ -43,21 +43,11 @@ class RasterParams(MethodParams):
     )
     surface: Literal["median", "denoised", "nearest", "centre", "topmost", "mean", "tin"] = Field(
         default="median",
-        description="Depth of a cell: median of its best supported layer, without "
-        "outliers; the same denoised, with steps preserved; of the nearest point, also "
-        "of the next "
-        "cells (markiewicz2015); of its point nearest the centre; of the topmost point "
-        "(skarlatos2012); mean of all; or tin, a triangulation, "
+        description="Depth of a cell: median of the layer with most points (layers are more than "
+        "2 cm apart), without outliers; the same denoised, with steps preserved; of the "
+        "nearest point, also of the next cells (markiewicz2015); of its point nearest "
+        "the centre; of the topmost point (skarlatos2012); mean of all; or tin, a triangulation, "
         "which closes windows (for comparison).",
-    )
-    denoise_cells: int = Field(
-        default=4, ge=0, le=20, description="Radius of the filter of surface denoised."
-    )
-    layer_m: float = Field(
-        default=0.02,
-        gt=0,
-        description="Depth step within a cell that separates two layers, of which the median "
-        "takes the one with more points.",
     )
     percentiles: tuple[Annotated[float, Field(ge=0, le=100)], ...] = Field(
         default=(),
@@ -82,7 +72,7 @@ class RasterParams(MethodParams):
         le=10,
         description="Where the scan's rows and columns are known, void cells between points so "
         "many rows or columns apart are recovered first, linear between them, if the points "
-        "lie on one surface (layer_m) and at most four times recover_gap_cells apart.",
+        "lie on one layer and at most four times recover_gap_cells apart.",
     )
     constraint: Constraint = Field(
         default="any", description="Raster only vertical, only horizontal, or any planes."

@@ -35,6 +35,10 @@ from orthoflow_plugins.raster.parameters import RasterParams
 
 # A cell takes the values of one of its points, not the mean of several.
 ONE_POINT: Final = frozenset({"nearest", "centre", "topmost", "tin"})
+# Layers within a cell are more than this apart.
+LAYER_M: Final = 0.02
+# Radius of the filter of the surface denoised.
+DENOISE_CELLS: Final = 4
 # Temporary arrays are limited to this many cells.
 CELLS_AT_ONCE: Final = 1 << 20
 # Maximum distance of neighbours in the scan, in radii of a narrow gap.
@@ -132,7 +136,7 @@ def carried_to_centres(
     rgb = None if surface.rgb is None else surface.rgb.copy()
     interpolate(
         few,
-        Surroundings(surface.places, slab.frame.width, params.layer_m),
+        Surroundings(surface.places, slab.frame.width, LAYER_M),
         cell_values(surface.depth_m, intensity=surface.intensity, rgb=surface.rgb),
         cell_values(np.empty(0, dtype=np.float32), intensity=intensity, rgb=rgb),
         reach_cells=0.0,
@@ -218,14 +222,14 @@ def _surface_of_all(
     sigma_m = _spread_m(count, moments)
     del moments  # A third of what is held here, and what follows takes more.
     if params.surface != "mean":
-        layer_m, gsd_m = params.layer_m, slab.frame.gsd_m
+        layer_m, gsd_m = LAYER_M, slab.frame.gsd_m
         depth_m = np.empty(count.size, dtype=np.float32)
         for cells, depths_m, ends in _grouped(cloud, slab, count, threads=threads):
             _sort_depths(depths_m, ends, depth_m[cells], layer_m, threads=threads)
         raster_m = depth_m.reshape(slab.frame.shape)
         raster_m = without_specks(raster_m, gsd_m=gsd_m, layer_m=layer_m, threads=threads)
         if params.surface == "denoised":
-            raster_m = denoised(raster_m, params.denoise_cells)
+            raster_m = denoised(raster_m, DENOISE_CELLS)
         depth_m = raster_m.ravel()
     few = kernels.FewPoints(
         n_inside=count,
@@ -547,7 +551,7 @@ def close_gaps(
     values = cell_values(surface.depth_m, intensity=surface.intensity, rgb=surface.rgb)
     is_found = interpolate(
         narrow,
-        Surroundings(surface.places, slab.frame.width, params.layer_m),
+        Surroundings(surface.places, slab.frame.width, LAYER_M),
         values,
         values,
         reach_cells=reach_cells,
@@ -590,7 +594,7 @@ def _recover_between_neighbours(
     window = np.ones((2 * span_cells + 1,) * 2, dtype=np.uint8)
     near = cv2.dilate(is_void.reshape(slab.frame.shape).view(np.uint8), window)
     is_near = np.asarray(near, dtype=np.bool_).ravel()
-    chosen = _points_on(cloud, slab, surface, is_near, params.layer_m, threads=threads)
+    chosen = _points_on(cloud, slab, surface, is_near, LAYER_M, threads=threads)
     for step in range(1, params.recover_scan_steps + 1):
         sums = kernels.Sums(
             n=np.zeros(n_cells, dtype=np.uint16),
@@ -598,7 +602,7 @@ def _recover_between_neighbours(
             intensity=np.zeros(n_cells if intensity.size else 0, dtype=np.float32),
             rgb=np.zeros((n_cells if rgb.size else 0, 3), dtype=np.float32),
         )
-        reach = kernels.Reach(step, float(span_cells), params.layer_m)
+        reach = kernels.Reach(step, float(span_cells), LAYER_M)
         for points in _grids(cloud, chosen):
             grid = kernels.ScanGrid(points, offsets, matrix)
             voids = is_void.reshape(slab.frame.shape)

@@ -73,13 +73,13 @@ def rastered_wall(
         allocate: returns the arrays of a large wall, by name.
         threads: number of threads.
     """
-    from orthoflow_plugins.raster.surfaces import SPAN_GAPS
+    from orthoflow_plugins.raster.surfaces import DENOISE_CELLS, SPAN_GAPS
 
     frame, width = slab.frame, slab.frame.width
     cells_most = _BAND_CELLS + (slab.n_cells if params.surface == "tin" else 0)
     # Noise is filtered twice, and a gap is as wide as what spans it plus a disc on either side and
     # a margin, between which it is interpolated.
-    reach_rows = _REACH_OF_OUTLIERS + 2 * params.denoise_cells
+    reach_rows = _REACH_OF_OUTLIERS + 2 * DENOISE_CELLS
     reach_rows += (SPAN_GAPS + 2) * params.recover_gap_cells + 2
     whole: dict[str, NDArray[np.generic]] = {}
     for band in bands_with_reach(frame.shape, cells_most=cells_most, reach_rows=reach_rows):

@@ -44,6 +44,8 @@ _UPRIGHT: Final = math.sin(math.radians(30.0))
 _FACE_FARTHEST_M: Final = 0.3
 # Empty areas must fill this share of their rectangle, as round windows do. Shadows do not.
 _FILLED_LEAST: Final = 0.7
+# With less of its outline measured an opening is the border of the scan.
+_SEEN_LEAST_SHARE: Final = 0.5
 _LONGEST_PX: Final = 1004
 _SMALLEST_PX: Final = 500
 _KIND_RGB: Final[Mapping[OpeningKind, tuple[int, int, int]]] = {
@@ -133,13 +135,6 @@ class SegmentOpenings(Method):
         area_least_m2: float = Field(
             default=0.1, gt=0.0, le=10_000.0, description="Smallest area of an opening."
         )
-        seen_least_share: float = Field(
-            default=0.5,
-            ge=0.0,
-            le=1.0,
-            description="Share of the outline along which the wall's face must be measured: "
-            "with less it is the border of the scan.",
-        )
         level: bool = Field(default=False, description="Also search floors, ceilings and slopes.")
 
     class In(Ports):
@@ -206,7 +201,7 @@ def _found_on(
     n_unbounded = 0
     for area in open_areas(relief, params.width_least_m, params.area_least_m2):
         outline = outline_of(area, relief, spacing_m)
-        if outline is None or outline.seen_of_all < params.seen_least_share:
+        if outline is None or outline.seen_of_all < _SEEN_LEAST_SHARE:
             n_unbounded += 1
             continue
         by_image = np.zeros(len(outline.corners), dtype=np.bool_)
