@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import WallFrame, wall_axes
-from orthoflow.products import SurfaceMask, Wall, Walls
+from orthoflow.products import Walls
+from tests import samples
 from tests.raster_scenes import UP
 
 NORMALS = np.array([[0, -1, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, 0, -1]], dtype=np.float64)
@@ -53,24 +54,11 @@ class BoxRoom:
 
     def walls(self) -> Walls:
         """The walls as rasters, all on their planes."""
-        return Walls(
-            walls=tuple(
-                Wall(
-                    frame=frame,
-                    plane_index=index,
-                    name=f"wall {index}",
-                    depth_m=np.zeros((frame.height, frame.width), dtype=np.float32),
-                    sigma_m=np.full((frame.height, frame.width), np.nan, dtype=np.float32),
-                    count=np.ones((frame.height, frame.width), dtype=np.uint32),
-                    mask=np.full((frame.height, frame.width), SurfaceMask.MEASURED, np.uint8),
-                )
-                for index, frame in enumerate(self.frames)
-            ),
-            up=UP,
-            intensity_source="none",
-            buffer_front_m=0.05,
-            buffer_behind_m=0.05,
-        )
+        rasters = [
+            samples.wall(frame, plane_index=index, name=f"wall {index}")
+            for index, frame in enumerate(self.frames)
+        ]
+        return samples.walls(*rasters, buffer_m=0.05)
 
     def colours(self, wall: int, cells: NDArray[np.float64]) -> NDArray[np.float64]:
         """Colours (..., 3) of 8 bits, not rounded, at cells (..., 2) of a wall."""

@@ -10,9 +10,9 @@ from orthoflow_plugins.simulate.building import Extent, Paint, SceneDraft, wall_
 
 from orthoflow.geometry import frame_over
 from orthoflow.geometry.scenes import SurfaceRole, TextureKind
-from orthoflow.products import Opening, Openings, Product, Truth, Wall, Walls
+from orthoflow.products import Opening, Openings, Product, Truth, Walls
 from orthoflow.testing.examples import example
-from tests.raster_scenes import UP
+from tests import samples
 
 GSD_M = 0.02
 FULL: Extent = (-1.5, 1.5, -1.0, 1.0)
@@ -33,19 +33,8 @@ def scene() -> tuple[Truth, Walls]:
     assert isinstance(truth, Truth)
     outline = draft.planes[plane]
     frame = frame_over(outline.outline, outline.plane.normal, gsd_m=GSD_M)
-    empty = np.zeros(frame.shape, dtype=np.float32)
-    wall = Wall(
-        frame=frame,
-        plane_index=3,
-        name="wall 3",
-        depth_m=empty,
-        sigma_m=empty,
-        count=np.ones(frame.shape, dtype=np.uint32),
-        mask=np.ones(frame.shape, dtype=np.uint8),
-    )
-    walls = Walls(
-        walls=(wall,), up=UP, intensity_source="none", buffer_front_m=0.15, buffer_behind_m=0.3
-    )
+    wall = samples.wall(frame, plane_index=3, name="wall 3")
+    walls = samples.walls(wall, buffer_behind_m=0.3)
     return replace(truth, scene=draft.finished(spectral_gap=0.0)), walls
 
 

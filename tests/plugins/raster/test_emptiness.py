@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -70,12 +69,6 @@ def only(cause: str, share: float) -> dict[str, object]:
     return {name: pytest.approx(value, abs=SHARE) for name, value in expected.items()}
 
 
-def test_a_wall_that_is_full_says_nothing(tmp_path: Path) -> None:
-    shares, said = causes(scenes.cloud_of(grid((0, 4), (0, 3))), tmp_path)
-    assert shares == only("behind", 0.0)
-    assert said == []
-
-
 def test_what_lies_behind_the_buffer_is_told_with_its_depth(tmp_path: Path) -> None:
     wall = without(grid((0, 4), (0, 3)), (1.0, 2.5), (0.5, 2.0))
     alcove = grid((1.0, 2.5), (0.5, 2.0), depth_m=-1.3)
@@ -86,42 +79,11 @@ def test_what_lies_behind_the_buffer_is_told_with_its_depth(tmp_path: Path) -> N
     assert "buffer_behind_m=1.3" in one.remedy
 
 
-def test_few_empty_cells_of_a_wall_are_told_in_the_log(tmp_path: Path) -> None:
-    lines: list[str] = []
-    ctx = dataclasses.replace(
-        scenes.context(tmp_path),
-        listen=lambda event: lines.append(event.text) if event.kind == "log" else None,
-    )
-    wall = without(grid((0, 4), (0, 3)), (1.0, 1.8), (0.5, 1.3))
-    params = RasterGrid.Params.model_validate({"gsd_m": WALL.gsd_m})
-    RasterGrid().run(RasterGrid.In(cloud=scenes.cloud_of(wall), planes=WALL.planes()), params, ctx)
-    assert not [one for one in ctx.diagnostics if one.code in CODES]
-    (told,) = (text for text in lines if "cells are empty" in text)
-    assert told.startswith("wall 0: 5.0% of its cells are empty")
-
-
 def test_an_opening_that_shows_nothing_has_no_setting(tmp_path: Path) -> None:
     wall = without(grid((0, 4), (0, 3)), (1.0, 2.5), (0.5, 2.0))
     shares, said = causes(scenes.cloud_of(wall), tmp_path)
     assert shares == only("unseen", 1.5 * 1.5 / 12.0)
     assert [(one.code, one.remedy) for one in said] == [("wall-unseen", "")]
-
-
-def test_the_shadow_of_a_thing_before_the_wall_is_hidden(tmp_path: Path) -> None:
-    # From the station 4 m before the wall, a screen halfway hides twice its size, aside of it.
-    station = np.array([[0.0, -4.0, 1.5]])
-    screen = grid((0.8, 1.4), (1.2, 1.8), depth_m=2.0, step_m=0.02)
-    shadow = ((1.6, 2.8), (0.9, 2.1))
-    wall = without(grid((0, 4), (0, 3)), *shadow)
-    cloud = scenes.cloud_of(np.vstack([wall, screen]))
-    known = dataclasses.replace(cloud, stations=station)
-    shares, said = causes(known, tmp_path)
-    # A voxel of 10 cm before the station is as wide as 20 cm on the wall.
-    assert shares["hidden"] > 0.8 * 1.44 / 12.0
-    assert shares["hidden"] + shares["unseen"] == pytest.approx(1.44 / 12.0, abs=SHARE)
-    assert "wall-hidden" in [one.code for one in said]
-    nowhere, _ = causes(cloud, tmp_path)
-    assert nowhere == only("unseen", 1.44 / 12.0)
 
 
 def test_cells_finer_than_the_scan_are_told_from_holes(tmp_path: Path) -> None:

@@ -367,42 +367,6 @@ def test_a_plane_that_runs_askew_is_farther_at_one_end(turn_deg: float) -> None:
     assert found.askew_m == pytest.approx(2.0 * half_m, abs=1e-9)
 
 
-@pytest.mark.parametrize(("lean_deg", "adjoins"), [(90.0, True), (46.0, True), (44.0, False)])
-def test_what_is_nearly_parallel_to_a_wall_bounds_nothing(
-    monkeypatch: pytest.MonkeyPatch, lean_deg: float, adjoins: bool
-) -> None:
-    monkeypatch.setattr(extents, "_stands", lambda *_: True)
-    lean = np.radians(lean_deg)
-    normal = np.array([np.sin(lean), -np.cos(lean), 0.0])
-    corners = upright(0.0, (0.0, 3.0), towards=1.0)[1]
-    planes = replace(
-        planes_of((0.0, WIDTH_M), (0.0, HEIGHT_M), (normal, corners)),
-        offset=np.array([0.0, normal @ [-0.2, 0.0, 0.0]]),
-    )
-    around: Any = None
-    size_m = (WIDTH_M, HEIGHT_M)
-    found = list(extents._bounds(planes, 0, rectangle_of(planes), size_m, around))
-    assert len(found) == adjoins
-
-
-def test_of_several_planes_beside_one_side_the_innermost_bounds(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(extents, "_stands", lambda bound, *_: bound.beyond_m != 0.1)
-    monkeypatch.setattr(extents, "_goes_on", lambda *_: False)
-    planes = planes_of(
-        (0.0, WIDTH_M),
-        (0.0, HEIGHT_M),
-        *(upright(-beyond, (0.0, 3.0), towards=1.0) for beyond in (0.5, 0.1, 0.3, 0.4)),
-        level(HEIGHT_M + 0.2, (0.0, 3.0), towards=-1.0),
-    )
-    around: Any = None
-    found = extents._bounds(planes, 0, rectangle_of(planes), (WIDTH_M, HEIGHT_M), around)
-    # That of 0.1 does not stand there.
-    sides = {bound.side: bound.beyond_m for bound in found}
-    assert sides == {"left": pytest.approx(0.3), "top": pytest.approx(0.2)}
-
-
 @pytest.mark.parametrize(
     ("share", "off_m", "depth_m", "left_m"),
     [

@@ -118,35 +118,3 @@ def test_without_grid_or_reach_nothing_is_spanned(tmp_path: Path, change: str) -
     wall = rastered(cloud, tmp_path, **params)
     # Cells in the middle between four points, too far for a gap of one cell.
     assert np.mean(wall.mask[4:-4, 4:-4] == SurfaceMask.VOID) > 0.1
-
-
-@pytest.mark.parametrize("surface", ["median", "centre"])
-def test_a_gap_takes_what_lies_at_its_centre_wherever_the_points_about_it_lie(
-    tmp_path: Path, surface: str
-) -> None:
-    """Depth and shade that rise evenly come back, though no point lies in the middle of a cell."""
-    rng = np.random.default_rng(9)
-    places = rng.uniform((0, 0), KNOWN.shape[::-1], (int(0.9 * 40 * 60), 2))
-    u, v = places.T
-    cloud = scenes.cloud_of(
-        KNOWN.world(u, v, 0.002 * u),
-        intensity=(0.1 + 0.01 * u + 0.005 * v).astype(np.float32),
-        rgb=np.repeat(np.rint(3.0 * u + 1.5 * v)[:, None], 3, axis=1).astype(np.uint8),
-    )
-    wall = rastered(cloud, tmp_path, surface=surface)
-    inner = np.zeros(KNOWN.shape, dtype=bool)
-    inner[3:-3, 3:-3] = True
-    rows, columns = np.nonzero((wall.mask == SurfaceMask.RECOVERED) & inner)
-    assert len(rows) > 500
-    off = wall.intensity[rows, columns] - (0.105 + 0.01 * columns + 0.005 * (rows + 0.5))
-    # A fifth of what a cell rises by at most: the nearest cell would be off by the whole of it.
-    assert np.sqrt(np.mean(off**2)) < 0.2 * 0.01
-    assert abs(off.mean()) < 0.01 * 0.01
-    shades = wall.rgb[rows, columns, 0] - (3.0 * (columns + 0.5) + 1.5 * (rows + 0.5))
-    assert np.sqrt(np.mean(shades**2)) < 1.0
-    # Few points are carried to the centre of their cell, too, but for rules of a single point.
-    measured = (wall.mask == SurfaceMask.MEASURED) & (wall.count <= 2) & inner
-    rows, columns = np.nonzero(measured)
-    off = wall.intensity[rows, columns] - (0.105 + 0.01 * columns + 0.005 * (rows + 0.5))
-    spread = float(np.sqrt(np.mean(off**2))) / 0.01
-    assert (spread < 0.1) if surface == "median" else (0.15 < spread < 0.5), spread

@@ -197,47 +197,6 @@ def test_without_intensity_the_grey_of_the_colours_stands_in_and_bare_points_giv
     assert any("neither intensity nor colour" in warning for warning in ctx.warnings)
 
 
-def three_planes() -> Planes:
-    """A floor of 20 m2, a wall of 12 m2 and a wall of 0.5 m2, by support."""
-    rectangles = [
-        [[0, 4, 0], [0, 0, 0], [5, 0, 0], [5, 4, 0]],
-        [[0, 4, 3], [0, 4, 0], [4, 4, 0], [4, 4, 3]],
-        [[0, 2, 1], [0, 2, 0], [0.5, 2, 0], [0.5, 2, 1]],
-    ]
-    normals = np.array([[0.0, 0, 1], [0, -1, 0], [0, -1, 0]])
-    corners = np.array(rectangles, dtype=np.float64)
-    return samples.planes(
-        normal=normals,
-        offset=np.einsum("ki,ki->k", normals, corners[:, 0]),
-        corners=corners,
-        n_points=np.array([30, 20, 10]),
-        names=("floor", "wall 0", "wall 1"),
-    )
-
-
-@pytest.mark.parametrize(
-    ("params", "expected"),
-    [
-        ({}, [0, 1]),
-        ({"min_area_m2": 0.1}, [0, 1, 2]),
-        ({"constraint": "vertical"}, [1]),
-        ({"constraint": "horizontal"}, [0]),
-        ({"n_walls_max": 1}, [0]),
-        ({"min_area_m2": 100.0}, [0]),
-        ({"ranks": [2, 0]}, [0, 2]),
-    ],
-    ids=str,
-)
-def test_planes_become_walls_by_direction_area_and_rank(
-    tmp_path: Path, params: dict[str, object], expected: list[int]
-) -> None:
-    planes = three_planes()
-    cloud = scenes.cloud_of(planes.corners.reshape(-1, 3))
-    walls = rastered(cloud, planes, tmp_path, gsd_m=0.1, **params)
-    assert [wall.plane_index for wall in walls.walls] == expected
-    assert [wall.name for wall in walls.walls] == [planes.names[k] for k in expected]
-
-
 def test_a_margin_widens_the_frame_on_all_sides(tmp_path: Path) -> None:
     known = scenes.leaning_wall()
     cloud, _ = one_point_per_cell(known)

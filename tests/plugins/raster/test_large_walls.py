@@ -146,47 +146,6 @@ def test_a_wall_that_no_photo_paints_lies_in_files(tmp_path: Path) -> None:
     assert not bare.rgb.any()
 
 
-def test_what_photos_reach_of_a_wall_that_none_paints_adds_up(tmp_path: Path) -> None:
-    where = ortho_scenes.frame()
-    # A wall that looks the other way, and a camera before it, behind the first wall.
-    back = dataclasses.replace(
-        where,
-        origin_world=where.world_from_wall(np.array([[where.width, 0.0]]), -4.0)[0],
-        u_world=-where.u_world,
-        normal_world=-where.normal_world,
-    )
-    walls = dataclasses.replace(
-        ortho_scenes.walls(where),
-        walls=tuple(ortho_scenes.walls(frame).walls[0] for frame in (where, back)),
-    )
-    # A board before all of the first wall; one photo shows its left part, one its right part.
-    rows, columns = np.mgrid[: where.height, : where.width] + 0.5
-    board = where.world_from_wall(np.column_stack([columns.ravel(), rows.ravel()]), 0.4)
-    whole = ortho_scenes.camera(where, aside_m=0.1)
-    viewers = [
-        dataclasses.replace(whole, width=600),
-        dataclasses.replace(whole, width=600, cx=whole.cx - 400.0),
-        ortho_scenes.camera(back),
-    ]
-    pictures = [np.zeros((viewer.height, viewer.width, 3), np.uint8) for viewer in viewers]
-    reached = []
-    for chosen in ((0, 1, 2), (0, 2), (1, 2)):
-        inputs = DsmBackward.In(
-            walls=walls,
-            photos=ortho_scenes.photos(*(pictures[k] for k in chosen)),
-            cameras=ortho_scenes.cameras(*(viewers[k] for k in chosen)),
-            cloud=raster_scenes.cloud_of(board),
-        )
-        out = DsmBackward().run(inputs, DsmBackward.Params(), context(tmp_path))
-        bare, shown = out.layers.layers
-        assert (bare.source, bare.wall, shown.wall) == ("no photo", 0, 1)
-        reached.append(bare.mask == LayerMask.OCCLUDED)
-    both, first, second = reached
-    assert (first & ~second).any()
-    assert (second & ~first).any()
-    np.testing.assert_array_equal(both, first | second)
-
-
 def large_layers(folder: Path, shape: tuple[int, int]) -> tuple[Layer, ...]:
     """Two photos whose quality falls from left to right, and the other way, in files."""
     rng = np.random.default_rng(2)

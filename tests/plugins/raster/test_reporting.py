@@ -160,19 +160,6 @@ def told(ctx: StepContext) -> dict[str, object]:
     return {one.code: one.values["share"] for one in ctx.diagnostics}
 
 
-def test_many_empty_cells_are_reported_by_cause(ctx: StepContext) -> None:
-    causes = {"behind": 0.2, "hidden": 0.025, "sparse": 0.31, "unseen": 0.06}
-    reporting.report_empty(
-        ctx,
-        [wall([[1, 1]]), wall([[0, 0]], name="no points")],
-        [emptiness(**causes), emptiness(unseen=1.0)],
-    )
-    # A twentieth of what is empty is not worth words.
-    assert told(ctx) == {"wall-behind-buffer": 0.2, "wall-sparse": 0.31, "wall-unseen": 0.06}
-    behind = ctx.diagnostics[0]
-    assert (behind.subject, behind.values["buffer_behind_m"]) == ("wall 0", 0.5)
-
-
 def test_what_stands_before_a_wall_is_left_out_and_what_stands_on_a_floor_is_not(
     ctx: StepContext,
 ) -> None:

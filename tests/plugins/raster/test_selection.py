@@ -205,21 +205,6 @@ def test_walls_and_floors_lean_by_ten_degrees_at_most(
             chosen_planes(leaning(degrees), choice, buffer_m)
 
 
-def test_planes_away_from_the_origin_are_as_large_and_as_far_as_anywhere() -> None:
-    near, shift = planes(MAIN, (0.4, 1.0, 3.0, 30.0)), np.array([300.0, -200.0, 50.0])
-    far = replace(near, corners=near.corners + shift, offset=near.offset + near.normal @ shift)
-    place = np.array([2.0, 0.5, 1.2])
-    for index, size_m2 in ((0, 10.0), (1, 6.0)):
-        assert selection.area_m2(near.corners[index]) == pytest.approx(size_m2)
-        assert selection.area_m2(far.corners[index]) == pytest.approx(size_m2)
-        there = selection.distance_m(far, index, place + shift)
-        assert there == pytest.approx(selection.distance_m(near, index, place))
-    # Above, beside and before a rectangle, along one side of it and off its corner.
-    for off, away in (((-1.0, 0.0, 0.0), 1.0), ((0, 0, 0.5), 0.5), ((-3.0, 0.0, 4.0), 5.0)):
-        corner = far.corners[0, 0]
-        assert selection.distance_m(far, 0, corner + off) == pytest.approx(away)
-
-
 def test_the_raster_of_a_plane_lies_over_its_rectangle_and_a_margin() -> None:
     turned = planes((0.0, 0.0, 5.0, 20.0))
     for margin_m in (0.0, 0.5):

@@ -25,8 +25,6 @@ class Scattered:
 
     places: NDArray[np.float64]
     depths_m: NDArray[np.float64]
-    row: NDArray[np.int64] | None = None
-    column: NDArray[np.int64] | None = None
 
     def cloud(self, turn: Turn) -> tuple[scenes.KnownWall, PointCloud]:
         known = dataclasses.replace(scenes.upright_wall(shape=turn.shape(SHAPE)), gsd_m=2.0**-7)
@@ -38,15 +36,7 @@ class Scattered:
             intensity=shade.astype(np.float32),
             rgb=rgb.astype(np.uint8),
         )
-        if self.row is None or self.column is None:
-            return known, cloud
-        # The scanner sees the wall turned: other rows and columns, the same neighbours.
-        numbers = np.column_stack([self.column, self.row]).astype(np.float64)
-        turned = turn.places(numbers, (int(self.row.max()) + 1, int(self.column.max()) + 1))
-        turned -= turned.min(axis=0)
-        return known, dataclasses.replace(
-            cloud, column=turned[:, 0].astype(np.uint32), row=turned[:, 1].astype(np.uint32)
-        )
+        return known, cloud
 
 
 def in_window(places: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -65,23 +55,6 @@ def in_any_order(per_cell: float) -> Scattered:
     places = rng.uniform((0, 0), SHAPE[::-1], (round(per_cell * SHAPE[0] * SHAPE[1]), 2))
     places = places[~in_window(places)]
     return Scattered(places, relief(places, rng))
-
-
-@cache
-def in_rows() -> Scattered:
-    rng = np.random.default_rng(12)
-    row, column = (grid.ravel() for grid in np.mgrid[:40, :40])
-    turned = np.radians(9.0)
-    across, down = 1.9 * column - 6.0, 1.9 * row - 12.0
-    places = np.column_stack(
-        [
-            np.cos(turned) * across + np.sin(turned) * down,
-            np.cos(turned) * down - np.sin(turned) * across,
-        ]
-    )
-    kept = (places > 0.0).all(axis=1) & (places < SHAPE[::-1]).all(axis=1) & ~in_window(places)
-    kept &= rng.random(len(kept)) > 0.1
-    return Scattered(places[kept], relief(places[kept], rng), row=row[kept], column=column[kept])
 
 
 def rastered(scattered: Scattered, turn: Turn, folder: Path, **params: object) -> Wall:
@@ -113,16 +86,6 @@ def test_a_turned_cloud_gives_the_turned_raster(tmp_path: Path, surface: str, tu
         assert 0.2 < np.mean(wall.mask == SurfaceMask.RECOVERED) < 0.5
         assert (wall.mask == SurfaceMask.VOID).any()
     assert_turned(wall, rastered(scattered, turn, tmp_path, surface=surface), turn)
-
-
-@pytest.mark.parametrize("turn", OTHER_TURNS, ids=str)
-def test_neighbours_in_a_scan_span_gaps_alike_in_all_directions(tmp_path: Path, turn: Turn) -> None:
-    params = {"surface": "centre"}
-    wall = rastered(in_rows(), TURNS[0], tmp_path, **params)
-    without = rastered(in_rows(), TURNS[0], tmp_path, **params, recover_scan_steps=0)
-    differs = np.nan_to_num(wall.depth_m) != np.nan_to_num(without.depth_m)
-    assert differs[wall.mask == SurfaceMask.RECOVERED].mean() > 0.5
-    assert_turned(wall, rastered(in_rows(), turn, tmp_path, **params), turn)
 
 
 @pytest.mark.parametrize("turn", OTHER_TURNS, ids=str)

@@ -72,23 +72,6 @@ def test_a_blurred_edge_is_found_in_its_middle() -> None:
         assert left_side(moved) == pytest.approx(-place, abs=0.08)
 
 
-def test_every_side_moves_outwards_alike() -> None:
-    # A bright square, a little smaller on the left, larger on the right, and so on.
-    left, top, right, bottom = 30.2, 20.8, 80.3, 70.9
-    rows = np.clip(np.arange(1, 101) - top, 0, 1) - np.clip(np.arange(1, 101) - bottom, 0, 1)
-    columns = np.clip(np.arange(1, 101) - left, 0, 1) - np.clip(np.arange(1, 101) - right, 0, 1)
-    square = (50.0 + 100.0 * np.outer(rows, columns)).astype(np.float32)
-    corners = np.array([[30.0, 20.0], [30.0, 70.0], [80.0, 70.0], [80.0, 20.0]])
-    moved = moved_to_edges(outline(corners), square)
-    assert moved[1].all()
-    expected = np.array([[left, top], [left, bottom], [right, bottom], [right, top]])
-    np.testing.assert_allclose(moved[0].corners, expected, atol=0.1)
-    for turns in range(1, 4):
-        corners, expected = quarter(corners), quarter(expected)
-        turned = moved_to_edges(outline(corners), np.rot90(square, turns).copy())
-        np.testing.assert_allclose(turned[0].corners, expected, atol=0.1)
-
-
 def quarter(places: NDArray[np.float64]) -> NDArray[np.float64]:
     """Places in a picture of 100 x 100 cells after numpy has turned it by a quarter."""
     return np.column_stack([places[:, 1], 100.0 - places[:, 0]])

@@ -75,10 +75,6 @@ def is_cornice(extent: Extent) -> bool:
     return extent[:2] == FULL[:2]
 
 
-def is_skirting(extent: Extent) -> bool:
-    return extent[3] < SHOWN[2] + 0.3
-
-
 def overlap(one: Extent, other: Extent) -> bool:
     return (
         one[0] < other[1] - 1e-9
@@ -124,58 +120,6 @@ def test_relief_and_recesses_are_as_deep_as_the_family_says() -> None:
     assert niches.min() >= 0.05
     assert min(doors.min(), niches.min()) < 0.07
     assert {round(d, 9) for found in all_drawn() for d, _ in found.panels} == {0.03}
-
-
-def test_pilasters_are_alike_and_stand_from_the_floor_to_the_cornice() -> None:
-    counts: Counter[tuple[int, bool]] = Counter()
-    skirted = 0
-    for found in all_drawn():
-        cornice = [extent for _, extent in found.stone if is_cornice(extent)]
-        top = cornice[0][2] if cornice else SHOWN[3]
-        upright = [
-            item for item in found.stone if not is_cornice(item[1]) and not is_skirting(item[1])
-        ]
-        skirting = [item for item in found.stone if is_skirting(item[1])]
-        ends = [extent[:2] for _, extent in upright]
-        is_cornered = bool(ends) and ends[0][0] < SHOWN[0]
-        inner = ends[1:-1] if is_cornered else ends
-        counts[len(inner), is_cornered] += 1
-        skirted += bool(skirting)
-        assert len({round(depth, 9) for depth, _ in upright}) <= 1
-        for _, extent in upright:
-            assert extent[2:] == pytest.approx((FULL[2], top))
-        widths = [right - left for left, right in inner]
-        if is_cornered:
-            # Behind the adjoining walls, where nobody sees them end.
-            assert ends[0][0] == pytest.approx(SHOWN[0] - 0.1)
-            assert ends[-1][1] == pytest.approx(SHOWN[1] + 0.1)
-            widths += [ends[0][1] - SHOWN[0], SHOWN[1] - ends[-1][0]]
-        assert np.ptp(widths or [0.0]) < 1e-9
-        # Evenly spread, each moved by 15 cm at most.
-        even = np.linspace(SHOWN[0], SHOWN[1], len(inner) + 2)[1:-1]
-        middles = np.array([0.5 * (left + right) for left, right in inner])
-        assert np.all(np.abs(middles - even) <= 0.15)
-        # A skirting runs along each bay.
-        rests = [SHOWN[0], *(end for pair in ends for end in pair), SHOWN[1]]
-        rests = rests[2:-2] if is_cornered else rests
-        bays = list(zip(rests[::2], rests[1::2], strict=True))
-        if skirting:
-            np.testing.assert_allclose([extent[:2] for _, extent in skirting], bays)
-            assert [extent[2] for _, extent in skirting] == pytest.approx([FULL[2]] * len(bays))
-            assert len({round(depth, 9) for depth, _ in skirting}) == 1
-        # Nothing in a bay comes nearer to its ends than 12 cm.
-        inside = [extent for _, extent, _ in found.recesses]
-        inside += [extent for _, extent in found.panels]
-        for a0, a1, _, b1 in inside:
-            assert any(
-                left + 0.12 <= a0 + 1e-9 and a1 <= right - 0.12 + 1e-9 for left, right in bays
-            )
-            assert b1 <= top - 0.15
-    assert {number for number, _ in counts} == {0, 1, 2, 3}
-    corners = sum(count for (_, is_cornered), count in counts.items() if is_cornered)
-    # Half and three fifths of 300, give or take 9.
-    assert 110 < corners < 190
-    assert 140 < skirted < 220
 
 
 def test_recesses_are_holes_of_the_wall_with_planes_of_their_own() -> None:

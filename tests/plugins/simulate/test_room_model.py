@@ -13,7 +13,6 @@ from orthoflow_plugins.simulate.building import Extent, SceneDraft
 from orthoflow_plugins.simulate.room_model import (
     CEILING_M,
     DESIGNED,
-    FLOOR_M,
     MOST_TEXTILE,
     Room,
     build_room,
@@ -167,72 +166,3 @@ def test_cloth_covers_as_much_of_the_main_wall_as_asked(share: float) -> None:
         elif share > 0.1:
             assert first[0] < design[0]
             assert first[1] > design[1]
-
-
-def test_true_planes_reach_as_far_as_they_are_seen() -> None:
-    planes = {item.name: item for item in room().planes}
-    assert set(planes) == {*WALLS, "niche", "door", "floor", "ceiling"}
-    bounds = [item.plane for name, item in planes.items() if name not in {"niche", "door"}]
-    for item in planes.values():
-        top_left, bottom_left, bottom_right, _ = item.outline
-        np.testing.assert_allclose(item.plane.distances_m(item.outline), 0.0, atol=1e-9)
-        # Points of the plane, 2 cm apart, that lie before all that bounds it.
-        right, down = bottom_right - bottom_left, bottom_left - top_left
-        shares = np.linspace(-0.1, 1.1, 301)
-        inside = np.ones((301, 301), dtype=np.bool_)
-        points = (
-            top_left
-            + shares[None, :, None] * right[None, None]
-            + shares[:, None, None] * down[None, None]
-        )
-        for bound in bounds:
-            if abs(bound.normal @ item.plane.normal) < 0.9:
-                inside &= bound.distances_m(points.reshape(-1, 3)).reshape(301, 301) >= 0.0
-        if item.name in {"niche", "door"}:
-            continue
-        rows, columns = np.nonzero(inside)
-        found = [
-            shares[columns.min()],
-            shares[columns.max()],
-            shares[rows.min()],
-            shares[rows.max()],
-        ]
-        np.testing.assert_allclose(found, [0.0, 1.0, 0.0, 1.0], atol=0.005)
-    for name, depth_m in (("niche", -0.25), ("door", -0.12)):
-        off = planes["main wall"].plane.distances_m(planes[name].outline)
-        np.testing.assert_allclose(off, depth_m, atol=1e-9)
-    assert planes["door"].outline[:, 2].min() == pytest.approx(FLOOR_M, abs=0.01)
-    assert planes["niche"].outline[:, 2].min() > FLOOR_M + 0.3
-
-
-@pytest.mark.parametrize(
-    ("name", "corners"),
-    # How far the walls beside it stand from the room's middle, to the left and to the right.
-    [
-        ("main wall", (-2.7, 2.7)),
-        ("opposite wall", (-2.7, 2.7)),
-        ("right wall", (-2.4, 2.0)),
-        ("left wall", (-2.0, 2.4)),
-    ],
-)
-def test_what_is_drawn_on_a_wall_lies_between_the_corners_of_the_room(
-    name: str, corners: tuple[float, float]
-) -> None:
-    sides = DESIGNED.sides(SceneDraft())
-    own = sides[WALLS.index(name)]
-    beside = sorted(
-        float(side.foot @ own.axis_a) for side in sides if abs(side.normal @ own.normal) < 0.5
-    )
-    assert beside == pytest.approx(corners, abs=0.02)
-    least, most = 9.0, -9.0
-    for seed in range(6):
-        found = along(build_room(np.random.default_rng(seed), obstacle=False), name)
-        narrow = found.extent[:, 1] - found.extent[:, 0] < 3.0
-        ends = found.extent[narrow][:, :2]
-        # Pilasters in the corners reach a little behind the next wall.
-        assert ends.min() >= corners[0] - 0.1 - 1e-9
-        assert ends.max() <= corners[1] + 0.1 + 1e-9
-        least, most = min(least, ends.min()), max(most, ends.max())
-    # And it is drawn on all of the wall.
-    assert least < corners[0] + 0.9
-    assert most > corners[1] - 0.9
