@@ -78,17 +78,8 @@ ERROR_CONTENT: Final = (
 )
 PIXEL_CONVENTION: Final = "OpenCV: the centre of the first (top-left) pixel is at (0, 0)"
 TIE_COLUMNS: Final = (
-    "photo",
-    "wall",
-    "u_px",
-    "v_px",
-    "x",
-    "y",
-    "z",
-    "role",
-    "residual_u_px",
-    "residual_v_px",
-    "sigma_px",
+    *("photo", "wall", "u_px", "v_px", "x", "y", "z"),
+    *("role", "residual_u_px", "residual_v_px", "sigma_px"),
     # A comment line would break plain CSV readers, so the header states it in a column of its own.
     "opencv_pixel_convention",
 )
@@ -436,17 +427,7 @@ def _cell(value: float) -> float | None:
 
 
 _COLUMNS: Final = (
-    "wall",
-    "number",
-    "kind",
-    "width_m",
-    "height_m",
-    "sill_m",
-    "area_m2",
-    "depth_m",
-    "edge_sigma_mm",
-    "seen_share",
-    "n_corners",
+    "wall number kind width_m height_m sill_m area_m2 depth_m edge_sigma_mm seen_share n_corners"
 )
 _DIGITS: Final = 4
 
@@ -476,17 +457,13 @@ def publish_openings(product: Openings, folder: Path, digest: str) -> None:
 
 
 def _rows(product: Openings) -> Iterator[Sequence[Value]]:
-    yield _COLUMNS
+    yield _COLUMNS.split()
     for place, opening in numbered_openings(product.openings):
         sigma_m = opening.edge_sigma_m
+        lengths = (opening.width_m, opening.height_m, opening.sill_m, opening.area_m2)
         yield (
-            opening.wall,
-            place,
-            opening.kind,
-            round(opening.width_m, _DIGITS),
-            round(opening.height_m, _DIGITS),
-            round(opening.sill_m, _DIGITS),
-            round(opening.area_m2, _DIGITS),
+            *(opening.wall, place, opening.kind),
+            *(round(length, _DIGITS) for length in lengths),
             None if opening.depth_m is None else round(opening.depth_m, _DIGITS),
             None if sigma_m is None else round(1e3 * sigma_m, 2),
             round(opening.seen_share, _DIGITS),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,6 @@ from rasterio.transform import Affine
 
 from orthoflow.errors import InputError
 from orthoflow.files.images import (
-    decode_image,
     decode_levels,
     encode_jpeg,
     encode_png,
@@ -43,10 +43,8 @@ class PhotoReader(Reader):
         photos: tuple[Photo, ...] = self.run(paths, params, calibration=given).photos.photos
         return photos
 
-    @property
-    def sheet(self) -> tuple[int, int]:
-        rows, columns, _ = decode_image(self.ctx.figures[0].path.read_bytes()).shape
-        return columns, rows
+    def files(self, contents: dict[str, bytes], **more: Any) -> tuple[Photo, ...]:
+        return self(*made.write(self.folder, contents), **more)
 
 
 @pytest.fixture
@@ -54,7 +52,7 @@ def read(tmp_path: Path) -> PhotoReader:
     return PhotoReader(ReadPhotos, tmp_path)
 
 
-def test_photos_come_by_name_with_their_bytes_untouched(tmp_path: Path, read: PhotoReader) -> None:
+def test_photos_come_by_name_with_their_bytes_untouched(read: PhotoReader) -> None:
     block = made.exif_block({made.ORIENTATION: 6}, {made.FOCAL_35MM: 28})
     files = {
         "b.JPG": made.jpeg(made.picture(48, 64), block),
@@ -62,7 +60,7 @@ def test_photos_come_by_name_with_their_bytes_untouched(tmp_path: Path, read: Ph
         "a.tiff": made.tiff(made.picture(30, 20), 8),
         "B.jpeg": encode_jpeg(made.picture()),
     }
-    photos = read(*made.write(tmp_path, files))
+    photos = read.files(files)
     assert [photo.name for photo in photos] == ["B.jpeg", "a.tiff", "b.JPG", "c.png"]
     assert all(photo.encoded == files[photo.name] for photo in photos)
     assert [(photo.width, photo.height) for photo in photos] == [
@@ -78,9 +76,9 @@ def test_photos_come_by_name_with_their_bytes_untouched(tmp_path: Path, read: Ph
     }
 
 
-def test_a_panorama_becomes_six_photos_with_exact_lenses(tmp_path: Path, read: PhotoReader) -> None:
+def test_a_panorama_becomes_six_photos_with_exact_lenses(read: PhotoReader) -> None:
     files = {"360_a.jpg": encode_jpeg(made.picture(128, 64)), "b.jpg": encode_jpeg(made.picture())}
-    photos = read(*made.write(tmp_path, files), panoramas=("360_*",))
+    photos = read.files(files, panoramas=("360_*",))
     assert [photo.name for photo in photos] == [
         *(f"360_a_{face}.png" for face in ("back", "down", "front", "left", "right", "up")),
         "b.jpg",
@@ -98,14 +96,14 @@ FISHEYE = (
 )
 
 
-def test_a_fisheye_becomes_the_faces_that_it_shows(tmp_path: Path, read: PhotoReader) -> None:
+def test_a_fisheye_becomes_the_faces_that_it_shows(read: PhotoReader) -> None:
     files = {
         "a.jpg": encode_jpeg(made.picture()),
         "b.jpg": encode_jpeg(made.picture()),
         "360.png": encode_png(made.picture(128, 64)),
     }
     text = f"cameras:\n  b.jpg: {CAMERA}\n  '*': {FISHEYE}\n"
-    photos = read(*made.write(tmp_path, files), calibration=text, panoramas=("360.png",))
+    photos = read.files(files, calibration=text, panoramas=("360.png",))
     # A panorama has a lens of its own, whatever the calibration says of all photos.
     assert [photo.name for photo in photos if not photo.name.startswith("360_")] == [
         *(f"a_{face}.png" for face in ("down", "front", "left", "right", "up")),
@@ -158,7 +156,7 @@ def test_a_wide_photo_that_cameras_speak_of_needs_no_calibration(
 # Other files in the folder
 
 
-def test_other_files_are_left_out_and_counted(tmp_path: Path, read: PhotoReader) -> None:
+def test_other_files_are_left_out_and_counted(read: PhotoReader) -> None:
     photo = encode_jpeg(made.picture())
     files = {
         "a.jpg": photo,
@@ -167,7 +165,7 @@ def test_other_files_are_left_out_and_counted(tmp_path: Path, read: PhotoReader)
         "a.CR2": b"II*\0",
         "K.txt": b"",
     }
-    assert [item.name for item in read(*made.write(tmp_path, files))] == ["a.jpg"]
+    assert [item.name for item in read.files(files)] == ["a.jpg"]
     assert "and were left out: a.jpg.camera, Thumbs.db, a.CR2 and 1 more" in read.warnings
 
 
@@ -224,12 +222,10 @@ def test_an_input_without_a_photo_is_refused(tmp_path: Path, read: PhotoReader) 
         read()
 
 
-def test_photos_of_one_name_live_together_under_their_paths(
-    tmp_path: Path, read: PhotoReader
-) -> None:
+def test_photos_of_one_name_live_together_under_their_paths(read: PhotoReader) -> None:
     pictures = [encode_jpeg(made.picture(seed=seed)) for seed in range(4)]
     names = ("x/one/a.jpg", "x/two/a.jpg", "x/two/b.jpg", "x/c.jpg")
-    photos = read(*made.write(tmp_path, dict(zip(names, pictures, strict=True))), calibration=None)
+    photos = read.files(dict(zip(names, pictures, strict=True)), calibration=None)
     assert {photo.name: photo.encoded for photo in photos} == {
         "one/a.jpg": pictures[0],
         "two/a.jpg": pictures[1],
@@ -243,7 +239,7 @@ def test_photos_of_one_name_live_together_under_their_paths(
 
 
 @pytest.mark.parametrize("kind", ["PNG", "TIFF", "WEBP"])
-def test_what_is_transparent_is_masked(tmp_path: Path, read: PhotoReader, kind: str) -> None:
+def test_what_is_transparent_is_masked(read: PhotoReader, kind: str) -> None:
     alpha = np.full((48, 64), 255, dtype=np.uint8)
     alpha[:, :21] = 0
     stream = io.BytesIO()
@@ -251,9 +247,9 @@ def test_what_is_transparent_is_masked(tmp_path: Path, read: PhotoReader, kind: 
     mask = np.full((48, 64), 255, dtype=np.uint8)
     mask[:8] = 0
     files = {f"a.{kind.lower().replace('tiff', 'tif')}": stream.getvalue()}
-    (photo,) = read(*made.write(tmp_path, files))
+    (photo,) = read.files(files)
     np.testing.assert_array_equal(used_pixels(photo), alpha > 0)
-    (photo,) = read(*made.write(tmp_path, files | {"a_mask.png": encode_png(mask)}))
+    (photo,) = read.files(files | {"a_mask.png": encode_png(mask)})
     np.testing.assert_array_equal(used_pixels(photo), (alpha > 0) & (mask > 0))
 
 
@@ -261,36 +257,32 @@ def test_what_is_transparent_is_masked(tmp_path: Path, read: PhotoReader, kind: 
 
 
 @pytest.mark.parametrize("share", [0.2, 0.95])
-def test_all_photos_that_are_cut_off_are_named_at_once(
-    tmp_path: Path, read: PhotoReader, share: float
-) -> None:
+def test_all_photos_that_are_cut_off_are_named_at_once(read: PhotoReader, share: float) -> None:
     image = made.picture(256, 192)
     writers = {"jpg": encode_jpeg, "png": encode_png, "tif": made.tiff, "webp": encode_webp}
     whole = {f"a.{suffix}": write(image) for suffix, write in writers.items()}
     cut = {name: content[: int(share * len(content))] for name, content in whole.items()}
     with pytest.raises(InputError) as caught:
-        read(*made.write(tmp_path, {"0.jpg": encode_jpeg(image), **cut}))
+        read.files({"0.jpg": encode_jpeg(image), **cut})
     lines = str(caught.value).splitlines()
     assert [line.split()[1] for line in lines] == sorted(cut)
     assert all("is damaged or cut off" in line or "cannot be decoded" in line for line in lines)
 
 
-def test_bytes_that_a_decoder_passes_over_are_reported(tmp_path: Path, read: PhotoReader) -> None:
+def test_bytes_that_a_decoder_passes_over_are_reported(read: PhotoReader) -> None:
     whole = encode_jpeg(made.picture(256, 192))
     padded = whole[:-2] + b"\0" * 40 + whole[-2:]
-    assert len(read(*made.write(tmp_path, {"a.jpg": padded, "b.jpg": whole}))) == 2
+    assert len(read.files({"a.jpg": padded, "b.jpg": whole})) == 2
     assert "photo a.jpg: holds bytes that its decoder skips" in read.warnings
 
 
-def test_a_photo_whose_blocks_are_shifted_is_named_with_the_row(
-    tmp_path: Path, read: PhotoReader
-) -> None:
+def test_a_photo_whose_blocks_are_shifted_is_named_with_the_row(read: PhotoReader) -> None:
     image = made.picture(640, 480)
     shifted = image // 2
     shifted[96:112, 256:] += 40
     shifted[112:] += 40
     photos = {"a.jpg": encode_jpeg(shifted), "b.jpg": encode_jpeg(image)}
-    assert len(read(*made.write(tmp_path, photos))) == 2
+    assert len(read.files(photos)) == 2
     assert "photo a.jpg: seems damaged from row 96 on" in read.warnings
     assert "b.jpg: seems" not in read.warnings
 
@@ -305,16 +297,16 @@ def test_a_photo_whose_blocks_are_shifted_is_named_with_the_row(
     ],
 )
 def test_a_file_that_only_has_the_name_of_a_photo_is_named(
-    tmp_path: Path, read: PhotoReader, content: bytes, named: str
+    read: PhotoReader, content: bytes, named: str
 ) -> None:
     with pytest.raises(InputError, match=rf"photo a\.jpg {named}"):
-        read(*made.write(tmp_path, {"a.jpg": content}))
+        read.files({"a.jpg": content})
 
 
 # Calibration
 
 
-def test_the_calibration_reaches_the_photos_it_names(tmp_path: Path, read: PhotoReader) -> None:
+def test_the_calibration_reaches_the_photos_it_names(read: PhotoReader) -> None:
     block = made.exif_block({}, {made.FOCAL_35MM: 28})
     files = {
         "a.jpg": made.jpeg(made.picture(), block),
@@ -323,7 +315,7 @@ def test_the_calibration_reaches_the_photos_it_names(tmp_path: Path, read: Photo
     }
     other = CAMERA.replace("fx: 60", "fx: 70")
     text = f"cameras:\n  b.jpg: {other}\n  '[ab].*': {CAMERA}\n  B.jpg: {CAMERA}\n"
-    photos = read(*made.write(tmp_path, files), calibration=text)
+    photos = read.files(files, calibration=text)
     assert [None if p.intrinsics is None else p.intrinsics.fx for p in photos] == [60.0, 70.0, None]
     assert photos[0].intrinsics is not None
     assert (photos[0].intrinsics.cx, photos[0].intrinsics.cy) == (32.0, 24.0)

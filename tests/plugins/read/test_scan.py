@@ -18,6 +18,8 @@ from orthoflow.products import PointCloud
 from tests import scan_files
 from tests.method_runs import Reader
 
+POINTS = np.round(np.random.default_rng(3).uniform(-5.0, 5.0, (400, 3)), 4)
+
 
 class ScanReader(Reader):
     """Returns the cloud of files."""
@@ -30,11 +32,6 @@ class ScanReader(Reader):
 @pytest.fixture
 def read(tmp_path: Path) -> ScanReader:
     return ScanReader(ReadScan, tmp_path)
-
-
-@pytest.fixture
-def points() -> NDArray[np.float64]:
-    return np.round(np.random.default_rng(3).uniform(-5.0, 5.0, (400, 3)), 4)
 
 
 def scan_of(cloud: PointCloud) -> dict[str, Any]:
@@ -66,10 +63,10 @@ def cartesian(points: NDArray[np.float64], **more: object) -> dict[str, object]:
     [("m", 1.0), ("cm", 0.01), ("mm", 0.001), ("ft", 0.3048), ("us-ft", 1200 / 3937)],
 )
 def test_survey_coordinates_come_out_in_metres_to_a_hundredth_of_a_millimetre(
-    tmp_path: Path, read: ScanReader, points: NDArray[np.float64], unit: str, factor: float
+    tmp_path: Path, read: ScanReader, unit: str, factor: float
 ) -> None:
     shift = np.array([634512.347, 486215.781, 112.193])
-    world_m = points + shift
+    world_m = POINTS + shift
     cloud = read(write_text(tmp_path / "a.xyz", world_m / factor), unit=unit)
     np.testing.assert_allclose(cloud.points_world(), world_m, atol=1e-5)
     assert (cloud.origin == np.floor(cloud.origin)).all()
@@ -83,10 +80,8 @@ def test_survey_coordinates_come_out_in_metres_to_a_hundredth_of_a_millimetre(
     assert cloud.source["resolution_m"] == 2.0**-21
 
 
-def test_a_box_keeps_the_points_in_it_and_on_its_faces(
-    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
-) -> None:
-    world_m = points + np.array([634512.347, 486215.781, 112.193])
+def test_a_box_keeps_the_points_in_it_and_on_its_faces(tmp_path: Path, read: ScanReader) -> None:
+    world_m = POINTS + np.array([634512.347, 486215.781, 112.193])
     # In feet: the box is in metres, as everything that follows.
     corner = world_m[7]
     box = [[*(corner - 4.0)], [*corner]]
@@ -111,7 +106,7 @@ def test_a_box_keeps_the_points_in_it_and_on_its_faces(
 
 
 def test_gsd_and_box_choose_nodes_of_a_copc_file_in_metres(
-    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
+    tmp_path: Path, read: ScanReader
 ) -> None:
     rng = np.random.default_rng(3)
     coarse, left, right = (
@@ -127,7 +122,7 @@ def test_gsd_and_box_choose_nodes_of_a_copc_file_in_metres(
     assert len(cloud) == 400 + np.count_nonzero((coarse <= 3.9).all(axis=1))
     assert scan_of(cloud)["n_read"] == 800
     assert "gsd_m only concerns" not in read.warnings
-    read(scan_files.write_las(tmp_path / "b.laz", points), gsd_m=0.1)
+    read(scan_files.write_las(tmp_path / "b.laz", POINTS), gsd_m=0.1)
     assert "gsd_m has no effect: it only concerns COPC files" in read.warnings
 
 
@@ -136,24 +131,20 @@ def test_a_box_without_an_inside_is_refused() -> None:
         ReadScan.Params(box=((0.0, 0.0, 1.0), (1.0, 1.0, 1.0)))
 
 
-def test_classes_choose_points_of_las_files(
-    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
-) -> None:
+def test_classes_choose_points_of_las_files(tmp_path: Path, read: ScanReader) -> None:
     classes = np.arange(400) % 3
-    path = scan_files.write_las(tmp_path / "a.laz", points, classes=classes)
+    path = scan_files.write_las(tmp_path / "a.laz", POINTS, classes=classes)
     cloud = read(path, classes=[0, 2])
-    np.testing.assert_allclose(cloud.points_world(), points[classes != 1], atol=6e-5)
+    np.testing.assert_allclose(cloud.points_world(), POINTS[classes != 1], atol=6e-5)
     assert scan_of(cloud)["left_out"] == {"other_class": 133}
     with pytest.raises(InputError, match="400 are of other classes than those asked for; change"):
         read(path, classes=[9])
-    read(write_text(tmp_path / "a.xyz", points), classes=[2])
+    read(write_text(tmp_path / "a.xyz", POINTS), classes=[2])
     assert "classes has no effect: it only concerns LAS and LAZ files" in read.warnings
 
 
-def test_stray_points_do_not_cost_the_scan_its_precision(
-    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
-) -> None:
-    world = points + np.array([634512.347, 486215.781, 112.193])
+def test_stray_points_do_not_cost_the_scan_its_precision(tmp_path: Path, read: ScanReader) -> None:
+    world = POINTS + np.array([634512.347, 486215.781, 112.193])
     world[:3] = 1.0
     cloud = read(write_text(tmp_path / "a.xyz", world))
     np.testing.assert_allclose(cloud.points_world()[3:], world[3:], atol=1e-5)
@@ -161,19 +152,16 @@ def test_stray_points_do_not_cost_the_scan_its_precision(
 
 
 @pytest.mark.parametrize("up", ["x", "-y"])
-def test_up_is_told_and_nothing_is_turned(
-    tmp_path: Path, read: ScanReader, points: NDArray[np.float64], up: str
-) -> None:
-    cloud = read(write_text(tmp_path / "a.xyz", points), up=up)
+def test_up_is_told_and_nothing_is_turned(tmp_path: Path, read: ScanReader, up: str) -> None:
+    cloud = read(write_text(tmp_path / "a.xyz", POINTS), up=up)
     expected = np.zeros(3)
     expected["xyz".index(up[-1])] = -1.0 if up.startswith("-") else 1.0
     np.testing.assert_array_equal(cloud.up, expected)
-    np.testing.assert_allclose(cloud.points_world(), points, atol=1e-6)
+    np.testing.assert_allclose(cloud.points_world(), POINTS, atol=1e-6)
 
 
-def test_finite_points_beyond_any_survey_are_named(
-    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
-) -> None:
+def test_finite_points_beyond_any_survey_are_named(tmp_path: Path, read: ScanReader) -> None:
+    points = POINTS.copy()
     points[5] = (0.5, 1e30, -2.0)
     points[9, 0] = -2e9
     points[11, 0] = np.nan
@@ -186,30 +174,28 @@ def test_finite_points_beyond_any_survey_are_named(
 
 
 def test_rounded_coordinates_and_a_scan_of_less_than_a_metre_are_warned_of(
-    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
+    tmp_path: Path, read: ScanReader
 ) -> None:
-    path = write_text(tmp_path / "a.xyz", points)
+    path = write_text(tmp_path / "a.xyz", POINTS)
     read(path)
     assert "rounded" not in read.warnings
     assert "is that right?" not in read.warnings
     read(path, unit="mm")
     assert "m (unit mm): is that right?: set {step}.unit=m if" in read.warnings
-    read(write_text(tmp_path / "b.xyz", np.round(points, 2)))
+    read(write_text(tmp_path / "b.xyz", np.round(POINTS, 2)))
     assert "the coordinates of b.xyz are rounded to 10 mm" in read.warnings
 
 
 # Several files and scans
 
 
-def test_several_files_become_one_cloud(
-    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
-) -> None:
-    first = write_text(tmp_path / "a.xyz", points)
+def test_several_files_become_one_cloud(tmp_path: Path, read: ScanReader) -> None:
+    first = write_text(tmp_path / "a.xyz", POINTS)
     second = scan_files.write_e57(
         tmp_path / "b.e57",
         [
             {
-                "fields": cartesian(points),
+                "fields": cartesian(POINTS),
                 "rotation": (1, 0, 0, 0),
                 "translation": (number, 0, 0),
             }
@@ -221,7 +207,7 @@ def test_several_files_become_one_cloud(
     assert cloud.scan is None
     assert len(cloud) == 1200
     np.testing.assert_allclose(
-        cloud.points_world()[400:800], points + np.array([10.0, 0, 0]), atol=1e-6
+        cloud.points_world()[400:800], POINTS + np.array([10.0, 0, 0]), atol=1e-6
     )
     np.testing.assert_array_equal(cloud.stations, [[10.0, 0, 0], [20.0, 0, 0]])
     assert "only 2 of 3 scans state where the scanner stood" in read.warnings
@@ -229,14 +215,12 @@ def test_several_files_become_one_cloud(
     assert scans == [("a.xyz", 0), ("b.e57", 0), ("b.e57", 1)]
 
 
-def test_stations_belong_to_scans_in_their_order(
-    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
-) -> None:
+def test_stations_belong_to_scans_in_their_order(tmp_path: Path, read: ScanReader) -> None:
     half = np.sqrt(0.5)
     scans = [
-        {"fields": cartesian(points)},
+        {"fields": cartesian(POINTS)},
         {
-            "fields": cartesian(points),
+            "fields": cartesian(POINTS),
             "rotation": (half, 0, 0, half),
             "translation": (3.0, 4.0, 0.5),
         },
@@ -254,12 +238,12 @@ def test_stations_belong_to_scans_in_their_order(
 
 
 def test_view_from_is_in_metres_and_gives_way_to_the_scanner(
-    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
+    tmp_path: Path, read: ScanReader
 ) -> None:
-    cloud = read(write_text(tmp_path / "a.xyz", points), view_from=[1.0, 2, 3.5], unit="ft")
+    cloud = read(write_text(tmp_path / "a.xyz", POINTS), view_from=[1.0, 2, 3.5], unit="ft")
     np.testing.assert_array_equal(cloud.stations, [[1.0, 2.0, 3.5]])
     assert cloud.stations_source == "view_from"
-    scan = scan_files.write_e57(tmp_path / "a.e57", [{"fields": cartesian(points)}])
+    scan = scan_files.write_e57(tmp_path / "a.e57", [{"fields": cartesian(POINTS)}])
     cloud = read(scan, view_from=[1.0, 2.0, 3.5])
     assert cloud.stations_source == "file"
     assert "view_from has no effect" in read.warnings
@@ -268,10 +252,8 @@ def test_view_from_is_in_metres_and_gives_way_to_the_scanner(
 # Intensity
 
 
-def test_the_user_can_set_full_intensity(
-    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
-) -> None:
-    table = np.column_stack([points, np.arange(400)])
+def test_the_user_can_set_full_intensity(tmp_path: Path, read: ScanReader) -> None:
+    table = np.column_stack([POINTS, np.arange(400)])
     cloud = read(write_text(tmp_path / "a.xyz", table), intensity_max=200.0)
     np.testing.assert_allclose(cloud.intensity, np.minimum(np.arange(400) / 200, 1), atol=1e-6)
     assert "199 intensities lie beyond 0 to 200 (intensity_max) and were clipped" in read.warnings
@@ -281,10 +263,10 @@ def test_the_user_can_set_full_intensity(
 
 
 def test_zero_intensity_and_zero_colours_are_absent_not_black(
-    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
+    tmp_path: Path, read: ScanReader
 ) -> None:
     zeros = np.zeros((400, 3), np.int64)
-    path = scan_files.write_las(tmp_path / "a.laz", points, intensity=zeros[:, 0], rgb=zeros)
+    path = scan_files.write_las(tmp_path / "a.laz", POINTS, intensity=zeros[:, 0], rgb=zeros)
     cloud = read(path)
     assert cloud.intensity is None
     assert cloud.rgb is None
@@ -294,11 +276,11 @@ def test_zero_intensity_and_zero_colours_are_absent_not_black(
 
 
 def test_an_intensity_that_repeats_the_colours_is_no_laser_intensity(
-    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
+    tmp_path: Path, read: ScanReader
 ) -> None:
     rgb = np.random.default_rng(0).integers(0, 256, (400, 3))
     grey = np.rint(rgb @ [0.299, 0.587, 0.114] * 257).astype(np.int64)
-    path = scan_files.write_las(tmp_path / "a.laz", points, intensity=grey, rgb=rgb * 256)
+    path = scan_files.write_las(tmp_path / "a.laz", POINTS, intensity=grey, rgb=rgb * 256)
     cloud = read(path)
     assert cloud.intensity is None
     assert cloud.source["intensity_source"] == "luminance"
@@ -306,28 +288,23 @@ def test_an_intensity_that_repeats_the_colours_is_no_laser_intensity(
 
 
 def test_grey_colours_made_from_the_intensity_leave_it_a_laser_intensity(
-    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
+    tmp_path: Path, read: ScanReader
 ) -> None:
     grey = np.random.default_rng(0).integers(0, 256, 400)
     rgb = np.repeat(grey[:, None], 3, axis=1)
-    path = scan_files.write_las(tmp_path / "a.laz", points, intensity=grey * 200, rgb=rgb)
+    path = scan_files.write_las(tmp_path / "a.laz", POINTS, intensity=grey * 200, rgb=rgb)
     cloud = read(path)
     assert cloud.intensity is not None
     assert cloud.source["intensity_source"] == "laser"
     assert "they do not come from photos" in read.warnings
 
 
-# Colours
-
-
 # The method as a whole
 
 
 @pytest.mark.usefixtures("charts")
-def test_a_picture_from_above_is_drawn(
-    tmp_path: Path, read: ScanReader, points: NDArray[np.float64]
-) -> None:
-    read(write_text(tmp_path / "a.xyz", points))
+def test_a_picture_from_above_is_drawn(tmp_path: Path, read: ScanReader) -> None:
+    read(write_text(tmp_path / "a.xyz", POINTS))
     (figure,) = read.ctx.figures
     assert figure.path.read_bytes().startswith(b"RIFF")  # WebP
     # Of a scan with rows and columns, what the scanner saw as well.
@@ -338,11 +315,11 @@ def test_a_picture_from_above_is_drawn(
 
 
 def test_too_little_scratch_space_is_said_before_anything_is_written(
-    tmp_path: Path, read: ScanReader, points: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, read: ScanReader, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=1000))
     with pytest.raises(StoreError, match=r"400 points need 0\.00 GB of scratch space, but only"):
-        read(scan_files.write_las(tmp_path / "a.laz", points))
+        read(scan_files.write_las(tmp_path / "a.laz", POINTS))
 
 
 # Real scans
