@@ -37,7 +37,7 @@ from orthoflow.testing.physics import (
     stated_errors_of_planes_hold,
     stated_errors_of_poses_hold,
 )
-from orthoflow.testing.witnesses import Subject, require
+from orthoflow.testing.witnesses import Subject, output_of, require
 
 # What a float parameter's name has in it: its unit, or a word that says it has none.
 UNIT_SUFFIXES: Final = (*UNITS, "world", "intensity")
@@ -285,9 +285,8 @@ def missing_ties_are_reported(subject: Subject) -> None:
         run = subject.run_on("no-ties", ties=empty)
     except OrthoflowError:
         return
-    cameras = run.outputs["cameras"]
-    found = cameras.cameras if isinstance(cameras, Cameras) else ()
-    oriented = [camera.photo for camera in found if camera.status == "ok"]
+    cameras = output_of(run, "cameras", Cameras).cameras
+    oriented = [camera.photo for camera in cameras if camera.status == "ok"]
     require(not oriented, f"without any ties {', '.join(oriented)} was oriented all the same")
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Final
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +34,7 @@ from orthoflow.testing.photographed import (
     wall_error_m,
     walls_of,
 )
-from orthoflow.testing.witnesses import Subject, require
+from orthoflow.testing.witnesses import Subject, output_of, require
 
 # Ties of 0.3 px and 1 mm at 2.5 m: single ones are off by 1.3 mm on the wall, a hundred together by
 # a tenth of that. A half pixel of the wrong convention is 1.5 mm.
@@ -52,6 +54,8 @@ _NO_VARIANCE: Final = 1e-30
 # The RMS over what is drawn is known to an eighth; our own methods have 0.82 to 0.93.
 _STATED_LIMITS: Final = (0.1, 2.0)
 
+_Kinds: TypeAlias = Mapping[str, Callable[[], Product]]
+
 
 def planes_follow_a_rigid_motion(subject: Subject) -> None:
     """Planes of a room turned about up and shifted are the planes, turned and shifted.
@@ -63,10 +67,9 @@ def planes_follow_a_rigid_motion(subject: Subject) -> None:
     for turned_deg, moved_by in ((0.0, shift), (33.0, np.zeros(3)), (191.7, shift)):
         cloud, truth = example_room(n_points=_ROOM_POINTS, turned_deg=turned_deg, shift_m=moved_by)
         run = subject.run_on(f"turned{turned_deg}{moved_by[0]}", cloud=cloud)
-        planes = run.outputs["planes"]
-        require(isinstance(planes, Planes) and len(planes) > 0, "no plane was found")
-        if isinstance(planes, Planes):
-            _match_planes(planes, truth)
+        planes = output_of(run, "planes", Planes)
+        require(len(planes) > 0, "no plane was found")
+        _match_planes(planes, truth)
 
 
 def _match_planes(found: Planes, truth: Planes) -> None:
@@ -88,9 +91,8 @@ def stated_errors_of_planes_hold(subject: Subject) -> None:
     ratios: list[float] = []
     for seed in _DRAWS:
         cloud, truth = example_room(seed=seed, n_points=_ROOM_POINTS)
-        planes = subject.run_on(f"stated{seed}", cloud=cloud).outputs["planes"]
-        if isinstance(planes, Planes):
-            ratios += _plane_ratios(planes, truth)
+        run = subject.run_on(f"stated{seed}", cloud=cloud)
+        ratios += _plane_ratios(output_of(run, "planes", Planes), truth)
     _check_ratios(ratios, "distances of planes to their true corners")
 
 
@@ -114,9 +116,8 @@ def stated_errors_of_poses_hold(subject: Subject) -> None:
     """Poses from drawn ties are off by a tenth to twice what their covariances state."""
     ratios: list[float] = []
     for seed in _DRAWS:
-        outputs = subject.run_on_photographs(f"stated{seed}", ties=drawn_ties(seed)).outputs
-        cameras = outputs["cameras"]
-        for camera in cameras.cameras if isinstance(cameras, Cameras) else ():
+        run = subject.run_on_photographs(f"stated{seed}", ties=drawn_ties(seed))
+        for camera in output_of(run, "cameras", Cameras).cameras:
             if camera.status == "ok" and camera.covariance is not None:
                 found, true = camera.viewing(), photographing_cameras()[camera.photo]
                 turn = true.rotation @ found.rotation.T
@@ -145,11 +146,7 @@ def _check_ratios(ratios: list[float], what: str) -> None:
 
 def poses_are_recovered(subject: Subject) -> None:
     """Two photos with ties of 0.3 px, some of them wrong, are oriented to 0.8 mm on the wall."""
-    cameras = subject.run_on_photographs().outputs["cameras"]
-    require(isinstance(cameras, Cameras), "cameras are missing")
-    if not isinstance(cameras, Cameras):
-        return
-    for camera in cameras.cameras:
+    for camera in output_of(subject.run_on_photographs(), "cameras", Cameras).cameras:
         require(camera.status == "ok", f"{camera.photo} was not oriented: {camera.status}")
         true = photographing_cameras()[camera.photo]
         error_m = wall_error_m(photographed_scene(), camera.viewing(), true)
@@ -164,38 +161,40 @@ def cells_show_their_own_place(subject: Subject) -> None:
     """At two cell sizes each painted cell has the colour of its own place, to 0.2 cells."""
     for gsd_m in _CELL_SIZES_M:
         scene = photographed_scene(gsd_m)
-        given: dict[str, Product] = {"walls": walls_of(scene), "cloud": cloud_of(scene)}
-        ports = {name: port.type_name for name, port in port_specs(subject.method.In).items()}
-        inputs = {
-            name: given[kind] if kind in given else PHOTOGRAPHED[kind]()
-            for name, kind in ports.items()
-            if kind in given or kind in PHOTOGRAPHED
+        kinds: _Kinds = {
+            **PHOTOGRAPHED,
+            "walls": partial(walls_of, scene),
+            "cloud": partial(cloud_of, scene),
         }
-        layers = subject.run_on(f"cells{gsd_m}", **inputs).outputs["layers"]
-        require(isinstance(layers, Layers) and layers.layers, "no layer was made")
-        if isinstance(layers, Layers):
-            for layer in layers.layers:
-                _check_cells(scene, layer, layer.source, layer.mask == LayerMask.PAINTED)
+        run = subject.run_on(f"cells{gsd_m}", **_inputs(subject, kinds))
+        layers = output_of(run, "layers", Layers).layers
+        require(layers, "no layer was made")
+        for layer in layers:
+            _check_cells(scene, layer, layer.source, layer.mask == LayerMask.PAINTED)
 
 
 def mosaics_show_cells_in_place(subject: Subject) -> None:
     """Two layers that overlap become one orthoimage whose cells have the colour of their place."""
     for gsd_m in _CELL_SIZES_M:
         scene = photographed_scene(gsd_m)
-        given: dict[str, Product] = {"layers": _two_halves(scene), "walls": walls_of(scene)}
-        ports = {name: port.type_name for name, port in port_specs(subject.method.In).items()}
-        inputs = {name: given[kind] for name, kind in ports.items() if kind in given}
-        made = subject.run_on(f"mosaic{gsd_m}", **inputs).outputs["orthoimages"]
-        require(isinstance(made, Orthoimages) and made.images, "no orthoimage was made")
-        if isinstance(made, Orthoimages):
-            for image in made.images:
-                painted = is_painted(image.mask)
-                _check_cells(scene, image, image.name, painted)
-                require(
-                    painted.mean() > _JOINED_SHARE,
-                    f"{image.name} at {gsd_m} m: {painted.mean():.0%} of the cells are painted, "
-                    "although the layers show all",
-                )
+        kinds: _Kinds = {"layers": partial(_two_halves, scene), "walls": partial(walls_of, scene)}
+        run = subject.run_on(f"mosaic{gsd_m}", **_inputs(subject, kinds))
+        images = output_of(run, "orthoimages", Orthoimages).images
+        require(images, "no orthoimage was made")
+        for image in images:
+            painted = is_painted(image.mask)
+            _check_cells(scene, image, image.name, painted)
+            require(
+                painted.mean() > _JOINED_SHARE,
+                f"{image.name} at {gsd_m} m: {painted.mean():.0%} of the cells are painted, "
+                "although the layers show all",
+            )
+
+
+def _inputs(subject: Subject, kinds: _Kinds) -> dict[str, Product]:
+    """What the method takes of these kinds, by port."""
+    ports = port_specs(subject.method.In).items()
+    return {name: kinds[port.type_name]() for name, port in ports if port.type_name in kinds}
 
 
 def _two_halves(scene: TexturedWall) -> Layers:

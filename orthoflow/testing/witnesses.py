@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TypeVar
 
 import numpy as np
 
@@ -17,6 +18,8 @@ from orthoflow.sdk import Method
 from orthoflow.testing.examples import example_inputs
 from orthoflow.testing.isolation import ElsewhereRun, run_elsewhere
 from orthoflow.testing.trials import Trial, TrialRun, run_trial
+
+_Product = TypeVar("_Product", bound=Product)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,6 +127,18 @@ class Subject:
     def run_cancelled(self) -> TrialRun:
         """Run the method in a step that was cancelled before it began."""
         return run_trial(self.witness.trial, self.folder / "cancelled", is_cancelled=True)
+
+
+def output_of(run: TrialRun, port: str, kind: type[_Product]) -> _Product:
+    """Return an output that a method of its kind has to give.
+
+    Raises:
+        AssertionError: it is missing, or of another type.
+    """
+    product = run.outputs.get(port)
+    if not isinstance(product, kind):
+        raise AssertionError(f"output {port} is missing")  # noqa: TRY004 - a broken rule
+    return product
 
 
 def require(holds: object, sentence: str) -> None:

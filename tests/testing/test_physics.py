@@ -66,7 +66,7 @@ def test_a_photo_that_is_not_oriented_is_named() -> None:
     lost = replace(oriented(0.0).run_on_photographs().outputs["cameras"].cameras[1], status="few")
     for cameras, said in (
         (photographed.cameras(lost), r"b\.png was not oriented: few"),
-        (None, "cameras are missing"),
+        (None, "output cameras is missing"),
     ):
         run = SimpleNamespace(outputs={"cameras": cameras})
         subject: Any = SimpleNamespace(run_on_photographs=lambda run=run: run)
