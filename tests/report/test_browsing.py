@@ -183,15 +183,6 @@ def test_a_run_without_a_record_says_what_its_journal_begins_with(tmp_path: Path
     assert (odd.state, odd.workflow, odd.run_id, odd.started) == ("unfinished", "", "", "")
 
 
-@pytest.mark.parametrize(("n_bytes", "state"), [(65_536, "unfinished"), (65_600, "damaged")])
-def test_a_first_line_has_64_kilobytes(tmp_path: Path, n_bytes: int, state: str) -> None:
-    folder = a_run(tmp_path / "going")
-    text = json.dumps({"workflow": "x"})
-    (folder / "journal.jsonl").write_text(text[:-1].ljust(n_bytes - 1) + "}")
-    (recorded,) = summaries([folder])
-    assert recorded.state == state
-
-
 def test_what_cannot_be_read_is_told_and_the_others_are_summed_up(tmp_path: Path) -> None:
     spoilt = a_run(tmp_path / "spoilt", "run.h5")
     empty = tmp_path / "empty"

@@ -99,20 +99,6 @@ def test_the_reason_of_a_failure_is_cut_where_it_is_endless(tmp_path: Path) -> N
     assert len(repr(OpenedRun(path=tmp_path / "run.h5", record=record([failed])))) < 700
 
 
-def swept_run(folder: Path) -> OpenedRun:
-    """Three tolerances, one of them twice, in one room; a step is called `unit`."""
-    cells = []
-    for value in (0.02, 0.05, 0.1):
-        name = f"plane=tolerance_m-{value:g}".replace(".", "_")
-        cells += [
-            cell(f"plane@data=hall,{name}{mark}", params={"tolerance_m": value})
-            for mark in (("", "#1") if value == 0.05 else ("",))
-        ]
-        rms = metrics(rms_mm=100.0 * value)
-        cells.append(cell(f"check@data=hall,{name},unit=a", metrics=rms))
-    return OpenedRun(path=folder / "run.h5", record=record(cells))
-
-
 def test_metrics_are_a_row_each_with_the_variants_beside(tmp_path: Path) -> None:
     table = opened(tmp_path).metrics()
     rms = table[table.metric == "rms_mm"]
@@ -126,23 +112,10 @@ def test_metrics_are_a_row_each_with_the_variants_beside(tmp_path: Path) -> None
     assert table[table.step == "scan"]["variant.plane"].isna().all()
 
 
-def test_a_swept_parameter_is_a_column_of_numbers(tmp_path: Path) -> None:
-    # A curve was `removeprefix("tolerance_m-").str.replace("_", ".").astype(float)` before.
-    table = swept_run(tmp_path).metrics()
-    rms = table[(table.step == "check") & (table.metric == "rms_mm")]
-    assert dict(zip(rms["plane.tolerance_m"], rms.value, strict=True)) == {
-        0.02: 2.0, 0.05: 5.0, 0.1: 10.0,
-    }  # fmt: skip
-    assert rms["plane.tolerance_m"].dtype == float
-    assert list(table["dataset"].unique()) == ["hall"]
-    # A step may be called as a column is.
-    assert {"unit", "variant.unit"} <= set(table.columns)
-
-
 def test_rows_state_which_of_several_swept_methods_they_are_of(tmp_path: Path) -> None:
     cells = [
         cell(
-            f"plane@plane={kind}-{value}",
+            f"plane@data=hall,plane={kind}-{value}",
             method=f"plane.{kind}",
             params={"tolerance_m": value},
             metrics=metrics(rms_mm=1.0),
@@ -151,11 +124,11 @@ def test_rows_state_which_of_several_swept_methods_they_are_of(tmp_path: Path) -
         for value in (2, 3)
     ]
     table = OpenedRun(path=tmp_path / "run.h5", record=record(cells)).metrics()
-    rows = table[table.metric == "rms_mm"][["plane.use", "plane.tolerance_m"]]
+    rows = table[table.metric == "rms_mm"][["dataset", "plane.use", "plane.tolerance_m"]]
     assert rows.to_numpy().tolist() == [
-        *(["plane.hough", 2.0], ["plane.hough", 3.0]),
-        *(["plane.region", 2.0], ["plane.region", 3.0]),
+        ["hall", f"plane.{kind}", value] for kind in ("hough", "region") for value in (2.0, 3.0)
     ]
+    assert rows["plane.tolerance_m"].dtype == float
 
 
 def test_figures_are_by_cell_and_name_and_shown(tmp_path: Path) -> None:
@@ -235,18 +208,6 @@ def test_runs_are_compared_as_a_table(tmp_path: Path) -> None:
     assert "<td>n_points</td>" in html
     assert "rms_mm" not in html
     assert np.isnan(table.loc[("plane@plane=coarse", "rms_mm")].difference)
-
-
-def test_a_run_whose_variants_show_different_walls_says_so(tmp_path: Path) -> None:
-    told = [metrics(omega_deg=10.0, phi_deg=0.0, area_m2=area) for area in (16.0, 1.2)]
-    cells = [
-        cell(f"wall@plane={index}", method="raster.grid", metrics=one)
-        for index, one in enumerate(told)
-    ]
-    run = OpenedRun(path=tmp_path / "run.h5", record=record(cells))
-    assert "<p>not all combinations show the same wall first" in run._repr_html_()
-    alone = OpenedRun(path=tmp_path / "run.h5", record=record(cells[:1]))
-    assert "not all combinations" not in alone._repr_html_()
 
 
 def shown(*rows: Pair[ComparedMetric]) -> str:
@@ -333,17 +294,10 @@ def test_what_is_wrong_with_a_workflow_is_raised(
     assert {"run", "open_run"} <= set(dir(orthoflow))
     with pytest.raises(WorkflowError, match="did you mean direct"):
         orthoflow.run("dirct.yaml")
-    (tmp_path / "fine.yaml").write_text("wall.gsd_m: 0.004\nwall.gsd: 1\n")
-    for files in ("fine.yaml", [tmp_path / "fine.yaml"]):
-        with pytest.raises(OrthoflowError, match=r"fine\.yaml:2:1: .*there is no parameter gsd in"):
-            orthoflow.run("direct.yaml", set_files=files)
     # What is wrong with a mapping of datasets is placed in what its author wrote.
     for said, message in (
         ({"set": {"plane.tolerance": 1}}, r"^datasets=: hall\.set\.plane\.tolerance: there is no "),
-        ({"scna": "a.e57"}, r"^datasets=: hall\.scna: there is no input scna \(did you mean scan"),
         ({"scan": ["a.e57", Path("b.e57")]}, r"^input scan@hall: there is no file a\.e57 in the w"),
-        ({"scan": 1}, r"^datasets=: hall\.scan: input should be a text, got 1"),
-        (0.1, r"^datasets=: hall: input should be a mapping, got 0\.1"),
         ({"scan": {1}}, r"datasets: expected a path, text"),
     ):
         with pytest.raises(OrthoflowError, match=message):

@@ -50,12 +50,11 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         server.shutdown()
 
 
-@pytest.mark.parametrize(("width", "height"), [(1350, 940), (412, 823)])
 def test_what_is_read_stays_where_it_is_when_the_script_comes(
-    new_page: Callable[[], Page], address: str, width: int, height: int
+    new_page: Callable[[], Page], address: str
 ) -> None:
     page = new_page()
-    page.show_as(width, height)
+    page.show_as(412, 823)
     page.visit(address)
     assert page.evaluate("document.documentElement.classList.contains('scripted')")
     assert sum(page.evaluate(SHIFTS)) < POOR_SHIFT

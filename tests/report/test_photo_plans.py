@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,14 +10,10 @@ import numpy as np
 import pytest
 from orthoflow_plugins.orient.report import residual_rows
 
-from orthoflow.geometry.cameras import looking_at
 from orthoflow.products import Camera, Cameras
-from orthoflow.report import photo_plans as module
-from orthoflow.report.pages import write_page
 from orthoflow.report.photo_plans import photo_plan
 from orthoflow.report.pictures import wall_pictures
-from tests import samples
-from tests.report_runs import HeldRun, camera, compared_run
+from tests.report_runs import HeldRun, compared_run
 
 
 def oriented(run: HeldRun, **changes: Any) -> HeldRun:
@@ -74,36 +69,6 @@ def test_without_an_oriented_photo_there_is_no_plan(tmp_path: Path) -> None:
     assert photo_plan(run, list(wall_pictures(run))) is None
 
 
-# --- the plan by itself ---
-
-UP = np.array([0.0, 0.0, 1.0])
-
-
-# Walls of 12 m from west to east and of 4 m from south to north.
-WALLS = [
-    ("hall", samples.facing_south(0.01, 1200, 300, (100.0, 200.0, 3.0))),
-    ("end", samples.facing_east(0.01, 400, 300, (100.0, 196.0, 3.0))),
-]
-
-
-def standing(name: str, x: float, y: float, towards: tuple[float, float]) -> Camera:
-    centre = np.array([x, y, 1.5])
-    rotation = looking_at(centre, centre + np.array([*towards, 0.0]), UP)
-    return Camera(
-        photo=name,
-        status="ok",
-        intrinsics=camera().intrinsics,
-        rotation_camera_from_world=rotation,
-        translation_camera_from_world=-rotation @ centre,
-    )
-
-
-PHOTOS = [
-    standing("a.jpg", 103.0, 194.0, (0.0, 1.0)),
-    standing("b.jpg", 109.0, 197.0, (-3.0, 4.0)),
-]
-
-
 def test_each_photo_has_a_row_with_its_error_on_the_wall(tmp_path: Path) -> None:
     one = replace(ours(compared_run(tmp_path)), sigma_wall_m=0.0012)
     refused = Camera(photo="gone.jpg", status="too few <ties>")
@@ -122,26 +87,3 @@ def test_each_photo_has_a_row_with_its_error_on_the_wall(tmp_path: Path) -> None
         ("gone.jpg", None, None, None, None, "too few <ties>"),
         ("untied.jpg", None, None, 0, 0, "ok"),
     )
-
-
-def test_the_page_has_a_table_of_photos(tmp_path: Path) -> None:
-    one = replace(ours(compared_run(tmp_path)), sigma_wall_m=0.001_234)
-    run = run_with(tmp_path, one, Camera(photo="gone.jpg", status="too few <ties>"))
-    write_page(run, tmp_path / "page.html")
-    page = (tmp_path / "page.html").read_text()
-    [table] = re.findall(r'aria-label="photos of orient@plane=fine".*?</table>', page, re.DOTALL)
-    rows = re.findall(r"<tr>(.*?)</tr>", table.partition("<tbody>")[2], re.DOTALL)
-    cells = [re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row, re.DOTALL) for row in rows]
-    assert [[re.sub("<wbr>", "", cell) for cell in row] for row in cells] == [
-        ["a.jpg", "1.23", "-", "10", "10", "ok"],
-        ["gone.jpg", "-", "-", "-", "-", "too few &lt;ties&gt;"],
-    ]
-
-
-def test_walls_and_photos_lie_in_metres_of_the_world() -> None:
-    walls, photos = module._drawn(UP, PHOTOS, dict(enumerate(WALLS)))
-    assert [wall[0] for wall in walls] == ["hall", "end"]
-    assert np.ptp(walls[0][2], axis=0) == pytest.approx([12.0, 0.0], abs=1e-9)
-    assert np.ptp(walls[1][2], axis=0) == pytest.approx([0.0, 4.0], abs=1e-9)
-    np.testing.assert_allclose([photo[1] for photo in photos], [[103.0, 194.0], [109.0, 197.0]])
-    np.testing.assert_allclose([photo[2] for photo in photos], [[0.0, 1.0], [-0.6, 0.8]])

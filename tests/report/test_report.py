@@ -86,18 +86,15 @@ def test_figures_lie_beside_the_page_as_png_and_svg(compared: Run, tmp_path: Pat
         "figures/check@plane=fine/error_map.png",
         "figures/check@plane=fine/chart.png",
     }
+    # Only a page beside them leads to them.
+    assert 'href="figures/' in (tmp_path / "report.html").read_text()
+    write_report([compared], tmp_path / "other.html")
+    assert 'href="figures/' not in (tmp_path / "other.html").read_text()
     assert write_figures(compared, tmp_path / "all", compared.cells) == 4
     assert len(list((tmp_path / "all").glob("check@plane=coarse/*.png"))) == 2
     for path in tmp_path.rglob("figures/**/*.png"):
         assert path.read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "figures" / "graph.svg").read_bytes().startswith(b"<?xml")
-
-
-def test_only_a_page_beside_its_figures_leads_to_their_files(compared: Run, tmp_path: Path) -> None:
-    write_page(compared, tmp_path / "report.html")
-    assert 'href="figures/' in (tmp_path / "report.html").read_text()
-    write_report([compared], tmp_path / "other.html")
-    assert 'href="figures/' not in (tmp_path / "other.html").read_text()
 
 
 def test_what_was_skipped_asks_for_no_citation() -> None:
@@ -110,20 +107,6 @@ def test_what_was_skipped_asks_for_no_citation() -> None:
         "Planes, 2015": ("plane.toy", "wall.toy: 4, Table 2"),
         "Walls, 2016": ("wall.toy",),
     }
-
-
-def test_figures_beyond_the_budget_are_drawn_smaller(
-    compared: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    before = sum(
-        len(picture.uri) for group in figure_groups(compared) for picture in group.pictures
-    )
-    monkeypatch.setattr("orthoflow.report.figures._BYTES_MOST", 100)
-    monkeypatch.setattr("orthoflow.report.figures._SMALL_BYTES", 0)
-    monkeypatch.setattr("orthoflow.report.figures._LEAST_SIDE_PX", 40)
-    groups = figure_groups(compared)
-    assert [len(group.pictures) for group in groups] == [2, 2]
-    assert sum(len(picture.uri) for group in groups for picture in group.pictures) < before / 2
 
 
 def test_a_picture_that_cannot_be_decoded_costs_its_place_not_the_page(
@@ -220,14 +203,6 @@ def test_what_nobody_asked_for_is_not_called_unreached(tmp_path: Path) -> None:
     page = (tmp_path / "report.html").read_text()
     assert "<li>Not reached: check</li>" in page
     assert "<li>Not asked for: theirs, match</li>" in page
-
-
-def test_a_main_wall_that_was_missed_is_told_before_what_was_found() -> None:
-    plane = cell("plane", method="plane.toy", metrics=metrics(rms_mm=1.6))
-    for value, first in ((0.0, ("main wall found", "no")), (1.0, None)):
-        check = cell("check", method="inspect.truth", metrics=metrics(main_found=value))
-        told = [(one.what, one.value) for one in answers(run(plane, check))]
-        assert told == [*([first] if first else []), ("points to the first plane, RMS", "1.6 mm")]
 
 
 def test_a_third_party_method_declares_its_headlines() -> None:
@@ -359,27 +334,6 @@ def test_what_a_run_was_broken_off_before_has_no_time_and_is_not_counted(
     assert "None of the 2 combinations was computed to its end" in page
     assert "not computed: wall@plane=coarse and 3 more" in page
     assert "found no plane" not in page
-
-
-def test_runs_on_different_data_are_not_ranked_together() -> None:
-    runs = [
-        run(
-            cell("scan", outputs={"cloud": given("", digest, "cloud")}),
-            cell(
-                "plane",
-                metrics=metrics(rms_mm=value),
-                inputs={"cloud": given("scan.cloud", digest, "cloud")},
-            ),
-            run_id=f"r{digest}",
-        )
-        for digest, value in (("1", 1.0), ("2", 2.0))
-    ]
-    table = comparison_table(runs)
-    assert table is not None
-    assert [(row.run, row.values[0].group, row.values[0].mark) for row in table.rows] == [
-        (f"toy <run>, {Path.cwd().name}, r1", "A", Mark.NONE),
-        (f"toy <run>, {Path.cwd().name}, r2", "B", Mark.NONE),
-    ]
 
 
 def test_runs_of_one_workflow_are_told_apart_by_their_options() -> None:

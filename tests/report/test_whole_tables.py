@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from orthoflow_provenance.document import RecordedFile
+from syrupy.assertion import SnapshotAssertion
 
 from orthoflow.records.compare import CellFacts, Distance, Pair, ParameterValue, RunComparison
 from orthoflow.report.combinations import (
@@ -13,8 +15,10 @@ from orthoflow.report.combinations import (
     combinations_of,
     wanted_metrics,
 )
-from orthoflow.report.differences import Difference, differences
+from orthoflow.report.differences import differences
+from orthoflow.report.rendering import environment
 from orthoflow.report.summaries import answers
+from tests.compared_runs import compared
 from tests.report_runs import (
     HeldRun,
     cell,
@@ -74,10 +78,8 @@ OTHER_FACTS = CellFacts(
 )
 
 
-def test_all_that_differs_between_two_runs_is_told() -> None:
+def test_all_that_differs_between_two_runs_is_in_tables(snapshot: SnapshotAssertion) -> None:
     file = RecordedFile(name="a.e57", size_bytes=3, sha256="0123456789abcdef" * 4)
-    far = Distance(unit="m", largest=0.25, limit=0.1, field="offset", n_values=3)
-    odd = Distance(unit="", largest=None, limit=0.0, field="names", n_values=3)
     told = differences(
         RunComparison(
             left=record([], run_id="r1"),
@@ -108,38 +110,21 @@ def test_all_that_differs_between_two_runs_is_told() -> None:
                 Pair(cell="a", name="min_mm", left=metric(2.0), right=None),
                 Pair(cell="a", name="same_mm", left=metric(2.0), right=metric(2.0)),
             ),
-            products=(
-                distance("one", "identical"),
-                distance("two", "different", "", far, odd),
-                distance("three", "different", "other shapes", far),
-            ),
+            products=(),
         )
     )
-    facts = (
-        "failed, plane.b result version 2, toys 1.0, code of toys abcdef01, colmap 4.2, seed 0, "
-        "no plane"
-    )
-    assert [(table.title, table.n_compared) for table in told] == [
-        ("Inputs", 2),
-        ("Options", 1),
-        ("Steps", 1),
-        ("Parameters", 1),
-        ("Environment", 1),
-        ("Metrics, time and memory left aside", 2),
-    ]
-    named = "a.e57 0123456789ab"
-    assert [table.rows for table in told] == [
-        (Difference(cell="", name="scan", left=f"{named}, {named}", right="not given"),),
-        (Difference(cell="", name="options", left="a=1 b=2", right=""),),
-        (Difference(cell="", name="a", left="ok, plane.a result version 1", right=facts),),
-        (Difference(cell="a", name="cell_m", left='"ä" (set)', right="null"),),
-        (Difference(cell="", name="python", left="3.11", right="-"),),
-        (
-            Difference(cell="a", name="rms_mm", left="1.5 mm", right="1.25 mm", change="-0.25"),
-            Difference(cell="a", name="max_mm", left="-", right="2 mm"),
-            Difference(cell="a", name="min_mm", left="2 mm", right="-"),
-        ),
-    ]
+    assert told == snapshot
+
+
+def test_products_that_differ_stand_first_with_their_distances() -> None:
+    far = Distance(unit="m", largest=0.25, limit=0.1, field="offset", n_values=3)
+    odd = Distance(unit="", largest=None, limit=0.0, field="names", n_values=3)
+    rows = Pair(cell="a", name="rms_mm", left=metric(1.0), right=metric(1.0))
+    products = (distance("one", "identical"), distance("two", "different", "shapes", far, odd))
+    page = environment().get_template("sections/differences.html.j2")
+    html = page.render(compared=replace(compared(rows), products=products), differences=())
+    words = "0.25 m at most in offset; names cannot be subtracted; shapes"
+    assert html.index("two (planes)") < html.index(words) < html.index("one (planes)")
 
 
 def test_checks_answer_first_then_the_last_of_the_other_steps() -> None:

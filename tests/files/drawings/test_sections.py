@@ -15,7 +15,6 @@ import pytest
 from orthoflow.errors import ArgumentError
 from orthoflow.files.drawings.sections import (
     CutLine,
-    Section,
     SectionDrawing,
     plan_cut,
     section_cut,
@@ -166,21 +165,11 @@ def test_a_sheet_of_it_has_title_block_coordinates_and_lines_in_scale(
 
 def test_a_hatch_too_small_for_a_line_of_its_pattern_is_left_out(tmp_path: Path) -> None:
     planes = box_planes()
-    stub = CutLine(
-        plane=2,
-        ends_m=np.array([[0.05, 0.0], [0.11, 0.0]]),
-        behind=np.array([0.0, 1.0]),
-        thickness_m=0.04,
-    )
+    ends_m, behind = np.array([[0.05, 0.0], [0.11, 0.0]]), np.array([0.0, 1.0])
+    stub = CutLine(plane=2, ends_m=ends_m, behind=behind, thickness_m=0.04)
     nothing = np.empty((0, 2, 2))
-    section = Section(
-        cut=plan_cut(planes, 1.2),
-        lines=(stub,),
-        gaps_m=nothing,
-        beyond_m=nothing,
-        points_m=nothing[0:, 0],
-        slab_m=0.0,
-        n_points=0,
+    section = replace(
+        section_of(plan_cut(planes, 1.2), planes), lines=(stub,), gaps_m=nothing, beyond_m=nothing
     )
     drawing = SectionDrawing(kind="plan", section=section, scale=100, origin="a box")
     text = SheetText(name="", block=TitleBlock(), notes=(), digest="0" * 64, run="run")

@@ -22,7 +22,6 @@ from PIL import Image
 from orthoflow.cli.program import program
 from orthoflow.errors import ArgumentError
 from orthoflow.files.drawings import pens
-from orthoflow.files.drawings.key_plans import KeyPlan
 from orthoflow.files.drawings.printed_pictures import encode_part
 from orthoflow.files.drawings.sheet_contents import (
     FOOT_M,
@@ -38,8 +37,8 @@ from orthoflow.files.drawings.sheet_contents import (
     paper_of,
     usual_papers,
 )
-from orthoflow.files.drawings.sheets import fitting_scale, lay_out, write_sheet
-from orthoflow.files.drawings.words import LANGUAGES, Phrase, _labels, label
+from orthoflow.files.drawings.sheets import fitting_scale, lay_out
+from orthoflow.files.drawings.words import LANGUAGES, _labels, label
 from orthoflow.files.geotiff import GridPlace, write_raster
 from orthoflow.geometry.frames import frame_over
 from orthoflow.records.open import open_run
@@ -355,33 +354,6 @@ def drawing(scale: int, size_m: tuple[float, float] = (3.8, 2.3), **more: object
         grid=1.0,
     )
     return replace(plain, **more)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(("n_notes", "paper"), [(2, "A3"), (1, "A2"), (4, "A2")])
-def test_the_heading_of_the_legend_is_above_its_first_row(
-    tmp_path: Path, n_notes: int, paper: str
-) -> None:
-    square = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [0.0, 3.0], [0.0, 0.0]])
-    plan = KeyPlan(
-        walls=square[None, :2],
-        numbers=(0,),
-        outlines=(square,),
-        marked=square[:2],
-        arrow=np.array([[2.0, 1.0], [2.0, 2.0]]),
-        up_label="y",
-        number=0,
-    )
-    plain = drawing(50, plan=plan)
-    notes = (Phrase(key="thickness"),) * n_notes
-    block = TitleBlock(layout="strip")
-    noted = replace(plain, text=replace(plain.text, notes=notes, block=block))
-    ((sheet, furniture),) = lay_out(noted, [paper_of(paper)])
-    write_sheet(tmp_path / "sheet.pdf", noted, sheet, furniture)
-    with page_of(tmp_path / "sheet.pdf") as page:
-        words = {word["text"]: word for word in page.extract_words()}
-    heading, row = words[label("legend")], words[label("legend_cross").split()[-1]]
-    assert 0.0 < row["top"] - heading["top"] < 20.0
-    assert 0.0 < row["x0"] - heading["x0"] < 120.0
 
 
 @pytest.mark.parametrize(
