@@ -1,8 +1,8 @@
-"""The documents as a site: `python docs/website.py` writes it to `site/`; reading fetches nothing.
+"""Build the documentation site: `python docs/website.py` writes it to `site/`, to be read offline.
 
-The pages in this folder and the texts at the root of the repository are taken as they are, links
-and all; the references of methods, products, metrics and commands are made of what plugins and the
-command line declare.
+The pages in this folder and the texts at the root of the repository are used with adapted links.
+The references of methods, products, metrics and commands are generated from the declarations of the
+plugins and the command line.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ _LIMITED: Final = {
     "orthoflow": ROOT / "orthoflow",
     "orthoflow_provenance": ROOT / "provenance" / "orthoflow_provenance",
 }
-# A limit of what files may ask for, with the comment that says of what it is the largest number.
+# A limit for files, with the comment that describes the limited quantity.
 _LIMIT: Final = re.compile(
     r"^(?:#: (?P<what>.+)\n)?(?P<name>(?:MOST|MAX|DEEPEST|FARTHEST)\w*): Final", re.MULTILINE
 )
@@ -91,7 +91,7 @@ def written(folder: Path) -> None:
 
 
 def _linked(text: str, source: str, pages: dict[str, str]) -> str:
-    """Point links to pages of the site; files that are no page are only named."""
+    """Adapt links to pages of the site; links to other files are replaced by their paths."""
 
     def link(found: re.Match[str]) -> str:
         to, anchor = found[1], found[2] or ""
@@ -103,7 +103,7 @@ def _linked(text: str, source: str, pages: dict[str, str]) -> str:
         if path.startswith("docs/pictures/"):
             return f"]({path.removeprefix('docs/')})"
         if not (ROOT / path).exists():
-            raise SystemExit(f"{source} links to {to}, which is not there")
+            raise SystemExit(f"{source} links to {to}, which does not exist")
         return f"] (`{path}`)"
 
     linked = _LINK.sub(link, text)
@@ -111,7 +111,10 @@ def _linked(text: str, source: str, pages: dict[str, str]) -> str:
 
 
 def _methods(catalog: Catalog) -> Iterator[str]:
-    yield "# Methods\n\nAs plugins declare them; `orthoflow plugins show ID` prints the same.\n"
+    yield (
+        "# Methods\n\nThis page lists the methods as declared by plugins; `orthoflow plugins show "
+        "ID` prints the same.\n"
+    )
     methods = [catalog.method(name).load() for name in sorted(catalog.methods)]
     for kind in sorted({method.id.partition(".")[0] for method in methods}):
         yield f"## {kind}\n\n{catalog.kinds[kind].spec.summary}\n"
@@ -150,9 +153,10 @@ def _paragraphs(method: type[Method]) -> str:
 
 def _products(catalog: Catalog) -> Iterator[str]:
     yield (
-        "# Products and their files\n\nThe data that steps exchange. A run folder has their files "
-        "in `products/<step>/`. The fields are those of the objects that `run.product(step, name)` "
-        "returns in Python; parts of a product are described below the first that has them.\n"
+        "# Products and their files\n\nProducts are the data that steps exchange. Their files are "
+        "in `products/<step>/` of a run folder. The fields are those of the objects that "
+        "`run.product(step, name)` returns in Python; parts of a product are described after the "
+        "first product that contains them.\n"
     )
     products = {name: _loaded(catalog.products[name].spec.target) for name in catalog.products}
     places = {product: name for name, product in products.items()}
@@ -170,7 +174,7 @@ def _products(catalog: Catalog) -> Iterator[str]:
 
 
 def _fields(described: type, places: dict[type, str]) -> Iterator[str]:
-    """What a docstring says of a product, a part of one or an enumeration, fields as a table."""
+    """Return the docstring of a product, a part of one or an enumeration, fields as a table."""
     about, _, attributes = (inspect.getdoc(described) or "").partition("Attributes:")
     yield f"{about.strip()}\n"
     said = {
@@ -200,12 +204,12 @@ def _fields(described: type, places: dict[type, str]) -> Iterator[str]:
 
 
 def _parts(described: type) -> list[type]:
-    """What the fields of a product, or of a part of one, are made of, in their order."""
+    """Return the types of the fields of a product, or of a part of one, in their order."""
     return list(dict.fromkeys(chain.from_iterable(_parts_of_fields(described).values())))
 
 
 def _parts_of_fields(described: type) -> dict[str, list[type]]:
-    """The classes of ours in the annotation of each field; enumerations by their docstring."""
+    """Return our own classes in the annotation of each field; enumerations by their docstring."""
     if not is_dataclass(described):
         return {}
     module = sys.modules[described.__module__]
@@ -239,10 +243,10 @@ def _loaded(target: str) -> type:
 
 def _metrics(catalog: Catalog) -> Iterator[str]:
     yield (
-        "# Metrics\n\nWhat methods measure. The prefix `all_` means over all walls, `wall_<k>_` of "
-        "that wall, `floor_` the intensity compared with itself. On a wall `x` and `u` run to the "
-        "right, `y` and `v` down, as seen by a viewer in front of it; `u` and `v` of a photo are "
-        "its columns and rows.\n"
+        "# Metrics\n\nMetrics are the numbers that methods report. The prefix `all_` means over "
+        "all walls, `wall_<k>_` for that wall, `floor_` for the intensity compared with itself. "
+        "On a wall, `x` and `u` point right and `y` and `v` down, as seen by a viewer in front of "
+        "it; in a photo, `u` and `v` are columns and rows.\n"
     )
     declared: dict[MetricSpec, list[str]] = {}
     for name in sorted(catalog.methods):
@@ -274,9 +278,9 @@ def _good(better: str) -> str:
 
 def _commands() -> Iterator[str]:
     yield (
-        "# Commands\n\n`orthoflow COMMAND --help` prints the same. To complete commands, options "
-        "and files, put this into `~/.bashrc` (`zsh_source` and `~/.zshrc`, or `fish_source`, for "
-        "other shells):\n\n"
+        "# Commands\n\n`orthoflow COMMAND --help` prints the same. For completion of commands, "
+        "options and files, add this to `~/.bashrc` (for other shells, use `zsh_source` and "
+        "`~/.zshrc`, or `fish_source`):\n\n"
         '```sh\neval "$(_ORTHOFLOW_COMPLETE=bash_source orthoflow)"\n```\n'
     )
     with click.Context(program, info_name="orthoflow", terminal_width=100) as context:
@@ -305,12 +309,13 @@ def limits() -> Iterator[tuple[str, str, str]]:
 
 def _limits() -> Iterator[str]:
     yield (
-        "# Limits\n\nThe most that a file may ask for. A larger file is refused in one sentence "
-        "before memory or time is spent on it, because a few kilobytes could otherwise demand "
-        "gigabytes or hours. Numbers that files state are also compared with the size of the file. "
-        "If a genuine file meets a limit, change the constant and report it; "
-        "`ORTHOFLOW_FUZZ_CASES=1000 python -m pytest tests/fuzz` tests them with damaged files.\n\n"
-        "| at most | of | constant |\n|---:|---|---|"
+        "# Limits\n\nThis page lists the maximum sizes and counts that a file may request. A file "
+        "that exceeds them is rejected with a message before memory or time is spent on it, "
+        "because a few kilobytes could otherwise demand gigabytes or hours. Numbers in files are "
+        "also compared with the size of the file. If a valid file exceeds a limit, change the "
+        "constant and report it; `ORTHOFLOW_FUZZ_CASES=1000 python -m pytest tests/fuzz` tests the "
+        "limits with damaged files.\n\n"
+        "| maximum | quantity | constant |\n|---:|---|---|"
     )
     for module, name, what in limits():
         if what:
@@ -324,7 +329,7 @@ def _cell(text: str) -> str:
 
 
 def build(output: Path) -> None:
-    """Build the site; a link that leads nowhere is an error."""
+    """Build the site; a broken link is an error."""
     with tempfile.TemporaryDirectory() as folder:
         pages = Path(folder) / "pages"
         pages.mkdir()
@@ -345,13 +350,13 @@ def build(output: Path) -> None:
         ]
         quiet = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
         if subprocess.run(command, check=False, env=quiet).returncode:
-            raise SystemExit("the site has mistakes, see above")
-    # Browsers let no script read the index of words from a file.
+            raise SystemExit("the site has errors (see above)")
+    # Browsers do not let scripts read the search index from a local file.
     for page in output.rglob("*.html"):
         text = page.read_text(encoding="utf-8")
         page.write_text(text.replace("</head>", f"{_NO_SEARCH}</head>", 1), encoding="utf-8")
     sys.stdout.write(
-        f"open {output / 'index.html'}; for its search: python -m http.server -d {output}\n"
+        f"open {output / 'index.html'}; the search needs: python -m http.server -d {output}\n"
     )
 
 
