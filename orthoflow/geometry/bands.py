@@ -1,4 +1,4 @@
-"""Rasters processed in bands of rows: a large raster is in a file and never wholly in memory."""
+"""Bands of rows: large rasters are kept in files and never completely in memory."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ from typing import Final
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-# Name, shape, type -> zeroed array, in a memory-mapped file if it is large.
+# Creates a zeroed array from a name, shape and type; in a memory-mapped file if it is large.
 Allocate = Callable[[str, tuple[int, ...], DTypeLike], NDArray[np.generic]]
 
-# Finished rasters with more cells are kept in files, because a site has many walls.
+# Finished rasters with more cells are kept in files, because a project may have many walls.
 IN_MEMORY_CELLS: Final = 1 << 22
-# Temporary arrays of a band take about 16 MB per byte of a cell.
+# Temporary arrays of a band need about 16 MB per byte of a cell.
 _BAND_CELLS: Final = 1 << 24
 
 
 def in_memory(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
-    """Return a zeroed array of a raster that is small enough; an `Allocate`."""
+    """Return a zeroed array in memory, for small rasters; an `Allocate`."""
     del name
     return np.zeros(shape, dtype=dtype)
 
 
 def row_bands(shape: tuple[int, ...], *, multiple: int = 1) -> Iterator[slice]:
-    """Cut a raster into bands of rows.
+    """Divide a raster into bands of rows.
 
     Args:
-        shape: rows, columns, and further dimensions of a cell.
-        multiple: the height of all bands but the last is a multiple of this.
+        shape: numbers of rows and columns, and further dimensions of a cell.
+        multiple: the height of every band except the last is a multiple of this.
 
     Yields:
-        The rows of each band, from the top.
+        The rows of each band, from top to bottom.
     """
     height = max(1, _BAND_CELLS // max(1, shape[1]) // multiple) * multiple
     for first in range(0, shape[0], height):
@@ -41,11 +41,11 @@ def row_bands(shape: tuple[int, ...], *, multiple: int = 1) -> Iterator[slice]:
 
 @dataclass(frozen=True, kw_only=True)
 class Band:
-    """A band of rows, and the rows around it that influence its result.
+    """A band of rows with a margin of rows that influence its result.
 
     Attributes:
         rows: the rows of the band.
-        around: these rows and a margin above and below, clipped to the raster.
+        around: the same rows with a margin above and below, clipped to the raster.
     """
 
     rows: slice
@@ -59,7 +59,7 @@ class Band:
 
 
 def bands_with_reach(shape: tuple[int, int], *, cells_most: int, reach_rows: int) -> Iterator[Band]:
-    """Cut a raster into bands of about equal height, each of at most `n_cells` with its margin."""
+    """Divide a raster into bands of similar height, with at most `n_cells` including margins."""
     n_rows, n_columns = shape
     height = max(1, cells_most // max(1, n_columns) - 2 * reach_rows)
     height = -(-n_rows // -(-n_rows // height))
@@ -70,12 +70,12 @@ def bands_with_reach(shape: tuple[int, int], *, cells_most: int, reach_rows: int
 
 
 def count_cells(raster: NDArray[np.generic], value: int) -> int:
-    """Count the cells of a raster (rows, cols) that have a value."""
+    """Count the cells of a raster (rows, cols) with a given value."""
     return sum(int(np.count_nonzero(raster[rows] == value)) for rows in row_bands(raster.shape))
 
 
 def holds_cells(raster: NDArray[np.generic], value: int) -> bool:
-    """Whether any cell of a raster (rows, cols) has a value."""
+    """Return whether any cell of a raster (rows, cols) has a given value."""
     return any(bool((raster[rows] == value).any()) for rows in row_bands(raster.shape))
 
 

@@ -1,4 +1,4 @@
-"""How good a cloud is, before anything is made of it: thickness, spacing, scans that disagree."""
+"""Quality of a cloud as read: thickness, point spacing, and misalignment of scans."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from orthoflow.geometry.robust import median_deviation
 
 
 def scan_step_m(count: NDArray[np.uint32], *, gsd_m: float) -> float:
-    """Estimate the distance between neighbouring points on the wall from the points per cell.
+    """Estimate the point spacing on a wall from the numbers of points per cell.
 
-    Cells are joined 2 x 2 until a block that holds points holds at least four on average: from then
-    on hardly any block of scanned surface is empty by chance, so that the blocks show the scanned
+    Cells are merged 2 x 2 until blocks with points contain at least four on average. Then hardly
+    any block of scanned surface is empty by chance, and the blocks with points show the scanned
     area.
 
     Args:
-        count: (rows, cols) points per cell.
-        gsd_m: side of a cell in metres.
+        count: (rows, cols) number of points per cell.
+        gsd_m: cell size in metres.
 
     Returns:
-        Side of the square per point, metres; 0 without points.
+        Square root of the area per point, metres; 0 if there are no points.
     """
-    # Sums over ever larger blocks stay below the number of points, which fits into 32 bits.
+    # Sums do not exceed the number of points, which fits into 32 bits.
     blocks, side_m = count, gsd_m
     while blocks.any():
         per_block = blocks.sum(dtype=np.int64) / np.count_nonzero(blocks)
@@ -39,7 +39,7 @@ def scan_step_m(count: NDArray[np.uint32], *, gsd_m: float) -> float:
 
 
 def _joined(blocks: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """Return sums of 2 x 2 blocks; a remaining row or column counts as it is."""
+    """Return sums of 2 x 2 blocks; an odd last row or column is kept."""
     rows, columns = blocks.shape
     sums = np.zeros((-(-rows // 2), -(-columns // 2)), dtype=np.uint32)
     for first_row in (0, 1):
@@ -49,36 +49,36 @@ def _joined(blocks: NDArray[np.uint32]) -> NDArray[np.uint32]:
     return sums
 
 
-# Sides of the pieces: the next where so few points lie in one that they show nothing.
+# Sides of pieces in metres; the next one is used if pieces contain too few points.
 _SIDES_M: Final = (0.1, 0.3, 1.0)
 _PIECES_MOST: Final = 300
 _PIECES_LEAST: Final = 20
-# Points of one scan that a piece must have, and that are looked at.
+# Minimum number of points of one scan in a piece, and maximum number used.
 _POINTS_LEAST: Final = 30
 _POINTS_MOST: Final = 4000
-# Few enough to stay in the processor's cache.
+# Points processed together, few enough for the cache of the processor.
 _AT_ONCE: Final = 1 << 16
 _HASH_BITS: Final = 20
 _CUBE_BITS: Final = 21
 _GATHERED_MOST: Final = 1_500_000
-# Points whose cube is found; of larger clouds those in some slabs of cubes.
+# Points assigned to cubes; for larger clouds, only those in some slabs of cubes.
 _LOOKED_AT_MOST: Final = 4_000_000
-# Odd, with bits all over, so that the upper bits of a product depend on all of a number.
+# Odd numbers with well distributed bits, so that the upper bits of a product depend on all bits.
 _PRIMES: Final = (np.uint32(2_654_435_761), np.uint32(2_246_822_519), np.uint32(3_266_489_917))
-# A piece is one surface if so many of its points lie near its plane, if they scatter by less than
-# this part of its side, and if they cover it both ways.
+# A piece is a single surface if this share of its points is near its plane, if their scatter is
+# below this share of its side, and if they cover it in both directions.
 _SURFACE_SHARE: Final = 0.85
 _SCATTER_SIDES: Final = 0.1
 _COVER_SIDES: Final = 0.15
 _NEAR_SIGMAS: Final = 4.0
-# Of the median of n values, in standard deviations of one over the root of n.
+# Standard deviation of the median of n values, relative to that of one value divided by sqrt(n).
 _MEDIAN_SIGMA: Final = 1.2533
 _SURE_SIGMAS: Final = 3.0
-# Scans nearer to each other than this agree, however little they scatter.
+# Scans closer to each other than this agree, even if they scatter less.
 _AGREE_M: Final = 0.001
-# A piece within this angle of level or of upright is one; noise turns the smallest by 2 degrees.
+# Tolerance in degrees for level and upright pieces; noise tilts the smallest pieces by 2 degrees.
 _SQUARE_DEG: Final = 5.0
-# Where the stated direction is up, hardly any building shows no level piece at all.
+# If the given up direction is right, hardly any building lacks level pieces.
 _LEVEL_NONE: Final = 0.03
 _LEVEL_PLAIN: Final = 0.15
 _SQUARE_PLAIN: Final = 0.8
@@ -87,18 +87,18 @@ _SQUARER_BY: Final = 0.15
 
 @dataclass(frozen=True, kw_only=True)
 class CloudQuality:
-    """Medians over pieces of surfaces.
+    """Medians over small pieces of surfaces.
 
     Attributes:
-        side_m: of the pieces.
-        n_pieces: how many were measured.
-        sigma_m: robust standard deviation of a scan's points about the surface: the thickness.
-        width_95_m: width that holds 95 % of them.
-        scan_step_m: from a point to the nearest one of its scan, on the surface.
-        scans_apart_m: how far scans that show the same piece lie apart there, across it; None where
-            fewer than 20 pieces are shown by two.
-        sigma_apart_m: what their scatter alone would make of that, one standard deviation.
-        normals: (n_pieces, 3) unit vectors of the pieces, to either side.
+        side_m: side of the pieces.
+        n_pieces: number of measured pieces.
+        sigma_m: thickness: robust standard deviation of the points of a scan from the surface.
+        width_95_m: width of the range that contains 95 % of these distances.
+        scan_step_m: distance from a point to the nearest point of the same scan.
+        scans_apart_m: distance between scans of the same piece, perpendicular to it; None if fewer
+            than 20 pieces are in more than one scan.
+        sigma_apart_m: standard deviation of that distance due to the scatter of points.
+        normals: (n_pieces, 3) unit normals of the pieces, with arbitrary sign.
     """
 
     side_m: float
@@ -111,10 +111,10 @@ class CloudQuality:
     normals: NDArray[np.float64]
 
     def square_shares(self, up: NDArray[np.float64]) -> tuple[float, float]:
-        """Share of the pieces that are level, and of those that are level or upright.
+        """Return the shares of level pieces, and of pieces that are level or upright.
 
         Args:
-            up: (3,) unit vector that points up, as stated.
+            up: (3,) unit vector of the given up direction.
         """
         cosines = np.abs(self.normals @ up)
         is_level = cosines > np.cos(np.radians(_SQUARE_DEG))
@@ -122,11 +122,12 @@ class CloudQuality:
         return float(is_level.mean()), float((is_level | is_upright).mean())
 
     def plainly_up(self, up: NDArray[np.float64]) -> int | None:
-        """Axis 0, 1, 2 that is up by the directions of surfaces; None where `up` may be right.
+        """Return the axis (0, 1, 2) that is up judging by surfaces; None if `up` may be right.
 
-        A room square to the axes looks the same along all of them, so that None is returned, as of
-        slopes and single walls: surfaces must be level or upright by one axis, some of them
-        level, and by `up` none level and many askew.
+        `up` is wrong if no surface is level with respect to it and many are inclined, while all
+        surfaces are level or upright with respect to one axis, and some of them are level. None is
+        returned for slopes, single walls and rooms parallel to all axes, which look the same along
+        each axis.
         """
         level, square = self.square_shares(up)
         for axis, direction in enumerate(np.eye(3)):
@@ -138,12 +139,12 @@ class CloudQuality:
 
     @property
     def is_thick(self) -> bool:
-        """Whether the cloud is thicker than its scan step."""
+        """Return whether the thickness of the cloud exceeds its point spacing."""
         return self.sigma_m > self.scan_step_m
 
     @property
     def disagrees(self) -> bool:
-        """Whether scans lie apart by more than they scatter, and by more than chance."""
+        """Return whether scans are farther apart than they scatter, and than by chance."""
         if self.scans_apart_m is None:
             return False
         limit_m = max(self.sigma_m, _AGREE_M, _SURE_SIGMAS * self.sigma_apart_m)
@@ -152,7 +153,7 @@ class CloudQuality:
 
 @dataclass(frozen=True, kw_only=True)
 class _Piece:
-    """What one piece shows; `apart_m` is NaN where one scan shows it."""
+    """Measurements of one piece; `apart_m` is NaN if it is in one scan only."""
 
     sigma_m: float
     width_95_m: float
@@ -165,14 +166,14 @@ class _Piece:
 def judge_quality(
     offsets: Sequence[NDArray[np.float32]], scan: NDArray[np.uint16] | None
 ) -> CloudQuality | None:
-    """Measure a cloud on some hundred pieces of surfaces, spread over it.
+    """Measure a cloud on a few hundred pieces of surfaces distributed over it.
 
     Args:
-        offsets: three arrays (n,), metres from one origin.
-        scan: (n,) number of each point's scan; None for one scan.
+        offsets: three arrays (n,) of coordinates in metres.
+        scan: (n,) scan of each point; None if there is one scan.
 
     Returns:
-        None where too few pieces show a surface.
+        The medians; None if there are too few pieces with a surface.
     """
     for side_m in _SIDES_M:
         pieces = [
@@ -188,7 +189,7 @@ def judge_quality(
 def _indices_of_pieces(
     offsets: Sequence[NDArray[np.float32]], side_m: float
 ) -> Iterator[NDArray[np.intp]]:
-    """Indices of the points in cubes about some of them."""
+    """Return the indices of the points in cubes around some of the points."""
     n_points = len(offsets[0])
     lows = tuple(axis.min() for axis in offsets)
     one_of = -(-n_points // _LOOKED_AT_MOST)
@@ -207,11 +208,11 @@ def _indices_of_pieces(
         chosen = start + np.flatnonzero(is_slab[slabs])
         found.append(chosen[is_asked[_hash(_cubes(offsets, lows, chosen, side_m))]])
     indices = np.concatenate(found)
-    # Equal hashes of other cubes are separated by the cubes themselves.
+    # Different cubes with the same hash are distinguished by their numbers.
     x, y, z = (axis.astype(np.int64) for axis in _cubes(offsets, lows, indices, side_m))
     groups = x + (y << _CUBE_BITS) + (z << 2 * _CUBE_BITS)
     known = np.unique(groups)
-    # Of a dense cloud, a part of the pieces shows as much.
+    # For a dense cloud, fewer pieces suffice.
     known = known[:: max(1, len(indices) // _GATHERED_MOST)]
     is_known = np.isin(groups, known)
     indices, groups = indices[is_known], groups[is_known]
@@ -229,7 +230,7 @@ def _cubes(
     *,
     axes: Sequence[int] = (0, 1, 2),
 ) -> list[NDArray[np.uint32]]:
-    """Number of the cube along axes, counted from the lowest point on."""
+    """Return the indices of cubes along axes, counted from the lowest point."""
     return [
         ((offsets[axis][chosen] - lows[axis]) * np.float32(1.0 / side_m)).astype(np.uint32)
         for axis in axes
@@ -237,7 +238,7 @@ def _cubes(
 
 
 def _hash(cubes: Sequence[NDArray[np.uint32]]) -> NDArray[np.uint32]:
-    """A number of 20 bits for cubes by one to three axes."""
+    """Return a 20-bit hash of cubes from their indices along one to three axes."""
     mixed = reduce(
         np.bitwise_xor, (axis * prime for axis, prime in zip(cubes, _PRIMES, strict=False))
     )
@@ -257,7 +258,7 @@ def _scans(scan: NDArray[np.uint16] | None, chosen: NDArray[np.intp]) -> NDArray
 def _measured(
     points: NDArray[np.float64], scan: NDArray[np.uint16], side_m: float
 ) -> _Piece | None:
-    """Measure one piece; None where it is no single surface."""
+    """Measure one piece; None if it is not a single surface."""
     numbers, counts = np.unique(scan, return_counts=True)
     enough = numbers[counts >= _POINTS_LEAST]
     if not len(enough):
@@ -292,7 +293,7 @@ def _measured(
 
 
 def _frame(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rows: two axes in the plane of most of the points (n, 3), and its normal."""
+    """Return two axes in the plane of most points (n, 3) and its normal, as rows."""
     kept = np.ones(len(points), dtype=np.bool_)
     axes = np.eye(3)
     for _ in range(3):
@@ -311,7 +312,7 @@ def _farthest(
     middles: dict[np.uint16, float],
     main: np.uint16,
 ) -> tuple[float, float]:
-    """How far the scan that lies farthest from the main one is away, and the sigma of that."""
+    """Return the largest distance of a scan from the main scan, and its standard deviation."""
     others = [one for one in middles if one != main]
     if not others:
         return np.nan, np.nan
@@ -324,7 +325,7 @@ def _farthest(
 
 
 def _step_m(on_surface: NDArray[np.float64]) -> float | None:
-    """Median distance of points (n, 2) to the nearest other one; None where all are the same."""
+    """Return the median distance to the nearest other point (n, 2); None if all coincide."""
     from scipy.spatial import cKDTree  # noqa: PLC0415 - loads slowly, and here alone
 
     distances, _ = cKDTree(on_surface).query(on_surface, k=2)

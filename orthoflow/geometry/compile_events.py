@@ -1,4 +1,4 @@
-"""Reports which kernel is being compiled; does not load the compiler itself."""
+"""Progress of the compilation of kernels; this module does not load the compiler."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ _listeners: list[Listener] = []
 
 @contextmanager
 def on_compiling(listener: Listener) -> Iterator[None]:
-    """Report the kernels that are compiled while the block runs, in any thread.
+    """Report the kernels that are compiled within a `with` block, in any thread.
 
     Args:
-        listener: called with `compiling NAME (3 so far)` when one is begun, and with an empty text
-            when it and all that it needs are compiled.
+        listener: called with `compiling NAME (3 so far)` when a compilation begins, and with an
+            empty string when it is complete.
     """
     _listeners.append(listener)
     try:
@@ -26,6 +26,6 @@ def on_compiling(listener: Listener) -> Iterator[None]:
 
 
 def report_compiling(text: str) -> None:
-    """Pass an event of the compiler to all listeners."""
+    """Call all listeners."""
     for listener in tuple(_listeners):
         listener(text)

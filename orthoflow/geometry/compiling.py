@@ -1,12 +1,12 @@
-"""Compilation of kernels by numba, with the same options everywhere.
+"""Compilation of kernels by numba, always with the same options.
 
-Numba wraps every function for callers in Python and in C. If a scene's tables are among the
-arguments, the wrappers take as long to compile as the function itself; functions that only kernels
-call need neither.
+Numba compiles wrappers of each function for callers in Python and in C. If the tables of a scene
+are among the arguments, the wrappers take as long to compile as the function itself. Functions that
+are called only by kernels need no wrappers.
 
-Numba caches kernels, but not its own functions: each process that compiles a kernel compiles those
-that it calls. Assigning an array to a slice of another (`part[2:] = array`) calls forty of them for
-an error message about shapes, so kernels assign single numbers.
+Numba caches kernels, but not its own functions, so each process that compiles a kernel also
+compiles the numba functions called by it. Assigning an array to a slice (`part[2:] = array`) needs
+forty of them for an error message about shapes; kernels therefore assign single numbers.
 """
 
 from __future__ import annotations
@@ -30,40 +30,40 @@ from orthoflow.geometry.compile_events import report_compiling
 
 _Kernel = TypeVar("_Kernel", bound=Callable[..., object])
 
-# Some 40 kB each; the code of one version has about 400.
+# About 40 kB each; one version of orthoflow has about 400.
 _MAX_FILES: Final = 8000
 _UNWRAPPED: Final = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 
 def compiled(function: _Kernel) -> _Kernel:
-    """Compile a kernel that Python calls; it lets other threads run.
+    """Compile a kernel that is called from Python and releases the interpreter lock.
 
-    Threads come from `geometry.threads`, not from numba's own loops: those take seconds more to
+    Threads are started by `geometry.threads`, because numba's parallel loops take seconds longer to
     compile.
     """
-    # The second of the wrappers, for callers in C, nobody needs.
+    # The wrapper for callers in C is not needed.
     return cast("_Kernel", _kept(function, nogil=True, no_cfunc_wrapper=True))
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Put a function of a few instructions into each kernel that calls it."""
+    """Inline a function of a few instructions into the kernels that call it."""
     return cast("Callable[..., Any]", _kept(function, inline="always"))
 
 
 def interpreted(kernel: Callable[..., Any]) -> Callable[..., Any]:
-    """Return an inlined function as Python runs it, for a few single calls."""
+    """Return the Python version of an inlined function, for occasional calls."""
     return cast("Callable[..., Any]", getattr(kernel, "py_func", kernel))
 
 
 def kernel_part(function: _Kernel) -> _Kernel:
-    """Compile a function that only kernels call, when one that does is compiled."""
+    """Compile a function called only by kernels, when the calling kernel is compiled."""
     return cast("_Kernel", _kept(function, **_UNWRAPPED))
 
 
 def typed_kernel_part(signature: str) -> Callable[[_Kernel], _Kernel]:
-    """Compile a function that only kernels call for one signature, when it is loaded.
+    """Compile a function called only by kernels for one signature, when it is loaded.
 
-    Without one, each constant that it is called with would compile a version of its own.
+    Without a signature, a version would be compiled for each constant argument.
     """
 
     def compile_part(function: _Kernel) -> _Kernel:
@@ -76,39 +76,38 @@ def typed_kernel_part(signature: str) -> Callable[[_Kernel], _Kernel]:
     return compile_part
 
 
-# Any: numba's kernels have no types.
+# Any, because numba has no types for kernels.
 def _kept(function: Callable[..., Any], **options: object) -> Any:
-    """Make a kernel whose compiled code is kept between processes."""
-    # Divisions do not stop at 0: lanes of a vector can fill.
+    """Return a kernel whose compiled code is cached between processes."""
+    # No exception for a division by 0, so that loops can be vectorised.
     kernel = numba.njit(error_model="numpy", **options)(function)  # type: ignore[call-overload]  # the stubs leave options out
     if not isinstance(kernel, Dispatcher):
-        # NUMBA_DISABLE_JIT: Python runs it.
+        # With NUMBA_DISABLE_JIT, the function runs in Python.
         return kernel
-    # Where nothing can be kept, no home and a program that only others may change, it is compiled
-    # in each process.
+    # Without a writable folder for the cache, kernels are compiled in each process.
     with suppress(RuntimeError):
-        # Numba has no public name for it.
+        # Numba has no public attribute for the cache.
         vars(kernel)["_cache"] = _KernelCache(function)  # type: ignore[no-untyped-call]
     _give_constants_no_version(kernel)
     return kernel
 
 
 class _KernelCache(FunctionCache):
-    """Numba's cache of a function, found by the content of all that it calls.
+    """Cache of the compiled code of a function, identified by the content of all its code.
 
-    Numba itself looks at the file of a kernel alone, and not at what the kernel calls in others.
-    Here the name of the files has the digest of the kernel, of all functions that it calls and of
-    the constants that these use. So an edit compiles what it changes and nothing else, wherever a
-    checkout lies, and several versions of the code share a folder.
+    Numba itself checks only the file of a kernel, not the functions that it calls in other files.
+    Here, file names contain the digest of the kernel, of all functions that it calls, and of the
+    constants used in them. Thus only kernels affected by an edit are recompiled, independently of
+    the folder of a checkout, and several versions of the code can share a cache.
     """
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return what is kept for argument types, or None."""
+        """Return the compiled code for argument types, or None."""
         self._open_files()
         return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep compiled code; a full disk costs the next process seconds and nothing else."""
+        """Save compiled code; if the disk is full, the next process compiles it again."""
         self._open_files()
         with suppress(OSError):
             super().save_overload(sig, data)  # type: ignore[no-untyped-call]
@@ -119,7 +118,7 @@ class _KernelCache(FunctionCache):
             self._cache_file.save(key, self._impl.reduce(data))  # type: ignore[no-untyped-call]
 
     def _open_files(self) -> None:
-        """Find the files; at the first call, since what a kernel calls may stand below it."""
+        """Return the cache files; at the first call, because callees may be defined later."""
         if not isinstance(self._cache_file, _KernelFiles):
             root = cast("str", vars(config)["CACHE_DIR"])
             folder = Path(root, "kernels") if root else Path(self._cache_path)
@@ -138,11 +137,11 @@ class _KernelCache(FunctionCache):
 
 
 class _KernelFiles(IndexDataCacheFile):
-    """Index and versions of a kernel.
+    """Files with the index and the compiled versions of a kernel.
 
-    Numba numbers the files of versions, and two processes that compile two versions at once take
-    one number for both: the index of one then names the code of the other. Here no two files have
-    one name. A file that was cut off by a power failure is as good as none.
+    Numba numbers the files of versions, so two processes that compile two versions at the same time
+    may use the same number, and an index may refer to the code of the other version. Here all file
+    names are unique. A file truncated by a power failure is ignored.
     """
 
     def _save_index(self, overloads: dict[Any, str]) -> None:
@@ -169,10 +168,10 @@ class _KernelFiles(IndexDataCacheFile):
 
 
 def content_digest(function: FunctionType) -> str:
-    """Return the SHA-256 of all that decides the compiled code of a function but argument types.
+    """Return the SHA-256 of everything, except argument types, that affects compiled code.
 
-    That is its bytecode and constants, and those of each function that it calls, with the values of
-    the module constants that these read.
+    This includes the bytecode and the constants of the function and of all functions that it calls,
+    and the values of module constants used in them.
     """
     digest = hashlib.sha256()
     seen: set[int] = set()
@@ -196,7 +195,7 @@ def content_digest(function: FunctionType) -> str:
 
 
 def _decisive(function: FunctionType) -> tuple[object, ...]:
-    """Code of a function and of those inside it, and what the names in it stand for."""
+    """Code of a function and of its nested functions, and the values of global names in it."""
     cells = tuple(cell.cell_contents for cell in function.__closure__ or ())
     found: list[object] = [function.__defaults__, cells]
     for code in _all_code(function.__code__):
@@ -211,7 +210,7 @@ def _decisive(function: FunctionType) -> tuple[object, ...]:
 
 
 def _described(value: object) -> bytes:
-    """Bytes that stand for a value which is no function."""
+    """Return bytes that represent a value other than a function."""
     if isinstance(value, np.ndarray):
         return f"{value.dtype}{value.shape}".encode() + value.tobytes()
     if isinstance(value, type):
@@ -219,12 +218,12 @@ def _described(value: object) -> bytes:
         return f"{value.__module__}.{value.__qualname__}{fields}".encode()
     if isinstance(value, int | float | complex | str | bytes | None):
         return repr(value).encode()
-    # Of libraries, whose versions numba's own and the platform stand for.
+    # Part of a library; the version of numba and the platform are part of the digest.
     return str(getattr(value, "__name__", type(value).__name__)).encode()
 
 
 def _all_code(code: CodeType) -> Iterator[CodeType]:
-    """Yield the code of a function and of those that are defined in it."""
+    """Yield the code of a function and of the functions defined in it."""
     yield code
     for value in code.co_consts:
         if isinstance(value, CodeType):
@@ -232,7 +231,7 @@ def _all_code(code: CodeType) -> Iterator[CodeType]:
 
 
 def _field_names(type_: object) -> tuple[object, ...]:
-    """Names of the fields of all named tuples among types: numba compares their types alone."""
+    """Return field names of named tuples in types, because numba compares only field types."""
     if isinstance(type_, types.NamedTuple | types.NamedUniTuple):
         fields = type_.instance_class._fields
         return (fields, *map(_field_names, type_.types))
@@ -241,10 +240,10 @@ def _field_names(type_: object) -> tuple[object, ...]:
 
 
 def _give_constants_no_version(kernel: Any) -> None:
-    """Let kernels call one version with all whole numbers, whichever are constants.
+    """Let kernels call the same version for all integers, whether constant or not.
 
-    Numba would compile one for each constant, and one for the 0 that a counter begins with, which
-    nothing calls then.
+    Otherwise numba would compile a version for each constant, and an unused one for the initial
+    value 0 of a counter.
     """
     template_for = kernel.get_call_template
 
@@ -253,16 +252,16 @@ def _give_constants_no_version(kernel: Any) -> None:
             named = dict(zip(kws, map(types.unliteral, kws.values()), strict=True))
             return template_for(tuple(map(types.unliteral, args)), named)
         except TypingError:
-            # A tuple whose members differ in type is indexed by constants alone.
+            # A tuple with members of different types can be indexed only by constants.
             return template_for(args, kws)
 
     kernel.get_call_template = template_for_any
 
 
 class _Compilation(event.Listener):
-    """Reports which kernel is being compiled; one that needs others waits for these.
+    """Reports which kernel is being compiled, including the kernels needed by another one.
 
-    The compiler's own lock lets one thread compile at a time.
+    The lock of the compiler ensures that only one thread compiles at a time.
     """
 
     def __init__(self) -> None:
@@ -270,19 +269,19 @@ class _Compilation(event.Listener):
         self._n_begun = 0
 
     def on_start(self, event: event.Event) -> None:
-        """Report what is compiled, and how many kernels were compiled in this process.
+        """Report the kernel being compiled, and the number compiled so far in this process.
 
-        The total is unknown, because it depends on the data of a step.
+        The total number depends on the data of a step and is unknown.
         """
         kernel = event.data["dispatcher"]
         self._depth += 1
         self._n_begun += 1
-        # What numba makes within a function of ours, or of its own, is all called alike.
+        # Functions that numba generates have no informative names.
         name = kernel.py_func.__qualname__.partition(".")[0]
         report_compiling(f"compiling {name} ({self._n_begun} so far)")
 
     def on_end(self, event: event.Event) -> None:
-        """Report that all is compiled."""
+        """Report the end of compilation."""
         self._depth -= 1
         if self._depth == 0:
             report_compiling("")

@@ -1,4 +1,4 @@
-"""Compiled passes that render the points of a cloud into the depth buffer of a photo."""
+"""Kernels that render the points of a cloud into the depth buffer of a photo."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from orthoflow.geometry.camera_kernels import project_point
 from orthoflow.geometry.compiling import compiled
 from orthoflow.geometry.slabs import Offsets
 
-# Counts stay below this, so that sums over 3 x 3 x 3 voxels fit into 16 bits.
+# Counts are limited, so that sums over 3 x 3 x 3 voxels fit into 16 bits.
 COUNT_MOST: Final = 2000
 
-# Points nearer to the projection centre than this are the camera itself.
+# Points closer to the projection centre belong to the camera or its tripod.
 _NEAREST_M: Final = 0.05
 _LARGEST_SPLAT_PX: Final = 24.0
 
 
 class DepthBuffer(NamedTuple):
-    """The nearest points of a cloud in a reduced photo.
+    """Depths of the nearest points of a cloud, at a reduced scale of a photo.
 
     Attributes:
-        nearest: (rows, cols) float32 metres along the optical axis, infinite where nothing is.
+        nearest: (rows, cols) float32 metres along the optical axis, infinite if there is no point.
         reduction: photo pixels per pixel of the buffer.
     """
 
@@ -33,12 +33,13 @@ class DepthBuffer(NamedTuple):
 
 
 class VoxelGrid(NamedTuple):
-    """Voxels that show how dense points are.
+    """Voxels with the local density of points.
 
     Attributes:
-        low: (3,) float64 metres from the cloud's origin, lower corner of the first voxel.
+        low: (3,) float64 lower corner of the first voxel, metres from the origin of the cloud.
         side_m: side of a voxel.
-        counts: (nx, ny, nz) uint16 points in each, or in each and its 26 neighbours.
+        counts: (nx, ny, nz) uint16 number of points in a voxel, or in a voxel and its 26
+            neighbours.
     """
 
     low: NDArray[np.float64]
@@ -67,15 +68,16 @@ def splat_points(
     n_least: int,
     buffer: DepthBuffer,
 ) -> None:
-    """Render points into a depth buffer as squares as large as the gaps between them.
+    """Render points into a depth buffer as squares that are as large as the point spacing.
 
     Args:
-        points: offsets from the cloud's origin.
-        camera: (25,) flat camera for these offsets.
-        around: points in 3 x 3 x 3 voxels; a surface through them covers 9 voxel faces, which gives
-            the spacing of its points.
-        n_least: points with fewer around them, themselves included, are outliers.
-        buffer: the nearest depths so far, lowered in place.
+        points: offsets from the origin of the cloud.
+        camera: (25,) parameters of a camera for these offsets.
+        around: number of points in 3 x 3 x 3 voxels; a surface covers about 9 voxel faces in them,
+            from which the point spacing follows.
+        n_least: minimum number of points around a point, including itself; other points are
+            outliers.
+        buffer: nearest depths so far, updated in place.
     """
     nx, ny, nz = around.counts.shape
     rows, columns = buffer.nearest.shape

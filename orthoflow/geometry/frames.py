@@ -26,7 +26,7 @@ UP_VECTORS: Final[dict[UpDirection, tuple[float, float, float]]] = {
     "-z": (0.0, 0.0, -1.0),
 }
 
-# e1 for each up axis; e2 = up x e1 completes the right-handed frame. With up = z this is (x, y, z).
+# Axis e1 for each up axis; e2 = up x e1 completes the right-handed frame: (x, y, z) if up = z.
 _FIRST_AXES: Final[dict[int, tuple[float, float, float]]] = {
     0: (0.0, 1.0, 0.0),
     1: (0.0, 0.0, 1.0),
@@ -40,15 +40,15 @@ def up_vector(direction: UpDirection) -> NDArray[np.float64]:
 
 
 def basis_from_up(up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the right-handed frame to which "horizontal", "2D" and the angles omega and phi refer.
+    """Return the right-handed frame in which "horizontal" and the angles omega and phi are defined.
 
     Args:
-        up: (3,) unit vector in world axes, any direction.
+        up: (3,) unit vector in world axes.
 
     Returns:
-        (3, 3) rows e1, e2, up: `basis @ point_world` gives (first, second, height). For up = z it
-        is the identity. e1 is the world axis that follows the one nearest to up (x after z, y
-        after x, z after y), made perpendicular to up.
+        (3, 3) with the rows e1, e2, up; `basis @ point_world` gives two horizontal coordinates and
+        the height. e1 is the world axis that follows the axis nearest to up (x after z, y after x,
+        z after y), made perpendicular to up. For up = z this is the identity.
     """
     axis = int(np.argmax(np.abs(up)))
     first = np.array(_FIRST_AXES[axis])
@@ -58,7 +58,7 @@ def basis_from_up(up: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def across(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Cross product (3,); `np.cross` takes twenty times as long for two single vectors."""
+    """Return the cross product of two vectors (3,), twenty times as fast as `np.cross`."""
     a, b, c = first.tolist()
     d, e, f = second.tolist()
     return np.array([b * f - c * e, c * d - a * f, a * e - b * d])
@@ -66,11 +66,11 @@ def across(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[n
 
 @dataclass(frozen=True, kw_only=True)
 class Plane:
-    """The points x with `normal . x = offset_m`.
+    """A plane: the points x with `normal . x = offset_m`.
 
     Attributes:
         normal: (3,) float64 unit vector in world axes, towards the viewer.
-        offset_m: distance of the plane from the world origin along the normal, metres, signed.
+        offset_m: signed distance of the plane from the world origin along the normal, metres.
     """
 
     normal: NDArray[np.float64]
@@ -81,15 +81,15 @@ class Plane:
             raise GeometryError(f"a plane needs a unit normal of shape (3,), got {self.normal!r}")
 
     def distances_m(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return signed distances (n,) of points (n, 3), metres, positive on the viewer's side."""
+        """Return signed distances (n,) of points (n, 3), metres, positive towards the viewer."""
         return points_world @ self.normal - self.offset_m
 
     def flipped(self) -> Plane:
-        """Return the same plane seen from the other side."""
+        """Return the same plane with the opposite normal."""
         return Plane(normal=-self.normal, offset_m=-self.offset_m)
 
     def towards(self, viewpoint_world: NDArray[np.float64]) -> Plane:
-        """Return the same plane with its normal on the side of a viewpoint (3,)."""
+        """Return the same plane with its normal towards a viewpoint (3,)."""
         signed_m = float(viewpoint_world @ self.normal) - self.offset_m
         return self if signed_m >= 0.0 else self.flipped()
 
@@ -98,7 +98,7 @@ def plane_through(points_world: NDArray[np.float64]) -> Plane:
     """Return the plane through three points (3, 3); its normal follows the right-hand rule.
 
     Raises:
-        GeometryError: the points coincide or lie on one line.
+        GeometryError: the points coincide or are collinear.
     """
     first, second, third = points_world
     normal = np.cross(second - first, third - first)
@@ -106,20 +106,20 @@ def plane_through(points_world: NDArray[np.float64]) -> Plane:
     extent = float(np.linalg.norm(points_world - first, axis=1).max())
     if not math.isfinite(length) or length <= 1e-9 * extent * extent or length == 0.0:
         raise GeometryError(
-            f"three points must span a plane, got {points_world.tolist()}, which lie on one line"
+            f"three points must define a plane, but {points_world.tolist()} are collinear"
         )
     normal = normal / length
     return Plane(normal=normal, offset_m=float(normal @ points_world.mean(axis=0)))
 
 
 def angle_between_deg(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
-    """Return the angle of two unit vectors in degrees, 0..180, accurate if small too."""
+    """Return the angle between two unit vectors in degrees, 0 to 180; small angles are accurate."""
     cross = float(np.linalg.norm(np.cross(first, second)))
     return math.degrees(math.atan2(cross, float(first @ second)))
 
 
 def omega_phi_deg(normal: NDArray[np.float64], up: NDArray[np.float64]) -> tuple[float, float]:
-    """Direction (omega 0..360) and inclination (phi -90..90) of a normal, in degrees.
+    """Return azimuth (omega, 0 to 360) and elevation (phi, -90 to 90) of a normal, in degrees.
 
     markiewicz2015 equation 3: n = (cos phi cos omega, cos phi sin omega, sin phi), in the (e1, e2,
     up) frame of `basis_from_up`.
@@ -130,7 +130,7 @@ def omega_phi_deg(normal: NDArray[np.float64], up: NDArray[np.float64]) -> tuple
 
 
 def rotation_from_vector(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotation matrix (3, 3) of a rotation vector (3,) in radians (Rodrigues)."""
+    """Return the rotation matrix (3, 3) of a rotation vector (3,) in radians (Rodrigues)."""
     angle = float(np.linalg.norm(vector))
     cross = cross_matrix(vector)
     if angle < 1e-8:
@@ -140,13 +140,13 @@ def rotation_from_vector(vector: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def cross_matrix(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Matrix (3, 3) that multiplies like the cross product from the left with a vector (3,)."""
+    """Return the matrix (3, 3) of the cross product with a vector (3,) from the left."""
     matrix: NDArray[np.float64] = cross_matrices(vector[None])[0]
     return matrix
 
 
 def cross_matrices(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Matrices (n, 3, 3) that multiply like the cross product with vectors (n, 3)."""
+    """Return the matrices (n, 3, 3) of the cross products with vectors (n, 3) from the left."""
     matrices = np.zeros((len(vectors), 3, 3))
     x, y, z = vectors.T
     matrices[:, 0, 1], matrices[:, 0, 2] = -z, y
@@ -156,10 +156,10 @@ def cross_matrices(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def signed_area(ring: NDArray[np.float64]) -> float:
-    """Return the area enclosed by an open ring (n, 2) by Gauss's formula, in its units squared.
+    """Return the signed area of an open ring (n, 2), by the shoelace formula.
 
-    Positive if it turns from the first axis to the second. Digits are lost far from the origin:
-    pass coordinates relative to one of its points.
+    It is positive if the ring turns from the first axis to the second. Precision is lost far from
+    the origin, so pass coordinates relative to one of the points.
 
     >>> signed_area(np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [0.0, 1.0]]))
     2.0
@@ -168,11 +168,11 @@ def signed_area(ring: NDArray[np.float64]) -> float:
     return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
 
 
-# If the angle between normal and up is smaller, a plane counts as a floor or ceiling: "right for
-# the viewer" would depend on the noise of a nearly vertical normal.
+# A plane is a floor or ceiling if the angle between its normal and the vertical is smaller: for a
+# nearly vertical normal, the direction to the right of the viewer would depend on noise.
 LEVEL_LIMIT_DEG: Final = 10.0
-# Beyond any survey frame on Earth: larger coordinates come from damaged numbers.
-#: metres from the origin; points beyond are left out with a warning
+# Coordinates in survey frames on Earth are smaller; larger ones are corrupt.
+#: metres from the origin; points farther away are ignored with a warning
 FARTHEST_M: Final = 1e9
 _LEAST_COSINE: Final = math.cos(math.radians(LEVEL_LIMIT_DEG))
 
@@ -181,9 +181,9 @@ RasterAxes = Literal["map", "wall", "level", "plane"]
 
 @dataclass(frozen=True, kw_only=True)
 class WallFrame:
-    """A raster grid on a plane: u to the viewer's right, v down, n towards the viewer.
+    """A raster on a plane: u to the right of the viewer, v down, n towards the viewer.
 
-    World point of a position (column, row) with a depth:
+    The world coordinates of a position (column, row) with a depth are
     `origin_world + gsd_m * (column * u_world + row * v_world) + depth_m * normal_world`. The centre
     of cell (row, column) is at (column + 0.5, row + 0.5); `u x v = -n`.
 
@@ -195,12 +195,12 @@ class WallFrame:
         gsd_m: side of a cell in metres.
         width: number of columns.
         height: number of rows.
-        map_crs: set where the raster is a map, with u to the east and v to the south: its
-            coordinate system, an EPSG code, or `site` for the world's own without a name.
-        up: unit vector along which heights count; None where it is unknown.
-        name: name of the wall, which is part of the name of its raster's coordinate system.
-        left_m: distance along the wall from its left edge to the left edge of this raster, for a
-            part of a wall.
+        map_crs: coordinate system of a raster that is a map, with u to the east and v to the south:
+            an EPSG code, or `site` for an unnamed world system; None if it is not a map.
+        up: unit vector of heights; None if unknown.
+        name: name of the wall, used in the name of the coordinate system of its raster.
+        left_m: distance along the wall from its left edge to the left edge of this raster, if it
+            is a part of a wall.
     """
 
     origin_world: NDArray[np.float64]
@@ -225,20 +225,21 @@ class WallFrame:
         if any(np.shape(vector) != (3,) for vector in vectors):
             raise GeometryError("a wall frame needs an origin and axes of three numbers each")
         if not np.allclose(np.cross(self.u_world, self.v_world), -self.normal_world, atol=1e-9):
-            raise GeometryError("a wall frame needs u x v = -n; these axes mirror the image")
+            raise GeometryError("a wall frame needs u x v = -n, but these axes mirror the image")
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns, in numpy's order."""
+        """Numbers of rows and columns."""
         return self.height, self.width
 
     @property
     def raster_axes(self) -> RasterAxes:
-        """The meaning of X and Y in the raster's files; this is the only place that decides it.
+        """The meaning of X and Y in files of this raster.
 
-        An upright wall has metres along it and heights, exact at its top edge; floors and ceilings
-        have the world's horizontal axes, ceilings with rows that go north, so that they lie over
-        the floor; sloping planes, and rasters whose up is unknown, count from the top-left corner.
+        For upright walls, X is the distance along the wall and Y the height, exact at the top edge.
+        For floors and ceilings, X and Y are the horizontal world axes; rows of a ceiling go north,
+        so that it can be superimposed on the floor. For sloping planes, and if up is unknown, X and
+        Y are distances from the top-left corner.
         """
         if self.map_crs is not None:
             return "map"
@@ -252,7 +253,7 @@ class WallFrame:
 
     @property
     def raster_corner_m(self) -> tuple[float, float]:
-        """Return X and Y of the outer corner of the top-left cell in the raster's files."""
+        """Return X and Y, in files, of the outer corner of the top-left cell."""
         axes = self.raster_axes
         if axes == "map":
             return float(self.origin_world[0]), float(self.origin_world[1])
@@ -263,22 +264,22 @@ class WallFrame:
 
     @property
     def raster_down(self) -> float:
-        """Return the change of Y per metre down the rows: -1, or 1 for ceilings."""
+        """Return the change of Y per metre in the direction of v: -1, or 1 for ceilings."""
         if self.up is None or self.raster_axes != "level":
             return -1.0
         return 1.0 if float(self.normal_world @ self.up) < 0.0 else -1.0
 
     @property
     def crs(self) -> str:
-        """Return the name of the coordinate system of the raster's files: the map's or the wall's.
+        """Return the name of the coordinate system in files: that of the map or of the wall.
 
-        The latter contains the wall's name and a number derived from the world position of X = Y =
-        0, so that rasters and parts of one wall share it and no two walls do.
+        The latter consists of the name of the wall and a hash of the world position of X = Y = 0,
+        so it is the same for all rasters and parts of one wall, and unique to the wall.
         """
         if self.map_crs is not None:
             return self.map_crs
         zero = self.world_from_wall(self.wall_from_raster(np.zeros((1, 2))))[0]
-        # The position in whole millimetres, and the axes to a millionth.
+        # The position is rounded to millimetres, the axes to 1e-6.
         axes = np.concatenate([self.u_world, self.v_world])
         place = [*np.round(1e3 * zero), *np.round(1e6 * axes)]
         digest = hashlib.sha256(",".join(f"{value:.0f}" for value in place).encode()).hexdigest()
@@ -286,13 +287,13 @@ class WallFrame:
 
     @property
     def plane(self) -> Plane:
-        """Return the plane of the frame."""
+        """Return the plane of the raster."""
         return Plane(
             normal=self.normal_world, offset_m=float(self.normal_world @ self.origin_world)
         )
 
     def has_cells_of(self, other: WallFrame) -> bool:
-        """Whether both have the same cells, to a thousandth of a cell at the corners."""
+        """Return whether both have the same cells, within 0.001 cells at the corners."""
         if self.shape != other.shape:
             return False
         apart = np.abs(self.corners_world() - other.corners_world()).max()
@@ -301,8 +302,8 @@ class WallFrame:
     def world_from_wall(
         self, pixels_wall: NDArray[np.float64], depths_m: NDArray[np.float64] | float = 0.0
     ) -> NDArray[np.float64]:
-        """World points (n, 3), metres, of wall positions (n, 2) = (column, row) and depths (n,)."""
-        # In a notebook a single position is given as a list of two numbers.
+        """Return world points (n, 3) of wall positions (n, 2) = (column, row) and depths (n,)."""
+        # In notebooks, a single position may be given as a list of two numbers.
         pixels = np.atleast_2d(np.asarray(pixels_wall, dtype=np.float64))
         in_plane = self.gsd_m * (pixels[:, :1] * self.u_world + pixels[:, 1:2] * self.v_world)
         lifted = np.multiply.outer(np.broadcast_to(depths_m, len(pixels)), self.normal_world)
@@ -310,7 +311,7 @@ class WallFrame:
         return points
 
     def wall_from_world(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Wall positions (n, 3) = (column, row, depth in metres) of world points (n, 3)."""
+        """Return wall positions (n, 3) = (column, row, depth in metres) of world points (n, 3)."""
         relative = points_world - self.origin_world
         return np.column_stack(
             [
@@ -321,43 +322,43 @@ class WallFrame:
         )
 
     def raster_from_wall(self, pixels_wall: NDArray[np.float64]) -> NDArray[np.float64]:
-        """X and Y (n, 2), metres, in the raster's files of wall positions (n, 2)."""
+        """Return X and Y (n, 2) in files, metres, of wall positions (n, 2)."""
         return np.array(self.raster_corner_m) + self.gsd_m * pixels_wall * [1.0, self.raster_down]
 
     def wall_from_raster(self, places_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Wall positions (n, 2) = (column, row) of X and Y (n, 2) in the raster's files."""
+        """Return wall positions (n, 2) = (column, row) of X and Y (n, 2) in files."""
         pixels: NDArray[np.float64] = (
             (places_m - np.array(self.raster_corner_m)) * [1.0, self.raster_down] / self.gsd_m
         )
         return pixels
 
     def distances_m(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Distance (n,) of world points (n, 3) from the raster's rectangle, on either side."""
+        """Return the distances (n,) of world points (n, 3) from the rectangle of the raster."""
         on_wall = self.wall_from_world(points_world)
         beside_px = on_wall[:, :2] - np.clip(on_wall[:, :2], 0.0, [self.width, self.height])
         beside_m = self.gsd_m * np.linalg.norm(beside_px, axis=1)
         return np.asarray(np.hypot(beside_m, on_wall[:, 2]))
 
     def corners_world(self) -> NDArray[np.float64]:
-        """Outer corners (4, 3) of the raster on the plane: top-left, then counter-clockwise."""
+        """Return the outer corners (4, 3) of the raster: top-left first, counter-clockwise."""
         columns = np.array([0, 0, self.width, self.width], dtype=np.float64)
         rows = np.array([0, self.height, self.height, 0], dtype=np.float64)
         return self.world_from_wall(np.column_stack([columns, rows]))
 
 
 def wall_axes(normal: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the axes u and v of the wall frame on a plane.
+    """Return the axes u and v of a wall frame on a plane.
 
-    u is horizontal and points to the right for a viewer in front of the plane. For floors and
-    ceilings (normal within 10 deg of up or down) u is the horizontal axis e1 of `basis_from_up`
-    projected onto the plane, so that a floor reads like a map: e1 to the right, e2 upwards.
+    u is horizontal and points to the right of the viewer. For floors and ceilings (normal within 10
+    degrees of the vertical) u is the axis e1 of `basis_from_up` projected onto the plane, so that a
+    floor looks like a map, with e1 to the right and e2 upwards.
 
     Args:
         normal: (3,) unit vector towards the viewer.
         up: (3,) unit vector.
 
     Returns:
-        (2, 3) rows u and v.
+        (2, 3) with the rows u and v.
     """
     if abs(float(normal @ up)) > math.cos(math.radians(LEVEL_LIMIT_DEG)):
         first = basis_from_up(up)[0]
@@ -371,7 +372,7 @@ def wall_axes(normal: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[n
 def frame_over(
     corners_world: NDArray[np.float64], normal: NDArray[np.float64], *, gsd_m: float
 ) -> WallFrame:
-    """Place a grid over a rectangle on a plane.
+    """Return the wall frame of a rectangle on a plane.
 
     Args:
         corners_world: (4, 3) metres, top-left first, counter-clockwise for the viewer.
@@ -379,16 +380,18 @@ def frame_over(
         gsd_m: side of a cell in metres.
 
     Returns:
-        The grid whose top-left corner is that of the rectangle; it covers the rectangle, so its
-        right and bottom edges may exceed it by less than a cell.
+        The frame that begins at the top-left corner of the rectangle and covers it; the right and
+        bottom edges may exceed it by less than a cell.
     """
     top_left, bottom_left, _, top_right = corners_world
     u = top_right - top_left
     width_m = float(np.linalg.norm(u))
     height_m = float(np.linalg.norm(bottom_left - top_left))
     if not (width_m > 0.0 and height_m > 0.0):
-        raise GeometryError(f"a rectangle needs an area, got corners {corners_world.tolist()}")
-    # Re-orthogonalised against the normal, because stored corners are rounded.
+        raise GeometryError(
+            f"the area of a rectangle must not be 0, got corners {corners_world.tolist()}"
+        )
+    # Stored corners are rounded, so the axes are made perpendicular to the normal again.
     u = u - (u @ normal) * normal
     u = u / np.linalg.norm(u)
     return WallFrame(
@@ -397,7 +400,8 @@ def frame_over(
         v_world=np.cross(u, normal),
         normal_world=normal.copy(),
         gsd_m=gsd_m,
-        # A tolerance of a millionth of a cell: 3.000000001 m at 3 mm must not add a column.
+        # With a tolerance of 1e-6 cells, so that 3.000000001 m with 3 mm cells does not add a
+        # column.
         width=max(1, math.ceil(width_m / gsd_m - 1e-6)),
         height=max(1, math.ceil(height_m / gsd_m - 1e-6)),
     )

@@ -1,9 +1,8 @@
-"""Interpolation of raster cells from the points around them.
+"""Interpolation of raster cells from surrounding points.
 
-No direction is favoured: all cells around a cell take part, weighted by the distance of their
-points from its centre, and their values are extrapolated to that centre along the slope. A raster
-that is rotated or mirrored is therefore interpolated to the rotated or mirrored result, up to the
-order of summation.
+All cells around a cell are used, weighted by the distance of their points from its centre, and a
+plane through their values gives the value at the centre. No direction is preferred, so rotating or
+mirroring a raster rotates or mirrors the result, up to the order of summation.
 
 This module loads numba: methods import it inside functions.
 """
@@ -21,24 +20,24 @@ from orthoflow.geometry.compiling import compiled, kernel_part
 from orthoflow.geometry.levels import Colours
 from orthoflow.geometry.threads import in_parts
 
-# Cells within this many times the distance of the nearest one take part, and all eight neighbours.
+# Cells up to this multiple of the distance of the nearest one are used, and all eight neighbours.
 _BEYOND_CELLS: Final = 1.0
 _NEIGHBOURS_SQUARE: Final = 2.0
-# Standard deviation of the weights, as a share of the distance to the nearest cell, at least 1.
+# Standard deviation of the weights, relative to the distance to the nearest cell (at least 1 cell).
 _SIGMA_SHARE: Final = 0.5
-# (1 - x / 8)^8 approximates exp(-x) in a tenth of the time; the outermost cells have no weight.
+# (1 - x / 8)^8 approximates exp(-x) in a tenth of the time; it is 0 for the outermost cells.
 _WEIGHT_LEAST: Final = 1e-6
-# A slope that the spread of the points hardly determines is taken as zero.
+# A slope is set to zero if the points hardly determine it.
 _RIDGE: Final = 0.005
-# Points whose squared distances differ by less count as equally near.
+# Points with a smaller difference of squared distances count as equally near.
 _AS_NEAR: Final = 1e-6
 
 
 class CellValues(NamedTuple):
-    """The values of cells, flat over a raster; arrays without cells are left alone.
+    """Values of the cells of a raster, in flat arrays; empty arrays are ignored.
 
     Attributes:
-        depth_m: float32, NaN where void.
+        depth_m: float32, NaN if void.
         intensity: float32.
         rgb: (cells, 3) uint8 or uint16.
     """
@@ -54,7 +53,7 @@ def cell_values(
     intensity: NDArray[np.float32] | None = None,
     rgb: Colours | None = None,
 ) -> CellValues:
-    """Return values in the form that kernels are compiled for."""
+    """Return values in the form for which kernels are compiled."""
     return CellValues(
         depth_m,
         np.empty(0, dtype=np.float32) if intensity is None else intensity,
@@ -63,13 +62,13 @@ def cell_values(
 
 
 class Surroundings(NamedTuple):
-    """The cells of a raster from which others are interpolated.
+    """Cells of a raster from which others are interpolated.
 
     Attributes:
-        places: (cells, 2) float32, position of their points right of and below the centre of the
-            cell, in cells; NaN for cells that are not used.
-        width: columns of the raster.
-        layer_m: depths that differ by more belong to different surfaces.
+        places: (cells, 2) float32 position of the points to the right of and below the centre of
+            their cell, in cells; NaN for cells that are not used.
+        width: number of columns of the raster.
+        layer_m: depths with a larger difference belong to different surfaces.
     """
 
     places: NDArray[np.float32]
@@ -86,23 +85,23 @@ def interpolate(
     reach_cells: float,
     threads: int,
 ) -> NDArray[np.bool_]:
-    """Interpolate cells linearly from their surroundings.
+    """Interpolate cells linearly from surrounding cells.
 
-    A void cell is interpolated from the surrounding points of one surface: its own if its depth is
-    known, else that of the nearest points, and among equally near ones that of the point nearest
-    the viewer. A cell with points keeps its value, shifted from the position of its points to its
-    centre. No result leaves the range of the surrounding values.
+    A void cell is interpolated from the surrounding points of one surface: that of its own depth if
+    known, otherwise that of the nearest point (of equally near points, the one nearest to the
+    viewer). The value of a cell with points is shifted from the position of its points to the
+    centre. Results are limited to the range of the surrounding values.
 
     Args:
         cells: (n,) flat indices of the cells to interpolate.
-        around: the cells to interpolate from.
-        values: the values of these cells, and the depths of the cells to interpolate where known.
-        into: the output; may be `values` unless one of the cells is itself used for others.
-        reach_cells: maximum distance of the nearest cell that can be used.
+        around: cells from which they are interpolated.
+        values: values of these cells, and depths of the cells to interpolate if known.
+        into: output; may be `values` if none of `cells` is used for others.
+        reach_cells: maximum distance to the nearest cell that can be used.
         threads: number of threads.
 
     Returns:
-        (n,) which cells were interpolated; the others are unchanged.
+        (n,) whether each cell was interpolated; others are unchanged.
     """
     wanted = _Wanted(
         cells=cells,
@@ -115,7 +114,7 @@ def interpolate(
 
 
 def _offsets_within(radius_cells: float) -> NDArray[np.int64]:
-    """Return the cells (k, 2) = (row, column) within a radius of a centre cell, itself first."""
+    """Return the cells (k, 2) = (row, column) within a radius, beginning with the centre."""
     most = math.floor(radius_cells)
     steps = np.arange(-most, most + 1, dtype=np.int64)
     rows, columns = (grid.ravel() for grid in np.meshgrid(steps, steps, indexing="ij"))
@@ -126,7 +125,7 @@ def _offsets_within(radius_cells: float) -> NDArray[np.int64]:
 
 
 class _Wanted(NamedTuple):
-    """The cells to interpolate, the neighbourhood of each, and which of them were interpolated."""
+    """The cells to interpolate, their neighbourhood, and whether they were interpolated."""
 
     cells: NDArray[np.int64]
     offsets: NDArray[np.int64]
@@ -134,7 +133,7 @@ class _Wanted(NamedTuple):
 
 
 class _Lenders(NamedTuple):
-    """Buffers for the neighbours of one cell: position, distance and weight."""
+    """Buffers for the positions, distances and weights of the neighbours of a cell."""
 
     cells: NDArray[np.int64]
     across: NDArray[np.float64]
@@ -182,7 +181,7 @@ def _find_lenders(
     depth_m: NDArray[np.float32],
     lenders: _Lenders,
 ) -> tuple[int, float]:
-    """Find the neighbours of a cell; return their number, and how fast their weight decreases."""
+    """Find the neighbours of a cell; return their number, and the decrease of their weights."""
     places, width = around.places, around.width
     height = places.shape[0] // width
     row, column = cell // width, cell % width
@@ -220,7 +219,7 @@ def _find_lenders(
 def _keep_layer(
     n: int, surface_m: float, layer_m: float, depth_m: NDArray[np.float32], lenders: _Lenders
 ) -> int:
-    """Keep those of n neighbours that lie on a surface; return their number."""
+    """Keep the neighbours that are on one surface; return their number."""
     kept = 0
     for k in range(n):
         if abs(depth_m[lenders.cells[k]] - surface_m) <= layer_m:
@@ -232,9 +231,9 @@ def _keep_layer(
 
 @kernel_part
 def _weigh(cell: int, n: int, sigma: float, places: NDArray[np.float32], lenders: _Lenders) -> None:
-    """Set the weight of each of n neighbours: linear regression, weighted by proximity.
+    """Set the weights of n neighbours by linear regression, weighted by proximity.
 
-    For a cell with points, set the weights that shift its own value to its centre.
+    For a cell with points, the weights shift its own value to its centre.
     """
     per_square = 1.0 / (16.0 * sigma * sigma)
     w, wx, wy, wxx, wxy, wyy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -262,7 +261,7 @@ def _weigh(cell: int, n: int, sigma: float, places: NDArray[np.float32], lenders
 
 @kernel_part
 def _mixed(values: NDArray[np.generic], lenders: _Lenders, n: int, own: int) -> float:
-    """Combine n neighbours into a cell, within their range; `own` is a cell with points, or -1."""
+    """Interpolate a cell within the range of n neighbours; `own` is -1 if it has no points."""
     total, least, most = 0.0, math.inf, -math.inf
     if own >= 0:
         total = float(values[own])

@@ -1,6 +1,6 @@
-"""Colour levels: 8 bits per channel, or 16 for deep photos, with the same shares of white.
+"""Colour levels with 8 or 16 bits per channel, converted in proportion to white.
 
-So 255 in 8 bits is 65535 in 16 bits, and every 8-bit level has an exact 16-bit one: times 257.
+255 in 8 bits corresponds to 65535 in 16 bits; an 8-bit level times 257 is its 16-bit level.
 """
 
 from __future__ import annotations
@@ -16,38 +16,38 @@ from numpy.typing import NDArray
 Colours: TypeAlias = NDArray[np.uint8 | np.uint16]
 Level: TypeAlias = type[np.uint8] | type[np.uint16]
 
-# Luma of red, green and blue as stored (Rec. 601), as in OpenCV.
+# Weights of red, green and blue in luma (Rec. 601, as in OpenCV).
 REC_601: Final = np.array([0.299, 0.587, 0.114])
 # 16-bit levels per 8-bit level.
 DEEPER: Final = 257
-# Steps of the table from light to levels; between them it is nearly linear.
+# Steps of the table from linear light to levels, which is nearly linear between them.
 _STEPS: Final = 1 << 16
-# A picture has a single tone if this share of it is within a level of 256 of its median, or darker
-# than this share of white, or brighter than white less this share.
+# A picture has a single tone if this share of its cells is within one of 256 levels of the median,
+# darker than this share of white, or brighter than white minus this share.
 _PLAIN_SHARE: Final = 0.98
 _DARK: Final = 0.03
 _LEVEL: Final = 0.5 / 255.0
 _TONE_SAMPLE: Final = 40_000
-# Smaller pictures are not judged.
+# Smaller pictures are not checked.
 _TONE_CELLS_MIN: Final = 2000
 
 
 def eight_bits(colours: Colours) -> NDArray[np.uint8]:
-    """Return colours in 8 bits: themselves, or 16 bits rounded."""
+    """Return colours with 8 bits, rounded from 16 bits if necessary."""
     if colours.dtype == np.uint8:
         return colours.view(np.uint8)
     return ((colours.astype(np.uint32) + DEEPER // 2) // DEEPER).astype(np.uint8)
 
 
 def sixteen_bits(colours: Colours) -> NDArray[np.uint16]:
-    """Return colours in 16 bits: themselves, or 8 bits times 257, which is lossless."""
+    """Return colours with 16 bits; 8 bits are converted without loss."""
     if colours.dtype == np.uint16:
         return colours.view(np.uint16)
     return colours.astype(np.uint16) * np.uint16(DEEPER)
 
 
 def in_levels(colours: Colours, level: Level) -> Colours:
-    """Return colours in 8 or in 16 bits."""
+    """Return colours with 8 or 16 bits."""
     return eight_bits(colours) if level is np.uint8 else sixteen_bits(colours)
 
 
@@ -58,7 +58,7 @@ def level_of(colours: Colours) -> Level:
 
 @cache
 def light_of_levels(highest: int) -> NDArray[np.float32]:
-    """Return light, 0 to 1, of the levels 0 to `highest` of sRGB (IEC 61966-2-1)."""
+    """Return the linear light, 0 to 1, of sRGB levels 0 to `highest` (IEC 61966-2-1)."""
     level = np.arange(highest + 1) / float(highest)
     light = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
     return light.astype(np.float32)
@@ -66,7 +66,7 @@ def light_of_levels(highest: int) -> NDArray[np.float32]:
 
 @cache
 def _share_of_light() -> NDArray[np.float32]:
-    """Levels, 0 to 1, of light in equal steps; with one more, so that there is always a next."""
+    """Return levels, 0 to 1, for equal steps of light; one more, for interpolation."""
     light = np.minimum(np.arange(_STEPS + 1) / (_STEPS - 1.0), 1.0)
     level = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
     return level.astype(np.float32)
@@ -75,16 +75,16 @@ def _share_of_light() -> NDArray[np.float32]:
 def lit_shares(
     levels: NDArray[np.floating], log_gains: NDArray[np.floating]
 ) -> NDArray[np.float64]:
-    """Multiply the light of levels (n, 3), 0 to 1, by the exponentials of (n, 3)."""
+    """Multiply the light of levels (n, 3), 0 to 1, by the exponential of (n, 3)."""
     light = np.interp(levels, np.linspace(0.0, 1.0, _STEPS), light_of_levels(_STEPS - 1))
-    # Interpolation ends with the table: clipped light is white.
+    # Light is clipped to white, the end of the table.
     gained = light * np.exp(log_gains)
     levels = np.interp(gained, np.linspace(0.0, 1.0, _STEPS), _share_of_light()[:_STEPS])
     return np.asarray(levels, dtype=np.float64)
 
 
 def lit(colours: Colours, log_gains: NDArray[np.float32]) -> Colours:
-    """Multiply the light of colours (n, 3) by the exponentials of (n, 3)."""
+    """Multiply the light of colours (n, 3) by the exponential of (n, 3)."""
     highest = int(np.iinfo(colours.dtype).max)
     light = light_of_levels(highest)[colours] * np.exp(log_gains)
     place = np.clip(light, 0.0, 1.0) * np.float32(_STEPS - 1)
@@ -97,7 +97,7 @@ def lit(colours: Colours, log_gains: NDArray[np.float32]) -> Colours:
 def plain_tone(
     picture: NDArray[np.generic], mask: NDArray[np.uint8], shown: Sequence[int], *, white: float
 ) -> tuple[str, float] | None:
-    """Whether a picture is nearly all black, white or one value.
+    """Check whether a picture is almost entirely black, white or of one value.
 
     Args:
         picture: (rows, cols) or (rows, cols, 3); NaN is ignored.
@@ -106,13 +106,13 @@ def plain_tone(
         white: the value of maximum brightness.
 
     Returns:
-        `black`, `white` or `one value`, and the share of such cells; None for a picture with tones,
-        or with few cells.
+        `black`, `white` or `one value`, and the share of these cells; None if the picture has
+        several tones or few cells.
 
     >>> ramp, mask = np.linspace(0.0, 1.0, 2000)[None], np.ones((1, 2000), dtype=np.uint8)
     >>> plain_tone(0.0 * ramp, mask, (1,), white=1.0), plain_tone(ramp, mask, (1,), white=1.0)
     (('black', 1.0), None)
-    >>> plain_tone(ramp[..., None], 0 * mask, (1,), white=1.0)  # shows nothing
+    >>> plain_tone(ramp[..., None], 0 * mask, (1,), white=1.0)  # no cell has content
     """
     step = max(1, math.isqrt(mask.size // _TONE_SAMPLE))
     is_shown = np.isin(mask[::step, ::step], shown)

@@ -1,4 +1,4 @@
-"""Narrow gaps of a raster, as distinguished from windows."""
+"""Narrow gaps in a raster, as opposed to windows."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from numpy.typing import NDArray
 
 
 def narrow_gaps(is_measured: NDArray[np.bool_], radius_cells: int) -> NDArray[np.int64]:
-    """Find the void cells of narrow gaps.
+    """Find the void cells in narrow gaps.
 
-    A gap is narrow where no disc of the radius fits into it: what remains void is the morphological
-    opening of the void cells, so windows and outlines keep their shape to the cell. Cells outside
-    the raster count as void. Every cell found has a measured cell within the radius.
+    A gap is narrow if no disc with the given radius fits into it. All other void cells are the
+    morphological opening of the void cells, so the shapes of windows and outlines are not changed.
+    Cells outside the raster count as void. Each cell found has a measured cell within the radius.
 
     Args:
-        is_measured: (rows, cols).
-        radius_cells: radius of the disc; with 0 no gap is found.
+        is_measured: (rows, cols) bool.
+        radius_cells: radius of the disc; 0 finds no gaps.
 
     Returns:
         (k,) flat indices, ascending.

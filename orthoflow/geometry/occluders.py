@@ -1,4 +1,4 @@
-"""Which points of a whole cloud hide others from photos."""
+"""Points of the whole cloud that hide others in photos."""
 
 from __future__ import annotations
 
@@ -23,32 +23,32 @@ from orthoflow.geometry.threads import even_parts, in_threads
 
 _LONGEST_SIDE_PX: Final = 2048
 _VOXELS_MOST: Final = 1 << 24
-# Small enough to separate a chair's legs, large enough to hold a few points of each surface.
+# Small enough to separate the legs of a chair, large enough to contain several points of a surface.
 _VOXEL_CELLS: Final = 6.0
-# No scanner measures at such short range: points there are errors, and many in a small volume.
+# Scanners do not measure at shorter range. Points there are errors, and dense.
 _BLIND_M: Final = 0.3
-# Where fewer than one in this many of a station's rays end, there is nothing: the others passed. A
-# rod of a millimetre stops more of the rays that meet a cube of 0.2 m.
+# A voxel is empty if fewer than one in this many rays of a station end in it. A rod of 1 mm stops a
+# larger share of the rays through a cube of 0.2 m.
 _PASSING_RAYS: Final = 200
 _N_ELEVATIONS: Final = 90
-# Half of the points that a surface scanned as finely as the wall has in 3 x 3 x 3 voxels.
+# Half the number of points in 3 x 3 x 3 voxels of a surface scanned with the spacing of the wall.
 _FEW_POINTS: Final = 0.5 * (3.0 * _VOXEL_CELLS) ** 2
-# The corner of a surface holds a quarter of them, and its edge half.
+# The corner of a surface has a quarter of these points, its edge half.
 _CORNER_SHARE: Final = 0.25
-# Share of the pairs of points: closer to 1 in 27 than to 1 in 9.
+# Share of pairs of points in the same voxel: closer to 1 in 27 than to 1 in 9.
 _SPREAD_SHARE: Final = 0.07
 _SAMPLED_MOST: Final = 1 << 20
-# Points with fewer about them, themselves included, are outliers and hide nothing.
+# Points with fewer points around them (including themselves) are outliers and hide nothing.
 POINTS_LEAST: Final = 6
 
 
 @dataclass(frozen=True, kw_only=True)
 class Box:
-    """The region in which points may hide others, and their spacing there.
+    """Region in which points may hide others, and the point spacing in it.
 
     Attributes:
-        low: (3,) float64 metres from the cloud's origin.
-        high: (3,) float64 metres from the cloud's origin.
+        low: (3,) float64 lower corner, metres from the origin of the cloud.
+        high: (3,) float64 upper corner, metres from the origin of the cloud.
         spacing_m: approximate spacing of neighbouring points of a surface.
     """
 
@@ -59,14 +59,14 @@ class Box:
 
 @dataclass(frozen=True, kw_only=True)
 class Occluders:
-    """A cloud prepared for rendering from any of the photos.
+    """A cloud prepared for rendering from the position of any photo.
 
     Attributes:
         origin: (3,) float64 metres.
         points: float32 offsets from the origin.
-        around: number of points around each.
-        n_least: points with fewer about them, in 3 x 3 x 3 voxels, are outliers.
-        threads: number of threads for one view; it does not change the result.
+        around: number of points around each point.
+        n_least: points with fewer points in 3 x 3 x 3 voxels around them are outliers.
+        threads: number of threads for one view, which does not affect the result.
     """
 
     origin: NDArray[np.float64]
@@ -86,17 +86,17 @@ def occluders_before(
     n_least: int = POINTS_LEAST,
     threads: int,
 ) -> Occluders:
-    """Count the points between cameras and walls, to detect outliers and estimate point spacing.
+    """Count points between cameras and walls, to detect outliers and estimate point spacing.
 
     Args:
         cloud: the whole cloud.
-        slabs: of the walls; nothing outside the box around them and the cameras can hide them.
-        cameras: all of them.
-        spacing_m: approximate spacing of the points of a wall; not the side of coarser cells,
-            because the larger the voxels, the more stray points of a dense scan they hold.
+        slabs: slabs of the walls; only points in the box around them and the cameras can hide them.
+        cameras: all cameras.
+        spacing_m: approximate point spacing on a wall. It must not be the size of coarser cells,
+            because larger voxels contain more stray points of a dense scan.
         stations_world: (s, 3) metres, positions of the scanner, if known.
-        n_least: points with fewer neighbours are outliers, in a box small enough for its voxels to
-            hold the intended number of points.
+        n_least: points with fewer neighbours are outliers, unless the box is so large that voxels
+            must be larger.
         threads: see `Occluders`.
     """
     places = [camera.centre_world for camera in cameras]
@@ -120,7 +120,7 @@ def occluders_in(
 
     Args:
         cloud: the whole cloud.
-        box: nothing outside of it hides anything.
+        box: region in which points may hide others.
         stations_world: (s, 3) metres, positions of the scanner, if known.
         n_least: see `Occluders`.
         threads: see `Occluders`.
@@ -145,7 +145,7 @@ def occluders_in(
         stations = np.unique(stations_world, axis=0) - cloud.origin
         _forget_passed(grid, points, stations, _CORNER_SHARE * n_few)
         _forget_around(grid, stations)
-    # A linear object has that many more points in larger voxels.
+    # In larger voxels, a linear object has more points by this factor.
     n_asked = math.ceil(n_least * larger)
     return Occluders(
         origin=cloud.origin, points=points, around=grid, n_least=n_asked, threads=threads
@@ -153,7 +153,7 @@ def occluders_in(
 
 
 def depth_buffer(occluders: Occluders, camera: ViewingCamera) -> DepthBuffer:
-    """Render the cloud through a camera."""
+    """Render the cloud as seen by a camera."""
     reduction = max(1, -(-max(camera.width, camera.height) // _LONGEST_SIDE_PX))
     shape = (-(-camera.height // reduction), -(-camera.width // reduction))
     flat = camera.shifted(occluders.origin).flat
@@ -188,9 +188,9 @@ def nothing_in_the_way(camera: ViewingCamera) -> DepthBuffer:
 
 
 def _closed(nearest: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Fill holes of a pixel or two, so that no wall is visible through a nearer surface.
+    """Fill holes of one or two pixels, so that no wall is visible through a nearer surface.
 
-    Take the nearest, then the farthest of 3 x 3 pixels, one axis after the other.
+    This is a minimum filter followed by a maximum filter, 3 x 3 pixels each.
     """
     for choose in (np.minimum, np.maximum):
         for axis in range(2):
@@ -207,15 +207,15 @@ def _part(points: Offsets, piece: slice) -> Offsets:
 
 
 def _forget_spread(counts: NDArray[np.uint16], squares: NDArray[np.uint32], n_few: float) -> None:
-    """Reject voxels whose few points are spread over all 27 voxels, which no surface does.
+    """Reject voxels with few points that are spread over all 27 voxels, unlike a surface.
 
-    Of all pairs of points, one in 27 shares a voxel if points are scattered, one in 9 on a surface
+    One in 27 pairs of points is in the same voxel if points are scattered, one in 9 on a surface
     and one in 3 along a line.
 
     Args:
-        counts: of 27 voxels, changed in place.
-        squares: of the counts of single voxels, changed in place.
-        n_few: a surface has more points than this.
+        counts: numbers of points in 27 voxels, changed in place.
+        squares: squared counts of single voxels, changed in place.
+        n_few: voxels with more points are not checked.
     """
     _sum_neighbours(squares)
     places = np.nonzero((counts > 1) & (counts < n_few))
@@ -227,11 +227,11 @@ def _forget_spread(counts: NDArray[np.uint16], squares: NDArray[np.uint32], n_fe
 def _forget_passed(
     grid: VoxelGrid, points: Offsets, stations: NDArray[np.float64], n_few: float
 ) -> None:
-    """Reject voxels which nearly all rays of the stations passed through.
+    """Reject voxels that nearly all rays of the stations passed through.
 
-    Stray points of a dense scan can be as close together as those of a surface, most of all near a
-    station; but hardly any of the rays in their direction ended there. A thinned cloud has as few
-    points near its stations, but not fewer than a surface has.
+    Stray points of a dense scan can be as dense as points of a surface, especially near a station,
+    but only a small share of the rays in their direction ends at them. In a thinned cloud, points
+    near a station are as few, but as many as expected for a surface.
     """
     every = slice(None, None, max(1, len(points.x) // _SAMPLED_MOST))
     places = np.column_stack([axis[every] for axis in points]).astype(np.float64)
@@ -240,7 +240,7 @@ def _forget_passed(
     middles = grid.low + grid.side_m * (
         np.array(np.unravel_index(filled, grid.counts.shape)).T + 0.5
     )
-    # Each station is assumed to have all points, so that the mean is that of all together.
+    # All points are attributed to each station, so the mean applies to all stations together.
     rays = np.zeros(len(filled))
     for station in stations:
         per_sr = weight * _points_per_sr(places - station) / len(stations)
@@ -252,7 +252,7 @@ def _forget_passed(
 
 
 def _points_per_sr(ways: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Count the points per direction: (rows, columns) of elevation and azimuth."""
+    """Count points per direction: (rows, columns) of elevation and azimuth."""
     counts = np.zeros((_N_ELEVATIONS, 2 * _N_ELEVATIONS))
     np.add.at(counts, _directions(ways), 1.0)
     edges = np.sin(np.linspace(-0.5 * math.pi, 0.5 * math.pi, _N_ELEVATIONS + 1))
@@ -260,7 +260,7 @@ def _points_per_sr(ways: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _directions(ways: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the row of elevation and the column of azimuth of each direction (n, 3)."""
+    """Return the row (elevation) and the column (azimuth) of each direction (n, 3)."""
     elevation = np.arctan2(ways[:, 2], np.hypot(ways[:, 0], ways[:, 1])) / math.pi + 0.5
     azimuth = np.arctan2(ways[:, 1], ways[:, 0]) / math.pi + 1.0
     rows, columns = ((_N_ELEVATIONS * each).astype(np.intp) for each in (elevation, azimuth))
@@ -268,7 +268,7 @@ def _directions(ways: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np
 
 
 def _forget_around(grid: VoxelGrid, stations: NDArray[np.float64]) -> None:
-    """Reject voxels at ranges below the minimum of a scanner."""
+    """Reject voxels closer to a station than the minimum range of scanners."""
     for station in stations:
         middle = (station - grid.low) / grid.side_m - 0.5
         reach = _BLIND_M / grid.side_m

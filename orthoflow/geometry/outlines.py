@@ -1,4 +1,4 @@
-"""Where the planes of a room intersect, and its outline: walls in plan, and as faces in space."""
+"""Intersections of the planes of a room, and its outline in plan and in space."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.frames import LEVEL_LIMIT_DEG, Plane, basis_from_up
 
-# Rectangles of points end before a corner that furniture hides, and extend past one at a reveal.
+# Rectangles of points end before a corner hidden by furniture, and extend past one at a reveal.
 REACH_M: Final = 0.3
 SHORTEST_M: Final = 0.1
-# The intersection of planes that are closer to parallel is poorly determined.
+# The intersection of planes that are more nearly parallel is poorly determined.
 _LEAST_ANGLE_DEG: Final = 20.0
 
 Interval = tuple[float, float]
@@ -27,8 +27,8 @@ class Surface:
     """A plane and the region where it was measured.
 
     Attributes:
-        plane: it.
-        rectangles_world: (m, 4, 3) metres, corners of the connected parts.
+        plane: the plane.
+        rectangles_world: (m, 4, 3) metres, corners of its connected parts.
     """
 
     plane: Plane
@@ -37,12 +37,12 @@ class Surface:
 
 @dataclass(frozen=True, kw_only=True)
 class Edge:
-    """A segment of the line in which two planes intersect.
+    """A segment of the intersection line of two planes.
 
     Attributes:
         first: index of one plane.
         second: index of the other, larger plane.
-        ends_world: (2, 3) metres.
+        ends_world: (2, 3) end points in metres.
     """
 
     first: int
@@ -57,10 +57,10 @@ class Edge:
 
 @dataclass(frozen=True, kw_only=True)
 class Corner:
-    """A point in which three planes intersect.
+    """Intersection point of three planes.
 
     Attributes:
-        planes: their indices, ascending.
+        planes: indices of the planes, ascending.
         point_world: (3,) metres.
     """
 
@@ -69,9 +69,9 @@ class Corner:
 
 
 def line_of(first: Plane, second: Plane) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Return the intersection line of two planes: its point (3,) nearest the origin, its direction.
+    """Return the intersection line of two planes: its point nearest the origin, its direction.
 
-    None for nearly parallel planes.
+    None if the planes are nearly parallel.
     """
     direction = np.cross(first.normal, second.normal)
     size = float(np.linalg.norm(direction))
@@ -84,9 +84,9 @@ def line_of(first: Plane, second: Plane) -> tuple[NDArray[np.float64], NDArray[n
 
 
 def edges_between(surfaces: Sequence[Surface], *, reach_m: float = REACH_M) -> tuple[Edge, ...]:
-    """Return the segments of the lines along which planes adjoin.
+    """Return the segments of intersection lines where planes adjoin.
 
-    A segment is where both planes were measured within `reach_m` of the line.
+    Along a segment, both planes were measured within `reach_m` of the line.
 
     Args:
         surfaces: planes with their rectangles.
@@ -97,7 +97,7 @@ def edges_between(surfaces: Sequence[Surface], *, reach_m: float = REACH_M) -> t
         line = line_of(first.plane, second.plane)
         if line is None:
             continue
-        # Solve about a point near both planes, so that survey coordinates lose no precision.
+        # Solve relative to a point near both planes, so that survey coordinates lose no precision.
         point, direction = line
         middle = first.rectangles_world.mean(axis=(0, 1))
         start = point + ((middle - point) @ direction) * direction
@@ -112,7 +112,7 @@ def edges_between(surfaces: Sequence[Surface], *, reach_m: float = REACH_M) -> t
 def corners_between(
     surfaces: Sequence[Surface], edges: Sequence[Edge], *, reach_m: float = REACH_M
 ) -> tuple[Corner, ...]:
-    """Return the points in which three planes that adjoin there intersect."""
+    """Return the intersection points of three planes that adjoin at the point."""
     by_pair: dict[tuple[int, int], list[Edge]] = {}
     for edge in edges:
         by_pair.setdefault((edge.first, edge.second), []).append(edge)
@@ -128,7 +128,7 @@ def corners_between(
     normals = np.array([surface.plane.normal for surface in surfaces])[at]
     offsets = np.array([surface.plane.offset_m for surface in surfaces])[at]
     meet = np.abs(np.linalg.det(normals)) >= math.sin(math.radians(_LEAST_ANGLE_DEG)) ** 2
-    # Solve about a nearby point, so that survey coordinates lose no precision.
+    # Solve relative to a nearby point, so that survey coordinates lose no precision.
     middles = np.array([surface.rectangles_world.mean(axis=(0, 1)) for surface in surfaces])
     near = middles[at[meet, 0]]
     rest = offsets[meet] - np.einsum("nij,nj->ni", normals[meet], near)
@@ -144,11 +144,12 @@ def corners_between(
 def _spans(
     surface: Surface, start: NDArray[np.float64], direction: NDArray[np.float64], reach_m: float
 ) -> list[Interval]:
-    """Return the intervals of a line near which a surface was measured: disjoint, ascending."""
+    """Return the intervals of a line near a measured surface, disjoint and ascending."""
     relative = surface.rectangles_world - start
     along = relative @ direction
     aside = relative @ np.cross(surface.plane.normal, direction)
-    # The part within reach of the line has its corners there and where its sides cross the limit.
+    # The part of a rectangle within reach is bounded by its corners within reach and by the points
+    # where its sides cross the limit.
     places = [np.where(np.abs(aside) <= reach_m, along, np.nan)]
     over = np.roll(aside, -1, axis=1) - aside
     for limit in (-reach_m, reach_m):
@@ -188,7 +189,7 @@ def _distance(edge: Edge, point: NDArray[np.float64]) -> float:
 
 # Maximum distance between the end of a wall's points and its corner with the next wall.
 _JOINED_M: Final = 1.0
-# Walls this close in front of each other that face the same way are one wall with relief.
+# Walls with the same direction that are closer to each other are one wall with relief.
 _RELIEF_M: Final = 0.5
 
 
@@ -197,13 +198,14 @@ class RoomOutline:
     """The boundary of a room.
 
     Attributes:
-        walls: indices of the planes that bound it and join another, in the order of the chains.
-        chains_world: outlines at the height of the floor, (n, 3) metres each; consecutive walls
-            share a point.
-        closed: for each chain whether its last point joins its first.
+        walls: indices of the bounding planes that join another one, in the order of the chains.
+        chains_world: outlines (n, 3) in metres at the height of the floor; consecutive walls share
+            a point.
+        closed: whether the last point of each chain joins its first point.
         faces_world: (w, 4, 3) metres, faces of `walls` from floor to ceiling: top left, bottom
-            left, bottom right, top right as the viewer sees them.
-        floor_m: height of the floor along up, or of the lowest wall where no floor was found.
+            left, bottom right, top right for the viewer.
+        floor_m: height of the floor along up, or of the lower edge of the lowest wall if no floor
+            was found.
     """
 
     walls: tuple[int, ...]
@@ -218,10 +220,10 @@ class _Wall:
     """A wall in plan.
 
     Attributes:
-        index: of its plane.
-        plane: it.
-        corners: (4, 3) of its rectangle, top left first, counter-clockwise for the viewer.
-        ends: (2, 2) left and right end in plan.
+        index: index of its plane.
+        plane: the plane.
+        corners: (4, 3) corners of its rectangle, top left first, counter-clockwise for the viewer.
+        ends: (2, 2) left and right ends in plan.
     """
 
     index: int
@@ -234,7 +236,7 @@ class _Wall:
         return float(np.linalg.norm(self.ends[1] - self.ends[0]))
 
 
-# A wall, by its place in the list, and its end: 0 left, 1 right.
+# Index of a wall in the list, and one of its ends: 0 left, 1 right.
 _End = tuple[int, int]
 
 
@@ -243,12 +245,12 @@ def room_outline(
 ) -> RoomOutline:
     """Join the walls of a room into its outline.
 
-    Of the planes of a wall with relief the first counts. A wall ends where its line crosses that of
-    the next, if its points come within a metre of there; otherwise where its points end.
+    Only the first plane of a wall with relief is used. A wall ends at its intersection with the
+    next wall if its points extend to within a metre of it, otherwise at the end of its points.
 
     Args:
-        planes: planes, the normals into the room, sorted by number of points, largest first.
-        corners_world: (k, 4, 3) metres, rectangles of their points, top left first,
+        planes: planes with normals into the room, in descending order of their numbers of points.
+        corners_world: (k, 4, 3) metres, corners of the rectangles of their points, top left first,
             counter-clockwise for the viewer.
         up: (3,) unit vector.
     """
@@ -276,7 +278,7 @@ def room_outline(
 def _level(
     planes: Sequence[Plane], corners: NDArray[np.float64], up: NDArray[np.float64]
 ) -> int | None:
-    """Return the largest level plane that faces a direction."""
+    """Return the largest level plane that faces a given direction."""
     limit = math.cos(math.radians(LEVEL_LIMIT_DEG))
     areas = {
         k: float(np.linalg.norm(np.cross(quad[1] - quad[0], quad[3] - quad[0])))
@@ -289,7 +291,7 @@ def _level(
 def _bounding(
     planes: Sequence[Plane], corners: NDArray[np.float64], basis: NDArray[np.float64]
 ) -> list[_Wall]:
-    """Return the walls without those that are relief on an earlier one."""
+    """Return the walls that are not relief on an earlier wall."""
     limit = math.sin(math.radians(LEVEL_LIMIT_DEG))
     upright = [
         _Wall(
@@ -303,14 +305,14 @@ def _bounding(
     ]
     kept: list[_Wall] = []
     for wall in upright:
-        # A rectangle of zero width, which no detector returns, has no position along a wall.
+        # A rectangle of zero width has no extent along a wall.
         if wall.length_m > 0.0 and not any(_is_relief(wall, larger) for larger in kept):
             kept.append(wall)
     return kept
 
 
 def _is_relief(wall: _Wall, larger: _Wall) -> bool:
-    """Whether a wall is in front of or behind most of a larger one and faces the same way."""
+    """Return whether a wall is relief: mostly in front of or behind a larger, parallel one."""
     if float(wall.plane.normal @ larger.plane.normal) < math.cos(math.radians(LEVEL_LIMIT_DEG)):
         return False
     middle = wall.corners.mean(axis=0)
@@ -324,7 +326,7 @@ def _is_relief(wall: _Wall, larger: _Wall) -> bool:
 
 
 def _joints(walls: Sequence[_Wall]) -> dict[_End, _End]:
-    """Return pairs of wall ends that meet, the nearest first."""
+    """Return pairs of wall ends that meet, the closest first."""
     candidates: list[tuple[float, _End, _End]] = []
     for (i, first), (j, second) in combinations(enumerate(walls), 2):
         crossing = _crossing(first, second)
@@ -346,7 +348,7 @@ def _joints(walls: Sequence[_Wall]) -> dict[_End, _End]:
 
 
 def _crossing(first: _Wall, second: _Wall) -> NDArray[np.float64] | None:
-    """Return the intersection of the lines of two walls in plan."""
+    """Return the intersection of two walls in plan."""
     along = [wall.ends[1] - wall.ends[0] for wall in (first, second)]
     matrix = np.column_stack([along[0], -along[1]])
     size = first.length_m * second.length_m
@@ -358,10 +360,10 @@ def _crossing(first: _Wall, second: _Wall) -> NDArray[np.float64] | None:
 
 
 def _chains(count: int, joints: dict[_End, _End]) -> list[tuple[list[_End], bool]]:
-    """Return chains of walls, each with the end at which it is entered; and whether they close."""
+    """Return chains of walls, each wall with its first end; and whether chains are closed."""
     left = set(range(count))
     chains: list[tuple[list[_End], bool]] = []
-    # Free ends first, so that an open chain is followed from its beginning.
+    # Begin at free ends, so that open chains are followed from their beginning.
     free = [(k, side) for k, side in product(range(count), (0, 1)) if (k, side) not in joints]
     for start in [*free, *((k, 0) for k in range(count))]:
         if start[0] not in left:
@@ -406,7 +408,7 @@ def _corner_in_plan(
 def _face(
     walls: Sequence[_Wall], place: int, joints: dict[_End, _End], levels: Sequence[Plane | None]
 ) -> NDArray[np.float64]:
-    """Return the corners (4, 3) of a wall between its neighbours, ceiling and floor."""
+    """Return the corners (4, 3) of a wall bounded by its neighbours, ceiling and floor."""
     own = walls[place]
     sides = []
     for side, (top, bottom) in enumerate(((0, 1), (3, 2))):
@@ -430,7 +432,7 @@ def _on_line(
     level: Plane | None,
     near: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return where a line meets floor or ceiling, or else its point nearest to a given one."""
+    """Return where a line meets a plane; without a plane, its point nearest to `near`."""
     point, direction = line
     if level is None:
         return np.asarray(point + (near - point) @ direction / (direction @ direction) * direction)

@@ -1,9 +1,8 @@
-"""Binning a cloud into the raster of a wall: streams the points, returns arrays per cell.
+"""Binning of the points of a cloud into the raster of a wall.
 
-A pass processes one chunk of the cloud after the other. `project_points` transforms a chunk; the
-passes then run over the entries of the points inside, each thread on the cells it owns. Every cell
-is therefore visited in the order of the points for any number of threads, and no result depends on
-it, including sums of floats.
+The cloud is processed in chunks. `project_points` transforms a chunk; the passes then process the
+points inside the raster, each thread for the cells assigned to it. Thus each cell is visited in the
+order of the points, and results, including sums of floats, do not depend on the number of threads.
 
 This module loads numba: methods import it inside functions.
 """
@@ -22,12 +21,12 @@ from orthoflow.geometry.frames import WallFrame
 from orthoflow.geometry.slabs import BOXED_POINTS, OffsetPoints, Offsets, Slab, read_only
 from orthoflow.geometry.threads import in_parts, in_threads
 
-# Cells are assigned to threads in runs of 2^17, some dozens of rows: a scan runs along columns or
-# rows, and a thread that meets its own points in long runs is not slowed down by the others'.
+# Cells are assigned to threads in runs of 2^17, a few dozen rows. Scans run along columns or rows,
+# and a thread is faster if the points of its cells come in long runs.
 _RUN_SHIFT: Final = 17
 NO_POINT: Final = np.uint32(0xFFFFFFFF)
-# One record per cell: a scan along columns accesses another row of the raster with every point, and
-# the passes are limited by one cache line for each.
+# One record per cell, because a scan along columns needs a different row of the raster, and thus at
+# least one cache line, for each point.
 WINNER: Final = np.dtype([("depth_m", "f4"), ("square", "f4"), ("point", "u4"), ("n_points", "u4")])
 
 
@@ -35,9 +34,9 @@ class Target(NamedTuple):
     """The raster into which points are binned.
 
     Attributes:
-        wall_from_offset: (3, 4) float64; rows give column, row and depth in metres of an offset.
-        behind_m: smallest accepted depth.
-        front_m: largest accepted depth.
+        wall_from_offset: (3, 4) float64 transform from offsets to column, row and depth in metres.
+        behind_m: smallest depth.
+        front_m: largest depth.
         height: number of rows.
         width: number of columns.
     """
@@ -50,13 +49,13 @@ class Target(NamedTuple):
 
 
 class Entries(NamedTuple):
-    """Points of one chunk that lie inside the raster, in order, (n,) each.
+    """Points of one chunk inside the raster, in order.
 
     Attributes:
-        cells: int32, row * width + column.
-        depths_m: float32.
-        squares: float32, squared distance to the centre of the cell, in cells.
-        points: uint32, index in the cloud.
+        cells: (n,) int32, row * width + column.
+        depths_m: (n,) float32.
+        squares: (n,) float32 squared distance to the centre of the cell, in cells.
+        points: (n,) uint32 index in the cloud.
     """
 
     cells: NDArray[np.int32]
@@ -75,18 +74,18 @@ def project_points(
     first: int,
     end: int,
 ) -> None:
-    """Set cell, depth and distance from the cell's centre of some points of a chunk.
+    """Set cell, depth and distance from the centre of the cell for points of a chunk.
 
-    Both ends of the buffer are inside. A cell owns its left and upper edge.
+    Depths at both limits are inside. The left and upper edges of a cell belong to it.
 
     Args:
-        offsets: of the chunk.
+        offsets: offsets of the chunk.
         target: the raster.
-        cells: overwritten, -1 outside the raster and its buffer.
-        depths_m: overwritten, as in `Entries`.
-        squares: overwritten, as in `Entries`.
-        first: first point to visit.
-        end: the point after the last one.
+        cells: output, -1 outside the raster or its range of depths.
+        depths_m: output, see `Entries`.
+        squares: output, see `Entries`.
+        first: index of the first point.
+        end: index after the last point.
     """
     m = target.wall_from_offset
     u0, u1, u2, u3 = m[0, 0], m[0, 1], m[0, 2], m[0, 3]
@@ -94,7 +93,7 @@ def project_points(
     d0, d1, d2, d3 = m[2, 0], m[2, 1], m[2, 2], m[2, 3]
     x, y, z = offsets.x, offsets.y, offsets.z
     for k in range(first, end):
-        # float64 on purpose: the pass is limited by memory, not by arithmetic.
+        # float64 costs no time, because the pass is limited by memory bandwidth.
         px, py, pz = np.float64(x[k]), np.float64(y[k]), np.float64(z[k])
         u = u0 * px + u1 * py + u2 * pz + u3
         v = v0 * px + v1 * py + v2 * pz + v3
@@ -110,19 +109,19 @@ def project_points(
 
 @inlined
 def is_own(cell, owners, owner):  # type: ignore[no-untyped-def]  # numba infers the types
-    """Return whether a thread owns a cell; owners are a power of two."""
+    """Return whether a cell belongs to a thread; the number of owners is a power of two."""
     return (cell >> _RUN_SHIFT) & (owners - 1) == owner
 
 
 @compiled
 def keep_topmost(entries: Entries, winners: NDArray[np.void], owners: int, owner: int) -> None:
-    """Let the largest depth win; ties go to the point nearer the centre, then the lower index.
+    """Select the point with the largest depth; of equal ones the nearest to the centre.
 
     Args:
-        entries: one chunk.
-        winners: (cells,) of `WINNER`, updated; depths start at minus infinity.
+        entries: points of one chunk; of equally near ones the first counts.
+        winners: (cells,) of `WINNER`, updated; depths are initially minus infinity.
         owners: number of threads that share the cells, a power of two.
-        owner: the thread whose cells to visit.
+        owner: the thread whose cells are processed.
     """
     for k in range(entries.cells.size):
         cell = entries.cells[k]
@@ -137,13 +136,13 @@ def keep_topmost(entries: Entries, winners: NDArray[np.void], owners: int, owner
 
 @compiled
 def keep_nearest(entries: Entries, winners: NDArray[np.void], owners: int, owner: int) -> None:
-    """Let the point nearest the centre of the cell win; ties go to the lower index.
+    """Select the point nearest to the centre of each cell; of equal ones the first.
 
     Args:
-        entries: one chunk.
-        winners: (cells,) of `WINNER`, updated; squares start at infinity.
+        entries: points of one chunk.
+        winners: (cells,) of `WINNER`, updated; squares are initially infinity.
         owners: number of threads that share the cells, a power of two.
-        owner: the thread whose cells to visit.
+        owner: the thread whose cells are processed.
     """
     for k in range(entries.cells.size):
         cell = entries.cells[k]
@@ -156,23 +155,23 @@ def keep_nearest(entries: Entries, winners: NDArray[np.void], owners: int, owner
             winner.point = entries.points[k]
 
 
-# Their entries (16 MB) stay in the processor's cache between the passes.
+# The entries of a chunk (16 MB) stay in the cache of the processor between passes.
 _CHUNK: Final = 1 << 20
 
-# A gap is filled from the cells nearest to it, or from cells one farther.
+# Gaps are filled from the nearest cells and from cells up to one cell farther away.
 _BESIDE_GAPS_CELLS: Final = 2
 
 _Value = TypeVar("_Value", bound=np.generic)
 
 
 def wall_from_offset(frame: WallFrame, origin: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the transform (3, 4) from offsets of a cloud (m) to (column, row, depth in metres).
+    """Return the transform (3, 4) from offsets in metres to (column, row, depth in metres).
 
-    The difference of the two origins is taken once, in float64, so that survey coordinates of 10^6
-    m lose no precision.
+    The difference of the two origins is computed in float64, so that survey coordinates of 10^6 m
+    lose no precision.
     """
     axes = np.vstack([frame.u_world / frame.gsd_m, frame.v_world / frame.gsd_m, frame.normal_world])
-    # Adding +0.0 avoids -0.0, which sorts below +0.0 by its bits.
+    # Adding +0.0 converts -0.0, whose bits differ from those of +0.0.
     return np.column_stack([axes, axes @ (origin - frame.origin_world) + 0.0])
 
 
@@ -184,16 +183,16 @@ def entries_inside(
     rows: slice | None = None,
     is_left_out: NDArray[np.bool_] | None = None,
 ) -> Iterator[Entries]:
-    """Yield the points inside a slab, chunk by chunk, in order.
+    """Yield the points inside a slab in order, by chunks.
 
-    Blocks of points whose box does not meet the slab are not read.
+    Blocks of points whose bounding boxes are outside the slab are not read.
 
     Args:
-        points: of the cloud.
-        slab: of the wall.
+        points: points of the cloud.
+        slab: slab of the wall.
         threads: number of threads.
-        rows: the rows of the raster that are needed; points in others may be omitted. None for all.
-        is_left_out: (n,) points to ignore; None to use all.
+        rows: rows of the raster that are needed; points in other rows may be omitted. None for all.
+        is_left_out: (n,) points to ignore; None if all are used.
     """
     frame = slab.frame
     target = Target(
@@ -219,7 +218,7 @@ def entries_inside(
 
 
 def _runs(points: OffsetPoints, target: Target, rows: slice | None) -> Iterator[tuple[int, int]]:
-    """Yield the first point, and the one after the last, of chunks that may have points inside."""
+    """Yield the first index and the end index of chunks that may have points inside."""
     n_points, boxes_m = points.x.size, points.boxes_m
     if boxes_m is None:
         edges = np.array([[0, n_points]])
@@ -236,27 +235,27 @@ def _runs(points: OffsetPoints, target: Target, rows: slice | None) -> Iterator[
 def _may_hold_points(
     boxes_m: NDArray[np.float64], target: Target, rows: slice | None
 ) -> NDArray[np.bool_]:
-    """Report which boxes (n, 2, 3) may meet a slab, which need not be aligned to the axes."""
+    """Return which bounding boxes (n, 2, 3) may intersect a slab, which may be oblique."""
     axes = target.wall_from_offset[:, :3]
     middles = boxes_m.mean(axis=1) @ axes.T + target.wall_from_offset[:, 3]
     halves = 0.5 * (boxes_m[:, 1] - boxes_m[:, 0]) @ np.abs(axes).T
     first_row, end_row = (0, target.height) if rows is None else (rows.start, rows.stop)
     low = np.array([0.0, first_row, target.behind_m])
     high = np.array([target.width, end_row, target.front_m])
-    # Far more than is lost by rounding.
+    # A tolerance that is much larger than rounding errors.
     slack = 1e-9 * (np.abs(middles) + halves) + 1e-6
-    # A box with a NaN coordinate compares false, and is kept.
+    # Comparisons with NaN are false, so a box with a NaN coordinate is kept.
     is_beside = (middles + halves < low - slack) | (middles - halves > high + slack)
     found: NDArray[np.bool_] = ~is_beside.any(axis=1)
     return found
 
 
 def share_cells(threads: int, *passes: Callable[[int, int], None]) -> None:
-    """Run passes one after the other, each thread on the cells it owns.
+    """Run passes one after the other, each in threads that process their own cells.
 
     Args:
         threads: number of threads, rounded down to a power of two.
-        passes: functions of the number of owners and the owner whose cells to visit.
+        passes: functions of the number of owners and of the owner whose cells are processed.
     """
     owners = 1 << (max(1, threads).bit_length() - 1)
 
@@ -274,18 +273,18 @@ def topmost_points(
     threads: int,
     is_left_out: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.void]:
-    """Return the point nearest to the viewer in each cell: the rule of skarlatos2012.
+    """Return the point of each cell that is nearest to the viewer (skarlatos2012).
 
-    Ties go to the point nearer the centre of its cell, then to the lower index.
+    Of equally near points, the one nearest to the centre of the cell is used, then the first one.
 
     Args:
-        points: of the cloud.
-        slab: of the wall.
+        points: points of the cloud.
+        slab: slab of the wall.
         threads: number of threads.
-        is_left_out: (n,) points to ignore; None to use all.
+        is_left_out: (n,) points to ignore; None if all are used.
 
     Returns:
-        (cells,) of `WINNER`; `point` is `NO_POINT` where the cell is void.
+        (cells,) of `WINNER`; `point` is `NO_POINT` if the cell is void.
     """
     winners = empty_winners(slab.n_cells)
     for entries in entries_inside(points, slab, threads=threads, is_left_out=is_left_out):
@@ -294,7 +293,7 @@ def topmost_points(
 
 
 def empty_winners(n_cells: int) -> NDArray[np.void]:
-    """Return cells without winners."""
+    """Return an array of cells without points."""
     winners = np.empty(n_cells, dtype=WINNER)
     winners[:] = (-np.inf, np.inf, NO_POINT, 0)
     return winners
@@ -303,12 +302,12 @@ def empty_winners(n_cells: int) -> NDArray[np.void]:
 def values_of_winners(
     winners: NDArray[np.void], values: NDArray[_Value], nothing: float
 ) -> NDArray[_Value]:
-    """Return the values (cells, channels) of the points that won the cells.
+    """Return the values (cells, channels) of the points selected for the cells.
 
     Args:
         winners: (cells,) of `WINNER`.
-        values: (n, channels) of the points of the cloud.
-        nothing: value for cells without a point of their own.
+        values: (n, channels) values of the points of the cloud.
+        nothing: value of cells without a point.
     """
     taken = np.full((winners.size, values.shape[1]), nothing, dtype=values.dtype)
     has_point = winners["n_points"] > 0
@@ -319,11 +318,11 @@ def values_of_winners(
 def places_of_winners(
     points: OffsetPoints, slab: Slab, winners: NDArray[np.void]
 ) -> NDArray[np.float32]:
-    """Return the positions of the points that won cells next to gaps, from which these are filled.
+    """Return the positions of the selected points in cells near gaps.
 
     Returns:
-        (cells, 2) right of and below the centre, in cells; 0 in cells without a void cell nearby,
-        NaN in cells without a point of their own.
+        (cells, 2) to the right of and below the centre of the cell, in cells; 0 if there is no void
+        cell nearby, NaN if the cell has no point.
     """
     from scipy import ndimage  # noqa: PLC0415 - few who load this need it
 

@@ -1,4 +1,4 @@
-"""Dataclasses of arrays with one row per item: selection and concatenation."""
+"""Dataclasses of arrays with one row per item, which can be selected and concatenated."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, kw_only=True)
 class Rows:
-    """Base of dataclasses whose arrays have one row per item; other fields describe all items."""
+    """Base class of dataclasses whose arrays have one row per item."""
 
     def __len__(self) -> int:
         return len(next(iter(_arrays(self).values())))
 
     def take(self, chosen: NDArray[np.bool_] | NDArray[np.intp] | slice) -> Self:
-        """Return some of the items; views for a slice."""
+        """Return the selected items; views if they are selected by a slice."""
         return replace(self, **{name: array[chosen] for name, array in _arrays(self).items()})
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """Concatenate the items of several; fields that describe all are the first's."""
+        """Concatenate items; fields that are not arrays are taken from the first object."""
         columns = {name: [getattr(part, name) for part in parts] for name in _arrays(parts[0])}
         return replace(parts[0], **{name: np.concatenate(own) for name, own in columns.items()})
 

@@ -1,4 +1,4 @@
-"""The points of a cloud, block by block, and the slab around a wall's plane that limits them."""
+"""Blocks of the points of a cloud, and the slab around the plane of a wall."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from orthoflow.geometry.threads import in_parts
 
 
 class Offsets(NamedTuple):
-    """Offsets of points from their cloud's origin, (n,) float32 metres each."""
+    """Offsets of points from the origin of their cloud, (n,) float32 metres each."""
 
     x: NDArray[np.float32]
     y: NDArray[np.float32]
@@ -21,19 +21,19 @@ class Offsets(NamedTuple):
 
 
 def read_only(x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32]) -> Offsets:
-    """Return arrays, including mapped files, in the form for which kernels are compiled."""
+    """Return arrays, which may be memory-mapped, in the form for which kernels are compiled."""
     views = [np.asarray(values).view(np.ndarray) for values in (x, y, z)]
     for view in views:
         view.flags.writeable = False
     return Offsets(*views)
 
 
-# Coordinates are read at the speed of memory or of the disk, which two threads saturate.
+# Two threads saturate the bandwidth of memory or of the disk.
 _BOXING_THREADS: Final = 2
 
 
 class OffsetPoints(Protocol):
-    """The part of a `PointCloud` that raster passes read."""
+    """The attributes of a `PointCloud` that raster passes use."""
 
     @property
     def origin(self) -> NDArray[np.float64]:
@@ -41,30 +41,30 @@ class OffsetPoints(Protocol):
 
     @property
     def x(self) -> NDArray[np.float32]:
-        """(n,) metres from the origin along x."""
+        """Offsets (n,) from the origin along x, metres."""
 
     @property
     def y(self) -> NDArray[np.float32]:
-        """(n,) metres from the origin along y."""
+        """Offsets (n,) from the origin along y, metres."""
 
     @property
     def z(self) -> NDArray[np.float32]:
-        """(n,) metres from the origin along z."""
+        """Offsets (n,) from the origin along z, metres."""
 
     @property
     def boxes_m(self) -> NDArray[np.float32] | None:
-        """The result of `block_boxes_m` for these points; None for too few to be worth it."""
+        """Result of `block_boxes_m` for these points; None if there are few points."""
 
 
-# Points of a box: their coordinates stay in the processor's cache while it is computed.
+# Points per box, few enough for the cache of the processor.
 BOXED_POINTS: Final = 1 << 16
 
 
 def block_boxes_m(points: OffsetPoints) -> NDArray[np.float32]:
-    """Return boxes (blocks, 2, 3) of `BOXED_POINTS` points: lowest and highest offsets, metres.
+    """Return bounding boxes (blocks, 2, 3) of `BOXED_POINTS` points each, metres.
 
-    A scan is ordered, so the points of a block are close together, and a pass over one wall need
-    not read those of the others.
+    Consecutive points of a scan are close together, so a pass over one wall need not read the
+    blocks of the other walls.
     """
     n_blocks = -(-len(points.x) // BOXED_POINTS)
     boxes_m = np.empty((n_blocks, 2, 3), dtype=np.float32)
@@ -81,12 +81,12 @@ def block_boxes_m(points: OffsetPoints) -> NDArray[np.float32]:
 
 @dataclass(frozen=True, kw_only=True)
 class Slab:
-    """The raster of a wall and the range of depths in front of and behind its plane.
+    """The raster of a wall, and the range of depths in front of and behind its plane.
 
     Attributes:
-        frame: where the cells lie.
-        front_m: range towards the viewer, measured from the plane.
-        behind_m: range away from the viewer, positive.
+        frame: raster on the plane.
+        front_m: maximum distance in front of the plane.
+        behind_m: maximum distance behind the plane, positive.
     """
 
     frame: WallFrame
@@ -99,7 +99,7 @@ class Slab:
         return self.frame.width * self.frame.height
 
     def over(self, rows: slice) -> Slab:
-        """Return the slab over some rows of the raster."""
+        """Return the slab of the given rows of the raster."""
         frame = self.frame
         corner = frame.origin_world + rows.start * frame.gsd_m * frame.v_world
         part = replace(frame, origin_world=corner, height=rows.stop - rows.start)

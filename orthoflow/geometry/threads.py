@@ -1,7 +1,7 @@
-"""Work shared by threads: fixed parts, and results in the order of the parts.
+"""Work shared by threads, in parts whose results are returned in order.
 
-The parts do not depend on the number of threads, or do not affect the result; so results have the
-same bits for any number of them. Compiled kernels release the interpreter lock.
+The parts do not depend on the number of threads, or do not affect the result, so results are
+identical for any number of threads. Compiled kernels release the interpreter lock.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def usable_cores() -> int:
 
 
 def address_space() -> int | None:
-    """Return the bytes of memory that this process may ask for (`ulimit -v`); None if unlimited."""
+    """Return the bytes that this process may still allocate (`ulimit -v`); None if unlimited."""
     import resource  # noqa: PLC0415 - only of Unix, where steps run
 
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
@@ -35,13 +35,13 @@ def address_space() -> int | None:
 
 
 def has_room_for_threads() -> bool:
-    """Whether threads may be started: starting one without free memory would block forever."""
+    """Return whether threads may be started; without free memory this would block forever."""
     limit = address_space()
     return limit is None or limit >= _ROOM_FOR_THREADS
 
 
 def start_beside(work: Callable[[], object]) -> Thread | None:
-    """Start a task that can also run in the calling thread; None if no thread can be started."""
+    """Start a task in a thread; return None if no thread can be started."""
     if not has_room_for_threads():
         return None
     thread = Thread(target=work, daemon=True)
@@ -54,7 +54,7 @@ def in_threads(tasks: Sequence[Callable[[], None]], *, threads: int | None = Non
 
     Args:
         tasks: functions to run.
-        threads: maximum number at the same time; None for all of them.
+        threads: maximum number of tasks that run at the same time; None for all tasks.
     """
     if len(tasks) == 1 or not has_room_for_threads():
         for task in tasks:
@@ -68,7 +68,7 @@ def in_threads(tasks: Sequence[Callable[[], None]], *, threads: int | None = Non
 def in_order(
     function: Callable[[_Item], _Result], items: Iterable[_Item], *, threads: int | None = None
 ) -> Iterator[_Result]:
-    """Yield a function's results, `threads` computed at once; None: one per processor."""
+    """Yield the results of a function, computed in threads (None: one per processor)."""
     if not has_room_for_threads():
         yield from map(function, items)
         return
@@ -77,12 +77,12 @@ def in_order(
 
 
 def even_parts(n_items: int, n_parts: int, *, multiple: int = 1) -> list[slice]:
-    """Cut a range into parts of about equal length; some may be empty.
+    """Divide a range into parts of similar length; some may be empty.
 
     Args:
         n_items: length of the range.
         n_parts: number of parts.
-        multiple: parts begin at multiples of this.
+        multiple: parts begin at multiples of this number.
     """
     n_units = -(-n_items // multiple)
     edges = [part * n_units // n_parts * multiple for part in range(n_parts)] + [n_items]
@@ -90,7 +90,7 @@ def even_parts(n_items: int, n_parts: int, *, multiple: int = 1) -> list[slice]:
 
 
 def in_parts(work: Callable[[int, int], None], n_items: int, *, threads: int) -> None:
-    """Call `work(first, end)` over one part of a range per thread."""
+    """Call `work(first, end)` for one part of a range per thread."""
     parts = even_parts(n_items, threads)
     in_threads([partial(work, part.start, part.stop) for part in parts])
 
@@ -98,7 +98,7 @@ def in_parts(work: Callable[[int, int], None], n_items: int, *, threads: int) ->
 def in_runs(
     work: Callable[[int, int], None], n_items: int, *, n_per_run: int, threads: int
 ) -> None:
-    """Call `work(first, end)` over runs of a range, each of the same length."""
+    """Call `work(first, end)` for parts of a range with the same length."""
     starts = range(0, n_items, n_per_run)
     in_threads(
         [partial(work, first, min(n_items, first + n_per_run)) for first in starts],

@@ -1,4 +1,4 @@
-"""The data that steps exchange: frozen dataclasses of named arrays and JSON, one per type."""
+"""Data types exchanged between steps: frozen dataclasses of named arrays and JSON."""
 
 from orthoflow.products.cloud import PointCloud
 from orthoflow.products.input_files import InputFiles

@@ -1,4 +1,4 @@
-"""The point cloud: offsets from an origin, the scanner's measurements, and its stations."""
+"""Point clouds: coordinates relative to an origin, measured values, and scanner stations."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ from orthoflow.errors import ProductError
 from orthoflow.geometry.slabs import BOXED_POINTS, block_boxes_m
 from orthoflow.products.product import JsonValue, Product, Tolerance
 
-# A cloud with fewer blocks is always read as a whole.
+# A cloud with fewer blocks is always read completely.
 _BLOCKS_LEAST: Final = 16
 
 
 @dataclass(frozen=True, kw_only=True)
 class PointCloud(Product):
-    """Points of one or several scans in one world frame.
+    """Points of one or more scans in one world frame.
 
-    The world point i is `origin + (x[i], y[i], z[i])`. Float32 holds offsets only, so survey
-    coordinates of 10^6 m lose no precision.
+    The world coordinates of point i are `origin + (x[i], y[i], z[i])`. Because float32 is used for
+    offsets only, survey coordinates of 10^6 m lose no precision.
 
     Attributes:
         origin: (3,) float64 metres.
-        x: (n,) float32 metres from the origin; y and z likewise. Three contiguous arrays, because
-            hot passes read them at memory speed.
+        x: (n,) float32 offset from the origin in metres; y and z likewise. Separate contiguous
+            arrays can be read at the speed of memory.
         up: (3,) float64 unit vector in world axes.
-        intensity: (n,) float32, 0..1, NaN for points without intensity; None if no point has one.
+        intensity: (n,) float32, 0 to 1, NaN if not measured; None if no point has an intensity.
         rgb: (n, 3) uint8 sRGB, or None.
-        has_rgb: (n,) bool, which points have a colour; None if all have (or none, with `rgb`).
-        scan: (n,) uint16 index of the scan the point is from, or None.
-        row: (n,) uint32 position in the scan's grid, or None; column likewise.
-        point_id: (n,) uint32 place of the point in the cloud that its source gave; None where that
-            is its place here. See `selected`.
-        stations: (s, 3) float64 metres, positions of the scanner (or the viewer), or None.
-        stations_source: `file`, `view_from` (given by the user) or None without stations.
-        source: how the data were read: files, unit, ranges before normalising, counts dropped; for
-            people.
+        has_rgb: (n,) bool, which points have a colour; None if `rgb` is None or applies to all.
+        scan: (n,) uint16 index of the scan of each point, or None.
+        row: (n,) uint32 row in the grid of the scan, or None; `column` likewise.
+        point_id: (n,) uint32 index of each point in the cloud as read; None if it is the index in
+            this cloud. See `selected`.
+        stations: (s, 3) float64 metres, positions of the scanner or the viewer, or None.
+        stations_source: `file`, `view_from` (given by the user), or None if there are no stations.
+        source: information on reading for users: files, unit, ranges before normalisation, numbers
+            of dropped points.
     """
 
     type_name: ClassVar[str] = "cloud"
@@ -112,22 +112,22 @@ class PointCloud(Product):
 
     @cached_property
     def boxes_m(self) -> NDArray[np.float32] | None:
-        """Return boxes (blocks, 2, 3) of consecutive points; None for a few blocks.
+        """Return bounding boxes (blocks, 2, 3) of consecutive points; None for small clouds.
 
-        Computed on first use, by one pass over the points.
+        Computed when first used.
         """
         return block_boxes_m(self) if len(self) > _BLOCKS_LEAST * BOXED_POINTS else None
 
     def points_world(self, index: NDArray[np.int64] | slice = slice(None)) -> NDArray[np.float64]:
-        """Return world points (m, 3) float64 of a selection; a copy, so keep selections small."""
+        """Return a copy of the world coordinates (m, 3) of selected points, float64."""
         offsets = np.column_stack([self.x[index], self.y[index], self.z[index]])
         return self.origin + offsets.astype(np.float64)
 
     def selected(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> PointCloud:
-        """Return the cloud of some points; each keeps its id and all that was measured of it.
+        """Return a cloud of selected points with their ids and all measured values.
 
         Args:
-            chosen: (n,) which points, or the places of those wanted in their new order.
+            chosen: (n,) bool mask of points, or their indices in the order wanted.
         """
         fields = ("x", "y", "z", "intensity", "rgb", "has_rgb", "scan", "row", "column")
         arrays = {name: getattr(self, name) for name in fields}
@@ -139,16 +139,18 @@ class PointCloud(Product):
         )
 
     def require_points(self, n_least: int) -> None:
-        """Refuse a cloud that no method can process.
+        """Refuse a cloud that cannot be processed.
 
         Raises:
-            ProductError: fewer than `n_least` points, or coordinates that are not finite.
+            ProductError: it has fewer than `n_least` points, or coordinates that are not finite.
         """
         if len(self) < n_least:
-            raise ProductError(f"the cloud has {len(self)} points, at least {n_least} are needed")
+            raise ProductError(
+                f"the cloud has {len(self)} points, but at least {n_least} are needed"
+            )
         for name, values in (("x", self.x), ("y", self.y), ("z", self.z), ("origin", self.origin)):
-            # A sum is NaN or infinite exactly when a term is (float64 cannot overflow here), and
-            # needs no mask of scan size.
+            # The sum is finite if and only if all terms are (float64 cannot overflow here), and
+            # needs no mask as large as the cloud.
             if not np.isfinite(np.sum(values, dtype=np.float64)):
                 raise ProductError(
                     f"the cloud has coordinates in {name} that are NaN or infinite: read it with "

@@ -1,4 +1,4 @@
-"""The files that a source reads: a workflow's inputs as its steps see them."""
+"""Input files of a workflow, as read by its steps."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import ClassVar
 
 @dataclass(frozen=True, kw_only=True)
 class InputFiles:
-    """Files of one workflow input, sorted by name; not stored, identified by name and content.
+    """Files of one input of a workflow, sorted by name; identified by content, and not stored.
 
     Attributes:
         name: name of the input in the workflow.
-        paths: existing files, read-only for methods.
+        paths: existing files; methods must not change them.
     """
 
     type_name: ClassVar[str] = "files"

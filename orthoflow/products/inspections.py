@@ -1,4 +1,4 @@
-"""Inspection of products: surveyed check points, the truth of a simulated scene, and findings."""
+"""Data for inspections: check points, the truth of a simulated scene, and results."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from orthoflow.products.product import (
 
 @dataclass(frozen=True, kw_only=True)
 class CheckPoints(Product):
-    """Surveyed points that were not used in anything they check.
+    """Surveyed points that were not used to make the data that they check.
 
     Attributes:
         names: names of the points.
         points_world: (n, 3) float64 metres.
-        classes: class of each point, e.g. `flat`, `vertical`; empty strings without one.
-        wall: (n,) int32 number of the wall in whose orthoimage the point was measured, the place of
-            its plane in `planes.json`; -1 for none.
+        classes: class of each point, such as `flat` or `vertical`; empty if none is given.
+        wall: (n,) int32 number of the wall in whose orthoimage the point was measured (index of its
+            plane in `planes.json`); -1 if not measured.
         pixels_wall: (n, 2) float64 measured (column, row), NaN where not measured.
-        places_m: (n, 2) float64 measured X and Y as the orthoimage's GeoTIFF has them, metres in
-            the plane of the wall, or east and north of a map; NaN where not measured so. None
-            where no point was.
-        shown_world: (n, 3) float64 metres, the world point shown where the point was measured; NaN
-            where not measured so. None where no point was.
+        places_m: (n, 2) float64 measured X and Y in the coordinates of the GeoTIFF of the
+            orthoimage: metres in the plane of the wall, or easting and northing of a map. NaN if
+            the point was measured otherwise; None if all were.
+        shown_world: (n, 3) float64 metres, world coordinates of the measured position; NaN if the
+            point was measured otherwise, None if all were.
     """
 
     type_name: ClassVar[str] = "checkpoints"
@@ -52,7 +52,7 @@ class CheckPoints(Product):
     def __post_init__(self) -> None:
         count = len(self.names)
         if len(self.classes) != count:
-            raise ProductError(f"checkpoints: {count} names have {len(self.classes)} classes")
+            raise ProductError(f"checkpoints: {count} names, but {len(self.classes)} classes")
         require_shapes(
             "checkpoints",
             {
@@ -67,13 +67,13 @@ class CheckPoints(Product):
 
 @dataclass(frozen=True, kw_only=True)
 class TakenPhoto:
-    """How a simulated photo was taken.
+    """Geometry of a simulated photo.
 
     Attributes:
         photo: file name.
-        wall: name of the wall that it is aimed at.
-        gsd_m: side of a pixel on the wall where the optical axis meets it.
-        obliquity_deg: angle between the optical axis and the wall's normal.
+        wall: name of the wall at which the camera is aimed.
+        gsd_m: size of a pixel on the wall, at the optical axis, in metres.
+        obliquity_deg: angle between the optical axis and the normal of the wall.
         roll_deg: rotation about the optical axis.
     """
 
@@ -89,16 +89,17 @@ class Truth(Product):
     """The truth of a simulated scene.
 
     Attributes:
-        scene: the surfaces with their colours; can be rendered from anywhere.
-        planes: the planes a detector should find.
-        labels: (n,) int16 per point of the simulated cloud: index into `planes`, -1 for none.
-        stations: (s, 3) float64 metres, where the scanner stood.
-        lowest_elevation_deg: lowest direction of the scanner, above the horizon positive.
-        highest_elevation_deg: highest direction of the scanner.
-        n_spoilt: points of the cloud that are gross outliers or mix the distances of two surfaces.
-        cameras: true orientations of the photos, or None without photos.
-        photos: how the photos were taken, in the order of `cameras`.
-        details: parameters of the simulation (scan step, noise, relief ...), JSON, for people.
+        scene: surfaces and their colours, which can be rendered from any position.
+        planes: planes that a detector should find.
+        labels: (n,) int16 index in `planes` of each point of the simulated cloud, -1 if none.
+        stations: (s, 3) float64 metres, positions of the scanner.
+        lowest_elevation_deg: lowest elevation that the scanner measures, positive above the
+            horizon.
+        highest_elevation_deg: highest elevation that the scanner measures.
+        n_spoilt: number of points that are gross outliers or mixtures of two distances.
+        cameras: true orientations of the photos, or None if there are no photos.
+        photos: geometry of the photos, in the order of `cameras`.
+        details: JSON parameters of the simulation (scan step, noise, relief ...), for users only.
     """
 
     type_name: ClassVar[str] = "truth"
@@ -118,13 +119,13 @@ class Truth(Product):
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """One number that an inspection returns.
+    """One numerical result of an inspection.
 
     Attributes:
-        name: metric name, unit in the name where it has one.
+        name: name of the metric, which contains the unit if it has one.
         value: the number.
-        unit: unit, `1` for shares and counts.
-        wall: index in `Walls` of the wall that the number describes, -1 for all together.
+        unit: unit; `1` for shares and counts.
+        wall: index in `Walls` of the wall that it describes, -1 for all walls together.
     """
 
     name: str
@@ -140,11 +141,11 @@ class Inspection(Product):
     Attributes:
         wall: (n,) int32 index in `Walls` of the wall of each measured point.
         points_world: (n, 3) float64 metres.
-        displacement_m: (n, 2) float64 metres along u and v: shown - true.
-        kind: (n,) uint8 class of the point; `kinds` names them.
+        displacement_m: (n, 2) float64 metres along u and v, shown minus true position.
+        kind: (n,) uint8 class of each point, an index in `kinds`.
         kinds: names of the classes.
-        findings: the numbers.
-        details: further statements of the method, JSON, for people.
+        findings: numerical results.
+        details: further JSON results, for users only.
     """
 
     type_name: ClassVar[str] = "inspection"
@@ -173,4 +174,6 @@ class Inspection(Product):
             },
         )
         if count and int(self.kind.max()) >= len(self.kinds):
-            raise ProductError(f"inspection.kind has more than the {len(self.kinds)} named kinds")
+            raise ProductError(
+                f"inspection.kind must be an index of one of {len(self.kinds)} kinds"
+            )

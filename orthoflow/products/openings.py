@@ -1,4 +1,4 @@
-"""Openings of walls: windows, doors, niches, and areas without data."""
+"""Openings in walls: windows, doors, niches, and areas without data."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from orthoflow.errors import ProductError
 from orthoflow.geometry.frames import FARTHEST_M
 from orthoflow.products.product import JsonValue, Product, Tolerance, require_shapes
 
-# The laser saw what lies behind the wall; the back was measured; nothing returned.
+# The laser passed through; the back was measured; there were no returns.
 OpeningKind = Literal["through", "niche", "no data"]
 
 _CORNERS_LEAST: Final = 3
 
 
 class OutlineSource(IntEnum):
-    """What the position of a side of an outline was found from.
+    """Source of the position of a side of an outline.
 
     Attributes:
-        DEPTH: the depths of the wall's raster.
+        DEPTH: depths of the raster of the wall.
         IMAGE: a photo, to a fraction of a cell.
-        UNSEEN: nothing: the wall beside it was not measured.
+        UNSEEN: none, because the wall next to the side was not measured.
     """
 
     DEPTH = 0
@@ -37,25 +37,25 @@ class OutlineSource(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Opening:
-    """One opening of a wall.
+    """An opening in a wall.
 
     Attributes:
-        wall: number of the wall, the place of its plane in `planes.json`.
-        wall_name: what the wall is called.
-        kind: `through` (the laser saw what lies behind the wall), `niche` (its back was measured)
-            or `no data` (nothing returned).
-        outline_m: (n, 2) float64 X and Y as the wall's GeoTIFF has them (metres along the wall and
-            height, or east and north of a map), counter-clockwise, not closed.
-        outline_world: (n, 3) float64 metres, the same corners on the wall's plane.
-        side_sigma_m: (n,) float64 standard deviation of each side, perpendicular to it, from corner
-            i to the next; NaN for sides that were not seen.
+        wall: number of the wall, the index of its plane in `planes.json`.
+        wall_name: name of the wall.
+        kind: `through` (laser rays passed through it), `niche` (its back was measured) or `no data`
+            (no returns, as with glass).
+        outline_m: (n, 2) float64 X and Y in the coordinates of the GeoTIFF of the wall (metres
+            along the wall and height, or easting and northing), counter-clockwise, not closed.
+        outline_world: (n, 3) float64 metres, the same corners on the plane of the wall.
+        side_sigma_m: (n,) float64 standard deviation of each side (from corner i to the next),
+            perpendicular to it; NaN if the side was not seen.
         side_source: (n,) uint8 `OutlineSource` of each side.
         area_m2: area of the outline.
-        width_m: extent along the wall's u.
-        height_m: extent along the wall's v.
-        sill_m: height of its lowest corner above the lower edge of the wall's raster.
-        seen_share: share of the outline along which the wall beside it was measured.
-        depth_m: distance of the back behind the wall's face, median; None where none was measured.
+        width_m: extent along u.
+        height_m: extent along v.
+        sill_m: height of the lowest corner above the lower edge of the raster.
+        seen_share: share of the outline along which the adjacent wall was measured.
+        depth_m: median distance from the face of the wall to the back; None if not measured.
         crs: coordinate system of `outline_m`, as `WallFrame.crs`.
     """
 
@@ -90,38 +90,39 @@ class Opening:
         )
         if count < _CORNERS_LEAST or not is_near:
             raise ProductError(
-                f"an opening needs {_CORNERS_LEAST} corners or more, of numbers below "
+                f"an opening needs at least {_CORNERS_LEAST} corners with coordinates below "
                 f"{FARTHEST_M:g}, got {count}"
             )
         if self.kind not in get_args(OpeningKind):
             raise ProductError(
-                f"an opening is {', '.join(get_args(OpeningKind))}, got {self.kind!r}"
+                f"the kind of an opening must be one of {', '.join(get_args(OpeningKind))}, "
+                f"got {self.kind!r}"
             )
         if int(self.side_source.max()) > max(OutlineSource):
             raise ProductError(f"opening.side_source must be at most {max(OutlineSource):d}")
 
     @property
     def edge_sigma_m(self) -> float | None:
-        """Return the RMS standard deviation of the sides that were seen; None without any."""
+        """Return the RMS of `side_sigma_m` of the sides that were seen; None if there are none."""
         seen = self.side_sigma_m[np.isfinite(self.side_sigma_m)]
         return math.sqrt(float(np.mean(seen**2))) if len(seen) else None
 
     @property
     def said(self) -> str:
-        """Return its description in a drawing: `niche 0.250 m deep, 0.80 x 1.86 m`."""
+        """Return the description for drawings, such as `niche 0.250 m deep, 0.80 x 1.86 m`."""
         deep = f" {self.depth_m:.3f} m deep" if self.kind == "niche" and self.depth_m else ""
         return f"{self.kind}{deep}, {self.width_m:.2f} x {self.height_m:.2f} m"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Openings(Product):
-    """Openings of all walls that were searched.
+    """Openings in all walls that were searched.
 
     Attributes:
-        openings: by wall, then from left to right.
-        walls: numbers of the walls that were searched, including those without openings.
-        map_crs: coordinate system of the world, if some wall's raster names it.
-        details: further statements of the method, JSON, for people.
+        openings: sorted by wall, then from left to right.
+        walls: numbers of the searched walls, including walls without openings.
+        map_crs: coordinate system of the world, if the raster of a wall specifies it.
+        details: further JSON results, for users only.
     """
 
     type_name: ClassVar[str] = "openings"
@@ -138,5 +139,5 @@ class Openings(Product):
     details: dict[str, JsonValue] = field(default_factory=dict)
 
     def of_wall(self, number: int) -> tuple[Opening, ...]:
-        """Return the openings of one wall, by the number of its plane."""
+        """Return the openings in the wall with this number."""
         return tuple(opening for opening in self.openings if opening.wall == number)

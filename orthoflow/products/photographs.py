@@ -1,4 +1,4 @@
-"""Photographs, their camera data, ties to the walls, and their orientation."""
+"""Photographs, their interior orientations, ties to the walls, and exterior orientations."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from orthoflow.products.product import (
 )
 from orthoflow.products.walls import Wall
 
-# Focal length where neither calibration nor EXIF states it, over the longer side.
+# Focal length relative to the longer side, if neither a calibration nor EXIF contains it.
 _USUAL_FOCAL: Final = 0.8
 
 
 @dataclass(frozen=True, kw_only=True)
 class Intrinsics:
-    """Interior orientation in orthoflow's pixel convention (first pixel centre at 0.5, 0.5).
+    """Interior orientation; the centre of the first pixel is at (0.5, 0.5).
 
     Attributes:
         width: pixels.
         height: pixels.
-        fx: focal length in pixels along u; fy along v.
-        cx: principal point in pixels; cy along v.
-        distortion: k1, k2, p1, p2, k3 (Brown, as OpenCV).
+        fx: focal length along u in pixels; `fy` along v.
+        cx: u of the principal point in pixels; `cy` is its v.
+        distortion: k1, k2, p1, p2, k3 (Brown's model, as in OpenCV).
         source: `calibration`, `exif`, `truth` or `estimated`.
-        skew: pixels along u per unit of y / z; None where rows and columns of pixels are square.
+        skew: pixels along u per unit of y / z; None if rows and columns are perpendicular.
     """
 
     width: int
@@ -68,7 +68,7 @@ class Intrinsics:
         rotation: NDArray[np.float64] | None = None,
         translation: NDArray[np.float64] | None = None,
     ) -> ViewingCamera:
-        """Return the camera with this lens at a pose; without one, at the origin of its own axes.
+        """Return the camera with this lens at a pose, by default at the origin of the world.
 
         Args:
             rotation: (3, 3), camera_from_world.
@@ -93,19 +93,20 @@ class Photo:
     """One photograph.
 
     Attributes:
-        name: file name, with the folders below the input where several photos have that name; poses
-            and ties refer to it.
-        encoded: the file's bytes as they were; pixel frame = the stored array, EXIF orientation
-            not applied.
-        width: pixels of the stored array.
-        height: pixels.
-        exif_orientation: EXIF tag 1..8, 1 without one.
+        name: file name, with its folders in the input if several photos have the same file name.
+            Poses and ties refer to it.
+        encoded: unchanged bytes of the file. Pixel coordinates refer to the image as stored; the
+            EXIF orientation is not applied.
+        width: width of the stored image in pixels.
+        height: height of the stored image in pixels.
+        exif_orientation: EXIF tag 1..8; 1 if there is no tag.
         exif_focal_px: focal length from EXIF in pixels, or None.
-        intrinsics: calibration if known, or None.
-        mask: PNG of the same size, white where pixels may be used; None if all may
-            (`files.images`).
-        camera: camera and focal length, the same text for photos of one lens; empty if unknown.
-        folder: folder of the file below the input, empty if all photos are in one.
+        intrinsics: calibrated interior orientation, or None.
+        mask: PNG of the same size, white where pixels may be used (see `files.images`); None if
+            all pixels may be used.
+        camera: camera model and focal length, identical for photos with the same lens; empty if
+            unknown.
+        folder: folder of the file in the input; empty if all photos are in one folder.
     """
 
     name: str
@@ -120,11 +121,11 @@ class Photo:
     folder: str = ""
 
     def lens_prior(self) -> tuple[ViewingCamera, LensFreedom]:
-        """Return what is known of the lens before any orientation: calibration, EXIF, or nothing.
+        """Return the lens as known before an orientation, from a calibration, EXIF, or a default.
 
         Returns:
-            A camera with the likeliest lens, at the origin of its own axes, and how far that lens
-            may be off; not at all if it is calibrated.
+            A camera with the most probable lens, at the origin of the world, and which of its
+            parameters are uncertain and by how much (none if calibrated).
         """
         if self.intrinsics is not None:
             return self.intrinsics.posed(), LensFreedom()
@@ -157,11 +158,11 @@ class Photos(Product):
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration(Product):
-    """Calibrated cameras, by photo name or pattern; the first that matches a photo applies.
+    """Calibrations by photo name or pattern; the first match applies to a photo.
 
     Attributes:
         patterns: photo names or shell patterns.
-        intrinsics: one per pattern.
+        intrinsics: interior orientation for each pattern.
     """
 
     type_name: ClassVar[str] = "calibration"
@@ -176,7 +177,7 @@ class TieRole(IntEnum):
     Attributes:
         CONTROL: used to orient the photo.
         CHECK: withheld from the orientation, to check it.
-        REJECTED: it contradicts the others, or its photo is not oriented.
+        REJECTED: contradicts the other ties, or its photo is not oriented.
     """
 
     CONTROL = 0
@@ -186,16 +187,16 @@ class TieRole(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class TieWall:
-    """The properties of a wall that an orientation needs to use its ties.
+    """Properties of a wall that orientations need.
 
     Attributes:
         name: label of the wall.
-        corners_world: four corners of its raster as (x, y, z) in metres: top-left, then
-            counter-clockwise for the viewer, as `WallFrame.corners_world` gives them.
-        normal_world: unit vector (x, y, z) to the viewer; no photo is taken from behind it.
-        gsd_m: side of a cell of its raster, metres; None without a raster, and then no error is too
-            large in cells.
-        plane_index: position of its plane in `Planes`; None if unknown.
+        corners_world: four corners (x, y, z) of its raster in metres: top-left, then
+            counter-clockwise for the viewer, as in `WallFrame.corners_world`.
+        normal_world: unit vector (x, y, z) towards the viewer; photos are never taken from behind.
+        gsd_m: cell size of its raster in metres; None if it has no raster, in which case errors are
+            not limited in cells.
+        plane_index: index of its plane in `Planes`; None if unknown.
     """
 
     name: str = ""
@@ -227,33 +228,30 @@ class TieWall:
 
 @dataclass(frozen=True, kw_only=True)
 class Ties(Product):
-    """Points seen in a photo with a known position on a wall.
+    """Points measured in photos whose positions on walls are known.
 
-    A matcher may leave `walls` and `search_radius_px` empty, but orientations are judged better
-    with them: without `walls` the points of the ties are used instead, and neither the side of a
-    wall nor its cells are known.
+    A matcher may leave `walls` and `search_radius_px` empty, but both help to assess orientations:
+    without `walls`, the points of the ties are used instead, and neither the visible side of a wall
+    nor its cell size is known.
 
     Attributes:
-        photo_names: names the column `photo` refers to.
+        photo_names: photos to which `photo` refers.
         photo: (n,) int32 index into `photo_names`.
         wall: (n,) int32 index of the wall, -1 if unknown.
-        pixels_photo: (n, 2) float64 (u, v), first pixel centre at (0.5, 0.5).
+        pixels_photo: (n, 2) float64 (u, v); the centre of the first pixel is at (0.5, 0.5).
         points_world: (n, 3) float64 metres.
-        sigma_px: (n,) float64 standard deviation of each of u and v, as stated by the method that
-            measured the tie, before any adjustment.
-        sigma_m: (n,) float64 the same of each of x, y and z. An adjustment expects for u and v the
-            variance sigma_px² plus that of sigma_m, converted to pixels by the derivative of the
-            projection.
+        sigma_px: (n,) float64 a priori standard deviation of u and of v.
+        sigma_m: (n,) float64 a priori standard deviation of x, of y and of z. Adjustments propagate
+            it to the photo and add its variance to that of `sigma_px`.
         role: (n,) uint8 `TieRole`.
-        residual_px: (n, 2) float64 observed - computed, NaN before an orientation.
-        walls: the walls to which the column `wall` refers; empty if the matcher does not state
-            them.
-        by_hand: (n,) uint8, 1 for ties measured by a person; None if there are none. They are never
-            withheld, and their sigmas are not estimated.
-        search_radius_px: one per photo name: the photo was searched no farther than this from the
-            expected position of a tie, so wrong ties lie within it, too; None if the whole photo
-            was searched, and empty if this holds for all photos.
-        details: further statements of the method, JSON, for people only.
+        residual_px: (n, 2) float64 observed minus computed; NaN before an orientation.
+        walls: walls to which `wall` refers; empty if not given.
+        by_hand: (n,) uint8, 1 for ties measured by hand; None if there are none. They are never
+            withheld, and their standard deviations are not estimated.
+        search_radius_px: for each photo, maximum distance from the expected position of a tie at
+            which the photo was searched (wrong ties are also within it); None if the whole photo
+            was searched. Empty if all photos were searched completely.
+        details: further JSON results, for users only.
     """
 
     type_name: ClassVar[str] = "ties"
@@ -298,18 +296,20 @@ class Ties(Product):
         if count and not 0 <= int(self.photo.min()) <= int(self.photo.max()) < len(
             self.photo_names
         ):
-            raise ProductError(f"ties.photo must name one of {len(self.photo_names)} photos")
+            raise ProductError(
+                f"ties.photo must be an index of one of {len(self.photo_names)} photos"
+            )
         if self.search_radius_px and len(self.search_radius_px) != len(self.photo_names):
             raise ProductError(
-                f"ties of {len(self.photo_names)} photos have {len(self.search_radius_px)} search "
-                "radii, one per photo is expected, or none"
+                f"ties.search_radius_px must be empty or have one value per photo, got "
+                f"{len(self.search_radius_px)} values for {len(self.photo_names)} photos"
             )
 
     def check_against(self, others: Mapping[str, Product]) -> None:
         """See `Product.check_against`.
 
         Raises:
-            ProductError: a tie has no position, no error, or names a photo that is not there.
+            ProductError: a position or an error of a tie is invalid, or a photo is unknown.
         """
         for name in ("pixels_photo", "points_world", "sigma_px", "sigma_m"):
             if not np.isfinite(getattr(self, name)).all():
@@ -320,29 +320,29 @@ class Ties(Product):
         _require_photos("ties", self.photo_names, others)
 
     def number(self, wall: int) -> int:
-        """Return the number of a wall as people see it: the place of its plane in `planes.json`."""
+        """Return the number of a wall shown to users: the index of its plane in `planes.json`."""
         known = self.walls[wall].plane_index if 0 <= wall < len(self.walls) else None
         return wall if known is None else known
 
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
-    """The orientation of one photo, or why there is none.
+    """Orientation of one photo, or the reason why it is not oriented.
 
     Attributes:
         photo: name of the photo.
-        status: `ok`, or the reason in one sentence; unless it is `ok`, the rest is None.
+        status: `ok`, or the reason in one sentence, in which case all following fields are None.
         intrinsics: interior orientation.
         rotation_camera_from_world: (3, 3) float64, det +1; x right, y down, z forward.
         translation_camera_from_world: (3,) float64 metres.
-        covariance: (6, 6) float64 of the pose as estimated, or None: first a small rotation vector
-            dr applied after the rotation R0, exp(dr) R0, in camera axes, radians; then
-            `translation_camera_from_world`, metres.
-        sigma0_px: the stated error of a tie's pixel coordinate (median `Ties.sigma_px` of the
-            control) times the standard deviation of unit weight, which is 1 if the ties deviate
-            from the pose as `Ties` states.
-        sigma_wall_m: error on the wall that `covariance` (and that of an estimated lens) predicts,
-            one standard deviation, metres.
+        covariance: (6, 6) float64 covariance of the estimated pose, or None. The first three
+            parameters are a small rotation vector dr in camera axes, radians, applied to the
+            rotation R0 as exp(dr) R0; the others are `translation_camera_from_world`, metres.
+        sigma0_px: a priori error of a pixel coordinate (median `Ties.sigma_px` of control ties)
+            times the standard deviation of unit weight, which is 1 if the a priori errors in `Ties`
+            are correct.
+        sigma_wall_m: standard deviation on the wall due to `covariance` (including that of an
+            estimated lens), metres.
     """
 
     photo: str
@@ -355,7 +355,7 @@ class Camera:
     sigma_wall_m: float | None = None
 
     def viewing(self) -> ViewingCamera:
-        """Return the camera that projects.
+        """Return the camera for projections.
 
         Raises:
             ProductError: the photo is not oriented.
@@ -368,27 +368,28 @@ class Camera:
 
 @dataclass(frozen=True, kw_only=True)
 class ResidualRow:
-    """Residuals (observed - computed) of one photo, role and coordinate, in one unit.
+    """Statistics of the residuals (observed minus computed) of one photo, role, axis and unit.
 
     Attributes:
         photo: name of the photo.
         role: `control` or `check`.
         axis: `u` or `v` of the photo.
-        unit: `px` of the photo, `cell` of the wall's raster, or `mm` on the wall: px times the
-            median size of a pixel there.
+        unit: `px` in the photo, `cell` of the raster of the wall, or `mm` on the wall (pixels times
+            the median size of a pixel on the wall).
         n: number of residuals.
-        mean: their mean.
+        mean: mean.
         shift_p: probability of such a mean by chance (Student's t, two-sided); None for one tie.
         sd: standard deviation.
-        median: their median.
+        median: median.
         nmad: 1.4826 times the median absolute deviation from the median.
-        skewness: third standardised moment; None if nothing varies.
+        skewness: third standardised moment; None if all residuals are the same.
         rmse: root mean square.
-        p95: length that 95 % of them do not exceed.
-        max: largest length.
-        beyond_own: share beyond twice the coordinate's own RMSE.
-        beyond_cells: share beyond two cells of the wall's raster; None if the cell is unknown.
-        beyond_any: share of ties of which u or v is beyond twice its own RMSE.
+        p95: 95th percentile of absolute values.
+        max: largest absolute value.
+        beyond_own: share of residuals that exceed twice the RMSE of this axis.
+        beyond_cells: share of residuals that exceed two cells of the raster of the wall; None if
+            the cell size is unknown.
+        beyond_any: share of ties with a u or v that exceeds twice the RMSE of its axis.
     """
 
     photo: str
@@ -415,11 +416,10 @@ class Cameras(Product):
     """Orientations of a set of photos.
 
     Attributes:
-        cameras: one per photo, in the photos' order.
-        ties: the ties with their roles and residuals after the orientation, or None.
-        residual_table: statistics of the residuals of the oriented photos as used in surveying; may
-            be empty.
-        details: further statements of the method, JSON, for people only.
+        cameras: orientation of each photo, in the order of the photos.
+        ties: ties with their roles and residuals after the orientation, or None.
+        residual_table: statistics of the residuals of oriented photos; may be empty.
+        details: further JSON results, for users only.
     """
 
     type_name: ClassVar[str] = "cameras"
@@ -439,15 +439,14 @@ class Cameras(Product):
         """See `Product.check_against`.
 
         Raises:
-            ProductError: an orientation is not a rotation, is not finite, or is of an unknown
-                photo.
+            ProductError: an orientation is not finite or not a rotation, or its photo is unknown.
         """
         for camera in self.cameras:
             rotation = camera.rotation_camera_from_world
             if camera.status != "ok":
                 continue
             if rotation is None or camera.translation_camera_from_world is None:
-                raise ProductError(f"camera {camera.photo} is ok and lacks its orientation")
+                raise ProductError(f"camera {camera.photo} has the status ok, but no orientation")
             is_turn = rotation.shape == (3, 3) and np.allclose(
                 rotation @ rotation.T, np.eye(3), atol=1e-6
             )
@@ -465,15 +464,18 @@ class Cameras(Product):
                 np.isfinite(spread).all() and (np.diagonal(spread) >= 0.0).all()
             ):
                 raise ProductError(
-                    f"camera {camera.photo}: covariance must be finite, with variances of 0 or more"
+                    f"camera {camera.photo}: covariance must be finite, with variances of at least "
+                    "0"
                 )
         _require_photos("cameras", [camera.photo for camera in self.cameras], others)
 
 
 def _require_photos(what: str, names: Iterable[str], others: Mapping[str, Product]) -> None:
-    """Refuse names of photos that are not among the photos of a step, if it has some."""
+    """Refuse names that are not names of the photos of a step, if the step has photos."""
     for product in others.values():
         known = {photo.name for photo in product.photos} if isinstance(product, Photos) else None
         unknown = [name for name in names if known is not None and name not in known]
         if unknown:
-            raise ProductError(f"{what} name the photo {unknown[0]}, which the step was not given")
+            raise ProductError(
+                f"{what} refer to the photo {unknown[0]}, which is not an input of the step"
+            )

@@ -16,7 +16,8 @@ from orthoflow.products.cloud import PointCloud
 from orthoflow.products.product import JsonValue, Payload, Product, Tolerance
 
 SideSource = Literal["stations", "photos", "guess", "given"]
-# Prefix of a plane's name; a level or sloping plane is neither floor nor ceiling nor wall.
+# Kind of a plane, the first part of its name. `level` and `sloping` planes are neither floors nor
+# ceilings nor walls.
 PlaneKind = Literal["wall", "floor", "ceiling", "level", "slope"]
 
 _SIDE_SOURCES: Final[Mapping[str, SideSource]] = {
@@ -25,14 +26,14 @@ _SIDE_SOURCES: Final[Mapping[str, SideSource]] = {
     "given": "given",
     "guess": "guess",
 }
-# The value of markiewicz2015.
+# Value used in markiewicz2015.
 _USUAL_TOLERANCE_M: Final = 0.05
 
 
 def plane_name(kind: PlaneKind, place: int) -> str:
-    """Name a plane, and the wall rastered over it, by its place in `planes.json`.
+    """Return the name of a plane and of its wall, which contains its index in `planes.json`.
 
-    The files `wall_<place>_*` have the same number, whatever the plane is.
+    The files `wall_<number>_*` have the same number for all kinds of planes.
 
     >>> plane_name("floor", 3)
     'floor 3'
@@ -42,14 +43,14 @@ def plane_name(kind: PlaneKind, place: int) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Spread:
-    """Thickness of the cloud for the points of one class.
+    """Thickness of the cloud for one class of points.
 
     Attributes:
-        low: smallest value of the class, in its unit.
-        high: largest value of the class.
+        low: lower limit of the class, in its unit.
+        high: upper limit of the class.
         n_points: number of measured points.
         sigma_m: robust standard deviation of their distances.
-        name: name of the class, if it has one.
+        name: name of the class, or empty.
     """
 
     low: float
@@ -61,16 +62,16 @@ class Spread:
 
 @dataclass(frozen=True, kw_only=True)
 class Thickness:
-    """Thickness of the cloud on one plane; classes are empty if nothing is known of them.
+    """Thickness of the cloud on one plane; classes are empty if their values are unknown.
 
     Attributes:
-        sigma_m: robust standard deviation of the distances, without relief.
-        width_95_m: width that holds 95 % of them.
-        scan_step_m: distance between neighbouring points on the plane, median.
-        incidence_deg: by the angle of incidence.
-        range_m: by the distance from the scanner.
-        intensity: by the intensity, 0..1.
-        material: by named material.
+        sigma_m: robust standard deviation of the distances, relief removed.
+        width_95_m: width of the range that contains 95 % of the distances.
+        scan_step_m: median distance between neighbouring points on the plane.
+        incidence_deg: classes of the angle of incidence.
+        range_m: classes of the distance from the scanner.
+        intensity: classes of the intensity, 0 to 1.
+        material: classes by material.
     """
 
     sigma_m: float
@@ -84,15 +85,15 @@ class Thickness:
 
 @dataclass(frozen=True, kw_only=True)
 class ScanRow:
-    """Thickness of the cloud along one row of a scan on the first plane.
+    """Thickness of the cloud along one scan row on the first plane.
 
     Attributes:
         row: number of the row.
         scan: number of the scan.
-        n_points: points of the row on the plane.
-        sigma_m: robust standard deviation of their distances, without relief; None if the row has
-            too few points.
-        material: by named material.
+        n_points: number of points of the row on the plane.
+        sigma_m: robust standard deviation of their distances, relief removed; None if there are too
+            few points.
+        material: classes by material.
     """
 
     row: int
@@ -104,29 +105,30 @@ class ScanRow:
 
 @dataclass(frozen=True, kw_only=True)
 class Planes(Product):
-    """Planes of a scene, ordered by support, largest first.
+    """Planes of a scene, in descending order of their numbers of points.
 
     Attributes:
         normal: (k, 3) float64 unit vectors towards the viewer, world axes.
-        offset: (k,) float64 metres, `normal . x` of the points on the plane.
-        corners: (k, 4, 3) float64 metres, rectangle on the plane: top-left first,
+        offset: (k,) float64 metres; points x on the plane satisfy `normal . x = offset`.
+        corners: (k, 4, 3) float64 metres, corners of a rectangle on each plane: top-left first,
             counter-clockwise for the viewer.
-        covariance: (k, 4, 4) float64 of (normal, offset); zero for a plane that was given.
-        n_points: (k,) int64, points that support the plane.
-        rms_m: (k,) float64, root mean square distance of those points.
-        up: (3,) float64 unit vector of the cloud they come from.
-        names: k short labels as `plane_name` gives them, e.g. `wall 0`, `floor 3`.
+        covariance: (k, 4, 4) float64 covariance of (normal, offset); zero for planes that were
+            given.
+        n_points: (k,) int64 number of points of each plane.
+        rms_m: (k,) float64 root mean square distance of these points.
+        up: (3,) float64 unit vector of the cloud.
+        names: k names from `plane_name`, such as `wall 0` or `floor 3`.
         part_corners: (p, 4, 3) float64 rectangles of connected parts, or None.
-        part_plane: (p,) int32 index of the plane a part lies on, or None.
-        viewpoint: how the side of the normals was chosen: `stations`, `view_from`, `given` or
+        part_plane: (p,) int32 index of the plane of each part, or None.
+        viewpoint: source of the visible side of planes: `stations`, `view_from`, `given` or
             `guess`.
-        side_from: the same per plane, if planes differ; empty if `viewpoint` holds for all.
-        tolerance_m: distance within which points counted when the planes were found; the default is
-            that of markiewicz2015.
-        thickness: of the cloud on each plane, None where it has too few points; empty if it was not
-            measured.
-        scan_row: for a cloud with rows, the row that shows most of the first plane.
-        details: further statements of the method about itself, JSON.
+        side_from: the same for each plane, if planes differ; empty if `viewpoint` applies to all.
+        tolerance_m: maximum distance of points from their plane in the detection; the default is
+            from markiewicz2015.
+        thickness: thickness of the cloud on each plane, None if the plane has too few points; empty
+            if not measured.
+        scan_row: scan row with the most points on the first plane, if the cloud has rows.
+        details: further JSON results, for users only.
     """
 
     type_name: ClassVar[str] = "planes"
@@ -182,17 +184,17 @@ class Planes(Product):
             raise ProductError(f"planes.tolerance_m must be positive, got {self.tolerance_m}")
         if self.side_from and len(self.side_from) != count:
             raise ProductError(
-                f"planes.side_from must be empty or one per plane, got {len(self.side_from)} for "
-                f"{count}"
+                "planes.side_from must be empty or have one value per plane, got "
+                f"{len(self.side_from)} for {count}"
             )
         if self.thickness and len(self.thickness) != count:
             raise ProductError(
-                f"planes.thickness must be empty or one per plane, got {len(self.thickness)} for "
-                f"{count}"
+                "planes.thickness must be empty or have one value per plane, got "
+                f"{len(self.thickness)} for {count}"
             )
 
     def to_payload(self) -> Payload:
-        """Return the planes as arrays and JSON; values common to all planes are stored once."""
+        """Return the planes as arrays and JSON; a value common to all planes is stored once."""
         payload = super().to_payload()
         if self.side_from:
             return payload
@@ -203,15 +205,15 @@ class Planes(Product):
         return len(self.offset)
 
     def side_source(self, index: int) -> SideSource:
-        """Return how the visible side of a plane was determined."""
+        """Return the source of the visible side of a plane."""
         return (
             self.side_from[index] if self.side_from else _SIDE_SOURCES.get(self.viewpoint, "guess")
         )
 
     def turned(self, index: int) -> Planes:
-        """Return the planes with one of them seen from its other side."""
+        """Return the planes with one of them viewed from the opposite side."""
         corners, parts = self.corners.copy(), self.part_corners
-        # From behind, right is left: the top-left corner of one side is the other's top-right.
+        # The top-left corner of one side is the top-right corner of the other.
         corners[index] = corners[index, ::-1]
         if parts is not None and self.part_plane is not None:
             parts = parts.copy()
@@ -228,7 +230,7 @@ class Planes(Product):
         )
 
     def plane(self, index: int) -> Plane:
-        """Return one of the planes, 0 the one with the largest support."""
+        """Return the plane with this index."""
         return Plane(normal=self.normal[index].copy(), offset_m=float(self.offset[index]))
 
     def sigma_angle_deg(self, index: int) -> float:
@@ -240,24 +242,24 @@ class Planes(Product):
         """See `Product.check_against`.
 
         Raises:
-            ProductError: a covariance, a support or a deviation is impossible.
+            ProductError: a covariance, a number of points or a deviation is invalid.
         """
         variances = np.diagonal(self.covariance, axis1=1, axis2=2)
         if not np.isfinite(self.covariance).all() or (variances < 0.0).any():
-            raise ProductError("planes.covariance must be finite, with variances of 0 or more")
+            raise ProductError("planes.covariance must be finite, with variances of at least 0")
         if not (np.isfinite(self.rms_m) & (self.rms_m >= 0.0)).all():
-            raise ProductError("planes.rms_m must be finite and 0 or more")
+            raise ProductError("planes.rms_m must be finite and at least 0")
         n_all = [len(other) for other in others.values() if isinstance(other, PointCloud)]
         if (self.n_points < 0).any() or (n_all and (self.n_points > n_all[0]).any()):
             raise ProductError(
-                f"planes.n_points must be from 0 to the number of points"
+                f"planes.n_points must be between 0 and the number of points"
                 f"{f', {n_all[0]}' if n_all else ''}, got {self.n_points.tolist()}"
             )
 
     def sigma_offset_m(self, index: int) -> float:
-        """Return the standard deviation of a plane's position at the middle of its rectangle.
+        """Return the standard deviation of the position of a plane at the centre of its rectangle.
 
-        The offset itself refers to the origin, which may be far away.
+        The standard deviation of the offset refers to the origin, which may be far away.
         """
         at_middle = np.append(self.corners[index].mean(axis=0), -1.0)
         return math.sqrt(max(0.0, float(at_middle @ self.covariance[index] @ at_middle)))
@@ -265,10 +267,10 @@ class Planes(Product):
 
 @dataclass(frozen=True, kw_only=True)
 class PointLabels(Product):
-    """The plane to which each point of a cloud belongs.
+    """The plane of each point of a cloud.
 
     Attributes:
-        plane_index: (n,) int16, position in `Planes`, or -1 for none.
+        plane_index: (n,) int16 index in `Planes`, -1 if the point is on no plane.
     """
 
     type_name: ClassVar[str] = "labels"
@@ -280,20 +282,20 @@ class PointLabels(Product):
     def __post_init__(self) -> None:
         if self.plane_index.ndim != 1 or self.plane_index.dtype != np.int16:
             raise ProductError(
-                f"labels.plane_index must be a flat int16 array, got {self.plane_index.dtype} of "
-                f"shape {self.plane_index.shape}"
+                "labels.plane_index must be a one-dimensional int16 array, got "
+                f"{self.plane_index.dtype} of shape {self.plane_index.shape}"
             )
 
     def check_against(self, others: Mapping[str, Product]) -> None:
-        """See `Product.check_against`: one label per point, and planes that exist.
+        """See `Product.check_against`.
 
         Raises:
-            ProductError: the labels contradict the cloud or the planes.
+            ProductError: the labels do not match the points or the planes.
         """
         for product in others.values():
             if isinstance(product, PointCloud) and len(product) != len(self.plane_index):
                 raise ProductError(
-                    f"labels.plane_index must hold one label for each of {len(product)} points, "
+                    f"labels.plane_index must have one label for each of {len(product)} points, "
                     f"got {len(self.plane_index)}"
                 )
             if isinstance(product, Planes) and self.plane_index.size:

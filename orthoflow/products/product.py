@@ -1,4 +1,4 @@
-"""The base of all products: a frozen dataclass that converts to and from named arrays and JSON."""
+"""Base class of all products, which convert to and from named arrays and JSON."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ Array: TypeAlias = NDArray[np.generic]
 Unit = Literal["m", "px", "grey", "deg", "1"]
 
 _ARRAY: Final = "$array"
-# Larger arrays are memory-mapped, whatever their product.
+# Larger arrays are memory-mapped for all types of products.
 _LARGE_BYTES: Final = 1 << 30
-# What inconsistent values may raise while a product checks itself.
+# Errors that the checks of a product may raise for inconsistent values.
 _NO_SENSE: Final = (
     *(AttributeError, IndexError, KeyError),
     *(TypeError, ValueError, GeometryError),
@@ -33,11 +33,11 @@ _NO_SENSE: Final = (
 
 @dataclass(frozen=True, kw_only=True)
 class Tolerance:
-    """How far two values of one field may differ and still count as equal.
+    """Maximum difference of two values of a field that still count as equal.
 
     Attributes:
         limit: largest absolute difference, in `unit`.
-        unit: metres, pixels, grey levels, degrees, or 1 for plain numbers.
+        unit: metres, pixels, grey levels, degrees, or 1 for numbers without a unit.
     """
 
     limit: float
@@ -46,14 +46,15 @@ class Tolerance:
 
 @dataclass(frozen=True, kw_only=True)
 class Payload:
-    """A product as stored: what store, record and comparison see.
+    """A product in the form used by the store, records and comparisons.
 
     Attributes:
         type_name: name of the product type, e.g. `planes`.
-        encoding_version: version of the layout below, raised when it changes.
-        metadata: JSON; holds everything that is not an array.
-        arrays: name -> array; a name may have `/` for nesting, e.g. `walls/0/depth_m`.
-        mapped: stored contiguous and uncompressed, so that readers can memory-map it.
+        encoding_version: version of the fields, incremented when they change.
+        metadata: JSON with all values that are not arrays.
+        arrays: arrays by name; `/` in a name separates levels, as in `walls/0/depth_m`.
+        mapped: whether arrays are stored contiguously and uncompressed, so that readers can
+            memory-map them.
     """
 
     type_name: str
@@ -64,18 +65,18 @@ class Payload:
 
 
 class Product:
-    """Base of all product types; subclasses are frozen dataclasses.
+    """Base class of product types, which are frozen dataclasses.
 
-    Fields may be numpy arrays, bytes, JSON values, members of an `IntEnum`, other dataclasses and
-    tuples of these; each may be None where its annotation states so. `None` means absent.
+    Fields may be numpy arrays, bytes, JSON values, members of an `IntEnum`, other dataclasses, and
+    tuples of these; optional fields may also be None.
 
     Attributes:
-        type_name: identity in workflows, store and record; never changes.
-        encoding_version: raised when the fields change.
-        mapped: store contiguous and memory-map on reading (for products of scan size; any product
-            of more than 1 GiB is).
-        embedded: put the arrays into the record, not only their digest.
-        tolerances: field name -> permitted difference of replays; other fields must be equal.
+        type_name: name in workflows, the store and records; must never change.
+        encoding_version: version of the fields, incremented when they change.
+        mapped: whether arrays are always memory-mapped, for products as large as a scan; arrays of
+            more than 1 GiB always are.
+        embedded: whether records contain the arrays instead of only their digests.
+        tolerances: permitted differences of replays by field name; other fields must be equal.
     """
 
     type_name: ClassVar[str]
@@ -85,7 +86,7 @@ class Product:
     tolerances: ClassVar[Mapping[str, Tolerance]] = {}
 
     def to_payload(self) -> Payload:
-        """Return the product as named arrays and JSON; arrays are not copied."""
+        """Return the product as named arrays and JSON, without copying arrays."""
         arrays: dict[str, Array] = {}
         metadata = _encode_fields(self, "", arrays)
         return Payload(
@@ -97,23 +98,23 @@ class Product:
         )
 
     def check_against(self, others: Mapping[str, Product]) -> None:
-        """Check the product, at the end of its step, against the other products of the step.
+        """Check the product against the other products of its step, when the step ends.
 
-        Subclasses that refer to others override it.
+        Subclasses whose fields refer to other products override it.
 
         Args:
-            others: inputs and other outputs of the step by port.
+            others: inputs and other outputs of the step, by port.
 
         Raises:
-            ProductError: the product contradicts one of them, or holds invalid values.
+            ProductError: the product contradicts another one, or has invalid values.
         """
 
     @classmethod
     def from_payload(cls, payload: Payload) -> Self:
-        """Build the product again from `to_payload`'s result; arrays are not copied.
+        """Create a product from the result of `to_payload`, without copying arrays.
 
         Raises:
-            ProductError: the payload is of another type, of another encoding, or incomplete.
+            ProductError: the payload has a different type or version, or is incomplete.
         """
         if payload.type_name != cls.type_name:
             raise ProductError(f"expected a {cls.type_name} product, got {payload.type_name}")
@@ -126,13 +127,13 @@ class Product:
             return typing.cast("Self", _decode_fields(cls, "", payload.metadata, payload.arrays))
         except _LackingFieldsError as error:
             raise ProductError(
-                f"{error}: raise the encoding_version of {cls.__name__}, which is "
-                f"{cls.encoding_version}, with its fields"
+                f"{error}: if its fields changed, increment the encoding_version of "
+                f"{cls.__name__}, which is {cls.encoding_version}"
             ) from error
 
 
 def require_shapes(what: str, wanted: Mapping[str, tuple[Array | None, tuple[int, ...]]]) -> None:
-    """Refuse arrays whose shapes do not match; those that are None are ignored.
+    """Refuse arrays with unexpected shapes; arrays that are None are ignored.
 
     Raises:
         ProductError: an array has an unexpected shape.
@@ -176,11 +177,11 @@ def _json_scalar(value: object, name: str) -> JsonValue:
         raise ProductError(f"{name} must be finite to be stored as JSON, got {value}")
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    raise ProductError(f"{name} holds a {type(value).__name__}, which no product can store")
+    raise ProductError(f"{name} is a {type(value).__name__}, which a product cannot store")
 
 
 class _LackingFieldsError(ProductError):
-    """A stored product has no value for a field without a default."""
+    """A stored product lacks a field that has no default."""
 
 
 def _decode_fields(
@@ -200,8 +201,8 @@ def _decode_fields(
     except ProductError:
         raise
     except _NO_SENSE as error:
-        # Arrays with too few dimensions, which a product may access before it checks them.
-        raise ProductError(f"a stored {cls.__name__} makes no sense: {error}") from error
+        # IndexError: a product may use an array before it checks the number of its dimensions.
+        raise ProductError(f"a stored {cls.__name__} is inconsistent: {error}") from error
 
 
 def _is_lacking(field: dataclasses.Field[object], values: Mapping[str, object]) -> bool:
@@ -249,10 +250,10 @@ def _member(kind: type[IntEnum], stored: int, name: str) -> IntEnum:
 
 
 def _of_kind(hint: object, value: object, name: str) -> object:
-    """Return a stored value if its field can hold it; the author of a record may store anything.
+    """Return a stored value if its type is allowed; records may contain arbitrary values.
 
     Raises:
-        ProductError: it has another type.
+        ProductError: the type is not allowed.
     """
     if isinstance(value, float) and not math.isfinite(value):
         raise ProductError(f"the stored {name} must be finite, got {value}")
@@ -265,7 +266,7 @@ def _of_kind(hint: object, value: object, name: str) -> object:
 
 @cache
 def _kinds(hint: object) -> tuple[type, ...] | None:
-    """Return the types that a decoded value of a field may have; None for any."""
+    """Return the types allowed for a field; None if all are."""
     found: list[type] = []
     for candidate in _alternatives(hint):
         origin = typing.get_origin(candidate) or candidate

@@ -1,4 +1,4 @@
-"""Rasters in a wall's plane: the surface, photos projected onto it, and the finished orthoimage."""
+"""Rasters of walls: surfaces, photos projected onto them, and finished orthoimages."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products.planes import plane_name
 from orthoflow.products.product import Array, JsonValue, Product, Tolerance
 
-# Percentiles of larger rasters are estimated from some of their rows.
+# Percentiles of larger rasters are estimated from a part of their rows.
 _CELLS_ASKED: Final = 1 << 25
-# What the intensity of a wall is: that of the laser; the grey of the colours instead; or none.
+# Source of the intensity of a wall: the laser, the grey value of its colours, or none.
 IntensitySource = Literal["laser", "luminance", "none"]
 
 
 class SurfaceMask(IntEnum):
-    """Where a wall's depth comes from.
+    """Source of the depth of a cell.
 
     Attributes:
-        VOID: nowhere; it is NaN.
+        VOID: none; the depth is NaN.
         MEASURED: points in the cell.
-        RECOVERED: neighbouring cells, over a small gap.
+        RECOVERED: interpolated from neighbouring cells, in a small gap.
     """
 
     VOID = 0
@@ -40,13 +40,13 @@ class SurfaceMask(IntEnum):
 
 
 class LayerMask(IntEnum):
-    """What one source shows of a cell.
+    """State of a cell in a layer.
 
     Attributes:
-        OUTSIDE: the source does not show the cell.
-        PAINTED: it has a colour.
-        OCCLUDED: an object is between the cell and the camera.
-        NO_SURFACE: no depth is known there.
+        OUTSIDE: the cell is outside the source.
+        PAINTED: the cell has a colour.
+        OCCLUDED: an object hides the cell from the camera.
+        NO_SURFACE: the depth is unknown.
     """
 
     OUTSIDE = 0
@@ -56,15 +56,15 @@ class LayerMask(IntEnum):
 
 
 class OrthoMask(IntEnum):
-    """The state of a cell of an orthoimage.
+    """State of a cell of an orthoimage.
 
     Attributes:
-        NONE: no source shows it.
-        PAINTED: its colour comes from a source.
-        FILLED: its colour comes from neighbouring cells.
-        OCCLUDED: hidden from every source that could show it.
-        NO_SURFACE: no depth is known there.
-        CONTRADICTED: its colour is that of one photo alone, and the scan has another one there.
+        NONE: the cell is outside all sources.
+        PAINTED: the colour is from a source.
+        FILLED: the colour is from neighbouring cells.
+        OCCLUDED: the cell is hidden in all sources that face it.
+        NO_SURFACE: the depth is unknown.
+        CONTRADICTED: the colour is from a single photo and contradicts the colour of the scan.
     """
 
     NONE = 0
@@ -75,39 +75,39 @@ class OrthoMask(IntEnum):
     CONTRADICTED = 5
 
 
-# States of cells whose colour is a source's, and those of cells that show something.
+# States of cells with a colour from a source, and of all cells with a colour.
 PAINTED_STATES: Final = (OrthoMask.PAINTED, OrthoMask.CONTRADICTED)
 SHOWN_STATES: Final = (*PAINTED_STATES, OrthoMask.FILLED)
 
 
 def is_painted(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Return which cells of an orthoimage's mask have the colour of a source."""
+    """Return which cells of a mask of an orthoimage have a colour from a source."""
     return np.isin(mask, PAINTED_STATES)
 
 
 def is_shown(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Return which cells of an orthoimage's mask show something, be it filled."""
+    """Return which cells of a mask of an orthoimage have a colour, including filled cells."""
     return np.isin(mask, SHOWN_STATES)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Wall:
-    """The scanned surface over one plane, a value per cell.
+    """Rasters of the scanned surface on one plane.
 
     Attributes:
-        frame: where the cells lie; all rasters have `frame.shape`.
-        plane_index: position of the plane in `Planes`.
-        name: label of the plane.
-        depth_m: float32 metres along the normal, NaN where void.
-        sigma_m: float32 metres, spread of the depths seen in the cell, NaN where unknown.
-        count: uint32 points in the cell.
+        frame: position of the cells; all rasters have `frame.shape`.
+        plane_index: index of the plane in `Planes`.
+        name: name of the plane.
+        depth_m: float32 metres along the normal, NaN if void.
+        sigma_m: float32 metres, spread of the depths in a cell, NaN if unknown.
+        count: uint32 number of points in a cell.
         mask: uint8 `SurfaceMask`.
-        intensity: float32 0..1, NaN where void, or None when the scan has neither intensity nor
-            colour.
+        intensity: float32 0 to 1, NaN if void; None if the scan has neither intensities nor
+            colours.
         rgb: (rows, cols, 3) uint8, or None.
-        rgb_mask: uint8, 1 where rgb holds a colour; None without rgb.
-        percentiles_m: (rows, cols, k) float32 metres, `Walls.percentiles` of the depths in the
-            cell, NaN in cells without points; None if not requested.
+        rgb_mask: uint8, 1 if the cell has a colour; None if `rgb` is None.
+        percentiles_m: (rows, cols, k) float32 metres, percentiles of the depths in a cell (see
+            `Walls.percentiles`), NaN in cells without points; None if not requested.
     """
 
     frame: WallFrame
@@ -129,21 +129,21 @@ class Wall:
 
 @dataclass(frozen=True, kw_only=True)
 class Walls(Product):
-    """One raster per chosen plane.
+    """Rasters of all selected planes.
 
     Attributes:
-        walls: in the order of the planes; `wall.plane_index` is the index of its plane.
+        walls: in the order of their planes; `plane_index` of each wall is the index of its plane.
         up: (3,) float64 unit vector.
-        intensity_source: `laser`, `luminance` (no laser intensity: grey of the colours instead) or
-            `none`.
+        intensity_source: `laser`, `luminance` (grey value of the colours, because there is no laser
+            intensity) or `none`.
         buffer_front_m: maximum distance of points in front of the planes.
-        buffer_behind_m: maximum distance behind them.
-        buffers_m: the same for each wall, in front and behind; empty if all walls have these.
-        percentiles: percentiles (0..100) of the depths in a cell that `Wall.percentiles_m` holds,
-            in order; empty if none were requested.
-        included: numbers of the planes that each wall shows, so that they are not walls of their
+        buffer_behind_m: maximum distance of points behind the planes.
+        buffers_m: distances in front and behind for each wall; empty if all walls have the above.
+        percentiles: percentiles (0 to 100) in `Wall.percentiles_m`, in order; empty if none were
+            requested.
+        included: for each wall, numbers of other planes that it shows, which have no wall of their
             own; empty if unknown.
-        details: further statements of the method, JSON.
+        details: further JSON results, for users only.
     """
 
     type_name: ClassVar[str] = "walls"
@@ -172,10 +172,14 @@ class Walls(Product):
     def __post_init__(self) -> None:
         if self.buffers_m and len(self.buffers_m) != len(self.walls):
             raise ProductError(
-                f"{len(self.walls)} walls need a buffer each or none, got {len(self.buffers_m)}"
+                f"walls.buffers_m must be empty or have one value per wall, got "
+                f"{len(self.buffers_m)} for {len(self.walls)} walls"
             )
         if self.included and len(self.included) != len(self.walls):
-            raise ProductError(f"included must tell of {len(self.walls)} walls, or of none")
+            raise ProductError(
+                f"walls.included must be empty or have one entry for each of {len(self.walls)} "
+                "walls"
+            )
         for wall in self.walls:
             rasters = wall.percentiles_m
             if rasters is not None and rasters.shape[2:] != (len(self.percentiles),):
@@ -185,25 +189,25 @@ class Walls(Product):
                 )
 
     def slab(self, index: int) -> Slab:
-        """Return the slab of a wall: its raster, and the depths around its plane."""
+        """Return the slab of a wall: its frame and range of depths."""
         front_m, behind_m = (
             self.buffers_m[index] if self.buffers_m else (self.buffer_front_m, self.buffer_behind_m)
         )
         return Slab(frame=self.walls[index].frame, front_m=front_m, behind_m=behind_m)
 
     def nearest(self, points_world: NDArray[np.float64]) -> NDArray[np.int32]:
-        """Index (n,) of the wall whose rectangle is nearest to each point (n, 3); -1 for none."""
+        """Return the index (n,) of the wall nearest to each point (n, 3); -1 if none."""
         if not self.walls:
             return np.full(len(points_world), -1, dtype=np.int32)
         distances_m = [wall.frame.distances_m(points_world) for wall in self.walls]
         return np.asarray(np.argmin(distances_m, axis=0), dtype=np.int32)
 
     def spacing_m(self) -> float:
-        """Return the finest raster's cell size, or the point spacing on it if that is larger."""
+        """Return the larger of cell size and point spacing of the finest raster."""
         return max(min(wall.frame.gsd_m for wall in self.walls), self.points_apart_m())
 
     def points_apart_m(self) -> float:
-        """Return the approximate point spacing on the finest raster, however coarse it is."""
+        """Return the approximate point spacing on the finest raster."""
         wall = min(self.walls, key=lambda wall: wall.frame.gsd_m)
         n_known = n_points = 0
         for rows in row_bands(wall.depth_m.shape):
@@ -216,18 +220,18 @@ class Walls(Product):
 
 @dataclass(frozen=True, kw_only=True)
 class Layer:
-    """One source (a photo, or the cloud itself) projected onto one wall.
+    """One source (a photo or the cloud) projected onto one wall.
 
     Attributes:
-        frame: where the cells lie.
+        frame: position of the cells.
         wall: index of the wall in `Walls`.
-        source: name of the source, e.g. a photo's name, or `cloud`.
-        rgb: (rows, cols, 3) uint8, or uint16 of deep photos (the same for all layers of a block), 0
-            where not painted; `geometry.levels` converts between them.
-        mask: uint8 `LayerMask`; cells of value 1 are painted.
-        quality: float32, larger is better, comparable between the layers of one wall; 0 where
-            not painted.
-        filled: uint8, 1 where the colour was inpainted from neighbours, or None.
+        source: name of the photo, or `cloud`.
+        rgb: (rows, cols, 3) uint8, or uint16 if any photo has 16 bits per channel; 0 in cells
+            without a colour. `geometry.levels` converts between them.
+        mask: uint8 `LayerMask`; cells with the value 1 have a colour.
+        quality: float32, larger is better, comparable between the layers of a wall; 0 in cells
+            without a colour.
+        filled: uint8, 1 if the colour was interpolated from neighbours; or None.
     """
 
     frame: WallFrame
@@ -248,11 +252,11 @@ class Layers(Product):
 
     Attributes:
         layers: grouped by wall in the order of `Walls`, then by source.
-        names: name of each wall, by its index.
-        plane_indices: position of each wall's plane in `Planes`, by its index; if empty, the index
+        names: names of the walls.
+        plane_indices: index in `Planes` of the plane of each wall; if empty, the index of the wall
             is used.
-        icc_profile: colour profile common to all sources, or None: sRGB or unknown.
-        details: further statements of the method, JSON.
+        icc_profile: colour profile of all sources; None for sRGB or if unknown.
+        details: further JSON results, for users only.
     """
 
     type_name: ClassVar[str] = "layers"
@@ -270,31 +274,31 @@ class Layers(Product):
     details: dict[str, JsonValue] = field(default_factory=dict)
 
     def number(self, wall: int) -> int:
-        """Return the number of a wall as people see it: the place of its plane in `planes.json`."""
+        """Return the number of a wall shown to users: the index of its plane in `planes.json`."""
         return self.plane_indices[wall] if wall < len(self.plane_indices) else wall
 
     def name(self, wall: int) -> str:
-        """Return the name of a wall by its index."""
+        """Return the name of the wall with this index."""
         known = wall < len(self.names)
         return self.names[wall] if known else plane_name("wall", self.number(wall))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Orthoimage:
-    """The finished image of one wall.
+    """The finished orthoimage of one wall.
 
     Attributes:
-        frame: where the cells lie.
+        frame: position of the cells.
         wall: index of the wall in `Walls`.
-        name: label of the wall.
-        rgb: (rows, cols, 3) uint8, or uint16 of deep photos, as in the sources, 0 where nothing is
-            shown; `geometry.eight_bits` converts to 8 bits.
-        mask: uint8 `OrthoMask`; painted and filled cells are shown.
-        source: int16 index into `sources`, -1 where not painted.
-        sources: names of the sources, e.g. photo names, or `cloud`.
-        plane_index: position of the wall's plane in `Planes`; None if unknown.
-        error_m: float32 expected error of a point measured in the image, one standard deviation of
-            u and of v, metres; NaN where unknown. None if unknown everywhere.
+        name: name of the wall.
+        rgb: (rows, cols, 3) uint8 or uint16 as in the layers; 0 in cells without a colour.
+            `geometry.eight_bits` converts to 8 bits.
+        mask: uint8 `OrthoMask`.
+        source: int16 index in `sources`, -1 if the colour is not from a source.
+        sources: names of the photos, or `cloud`.
+        plane_index: index in `Planes` of the plane of the wall; None if unknown.
+        error_m: float32 metres, standard deviation of u and of v of a point measured in the image,
+            NaN if unknown; None if unknown for all cells.
         n_check_points: number of independent points that check the photos on this wall.
     """
 
@@ -316,7 +320,7 @@ class Orthoimage:
     def expected_mm(self) -> tuple[float, float]:
         """Return median and 95th percentile of the expected error, millimetres; NaN if unknown.
 
-        Estimated from some of the rows of large images.
+        Estimated from a part of the rows if the image is large.
         """
         if self.error_m is None:
             return math.nan, math.nan
@@ -329,7 +333,7 @@ class Orthoimage:
 
     @property
     def number(self) -> int:
-        """The number of the wall as people see it: the place of its plane in `planes.json`."""
+        """Number of the wall shown to users: the index of its plane in `planes.json`."""
         return self.wall if self.plane_index is None else self.plane_index
 
 
@@ -338,10 +342,10 @@ class Orthoimages(Product):
     """Orthoimages of all walls, in the order of `Walls`.
 
     Attributes:
-        images: one per wall.
-        icc_profile: colour profile of the colours, or None: sRGB or unknown.
-        layers: what each source shows by itself, if requested; None otherwise.
-        details: further statements of the method, JSON.
+        images: orthoimage of each wall.
+        icc_profile: colour profile; None for sRGB or if unknown.
+        layers: layers from which the images were made, if requested, or None.
+        details: further JSON results, for users only.
     """
 
     type_name: ClassVar[str] = "orthoimages"

@@ -161,5 +161,5 @@ def test_a_grid_covers_its_rectangle_to_a_millionth_of_a_cell(
 def test_a_rectangle_without_an_area_is_refused(flat: list[float]) -> None:
     right, down = np.array([flat[0], 0, 0]), np.array([0, 0, -flat[1]])
     corners = np.array([0 * right, down, down + right, right])
-    with pytest.raises(GeometryError, match="a rectangle needs an area"):
+    with pytest.raises(GeometryError, match="the area of a rectangle must not be 0"):
         frame_over(corners, np.array([0.0, -1.0, 0.0]), gsd_m=0.1)

@@ -71,7 +71,7 @@ def test_a_plane_runs_through_its_three_points_by_the_right_hand_rule(seed: int)
     ],
 )
 def test_points_on_a_line_span_no_plane(points: list[list[float]]) -> None:
-    with pytest.raises(GeometryError, match="three points must span a plane"):
+    with pytest.raises(GeometryError, match="three points must define a plane"):
         plane_through(np.array(points, dtype=np.float64))
 
 

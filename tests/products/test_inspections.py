@@ -29,5 +29,5 @@ def test_check_points_have_a_row_each(name: str) -> None:
     for wrong in (right[:2], np.concatenate([right, right], axis=right.ndim - 1)):
         with pytest.raises(ProductError, match=f"checkpoints.*{name}"):
             points_of(**{name: wrong})
-    with pytest.raises(ProductError, match="3 names have 2 classes"):
+    with pytest.raises(ProductError, match="3 names, but 2 classes"):
         points_of(classes=("", ""))

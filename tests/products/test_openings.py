@@ -28,8 +28,8 @@ def test_the_error_of_all_sides_counts_those_that_were_seen() -> None:
     [
         ({"outline_world": np.zeros((3, 3))}, "opening.outline_world must have shape"),
         ({"side_source": np.zeros(3, dtype=np.uint8)}, "opening.side_source must have shape"),
-        ({"outline_m": np.full((4, 2), np.nan)}, "needs 3 corners or more, of numbers"),
-        ({"kind": "hole"}, "an opening is through, niche, no data, got 'hole'"),
+        ({"outline_m": np.full((4, 2), np.nan)}, "at least 3 corners with coordinates below"),
+        ({"kind": "hole"}, "must be one of through, niche, no data, got 'hole'"),
         ({"side_source": np.full(4, 9, dtype=np.uint8)}, "opening.side_source must be at most 2"),
     ],
     ids=["corners", "sides", "not finite", "kind", "source"],

@@ -69,5 +69,7 @@ def test_a_plane_taken_out_does_not_hold_the_others() -> None:
     "index", [np.zeros(3, dtype=np.int32), np.zeros((3, 1), dtype=np.int16), np.zeros(3)]
 )
 def test_labels_are_flat_short_integers(index: np.ndarray) -> None:
-    with pytest.raises(ProductError, match=r"labels.plane_index must be a flat int16 array"):
+    with pytest.raises(
+        ProductError, match=r"labels.plane_index must be a one-dimensional int16 array"
+    ):
         PointLabels(plane_index=index)

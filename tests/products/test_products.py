@@ -204,7 +204,7 @@ def test_a_payload_that_lacks_an_array_is_refused() -> None:
 def test_a_payload_that_lacks_a_field_is_refused() -> None:
     version = Walls.encoding_version
     payload = Payload(type_name="walls", encoding_version=version, metadata={}, arrays={})
-    said = rf"lacks fields: walls, .*: raise the encoding_version of Walls, which is {version}"
+    said = rf"lacks fields: walls, .* the encoding_version of Walls, which is {version}"
     with pytest.raises(ProductError, match=said):
         Walls.from_payload(payload)
 
@@ -268,17 +268,21 @@ def test_arrays_of_another_length_or_type_are_refused() -> None:
         ProductError, match=r"depth_m has \(2, 2\) cells, but its frame has \(3, 4\)"
     ):
         dataclasses.replace(walls().walls[0], depth_m=np.zeros((2, 2), np.float32))
-    with pytest.raises(ProductError, match="2 walls need a buffer each or none, got 1"):
+    with pytest.raises(ProductError, match="one value per wall, got 1 for 2 walls"):
         dataclasses.replace(walls(), buffers_m=((0.2, 0.4),))
-    with pytest.raises(ProductError, match="the cloud has 1 points, at least 3 are needed"):
+    with pytest.raises(ProductError, match="the cloud has 1 points, but at least 3 are needed"):
         cloud(1).require_points(3)
     with pytest.raises(ProductError, match=r"planes.names must have shape \(6,\), got \(5,\)"):
         dataclasses.replace(box_planes(), names=box_planes().names[:5])
     with pytest.raises(ProductError, match=r"planes.normal must be unit vectors, got lengths"):
         dataclasses.replace(box_planes(), normal=box_planes().normal * (1.0 + 2e-5))
-    with pytest.raises(ProductError, match="must be empty or one per plane, got 1 for 6"):
+    with pytest.raises(
+        ProductError, match="must be empty or have one value per plane, got 1 for 6"
+    ):
         dataclasses.replace(box_planes(), thickness=(None,))
-    with pytest.raises(ProductError, match="side_from must be empty or one per plane, got 1 for 6"):
+    with pytest.raises(
+        ProductError, match="side_from must be empty or have one value per plane, got 1 for 6"
+    ):
         dataclasses.replace(box_planes(), side_from=("photos",))
     with pytest.raises(ProductError, match=r"planes\.tolerance_m must be positive, got 0"):
         dataclasses.replace(box_planes(), tolerance_m=0.0)

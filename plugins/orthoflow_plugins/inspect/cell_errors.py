@@ -2,7 +2,7 @@
 
 All cells of small walls are compared, and an evenly spread sample of the cells of large walls.
 Colours are rendered in whole blocks, since patches need neighbouring cells; visibility is tested on
-a regular lattice, which misses nothing wider than its spacing.
+a regular lattice, which covers every area wider than its spacing.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class SamplingRule:
 
 
 def sampling(image: Orthoimage, rule: SamplingRule, first_row: int) -> Sampling:
-    """Choose cells of an image; blocks that show nothing have no colours to compare.
+    """Choose cells of an image; blocks without coloured cells cannot be compared.
 
     Args:
         image: orthoimage of a wall, or a band of it.

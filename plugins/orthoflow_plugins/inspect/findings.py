@@ -223,7 +223,7 @@ def prefixed(specs: Sequence[MetricSpec], prefix: str, what: str) -> tuple[Metri
     Args:
         specs: the metrics.
         prefix: prefix of the new names, possibly with wildcards.
-        what: suffix of the new labels; `{0}` stands for the text that a wildcard matches.
+        what: suffix of the new labels; `{0}` is replaced by the text that the wildcard matches.
     """
     n_wildcards = len(re.findall(r"\*|\[[^\]]+\]", prefix))
     return tuple(

@@ -203,7 +203,7 @@ def find_by_truth(
         search_cells: search radius.
 
     Returns:
-        (2,) column and row, or None if nothing correlates.
+        (2,) column and row, or None if no position correlates.
     """
     from orthoflow.geometry.scene_views import render_frame
 

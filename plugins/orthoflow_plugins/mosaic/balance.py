@@ -228,9 +228,9 @@ def with_seams(
             continue
         for mine, other, sign in ((i, j, 1.0), (j, i, -1.0)):
             part = common(balance.lights[mine].box, around)
-            assert part is not None  # noqa: S101 - what both show lies in all of these
+            assert part is not None  # noqa: S101 - both contain the overlap
             part = common(part, shares.boxes[other])
-            assert part is not None  # noqa: S101 - what both show lies in all of these
+            assert part is not None  # noqa: S101 - both contain the overlap
             weights = shares.within(other, part)
             towards = np.float32(sign) * apart[inside(part, around)] * weights[..., None]
             logs[mine][inside(part, balance.lights[mine].box)] += towards

@@ -160,7 +160,7 @@ def joined(
 
     Args:
         painters: layers of the wall with coloured cells.
-        others: layers without any, whose masks tell which cells are occluded.
+        others: layers without coloured cells; their masks show which cells are occluded.
         params: the rule for seams.
         drawn: areas assigned to photos by hand, which override the rule where the photo shows
             them.

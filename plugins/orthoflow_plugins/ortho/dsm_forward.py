@@ -34,7 +34,7 @@ _BAND_CELLS: Final = 1 << 23
 
 
 class DsmForward(Method):
-    """Trace the ray of each pixel to its first intersection with the surface, and paint that cell.
+    """Trace the ray of each pixel to its first intersection with the surface, and colour that cell.
 
     If several pixels hit the same cell, the one closest to the cell centre is used unchanged;
     colours are not interpolated. Objects in front of the depth range of the wall hide it as in

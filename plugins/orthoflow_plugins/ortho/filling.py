@@ -80,7 +80,7 @@ def inpainted(
     method: Inpainting,
     radius_px: float,
 ) -> NDArray[np.uint8]:
-    """Paint the fillable cells with OpenCV, from the colours of painted cells only.
+    """Inpaint the fillable cells with OpenCV, from the colours of painted cells only.
 
     Args:
         rgb: (rows, cols, 3); values of void cells have no influence.

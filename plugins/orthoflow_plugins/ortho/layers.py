@@ -1,4 +1,4 @@
-"""Collects the layers that photos paint on walls."""
+"""Collection of the layers of photos on walls."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class LayerStack:
     def __init__(self, walls: Walls, ctx: StepContext) -> None:
         self.painted: list[Layer] = []
         self._walls, self._ctx = walls, ctx
-        # Visibility masks of walls that no photo has painted so far.
+        # Visibility masks of walls on which no photo has coloured a cell so far.
         self._reached: dict[int, NDArray[np.uint8]] = {}
 
     def allocator(self, wall: int) -> Allocate:
@@ -49,12 +49,12 @@ class LayerStack:
         return lambda name, shape, dtype: self._new(f"{wall}.scratch.{name}", shape, dtype)
 
     def add(self, layer: Layer) -> None:
-        """Add the layer of a photo that paints at least one cell."""
+        """Add the layer of a photo that gives a colour to at least one cell."""
         self._reached.pop(layer.wall, None)
         self.painted.append(layer)
 
     def note_reached(self, wall: int, mask: NDArray[np.uint8]) -> None:
-        """Record the visibility of a wall on which a photo paints no cell.
+        """Record the visibility of a wall on which a photo colours no cell.
 
         Args:
             wall: index of the wall.
@@ -72,13 +72,13 @@ class LayerStack:
         self._reached[wall] = kept
 
     def joined(self, level: Level) -> Layers:
-        """Sort the layers by wall, and add an empty layer for each wall without one.
+        """Sort the layers by wall, and add an empty layer for each wall that has no layer.
 
         Args:
             level: numpy type of the colours.
 
         Raises:
-            MethodError: no photo paints any wall.
+            MethodError: no photo shows any wall.
         """
         if not self.painted:
             raise MethodError(UNSEEN_WALLS)

@@ -77,7 +77,7 @@ class PhotosOnWalls(Ports):
 
 
 class LayersOfPhotos(Ports):
-    """A layer for each wall and photo that paints on it."""
+    """A layer for each pair of a wall and a photo that shows it."""
 
     layers: Layers
 
