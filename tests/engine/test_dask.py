@@ -44,22 +44,20 @@ steps:
 
 @contextmanager
 def cluster(
-    n_workers: int, answers: Path | None = None, **resources: float
+    n_workers: int, *, processes: bool = True, **resources: float
 ) -> Iterator[LocalCluster]:
-    """Open a cluster, of processes where there is a folder for what they tell each other."""
-    preload = {"preload": ["tests.asking_once"], "preload_argv": [str(answers)]}
+    """Open a cluster of processes or threads."""
     # Those of processes are forked from one that has loaded dask, as are those after killed ones.
     with (
         dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}),
         LocalCluster(  # type: ignore[no-untyped-call]
             n_workers=n_workers,
-            processes=answers is not None,
+            processes=processes,
             threads_per_worker=1,
             resources=resources,
             memory_limit=0,
             dashboard_address="127.0.0.1:0",
             silence_logs=50,
-            **(preload if answers else {}),
         ) as opened,
     ):
         yield opened
@@ -113,11 +111,10 @@ def is_under_way(event: RunEvent) -> bool:
 
 @pytest.fixture(scope="module")
 def office(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Office]:
-    start_fork_server("tests.asking_once", "orthoflow.engine.dask")
+    start_fork_server("orthoflow.engine.dask")
     with toy_world(tmp_path_factory.mktemp("office")) as world:
         quiet = digests(world.run(STEPS, executor="inline"))
-        (world.folder / "answers").mkdir()
-        with cluster(2, world.folder / "answers", **{CORES: 1}) as opened:
+        with cluster(2, **{CORES: 1}) as opened:
             yield Office(world, opened, quiet)
 
 
@@ -197,7 +194,7 @@ def test_a_lost_scheduler_is_said_and_the_run_goes_on_without(
 ) -> None:
     monkeypatch.setattr(engine_dask, "_PATIENCE_S", 3.0)
     world, folder = office.world, office.world.folder / "alone"
-    with cluster(1, world.folder / "answers", **{CORES: 1}) as lost:
+    with cluster(1, **{CORES: 1}) as lost:
         plan = world.plan(
             STEPS, executor="dask", scheduler=lost.scheduler_address, force=("second",)
         )
@@ -248,7 +245,7 @@ def test_workers_that_do_not_say_their_cores_get_no_work(
     office: Office, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(engine_dask, "_PATIENCE_S", 1.0)
-    with cluster(1) as silent:
+    with cluster(1, processes=False) as silent:
         plan = office.world.plan(STEPS, executor="dask", scheduler=silent.scheduler_address)
         with pytest.raises(ArgumentError, match="no worker there states how many cores it has"):
             DaskExecutor(plan, tmp_path, Capacity.of_jobs(1, 1), lambda *_: None)
