@@ -16,7 +16,7 @@ from orthoflow.engine.journal import is_running
 from orthoflow.engine.scheduler import execute
 from orthoflow.errors import ArgumentError, CancelledStepError, StoreError
 from orthoflow.records.runs import find_record
-from tests.engine_world import World, digests, start_coordinator, toy_world
+from tests.engine_world import World, digests, has_ended, start_coordinator, toy_world
 from tests.long_loops import IS_LONG, long_only
 
 STEPS = """
@@ -46,13 +46,6 @@ def wait_for(world: World, folder: str, event: str, address: str) -> None:
     pytest.fail(f"{address} never {event}")
 
 
-def is_alive(process_id: int) -> bool:
-    try:
-        return Path(f"/proc/{process_id}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
-
-
 @pytest.fixture(scope="module")
 def quiet(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """Digests of an undisturbed run."""
@@ -79,24 +72,6 @@ def test_a_run_killed_at_any_moment_resumes_with_the_same_digests(
     assert list(world.store.scratch.iterdir()) == []
     collect_garbage(world.store)
     assert len(world.run(STEPS, into="after").cached) == 4
-
-
-def test_steps_and_what_they_started_die_with_their_coordinator(world: World) -> None:
-    steps = STEPS.replace("work.slow", "work.spawns_and_waits")
-    process = start_coordinator(world, steps, "run")
-    log = world.folder / "run" / "logs" / "second.log"
-    deadline = time.monotonic() + 60
-    while not (log.exists() and log.read_text().endswith("\n")) and time.monotonic() < deadline:
-        time.sleep(0.01)
-    grandchild = int(log.read_text().removeprefix("started "))
-    step = int(Path(f"/proc/{grandchild}/stat").read_text().rpartition(")")[2].split()[1])
-    process.kill()
-    process.communicate()
-    deadline = time.monotonic() + 5
-    while (is_alive(step) or is_alive(grandchild)) and time.monotonic() < deadline:
-        time.sleep(0.02)
-    assert not is_alive(step)
-    assert not is_alive(grandchild)
 
 
 @pytest.mark.parametrize(
@@ -140,10 +115,15 @@ def test_two_runs_share_a_store_at_once(world: World, quiet: dict[str, str]) -> 
     assert digests(outcome) == quiet
 
 
-def test_a_run_folder_in_use_is_refused_and_so_is_garbage_collection(world: World) -> None:
-    process = start_coordinator(world, STEPS.replace("steps: 6", "steps: 2000"), "run")
+def test_a_run_in_progress_is_left_alone_and_goes_on_after_a_kill(world: World) -> None:
+    process = start_coordinator(world, STEPS.replace("work.slow", "work.spawns_and_waits"), "run")
+    log = world.folder / "run" / "logs" / "second.log"
+    deadline = time.monotonic() + 60
+    while not (log.exists() and log.read_text().endswith("\n")) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    grandchild = int(log.read_text().removeprefix("started "))
+    step = int(Path(f"/proc/{grandchild}/stat").read_text().rpartition(")")[2].split()[1])
     try:
-        wait_for(world, "run", "started", "second")
         with pytest.raises(ArgumentError, match="is in use by another run; wait for its end"):
             world.run(STEPS)
         assert is_running(world.folder / "run")
@@ -155,6 +135,9 @@ def test_a_run_folder_in_use_is_refused_and_so_is_garbage_collection(world: Worl
         process.kill()
         process.communicate()
     assert not is_running(world.folder / "run")
+    # Steps and what they started end with their coordinator.
+    assert has_ended(step)
+    assert has_ended(grandchild)
     # What had ended is not computed again.
     assert world.run(STEPS).resumed == {"first"}
     assert [event["event"] for event in events(world, "run")].count("resumed") == 1

@@ -131,22 +131,6 @@ def test_threads_are_fixed_before_any_library_loads(world: World, jobs: int, cor
     assert not Path(scratch).exists()
 
 
-def test_a_bad_input_file_ends_with_exit_code_two(world: World) -> None:
-    (world.folder / "data.txt").write_text("one two")
-    steps = """
-inputs: {data: {files: data.txt}}
-steps:
-  first: {use: make.file, in: {files: inputs.data}}
-  second: {use: work.add, in: {numbers: first.numbers}}
-"""
-    outcome = world.run(steps, executor="inline")
-    assert outcome.exit_code == 2
-    assert outcome.results["first"].error_message.startswith("data.txt must hold numbers")
-    given = outcome.inputs["data"]
-    assert given is not None
-    assert given.files[0].name == "data.txt"
-
-
 def test_results_of_code_that_changed_during_the_run_are_not_kept(world: World) -> None:
     (world.site / "toy_plugin-1.0.dist-info" / "direct_url.json").write_text("{}")
     plan = world.plan(CHAIN, executor="inline")
