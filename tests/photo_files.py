@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import struct
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
-from orthoflow.files.images import encode_jpeg, encode_png
+from orthoflow.files.images import encode_jpeg
 
 ORIENTATION, MAKE, MODEL = 0x0112, 0x010F, 0x0110
 FOCAL, FOCAL_35MM, MAKER_NOTE = 0x920A, 0xA405, 0x927C
@@ -84,39 +85,18 @@ def _app1(content: bytes) -> bytes:
 
 def png(image: NDArray[np.uint8], exif: bytes) -> bytes:
     """A PNG file with an EXIF chunk."""
-    encoded = encode_png(image)
-    chunk = b"eXIf" + exif
-    whole = struct.pack(">I", len(exif)) + chunk + struct.pack(">I", zlib.crc32(chunk))
-    end = encoded.rindex(b"IEND") - 4
-    return encoded[:end] + whole + encoded[end:]
+    return _saved(image, "PNG", exif=exif)
 
 
 def tiff(image: NDArray[np.uint8], orientation: int = 1) -> bytes:
-    """An uncompressed RGB TIFF file of one strip, its directory in front."""
-    height, width = image.shape[:2]
-    tags: dict[int, Value] = {
-        0x100: width,
-        0x101: height,
-        0x103: 1,
-        0x106: 2,
-        ORIENTATION: orientation,
-        0x115: 3,
-        0x116: height,
-        0x117: 3 * width * height,
-    }
-    bits = struct.pack("<HHH", 8, 8, 8)
-    start = 8 + 2 + 12 * (len(tags) + 2) + 4
-    listed = {
-        **{tag: _encoded(value, "<") for tag, value in tags.items()},
-        0x102: (3, 3, struct.pack("<I", start)),
-        0x111: (4, 1, struct.pack("<I", start + len(bits))),
-    }
-    entries = b"".join(
-        struct.pack("<HHI", tag, kind, count) + raw.ljust(4, b"\0")
-        for tag, (kind, count, raw) in sorted(listed.items())
-    )
-    head = b"II*\0" + struct.pack("<I", 8) + struct.pack("<H", len(listed))
-    return head + entries + struct.pack("<I", 0) + bits + image.tobytes()
+    """An uncompressed RGB TIFF file, its directory in front."""
+    return _saved(image, "TIFF", tiffinfo={ORIENTATION: orientation})
+
+
+def _saved(image: NDArray[np.uint8], kind: str, **more: object) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(image).save(stream, kind, **more)
+    return stream.getvalue()
 
 
 def write(folder: Path, files: Mapping[str, bytes]) -> tuple[Path, ...]:

@@ -367,8 +367,7 @@ def _e57_fields(
     low: float = 0.0,
     rgb: float | None = 1.0,
 ) -> dict[str, Any]:
-    axes = ("cartesianX", "cartesianY", "cartesianZ")
-    fields: dict[str, Any] = dict(zip(axes, (scene.points + shift).T, strict=True))
+    fields = scan_files.cartesian(scene.points + shift)
     if intensity is not None:
         fields["intensity"] = low + scene.reflectance * (intensity - low)
     if rgb is not None:

@@ -124,6 +124,13 @@ def _add_hierarchy(file: Any, levels: list[int], entries: list[bytes]) -> None:
     file.write(struct.pack("<5d2Q", 4.0, 4.0, 4.0, 4.0, 0.5, start, len(root)))
 
 
+# Any: arrays of every kind.
+def cartesian(points: NDArray[np.float64], **more: Any) -> dict[str, Any]:
+    """Fields of points of an E57 scan."""
+    names = ("cartesianX", "cartesianY", "cartesianZ")
+    return {**dict(zip(names, points.T, strict=True)), **more}
+
+
 def write_e57(
     path: Path,
     scans: Sequence[Mapping[str, Any]],
@@ -300,11 +307,7 @@ def write_pcd(
         rows = [" ".join(repr(item.item()) for item in row) for row in zip(*arrays, strict=True)]
         path.write_text(header + "\n".join([*rows, ""]))
     elif data == "binary":
-        dtype = np.dtype([(name, array.dtype) for name, array in fields.items()])
-        table = np.zeros(count, dtype)
-        for name, array in fields.items():
-            table[name] = array
-        path.write_bytes(header.encode() + table.tobytes())
+        path.write_bytes(header.encode() + np.rec.fromarrays(arrays, names=[*fields]).tobytes())
     else:
         plain = b"".join(array.tobytes() for array in arrays)
         # LZF of literals only: their number less one before up to 32 of them.

@@ -47,8 +47,8 @@ def pinhole(**more: Any) -> dict[str, Any]:
 
 def written(folder: Path, *images: dict[str, Any]) -> Path:
     points = np.random.default_rng(0).uniform(0, 1, (5, 3))
-    fields = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), points.T, strict=True))
-    return scan_files.write_e57(folder / "room.e57", [{"fields": fields}], images)
+    scan = {"fields": scan_files.cartesian(points)}
+    return scan_files.write_e57(folder / "room.e57", [scan], images)
 
 
 def read(path: Path) -> tuple[Photos, Cameras]:

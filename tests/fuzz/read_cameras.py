@@ -162,7 +162,7 @@ _NUMBERS: Final = {
 def _e57_files(folder: Path) -> None:
     picture = photo_files.picture(_WIDTH, _HEIGHT)
     points = np.random.default_rng(1).uniform(0.0, 1.0, (5, 3))
-    fields = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), points.T, strict=True))
+    fields = scan_files.cartesian(points)
     pose = {"rotation": (0.8, 0.0, 0.0, 0.6), "translation": (1.0, 2.0, 3.0)}
     sphere = {
         "imageWidth": 64,

@@ -92,13 +92,11 @@ def _intensity() -> NDArray[np.int64]:
 
 
 def _e57_files(folder: Path) -> None:
-    x, y, z = _points().T
     red, green, blue = _rgb().T
-    cartesian = {"cartesianX": x, "cartesianY": y, "cartesianZ": z}
     colours = {"colorRed": red, "colorGreen": green, "colorBlue": blue}
     grid = {"rowIndex": np.arange(_N) % 8, "columnIndex": np.arange(_N) // 8}
     whole = {
-        "fields": {**cartesian, "intensity": _intensity(), **colours, **grid},
+        "fields": scan_files.cartesian(_points(), intensity=_intensity(), **colours, **grid),
         "rotation": (0.8, 0.0, 0.0, 0.6),
         "translation": (1.0, 2.0, 3.0),
         "intensity_limits": (0.0, 65535.0),
@@ -110,7 +108,7 @@ def _e57_files(folder: Path) -> None:
         "sphericalElevation": np.linspace(-1.0, 1.0, _N),
         "sphericalInvalidState": np.arange(_N) % 2,
     }
-    scan_files.write_e57(folder / "two.e57", [whole, {"fields": cartesian}])
+    scan_files.write_e57(folder / "two.e57", [whole, {"fields": scan_files.cartesian(_points())}])
     scan_files.write_e57(folder / "spherical.e57", [{"fields": spherical}])
 
 

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from orthoflow.errors import InputError, OrthoflowError, PluginError
 from orthoflow.files.points import ScanFile, open_scan
@@ -76,17 +75,12 @@ def ptx(folder: Path, *, line: int = 0, change: str = "") -> Path:
     return path
 
 
-def cartesian(points: NDArray[np.float64], **more: NDArray[np.generic]) -> dict[str, object]:
-    names = ("cartesianX", "cartesianY", "cartesianZ")
-    return {**dict(zip(names, points.T, strict=True)), **more}
-
-
 def e57(folder: Path, *fields: dict[str, Any], **more: object) -> Path:
     return scan_files.write_e57(folder / "a.e57", [{"fields": one, **more} for one in fields])
 
 
 def flipped_e57(folder: Path) -> Path:
-    path = e57(folder, cartesian(POINTS))
+    path = e57(folder, scan_files.cartesian(POINTS))
     content = bytearray(path.read_bytes())
     content[200] ^= 1
     path.write_bytes(bytes(content))
@@ -338,7 +332,7 @@ def test_a_tilted_e57_scanner_turns_each_axis_where_its_pose_says(
     rotation: tuple[float, ...], axes_world: list[tuple[float, ...]], tmp_path: Path
 ) -> None:
     station = np.array([4.0, -2.0, 1.0])
-    fields = cartesian(np.vstack([np.eye(3), [[2.0, 3.0, 5.0]]]))
+    fields = scan_files.cartesian(np.vstack([np.eye(3), [[2.0, 3.0, 5.0]]]))
     (block,) = read_all(e57(tmp_path, fields, rotation=rotation, translation=station))
     x, y, z = np.array(axes_world)
     expected = station + np.array([x, y, z, 2.0 * x + 3.0 * y + 5.0 * z])
@@ -347,7 +341,7 @@ def test_a_tilted_e57_scanner_turns_each_axis_where_its_pose_says(
 
 def test_e57_leaves_out_points_without_a_position(tmp_path: Path) -> None:
     state = np.arange(40) % 3
-    fields = cartesian(POINTS, cartesianInvalidState=state, intensity=np.arange(40.0))
+    fields = scan_files.cartesian(POINTS, cartesianInvalidState=state, intensity=np.arange(40.0))
     (block,) = read_all(e57(tmp_path, fields))
     np.testing.assert_allclose(block.points, POINTS[state == 0], atol=1e-6)
     np.testing.assert_array_equal(block.intensity, np.flatnonzero(state == 0))

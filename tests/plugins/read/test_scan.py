@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from orthoflow_plugins.read.scan import ReadScan
 
 from orthoflow.errors import InputError, StoreError
@@ -44,15 +43,6 @@ def write_text(path: Path, table: Iterable[Iterable[float]], header: str = "") -
     rows = [" ".join(repr(float(value)) for value in row) for row in table]
     path.write_text("\n".join([*([header] if header else []), *rows, ""]))
     return path
-
-
-def cartesian(points: NDArray[np.float64], **more: object) -> dict[str, object]:
-    return {
-        "cartesianX": points[:, 0],
-        "cartesianY": points[:, 1],
-        "cartesianZ": points[:, 2],
-        **more,
-    }
 
 
 # Coordinates
@@ -195,7 +185,7 @@ def test_several_files_become_one_cloud(tmp_path: Path, read: ScanReader) -> Non
         tmp_path / "b.e57",
         [
             {
-                "fields": cartesian(POINTS),
+                "fields": scan_files.cartesian(POINTS),
                 "rotation": (1, 0, 0, 0),
                 "translation": (number, 0, 0),
             }
@@ -218,9 +208,9 @@ def test_several_files_become_one_cloud(tmp_path: Path, read: ScanReader) -> Non
 def test_stations_belong_to_scans_in_their_order(tmp_path: Path, read: ScanReader) -> None:
     half = np.sqrt(0.5)
     scans = [
-        {"fields": cartesian(POINTS)},
+        {"fields": scan_files.cartesian(POINTS)},
         {
-            "fields": cartesian(POINTS),
+            "fields": scan_files.cartesian(POINTS),
             "rotation": (half, 0, 0, half),
             "translation": (3.0, 4.0, 0.5),
         },
@@ -243,7 +233,7 @@ def test_view_from_is_in_metres_and_gives_way_to_the_scanner(
     cloud = read(write_text(tmp_path / "a.xyz", POINTS), view_from=[1.0, 2, 3.5], unit="ft")
     np.testing.assert_array_equal(cloud.stations, [[1.0, 2.0, 3.5]])
     assert cloud.stations_source == "view_from"
-    scan = scan_files.write_e57(tmp_path / "a.e57", [{"fields": cartesian(POINTS)}])
+    scan = scan_files.write_e57(tmp_path / "a.e57", [{"fields": scan_files.cartesian(POINTS)}])
     cloud = read(scan, view_from=[1.0, 2.0, 3.5])
     assert cloud.stations_source == "file"
     assert "view_from has no effect" in read.warnings
