@@ -12,8 +12,8 @@ from pydantic import Field, model_validator
 from orthoflow.errors import GeometryError, MethodError
 from orthoflow.geometry import Plane, plane_through, wall_axes
 from orthoflow.products import PointCloud, PointLabels, SideSource
-from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, MetricSpec, StepContext
-from orthoflow_plugins.plane.detector import DetectorIn, DetectorOut
+from orthoflow.sdk import DiagnosticSpec, Method, MethodParams, StepContext
+from orthoflow_plugins.plane.detector import DETECTOR_METRICS, DetectorIn, DetectorOut
 
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.cloud import PreparedCloud
@@ -30,6 +30,7 @@ _BUFFER_TOLERANCES: Final = 3.0
 # Cell size of the robust box, and the share of points outside it per side.
 _BOX_CELL_M: Final = 0.05
 _OUTSIDE_SHARE: Final = 0.0005
+_METRICS: Final = {"n_planes", "labelled_share", "rms_mm", "omega_deg", "phi_deg", "offset_m"}
 _EVERYWHERE_M: Final = 1e9
 _NO_BOUNDS_M: Final = (-_EVERYWHERE_M, _EVERYWHERE_M, -_EVERYWHERE_M, _EVERYWHERE_M)
 
@@ -116,19 +117,7 @@ class GivenPlane(Method):
 
     id = "plane.given"
     determinism = "exact"
-    metrics = (
-        MetricSpec("n_planes", label="planes found"),
-        MetricSpec("labelled_share", label="points that lie on a plane"),
-        MetricSpec(
-            "rms_mm",
-            label="points to the first plane, RMS",
-            headline=True,
-            description="the relief of the wall counts in full: it is no error of the image",
-        ),
-        MetricSpec("omega_deg", label="direction of the first normal (omega)"),
-        MetricSpec("phi_deg", label="inclination of the first normal (phi)"),
-        MetricSpec("offset_m", label="offset of the first plane"),
-    )
+    metrics = tuple(metric for metric in DETECTOR_METRICS if metric.name in _METRICS)
     citations = (
         (
             "Skarlatos, Kiparissi, Theodoridou 2012: Direct orthophoto generation from color point "

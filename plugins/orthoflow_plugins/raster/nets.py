@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -22,19 +21,9 @@ _ROWS_AT_ONCE: Final = 256
 _ROUNDING_CELLS: Final = 1e-6
 
 
-@dataclass(frozen=True, kw_only=True)
-class Net:
-    """Interpolated values at the centres of the cells, all arrays flat over these.
-
-    Attributes:
-        depth_m: float32, NaN without a triangle.
-        intensity: float32, likewise, or None.
-        rgb: (cells, 3) uint8, 0 without a triangle, or None.
-    """
-
-    depth_m: NDArray[np.float32]
-    intensity: NDArray[np.float32] | None
-    rgb: NDArray[np.uint8] | None
+# Values at the centres of the cells: depth, intensity and colour (cells, 3) if the cloud has them;
+# NaN and 0 without a triangle.
+Net = tuple[NDArray[np.float32], NDArray[np.float32] | None, NDArray[np.uint8] | None]
 
 
 def interpolate_net(
@@ -78,11 +67,9 @@ def interpolate_net(
             "surface tin needs points that span triangles about the cells of each wall, and the "
             f"{len(taken)} cells with points of this one do not: take another surface"
         )
-    return Net(
-        depth_m=found[:, 0].copy(),
-        intensity=None if cloud.intensity is None else found[:, 1].copy(),
-        rgb=None if cloud.rgb is None else np.rint(np.nan_to_num(found[:, -3:])).astype(np.uint8),
-    )
+    intensity = None if cloud.intensity is None else found[:, 1].copy()
+    rgb = None if cloud.rgb is None else np.rint(np.nan_to_num(found[:, -3:])).astype(np.uint8)
+    return found[:, 0].copy(), intensity, rgb
 
 
 def _interpolate(

@@ -37,7 +37,7 @@ from orthoflow_plugins.raster.parameters import RasterParams
 ONE_POINT: Final = frozenset({"nearest", "centre", "topmost", "tin"})
 # Layers within a cell are more than this apart.
 LAYER_M: Final = 0.02
-# Radius of the filter of the surface denoised.
+# Radius of the filter of the surface denoised; half of it is the sigma of the Gaussian weight.
 DENOISE_CELLS: Final = 4
 # Temporary arrays are limited to this many cells.
 CELLS_AT_ONCE: Final = 1 << 20
@@ -181,13 +181,11 @@ def _surface_of_winners(
     if params.surface != "tin":
         return surface
     vertices = np.where(winners["n_points"] > 0, winners["point"], NO_POINT)
-    net = interpolate_net(cloud, slab, vertices, winners["depth_m"])
     # The values of the triangulation at the centres replace those of points in cells.
-    is_known = np.isfinite(net.depth_m)[:, np.newaxis]
+    depth_m, intensity, rgb = interpolate_net(cloud, slab, vertices, winners["depth_m"])
+    is_known = np.isfinite(depth_m)[:, np.newaxis]
     places = np.where(is_known, np.float32(0.0), np.float32(np.nan)).repeat(2, 1)
-    return replace(
-        surface, depth_m=net.depth_m, intensity=net.intensity, rgb=net.rgb, places=places
-    )
+    return replace(surface, depth_m=depth_m, intensity=intensity, rgb=rgb, places=places)
 
 
 def _contest(
@@ -229,7 +227,7 @@ def _surface_of_all(
         raster_m = depth_m.reshape(slab.frame.shape)
         raster_m = without_specks(raster_m, gsd_m=gsd_m, layer_m=layer_m, threads=threads)
         if params.surface == "denoised":
-            raster_m = denoised(raster_m, DENOISE_CELLS)
+            raster_m = denoised(raster_m)
         depth_m = raster_m.ravel()
     few = kernels.FewPoints(
         n_inside=count,
@@ -420,7 +418,7 @@ def _sparse(is_known: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return is_known & (known < _SPARSE_SHARE * np.asarray(around))
 
 
-def denoised(depth_m: NDArray[np.float32], radius_cells: int) -> NDArray[np.float32]:
+def denoised(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
     """Average depths over neighbours on the same surface (bilateral filter, Tomasi 1998).
 
     The permitted difference of depth follows from the noise of the raster, so that steps of more
@@ -428,8 +426,6 @@ def denoised(depth_m: NDArray[np.float32], radius_cells: int) -> NDArray[np.floa
 
     Args:
         depth_m: (rows, cols) metres, NaN where void.
-        radius_cells: maximum distance of neighbours; half of it is the sigma of the Gaussian
-            weight.
 
     Returns:
         (rows, cols) metres, NaN where it was.
@@ -438,7 +434,7 @@ def denoised(depth_m: NDArray[np.float32], radius_cells: int) -> NDArray[np.floa
 
     noise_m = depth_noise_m(depth_m)
     is_known = np.isfinite(depth_m)
-    if noise_m < _NOISE_LEAST_M or radius_cells == 0 or not is_known.any():
+    if noise_m < _NOISE_LEAST_M or not is_known.any():
         return depth_m
     lowest = float(depth_m[is_known].min())
     values = depth_m
@@ -448,9 +444,9 @@ def denoised(depth_m: NDArray[np.float32], radius_cells: int) -> NDArray[np.floa
         values = np.asarray(
             cv2.bilateralFilter(
                 filled,
-                2 * radius_cells + 1,
+                2 * DENOISE_CELLS + 1,
                 sigmaColor=reach_m,
-                sigmaSpace=0.5 * max(1.0, float(radius_cells)),
+                sigmaSpace=0.5 * DENOISE_CELLS,
                 borderType=cv2.BORDER_REPLICATE,
             ),
             dtype=np.float32,
