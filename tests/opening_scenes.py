@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import WallFrame
-from orthoflow.products import PointCloud, SurfaceMask, Wall, Walls
+from orthoflow.products import PointCloud, Walls
+from tests import samples
 from tests.raster_scenes import SURVEY, UP, leaning_wall
 
 GSD_M = 0.01
@@ -81,23 +82,17 @@ def walls(*, noise_m: float = 0.002, face_m: float = 0.0, sparse: bool = False) 
     is_void |= rng.random(SHAPE) < 0.02
     is_void[:, 274:277] = True
     depth[is_void] = np.nan
-    wall = Wall(
-        frame=frame(),
+    wall = samples.wall(
+        frame(),
         plane_index=4,
         name="wall 4",
         depth_m=depth.astype(np.float32),
         sigma_m=np.full(SHAPE, noise_m, dtype=np.float32),
         count=np.where(is_void, 0, (rows % 3 == 0) if sparse else 2).astype(np.uint32),
-        mask=np.where(is_void, SurfaceMask.VOID, SurfaceMask.MEASURED).astype(np.uint8),
         intensity=np.full(SHAPE, 0.5, dtype=np.float32),
     )
-    return Walls(
-        walls=(wall,),
-        up=UP,
-        intensity_source="laser",
-        buffer_front_m=FRONT_M,
-        buffer_behind_m=BEHIND_M,
-    )
+    buffers = {"buffer_front_m": FRONT_M, "buffer_behind_m": BEHIND_M}
+    return samples.walls(wall, intensity_source="laser", **buffers)
 
 
 def cloud(*, knows_stations: bool = True) -> PointCloud:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,6 @@ from orthoflow_plugins.plane.votes import VOTE_SHARES, vote_planes
 from pydantic import ValidationError
 from scipy.spatial import KDTree
 
-from orthoflow.geometry import frame_over
 from tests.plane_scenes import (
     ROOM,
     STATION,
@@ -62,34 +60,6 @@ def test_raw_coordinates_with_one_vote_per_cell_are_refused() -> None:
 def test_floor_and_ceiling_alone_are_found_once_each(method: Any, tmp_path: Path) -> None:
     planes = detect(method, cloud_of(sampled(ROOM[4:6])), tmp_path)[0].planes
     assert sorted(planes.names) == ["ceiling 1", "floor 0"]
-
-
-def test_rectangles_hold_the_entire_wall_and_little_more(tmp_path: Path) -> None:
-    planes = detect(Hough2d, cloud_of(sampled(), stations=STATION), tmp_path)[0].planes
-    frame = frame_over(planes.corners[0], planes.normal[0], gsd_m=0.01)
-    assert frame.u_world @ (1.0, 0.0, 0.0) > 0.99  # the front wall seen from inside: east is right
-    placed = frame.wall_from_world(sampled()[: ROOM[0].n_points])[:, :2]
-    assert placed.min() >= -0.1
-    assert (placed <= np.array([frame.width, frame.height]) + 0.1).all()
-    assert frame.width * 0.01 == pytest.approx(6.0, abs=0.02)
-    assert frame.height * 0.01 == pytest.approx(3.0, abs=0.02)
-
-
-def test_a_guessed_side_is_warned_about_and_scan_numbers_outvote_a_nearer_station(
-    tmp_path: Path,
-) -> None:
-    out, ctx = detect(Hough2d, cloud_of(sampled()), tmp_path)
-    assert out.planes.viewpoint == "guess"
-    assert any("set view_from of read.scan" in warning for warning in ctx.warnings)
-    # Inside a room the guess is right all the same.
-    assert (out.planes.normal @ STATION[0] > out.planes.offset).all()
-    points = sampled(ROOM[:1])
-    stations = np.array([[0.0, 2.5, 0.0], [0.0, -4.0, 0.0]])
-    cloud = dataclasses.replace(
-        cloud_of(points, stations=stations), scan=np.ones(len(points), dtype=np.uint16)
-    )
-    planes = detect(Hough2d, cloud, tmp_path)[0].planes
-    assert planes.normal[0] @ (0.0, 1.0, 0.0) < -0.99
 
 
 def test_a_perfectly_flat_wall_is_found(tmp_path: Path) -> None:

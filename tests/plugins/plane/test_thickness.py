@@ -12,13 +12,13 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.plane.cloud import prepare
 from orthoflow_plugins.plane.ransac import Ransac
-from orthoflow_plugins.plane.thickness import RowPoints, measure_thickness, row_points
+from orthoflow_plugins.plane.thickness import row_points
 from pydantic import ValidationError
 
 from orthoflow.errors import MethodError
 from orthoflow.products import PointCloud
 from tests import plane_scenes
-from tests.plane_scenes import cloud_of, prepared
+from tests.plane_scenes import cloud_of
 
 # A wall of 6 x 3 m at y = 2, seen from the middle of a room.
 STATION = np.array([[0.0, 0.0, 0.0]])
@@ -109,35 +109,6 @@ def test_materials_that_overlap_or_fall_are_refused(
         Ransac.Params.model_validate({"materials": materials})
 
 
-def test_a_row_is_measured_piece_by_piece_about_its_means() -> None:
-    rng = np.random.default_rng(1)
-    along = np.sort(rng.uniform(0.0, 1.0, 300)) + 5.0
-    # Relief by piece, and one piece with three points only.
-    piece = np.floor((along - along[0]) / 0.1).astype(int)
-    kept = (piece != 4) | (np.cumsum(piece == 4) <= 3)
-    along, piece = along[kept], piece[kept]
-    distance = 0.01 * piece + rng.normal(0.0, 0.001, len(along))
-    intensity = rng.uniform(0.0, 1.0, len(along))
-    row = RowPoints(row=7, scan=2, along_m=along, distance_m=distance, intensity=intensity)
-    found = row.measured({"dark": (0.0, 0.5)})
-    deviation, shown = [], []
-    for k in np.unique(piece):
-        mine = piece == k
-        n = np.count_nonzero(mine)
-        if n >= 4:
-            deviation.append((distance[mine] - distance[mine].mean()) / np.sqrt(1.0 - 1.0 / n))
-            shown.append(intensity[mine])
-    values, shades = np.abs(np.concatenate(deviation)), np.concatenate(shown)
-    assert (found.row, found.scan, found.n_points) == (7, 2, len(along))
-    assert found.sigma_m == pytest.approx(1.4826 * np.median(values), rel=1e-4)
-    (dark,) = found.material
-    assert dark.n_points == np.count_nonzero(shades <= 0.5)
-    assert dark.sigma_m == pytest.approx(1.4826 * np.median(values[shades <= 0.5]), rel=1e-4)
-    assert dataclasses.replace(row, intensity=None).measured({"dark": (0.0, 0.5)}).material == ()
-    thin = RowPoints(row=0, scan=0, along_m=np.arange(9.0), distance_m=np.ones(9), intensity=None)
-    assert thin.measured({}).sigma_m is None
-
-
 def test_the_row_with_most_points_on_the_first_plane_is_taken() -> None:
     # Two scans of a wall at y = 2 in rows of points; row 3 of scan 1 has most on the wall.
     rng = np.random.default_rng(0)
@@ -181,28 +152,3 @@ def test_the_row_with_most_points_on_the_first_plane_is_taken() -> None:
     few = np.where(np.cumsum(on_wall) <= 19, of_sample, -1)
     cloud.claims[:] = few
     assert row_points(planes, few, cloud, known) is None
-
-
-def test_thickness_needs_fifty_points_in_tiles_of_four() -> None:
-    rng = np.random.default_rng(2)
-
-    def thickness(n_points: int, per_tile: int) -> Any:
-        x = 0.1 * (np.arange(n_points) // per_tile) + 0.05
-        y = 2.0 + rng.normal(0.0, 0.001, n_points)
-        points = np.column_stack([x, y, np.full(n_points, 0.05)])
-        points = np.vstack([points, [[0.0, 0.0, 9.0]]])
-        planes: Any = type("P", (), {"__len__": lambda _: 1})()
-        planes.normal, planes.offset = np.array([[0.0, -1.0, 0.0]]), [-2.0]
-        planes.up = np.array([0.0, 0.0, 1.0])
-        of_sample = np.append(np.zeros(n_points, dtype=np.int64), -1)
-        cloud = cloud_of(points)
-        (found,) = measure_thickness(planes, of_sample, prepared(points), cloud, 0.05, {})
-        return found
-
-    assert thickness(52, 4) is not None
-    assert thickness(48, 4) is None
-    assert thickness(90, 3) is None
-    found = thickness(4_000, 40)
-    assert found.sigma_m == pytest.approx(0.001, rel=0.05)
-    # Forty points on a square decimetre.
-    assert found.scan_step_m == pytest.approx(0.1 / np.sqrt(40.0))

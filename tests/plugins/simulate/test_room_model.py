@@ -155,14 +155,3 @@ def test_cloth_covers_as_much_of_the_main_wall_as_asked(share: float) -> None:
         # Over the skirting and under the cornice.
         assert cloth[2] >= -1.32
         assert cloth[3] <= 1.3
-    if share:
-        first = cloths[0]
-        design = np.array([-0.45, 0.65, -0.45, 1.0])
-        if share < 0.095:
-            # The design, smaller about its middle.
-            assert (first[1] - first[0]) / (first[3] - first[2]) == pytest.approx(1.1 / 1.45)
-            assert first[0] + first[1] == pytest.approx(design[0] + design[1])
-            assert first[2] + first[3] == pytest.approx(design[2] + design[3])
-        elif share > 0.1:
-            assert first[0] < design[0]
-            assert first[1] > design[1]
