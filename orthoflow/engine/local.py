@@ -6,7 +6,6 @@ Processes are forked from a server of `multiprocessing` that has loaded `engine.
 from __future__ import annotations
 
 import dataclasses
-import errno
 import multiprocessing
 import os
 import signal
@@ -231,13 +230,10 @@ def start_process(
                 failure = error
             else:
                 return process
-    is_of_files = isinstance(failure, OSError) and failure.errno in (errno.EMFILE, errno.ENFILE)
-    why = (
-        "too many files are open: raise the limit (`ulimit -n`)"
-        if is_of_files
-        else "the machine has too little memory or allows too few processes"
-    )
-    raise StepFailedError(why) from failure
+    raise StepFailedError(
+        f"{one_line(failure) or type(failure).__name__}; close other programs, or raise the limits "
+        "of open files and processes (`ulimit`)"
+    ) from failure
 
 
 @contextmanager
