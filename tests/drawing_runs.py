@@ -187,7 +187,7 @@ def write_drawing_run(
             metrics=metrics(gain_max=1.2) if step == "mosaic" and differ else (),
             environment="",
             inputs={
-                port: _given_by(given[source], f"{source}.{port}")
+                port: replace(given[source], source=f"{source}.{port}", embedded=False)
                 for port, source in taken.get(step, {}).items()
             },
             outputs={given[step].type_name: given[step]},
@@ -206,15 +206,6 @@ def _recorded(shelf: ProductShelf, product: Product) -> RecordedProduct:
         encoding_version=payload.encoding_version,
         digest=shelf.put(payload),  # type: ignore[arg-type] # a payload like any
         embedded=True,
-    )
-
-
-def _given_by(product: RecordedProduct, source: str) -> RecordedProduct:
-    return RecordedProduct(
-        type_name=product.type_name,
-        encoding_version=product.encoding_version,
-        digest=product.digest,
-        source=source,
     )
 
 

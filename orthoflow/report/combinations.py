@@ -1,4 +1,4 @@
-"""The combinations of variants that a run computed, and what each of them gave."""
+"""The combinations of variants that a run computed, their metrics, and their environments."""
 
 from __future__ import annotations
 

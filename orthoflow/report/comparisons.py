@@ -1,4 +1,4 @@
-"""The comparison table: combinations as rows, metrics as columns, the best marked."""
+"""The comparison table (combinations and their metrics) and the table of datasets."""
 
 from __future__ import annotations
 

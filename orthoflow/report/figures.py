@@ -1,4 +1,4 @@
-"""The pictures that methods drew: on the page, bounded in bytes, and as files of the run."""
+"""The figures of methods, on the page and as files, and the graph of a run."""
 
 from __future__ import annotations
 

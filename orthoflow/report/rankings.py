@@ -1,4 +1,4 @@
-"""The best of a column, among values that may be compared, by what makes a metric good."""
+"""Numbers as pages print them, and the best values of a column."""
 
 from __future__ import annotations
 

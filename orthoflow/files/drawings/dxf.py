@@ -1,4 +1,7 @@
-"""CAD files: each wall in its plane with grid, heights and dimensions, and the room in space."""
+"""CAD files: each wall in its plane with grid, heights and dimensions, and the room in space.
+
+Openings are drawn as rectangles or arches where these fit.
+"""
 
 from __future__ import annotations
 

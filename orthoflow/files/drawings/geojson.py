@@ -1,4 +1,9 @@
-"""Outlines and lines of a room as GeoJSON, for GIS programs."""
+"""Files for GIS programs: GeoJSON of walls and rooms, and a QGIS project of the walls.
+
+Every wall has a coordinate system of its own, which cannot be transformed into another. So the
+project opens each raster through a GDAL virtual raster beside it that shifts X only: Y stays the
+height.
+"""
 
 from __future__ import annotations
 

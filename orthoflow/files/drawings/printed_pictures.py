@@ -1,4 +1,7 @@
-"""Rasters of walls as pictures for paper, at the resolution of print and in bounded memory."""
+"""Pictures of walls: rasters for print and CAD, contours, elevations, and relief.
+
+Rasters are read in parts, so that memory is bounded.
+"""
 
 from __future__ import annotations
 
@@ -580,7 +583,6 @@ _AROUND_ROWS: Final = 8
 # Noise is estimated from so many rows on either side of the middle.
 _SAMPLED_ROWS: Final = 128
 _FIGURE_PX: Final = 1600
-_FIGURE_DPI: Final = 450
 # Contours as in a drawing at this scale: smoothed over half a millimetre of its paper.
 _CONTOUR_SCALE: Final = 20
 # In front of the plane, behind it.
@@ -737,4 +739,4 @@ def write_depth_figure(depth: Path, frame: WallFrame, path: Path, light: Light) 
             aspect=40,
             extend="both",
         )
-        figure.savefig(path, dpi=_FIGURE_DPI, metadata={"Software": None})
+        figure.savefig(path, metadata={"Software": None})

@@ -1,4 +1,4 @@
-"""The contents of a sheet: a drawing is its size, notes, legends, and functions that draw it."""
+"""Sheets as data: paper, the office's title block (a YAML file), drawings and their pictures."""
 
 from __future__ import annotations
 

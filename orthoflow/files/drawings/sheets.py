@@ -1,4 +1,4 @@
-"""Sheets: drawings on paper to scale, as PDF.
+"""Sheets: drawings on paper to scale, as PDF, divided if they fit on no paper.
 
 Pictures are embedded once; everything else is vectors and text. Lengths on the paper are
 millimetres from its bottom-left corner until they are passed to reportlab, in points.
