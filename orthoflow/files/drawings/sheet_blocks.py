@@ -435,9 +435,9 @@ def _scale_and_sheet(drawing: Drawing, sheet: Sheet) -> Iterator[tuple[list[Any]
     high_mm = pens.TITLE_MM if inches is None else pens.HEADING_MM
     large = pens.paragraph(text, high_mm=high_mm, is_bold=True)
     yield [_small(label("scale", language)), large], False
-    said = label("sheet_of", language, number=sheet.number, count=sheet.count)
+    which = label("sheet_of", language, number=sheet.number, count=sheet.count)
     size = sheet.paper.name or f"{sheet.paper.width_mm:g} x {sheet.paper.height_mm:g} mm"
-    yield [pens.paragraph(said), pens.paragraph(f"{label('paper', language)} {size}")], False
+    yield [pens.paragraph(which), pens.paragraph(f"{label('paper', language)} {size}")], False
 
 
 def _rows(
