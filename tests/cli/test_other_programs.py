@@ -90,7 +90,7 @@ def test_qgis_opens_orthoimage_and_vectors_in_the_same_coordinates(exported: Pat
     wide, high = SIZE_M[0] - 0.2, SIZE_M[2] - 0.2
     # Y is the height: the room begins at 100 m, the picture 10 cm above.
     assert said["extent"] == pytest.approx([0.0, 100.1, wide, 100.1 + high], abs=1e-9)
-    kinds = {"frame": 1, "rectangle": 1, "part": 1, "edge": 4, "check point": 2, "opening": 1}
+    kinds = {"frame": 1, "rectangle": 1, "edge": 4, "check point": 2, "opening": 1}
     assert said[f"wall_{WALL}.geojson"] == [True, kinds]
     is_valid, kinds = said["room.geojson"]
     assert is_valid
