@@ -171,7 +171,7 @@ SEEDS = ["{sweep: [1, -2]}", "{sweep: [1, 2, 1]}", "{swep: [1, 2]}", "true"]
 SET_FILES = ["plane.celm: 1", "wall.gsd_m: fine", "wall: {gsd_m: 1}", "- 1", "wall.gsd_m: [1\n"]
 # Behind the workflow of rooms.
 MAPPINGS = [
-    "datasets: {hall: {scans: a.e57}}",
+    "datasets: {hall: {skan: a.e57}}",
     "datasets: {hall: {wall.gsd_m: 0.5}}",
     "datasets: {Hall: {}}",
     "datasets: {}",
