@@ -18,7 +18,13 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
 from orthoflow.files.images import photo_grey
-from orthoflow.geometry.cameras import LensFreedom, ViewingCamera, opencv_matrix, to_opencv
+from orthoflow.geometry.cameras import (
+    POSE_PARAMETERS,
+    LensFreedom,
+    ViewingCamera,
+    opencv_matrix,
+    to_opencv,
+)
 from orthoflow.geometry.key_points import Features
 from orthoflow.geometry.resection import SeenPoints, adjust, misfit
 from orthoflow.geometry.robust import MEDIAN_LENGTH, NMAD_FACTOR
@@ -194,6 +200,20 @@ def estimated_lens(photo: Photo, found: Intrinsics | None) -> LensFreedom | None
     if photo.intrinsics is not None or found is None or found.source != "estimated":
         return None
     return photo.lens_prior()[1]
+
+
+def lens_by_ties(trace: Trace, lens: LensFreedom) -> tuple[ViewingCamera, float]:
+    """Return the camera adjusted to a photo's own ties, and the standard deviation of ln f.
+
+    Args:
+        trace: of the photo.
+        lens: free parameters of the lens, the focal length among them.
+    """
+    try:
+        found = adjust(joined(trace.pieces), trace.settled, lens=lens, soft_limit=2.0)
+    except GeometryError:
+        return trace.settled, math.inf
+    return found.camera, math.sqrt(found.covariance[POSE_PARAMETERS, POSE_PARAMETERS])
 
 
 def _rank(trace: Trace) -> tuple[float, int]:
@@ -446,9 +466,8 @@ def recovered_traces(
         Results of the photos that were found, by name.
     """
     recovered: dict[str, Trace] = {}
-    known = sorted((trace for trace in traces if trace.n_ties), key=lambda each: -each.n_ties)
-    # Lenses are best known from most ties.
-    settled = {name: oriented[name] for each in known for name in [photos.photos[each.photo].name]}
+    known = [trace for trace in traces if trace.n_ties]
+    settled = _settled(photos, oriented, known)
     missing = [k for k, photo in enumerate(photos.photos) if photo.name not in oriented]
     views = [_view(trace, photos, setup) for trace in known] if missing else []
     is_new = bool(known)
@@ -470,6 +489,27 @@ def recovered_traces(
         missing = [k for k in missing if photos.photos[k].name not in recovered]
         is_new = len(recovered) > n_before
     return recovered
+
+
+def _settled(
+    photos: Photos, oriented: Mapping[str, Camera], traces: Sequence[Trace]
+) -> dict[str, Camera]:
+    """Return cameras of matched photos by name, those with the most precise focal length first.
+
+    Estimated lenses are adjusted to the new ties.
+    """
+    cameras: list[tuple[float, Camera]] = []
+    for trace in traces:
+        photo = photos.photos[trace.photo]
+        camera, sigma = oriented[photo.name], 0.0
+        freedom = estimated_lens(photo, camera.intrinsics)
+        if freedom is not None:
+            found, sigma = lens_by_ties(trace, freedom)
+            lens = Intrinsics.of(found, source="estimated")
+            camera = replace(camera, intrinsics=lens)
+        cameras.append((sigma, camera))
+    cameras.sort(key=lambda each: each[0])
+    return {camera.photo: camera for _, camera in cameras}
 
 
 def _view(trace: Trace, photos: Photos, setup: Setup) -> View:
