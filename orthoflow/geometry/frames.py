@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
@@ -291,6 +291,11 @@ class WallFrame:
         return Plane(
             normal=self.normal_world, offset_m=float(self.normal_world @ self.origin_world)
         )
+
+    def of_rows(self, rows: slice) -> WallFrame:
+        """Return the frame of the given rows."""
+        corner = self.origin_world + rows.start * self.gsd_m * self.v_world
+        return replace(self, origin_world=corner, height=rows.stop - rows.start)
 
     def has_cells_of(self, other: WallFrame) -> bool:
         """Return whether both have the same cells, within 0.001 cells at the corners."""

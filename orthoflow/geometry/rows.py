@@ -1,13 +1,15 @@
-"""Dataclasses of arrays with one row per item, which can be selected and concatenated."""
+"""Selection of rows from dataclasses of arrays, per item or per row of a raster."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Any, ClassVar, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+from orthoflow.geometry.frames import WallFrame
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,5 +30,28 @@ class Rows:
         return replace(parts[0], **{name: np.concatenate(own) for name, own in columns.items()})
 
 
-def _arrays(rows: Rows) -> dict[str, NDArray[Any]]:
+class _Raster(Protocol):
+    """A dataclass with a frame and arrays of its cells."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def frame(self) -> WallFrame: ...
+
+
+_AnyRaster = TypeVar("_AnyRaster", bound=_Raster)
+
+
+def raster_rows(raster: _AnyRaster, rows: slice) -> _AnyRaster:
+    """Return a band of rows of a raster: views of its arrays, and the frame of the band."""
+    frame = raster.frame
+    bands = {
+        name: array[rows]
+        for name, array in _arrays(raster).items()
+        if array.shape[:2] == frame.shape
+    }
+    return replace(raster, frame=frame.of_rows(rows), **bands)
+
+
+def _arrays(rows: object) -> dict[str, NDArray[Any]]:
     return {name: value for name, value in vars(rows).items() if isinstance(value, np.ndarray)}

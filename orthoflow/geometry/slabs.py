@@ -100,7 +100,4 @@ class Slab:
 
     def over(self, rows: slice) -> Slab:
         """Return the slab of the given rows of the raster."""
-        frame = self.frame
-        corner = frame.origin_world + rows.start * frame.gsd_m * frame.v_world
-        part = replace(frame, origin_world=corner, height=rows.stop - rows.start)
-        return replace(self, frame=part)
+        return replace(self, frame=self.frame.of_rows(rows))

@@ -120,16 +120,10 @@ class Product:
             raise ProductError(f"expected a {cls.type_name} product, got {payload.type_name}")
         if payload.encoding_version != cls.encoding_version:
             raise ProductError(
-                f"{cls.type_name} has encoding version {payload.encoding_version}, this orthoflow "
-                f"reads version {cls.encoding_version}: use the orthoflow that wrote it"
+                f"{cls.type_name} has encoding version {payload.encoding_version}, but this "
+                f"version of orthoflow reads {cls.encoding_version}: use the version that wrote it"
             )
-        try:
-            return typing.cast("Self", _decode_fields(cls, "", payload.metadata, payload.arrays))
-        except _LackingFieldsError as error:
-            raise ProductError(
-                f"{error}: if its fields changed, increment the encoding_version of "
-                f"{cls.__name__}, which is {cls.encoding_version}"
-            ) from error
+        return typing.cast("Self", _decode_fields(cls, "", payload.metadata, payload.arrays))
 
 
 def require_shapes(what: str, wanted: Mapping[str, tuple[Array | None, tuple[int, ...]]]) -> None:
@@ -180,10 +174,6 @@ def _json_scalar(value: object, name: str) -> JsonValue:
     raise ProductError(f"{name} is a {type(value).__name__}, which a product cannot store")
 
 
-class _LackingFieldsError(ProductError):
-    """A stored product lacks a field that has no default."""
-
-
 def _decode_fields(
     cls: type, prefix: str, metadata: Mapping[str, JsonValue], arrays: Mapping[str, Array]
 ) -> object:
@@ -195,7 +185,10 @@ def _decode_fields(
             values[field.name] = _decode(hints[field.name], metadata[field.name], name, arrays)
     lacking = [field.name for field in dataclasses.fields(cls) if _is_lacking(field, values)]
     if lacking:
-        raise _LackingFieldsError(f"a stored {cls.__name__} lacks fields: {', '.join(lacking)}")
+        raise ProductError(
+            f"a stored {cls.__name__} lacks fields: {', '.join(lacking)}; new fields need a "
+            "default or a new encoding_version of the product"
+        )
     try:
         return cls(**values)
     except ProductError:

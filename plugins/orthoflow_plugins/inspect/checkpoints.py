@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import ClassVar, Final
 
 import numpy as np
@@ -34,7 +33,7 @@ from orthoflow.sdk import (
     Ports,
     StepContext,
 )
-from orthoflow_plugins.inspect.figures import enlargement, vector_map
+from orthoflow_plugins.inspect.figures import draw_arrows
 from orthoflow_plugins.inspect.findings import (
     CAPPED,
     CHECK_TABLE,
@@ -349,14 +348,14 @@ def _draw(
         mine = [points[k] for k in own]
         places = np.array([point.place for point in mine])
         shifts = places - np.array([point.expected for point in mine])
-        times = enlargement(shifts, picture.image)
-        ctx.figure(
+        draw_arrows(
+            ctx,
             f"wall_{picture.image.number}_residuals",
-            partial(vector_map, picture.image, places, shifts, [names[k] for k in own]),
-            f"{picture.image.name}: residuals of check points (shown minus surveyed position), "
-            f"enlarged {times:g} times; green up to the median, yellow up to twice the "
-            "median, red beyond. Short arrows in all directions are noise; neighbouring arrows in "
-            "the same direction are a real shift of the image.",
+            picture.image,
+            places,
+            shifts,
+            title="residuals of check points (shown minus surveyed position)",
+            names=[names[k] for k in own],
         )
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from functools import partial
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,9 @@ from orthoflow.files.drawing import (
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.levels import eight_bits
 from orthoflow.products import Orthoimage
+
+if TYPE_CHECKING:
+    from orthoflow.sdk import StepContext
 
 DEPTH_SPAN_MM: Final = 10.0
 COLOUR_SPAN_GREY: Final = 60.0
@@ -132,6 +136,26 @@ def _grey_means(image: Orthoimage) -> NDArray[np.float32]:
         grey = eight_bits(squares).reshape(factor, columns, factor * 3)
         means[row] = grey.mean(axis=(0, 2), dtype=np.float32)
     return means
+
+
+def draw_arrows(
+    ctx: StepContext,
+    name: str,
+    image: Orthoimage,
+    places: NDArray[np.float64],
+    shift_cells: NDArray[np.float64],
+    *,
+    title: str,
+    names: Sequence[str] = (),
+) -> None:
+    """Draw displacements with `vector_map` as a figure of a step."""
+    ctx.figure(
+        name,
+        partial(vector_map, image, places, shift_cells, names),
+        f"{image.name}: {title}, enlarged {enlargement(shift_cells, image):g} times; green up to "
+        "the median, yellow up to twice the median, red beyond. Short arrows in all directions are "
+        "noise; neighbouring arrows in the same direction are a real shift.",
+    )
 
 
 def enlargement(shift_cells: NDArray[np.float64], image: Orthoimage) -> float:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -15,12 +15,9 @@ from orthoflow.geometry.cameras import to_opencv
 from orthoflow.products import Orthoimage, Orthoimages, SurfaceMask, Wall, Walls
 
 if TYPE_CHECKING:
-    from orthoflow.geometry.scene_views import TrueOrthoimage
     from orthoflow.sdk import StepContext
 
 _SAME_DIRECTION_DEG: Final = 2.0
-
-_Framed = TypeVar("_Framed", Orthoimage, Wall, "TrueOrthoimage")
 
 
 def on_walls(images: Orthoimages, walls: Walls) -> Orthoimages:
@@ -44,20 +41,6 @@ def on_walls(images: Orthoimages, walls: Walls) -> Orthoimages:
         number = walls.walls[index].plane_index
         placed.append(replace(image, wall=index, plane_index=number))
     return replace(images, images=tuple(placed))
-
-
-def rows_of(raster: _Framed, rows: slice) -> _Framed:
-    """Return a band of rows of a raster, with the frame of that band."""
-    frame = raster.frame
-    corner = frame.origin_world + rows.start * frame.gsd_m * frame.v_world
-    part = replace(frame, origin_world=corner, height=rows.stop - rows.start)
-    arrays: dict[str, Any] = {
-        field.name: value[rows]
-        for field in fields(raster)
-        if isinstance(value := getattr(raster, field.name), np.ndarray)
-        and value.shape[:2] == frame.shape
-    }
-    return replace(raster, frame=part, **arrays)
 
 
 def in_files(ctx: StepContext, name: str) -> Allocate:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import ClassVar, Final, Literal
 
 import numpy as np
@@ -29,7 +28,7 @@ from orthoflow.sdk import (
     Ports,
     StepContext,
 )
-from orthoflow_plugins.inspect.figures import enlargement, vector_map
+from orthoflow_plugins.inspect.figures import draw_arrows
 from orthoflow_plugins.inspect.findings import (
     DISPLACEMENTS,
     IMAGE_QUALITY,
@@ -196,13 +195,13 @@ class _Verdict:
 
     def draw(self, ctx: StepContext) -> None:
         """Draw the displacements (markiewicz2015, Figure 25)."""
-        times = enlargement(self.pairs.shift, self.image)
-        ctx.figure(
+        draw_arrows(
+            ctx,
             f"wall_{self.image.number}_displacements",
-            partial(vector_map, self.image, self.pairs.places, self.pairs.shift),
-            f"{self.image.name}: displacements between orthoimage and intensity, enlarged "
-            f"{times:g} times; yellow over the median, red over twice the median. Short arrows in "
-            "all directions are noise; neighbouring arrows in the same direction are a real shift.",
+            self.image,
+            self.pairs.places,
+            self.pairs.shift,
+            title="displacements between orthoimage and intensity",
         )
 
 

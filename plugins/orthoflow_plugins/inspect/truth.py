@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry.bands import Band, count_cells
+from orthoflow.geometry.rows import raster_rows
 from orthoflow.geometry.scenes import Viewers
 from orthoflow.products import (
     PAINTED_STATES,
@@ -68,7 +69,7 @@ from orthoflow_plugins.inspect.orientation_errors import (
     tie_findings,
 )
 from orthoflow_plugins.inspect.patches import PATCH_CELLS, PatchShifts
-from orthoflow_plugins.inspect.placing import in_files, on_walls, rows_of, wall_of
+from orthoflow_plugins.inspect.placing import in_files, on_walls, wall_of
 from orthoflow_plugins.inspect.plane_errors import (
     LABEL_SCORES,
     found_planes,
@@ -445,7 +446,7 @@ class _Judge:
             band: rows to compare.
             cell_step: every nth traced cell is kept.
         """
-        part, surface = rows_of(image, band.around), rows_of(wall, band.around)
+        part, surface = raster_rows(image, band.around), raster_rows(wall, band.around)
         chosen = sampling(part, self.rule, band.around.start)
         true = self._true_orthoimage(part, chosen)
         errors = wall_errors(part, surface, true, chosen, band.inner, self.rule.error_step)
@@ -456,9 +457,9 @@ class _Judge:
         cells, shift_m, length_m = np.empty((0, 2), np.int64), np.empty((0, 2)), np.empty((0, 0))
         if self.inputs.cameras is not None and self.views is not None:
             traced = trace_sources(
-                rows_of(part, band.inner),
-                rows_of(surface, band.inner),
-                rows_of(true, band.inner),
+                raster_rows(part, band.inner),
+                raster_rows(surface, band.inner),
+                raster_rows(true, band.inner),
                 chosen.lattice[band.inner],
                 self.inputs.cameras,
                 self.inputs.truth,

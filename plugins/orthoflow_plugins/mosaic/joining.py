@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import MethodError
 from orthoflow.geometry.bands import Allocate, bands_with_reach
 from orthoflow.geometry.levels import Colours, Level, in_levels
+from orthoflow.geometry.rows import raster_rows
 from orthoflow.products import Layer, LayerMask, OrthoMask, Wall
 from orthoflow_plugins.mosaic.graph_cut import CutLabels, cut_labels
 from orthoflow_plugins.mosaic.parameters import SeamsParams
@@ -126,7 +126,7 @@ def require_sources(layers: Sequence[Layer], priority: Sequence[str]) -> None:
     unknown = [name for name in priority if name not in sources]
     if unknown:
         raise MethodError(
-            f"priority names {', '.join(unknown)}, but the layers are of "
+            f"priority refers to {', '.join(unknown)}, but the layers are of "
             f"{', '.join(sorted(sources))} (mosaic.seams)"
         )
 
@@ -182,7 +182,7 @@ def joined(
     reach = cells_min + math.ceil(math.sqrt(cells_min)) + 1 if cells_min > 1 else 0
     for band in bands_with_reach(shape, cells_most=_BAND_CELLS, reach_rows=reach):
         rows = band.around
-        parts = [_part(layer, rows) for layer in painters]
+        parts = [raster_rows(layer, rows) for layer in painters]
         values = [preference(rows) for preference in preferred]
         if drawn is not None:
             chosen = drawn.chosen(rows)
@@ -191,7 +191,7 @@ def joined(
                 for index, value in enumerate(values)
             ]
         rank, owner = best_views(
-            [*parts, *(_part(layer, rows) for layer in others)],
+            [*parts, *(raster_rows(layer, rows) for layer in others)],
             [*values, *(layer.quality[rows] for layer in others)],
         )
         if cells_min > 1 and len(painters) > 1:
@@ -230,18 +230,6 @@ def coloured(
                 colours = balance.shown(index, colours, down + rows.start, columns)
             rgb[rows][is_mine] = colours
     return rgb
-
-
-def _part(layer: Layer, rows: slice) -> Layer:
-    """Return a view of the given rows of a layer."""
-    return replace(
-        layer,
-        frame=replace(layer.frame, height=rows.stop - rows.start),
-        rgb=layer.rgb[rows],
-        mask=layer.mask[rows],
-        quality=layer.quality[rows],
-        filled=None if layer.filled is None else layer.filled[rows],
-    )
 
 
 def best_views(

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 VISIBILITY_OFF: Final = DiagnosticSpec(
     code="visibility-not-tested",
     severity="warning",
-    text="visibility none: cells hidden from a photo are painted from it as well",
+    text="visibility none: cells also take their colours from photos in which they are hidden",
 )
 
 

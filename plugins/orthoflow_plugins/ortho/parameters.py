@@ -22,7 +22,7 @@ class VisibilityParams(MethodParams):
         default=80.0,
         gt=0,
         lt=90,
-        description="Largest angle of incidence at which cells are painted.",
+        description="Largest angle of incidence at which a cell takes its colour from a photo.",
     )
 
 

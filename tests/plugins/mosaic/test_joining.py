@@ -246,7 +246,7 @@ def test_layers_of_a_wall_share_its_raster() -> None:
             "made from the same walls"
         )
     with pytest.raises(
-        MethodError, match=r"^priority names c\.jpg, but the layers are of a\.jpg, b"
+        MethodError, match=r"^priority refers to c\.jpg, but the layers are of a\.jpg, b"
     ):
         module.require_sources([other, one], ["b.jpg", "c.jpg"])
     module.require_sources([other, one], ["b.jpg"])
