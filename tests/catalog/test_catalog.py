@@ -273,9 +273,7 @@ def test_an_unknown_method_mentions_plugins_that_failed(
 
 
 CLASS = """\
-from orthoflow.products.cloud import PointCloud
-from orthoflow.products.planes import Planes, PointLabels
-from orthoflow.products.walls import Walls
+from orthoflow.products import Cameras, Planes, PointCloud, PointLabels, Walls
 from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports
 
 class Mine(Method):
@@ -315,6 +313,7 @@ CHANGES = {
     ),
     "invented port": ("cloud: P", "cloud: PointCloud\n        more: P", "kind plane has no input"),
     "other type": ("cloud: PointCloud", "cloud: Walls", "port cloud carries cloud in kind plane"),
+    "type before": ("cloud: PointCloud", "cloud: Cameras", "port cloud carries cloud in kind"),
     "lacking output": ("        labels: PointLabels\n", "", "its outputs must be planes, labels"),
     "other output": (
         "labels: PointLabels",
