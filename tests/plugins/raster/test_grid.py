@@ -228,30 +228,11 @@ def test_what_gives_no_raster_is_refused(tmp_path: Path) -> None:
         normal=np.zeros((0, 3)),
         offset=np.zeros(0),
         corners=np.zeros((0, 4, 3)),
-        covariance=np.zeros((0, 4, 4)),
         n_points=np.zeros(0, dtype=np.int64),
-        rms_m=np.zeros(0),
         names=(),
     )
     with pytest.raises(MethodError, match="no plane was found"):
         rastered(cloud, planes, tmp_path)
-
-
-def test_metrics_are_reported_and_what_the_report_draws_of_walls_is_not_drawn_twice(
-    tmp_path: Path,
-) -> None:
-    known = scenes.leaning_wall()
-    cloud, _ = one_point_per_cell(known)
-    _, ctx = run(cloud, known.planes(), tmp_path)
-    metrics = {metric.name: metric.value for metric in ctx.metrics}
-    assert metrics["n_walls"] == 1
-    assert metrics["n_points_inside"] == 1200
-    assert metrics["measured_share"] == 1.0
-    assert metrics["void_share"] == metrics["recovered_share"] == 0.0
-    assert ctx.figures == []
-    # Cells finer than the scan are reported.
-    _, ctx = run(cloud, known.planes(), tmp_path, gsd_m=known.gsd_m / 2)
-    assert any("finer than the scan" in warning for warning in ctx.warnings)
 
 
 @pytest.mark.parametrize(("away_m", "is_told"), [(0.95, False), (1.05, True)])

@@ -17,10 +17,9 @@ from orthoflow_plugins.ortho.dsm_backward import DsmBackward
 from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
 from orthoflow_plugins.raster.grid import RasterGrid
 
-from orthoflow.files import geotiff, images, publishing
 from orthoflow.geometry import bands
 from orthoflow.geometry.bands import count_cells, count_known, holds_cells
-from orthoflow.products import Layer, LayerMask, Layers, Walls
+from orthoflow.products import Layer, LayerMask, Layers
 from tests import inspect_scenes, ortho_scenes, raster_scenes
 from tests.long_loops import long_only
 from tests.plugins.ortho.test_direct import bare_walls
@@ -245,38 +244,3 @@ def test_cells_are_counted_in_bands_as_in_the_whole(monkeypatch: pytest.MonkeyPa
     assert count_known(depths) == np.count_nonzero(mask != 2)
     assert holds_cells(mask, 3)
     assert not holds_cells(mask, 4)
-
-
-def test_rasters_of_large_walls_are_published_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    where = dataclasses.replace(ortho_scenes.frame(), width=600, height=700)
-    rng = np.random.default_rng(4)
-    depths = rng.normal(0.0, 0.01, where.shape).astype(np.float32)
-    depths[rng.random(where.shape) < 0.2] = np.nan
-    (wall,) = ortho_scenes.walls(where, depths).walls
-    walls = Walls(
-        walls=(dataclasses.replace(wall, intensity=np.abs(depths)),),
-        up=np.array([0.0, 0.0, 1.0]),
-        intensity_source="laser",
-        buffer_front_m=0.1,
-        buffer_behind_m=0.1,
-    )
-    folders = [tmp_path / "whole", tmp_path / "bands"]
-    for folder in folders:
-        folder.mkdir()
-        publishing.publish_walls(walls, folder, "sha256:" + "ab" * 32)
-        monkeypatch.setattr(bands, "_BAND_CELLS", 1000)
-        monkeypatch.setattr(images, "_IN_MEMORY_PX", 400 * 600)
-    for path in sorted(folders[0].iterdir()):
-        other = folders[1] / path.name
-        if path.suffix == ".tif":
-            whole, banded = geotiff.read_raster(path), geotiff.read_raster(other)
-            np.testing.assert_array_equal(whole.values, banded.values)
-            assert (whole.tags, whole.crs_wkt) == (banded.tags, banded.crs_wkt)
-        elif path.suffix == ".png":
-            # Black and white are those of every fourth row.
-            pictures = [images.decode_image(file.read_bytes()) for file in (path, other)]
-            assert np.abs(pictures[0].astype(int) - pictures[1]).max() <= 6
-        else:
-            assert path.read_text() == other.read_text()

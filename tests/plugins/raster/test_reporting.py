@@ -104,22 +104,12 @@ def test_cells_that_are_advised_are_no_longer_too_fine(ctx: StepContext) -> None
     assert "empty" not in said.text
 
 
-def emptiness(
-    *,
-    behind: float = 0.0,
-    before: float = 0.0,
-    hidden: float = 0.0,
-    sparse: float = 0.0,
-    unseen: float = 0.0,
-) -> Emptiness:
+def emptiness(**shares: float) -> Emptiness:
+    known = {"behind": 0.0, "before": 0.0, "hidden": 0.0, "sparse": 0.0, "unseen": 0.0, **shares}
     return Emptiness(
-        behind_share=behind,
-        behind_m=0.4321 if behind else math.nan,
-        before_share=before,
-        before_m=2.7654 if before else math.nan,
-        hidden_share=hidden,
-        sparse_share=sparse,
-        unseen_share=unseen,
+        behind_m=0.4321 if known["behind"] else math.nan,
+        before_m=2.7654 if known["before"] else math.nan,
+        **{f"{cause}_share": share for cause, share in known.items()},
     )
 
 

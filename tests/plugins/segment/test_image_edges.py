@@ -72,11 +72,6 @@ def test_a_blurred_edge_is_found_in_its_middle() -> None:
         assert left_side(moved) == pytest.approx(-place, abs=0.08)
 
 
-def quarter(places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Places in a picture of 100 x 100 cells after numpy has turned it by a quarter."""
-    return np.column_stack([places[:, 1], 100.0 - places[:, 0]])
-
-
 def test_sides_that_were_not_seen_stay() -> None:
     grey = picture(step_at(LEFT + 0.3))
     assert left_side(moved_to_edges(outline(seen=np.array([0.4, 1, 1, 1])), grey)) is None

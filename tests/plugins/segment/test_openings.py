@@ -118,20 +118,6 @@ def test_parameters_leave_out_what_is_less(
     assert [opening.kind for opening in openings.openings] == kinds
 
 
-def test_of_large_walls_every_nth_cell_places_the_same_outlines(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fine, _ = found(tmp_path, cloud=scenes.cloud())
-    monkeypatch.setattr("orthoflow_plugins.segment.areas._CELLS_TOLD", scenes.SHAPE[0] * 200)
-    coarse, _ = found(tmp_path, cloud=scenes.cloud())
-    assert len(coarse.openings) == len(fine.openings)
-    for small, large in zip(fine.openings, coarse.openings, strict=True):
-        assert large.kind == small.kind
-        assert large.area_m2 == pytest.approx(small.area_m2, rel=0.03)
-        sigma_m = (large.edge_sigma_m or 0.0, small.edge_sigma_m or 0.0)
-        assert sigma_m[0] > 1.3 * sigma_m[1]
-
-
 def image(source: str, out_cells: float = 0.35) -> Orthoimages:
     """The window dark on a grey wall, its border so much farther out than that of the depth."""
     places = scenes.centres()
@@ -201,13 +187,7 @@ def leaning(rise_deg: float) -> Walls:
     """The wall, in a room of which it leans by so much from upright."""
     walls, rise = scenes.walls(), np.radians(rise_deg)
     frame = walls.walls[0].frame
-    return Walls(
-        walls=walls.walls,
-        up=np.sin(rise) * frame.normal_world - np.cos(rise) * frame.v_world,
-        intensity_source="laser",
-        buffer_front_m=scenes.FRONT_M,
-        buffer_behind_m=scenes.BEHIND_M,
-    )
+    return replace(walls, up=np.sin(rise) * frame.normal_world - np.cos(rise) * frame.v_world)
 
 
 @pytest.mark.parametrize("rise_deg", [90.0, 33.0, -33.0])
