@@ -95,8 +95,8 @@ def occluders_before(
         spacing_m: approximate point spacing on a wall. It must not be the size of coarser cells,
             because larger voxels contain more stray points of a dense scan.
         stations_world: (s, 3) metres, positions of the scanner, if known.
-        n_least: points with fewer neighbours are outliers, unless the box is so large that voxels
-            must be larger.
+        n_least: points with fewer neighbours are outliers; the number is increased for large boxes,
+            whose voxels are larger.
         threads: see `Occluders`.
     """
     places = [camera.centre_world for camera in cameras]

@@ -61,7 +61,7 @@ _Number = tuple[str, float, str]
 
 @dataclass(frozen=True, kw_only=True)
 class Sampling:
-    """Which cells of an orthoimage are compared.
+    """Selection of the cells of an orthoimage that are compared.
 
     Attributes:
         coloured: (rows, cols) bool, cells whose colour is compared.

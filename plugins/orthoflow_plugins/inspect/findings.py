@@ -28,7 +28,7 @@ lower, higher = (partial(MetricSpec, better=better) for better in ("lower", "hig
 _AXES: Final = ("x", "y")
 # Largest share of the points that the iterated rule may remove.
 _OUTLIERS_MOST: Final = 0.25
-# Largest share that the rule without the cap may remove.
+# Maximum share of points that the rule without the cap removes.
 _MOST_WITHOUT_CAP: Final = 0.5
 # Shorter distances between check points depend on single points more than on the scale.
 _LENGTH_LEAST_SHARE: Final = 0.25
@@ -218,7 +218,7 @@ def of_walls(specs: Sequence[MetricSpec]) -> tuple[MetricSpec, ...]:
 
 
 def prefixed(specs: Sequence[MetricSpec], prefix: str, what: str) -> tuple[MetricSpec, ...]:
-    """Return copies of metrics for another subject; the copies are no headlines.
+    """Return copies of metrics for another subject, which are not headline metrics.
 
     Args:
         specs: the metrics.

@@ -224,7 +224,7 @@ class _PlaneDistance:
 
     @property
     def score(self) -> float:
-        """Return the sum of angle and offset in units of their limits; smaller is nearer."""
+        """Return the sum of angle and offset, each divided by its limit."""
         return self.angle_deg / _FOUND_ANGLE_DEG + abs(self.offset_m) / _FOUND_OFFSET_M
 
 

@@ -268,7 +268,7 @@ def _apart(
 
 @dataclass(frozen=True, kw_only=True)
 class _Shares:
-    """The share of each layer in the cells around a block.
+    """Share of each layer in the cells around a block.
 
     Attributes:
         boxes: box of each layer, with a margin.

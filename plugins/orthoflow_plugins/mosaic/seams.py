@@ -386,7 +386,7 @@ def _report_empty(ctx: StepContext, image: Orthoimage, cameras: Cameras | None) 
 
 
 def _way_to_a_photo(cameras: Cameras | None) -> str:
-    """Return a hint how to fill cells in no oriented photo; refused photos may show them."""
+    """Return how cells that are in no oriented photo might be filled."""
     if cameras is None:
         return "check which photos are refused, or take another one"
     n_photos = len(cameras.cameras)

@@ -1,6 +1,6 @@
 """Gaps between painted cells: which to fill, their colours, and a figure of the result.
 
-The rule and the figure follow skarlatos2012 (section 3, Figure 5).
+The rule and the figure are those of skarlatos2012 (section 3, Figure 5).
 """
 
 from __future__ import annotations
