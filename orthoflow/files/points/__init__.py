@@ -1,4 +1,4 @@
-"""Scans as files of other programs, read block by block: `open_scan` chooses the reader."""
+"""Readers of point files, block by block; `open_scan` chooses the reader for a file."""
 
 from orthoflow.files.points.formats import FORMATS, open_scan
 from orthoflow.files.points.scan_file import PointBlock, PointQuery, Scan, ScanFile

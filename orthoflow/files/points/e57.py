@@ -1,8 +1,8 @@
-"""E57 through libE57's block buffers: several scans with their poses, cartesian or spherical.
+"""E57 files, read with libE57: several scans with poses, in Cartesian or spherical coordinates.
 
-Its XML is checked first: libE57 compares each child of a structure with all previous ones, so that
-60,000 take over 50 s, and whether it reads the files that entities name must not depend on its
-version. The standard (ASTM E2807) needs neither.
+The XML section is checked before libE57 parses it. libE57 compares each child of a structure with
+all previous ones, so 60,000 children take over 50 s; and whether it reads the files that XML
+entities refer to depends on its version. The standard (ASTM E2807) needs neither.
 """
 
 from __future__ import annotations
@@ -44,35 +44,35 @@ _CARTESIAN: Final = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL: Final = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 _COLOURS: Final = ("colorRed", "colorGreen", "colorBlue")
 _GRID: Final = ("rowIndex", "columnIndex")
-# Non-zero if the value is invalid.
+# Fields that are non-zero for invalid values.
 _STATES: Final = (
     "cartesianInvalidState",
     "sphericalInvalidState",
     "isIntensityInvalid",
     "isColorInvalid",
 )
-# Scans of large buildings, a thousand scans with pictures, have a few million bytes.
+# The XML of a large building (a thousand scans with pictures) has a few million bytes.
 #: bytes of the XML of an E57 file
 MOST_XML_BYTES: Final = 1 << 25
 #: elements of the XML of an E57 file
 MOST_XML_ELEMENTS: Final = 200_000
-#: levels of elements in the XML of an E57 file
+#: nesting levels of the XML of an E57 file
 DEEPEST_XML: Final = 64
-# The elements of a structure differ in their names.
-#: different names of elements in the XML of an E57 file
+# The fields of a structure have different names, so their number is limited, too.
+#: different element names in the XML of an E57 file
 MOST_XML_NAMES: Final = 500
-# E57 3.3: pages of 1024 bytes, the last four of each a checksum.
+# E57 3.3: the file has pages of 1024 bytes, of which the last four are a checksum.
 _PAGE: Final = 1024
 _PAYLOAD: Final = 1020
 _HEADER: Final = struct.Struct("<8sIIQQQQ")
 _TAG: Final = re.compile(rb"<(/?)([A-Za-z_][\w:.-]*)[^<>]*?(/?)>")
 
-# Index in the file, number of points, names of the fields that are read by meaning, its pose.
+# Index in the file, number of points, field name by meaning, and pose.
 _Part = tuple[int, int, dict[str, str], tuple[NDArray[np.float64], NDArray[np.float64]] | None]
 
 
 def open_e57(path: Path, *, intensity_field: str | None = None) -> ScanFile:
-    """Open an E57 file; every scan with points is read, in the order of the file."""
+    """Open an E57 file; all scans with points are read, in file order."""
     check_xml(path)
     pye57 = load_library("pye57", path)
     parts: list[_Part] = []
@@ -96,7 +96,7 @@ def open_e57(path: Path, *, intensity_field: str | None = None) -> ScanFile:
 
 
 def _unit(root: Any) -> StatedUnit:
-    """Metres, as in the standard, unless the coordinate metadata state another unit."""
+    """Return metres, as in the standard, unless the coordinate metadata declare another unit."""
     text = str(root["coordinateMetadata"].value()) if root.isDefined("coordinateMetadata") else ""
     found = unit_of_crs(text, "coordinate metadata")
     found = found or unit_of_comments([text], "coordinate metadata")
@@ -147,17 +147,18 @@ def _read_header(
 
 
 def pose_of(node: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return rotation and translation to the file's world; the identity without a pose."""
+    """Return rotation and translation to the world frame; the identity if there is no pose."""
     from scipy.spatial.transform import Rotation
 
     rotation, translation = np.eye(3), np.zeros(3)
     pose = node["pose"] if node.isDefined("pose") else None
     if pose is not None and pose.isDefined("rotation"):
-        # By name: files may store the four numbers in any order.
+        # By name, since the file may store the four numbers in any order.
         quaternion = [number_of(pose["rotation"][name]) for name in "wxyz"]
         length = math.hypot(*quaternion)
         if math.isfinite(length) and length > 0.0:
-            # Normalised before scipy squares it: squares of stored numbers may over- or underflow.
+            # Normalise before scipy does: the squares of very large or small numbers over- or
+            # underflow.
             unit = [item / length for item in quaternion]
             rotation = np.asarray(Rotation.from_quat(unit, scalar_first=True).as_matrix())
     if pose is not None and pose.isDefined("translation"):
@@ -166,7 +167,7 @@ def pose_of(node: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def number_of(node: Any) -> float:
-    """Return the value of a number's node, whatever its type."""
+    """Return the value of a numeric node of any type."""
     scaled = getattr(node, "scaledValue", None)
     return float(node.value() if scaled is None else scaled())
 
@@ -191,8 +192,9 @@ def _blocks(path: Path, pye57: Any, parts: list[_Part]) -> Iterator[PointBlock]:
                 arrays: Values = {}
                 buffers = libe57.VectorSourceDestBuffer()
                 for meaning, name in used.items():
-                    # No integers: pye57 treats numpy's 64-bit ones as 32-bit ones and returns
-                    # garbage, and its own readers' 16 bits are too few for rows and columns.
+                    # No integer buffers: pye57 treats numpy's 64-bit integers as 32-bit ones and
+                    # returns garbage, and the 16 bits of its own readers are too few for rows and
+                    # columns.
                     kind = np.float64 if meaning in ("x", "y", "z", "row", "column") else np.float32
                     arrays[meaning] = np.zeros(capacity, dtype=kind)
                     buffers.append(
@@ -231,7 +233,7 @@ def _block(
 ) -> PointBlock:
     axes = np.stack([values[axis] for axis in "xyz"])
     if is_spherical:
-        # E57 8.4.4: azimuth from x towards y, elevation from the xy plane towards z, radians.
+        # E57 8.4.4: azimuth from x towards y, elevation from the xy plane towards z, in radians.
         distance, azimuth, elevation = axes
         level = distance * np.cos(elevation)
         axes = np.stack(
@@ -251,8 +253,8 @@ def check_xml(path: Path) -> None:
     """Check the XML of an E57 file before libE57 parses it.
 
     Raises:
-        InputError: it is too large or too deep, declares a document type or entities, or has more
-            names of elements than any scanner's program writes.
+        InputError: the XML is too large or too deep, declares a document type or entities, or has
+            more element names than any scanner software writes.
     """
     xml = _xml_of(path)
     if b"<!DOCTYPE" in xml or b"<!ENTITY" in xml:

@@ -1,4 +1,4 @@
-"""The meaning of the fields of a point, by one table of names for all formats."""
+"""Meaning of the fields of a point: one table of field names for all formats."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ IGNORED: Final = "_"
 _COLOURS: Final = ("r", "g", "b")
 _NORMALS: Final = ("nx", "ny", "nz")
 _READ: Final = ("x", "y", "z", *_COLOURS, "rgb", "intensity", "row", "column")
-# The names of a meaning, the most certain first: of `N X Y Z` the first is no northing.
+# Field name -> meaning, the most reliable names first: in `N X Y Z`, `N` is not the northing.
 _MEANINGS: Final = {
     alias: name
     for name, text in {
@@ -47,7 +47,7 @@ _MEANINGS: Final = {
     for alias in text.split()
 }
 _PLACES: Final = {alias: place for place, alias in enumerate(_MEANINGS)}
-# Substitutes for an intensity, the best first.
+# Fields that can replace a missing intensity, best first.
 _STAND_INS: Final = (
     *("reflectance", "reflectivity", "scalarreflectance", "amplitude", "scalaramplitude"),
     *("remission", "scalarremission", "intensity16", "returnintensity", "signalstrength"),
@@ -56,18 +56,18 @@ _STAND_INS: Final = (
 _INTENSITY_PARTS: Final = re.compile(
     "intens|reflect|amplitud|remission|signal|echo|power|grey|gray|luminance|bright"
 )
-# The search for brackets takes quadratic time.
+# Limited because the search for brackets takes quadratic time.
 _LONGEST_NAME: Final = 200
 
 
 @dataclass(frozen=True, kw_only=True)
 class Columns:
-    """The meaning of the columns of a table, or of the fields of a point.
+    """Meaning of the columns of a table, or of the fields of a point.
 
     Attributes:
-        names: meaning of each, `_` for one that is not used.
-        labels: their names in the file; empty if they have none.
-        unit: unit of the coordinates, if their names state it (`X [ft]`).
+        names: meaning of each column, `_` for an unused one.
+        labels: column names in the file; empty if it has none.
+        unit: unit of the coordinates, if the column names include it (`X [ft]`).
     """
 
     names: tuple[str, ...]
@@ -76,14 +76,14 @@ class Columns:
 
     @property
     def places(self) -> dict[str, int]:
-        """Positions of the columns that are read, by meaning, coordinates first."""
+        """Indices of the columns that are read, by meaning, coordinates first."""
         found = {name: self.names.index(name) for name in _READ if name in self.names}
         has_rgb, has_grid = set(_COLOURS) <= set(found), {"row", "column"} <= set(found)
         idle = {"rgb"} if has_rgb else set(_COLOURS)
         idle |= set() if has_grid else {"row", "column"}
         return {name: place for name, place in found.items() if name not in idle}
 
-    # Any: whatever else a scan states.
+    # Any: values of other attributes of `Scan`.
     def scan(self, **more: Any) -> Scan:
         """Return a scan with these fields."""
         places = self.places
@@ -105,7 +105,7 @@ class Columns:
 
 
 def plain_name(name: str) -> str:
-    """Reduce a field's name to its lower-case letters and digits, without bracketed parts."""
+    """Reduce a field name to its lower-case letters and digits, without parts in brackets."""
     if len(name) > _LONGEST_NAME:
         return ""
     plain = unicodedata.normalize("NFKD", re.sub(r"[\[(].*?[\])]", "", name.lower()))
@@ -113,42 +113,42 @@ def plain_name(name: str) -> str:
 
 
 def meaning_of(name: str) -> str:
-    """Return the meaning of a field's name in any format, `_` without one."""
+    """Return the meaning of a field name in any format, `_` if it is unknown."""
     base, unit = _split_unit(name)
     known = _MEANINGS.get(plain_name(name))
     return known or (_MEANINGS.get(plain_name(base), IGNORED) if unit else IGNORED)
 
 
 def _certainty(label: str) -> int:
-    """Return the place of a name among those of its meaning, the most certain first."""
+    """Return the rank of a field name in the table of names; 0 is the most reliable."""
     base = label if plain_name(label) in _MEANINGS else _split_unit(label)[0]
     return _PLACES.get(plain_name(base), 0)
 
 
 def may_be_intensity(name: str) -> bool:
-    """Whether a field's name suggests a measure of the returned light."""
+    """Whether a field name suggests a measure of the returned light."""
     return _INTENSITY_PARTS.search(plain_name(name)) is not None
 
 
 def columns_of_names(
     labels: Sequence[str], *, intensity_field: str | None = None
 ) -> Columns | None:
-    """Classify fields by their names.
+    """Determine the meaning of fields from their names.
 
     Args:
-        labels: names of the fields, in order.
-        intensity_field: name of the field to use as the intensity; None for the usual names, else
-            those of reflectance, amplitude and remission.
+        labels: field names, in order.
+        intensity_field: name of the field to use as intensity; None for the usual names or, if
+            there are none, those of reflectance, amplitude and remission.
 
     Returns:
-        None if they do not include x, y and z.
+        The columns, or None if x, y or z is missing.
     """
     plain = [plain_name(label) for label in labels]
     names = [IGNORED] * len(labels)
-    # If a meaning occurs twice (`I` and `Intensity`), the field with its most certain name is used.
+    # If two fields have the same meaning (`I` and `Intensity`), use the more reliable name.
     for index in sorted(range(len(labels)), key=lambda k: _certainty(labels[k])):
         meaning = meaning_of(labels[index])
-        # I, J, K are a direction.
+        # `I, J, K` are the components of a direction.
         is_direction = plain[index] == "i" and {"j", "k"} <= set(plain)
         if meaning not in names and not is_direction:
             names[index] = meaning
@@ -169,7 +169,7 @@ def columns_of_names(
 
 
 def columns_of_user(text: str | Sequence[str]) -> Columns:
-    """Return columns named by the user, e.g. `x y z r g b intensity`; `_` skips one.
+    """Return columns as named by the user, e.g. `x y z r g b intensity`; `_` skips a column.
 
     Raises:
         InputError: a name is unknown or given twice, or x, y, z are incomplete.
@@ -200,23 +200,23 @@ def columns_of_user(text: str | Sequence[str]) -> Columns:
 def columns_of_values(
     file_name: str, samples: NDArray[np.float64], first_line: str, *, is_pts: bool
 ) -> Columns:
-    """Find the meaning of columns without a header from their values, if it is unambiguous.
+    """Infer the meaning of columns without a header from their values, if it is unambiguous.
 
     Args:
-        file_name: for messages.
+        file_name: name of the file, for messages.
         samples: (n, columns) numbers of the first lines.
-        first_line: for messages.
-        is_pts: the file is a PTS file, with the intensity before the colours.
+        first_line: the first line, for messages.
+        is_pts: the file is a PTS file, in which the intensity precedes the colours.
 
     Raises:
-        InputError: the columns are ambiguous.
+        InputError: the meaning is ambiguous.
     """
     n_columns, first = samples.shape[1], samples[:, 0]
     is_whole = np.isfinite(first).all() and np.all(first == np.round(first))
     counts = is_whole and n_columns > 3 and len(first) >= 5 and np.all(np.diff(first) == 1.0)
     lead = ("number",) if counts else ()
     rest = samples[:, len(lead) + 3 :]
-    # All orders of an intensity, colours and normals with this many columns.
+    # All orders of intensity, colours and normals that have this number of columns.
     parts = (("intensity",), _COLOURS, _NORMALS)
     orders = [order for count in range(4) for order in permutations(parts, count)]
     readings = [
@@ -239,7 +239,7 @@ def columns_of_values(
 
 
 def _fits(name: str, values: NDArray[np.float64]) -> bool:
-    """Whether three columns can be colours (`r`) or normals (`nx`)."""
+    """Whether three columns can be colours (name `r`) or normals (name `nx`)."""
     finite = values[np.isfinite(values).all(axis=1)]
     if not len(finite):
         return False
@@ -252,7 +252,7 @@ def _fits(name: str, values: NDArray[np.float64]) -> bool:
     if finite.min() < 0.0 or largest.max() > 65535.0:
         return False
     if (largest > 255.0).any() and not (largest > 255.0).all():
-        # Channels of different depth: one of them is an intensity.
+        # The ranges of the columns differ, so one of them is an intensity.
         return False
     if largest.max() <= 1.0:
         return not are_normals
@@ -260,7 +260,7 @@ def _fits(name: str, values: NDArray[np.float64]) -> bool:
 
 
 def _split_unit(label: str) -> tuple[str, str | None]:
-    """Split a name from its unit: `X [ft]`, `y_mm`, `Z(m)`."""
+    """Split a name and its unit: `X [ft]`, `y_mm`, `Z(m)`."""
     found = re.fullmatch(
         r"\s*(.+?)\s*(?:\[([^\]]*)\]|\(([^)]*)\)|[_ ]([A-Za-z-]+))\s*", label[:_LONGEST_NAME]
     )

@@ -1,4 +1,4 @@
-"""Choice of the reader of a point file, by its content and its suffix."""
+"""Choice of the reader for a point file, from its content and its suffix."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from orthoflow.errors import InputError
 from orthoflow.files.points.fields import Columns
 from orthoflow.files.points.scan_file import PointQuery, ScanFile
 
-# The densest encodings take a byte for eight points; a small file that states more is refused
-# before memory is allocated for them.
-#: points that a file states, per byte that it has
+# The densest encodings need a byte for eight points; a file that declares more points for its size
+# is refused before memory is allocated for them.
+#: points declared by a file, per byte of its size
 MOST_POINTS_PER_BYTE: Final = 8
 
 
@@ -22,11 +22,11 @@ class Format(NamedTuple):
     """One family of point files.
 
     Attributes:
-        name: its usual name.
-        suffixes: lower case, with the dot.
-        reader: module and function that open its files.
-        signature: first bytes of its files, matched; None for plain text.
-        beginning: what its files begin with, for messages.
+        name: common name of the format.
+        suffixes: file suffixes in lower case, with the dot.
+        reader: module and function that open the files.
+        signature: pattern of the first bytes of a file; None for plain text.
+        beginning: expected beginning of a file, for messages.
     """
 
     name: str
@@ -37,7 +37,7 @@ class Format(NamedTuple):
 
 
 _PLY_START: Final = re.compile(rb"ply[\n\r ]", re.IGNORECASE)
-# Programs write first lines of their own, or none.
+# Some programs write their own first line, or no comment line at all.
 _PCD_START: Final = re.compile(
     rb"# \.PCD|(?:.*\n)*?[ \t]*(?:fields|columns)[ \t].*\n(?:.*\n)?[ \t]*size[ \t]", re.IGNORECASE
 )
@@ -55,10 +55,11 @@ _SNIFFED_BYTES: Final = 4096
 
 
 def find_format(path: Path) -> Format:
-    """Return the format of a point file: by its content if that is certain, else by its suffix.
+    """Return the format of a point file, from its content if that is conclusive, else its suffix.
 
     Raises:
-        InputError: the file is missing, empty, not what its suffix states, or of an unknown format.
+        InputError: the file is missing or empty, does not match its suffix, or has an unknown
+            format.
     """
     if not path.is_file():
         found = "a folder" if path.is_dir() else "nothing"
@@ -96,17 +97,18 @@ def open_scan(
     query: PointQuery | None = None,
     intensity_field: str | None = None,
 ) -> ScanFile:
-    """Open a point file up to its header.
+    """Open a point file and read its header.
 
     Args:
         path: the file.
-        columns: meaning of the columns of a text file, if the user states it.
-        classes: of a LAS or LAZ file only points of these classes are read; all if empty.
-        query: of a COPC file only parts with such points are read; others are read completely.
-        intensity_field: name of the field to use as the intensity; None for the usual one.
+        columns: meaning of the columns of a text file, if given by the user.
+        classes: classes of points to read from a LAS or LAZ file; all if empty.
+        query: requested points; a COPC file is read only where it has such points, other files
+            are read completely.
+        intensity_field: name of the field to use as intensity; None for the usual one.
 
     Raises:
-        InputError: the file cannot be read, with the reason in one sentence.
+        InputError: the file cannot be read; the message gives the reason.
         PluginError: the library for this format is missing.
     """
     found = find_format(path)

@@ -1,13 +1,13 @@
-"""LAS, LAZ and COPC through laspy, block by block.
+"""LAS, LAZ and COPC files, read with laspy block by block.
 
-Header and chunk table are checked before the libraries use them: a damaged number of records keeps
-laspy busy for hours, and a damaged chunk table makes the decompressor allocate any amount of
-memory, which ends the process without an exception.
+Header and chunk table are checked before the libraries use them: a damaged point count keeps laspy
+busy for hours, and a damaged chunk table can make the decompressor allocate so much memory that the
+process ends without an exception.
 
-For point formats 6 and up, whose fields are compressed separately, only the fields of a cloud are
-decoded. A COPC file is a LAZ file whose chunks are the nodes of an octree (copc.io, 1.0): the root
-holds some points of the whole cloud, each node below holds points between those, at twice the
-density. Only those nodes are decoded that hold requested points.
+Point formats 6 and up compress each field separately, so only the fields of a cloud are decoded. A
+COPC file is a LAZ file whose chunks are the nodes of an octree (copc.io, 1.0): the root contains a
+sparse sample of the whole cloud, and each child node adds points in between at twice the density.
+Only nodes with requested points are decoded.
 """
 
 from __future__ import annotations
@@ -53,13 +53,13 @@ _VLR_BYTES: Final = 54
 _EVLR_BYTES: Final = 60
 _OFFSET_BYTES: Final = 8
 _CHUNKED: Final = (2, 3)
-# From the compression's record: the compressor, the position of its list of items, and the number
-# of layers of each type (point, colours, colours with infrared, wave packets).
+# Contents of the LASzip record: the compressor, the position of its list of items, and the number
+# of layers of each item type (point, colours, colours with infrared, wave packets).
 _LAYERED: Final = 3
 _ITEMS_AT: Final = 32
 _LAYERS: Final = {10: 9, 11: 1, 12: 2, 13: 1}
 _EXTRA_BYTES: Final = 14
-#: points of a LAZ chunk, or twice those of the file
+#: points of a LAZ chunk, unless twice the number of points in the file is larger
 MOST_FIXED_CHUNK: Final = 50_000_000
 _WKT_RECORD: Final = 2112
 _GEO_KEYS: Final = 34735
@@ -71,12 +71,12 @@ _COPC_RECORD: Final = struct.Struct("<H16sHH32s")
 _COPC_INFO: Final = struct.Struct("<5d2Q")
 _COPC_ENTRY: Final = struct.Struct("<4iQii")
 _PAGE: Final = -1
-# Deeper trees have nodes smaller than any scanner's point spacing.
+# Deeper nodes would be smaller than the point spacing of any scanner.
 _LEVELS_MOST: Final = 32
 
 
 class _Chunk(NamedTuple):
-    """A chunk of a file: where it begins, its size, and the number of its points."""
+    """A chunk of a file: its offset, size and number of points."""
 
     offset: int
     n_bytes: int
@@ -94,14 +94,14 @@ def open_las(
 
     Args:
         path: the file.
-        classes: only points of these classes are read; all if empty.
-        query: of a COPC file only nodes with such points are read.
-        intensity_field: name of the field to use as the intensity; None for the usual one.
+        classes: classes of points to read; all if empty.
+        query: requested points; only nodes of a COPC file with such points are read.
+        intensity_field: name of the field to use as intensity; None for the usual one.
     """
     laspy = load_library("laspy", path)
     _check_header(path)
     notes: list[str] = []
-    # Records after the points may state any size: only that of the coordinate system is read.
+    # Records after the points may declare any size; only the coordinate system is read from them.
     with reading(path, FORMAT), laspy.open(path, read_evlrs=False) as reader:
         header = reader.header
         n_points = _count_points(path, header, notes)
@@ -115,7 +115,7 @@ def open_las(
     columns = columns_of_names(names, intensity_field=intensity_field)
     intensity = "intensity" if columns is None else names[columns.names.index("intensity")]
     if intensity == "intensity" and intensity_field is None and n_points:
-        # If the usual field holds only zeros, an extra one stands in for it.
+        # If the usual field contains only zeros, use an extra field instead.
         others = columns_of_names(("x", "y", "z", *extra))
         if others is not None and "intensity" in others.names:
             with reading(path, FORMAT), laspy.open(path, read_evlrs=False) as reader:
@@ -125,7 +125,7 @@ def open_las(
     has_rgb = set(names) >= set(_COLOURS)
     used = ("X", "Y", "Z", intensity, *(_COLOURS if has_rgb else ()))
     scan = Scan(
-        # Points of every format have an intensity.
+        # All point formats have an intensity.
         fields=frozenset({"intensity", "rgb"} if has_rgb else {"intensity"}),
         fields_used=used,
         fields_not_used=tuple(
@@ -145,7 +145,7 @@ def open_las(
 
 
 def _count_points(path: Path, header: Any, notes: list[str]) -> int:
-    """Number of points; if an uncompressed file holds more than its header states, that."""
+    """Return the number of points; for uncompressed files, the actual one if it is larger."""
     stated = int(header.point_count)
     if header.are_points_compressed:
         return stated
@@ -165,7 +165,7 @@ def _count_points(path: Path, header: Any, notes: list[str]) -> int:
 
 
 def _unit(path: Path, header: Any) -> StatedUnit | None:
-    """Unit of the coordinate system, from WKT if the file has it, else from GeoTIFF keys."""
+    """Return the unit of the coordinate system, from WKT if present, else from GeoTIFF keys."""
     texts = [getattr(vlr, "string", "") for vlr in header.vlrs if vlr.record_id == _WKT_RECORD]
     for text in [*texts, *_wkt_behind_points(path)]:
         found = unit_of_crs(str(text), "WKT")
@@ -186,7 +186,7 @@ def _unit(path: Path, header: Any) -> StatedUnit | None:
 
 
 def _wkt_behind_points(path: Path) -> Iterator[str]:
-    """Yield coordinate systems in the records after the points, limited in number and size."""
+    """Yield coordinate systems from records after the points, limited in number and size."""
     n_file = path.stat().st_size
     with path.open("rb") as file:
         header = file.read(_HEADER_BYTES)
@@ -246,31 +246,31 @@ def _block(chunk: Any, classes: frozenset[int], intensity: str) -> PointBlock:
     if classes:
         causes["other_class"] = ~np.isin(np.asarray(chunk.classification), list(classes))
     axes = np.empty((3, len(chunk)))
-    # In parts, so that a part stays in the processor's cache from one step to the next.
+    # Convert in parts that fit into the processor's cache.
     for start in range(0, len(chunk), _PART_POINTS):
         part = slice(start, start + _PART_POINTS)
         for place, name in enumerate("XYZ"):
-            # Scale and offset in float64: survey coordinates keep every digit.
+            # Scale and offset in float64 preserve all digits of survey coordinates.
             np.multiply(chunk[name][part], chunk.scales[place], out=axes[place, part])
             axes[place, part] += chunk.offsets[place]
     return point_block(axes, values, causes=causes)
 
 
 def _count_outside(path: Path, header: Any, block: PointBlock) -> int:
-    """Count points outside the bounds that the header states.
+    """Count points outside the bounding box in the header.
 
-    Compressed points have no checksum, so the bounds are the only indication of a changed byte:
-    some points far outside are damage. Bounds elsewhere (the points were moved, or others appended)
-    are stale, and only reported.
+    Compressed points have no checksum, so the bounding box is the only way to detect a changed
+    byte: if some points are far outside, the file is damaged. If the box is somewhere else, it is
+    out of date (points were moved or appended); this is only reported.
 
     Raises:
         InputError: a compressed file is damaged.
     """
     low, high = (np.asarray(bound, np.float64) for bound in (header.mins, header.maxs))
     extent = float((high - low).max())
-    # Implausible bounds are ignored; NaN compares as False.
+    # Ignore implausible bounds; comparisons with NaN are False.
     is_usable = np.all(np.abs([low, high]) < _FARTHEST) and np.all(high >= low) and extent > 0.0
-    # Headers are often rounded to the last digit.
+    # Many programs round the bounds to the last digit.
     slack = 1e-3 * max(extent, 1.0)
     if not is_usable or (
         np.all(block.bounds[0] >= low - slack) and np.all(block.bounds[1] <= high + slack)
@@ -291,10 +291,10 @@ def _count_outside(path: Path, header: Any, block: PointBlock) -> int:
 
 
 def _check_header(path: Path) -> None:
-    """Compare the counts and offsets of the header with the file's size.
+    """Compare counts and offsets in the header with the size of the file.
 
     Raises:
-        InputError: they do not fit.
+        InputError: they are inconsistent.
     """
     n_file = path.stat().st_size
     with path.open("rb") as file:
@@ -313,17 +313,17 @@ def _check_header(path: Path) -> None:
 
 
 def _checked_chunks(path: Path, header: Any) -> list[_Chunk]:
-    """Compare the chunk table with the file's size and the header's number of points.
+    """Compare the chunk table with the size of the file and the point count in the header.
 
     Args:
         path: the file.
-        header: laspy's header of it.
+        header: its header, as read by laspy.
 
     Returns:
-        The chunks; none without compression by chunks.
+        The chunks; empty if the file is not compressed in chunks.
 
     Raises:
-        InputError: the table cannot belong to this file.
+        InputError: the table is inconsistent with the file.
     """
     if not header.are_points_compressed:
         return []
@@ -339,7 +339,7 @@ def _checked_chunks(path: Path, header: Any) -> list[_Chunk]:
     with path.open("rb") as file:
         at = _offset_at(path, file, start)
         if at <= 0:
-            # Written at the end by programs that could not go back.
+            # Programs that could not seek back wrote the offset at the end of the file.
             at = _offset_at(path, file, n_file - _OFFSET_BYTES)
         if not start + _OFFSET_BYTES <= at <= n_file - _OFFSET_BYTES:
             raise _damaged(path, "its chunk table lies outside the file, which is cut off")
@@ -378,10 +378,10 @@ def _check_chunks(
 
 
 def _check_layers(path: Path, record: bytes, start: int, chunks: list[int]) -> None:
-    """Compare the layers of each chunk with its size: the decompressor allocates them first.
+    """Compare the sizes of a chunk's layers with its own: the decompressor allocates them first.
 
-    A chunk of point formats 6 and up is its first point, the number of its points, the size of each
-    layer, and the layers.
+    A chunk of point formats 6 and up consists of its first point, its number of points, the size
+    of each layer, and the layers.
     """
     (n_items,) = struct.unpack_from("<H", record, _ITEMS_AT)
     items = [struct.unpack_from("<HH", record, _ITEMS_AT + 2 + 6 * k) for k in range(n_items)]
@@ -412,10 +412,10 @@ def _records(
     intensity: str,
     nodes: Sequence[_Chunk] | None,
 ) -> Iterator[Any]:
-    """Yield laspy's records of up to `BLOCK_POINTS` points each, in the order of the file.
+    """Yield laspy's records of up to `BLOCK_POINTS` points each, in file order.
 
     Raises:
-        BaseException: whatever the library raises for a damaged file.
+        BaseException: any error of the library about a damaged file.
     """
 
     def record(points: NDArray[Any]) -> Any:
@@ -425,7 +425,7 @@ def _records(
 
     row = header.point_format.dtype()
     if not header.are_points_compressed:
-        # Mapped, so that also a file can be read whose header states too few points.
+        # Mapped to memory, so that all points are read even if the header declares too few.
         start = int(header.offset_to_point_data)
         n_present = min(n_points, (path.stat().st_size - start) // row.itemsize)
         mapped = np.memmap(path, dtype=row, mode="r", offset=start, shape=(n_present,))
@@ -442,7 +442,7 @@ def _records(
         with laspy.open(path, decompression_selection=fields, read_evlrs=False) as reader:
             yield from reader.chunk_iterator(BLOCK_POINTS)
         return
-    # As many nodes at once as make a block.
+    # Decode as many nodes at once as fit into a block.
     lazrs = load_library("lazrs", path)
     compression = bytes(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
     totals = itertools.accumulate(node.n_points for node in nodes)
@@ -463,16 +463,16 @@ def _records(
 
 
 def _chosen_nodes(path: Path, chunks: Sequence[_Chunk], query: PointQuery) -> list[_Chunk] | None:
-    """Return the nodes of a COPC file with requested points, in the order of the file.
+    """Return the nodes of a COPC file that contain requested points, in file order.
 
-    The first level whose points are no farther apart than requested is the last one. If no node
-    meets the box, the root is returned, whose points show where the cloud is.
+    The deepest level read is the first whose point spacing is not larger than requested. If no
+    node intersects the box, the root is returned, which shows where the cloud is.
 
     Returns:
-        None for a file without an octree.
+        The nodes, or None for a file without an octree.
 
     Raises:
-        InputError: the octree does not fit the file.
+        InputError: the octree is inconsistent with the file.
     """
     n_start = _HEADER_BYTES + _COPC_RECORD.size + _COPC_INFO.size
     with path.open("rb") as file:
@@ -492,10 +492,10 @@ def _chosen_nodes(path: Path, chunks: Sequence[_Chunk], query: PointQuery) -> li
         raise _bad_octree(path, "it names chunks that the file does not have")
     last = _LEVELS_MOST
     if query.spacing is not None:
-        # One by one: a damaged file's spacing may be so large that the quotient is not finite.
+        # Separate logarithms: a damaged file's spacing may be so large that the quotient overflows.
         levels = math.log2(spacing) - math.log2(query.spacing)
         last = max(0, math.ceil(levels - 1e-9))
-    # Coordinates are rounded to steps of the file.
+    # Coordinates are rounded to the resolution of the file.
     slack = 2e-6 * half
 
     def is_wanted(level: int, *place: int) -> bool:
@@ -512,14 +512,14 @@ def _chosen_nodes(path: Path, chunks: Sequence[_Chunk], query: PointQuery) -> li
 
 
 def _read_nodes(path: Path, root: tuple[int, int]) -> dict[tuple[int, ...], _Chunk]:
-    """Return the chunk of each node with points, by its level and its place there."""
+    """Return the chunks of all nodes with points, by level and position."""
     n_file = n_left = path.stat().st_size
     nodes: dict[tuple[int, ...], _Chunk] = {}
     pages, seen = [root], {root}
     with path.open("rb") as file:
         while pages:
             offset, n_bytes = pages.pop()
-            # Pages are adjacent, so that together they are no longer than the file.
+            # Pages do not overlap, so their total size cannot exceed that of the file.
             n_left -= n_bytes
             if offset + n_bytes > n_file or n_left < 0:
                 raise _bad_octree(path, "its pages lie outside the file")

@@ -1,4 +1,4 @@
-"""LZF, the compression of binary PCD files."""
+"""LZF compression, as used in binary PCD files."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ def decompress_lzf(packed: NDArray[np.uint8], plain: NDArray[np.uint8]) -> int:
 
     Args:
         packed: compressed bytes.
-        plain: array to fill, as long as the header states.
+        plain: array to fill, with the size declared in the header.
 
     Returns:
-        Bytes written, or -1 when the data are damaged or do not fit.
+        Number of bytes written, or -1 if the data are damaged or do not fit.
     """
     read = 0
     written = 0
@@ -46,7 +46,7 @@ def decompress_lzf(packed: NDArray[np.uint8], plain: NDArray[np.uint8]) -> int:
         count += 2
         if source < 0 or written + count > plain.size:
             return -1
-        # Byte by byte: source and target overlap where a pattern repeats.
+        # Byte by byte: source and target overlap if a pattern repeats.
         for _ in range(count):
             plain[written] = plain[source]
             written += 1

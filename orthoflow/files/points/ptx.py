@@ -1,7 +1,7 @@
-"""PTX (Leica): several scans on grids, each with the pose of its scanner; 0 0 0 means no return.
+"""PTX files (Leica): several scans on grids, each with the scanner's pose; 0 0 0 is no return.
 
-Files are met whose scans have fewer lines than rows times columns, and blank lines between scans.
-So scans are found by what only their headers have, two lines of one number each.
+Some files have scans with fewer lines than rows times columns, or blank lines between scans.
+Therefore, scans are found by two consecutive lines with one number each, which only headers have.
 """
 
 from __future__ import annotations
@@ -48,19 +48,20 @@ _HEADER: Final = re.compile(rb"^[ \t]*\d{1,9}[ \t]*\r?\n[ \t]*\d{1,9}[ \t]*\r?\n
 _BLANK: Final = re.compile(rb"^[ \t]*\r?\n", re.MULTILINE)
 _SAMPLE_LINES: Final = 200
 _SEARCH_BYTES: Final = 1 << 24
-# Two numbers and their ends of line.
+# Two numbers and their line ends.
 _MOST_HEADER_BYTES: Final = 100
 _MOST_SCANS: Final = 1 << 16
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Part:
-    """A scan's place in the file, its grid and pose, and what its lines hold.
+    """Position, grid, pose and line format of a scan in the file.
 
     Attributes:
-        start: of the first line of points, bytes; `end` is behind the last one.
-        n_points: lines with points.
-        n_rows: rows of the grid; points come column by column.
+        start: offset of the first line of points in bytes.
+        end: offset behind the last line of points in bytes.
+        n_points: number of lines with points.
+        n_rows: number of rows of the grid; points are stored column by column.
         n_places: rows times columns.
         pose: rotation and translation, world from scan.
         layout: how the numbers of a line are separated.
@@ -76,27 +77,27 @@ class _Part:
 
     @property
     def is_whole(self) -> bool:
-        """Whether there is a line for each place of the grid."""
+        """Whether there is a line for each position of the grid."""
         return self.n_points == self.n_places
 
     @property
     def columns(self) -> Columns:
-        """What the columns are."""
+        """Meaning of the columns, from their number."""
         return Columns(names=tuple(_COLUMNS[self.layout.n_columns].split()))
 
     def scan(self) -> Scan:
-        """Return what is known of the scan."""
+        """Return the metadata of the scan."""
         scan = self.columns.scan(station=self.pose[1])
         if self.is_whole:
             scan.fields |= {"grid"}
-        # The format's own scales; data beyond them are scaled by what is there.
+        # The standard ranges of the format; data outside them are scaled by their own range.
         scan.intensity_limits = (0.0, 1.0) if "intensity" in scan.fields else None
         scan.rgb_limit = 255.0 if "rgb" in scan.fields else None
         return scan
 
 
 def open_ptx(path: Path, *, intensity_field: str | None = None) -> ScanFile:
-    """Open a PTX file; its fields have no names, so that there is no choice among them."""
+    """Open a PTX file; its fields have no names, so `intensity_field` is ignored."""
     del intensity_field
     places = _find_headers(path)
     if len(places) < 2 or places[0][0] > 0:
@@ -135,7 +136,7 @@ def _blocks(path: Path, parts: list[_Part]) -> Iterator[PointBlock]:
 
 
 def _find_headers(path: Path) -> list[tuple[int, int]]:
-    """Offset of each header, and filled lines before it; the same at the end."""
+    """Return the offset of each header and of the end, and the filled lines before it."""
     found: list[tuple[int, int]] = []
     offset, n_filled, kept = 0, 0, b""
     with path.open("rb") as file:
@@ -144,7 +145,8 @@ def _find_headers(path: Path) -> list[tuple[int, int]]:
             block = file.read(_SEARCH_BYTES)
             is_last = len(block) < _SEARCH_BYTES
             text = kept + block
-            # Whole lines; the end, where a header may begin, is looked through with the next.
+            # Only whole lines; a header may begin at the end of the text, so keep that for the next
+            # block.
             cut = len(text)
             if not is_last:
                 cut = text.rfind(b"\n", 0, len(text) - _MOST_HEADER_BYTES) + 1
@@ -178,7 +180,7 @@ def _read_header(
     try:
         n_columns, n_rows = (int(item) for item in lines[:2])
         numbers = [[float(item) for item in row.split()] for row in lines[2:]]
-        # Row vectors in the file: point @ matrix, the translation in the last row.
+        # The file stores row vectors: point @ matrix, with the translation in the last row.
         matrix = np.array(numbers[4:], dtype=np.float64).T
         is_whole = [len(row) for row in numbers] == [3] * 4 + [4] * 4
     except ValueError:
@@ -196,7 +198,7 @@ def _read_header(
             continue
         first = first or text
         found = find_layout(text)
-        # Points without a return may be shorter than others.
+        # Lines of points without a return may be shorter than others.
         if found and found.n_columns in _COLUMNS:
             layout = max(layout or found, found, key=lambda item: item.n_columns)
         elif found is None and re.fullmatch(r"\d+", text):

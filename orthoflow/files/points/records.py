@@ -1,8 +1,9 @@
-"""PLY and PCD: a header that names the fields, then records, binary or a line each.
+"""PLY and PCD files: a header that names the fields, then binary records or lines of text.
 
-Rows of one size are read a block at a time. Where lists stand in the vertices of a PLY file, or in
-binary files before them, plyfile reads the file as a whole: rows then differ in size, and such
-files are small. Compressed PCD files hold field after field, not point after point.
+Records of constant size are read a block at a time. If the vertices of a PLY file contain lists, or
+a binary file has lists before its vertices, plyfile reads the whole file at once: such records
+differ in size, but such files are small. Compressed PCD files are stored field by field, not point
+by point.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from orthoflow.files.points.text import Layout, read_tables, take_lines, values_
 from orthoflow.files.points.units import unit_of_comments
 
 _HEADER_BYTES: Final = 1 << 20
-# Fields of a point, known or not.
+# Counts known and unknown fields.
 #: fields of a point in PLY and PCD files
 MOST_FIELDS: Final = 1000
 _PLY_TYPES: Final = {
@@ -54,14 +55,14 @@ _PLY_TYPES: Final = {
     )
     for name in names
 }
-# The type of a list, whose rows plyfile reads.
+# The type of a list; plyfile reads elements with lists.
 _LIST: Final = "O"
 _VERTEX_NAMES: Final = ("vertex", "vertices", "point", "points")
 _BYTE_ORDERS: Final = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _PCD_KINDS: Final = {"I": "i", "U": "u", "F": "f"}
 _PCD_KEYS: Final = ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "DATA")
 
-# Name, number of entries, and names and types of the properties of a PLY element.
+# Name, number of entries, property names and property types of a PLY element.
 _Element = tuple[str, int, list[str], list[str]]
 
 
@@ -95,7 +96,7 @@ def open_ply(path: Path, *, intensity_field: str | None = None) -> ScanFile:
     columns = replace(columns, labels=tuple(names))
     before, what = elements[:position], "vertex element"
     if _LIST in kinds or (order and any(_LIST in types for *_, types in before)):
-        # A value takes a byte at least; plyfile allocates what a header states.
+        # A value has at least one byte, and plyfile allocates the declared number of values.
         n_stated = sum(count * len(types) for _, count, _, types in elements)
         n_present = path.stat().st_size - offset
         if n_stated > n_present:
@@ -124,9 +125,9 @@ def open_ply(path: Path, *, intensity_field: str | None = None) -> ScanFile:
 
 
 def _ply_header(text: str) -> tuple[str, list[_Element], list[str]]:
-    """Byte order (empty for ASCII), elements and comments.
+    """Return byte order (empty for ASCII), elements and comments.
 
-    plyfile's own parser, stricter, refuses two properties of one name and other orders of lines.
+    plyfile's own parser is stricter: it refuses repeated property names and some line orders.
     """
     if not text:
         raise ValueError("no end_header")
@@ -168,7 +169,7 @@ def open_pcd(path: Path, *, intensity_field: str | None = None) -> ScanFile:
         if words and words[0].startswith("#"):
             comments.append(" ".join(words).lstrip("# "))
         elif words:
-            # PCD 0.5 and before call the fields COLUMNS.
+            # PCD 0.5 and older use COLUMNS instead of FIELDS.
             entries[words[0].upper().replace("COLUMNS", "FIELDS")] = words[1:]
     try:
         return _open_pcd(path, entries, comments, offset, intensity_field)
@@ -201,7 +202,7 @@ def _open_pcd(
             for k, (kind, count) in enumerate(zip(kinds, counts, strict=True))
         ]
     )
-    # Fields of several values, as descriptors are, mean nothing here.
+    # Ignore fields with several values, such as descriptors.
     single = [label if count == 1 else "" for label, count in zip(labels, counts, strict=True)]
     columns = columns_of_names(single, intensity_field=intensity_field)
     if columns is None:
@@ -227,7 +228,7 @@ def _open_pcd(
     scan = columns.scan(
         rgb_limit=255.0 if "rgb" in columns.places else None,
         unit=unit_of_comments(comments),
-        # The default, 0 0 0 and no rotation, says nothing.
+        # The default value, 0 0 0 without rotation, means that the position is unknown.
         station=np.array(pose[:3]) if any(pose[:3]) else None,
     )
     scan.fields = scan.fields - {"grid"} | ({"grid"} if height > 1 else frozenset())
@@ -242,7 +243,7 @@ def _open_pcd(
 
 # Any: a partial function that yields values by meaning.
 def _blocks(read: Any, width: int = 0) -> Iterator[PointBlock]:
-    """Blocks of points; of an organised cloud with their places in a grid `width` points wide."""
+    """Yield blocks of points; `width` is the grid width of an organised cloud, else 0."""
     start = 0
     for values in read():
         if width:
@@ -318,7 +319,7 @@ def _compressed(
         packed = np.frombuffer(file.read(n_packed), np.uint8)
     if len(packed) != n_packed:
         raise cut_off(path, "compressed data", f"{len(packed)} bytes", str(n_packed))
-    # LZF turns three bytes into 264 at best: more cannot be meant, and is not allocated.
+    # LZF expands 3 bytes to at most 264, so a larger size is wrong and is not allocated.
     is_possible = n_stated == n_plain and n_plain <= 264 * n_packed
     plain = np.zeros(n_plain if is_possible else 0, dtype=np.uint8)
     if not is_possible or decompress_lzf(packed, plain) != n_plain:

@@ -1,8 +1,8 @@
-"""What every reader of point files returns: scans with their metadata, then blocks of points.
+"""Common result of all point file readers: scans with metadata, then blocks of points.
 
-A reader opens a file up to its header, states what each of its scans has, and yields blocks of
-points. `point_block` makes a block of the columns of any format, so that points without return,
-flagged points and poses are treated once, for all of them.
+A reader opens a file, reads its header, describes its scans and yields blocks of points.
+`point_block` builds a block from the columns of any format, so that points without return, flagged
+points and poses are handled in the same way for all formats.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError, OrthoflowError, PluginError
 from orthoflow.files.points.units import StatedUnit
 
-# 12 MB of float64 coordinates: large enough for memory speed, small enough to hold several copies.
+# 12 MB of float64 coordinates: fast to process, and small enough to keep several copies.
 BLOCK_POINTS: Final = 500_000
-# Half of the programs that read our products count positions in 32 bits.
-#: points of a scan file (one less is read)
+# Half of the programs that read our products use 32-bit point indices.
+#: points of a scan file (at most one less can be read)
 MOST_POINTS: Final = 2**32
 
 PointField = Literal["intensity", "rgb", "grid"]
@@ -34,18 +34,18 @@ Values = dict[str, NDArray[Any]]
 
 @dataclass(kw_only=True)
 class Scan:
-    """One scan of a file, with its own metadata.
+    """One scan of a file and its metadata.
 
     Attributes:
-        name: as the file calls it, or empty.
-        fields: what each of its points has besides coordinates.
+        name: name of the scan in the file, or empty.
+        fields: attributes of its points besides coordinates.
         fields_used: names of the file's fields that are read.
-        fields_not_used: names of those that are not.
-        intensity_limits: smallest and largest intensity stated in the file, or None.
-        rgb_limit: stated value of full brightness, or None.
-        unit: unit of its coordinates, if the file states one.
+        fields_not_used: names of the file's other fields.
+        intensity_limits: smallest and largest intensity according to the file, or None.
+        rgb_limit: colour value of full brightness according to the file, or None.
+        unit: unit of the coordinates, or None if the file does not declare one.
         station: (3,) position of the scanner, in the file's unit, or None.
-        station_is_posed: the file states a pose other than the identity.
+        station_is_posed: the file contains a pose other than the identity.
     """
 
     name: str = ""
@@ -61,18 +61,19 @@ class Scan:
 
 @dataclass(frozen=True, kw_only=True)
 class PointBlock:
-    """Some points of one scan, as in the file, with poses applied.
+    """A block of points of one scan, with poses applied and values as in the file.
 
     Attributes:
         points: (n, 3) float64 in the file's unit; may contain NaN and infinities.
-        scan: position of the scan in its file.
-        n_read: points of the file that this block accounts for, including those left out.
-        left_out: number of points left out, by cause: `invalid`, `no_return`, `withheld`,
+        scan: index of the scan in its file.
+        n_read: number of points of the file that this block accounts for, including omitted ones.
+        left_out: number of omitted points by cause: `invalid`, `no_return`, `withheld`,
             `synthetic`, `other_class`.
-        intensity: (n,) float32 in the file's own scale, NaN if invalid; None without.
+        intensity: (n,) float32 in the file's own scale, NaN if invalid, or None.
         rgb: (n, 3) in the file's own scale and type, or None.
-        has_rgb: (n,) which points have a valid colour; None if all have.
-        row: (n,) int64 position in the scan's grid, or None; column likewise.
+        has_rgb: (n,) points with a valid colour; None if all have one.
+        row: (n,) int64 row in the scan's grid, or None.
+        column: (n,) int64 column in the scan's grid, or None.
     """
 
     points: NDArray[np.float64]
@@ -87,7 +88,7 @@ class PointBlock:
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
-        """Smallest and largest coordinates (2, 3); NaN shows, no points give infinities."""
+        """Smallest and largest coordinates (2, 3), NaN included; infinities without points."""
         if not len(self.points):
             return np.array([[np.inf] * 3, [-np.inf] * 3])
         return np.stack([self.points.min(axis=0), self.points.max(axis=0)])
@@ -95,15 +96,15 @@ class PointBlock:
 
 @dataclass(frozen=True, kw_only=True)
 class ScanFile:
-    """One point file, opened up to its header.
+    """A point file whose header has been read.
 
     Attributes:
         name: file name without folder, for messages and the record.
-        format_name: e.g. `E57`.
+        format_name: name of the format, e.g. `E57`.
         n_most: maximum number of points.
-        scans: its scans, in the order of their blocks.
+        scans: the scans, in the order of their blocks.
         read: yields the points; can be called once.
-        notes: notes of the reader, as sentences for the user; complete after reading.
+        notes: remarks of the reader as sentences for the user; complete after reading.
         is_chosen: only the requested parts of the file are read.
     """
 
@@ -129,13 +130,13 @@ class ScanFile:
 
     @property
     def fields(self) -> frozenset[PointField]:
-        """What the points of at least one scan have besides coordinates."""
+        """Attributes besides coordinates that the points of at least one scan have."""
         return frozenset().union(*(scan.fields for scan in self.scans))
 
 
 @dataclass(frozen=True, kw_only=True)
 class PointQuery:
-    """The requested points of a file; a reader may return more.
+    """The points requested from a file; a reader may return more.
 
     Attributes:
         box: (2, 3) lowest and highest coordinates in the file's unit, or None for all.
@@ -157,13 +158,13 @@ def point_block(
     scan: int = 0,
     pose: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
 ) -> PointBlock:
-    """Make a block of points from the values in a file.
+    """Build a block of points from the values of a file.
 
     Args:
-        axes: (3, n) x, y, z; points with all three exactly zero have no return.
+        axes: (3, n) x, y, z; a point with all three exactly zero has no return.
         values: (n,) by name: `intensity`, `r`, `g`, `b` or packed `rgb`, `has_rgb`, `row`,
             `column`; in the file's own types.
-        causes: (n,) points that are left out, by cause; each counts for the first one.
+        causes: (n,) True for points to omit, by cause; a point counts for its first cause.
         scan: index of the scan.
         pose: (3, 3) rotation and (3,) translation to the file's world; None for the identity.
     """
@@ -208,12 +209,12 @@ def point_block(
 
 
 def axes_of(values: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
-    """Return (3, n) coordinates, axis by axis in memory: later passes run along the axes."""
+    """Return (3, n) coordinates; each axis is contiguous because later passes run along axes."""
     return np.stack([values[axis].astype(np.float64, copy=False) for axis in "xyz"])
 
 
 def _unpacked(packed: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return colours (n, 3) from 0x00RRGGBB, stored in an integer or in the bits of a float."""
+    """Return colours (n, 3) from 0x00RRGGBB, stored as an integer or in the bits of a float."""
     if packed.dtype.kind == "f":
         bits = np.ascontiguousarray(packed.astype(np.float32)).view(np.uint32)
     else:
@@ -222,7 +223,7 @@ def _unpacked(packed: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def cut_off(path: Path, what: str, found: str, expected: str) -> InputError:
-    """Return the error for a file that ends before the length that its header states."""
+    """Return the error for a file that is shorter than its header declares."""
     return InputError(
         f"{path.name} is cut off: its {what} holds {found}, its header states {expected}; copy or "
         "export it again"
@@ -231,7 +232,7 @@ def cut_off(path: Path, what: str, found: str, expected: str) -> InputError:
 
 @contextmanager
 def reading(path: Path, format_name: str) -> Iterator[None]:
-    """Turn whatever a library raises while it reads a file into one sentence about the file.
+    """Convert any error of a library that reads a file into one sentence about the file.
 
     Raises:
         InputError: the library failed.
@@ -241,7 +242,7 @@ def reading(path: Path, format_name: str) -> Iterator[None]:
     except (OrthoflowError, KeyboardInterrupt, SystemExit, GeneratorExit):
         raise
     except BaseException as error:
-        # BaseException: a panic in a library written in Rust is not an Exception.
+        # BaseException: a panic in a Rust library is not an Exception.
         raise InputError(
             f"{path.name} cannot be read as {format_name}: {_first_line(error)}; the file is "
             "damaged or cut off, copy or export it again"
@@ -250,10 +251,10 @@ def reading(path: Path, format_name: str) -> Iterator[None]:
 
 # Any: the libraries have no types.
 def load_library(name: str, path: Path) -> Any:
-    """Import a reading library when a file needs it.
+    """Import a library for reading, not before a file needs it.
 
     Raises:
-        PluginError: it is not installed or does not load.
+        PluginError: it is not installed, or its import fails.
     """
     try:
         return import_module(name)

@@ -1,4 +1,4 @@
-"""Lines of numbers, read fast and in blocks, and text scans: a point per line."""
+"""Text scans with one point per line, and fast reading of lines of numbers in blocks."""
 
 from __future__ import annotations
 
@@ -35,21 +35,21 @@ from orthoflow.files.points.scan_file import (
 )
 from orthoflow.files.points.units import unit_of_comments, unit_of_name, unit_of_word
 
-# Lines of text scans and headers are much shorter.
+# Far longer than the lines of any text scan or header.
 #: bytes of a line of a text scan
 MOST_LINE_BYTES: Final = 10_000
 _HEADER_LINES: Final = 200
 _SAMPLE_LINES: Final = 1000
-# Some 300,000 points at a time.
+# About 300,000 points.
 _BLOCK_BYTES: Final = 1 << 24
-# Of the number of points; a number that is longer counts nothing.
+# Maximum number of digits of a point count; a longer number is not a count.
 _MOST_DIGITS: Final = 20
 _NUMBER: Final = re.compile(
     r"[-+]?(\d+(\.\d*|,\d+)?|[.,]\d+)([eE][-+]?\d+)?"
     r"|[-+]?(nan(\(\w*\))?|inf(inity)?|1\.#\w+)|n/a|na|null|#(num!|n/a|value!|div/0!|ref!)",
     re.IGNORECASE,
 )
-# How C libraries print what is not finite: `nan(0x8000)`, `-nan(ind)`, `1.#QNAN`, `-1.#IND00`; and
+# How C libraries print NaN and infinity (`nan(0x8000)`, `-nan(ind)`, `1.#QNAN`, `-1.#IND00`), and
 # how spreadsheets do.
 _NOT_A_NUMBER: Final = re.compile(
     rb"(?:[-+]?(?:nan(?:\(\w*\))?|1[.,]#(?:ind|[qs]?nan|inf)\d*)|(?<![^\s,;])(?:n/a|na|null))"
@@ -57,7 +57,7 @@ _NOT_A_NUMBER: Final = re.compile(
     re.IGNORECASE,
 )
 _COMMENT: Final = "#/ \t;!%"
-# `Points:0`, `P_x`: what no sentence holds, but the names of columns may be.
+# Column names such as `Points:0` or `P_x`, which do not occur in sentences.
 _NO_WORD: Final = re.compile(
     r"[A-Za-z]+(?:[:_.\[(]?[0-2]|[:_.\[(][xyzXYZ])[\])]?|//?X|[PL][xyz]|[A-Za-z]+Time"
 )
@@ -72,10 +72,10 @@ class Layout:
     """How the numbers of a line are separated.
 
     Attributes:
-        separator: a character; a space stands for any white space.
+        separator: one character; a space represents any white space.
         decimal: `.` or `,`.
-        n_columns: numbers in the first line.
-        is_quoted: fields may be in quotes, which may hold separators.
+        n_columns: number of fields in the first line.
+        is_quoted: fields may be in quotes and contain separators.
     """
 
     separator: str = " "
@@ -84,7 +84,7 @@ class Layout:
     is_quoted: bool = False
 
     def fields(self, line: str) -> list[str]:
-        """Split a line, without quotes and the empty field after a closing separator."""
+        """Split a line; remove quotes and the empty field after a final separator."""
         if self.separator == " ":
             return [_unquoted(item) for item in line.split()]
         fields = line.split(self.separator)
@@ -103,11 +103,11 @@ def open_text(
 
     Args:
         path: the file.
-        columns: what the columns are, if the user states it.
-        intensity_field: name of the column that is the intensity; None for the usual one.
+        columns: meaning of the columns, if given by the user.
+        intensity_field: name of the column to use as intensity; None for the usual one.
 
     Raises:
-        InputError: it is not known what the columns are.
+        InputError: the meaning of the columns is unknown.
     """
     lines = _first_lines(path)
     n_stated: int | None = None
@@ -173,12 +173,12 @@ def _blocks(
 def _columns_of_header(
     path: Path, headers: list[str], line: str, layout: Layout, intensity_field: str | None
 ) -> Columns | None:
-    """Columns as the last header line names them; None where there is no such line.
+    """Return the columns named in the last header line; None if there is no such line.
 
-    A line of units may follow the one of names.
+    A line of units may follow the line of names.
 
     Raises:
-        InputError: there is one, and it names no x, y and z for the columns there are.
+        InputError: there is a header, but it does not name x, y and z or has too few columns.
     """
     unit: str | None = None
     for header in reversed(headers):
@@ -203,7 +203,7 @@ def _columns_of_header(
         )
         if any(re.match(r"lat(?!er)|lon(?!ger)", label, re.IGNORECASE) for label in labels):
             text += "; if these are degrees, project them to a plane system in metres first"
-        # What is known stays, and x, y, z that are missing are as like to be the last of the rest.
+        # Keep known columns; missing x, y, z are assumed to be the last of the unknown ones.
         names = [meaning_of(label) for label in labels] if fits else []
         missing = [axis for axis in "xyz" if axis not in names]
         others = [place for place, name in enumerate(names) if name == IGNORED]
@@ -220,7 +220,7 @@ def _columns_of_header(
 
 
 def _labels(header: str) -> list[str]:
-    # A semicolon begins a comment, unless it parts columns of which the first has no name.
+    # A semicolon starts a comment, unless it separates columns of which the first has no name.
     stripped = header.lstrip(_COMMENT if header.count(";") == 1 else _COMMENT.replace(";", ""))
     return _fields_of(stripped)[0]
 
@@ -255,7 +255,7 @@ def _first_lines(path: Path) -> list[str]:
 
 
 def line_at(path: Path, place: int | None = None) -> int:
-    """Return the number, from 1, of the line that begins at a place of a file; None is its end."""
+    """Return the number, from 1, of the line that begins at an offset; None is the file's end."""
     n_lines, n_left, is_within = 1, path.stat().st_size if place is None else place, False
     with path.open("rb") as file:
         while block := file.read(min(_BLOCK_BYTES, n_left)):
@@ -266,13 +266,13 @@ def line_at(path: Path, place: int | None = None) -> int:
 
 
 def _count_ends(block: bytes) -> int:
-    # Five times as fast as `bytes.count` where lines are short.
+    # Five times as fast as `bytes.count` for short lines.
     return int(np.count_nonzero(np.frombuffer(block, dtype=np.uint8) == ord("\n")))
 
 
 # Any: arrays of any type.
 def values_of(table: Table, columns: Columns, packed: Any = np.int64) -> Values:
-    """Return the columns of a table of text by meaning, packed colours in their own type."""
+    """Return the columns of a text table by meaning; packed colours are cast to type `packed`."""
     values: Values = dict(zip(columns.places, table, strict=True))
     if "rgb" in values:
         values["rgb"] = np.nan_to_num(values["rgb"], posinf=0.0, neginf=0.0).astype(packed)
@@ -280,19 +280,19 @@ def values_of(table: Table, columns: Columns, packed: Any = np.int64) -> Values:
 
 
 def is_comment(line: bytes) -> bool:
-    """Whether a line is no data: it begins with `#` or `//`, and not with `#NUM!` or the like."""
+    """Whether a line is a comment: it begins with `#` or `//`, but not with e.g. `#NUM!`."""
     start = line.lstrip()
     return start.startswith((b"#", b"//")) and not _NOT_A_NUMBER.match(start)
 
 
 def find_layout(line: str, sample: Sequence[str] = ()) -> Layout | None:
-    """Layout of a line with at least three numbers, and more numbers than texts; None for others.
+    """Return the layout of a line with at least three numbers and more numbers than texts, or None.
 
     Numbers may be quoted, as in CSV files.
 
     Args:
         line: the first line of numbers.
-        sample: lines after it, which show decimal commas if its own numbers are whole.
+        sample: the following lines; they show decimal commas if the first has only integers.
     """
     fields, separator = _fields_of(line)
     if not _are_mostly_numbers(fields):
@@ -313,8 +313,8 @@ def _are_mostly_numbers(fields: Sequence[str]) -> bool:
 
 
 def _fields_of(line: str) -> tuple[list[str], str]:
-    """Fields of a line, and the separator found: semicolon, tab, comma or white space."""
-    # What is in quotes does not separate.
+    """Return the fields of a line and its separator: semicolon, tab, comma or white space."""
+    # Separators in quotes do not count.
     bare = re.sub('"[^"]*"', '""', line)
     words = bare.split()
     separator = " "
@@ -322,7 +322,7 @@ def _fields_of(line: str) -> tuple[list[str], str]:
         separator = ";"
     elif "\t" in bare and not any(_are_numbers(f.split()) for f in bare.split("\t") if " " in f):
         separator = "\t"
-    # `1,5 2,5 3,5` is three numbers with decimal commas, `1, 2, 3` and `1,2,3` are not.
+    # `1,5 2,5 3,5` is three numbers with decimal commas; `1, 2, 3` and `1,2,3` are not.
     elif "," in bare and not (len(words) >= 3 and _are_numbers(words)):
         separator = ","
     return Layout(separator=separator, n_columns=0).fields(line), separator
@@ -337,7 +337,7 @@ def _are_numbers(fields: Sequence[str]) -> bool:
 
 
 def _numbers(line: str, layout: Layout) -> list[float]:
-    """Numbers of a line; NaN for a field that is none."""
+    """Return the numbers of a line; NaN for a field that is not a number."""
     texts = [field.replace(layout.decimal, ".") for field in layout.fields(line)]
     is_number = [
         _NUMBER.fullmatch(text) and "," not in text and not _NOT_A_NUMBER.fullmatch(text.encode())
@@ -347,7 +347,7 @@ def _numbers(line: str, layout: Layout) -> list[float]:
 
 
 def take_lines(file: BinaryIO, n_lines: int) -> list[bytes]:
-    """Read the next lines of a file, up to a number; never more of a line than it may have.
+    """Read up to `n_lines` further lines of a file; no line is read beyond its maximum length.
 
     Raises:
         InputError: a line is longer than `MOST_LINE_BYTES`.
@@ -361,7 +361,7 @@ def take_lines(file: BinaryIO, n_lines: int) -> list[bytes]:
 
 
 def long_line(path: Path, place: int) -> InputError:
-    """Return the error for a line that no list of points has, at a place of a file within it."""
+    """Return the error for a line too long for a point list; `place` is an offset within it."""
     return InputError(
         f"{path.name}, line {line_at(path, place) - 1}: the line has more than {MOST_LINE_BYTES} "
         "bytes, so this is not a list of points; export the file again"
@@ -379,17 +379,17 @@ def read_tables(
     """Read lines of numbers in blocks.
 
     Args:
-        file: open at the start of a line.
+        file: file, positioned at the start of a line.
         layout: how numbers are separated.
-        columns: which columns are wanted, counted from 0.
+        columns: indices of the requested columns, from 0.
         n_rows: maximum number of rows; None for all. No line after them is read.
-        end: where in the file the last line ends; None for the end of the file.
+        end: offset in the file where the last line ends; None for the end of the file.
 
     Yields:
-        The columns; no rows for lines that are blank or comments, NaN where a line is too short.
+        The columns, without blank lines and comments; NaN where a line is too short.
 
     Raises:
-        InputError: a line holds something else than numbers.
+        InputError: a line contains something other than numbers.
     """
     wanted, n_left = list(columns), n_rows
     while n_left != 0:
@@ -409,7 +409,7 @@ def read_tables(
 
 
 def _take_block(file: BinaryIO, n_lines: int | None, end: int | None) -> bytes:
-    """Read the next whole lines of a file, up to a number of lines and bytes."""
+    """Read the next whole lines of a file, up to a number of lines and an offset."""
     size = _BLOCK_BYTES if end is None else min(_BLOCK_BYTES, end - file.tell())
     block = file.read(size)
     if block and not block.endswith(b"\n"):
@@ -426,10 +426,10 @@ def _take_block(file: BinaryIO, n_lines: int | None, end: int | None) -> bytes:
 
 
 def _table(block: bytes, layout: Layout, wanted: list[int]) -> Table:
-    """Parse lines; those with comments or other spellings of NaN once more, without these."""
+    """Parse lines; if that fails, remove comments and other spellings of NaN and parse again."""
     try:
         table = _parse(block, layout, wanted, layout.separator)
-        # Of single spaces as separators, a line of spaces alone would be a row.
+        # If single spaces are the separator, a line of spaces would become a row.
         if layout.separator != " " or not np.isnan(table[0]).any():
             return table
     except ValueError:
@@ -446,7 +446,7 @@ def _parse(block: bytes, layout: Layout, columns: list[int], separator: str) -> 
     if block.isspace() or not block:
         return [np.empty(0)] * len(columns)
     with warnings.catch_warnings():
-        # A longer first line is only warned about and would lose numbers.
+        # pandas only warns about a longer first line, and would drop numbers.
         warnings.simplefilter("error", pd.errors.ParserWarning)
         try:
             frame = pd.read_csv(
@@ -454,7 +454,7 @@ def _parse(block: bytes, layout: Layout, columns: list[int], separator: str) -> 
                 sep=separator,
                 decimal=layout.decimal,
                 header=None,
-                # All columns, wanted or not: only so does pandas notice a line with too many.
+                # All columns, requested or not: otherwise pandas misses lines with too many fields.
                 names=list(range(layout.n_columns)),
                 index_col=False,
                 engine="c",
@@ -472,7 +472,7 @@ def _parse(block: bytes, layout: Layout, columns: list[int], separator: str) -> 
 def _unread_line(
     path: Path, start: int, block: bytes, layout: Layout, wanted: list[int]
 ) -> InputError:
-    """Return the error for the first line of a block, which begins at `start`, that is no data."""
+    """Return the error for the first line of a block that is not data; `start` is its offset."""
     first_line = line_at(path, start)
     where, got = f"from line {first_line}", " per line"
     for number, line in enumerate(block.split(b"\n"), start=first_line):

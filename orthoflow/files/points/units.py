@@ -1,4 +1,4 @@
-"""Units of coordinates as files state them: coordinate systems, comments, names of columns."""
+"""Units of coordinates, from coordinate systems, comments or column names in files."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _WORDS: Final[dict[str, str]] = {
 }
 _UNIT: Final = "|".join(f"(?P<u{k}>{word})" for k, word in enumerate(_WORDS))
 _ANY: Final = re.compile(rf"(?:{_UNIT})\b", re.IGNORECASE)
-# A unit counts where the comment speaks of one; `in` only directly behind the word `unit`.
+# A unit counts only if the comment mentions units; `in` only directly after the word `unit`.
 _CONTEXT: Final = re.compile(
     r"\b(?:(?:length|linear|coordinate|xyz|measurement)?[\s_-]*units?(?:[\s_-]*of[\s_-]*\w+)?"
     r"|(?:coordinates?|coords?|xyz|lengths?|distances?|positions?)(?:\s+(?:are|is|given))?\s+in\b)"
@@ -45,7 +45,7 @@ _WKT: Final = re.compile(
     r"|GEODCRS|GEOC_?CS|LOCAL_?CS|ENGCRS|ENGINEERINGCRS|BOUNDCRS|VERT_?CS|VERTCRS)\s*[\[(].*",
     re.DOTALL,
 )
-# GeoTIFF 1.0, 6.2 and 6.3.1.3: keys, and codes of units of length.
+# GeoTIFF 1.0, 6.2 and 6.3.1.3: keys, and codes of length units.
 _MODEL_TYPE, _GEOGRAPHIC = 1024, 2
 _GEOGRAPHIC_TYPE, _PROJECTED, _LINEAR_UNITS = 2048, 3072, 3076
 _VERTICAL, _VERTICAL_UNITS = 4096, 4099
@@ -57,19 +57,19 @@ _GEO_UNITS: Final = {
     1025: 0.001,
     1033: 0.01,
 }
-# Beyond, a text is no coordinate system, and pyproj would be busy with it.
+# A longer text is not a coordinate system, and would keep pyproj busy.
 _LONGEST_CRS: Final = 100_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class StatedUnit:
-    """The unit that a file states.
+    """The unit declared by a file.
 
     Attributes:
-        name: of `UNITS_M`, or `deg` for geographic coordinates; with two names, `us-ft/m`, heights
-            have the second.
-        metres: of the unit along x, y and z.
-        source: where it is stated.
+        name: a key of `UNITS_M`, or `deg` for geographic coordinates; of two names, as in
+            `us-ft/m`, the second is for heights.
+        metres: length of the unit along x, y and z in metres.
+        source: where the file declares it.
     """
 
     name: str
@@ -78,19 +78,19 @@ class StatedUnit:
 
 
 def unit_of_name(name: str, source: str) -> StatedUnit:
-    """Build the unit of one name of `UNITS_M`, or `deg`."""
+    """Return the unit with a name of `UNITS_M`, or `deg`."""
     metres = UNITS_M.get(name, float("nan"))
     return StatedUnit(name=name, metres=(metres, metres, metres), source=source)
 
 
 def unit_of_word(text: str) -> str | None:
-    """Name of the unit that a text is, e.g. `[ft]`; None for anything else."""
+    """Return the name of the unit if a text is one, e.g. `[ft]`; None otherwise."""
     found = _ANY.fullmatch(text.strip(" []()._-"))
     return None if found is None else _name(found)
 
 
 def unit_of_comments(comments: Iterable[str], what: str = "comment") -> StatedUnit | None:
-    """Find the unit in comments of a header: a coordinate system, or words about a unit."""
+    """Find the unit in header comments: a coordinate system, or a phrase about a unit."""
     for comment in comments:
         if len(comment) > _LONGEST_CRS:
             continue
@@ -110,7 +110,7 @@ def unit_of_comments(comments: Iterable[str], what: str = "comment") -> StatedUn
 
 
 def unit_of_crs(text: str, what: str) -> StatedUnit | None:
-    """Unit of a coordinate system, WKT or `EPSG:nnnn`; None where pyproj does not know it."""
+    """Return the unit of a coordinate system (WKT or `EPSG:nnnn`); None if unknown to pyproj."""
     if not text.strip() or len(text) > _LONGEST_CRS:
         return None
     import pyproj
@@ -135,7 +135,7 @@ def unit_of_crs(text: str, what: str) -> StatedUnit | None:
 
 
 def unit_of_geo_keys(keys: Mapping[int, int]) -> StatedUnit | None:
-    """Unit that GeoTIFF keys state: their own unit keys win over those of the coded systems."""
+    """Return the unit in GeoTIFF keys; explicit unit keys override those of coded systems."""
     import pyproj
 
     factors: dict[str, float] = {}
@@ -164,7 +164,7 @@ def unit_of_geo_keys(keys: Mapping[int, int]) -> StatedUnit | None:
 
 
 def refuse_degrees(file_name: str, unit: StatedUnit) -> None:
-    """Refuse geographic coordinates, from which no wall can be measured.
+    """Refuse geographic coordinates, in which walls cannot be measured.
 
     Raises:
         InputError: the unit is degrees.
@@ -179,7 +179,7 @@ def refuse_degrees(file_name: str, unit: StatedUnit) -> None:
 
 
 def _unit_of_factors(level_m: float, height_m: float, source: str) -> StatedUnit | None:
-    """Build the unit of two factors to metres; None where they are no lengths."""
+    """Build a unit from its factors to metres; None if they are not lengths."""
     if not (level_m > 0.0 and height_m > 0.0):
         return None
     # Feet differ in the sixth digit.
