@@ -1,4 +1,4 @@
-"""Many runs at a glance: which lie below some folders, what came out, and in what they differ."""
+"""Overview of many runs: run folders below given folders, their results and differences."""
 
 from __future__ import annotations
 
@@ -27,36 +27,37 @@ from orthoflow.untrusted_text import open_file, parse_json
 
 RunState: TypeAlias = Literal["ok", "failed", "running", "unfinished", "damaged"]
 
-# Runs lie in runs/, sorted into folders at most; deeper lies something else.
+# Run folders are in runs/ or a few folders below it; deeper ones are not searched for.
 _DEEPEST: Final = 6
-# Folders of a run, and of what is no run: to look into them costs time and finds nothing.
+# Folders that contain no runs; searching them takes time.
 _NO_RUNS: Final = frozenset({"products", "logs", "pages", "node_modules", "__pycache__"})
-# In the folder of a run: parts of it, and what was exported.
+# Subfolders of a run folder that contain no further runs.
 _OF_A_RUN: Final = frozenset({"datasets", "export"})
 _FIRST_LINE_BYTES: Final = 1 << 16
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunSummary:
-    """A row of a table of runs.
+    """Summary of a run, a row in a table of runs.
 
     Attributes:
-        folder: of the run, as its finder named it.
-        state: `ok`; `failed`, some cell did; `running`, just now; `unfinished`, it was interrupted;
-            `damaged`, the record cannot be read, or its seal does not hold.
-        reason: what failed, first, or why it cannot be read; empty where all is well.
+        folder: run folder, as found.
+        state: `ok`; `failed` if a cell failed; `running`; `unfinished` if interrupted; `damaged` if
+            the record cannot be read or its seal is broken.
+        reason: first failure, or why the record cannot be read; empty if there is no problem.
         workflow: name of the workflow.
-        run_id: of the run.
+        run_id: id of the run.
         started: ISO 8601 UTC; empty if unknown.
-        metrics: numbers of the baseline by `step.metric`, and by `metric` alone as the last step
-            has it; of several datasets the median, of what is yes or no the share.
-        n_datasets: that it ran on; 0 for a run on none.
-        n_values: how many of these have each of the numbers; empty for a run on none.
-        headlines: the headline numbers, most important first.
-        flags: those that are 1 where something is so and 0 where not.
-        facts: what may differ between runs beside parameters: `seed`, `orthoflow` (its version),
-            methods of the baseline by `step.use`, and inputs by `input <name>`.
-        parameters: `step.parameter` -> its values, of variants and datasets several.
+        metrics: metrics of the baseline by `step.metric`, and by `metric` alone for the last step
+            that reports it. For several datasets, the median, or the share of "yes" for yes/no
+            metrics.
+        n_datasets: number of datasets; 0 if the workflow lists none.
+        n_values: number of datasets that have each metric; empty if there are no datasets.
+        headlines: names of the headline metrics, most important first.
+        flags: names of yes/no metrics.
+        facts: properties other than parameters that may differ between runs: `seed`, `orthoflow`
+            (version), methods of the baseline by `step.use`, and inputs by `input <name>`.
+        parameters: `step.parameter` -> values, more than one if variants or datasets differ.
     """
 
     folder: Path
@@ -75,7 +76,7 @@ class RunSummary:
 
     @property
     def names(self) -> frozenset[str]:
-        """What `values` knows something of."""
+        """Names accepted by `values`."""
         return frozenset((*self.metrics, *self.facts, *self.parameters))
 
     def values(self, name: str) -> tuple[JsonValue, ...]:
@@ -87,7 +88,7 @@ class RunSummary:
 
     @property
     def all_facts(self) -> dict[str, JsonValue]:
-        """Facts and parameters; several values of one are a text, as `0.02|0.05`."""
+        """Facts and parameters; several values of a parameter are joined, as in `0.02|0.05`."""
         return dict(self.facts) | {
             name: values[0] if len(values) == 1 else "|".join(map(_sorted_json, values))
             for name, values in self.parameters.items()
@@ -95,10 +96,10 @@ class RunSummary:
 
 
 def run_folders(folders: Sequence[Path]) -> list[Path]:
-    """Find the run folders in and below some folders, sorted; no link is followed.
+    """Return the run folders in and below the given folders, sorted; links are not followed.
 
     Raises:
-        ArgumentError: one of them is no folder.
+        ArgumentError: a path is not a folder.
     """
     found: dict[Path, None] = {}
     for folder in folders:
@@ -109,15 +110,15 @@ def run_folders(folders: Sequence[Path]) -> list[Path]:
 
 
 def summaries(folders: Iterable[Path]) -> Iterator[RunSummary]:
-    """Summarise run folders one after the other; those that cannot be read are reported."""
+    """Summarise run folders one by one; the state of unreadable ones is `damaged`."""
     for folder in folders:
         yield _summary(folder)
 
 
 def differing_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValue]]:
-    """Facts that distinguish each run from others of the same workflow, by its folder.
+    """Return, by folder, the facts that distinguish a run from others of the same workflow.
 
-    A fact that some of them lack differs only where two others disagree on it.
+    A fact that some runs lack counts as different only if two other runs disagree on it.
     """
     facts = {run.folder: run.all_facts for run in runs}
     values: dict[tuple[str, str], set[str]] = {}
@@ -139,7 +140,7 @@ def _sorted_json(value: JsonValue) -> str:
 
 
 def key_metrics(runs: Iterable[RunSummary], *, most: int) -> list[str]:
-    """Names of the headline numbers of some runs, those of most runs first."""
+    """Return the names of the headline metrics of the runs, the most frequent first."""
     counts = Counter(name for run in runs for name in run.headlines)
     chosen = sorted(counts, key=lambda name: -counts[name])[:most]
     return [name for name in counts if name in chosen]
@@ -149,7 +150,7 @@ def _below(folder: Path) -> Iterator[Path]:
     for place, folders, files in os.walk(folder):
         if RECORD_FILE in files or JOURNAL in files:
             yield Path(place)
-            # Who has a record alone in a folder replays it there.
+            # A record that is alone in its folder can be replayed there.
             if Path(place) != folder:
                 folders.clear()
                 continue
@@ -170,7 +171,7 @@ def _summary(folder: Path) -> RunSummary:
         if doubt := broken_seal(run):
             return RunSummary(folder=folder, state="damaged", reason=doubt)
         return _of_run(folder, run)
-    except Exception as error:  # noqa: BLE001 - a record may contain anything; the others are still listed
+    except Exception as error:  # noqa: BLE001 - a record may contain anything
         unforeseen = f"the record is not as one was written: {type(error).__name__}: "
         reason = f"{'' if isinstance(error, OrthoflowError) else unforeseen}{error}"
         return RunSummary(folder=folder, state="damaged", reason=reason)
@@ -194,7 +195,7 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
             if cell.status != "skipped":
                 facts[f"{cell.step}.use"] = cell.method
             for row in cell_metrics(cell):
-                # Of several datasets errors with signs are given by their sizes.
+                # Over several datasets, the absolute values of signed errors are used.
                 is_size = len(parts) > 1 and row.better == "lower"
                 for name in (f"{row.step}.{row.metric}", row.metric):
                     own[name] = abs(row.value) if is_size else row.value
@@ -222,7 +223,7 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
 
 
 def _parameters(cells: Iterable[RecordedCell]) -> dict[str, tuple[JsonValue, ...]]:
-    """Return the values that each parameter has in the cells, each once."""
+    """Return the distinct values of each parameter in the cells."""
     found: dict[str, dict[str, JsonValue]] = {}
     for cell in cells:
         if cell.repeat == 0 and cell.status != "skipped":

@@ -1,4 +1,4 @@
-"""Charts by matplotlib in one style, at the width of a journal's column: for pages and as files."""
+"""Matplotlib charts in one style, as wide as a journal column, for pages and files."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ChartFormat: TypeAlias = Literal["svg", "pdf", "png"]
-# From above, in metres: name, number and corners (4, 2) of a wall; name, foot (2,) and viewing
+# Plan view, in metres: name, number and corners (4, 2) of a wall; name, position (2,) and viewing
 # direction (2,) of a photo.
 PlanWall: TypeAlias = tuple[str, int, NDArray[np.float64]]
 PlanPhoto: TypeAlias = tuple[str, NDArray[np.float64], NDArray[np.float64]]
 
-# Distinguished by people who see few colours, and by their strokes where there are none
-# (Okabe and Ito 2008).
+# Distinguishable with colour vision deficiency (Okabe and Ito 2008), and by line style in greyscale
+# prints.
 COLOURS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#000000")
 _STROKES: Final = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
 _LOGARITHMIC_RATIO: Final = 20.0
-# An axis that begins near 0 begins there: half of it would show a difference too large.
+# An axis whose values begin near 0 starts at 0; a truncated axis exaggerates differences.
 _NEAR_ZERO: Final = 0.6
-# Of a viewing direction, of the plan; and of how many photos names can be read.
+# Length of a viewing direction as a share of the plan, and maximum number of photos with names.
 _ARROW_SHARE: Final = 0.06
 _NAMED_PHOTOS: Final = 60
 _STYLE: Final = {"font.size": 8.0, "axes.grid": True}
@@ -40,13 +40,13 @@ _STYLE: Final = {"font.size": 8.0, "axes.grid": True}
 
 @dataclass(frozen=True, kw_only=True)
 class ChartPoint:
-    """One point of a line.
+    """A point of a line.
 
     Attributes:
-        x: along the axis.
-        y: across.
-        spread: half the length of its bar; NaN for none.
-        is_filled: it stands out, as that of the baseline does.
+        x: value on the horizontal axis.
+        y: value on the vertical axis.
+        spread: half the length of its error bar; NaN if it has none.
+        is_filled: whether it is highlighted, as the baseline is.
     """
 
     x: float
@@ -63,16 +63,17 @@ def line_chart(
     bounds: tuple[float, float] = (-math.inf, math.inf),
     suffix: ChartFormat = "svg",
 ) -> bytes:
-    """Draw lines with bars over one axis.
+    """Draw lines with error bars.
 
     Args:
-        lines: name -> points, in the order of x; as many as `COLOURS` are distinguished.
-        below: label of the axis along.
-        beside: label of the axis across, with its unit.
-        bounds: that values across cannot lie beyond, e.g. 0 and 1 of shares.
-        suffix: format of the file.
+        lines: name -> points in the order of x; `COLOURS` limits the number of distinguishable
+            lines.
+        below: label of the horizontal axis.
+        beside: label of the vertical axis, with its unit.
+        bounds: limits of possible y values, e.g. 0 and 1 for shares.
+        suffix: file format.
     """
-    from matplotlib.figure import Figure  # noqa: PLC0415 - pages without charts need none
+    from matplotlib.figure import Figure  # noqa: PLC0415 - not needed for pages without charts
 
     every = [point for points in lines.values() for point in points]
     xs = sorted({point.x for point in every})
@@ -130,15 +131,15 @@ def plan_chart(
     labels: Sequence[str],
     suffix: ChartFormat = "svg",
 ) -> bytes:
-    """Draw walls and photos from above, to scale.
+    """Draw a plan of walls and photos, to scale.
 
     Args:
-        walls: as lines, each with its name, in the colour of its plane.
-        photos: as dots with an arrow where they look; names where there is room.
-        labels: of both axes.
-        suffix: format of the file.
+        walls: drawn as lines with their names, in the colours of their planes.
+        photos: drawn as dots with an arrow in the viewing direction; with names if there are few.
+        labels: labels of both axes.
+        suffix: file format.
     """
-    from matplotlib.figure import Figure  # noqa: PLC0415 - pages without charts need none
+    from matplotlib.figure import Figure  # noqa: PLC0415 - not needed for pages without charts
 
     feet, looks = (np.array([photo[k] for photo in photos]).reshape(-1, 2) for k in (1, 2))
     span = float(np.ptp(np.vstack([*(wall[2] for wall in walls), feet]), axis=0).max()) or 1.0
@@ -182,7 +183,7 @@ def _name(axes: Axes, name: str, place: NDArray[np.float64], *, colour: Any, abo
 
 
 def saved(figure: Figure, suffix: ChartFormat) -> bytes:
-    """Write a figure, without the date: the same figure gives the same bytes."""
+    """Return the file of a figure without a date, so that the same figure gives the same bytes."""
     stream = io.BytesIO()
     undated: dict[str, dict[str, Any]] = {
         "svg": {"Date": None},
@@ -194,5 +195,5 @@ def saved(figure: Figure, suffix: ChartFormat) -> bytes:
 
 
 def as_image(svg: bytes) -> str:
-    """Return an SVG file as a data URI for an image of a page."""
+    """Return an SVG file as a data URI for an image on a page."""
     return f"data:image/svg+xml;base64,{base64.b64encode(svg).decode('ascii')}"

@@ -1,4 +1,4 @@
-"""The combinations of variants that a run computed, their metrics, and their environments."""
+"""The combinations of variants in a run, their metrics and their environments."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from orthoflow.version import DISTRIBUTION
 from orthoflow.workflow.expand import variants_text
 from orthoflow.workflow.model import DATA
 
-# Walls that differ by more are two.
+# Planes whose normals differ by more are different walls.
 _TURNED_DEG: Final = 10.0
 _LARGER: Final = 1.5
 _ROOMS_MOST: Final = 3
@@ -34,13 +34,13 @@ class Measured:
     """A metric of one combination.
 
     Attributes:
-        value: the mean over the repeats; of errors of both signs that of their sizes.
-        spread: standard deviation over the repeats, NaN without repeats.
-        n_repeats: how many values there are.
-        n_all: how many runs of the step came to their end, with a value or without.
+        value: mean over the repeats; if these are errors of both signs, the mean absolute value.
+        spread: standard deviation over the repeats, NaN if there are none.
+        n_repeats: number of values.
+        n_all: number of repeats of the step that finished, with or without a value.
         unit: `1` for counts and shares.
-        environment: id of the environment that it was computed in.
-        is_of_sizes: the repeats are errors of both signs.
+        environment: id of the environment in which it was computed.
+        is_of_sizes: whether `value` is a mean of absolute values.
     """
 
     value: float
@@ -54,13 +54,13 @@ class Measured:
 
 @dataclass(frozen=True, kw_only=True)
 class Combination:
-    """One way through the variants.
+    """One choice of a variant for each step with variants.
 
     Attributes:
-        run: the run it belongs to.
-        assignment: step -> variant; empty when nothing varies.
-        cells: the cells that it is made of, in the order of the graph, repeats behind the first.
-        is_baseline: it is the one that the workflow calls its baseline.
+        run: run to which it belongs.
+        assignment: step -> variant; empty if the workflow has no variants.
+        cells: its cells in the order of the graph, each followed by its repeats.
+        is_baseline: whether it is the workflow's baseline.
     """
 
     run: Run
@@ -70,33 +70,33 @@ class Combination:
 
     @property
     def name(self) -> str:
-        """The variants in words, e.g. `plane=ransac, orient=pnp`."""
+        """The variants as text, e.g. `plane=ransac, orient=pnp`."""
         return variants_text(self.assignment)
 
     @property
     def failure(self) -> RecordedCell | None:
-        """The first cell that failed; what lies behind it was skipped and is not named."""
+        """The first cell that failed; cells that depend on it were skipped."""
         failed = (cell for cell in self.cells if cell.status == "failed" and cell.repeat == 0)
         return next(failed, None)
 
     @property
     def missing(self) -> tuple[RecordedCell, ...]:
-        """Cells that the run was interrupted before; optional steps without data are none."""
+        """Cells that were not reached before the run was interrupted."""
         return tuple(cell for cell in self.cells if cell.repeat == 0 and is_missing(cell))
 
     @property
     def n_failed_repeats(self) -> int:
-        """How many of the repeats after the first failed."""
+        """Number of repeats that failed, not counting the first."""
         return sum(cell.status == "failed" and cell.repeat > 0 for cell in self.cells)
 
     @property
     def varied_cells(self) -> tuple[RecordedCell, ...]:
-        """Cells that the variants have a part in, without repeats; all when nothing varies."""
+        """Cells that depend on variants, without repeats; all cells if there are no variants."""
         first = [cell for cell in self.cells if cell.repeat == 0]
         return tuple(cell for cell in first if cell.assignment or not self.assignment)
 
     def measured(self, step: str, metric: str) -> Measured | None:
-        """Return a metric of a step, None when the step did not report it."""
+        """Return a metric of a step, or None if the step did not report it."""
         found = [
             (row, cell.environment)
             for cell in self.cells
@@ -107,13 +107,13 @@ class Combination:
         if not found:
             return None
         values = np.array([row.value for row, _ in found])
-        # Their mean would be small where the repeats lie far apart, on both sides of the truth.
+        # Errors of both signs would cancel in the mean, however far the repeats are from the truth.
         is_of_sizes = bool(values.min() < 0.0 < values.max()) and found[0][0].better == "lower"
         if is_of_sizes:
             values = np.abs(values)
         return Measured(
             value=float(values.mean()),
-            # The mean of equal values may be off in its last digit; from the first one none is.
+            # Differences from the first value make the spread of identical values exactly 0.
             spread=float((values - values[0]).std(ddof=1)) if len(values) > 1 else math.nan,
             n_repeats=len(values),
             n_all=sum(cell.step == step and cell.status == "ok" for cell in self.cells),
@@ -123,19 +123,19 @@ class Combination:
         )
 
     def n_items(self, step: str, counted_by: str) -> float:
-        """How many items a metric of a step sums up, of repeats their mean; NaN: nobody counts."""
+        """Return the number of items a metric sums over (mean over repeats), NaN if not counted."""
         count = self.measured(step, counted_by) if counted_by else None
         return math.nan if count is None else count.value
 
 
 def unequal_walls(combinations: Iterable[Combination]) -> str:
-    """Return where the first walls of combinations are not one, room by room; empty where they are.
+    """Return in which datasets the first walls of the combinations differ; empty if in none.
 
-    What was found decides which wall is the first, so that numbers of it may be of different ones.
+    The detected planes decide which wall is the first, so its metrics may be of different walls.
     """
     by_room: dict[tuple[Path, str], list[tuple[Combination, tuple[float, ...]]]] = {}
     for one in combinations:
-        # Of the last step that gives walls.
+        # The last step that outputs walls.
         steps = [cell.step for cell in one.cells if gives(cell, Walls.type_name)][-1:]
         found = [one.measured(step, name) for step in steps for name in _FIRST_WALL]
         wall = tuple(value.value for value in found if value is not None)
@@ -144,7 +144,7 @@ def unequal_walls(combinations: Iterable[Combination]) -> str:
             by_room.setdefault(room, []).append((one, wall))
     groups = []
     for shown in by_room.values():
-        # What most of them show is what the odd ones do not.
+        # The walls of the majority; the other combinations are reported.
         walls = [wall for _, wall in shown]
         usual = max(walls, key=lambda wall: sum(_may_be_one_wall(wall, other) for other in walls))
         odd = [
@@ -168,13 +168,13 @@ _FIRST_WALL: Final = ("omega_deg", "phi_deg", "area_m2")
 
 
 def _may_be_one_wall(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
-    """Whether omega, phi and area may be those of one wall, its edges a little elsewhere."""
+    """Return whether omega, phi and area may belong to the same wall with slightly other edges."""
     is_turned = angle_between_deg(_normal(*one[:2]), _normal(*other[:2])) >= _TURNED_DEG
     return not is_turned and max(one[2], other[2]) <= _LARGER * min(one[2], other[2])
 
 
 def _normal(omega_deg: float, phi_deg: float) -> NDArray[np.float64]:
-    """(3,) unit vector; markiewicz2015 equation 3, as `omega_phi_deg`."""
+    """Return the unit normal (3,) for `omega_phi_deg` (markiewicz2015, equation 3)."""
     omega, phi = math.radians(omega_deg), math.radians(phi_deg)
     across = math.cos(phi)
     return np.array([across * math.cos(omega), across * math.sin(omega), math.sin(phi)])
@@ -185,26 +185,26 @@ def _wall_words(wall: tuple[float, ...]) -> str:
 
 
 def gives(cell: RecordedCell, *type_names: str) -> bool:
-    """Whether a cell has given a product of one of these types."""
+    """Return whether a cell has an output of one of these types."""
     return any(product.type_name in type_names for product in cell.outputs.values())
 
 
 def is_check(cell: RecordedCell) -> bool:
-    """Whether a cell judges the results of others: it gives inspections and nothing else."""
+    """Return whether a cell only checks the results of other steps: all outputs are inspections."""
     types = {product.type_name for product in cell.outputs.values()}
     return types == {Inspection.type_name}
 
 
 def is_missing(cell: RecordedCell) -> bool:
-    """Return whether the run was interrupted before the cell."""
+    """Return whether the run was interrupted before this cell."""
     return cell.error_type == NOT_YET
 
 
 def combinations_of(run: Run) -> tuple[Combination, ...]:
-    """Return every combination of variants that the run has cells of, the baseline marked.
+    """Return every combination of variants in a run, with the baseline marked.
 
     A combination that is part of a larger one (`plane=ransac` of `plane=ransac, orient=pnp`) is
-    no row of its own.
+    omitted.
     """
     assignments = list(dict.fromkeys(tuple(cell.assignment.items()) for cell in run.record.cells))
     parts = [frozenset(items) for items in assignments]
@@ -220,7 +220,7 @@ def combinations_of(run: Run) -> tuple[Combination, ...]:
 def combination_of(
     run: Run, assignment: Mapping[str, str], baseline: Mapping[str, str]
 ) -> Combination:
-    """Return all cells that lead to what has some variants, and to nothing that needs more."""
+    """Return the combination of all cells that are compatible with the given variants."""
     return Combination(
         run=run,
         assignment=assignment,
@@ -232,7 +232,7 @@ def combination_of(
 
 
 def baseline_of(run: Run) -> Mapping[str, str]:
-    """The variants that the workflow calls its baseline; empty without a comparison."""
+    """Return the variants of the workflow's baseline; empty if there is no comparison."""
     found = _comparison(run).get("baseline")
     if not isinstance(found, dict):
         return {}
@@ -240,14 +240,14 @@ def baseline_of(run: Run) -> Mapping[str, str]:
 
 
 def baseline_cells(run: Run) -> tuple[RecordedCell, ...]:
-    """The cells of the baseline, of the first combination when the workflow names none."""
+    """Return the cells of the baseline, or of the first combination if none is declared."""
     found = combinations_of(run)
     chosen = next((one for one in found if one.is_baseline), found[0] if found else None)
     return tuple(cell for cell in chosen.cells if cell.repeat == 0) if chosen else ()
 
 
 def baseline_addresses(run: Run) -> tuple[str, ...]:
-    """The cells whose figures lie beside the page: of the baseline, and before all variants."""
+    """Return the cells whose figures are next to the page: baseline and cells without variants."""
     baseline = {cell.address for cell in baseline_cells(run)}
     return tuple(
         address
@@ -257,12 +257,12 @@ def baseline_addresses(run: Run) -> tuple[str, ...]:
 
 
 class Way(NamedTuple):
-    """The cells of one combination, a row of the comparison, that the page shows with it.
+    """The cells that the page shows for one combination, a row of the comparison.
 
     Attributes:
-        anchor: its anchor on the page.
-        name: the variants in words.
-        cells: addresses of the cells that no row above and no section of the page shows.
+        anchor: anchor on the page.
+        name: the variants as text.
+        cells: addresses of its cells that are not shown by a row above or by a section of the page.
     """
 
     anchor: str
@@ -271,11 +271,11 @@ class Way(NamedTuple):
 
 
 def ways(run: Run, prefix: str) -> tuple[Way, ...]:
-    """Return the combinations of a run, each cell with the first that it belongs to.
+    """Return the combinations of a run; a cell belongs to the first combination that has it.
 
     Args:
         run: the run.
-        prefix: what the anchors begin with.
+        prefix: prefix of the anchors.
     """
     shown = set(baseline_addresses(run))
     found = []
@@ -287,7 +287,7 @@ def ways(run: Run, prefix: str) -> tuple[Way, ...]:
 
 
 def improved_on(run: Run, addresses: Collection[str]) -> frozenset[str]:
-    """Cells whose result a later step of the same kind continues, such as a first orientation."""
+    """Return cells whose result a later step of the same kind refines, e.g. first orientations."""
     return frozenset(
         before.address
         for address in addresses
@@ -299,7 +299,7 @@ def improved_on(run: Run, addresses: Collection[str]) -> frozenset[str]:
 
 
 def wanted_metrics(run: Run) -> tuple[str, ...]:
-    """The patterns `step.metric` that the workflow's comparison asks for."""
+    """Return the patterns `step.metric` that the workflow's comparison selects."""
     found = _comparison(run).get("metrics")
     return tuple(str(pattern) for pattern in found) if isinstance(found, list) else ()
 
@@ -314,7 +314,7 @@ def _comparison(run: Run) -> Mapping[str, object]:
 
 
 def _is_baseline(assignment: Mapping[str, str], baseline: Mapping[str, str]) -> bool:
-    # A dataset is none of the baseline's steps: each has a baseline of its own.
+    # The dataset is not part of the baseline: each dataset has its own baseline.
     return bool(baseline) and all(
         baseline.get(step, variant) == variant for step, variant in assignment.items()
     )
@@ -322,39 +322,40 @@ def _is_baseline(assignment: Mapping[str, str], baseline: Mapping[str, str]) -> 
 
 @dataclass(frozen=True, kw_only=True)
 class EnvironmentGroups:
-    """Which environments of some runs are one for those who compare.
+    """Groups of equivalent environments.
 
     Attributes:
-        first: id -> id of the first one that it is like.
-        words: id of each first one -> what it is, and in what it is unlike the very first.
+        first: id -> id of the first equivalent environment.
+        words: id of the first environment of each group -> description, with its differences from
+            the first group.
     """
 
     first: Mapping[str, str]
     words: Mapping[str, str]
 
     def are_comparable(self, one: str, other: str) -> bool:
-        """Whether values of two environments may be compared."""
+        """Return whether values from two environments may be compared."""
         return self.first.get(one, one) == self.first.get(other, other)
 
 
 def group_environments(runs: Iterable[Run]) -> EnvironmentGroups:
-    """Join the environments in which what the methods of the runs use is the same.
+    """Group the environments that are the same in all packages that the methods use.
 
-    Of packages those count that the methods' distributions, or this one, require; all of them
-    where one of these is not installed here. What only one environment has is nothing that both
-    could have used, such as a plugin that was installed between two runs.
+    Only packages required by the distributions of the methods, or by orthoflow, are compared; if
+    one of these distributions is not installed, all packages are. A package found in only one
+    environment, such as a plugin installed between two runs, is ignored.
     """
     runs = tuple(runs)
     environments = {one.id: one for run in runs for one in run.record.environments}
     named = {cell.distribution for run in runs for cell in run.record.cells} - {""}
-    # Of one alone nothing has to be known.
+    # A single environment needs no comparison.
     several = len(environments) > 1
     used = required_distributions(frozenset({*named, DISTRIBUTION})) if several else None
     first: dict[str, str] = {}
     known: dict[str, dict[str, str]] = {}
     for key, environment in environments.items():
         facts = _facts(environment, used)
-        # Against all that a group has seen: of three, two may differ in what the first lacks.
+        # Compare with all members: two of them may differ in a package that the first lacks.
         like = next((name for name, seen in known.items() if _agree(seen, facts)), key)
         first[key] = like
         known[like] = facts | known.get(like, {})
@@ -363,7 +364,7 @@ def group_environments(runs: Iterable[Run]) -> EnvironmentGroups:
 
 
 def environment_words(environment: RecordedEnvironment) -> str:
-    """State in one line where something was computed."""
+    """Return a one-line description of an environment."""
     commit = f", code at commit {environment.git_commit}" if environment.git_commit else ""
     return (
         f"Python {environment.python}, {environment.os}, {environment.cpu}, "
@@ -374,14 +375,14 @@ def environment_words(environment: RecordedEnvironment) -> str:
 def distinct_words(
     environments: Sequence[RecordedEnvironment], used: Collection[str] | None = None
 ) -> dict[str, str]:
-    """State where things were computed, with the packages in which each is unlike the first.
+    """Return descriptions of environments, with the packages in which each differs from the first.
 
     Args:
-        environments: in the order of the texts.
-        used: the packages that count; all when not given.
+        environments: in the order of the descriptions.
+        used: packages to compare; None for all.
 
     Returns:
-        By id.
+        Environment id -> description.
     """
     return {
         one.id: environment_words(one)
@@ -392,7 +393,7 @@ def distinct_words(
 
 
 def _other_packages(own: Mapping[str, str], others: Mapping[str, str]) -> str:
-    """State in which packages an environment differs from another; empty where in none."""
+    """Return the packages in which an environment differs from another; empty if in none."""
     texts = [f"{name} {own[name]}" for name in own if own[name] != others.get(name)]
     texts += [f"no {name}" for name in others if name not in own]
     return f"; unlike the first with {first_few(texts)}" if texts else ""

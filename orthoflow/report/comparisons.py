@@ -1,4 +1,4 @@
-"""The comparison table (combinations and their metrics) and the table of datasets."""
+"""The table of combinations and their metrics, and the table of datasets."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ from orthoflow.workflow.expand import variants_text
 from orthoflow.workflow.model import DATA
 
 _NOTHING: Final = "-"
-# A machine that does nothing else moves the times of short steps by so much.
+# Run times of short steps vary by this much even on an idle machine.
 _TIMED_S: Final = 0.1
-_MAX_DESCRIBED: Final = 12  # metrics that are shown where none of quality differs
-_MAX_NAMED: Final = 3  # numbers that a combination is best in
-# Cost of the steps in which combinations differ; processor time hardly depends on other programs.
+_MAX_DESCRIBED: Final = 12  # metrics shown if no quality metric differs
+_MAX_NAMED: Final = 3  # metrics listed in which a combination is best
+# Cost of the steps in which combinations differ; processor time hardly depends on machine load.
 _SUMMED: Final = tuple(
     MetricRow(cell="", step="", method="", name=name, value=0.0, unit=unit, label=label,
               better="lower", headline=True)
@@ -56,17 +56,17 @@ _SUMMED: Final = tuple(
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """One combination.
+    """A row of the table: one combination.
 
     Attributes:
-        run: the run it belongs to, its workflow and id.
-        variants: variant of each varied step; a dash where the step has no part in it.
-        name: these in words, with the run where there are several.
-        is_baseline: the workflow calls it its baseline.
-        failure: where and why it failed, empty when it did not.
-        missing: addresses that the run was interrupted before.
-        values: one per column.
-        remark: how many of its repeats failed.
+        run: label of its run: workflow and id.
+        variants: variant of each varied step; a dash if the combination does not include the step.
+        name: the variants as text, with the run if there are several.
+        is_baseline: whether it is the workflow's baseline.
+        failure: which cell failed and why; empty if none failed.
+        missing: addresses of cells not reached before the run was interrupted.
+        values: one value per column.
+        remark: number of failed repeats, as text.
     """
 
     run: str
@@ -80,29 +80,29 @@ class Row:
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """Letters of the environments and data of its numbers, each once."""
+        """Distinct letters of the environments and data of its values."""
         return tuple(dict.fromkeys(value.group for value in self.values if value.group))
 
     @property
     def shortfall(self) -> str:
-        """Why it has no time and no memory, in a word or two; empty when it is whole."""
+        """Why it has no time and memory, in a word or two; empty if it is complete."""
         return "failed" if self.failure else "not computed" if self.missing else ""
 
     def count(self, mark: Mark) -> int:
-        """In how many numbers it stands like this."""
+        """Return the number of values with this mark."""
         return sum(value.mark is mark for value in self.values)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ComparisonTable:
-    """Combinations beside each other.
+    """Table of combinations and their metrics.
 
     Attributes:
-        steps: the varied steps.
-        columns: metrics, processor time and memory last.
+        steps: steps with variants.
+        columns: metrics; processor time and memory last.
         rows: in the order of the runs and their graphs.
-        shows_runs: rows come from more than one run.
-        groups: letter -> what environment and data it stands for; empty when all is of one kind.
+        shows_runs: whether the rows come from more than one run.
+        groups: letter -> environment and data; empty if these are the same for all values.
     """
 
     steps: tuple[str, ...]
@@ -113,13 +113,13 @@ class ComparisonTable:
 
     @property
     def baseline(self) -> str:
-        """The combination that the others are compared with; empty where there is none, or two."""
+        """Name of the baseline; empty if there is none or more than one."""
         found = [row.name for row in self.rows if row.is_baseline]
         return found[0] if len(found) == 1 else ""
 
     @property
     def glance(self) -> tuple[Row, ...]:
-        """The rows: which is best, then near the best most often first."""
+        """The rows, sorted by how often they are best, then by how often they are near the best."""
 
         def place(row: Row) -> tuple[bool, int, int]:
             return bool(row.shortfall), -row.count(Mark.BEST), -row.count(Mark.NEAR)
@@ -127,7 +127,7 @@ class ComparisonTable:
         return tuple(sorted(self.rows, key=place))
 
     def best_in(self, row: Row) -> str:
-        """Name what a row is clearly best in, at most three; empty if nothing."""
+        """Return the metrics in which a row is clearly best, at most three; may be empty."""
         found = [
             ": ".join(filter(None, (column.step, column.titled)))
             for column, value in zip(self.columns, row.values, strict=True)
@@ -137,10 +137,10 @@ class ComparisonTable:
 
 
 def comparison_table(runs: Sequence[Run]) -> ComparisonTable | None:
-    """Put the combinations of one or more runs beside each other; None when there is but one.
+    """Return the table of combinations of one or more runs; None if there is only one combination.
 
-    Values are ranked only among those of one environment and one set of data; with more than one
-    of either, letters distinguish them.
+    Values are ranked only within the same environment and data; if there are several of either,
+    letters distinguish them.
     """
     combinations = [one for run in runs for one in combinations_of(run)]
     if len(combinations) < 2:
@@ -182,9 +182,9 @@ def comparison_table(runs: Sequence[Run]) -> ComparisonTable | None:
 
 
 def comparison_columns(combinations: Sequence[Combination]) -> tuple[MetricRow, ...]:
-    """Metrics that the workflows ask for, else those of quality; the cost has its own places.
+    """Return the metrics that the workflows select, or else the quality metrics, without costs.
 
-    Where none of quality differs, what does is described behind them and not judged.
+    If no quality metric differs, other metrics that differ are appended; they are not ranked.
     """
     first: dict[tuple[str, str], MetricRow] = {}
     for cell in (cell for one in combinations for cell in one.cells):
@@ -198,7 +198,8 @@ def comparison_columns(combinations: Sequence[Combination]) -> tuple[MetricRow, 
     else:
         wanted = headline_keys(cell for one in combinations for cell in one.cells)
         if not any(_differs(key, combinations) for key in wanted):
-            # Of a metric of several steps the last step's, which improves on the earlier ones.
+            # If several steps report a metric, the last one refines the results of the earlier
+            # ones.
             last = {metric: (step, metric) for step, metric in first}
             order = {step: place for place, (step, _) in enumerate(first)}
             described = [
@@ -215,7 +216,7 @@ def comparison_columns(combinations: Sequence[Combination]) -> tuple[MetricRow, 
 
 
 def _differs(key: tuple[str, str], combinations: Sequence[Combination]) -> bool:
-    """Whether a metric is not the same in all combinations that have it."""
+    """Return whether the combinations that have a metric have different values."""
     values = [value.value for one in combinations if (value := one.measured(*key))]
     return any(not is_rounding(values[0], value) for value in values[1:])
 
@@ -224,7 +225,7 @@ def _matching(patterns: Iterable[str], known: Iterable[tuple[str, str]]) -> list
     found: dict[tuple[str, str], None] = {}
     for pattern in patterns:
         for step, metric in known:
-            # `*.wall_s` asks for every step's time; the table sums it up in a column of its own.
+            # `*.wall_s` selects the time of every step; the table has a column for its sum.
             is_summed = pattern.startswith("*.") and metric in COSTS
             if not is_summed and fnmatchcase(f"{step}.{metric}", pattern):
                 found[step, metric] = None
@@ -232,7 +233,7 @@ def _matching(patterns: Iterable[str], known: Iterable[tuple[str, str]]) -> list
 
 
 def _costs(one: Combination, origins: Origins) -> tuple[Value, Value]:
-    """Processor time and memory of the steps that the variants have a part in, if all is there."""
+    """Return processor time and memory of the cells that depend on variants, if none is missing."""
     varied = [cell for cell in one.varied_cells if cell.status == "ok"]
     if one.failure or one.missing or not varied:
         return Value(), Value()
@@ -246,7 +247,7 @@ def _costs(one: Combination, origins: Origins) -> tuple[Value, Value]:
 
 
 def _run_labels(runs: Sequence[Run]) -> dict[tuple[Path, str], str]:
-    """The workflow with the options that not all runs have, the run's folder and its id."""
+    """Return run labels: workflow, options that differ between runs, run folder and id."""
     shared = frozenset.intersection(*(frozenset(run.record.overrides) for run in runs))
     labels = {}
     for run in runs:
@@ -257,7 +258,7 @@ def _run_labels(runs: Sequence[Run]) -> dict[tuple[Path, str], str]:
 
 
 def measured_text(measured: Measured) -> str:
-    """Print a value, of repeats with their standard deviation."""
+    """Format a value, with its standard deviation if there are repeats."""
     if measured.n_repeats > 1:
         return number_with_spread(measured.value, measured.spread)
     return number(measured.value)
@@ -267,7 +268,7 @@ def _value(one: Combination, origins: Origins, column: MetricRow) -> Value:
     measured = one.measured(column.step, column.metric)
     if measured is None:
         return Value()
-    # Of a repeat that missed the wall there is no error of it, and the others look as good as any.
+    # A repeat that missed the wall has no error, which makes the remaining ones look good.
     of_all = (
         f" ({measured.n_repeats} of {measured.n_all} repeats)"
         if measured.n_repeats < measured.n_all
@@ -285,21 +286,21 @@ def _value(one: Combination, origins: Origins, column: MetricRow) -> Value:
     )
 
 
-# Environment, the first of its equivalent ones, and digests of data.
+# Id of the first equivalent environment, and digests of data.
 _Origin: TypeAlias = tuple[str, tuple[str, ...]]
-# Record, id of the run, and dataset.
+# Record, run id and dataset.
 _Place: TypeAlias = tuple[Path, str, str]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Origins:
-    """A letter for each environment and set of data that values of combinations are of.
+    """Letters for the environments and data from which values of combinations originate.
 
     Attributes:
-        environments: the environments.
-        data: record, run and dataset -> digests of what the methods were given.
-        letters: environment and data -> letter; without any when all is of one kind.
-        legend: letter -> what it stands for.
+        environments: groups of equivalent environments.
+        data: record, run and dataset -> digests of the input data.
+        letters: environment and data -> letter; empty if all values have the same origin.
+        legend: letter -> description.
     """
 
     environments: EnvironmentGroups
@@ -309,7 +310,7 @@ class Origins:
 
     @staticmethod
     def of(combinations: Sequence[Combination]) -> Origins:
-        """Look through the environments and the data of combinations."""
+        """Determine the origins of all values of the combinations."""
         groups = group_environments({_place(one)[:2]: one.run for one in combinations}.values())
         data: dict[_Place, tuple[str, ...]] = {}
         places: dict[_Origin, dict[str, None]] = {}
@@ -335,7 +336,7 @@ class Origins:
         return Origins(environments=groups, data=data, letters=letters, legend=legend)
 
     def letter(self, one: Combination, environment: str) -> str:
-        """Return the letter of a value; empty when all values are of one kind."""
+        """Return the letter of a value; empty if all values have the same origin."""
         first = self.environments.first.get(environment, environment)
         return self.letters.get((first, self.data[_place(one)]), "")
 
@@ -345,11 +346,11 @@ def _place(one: Combination) -> _Place:
 
 
 def _data_of(record: RunRecord, data: str) -> tuple[str, ...]:
-    """What the methods were given: digests of input files, and of simulated data."""
+    """Return the digests of input files and of simulated data."""
     digests = [
         file.sha256
         for given in record.inputs
-        # `scan@hall` is that of one dataset; the others' have no part in it.
+        # `scan@hall` is an input of the dataset hall only.
         if given.name.partition("@")[2] in {"", data}
         for file in given.files
     ]
@@ -363,13 +364,13 @@ def _data_of(record: RunRecord, data: str) -> tuple[str, ...]:
 
 
 def _letter(index: int) -> str:
-    # 27 environments in one report: AA follows Z.
+    # AA follows Z.
     first, last = divmod(index, len(ascii_uppercase))
     return (ascii_uppercase[first - 1] if first else "") + ascii_uppercase[last]
 
 
 _MOST_COLUMNS: Final = 6
-# Pictures of a page with many rooms get smaller, until they show nothing any more.
+# Pixels in all pictures together; with many datasets, the pictures become too small to be useful.
 _PICTURES_PX: Final = 2_000_000
 _LARGEST_PX: Final = 220
 _SMALLEST_PX: Final = 64
@@ -377,16 +378,16 @@ _SMALLEST_PX: Final = 64
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetRow:
-    """One dataset, as the baseline has it.
+    """Results of the baseline on one dataset.
 
     Attributes:
-        name: of the dataset.
-        page: where its own page lies, relative to this one; empty without one.
-        picture: data URI of its first orthoimage, empty without one.
-        failed: its failed cells and why they did, without those that were skipped behind them.
-        missing: its cells that the run was interrupted before.
-        values: one per column.
-        limit: what limits it most, and how much more does.
+        name: name of the dataset.
+        page: path of its own page, relative to this one; empty if it has none.
+        picture: data URI of its first orthoimage; empty if there is none.
+        failed: failed cells and the reasons, without the cells skipped as a consequence.
+        missing: cells not reached before the run was interrupted.
+        values: one value per column.
+        limit: the most important diagnostic, and how many more there are.
     """
 
     name: str
@@ -403,9 +404,9 @@ class DatasetTable:
     """The datasets of a run.
 
     Attributes:
-        columns: what is measured of each: step, and metric with its unit.
+        columns: step, and metric with its unit.
         rows: in the order of the run.
-        baseline: the variants that the numbers are of; empty where nothing varies.
+        baseline: variants to which the values belong; empty if there are no variants.
     """
 
     columns: tuple[tuple[str, str], ...]
@@ -414,11 +415,11 @@ class DatasetTable:
 
 
 def dataset_table(parts: Mapping[str, Run], pages: Mapping[str, str]) -> DatasetTable:
-    """Put the datasets of a run below each other.
+    """Return the table of the datasets of a run.
 
     Args:
         parts: dataset -> its part of the run.
-        pages: dataset -> its own page, relative to the one that is made.
+        pages: dataset -> its own page, relative to the page being written.
     """
     own = {
         name: {cell.address for cell in part.record.cells if DATA in cell.assignment}
@@ -426,7 +427,7 @@ def dataset_table(parts: Mapping[str, Run], pages: Mapping[str, str]) -> Dataset
     }
     measured = {name: _measured(part, own[name]) for name, part in parts.items()}
     units = {key: row for values in measured.values() for key, row in values.items()}
-    # Those of the comparison, which the workflow may have asked for.
+    # The columns of the comparison, which the workflow may have selected.
     columns = comparison_columns([one for part in parts.values() for one in combinations_of(part)])
     wanted = [(column.step, column.metric) for column in columns]
     chosen = [key for key in wanted if key in units][:_MOST_COLUMNS]
@@ -456,7 +457,7 @@ _Measured = Mapping[tuple[str, str], MetricRow]
 
 
 def _measured(part: Run, own: AbstractSet[str]) -> _Measured:
-    """What the baseline's cells of this dataset measured: (step, metric) -> the number."""
+    """Return the metrics of the baseline on this dataset: (step, metric) -> value."""
     return {
         (row.step, row.metric): row
         for cell in baseline_cells(part)
@@ -476,7 +477,7 @@ def _dataset_value(measured: MetricRow | None) -> Value:
 
 
 def _limit(part: Run, own: AbstractSet[str]) -> str:
-    """What the baseline's steps of this dataset warn of; failures stand beside it."""
+    """Return the warnings of the baseline on this dataset; failures are listed separately."""
     baseline = {cell.address for cell in baseline_cells(part)} & own
     texts = [
         limit.text

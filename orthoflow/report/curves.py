@@ -1,4 +1,4 @@
-"""What a parameter does: metrics over the values that it was given, as drawings for the page."""
+"""Metrics plotted against the values of a swept parameter."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ from orthoflow.workflow.model import DATA
 _MOST_CURVES: Final = 12
 _LONGEST_NAME: Final = 120
 _MOST_LINES: Final = 6
-# An untrusted record may have any number; differences of larger ones are meaningless.
+# Records are untrusted and may contain any number; differences of larger ones are meaningless.
 _LARGEST: Final = 1e100
 _FEWEST_VALUES: Final = 2
 
 
 @dataclass(frozen=True, kw_only=True)
 class Curve:
-    """One metric over one parameter.
+    """One metric plotted against one parameter.
 
     Attributes:
-        name: the metric and the parameter by the names of their steps and themselves.
-        title: the metric, its step and the parameter, in words.
-        caption: what the points and bars are, in words.
+        name: file name: metric and parameter with their steps.
+        title: title: metric, step and parameter.
+        caption: explanation of the points and error bars.
         lines: name -> points.
-        below: label of the axis of the parameter.
-        beside: label of the axis of the metric, with its unit.
-        bounds: that the metric cannot lie beyond.
+        below: label of the parameter's axis.
+        beside: label of the metric's axis, with its unit.
+        bounds: limits of possible values of the metric.
     """
 
     name: str
@@ -55,21 +55,21 @@ class Curve:
 
     @property
     def picture(self) -> Picture:
-        """The drawing as a picture of a page."""
+        """The chart as a picture on a page."""
         return Picture(uri=as_image(self.file("svg")), title=self.title, caption=self.caption)
 
     def file(self, suffix: ChartFormat) -> bytes:
-        """The drawing as a file."""
+        """Return the chart as a file."""
         return line_chart(
             self.lines, below=self.below, beside=self.beside, bounds=self.bounds, suffix=suffix
         )
 
 
 def curve_files(run: Run, suffix: ChartFormat = "svg") -> dict[str, bytes]:
-    """Return the drawings of a run, over its datasets where it has several, as files by name."""
+    """Return the curves of a run, over all its datasets, as files by name."""
     parts = parts_of(run)
     drawn = curves([*parts.values()] if len(parts) > 1 else [run])
-    # What a record calls its steps and metrics may be no name of a file.
+    # Names of steps and metrics in a record may be invalid as file names.
     names = (re.sub(r"[^\w.-]", "_", curve.name)[:_LONGEST_NAME] for curve in drawn)
     return {
         f"{index:02d}_{name}.{suffix}": curve.file(suffix)
@@ -78,27 +78,27 @@ def curve_files(run: Run, suffix: ChartFormat = "svg") -> dict[str, bytes]:
 
 
 def curves(parts: Sequence[Run]) -> tuple[Curve, ...]:
-    """Draw the metrics of a comparison over every parameter in which variants differ alone.
+    """Return curves of the compared metrics for every parameter that is swept.
 
-    A sweep is known by what was run, not by how the workflow was written: variants of a step that
-    call one method and differ in one number.
+    Sweeps are found from the cells, not from the workflow text: variants of a step that call the
+    same method and differ in one number.
 
     Args:
-        parts: the run, or its datasets, of which medians are drawn and how far they lie apart.
+        parts: the run, or the parts of its datasets, over which medians and spreads are computed.
     """
     return tuple(islice(_curves(parts), _MOST_CURVES))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep:
-    """Variants of a step that differ in a number, and perhaps in other parameters.
+    """Variants of a step that differ in a number, and possibly in other parameters.
 
     Attributes:
         step: name of the step.
-        method: what its variants call, `plane.ransac`.
+        method: method of the variants, e.g. `plane.ransac`.
         parameter: name of the parameter.
         values: variant -> value.
-        others: variant -> what else is set to differ, in words.
+        others: variant -> other parameters that differ, as text.
     """
 
     step: str
@@ -109,14 +109,14 @@ class Sweep:
 
 
 def sweeps(cells: Sequence[RecordedCell]) -> Iterator[Sweep]:
-    """Find the sweeps among cells: some variants differ in one number alone."""
+    """Yield the sweeps among cells: groups of variants that differ in only one number."""
     by_method: dict[tuple[str, str], dict[str, RecordedCell]] = {}
     for cell in cells:
         variant = cell.assignment.get(cell.step)
         if variant is not None and cell.repeat == 0 and cell.status != "skipped":
             by_method.setdefault((cell.step, cell.method), {}).setdefault(variant, cell)
     for (step, method), variants in by_method.items():
-        # What nobody set a method may have from what was set: a default that gives way to a value.
+        # Only parameters that were set: defaults may depend on other parameters.
         names = sorted({name for cell in variants.values() for name in cell.params_set})
         differ = [
             name
@@ -147,7 +147,7 @@ def sweeps(cells: Sequence[RecordedCell]) -> Iterator[Sweep]:
 
 
 class _Value(NamedTuple):
-    """What one combination measured, and in how many repeats."""
+    """Value of one combination, and its spread over repeats."""
 
     value: float
     spread: float
@@ -155,21 +155,21 @@ class _Value(NamedTuple):
     dataset: str
 
 
-# Value of the parameter -> what combinations measured there.
+# Value of the parameter -> values of the combinations.
 _Line = dict[float, list[_Value]]
 
 
 def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
     combinations = [one for part in parts for one in combinations_of(part)]
     cells = [cell for part in parts for cell in part.record.cells]
-    # What several methods sweep is one drawing: axes of their own would hide which is better.
+    # Sweeps of several methods share a chart, so that they can be compared.
     swept: dict[tuple[str, str], list[Sweep]] = {}
     for sweep in sweeps(cells):
         swept.setdefault((sweep.step, sweep.parameter), []).append(sweep)
     columns = comparison_columns(combinations)
     for column in sorted(columns, key=lambda one: not one.headline):
         for (step, parameter), group in swept.items():
-            # A parameter over itself is meaningless.
+            # The parameter itself may be a metric; plotting it against itself is meaningless.
             is_behind = any(cell.step == column.step and step in cell.assignment for cell in cells)
             if (column.step, column.metric) == (step, parameter) or not is_behind:
                 continue
@@ -186,9 +186,10 @@ def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
 def _lines(
     combinations: Sequence[Combination], sweep: Sweep, column: MetricRow
 ) -> dict[str, _Line]:
-    """One line per combination of the other variants, over the datasets that all its points have.
+    """Return a line per combination of the other variants, over datasets that all its points have.
 
-    The hard datasets are often those that a value fails on: without them it would look better.
+    Parameter values that fail on difficult datasets would look better if these were excluded for
+    them alone.
     """
     lines: dict[str, _Line] = {}
     for one in combinations:
@@ -216,7 +217,7 @@ def _curve(parameter: str, column: MetricRow, lines: Mapping[str, _Line], n_data
         for name, line in lines.items()
     }
     every = [point for points in drawn.values() for point in points]
-    # Sizes of errors are never below 0, and what is judged by more and lies in 0 to 1 is a share.
+    # Absolute errors are not negative; metrics between 0 and 1 where higher is better are shares.
     is_size = column.better == "lower" and all(point.y >= 0.0 for point in every)
     is_share = column.better == "higher" and all(0.0 <= point.y <= 1.0 for point in every)
     notes = [_points_text(lines, column.unit, n_datasets)]
@@ -238,9 +239,9 @@ def _curve(parameter: str, column: MetricRow, lines: Mapping[str, _Line], n_data
 def _point(x: float, found: Sequence[_Value], column: MetricRow, *, is_over: bool) -> ChartPoint:
     numbers = np.array([one.value for one in found])
     if column.better == "lower":
-        # Errors of both signs would make each other small, and the most negative look best.
+        # Errors of both signs would cancel, and the most negative one would look best.
         numbers = np.abs(numbers)
-    # A bar over datasets is how far they lie apart, not how far the repeats of one do.
+    # Over datasets, the bar is the spread between datasets, not between repeats.
     spread = spread_of(numbers, column.unit) if is_over else found[0].spread
     return ChartPoint(
         x=x,
@@ -251,7 +252,7 @@ def _point(x: float, found: Sequence[_Value], column: MetricRow, *, is_over: boo
 
 
 def _points_text(lines: Mapping[str, _Line], unit: str, n_datasets: int) -> str:
-    """What the points are, and over datasets how many these are: what failed has no part in it."""
+    """Return the explanation of the points, with the number of datasets without failures."""
     found = [values for line in lines.values() for values in line.values()]
     if n_datasets < 2:
         if any(math.isfinite(one.spread) for values in found for one in values):

@@ -1,4 +1,4 @@
-"""Two runs side by side: what differs, equal differences in one row, and how far apart."""
+"""Differences between two runs, with equal ones grouped into one row."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _NOTHING: Final = "-"
 
 @dataclass(frozen=True, kw_only=True)
 class Difference:
-    """A value that differs between the two runs."""
+    """A value that differs between two runs."""
 
     cell: str
     name: str
@@ -36,16 +36,16 @@ class Difference:
 
 @dataclass(frozen=True, kw_only=True)
 class DifferenceTable:
-    """What differs of one kind.
+    """Differences of one kind.
 
     Attributes:
-        title: what kind.
-        n_compared: how many things both runs have.
+        title: name of the kind.
+        n_compared: number of values that both runs have.
         n_different: number of those that differ.
-        rows: those that differ, and those that only one run has; equal ones are grouped.
-        n_alone: how many things only one run has.
-        n_rounded: how many things differ by rounding only; they have no row.
-        whose: of which steps they are, if not of all.
+        rows: values that differ, and values that only one run has; equal rows are grouped.
+        n_alone: number of values that only one run has.
+        n_rounded: number of values that differ by rounding only; they have no row.
+        whose: steps to which the table is restricted; empty for all.
     """
 
     title: str
@@ -58,7 +58,7 @@ class DifferenceTable:
 
 
 def differences(comparison: RunComparison) -> tuple[DifferenceTable, ...]:
-    """Put a comparison of two runs into tables of what differs, one per kind of thing."""
+    """Return a table of differences for each kind of value in a comparison of two runs."""
     step_of, of_shared = comparison.step_of, comparison.of_shared_steps
     parameters = comparison.shared(comparison.parameters)
     moved = moved_first([pair for pair in comparison.measured if pair.is_moved], step_of)
@@ -68,7 +68,7 @@ def differences(comparison: RunComparison) -> tuple[DifferenceTable, ...]:
         _table("Steps", comparison.cells, str, step_of),
         _table("Parameters", parameters, _parameter_text, step_of, whose=of_shared),
         _table("Environment", comparison.environment, str),
-        # Time and memory always differ, and stand in the comparison table.
+        # Time and memory always differ, and are in the comparison table.
         _table(
             "Metrics, time and memory left aside",
             comparison.measured,
@@ -91,16 +91,16 @@ def _table(
     change: Callable[[Pair[Side]], str] = lambda _pair: "",
     whose: str = "",
 ) -> DifferenceTable:
-    """Return what differs between things, with equal differences of a step grouped.
+    """Return the differences of one kind, with equal differences of a step grouped.
 
     Args:
-        title: what kind of things.
-        pairs: all.
-        text: how a side is written.
-        step_of: the step of each cell.
-        different: those that have a row, in this order; None for all that differ.
-        change: how far one moved.
-        whose: of which steps they are, if not of all.
+        title: name of the kind.
+        pairs: all values.
+        text: formats the value of one run.
+        step_of: step of each cell.
+        different: pairs that have a row, in this order; None for all that differ.
+        change: formats the change between the runs.
+        whose: steps to which the table is restricted; empty for all.
     """
     steps = step_of or {}
     counts = DifferenceCounts.of(pairs)
@@ -141,7 +141,7 @@ def _parameter_text(parameter: ParameterValue) -> str:
     return f"{text} (set)" if parameter.is_set else text
 
 
-# --- equal rows as one, headline numbers first ---
+# --- grouping of equal rows and their order ---
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,14 +150,14 @@ class RowGroup(Generic[Side]):
 
     Attributes:
         pair: the first of them.
-        n: how many there are.
+        n: number of rows.
     """
 
     pair: Pair[Side]
     n: int
 
     def label(self, step_of: Mapping[str, str]) -> str:
-        """Name what they are of: a cell, or else a step and how many cells of it.
+        """Return the label: the address of one cell, or a step and the number of its cells.
 
         >>> steps = {"wall@a": "wall", "wall@b": "wall"}
         >>> rows = [Pair(cell=cell, name="cell_m", left=1, right=2) for cell in steps]
@@ -169,7 +169,7 @@ class RowGroup(Generic[Side]):
         if self.n == 1:
             return ".".join(part for part in (cell, name) if part)
         step = step_of.get(cell, cell)
-        # A row of a step itself has its name.
+        # A row about the step itself has no other name.
         what = ".".join(dict.fromkeys(part for part in (step, name) if part))
         return f"{what}, {self.n} steps"
 
@@ -177,7 +177,7 @@ class RowGroup(Generic[Side]):
 def grouped_rows(
     pairs: Iterable[Pair[Side]], text: Callable[[Side], str], step_of: Mapping[str, str]
 ) -> list[RowGroup[Side]]:
-    """Put pairs of one step whose sides have equal texts together, in the order of the first."""
+    """Group pairs of a step with equal texts, in the order of their first occurrence."""
     found: dict[Hashable, list[Pair[Side]]] = {}
     for pair in pairs:
         sides = (None if side is None else text(side) for side in (pair.left, pair.right))
@@ -189,16 +189,16 @@ def grouped_rows(
 def moved_first(
     pairs: Sequence[Pair[ComparedMetric]], step_of: Mapping[str, str]
 ) -> list[Pair[ComparedMetric]]:
-    """Put headline numbers first, then others with a good side, then the rest, rounding last.
+    """Sort headline metrics first, then other ranked metrics, then unranked ones, then rounding.
 
-    Of each of them the largest relative change comes first.
+    Within each group, the largest relative change comes first.
     """
     places = {step: place for place, step in enumerate(dict.fromkeys(step_of.values()))}
 
     def key(pair: Pair[ComparedMetric]) -> tuple[bool, int, float, int]:
         facts = pair.right or pair.left
         group = 2 if facts is None else 0 if facts.headline else 1 if facts.better else 2
-        # A later step takes further what an earlier one has begun, as orientations do.
+        # A later step refines the results of an earlier one, as with orientations.
         later = -places.get(step_of.get(pair.cell, pair.cell), 0)
         return pair.is_rounded, group, -_relative_change(pair), later
 
@@ -206,10 +206,10 @@ def moved_first(
 
 
 def _relative_change(pair: Pair[ComparedMetric]) -> float:
-    """How far a value moved, as a share of the larger one; 0 where there is one only."""
+    """Return the change relative to the larger value; 0 if only one run has it."""
     left, right = pair.left, pair.right
     if left is None or right is None or left.value == right.value:
         return 0.0
     change = abs(right.value - left.value) / max(abs(left.value), abs(right.value))
-    # What was a number and is none has moved most.
+    # A change from a number to NaN counts as the largest.
     return math.inf if math.isnan(change) else change

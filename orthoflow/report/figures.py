@@ -1,4 +1,4 @@
-"""The figures of methods, on the page and as files, and the graph of a run."""
+"""Figures of the methods, on the page and as files, and the graph of a run."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 _MAX_ABREAST: Final = 5  # boxes in a row
 _MAX_LETTERS: Final = 26
-# Distinguished without colours by the width and dashes of the frame.
+# Distinguishable without colour by line width and dashes.
 _FRAMES: Final[dict[str, dict[str, Any]]] = {
     "ok": {"edgecolor": "#5b6570", "facecolor": "#f3f5f7"},
     "cached": {"edgecolor": "#1c6b35", "facecolor": "#eaf5ec"},
@@ -36,10 +36,11 @@ _FRAMES: Final[dict[str, dict[str, Any]]] = {
 
 
 def run_graph(run: Run) -> nx.DiGraph[str]:
-    """Return the steps of a run, each below all that it depends on; arrows are products.
+    """Return the graph of the steps of a run; edges are products.
 
-    Nodes have `state`, `about` (methods and time) and `row`; wide levels continue in further rows,
-    and what neither takes nor gives anything because it was skipped is last.
+    Nodes have `state`, `about` (methods and time) and `row`. A step is below all steps on which it
+    depends; wide levels are split into several rows, and skipped steps without connections are
+    last.
     """
     import networkx as nx  # noqa: PLC0415 - takes 0.2 seconds
 
@@ -67,8 +68,8 @@ def run_graph(run: Run) -> nx.DiGraph[str]:
 
 
 def graph_file(run: Run) -> bytes:
-    """Draw the graph of a run as an SVG file."""
-    from matplotlib.figure import Figure  # noqa: PLC0415 - pages without charts need none
+    """Return the drawing of a run's graph as an SVG file."""
+    from matplotlib.figure import Figure  # noqa: PLC0415 - not needed for pages without charts
 
     nodes, edges = (graph := run_graph(run)).nodes, graph.edges
     rows = 1 + max((row for _, row in nodes(data="row")), default=0)
@@ -93,7 +94,7 @@ def graph_file(run: Run) -> bytes:
             (x0, y0), (x1, y1) = (
                 (nodes[node]["column"], nodes[node]["row"]) for node in (before, after)
             )
-            # Past other rows an arrow bulges, so that it is seen beside their boxes.
+            # Arrows past other rows are curved, so that they do not run behind boxes.
             bulge = 0.25 if y1 - y0 > 1 else 0.0
             axes.annotate(
                 "",
@@ -113,7 +114,7 @@ def graph_file(run: Run) -> bytes:
 
 
 def graph_picture(run: Run) -> Picture:
-    """Return the drawing as a picture of a page."""
+    """Return the graph as a picture on a page."""
     return Picture(
         uri=as_image(graph_file(run)),
         title="What each step passes on",
@@ -145,16 +146,16 @@ def _state(cells: Sequence[RecordedCell]) -> str:
     return "cached" if all(cell.cached_from for cell in cells if cell.status == "ok") else "ok"
 
 
-_BYTES_MOST: Final = 3_900_000  # of all figures on a page; a third more in base64
+_BYTES_MOST: Final = 3_900_000  # of all figures on a page; base64 adds a third
 _LEAST_SIDE_PX: Final = 240
 _MAX_SIDE_PX: Final = 700
 _DPI: Final = 300
-_SMALL_BYTES: Final = 20_000  # not worth drawing again
+_SMALL_BYTES: Final = 20_000  # smaller files are not scaled down
 
 
 @dataclass(frozen=True, kw_only=True)
 class FigureGroup:
-    """The figures of one cell."""
+    """Figures of one cell."""
 
     cell: str
     method: str
@@ -164,14 +165,14 @@ class FigureGroup:
 def figure_groups(
     run: Run, *, share: float = 1.0, with_files: bool = False
 ) -> tuple[FigureGroup, ...]:
-    """The figures of every cell, repeats of random methods left out; equal ones once.
+    """Return the figures of all cells except repeats; identical figures only once.
 
-    When they are too many for a page, the large ones are drawn smaller.
+    If they exceed the limit of a page, large figures are scaled down.
 
     Args:
         run: the run.
-        share: which part of a page's bytes they may take.
-        with_files: those of `baseline_addresses` lie in `FIGURES_FOLDER` beside the page.
+        share: share of the page's limit that they may use.
+        with_files: whether the figures of `baseline_addresses` are also files in `FIGURES_FOLDER`.
     """
     named = figure_files(run, baseline_addresses(run)) if with_files else {}
     files = {id(figure): path for path, figure in named.items()}
@@ -208,23 +209,22 @@ def figure_groups(
 def write_figures(
     run: Run, folder: Path, addresses: Iterable[str], *, inside: str = "", as_pdf: bool = False
 ) -> int:
-    """Write the figures of cells as PNG or SVG files below `folder/<cell>/`, and the run's graph.
+    """Write the figures of cells to `folder/<cell>/` as PNG or SVG files, and the run's graph.
 
-    A picture that is damaged has no file, nor has an SVG one in which a browser would run or load
-    something.
+    Damaged pictures are omitted, and SVG files with scripts or external references.
 
     Args:
         run: the run.
-        folder: made when missing.
-        addresses: of the cells.
-        inside: a folder in it that takes the place of `folder`; it must be no link.
-        as_pdf: pictures as a page of a PDF each, 300 dpi.
+        folder: output folder, created if missing.
+        addresses: addresses of the cells.
+        inside: subfolder in which to write instead; it must not be a link.
+        as_pdf: write each picture as a PDF page with 300 dpi.
 
     Returns:
-        How many figures were written.
+        The number of figures written.
 
     Raises:
-        RecordError: a figure has a name or a type that no file can have; nothing is written.
+        RecordError: the name or type of a figure is not valid for a file; nothing is written.
         StoreError: the folder cannot be written.
     """
     named = figure_files(run, addresses)
@@ -239,13 +239,13 @@ def write_figures(
 
 
 def _content(figure: RecordedFigure, *, as_pdf: bool) -> bytes | None:
-    """The bytes of a figure's file; None for one that is damaged, or more than a drawing."""
+    """Return the content of a figure's file; None if it is damaged or an unsafe drawing."""
     if figure.media_type == "image/svg+xml":
         return figure.data if is_plain_svg(figure.data) else None
     try:
         if as_pdf:
             return encode_pdf(decode_image(figure.data, figure.name), dpi=_DPI)
-        # PNG is what papers and word processors take.
+        # PNG is accepted by publishers and word processors.
         if figure.media_type == "image/webp":
             return encode_png(decode_image(figure.data, figure.name))
     except InputError:
@@ -254,11 +254,11 @@ def _content(figure: RecordedFigure, *, as_pdf: bool) -> bytes | None:
 
 
 def _fitted(figures: tuple[RecordedFigure, ...], bytes_most: float) -> Iterable[RecordedFigure]:
-    """Figures as they are or, where all are too many bytes, drawn smaller."""
+    """Return the figures, scaled down if they have too many bytes together."""
     n_bytes = sum(len(figure.data) for figure in figures)
     if n_bytes <= bytes_most:
         return figures
-    # Bytes go about with the area.
+    # The size in bytes is roughly proportional to the area.
     side_px = round(LONGEST_SIDE_PX * math.sqrt(0.8 * max(0.0, bytes_most) / n_bytes))
     side_px = min(max(side_px, _LEAST_SIDE_PX), _MAX_SIDE_PX)
     return tuple(in_order(partial(_smaller, side_px=side_px), figures))
@@ -270,7 +270,7 @@ def _smaller(figure: RecordedFigure, side_px: int) -> RecordedFigure:
     try:
         data = shrunk_webp(figure.data, figure.name, longest_side_px=side_px)
     except InputError:
-        # A picture that cannot be decoded costs its place on the page, not the page.
+        # A picture that cannot be decoded is omitted; the page is still written.
         return replace(figure, data=b"", caption=f"{figure.caption} (the picture is damaged)")
     is_smaller = len(data) < len(figure.data)
     return replace(figure, media_type="image/webp", data=data) if is_smaller else figure

@@ -1,4 +1,4 @@
-"""A finished run for people at a Python prompt or in a notebook: tables, pictures, arrays."""
+"""Finished runs in Python and notebooks: tables, pictures and arrays."""
 
 from __future__ import annotations
 
@@ -39,19 +39,19 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _THUMBNAIL_PX: Final = 640
-_FIGURES_MOST: Final = 24  # shown at once: a notebook keeps them all in its file
-_ROWS_MOST: Final = 60  # of a table of what differs
+_FIGURES_MOST: Final = 24  # shown at once: notebooks store them in their files
+_ROWS_MOST: Final = 60  # in a table of differences
 _PARAMETERS_MOST: Final = 8
 
 
 @dataclass(frozen=True, kw_only=True)
 class Varied:
-    """What varies in a run.
+    """Steps and parameters that vary in a run.
 
     Attributes:
-        steps: the steps with variants; `data` for datasets.
-        methods: step -> variant -> method, of steps that sweep parameters.
-        swept: (step, parameter) -> variant -> value, of parameters that are swept.
+        steps: steps with variants; `data` for datasets.
+        methods: step -> variant -> method, for steps with swept parameters.
+        swept: (step, parameter) -> variant -> value, for swept parameters.
     """
 
     steps: tuple[str, ...]
@@ -60,7 +60,7 @@ class Varied:
 
     @classmethod
     def of(cls, run: Run) -> Varied:
-        """Look through the cells of a run."""
+        """Determine what varies from the cells of a run."""
         swept: dict[tuple[str, str], dict[str, float]] = {}
         for sweep in sweeps(run.record.cells):
             swept.setdefault((sweep.step, sweep.parameter), {}).update(sweep.values)
@@ -73,7 +73,7 @@ class Varied:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Name the columns, those of steps as in tables of several runs."""
+        """Names of the columns; those of steps are as in tables of several runs."""
         return (
             *("dataset" if step == DATA else f"variant.{step}" for step in self.steps),
             *(f"{step}.use" for step in self.methods),
@@ -81,7 +81,7 @@ class Varied:
         )
 
     def values(self, assignment: Mapping[str, str]) -> tuple[str | float | None, ...]:
-        """Return the columns of a cell or combination; None where it has no part in one."""
+        """Return the column values of a cell or combination; None in columns that do not apply."""
         variants = (assignment.get(step) for step in self.steps)
         numbers = (values.get(assignment.get(step, "")) for (step, _), values in self.swept.items())
         methods = (named.get(assignment.get(step, "")) for step, named in self.methods.items())
@@ -90,18 +90,18 @@ class Varied:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class OpenedRun(Run):
-    """A finished run; `Run` has what programs need, and here is what people want to see."""
+    """A finished run, with tables, pictures and arrays for interactive use."""
 
     def metrics(self) -> pd.DataFrame:
-        """Every number of every cell, a row each.
+        """Return a table with a row for every metric of every cell.
 
         Returns:
-            Columns `cell`, `step`, `method`, `dataset` of several, `variant.<step>` of each step
-            that varies (missing where the cell does not have it), the method of each step that
-            sweeps parameters (`plane.use`), each swept parameter (`plane.tolerance_m`,
-            a number), `repeat`, `metric`, `value`, `unit`.
+            Columns `cell`, `step`, `method`, `dataset` (if there are several), `variant.<step>` for
+            each step with variants (missing if it does not apply to the cell), the method of each
+            step with swept parameters (`plane.use`), each swept parameter (`plane.tolerance_m`, a
+            number), `repeat`, `metric`, `value`, `unit`.
         """
-        import pandas as pd  # noqa: PLC0415 - takes a second, and few ask
+        import pandas as pd  # noqa: PLC0415 - takes a second and is rarely needed
 
         varied = Varied.of(self)
         rows = [
@@ -124,7 +124,7 @@ class OpenedRun(Run):
 
     @cached_property
     def figures(self) -> Figures:
-        """All pictures of the methods, by `step/name`; a notebook shows them."""
+        """Return all figures of the methods, by `step/name`; notebooks display them."""
         return Figures(
             {
                 f"{cell.address}/{figure.name}": ShownFigure(**vars(figure))
@@ -137,18 +137,21 @@ class OpenedRun(Run):
         """Return an output as an object of its product class.
 
         Args:
-            address: of the cell.
-            port: of the output.
-            store: folder of stored results, for products that the record only names.
+                address: address of the cell.
+                port: name of the output.
+                store: folder of stored results, for products that the record references but does
+                    not contain.
 
         Raises:
-            ArgumentError: the run has no such cell, or the cell no such output.
-            RecordError: neither the record nor the store has the output, or the record is damaged.
-            PluginError: no installed plugin knows the product's type.
-            DamageError: the output was damaged in the store.
+                ArgumentError: the run does not have this cell, or the cell does not have this
+                    output.
+                RecordError: neither the record nor the store contains the output, or the record is
+                    damaged.
+                PluginError: no installed plugin defines the type of the product.
+                DamageError: the stored output is damaged.
         """
         from orthoflow.catalog.discovery import discover_catalog  # noqa: PLC0415 - loads plugins
-        from orthoflow.engine.store import stores_at  # noqa: PLC0415 - few ask
+        from orthoflow.engine.store import stores_at  # noqa: PLC0415 - rarely needed
 
         output = self.cell(address).outputs.get(port)
         if output is None or output.embedded:
@@ -163,7 +166,7 @@ class OpenedRun(Run):
         return cls.from_payload(payload)
 
     def verify(self) -> Verification:
-        """Check all of the record and the published files beside it, as `orthoflow verify` does."""
+        """Check the record and the published files, as `orthoflow verify` does."""
         return verify_run(self.path)
 
     def orthoimage(
@@ -172,13 +175,13 @@ class OpenedRun(Run):
         """Return the orthoimage of a wall as an array with its frame.
 
         Args:
-            number: of the wall, as in the names of its files; None for the first one.
-            cell: address of the cell that made it; None for that of the baseline, or, with a
-                warning, of another combination where it has none.
-            data: name of the dataset, where the run has several; None for the first one.
+                number: number of the wall, as in the names of its files; None for the first one.
+                cell: address of the cell that made it. None for the cell of the baseline, or, with
+                    a warning, of another combination if the baseline has no orthoimage.
+                data: name of the dataset, if the run has several; None for the first one.
 
         Raises:
-            ArgumentError: the run has no such orthoimage; lists those it has.
+            ArgumentError: the run does not have this orthoimage; the message lists those it has.
         """
         part = self if data is None else self._part(data)
         places = dict(embedded_products(part, "orthoimages"))
@@ -202,7 +205,7 @@ class OpenedRun(Run):
         return WallImage(image=image, cell=chosen, file=files[0] if files else None)
 
     def _part(self, data: str) -> Run:
-        """What belongs to a dataset."""
+        """Return the part of the run that belongs to a dataset."""
         parts = parts_of(self)
         if data not in parts:
             raise ArgumentError(
@@ -217,20 +220,21 @@ class OpenedRun(Run):
         """Compare this run with another one, see `RunComparison`.
 
         Args:
-            other: the run, its folder or its record.
-            store: folder of stored results, for products that the records only name.
+            other: the other run, its folder or its record.
+            store: folder of stored results, for products that the records reference but do not
+                contain.
 
         Raises:
-            ArgumentError: there is no such run.
+            ArgumentError: the other run does not exist.
             RecordError: a record is damaged.
         """
-        from orthoflow.engine.store import stores_at  # noqa: PLC0415 - few ask
+        from orthoflow.engine.store import stores_at  # noqa: PLC0415 - rarely needed
 
         opened = other if isinstance(other, Run) else open_run(other)
         return ShownComparison(**vars(compare_runs(self, opened, stores=stores_at(store))))
 
     def _way_to_logs(self) -> str:
-        """How to read the logs of failed steps; empty if none failed."""
+        """Return how to read the logs of failed steps; empty if none failed."""
         failed = [cell for cell in self.record.cells if cell.status == "failed"]
         if not failed or not failed[0].log:
             return ""
@@ -251,16 +255,16 @@ class OpenedRun(Run):
 
 
 def open_run(path: str | Path) -> OpenedRun:
-    """Open a finished run, with a warning where the seal of its record does not hold.
+    """Open a finished run, with a warning if the seal of its record is broken.
 
-    Large arrays of products are looked at when they are read; `OpenedRun.verify` looks at all.
+    Large arrays are verified when they are read; `OpenedRun.verify` checks everything.
 
     Args:
         path: a run folder, or the `run.h5` in it.
 
     Raises:
-        ArgumentError: nothing is there, or the folder holds no finished run.
-        RecordError: the record is damaged, no record at all, or of a newer format.
+        ArgumentError: the path does not exist, or the folder does not contain a finished run.
+        RecordError: the file is damaged, not a record, or has a newer format.
     """
     plain = open_plain_run(path)
     if doubt := broken_seal(plain):
@@ -269,21 +273,21 @@ def open_run(path: str | Path) -> OpenedRun:
 
 
 def open_runs(paths: Sequence[str | Path]) -> RunSet:
-    """Open several runs of one comparison as one table, see `RunSet.metrics`.
+    """Open several runs as one table, see `RunSet.metrics`.
 
     Args:
         paths: run folders, or the `run.h5` in them.
 
     Raises:
-        ArgumentError: nothing is at one of them, or there is none.
-        RecordError: a record is damaged, no record at all, or of another version.
+        ArgumentError: a path does not exist, or no paths are given.
+        RecordError: a file is damaged, not a record, or has another version.
     """
     return join_runs([open_run(path) for path in paths])
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class ShownComparison(RunComparison):
-    """Two runs side by side, as a notebook shows them."""
+    """A comparison of two runs that notebooks display."""
 
     def _repr_html_(self) -> str:
         parameters = [
@@ -309,7 +313,7 @@ class ShownComparison(RunComparison):
 
 
 class Figures(dict[str, "ShownFigure"]):
-    """Pictures by name."""
+    """Figures by name."""
 
     def __missing__(self, name: str) -> ShownFigure:
         raise ArgumentError(
@@ -331,10 +335,10 @@ class Figures(dict[str, "ShownFigure"]):
 
 @dataclass(frozen=True, kw_only=True)
 class ShownFigure(RecordedFigure):
-    """A picture that a notebook shows."""
+    """A figure that notebooks display."""
 
     def save(self, path: str | Path) -> None:
-        """Write the picture's bytes to a file."""
+        """Write the figure to a file."""
         Path(path).write_bytes(self.data)
 
     def _repr_html_(self) -> str:
@@ -343,12 +347,12 @@ class ShownFigure(RecordedFigure):
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class WallImage:
-    """An orthoimage as an array: `numpy.asarray(it)` is `rgb`.
+    """An orthoimage as an array: `numpy.asarray` of it returns `rgb`.
 
     Attributes:
         image: the product with colours, mask, sources and frame.
         cell: address of the cell that made it.
-        file: its GeoTIFF, None where the run's files are not beside the record.
+        file: its GeoTIFF; None if the files of the run are not next to the record.
     """
 
     image: Orthoimage
@@ -357,17 +361,17 @@ class WallImage:
 
     @property
     def rgb(self) -> Colours:
-        """(rows, columns, 3) uint8, or uint16 of deep photos; 0 where nothing is shown."""
+        """(rows, columns, 3) uint8, or uint16 from 16-bit photos; 0 in cells without a colour."""
         return self.image.rgb
 
     @property
     def is_shown(self) -> NDArray[np.bool_]:
-        """(rows, columns), where a photo, or its neighbours, gave a colour."""
+        """(rows, columns), whether a cell has a colour, including filled cells."""
         return is_shown(self.image.mask)
 
     @property
     def frame(self) -> WallFrame:
-        """Where the cells lie: `frame.world_from_wall` gives metres."""
+        """Position of the cells; `frame.world_from_wall` returns metres."""
         return self.image.frame
 
     def __array__(
@@ -392,7 +396,7 @@ class WallImage:
         return _html("picture", data_uri(picture, "image/webp"), repr(self))
 
 
-# Any: what the macro takes.
+# Any: as the macro requires.
 def _html(macro: str, *values: Any) -> str:
-    """Fill a macro of the template for notebooks, which escapes what a record states."""
+    """Render a macro of the notebook template, which escapes the text of a record."""
     return str(getattr(environment().get_template("notebook.html.j2").module, macro)(*values))

@@ -1,4 +1,4 @@
-"""Ties with their residuals, and displacements, as vectors drawn on pictures of the walls."""
+"""Drawings of ties with residuals, and of displacements, on pictures of the walls."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from orthoflow.report.pictures import (
     side_px,
 )
 
-_MAX_MARKS: Final = 600  # in one drawing
-# Drawn length of a vector of RMS length, and of the reference, as shares of the longer side.
+_MAX_MARKS: Final = 600  # per drawing
+# Drawn lengths of a vector of RMS length and of the reference, as shares of the longer side.
 _RMS_SHARE: Final = 0.025
 _REFERENCE_SHARE: Final = 0.08
-_STEP_M: Final = 1e-3  # for derivatives; photos change by about a pixel over it
+_STEP_M: Final = 1e-3  # for derivatives; changes a position in a photo by about one pixel
 # Kind -> marker and colour, visible on light and dark pictures.
 _MARKERS: Final = {
     "control": ("o", "#3ee066"),
@@ -41,15 +41,15 @@ _Vectors: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np
 
 
 def overlays(run: Run, walls: Sequence[Picture], *, share: float = 1.0) -> Iterator[Picture]:
-    """Draw the ties of every orientation and the displacements of every inspection of a run.
+    """Draw the ties of all orientations and the displacements of all inspections of a run.
 
     Args:
         run: the run.
-        walls: pictures of its walls, on which vectors are drawn.
-        share: which part of a page's bytes the drawings may take.
+        walls: pictures of its walls, used as backgrounds.
+        share: share of the page's limit that the drawings may use.
     """
     cameras, inspections = (embedded_products(run, name) for name in ("cameras", "inspection"))
-    # Digest of a walls product -> the first picture of each of its walls.
+    # Digest of a walls product -> first picture of each of its walls.
     known: dict[str, dict[int, Picture]] = {}
     for picture in walls:
         for product in run.cells[picture.cell].outputs.values():
@@ -73,7 +73,7 @@ def overlays(run: Run, walls: Sequence[Picture], *, share: float = 1.0) -> Itera
                     ),
                     f"Displacements in the orthoimage of {ground.name}, {address}",
                     side,
-                    # The numbers of a method leave these out.
+                    # The metrics of the method exclude these.
                     remark="points beside depth steps included; ",
                 )
 
@@ -81,7 +81,7 @@ def overlays(run: Run, walls: Sequence[Picture], *, share: float = 1.0) -> Itera
 def _walls_before(
     run: Run, address: str, known: Mapping[str, Mapping[int, Picture]]
 ) -> Mapping[int, Picture]:
-    """Pictures of the nearest walls that went into a cell."""
+    """Return the pictures of the nearest walls upstream of a cell."""
     for cell in run.upstream(address):
         for given in cell.inputs.values():
             if given.digest in known:
@@ -122,16 +122,16 @@ def residuals_on_wall(
     residual_px: NDArray[np.float64],
     frame: WallFrame,
 ) -> NDArray[np.float64]:
-    """Convert residuals in a photo to the wall.
+    """Convert residuals from a photo to a wall.
 
     Args:
-        camera: an oriented one.
+        camera: an oriented photo.
         points_world: (n, 3) metres.
-        residual_px: (n, 2) observed - computed.
-        frame: its u and v are the axes of the answer.
+        residual_px: (n, 2) observed minus computed.
+        frame: frame of the wall.
 
     Returns:
-        (n, 2) metres along u and v; NaN where the photo does not show the point.
+        (n, 2) metres along u and v; NaN for points outside the photo.
     """
     viewing = camera.viewing().shifted(frame.origin_world)
     points = points_world - frame.origin_world
@@ -142,14 +142,14 @@ def residuals_on_wall(
     ]
     jacobian = np.stack(along, axis=2)
     found = np.full((len(points), 2), np.nan)
-    # A wall seen edge-on has no answer.
+    # There is no solution for a wall seen edge-on.
     solvable = np.isfinite(jacobian).all(axis=(1, 2)) & (np.linalg.det(jacobian) != 0.0)
     found[solvable] = np.linalg.solve(jacobian[solvable], residual_px[solvable, :, None])[..., 0]
     return found
 
 
 def magnification_for(frame: WallFrame, lengths_m: NDArray[np.float64]) -> float:
-    """Return a round number by which vectors are enlarged so that they can be seen."""
+    """Return a round magnification that makes the vectors visible."""
     known = lengths_m[np.isfinite(lengths_m).all(axis=1)]
     rms_m = float(np.sqrt(np.mean(np.sum(known**2, axis=1)))) if len(known) else 0.0
     if rms_m == 0.0:
@@ -170,7 +170,7 @@ def _overlay(
     frame = frame_of(ground)
     magnification = magnification_for(frame, lengths_m[kinds != "rejected"])
     feet = frame.wall_from_world(points_world)[:, :2]
-    # Left out evenly.
+    # Omit marks evenly.
     chosen = np.unique(np.linspace(0, len(kinds) - 1, min(_MAX_MARKS, len(kinds))).astype(np.int64))
     longest = max(frame.width, frame.height)
     reference_mm = round_below(1e3 * _REFERENCE_SHARE * longest * frame.gsd_m / magnification)
@@ -205,12 +205,12 @@ def _drawn(
     """Draw marks and vectors on the picture of a wall, as WebP.
 
     Args:
-        ground: the picture.
-        groups: kind -> which of the places have it.
-        feet: (n, 2) places in cells.
-        vectors: (n, 2) likewise.
-        reference: text and length in cells of the reference vector.
-        side: the drawing's longer side, pixels.
+        ground: background picture.
+        groups: kind -> indices of its positions.
+        feet: (n, 2) positions in cells.
+        vectors: (n, 2) in cells.
+        reference: text of the reference vector, and its length in cells.
+        side: longer side of the drawing, pixels.
     """
     frame = frame_of(ground)
     content = base64.b64decode(ground.uri.partition(",")[2])
@@ -223,7 +223,7 @@ def _drawn(
             marker, colour = _MARKERS.get(kind, _OTHERS)
             u, v = feet[members].T
             axes.scatter(u, v, s=1.2, marker=marker, color=colour, linewidths=0.5, label=kind)
-            # Rejected ties may be metres off: a mark shows them.
+            # Rejected ties may be off by metres, so they have a mark but no vector.
             if kind != "rejected":
                 ends = np.stack([feet[members], feet[members] + vectors[members]])
                 axes.plot(*ends.T.swapaxes(1, 2), color=colour, linewidth=0.6)

@@ -1,4 +1,4 @@
-"""Writing the page: the templates filled from the records."""
+"""Writing of the report page from templates and records."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ from orthoflow.report.tables import plane_tables
 if TYPE_CHECKING:
     from orthoflow.engine.store import Store
 
-# Columns of what holds over all datasets.
+# Columns of the table over all datasets.
 _OVER_SHOWN: Final = (
     *("combination", "datasets", "failed", "absent", "partly", "median", "spread", "pairs"),
     *("wins", "losses", "median_difference", "interval_low", "interval_high"),
@@ -65,7 +65,7 @@ _NONE_BROKEN: Final[Mapping[Path, str]] = MappingProxyType({})
 
 
 def _part(every: Mapping[str, Sequence[Any]], addresses: Collection[str]) -> SimpleNamespace:
-    """What some cells have a part in, of pictures, tables and cells by kind."""
+    """Return the pictures, tables and cells (by kind) that belong to the given cells."""
     return SimpleNamespace(
         **{
             kind: [one for one in ones if (getattr(one, "cell", "") or one.address) in addresses]
@@ -77,23 +77,24 @@ def _part(every: Mapping[str, Sequence[Any]], addresses: Collection[str]) -> Sim
 def write_page(
     run: Run, path: Path, *, go_on: str = "", broken_seals: Mapping[Path, str] = _NONE_BROKEN
 ) -> None:
-    """Write the report of one run, and its figures as PNG and SVG files into `figures/` beside it.
+    """Write the report of one run, and its figures as PNG and SVG files in `figures/` next to it.
 
-    Of a comparison these are the figures of the baseline; `write_figures` writes those of any cell.
-    A run on several datasets gets a page for each, in `pages/`, and one that leads to them.
+    If the run has variants, only the figures of the baseline are written; `write_figures` writes
+    those of any cell. If it has several datasets, each has its own page in `pages/`, with links
+    from the main page.
 
     Args:
         run: the run.
-        path: file to write.
-        go_on: of a run that was interrupted, the command that goes on with it.
-        broken_seals: record -> why its seal does not hold.
+        path: output file.
+        go_on: command that resumes the run, if it was interrupted.
+        broken_seals: record -> why its seal is broken.
 
     Raises:
         StoreError: a file cannot be written.
-        RecordError: the record is damaged, or a figure has a name that no file can have.
+        RecordError: the record is damaged, or the name of a figure is not valid for a file.
     """
     addresses = baseline_addresses(run)
-    # Before the page is written: a record with such names gets none.
+    # Checked first, so that no page is written for a record with invalid names.
     figure_files(run, addresses)
     pages = pages_of(run)
     with run.held_open() as opened:
@@ -120,14 +121,14 @@ def write_report(
     broken_seals: Mapping[Path, str] = _NONE_BROKEN,
     stores: Sequence[Store] = (),
 ) -> None:
-    """Write one self-contained HTML file about one or more runs.
+    """Write a self-contained HTML file about one or more runs.
 
     Args:
-        runs: opened with `orthoflow.open_run`; of two, the page also lists the differences.
-        path: file to write; replaced as a whole, never half.
-        go_on: of a run that was interrupted, the command that goes on with it.
-        broken_seals: record -> why its seal does not hold.
-        stores: where products are that the records of two runs only name.
+        runs: opened with `orthoflow.open_run`; for two runs, the page also lists the differences.
+        path: output file; replaced atomically.
+        go_on: command that resumes the run, if it was interrupted.
+        broken_seals: record -> why its seal is broken.
+        stores: stores with products that the records of two runs reference but do not contain.
 
     Raises:
         StoreError: the file cannot be written.
@@ -168,13 +169,13 @@ def _content(
 
 
 def _overview(run: Run, prefix: str, folder: Path, pages: Mapping[str, str]) -> SimpleNamespace:
-    """Describe a run on several datasets, whose pictures and figures stand on own pages.
+    """Return the template data of a run whose datasets have their own pages.
 
     Args:
         run: the run.
-        prefix: what the anchors begin with.
-        folder: that the page lies in.
-        pages: dataset -> its own page; empty for a page that leads to none.
+        prefix: prefix of the anchors.
+        folder: folder of the page.
+        pages: dataset -> its own page; empty if there are none.
     """
     parts = parts_of(run)
     over = over_datasets(parts)
@@ -202,18 +203,18 @@ def _section(
     share: float = 1.0,
     with_files: bool = False,
 ) -> SimpleNamespace:
-    """Collect all that the templates need of one run.
+    """Return the template data of one run.
 
     Args:
         run: the run.
-        prefix: what the anchors begin with.
-        folder: that the page lies in; files are named from there.
-        broken_seals: record -> why its seal does not hold.
-        share: which part of the page's bytes pictures may take.
-        with_files: the figures' own files are written beside the page.
+        prefix: prefix of the anchors.
+        folder: folder of the page; paths of files are relative to it.
+        broken_seals: record -> why its seal is broken.
+        share: share of the page's limit that pictures may use.
+        with_files: whether files of the figures are written next to the page.
     """
     from_page = Path(os.path.relpath(run.folder, folder))
-    # The baseline's stand first: they are what the numbers beside them are of.
+    # Pictures of the baseline come first, because the metrics next to them belong to it.
     baseline = {cell.address for cell in baseline_cells(run)}
     orthoimages, walls = (
         sorted(pictures(run, share=share), key=lambda picture: picture.cell not in baseline)
@@ -275,7 +276,7 @@ def _section(
 
 
 def _files(run: Run, from_page: Path) -> Mapping[str, Mapping[str, str]]:
-    """The files that cells published: address -> name -> where it lies from the page."""
+    """Return the published files of cells: address -> name -> path relative to the page."""
     published = {file.path for file in run.record.published}
     found: dict[str, dict[str, str]] = defaultdict(dict)
     for address, paths in run.files.items():

@@ -1,4 +1,4 @@
-"""Methods compared over datasets: medians, and differences dataset by dataset with a rank test."""
+"""Comparison of methods over datasets: medians, paired differences and rank tests."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from orthoflow.untrusted_text import Value, first_few
 from orthoflow.workflow.expand import variants_text
 from orthoflow.workflow.model import DATA
 
-# Of four differences that all agree p is 0.125: a test of so few can show nothing.
+# With four datasets p is at least 0.125, so no difference can be significant.
 _MIN_TESTED: Final = 5
-# For two methods signed ranks are more powerful.
+# Minimum for ranks; for two methods, signed ranks are more powerful.
 _MIN_RANKED: Final = 3
-# Of six that all agree p is 0.031, of five 0.0625.
+# If all differences agree, p is 0.031 for six datasets and 0.0625 for five.
 _MIN_SHOWN: Final = 6
 _SHOWN_P: Final = 0.05
 _MAX_NAMED: Final = 6
@@ -41,25 +41,23 @@ _TEST: Final = f"p below {_SHOWN_P:g} after Holm's correction"
 
 @dataclass(frozen=True, kw_only=True)
 class Paired:
-    """How a method does against the reference on the datasets that both have a value of.
+    """Comparison of a method with the reference on the datasets on which both have a value.
 
-    What differs by rounding only (`is_rounding`) is level: neither better nor worse, and a
-    difference of zero.
+    Differences due to rounding (`is_rounding`) count as zero: neither better nor worse.
 
     Attributes:
-        n: datasets with both values.
-        wins: datasets on which the method is better.
-        losses: datasets on which it is worse.
-        median: median of the differences, in the metric's unit; negative where it has less. For
-            signed errors the sizes are compared, where 1 is best the factors to 1, as logarithms.
-            Of what is yes or no the mean, the difference of the shares.
-        p: Wilcoxon's signed-rank test that the differences lie about zero, two-sided; NaN of
-            fewer than five differences.
+        n: number of datasets with both values.
+        wins: number of datasets on which the method is better.
+        losses: number of datasets on which it is worse.
+        median: median difference in the metric's unit; negative if the method has smaller values.
+            Signed errors are compared by absolute value, and metrics for which 1 is best by the
+            logarithm of their ratio to 1. For yes/no metrics, the difference of the shares.
+        p: of Wilcoxon's two-sided signed-rank test; NaN for fewer than five differences.
         effect: matched-pairs rank-biserial correlation, from -1 (worse on every dataset) to 1
-            (better on every one); NaN where p is.
-        interval: of the median difference, at least 95 % confidence, from order statistics, which
-            take no distribution for granted; NaN of fewer than six datasets, and of shares.
-        p_holm: p corrected by Holm for all comparisons of the run; NaN where p is.
+            (better on every dataset); NaN if p is.
+        interval: distribution-free interval of the median difference from order statistics, with a
+            confidence of at least 95 %; NaN for fewer than six datasets and for shares.
+        p_holm: p corrected by Holm's method for all comparisons of the run; NaN if p is.
     """
 
     n: int
@@ -74,22 +72,23 @@ class Paired:
 
 @dataclass(frozen=True, kw_only=True)
 class MethodOverDatasets:
-    """The variants on which a step depends, on all datasets.
+    """Results of the variants on which a step depends, on all datasets.
 
     Attributes:
-        variants: step -> variant; empty when nothing varies.
-        is_reference: the others are compared with it.
-        n: datasets with a value.
-        n_failed: datasets on which the step, or one before it, failed; they have no part in any
-            number.
-        n_absent: datasets that have no value though nothing failed, or were left out.
-        n_partly: datasets with a value of only some repeats.
-        n_apart: datasets on which both have a value, but of different environments or of unequal
-            numbers of photos, so that they are not paired.
-        median: over the datasets, of signed errors of their sizes; NaN without any. Of what is yes
-            or no the mean, the share of yes.
-        spread: 1.4826 times the median absolute deviation from it; NaN without any, and of shares.
-        paired: against the reference; None for itself, and where neither more nor less is better.
+        variants: step -> variant; empty if there are no variants.
+        is_reference: whether the others are compared with this one.
+        n: number of datasets with a value.
+        n_failed: number of datasets on which the step or one before it failed; they are not used.
+        n_absent: number of datasets without a value although nothing failed, or left out.
+        n_partly: number of datasets on which only some repeats have a value.
+        n_apart: number of datasets that cannot be paired because the environments or the numbers of
+            photos differ from those of the reference.
+        median: median over the datasets, of absolute values for signed errors; for yes/no metrics,
+            the share of "yes"; NaN if there are no values.
+        spread: 1.4826 times the median absolute deviation; NaN if there are no values, and for
+            shares.
+        paired: comparison with the reference; None for the reference itself and for unranked
+            metrics.
     """
 
     variants: Mapping[str, str]
@@ -105,20 +104,20 @@ class MethodOverDatasets:
 
     @property
     def name(self) -> str:
-        """The variants in words, `plane=ransac`."""
+        """The variants as text, e.g. `plane=ransac`."""
         return variants_text(self.variants)
 
 
 @dataclass(frozen=True, kw_only=True)
 class MeanRanks:
-    """How methods rank over the datasets that all have a value of (Demsar 2006).
+    """Ranks of methods over the datasets on which all of them have a value (Demsar 2006).
 
     Attributes:
-        n: datasets.
-        ranks: method -> mean rank, 1 is best, best first.
-        p: Friedman's test that all are equal.
-        critical_difference: of two mean ranks, by Nemenyi at 0.05: nearer ones are not shown to
-            differ.
+        n: number of datasets.
+        ranks: method -> mean rank, best (1) first.
+        p: of Friedman's test that all methods are equal.
+        critical_difference: by Nemenyi's test at 0.05; methods whose mean ranks differ by less are
+            not significantly different.
     """
 
     n: int
@@ -128,7 +127,7 @@ class MeanRanks:
 
     @property
     def leading(self) -> tuple[str, ...]:
-        """The best, and all that are not shown to differ from it; all where p is not below 0.05."""
+        """The best and those not significantly different from it; all if p is 0.05 or more."""
         best = min(self.ranks.values())
         reach = self.critical_difference if self.p < _SHOWN_P else math.inf
         return tuple(name for name, rank in self.ranks.items() if rank - best < reach)
@@ -139,9 +138,9 @@ class MetricOverDatasets:
     """One metric of one step over all datasets.
 
     Attributes:
-        column: the metric, as one of its cells has it.
-        methods: the variants on which the step depends, in the order of the graph.
-        ranks: of all of them; None of fewer than three, or than five datasets.
+        column: metadata of the metric.
+        methods: results of the variants on which the step depends, in the order of the graph.
+        ranks: ranks of all methods; None for fewer than three methods or five datasets.
     """
 
     column: MetricRow
@@ -150,26 +149,26 @@ class MetricOverDatasets:
 
     @property
     def middle(self) -> str:
-        """What the medians are, which are shares where the metric is yes or no."""
+        """Name of the central value: the median, or the share for yes/no metrics."""
         return "share" if is_flag(self.column.unit) else "median"
 
     @property
     def reference(self) -> MethodOverDatasets:
-        """What the others are compared with."""
+        """Results of the reference."""
         return next(one for one in self.methods if one.is_reference)
 
     def method_of(self, assignment: Mapping[str, str]) -> MethodOverDatasets | None:
-        """Return the variants that a combination has of the step."""
+        """Return the results of the variants that a combination has for the step."""
         return next(
             (one for one in self.methods if one.variants.items() <= assignment.items()), None
         )
 
 
 def middle_of(values: NDArray[np.float64], unit: str) -> float:
-    """What stands for the values of several datasets; NaN without any.
+    """Return the central value over several datasets; NaN if there are none.
 
-    Their median, but of what is yes or no the mean, the share of yes: the median would hide all
-    that is so on fewer than half of them.
+    This is the median; for yes/no metrics, the mean, which is the share of "yes": the median would
+    be the same for any minority.
     """
     if not values.size:
         return math.nan
@@ -177,17 +176,17 @@ def middle_of(values: NDArray[np.float64], unit: str) -> float:
 
 
 def spread_of(values: NDArray[np.float64], unit: str) -> float:
-    """How far the values of several datasets lie apart; NaN without any.
+    """Return the spread of values over several datasets; NaN if there are none.
 
-    A share has none, since it determines both counts.
+    A share has no spread, since it determines the counts of both values.
     """
     return math.nan if is_flag(unit) or not values.size else median_deviation(values)
 
 
 def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
-    """Compare the variants of a run over its datasets, metric by metric.
+    """Compare the variants of a run over its datasets, for every metric.
 
-    Values of different environments, or over unequal numbers of photos, are never paired.
+    Values from different environments, or over different numbers of photos, are never paired.
 
     Args:
         parts: dataset -> its part of the run.
@@ -197,7 +196,7 @@ def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
     if len(parts) < 2 or not every:
         return ()
     environments = group_environments(parts.values())
-    # Step -> variants on which it depends -> dataset -> what leads to it.
+    # Step -> variants on which it depends -> dataset -> combination.
     ways: dict[str, dict[tuple[tuple[str, str], ...], dict[str, Combination]]] = {}
     for name, part in parts.items():
         baseline = baseline_of(part)
@@ -234,11 +233,11 @@ def _over(
     )
 
     def comparable(own: tuple[tuple[str, str], ...]) -> dict[str, tuple[Measured, Measured]]:
-        """Dataset -> its value and that of the reference, where they may be compared."""
+        """Return, by dataset, its value and that of the reference, if they are comparable."""
         found = {}
         for name in measured[own].keys() & measured[reference].keys():
             both = measured[own][name], measured[reference][name]
-            # Errors over more photos are no worse ones.
+            # A larger error over more photos is not a worse result.
             ours, theirs = (
                 ways[key][name].n_items(step, column.counted_by) for key in (own, reference)
             )
@@ -253,7 +252,7 @@ def _over(
     for own, by_data in ways.items():
         values = np.array([value.value for value in measured[own].values()])
         if column.better == "lower":
-            # Errors of both signs would make each other small.
+            # Errors of both signs would cancel.
             values = np.abs(values)
         n_failed = sum(one.failure is not None for one in by_data.values())
         n_both = len(measured[own].keys() & measured[reference].keys())
@@ -285,7 +284,7 @@ def _over(
 
 
 def _corrected(metrics: Iterable[MetricOverDatasets]) -> tuple[MetricOverDatasets, ...]:
-    """Correct all p of a run together, by Holm: of many comparisons some are small by chance."""
+    """Correct all p-values of a run together: some of many are small by chance."""
     metrics = tuple(metrics)
     found = [one.paired.p for metric in metrics for one in metric.methods if one.paired]
     corrected = holm([p for p in found if math.isfinite(p)])
@@ -304,7 +303,7 @@ def _corrected(metrics: Iterable[MetricOverDatasets]) -> tuple[MetricOverDataset
 
 
 def holm(values: Sequence[float]) -> dict[float, float]:
-    """Correct p-values of several tests by Holm's step-down method: p -> corrected p.
+    """Return p -> corrected p for the p-values of several tests, by Holm's step-down method.
 
     >>> holm([0.01, 0.04, 0.03])
     {0.01: 0.03, 0.03: 0.06, 0.04: 0.06}
@@ -319,7 +318,7 @@ def mean_ranks(names: Sequence[str], badness_of: NDArray[np.float64]) -> MeanRan
     """Rank methods over datasets, and test whether they differ.
 
     Args:
-        names: of the methods, three at least.
+        names: names of the methods, at least three.
         badness_of: (datasets, methods), smaller is better.
     """
     from scipy.stats import (  # noqa: PLC0415 - takes half a second
@@ -341,11 +340,11 @@ def mean_ranks(names: Sequence[str], badness_of: NDArray[np.float64]) -> MeanRan
 
 
 def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
-    """State in a sentence or two which variants are shown to be better; empty without several.
+    """Summarise which variants are significantly better; empty if there is only one combination.
 
     Args:
         over: the metrics.
-        n_datasets: how many the run has.
+        n_datasets: number of datasets of the run.
     """
     judged = [metric for metric in over if metric.column.better in BETTER]
     rows = [(metric, one) for metric in judged for one in metric.methods if not one.is_reference]
@@ -387,20 +386,20 @@ def _paired(pairs: Iterable[tuple[Measured, Measured]], column: MetricRow) -> Pa
     worse = []
     for both in pairs:
         own, other = (badness(one.value, column.better) for one in both)
-        # A rank test would take the last digits of six datasets for a proof.
+        # Otherwise a rank test could treat rounding differences in six datasets as significant.
         if math.isfinite(own - other):
             worse.append(0.0 if is_rounding(own, other) else own - other)
     return paired_differences(np.array(worse), column.better, column.unit) if worse else None
 
 
 def paired_differences(worse: NDArray[np.float64], better: str, unit: str = "1") -> Paired:
-    """Judge differences of pairs.
+    """Return statistics of paired differences.
 
     Args:
-        worse: (n,) how much worse than the reference the method is on each dataset, finite; at
-            least one; zero where they are level.
-        better: which values are, for the sign of the differences.
-        unit: of its values.
+        worse: (n,) finite, by how much the method is worse than the reference on each dataset; 0 if
+            they are level; n is at least 1.
+        better: better direction of the metric, for the sign of the differences.
+        unit: unit of the metric.
     """
     from scipy.stats import quantile_test, rankdata, wilcoxon  # noqa: PLC0415 - half a second
 
@@ -413,7 +412,7 @@ def paired_differences(worse: NDArray[np.float64], better: str, unit: str = "1")
         p = float(wilcoxon(moved).pvalue)
     low, high = math.nan, math.nan
     if not is_flag(unit):
-        # Any: scipy's types name another class.
+        # Any: the stubs of scipy declare another class.
         tested: Any = quantile_test(sign * worse)
         low, high = tested.confidence_interval(1.0 - _SHOWN_P)
     return Paired(
@@ -454,7 +453,7 @@ _OVER: Final = (
 
 
 def over_table(over: Sequence[MetricOverDatasets]) -> Table:
-    """Return a row per metric and combination of what holds over all datasets.
+    """Return a table with a row per metric and combination of the statistics over all datasets.
 
     Unknown values, such as p for two datasets, are empty.
     """
@@ -487,5 +486,5 @@ def over_table(over: Sequence[MetricOverDatasets]) -> Table:
 
 
 def _known(value: float) -> float | None:
-    # No difference where more is better is -0.0.
+    # Adding 0.0 turns -0.0, from metrics where higher is better, into 0.0.
     return None if math.isnan(value) else value + 0.0

@@ -1,4 +1,4 @@
-"""Tables and citations of a run as a paper takes them: CSV, LaTeX, Markdown and BibTeX."""
+"""Tables and citations of a run for publications: CSV, LaTeX, Markdown and BibTeX."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from orthoflow.report.tables import Column, Table, escaped_latex
 from orthoflow.untrusted_text import shown
 from orthoflow.workflow.model import DATA
 
-# More stand below each other.
+# If there are more, combinations are rows instead of columns.
 _FEW_COMBINATIONS: Final = 4
-# `Hoehle and Hoehle 2009, title, doi:10.1016/...`: of which only authors and year are certain.
+# `Hoehle and Hoehle 2009, title, doi:10.1016/...`; only authors and year are required.
 _CITATION: Final = re.compile(
     r"(?P<authors>[^\d]+?),? (?P<year>(?:19|20)\d\d)\b[,:]?\s*(?P<rest>.*)"
 )
@@ -27,11 +27,11 @@ _URL: Final = re.compile(r",?\s*(https?://\S+)")
 
 
 def paper_files(run: Run) -> dict[str, str]:
-    """Return the files of a run for a paper, by name.
+    """Return the files of a run for a publication, by name.
 
-    `results` has a row per combination and dataset with the metrics that the comparison asks for,
-    or else the headlines; `datasets` what holds over all datasets, where there are several; the
-    CSV file has every digit, a row per value.
+    `results` has a row per combination and dataset with the metrics that the comparison selects, or
+    else the headline metrics; `datasets` has the statistics over all datasets, if there are
+    several; `values.csv` has a row per value, with all digits.
     """
     files = {"results.csv": _values(run).csv()}
     tables = [_results(run)]
@@ -46,7 +46,7 @@ def paper_files(run: Run) -> dict[str, str]:
 
 
 def _values(run: Run) -> Table:
-    """Return a row per combination and metric, with unit and better side."""
+    """Return a table with a row per combination and metric, with unit and better direction."""
     columns = comparison_columns(combinations := combinations_of(run))
     factors = _factors(combinations)
     names = (
@@ -73,7 +73,7 @@ def _values(run: Run) -> Table:
 
 
 def _results(run: Run) -> Table:
-    """The comparison: metrics as rows where combinations are few, combinations as rows else."""
+    """Return the comparison, with metrics as rows if there are few combinations."""
     columns = comparison_columns(combinations := combinations_of(run))
     factors = _factors(combinations)
     texts = [
@@ -121,16 +121,16 @@ def _results(run: Run) -> Table:
 
 
 def _factors(combinations: Iterable[Combination]) -> tuple[str, ...]:
-    """Names of what varies, the dataset first."""
+    """Return the names of the factors, the dataset first."""
     found = dict.fromkeys(step for one in combinations for step in one.assignment)
     return tuple(sorted(found, key=lambda factor: factor != DATA))
 
 
 def bibtex(cited: Mapping[str, Sequence[str]]) -> str:
-    """Return citations as BibTeX entries, each with the methods that ask for it.
+    """Return citations as BibTeX entries, each with a note on the methods that cite it.
 
     Args:
-        cited: text -> methods, with what each takes of it.
+        cited: citation -> methods, with what each of them uses from it.
 
     >>> print(bibtex({"Gruen 1985, Adaptive matching, doi:10.1/x": ["inspect.surf"]}), end="")
     @misc{gruen1985,
@@ -149,7 +149,7 @@ def bibtex(cited: Mapping[str, Sequence[str]]) -> str:
         keys[key] = keys.get(key, -1) + 1
         suffix = chr(ord("a") + keys[key]) if keys[key] else ""
         lines = [
-            # A DOI and an address are taken as they are.
+            # DOIs and URLs are not escaped.
             f"  {name} = {{{value if name in ('doi', 'url') else escaped_latex(value)}}},"
             for name, value in fields.items()
             if value
@@ -159,7 +159,7 @@ def bibtex(cited: Mapping[str, Sequence[str]]) -> str:
 
 
 def _once(cited: Mapping[str, Sequence[str]]) -> list[dict[str, str]]:
-    """Fields of each entry; texts with one DOI are one, with the longest title of them."""
+    """Return the fields of each entry; citations with the same DOI are merged, longest title."""
     found: dict[str, dict[str, str]] = {}
     for text, methods in cited.items():
         fields = {**_fields(" ".join(shown(text).split())), "note": "; ".join(methods)}

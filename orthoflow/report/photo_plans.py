@@ -1,4 +1,4 @@
-"""Where photos were taken: walls and cameras from above, as a drawing, and a row per photo."""
+"""Plan views of walls and photo positions, with a table of the photos."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from orthoflow.untrusted_text import Value, first_few
 
 @dataclass(frozen=True, kw_only=True)
 class PhotoPlan:
-    """The plan of one orientation.
+    """Plan view of one orientation.
 
     Attributes:
-        walls: from above.
-        photos: likewise, those that are oriented.
-        caption: what it shows, and which photos are missing, in words.
+        walls: walls in plan view.
+        photos: oriented photos in plan view.
+        caption: description, including the photos that are missing.
         cell: address of the orientation.
-        table: how well each photo is oriented.
-        axes: labels of the axes of the scan to the right and upwards.
+        table: quality of the orientation of each photo.
+        axes: labels of the scan's axes to the right and upwards.
     """
 
     walls: tuple[PlanWall, ...]
@@ -42,7 +42,7 @@ class PhotoPlan:
 
     @property
     def picture(self) -> Picture:
-        """The drawing as a picture of a page."""
+        """The plan as a picture on a page."""
         return Picture(
             uri=as_image(self.file("svg")),
             title="Photos and walls from above",
@@ -50,12 +50,12 @@ class PhotoPlan:
         )
 
     def file(self, suffix: ChartFormat) -> bytes:
-        """The drawing as a file."""
+        """Return the plan as a file."""
         return plan_chart(self.walls, self.photos, labels=self.axes, suffix=suffix)
 
 
 def photo_plan(run: Run, walls: Sequence[Picture]) -> PhotoPlan | None:
-    """Draw the photos of the baseline's last orientation; None where none is oriented.
+    """Return the plan of the baseline's last orientation; None if no photo is oriented.
 
     Args:
         run: the run.
@@ -68,7 +68,7 @@ def photo_plan(run: Run, walls: Sequence[Picture]) -> PhotoPlan | None:
         cameras = orientation.cameras
         oriented = [one for one in cameras if one.status == "ok"]
         if oriented:
-            # Of one wall its intensity and its depth are shown.
+            # There are two pictures of each wall, intensity and depth.
             frames = {
                 picture.number: (picture.name, picture.frame)
                 for picture in walls
@@ -122,7 +122,7 @@ def _table(orientation: Cameras) -> Table:
 
 
 def _counts(ties: Ties | None, role: TieRole) -> dict[str, int]:
-    """How many ties of a role each photo has."""
+    """Return the number of ties with a role in each photo."""
     if ties is None:
         return {}
     counts = np.bincount(ties.photo[ties.role == role], minlength=len(ties.photo_names))
@@ -150,7 +150,7 @@ def _drawn(
     oriented: Sequence[Camera],
     walls: Mapping[int, tuple[str, WallFrame]],
 ) -> tuple[tuple[PlanWall, ...], tuple[PlanPhoto, ...]]:
-    """Return walls, by number, and photos in the view from above."""
+    """Return walls (by number) and photos in plan view."""
     axes = basis_from_up(up)[:2].T
     viewing = {camera.photo: camera.viewing() for camera in oriented}
     return (
@@ -158,7 +158,7 @@ def _drawn(
             (name, number, np.asarray(frame.corners_world(), dtype=np.float64) @ axes)
             for number, (name, frame) in walls.items()
         ),
-        # The middle of a photo looks along the third axis of its camera.
+        # The third axis of a camera is its viewing direction.
         tuple(
             (name, one.centre_world @ axes, one.rotation[2] @ axes) for name, one in viewing.items()
         ),

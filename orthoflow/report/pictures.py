@@ -1,4 +1,4 @@
-"""Pictures for the page: products as small images, those of one wall over each other."""
+"""Pictures on the page: products as small images, grouped by wall."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ from orthoflow.untrusted_text import shown
 T = TypeVar("T", bound=Product)
 LONGEST_SIDE_PX: Final = 1000
 SHORTEST_SIDE_PX: Final = 320
-# Pictures of the full size that a page holds; of more, each becomes smaller. A picture of 1000 px
-# takes about 90 kB.
+# Number of pictures that a page can contain at full size; if there are more, each becomes smaller.
+# A picture of 1000 px takes about 90 kB.
 _FULL_PICTURES: Final = 24
-# The baseline's orthoimages are there to be looked into: as many cells as a page can carry, about
-# 0.15 bytes each.
+# The baseline's orthoimages are for close inspection, so they have as many cells as a page allows,
+# at about 0.15 bytes per cell.
 _CLOSE_CELLS: Final = 12_000_000
 
-# Number of places of a wall with depths to a millimetre, some 40 kB of a page.
+# Number of positions on a wall with depths in millimetres, about 40 kB on a page.
 _PLACES_MOST: Final = 8_000
-# The bar of the scale takes this share of the picture's width, at most.
+# Maximum length of the scale bar as a share of the picture's width.
 _BAR_SHARE: Final = 0.3
-# From blue (behind the plane) over white (on it) to red (in front): readable in grey and with
-# red-green blindness. Colours of the classes RdBu, Brewer 2003.
+# From blue (behind the plane) through white (on it) to red (in front): readable in greyscale and
+# with red-green colour blindness. Colours of ColorBrewer's RdBu (Brewer 2003).
 DIVERGING: Final = np.array(
     [[33, 102, 172], [146, 197, 222], [247, 247, 247], [244, 165, 130], [178, 24, 43]],
     dtype=np.float64,
@@ -55,30 +55,31 @@ _PLACES: Final = np.linspace(-1.0, 1.0, 255)
 _DIVERGING_TABLE: Final = np.rint(
     np.column_stack([np.interp(_PLACES, np.linspace(-1, 1, 5), one) for one in DIVERGING.T])
 ).astype(np.uint8)
-# Rasters of one wall by two methods: their planes are some centimetres and a degree apart at most.
+# Planes of one wall from two methods differ by at most some centimetres and a degree.
 _SAME_NORMAL_COSINE: Final = float(np.cos(np.radians(5.0)))
 _SAME_PLACE_SHARE: Final = 0.1  # of the longer side, between centres
 
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """One image on the page.
+    """An image on the page.
 
     Attributes:
         uri: data URI of the image.
-        title: what it shows.
-        caption: size and shares, in words.
+        title: title.
+        caption: size and shares of the cells.
         file: path of the full image relative to the run folder, or empty.
-        cell: address of the cell it comes from.
-        wall: index of the wall it shows, -1 for what is no raster of a wall.
-        number: of that wall for people: the place of its plane in `planes.json`.
-        name: of that wall.
-        frame: where it lies in the world, None for what is no raster of a wall.
-        id: name of its place on the page; empty where nothing refers to it.
-        depths: `columns` and `rows` of a coarse grid, and `mm` row by row, None where unknown; of
-            a picture of depth.
-        depth_limit_m: depth of the last of its colours; the first is as far behind the plane.
-        reading: how to read it and what would be bad, a sentence.
+        cell: address of the cell that made it.
+        wall: index of its wall; -1 if it is not a raster of a wall.
+        number: number of the wall shown to users: the index of its plane in `planes.json`.
+        name: name of the wall.
+        frame: frame of the raster; None if it is not a raster of a wall.
+        id: HTML id; empty if nothing refers to it.
+        depths: for pictures of depth, `columns` and `rows` of a coarse grid, and `mm` row by row,
+            None if unknown.
+        depth_limit_m: depth of the last colour of the scale; the first is at the same distance
+            behind the plane.
+        reading: one sentence on how to interpret it and what indicates a problem.
     """
 
     uri: str
@@ -97,40 +98,40 @@ class Picture:
 
     @property
     def width_m(self) -> float:
-        """Width on the wall, metres; 0 for what is no raster of a wall."""
+        """Width on the wall, metres; 0 if it is not a raster of a wall."""
         return self.frame.width * self.frame.gsd_m if self.frame is not None else 0.0
 
     @property
     def scale(self) -> tuple[str, float]:
-        """A round length, 1, 2 or 5 times a power of ten, and its share of the width in percent."""
+        """Length of the scale bar (1, 2 or 5 times a power of ten), and its percentage of width."""
         length_m = round_below(_BAR_SHARE * self.width_m)
         words = f"{length_m:g} m" if length_m >= 1.0 else f"{100.0 * length_m:g} cm"
         return words, 100.0 * length_m / self.width_m
 
     @property
     def layer(self) -> str:
-        """What it shows besides its wall, with its variants: the same for all walls of a cell."""
+        """Title without the wall, with variants: the same for all walls of a cell."""
         text = self.title.removeprefix(self.name).strip(" ,")
         return text if text and not text.startswith("(") else f"orthoimage {text}".strip()
 
 
 def data_uri(content: bytes, media_type: str) -> str:
-    """Return the bytes of a file as a URI that carries them."""
+    """Return the content of a file as a data URI."""
     return f"data:{media_type};base64,{base64.b64encode(content).decode('ascii')}"
 
 
 def side_px(n_pictures: float) -> int:
-    """Longest side of each of so many pictures, in pixels: the page stays small enough to send."""
+    """Return the longest side of each of n pictures in pixels that keeps the page small."""
     share = min(1.0, math.sqrt(_FULL_PICTURES / max(1, n_pictures)))
     return max(SHORTEST_SIDE_PX, round(LONGEST_SIDE_PX * share))
 
 
 def orthoimage_pictures(run: Run, *, share: float = 1.0) -> Iterator[Picture]:
-    """Every orthoimage that the record holds; equal ones of several cells once.
+    """Yield every orthoimage in the record; identical ones of several cells once.
 
     Args:
         run: the run.
-        share: which part of a page's bytes they may take.
+        share: share of the page's limit that they may use.
     """
     n_products = len(embedded_products(run, "orthoimages"))
     baseline = {cell.address for cell in baseline_cells(run)}
@@ -143,7 +144,7 @@ def orthoimage_pictures(run: Run, *, share: float = 1.0) -> Iterator[Picture]:
 
 
 def thumbnail(run: Run, addresses: Collection[str], *, longest_side_px: int) -> str:
-    """Give the first orthoimage of some cells as a small picture, a data URI; empty without any."""
+    """Return a thumbnail of the cells' first orthoimage as a data URI; empty if they have none."""
     places = [cell for cell, _ in embedded_products(run, "orthoimages") if cell in addresses]
     for address, product in products_of(run, Orthoimages, places[-1:]):
         for image in product.images:
@@ -153,11 +154,11 @@ def thumbnail(run: Run, addresses: Collection[str], *, longest_side_px: int) -> 
 
 
 def wall_pictures(run: Run, *, share: float = 1.0) -> Iterator[Picture]:
-    """Intensity and depth of every wall raster that the record holds; equal ones once.
+    """Yield intensity and depth of every wall raster in the record; identical ones once.
 
     Args:
         run: the run.
-        share: which part of a page's bytes they may take.
+        share: share of the page's limit that they may use.
     """
     n_products = len(embedded_products(run, "walls"))
     for address, product in products_of(run, Walls):
@@ -170,19 +171,19 @@ def wall_pictures(run: Run, *, share: float = 1.0) -> Iterator[Picture]:
         yield from _drawn(drawings, n_products=n_products / share)
 
 
-# What gives the file, so many pixels long, and the picture of it, which has a frame.
+# Function that encodes the image with a given longest side in pixels, and its picture with a frame.
 _Drawing = tuple[Callable[[int], bytes], Picture]
 
 
 def _drawn(
     drawings: Sequence[_Drawing], *, n_products: float, close_cells: float = 0.0
 ) -> Iterator[Picture]:
-    """Draw pictures side by side; encoding takes most of a report's time.
+    """Encode pictures in parallel; this takes most of the time of a report.
 
     Args:
-        drawings: of one product.
-        n_products: how many products share the page.
-        close_cells: each of them shows so many cells at least, where it has them.
+        drawings: pictures of one product.
+        n_products: number of products on the page.
+        close_cells: minimum number of cells of each picture, if the raster has them.
     """
     small_px = side_px(n_products * len(drawings))
 
@@ -219,7 +220,7 @@ def _orthoimage(run: Run, address: str, image: Orthoimage) -> _Drawing:
 
 
 def _states(image: Orthoimage) -> str:
-    """Return what became of the cells, so that the shares add up to all of them."""
+    """Return the shares of the cell states, which add up to 100 %."""
     words = {
         OrthoMask.PAINTED: "painted",
         OrthoMask.CONTRADICTED: "painted by one photo alone against the colours of the scan",
@@ -273,7 +274,7 @@ def _intensity(
 
 
 def _raster(run: Run, address: str, index: int, wall: Wall, what: str) -> Picture:
-    """A picture of `depth` or `intensity`, but for what it shows and how it is read."""
+    """Return a picture of `depth` or `intensity` without image data, caption and reading."""
     return Picture(
         uri="",
         title=_title(f"{wall.name}, {what}", address),
@@ -288,16 +289,16 @@ def _raster(run: Run, address: str, index: int, wall: Wall, what: str) -> Pictur
 
 
 def depth_colours(depth_m: NDArray[np.float32], limit_m: float) -> NDArray[np.uint8]:
-    """Colour depths from blue (-limit) over white (0) to red (+limit); NaN is white."""
+    """Return colours of depths from blue (-limit) to red (+limit); 0 and NaN are white."""
     place = np.clip(np.asarray(depth_m, dtype=np.float32) / np.float32(limit_m), -1.0, 1.0)
-    # One table look-up per cell: mixing colours cell by cell takes ten times as long.
+    # One table look-up per cell is ten times as fast as mixing colours.
     index = np.rint(np.nan_to_num(place) * 127.0 + 127.0).astype(np.int16)
     coloured: NDArray[np.uint8] = _DIVERGING_TABLE[index]
     return coloured
 
 
 def frame_words(frame: WallFrame) -> str:
-    """Return how large a raster is on the wall, and how fine."""
+    """Return size and resolution of a raster as text."""
     return (
         f"{frame.width * frame.gsd_m:.2f} x {frame.height * frame.gsd_m:.2f} m at "
         f"{1000 * frame.gsd_m:g} mm, {frame.width} x {frame.height} cells"
@@ -305,9 +306,9 @@ def frame_words(frame: WallFrame) -> str:
 
 
 def embedded_products(run: Run, type_name: str) -> tuple[tuple[str, str], ...]:
-    """Cells and ports whose product of a type lies in the record; equal products once.
+    """Return cells and ports with a product of a type in the record; identical products once.
 
-    Repeats of a random method are left out: they differ in their numbers only.
+    Repeats of a random method are omitted: they differ in their metrics only.
     """
     found: dict[str, tuple[str, str]] = {}
     for address, cell in run.cells.items():
@@ -320,14 +321,14 @@ def embedded_products(run: Run, type_name: str) -> tuple[tuple[str, str], ...]:
 def products_of(
     run: Run, cls: type[T], addresses: Container[str] | None = None
 ) -> Iterator[tuple[str, T]]:
-    """Yield the products of a type that the record holds, each with the address of its cell.
+    """Yield the products of a type in the record, each with the address of its cell.
 
-    One at a time: those of a large building fill the memory together.
+    One product at a time, since those of a large building may exceed the memory together.
 
     Args:
         run: the run.
         cls: class of the products.
-        addresses: of their cells; None for all.
+        addresses: addresses of the cells; None for all.
     """
     every = embedded_products(run, cls.type_name)
     places = [place for place in every if addresses is None or place[0] in addresses]
@@ -357,7 +358,7 @@ def _percent(share: float) -> str:
 
 
 def coarse_depths(depth_m: NDArray[np.float32]) -> dict[str, object]:
-    """Return `columns`, `rows` and `mm` in the middle of each cell of a coarse grid."""
+    """Return `columns`, `rows` and `mm` (depths at cell centres) of a coarse grid."""
     height, width = depth_m.shape
     step = max(1.0, math.sqrt(width * height / _PLACES_MOST))
     columns, rows = max(1, round(width / step)), max(1, round(height / step))
@@ -371,11 +372,11 @@ def coarse_depths(depth_m: NDArray[np.float32]) -> dict[str, object]:
 def cursor_places(
     orthoimages: Sequence[Picture], walls: Sequence[Picture]
 ) -> list[dict[str, object]]:
-    """Return where the cells of each orthoimage lie in the world, for the page's script.
+    """Return the frames of orthoimages and coarse depths, for the page's script.
 
     Args:
         orthoimages: pictures of orthoimages.
-        walls: pictures of walls, of which those of the depth know it.
+        walls: pictures of walls, including those of depth.
     """
     places: list[dict[str, object]] = []
     for picture in orthoimages:
@@ -404,15 +405,16 @@ def cursor_places(
 
 
 def sliders(pictures: Sequence[Picture], n_orthoimages: int) -> list[dict[str, object]]:
-    """Group pictures by the place that they show, for the page's script.
+    """Group pictures of the same part of a wall, for the page's script.
 
     Args:
         pictures: orthoimages first, then rasters of walls.
-        n_orthoimages: how many of them are orthoimages; each of the groups has at least one.
+        n_orthoimages: number of orthoimages; every group contains at least one.
 
     Returns:
-        Of groups of two and more: the wall, width over height of the first picture, and of each
-        picture its id, titles, and rectangle in percent of the first one's sides.
+        For each group of two or more pictures: name of the wall, width over height of the first
+        picture, and of each picture its id, titles, and rectangle in percent of the first one's
+        sides.
     """
     groups: list[list[Picture]] = []
     for index, picture in enumerate(pictures):
@@ -452,7 +454,7 @@ def _placed(picture: Picture, reference: WallFrame) -> dict[str, object]:
 
 
 def frame_of(picture: Picture) -> WallFrame:
-    """Return where a raster of a wall lies in the world."""
+    """Return the frame of a raster of a wall."""
     if picture.frame is None:
         raise ValueError(f"{picture.title} is no raster of a wall")
     return picture.frame

@@ -1,4 +1,4 @@
-"""Numbers as pages print them, and the best values of a column."""
+"""Formatting of numbers, and the best values of a column."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Final
 
 from orthoflow.records.runs import is_rounding
 
-_DIGITS_MOST: Final = 6  # of a mean beside its spread
+_DIGITS_MOST: Final = 6  # of a mean with its spread
 _DIGITS_FEW: Final = 4
 
 
 def number(value: float, *, significant: int = 4) -> str:
-    """Print a number with four significant digits, without an exponent where one can.
+    """Format a number with four significant digits, without an exponent if possible.
 
     >>> number(0.0123456), number(1234567.0), number(12.0), number(0.14151, significant=2)
     ('0.01235', '1234567', '12', '0.14')
@@ -26,12 +26,12 @@ def number(value: float, *, significant: int = 4) -> str:
     if digits >= 10:
         return f"{value:.3g}"
     printed = f"{value:.{digits}f}"
-    # Zeros before the point count.
+    # Zeros before the decimal point are significant.
     return printed.rstrip("0").rstrip(".") if digits else printed
 
 
 def number_with_unit(value: float, unit: str, *, significant: int = 4) -> str:
-    """Print a number and its unit; shares and counts (unit 1) stand alone.
+    """Format a number with its unit; shares and counts (unit 1) have none.
 
     >>> number_with_unit(2.5, "mm"), number_with_unit(1.0, "yes/no"), number_with_unit(0.4, "1")
     ('2.5 mm', 'yes', '0.4')
@@ -43,7 +43,7 @@ def number_with_unit(value: float, unit: str, *, significant: int = 4) -> str:
 
 
 def number_with_spread(value: float, spread: float) -> str:
-    """Print a mean and its standard deviation, to the latter's second digit where that is sane.
+    """Format a mean to the second digit of its standard deviation, unless it is very small.
 
     >>> number_with_spread(12.3456, 0.0123), number_with_spread(3.0, 0.0)
     ('12.346 ± 0.012', '3')
@@ -62,7 +62,7 @@ def number_with_spread(value: float, spread: float) -> str:
 
 
 def seconds_in_words(seconds: float) -> str:
-    """Print a time.
+    """Format a duration.
 
     >>> seconds_in_words(0.042), seconds_in_words(12.34), seconds_in_words(125.0)
     ('0.04 s', '12.3 s', '2 min 05 s')
@@ -74,17 +74,16 @@ def seconds_in_words(seconds: float) -> str:
     return "{} min {:02d} s".format(*divmod(round(seconds), 60))
 
 
-# Without repeats of both nobody knows how far values of the same method lie apart, nor where they
-# all give one value. What is nearer than this share of the best is no difference then; times and
-# memory scatter more, times from run to run by so much (docs/performance.md), whatever their
-# repeats in one run suggest.
+# Used if there are no repeats of both values, or all repeats are identical, so that the scatter is
+# unknown: smaller differences, relative to the best, count as none. Times and memory scatter more
+# from run to run (docs/performance.md), even if the repeats of one run agree.
 _LEVEL_SHARE: Final = 0.01
 _LEVEL_COST_SHARES: Final = {"s": 0.3, "MiB": 0.1}
 FLAG: Final = "yes/no"
 
 
 class Mark(Enum):
-    """How a value stands among those that it may be compared with."""
+    """Rank of a value among those with which it may be compared."""
 
     NONE = ""
     BEST = "best"
@@ -94,16 +93,16 @@ class Mark(Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class Value:
-    """One place of a comparison table.
+    """A field of a comparison table.
 
     Attributes:
-        text: the number as printed, empty where there is none.
-        sort: the number that the table is sorted by, NaN where there is none.
-        spread: standard deviation over repeats, NaN without repeats.
-        mark: how it stands among the values of its group.
-        group: letter of its environment and data, empty when the table has one of each.
-        note: more in words, e.g. how many repeats.
-        n_items: items that it sums up, NaN where nobody counts them.
+        text: formatted number; empty if there is none.
+        sort: sort key of the table; NaN if there is none.
+        spread: standard deviation over repeats; NaN if there are none.
+        mark: rank among the values of its group.
+        group: letter of its environment and data; empty if all values have the same.
+        note: remark, e.g. the number of repeats.
+        n_items: number of items it sums over; NaN if not counted.
     """
 
     text: str = ""
@@ -116,20 +115,20 @@ class Value:
 
 
 def rank(values: Sequence[Value], better: str, unit: str = "1") -> list[Value]:
-    """Mark the best of each group; a group whose values are all level has none.
+    """Mark the best value of each group, unless all values of the group are level.
 
-    Groups with a value of a single run are not ranked: on another machine, or with another seed,
-    another may be the best. A value whose distance from the best is not above both their standard
-    deviations together (in quadrature), or where one of them has repeats of one value, not above a
-    hundredth of the best (a tenth of a memory, three tenths of a time), or just of rounding, is
-    marked as near the best; the best is then only among the best, too. What sums up fewer items
-    than another of its group is not ranked: a method that refuses difficult photos has smaller
-    errors of the rest.
+    Groups with a value of a single run are not ranked: with another machine or seed, another value
+    may be the best. A value is near the best if its distance from the best does not exceed their
+    standard deviations combined in quadrature; or, if there are none or the repeats of one are
+    identical, 1 % of the best (10 % for memory, 30 % for times), or rounding. If any value is near
+    the best, the best is also marked as near. A value that sums over fewer items than another in
+    its group is not ranked: a method that rejects difficult photos has smaller errors for the
+    remaining ones.
 
     Args:
-        values: a column.
-        better: which of its values are, a key of `BETTER`; those of others are not ranked.
-        unit: of its values.
+        values: values of a column.
+        better: better direction, a key of `BETTER`; other metrics are not ranked.
+        unit: unit of the values.
     """
     if better not in BETTER:
         return list(values)
@@ -152,14 +151,14 @@ def rank(values: Sequence[Value], better: str, unit: str = "1") -> list[Value]:
         if len(leading) == len(members):
             continue
         for index in leading:
-            # What several share nobody leads in.
+            # If several values share the best rank, none of them is the best.
             mark = Mark.NEAR if len(leading) > 1 else Mark.BEST
             marked[index] = replace(values[index], mark=mark)
     return marked
 
 
 def _are_level(one: Value, other: Value, better: str, unit: str) -> bool:
-    """Whether nothing shows that a value differs from a better one."""
+    """Return whether a value is not distinguishable from a better one."""
     if is_rounding(badness(one.sort, better), badness(other.sort, better)):
         return True
     known = [
@@ -168,30 +167,30 @@ def _are_level(one: Value, other: Value, better: str, unit: str) -> bool:
         if math.isfinite(value.spread) and not is_rounding(value.sort, value.sort + value.spread)
     ]
     share = max(cost_share(unit), 0.0 if len(known) == 2 else _LEVEL_SHARE)
-    # Signed errors count by their size.
+    # Signed errors are compared by absolute value.
     own, leading = (abs(v.sort) if better == "lower" else v.sort for v in (one, other))
     return abs(own - leading) <= max(math.hypot(*known), share * abs(leading))
 
 
 def cost_share(unit: str) -> float:
-    """Return by what share values scatter from run to run: times and memory do, others do not."""
+    """Return the relative scatter of values from run to run; 0 except for times and memory."""
     return _LEVEL_COST_SHARES.get(unit, 0.0)
 
 
-# What a method declares of a metric (`MetricSpec.better`), in words; others are not judged.
+# Better direction as declared by a method (`MetricSpec.better`); others are not ranked.
 BETTER: Final = {"lower": "less is better", "higher": "more is better", "one": "1 is best"}
 
 
 def is_flag(unit: str) -> bool:
-    """Whether values of a unit are 1 where something is so and 0 where not."""
+    """Return whether a unit is that of yes/no metrics (1 or 0)."""
     return unit == FLAG
 
 
 def badness(value: float, better: str) -> float:
-    """Return a number that is smaller the better the value is; signed errors count by their size.
+    """Return a number that decreases as the value improves; signed errors count by absolute value.
 
     Raises:
-        ValueError: the metric has no good side.
+        ValueError: the metric has no better direction.
     """
     if better == "lower":
         return abs(value)

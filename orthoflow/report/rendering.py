@@ -1,4 +1,4 @@
-"""The templates of pages and drawings, and writing what they give."""
+"""Template environment of pages and drawings."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from orthoflow.report.rankings import BETTER, Mark, number, number_with_unit
 from orthoflow.untrusted_text import shown
 from orthoflow.version import __version__
 
-# Parentheses in a DOI come in pairs, as in doi:10.1007/3DRes.02(2011)3.
+# Parentheses in DOIs are paired, as in doi:10.1007/3DRes.02(2011)3.
 _DOI: Final = re.compile(r"doi:\s*(10\.(?:\([^\s()]*\)|[^\s,;()])*(?:\([^\s()]*\)|[^\s,;().]))")
 
 
 @cache
 def environment() -> jinja2.Environment:
-    """Return the templates, with what all pages share."""
+    """Return the template environment, with functions and values common to all pages."""
     environment = jinja2.Environment(
         autoescape=True,
         trim_blocks=True,
@@ -41,12 +41,12 @@ def environment() -> jinja2.Environment:
         "number": number,
         "environments": distinct_words,
         "cited": cited,
-        # A long name or address may be broken behind its underscores, and before its variants.
+        # Allow line breaks after underscores and before variants of long names and addresses.
         "breakable": lambda name: Markup(re.sub(r"([_@,])", r"\1<wbr>", str(escape(shown(name))))),
         "urlpath": quote,
         "shell": shlex.quote,
     }
-    # Ours, and no template: braces in them mean nothing.
+    # Part of the package and not a template, so braces have no meaning.
     folder = files("orthoflow.report") / "templates"
     css, early, script = (
         folder.joinpath(name).read_text(encoding="utf-8")
@@ -69,19 +69,19 @@ def environment() -> jinja2.Environment:
 
 
 def _shown(value: object) -> object:
-    """Write out what turns reading round; what is markup already was made of escaped parts."""
+    """Escape control characters, such as text direction marks; markup has been escaped before."""
     is_text = isinstance(value, str) and not isinstance(value, Markup)
     return shown(str(value), keep="\n\t") if is_text else value
 
 
 def _hash_source(text: str) -> str:
-    """Name a style or a script for the policy of the page, by its content."""
+    """Return the hash of a style or script for the page's content security policy."""
     digest = hashlib.sha256(text.encode("utf-8")).digest()
     return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
 
 
 def cited(citation: str) -> Markup:
-    """Escape a citation and make its DOI a link: a page that links needs no network itself."""
+    """Escape a citation and make its DOI a link, which does not need the network until clicked."""
     return Markup(
         _DOI.sub(
             lambda found: (

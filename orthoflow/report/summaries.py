@@ -1,4 +1,4 @@
-"""Numbers and sentences of the page, taken from the record."""
+"""Numbers and sentences of the page, from the record."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _PLANE: Final = re.compile(r"\b(?:wall|floor|ceiling) (\d+)")
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """One number of the first screen: what, how much, from which cell, and what else to know."""
+    """A headline metric: label, value, cell and remark."""
 
     what: str
     value: str
@@ -48,11 +48,12 @@ class Limit:
 
 
 def headline_keys(cells: Iterable[RecordedCell]) -> list[tuple[str, str]]:
-    """Return step and metric of the headline numbers, as methods declare them.
+    """Return step and metric of the headline metrics, as declared by the methods.
 
-    What checks results stands first, then the last of the other steps; in a step in the order in
-    which its method reports. Of a metric that several steps report the last step's counts: it takes
-    further what an earlier one has begun, as orientations do. Each check has its own.
+    Steps that check results come first, then the other steps, the last one first; within a step,
+    metrics keep the order in which the method reports them. If several steps report the same
+    metric, only the last step is used, since it refines the results of earlier ones; checks keep
+    their own.
     """
     checks: dict[str, dict[str, None]] = {}
     others: dict[str, dict[str, None]] = {}
@@ -70,13 +71,13 @@ def headline_keys(cells: Iterable[RecordedCell]) -> list[tuple[str, str]]:
 
 
 def answers(run: Run) -> tuple[Answer, ...]:
-    """Return how good the products are: the headline numbers of the baseline."""
+    """Return the headline metrics of the baseline."""
     cells = {cell.step: cell for cell in baseline_cells(run)}
     rows = {step: {row.metric: row for row in cell_metrics(cell)} for step, cell in cells.items()}
     keys = [key for key in headline_keys(cells.values()) if key[1] in rows[key[0]]]
     chosen = [rows[step][metric] for step, metric in keys]
     found = []
-    # What is not as it should be stands first; what is so is no news.
+    # Yes/no metrics with the undesired value come first; those with the desired value are omitted.
     for row in sorted(chosen, key=lambda row: not is_flag(row.unit)):
         if is_flag(row.unit) and row.value:
             continue
@@ -94,7 +95,7 @@ def answers(run: Run) -> tuple[Answer, ...]:
 
 
 def has_measured_lengths(run: Run) -> bool:
-    """Whether a check of the baseline measured lengths, by which its pictures are off."""
+    """Return whether a check of the baseline compared lengths, so that their errors are known."""
     return any(
         metric.unit == "mm"
         for cell in baseline_cells(run)
@@ -104,10 +105,10 @@ def has_measured_lengths(run: Run) -> bool:
 
 
 def limits(run: Run) -> tuple[Limit, ...]:
-    """What limits the results: failures, combinations of different walls, then diagnostics by code.
+    """Return what limits the results: failures, combinations of different walls, and diagnostics.
 
-    Of the diagnostics that no later step has settled errors stand first, and last those that are
-    only about planes of which no orthoimage was made.
+    Diagnostics that a later step resolved are omitted. The remaining ones are grouped by code,
+    errors first; diagnostics that concern only planes without an orthoimage come last.
     """
     failures: dict[str, list[str]] = {}
     for cell in run.record.cells:
@@ -118,7 +119,7 @@ def limits(run: Run) -> tuple[Limit, ...]:
     imaged = {
         found[1] for file in run.record.published if (found := _IMAGE.search(file.path)) is not None
     }
-    # A later orientation reports by itself which photos it leaves open.
+    # A later orientation reports itself which photos are not oriented.
     oriented = [
         cell.address
         for cell in by_baseline
@@ -146,14 +147,14 @@ def limits(run: Run) -> tuple[Limit, ...]:
 
 
 def _is_of_others_than(numbers: Collection[str], group: DiagnosticGroup) -> bool:
-    """Whether diagnostics are about planes, but none of these, where there are any."""
+    """Return whether diagnostics concern only planes that are not among these, if there are any."""
     about = (_PLANE.fullmatch(subject) for subject in (group.worst.subject, *group.subjects))
     named = [plane[1] for plane in about if plane]
     return bool(numbers and named) and not any(number in numbers for number in named)
 
 
 def results(run: Run) -> dict[str, tuple[str, ...]]:
-    """Which cells have a result, failed, were not reached or not asked for: which -> addresses."""
+    """Return addresses by result: succeeded, failed, not reached or not selected."""
     found: dict[str, tuple[str, ...]] = {"ok": (), "failed": (), "skipped": (), "not asked for": ()}
     for cell in run.record.cells:
         which = "not asked for" if cell.error_type == NOT_ASKED_FOR else cell.status
@@ -162,12 +163,13 @@ def results(run: Run) -> dict[str, tuple[str, ...]]:
 
 
 def citations(run: Run) -> dict[str, tuple[str, ...]]:
-    """What the methods of a run ask to be cited: text -> methods, with what each takes of it."""
+    """Return citations of the methods: citation -> methods, with what each uses from it."""
     found: dict[str, dict[str, None]] = {}
     for cell in run.record.cells:
         if cell.status != "skipped":
             for citation in cell.citations:
-                # `..., doi:... (4.4, Table 2)`: one entry for a paper, wherever in it a method is.
+                # `..., doi:... (4.4, Table 2)`: one entry per publication, whichever sections
+                # methods cite.
                 placed = _PLACE.fullmatch(citation)
                 text, place = placed.groups() if placed else (citation, "")
                 method = f"{cell.method}: {place}" if place else cell.method

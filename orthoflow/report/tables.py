@@ -1,4 +1,4 @@
-"""Tables for pages and papers, and the planes that a run found as such."""
+"""Tables for pages and publications, and the detected planes as tables."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _LATEX: Final = {
 
 
 def escaped_latex(text: str) -> str:
-    """Escape a text for LaTeX."""
+    """Return a text escaped for LaTeX."""
     return "".join(_LATEX.get(sign, sign) for sign in shown(text))
 
 
@@ -34,10 +34,10 @@ class Column(NamedTuple):
     """A column of a table.
 
     Attributes:
-        label: its heading, with unit and good side.
-        name: in CSV.
-        is_numeric: it stands to the right, and is sorted by numbers.
-        digits: significant ones of its numbers.
+        label: heading, with unit and better direction.
+        name: heading in CSV.
+        is_numeric: whether it is right-aligned and sorted numerically.
+        digits: number of significant digits.
     """
 
     label: str
@@ -48,13 +48,13 @@ class Column(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """A table, which pages, CSV, LaTeX and Markdown show.
+    """A table that is shown on pages and written as CSV, LaTeX and Markdown.
 
     Attributes:
-        name: of its files.
-        caption: what it shows, one sentence.
-        columns: heading of each column.
-        rows: of values; None for nothing.
+        name: name of its files without suffix.
+        caption: one sentence.
+        columns: columns in order.
+        rows: rows of values; None if a field is empty.
     """
 
     name: str
@@ -63,13 +63,13 @@ class Table:
     rows: tuple[tuple[Value, ...], ...]
 
     def text(self, value: Value, column: Column, missing: str = "-") -> str:
-        """Print a value."""
+        """Format a value."""
         if isinstance(value, float):
             return number(value, significant=column.digits)
         return missing if value is None else str(value)
 
     def only(self, *names: str) -> Table:
-        """Return some of its columns."""
+        """Return the table with only these columns."""
         places = [place for place, column in enumerate(self.columns) if column.name in names]
         return replace(
             self,
@@ -78,11 +78,11 @@ class Table:
         )
 
     def csv(self) -> str:
-        """Return the table as CSV, numbers with all digits."""
+        """Return the table as CSV, with all digits of numbers."""
         return csv_text([[column.name for column in self.columns], *self.rows])
 
     def latex(self) -> str:
-        """Return the table as LaTeX, for the package booktabs."""
+        """Return the table as LaTeX code for the package booktabs."""
         head, *rows = (" & ".join(map(escaped_latex, row)) + r" \\" for row in self._texts())
         return "\n".join(
             (
@@ -97,7 +97,7 @@ class Table:
         )
 
     def markdown(self) -> str:
-        """Return the table as Markdown, numbers to the right."""
+        """Return the table as Markdown, with numbers right-aligned."""
         head, *rows = self._texts()
         rule = ["---:" if column.is_numeric else "---" for column in self.columns]
         lines = [f"| {' | '.join(map(_markdown, row))} |" for row in (head, rule, *rows)]
@@ -119,10 +119,10 @@ class PlaneTables:
 
     Attributes:
         cell: address of the cell.
-        viewpoint: where the side of the viewer comes from, in words.
+        viewpoint: how it was decided from which side each plane is viewed.
         planes: a row per plane.
-        materials: thickness of the cloud by place and material.
-        before: all cells that have a part in these planes.
+        materials: thickness of the cloud by position and material.
+        before: addresses of all upstream cells.
     """
 
     cell: str
@@ -132,15 +132,15 @@ class PlaneTables:
     before: frozenset[str] = frozenset()
 
     def taken_further(self, tables: Iterable[PlaneTables]) -> bool:
-        """Whether another of the tables shows what a later step made of these planes."""
+        """Return whether another table shows planes that a later step derived from these."""
         return any(self.cell in table.before for table in tables)
 
 
 def plane_tables(run: Run) -> tuple[PlaneTables, ...]:
-    """The planes of every cell that found some; equal products once."""
+    """Return the planes of every cell that detected some; identical products once."""
     found = []
     for address, planes in products_of(run, Planes):
-        # Of several sources of sides, how many planes each has.
+        # Number of planes by the source of their side.
         counts = Counter(planes.side_source(index) for index in range(len(planes)))
         sources = [f"{source} ({count})" for source, count in counts.items()]
         found.append(
@@ -163,7 +163,7 @@ def _plane_table(planes: Planes) -> Table:
         omega, phi = omega_phi_deg(planes.normal[index], planes.up)
         first, second, _, last = planes.corners[index]
         wide_m, high_m = np.linalg.norm(last - first), np.linalg.norm(second - first)
-        # Nothing for planes that were given.
+        # Given planes have no thickness.
         thickness = planes.thickness[index] if planes.thickness else None
         spread = (None, None) if thickness is None else (thickness.sigma_m, thickness.scan_step_m)
         rows.append(
