@@ -54,17 +54,8 @@ def writing_to(folder: Path) -> Iterator[None]:
         raise store_error(error, folder) from error
 
 
-def sync_folder(folder: Path) -> None:
-    """Make renames in a folder survive a power cut."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def sync_file(path: Path) -> None:
-    """Make the content of a closed file survive a power cut."""
+def sync(path: Path) -> None:
+    """Make the content of a closed file, or the names in a folder, survive a power cut."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -74,14 +65,8 @@ def sync_file(path: Path) -> None:
 
 def sync_tree(folder: Path) -> None:
     """Make everything below a folder survive a power cut, except its own name."""
-    folders = [folder]
-    for path in folder.rglob("*"):
-        if path.is_dir():
-            folders.append(path)
-        else:
-            sync_file(path)
-    for path in folders:
-        sync_folder(path)
+    for path in (*folder.rglob("*"), folder):
+        sync(path)
 
 
 def write_whole(path: Path, content: bytes) -> None:
@@ -101,7 +86,7 @@ def write_whole(path: Path, content: bytes) -> None:
         except OSError:
             aside.unlink(missing_ok=True)
             raise
-        sync_folder(path.parent)
+        sync(path.parent)
 
 
 def place_folder(aside: Path, final: Path) -> bool:
@@ -115,14 +100,14 @@ def place_folder(aside: Path, final: Path) -> bool:
     """
     with writing_to(final.parent):
         final.parent.mkdir(parents=True, exist_ok=True)
-        sync_folder(aside)
+        sync(aside)
         try:
             aside.rename(final)
         except OSError as error:
             if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
                 raise
             return False
-        sync_folder(final.parent)
+        sync(final.parent)
     return True
 
 

@@ -17,7 +17,7 @@ from orthoflow_provenance.document import UnsafeFileError
 from orthoflow_provenance.paths import path_below
 from pydantic import TypeAdapter
 
-from orthoflow.engine.durability import is_locked, lock_file, sync_folder, writing_to
+from orthoflow.engine.durability import is_locked, lock_file, sync, writing_to
 from orthoflow.engine.environment import now, time_in_a_name
 from orthoflow.engine.results import CellResult, CellStatus
 from orthoflow.errors import ArgumentError, RecordError, StoreError
@@ -204,7 +204,7 @@ class Journal:
             return
         self.write("run", time=self.started, format=_FORMAT, run_id=self.run_id, workflow=name)
         with writing_to(self._folder):
-            sync_folder(self._folder)
+            sync(self._folder)
 
     def _read_lines(self) -> list[JournalLine]:
         """Read complete lines; an incomplete last one is removed."""

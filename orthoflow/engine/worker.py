@@ -172,7 +172,7 @@ def run_step(task: Task, pipe: Connection, variables: Mapping[str, str]) -> None
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_coordinator, daemon=True).start()
     events = _EventPipe(pipe)
-    result = run_task(task, events.listen, stop.is_set, has_own_process=True)
+    result = run_task(task, events.listen, stop.is_set)
     events.send(RESULT + result_to_json(result).encode())
     for stream in (sys.stdout, sys.stderr):
         with suppress(AttributeError, OSError, ValueError):
@@ -265,20 +265,13 @@ class _EventPipe:
             self._pipe.send_bytes(message)
 
 
-def run_task(
-    task: Task,
-    listen: Listener,
-    is_cancelled: Callable[[], bool],
-    *,
-    has_own_process: bool = False,
-) -> CellResult:
+def run_task(task: Task, listen: Listener, is_cancelled: Callable[[], bool]) -> CellResult:
     """Run a task to its end; every failure becomes a failed result, never an exception.
 
     Args:
         task: what to run; its folder exists.
         listen: called with progress, log lines and diagnostics.
         is_cancelled: asks whether to stop.
-        has_own_process: whether this process ends with the task.
     """
     started = now()
     sampler, progress = MemorySampler(), _ProgressWithCompiling(listen)

@@ -35,7 +35,7 @@ from orthoflow_provenance.document import (
 from orthoflow_provenance.paths import colliding, path_below
 from orthoflow_provenance.record import write_record
 
-from orthoflow.engine.durability import sync_folder, sync_tree, write_whole, writing_to
+from orthoflow.engine.durability import sync, sync_tree, write_whole, writing_to
 from orthoflow.engine.file_digests import FileDigests, file_sha256
 from orthoflow.engine.journal import (
     RECORD_FILE,
@@ -305,7 +305,7 @@ def write_run(
                 sync_tree(run_folder)
                 finished = unfinished.replace(run_folder / RECORD_FILE)
                 (run_folder / OUTLINE_FILE).unlink(missing_ok=True)
-                sync_folder(run_folder)
+                sync(run_folder)
             return read_run(finished)
     except StoreError as error:
         needed = [name for result in outcome.results.values() for name in result.objects]
