@@ -1,1 +1,1 @@
-"""Methods of the kind `orient`: where the photos were taken."""
+"""Methods of the kind `orient`: exterior orientation of the photos."""

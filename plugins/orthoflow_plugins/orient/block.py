@@ -1,7 +1,7 @@
-"""A block of photos that share lenses and points: bundle adjustment and covariance.
+"""Bundle adjustment of a block of photos that share lenses and points, with its covariance.
 
-COLMAP's cost functions and the Ceres solver adjust it; the covariance of all unknowns includes
-correlated errors of the observations.
+The adjustment uses COLMAP's cost functions and the Ceres solver. The covariance of the unknowns
+takes correlated errors of the observations into account.
 """
 
 from __future__ import annotations
@@ -33,42 +33,42 @@ from orthoflow.products import JsonValue, Photo
 from orthoflow.sdk import DiagnosticSpec
 from orthoflow_plugins.orient.pose import Lens, Note
 
-# Lower limit of the standard deviation of a known point, whose variance is a divisor.
+# Lower limit of the standard deviation of a known point; avoids a division by zero.
 _MIN_SIGMA_M: Final = 1e-6
 _CORRELATED: Final = 0.95
 _MIN_FOR_PLANE: Final = 3
 _POSE_NAMES: Final = ("tilt", "pan", "roll", "x", "y", "distance")
 _ITERATIONS: Final = 60
-# Of the cost: the square of a hundredth of a standard deviation.
+# Relative change of the cost at which the solver stops.
 _CONVERGED: Final = 1e-8
 # COLMAP's order: fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6.
 _MODEL: Final = "FULL_OPENCV"
 _N_VALUES: Final = 12
 _COLUMNS: Final = {"cx": 2, "cy": 3, "k1": 4, "k2": 5, "p1": 6, "p2": 7}
-# COLMAP has fx and fy; this prior of their ratio fixes it.
+# COLMAP estimates fx and fy separately; this prior keeps their ratio fixed.
 _TIED_ASPECT: Final = 1e-5
-# An observation this far off has no weight with a loss this narrow.
+# An observation with this residual has no weight under a loss of this scale.
 _FAR_PX: Final = -1e6
 _NOTHING: Final = 1e-9
 LENS_CONFUSED: Final = DiagnosticSpec(
     code="lens-correlated-with-pose",
     severity="warning",
-    text="the {parameter} of the lens of {subject} and the {pose} of its photos correlate by "
-    "{correlation:.3f}",
-    remedy="photos from other sides, some turned by 90 degrees, or a calibration{also} would "
-    "separate them",
+    text="the lens parameter {parameter} of {subject} and the {pose} of its photos have a "
+    "correlation of {correlation:.3f}",
+    remedy="to separate them, add photos from other directions, some rotated by 90 degrees, or "
+    "give a calibration{also}",
     rank_by="correlation",
 )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Observations(Rows):
-    """Pixels of points in photos.
+    """Observations of points in photos.
 
     Attributes:
         photo: (m,) index of the camera.
         point: (m,) index of the point.
-        pixels: (m, 2).
+        pixels: (m, 2) measured pixels.
         sigma_px: (m,) standard deviation of each coordinate.
     """
 
@@ -83,9 +83,10 @@ class Points(Rows):
     """Points of a block.
 
     Attributes:
-        now: (k, 3) metres, adjusted.
-        known: (k, 3) metres, in the scan; any value without the scan.
-        sigma_m: (k,) standard deviation of each coordinate of `known`; inf without the scan.
+        now: (k, 3) metres, adjusted positions.
+        known: (k, 3) metres, positions in the scan; arbitrary for points that are not in the scan.
+        sigma_m: (k,) standard deviation of each coordinate of `known`; inf for points that are not
+            in the scan.
     """
 
     now: NDArray[np.float64]
@@ -95,7 +96,7 @@ class Points(Rows):
 
 @dataclass(frozen=True, kw_only=True)
 class Block:
-    """Cameras, lenses, points and observations, in a world with its origin nearby.
+    """Cameras, lenses, points and observations, in coordinates with a nearby origin.
 
     Attributes:
         cameras: one per photo.
@@ -113,12 +114,15 @@ class Block:
 
     @property
     def is_joint(self) -> NDArray[np.bool_]:
-        """Points (k,) seen more than once, which are adjusted; others only widen their pixel."""
+        """Points (k,) seen more than once; only these are adjusted.
+
+        The uncertainty of the others is added to that of their pixel.
+        """
         return np.bincount(self.seen.point, minlength=len(self.points)) > 1
 
     @property
     def lens_starts(self) -> NDArray[np.intp]:
-        """First column of each lens in the normal matrix, after the poses; and the end."""
+        """First column of each lens in the normal matrix, after the poses, and the end."""
         sizes = [lens.freedom.sigmas.size for lens in self.lenses]
         return POSE_PARAMETERS * len(self.cameras) + np.cumsum([0, *sizes], dtype=np.intp)
 
@@ -139,9 +143,9 @@ class BlockCovariance:
 
     Attributes:
         matrix: (p, p), columns as in `Block.columns`.
-        cofactors: (p, p) the same from the a priori sigmas.
+        cofactors: (p, p) the same, from the a priori standard deviations.
         sigma0: standard deviation of unit weight.
-        redundancy: observations beyond what determines the unknowns.
+        redundancy: number of observations minus number of unknowns that they determine.
     """
 
     matrix: NDArray[np.float64]
@@ -154,8 +158,8 @@ def solve(block: Block, *, soft_limit: float) -> Block:
     """Adjust all cameras, lenses and points seen more than once.
 
     Args:
-        block: the start.
-        soft_limit: residuals beyond so many standard deviations get less weight (Huber).
+        block: initial values.
+        soft_limit: residuals beyond this many standard deviations get less weight (Huber).
 
     Raises:
         GeometryError: the block has no solution.
@@ -163,8 +167,8 @@ def solve(block: Block, *, soft_limit: float) -> Block:
     import pyceres
 
     ceres: Any = pyceres
-    # The solver changes poses, lenses and points in place. COLMAP's adjuster must outlive it, and a
-    # single reference to the problem keeps costs and losses alive.
+    # The solver changes poses, lenses and points in place. COLMAP's adjuster must outlive the
+    # solver, and a single reference to the problem keeps its costs and losses alive.
     scene, adjuster = _set_up(block)
     problem = adjuster.problem
     images = [scene.images[index + 1] for index in range(len(block.cameras))]
@@ -177,7 +181,7 @@ def solve(block: Block, *, soft_limit: float) -> Block:
     options = ceres.SolverOptions()
     options.max_num_iterations = _ITERATIONS
     options.function_tolerance = _CONVERGED
-    # The order of sums of several threads is not reproducible.
+    # The order of summation is not reproducible with several threads.
     options.num_threads = 1
     kinds = ceres.LinearSolverType
     options.linear_solver_type = kinds.DENSE_SCHUR if joint else kinds.DENSE_NORMAL_CHOLESKY
@@ -208,11 +212,13 @@ def solve(block: Block, *, soft_limit: float) -> Block:
 
 
 def pixel_covariances(block: Block, *, alone: bool = False) -> NDArray[np.float64]:
-    """Return covariances (m, 2, 2) of the pixels, including that of the point if seen once.
+    """Return the covariances (m, 2, 2) of the pixels.
+
+    They include the uncertainty of points that are seen only once.
 
     Args:
         block: the block.
-        alone: include that of every point.
+        alone: include the uncertainty of all points.
     """
     seen = block.seen
     covariances = (seen.sigma_px**2)[:, None, None] * np.eye(2)
@@ -230,8 +236,8 @@ def block_covariance(block: Block, *, soft_limit: float) -> BlockCovariance:
     """Return the covariance of a block after its adjustment.
 
     Args:
-        block: as adjusted.
-        soft_limit: residuals beyond so many standard deviations get less weight (Huber).
+        block: the adjusted block.
+        soft_limit: residuals beyond this many standard deviations get less weight (Huber).
 
     Raises:
         GeometryError: the observations do not determine the block.
@@ -244,7 +250,7 @@ def block_covariance(block: Block, *, soft_limit: float) -> BlockCovariance:
     normal = np.diag(prior)
     squares, n_rows = 0.0, 0
     for columns, jacobian, residuals in rows:
-        # Not by BLAS: its sums depend on the number of threads.
+        # einsum instead of BLAS, where the order of summation depends on the number of threads.
         normal[np.ix_(columns, columns)] += np.einsum("ij,ik->jk", jacobian, jacobian)
         squares += float((residuals**2).sum())
         n_rows += len(residuals)
@@ -263,7 +269,7 @@ def block_covariance(block: Block, *, soft_limit: float) -> BlockCovariance:
 def lenses_json(
     block: Block, photos: Sequence[Photo], covariance: NDArray[np.float64]
 ) -> JsonValue:
-    """Return each adjusted lens, with standard deviations of free parameters."""
+    """Return the adjusted lenses with the standard deviations of their free parameters."""
     entries: list[JsonValue] = []
     sigmas = np.sqrt(np.diag(covariance))
     for index, lens in enumerate(block.lenses):
@@ -285,7 +291,7 @@ def lenses_json(
 
 
 def lens_statistics(block: Block) -> JsonValue:
-    """Return mean and SD of free parameters over lenses of one size with the same ones."""
+    """Return mean and SD of the free parameters, per image size and set of free parameters."""
     kinds: dict[tuple[int, int, tuple[str, ...]], list[NDArray[np.float64]]] = {}
     for index, lens in enumerate(block.lenses):
         camera, names = block.cameras[block.lens_of.index(index)], lens.freedom.names
@@ -311,10 +317,10 @@ def lens_statistics(block: Block) -> JsonValue:
 def correlation_notes(
     block: Block, photos: Sequence[Photo], cofactors: NDArray[np.float64]
 ) -> list[tuple[str, Note]]:
-    """Return the lens parameters that correlate with poses, each with the first photo."""
+    """Return a note for each lens parameter correlated with poses, with the lens's first photo."""
     notes: list[tuple[str, Note]] = []
-    # Separate lenses of what may be one camera are each determined by their own photos.
-    shared = ", or intrinsics: shared where one camera took them all at one zoom,"
+    # Each of several lenses is determined by its own photos only, even if it is one camera.
+    shared = ", or set intrinsics: shared if one camera took all photos at the same zoom"
     also = shared if len(block.lenses) > 1 else ""
     scale = np.sqrt(np.diag(cofactors))
     correlations = np.abs(cofactors / np.outer(scale, scale))
@@ -322,7 +328,7 @@ def correlation_notes(
         members = block.photos_of(index)
         for column, name in enumerate(lens.freedom.names, block.lens_starts[index]):
             of_poses = correlations[: POSE_PARAMETERS * len(block.cameras), column]
-            # Only what is correlated in all its photos is undetermined.
+            # A parameter is undetermined only if it is correlated in all photos of the lens.
             confused = of_poses.reshape(-1, POSE_PARAMETERS)[members].min(axis=0)
             worst = int(confused.argmax())
             if confused[worst] > _CORRELATED:
@@ -333,15 +339,15 @@ def correlation_notes(
 
 
 _Rows = tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]
-"""Equations in standard deviations with points eliminated: columns (c,) of the unknowns, Jacobian
-(r, c) and residuals (r,).
+"""Equations in units of standard deviations, with the points eliminated: columns (c,) of the
+unknowns, Jacobian (r, c) and residuals (r,).
 """
 
 
 def _adjusted_points(
     block: Block, cofactors: NDArray[np.float64], soft_limit: float
 ) -> AdjustedPoints:
-    """Return the points of the scan with their residuals in the photos."""
+    """Return the scan points with their residuals in the photos."""
     known = np.isfinite(block.points.sigma_m[block.seen.point])
     # Points seen by several photos are compared with the scan as well.
     at_scan = replace(block.points, now=block.points.known)
@@ -357,7 +363,7 @@ def _adjusted_points(
         by_camera, by_point, off = _seen_by(block, photo, mine, with_places[mine], soft_limit)
         residuals[mine], by_place[mine] = off, by_point
         jacobian[mine[:, None, None], [[0], [1]], own] = by_camera
-        # The error of a place acts once through all photos that see it.
+        # The error of a point has the same sign and size in all photos that see it.
         by_camera, by_point, _ = _seen_by(block, photo, mine, of_pixels[mine], math.inf)
         pulls[mine[:, None, None], [[0], [1], [2]], own] = np.einsum(
             "nip,nid->ndp", by_camera, by_point
@@ -404,10 +410,11 @@ def _seen_by(
     covariances: NDArray[np.float64],
     soft_limit: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return equations of a photo's m observations, in standard deviations, robustly weighted.
+    """Return the equations of a photo's m observations, whitened and robustly weighted.
 
     Returns:
-        Derivatives by pose and lens (m, 2, c) and by the points (m, 2, 3), and residuals (m, 2).
+        Derivatives with respect to pose and lens (m, 2, c) and to the points (m, 2, 3), and
+        residuals (m, 2).
     """
     camera, seen = block.cameras[photo], block.seen
     points = seen.point[mine]
@@ -450,8 +457,8 @@ def _without_point(
 def _set_up(block: Block) -> tuple[Any, Any]:
     """Set up poses and lenses as COLMAP's scene and adjuster.
 
-    Only COLMAP's adjuster provides the manifold of a pose, and it requires observations: two of one
-    point per photo, so far off that they have no weight.
+    Only COLMAP's adjuster provides the manifold of a pose, and it requires observations. So each
+    photo gets two observations of a point with residuals so large that they have no weight.
     """
     import pycolmap
 
@@ -490,7 +497,7 @@ def _add_observations(
     joint: dict[int, NDArray[np.float64]],
     soft_limit: float,
 ) -> None:
-    """Add observations: of points seen once with the point's covariance, of others without."""
+    """Add the observations; those of points seen once include the point's covariance."""
     import pyceres
     import pycolmap
     from pycolmap import cost_functions
@@ -521,15 +528,15 @@ def _add_observations(
 def _values(camera: ViewingCamera) -> NDArray[np.float64]:
     if camera.skew:
         raise MethodError(
-            f"a lens of the block has a skew of {camera.skew:.1f} px, which no camera model of "
-            "COLMAP has: calibrate it without, or use orient.dlt or orient.pnp"
+            f"a lens of the block has a skew of {camera.skew:.1f} px, which COLMAP's camera models "
+            "do not support: calibrate it without skew, or use orient.dlt or orient.pnp"
         )
     values = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion]
     return np.pad(np.array(values), (0, _N_VALUES - len(values)))
 
 
 def _limit_lens(problem: Any, lens: Lens, values: NDArray[np.float64]) -> None:
-    """Fix parameters of a lens that are not free, and constrain the others by their prior."""
+    """Hold the fixed parameters of a lens, and constrain the free ones by their prior."""
     import pyceres
 
     ceres: Any = pyceres

@@ -1,4 +1,4 @@
-"""`orient.colmap-bundle`: all photos at once, from their ties with the walls and between them."""
+"""`orient.colmap-bundle`: bundle adjustment of all photos with ties to walls and photos."""
 
 from __future__ import annotations
 
@@ -77,31 +77,31 @@ from orthoflow_plugins.orient.report import Oriented, hand_over
 
 _SHARE_BY_ITSELF: Final = 0.4
 _SHARE_FEATURES: Final = 0.7
-# Photos are tied if each shows this share of what the other shows of the walls.
+# Two photos are matched if each shows at least this share of the wall points of the other.
 _MIN_OVERLAP: Final = 0.2
-# More points between photos would only take time.
+# More tie points only increase the computing time.
 _MAX_PHOTO_POINTS: Final = 1000
-# Sharing by which each photo of a lens is tested.
+# The sharing mode in which the photos of a lens are tested for consistency.
 _TESTED: Final = "focal-group"
 _ROUNDS: Final = 5
 _TIE_SIGMA_START_PX: Final = 0.5
 _TIE_SIGMA_RANGE_PX: Final = (0.1, 2.0)
-# Scan ties of several photos this close together are one point of the scan.
+# Scan points of different photos within this distance are the same point.
 _SAME_PLACE_M: Final = 1e-6
-# Whether photos without EXIF share a lens is unknown. A series is seldom taken with several, and
-# the lens of many photos is determined far better than that of one. But a zoom lens may have been
-# used, or a picture rotated or cropped. So the focal length by each photo's own ties is compared.
-# Zooming changes it by more than this share; correlated errors of the scan change that of one photo
-# by less (up to 0.7 % on photogrammetric clouds of 10 to 30 mm noise).
+# Photos without EXIF may or may not share a lens. A series is usually taken with one lens, and many
+# photos determine a lens far better than a single one does. But the photographer may have zoomed,
+# and a photo may have been rotated or cropped. Therefore each photo's focal length from its own
+# ties is compared with the shared one. Zooming changes it by more than this share; correlated scan
+# errors change it by less (up to 0.7 % with photogrammetric clouds of 10 to 30 mm noise).
 _MIN_ZOOM: Final = 0.02
 _ZOOM_SIGMAS: Final = 5.0
-# The photos that contradict most distort the lens, so that others contradict it as well: they are
-# separated first.
+# Photos with the largest contradiction distort the shared lens, so that others contradict it as
+# well. Those within this share of the largest are separated first.
 _SHARE_OF_WORST: Final = 0.5
 NO_BLOCK: Final = DiagnosticSpec(
     code="bundle-without-result",
     severity="warning",
-    text="the photos keep their separate orientations: {reason}",
+    text="the bundle adjustment failed, so each photo keeps its separate orientation: {reason}",
 )
 
 
@@ -109,12 +109,12 @@ class OrientColmapBundle(Method):
     """Orient all photos at once: bundle adjustment with the scan as control.
 
     Each photo is first oriented separately; photos whose ties agree with their pose no better than
-    by chance are left out. Key points matched between photos tie them to each other. COLMAP's cost
-    functions and the Ceres solver then adjust poses, lenses and points together: ties with walls
-    are weighted by the standard deviations of their matcher, ties between photos by that of their
-    residuals. Lenses without calibration start from EXIF and are refined, shared by photos of one
-    focal length, or without EXIF by those whose ties do not contradict. The gates are those of
-    `orient.pnp`, with the same check points.
+    by chance are excluded. Key points are then matched between overlapping photos. COLMAP's cost
+    functions and the Ceres solver adjust poses, lenses and points together: ties to walls are
+    weighted by the standard deviations from their matcher, ties between photos by that of their
+    residuals. Uncalibrated lenses start from EXIF and are refined. Photos with the same focal
+    length in EXIF share a lens; so do photos without EXIF unless their ties contradict this. The
+    gates and check points are those of `orient.pnp`.
     """
 
     id: ClassVar[str] = "orient.colmap-bundle"
@@ -141,12 +141,13 @@ class OrientColmapBundle(Method):
 
         intrinsics: Sharing = Field(
             default="focal-group",
-            description="Which photos share a lens: those of one size and one stated focal length, "
-            "or of one size without any if their ties do not contradict (focal-group), all of "
-            "one size (shared), or none (per-photo).",
+            description="Which photos share a lens. focal-group: photos with the same image size "
+            "and the same EXIF focal length or calibration, and photos of the same size without "
+            "either unless their ties contradict this; shared: all photos of the same size; "
+            "per-photo: none.",
         )
         photo_ties: bool = Field(
-            default=True, description="Tie overlapping photos to each other as well."
+            default=True, description="Also match overlapping photos with each other."
         )
         max_features: int = Field(
             default=3000, ge=100, description="Key points per photo for ties between photos."
@@ -181,7 +182,7 @@ class OrientColmapBundle(Method):
 
     @classmethod
     def tools(cls) -> dict[str, str]:
-        """COLMAP and Ceres adjust, OpenCV detects key points."""
+        """COLMAP and Ceres for the adjustment, OpenCV for the key points."""
         names = ("pycolmap", "pyceres", "scipy", "opencv-python-headless")
         return {name: version(name) for name in names}
 
@@ -189,7 +190,7 @@ class OrientColmapBundle(Method):
 def _by_itself(
     tied: TiedPhoto, ties: Ties, params: OrientColmapBundle.Params
 ) -> Trusted | Oriented:
-    """Orient a photo by its own ties; refuse it if they agree by chance only."""
+    """Orient a photo by its own ties; refuse it if they agree only by chance."""
     found = by_itself(tied, ties, params, estimate_pose)
     if isinstance(found, Oriented):
         return found
@@ -203,7 +204,7 @@ def _by_itself(
 def _adjusted(
     block: Sequence[Trusted], params: OrientColmapBundle.Params, ctx: StepContext
 ) -> Adjusted | None:
-    """Adjust photos with shared lenses, and again with separate lenses where ties contradict."""
+    """Adjust photos with shared lenses; repeat with separate lenses where ties contradict them."""
     photos = [item.tied.photo for item in block]
     cameras = [item.estimate.resection.camera for item in block]
     between = _photo_ties(block, params, ctx)
@@ -218,8 +219,8 @@ def _adjusted(
                 return adjusted
             for at in sorted(others):
                 ctx.log(
-                    f"photo {photos[at].name}: its ties contradict the lens of the other photos of "
-                    "its size, so it gets one of its own"
+                    f"photo {photos[at].name}: its ties contradict the lens shared by the photos "
+                    "of this size, so it gets its own lens"
                 )
             apart |= others
     except GeometryError as error:
@@ -275,13 +276,13 @@ class Adjusted:
     """A block after its adjustment.
 
     Attributes:
-        block: cameras, lenses and points, in a world with its origin nearby.
-        covariance: of all unknowns.
-        estimates: one per photo, in the world.
+        block: cameras, lenses and points, in coordinates with a nearby origin.
+        covariance: covariance of all unknowns.
+        estimates: one per photo, in world coordinates.
         tie_sigma_px: standard deviation of a coordinate of a tie between photos, in pixels of the
-            picture in which it was found.
+            (reduced) picture in which the key point was found.
         ties_px: (m,) lengths of the residuals of these ties, photo pixels.
-        n_tie_points: points that the scan does not contain.
+        n_tie_points: number of points that are not in the scan.
     """
 
     block: Block
@@ -297,11 +298,12 @@ class _Weights:
     """Inliers and weights of an adjustment.
 
     Attributes:
-        agreeing: per photo, (n,) bool, inliers of its scan ties.
+        agreeing: per photo, (n,) bool, inliers among its scan ties.
         units: standard deviation of unit weight of each photo's scan ties.
-        limits: of each photo's scan ties, in standard deviations.
-        tie_active: (m,) bool, inliers of the observations between photos.
-        tie_sigma: their standard deviation, pixels of the picture in which they were found.
+        limits: rejection limit of each photo's scan ties, in standard deviations.
+        tie_active: (m,) bool, inliers among the ties between photos.
+        tie_sigma: standard deviation of these ties, in pixels of the (reduced) picture in which
+            the key points were found.
     """
 
     agreeing: list[NDArray[np.bool_]]
@@ -321,9 +323,9 @@ def adjust_block(
 
     Args:
         photos: the photos.
-        ties: between them, in the world.
+        ties: ties between the photos, in world coordinates.
         groups: index of each photo's lens, and the lenses.
-        params: how to reject.
+        params: parameters of the rejection.
 
     Raises:
         GeometryError: the ties do not determine the block.
@@ -381,14 +383,15 @@ def adjust_block(
 
 
 def of_another_lens(photos: Sequence[Trusted], adjusted: Adjusted) -> Set[int]:
-    """Find the photos whose own focal length contradicts the lens shared by their size alone.
+    """Find the photos whose own focal length contradicts a lens shared only by image size.
 
     Args:
-        photos: of the block.
-        adjusted: the block.
+        photos: photos of the block.
+        adjusted: the adjusted block.
 
     Returns:
-        Indices of those that contradict it most; the others are decided by another adjustment.
+        Indices of the photos with the largest contradiction; the others are tested again after the
+        next adjustment.
     """
     block = adjusted.block
     excesses: dict[int, float] = {}
@@ -409,7 +412,7 @@ def _start(
     groups: tuple[tuple[int, ...], tuple[Lens, ...]],
     middle: NDArray[np.float64],
 ) -> tuple[ViewingCamera, ...]:
-    """Return the initial cameras, in a world shifted to `middle`."""
+    """Return the initial cameras, in coordinates with the origin at `middle`."""
     alone = [item.estimate.resection.camera for item in photos]
     cameras: list[ViewingCamera] = []
     lens_of, lenses = groups
@@ -419,10 +422,10 @@ def _start(
         if not lens.freedom.sigmas.size:
             own = posed(lens.prior, own)
         elif lens.source == UNKNOWN:
-            # From the photo whose own ties determine the focal length best.
+            # Start from the photo whose own ties determine the focal length best.
             best = min(members, key=lambda k: focal_sigma(photos[k].estimate.resection))
             if best != at:
-                # Another focal length changes the position.
+                # A different focal length changes the position.
                 own = posed(alone[best], own)
                 with suppress(GeometryError):
                     own = fitted(item.tied.control(item.estimate.agreeing), own)
@@ -439,7 +442,7 @@ def _block(
     state: tuple[tuple[ViewingCamera, ...], NDArray[np.float64], NDArray[np.float64]],
     weights: _Weights,
 ) -> Block:
-    """Build the block from scan ties and ties between photos, with current cameras and points."""
+    """Build the block from scan ties, ties between photos, and the current cameras and points."""
     cameras, positions, middle = state
     seen = [
         item.tied.seen.take(chosen) for item, chosen in zip(photos, weights.agreeing, strict=True)
@@ -478,7 +481,7 @@ def _block(
 def _weighed(
     photos: Sequence[Trusted], fits: Sequence[Misfit], used: _Weights, rejection_sigma: float
 ) -> _Weights:
-    """Reject outliers among the scan ties and estimate the standard deviation of the rest."""
+    """Reject outliers among the scan ties and estimate the standard deviation of the inliers."""
     agreeing, units, limits = [], [], []
     for item, fit, some in zip(photos, fits, used.agreeing, strict=True):
         is_check = item.tied.is_check
@@ -493,11 +496,19 @@ def _weighed(
 def _weigh_between(
     ties: PhotoTies, lengths: NDArray[np.float64], weights: _Weights, rejection_sigma: float
 ) -> None:
-    """Do the same for ties between photos from the lengths (m,) of their residuals."""
+    """Reject outliers among the ties between photos and estimate the inliers' deviation.
+
+    Args:
+        ties: ties between photos.
+        lengths: (m,) lengths of their residuals, in pixels of the reduced pictures.
+        weights: current inliers and weights, updated in place.
+        rejection_sigma: limit in standard deviations.
+    """
     from scipy.special import chdtri  # scipy.stats would take seconds to import
 
     active = weights.tie_active
-    # Of 2 m coordinates 3 determine the point: the sum of squares is chi-square with the rest.
+    # m observations have 2 m coordinates, 3 of which determine the point: the sum of squares has a
+    # chi-square distribution with 2 m - 3 degrees of freedom.
     squares = np.bincount(ties.point[active], lengths[active] ** 2)
     n_seeing = np.bincount(ties.point[active])
     is_tied = n_seeing > 1
@@ -505,7 +516,7 @@ def _weigh_between(
     sigma = math.sqrt(float(np.median(squares[is_tied] / usual)))
     weights.tie_sigma = float(np.clip(sigma, *_TIE_SIGMA_RANGE_PX))
     near = lengths <= rejection_sigma * weights.tie_sigma
-    # Points need inliers in two photos.
+    # A point needs inliers in at least two photos.
     counts = np.bincount(ties.point[near], minlength=len(ties.points_world))
     weights.tie_active = near & (counts[ties.point] > 1)
 
@@ -513,7 +524,7 @@ def _weigh_between(
 def _tie_residuals(
     ties: PhotoTies, cameras: Sequence[ViewingCamera], positions: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the lengths (m,) in pixels of the residuals of ties between photos."""
+    """Return the lengths (m,) of the residuals of ties between photos, in pixels."""
     lengths = np.full(len(ties.photo), np.inf)
     for at, camera in enumerate(cameras):
         mine = ties.photo == at

@@ -1,7 +1,7 @@
 """`orient.dlt`: direct linear transform of single photos (markiewicz2015, 3.6 and 4.3).
 
-Eleven parameters, without prior knowledge, start an adjustment; distortion that its lens model
-omits is included in the stated error.
+The eleven parameters, estimated without prior knowledge, are the initial values of an adjustment.
+The predicted error includes lens distortion that the model omits.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ from orthoflow_plugins.orient.report import hand_over
 
 Distortion = Literal["none", "k1", "k1 k2 p1 p2"]
 
-# Nearly free: points with relief determine a lens far better.
+# Practically free: control points with relief determine a lens far better.
 _FREE: Final = {"focal_sigma": 1.0, "aspect_sigma": 0.5}
 _CENTRE_SHARE: Final = 0.5
 _SKEW_SHARE: Final = 0.5
-# Decentring and principal point are correlated except on deep relief.
+# Decentring distortion and principal point are correlated unless the relief is deep.
 _PINNED_CENTRE_SHARE: Final = 0.05
 _FULL: Final = "k1 k2 p1 p2"
 _FREEDOMS: Final[Mapping[Distortion, LensFreedom]] = {
@@ -62,31 +62,31 @@ _FREEDOMS: Final[Mapping[Distortion, LensFreedom]] = {
 _LEAST: Final[Mapping[Distortion, int]] = {"none": 12, "k1": 16, _FULL: 24}
 # Relief below this many standard deviations of the points is mostly their noise.
 _RELIEF_SIGMAS: Final = 10.0
-# With flatter control, rounding of coordinates determines the eleven parameters.
+# With flatter control points, the eleven parameters depend on rounding errors of coordinates.
 _MAX_CONDITION: Final = 5000.0
-# Standard deviation of unit weight beyond which the lens model is insufficient.
+# The lens model is insufficient if the standard deviation of unit weight exceeds this.
 _MAX_SIGMA0: Final = 1.5
-# Points per side of the grid over a photo on which lens models are compared.
+# Lens models are compared on a grid with this many points per side of the photo.
 _FRAME: Final = 12
 DLT_MISFIT: Final = DiagnosticSpec(
     code="dlt-without-distortion",
     severity="warning",
     text="photo {subject}: its ties deviate {sigma0:.1f} times as much as expected, and a complete "
     "lens model moves its points by {moved_px:.1f} px: its lens has distortion that this DLT does "
-    "not model, most at the corners; the stated error is {factor:.1f} times as large for it",
+    "not model, mostly at the corners; the predicted error was multiplied by {factor:.1f}",
     remedy="{step}.distortion=k1k2, or a calibration",
     rank_by="sigma0",
 )
 
 
 class OrientDlt(Method):
-    """Orient each photo by eleven parameters, or more with distortion, from its ties alone.
+    """Orient each photo by eleven parameters, or more with distortion, from its ties only.
 
-    Calibration and EXIF serve only to reject wrong ties, and not at all with `prior: none`. The
-    linear solution starts a weighted adjustment of pose, fx, fy and principal point (and
-    distortion); the skew is recorded but kept only on request, since modern cameras have none.
-    Nearly coplanar control points do not determine the parameters and are refused. The gates are
-    those of `orient.pnp`.
+    Calibration and EXIF are used only to reject wrong ties; `prior: none` does not use them at all.
+    The linear solution is the start of a weighted adjustment of pose, fx, fy and principal point
+    (and distortion). The skew is recorded, but used only if requested, since modern cameras have
+    none. Photos with nearly coplanar control points are refused, since these do not determine the
+    parameters. The gates are those of `orient.pnp`.
     """
 
     id: ClassVar[str] = "orient.dlt"
@@ -104,18 +104,18 @@ class OrientDlt(Method):
 
         distortion: Distortion = Field(
             default="none",
-            description="Distortion estimated with the eleven parameters: none, k1, or "
+            description="Distortion parameters estimated in addition to the eleven: none, k1, or "
             "k1 k2 p1 p2.",
         )
         skew: bool = Field(
             default=False,
-            description="Keep the skew, the eleventh parameter, for rows and columns of pixels "
-            "that are not perpendicular; also in the orthoimage.",
+            description="Use the skew, the eleventh parameter (the angle between pixel rows and "
+            "columns), in the camera model and the orthoimage.",
         )
         prior: Literal["lens", "none"] = Field(
             default="lens",
-            description="How wrong ties are rejected: with the lens of calibration or EXIF, or by "
-            "trying usual focal lengths (markiewicz2015).",
+            description="Lens used to reject wrong ties. lens: from calibration or EXIF; none: "
+            "several usual focal lengths are tried (markiewicz2015).",
         )
 
     In = OrientIn
@@ -132,7 +132,7 @@ class OrientDlt(Method):
 
     @classmethod
     def tools(cls) -> dict[str, str]:
-        """OpenCV rejects wrong ties."""
+        """OpenCV for the rejection of wrong ties."""
         return {name: version(name) for name in ("opencv-python-headless", "scipy")}
 
 
@@ -140,7 +140,7 @@ def relief(points: NDArray[np.float64]) -> tuple[float, float]:
     """Measure the relief of points (n, 3) about their best-fitting plane.
 
     Returns:
-        Root mean square distance from it, and standard deviation along its longer axis, metres.
+        RMS distance from the plane, and standard deviation along the longest axis, in metres.
     """
     centred = points - points.mean(axis=0)
     variances = np.linalg.eigvalsh(np.einsum("ni,nj->ij", centred, centred) / len(points))
@@ -159,9 +159,9 @@ def direct_linear(
         size_px: width and height of the photo.
 
     Returns:
-        The camera, without distortion, with the skew; and the largest over the second smallest
-        singular value of the normalised equations, which grows without bound on points of one
-        plane.
+        The camera, without distortion and with skew; and the ratio of the largest to the second
+        smallest singular value of the normalised equations, which tends to infinity for coplanar
+        points.
 
     Raises:
         GeometryError: the points do not determine a camera.
@@ -175,8 +175,8 @@ def direct_linear(
     rows = np.zeros((len(pixels), 2, 12))
     rows[:, 0, :4], rows[:, 0, 8:] = xyz, -uv[:, :1] * xyz
     rows[:, 1, 4:8], rows[:, 1, 8:] = xyz, -uv[:, 1:] * xyz
-    # By normal equations, summed in order: a singular value decomposition depends on the number of
-    # threads. The adjustment recovers the lost digits.
+    # Normal equations with a fixed order of summation, since a singular value decomposition depends
+    # on the number of threads. The subsequent adjustment recovers the lost digits.
     values, vectors = np.linalg.eigh(np.einsum("nij,nik->jk", rows, rows))
     matrix = vectors[:, 0].reshape(3, 4)
     inverse_px = np.array(
@@ -191,8 +191,8 @@ def direct_linear(
 def estimate_dlt(tied: TiedPhoto, params: OrientDlt.Params) -> Estimate | str:
     """Orient a photo by a direct linear transform of its control points, or return why not.
 
-    With `prior: none` neither calibration nor EXIF is used to reject wrong ties. Without `skew` the
-    adjustment starts from square pixels.
+    With `prior: none`, neither calibration nor EXIF is used to reject wrong ties. Without `skew`,
+    the adjustment assumes perpendicular pixel rows and columns.
     """
     if params.prior == "none":
         tied = replace(tied, photo=replace(tied.photo, intrinsics=None, exif_focal_px=None))
@@ -228,21 +228,21 @@ def estimate_dlt(tied: TiedPhoto, params: OrientDlt.Params) -> Estimate | str:
 
 
 def _normalisation(values: NDArray[np.float64], length: float) -> tuple[NDArray[np.float64], float]:
-    """Return shift and scale that centre points at a mean distance from the origin."""
+    """Return the shift and scale that centre the points and set their mean distance to `length`."""
     shift = values.mean(axis=0)
     mean = float(np.linalg.norm(values - shift, axis=1).mean())
     if not mean > 0.0:
-        raise GeometryError("the points of a direct linear transform lie in one place")
+        raise GeometryError("the points of a direct linear transform coincide")
     return shift, length / mean
 
 
 def _decomposed(
     matrix: NDArray[np.float64], points: NDArray[np.float64], size_px: tuple[int, int]
 ) -> ViewingCamera:
-    """Decompose a projection matrix (3, 4)."""
+    """Decompose a projection matrix (3, 4) into lens and pose."""
     if np.linalg.det(matrix[:, :3]) < 0.0:
         matrix = -matrix
-    # RQ from QR: rows and columns in reverse order.
+    # RQ decomposition, from QR with rows and columns reversed.
     q, r = np.linalg.qr(matrix[::-1, :3].T)
     upper, rotation = r.T[::-1, ::-1], q.T[::-1]
     signs = np.sign(np.diag(upper))
@@ -277,10 +277,10 @@ def _freedom(distortion: Distortion, size_px: tuple[int, int], *, keeps_skew: bo
 
 
 def _too_poor(control: SeenPoints, distortion: Distortion, least: int) -> str:
-    """Return why control points do not suffice for eleven parameters or more; empty if they do."""
+    """Return why the control points do not suffice for a DLT; empty if they do."""
     if len(control) < least:
         return (
-            f"only {len(control)} control points agree with one pose, a DLT with distortion "
+            f"only {len(control)} control points agree with one pose; a DLT with distortion "
             f'"{distortion}" requires {least}'
         )
     rms_m, extent_m = relief(control.points_world)
@@ -288,7 +288,7 @@ def _too_poor(control: SeenPoints, distortion: Distortion, least: int) -> str:
     if rms_m < _RELIEF_SIGMAS * sigma_m:
         return _flat(
             control,
-            f"its points are known to {1000 * sigma_m:.1f} mm, and a DLT needs "
+            f"their standard deviation is {1000 * sigma_m:.1f} mm, and a DLT needs "
             f"{_RELIEF_SIGMAS:g} times as much relief",
         )
     return _flat(control, "a DLT needs relief") if rms_m < extent_m / _MAX_CONDITION else ""
@@ -299,16 +299,16 @@ def _with_what_is_missing(
 ) -> Estimate:
     """Add the systematic error of an incomplete lens model to the covariance.
 
-    Residuals show hardly a tenth of missing distortion: the other parameters absorb the rest and
-    distort the photo between and beyond the ties. So the error is that of the complete model plus
-    the distance from it. Without this, eleven parameters with the unknown distortion of a usual
-    lens stated a ninth of their error.
+    Residuals contain less than a tenth of the missing distortion: the other parameters absorb most
+    of it and distort the photo between and beyond the ties. Therefore the error is that of the
+    complete model plus the difference between the models. Otherwise the predicted error of eleven
+    parameters with the unknown distortion of a typical lens would be a ninth of the actual one.
 
     Args:
-        estimate: by the incomplete model.
+        estimate: estimate with the incomplete model.
         control: its control points.
-        start: of its adjustment.
-        freedom: of the lens in the complete model.
+        start: start of its adjustment.
+        freedom: free lens parameters of the complete model.
     """
     model = estimate.resection
     try:
@@ -323,7 +323,7 @@ def _with_what_is_missing(
     except GeometryError:
         return estimate
     points = control.points_world
-    # Mean square of a coordinate.
+    # Mean square per coordinate, without the part explained by the complete model's own variance.
     moved_px = _moved_px(model.camera, full.camera, points)
     missing = 0.5 * float((moved_px**2).sum(axis=1).mean()) - _variance_px2(full, points)
     if missing <= 0.0:
@@ -332,7 +332,7 @@ def _with_what_is_missing(
     wider = replace(model, covariance=full.covariance + np.outer(bias, bias), lens=full.lens)
     factor = _variance_px2(wider, points) / _variance_px2(model, points)
     wider = replace(wider, variance_factor=factor * model.variance_factor)
-    # Neighbouring ties share a misfit of the lens, which the variance factor includes already.
+    # The variance factor already includes the misfit of the lens that neighbouring ties share.
     beyond_noise = factor * model.variance_factor / model.sigma0**2
     notes: tuple[Note, ...] = ()
     if model.sigma0 > _MAX_SIGMA0 or beyond_noise > _MAX_SIGMA0**2:
@@ -344,16 +344,16 @@ def _with_what_is_missing(
 def _flat(control: SeenPoints, why: str) -> str:
     rms_m, _ = relief(control.points_world)
     return (
-        f"the control lies within {1000 * rms_m:.1f} mm (RMS) of one plane; {why}: use "
+        f"the control points are within {1000 * rms_m:.1f} mm (RMS) of one plane; {why}: use "
         "orient.pnp or orient.colmap-bundle"
     )
 
 
 def _bias(camera: ViewingCamera, full: Resection, control: SeenPoints) -> NDArray[np.float64]:
-    """Return the change of parameters (p,) that fits the complete model over the whole frame.
+    """Return the parameter change (p,) that best reproduces the complete model over the photo.
 
-    The difference of the parameters would not do: large changes of focal length and distance
-    cancel, but not to first order.
+    The plain difference of the parameters is unsuitable: large changes of focal length and distance
+    compensate each other, but not in the linearised model.
     """
     middle = control.points_world.mean(axis=0)
     points = _frame_points(camera, control) - middle
@@ -368,7 +368,7 @@ def _bias(camera: ViewingCamera, full: Resection, control: SeenPoints) -> NDArra
 
 
 def _frame_points(camera: ViewingCamera, control: SeenPoints) -> NDArray[np.float64]:
-    """Return points (n, 3) on a grid over the photo, as far as the nearest control point."""
+    """Return points (n, 3) on a grid over the photo, each at the range of the nearest control."""
     across, down = ((np.arange(_FRAME) + 0.5) / _FRAME for _ in range(2))
     pixels = np.stack(np.meshgrid(across * camera.width, down * camera.height), axis=-1)
     pixels = pixels.reshape(-1, 2)
@@ -385,7 +385,7 @@ def _frame_points(camera: ViewingCamera, control: SeenPoints) -> NDArray[np.floa
 def _moved_px(
     camera: ViewingCamera, other: ViewingCamera, points: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the displacement (n, 2) in pixels of points between two cameras."""
+    """Return the differences (n, 2) in pixels between the projections by two cameras."""
     return other.project(points)[:, :2] - camera.project(points)[:, :2]
 
 

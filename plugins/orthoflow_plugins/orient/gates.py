@@ -1,7 +1,7 @@
 """Gates: the criteria that an orientation must meet.
 
-Each gate declares a value of the orientation, its limit, the source of the limit, and the reason of
-a refusal.
+Each gate declares a value of the orientation, a limit, the source of the limit, and the reason to
+give for a refusal.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from orthoflow_plugins.orient.pose import (
 )
 
 _GRID_SIDE: Final = 15
-# Flatter views of a wall are not painted.
+# Photos that show a wall at a smaller angle are not used for its orthoimage.
 _GRAZING_COSINE: Final = 0.1
 
 
@@ -43,12 +43,12 @@ class KnownWall:
     """A wall as described by ties.
 
     Attributes:
-        index: of the wall.
-        number: of its plane in `planes.json`, for messages.
-        name: for messages.
-        corners_world: (4, 3) metres: top-left, then counter-clockwise for the viewer.
+        index: index of the wall.
+        number: number of its plane in `planes.json`, for messages.
+        name: name of the wall, for messages.
+        corners_world: (4, 3) metres: top-left, then counter-clockwise as seen by the viewer.
         normal: (3,) unit vector towards the viewer.
-        gsd_m: cell of its raster, or None if unknown.
+        gsd_m: cell size of its raster, or None if unknown.
         has_side: whether the normal is known to point to the viewer.
     """
 
@@ -67,11 +67,11 @@ class WallError:
 
     Attributes:
         rms_m: standard deviation of a coordinate in the wall's plane, RMS over the footprint.
-        worst_m: the largest one in the footprint, and at the corners of the image.
-        corners_m: (4,) the same at the corners of the image, top-left, top-right, bottom-left,
+        worst_m: largest standard deviation in the footprint and at the image corners.
+        corners_m: (4,) standard deviations at the image corners: top-left, top-right, bottom-left,
             bottom-right; NaN where a corner shows none of the walls.
         footprint_px: (n, 2) pixels of the grid points in the footprint.
-        sigmas_m: (n,) standard deviation of a coordinate in the wall's plane at these.
+        sigmas_m: (n,) standard deviation of a coordinate in the wall's plane at these points.
     """
 
     rms_m: float
@@ -82,7 +82,7 @@ class WallError:
 
 
 def known_walls(ties: Ties, chosen: NDArray[np.bool_]) -> list[KnownWall]:
-    """Describe the walls of some ties, by their matcher if it does, else by the points."""
+    """Describe the walls of the chosen ties as their matcher did, or else by their points."""
     known = []
     for index in np.unique(ties.wall[chosen & (ties.wall >= 0)]).tolist():
         has_side = index < len(ties.walls)
@@ -105,7 +105,7 @@ def known_walls(ties: Ties, chosen: NDArray[np.bool_]) -> list[KnownWall]:
 
 
 def wall_error(resection: Resection, walls: Sequence[KnownWall]) -> WallError | None:
-    """Predict the error on the walls from the covariance; None if the photo shows no wall."""
+    """Predict the error on the walls from the covariance; None if the photo shows none of them."""
     parts = [_variances(resection, wall, _grid(wall, (_GRID_SIDE, _GRID_SIDE))) for wall in walls]
     variances = np.concatenate([np.empty(0), *(part[0] for part in parts)])
     shown = np.isfinite(variances)
@@ -127,14 +127,14 @@ def sigmas_on_wall(
     """Predict the standard deviation of a coordinate in a wall's plane, on a grid over the wall.
 
     Returns:
-        (rows, cols) metres, the first row at the top, NaN where the photo does not show the wall.
+        (rows, cols) metres, first row at the top; NaN where the photo does not show the wall.
     """
     variances, _ = _variances(resection, wall, _grid(wall, shape))
     return np.sqrt(variances).reshape(shape)
 
 
 def _at_corners(resection: Resection, walls: Sequence[KnownWall]) -> NDArray[np.float64]:
-    """Return variances (4,) at the corners of the image, the largest of all walls shown there."""
+    """Return the variances (4,) at the image corners, the largest of the walls shown there."""
     camera, worst = resection.camera, np.full(4, np.nan)
     # Centres of the outermost pixels.
     corners_px = np.array(
@@ -204,7 +204,7 @@ def _seen(
 
 
 def _about(points: NDArray[np.float64]) -> TieWall:
-    """Describe the bounding rectangle of points in their own plane."""
+    """Describe the bounding rectangle of points in their best-fitting plane."""
     middle = points.mean(axis=0)
     axes = np.linalg.svd(points - middle, full_matrices=False)[2]
     local = (points - middle) @ axes[:2].T
@@ -218,8 +218,8 @@ def _about(points: NDArray[np.float64]) -> TieWall:
 
 _MIN_TIES: Final = 8
 _CROWDED_RATIO: Final = 10
-# Residuals of right ties are concentrated near 0, unlike those of wrong ones: several radii, as
-# shares of the limit, are tested.
+# Unlike those of wrong ties, residuals of correct ties are concentrated near 0. Therefore several
+# radii are tested, given as shares of the limit.
 _CHANCE_RADII: Final = (0.2, 0.35, 0.6, 1.0)
 _PLACE_PX: Final = 8.0
 _MIN_CHECKS: Final = 5
@@ -227,39 +227,40 @@ _MIN_ON_WALL: Final = 4
 CROWDED: Final = DiagnosticSpec(
     code="ties-crowded",
     severity="warning",
-    text="photo {subject}: one quarter has {n_most} ties, another {n_least}: more than {ratio} "
-    "times as many",
+    text="photo {subject}: the ties are unevenly distributed; one quarter of the photo has "
+    "{n_most}, another {n_least} (more than {ratio} times as many)",
 )
 SMALL_HULL: Final = DiagnosticSpec(
     code="control-covers-little",
     severity="warning",
-    text="photo {subject}: the control points cover {share:.0%} of the part that shows the walls",
+    text="photo {subject}: the control points cover only {share:.0%} of the part of the photo that "
+    "shows the walls",
     rank_by="-share",
 )
 FOCAL_ESTIMATED: Final = DiagnosticSpec(
     code="focal-length-estimated",
     severity="warning",
-    text="photo {subject}: neither calibration nor EXIF states its focal length, which was "
-    "estimated",
-    remedy="a calibration file makes it more accurate",
+    text="photo {subject}: its focal length was estimated, since neither calibration nor EXIF "
+    "contains it",
+    remedy="a calibration file improves the accuracy",
 )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Candidate:
-    """An orientation with the values that the gates test, None where undefined.
+    """An orientation with the values that the gates test; None for undefined values.
 
     Attributes:
         photo: the photo.
         seen: its ties.
-        is_check: (n,) check points.
-        walls: index of the wall of each tie (n,).
+        is_check: (n,) True for check points.
+        walls: (n,) index of the wall of each tie.
         estimate: the estimated pose.
         known: the walls of the inliers.
         error: predicted error on these walls, None if the photo shows none of them.
-        params: with the limits.
-        search_radius_px: of the matcher about expected positions, within which wrong ties lie, too;
-            inf if it searched everywhere.
+        params: parameters with the limits.
+        search_radius_px: radius around the expected positions within which the matcher searched,
+            so that wrong ties are within it, too; inf if it searched the whole photo.
     """
 
     photo: Photo
@@ -286,8 +287,8 @@ class Candidate:
     def checked(self) -> NDArray[np.bool_]:
         """Inliers among the check points that do not duplicate a control point.
 
-        A key point with two main directions has two features in one place, and both may be matched
-        with the same point.
+        A key point with two main directions has two features at the same position, and both may be
+        matched with the same point.
         """
         places = np.column_stack([self.seen.pixels_photo, self.seen.points_world])
         place = np.unique(places, axis=0, return_inverse=True)[1].ravel()
@@ -295,13 +296,13 @@ class Candidate:
 
     @cached_property
     def quadrant_counts(self) -> list[int]:
-        """Inliers in the quarters of the photo, in the order of `image_cells`."""
+        """Number of inliers in each quarter of the photo, in the order of `image_cells`."""
         cells = self._quarters(self.seen.pixels_photo[self.estimate.agreeing])
         return [int((cells == quarter).sum()) for quarter in range(4)]
 
     @cached_property
     def gsd_m(self) -> float | None:
-        """Smallest cell of its walls, None if unknown."""
+        """Smallest cell size of its walls, None if unknown."""
         return min((wall.gsd_m for wall in self.known if wall.gsd_m is not None), default=None)
 
     @property
@@ -313,7 +314,7 @@ class Candidate:
         inside = self.estimate.agreeing & (fit.normalised > 0.0)
         lengths_px = np.linalg.norm(fit.residuals_px[inside], axis=1)
         px = float(np.median(lengths_px / fit.normalised[inside]))
-        # Wrong ties lie where there is texture, not all over the photo.
+        # Wrong ties occur only where there is texture, not all over the photo.
         textured = max(hull_area(self.seen.pixels_photo), 1.0) / 4.0
         area = min(textured, (2.0 * self.search_radius_px) ** 2)
         found = []
@@ -346,18 +347,18 @@ class Candidate:
         return math.sqrt(squares[self.withheld].mean() / squares[self.control].mean())
 
     def in_cells(self, length_m: float) -> float | None:
-        """Convert a length on the wall to cells of its raster; None if these are unknown."""
+        """Convert a length on the wall to cells of its raster; None if the cell size is unknown."""
         return length_m / self.gsd_m if self.gsd_m else None
 
     @cached_property
     def poor_quarter(self) -> tuple[int, str] | None:
-        """Number of ties in a quarter of the photo with too few, and the reason.
+        """Number of ties in a quarter of the photo that has too few, and the reason.
 
-        In markiewicz2015 each quarter needs two ties. But an obstacle, or a view past the end of
-        the wall, may fill a quarter in which there can be no tie. Such a photo is usable if the
-        rest of it determines the pose: the largest predicted error on the walls in that quarter
-        must meet the limit of the average over the photo. A quarter that shows no wall needs no
-        ties. `strict` applies the rule of the paper.
+        In markiewicz2015, each quarter needs two ties. However, a quarter without ties may show
+        only an obstacle, or what is beyond the end of the wall. Such a photo is usable if the other
+        quarters determine the pose: the largest predicted error on the walls in that quarter must
+        meet the limit for the average over the photo. A quarter that shows no wall needs no ties.
+        `strict` applies the rule of the paper.
         """
         params = self.params
         for quarter, count in enumerate(self.quadrant_counts):
@@ -371,7 +372,7 @@ class Candidate:
                 worst_m = float(self.error.sigmas_m[here].max(initial=0.0))
             most_m = params.max_sigma_wall_cells * (self.gsd_m or 0.0)
             if worst_m > most_m:
-                allowed = f", at most {1000 * most_m:.1f} mm is allowed" if self.gsd_m else ""
+                allowed = f"; the limit is {1000 * most_m:.1f} mm" if self.gsd_m else ""
                 return count, (
                     ": the pose would be extrapolated there, with a predicted error of "
                     f"{1000 * worst_m:.1f} mm{allowed}"
@@ -380,7 +381,7 @@ class Candidate:
 
     @property
     def before_wall_m(self) -> float | None:
-        """Smallest distance before a wall with control points and a known side."""
+        """Smallest distance in front of a wall that has control points and a known front."""
         centre = self.estimate.resection.camera.centre_world
         used = self.walls[self.control]
         return min(
@@ -394,7 +395,10 @@ class Candidate:
 
     @cached_property
     def hull_ratio(self) -> float:
-        """Area of the control's hull over that of its walls in the photo; 0 without walls."""
+        """Ratio of the area of the control points' hull to that of the walls in the photo.
+
+        It is 0 if the photo shows none of the walls.
+        """
         if self.error is None:
             return 0.0
         footprint = hull_area(self.error.footprint_px)
@@ -402,9 +406,10 @@ class Candidate:
 
     @cached_property
     def needed_tie(self) -> tuple[float, NDArray[np.float64]] | None:
-        """Largest predicted error, in cells, without one of few ties, and the pixel of that tie.
+        """Largest predicted error, in cells, if one tie is left out, and the pixel of that tie.
 
-        An undetected wrong tie displaces the pose by no more than the uncertainty without it.
+        An undetected error of a tie displaces the pose by no more than the uncertainty of the pose
+        without that tie.
         """
         without = [wall_error(one, self.known) for one in self.estimate.without_one]
         if self.gsd_m is None or not without:
@@ -423,12 +428,12 @@ class Gate:
     """A criterion for an orientation.
 
     Attributes:
-        name: for the record.
-        value: that is tested; None passes.
-        limit: the smallest value that passes, or the parameter with it.
-        is_upper: whether the limit is the largest value instead.
-        source: of the limit.
-        reason: of a refusal, by the candidate, its value and the limit.
+        name: name in the record.
+        value: computes the value to test; None passes.
+        limit: the smallest value that passes, or the name of a parameter that contains it.
+        is_upper: whether the limit is the largest value that passes instead.
+        source: source of the limit.
+        reason: returns the reason for a refusal from the candidate, its value and the limit.
     """
 
     name: str
@@ -450,8 +455,8 @@ CONTROL_GATES: Final = (
         limit=12,
         source="twice the unknowns of a pose",
         reason=lambda c, value, limit: (
-            f"only {value} of {(~c.is_check).sum()} control points agree with one pose, at least "
-            f"{limit} must"
+            f"only {value} of {(~c.is_check).sum()} control points agree with one pose; at least "
+            f"{limit} are required"
         ),
     ),
     Gate(
@@ -460,7 +465,8 @@ CONTROL_GATES: Final = (
         limit=0.04,
         source="robust sampling finds a pose among these outliers (benchmarks/robust_pose.py)",
         reason=lambda c, value, limit: (
-            f"only {value:.1%} of {len(c.seen)} ties agree with one pose, at least {limit:.1%} must"
+            f"only {value:.1%} of {len(c.seen)} ties agree with one pose; at least {limit:.1%} are "
+            "required"
         ),
     ),
     Gate(
@@ -468,17 +474,17 @@ CONTROL_GATES: Final = (
         value=lambda c: c.chance,
         limit=1e-5,
         is_upper=True,
-        source="one wrong pose in a hundred thousand passes (binomial test)",
-        reason=lambda c, *_: f"{_checks(c)}, as many as with a wrong pose by chance",
+        source="one in 100 000 wrong poses passes (binomial test)",
+        reason=lambda c, *_: f"{_checks(c)}, no more than would agree with a wrong pose by chance",
     ),
     Gate(
         name="check-share",
         value=lambda c: c.check_over_control,
         limit=0.5,
-        source="with a right pose, check points agree as often as control points",
+        source="with a correct pose, check points agree as often as control points",
         reason=lambda c, *_: (
-            f"{_checks(c)}, but {c.control_share:.0%} of the control points: the pose was fitted "
-            "to chance"
+            f"{_checks(c)}, but {c.control_share:.0%} of the control points do: the pose was "
+            "fitted to ties that agree by chance"
         ),
     ),
     Gate(
@@ -486,29 +492,29 @@ CONTROL_GATES: Final = (
         value=lambda c: c.check_rms_over_control,
         limit=2.0,
         is_upper=True,
-        source="with a right pose, check points deviate as much as control points",
+        source="with a correct pose, check points deviate as much as control points",
         reason=lambda _, value, limit: (
-            f"the check points deviate {value:.1f} times as much as the control points, at most "
-            f"{limit:g} times is plausible"
+            f"the check points deviate {value:.1f} times as much as the control points; the limit "
+            f"is {limit:g} times"
         ),
     ),
 )
-"""Agreement of the ties."""
+"""Gates that test the agreement of the ties."""
 
 _SIDE: Final = Gate(
     name="side",
     value=lambda c: c.before_wall_m,
     limit=0.0,
     source="a photo shows the front of a wall",
-    reason=lambda *_: "the pose lies behind the wall it would show, so it must be wrong",
+    reason=lambda *_: "the camera would be behind the wall it shows, so the pose is wrong",
 )
 
 
 def _too_inexact(of: str, c: Candidate, value: float, limit: float) -> str:
     gsd_mm = 1000.0 * (c.gsd_m or math.nan)
     return (
-        f"its predicted error {of} is {value * gsd_mm:.1f} mm, at most {limit:g} cells of "
-        f"{gsd_mm:g} mm are allowed"
+        f"its predicted error {of} is {value * gsd_mm:.1f} mm; the limit is {limit:g} cells of "
+        f"{gsd_mm:g} mm"
     )
 
 
@@ -527,15 +533,15 @@ _ON_WALLS: Final = (
         limit="max_sigma_corner_cells",
         is_upper=True,
         source="the job",
-        reason=partial(_too_inexact, "at the worst place of the wall"),
+        reason=partial(_too_inexact, "at the worst position on the wall"),
     ),
 )
 _SHOWN: Final = Gate(
     name="shown",
     value=lambda c: c.error is not None,
     limit=1.0,
-    source="a photo that shows no wall paints nothing",
-    reason=lambda *_: "with this pose the photo would show no wall that its ties lie on",
+    source="a photo that shows no wall is of no use",
+    reason=lambda *_: "with this pose, the photo would show none of the walls of its ties",
 )
 
 GATES: Final = (
@@ -546,7 +552,7 @@ GATES: Final = (
         limit="min_quadrant_ties",
         source="markiewicz2015, 4.3",
         reason=lambda c, value, limit: (
-            f"a quarter of the photo has {value} ties, each needs {limit:g}"
+            f"a quarter of the photo has {value} ties; each needs {limit:g}"
             f"{c.poor_quarter[1] if c.poor_quarter else ''}"
         ),
     ),
@@ -558,24 +564,24 @@ GATES: Final = (
         limit="min_hull_ratio",
         source="the job",
         reason=lambda _, value, limit: (
-            f"the control covers {value:.1%} of the part of the photo that shows the walls, at "
-            f"least {limit:.1%} is required"
+            f"the control points cover {value:.1%} of the part of the photo that shows the walls; "
+            f"at least {limit:.1%} is required"
         ),
     ),
     *_ON_WALLS,
 )
-"""Gates of an orientation by ties of a matcher, in order."""
+"""Gates for an orientation from ties of a matcher, in order."""
 
 GATES_BEFORE_BLOCK: Final = (*CONTROL_GATES, _SIDE)
-"""Gates before a bundle adjustment, in which other photos may improve the accuracy."""
+"""Gates before a bundle adjustment; accuracy is not tested, since other photos may improve it."""
 
 
 def _unchecked_tie(c: Candidate, value: float, limit: float) -> str:
     u, v = (math.nan, math.nan) if c.needed_tie is None else c.needed_tie[1]
     return (
-        f"without the tie at (u {u:.0f}, v {v:.0f}) its predicted error on the wall would be "
-        f"{value:.1f} cells of {1000.0 * (c.gsd_m or math.nan):g} mm, at most {limit:g} are "
-        "allowed: an error of that tie could not be detected; measure more, farther apart"
+        f"without the tie at (u {u:.0f}, v {v:.0f}), its predicted error on the wall would be "
+        f"{value:.1f} cells of {1000.0 * (c.gsd_m or math.nan):g} mm; the limit is {limit:g} "
+        "cells. An error of that tie could not be detected: measure more ties, farther apart"
     )
 
 
@@ -592,18 +598,18 @@ GATES_BY_HAND: Final = (
         reason=_unchecked_tie,
     ),
 )
-"""Gates of a pose from ties measured by hand."""
+"""Gates for a pose from ties measured by hand."""
 
 
 def refusal(candidate: Candidate, gates: Sequence[Gate] | None = None) -> tuple[str, str] | None:
-    """Test an orientation; None if it meets all gates.
+    """Test an orientation.
 
     Args:
         candidate: the orientation.
-        gates: in order; None for those of its ties.
+        gates: the gates, in order; None chooses them by the origin of the ties.
 
     Returns:
-        Name of the first gate that refuses, and the reason.
+        Name of the first gate that is not passed, and the reason; None if all are passed.
     """
     if gates is None:
         gates = GATES_BY_HAND if candidate.estimate.without_one else GATES
@@ -617,12 +623,13 @@ def refusal(candidate: Candidate, gates: Sequence[Gate] | None = None) -> tuple[
 
 
 def too_few(n_ties: int) -> str:
-    """Return why ties are too few for an orientation; empty if they suffice."""
+    """Return why there are too few ties for an orientation; empty if they suffice."""
     if n_ties >= _MIN_TIES:
         return ""
     return (
-        f"{n_ties} ties with the walls, at least {_MIN_TIES} are required: the photo shows none of "
-        "the walls, its colours differ too much from the intensity, or the cells are too coarse"
+        f"only {n_ties} ties to the walls were found; at least {_MIN_TIES} are required: the photo "
+        "shows none of the walls, its colours differ too much from the intensity, or the cells "
+        "are too coarse"
     )
 
 

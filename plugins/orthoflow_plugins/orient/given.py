@@ -1,4 +1,4 @@
-"""`orient.given`: poses from elsewhere, as they are or corrected by ties that a person measured."""
+"""`orient.given`: poses from other programs, unchanged or corrected by ties measured by hand."""
 
 from __future__ import annotations
 
@@ -25,25 +25,26 @@ from orthoflow_plugins.orient.pose import (
 from orthoflow_plugins.orient.report import Oriented, hand_over, measure_expected
 
 _SIDE: Final = 15
-# Residual of a tie that contradicts the pose, in standard deviations.
+# A tie contradicts the pose if its residual exceeds this many standard deviations.
 _DISAGREEING: Final = 3.5
 POSE_DISAGREES: Final = DiagnosticSpec(
     code="pose-against-ties",
     severity="warning",
     text="photo {subject}: {n} of its {n_ties} ties measured by hand disagree with the given "
     "pose, by up to {longest_px:.1f} px",
-    remedy="measure at least {n_least}, which then orient it, or correct them",
+    remedy="correct them, or measure at least {n_least}, from which the photo is then oriented",
     rank_by="longest_px",
 )
 
 
 class OrientGiven(Method):
-    """Take poses of other programs unchanged.
+    """Use poses from other programs unchanged.
 
-    They are not verified: their status is ok, the source of their lens is `given`, and an error on
-    the wall is stated only if the files do. A photo with at least six ties measured by hand is
-    oriented by these, with the given lens, and must meet their gates; fewer ties only check the
-    given pose. Poses in another frame than the scan's are refused, as none of them shows a wall.
+    They are not verified: their status is ok, the source of their lens is `given`, and their error
+    on the wall is known only if the files contain it. A photo with at least six ties measured by
+    hand is oriented from these, with the given lens, and must pass the gates for such ties; fewer
+    ties are used only to check the given pose. If none of the poses shows a wall, they are refused,
+    since they are not in the coordinate system of the scan.
     """
 
     id: ClassVar[str] = "orient.given"
@@ -52,7 +53,7 @@ class OrientGiven(Method):
     citations: ClassVar[tuple[str, ...]] = ()
 
     class Params(OrientParams):
-        """Limits of the gates of a pose by ties measured by hand."""
+        """Limits of the gates for poses from ties measured by hand."""
 
     class In(Ports):
         """Poses, photos, walls, and ties measured by hand."""
@@ -65,7 +66,7 @@ class OrientGiven(Method):
     Out = OrientOut
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> OrientOut:
-        """Take the poses, and check those with ties."""
+        """Return the poses, and check those with ties."""
         given = {camera.photo: camera for camera in inputs.cameras.cameras}
         if inputs.walls is not None:
             _require_a_wall_in_view(list(given.values()), inputs.walls)
@@ -149,10 +150,10 @@ def _on_walls(ties: Ties, walls: Walls | None) -> Ties:
 
 
 def _require_a_wall_in_view(cameras: Sequence[Camera], walls: Walls) -> None:
-    """Refuse poses of which none shows a wall from before it.
+    """Refuse the poses if none of them shows the front of a wall.
 
     Raises:
-        MethodError: there is none.
+        MethodError: none of them does.
     """
     oriented = [camera.viewing() for camera in cameras if camera.status == "ok"]
     for wall in walls.walls:
@@ -169,10 +170,10 @@ def _require_a_wall_in_view(cameras: Sequence[Camera], walls: Walls) -> None:
     centres = np.array([camera.centre_world for camera in oriented])
     corners = np.concatenate([wall.frame.corners_world() for wall in walls.walls])
     raise MethodError(
-        f"none of the {len(oriented)} given poses shows a wall: they stand at {_extent(centres)}, "
-        f"the walls at {_extent(corners)} (x, y, z in metres). Cameras and scan must be in one "
-        "frame and unit: transform the model to that of the scan before exporting it, or match "
-        "the photos instead"
+        f"none of the {len(oriented)} given poses shows a wall: the cameras are at "
+        f"{_extent(centres)}, the walls at {_extent(corners)} (x, y, z in metres). Cameras and "
+        "scan must use the same coordinate system and unit: transform the cameras to the system "
+        "of the scan before exporting them, or match the photos instead"
     )
 
 

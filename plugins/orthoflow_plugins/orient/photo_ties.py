@@ -1,4 +1,4 @@
-"""Ties between photos: key points matched between pairs and joined to tracks."""
+"""Ties between photos: key points matched in pairs of photos and joined to tracks."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from orthoflow.geometry.key_points import Features, find_features, mutual_matche
 from orthoflow.products import Photo
 from orthoflow_plugins.orient.pose import camera_rays
 
-# Larger photos are reduced: SIFT takes 0.23 GB per million pixels, and thousands of key points at
-# half the resolution tie photos as well as more at full resolution.
+# Larger photos are reduced: SIFT needs 0.23 GB per million pixels, and thousands of key points at
+# half the resolution are as good as more of them at full resolution.
 _MAX_SIDE_PX: Final = 1600
 _MAX_RATIO: Final = 0.85
 _MAX_PARTNERS: Final = 8
-# The poses are known to a few pixels.
+# Limits for matches; the poses are accurate to a few pixels.
 _MAX_OFF_LINE_PX: Final = 6.0
 _MAX_OFF_POINT_PX: Final = 8.0
 _MIN_ANGLE: Final = np.radians(2.0)
@@ -33,10 +33,10 @@ class PhotoTies:
 
     Attributes:
         photo: (m,) index of the photo of each observation.
-        point: (m,) index of its point, 0..k-1, each at least twice.
-        pixels: (m, 2).
-        scale: (m,) pixels of the photo per pixel in which the key point was found.
-        points_world: (k, 3) metres, intersected from the given poses.
+        point: (m,) index of its point, 0..k-1; each point is observed at least twice.
+        pixels: (m, 2) pixels of the photo.
+        scale: (m,) photo pixels per pixel of the reduced picture in which the key point was found.
+        points_world: (k, 3) metres, intersected with the given poses.
     """
 
     photo: NDArray[np.intp]
@@ -53,7 +53,7 @@ def photo_features(photo: Photo, n_most: int) -> Features:
 
 
 def _reduction(width: int, height: int) -> float:
-    """Return the pixels of a photo per pixel of the picture in which key points are found."""
+    """Return the number of photo pixels per pixel of the picture used for key points."""
     return max(1.0, max(width, height) / _MAX_SIDE_PX)
 
 
@@ -63,9 +63,9 @@ def overlapping_pairs(
     """Choose the pairs of photos with enough overlap.
 
     Args:
-        cameras: of the photos.
-        points: (n, 3) points of the walls in each photo.
-        least_share: of one photo's points that the other must show.
+        cameras: cameras of the photos.
+        points: (n, 3) wall points visible in each photo.
+        least_share: minimum share of each photo's points that the other must show.
     """
     shares = np.zeros((len(cameras), len(cameras)))
     for first, shown in enumerate(points):
@@ -90,10 +90,10 @@ def tie_photos(
     """Match key points of pairs of photos, and join those that agree with the poses to tracks.
 
     Args:
-        cameras: of the photos, known to a few pixels.
-        features: of the photos.
-        pairs: photos to match.
-        n_most: maximum number of points, those with most observations first.
+        cameras: cameras of the photos, accurate to a few pixels.
+        features: key points of the photos.
+        pairs: pairs of photos to match.
+        n_most: maximum number of points; those with the most observations are preferred.
     """
     starts = np.concatenate([[0], np.cumsum([len(item.pixels) for item in features])])
     rays = [
@@ -118,7 +118,7 @@ def _off_line_px(
     first: tuple[ViewingCamera, NDArray[np.float64]],
     second: tuple[ViewingCamera, NDArray[np.float64]],
 ) -> NDArray[np.float64]:
-    """Return distances (n,) in pixels of rays of the second photo from their epipolar lines."""
+    """Return the distances (n,) of the second photo's rays from their epipolar lines, in pixels."""
     rotation = second[0].rotation @ first[0].rotation.T
     baseline = second[0].translation - rotation @ first[0].translation
     lines = first[1] @ (cross_matrix(baseline) @ rotation).T
@@ -128,7 +128,7 @@ def _off_line_px(
 
 
 def _tracks(links: NDArray[np.intp], starts: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    """Return sets of linked key points, longest first, without those with two of one photo."""
+    """Return tracks of linked key points, longest first; none with two points in one photo."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -154,7 +154,7 @@ def _located(
     rays: Sequence[NDArray[np.float64]],
     tracks: Sequence[NDArray[np.intp]],
 ) -> PhotoTies:
-    """Intersect the rays of each track and keep those that agree; all of one length at once."""
+    """Intersect the rays of each track, by track length, and keep the tracks that agree."""
     counts = [len(item.pixels) for item in features]
     photo_of = np.repeat(np.arange(len(cameras)), counts)
     pixels = np.vstack([item.pixels for item in features])
@@ -188,7 +188,10 @@ def _located(
 def _meeting(
     tracks: NDArray[np.intp], centres: NDArray[np.float64], directions: NDArray[np.float64]
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Return tracks (k, m) whose rays meet in front at a sufficient angle, and points (k, 3)."""
+    """Return tracks (k, m) whose rays meet in front of the cameras at a sufficient angle.
+
+    The second value is their points of intersection (k, 3).
+    """
     unit = directions / np.linalg.norm(directions, axis=2, keepdims=True)
     cosines = np.einsum("nid,njd->nij", unit, unit)
     wide = cosines.min(axis=(1, 2)) < np.cos(_MIN_ANGLE)

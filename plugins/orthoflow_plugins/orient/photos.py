@@ -1,4 +1,4 @@
-"""Photos one by one: ties, check points, lens priors, and the acceptance of each orientation."""
+"""Orientation of single photos: ties, check points, lens priors and acceptance."""
 
 from __future__ import annotations
 
@@ -45,23 +45,23 @@ from orthoflow_plugins.orient.report import Oriented, numbers_json
 
 MIN_TIES: Final = 6
 _MAX_WRONG: Final = 2
-# Subsets that are tried at most: two of 24 ties left out, one of any number.
+# Maximum number of subsets to try; enough to leave out two of up to 24 ties.
 _MAX_TRIALS: Final = 300
-# Probability that right ties are called contradictory.
+# Probability that correct ties are classified as contradictory.
 _CONTRADICTION: Final = 1e-3
 # Limit of residuals, in standard deviations of a coordinate.
 _LIMIT: Final = 3.5
-# The same pose, adjusted from two starts, differs by far less.
+# Poses that differ by more are distinct; the same pose from two starts differs far less.
 _ONE_POSE_RAD: Final = math.radians(2.0)
 BY_HAND: Final = DiagnosticSpec(
     code="photo-oriented-by-hand",
     severity="warning",
-    text="photo {subject}: oriented by ties measured by hand alone",
+    text="photo {subject}: oriented only from ties measured by hand",
 )
 HAND_TIES_LEFT_OUT: Final = DiagnosticSpec(
     code="ties-by-hand-contradict",
     severity="warning",
-    text="photo {subject}: {n} ties measured by hand contradict the others and are left out: "
+    text="photo {subject}: {n} ties measured by hand contradict the others and were left out: "
     "{places}",
     remedy="measure them again",
     rank_by="n",
@@ -69,19 +69,19 @@ HAND_TIES_LEFT_OUT: Final = DiagnosticSpec(
 
 
 _Fit = tuple[float, Resection, ViewingCamera]
-"""An adjustment to some ties: the probability of larger residuals with these sigmas, the camera,
-and the prior of its lens.
+"""An adjustment to some ties: the probability of larger residuals given their standard deviations,
+the camera, and the prior of its lens.
 """
 
 
 def pose_by_hand(tied: TiedPhoto) -> tuple[Estimate, Start] | str:
-    """Orient a photo by its ties measured by hand, or return why not.
+    """Orient a photo from its ties measured by hand, or return why not.
 
     Args:
         tied: the photo, with at least `MIN_TIES` ties measured by hand.
 
     Returns:
-        The orientation by them alone, and the start of an adjustment of all ties.
+        The orientation from these ties only, and the start of an adjustment with all ties.
     """
     seen = tied.seen
     known, hand = lens_prior(tied.photo), seen.take(tied.by_hand)
@@ -113,7 +113,7 @@ def pose_by_hand(tied: TiedPhoto) -> tuple[Estimate, Start] | str:
 
 
 def _consistent(hand: SeenPoints, lens: Lens) -> tuple[NDArray[np.intp], _Fit] | str:
-    """Find consistent ties: all, or all but one or two that are clearly wrong."""
+    """Find consistent ties: all of them, or all except one or two that are clearly wrong."""
     n_most = min(_MAX_WRONG, len(hand) - MIN_TIES)
     if math.comb(len(hand), n_most) > _MAX_TRIALS:
         n_most = 1
@@ -124,8 +124,8 @@ def _consistent(hand: SeenPoints, lens: Lens) -> tuple[NDArray[np.intp], _Fit] |
             fits = _distinct(_fits(hand.take(kept), lens))
             if len(fits) > 1:
                 return (
-                    "two poses agree with its ties measured by hand: add some outside the "
-                    "plane of the others"
+                    "two different poses agree with its ties measured by hand: measure more ties "
+                    "outside the plane of these"
                 )
             fitting += [(kept, fit) for fit in fits]
         if len(fitting) == 1:
@@ -135,9 +135,9 @@ def _consistent(hand: SeenPoints, lens: Lens) -> tuple[NDArray[np.intp], _Fit] |
                 {int(at) for kept, _ in fitting for at in np.setdiff1d(np.arange(len(hand)), kept)}
             )
             return (
-                f"its {len(hand)} ties measured by hand contradict each other, and it is not clear "
-                f"which is wrong, one of {_places(hand.pixels_photo[suspect])}: measure them "
-                "again, or add more"
+                f"its {len(hand)} ties measured by hand contradict each other; one of "
+                f"{_places(hand.pixels_photo[suspect])} must be wrong, but it is not clear which: "
+                "measure them again, or add more"
             )
     return (
         f"its {len(hand)} ties measured by hand contradict each other by more than their sigma_px "
@@ -147,7 +147,7 @@ def _consistent(hand: SeenPoints, lens: Lens) -> tuple[NDArray[np.intp], _Fit] |
 
 
 def _fits(seen: SeenPoints, known: Lens) -> Iterator[_Fit]:
-    """Adjust from every start and return the fits that the ties allow."""
+    """Adjust from every start and yield the fits that are consistent with the ties."""
     from scipy.special import chdtrc  # scipy.stats would take seconds to import
 
     for lens in (known.prior, *known.guesses):
@@ -178,7 +178,7 @@ def _distinct(fits: Iterator[_Fit]) -> list[_Fit]:
 
 
 def _starts(seen: SeenPoints, lens: ViewingCamera) -> list[ViewingCamera]:
-    """Return the poses of SQPnP and, for coplanar points, of IPPE."""
+    """Return initial poses by SQPnP and, for coplanar points, by IPPE."""
     import cv2
 
     straight = undistorted_pixels(seen.pixels_photo, lens)
@@ -213,51 +213,52 @@ def _starts(seen: SeenPoints, lens: ViewingCamera) -> list[ViewingCamera]:
 
 
 def _as_stated(resection: Resection) -> Resection:
-    """Use the a priori standard deviations if few residuals are small by chance."""
+    """Use the a priori standard deviations if the residuals are smaller than these."""
     unit = max(1.0, resection.sigma0)
     covariance = resection.covariance * (unit / resection.sigma0) ** 2
     return replace(resection, covariance=covariance, sigma0=unit, variance_factor=unit**2)
 
 
 def _places(pixels: NDArray[np.float64] | Sequence[NDArray[np.float64]]) -> str:
-    """List pixels in the convention of a file of ties."""
+    """List pixels in the convention of tie files."""
     counted = to_opencv(np.asarray(pixels))
     return ", ".join(f"(u {u:.0f}, v {v:.0f})" for u, v in counted)
 
 
 _SEED_LIMIT: Final = 2**31 - 1
-# Check points are drawn evenly from a grid with this many cells a side.
+# Check points are drawn evenly from a grid with this many cells per side.
 _STRATA: Final = 6
-# Photos of a lens by which its EXIF is tested.
+# Number of photos with which the EXIF focal length of a lens is tested.
 _TESTED_PER_LENS: Final = 5
-# Photos of a camera whose focal lengths agree within a factor, and then outweigh EXIF of another.
+# If the focal lengths of at least this many photos of a camera agree within this factor, they take
+# precedence over the contradicting EXIF value of another photo.
 _MIN_OTHERS: Final = 2
 _SAME_FOCAL: Final = 1.05
 EXIF_CONTRADICTED: Final = DiagnosticSpec(
     code="exif-focal-contradicted",
     severity="warning",
-    text="photos {subject}: EXIF states a focal length of {exif_px:.0f} px, but their ties give "
-    "{focal_px:.0f} px, a factor of {factor:.2f}: EXIF is not used (digital zoom, an adapter, or "
-    "a cropped picture)",
+    text="photos {subject}: the EXIF focal length is {exif_px:.0f} px, but their ties give "
+    "{focal_px:.0f} px, a factor of {factor:.2f}: EXIF was not used (possible causes: digital "
+    "zoom, an adapter, or cropping)",
     remedy="a calibration file resolves this",
 )
 EXIF_LEFT_OUT: Final = DiagnosticSpec(
     code="exif-focal-left-out",
     severity="warning",
-    text="photo {subject}: its EXIF contradicts the other photos of its camera, so it is oriented "
-    "with their focal length of {focal_px:.0f} px",
+    text="photo {subject}: its EXIF focal length contradicts the other photos of its camera, so it "
+    "was oriented with their focal length of {focal_px:.0f} px",
     remedy="a calibration file resolves this",
 )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Trusted:
-    """A photo with an orientation by its own ties.
+    """A photo oriented from its own ties.
 
     Attributes:
-        tied: its ties.
+        tied: the photo with its ties.
         estimate: its separate orientation.
-        by_hand: its orientation by ties measured by hand alone, or None.
+        by_hand: its orientation only from ties measured by hand, or None.
         kept: (n,) bool, the ties of that orientation.
     """
 
@@ -267,7 +268,7 @@ class Trusted:
     kept: NDArray[np.bool_]
 
     def judged(self, ties: Ties, params: OrientParams, estimate: Estimate) -> Oriented:
-        """Judge an orientation by all ties; if it contradicts those by hand, take theirs."""
+        """Test an orientation; return that from ties by hand if it fails or contradicts them."""
         found = judged(self.tied, candidate_of(self.tied, ties, params, estimate))
         is_with_hand = not (self.kept & (found.role == TieRole.REJECTED)).any()
         if self.by_hand is None or (found.camera.status == "ok" and is_with_hand):
@@ -282,21 +283,21 @@ def require(ties: Ties, photos: Photos) -> None:
     """Refuse inputs without photos or ties.
 
     Raises:
-        MethodError: no photos, no ties, or ties of other photos.
+        MethodError: there are no photos or no ties, or the ties refer to other photos.
     """
     if not photos.photos:
         raise MethodError("there are no photos to orient: give at least one photo")
     if not len(ties.photo):
         raise MethodError(
             "there are no ties between photos and walls, so no photo can be oriented: see the "
-            "matching step"
+            "diagnostics of the matching step"
         )
     names = {photo.name for photo in photos.photos}
     unknown = [name for name in ties.photo_names if name not in names]
     if unknown:
         raise MethodError(
-            f"the ties name photo {unknown[0]}, which is not among the photos given: wire "
-            "the photos that the ties were made from"
+            f"the ties refer to photo {unknown[0]}, which is not among the given photos: connect "
+            "the photos from which the ties were computed"
         )
 
 
@@ -304,7 +305,7 @@ def tied_photo(
     photo: Photo, ties: Ties, params: OrientParams, rng: np.random.Generator
 ) -> TiedPhoto:
     """Choose the ties of a photo and split them into control and check."""
-    # Drawn for every photo, so that its samples do not depend on the ties of others.
+    # One draw per photo, so that its samples do not depend on the ties of other photos.
     own = np.random.default_rng(int(rng.integers(_SEED_LIMIT)))
     chosen = ties_of_photo(ties, photo.name)
     chosen = chosen[ties.role[chosen] != TieRole.REJECTED]
@@ -339,8 +340,8 @@ def withheld(
 ) -> NDArray[np.bool_]:
     """Choose check points (n,): a share of the ties, evenly from all parts of the image.
 
-    The ties are shuffled, sorted by their cell of the image, and every (1 / share)-th is taken, so
-    that each cell contributes its share and the total is at least `share`.
+    The ties are shuffled and sorted by the image cell they are in; then every (1 / share)-th is
+    taken. So each cell contributes its share, and the total is at least `share`.
     """
     shuffled = rng.permutation(len(pixels_photo))
     cells = image_cells(pixels_photo, size_px, _STRATA)
@@ -355,10 +356,10 @@ def withheld(
 def with_believable_priors(
     photos: Sequence[Photo], ties: Ties, params: OrientParams, ctx: StepContext
 ) -> list[Photo]:
-    """Replace focal lengths of EXIF that the ties of photos of that lens contradict.
+    """Replace EXIF focal lengths that contradict the ties.
 
-    Digital zoom, adapters and cropping make EXIF wrong for all photos of a lens. The photos with
-    most ties are tested, and the others get the focal length that these give.
+    Digital zoom, adapters and cropping make EXIF wrong for all photos of a lens. Those with the
+    most ties are tested, and the resulting focal length is used for all of them.
     """
     believed = list(photos)
     lenses: dict[tuple[object, ...], list[int]] = {}
@@ -367,7 +368,7 @@ def with_believable_priors(
             key = (photo.camera, photo.width, photo.height, photo.exif_focal_px)
             lenses.setdefault(key, []).append(at)
     for members in lenses.values():
-        # A separate generator: orientations must not depend on the presence of EXIF.
+        # A separate random generator, so that orientations do not depend on the presence of EXIF.
         rng = np.random.default_rng(0)
         tied = [tied_photo(photos[at], ties, params, rng) for at in members]
         tied.sort(key=lambda each: -len(each.seen))
@@ -394,10 +395,10 @@ def with_believable_priors(
 def each_by_itself(
     ties: Ties, photos: Photos, params: OrientParams, ctx: StepContext, estimator: Estimator
 ) -> list[Oriented]:
-    """Orient the photos separately by their own ties, and judge each.
+    """Orient each photo separately from its own ties, and test each orientation.
 
     Raises:
-        MethodError: no photos, no ties, or ties of other photos.
+        MethodError: there are no photos or no ties, or the ties refer to other photos.
     """
     require(ties, photos)
 
@@ -422,9 +423,9 @@ def looked_at(
 
     Args:
         photos: the photos.
-        look: orients one.
-        ctx: the context, for progress and diagnostics.
-        share: of the step's progress.
+        look: function that orients one photo.
+        ctx: context for progress and diagnostics.
+        share: share of the step's progress.
     """
     found = []
     for nth, tied in enumerate(photos):
@@ -442,7 +443,7 @@ def looked_at(
 
 
 def _focal_px(found: Trusted | Oriented) -> float | None:
-    """Return the focal length of an oriented photo."""
+    """Return the focal length of an oriented photo; None if it is not oriented."""
     if isinstance(found, Trusted):
         return found.estimate.resection.camera.fx
     return found.camera.intrinsics.fx if found.camera.intrinsics is not None else None
@@ -451,7 +452,7 @@ def _focal_px(found: Trusted | Oriented) -> float | None:
 def _focal_of_others(
     photo: Photo, photos: Sequence[TiedPhoto], found: Sequence[Trusted | Oriented]
 ) -> float | None:
-    """Return the focal length of other photos of a camera if they agree and EXIF contradicts."""
+    """Return the focal length of the camera's other photos if they agree and contradict EXIF."""
     if photo.intrinsics is not None or photo.exif_focal_px is None:
         return None
     camera = (photo.camera, photo.width, photo.height)
@@ -471,16 +472,17 @@ def _focal_of_others(
 def by_itself(
     tied: TiedPhoto, ties: Ties, params: OrientParams, estimator: Estimator
 ) -> Trusted | Oriented:
-    """Orient a photo by its own ties.
+    """Orient a photo from its own ties.
 
     Returns:
-        A final result if only ties by hand orient it, or none.
+        A final result if the photo is oriented only from ties by hand or not at all; otherwise an
+        orientation that is still to be tested.
     """
     alone, kept = None, np.zeros(len(tied.seen), dtype=np.bool_)
     reason = too_few(len(tied.seen))
     if tied.by_hand.sum() >= MIN_TIES:
         alone, pose = oriented_by_hand(tied, ties, params)
-        # Ties by hand are never check points, so the others have to check the pose.
+        # Ties by hand are never check points, so other ties are needed to check the pose.
         too_few_others = too_few(int((~tied.by_hand).sum()))
         if pose is not None:
             own, start = pose
@@ -501,7 +503,7 @@ def by_itself(
 def oriented_by_hand(
     tied: TiedPhoto, ties: Ties, params: OrientParams
 ) -> tuple[Oriented, tuple[Estimate, Start] | None]:
-    """Orient a photo by its ties measured by hand alone."""
+    """Orient a photo only from its ties measured by hand, and test the orientation."""
     found = pose_by_hand(tied)
     if isinstance(found, str):
         return refused(tied, found), None
@@ -509,7 +511,7 @@ def oriented_by_hand(
 
 
 def _joined(tied: TiedPhoto, ties: Ties, params: OrientParams, start: Start) -> Estimate | None:
-    """Orient a photo by all ties from the pose by hand; None if they contradict it."""
+    """Orient a photo from all ties, starting at the pose by hand; None if they contradict it."""
     try:
         joined = adjusted(tied, start, params)
     except GeometryError:
@@ -521,7 +523,7 @@ def _joined(tied: TiedPhoto, ties: Ties, params: OrientParams, start: Start) -> 
 def candidate_of(
     tied: TiedPhoto, ties: Ties, params: OrientParams, estimate: Estimate
 ) -> Candidate:
-    """Return the data by which an orientation is judged."""
+    """Return the data with which an orientation is tested."""
     used = np.zeros(len(ties.photo), dtype=np.bool_)
     used[tied.chosen[estimate.agreeing]] = True
     known = known_walls(ties, used)
@@ -541,7 +543,7 @@ def candidate_of(
 
 
 def judged(tied: TiedPhoto, candidate: Candidate) -> Oriented:
-    """Accept an orientation, or refuse it with the reason."""
+    """Accept an orientation, or refuse it with a reason."""
     against, estimate = refusal(candidate), candidate.estimate
     entry = numbers_json(candidate) if candidate.control.any() else {}
     if against is not None:
@@ -571,7 +573,7 @@ def judged(tied: TiedPhoto, candidate: Candidate) -> Oriented:
 
 
 def refused(tied: TiedPhoto, reason: str) -> Oriented:
-    """Return a photo without an orientation."""
+    """Return the result for a photo that is not oriented."""
     n_ties = len(tied.chosen)
     return Oriented(
         camera=Camera(photo=tied.photo.name, status=reason),

@@ -1,4 +1,4 @@
-"""`orient.pnp`: single-photo resection from ties with the walls (markiewicz2015, 3.6 and 4.3)."""
+"""`orient.pnp`: resection of single photos from ties to walls (markiewicz2015, 3.6 and 4.3)."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ from orthoflow_plugins.orient.pose import (
 )
 from orthoflow_plugins.orient.report import hand_over
 
-# solvePnP needs six points if they are not coplanar.
+# solvePnP needs six points unless they are coplanar.
 _LEAST: Final = 6
 
 
 class OrientPnp(Method):
     """Orient each photo separately: robust pose, then a weighted adjustment with the full lens.
 
-    A share of the ties is withheld as check points. A photo is `ok` only if its ties suffice and
-    are well distributed, the check points agree beyond chance, the camera is in front of the wall,
-    and the predicted error on the wall is small; else the reason is stated.
+    Some of the ties are withheld as check points. A photo is `ok` only if it has enough ties, they
+    are well distributed, more check points agree than by chance, the camera is in front of the
+    wall, and the predicted error on the wall is small; otherwise its status is the reason why not.
     """
 
     id: ClassVar[str] = "orient.pnp"
@@ -58,9 +58,9 @@ class OrientPnp(Method):
 
         method: Literal["weighted", "opencv"] = Field(
             default="weighted",
-            description="weighted: each tie is weighted by its own sigmas and an uncalibrated lens "
-            "is refined; opencv: cv2.solvePnP, iterative, equal weights, fixed lens "
-            "(markiewicz2015).",
+            description="weighted: each tie is weighted by its own standard deviations, and an "
+            "uncalibrated lens is refined; opencv: iterative cv2.solvePnP with equal weights and "
+            "a fixed lens (markiewicz2015).",
         )
 
     In = OrientIn
@@ -74,21 +74,21 @@ class OrientPnp(Method):
 
     @classmethod
     def tools(cls) -> dict[str, str]:
-        """OpenCV finds the first pose."""
+        """OpenCV for the first pose."""
         return {name: version(name) for name in ("opencv-python-headless", "scipy")}
 
 
 def estimate_by_opencv(tied: TiedPhoto, params: OrientParams) -> Estimate | str:
     """Orient a photo by `cv2.solvePnP` (iterative, Levenberg-Marquardt), or return why not.
 
-    All ties have the same weight, the lens is fixed, and solvePnP starts without a pose. Outliers
-    are rejected, and it is called again until the ties stay the same. The first inliers are those
-    of robust sampling: least squares of all ties would fail.
+    All ties have the same weight, the lens is fixed, and solvePnP gets no initial pose. Outliers
+    are rejected, and solvePnP is called again, until the set of inliers no longer changes. The
+    first inliers come from robust sampling, since least squares with all ties would fail.
     """
     robust = robust_start(tied, params)
     if robust is None:
         return no_pose(tied.seen)
-    # Pixels of equal uncertainty, exact points.
+    # All pixels get the same uncertainty, and the points are treated as exact.
     n = len(tied.seen)
     sigma_px = np.full(n, expected_px(tied.control(robust.agreeing)))
     equal = replace(tied, seen=replace(tied.seen, sigma_px=sigma_px, sigma_m=np.zeros(n)))
@@ -103,17 +103,17 @@ def _solved(seen: SeenPoints, lens: ViewingCamera) -> ViewingCamera:
     """Return the camera at the pose of solvePnP.
 
     Raises:
-        GeometryError: there is none.
+        GeometryError: solvePnP finds no pose.
     """
     import cv2
 
     if len(seen) < _LEAST:
-        raise GeometryError(f"solvePnP needs {_LEAST} ties, {len(seen)} agree with one pose")
+        raise GeometryError(f"solvePnP needs {_LEAST} ties; only {len(seen)} agree with one pose")
     if lens.skew:
-        raise GeometryError(f"solvePnP knows no skew, and the lens has {lens.skew:.1f} px of it")
-    # Survey coordinates would lose digits.
+        raise GeometryError(f"solvePnP does not support skew, and the lens has {lens.skew:.1f} px")
+    # Large survey coordinates would lose digits.
     middle = seen.points_world.mean(axis=0)
-    # Any: the stubs want one of its many array types.
+    # Any, because OpenCV's type stubs do not accept these arrays.
     call: Any = cv2.solvePnP
     try:
         found, turn, shift = call(
@@ -124,7 +124,7 @@ def _solved(seen: SeenPoints, lens: ViewingCamera) -> ViewingCamera:
             flags=cv2.SOLVEPNP_ITERATIVE,
         )
     except cv2.error as error:
-        raise GeometryError(f"solvePnP gave up ({error.err})") from error
+        raise GeometryError(f"solvePnP failed ({error.err})") from error
     if not found:
         raise GeometryError("solvePnP finds no pose")
     return lens.at_opencv_pose(turn, shift, middle)

@@ -1,4 +1,4 @@
-"""The pose of one photo: lens prior, robust start, adjustment, and rejection of ties."""
+"""Pose of a single photo: lens prior, robust start, adjustment and rejection of ties."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from orthoflow.geometry.robust import MEDIAN_LENGTH
 from orthoflow.products import Cameras, Intrinsics, Photo, Photos, Ties
 from orthoflow.sdk import DiagnosticSpec, MethodParams, MetricSpec, Ports
 
-# A diagnostic of a photo: its declaration and values.
+# Declaration and values of a diagnostic of a photo.
 Note: TypeAlias = tuple[DiagnosticSpec, Mapping[str, Any]]
 NOT_ORIENTED: Final = DiagnosticSpec(
     code="photo-not-oriented",
@@ -45,7 +45,7 @@ NOT_ORIENTED: Final = DiagnosticSpec(
 def _median_and_worst(
     name: str, label: str, *, is_headline: bool = False, description: str = ""
 ) -> tuple[MetricSpec, MetricSpec]:
-    """Declare a metric of photos as median and worst."""
+    """Declare a metric with its median and worst value over the photos."""
 
     def spec(which: str, **more: Any) -> MetricSpec:
         return MetricSpec(
@@ -66,27 +66,27 @@ ORIENTATION_METRICS: Final = (
     MetricSpec("n_ties", label="ties"),
     MetricSpec("n_control", label="control points"),
     MetricSpec("n_check", label="check points"),
-    MetricSpec("rejected_share", label="share of the ties that is rejected"),
+    MetricSpec("rejected_share", label="share of rejected ties"),
     *_median_and_worst("control_rmse_px", "control points, RMS per axis"),
     *_median_and_worst("check_rmse_px", "check points, RMS per axis"),
     *_median_and_worst(
         "check_rmse_mm",
         "check points, RMS per axis on the wall",
         is_headline=True,
-        description="mean of both axes of the photo; along one of the wall it may be more",
+        description="mean over both axes of the photo; it may be larger along one axis of the wall",
     ),
     *_median_and_worst(
         "sigma_wall_mm",
         "expected error of the orientation on the wall",
         is_headline=True,
-        description="against the scan; errors of depth and scan add to it",
+        description="relative to the scan; errors of depth and scan add to it",
     ),
 )
 """Metrics of all orientation methods."""
 
 
 class OrientIn(Ports):
-    """Ties with the walls, and the photos they are in."""
+    """Ties to the walls, and the photos in which they were found."""
 
     ties: Ties
     photos: Photos
@@ -99,86 +99,90 @@ class OrientOut(Ports):
 
 
 class OrientParams(MethodParams):
-    """Rejection, withheld share, and the limits of the gates that depend on the job."""
+    """Rejection, share of check points, and the limits of the gates."""
 
     rejection_sigma: float = Field(
         default=3.5,
         gt=1,
         le=20,
-        description="Ties with residuals beyond this multiple of their standard deviation are "
+        description="Ties whose residuals exceed this multiple of their standard deviation are "
         "rejected.",
     )
     threshold_px: float | None = Field(
         default=None,
         gt=0,
-        description="Largest deviation of a tie from a sampled pose; without it, what the "
-        "ties' own standard deviations allow.",
+        description="Maximum deviation of a tie from a sampled pose; by default it follows from "
+        "the standard deviations of the ties.",
     )
     check_share: float = Field(
         default=0.2,
         ge=0.2,
         le=0.5,
-        description="Share of the ties withheld to check the orientation.",
+        description="Share of the ties that is withheld to check the orientation.",
     )
     min_quadrant_ties: int = Field(
         default=2,
         ge=0,
-        description="Ties that must agree in each quarter of a photo (markiewicz2015: 2), "
-        "unless the predicted error on the walls in that quarter stays below "
-        "max_sigma_wall_cells; 0 leaves it to the predicted error alone.",
+        description="Minimum number of inliers in each quarter of a photo (markiewicz2015: 2). "
+        "Fewer are accepted if the predicted error on the walls in that quarter is below "
+        "max_sigma_wall_cells; 0 disables the test.",
     )
     quadrants: Literal["predicted", "strict"] = Field(
         default="predicted",
         description="strict: a photo with fewer than min_quadrant_ties in a quarter is refused "
-        "regardless of the predicted error, even if the quarter shows no wall (markiewicz2015).",
+        "regardless of the predicted error, even if that quarter shows no wall (markiewicz2015).",
     )
     min_hull_ratio: float = Field(
         default=0.4,
         ge=0,
         le=1,
-        description="Area of the control's hull over that of the walls in the photo.",
+        description="Minimum ratio of the area of the control points' convex hull to that of the "
+        "walls in the photo.",
     )
     max_sigma_wall_cells: float = Field(
         default=1.0,
         gt=0,
-        description="Largest predicted error on the wall, RMS over what the photo shows, in "
-        "cells of its raster.",
+        description="Maximum allowed predicted error on the wall (RMS over the area that the photo "
+        "shows), in raster cells.",
     )
     max_sigma_corner_cells: float = Field(
-        default=3.0, gt=0, description="The same at the worst place of what the photo shows."
+        default=3.0,
+        gt=0,
+        description="Maximum allowed predicted error at the worst position of the area that the "
+        "photo shows, in raster cells.",
     )
 
 
 Sharing = Literal["focal-group", "shared", "per-photo"]
 UNKNOWN: Final = "none"
-"""Source of a lens with neither calibration nor EXIF."""
+"""Source of a lens without calibration and EXIF."""
 MAX_ROUNDS: Final = 8
-"""Most rounds of adjustment and rejection."""
+"""Maximum number of rounds of adjustment and rejection."""
 SOFT_LIMIT: Final = 3.0
-"""Residuals beyond so many standard deviations get less weight (Huber).
+"""Residuals beyond this many standard deviations get less weight (Huber).
 
-That is one normal tie in a hundred; at 2 it was one in seven, which reduced the accuracy and
-understated the error by another tenth.
+This affects one in a hundred normally distributed ties. A limit of 2 affects one in seven, which
+reduced the accuracy and underestimated the error by a further 10 %.
 """
 _LEAST_FOR_POSE: Final = 4
 _CONFIDENCE: Final = 0.99999
 _MAX_TRIALS: Final = 20_000
-# Relative change of the standard deviation of unit weight below which it has converged.
+# The standard deviation of unit weight has converged if its relative change is below this.
 _SETTLED_SHARE: Final = 0.02
 _SIGMA0_RANGE: Final = (0.1, 3.0)
 _MAX_CHANCE_SHARE: Final = 0.1
 _TIGHTENING: Final = 0.8
 _MAX_TIGHTENED: Final = 7
-# Ties needed to solve for a lens, which its prior constrains.
+# Minimum number of ties for the adjustment of a lens with a prior.
 _LEAST_FOR_LENS: Final = 8
-# A calibration whose focal length is off by more than both is that of another lens.
+# A calibration whose focal length deviates by more than both limits belongs to another lens.
 _MIN_FOCAL_OFF: Final = 0.03
 _FOCAL_OFF_SIGMAS: Final = 5.0
 _LEAST_FOR_FOCAL: Final = 25
 MIN_EXIF_OFF: Final = 0.15
-"""Deviation of ln f beyond which EXIF is wrong if many more ties agree with the other value.
+"""EXIF is wrong if ln f deviates by more than this and many more ties agree with the other value.
 
-Correct EXIF is within a few percent.
+Correct EXIF values are accurate to a few percent.
 """
 _MANY_MORE: Final = 1.2
 _OTHER_LENS: Final = LensFreedom(focal_sigma=0.35, k1_sigma=0.1)
@@ -189,13 +193,13 @@ _UNDONE: Final = 1e-9
 
 @dataclass(frozen=True, kw_only=True)
 class Lens:
-    """The lens of one photo or several.
+    """The lens of one or more photos.
 
     Attributes:
-        prior: the likeliest lens; its pose is not used.
+        prior: the most likely lens; its pose is not used.
         freedom: prior standard deviations of its parameters.
-        source: of the prior: `calibration`, `exif`, `UNKNOWN` ...
-        guesses: other lenses to try for a first pose.
+        source: source of the prior: `calibration`, `exif`, `UNKNOWN` ...
+        guesses: other lenses to try for the first pose.
     """
 
     prior: ViewingCamera
@@ -205,7 +209,7 @@ class Lens:
 
 
 def lens_prior(photo: Photo) -> Lens:
-    """Return what is known of a photo's lens, and focal lengths to try."""
+    """Return the prior of a photo's lens, with focal lengths to try."""
     known, freedom = photo.lens_prior()
     if photo.intrinsics is not None:
         return Lens(prior=known, freedom=freedom, source=photo.intrinsics.source)
@@ -228,10 +232,11 @@ def lens_groups(
 
     Args:
         photos: the photos.
-        cameras: oriented photo by photo; the start of lenses without a prior.
-        sharing: `focal-group`: photos of one size and one stated focal length share a lens, or
-            those of one size without any; `shared`: all of one size; `per-photo`: none.
-        apart: photos with a lens of their own in any case.
+        cameras: cameras from separate orientations, as initial values of lenses without a prior.
+        sharing: `focal-group`: photos with the same size and the same EXIF focal length or
+            calibration share a lens, as do those of the same size without either; `shared`: all
+            photos of the same size; `per-photo`: none.
+        apart: photos that get their own lens in any case.
 
     Returns:
         Index of each photo's lens, and the lenses.
@@ -256,7 +261,7 @@ def lens_groups(
 
 
 def focal_sigma(resection: Resection) -> float:
-    """Return the standard deviation of an adjusted ln(focal length); inf where it was held."""
+    """Return the standard deviation of ln(focal length); inf if it was not adjusted."""
     if "focal" not in resection.lens.names:
         return math.inf
     column = POSE_PARAMETERS + resection.lens.names.index("focal")
@@ -264,7 +269,7 @@ def focal_sigma(resection: Resection) -> float:
 
 
 def camera_rays(camera: ViewingCamera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return directions (n, 3) with z = 1 in camera axes; NaN where distortion has no inverse."""
+    """Return rays (n, 3) with z = 1 in camera axes; NaN where the distortion has no inverse."""
     found = undistorted(*camera.bent_rays(pixels.T), camera.distortion)
     rays = np.column_stack([found[0], found[1], np.ones(len(pixels))])
     rays[~(found[2] < _UNDONE)] = np.nan
@@ -277,11 +282,11 @@ class TiedPhoto:
 
     Attributes:
         photo: the photo.
-        chosen: (n,) index into all ties.
+        chosen: (n,) indices of its ties among all ties.
         seen: these ties as observations.
-        is_check: (n,) check points, withheld from every estimation.
-        by_hand: (n,) measured by hand.
-        seed: of robust sampling.
+        is_check: (n,) True for check points, which are withheld from every estimation.
+        by_hand: (n,) True for ties measured by hand.
+        seed: seed of the robust sampling.
     """
 
     photo: Photo
@@ -302,14 +307,14 @@ class Estimate:
 
     Attributes:
         resection: the adjusted camera.
-        source: of the lens prior: `calibration`, `exif`, `none` ...
-        fit: residuals of all the photo's ties, control and check.
+        source: source of the lens prior: `calibration`, `exif`, `none` ...
+        fit: residuals of all ties of the photo, control and check points.
         agreeing: (n,) bool, ties within the limit.
-        limit: in standard deviations, as `fit.normalised`.
+        limit: rejection limit in standard deviations, as in `fit.normalised`.
         notes: diagnostics of the method.
         numbers: further results of the method by name, for the record.
-        without_one: of a pose from ties measured by hand, the accuracy without each of them in
-            turn; else empty.
+        without_one: for a pose from ties measured by hand, the accuracy if each of them is left out
+            in turn; otherwise empty.
     """
 
     resection: Resection
@@ -331,9 +336,9 @@ class Estimate:
 
 
 Estimator = Callable[[TiedPhoto, OrientParams], Estimate | str]
-"""Orients one photo by its control points, or returns the reason why not."""
+"""Orients one photo from its control points, or returns the reason why not."""
 Solver = Callable[[SeenPoints, ViewingCamera], ViewingCamera]
-"""Estimates a pose from points and a start, or raises a `GeometryError`."""
+"""Estimates a pose from points and an initial camera, or raises a `GeometryError`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -343,8 +348,8 @@ class Start:
     Attributes:
         camera: pose and lens.
         lens: prior of the lens.
-        agreeing: (n,) bool, ties of the first adjustment.
-        n_least_for_lens: inliers needed to adjust the lens.
+        agreeing: (n,) bool, ties used in the first adjustment.
+        n_least_for_lens: minimum number of inliers to adjust the lens.
     """
 
     camera: ViewingCamera
@@ -354,7 +359,7 @@ class Start:
 
 
 def estimate_pose(tied: TiedPhoto, params: OrientParams) -> Estimate | str:
-    """Orient a photo by its control points, weighted by their own sigmas, or return why not."""
+    """Orient a photo from its control points, weighted by their sigmas, or return why not."""
     start = robust_start(tied, params)
     if start is None:
         return no_pose(tied.seen)
@@ -366,10 +371,10 @@ def estimate_pose(tied: TiedPhoto, params: OrientParams) -> Estimate | str:
 
 
 def focal_without_exif(tied: TiedPhoto, params: OrientParams) -> float | None:
-    """Return the focal length in pixels from a photo's ties if they contradict that of EXIF.
+    """Return the focal length in pixels from a photo's ties if it contradicts EXIF.
 
     Returns:
-        None if they do not contradict it, or do not determine it.
+        None if it agrees with EXIF or cannot be determined.
     """
     exif_px = tied.photo.exif_focal_px
     if tied.photo.intrinsics is not None or exif_px is None or len(tied.seen) < _LEAST_FOR_FOCAL:
@@ -391,16 +396,16 @@ def focal_without_exif(tied: TiedPhoto, params: OrientParams) -> float | None:
 
 
 def no_pose(seen: SeenPoints) -> str:
-    """Return the reason that too few ties agree."""
+    """Return the message that too few ties agree."""
     return f"no pose agrees with enough of its {len(seen)} ties"
 
 
 def robust_start(tied: TiedPhoto, params: OrientParams) -> Start | None:
-    """Find the pose with most inliers among the control points; None if there is none."""
+    """Find the pose with the most inliers among the control points; None if there is none."""
     lens, control = lens_prior(tied.photo), tied.seen.take(~tied.is_check)
     threshold_px = params.threshold_px
     if threshold_px is None:
-        # An approximate lens displaces even right ties.
+        # With an approximate lens, even correct ties deviate more.
         slack = 1.0 if lens.source not in ("exif", UNKNOWN) else 2.0
         threshold_px = slack * params.rejection_sigma * expected_px(control)
     best: tuple[ViewingCamera, NDArray[np.bool_]] | None = None
@@ -412,7 +417,7 @@ def robust_start(tied: TiedPhoto, params: OrientParams) -> Start | None:
         return None
     agreeing = np.zeros(len(tied.seen), dtype=np.bool_)
     agreeing[~tied.is_check] = best[1]
-    # Duplicate points do not help to determine a pose.
+    # Duplicate points do not contribute to a pose.
     if len(set(map(tuple, tied.seen.points_world[agreeing].round(4).tolist()))) < 5:
         return None
     return Start(camera=best[0], lens=replace(lens, prior=best[0]), agreeing=agreeing)
@@ -421,13 +426,14 @@ def robust_start(tied: TiedPhoto, params: OrientParams) -> Start | None:
 def adjusted(
     tied: TiedPhoto, start: Start, params: OrientParams, solve: Solver | None = None
 ) -> Estimate:
-    """Adjust and reject in turns until the control points stay the same.
+    """Alternate adjustment and rejection until the set of control points no longer changes.
 
     Args:
         tied: the photo.
         start: pose, lens and first control points.
-        params: how to reject.
-        solve: estimates the pose; None for the weighted, robust adjustment of pose and lens.
+        params: parameters of the rejection.
+        solve: function that estimates the pose; None for the weighted, robust adjustment of pose
+            and lens.
 
     Raises:
         GeometryError: the inliers do not determine the camera.
@@ -439,7 +445,7 @@ def adjusted(
         used = agreeing & ~is_check
         lens = start.lens.freedom if used.sum() >= start.n_least_for_lens else LensFreedom()
         control, soft_limit = seen.take(used), math.inf if solve else SOFT_LIMIT * unit
-        # A fixed lens is that of the prior.
+        # A lens that is not adjusted is that of the prior.
         begin = camera if lens.sigmas.size else posed(prior, camera)
         if solve:
             camera = solve(control, begin)
@@ -469,7 +475,7 @@ def ties_of_photo(ties: Ties, name: str) -> NDArray[np.intp]:
 def image_cells(
     pixels_photo: NDArray[np.float64], size_px: tuple[int, int], side: int
 ) -> NDArray[np.intp]:
-    """Return the cell (n,) of each pixel in a grid of side x side cells over an image."""
+    """Return the cell (n,) of each pixel in a grid of side x side cells over the image."""
     scaled = np.floor(pixels_photo * side / np.array(size_px)).astype(np.intp)
     scaled = np.clip(scaled, 0, side - 1)
     cells: NDArray[np.intp] = scaled[:, 1] * side + scaled[:, 0]
@@ -477,10 +483,11 @@ def image_cells(
 
 
 def without_chance(normalised: NDArray[np.float64], limit: float) -> float:
-    """Tighten a limit until it admits hardly any outlier by chance.
+    """Tighten a limit until it accepts hardly any outliers by chance.
 
-    Residuals of outliers near a pose are distributed evenly: the ring from one to three times the
-    limit has eight times the area within it, so an eighth of its ties are expected within.
+    Near a pose, residuals of outliers are distributed evenly. The ring from one to three times the
+    limit has eight times the area of the circle inside, so an eighth as many outliers as in the
+    ring are expected within the limit.
     """
     lengths = np.sort(normalised[np.isfinite(normalised)])
     for tightened in limit * _TIGHTENING ** np.arange(_MAX_TIGHTENED):
@@ -506,7 +513,7 @@ def expected_px(seen: SeenPoints) -> float:
 
 
 def posed(lens: ViewingCamera, pose: ViewingCamera) -> ViewingCamera:
-    """Return a camera with the lens of one and the pose of another."""
+    """Return a camera with the lens of the first and the pose of the second."""
     return replace(lens, rotation=pose.rotation, translation=pose.translation)
 
 
@@ -519,9 +526,9 @@ def undistorted_pixels(pixels: NDArray[np.float64], lens: ViewingCamera) -> NDAr
 
 
 def _contradicted_calibration(found: Estimate, control: SeenPoints) -> str:
-    """Return the reason that a calibrated photo has another focal length; empty if it may be right.
+    """Return why a calibration contradicts the ties of a photo; empty if it may be correct.
 
-    The pose absorbs most of a wrong focal length, and the residuals do not show the rest.
+    The pose absorbs most of a wrong focal length, so the residuals do not reveal it.
     """
     camera = found.resection.camera
     if found.resection.lens.sigmas.size or len(control) < _LEAST_FOR_FOCAL:
@@ -536,21 +543,21 @@ def _contradicted_calibration(found: Estimate, control: SeenPoints) -> str:
         return ""
     return (
         f"its ties give a focal length of {free.camera.fx:.0f} px +- "
-        f"{sigma * free.camera.fx:.0f} px, but its calibration states {camera.fx:.0f} px: the "
-        "calibration belongs to another lens, zoom or image size"
+        f"{sigma * free.camera.fx:.0f} px, but its calibration has {camera.fx:.0f} px: the "
+        "calibration belongs to another lens, zoom setting or image size"
     )
 
 
 def _robust_pose(
     seen: SeenPoints, lens: ViewingCamera, threshold_px: float, seed: int
 ) -> tuple[ViewingCamera, NDArray[np.bool_]] | None:
-    """Find the pose with most inliers (MSAC on P3P: Torr & Zisserman 2000).
+    """Find the pose with the most inliers (MSAC on P3P: Torr & Zisserman 2000).
 
     Args:
         seen: the ties.
         lens: the camera's interior orientation; its pose is ignored.
-        threshold_px: largest residual of an inlier.
-        seed: of the samples.
+        threshold_px: maximum residual of an inlier.
+        seed: seed of the sampling.
 
     Returns:
         The camera at that pose and its inliers (n,); None if no pose is found.
@@ -569,10 +576,10 @@ def _robust_pose(
     usac.maxIterations = _MAX_TRIALS
     usac.confidence = _CONFIDENCE
     usac.randomGeneratorState = seed
-    # With several threads results are not reproducible.
+    # Results are not reproducible with several threads.
     usac.isParallel = False
     usac.score = cv2.SCORE_METHOD_MSAC
-    # The subsequent adjustment replaces a local optimisation at a third of the time.
+    # The subsequent adjustment replaces the local optimisation and takes a third of its time.
     usac.loMethod = cv2.LOCAL_OPTIM_NULL
     call: Any = cv2.solvePnPRansac
     try:

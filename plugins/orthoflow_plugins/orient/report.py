@@ -1,4 +1,4 @@
-"""Reports of an orientation step: product, diagnostics, metrics, figures and residuals."""
+"""Results of an orientation step: product, diagnostics, metrics, figures and residuals."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ from orthoflow_plugins.orient.pose import NOT_ORIENTED, Note, ties_of_photo
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Of a normal distribution 4.55 % lie beyond; of any, at most a quarter can (Chebyshev).
+# 4.55 % of a normal distribution are beyond this limit, and at most a quarter of any (Chebyshev).
 _BEYOND: Final = 2.0
 _SIDE_PX: Final = 900
-# markiewicz2015, Figure 17: control green, rejected red, check yellow.
+# As in markiewicz2015, Figure 17: control green, rejected red, check yellow.
 _ROLE_RGB: Final = {
     TieRole.REJECTED: (220, 40, 40),
     TieRole.CONTROL: (40, 200, 60),
@@ -47,33 +47,33 @@ _MAX_FIGURES: Final = 24
 _SUB_PIXEL_BITS: Final = 4
 # Cells along the longer side of a map of predicted errors.
 _MAP_CELLS: Final = 90
-# Histograms, with normal distributions: markiewicz2015, Figures 18, 20, 21 and 23.
+# Histograms with normal distributions as in markiewicz2015, Figures 18, 20, 21 and 23.
 _BARS: Final = 40
 _BARS_OF_A_PHOTO: Final = 25
-# Rows of the picture of single photos, and how much of a row its highest bar takes.
+# Rows of the figure with single photos, and the height of the highest bar relative to the row.
 _MAX_PHOTOS: Final = 30
 _ROW_SHARE: Final = 0.8
 _BAR_COLOUR: Final = "#9db8d2"
 _CURVE_COLOUR: Final = "#b03a2e"
-# Of the plan of photos: length of an arrow, and points of a photo's control.
+# Plan of the photos: length of an arrow, and maximum number of control points per photo.
 _VIEW_M: Final = 0.4
 _MAX_CONTROL: Final = 300
 _PERCENTILE: Final = 99.5
-# Letters of a photo's name for which there is room, and residuals of which densities are made.
+# Maximum length of a photo name in figures, and maximum number of residuals for a density.
 _NAME_LETTERS: Final = 14
 _MAX_KERNELS: Final = 5000
 _KINDS: Final = (TieRole.CONTROL, TieRole.CHECK)
 
 RESIDUAL_COLUMNS: Final[Mapping[str, JsonValue]] = {
-    "residual": "observed - computed; u and v of the photo",
-    "unit": "px of the photo, cell of the wall's raster, or mm on the wall: px times the median "
-    "size of a pixel there",
-    "shift_p": "probability of such a mean by chance, Student's t, two-sided",
+    "residual": "observed minus computed; u and v of the photo",
+    "unit": "px of the photo, cell of the wall's raster, or mm on the wall (px times the median "
+    "pixel size on the wall)",
+    "shift_p": "probability that chance causes such a mean (two-sided Student's t test)",
     "nmad": "1.4826 times the median absolute deviation from the median",
-    "p95": "95 % of the residuals are no longer than this",
-    "beyond_own": "share beyond twice the coordinate's own RMSE",
-    "beyond_cells": "share beyond two cells of the wall's raster, a reference that does not move",
-    "beyond_any": "share of ties of which u or v lies beyond twice its own RMSE",
+    "p95": "95 % of the absolute residuals do not exceed this",
+    "beyond_own": "share of residuals beyond twice the coordinate's own RMSE",
+    "beyond_cells": "share of residuals beyond two raster cells of the wall, a fixed reference",
+    "beyond_any": "share of ties whose u or v exceeds twice its own RMSE",
 }
 
 
@@ -84,11 +84,11 @@ class Oriented:
     Attributes:
         camera: its orientation, or the reason why there is none.
         chosen: (n,) indices of its ties among all ties.
-        role: (n,) `TieRole` of these.
-        residuals_px: (n, 2) observed - computed, NaN without an orientation.
-        entry: for the record.
-        notes: diagnostics.
-        candidate: the values that were tested, if it was accepted.
+        role: (n,) `TieRole` of these ties.
+        residuals_px: (n, 2) observed minus computed; NaN if the photo is not oriented.
+        entry: entry in the record.
+        notes: diagnostics of the photo.
+        candidate: the tested values, if the orientation was accepted.
     """
 
     camera: Camera
@@ -100,13 +100,13 @@ class Oriented:
     candidate: Candidate | None = None
 
     def residuals_of(self, kind: TieRole) -> NDArray[np.float64]:
-        """Return the known residuals (m, 2) of one role."""
+        """Return the finite residuals (m, 2) of one role."""
         values = self.residuals_px[self.role == kind]
         return np.asarray(values[np.isfinite(values).all(axis=1)])
 
 
 def pixel_mm(candidate: Candidate) -> float:
-    """Return the median size of a pixel of the photo at its control points."""
+    """Return the median size of a photo pixel at the control points, in millimetres."""
     camera = candidate.estimate.resection.camera
     derivatives = pixels_by_point(camera, candidate.seen.points_world[candidate.control])
     across = np.linalg.svd(derivatives, compute_uv=False)
@@ -143,7 +143,7 @@ def numbers_json(candidate: Candidate) -> dict[str, JsonValue]:
 
 
 def residual_table(candidate: Candidate) -> list[ResidualRow]:
-    """Return the rows of the table of residuals, control and check apart."""
+    """Return the rows of the residual table, separately for control and check points."""
     units = {"px": 1.0, "mm": pixel_mm(candidate)}
     if candidate.gsd_m is not None:
         units["cell"] = units["mm"] / (1000.0 * candidate.gsd_m)
@@ -165,11 +165,11 @@ def residual_rows(
     Args:
         photo: name of the photo.
         role: `control` or `check`.
-        residuals_px: (n, 2), observed - computed.
-        units: size of a pixel in each unit by name; `cell` if known.
+        residuals_px: (n, 2), observed minus computed.
+        units: size of a pixel in each unit, by the unit's name; includes `cell` if known.
 
     Returns:
-        One row per coordinate and unit; none without residuals.
+        One row per coordinate and unit; empty if there are no residuals.
     """
     if not len(residuals_px):
         return []
@@ -212,7 +212,7 @@ def hand_over(
     found: Sequence[Oriented],
     details: dict[str, JsonValue] | None = None,
 ) -> Cameras:
-    """Return the product; report diagnostics, metrics and figures.
+    """Return the product, and report diagnostics, metrics and figures.
 
     Args:
         ctx: the context.
@@ -241,7 +241,7 @@ def hand_over(
         "photos": {item.camera.photo: item.entry for item in found},
         "residual_columns": dict(RESIDUAL_COLUMNS),
         "sigma_wall": "standard deviation of one coordinate in the wall's plane, from the "
-        "covariance, RMS over what the photo shows of its walls",
+        "covariance, RMS over the part of its walls that the photo shows",
     }
     return Cameras(
         cameras=tuple(item.camera for item in found),
@@ -252,13 +252,13 @@ def hand_over(
 
 
 def measure_expected(ctx: StepContext, cameras: Sequence[Camera]) -> None:
-    """Report the stated errors on the wall, if any."""
+    """Report the errors on the wall of the cameras for which they are known."""
     sigmas = [camera.sigma_wall_m for camera in cameras if camera.sigma_wall_m is not None]
     _sum_up(ctx, "sigma_wall_mm", [1000.0 * sigma for sigma in sigmas], "mm")
 
 
 def _chance_of_mean(values: NDArray[np.float64]) -> float | None:
-    """Return the probability of a larger mean without a shift; None for fewer than two."""
+    """Return the p-value of the mean (t test against 0); None for fewer than two values."""
     from scipy.special import stdtr  # scipy.stats would take seconds to import
 
     n = len(values)
@@ -271,7 +271,7 @@ def _chance_of_mean(values: NDArray[np.float64]) -> float | None:
 
 
 def _skewness(values: NDArray[np.float64]) -> float | None:
-    """Return the third standardised moment; None without variance."""
+    """Return the third standardised moment; None if the variance is zero."""
     centred = values - values.mean()
     variance = float(np.mean(centred**2))
     return float(np.mean(centred**3)) / variance**1.5 if variance > 0.0 else None
@@ -321,7 +321,7 @@ def draw_ties(
     role: NDArray[np.uint8],
     status: str,
 ) -> None:
-    """Draw a photo's ties on it: control green, check yellow, rejected red."""
+    """Draw the ties of a photo: control green, check yellow, rejected red."""
     import cv2
 
     if len(ctx.figures) >= _MAX_FIGURES:
@@ -334,7 +334,7 @@ def draw_ties(
     scale = min(1.0, _SIDE_PX / max(photo.width, photo.height))
     size = (max(1, round(photo.width * scale)), max(1, round(photo.height * scale)))
     small = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    # Dimmed, so that the marks stand out.
+    # Dim the photo so that the marks are easy to see.
     canvas = np.rint(0.7 * small).astype(np.uint8)
     unit = 1 << _SUB_PIXEL_BITS
     for kind, colour in _ROLE_RGB.items():
@@ -345,9 +345,9 @@ def draw_ties(
     ctx.figure(
         name,
         partial(_with_legend, canvas, counts),
-        f"Ties of {photo.name}: control green, check yellow, rejected red. {status}. Green over "
-        "the whole wall holds the photo; green in one corner alone, or red among it everywhere, "
-        "does not.",
+        f"Ties of {photo.name}: control green, check yellow, rejected red. {status}. Green ties "
+        "spread over the whole wall mean a reliable orientation; green in one corner only, or "
+        "mixed with red everywhere, does not.",
     )
 
 
@@ -367,11 +367,11 @@ def _with_legend(canvas: NDArray[np.uint8], counts: Mapping[TieRole, int]) -> by
 
 
 def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
-    """Draw the predicted error over each wall, at every place that of the most accurate photo.
+    """Draw the predicted error over each wall, at each position that of the most accurate photo.
 
     Args:
         ctx: the context.
-        candidates: of accepted photos.
+        candidates: the accepted orientations.
     """
     walls = {wall.index: wall for candidate in candidates for wall in candidate.known}
     for index in sorted(walls):
@@ -388,7 +388,7 @@ def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
         shown = np.isfinite(best)
         if not shown.any():
             continue
-        # Percentiles: a corner that photos hardly reach must not dominate the scale.
+        # Percentiles, so that a hardly covered corner does not dominate the scale.
         median_m, high_m = np.percentile(best[shown], [50.0, 98.0])
         error_mm = np.where(shown, 1e3 * best, np.nan)
         label = "predicted error of a coordinate [mm]"
@@ -396,22 +396,23 @@ def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
         ctx.figure(
             f"wall_{wall.number}_predicted_error",
             partial(map_chart, error_mm, label, frame, low=0.0, high=round_scale(1e3 * high_m)),
-            f"Predicted error of a coordinate on {wall.name}, of the most accurate photo at each "
-            f"place, median {1e3 * median_m:.2g} mm; grey where no oriented photo shows the wall. "
-            "Bright places far from ties are where the orthoimage may be off; more ties there "
+            f"Predicted error of a coordinate on {wall.name}, at each position that of the most "
+            f"accurate photo; median {1e3 * median_m:.2g} mm. Grey: no oriented photo shows the "
+            "wall. In bright areas far from ties, the orthoimage may be displaced; more ties there "
             "would help.",
         )
 
 
 @in_column_style()
 def draw_positions(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
-    """Draw positions of photos and control points along the first wall and facing it.
+    """Draw the positions of photos and control points in two views of the first wall.
 
-    After skarlatos2012, Figure 3. For a floor the second view is its plan.
+    One view is along the wall, one faces it; for a floor, the second view is its plan. The figure
+    follows skarlatos2012, Figure 3.
 
     Args:
         ctx: the context.
-        candidates: of accepted photos.
+        candidates: the accepted orientations.
     """
     walls = {wall.index: wall for candidate in candidates for wall in candidate.known}
     if not walls:
@@ -423,7 +424,7 @@ def draw_positions(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
     feet = np.array([one.estimate.resection.camera.centre_world for one in candidates])
     everything = np.vstack([feet, *(wall.corners_world for wall in walls.values())]) - origin
     spans_m = np.ptp(everything @ axes_world.T, axis=0)
-    # To scale.
+    # Both views have the same scale.
     heights = np.clip(2.9 * spans_m[[2, 1]] / spans_m[0], 0.5, 3.5)
     figure = column_figure(float(heights.sum()) + 0.9)
     panels = figure.subplots(2, 1, height_ratios=heights)
@@ -441,15 +442,15 @@ def draw_positions(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
     ctx.figure(
         "positions",
         figure,
-        "Where the oriented photos were taken and which way they look, with their control: seen "
-        "along the first wall (above) and facing it (below); of a floor the lower view is its "
+        "Positions and viewing directions of the oriented photos, with their control points: seen "
+        "along the first wall (top) and facing it (bottom); for a floor, the lower view is its "
         "plan. A photo behind a wall or far from the others is oriented wrongly.",
     )
 
 
 @in_column_style()
 def draw_residuals(ctx: StepContext, photos: Sequence[Oriented]) -> None:
-    """Draw histograms of the residuals of oriented photos, together and separately."""
+    """Draw histograms of the residuals of the oriented photos, together and separately."""
     pooled = {
         kind: np.vstack([np.empty((0, 2)), *(photo.residuals_of(kind) for photo in photos)])
         for kind in _KINDS
@@ -476,7 +477,7 @@ def _draw_position(
     x, y = ((camera.centre_world - origin) @ shown).tolist()
     across, down = (_VIEW_M * camera.rotation[2] @ shown).tolist()
     axes.arrow(x, y, across, down, head_width=0.2 * _VIEW_M, color=_CURVE_COLOUR, linewidth=0.8)
-    # From above photos of one column coincide, and so would their names.
+    # In the other view, photos above each other coincide, and so would their names.
     if is_named:
         axes.annotate(
             candidate.photo.name, (x, y), xytext=(2, 2), textcoords="offset points", fontsize=6.0
@@ -489,7 +490,7 @@ def _draw_pooled(ctx: StepContext, pooled: dict[TieRole, NDArray[np.float64]]) -
     reach = _reach(np.vstack(list(pooled.values())))
     for (kind, values), row in zip(pooled.items(), panels, strict=True):
         for label, column, axes in zip("uv", values.T, row, strict=True):
-            # One outline is faster than forty bars.
+            # Drawing one outline is faster than drawing forty bars.
             counts, edges = np.histogram(column, bins=_BARS, range=(-reach, reach))
             axes.stairs(counts, edges, fill=True, color=_BAR_COLOUR)
             _draw_curves(axes, column, edges)
@@ -501,9 +502,9 @@ def _draw_pooled(ctx: StepContext, pooled: dict[TieRole, NDArray[np.float64]]) -
     ctx.figure(
         "residuals",
         figure,
-        "Residuals of all oriented photos: narrow peaks about 0 are good; one beside 0, a density "
-        "with lobes beside its peak, or one broader for check ties than for control, is a "
-        "systematic error or a group of wrong ties.",
+        "Residuals of all oriented photos. Narrow peaks around 0 are good. A peak away from 0, a "
+        "density with secondary peaks, or a broader one for check than for control ties indicates "
+        "a systematic error or a group of wrong ties.",
     )
 
 
@@ -535,8 +536,8 @@ def _draw_each(
         "residuals_by_photo",
         figure,
         "Residuals of each oriented photo, with their density and the normal distribution of the "
-        "same mean and SD: a row that is broader than the others, beside 0, or has lobes, is a "
-        "photo to look at.",
+        "same mean and SD. Look at photos whose row is broader than the others, is not centred on "
+        "0, or has several peaks.",
     )
 
 
@@ -561,11 +562,12 @@ def _draw_curves(
     scale: float = 1.0,
     base: float = 0.0,
 ) -> None:
-    """Draw the normal distribution and the density of values, which shows several modes."""
+    """Draw the normal distribution and the density of the values, which may have several peaks."""
     grid = np.linspace(edges[0], edges[-1], 161)
     curve = scale * _normal(values, edges, grid) + base
     axes.plot(grid, curve, color="black", linestyle="--", linewidth=0.6, label="normal")
-    # Silverman's rule of thumb, robust: an SD that outliers widen would smooth lobes away.
+    # Silverman's rule of thumb with a robust spread: an SD inflated by outliers would smooth
+    # secondary peaks away.
     spread = min(float(values.std()), median_deviation(values, float(np.median(values))))
     width = max(0.9 * spread * len(values) ** -0.2, 1e-9)
     some = values[:: max(1, len(values) // _MAX_KERNELS)]
@@ -575,19 +577,19 @@ def _draw_curves(
 
 
 def _end_of(name: str) -> str:
-    """Shorten a photo's name at its beginning, as names of a series differ at the end."""
+    """Shorten a photo's name at its beginning, since the names of a series differ at the end."""
     return name if len(name) <= _NAME_LETTERS else f"..{name[2 - _NAME_LETTERS :]}"
 
 
 def _reach(values: NDArray[np.float64]) -> float:
-    """Return the largest residual that is drawn, the same in all panels of a figure."""
+    """Return the largest residual to draw, for all panels of a figure."""
     return round_scale(max(float(np.percentile(np.abs(values), _PERCENTILE)), 1e-6))
 
 
 def _normal(
     values: NDArray[np.float64], edges: NDArray[np.float64], grid: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return counts per bar of a normal distribution with mean and SD of the values."""
+    """Return counts per bar of a normal distribution with the mean and SD of the values."""
     mean, deviation = float(values.mean()), max(float(values.std()), 1e-9)
     density = np.exp(-0.5 * ((grid - mean) / deviation) ** 2) / deviation / np.sqrt(2.0 * np.pi)
     return np.asarray(len(values) * (edges[1] - edges[0]) * density)

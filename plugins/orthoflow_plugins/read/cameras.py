@@ -65,7 +65,7 @@ class ReadCameras(Method):
             better="lower",
             counted_by="n_oriented",
             headline=True,
-            description="against the scan; errors of depth and scan add to it",
+            description="relative to the scan; errors of depth and scan add to it",
         ),
     )
     citations: ClassVar[tuple[str, ...]] = (

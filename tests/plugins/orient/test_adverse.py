@@ -29,7 +29,7 @@ def oriented(kind: str, seed: int, folder: Path) -> str:
 def test_a_photo_in_trouble_is_right_or_refused(tmp_path: Path, kind: str) -> None:
     status = oriented(kind, 0, tmp_path)
     if kind == "calibration of another lens":
-        assert "the calibration belongs to another lens, zoom or image size" in status
+        assert "the calibration belongs to another lens, zoom setting or image size" in status
 
 
 @pytest.mark.long

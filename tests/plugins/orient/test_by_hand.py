@@ -116,7 +116,7 @@ def test_a_gross_blunder_among_eight_is_left_out_or_refused(orient: Orient, size
         if found.status == "ok":
             assert error_share(found) < 3.0
             assert cameras.ties.role.tolist() == [0] * 7 + [int(TieRole.REJECTED)]
-            assert any("contradict the others and are left out" in text for text in warnings)
+            assert any("contradict the others and were left out" in text for text in warnings)
         else:
             assert "measured by hand contradict" in found.status
     # Far off, the blunder is plain.
@@ -164,7 +164,7 @@ def test_ties_by_hand_stand_against_a_repeated_motif(orient: Orient) -> None:
 
 def test_fewer_than_six_are_ordinary_ties(orient: Orient) -> None:
     (found,) = orient(clicked(1, n=5), CALIBRATED)[0].cameras
-    assert found.status.startswith("5 ties with the walls")
+    assert found.status.startswith("only 5 ties to the walls")
 
 
 # --- which of them fit together ---
@@ -216,4 +216,4 @@ def test_a_small_plate_seen_from_afar_may_be_turned_either_way(relief_m: float) 
     points = np.array([1.3, 0.0, 1.1]) + np.stack([along, away, up], axis=1)
     reason = by_hand(by(points))
     assert isinstance(reason, str)
-    assert reason.startswith("two poses")
+    assert reason.startswith("two different poses")

@@ -272,5 +272,5 @@ def test_five_points_and_points_in_one_place_determine_no_camera() -> None:
     direct_linear(seen.pixels_photo, seen.points_world, SIZE_PX)
     with pytest.raises(GeometryError, match="needs six points, got 5"):
         direct_linear(seen.pixels_photo[:5], seen.points_world[:5], SIZE_PX)
-    with pytest.raises(GeometryError, match="lie in one place"):
+    with pytest.raises(GeometryError, match="coincide"):
         direct_linear(seen.pixels_photo, np.ones((6, 3)), SIZE_PX)

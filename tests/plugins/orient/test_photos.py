@@ -39,7 +39,7 @@ def test_what_no_orientation_can_start_from_is_refused() -> None:
         photos.require(ties(), Photos(photos=()))
     with pytest.raises(MethodError, match="there are no ties between photos and walls"):
         photos.require(ties(0), both)
-    with pytest.raises(MethodError, match="the ties name photo b, which is not among"):
+    with pytest.raises(MethodError, match="the ties refer to photo b, which is not among"):
         photos.require(ties(), Photos(photos=(photo("a"),)))
 
 
