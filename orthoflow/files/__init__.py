@@ -1,1 +1,1 @@
-"""Files of other programs: images, GeoTIFF, point clouds, and the files that a run publishes."""
+"""Readers of files from other programs (images, GeoTIFF, point clouds), and writers of results."""

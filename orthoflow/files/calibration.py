@@ -1,4 +1,4 @@
-"""The calibration file: cameras by photo name or pattern, in OpenCV's model and pixel convention.
+"""Calibration files: cameras by photo name or pattern, with OpenCV's model and pixel convention.
 
 ```yaml
 cameras:
@@ -9,10 +9,9 @@ cameras:
   "*": {width: 4000, height: 3000, fx: 3004.2, fy: 3004.2, cx: 1999.5, cy: 1499.5}
 ```
 
-The first entry that matches a photo applies. For `model: fisheye` (`cv2.fisheye`) the distortion is
-k1, k2, k3, k4, and `field_of_view_deg` the full angle to use, 180 by default. Pixels in the file
-count from the centre of the first pixel; internally, that centre is at (0.5, 0.5), and only this
-module converts.
+The first entry that matches a photo is used. For `model: fisheye` (`cv2.fisheye`), the distortion
+is k1, k2, k3, k4, and `field_of_view_deg` is the full angle to use, 180 by default. In the file,
+the centre of the first pixel is (0, 0); internally it is (0.5, 0.5). Only this module converts.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ from orthoflow.geometry.cameras import HALF_PIXEL
 from orthoflow.products import Calibration, Intrinsics
 from orthoflow.untrusted_text import text_of_file
 
-# Some seconds of parsing; a calibration of a thousand cameras has about 150 kB.
+# Such a file takes some seconds to parse; a calibration of a thousand cameras has about 150 kB.
 #: bytes of a calibration file
 MOST_BYTES: Final = 400_000
 #: entries of a calibration file
@@ -57,7 +56,7 @@ class CalibratedLenses:
 
     Attributes:
         patterns: photo names or shell patterns.
-        lenses: one per pattern.
+        lenses: one lens per pattern.
     """
 
     patterns: tuple[str, ...]
@@ -68,7 +67,7 @@ def read_calibration(path: Path) -> CalibratedLenses:
     """Read a calibration file.
 
     Raises:
-        InputError: the file cannot be used; one line per problem, `file:line:column: ...`.
+        InputError: the file is invalid; one line per problem, `file:line:column: ...`.
     """
     text = text_of_file(
         path,
@@ -88,7 +87,7 @@ def read_calibration(path: Path) -> CalibratedLenses:
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:
-    """Write a calibration file that `read_calibration` reads.
+    """Write a calibration file for `read_calibration`.
 
     Raises:
         StoreError: the file cannot be written.
@@ -120,7 +119,7 @@ def calibration_text(calibration: Calibration) -> str:
 
 
 def matching_pattern(patterns: Sequence[str], photo_name: str) -> str | None:
-    """Return the first pattern that is the photo's name, or matches it as in a shell.
+    """Return the first pattern that equals the photo's name or matches it as in a shell.
 
     Matching is case-sensitive. A name with brackets matches itself, and a name with folders is also
     matched without them.
@@ -140,11 +139,11 @@ def lens_for(
     Args:
         calibration: the calibrated lenses.
         photo_name: file name of the photo.
-        width: pixels of its stored array.
-        height: pixels.
+        width: width of the stored array in pixels.
+        height: height of the stored array in pixels.
 
     Raises:
-        InputError: the photo has another size than the calibration.
+        InputError: the size of the photo differs from that of the calibration.
     """
     pattern = matching_pattern(calibration.patterns, photo_name)
     if pattern is None:
@@ -165,7 +164,7 @@ def lens_for(
 
 
 class _Lens(BaseModel):
-    """An entry of the file; validators use the fields above theirs."""
+    """An entry of the file; each validator uses the fields above its own."""
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -245,7 +244,7 @@ _FIELDS_ABOVE: Final = len(_Lens.model_fields) - 1
 
 
 def _lens(given: Mapping[str, Any], terms: tuple[float, ...]) -> Intrinsics | FisheyeLens:
-    """Return the lens of an entry, in our convention."""
+    """Return the lens of an entry, in orthoflow's pixel convention."""
     pixels = {key: given[key] for key in _REQUIRED}
     pixels |= {key: pixels[key] + HALF_PIXEL for key in ("cx", "cy")}
     if not given["model"]:
@@ -267,7 +266,7 @@ def _problem(lens: Intrinsics | FisheyeLens) -> str:
 
 
 def _folds(camera: Intrinsics) -> bool:
-    """Whether the lens model cannot be undone somewhere in the image."""
+    """Whether the lens model is not invertible somewhere in the image."""
     sides = (np.linspace(0.0, side, 9) for side in (camera.width, camera.height))
     pixels = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
     try:
@@ -275,7 +274,7 @@ def _folds(camera: Intrinsics) -> bool:
             rays = camera.posed().rays_camera(pixels)
     except (GeometryError, np.linalg.LinAlgError):
         return True
-    # The search may end beyond the fold: the radius must increase all the way to the ray.
+    # The search may end beyond the fold, so check that the radius increases all the way to the ray.
     k1, k2, _, _, k3 = camera.distortion
     steps = np.linspace(0.0, float((rays[:, :2] ** 2).sum(axis=1).max()), 200)
     growth = 1.0 + steps * (3.0 * k1 + steps * (5.0 * k2 + steps * 7.0 * k3))

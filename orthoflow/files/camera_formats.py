@@ -1,6 +1,6 @@
-"""Files of cameras: choice of the reader, and readers of `cameras.json`, Bundler, RealityCapture.
+"""Camera files: choice of the reader, and readers for `cameras.json`, Bundler and RealityCapture.
 
-Metashape, COLMAP and E57 have modules of their own.
+Metashape, COLMAP and E57 have their own modules.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ _ANGLES: Final = ("x", "y", "alt", "heading", "pitch", "roll")
 _FOCAL_BEHIND: Final = re.compile(r"\s+0\s+[-+.\deE]+$")
 _SEPARATORS: Final = re.compile("[,;\t]")
 _FIRST_LINES: Final = 50
-# Preferred names if there are several files of one kind.
+# Preferred names if a folder has several files of one format.
 _USUAL_NAMES: Final = ("cameras.json", "bundle.out", "cameras.xml", "cameras.csv")
 
 
 def read_given_cameras(paths: Sequence[Path]) -> tuple[GivenCamera, ...]:
-    """Read the cameras of one file, or of a folder of files that belong together.
+    """Read the cameras of one file, or of a folder with files that belong together.
 
     Raises:
-        InputError: the files are of no known kind, damaged, or hold too many.
+        InputError: the format is unknown, a file is damaged, or there are too many cameras.
     """
     found = _read(paths)
     if len(found) > MOST_CAMERAS:
@@ -61,7 +61,8 @@ def read_given_cameras(paths: Sequence[Path]) -> tuple[GivenCamera, ...]:
 def _read(paths: Sequence[Path]) -> tuple[GivenCamera, ...]:
     models = _colmap_models(paths)
     if models:
-        # Of several reconstructions the one that orients most photos; COLMAP numbers them.
+        # Of several reconstructions (COLMAP numbers them), use the one with the most oriented
+        # photos.
         found = [read_colmap_model(parts) for parts in models]
         return max(found, key=lambda cameras: sum(not camera.reason for camera in cameras))
     readers: dict[str, Callable[[Path], tuple[GivenCamera, ...]]] = {
@@ -92,7 +93,7 @@ def _read(paths: Sequence[Path]) -> tuple[GivenCamera, ...]:
 
 
 def _colmap_models(paths: Sequence[Path]) -> list[list[Path]]:
-    """Return the parts of each COLMAP model among files, binary before text, by folder."""
+    """Return the parts of each COLMAP model; text models only if there are no binary ones."""
     for suffix in (".bin", ".txt"):
         folders: dict[Path, dict[str, Path]] = {}
         for path in paths:
@@ -105,11 +106,12 @@ def _colmap_models(paths: Sequence[Path]) -> list[list[Path]]:
 
 
 def _photo_list(path: Path, paths: Sequence[Path]) -> list[str]:
-    """Return the names of the photos of a Bundler file, from a list beside it with as many entries.
+    """Return the photo names of a Bundler file, from a list in the same folder.
 
-    A line is a name, which may contain spaces or be quoted, or a name, 0 and a focal length in
-    pixels. Of several lists the one named like the file is used, then `list.txt`; else lists of
-    photos must state the same.
+    Each line of the list is a photo name, which may contain spaces or be quoted, optionally
+    followed by 0 and a focal length in pixels. Only lists with one line per camera are used. A list
+    with the name of the Bundler file has priority, then `list.txt`; otherwise all lists of photos
+    must have the same content.
     """
     n_cameras = bundler_count(path)
     lists = {
@@ -140,10 +142,10 @@ def _photo_list(path: Path, paths: Sequence[Path]) -> list[str]:
 
 
 def read_cameras_json(path: Path) -> tuple[GivenCamera, ...]:
-    """Read the `cameras.json` of a run: OpenCV's pixels, X_camera = R X_world + t.
+    """Read the `cameras.json` of a run: OpenCV pixel coordinates, X_camera = R X_world + t.
 
     Raises:
-        InputError: it is damaged.
+        InputError: the file is damaged.
     """
     try:
         content: Any = parse_json(text_of(path))
@@ -193,10 +195,10 @@ def _of_json(name: str, entry: Mapping[str, Any], path: Path) -> GivenCamera:
 
 
 def bundler_count(path: Path) -> int:
-    """Return the number of cameras that a Bundler file states.
+    """Return the number of cameras according to the header of a Bundler file.
 
     Raises:
-        InputError: it states none.
+        InputError: the header has no such number.
     """
     words = list(islice(_words_of(path), 2))
     counts = numbers_of(words, path, "the counts of cameras and points")
@@ -208,16 +210,16 @@ def bundler_count(path: Path) -> int:
 def read_bundler(path: Path, names: Sequence[str]) -> tuple[GivenCamera, ...]:
     """Read a Bundler file: f, k1, k2, R and t of each camera, with OpenGL axes.
 
-    Its pixels count from the centre of the photo, y upwards.
+    Pixel coordinates in the file are relative to the centre of the photo, with y upwards.
 
     Args:
         path: the file.
-        names: names of the photos, in the order of the file.
+        names: photo names, in the order of the file.
 
     Raises:
-        InputError: it is damaged.
+        InputError: the file is damaged.
     """
-    # Points follow the cameras, and may be many.
+    # Only the cameras; the points after them may be many.
     values = numbers_of(
         list(islice(_words_of(path), 2, 2 + 15 * len(names))), path, "the parameters of cameras"
     )
@@ -245,7 +247,7 @@ def _words_of(path: Path) -> Iterator[str]:
 
 
 def _head_of(lines: Sequence[str]) -> tuple[int, list[str]] | None:
-    """Return line and columns of the header of a RealityCapture list; None without one."""
+    """Return line and columns of the header of a RealityCapture list; None if it has none."""
     for number, line in enumerate(lines):
         columns = [word.strip().lower() for word in _SEPARATORS.split(line.lstrip("# \ufeff"))]
         if {"name", "heading"} <= set(columns):
@@ -263,13 +265,12 @@ def _is_realitycapture(path: Path) -> bool:
 def read_realitycapture_list(path: Path) -> tuple[GivenCamera, ...]:
     """Read RealityCapture's "internal/external camera parameters" (CSV).
 
-    The focal length is the equivalent of a film 36 mm wide on the photo's longer side, the
-    principal point in shares of that side from the centre; heading is clockwise from north (y),
-    pitch 0 looks straight down. Terms that are not in the list are zero; comment lines may be
-    anywhere.
+    The focal length is the equivalent for a 36 mm film along the photo's longer side. The principal
+    point is relative to the centre, as a fraction of that side. Heading is clockwise from north
+    (y); pitch 0 looks straight down. Missing parameters are zero; comment lines may be anywhere.
 
     Raises:
-        InputError: it is damaged.
+        InputError: the file is damaged.
     """
     lines = text_of(path).splitlines()
     number, columns = _head_of(lines) or (0, [])
@@ -309,7 +310,7 @@ def _of_row(row: Mapping[str, str], path: Path, line: int) -> GivenCamera:
     (focal,) = numbers_of([row["f"]], path, "the focal length", line)
     if not focal > 0.0:
         raise damaged(path, f"the focal length of {name} must be positive, got {focal:g}", line)
-    # The camera's OpenGL axes are turned about z by -heading, x by pitch and y by roll.
+    # The camera's OpenGL axes are rotated about z by -heading, x by pitch and y by roll.
     heading, pitch, roll = pose[3:]
     world_from_axes = Rotation.from_euler("ZXY", [-heading, pitch, roll], degrees=True)
     rotation = _FROM_OPENGL @ world_from_axes.as_matrix().T

@@ -1,8 +1,8 @@
-"""Orientations as a COLMAP model: `cameras.txt`, `images.txt`, `points3D.txt`; also reads `.bin`.
+"""COLMAP models: `cameras.txt`, `images.txt` and `points3D.txt`; `.bin` files can be read, too.
 
-COLMAP counts pixels as orthoflow does, the centre of the first one at (0.5, 0.5), and has the same
-camera axes, so nothing is converted. The points written are the ties that the orientation kept.
-Models are read and written by pycolmap.
+COLMAP has the same pixel coordinates as orthoflow (the centre of the first pixel is (0.5, 0.5)) and
+the same camera axes, so nothing is converted. The written points are the ties that the orientation
+kept. pycolmap reads and writes the models.
 """
 
 from __future__ import annotations
@@ -36,8 +36,7 @@ from orthoflow.files.photo_files import MOST_PIXELS
 from orthoflow.products import Camera, Cameras, Intrinsics, TieRole, Ties
 from orthoflow.untrusted_text import open_file, reading
 
-# Our names of the parameters of models that OpenCV's include; COLMAP uses another one for one of
-# them.
+# COLMAP's parameter names -> ours, for models that OpenCV's model includes.
 _NAMES: Final = {"k": "k1"}
 _BROWN: Final = frozenset(
     {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
@@ -45,7 +44,7 @@ _BROWN: Final = frozenset(
 _FISHEYES: Final = frozenset(
     {"SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"}
 )
-# The files of a model; rigs and frames since version 3.12. Its points are not needed.
+# The files of a model; rigs and frames since version 3.12. Its points are not read.
 COLMAP_PARTS: Final = ("cameras", "images", "rigs", "frames")
 _OBSERVATION_BYTES: Final = 24
 _POSE_BYTES: Final = 64
@@ -59,12 +58,12 @@ _UNDISTORT: Final = "undistort the model with COLMAP (image_undistorter), or ref
 
 @dataclass(frozen=True, kw_only=True)
 class ColmapModel:
-    """The numbers of written items.
+    """The size of a written model.
 
     Attributes:
-        n_cameras: lenses.
+        n_cameras: number of lenses.
         n_images: number of oriented photos.
-        n_points: ties.
+        n_points: number of points from ties.
     """
 
     n_cameras: int
@@ -76,7 +75,7 @@ def write_colmap_model(folder: Path, cameras: Cameras) -> ColmapModel:
     """Write a text model for COLMAP into an existing folder.
 
     Raises:
-        ArgumentError: no photo is oriented, or a photo's name has spaces.
+        ArgumentError: no photo is oriented, or a photo name contains spaces.
         PluginError: pycolmap is missing.
         StoreError: a file cannot be written.
     """
@@ -113,7 +112,7 @@ def write_colmap_model(folder: Path, cameras: Cameras) -> ColmapModel:
         image.points2D = [pycolmap.Point2D(xy) for xy in ties[:, :2]]
         pose = pycolmap.Rigid3d(np.column_stack([viewer.rotation, viewer.translation]))
         model.add_image_with_trivial_frame(image, pose)
-    # A place that several photos see is one point.
+    # A position that is a tie of several photos becomes one point.
     image_of = np.concatenate([np.full(len(ties), k) for k, ties in enumerate(seen, start=1)])
     nth = np.concatenate([np.arange(len(ties)) for ties in seen])
     tied = np.concatenate(seen)
@@ -143,7 +142,7 @@ def _pycolmap(purpose: str) -> Any:
 
 
 def _kept_ties(ties: Ties | None, photo: str) -> NDArray[np.float64]:
-    """Ties of a photo that its orientation kept (n, 6): pixel, place, length of the residual."""
+    """Return a photo's ties kept by the orientation (n, 6): pixel, position, residual length."""
     if ties is None or photo not in ties.photo_names:
         return np.empty((0, 6))
     mine = (ties.photo == ties.photo_names.index(photo)) & (ties.role != TieRole.REJECTED)
@@ -166,7 +165,7 @@ def read_colmap_model(parts: Sequence[Path]) -> tuple[GivenCamera, ...]:
     """Read the orientations of a text or binary model with pycolmap, including rigs.
 
     Args:
-        parts: `cameras`, `images` and, if present, `rigs` and `frames`, all `.txt` or all `.bin`.
+        parts: `cameras`, `images` and, if present, `rigs` and `frames`; all `.txt` or all `.bin`.
 
     Raises:
         InputError: the model is damaged.
@@ -184,12 +183,12 @@ def read_colmap_model(parts: Sequence[Path]) -> tuple[GivenCamera, ...]:
     with tempfile.TemporaryDirectory() as folder:
         for path in parts:
             (Path(folder) / f"{path.stem.lower()}{suffix}").symlink_to(path.absolute())
-        # Points are many, and not needed.
+        # An empty file, because points are many and not needed.
         (Path(folder) / f"points3D{suffix}").write_bytes(bytes(8) if suffix == ".bin" else b"")
         try:
             model = pycolmap.Reconstruction(folder)
         except Exception as error:  # pycolmap raises what its checks in C++ become
-            # In the order of its sources.
+            # pycolmap's messages begin with a position in its C++ source.
             reason = " ".join(str(error).rpartition("] ")[2].split())[:_MAX_SAID]
             raise damaged(images, f"pycolmap cannot read the COLMAP model ({reason})") from error
     if not model.images:
@@ -210,9 +209,9 @@ def read_colmap_model(parts: Sequence[Path]) -> tuple[GivenCamera, ...]:
 
 
 def _require_whole(path: Path) -> None:
-    """Refuse a binary part that ends early, or states more than its bytes can hold.
+    """Refuse a binary file that is cut off or declares more items than its size allows.
 
-    pycolmap allocates memory for as many as are stated, and loops over them past the end.
+    pycolmap allocates memory for the declared number, and reads past the end of the file.
     """
     end_of = {"images": _end_of_image, "rigs": _end_of_rig, "frames": _end_of_frame}
     content, at = path.read_bytes(), 8
@@ -247,7 +246,7 @@ def _end_of_rig(content: bytes, at: int) -> int:
 
 
 def _whole_names(images: Path) -> dict[int, str]:
-    """Names of photos by image number from a text, because pycolmap ends names at a space."""
+    """Return photo names by image number, from a text file; pycolmap ends a name at a space."""
     names: dict[int, str] = {}
     with open_file(images) as content:
         stream = TextIOWrapper(content, encoding="utf-8", errors="replace")
@@ -256,7 +255,7 @@ def _whole_names(images: Path) -> dict[int, str]:
             if words and not words[0].startswith("#"):
                 if len(words) == _WORDS_OF_IMAGE and words[0].isdecimal():
                     names[int(words[0])] = words[9].strip()
-                # The points of the image are on a line of their own, which may be empty.
+                # The next line contains the points of the image, and may be empty.
                 next(stream, None)
     return names
 
@@ -264,7 +263,7 @@ def _whole_names(images: Path) -> dict[int, str]:
 def _given(
     image: Any, whole_name: str, lens: Intrinsics | WideLens | str, note: str, *, path: Path
 ) -> GivenCamera:
-    """Return the camera of an image."""
+    """Return the orientation of an image."""
     name = photo_path(whole_name)
     if isinstance(lens, str):
         return GivenCamera(name=name, reason=lens)
@@ -284,7 +283,7 @@ def _given(
 
 
 def _lens_of(camera: Any, path: Path) -> tuple[Intrinsics | WideLens | str, str]:
-    """Return a camera's lens with the terms it omits, or the reason why there is none."""
+    """Return a camera's lens and a note on omitted terms, or the reason why it has no lens."""
     if min(camera.width, camera.height) < 1 or camera.width * camera.height > MOST_PIXELS:
         raise damaged(path, f"a camera has {camera.width} x {camera.height} pixels")
     if camera.is_spherical():

@@ -1,10 +1,10 @@
-"""Panoramas and fisheye photos converted to photos of the faces of a cube, for all methods.
+"""Conversion of panoramas and fisheye photos to photos of cube faces, which all methods can use.
 
-A fisheye is OpenCV's (`cv2.fisheye`; Kannala and Brandt 2006): a point theta off the axis is seen
-theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) focal lengths from the principal
-point. Metashape's also has tangential terms and a skew. The columns of a panorama count azimuth
-clockwise seen from above, its rows elevation downwards, as in ASTM E2807; its camera looks at the
-centre of the picture.
+The fisheye model is OpenCV's (`cv2.fisheye`; Kannala and Brandt 2006): the image of a point at the
+angle theta from the axis is theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) focal
+lengths from the principal point. Metashape's model also has tangential terms and skew. In a
+panorama, columns are azimuths, clockwise as seen from above, and rows are elevations, from top to
+bottom, as in ASTM E2807; its camera looks at the centre of the image.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from orthoflow.geometry.cameras import HALF_PIXEL
 from orthoflow.geometry.levels import Colours
 from orthoflow.products import Intrinsics
 
-# Rows: right, down and forwards of each face, in the camera's axes (x right, y down, z forward).
+# Rows: right, down and forward vectors of each face in camera axes (x right, y down, z forward).
 FACES: Final[Mapping[str, NDArray[np.float64]]] = {
     "front": np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
     "left": np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]),
@@ -39,15 +39,15 @@ FACES: Final[Mapping[str, NDArray[np.float64]]] = {
 MOST_PX: Final = 32_766
 WIDEST_DEG: Final = 180.0
 _FULL_TURN_DEG: Final = 360.0
-# Directions per side used to find the part of a face that the lens sees.
+# Number of directions per side for finding the part of a face that the lens sees.
 _TRIED: Final = 65
-# A face that shows less than this share of the largest one is omitted.
+# A face with less than this share of the largest face's visible area is omitted.
 _LEAST_SHARE: Final = 0.02
 _ANGLES_TRIED: Final = 2000
 
 
 def face_rays(lens: Intrinsics) -> NDArray[np.float64]:
-    """Return directions (height, width, 3) of the pixels of a face, z = 1, in its own axes."""
+    """Return the directions (height, width, 3) of a face's pixels in its own axes, with z = 1."""
     right = (np.arange(lens.width) + 0.5 - lens.cx) / lens.fx
     down = (np.arange(lens.height) + 0.5 - lens.cy) / lens.fy
     across, along = np.meshgrid(right, down)
@@ -55,7 +55,7 @@ def face_rays(lens: Intrinsics) -> NDArray[np.float64]:
 
 
 def face_in(name: str) -> tuple[str, str] | None:
-    """Return stem and face of the name of a photo that may be a face; None if it is not.
+    """Return stem and face of a photo name that may be a cube face; None otherwise.
 
     >>> face_in("hall_left.png"), face_in("left.png")
     (('hall', 'left'), None)
@@ -66,7 +66,7 @@ def face_in(name: str) -> tuple[str, str] | None:
 
 @dataclass(frozen=True, kw_only=True)
 class PanoramaLens:
-    """The lens of a panorama over the whole sphere; pixels as ours."""
+    """The lens of a panorama that covers the whole sphere, in orthoflow's pixel coordinates."""
 
     width: int
     height: int
@@ -79,23 +79,25 @@ class PanoramaLens:
         return np.stack([u, v], axis=-1)
 
     def sees(self, pixels: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Report which pixels (..., 2) lie inside the image: all do."""
+        """Return which pixels (..., 2) are inside the image: all finite ones."""
         return np.asarray(np.isfinite(pixels).all(axis=-1))
 
 
 @dataclass(frozen=True, kw_only=True)
 class FisheyeLens:
-    """A fisheye lens; pixels as ours, the first one's centre at (0.5, 0.5).
+    """A fisheye lens, in orthoflow's pixel coordinates (first pixel centre at (0.5, 0.5)).
 
     Attributes:
-        width: pixels.
-        height: pixels.
-        fx: focal length in pixels along u; fy along v.
-        cx: principal point in pixels; cy along v.
+        width: image width in pixels.
+        height: image height in pixels.
+        fx: focal length along u in pixels.
+        fy: focal length along v in pixels.
+        cx: principal point along u in pixels.
+        cy: principal point along v in pixels.
         radial: k1, k2, k3, k4.
         tangential: p1, p2, applied to the undistorted direction.
         skew: pixels along u per unit along v.
-        field_of_view_deg: the full angle that the lens shows; photos are not used beyond it.
+        field_of_view_deg: full angle covered by the lens; photos are not used outside it.
     """
 
     width: int
@@ -115,7 +117,7 @@ class FisheyeLens:
         across = np.hypot(x, y)
         theta = np.arctan2(across, z)
         with np.errstate(all="ignore"):
-            # Undistorted; straight ahead it is zero.
+            # Undistorted direction; it is zero on the axis.
             scale = np.where(across > 0.0, theta / np.where(across > 0.0, across, 1.0), 0.0)
             a, b = x * scale, y * scale
             radial, (p1, p2) = _radial(self.radial, theta), self.tangential
@@ -129,17 +131,17 @@ class FisheyeLens:
         return pixels
 
     def sees(self, pixels: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Report which pixels (..., 2) lie inside the image; NaN does not."""
+        """Return which pixels (..., 2) are inside the image; NaN is outside."""
         u, v = pixels[..., 0], pixels[..., 1]
         return (u >= 0.0) & (u < self.width) & (v >= 0.0) & (v < self.height)
 
     @property
     def limit_rad(self) -> float:
-        """Return the angle off the axis up to which the lens is used."""
+        """Return the largest angle from the axis at which the lens is used."""
         return min(math.radians(0.5 * self.field_of_view_deg), _fold_rad(self.radial))
 
     def finest_px(self, theta_rad: float) -> float:
-        """Return the maximum number of pixels per radian within a right angle off the axis."""
+        """Return the higher of radial and tangential resolution at an angle, pixels per radian."""
         theta = min(theta_rad, self.limit_rad)
         around = _bent(self, theta) / math.sin(theta) if theta > 0.0 else 1.0
         with np.errstate(all="ignore"):
@@ -171,7 +173,7 @@ def _problem_of_numbers(lens: FisheyeLens) -> str:
 
 def _problem_of_faces(lens: FisheyeLens) -> str:
     fold = _fold_rad(lens.radial)
-    # The farthest corner from the principal point, in focal lengths.
+    # Distance of the farthest corner from the principal point, in focal lengths.
     across = max(lens.cx, lens.width - lens.cx) / lens.fx
     down = max(lens.cy, lens.height - lens.cy) / lens.fy
     is_inside = _bent(lens, fold) < math.hypot(across, down)
@@ -202,7 +204,7 @@ def _radial(radial: tuple[float, ...], theta: NDArray[np.float64]) -> NDArray[np
 
 
 def _growth(radial: tuple[float, ...], theta: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the derivative of the distorted by the undistorted angle."""
+    """Return the derivative of the distorted angle with respect to the undistorted one."""
     k1, k2, k3, k4 = radial
     t2 = theta * theta
     return 1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
@@ -210,10 +212,10 @@ def _growth(radial: tuple[float, ...], theta: NDArray[np.float64]) -> NDArray[np
 
 @cache
 def _fold_rad(radial: tuple[float, ...]) -> float:
-    """Angle off the axis where a lens model stops increasing; a straight angle if never."""
+    """Return the angle from the axis where the lens model stops increasing; pi if it never does."""
     angles = np.linspace(0.0, math.pi, _ANGLES_TRIED)
     with np.errstate(all="ignore"):
-        # Written as a negated comparison, so that NaN fails it.
+        # Negated, so that NaN counts as not increasing.
         stops = ~(_growth(radial, angles) > 0.0)
     return float(angles[max(int(np.argmax(stops)) - 1, 0)]) if stops.any() else math.pi
 
@@ -225,9 +227,9 @@ def _bent(lens: FisheyeLens, theta_rad: float) -> float:
 
 @cache
 def face_lenses(lens: WideLens) -> Mapping[str, Intrinsics]:
-    """Return lenses of the faces that a lens shows, each cropped to the visible part.
+    """Return the lenses of the faces that a lens sees, each cropped to the visible part.
 
-    Those of a panorama are as fine as it is at the centre of a face.
+    The faces of a panorama have its resolution at the centre of a face.
     """
     if isinstance(lens, PanoramaLens):
         side = max(1, round(lens.width / math.pi))
@@ -245,7 +247,7 @@ def face_lenses(lens: WideLens) -> Mapping[str, Intrinsics]:
 
 
 def _lens_of_face(side: int, ends: tuple[int, int, int, int]) -> Intrinsics:
-    """Return the lens of a part of a face: left, right, top and bottom in pixels of its side."""
+    """Return the lens of a part of a face; `ends` is left, right, top and bottom in pixels."""
     left, right, top, bottom = ends
     return Intrinsics(
         width=right - left,
@@ -259,9 +261,9 @@ def _lens_of_face(side: int, ends: tuple[int, int, int, int]) -> Intrinsics:
 
 
 def _cut(lens: FisheyeLens, face: str, seen: NDArray[np.bool_]) -> Intrinsics:
-    """Lens of the part of a face between the outermost visible directions, with a margin.
+    """Return the lens of the part of a face within the outermost visible directions plus a margin.
 
-    A face has the resolution of the photo at its centre, so that nothing is lost there.
+    A face has the resolution of the photo at the centre of the face.
     """
     off_axis = 0.0 if face == "front" else 0.5 * math.pi
     side = max(1, round(2.0 * lens.finest_px(off_axis)))
@@ -278,15 +280,15 @@ def _cut(lens: FisheyeLens, face: str, seen: NDArray[np.bool_]) -> Intrinsics:
 
 @dataclass(frozen=True, kw_only=True)
 class CubeFace:
-    """A face of a cube around a panorama or a fisheye's photo, as a photo.
+    """A face of the cube around a panorama or fisheye camera, as a photo.
 
     Attributes:
-        name: name of the photo.
-        photo: the file of the whole, unmodified.
-        face: which of `FACES`.
-        lens: its lens, which is exact.
-        whole: lens of the whole.
-        used: mask of the whole (rows, columns), True where it may be used; None: all.
+        name: photo name of the face.
+        photo: content of the file of the wide photo, unmodified.
+        face: key of `FACES`.
+        lens: lens of the face, without distortion.
+        whole: lens of the wide photo.
+        used: mask of the wide photo (rows, columns), True for usable pixels; None for all.
     """
 
     name: str
@@ -297,11 +299,11 @@ class CubeFace:
     used: NDArray[np.bool_] | None = None
 
     def encoded(self) -> bytes:
-        """Return the photo as a PNG file, black where the whole shows nothing."""
+        """Return the face as a PNG file, black where the wide photo shows nothing."""
         return encode_png(self.picture(decode_levels(self.photo, self.name)))
 
     def mask(self) -> NDArray[np.bool_] | None:
-        """Return which pixels (height, width) may be used; None if all may."""
+        """Return the usable pixels (height, width) of the face; None for all."""
         seen = self.whole.sees(self._pixels())
         if self.used is not None:
             used = self.picture(np.where(self.used, np.uint8(255), np.uint8(0)))
@@ -309,37 +311,37 @@ class CubeFace:
         return None if seen.all() else seen
 
     def picture(self, whole: Colours) -> Colours:
-        """Resample the face from the whole (rows, columns[, 3]) by bilinear interpolation."""
+        """Resample the face from the wide photo (rows, columns[, 3]), bilinearly."""
         import cv2
 
         pixels = self._pixels()
         seen = self.whole.sees(pixels)
         if isinstance(self.whole, PanoramaLens):
-            # The last column is left of the first; above the first row, that row is repeated.
+            # Repeat the last column left of the first, and the first row above itself.
             whole = np.concatenate([whole[:, -1:], whole, whole[:, :1]], axis=1)
             pixels[..., 0] += 1.0
         pixels[~seen] = 0.0
-        # OpenCV counts from the centre of the first pixel.
+        # In OpenCV, the centre of the first pixel is (0, 0).
         u, v = np.moveaxis((pixels - HALF_PIXEL).astype(np.float32), -1, 0)
         found = cv2.remap(whole, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         found[~seen] = 0
         return np.asarray(found, dtype=whole.dtype)
 
     def _pixels(self) -> NDArray[np.float64]:
-        """Return pixels of the whole (height, width, 2) of those of the face."""
+        """Return the pixels of the wide photo (height, width, 2) that the face's pixels show."""
         return self.whole.project(face_rays(self.lens) @ FACES[self.face])
 
 
 def faces_of(
     photo: bytes, stem: str, lens: WideLens, used: NDArray[np.bool_] | None = None
 ) -> tuple[CubeFace, ...]:
-    """Return the visible parts of a wide photo as photos `<stem>_<face>.png`.
+    """Return the visible cube faces of a wide photo, named `<stem>_<face>.png`.
 
     Args:
-        photo: the file's bytes.
-        stem: stem of its name.
-        lens: its lens.
-        used: mask of the photo (height, width), True where it may be used; None: all.
+        photo: content of the file.
+        stem: file name without suffix.
+        lens: lens of the photo.
+        used: mask of the photo (height, width), True for usable pixels; None for all.
 
     Raises:
         InputError: the lens is invalid.

@@ -1,4 +1,4 @@
-"""Documents of users as pydantic models: every mistake with its place, in the words of a file."""
+"""Validation of user documents by pydantic models, with positions and readable messages."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from orthoflow.products.product import JsonValue
 from orthoflow.untrusted_text import first_few
 
 Model = TypeVar("Model", bound=BaseModel)
-# Letters of a value, and of a path, that a message repeats.
+# Maximum lengths of a value and of a path in messages, in characters.
 _SHOWN: Final = 60
 _LONGEST_PATH: Final = 100
 
@@ -33,15 +33,15 @@ _LONGEST_PATH: Final = 100
 def read_model(
     text: str, model: type[Model], most_values: int = MOST_VALUES
 ) -> tuple[Model | None, list[tuple[Position, str]]]:
-    """Read a document as a pydantic model, or find out what is wrong with it and where.
+    """Read a document as a pydantic model, or find its errors and their positions.
 
     Args:
         text: the document.
-        model: that forbids other keys.
-        most_values: larger documents are refused, aliases expanded.
+        model: a model that forbids additional keys.
+        most_values: maximum number of values, with aliases expanded.
 
     Returns:
-        None with one problem at least, in the order of the text.
+        The model, or None and at least one problem, in the order of the text.
     """
     log = _Collected()
     document = read_yaml(text, log, most_values)
@@ -68,8 +68,8 @@ class _Collected:
         self.found.append((position, f"{path}: {message}" if path else message))
 
 
-# Code of pydantic's -> what was expected, in the words of a file instead of Python's. Validators of
-# ours raise custom errors with a `form`.
+# pydantic's error code -> expected value, in terms of a file instead of Python. Our own validators
+# raise custom errors with a `form`.
 _FORMS: Final[Mapping[str, str]] = {
     "bool_type": "true or false",
     "dict_type": "a mapping",
@@ -91,22 +91,22 @@ _OF_NUMBERS: Final = frozenset(
     ("finite_number", "float_type", "int_from_float", "int_type", "time")
 )
 _OF_LISTS: Final = frozenset(("tuple_type", "list_type", "missing", "too_long", "too_short"))
-# Keys of a call that are often written among its parameters.
+# Keys of a method call that are often written among its parameters by mistake.
 _BESIDE: Final = ("use", "repeat", "resources", "timeout")
 
 
 def mistakes(
     error: ValidationError, model: type[BaseModel], data: JsonValue, owner: str = ""
 ) -> Iterator[tuple[Location, str, bool]]:
-    """Yield each mistake once: its location in the data, a sentence, and whether it is of a key.
+    """Yield each mistake once: location in the data, message, and whether it concerns a key.
 
     Args:
-        error: of the model.
-        model: the expected form.
-        data: what was validated.
-        owner: whose parameters they are; empty for sections of a file.
+        error: the validation error.
+        model: the model that failed.
+        data: the validated data.
+        owner: owner of the parameters; empty for sections of a file.
     """
-    # Each alternative of a type reports its own expectation.
+    # Each alternative of a type union reports its own error.
     places: dict[tuple[Location, bool], list[ErrorDetails]] = {}
     for details in error.errors(include_url=False):
         at_key = details["loc"][-1:] == ("[key]",) or details["type"] == "extra_forbidden"
@@ -118,15 +118,15 @@ def mistakes(
         group = [key for key in places if key[0][:1] == (name,)]
         kinds = {one["type"] for key in group for one in places[key]}
         form = _list_form(model, str(name)) if kinds & _OF_LISTS else ""
-        # A wrong form of one list is one mistake.
+        # All errors within one malformed list count as one mistake.
         if form and isinstance(data, dict):
             yield (name,), f"{name} is written {form}, got {_shown(data.get(str(name)))}", True
             for key in group:
                 del places[key]
     keys = {loc for loc, at_key in places if at_key}
     for (loc, at_key), alternatives in places.items():
-        # A list is too short because of its items, a value is wrong because of its key, and a key
-        # is missing because it is misspelt.
+        # Skip consequences: a list too short because of invalid items, a wrong value of an invalid
+        # key, a key that is missing because it is misspelt.
         follows = any(len(other) > len(loc) and other[: len(loc)] == loc for other, _ in places)
         is_missing = alternatives[0]["type"] == "missing"
         beside = [str(key[-1]) for key in keys if key[:-1] == loc[:-1]]
@@ -136,7 +136,7 @@ def mistakes(
 
 
 def existing(data: Any, loc: Location) -> Location:
-    """Return the parts of a location that lead to values, without pydantic's names of types."""
+    """Return the part of a location that exists in the data, without pydantic's type names."""
     found: list[str | int] = []
     for part in loc:
         is_index = isinstance(data, list) and isinstance(part, int) and part < len(data)
@@ -182,7 +182,7 @@ def _shown(value: JsonValue) -> str:
 
 
 def _list_form(model: type[BaseModel], name: str) -> str:
-    """Return how a parameter is written if it is a list, else nothing."""
+    """Return how a list parameter is written; empty for other parameters."""
     schema = model.model_json_schema()
     form = type_text(schema.get("properties", {}).get(name, {}), schema.get("$defs", {}))
     return form if "[" in form else ""
@@ -220,20 +220,20 @@ def _unknown_key(name: str, known: Sequence[str], value: JsonValue, owner: str) 
 
 
 def _keys_at(model: type[BaseModel], loc: Location) -> list[str]:
-    """Return the keys that the model at a location has."""
+    """Return the keys of the models at a location."""
     models = _models_in(_annotations_at(model, loc))
     return [info.alias or name for one in models for name, info in one.model_fields.items()]
 
 
 def _literals_at(model: type[BaseModel], loc: Location) -> list[str]:
-    """Return the words that may stand at a location."""
+    """Return the literal words allowed at a location."""
     parts = _parts_of(_annotations_at(model, loc))
     literals = (part for part in parts if typing.get_origin(part) is typing.Literal)
     return [str(word) for one in literals for word in typing.get_args(one)]
 
 
 def _annotations_at(model: type[BaseModel], loc: Location) -> list[object]:
-    """Return the types at a location, and those around what is a name in a mapping or an index."""
+    """Return the types at a location, and the containing types if its last parts are not fields."""
     found: list[object] = [model]
     for part in loc:
         fields: list[object] = [
@@ -259,7 +259,7 @@ def _parts_of(annotations: Iterable[object]) -> Iterator[object]:
 
 # Units and decimals ------------------------------------------------------------------------------
 
-# Each unit in the first of its family, by the suffixes of parameter names.
+# Factors to the first unit of each family; the keys are suffixes of parameter names.
 _FAMILIES: Final[tuple[Mapping[str, float], ...]] = (
     {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "dm": 0.1, "km": 1e3, "um": 1e-6, "µm": 1e-6},
     {"deg": 1.0, "rad": 180.0 / math.pi, "°": 1.0, "gon": 0.9},
@@ -277,7 +277,7 @@ _NUMBER: Final = re.compile(r"([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)\s*([a-zµ�
 
 
 def meant_number(parameter: str, text: object) -> str:
-    """Return how a number given as text is written; empty if it does not look like one.
+    """Return a hint how a number given as text is written; empty if it does not look like one.
 
     >>> meant_number("tolerance_m", "0,02")
     '; decimals have a point: 0.02'
@@ -300,7 +300,7 @@ def meant_number(parameter: str, text: object) -> str:
 
 
 def meant_parameter(name: str, known: Iterable[str], value: JsonValue) -> str:
-    """Return the parameter with the same meaning in another unit; empty if there is none.
+    """Return a hint to the parameter with the same meaning in another unit; empty if none exists.
 
     >>> meant_parameter("gsd_mm", ["gsd_m", "crs"], 50)
     ' (it is gsd_m, in metres: gsd_m: 0.05)'
@@ -318,7 +318,7 @@ def meant_parameter(name: str, known: Iterable[str], value: JsonValue) -> str:
 
 
 def _factor(given: str, wanted: str) -> float | None:
-    """Return the factor between two units."""
+    """Return the conversion factor between two units; None if they are of different families."""
     for family in _FAMILIES:
         if given in family and wanted in family:
             return family[given] / family[wanted]

@@ -1,4 +1,4 @@
-"""Charts and pictures at the width of a journal's column, 85 mm, with text of 6 points or more."""
+"""Charts and pictures in the width of a journal column (85 mm), with text of at least 6 points."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 # Two columns of a journal are 85 mm wide each.
 COLUMN_INCHES: Final = 85.0 / 25.4
 DPI: Final = 300
-# A picture higher than this would not leave room for its caption on a page.
+# A higher picture would not leave room for its caption on a page.
 _MAX_HEIGHT_INCHES: Final = 6.0
-# More pixels along a picture's longer side than a column shows cost time only.
+# A column cannot show more pixels than this along a picture's longer side.
 _MAX_SIDE_PX: Final = 1000
 _MISSING: Final = "#8a949e"
-# What X and Y of a wall's raster are, as its files have them.
+# Axis labels for X and Y of a wall's raster, as in its files.
 _AXES: Final[Mapping[RasterAxes, tuple[str, str]]] = {
     "wall": ("along the wall [m]", "height [m]"),
     "level": ("x [m]", "y [m]"),
@@ -35,9 +35,9 @@ _AXES: Final[Mapping[RasterAxes, tuple[str, str]]] = {
     "plane": ("across [m]", "up [m]"),
 }
 _Scale = Callable[[ArrayLike], NDArray[np.float64]]
-# Height of the numbers and the label below a picture with axes.
+# Height of the tick labels and the axis label below a picture.
 _AXIS_INCHES: Final = 0.25
-# Any: matplotlib's own types name every setting that it has.
+# Any: matplotlib's own types list every setting by name.
 _STYLE: Final[Mapping[Any, Any]] = {
     "font.family": "DejaVu Sans",
     "axes.spines.top": False,
@@ -51,12 +51,12 @@ _STYLE: Final[Mapping[Any, Any]] = {
     "legend.frameon": False,
     "legend.fontsize": 7.0,
     "savefig.dpi": DPI,
-    # The same numbers give the same bytes, and text stays text in PDF.
+    # The same numbers give the same bytes, and text remains text in PDF.
     "svg.hashsalt": "orthoflow",
     "pdf.fonttype": 42,
     "text.parse_math": False,
 }
-# Of figures with several panels, and of pictures with a frame.
+# For figures with several panels and pictures with axes.
 _PANELS: Final[Mapping[Any, Any]] = {
     "figure.dpi": DPI,
     "font.size": 7.0,
@@ -78,10 +78,10 @@ _PANELS: Final[Mapping[Any, Any]] = {
 
 @contextmanager
 def styled(settings: Mapping[Any, Any]) -> Iterator[None]:
-    """Draw in the style of all charts, whatever the user's own settings of matplotlib are.
+    """Draw in the style of all charts, regardless of the user's matplotlib settings.
 
     Args:
-        settings: of matplotlib, in addition to those of all charts.
+        settings: matplotlib settings in addition to those of all charts.
     """
     import matplotlib as mpl
 
@@ -93,13 +93,13 @@ def styled(settings: Mapping[Any, Any]) -> Iterator[None]:
 
 @contextmanager
 def in_column_style() -> Iterator[None]:
-    """Draw figures of several panels and pictures with a frame: a context, or a decorator."""
+    """Use the style of figures with several panels and pictures with axes; also as a decorator."""
     with styled(_PANELS):
         yield
 
 
 def column_figure(height_inches: float) -> Figure:
-    """Return an empty figure of a column's width; to be called `in_column_style`."""
+    """Return an empty figure of column width; call it within `in_column_style`."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(COLUMN_INCHES, height_inches), layout="constrained")
@@ -110,13 +110,14 @@ def picture_figure(
 ) -> tuple[Figure, Axes]:
     """Return a figure that shows a picture, and its axes.
 
-    The units of the axes are the picture's pixels, or columns and rows of a wall's raster. A wall's
-    figure is labelled in metres, as the raster's files have them.
+    The axes are in pixels of the picture or, with a frame, in columns and rows of the wall's
+    raster, and labelled in metres as in its files.
 
     Args:
         picture: (rows, cols) grey or (rows, cols, 3) RGB.
         extra_inches: height for a legend or a colour bar.
-        frame: of the wall that the picture shows, which may have more cells than it has pixels.
+        frame: frame of the wall that the picture shows; it may have more cells than the picture
+            has pixels.
     """
     rows, columns = picture.shape[:2] if frame is None else frame.shape
     height = min(COLUMN_INCHES * rows / columns, _MAX_HEIGHT_INCHES)
@@ -126,7 +127,7 @@ def picture_figure(
     axes.set_anchor("N")
     extent = (0.0, float(columns), float(rows), 0.0)
     axes.imshow(picture, cmap="gray", vmin=0, vmax=255, extent=extent)
-    # Arrows that reach beyond the picture do not change what is shown of it.
+    # Arrows that extend beyond the picture must not change the limits of the axes.
     axes.autoscale(enable=False)
     if frame is not None:
         _label_in_metres(axes, frame)
@@ -162,7 +163,7 @@ def map_chart(
     high: float,
     cmap: str = "inferno",
 ) -> bytes:
-    """Return a map of values (rows, cols) of a wall with its colour bar, as WebP; NaN is grey."""
+    """Return a map of wall values (rows, cols) with a colour bar, as WebP; NaN is grey."""
     import matplotlib as mpl
 
     with in_column_style():
@@ -183,14 +184,14 @@ def map_chart(
 
 
 def encode_chart(figure: Figure) -> bytes:
-    """Encode a figure as WebP, which takes a tenth of the bytes of PNG where it shows a photo."""
+    """Encode a figure as WebP, which for photos needs a tenth of the bytes of PNG."""
     stream = io.BytesIO()
     figure.savefig(stream, format="webp", pil_kwargs={"quality": 90})
     return stream.getvalue()
 
 
 def round_scale(value: float) -> float:
-    """Round up to 1, 2 or 5 times a power of ten: figures of similar runs have one scale.
+    """Round up to 1, 2 or 5 times a power of ten, so that similar runs share a scale.
 
     >>> round_scale(0.34), round_scale(7.0)
     (0.5, 10.0)
@@ -202,15 +203,16 @@ def round_scale(value: float) -> float:
     return float(f"{step * power:.6g}")
 
 
-# Saturation and value of hues by the golden ratio, in turn: the first twenty colours differ most.
+# Saturation and value of successive hues, which differ by the golden ratio: this separates the
+# first twenty colours best.
 _HUE_STEP: Final = 0.618033988749895
 _SHADES: Final = ((0.9, 0.8), (0.8, 0.55), (0.45, 0.9))
 
 
 def plane_ink(index: int) -> tuple[float, float, float]:
-    """Return the colour (red, green, blue), 0..1, of a plane, or of a photo, in all charts.
+    """Return the colour (red, green, blue), 0..1, of a plane or photo in all charts.
 
-    The hue is that of `plane_colour`, the colour of its points in clouds.
+    The hue is that of `plane_colour`, the colour of the plane's points in clouds.
 
     >>> tuple(round(value, 2) for value in plane_ink(0))
     (0.8, 0.08, 0.08)
@@ -219,7 +221,7 @@ def plane_ink(index: int) -> tuple[float, float, float]:
 
 
 def _shrunk(values: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return means of what is known, no side longer than a column has pixels."""
+    """Return values averaged to the pixels of a column, ignoring NaN."""
     import cv2
 
     shown = np.asarray(values, dtype=np.float64)

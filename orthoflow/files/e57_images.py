@@ -1,8 +1,8 @@
-"""Photos inside E57 files (`images2D`), with their lenses and poses if the file states them.
+"""Photos in E57 files (`images2D`), with lenses and poses if the file contains them.
 
-The camera of a pinhole image has x to the right, y up and z backwards (ASTM E2807), in a frame
-whose pose transforms to the file's world. Principal points count from the outer corner of the first
-pixel, as ours do. The directions of a spherical image are x forwards, y to the left and z up.
+The camera axes of a pinhole image are x right, y up and z backwards (ASTM E2807); its pose
+transforms them to the file's world. Principal points are relative to the outer corner of the first
+pixel, as in orthoflow. The axes of a spherical image are x forwards, y left and z up.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from orthoflow.products import Intrinsics
 
 SUFFIX: Final = ".e57"
 _FROM_Y_UP: Final = np.diag([1.0, -1.0, -1.0])
-# From x forwards, y to the left, z up to a camera's axes.
+# From the axes x forwards, y left, z up to camera axes.
 _FROM_PANORAMA: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 _REPRESENTATIONS: Final = ("pinhole", "spherical", "cylindrical", "visualReference")
 _CONTENTS: Final = {"jpegImage": ".jpg", "pngImage": ".png"}
@@ -39,12 +39,12 @@ _UNUSUAL: Final = re.compile(r"[^\w.-]+")
 
 @dataclass(frozen=True, kw_only=True)
 class E57Image:
-    """A photo inside an E57 file.
+    """A photo in an E57 file.
 
     Attributes:
-        name: name of the photo: the file's, the image's, and the suffix of its content.
-        content: JPEG or PNG as in the file.
-        camera: its lens and pose, or why there is none.
+        name: photo name: name of the file, name of the image, and suffix of the content.
+        content: JPEG or PNG data, as in the file.
+        camera: lens and pose, or the reason why they are missing.
     """
 
     name: str
@@ -56,7 +56,7 @@ def read_e57_images(path: Path) -> tuple[E57Image, ...]:
     """Read the photos of an E57 file.
 
     Raises:
-        InputError: the file is damaged, or holds no photos.
+        InputError: the file is damaged, or contains no photos.
         PluginError: the library for E57 is missing.
     """
     pye57 = load_library("pye57", path)
@@ -76,7 +76,7 @@ def read_e57_images(path: Path) -> tuple[E57Image, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class E57ImageCount:
-    """The number of images of an E57 file, and how many of them have lens and pose."""
+    """Number of images in an E57 file, and number of those with lens and pose."""
 
     n_images: int = 0
     n_posed: int = 0
@@ -108,7 +108,7 @@ def _children(vector: Any) -> Iterator[Any]:
 
 
 def _image(path: Path, index: int, node: Any) -> Iterator[E57Image]:
-    """Yield the photo of an image, or none without a JPEG or PNG."""
+    """Yield the photo of an image; nothing if it has no JPEG or PNG data."""
     for kind in _REPRESENTATIONS:
         field = f"{kind}Representation"
         shown = node[field] if node.isDefined(field) else None
@@ -121,7 +121,7 @@ def _image(path: Path, index: int, node: Any) -> Iterator[E57Image]:
 
 
 def _is_whole(shown: Any) -> bool:
-    """Whether a spherical image covers the sphere, to half a pixel."""
+    """Whether a spherical image covers the whole sphere, within half a pixel."""
     width, height, across, up = (
         number_of(shown[name])
         for name in ("imageWidth", "imageHeight", "pixelWidth", "pixelHeight")

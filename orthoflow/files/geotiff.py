@@ -1,9 +1,9 @@
-"""GeoTIFF in the plane of a wall: one-band rasters and cloud-optimised orthoimages.
+"""GeoTIFF files in the plane of a wall: single-band rasters and cloud-optimised orthoimages.
 
-X is metres along the wall from its left edge and Y the height, or world x and y of floors and
-ceilings, in a local metric coordinate system of the wall's own, pixel-is-area; rasters of level
-planes may be in a map instead, X to the east and Y to the north. `WallFrame.raster_axes` decides.
-Equal rasters give equal bytes.
+The coordinates are local, in metres, pixel-is-area. For walls, X runs along the wall from its left
+edge and Y is the height; for floors and ceilings, they are x and y of the world. Rasters of level
+planes can be in map coordinates instead (easting, northing). `WallFrame.raster_axes` decides.
+Identical rasters give identical bytes.
 """
 
 from __future__ import annotations
@@ -35,30 +35,30 @@ if TYPE_CHECKING:
     from rasterio.transform import Affine
     from rasterio.windows import Window
 
-# Exactly as GDAL reads it back from a GeoTIFF, so that other references to it match.
+# Exactly as GDAL returns it from a GeoTIFF, so that comparisons with it succeed.
 _LOCAL_CRS_WKT: Final = (
     'LOCAL_CS["{},'
     ' metres",UNIT["metre",1,AUTHORITY["EPSG","9001"]],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
 )
 SITE_CRS: Final = "site"
-# Placeholder for the id of the run, which products do not know before their files are published.
+# Placeholder for the run id, which is not known before files are published.
 _ANY_RUN: Final = "00000000-000000-000000"
 SITE_CRS_WKT: Final = _LOCAL_CRS_WKT.format("coordinates of the scan")
 _NAMED_SUFFIXES: Final = (".tif", ".json", ".geojson", ".html")
 _NO_NAME: Final = re.compile(r"[^\w .,()-]", re.ASCII)
-# Data that are read are kept in memory, with copies.
+# The data are kept in memory, with copies.
 #: pixels of an imported orthoimage
 MOST_CELLS: Final = 1 << 28
 #: bands of an imported orthoimage
 MOST_BANDS: Final = 4
 TILE_PX: Final = 512
 _CACHE_BYTES: Final = 1 << 27
-# Maximum compression ratio that a small file may state: deflate has at most 1032 to 1.
+# Maximum compression ratio that a file may declare; deflate reaches at most 1032 to 1.
 _LARGEST_RATIO: Final = 1100
 _LONGEST_CRS: Final = 100
 _SIDES_M: Final = (1e-6, 1e6)
 _ALWAYS_ALLOWED_VALUES: Final = 64 << 20
-# Types of single bands, and their values for no data.
+# Data types of single bands, and their nodata values.
 _NOTHING: Final = {"float32": math.nan, "int16": -1, "int32": -1, "uint8": None}
 
 
@@ -66,7 +66,7 @@ _COG_OPTIONS: Final[dict[str, object]] = {
     "compress": "DEFLATE",
     "predictor": "YES",
     "blocksize": TILE_PX,
-    # The driver makes overviews itself; odd factors with a mask crashed older builds.
+    # The driver creates the overviews: odd factors with a mask crashed older builds.
     "overviews": "AUTO",
     "resampling": "AVERAGE",
 }
@@ -77,10 +77,10 @@ class GridPlace:
     """The position of a raster in its coordinate system.
 
     Attributes:
-        gsd_m: side of a cell in metres.
+        gsd_m: cell size in metres.
         corner_m: X and Y of the outer corner of the top-left cell.
         crs: an EPSG code, `site`, or the name of a local system.
-        down: change of Y per metre down the rows, -1 or 1.
+        down: change of Y per metre from row to row, -1 or 1.
     """
 
     gsd_m: float
@@ -90,7 +90,7 @@ class GridPlace:
 
     @classmethod
     def of(cls, frame: WallFrame) -> Self:
-        """Return the position of the raster of a wall."""
+        """Return the position of a wall's raster."""
         return cls(
             gsd_m=frame.gsd_m,
             corner_m=frame.raster_corner_m,
@@ -104,11 +104,11 @@ class RasterFile:
     """The content of a GeoTIFF.
 
     Attributes:
-        values: (rows, cols) for one band, (rows, cols, bands) for more; stored type.
+        values: (rows, cols) for one band, (rows, cols, bands) for several; stored type.
         shown: (rows, cols) True where the dataset mask is valid.
-        place: its position; the coordinate system is not included.
-        tags: the dataset's tags.
-        crs_wkt: coordinate system, as GDAL gives it.
+        place: position of the raster; its coordinate system is not included.
+        tags: tags of the dataset.
+        crs_wkt: coordinate system, as returned by GDAL.
     """
 
     values: NDArray[np.generic]
@@ -119,20 +119,20 @@ class RasterFile:
 
 
 def local_crs_name(name: str) -> str:
-    """Name of the coordinate system of a wall in a run, to be completed by `name_run`."""
+    """Return the name of a wall's coordinate system; `name_run` later inserts the run id."""
     return f"run {_ANY_RUN} {re.sub(_NO_NAME, '_', name)}"
 
 
 def local_crs_wkt(name: str) -> str:
-    """Return the WKT of the coordinate system of a wall, by its name."""
+    """Return the WKT of a wall's coordinate system, from the name of the wall."""
     return _LOCAL_CRS_WKT.format(local_crs_name(name))
 
 
 def name_run(path: Path, run_id: str) -> None:
-    """Insert the id of a run into the names of the coordinate systems of a published file.
+    """Insert a run id into the names of the coordinate systems in a published file.
 
-    The files that products publish are the same for every run; this makes them specific. An id of
-    another length than orthoflow's is cut or padded, so that no offset in the file changes.
+    Products publish the same bytes in every run; the id makes the names unique. An id of another
+    length than orthoflow's is cut or padded, so that no offset in the file changes.
     """
     if path.suffix not in _NAMED_SUFFIXES or path.stat().st_size == 0:
         return
@@ -146,13 +146,13 @@ def name_run(path: Path, run_id: str) -> None:
 
 
 def require_map_crs(crs: str) -> None:
-    """Refuse coordinate systems that are not maps in metres.
+    """Refuse coordinate systems that are not map projections in metres.
 
     Raises:
-        InputError: there is no such coordinate system, or it is not in metres.
+        InputError: the coordinate system is unknown, or not in metres.
     """
     found = _map_crs(crs)
-    # For a local system GDAL states the unit, but not that it is projected.
+    # For the local system of the site, GDAL reports the unit, but not a projection.
     if crs != SITE_CRS and not (found.is_projected and found.linear_units_factor[1] == 1.0):
         raise InputError(
             f"{crs} is not a coordinate system in metres: expected a projected one, such as "
@@ -161,12 +161,12 @@ def require_map_crs(crs: str) -> None:
 
 
 def epsg_of(map_crs: str | None) -> int | None:
-    """Return the EPSG code of a map's coordinate system; None for `site` and any other text.
+    """Return the EPSG code of a map coordinate system; None for `site` and any other text.
 
     >>> epsg_of("EPSG:25832"), epsg_of("site"), epsg_of(None)
     (25832, None, None)
     """
-    # GDAL also accepts paths and addresses as coordinate systems, and a record may contain any.
+    # GDAL also accepts paths and URLs as coordinate systems, and records may contain any text.
     found = re.fullmatch(r"EPSG:([0-9]{4,6})", map_crs or "", re.IGNORECASE)
     return int(found[1]) if found else None
 
@@ -187,7 +187,7 @@ def _map_crs(crs: str) -> CRS:
     """Return the coordinate system of a map.
 
     Raises:
-        InputError: there is none of that name.
+        InputError: it does not exist.
     """
     from rasterio.crs import CRS
     from rasterio.errors import CRSError
@@ -214,16 +214,15 @@ def write_raster(
     place: GridPlace,
     tags: Mapping[str, str],
 ) -> None:
-    """Write one band: values with NaN for no data, labels with -1 for it, or classes.
+    """Write a single-band raster: values, labels or classes, a row of tiles at a time.
 
-    It is written band by band of rows.
+    No data is NaN for values and -1 for labels; classes have no nodata value.
 
     Args:
-        path: file to write; its folder exists.
-        values: (rows, cols) float32, int16 or int32 labels, or uint8 classes, which have no value
-            for no data.
+        path: output file in an existing folder.
+        values: (rows, cols) float32 values, int16 or int32 labels, or uint8 classes.
         place: position of the raster.
-        tags: text stored with the raster.
+        tags: texts stored in the file.
 
     Raises:
         StoreError: the file cannot be written.
@@ -256,15 +255,15 @@ def write_orthoimage(
 ) -> None:
     """Write a cloud-optimised RGB GeoTIFF with overviews and an internal dataset mask.
 
-    It is written band by band, so that arrays mapped from files need not fit into memory; an
-    uncompressed copy exists beside the file while it is written.
+    The file is written a row of tiles at a time, so memory-mapped arrays may be larger than memory;
+    meanwhile, an uncompressed copy exists next to it.
 
     Args:
-        path: file to write; its folder exists.
-        rgb: (rows, cols, 3), 8 or 16 bits, which the file has, too.
+        path: output file in an existing folder.
+        rgb: (rows, cols, 3) with 8 or 16 bits, which the file keeps.
         shown: (rows, cols) True where the image has content (painted or filled).
         place: position of the raster.
-        tags: text stored with the image.
+        tags: texts stored in the file.
         icc_profile: colour profile; None for sRGB or unknown.
 
     Raises:
@@ -278,7 +277,7 @@ def write_orthoimage(
         )
     from rasterio.shutil import copy
 
-    # The driver of cloud-optimised files copies another.
+    # The driver for cloud-optimised files can only copy another file.
     plain = path.with_name(f"{path.name}.plain")
     profile = {"count": 3, "dtype": rgb.dtype.name} | _placed(shown.shape, place)
     try:
@@ -302,7 +301,7 @@ def _rows(window: Window) -> slice:
 
 
 def _require_written(path: Path, values: NDArray[np.generic]) -> None:
-    """Read the file back: if the disk is full at closing, GDAL only logs it."""
+    """Read the file back: if the disk is full when closing the file, GDAL only logs it."""
     import rasterio
 
     with rasterio.open(path) as dataset:
@@ -316,13 +315,13 @@ def _require_written(path: Path, values: NDArray[np.generic]) -> None:
 def world_file_text(place: GridPlace, *, rows: float = 1.0, columns: float = 1.0) -> str:
     """Return the world file of a wall's raster, for programs that do not read GeoTIFF tags.
 
-    Six lines: step along a row, two rotations, step down a column, and the centre of the first
-    pixel.
+    Its six lines are the step along a row, two rotations, the step down a column, and the centre of
+    the first pixel.
 
     Args:
         place: position of the raster.
-        rows: rows of cells that a pixel covers; more than one for a preview.
-        columns: columns of cells that a pixel covers.
+        rows: rows of cells per pixel; more than one for a preview.
+        columns: columns of cells per pixel.
     """
     across_m, down_m = columns * place.gsd_m, place.down * rows * place.gsd_m
     first = (place.corner_m[0] + 0.5 * across_m, place.corner_m[1] + 0.5 * down_m)
@@ -331,15 +330,15 @@ def world_file_text(place: GridPlace, *, rows: float = 1.0, columns: float = 1.0
 
 
 def read_raster(path: Path) -> RasterFile:
-    """Read a GeoTIFF that orthoflow or another program wrote.
+    """Read a GeoTIFF from orthoflow or another program.
 
     Raises:
-        InputError: GDAL cannot read the file, it is too large, or its cells are not square and
-            upright.
+        InputError: GDAL cannot read the file, it is too large, or its cells are not square or not
+            aligned with the axes.
     """
     with RasterParts(path) as raster:
         rows, columns = raster.shape
-        # What a small file can state and no orthoimage has, before memory is allocated.
+        # Check the declared size before memory is allocated.
         if rows * columns > MOST_CELLS or raster.bands > MOST_BANDS:
             raise InputError(
                 f"{path.name} is too large: {columns} x {rows} cells in {raster.bands} bands, at "
@@ -355,7 +354,7 @@ def read_raster(path: Path) -> RasterFile:
 
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """Turn what GDAL raises while it reads a file into a sentence.
+    """Convert errors of GDAL while reading a file into an error about the file.
 
     Raises:
         InputError: the file cannot be read.
@@ -367,28 +366,28 @@ def _reading(path: Path) -> Iterator[None]:
         with quiet(), rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES):
             yield
     except (RasterioError, OSError, UnicodeDecodeError) as error:
-        # UnicodeDecodeError: GDAL's messages and tags contain bytes of the file.
+        # UnicodeDecodeError: GDAL's messages and tags can contain bytes of the file.
         raise InputError(
             f"{path} cannot be read as a GeoTIFF: {error}; expected a whole TIFF file"
         ) from error
 
 
 class RasterParts:
-    """A GeoTIFF of any size that is read in parts, at the requested resolution.
+    """A GeoTIFF of any size, read in parts and at the requested resolution.
 
     Attributes:
         shape: rows and columns.
-        place: its position; the coordinate system is not included.
+        place: position of the raster; its coordinate system is not included.
         bands: number of bands.
-        dtype: numpy's name of the stored type.
+        dtype: numpy name of the stored type.
     """
 
     def __init__(self, path: Path) -> None:
         """Open a file.
 
         Raises:
-            InputError: GDAL cannot read it, its cells are not square and upright, or there are more
-                than the file can hold.
+            InputError: GDAL cannot read the file, its cells are not square or not aligned with the
+                axes, or it declares more cells than its size allows.
         """
         import rasterio
 
@@ -408,7 +407,7 @@ class RasterParts:
 
     @property
     def gsd_m(self) -> float:
-        """Return the side of a cell in metres."""
+        """Return the cell size in metres."""
         return self.place.gsd_m
 
     @property
@@ -428,8 +427,8 @@ class RasterParts:
         """Read a part, averaged to fewer pixels.
 
         Args:
-            cells: left, top, right and bottom of the part, in cells, fractions allowed.
-            shape: requested rows and columns, at most as many as cells.
+            cells: left, top, right and bottom of the part in cells, possibly fractional.
+            shape: requested rows and columns, at most the number of cells.
 
         Returns:
             (rows, cols[, bands]) values, and (rows, cols) True where the file has content.
@@ -449,7 +448,7 @@ class RasterParts:
         return values, shown > 0
 
     def header(self) -> RasterPlace:
-        """Return what the file states of itself."""
+        """Return the metadata of the file."""
         from rasterio.warp import transform
 
         dataset = self._dataset
@@ -476,12 +475,12 @@ class RasterParts:
 
 
 def check_header(path: Path, dataset: DatasetReader) -> None:
-    """Refuse a file that references others, or states more than any file of its size can hold.
+    """Refuse a file that references other files, or declares more data than its size allows.
 
     Raises:
-        InputError: it does.
+        InputError: it is such a file.
     """
-    # GDAL reads reduced scales from there, even from the network.
+    # GDAL would read overviews from that file, even over the network.
     if dataset.tags(ns="OVERVIEWS"):
         raise InputError(
             f"{path.name} names another file for its overviews: expected a TIFF file that needs "
@@ -497,7 +496,7 @@ def check_header(path: Path, dataset: DatasetReader) -> None:
 
 
 def _gsd_m(path: Path, transform: Affine) -> float:
-    """Side of square cells whose X grows to the right and whose Y grows along the columns."""
+    """Return the size of square cells with X along the rows and Y along the columns."""
     side = float(transform.a)
     limit = 1e-6 * abs(side)
     if (
@@ -538,7 +537,7 @@ def _write(
     tags: Mapping[str, str],
     icc_profile: bytes | None = None,
 ) -> None:
-    """Write a tiled GeoTIFF of values (rows, cols, bands), a row of tiles at a time."""
+    """Write (rows, cols, bands) values to a tiled GeoTIFF, a row of tiles at a time."""
     import rasterio
     from rasterio.enums import ColorInterp
 
@@ -559,7 +558,7 @@ def _write(
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Convert messages of GDAL or the disk while a file is written into a sentence.
+    """Convert errors of GDAL or the disk while writing a file into an error about the file.
 
     Raises:
         StoreError: the file cannot be written.
@@ -576,10 +575,10 @@ def writing(path: Path) -> Iterator[None]:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Restrict GDAL to the file itself, and keep rasterio's advice from the user's terminal.
+    """Restrict GDAL to the file itself, and hide rasterio's warnings from the user.
 
-    Masks are written into it. Overviews, masks and metadata beside a file are ignored: they are not
-    part of its digest, and may reference any other file, even in the network.
+    Masks are written into the file. Overviews, masks and metadata in separate files are ignored:
+    they are not part of its digest, and may reference any other file, even on the network.
     """
     import rasterio
 
@@ -592,10 +591,10 @@ def quiet() -> Iterator[None]:
 
 @cache
 def let_go_of_untrusted_text() -> None:
-    """Print no traceback if rasterio cannot decode a part of a file that GDAL quotes.
+    """Suppress tracebacks if rasterio cannot decode bytes of a file in a message of GDAL.
 
-    It tries this in a callback, which cannot raise, and so prints the error in both of Python's
-    ways. GDAL's own error about the file is raised afterwards.
+    This happens in a callback, which cannot raise, so Python prints the error through both hooks.
+    GDAL's own error about the file is raised afterwards.
     """
     log_unraisable, show_exception = sys.unraisablehook, sys.excepthook
 
@@ -607,7 +606,7 @@ def let_go_of_untrusted_text() -> None:
     def show_others(
         kind: type[BaseException], error: BaseException, trace: TracebackType | None
     ) -> None:
-        # An exception that ends a program has passed through a line of it.
+        # An error that ends the program has a traceback.
         if not (trace is None and isinstance(error, UnicodeDecodeError)):
             show_exception(kind, error, trace)
 
@@ -616,19 +615,19 @@ def let_go_of_untrusted_text() -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class RasterPlace:
-    """The header of a GeoTIFF.
+    """The metadata of a GeoTIFF.
 
     Attributes:
         shape: rows and columns.
-        transform: six numbers, X of the column, X of the row, X of the corner, and so for Y.
-        epsg: code of the coordinate system, None for one without a code.
-        wkt: coordinate system, as GDAL gives it.
+        transform: six numbers: X per column, X per row, X of the corner, and the same for Y.
+        epsg: code of the coordinate system, or None.
+        wkt: coordinate system, as returned by GDAL.
         wkt2: the same as WKT 2.
         bounds: smallest X and Y, largest X and Y, in the coordinate system.
         outline_lonlat: corners on Earth, counter-clockwise and closed, longitude and latitude in
             degrees; empty if the coordinate system has no position on Earth.
-        bands: type of each band.
-        tags: the dataset's tags.
+        bands: data type of each band.
+        tags: tags of the dataset.
     """
 
     shape: tuple[int, int]
@@ -643,11 +642,11 @@ class RasterPlace:
 
 
 def place_of(path: Path) -> RasterPlace:
-    """Read the header of a GeoTIFF.
+    """Read the metadata of a GeoTIFF.
 
     Raises:
-        InputError: GDAL cannot read the file, its cells are not square and upright, or it states
-            more than any file of its size can hold.
+        InputError: GDAL cannot read the file, its cells are not square or not aligned with the
+            axes, or it declares more data than its size allows.
     """
     with RasterParts(path) as raster:
         return raster.header()

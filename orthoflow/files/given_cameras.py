@@ -1,7 +1,7 @@
-"""Orientations of photos from other programs, converted from their conventions into ours.
+"""Photo orientations from other programs, converted to orthoflow's conventions.
 
-The results have our axes (x right, y down, z forward) and our pixels (first centre at 0.5, 0.5), in
-the world of the file. `camera_formats` chooses the reader.
+The results have orthoflow's axes (x right, y down, z forward) and pixel coordinates (centre of the
+first pixel at (0.5, 0.5)), in the world of the file. `camera_formats` chooses the reader.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from orthoflow.files.photo_files import MOST_PIXELS
 from orthoflow.products import Intrinsics
 from orthoflow.untrusted_text import open_text, reading, text_of_file
 
-# Limits for models with the observations of each photo, which are read line by line, and for other
-# files.
+# Larger limits for models that contain the observations of each photo, as they are read line by
+# line; smaller ones for other files.
 #: bytes of a file of a COLMAP model, or Bundler's
 MOST_MODEL_BYTES: Final = 500_000_000
 #: bytes of a file of cameras (`cameras.json`, Metashape's XML, RealityCapture's list)
@@ -42,28 +42,29 @@ _WHAT: Final = "a file of cameras"
 MOST_CAMERAS: Final = 100_000
 _LONGEST_NUMBER: Final = 12
 _ORTHONORMAL: Final = 1e-4
-# A lens this close to another one is equivalent for any matcher; beyond the other limit its error
-# is visible in an orthoimage.
+# A lens that differs by no more is equivalent for matching; beyond the other limit the error is
+# visible in an orthoimage.
 NEGLIGIBLE_PX: Final = 0.05
-#: error in pixels of what a file of cameras states and cannot be represented
+#: error in pixels due to lens terms of a file of cameras that cannot be represented
 MAX_LEFT_OUT_PX: Final = 0.5
 _FEWEST_DIRECTIONS: Final = 30
 _FAR_PX: Final = 1e4
 _WIDEST_FITTED_DEG: Final = 355.0
-# Of OpenCV's lenses: k1, k2, p1, p2, k3, and k1 to k4, p1, p2.
+# Number of terms in OpenCV's models: k1, k2, p1, p2, k3; and k1 to k4, p1, p2.
 _BROWN_TERMS, _FISHEYE_TERMS = 5, 6
 
 
 @dataclass(frozen=True, kw_only=True)
 class CentredLens:
-    """A lens whose file does not state the photo's size, and counts from the photo's centre.
+    """A lens from a file that does not contain the photo's size and measures from its centre.
 
     Attributes:
         focal_px: focal length in pixels, or None if it is relative to the photo's longer side.
-        focal_share: focal length as a share of the photo's longer side, or None.
-        off_middle: principal point from the middle, right and down, in shares of that side.
+        focal_share: focal length as a fraction of the photo's longer side, or None.
+        off_middle: principal point relative to the centre, right and down, as a fraction of that
+            side.
         radial: k1, k2, k3, k4.
-        tangential: two terms whose order and signs the file does not define; they are omitted.
+        tangential: two terms whose order and signs the file does not define; they are ignored.
     """
 
     focal_px: float | None = None
@@ -73,7 +74,7 @@ class CentredLens:
     tangential: tuple[float, ...] = (0.0, 0.0)
 
     def of_size(self, width: int, height: int) -> tuple[Intrinsics | FisheyeLens, float]:
-        """Lens for a photo of this size, and the largest omitted distortion in pixels."""
+        """Return the lens for a photo of this size, and the largest ignored distortion in px."""
         longest = max(width, height)
         focal = self.focal_px or (self.focal_share or 0.0) * longest
         terms = {f"k{n}": term for n, term in enumerate(self.radial, start=1)}
@@ -89,17 +90,17 @@ class CentredLens:
 
 @dataclass(frozen=True, kw_only=True)
 class GivenCamera:
-    """The orientation of one photo as in a file.
+    """The orientation of one photo, as in a file.
 
     Attributes:
-        name: name of the photo, with the folders that the file states, separated by slashes; some
-            programs omit its suffix.
-        lens: interior orientation, if the file states it.
-        rotation: (3, 3) camera_from_world; None if the file only states why there is none.
+        name: photo name, including folders in the file, separated by slashes; some programs omit
+            the suffix.
+        lens: interior orientation, or None if the file does not contain it.
+        rotation: (3, 3) camera_from_world; None if the file only gives the reason for its absence.
         translation: (3,) camera_from_world, in the unit of the file.
-        sigma_wall_m: predicted error on the wall, if the file states it.
-        reason: why the photo has no orientation; empty if it has one.
-        note: what was approximated or converted; empty if nothing.
+        sigma_wall_m: predicted error on the wall, or None if the file does not contain it.
+        reason: reason why the photo has no orientation; empty if it has one.
+        note: remarks on approximations and conversions; may be empty.
     """
 
     name: str
@@ -111,7 +112,7 @@ class GivenCamera:
     note: str = ""
 
     def of_face(self, face: str) -> GivenCamera:
-        """Return the camera of a face of the cube of a wide photo."""
+        """Return the camera of a cube face of a wide photo."""
         if not isinstance(self.lens, WideLens) or self.rotation is None:
             return self
         problem = problem_of(self.lens)
@@ -130,20 +131,19 @@ class GivenCamera:
 
 
 def text_of(path: Path) -> str:
-    """Return the text of a file of cameras.
+    """Return the text of a camera file.
 
     Raises:
-        InputError: it cannot be read, is not text, or is larger than any such file.
+        InputError: the file cannot be read, is not text, or is too large.
     """
     return text_of_file(path, MOST_BYTES, _WHAT)
 
 
 def lines_of(path: Path) -> Iterator[str]:
-    """Yield the lines of a model, without their line ends.
+    """Yield the lines of a model, without line ends.
 
     Raises:
-        InputError: it cannot be read, is not text, is larger than any such file, or has a longer
-            line.
+        InputError: the file cannot be read, is not text, is too large, or has too long a line.
     """
     with reading(path, MOST_MODEL_BYTES, _WHAT), open_text(path) as stream:
         while line := stream.readline(MOST_LINE):
@@ -158,7 +158,7 @@ def photo_path(text: str) -> str:
 
 
 def normalised_grid(lens: Intrinsics) -> NDArray[np.float64]:
-    """Return positions (n, 2) in front of a lens, as x / z and y / z, that cover its image."""
+    """Return points (n, 2) that cover the image of a lens, as x / z and y / z."""
     u, v = np.meshgrid(np.linspace(0, lens.width, 25), np.linspace(0, lens.height, 19))
     return np.column_stack([(u.ravel() - lens.cx) / lens.fx, (v.ravel() - lens.cy) / lens.fy])
 
@@ -166,15 +166,15 @@ def normalised_grid(lens: Intrinsics) -> NDArray[np.float64]:
 def lens_of_terms(
     terms: Mapping[str, float], width: int, height: int, *, is_fisheye: bool = False
 ) -> tuple[Intrinsics | FisheyeLens, float]:
-    """Return the lens of another program's terms, the nearest of ours where we lack some of them.
+    """Return the lens for another program's parameters, approximated where our model lacks some.
 
     Args:
-        terms: `fx`, `fy`, `cx`, `cy` and `skew` in pixels; `k1` to `k4`, `p1` and `p2` as OpenCV
-            has them; `p3` and `p4`: the tangential terms are multiplied by 1 + p3 r^2 + p4 r^4.
-            Missing ones are 0.
-        width: pixels.
-        height: pixels.
-        is_fisheye: they are terms of the angle off the axis.
+        terms: `fx`, `fy`, `cx`, `cy` and `skew` in pixels; `k1` to `k4`, `p1` and `p2` as in
+            OpenCV; with `p3` and `p4`, the tangential terms are multiplied by
+            1 + p3 r^2 + p4 r^4. Missing parameters are 0.
+        width: image width in pixels.
+        height: image height in pixels.
+        is_fisheye: the distortion is a function of the angle from the axis.
 
     Returns:
         The lens, which may be invalid, and its largest deviation in pixels.
@@ -194,7 +194,7 @@ def lens_of_terms(
     xy = normalised_grid(start)
     rays = np.column_stack([xy, np.ones(len(xy))])
     if is_fisheye:
-        # Here a position of the grid is an angle off the axis.
+        # For a fisheye, the positions of the grid are angles from the axis.
         theta = np.hypot(*xy.T)[:, None]
         rays = np.column_stack([xy * np.sinc(theta / np.pi), np.cos(theta)])
     x, y = xy.T
@@ -210,7 +210,7 @@ def lens_of_terms(
 def _fisheye(
     start: Intrinsics, terms: Sequence[float], field_of_view_deg: float, skew: float = 0.0
 ) -> FisheyeLens:
-    """Return a fisheye of the size, focal length and principal point of another lens."""
+    """Return a fisheye lens with the size, focal length and principal point of another lens."""
     return FisheyeLens(
         width=start.width,
         height=start.height,
@@ -228,15 +228,16 @@ def _fisheye(
 def nearest_lens(
     start: Intrinsics, rays: NDArray[np.float64], pixels: NDArray[np.float64]
 ) -> tuple[Intrinsics | FisheyeLens, float]:
-    """Return our lens nearest to another program's, and the deviation in pixels.
+    """Return the lens in our models closest to another program's, and its deviation in pixels.
 
     Args:
         start: focal length, principal point and size of the other lens.
         rays: (n, 3) directions that cover its image.
-        pixels: (n, 2) their pixels.
+        pixels: (n, 2) pixels of these directions.
 
     Returns:
-        OpenCV's model, or its fisheye if that deviates too much; the largest deviation.
+        The lens in OpenCV's model, or in its fisheye model if the former deviates too much, and
+        its largest deviation.
     """
     from scipy.optimize import least_squares
 
@@ -274,7 +275,7 @@ def nearest_lens(
 def lens_or_reason(
     whose: str, lens: Intrinsics | FisheyeLens, worst_px: float, way_out: str
 ) -> tuple[Intrinsics | FisheyeLens | str, str]:
-    """Return a lens with a note of omitted terms, or the reason why it cannot be used."""
+    """Return a lens and a note on ignored terms, or the reason why the lens cannot be used."""
     if worst_px <= NEGLIGIBLE_PX:
         return lens, ""
     size = f"{worst_px:.2g} pixels" if worst_px < _FAR_PX else "more than any pixels"
@@ -284,16 +285,16 @@ def lens_or_reason(
 
 
 def damaged(path: Path, what: str, line: int | None = None) -> InputError:
-    """Return the error for an invalid file of cameras."""
+    """Return the error for an invalid camera file."""
     where = path.name if line is None else f"{path.name}:{line}"
     return InputError(f"{where}: {what}; export the cameras again")
 
 
 def numbers_of(texts: Sequence[str], path: Path, what: str, line: int | None = None) -> list[float]:
-    """Parse words as finite numbers.
+    """Convert words to finite numbers.
 
     Raises:
-        InputError: one of them is not a number.
+        InputError: a word is not a finite number.
     """
     try:
         values = [float(text) for text in texts]
@@ -305,13 +306,13 @@ def numbers_of(texts: Sequence[str], path: Path, what: str, line: int | None = N
 
 
 def rotation_of(values: Sequence[float], path: Path, whose: str) -> NDArray[np.float64]:
-    """Return nine numbers as the nearest rotation matrix.
+    """Return the rotation matrix closest to nine numbers.
 
     Raises:
-        InputError: they are far from one.
+        InputError: they are far from a rotation.
     """
     matrix = np.array(values, dtype=np.float64).reshape(3, 3)
-    # LAPACK may not terminate for singular values of infinity.
+    # LAPACK may not terminate if values are infinite.
     if (np.abs(matrix) <= 1.0 + _ORTHONORMAL).all():
         left, _, right = np.linalg.svd(matrix)
         rotation: NDArray[np.float64] = left @ right
@@ -321,10 +322,10 @@ def rotation_of(values: Sequence[float], path: Path, whose: str) -> NDArray[np.f
 
 
 def checked_lens(lens: Intrinsics, path: Path, whose: str) -> Intrinsics:
-    """Return a lens if it is valid.
+    """Return a lens after checking that it is valid.
 
     Raises:
-        InputError: it is not.
+        InputError: it is invalid.
     """
     values = (lens.fx, lens.fy, lens.cx, lens.cy, lens.skew or 0.0, *lens.distortion)
     if not (all(map(math.isfinite, values)) and lens.fx > 0.0 and lens.fy > 0.0):

@@ -1,4 +1,4 @@
-"""A room as binary glTF 2.0: each wall with its orthoimage, flat or in relief, in metres, y up."""
+"""A room as binary glTF 2.0: walls with orthoimages, flat or in relief, in metres, y up."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from orthoflow.version import __version__
 
 # Largest texture that the graphics of current phones support.
 LONGEST_TEXTURE_PX: Final = 4096
-# Browsers open pages of some hundred megabytes; text encoding adds a third.
+# Browsers can open pages of some hundred megabytes; base64 adds a third.
 _INSIDE_MOST_BYTES: Final = 1 << 27
 _COMPONENTS: Final = {"float32": 5126, "uint16": 5123, "uint32": 5125}
 _VERTICES, _INDICES = 34962, 34963
@@ -39,19 +39,18 @@ def write_room(
     up: NDArray[np.float64],
     depths: Mapping[int, Path] | None = None,
 ) -> None:
-    """Write the walls; memory holds one texture at a time beside the file.
+    """Write the walls; one texture at a time is in memory, besides the file itself.
 
-    A wall is a node with a matrix: its vertices are metres on the wall, its matrix places it
-    relative to `extras.offset_world` of the root, which makes the world's up y. So large survey
-    coordinates stay out of the 32 bits of vertices. Empty cells are transparent; seen from behind,
-    a wall is invisible.
+    Each wall is a node with a matrix. Its vertices are in metres on the wall; the matrix positions
+    them relative to `extras.offset_world` of the root and makes the world's up direction y, so that
+    large survey coordinates need not fit into 32-bit vertices. Empty cells are transparent; a wall
+    seen from behind is invisible.
 
     Args:
         path: output file, `.glb`.
-        orthos: at least one.
-        up: (3,) unit vector of the world.
-        depths: GeoTIFF of the depths of each wall, by number, for walls in relief; without them
-            walls are flat.
+        orthos: the orthoimages, at least one.
+        up: (3,) unit vector of the world's up direction.
+        depths: GeoTIFF of depths by wall number, for walls in relief; walls without one are flat.
 
     Raises:
         StoreError: the file cannot be written.
@@ -82,13 +81,13 @@ def write_room(
 
 
 def write_page(path: Path, model: Path) -> None:
-    """Write a page that shows a model without a server: the model is embedded, up to some size.
+    """Write a page that shows a model without a server; a small model is embedded.
 
-    For a larger or unreadable one, the page asks for the file.
+    For a large or unreadable model, the page asks for the file.
 
     Args:
         path: output file, `.html`.
-        model: a file of `write_room`.
+        model: a file written by `write_room`.
 
     Raises:
         StoreError: the file cannot be written.
@@ -101,7 +100,7 @@ def write_page(path: Path, model: Path) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Document:
-    """A glTF document under construction, and its binary data."""
+    """A glTF document under construction, with its binary data."""
 
     data: bytearray = field(default_factory=bytearray)
     views: list[JsonValue] = field(default_factory=list)
@@ -112,7 +111,7 @@ class _Document:
     nodes: list[JsonValue] = field(default_factory=list)
 
     def add_wall(self, ortho: OrthoFile, offset: NDArray[np.float64], depth: Path | None) -> int:
-        """Add mesh, texture and node of a wall; return the node's number."""
+        """Add the mesh, texture and node of a wall; return the number of the node."""
         frame = ortho.frame
         mesh = flat_mesh(frame) if depth is None else relief_mesh(frame, depth)
         attributes: dict[str, JsonValue] = {"POSITION": self._array(mesh.vertices, "VEC3")}
@@ -149,7 +148,7 @@ class _Document:
                 },
             }
         )
-        # The root comes first.
+        # The root is node 0.
         return len(self.nodes)
 
     def finished(self, root: dict[str, JsonValue]) -> bytes:
@@ -199,7 +198,7 @@ class _Document:
             },
             "extensions": {"KHR_materials_unlit": {}},
         }
-        # Colours are those of photos, which are already lit.
+        # No shading: photos contain the actual lighting.
         if not is_whole:
             material |= {"alphaMode": "MASK", "alphaCutoff": 0.5}
         self.materials.append(material)
@@ -225,28 +224,28 @@ class _Document:
             "byteLength": len(content),
         }
         self.views.append(view if target is None else {**view, "target": target})
-        # Each begins at a multiple of four bytes, and so does what follows the last.
+        # Each view begins at a multiple of four bytes, and the data end at one.
         self.data.extend(content + bytes(-len(content) % 4))
         return len(self.views) - 1
 
 
 def _columns(matrix: NDArray[np.float64]) -> JsonValue:
-    """Return sixteen numbers column by column, as glTF requires for matrices."""
+    """Return the sixteen numbers column by column, as glTF requires for matrices."""
     return numbers(matrix.T.ravel())
 
 
-# Along the longest side of a wall; some 300,000 triangles, which phones can still display.
+# Along the longer side of a wall: about 300,000 triangles, which phones can still display.
 LONGEST_NODES: Final = 512
 
 
 @dataclass(frozen=True, kw_only=True)
 class WallMesh:
-    """Triangles of a wall, from the top-left corner of its raster.
+    """Triangles of a wall, relative to the top-left corner of its raster.
 
     Attributes:
-        vertices: (n, 3) float32 metres: x to the right, y upwards, z towards the viewer.
-        places: (n, 2) float32 in the picture of the wall, (0, 0) top-left to (1, 1).
-        triangles: (m, 3) vertices, counterclockwise for the viewer; uint16 or uint32.
+        vertices: (n, 3) float32 metres: x right, y up, z towards the viewer.
+        places: (n, 2) float32 texture coordinates, from (0, 0) top-left to (1, 1).
+        triangles: (m, 3) vertex indices, counterclockwise for the viewer; uint16 or uint32.
     """
 
     vertices: NDArray[np.float32]
@@ -265,17 +264,17 @@ def flat_mesh(frame: WallFrame) -> WallMesh:
 
 
 def relief_mesh(frame: WallFrame, depth: Path) -> WallMesh:
-    """Return the surface of a wall; its rectangle if no depth is known.
+    """Return the surface of a wall, or its rectangle if no depth is known.
 
-    Nodes are means of cells, at most `LONGEST_NODES` along a side. Triangles with a node of unknown
-    depth are omitted; steps become slopes one node wide.
+    Nodes are averages of cells, at most `LONGEST_NODES` along a side. Triangles with a node of
+    unknown depth are omitted; depth steps become slopes one node wide.
 
     Args:
-        frame: of the wall.
-        depth: GeoTIFF of its depths in metres, towards the viewer.
+        frame: frame of the wall.
+        depth: GeoTIFF of its depths in metres, positive towards the viewer.
 
     Raises:
-        InputError: the file cannot be read, or has other cells than the wall.
+        InputError: the file cannot be read, or its size differs from the wall's.
     """
     rows, columns = frame.shape
     factor = max(1.0, max(rows, columns) / LONGEST_NODES)
@@ -306,7 +305,7 @@ def relief_mesh(frame: WallFrame, depth: Path) -> WallMesh:
 
 
 def _places(count: int) -> NDArray[np.float32]:
-    """Positions of nodes of a side, 0 to 1: at the centre of their cells, the outer at its ends."""
+    """Return positions of nodes along a side, 0 to 1: cell centres, except at both ends."""
     places = (np.arange(count) + 0.5) / count
     places[0], places[-1] = 0.0, 1.0
     return places.astype(np.float32)

@@ -1,7 +1,7 @@
-"""Photos and pictures as bytes: decode, encode, and small previews for the report.
+"""Encoding and decoding of photos and pictures, and small previews for the report.
 
-Arrays are RGB in this interface; OpenCV's BGR stays inside. Nothing here applies the EXIF
-orientation: the pixel frame is the stored array.
+Arrays are RGB; OpenCV's BGR is only used internally. The EXIF orientation is never applied: pixel
+coordinates refer to the stored array.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from orthoflow.products import Photo
 if TYPE_CHECKING:
     from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 
-# Suffixes of photos; other files are not photos, or must be converted first.
+# Suffixes of photos; files with other suffixes are not photos, or must be converted first.
 PHOTO_SUFFIXES: Final = (
     *(".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".png", ".tif", ".tiff"),
     *(".webp", ".heic", ".heif", ".hif", ".avif"),
 )
-# Suffixes of raw photos of cameras.
+# Suffixes of camera raw files.
 RAW_SUFFIXES: Final = frozenset(
     {".3fr", ".arw", ".cr2", ".cr3", ".dng", ".iiq", ".nef"}
     | {".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".srw"}
 )
 PREVIEW_SIDE_PX: Final = 1600
-# Larger images are averaged before they are reduced, this many rows of the result at a time.
+# Larger images are averaged before they are reduced, in bands of this many rows of the result.
 _IN_MEMORY_PX: Final = 1 << 26
 _BAND_PX: Final = 64
 STRETCH_PERCENTILES: Final = (1.0, 99.0)
@@ -50,42 +50,42 @@ STRETCH_PERCENTILES: Final = (1.0, 99.0)
 Shrunk = TypeVar("Shrunk", np.float32, np.uint8)
 Sampled = TypeVar("Sampled", bound=np.generic)
 Part = tuple[slice, slice]
-# Image (rows, cols[, 3]) of a part of a raster, and where it has content.
+# Function that returns a part of an image (rows, cols[, 3]), and where it has content.
 Cells = Callable[[Part], tuple[NDArray[np.uint8], NDArray[np.bool_]]]
 
 
 def decode_image(encoded: bytes, name: str = "image") -> NDArray[np.uint8]:
-    """Decode a JPEG, PNG, TIFF or WebP file into (rows, cols, 3) RGB of 8 bits.
+    """Decode a JPEG, PNG, TIFF or WebP file to 8-bit RGB (rows, cols, 3).
 
     Args:
-        encoded: the file's bytes.
-        name: its name in an error.
+        encoded: content of the file.
+        name: name of the image in error messages.
 
     Raises:
-        InputError: the bytes are not a JPEG, PNG, TIFF or WebP, or incomplete, or have too many
+        InputError: the data are not JPEG, PNG, TIFF or WebP, are incomplete, or have too many
             pixels.
     """
     return eight_bits(_decoded(encoded, name, is_deep=False))
 
 
 def decode_levels(encoded: bytes, name: str = "image") -> Colours:
-    """Decode as `decode_image`, but into uint16 where a PNG or TIFF file has more than 8 bits.
+    """Decode like `decode_image`, but to uint16 if a PNG or TIFF file has more than 8 bits.
 
     Raises:
-        InputError: as `decode_image`.
+        InputError: as for `decode_image`.
     """
     return _decoded(encoded, name, is_deep=True)
 
 
 def _decoded(encoded: bytes, name: str, *, is_deep: bool) -> Colours:
-    """Decode an image into RGB; a PNG of 16 bits into 8 unless `deep`."""
+    """Decode an image to RGB; a 16-bit PNG to 8 bits unless `is_deep`."""
     import cv2
 
     problem = unreadable(encoded)
     if problem:
         raise InputError(f"{name} {problem}")
     kind = photo_format(encoded)
-    # OpenCV allocates memory for a chunk of a PNG of any stated length.
+    # OpenCV allocates memory for PNG chunks of any declared length.
     if kind == "PNG" and not is_whole_png(encoded):
         raise InputError(_not_an_image(encoded, name))
     size = stated_size(encoded)
@@ -113,12 +113,12 @@ def _decoded(encoded: bytes, name: str, *, is_deep: bool) -> Colours:
 
 
 def encode_png(image: Colours) -> bytes:
-    """Encode (rows, cols) grey, (rows, cols, 3) RGB or (rows, cols, 4) RGBA as PNG, as deep."""
+    """Encode (rows, cols) grey, (rows, cols, 3) RGB or (rows, cols, 4) RGBA as PNG, same depth."""
     return _encode(".png", image, [])
 
 
 def encode_pdf(image: Colours, *, dpi: int) -> bytes:
-    """Encode a picture as a PDF with one page of its size."""
+    """Encode a picture as a PDF with one page of the picture's size."""
     from PIL import Image
 
     stream = io.BytesIO()
@@ -134,7 +134,7 @@ def encode_jpeg(image: NDArray[np.uint8], *, quality: int = 90) -> bytes:
 
 
 def encode_webp(image: NDArray[np.uint8], *, quality: int = 85) -> bytes:
-    """Encode an image as lossy WebP, which for photos takes a tenth of the bytes of PNG.
+    """Encode an image as lossy WebP, which for photos needs a tenth of the bytes of PNG.
 
     Args:
         image: (rows, cols) grey, (rows, cols, 3) RGB or (rows, cols, 4) RGBA.
@@ -147,7 +147,7 @@ def encode_webp(image: NDArray[np.uint8], *, quality: int = 85) -> bytes:
 
 
 def cells_per_preview_px(shape: tuple[int, ...]) -> tuple[float, float]:
-    """Return the rows and columns of a raster that a pixel of its preview covers."""
+    """Return the numbers of raster rows and columns per pixel of a preview."""
     if max(shape) <= PREVIEW_SIDE_PX:
         return 1.0, 1.0
     factor = _averaged_px(shape, PREVIEW_SIDE_PX)
@@ -157,26 +157,27 @@ def cells_per_preview_px(shape: tuple[int, ...]) -> tuple[float, float]:
 
 
 def stretch_to_grey(values: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Return a grey picture of a raster: 1st percentile black, 99th white, NaN black."""
+    """Return a grey picture of a raster, with the 1st percentile and NaN black, the 99th white."""
     return _stretched(values, _stretch_of(values))
 
 
 def grey_cells(values: NDArray[np.floating]) -> Cells:
-    """Yield the picture of `stretch_to_grey` part by part, with NaN for empty cells.
+    """Return a function for parts of the picture of `stretch_to_grey`; NaN cells are empty.
 
-    For a raster (rows, cols) of more than 64 million cells the percentiles are those of some rows.
+    For a raster (rows, cols) of more than 64 million cells, percentiles are estimated from some of
+    its rows.
     """
     stretch = _stretch_of(sampled_rows(values))
     return lambda part: (_stretched(values[part], stretch), np.isfinite(values[part]))
 
 
 def sampled_rows(values: NDArray[Sampled]) -> NDArray[Sampled]:
-    """Return rows of a raster with at most 64 million cells, spread evenly."""
+    """Return evenly spaced rows of a raster, with at most 64 million cells."""
     return values[:: max(1, -(-values.size // _IN_MEMORY_PX))]
 
 
 def _stretch_of(values: NDArray[np.floating]) -> tuple[float, float] | None:
-    """Return the value of black, and the range to white; None without data."""
+    """Return the value shown black and the range up to white; None if there are no data."""
     known = values[np.isfinite(values)]
     if not known.size:
         return None
@@ -195,9 +196,9 @@ def _stretched(
 
 
 def cells_png(shape: tuple[int, ...], cells: Cells) -> bytes:
-    """Return a small PNG of a raster computed in parts, transparent where empty.
+    """Return a small PNG of a raster computed in parts, transparent where it is empty.
 
-    It is averaged down to `PREVIEW_SIDE_PX`; a smaller one is unchanged.
+    It is averaged down to `PREVIEW_SIDE_PX`; a smaller one keeps its size.
     """
     return encode_png(_preview(shape, cells, PREVIEW_SIDE_PX))
 
@@ -205,9 +206,9 @@ def cells_png(shape: tuple[int, ...], cells: Cells) -> bytes:
 def cells_webp(
     shape: tuple[int, ...], cells: Cells, *, longest_side_px: int, least_px: int = 0
 ) -> bytes:
-    """Return the picture of `cells_png` as lossy WebP, with another longest side.
+    """Return the picture of `cells_png` as lossy WebP, with a given maximum length of its sides.
 
-    If it has fewer cells on its longer side than `least_px`, each becomes a square of pixels.
+    If the longer side has fewer than `least_px` cells, each cell becomes a square of pixels.
     """
     image = _preview(shape, cells, longest_side_px)
     factor = min(-(-least_px // max(shape)), longest_side_px // max(shape))
@@ -215,7 +216,7 @@ def cells_webp(
 
 
 def shrunk_webp(encoded: bytes, name: str, *, longest_side_px: int) -> bytes:
-    """Return an encoded image as WebP with a limited longest side.
+    """Return an encoded image as WebP, reduced to a maximum length of its sides.
 
     Raises:
         InputError: the bytes are not an image.
@@ -228,7 +229,7 @@ def shrunk_webp(encoded: bytes, name: str, *, longest_side_px: int) -> bytes:
 
 def _preview(shape: tuple[int, ...], cells: Cells, longest_side_px: int) -> NDArray[np.uint8]:
     if max(shape) > longest_side_px:
-        # Averaged under the mask: black void must not darken the border of the content.
+        # Averaged within the mask, so that the black of empty cells does not darken the border.
         summed, weight = _weighted(shape, cells, _averaged_px(shape, longest_side_px))
         summed = _shrink(summed, longest_side_px)
         weight = _shrink(weight, longest_side_px)
@@ -244,10 +245,10 @@ def _preview(shape: tuple[int, ...], cells: Cells, longest_side_px: int) -> NDAr
 def _weighted(
     shape: tuple[int, ...], cells: Cells, factor: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return colours times their weight, and weights, averaged over squares of `factor` pixels.
+    """Return weighted colours and weights, averaged over squares of `factor` pixels.
 
-    A band of squares at a time, since float32 of a whole large image would not fit into memory. A
-    remainder at the right and below is cut off.
+    One band of squares at a time, since a large image would not fit into memory as float32.
+    Incomplete squares at the right and bottom are cut off.
     """
     import cv2
 
@@ -317,17 +318,17 @@ def _not_an_image(encoded: bytes, name: str, reason: str = "") -> str:
     )
 
 
-# Masks are black and white; compression artefacts are rounded to one or the other.
+# Masks are black and white; this limit removes compression artefacts.
 _USED_LEAST: Final = 128
 _LONGEST_SIDE_PX: Final = 2048
 
 
 def photo_rgb(photo: Photo) -> NDArray[np.uint8]:
-    """Return a photo's colours, (height, width, 3).
+    """Return a photo's colours (height, width, 3).
 
     Raises:
-        InputError: the file is no image.
-        MethodError: the size of the image is not that of the photo.
+        InputError: the file is not an image.
+        MethodError: the size of the image differs from that of the photo.
     """
     rgb = decode_image(photo.encoded, f"photo {photo.name}")
     if rgb.shape[:2] != (photo.height, photo.width):
@@ -339,16 +340,16 @@ def photo_rgb(photo: Photo) -> NDArray[np.uint8]:
 
 
 def photo_grey(photo: Photo) -> NDArray[np.uint8]:
-    """Return a photo's grey (Rec. 601), (height, width), or raise as `photo_rgb`."""
+    """Return a photo's grey values (height, width; Rec. 601); raises as `photo_rgb`."""
     import cv2
 
     return np.asarray(cv2.cvtColor(photo_rgb(photo), cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
 def reduced(grey: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:
-    """Reduce a picture by a factor below 1 with a low-pass filter; (u, v) becomes (u, v) x factor.
+    """Reduce a picture by a factor below 1, low-pass filtered; (u, v) becomes factor * (u, v).
 
-    The picture is warped, not resized, because a resize scales by the rounded size.
+    Warping is used because resizing would scale by the rounded size.
     """
     import cv2
 
@@ -358,7 +359,7 @@ def reduced(grey: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:
     # The width of the Gaussian matches the resolution of the coarser grid.
     sigma = 0.5 * np.sqrt(max(0.0, factor**-2 - 1.0))
     soft = cv2.GaussianBlur(grey, (0, 0), sigma) if sigma > 0.1 else grey
-    # (0.5, 0.5) / factor in OpenCV's convention.
+    # (0.5, 0.5) / factor in OpenCV's pixel convention.
     shift = HALF_PIXEL / factor - HALF_PIXEL
     matrix = np.array([[1.0 / factor, 0.0, shift], [0.0, 1.0 / factor, shift]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -369,7 +370,7 @@ def reduced(grey: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:
 
 
 def decode_mask(encoded: bytes, name: str) -> NDArray[np.bool_]:
-    """Decode a picture of black and white: True (height, width) where pixels may be used.
+    """Decode a black and white picture: (height, width) True for usable pixels.
 
     Raises:
         InputError: the bytes are not a picture.
@@ -378,12 +379,12 @@ def decode_mask(encoded: bytes, name: str) -> NDArray[np.bool_]:
 
 
 def used_pixels(photo: Photo) -> NDArray[np.bool_] | None:
-    """Return which pixels (height, width) of a photo may be used; None if all may."""
+    """Return the usable pixels (height, width) of a photo; None for all."""
     return None if photo.mask is None else decode_mask(photo.mask, f"the mask of {photo.name}")
 
 
 def before_masks(buffer: DepthBuffer, photo: Photo) -> DepthBuffer:
-    """Put masked parts of a photo directly in front of its lens so that it shows nothing behind."""
+    """Close the depth buffer in front of the lens where the photo is masked."""
     used = used_pixels(photo)
     if used is None:
         return buffer
@@ -394,6 +395,6 @@ def before_masks(buffer: DepthBuffer, photo: Photo) -> DepthBuffer:
         nearest = np.full(shape, buffer.nearest[0, 0], dtype=np.float32)
     rows, columns = (np.arange(0, side, reduction) for side in used.shape)
     whole = np.logical_and.reduceat(np.logical_and.reduceat(used, rows, axis=0), columns, axis=1)
-    # Nearer than anything, also in front of a camera within the slab of a wall.
+    # Nearer than anything else, even if the camera is within the buffer of a wall.
     nearest = np.where(whole, nearest, np.float32(-np.inf))
     return buffer._replace(nearest=np.ascontiguousarray(nearest), reduction=float(reduction))

@@ -1,13 +1,12 @@
-"""Cameras of Agisoft Metashape: "Export Cameras" as Agisoft XML.
+"""Cameras from Agisoft Metashape: "Export Cameras" as Agisoft XML.
 
-Metashape has our axes (x right, y down, z forward) and our pixels (the centre of the first one at
-(0.5, 0.5)), its principal point counts from the middle of the photo, and what it calls P1 and P2
-is p2 and p1 in OpenCV (Metashape Pro manual, appendix on camera models). A camera's matrix leads
-from it to the chunk, whose own transform leads to the world: of a chunk with a geographic or
-projected coordinate system to geocentric metres of its datum, from where poses are converted into
-that system.
-The cameras of a rig other than its master have no matrix but the master's, and their sensor states
-where it stands in the master's axes.
+Metashape has orthoflow's axes (x right, y down, z forward) and pixel coordinates (centre of the
+first pixel at (0.5, 0.5)), but measures the principal point from the centre of the photo, and its
+P1 and P2 are p2 and p1 in OpenCV (Metashape Pro manual, appendix on camera models). A camera's
+matrix transforms to the chunk; the chunk's own transform leads to the world. For chunks with a
+geographic or projected coordinate system, the world is geocentric in metres of the system's datum,
+and the poses are converted from there. In a rig, only the master camera has a matrix; the sensors
+of the other cameras contain their pose relative to the master.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ from orthoflow.products import Intrinsics
 MOST_TAGS: Final = 2_000_000
 _TERMS: Final = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 _SINCE_EXPORT: Final = "optimise the cameras without k4, p3 and p4 and export again"
-# Half the step in metres by which the axes of a coordinate system are found at a position.
+# Half the distance in metres over which the local axes of a coordinate system are computed.
 _STEP_M: Final = 50.0
 _SINCE: Final = "Metashape 1.2 or newer writes f, cx, cy, k1 ... for each sensor"
 
@@ -54,7 +53,7 @@ def read_metashape_xml(path: Path) -> tuple[GivenCamera, ...]:
     """Read the cameras of all chunks.
 
     Raises:
-        InputError: it is damaged, or not such a file.
+        InputError: the file is damaged, or not a Metashape export.
     """
     root = _root(path)
     chunks = root.findall("chunk") or root.findall(".//chunk")
@@ -68,7 +67,7 @@ def read_metashape_xml(path: Path) -> tuple[GivenCamera, ...]:
 def _root(path: Path) -> ET.Element:
     """Parse XML without its dangerous features."""
     text = text_of(path)
-    # Entities can expand without bound, and only a document type can define them.
+    # Entities can expand without limit, and only a document type can define them.
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise InputError(
             f"{path.name} defines a document type, which no export of Metashape "
@@ -91,7 +90,7 @@ def _of_chunk(chunk: ET.Element, path: Path) -> Iterator[GivenCamera]:
         for component in chunk.findall("components/component")
     }
     whole = _Similarity(chunk.find("transform"), path)
-    # Of a chunk that nothing places, the system is only the one that new chunks have.
+    # A chunk without any georeference still has the default system of new chunks.
     is_placed = any(world.is_placed for world in (whole, *worlds.values()))
     site = _site(chunk.findtext("reference", ""), path) if is_placed else None
     elements = [*chunk.findall("cameras/camera"), *chunk.findall("cameras/group/camera")]
@@ -115,7 +114,7 @@ _OFF: Final = ("false", "0")
 
 
 def _site(wkt: str, path: Path) -> Callable[[GivenCamera], GivenCamera] | None:
-    """Return the transform from geocentric metres to the chunk's system; None without one.
+    """Return the transform from geocentric metres to the chunk's system; None if it has none.
 
     Raises:
         InputError: the system is in degrees, or unknown.
@@ -126,7 +125,7 @@ def _site(wkt: str, path: Path) -> Callable[[GivenCamera], GivenCamera] | None:
 
     try:
         stated = pyproj.CRS.from_wkt(wkt)
-        # Metashape omits parameters of projections that a code implies.
+        # Metashape omits projection parameters that follow from a code.
         code = stated.to_json_dict().get("id", {})
         crs = pyproj.CRS.from_authority(code["authority"], code["code"]) if code else stated
         if crs.is_geocentric:
@@ -153,7 +152,7 @@ def _site(wkt: str, path: Path) -> Callable[[GivenCamera], GivenCamera] | None:
         there = to_site(np.vstack([centre, places]))
         if not np.isfinite(there).all():
             raise damaged(path, f"{given.name} is nowhere in {crs.name}")
-        # The axes of the system at the camera; the remaining scale and shear are dropped.
+        # Axes of the system at the camera, without the remaining scale and shear.
         left, _, right = np.linalg.svd((there[1:4] - there[4:]).T / (2.0 * _STEP_M))
         turned = rotation @ (left @ right).T
         return replace(
@@ -166,12 +165,12 @@ def _site(wkt: str, path: Path) -> Callable[[GivenCamera], GivenCamera] | None:
     return converted
 
 
-# Any: pyproj has no types that strict checks accept.
+# Any: pyproj has no types that mypy accepts in strict mode.
 def _from_geocentric(crs: Any, path: Path) -> Any:
-    """The transformer from geocentric metres of a projected system's own datum, as Metashape has.
+    """Return the transformer from geocentric metres of a projected system's datum, as Metashape.
 
     Raises:
-        InputError: its heights need a grid that is not there.
+        InputError: the heights need a grid that is not installed.
     """
     import pyproj
 
@@ -195,7 +194,7 @@ def _from_geocentric(crs: Any, path: Path) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what is raised here
         group = pyproj.transformer.TransformerGroup(geocentric, crs, always_xy=True)
-    # A negative accuracy is that of heights which stay as they are.
+    # A negative accuracy means that heights are not converted.
     if crs.is_compound and not (group.best_available and group.transformers[0].accuracy >= 0.0):
         grids = [grid.short_name for way in group.unavailable_operations for grid in way.grids]
         missing = f" without its grid {grids[0]} (`projsync --file {grids[0]}`)" if grids else ""
@@ -207,7 +206,7 @@ def _from_geocentric(crs: Any, path: Path) -> Any:
 
 
 class _Similarity:
-    """World from chunk: scale, rotation and shift; none if the chunk was not referenced."""
+    """World from chunk: scale, rotation and translation; identity without a transform."""
 
     def __init__(self, transform: ET.Element | None, path: Path) -> None:
         self.rotation, self.shift, self.scale = np.eye(3), np.zeros(3), 1.0
@@ -225,7 +224,7 @@ class _Similarity:
 def _pose(
     element: ET.Element, places: Sequence[str], path: Path, whose: str
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return rotation and shift as an element states them, the shift under one of some names."""
+    """Return rotation and translation of an element; the translation may have several names."""
     rotation, shift = np.eye(3), np.zeros(3)
     if words := element.findtext("rotation", "").split():
         rotation = rotation_of(_some(words, 9, path, "rotation", whose), path, whose)
@@ -242,7 +241,7 @@ def _some(words: list[str], count: int, path: Path, what: str, whose: str) -> li
 
 
 class _Sensor:
-    """A sensor: its lens or why there is none, and its pose in its rig."""
+    """A sensor: its lens, or the reason why it has none, and its pose in its rig."""
 
     def __init__(self, element: ET.Element, path: Path) -> None:
         self.label = element.get("label", element.get("id", ""))
@@ -287,7 +286,7 @@ class _Sensor:
 
 
 def _size(owner: ET.Element, label: str, path: Path) -> tuple[int, int]:
-    """Width and height in pixels."""
+    """Return width and height in pixels."""
     size = owner.find("resolution")
     words = [] if size is None else [size.get("width", ""), size.get("height", "")]
     values = numbers_of(words, path, f"the size of sensor {label}")
@@ -336,7 +335,7 @@ def _camera(
 
 
 def _rolling_shutter(element: ET.Element, sensor: _Sensor) -> str:
-    """Return the displacement by a compensated rolling shutter, if the file states it."""
+    """Return a note on a compensated rolling shutter, with the displacement if it is known."""
     words = element.findtext("rolling_shutter", "").split()
     moved = ""
     try:

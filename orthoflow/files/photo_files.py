@@ -1,8 +1,8 @@
-"""Photo files: format, page, size, EXIF, profile, transparency and damage; the pixels of TIFF.
+"""Photo files: format, page, size, EXIF, profile, transparency and damage; TIFF pixels.
 
-Pillow reads the containers, GDAL the pages of TIFF files, and simplejpeg (libjpeg-turbo) finds
-damage inside the scan data of a JPEG, which other decoders fill with grey or noise. EXIF tags are
-as in CIPA DC-008 (Exif 2.32); a damaged block gives what can still be read, never an error.
+Pillow reads the containers, GDAL the pages of TIFF files. simplejpeg (libjpeg-turbo) detects damage
+in the scan data of a JPEG, which other decoders fill with grey or noise. EXIF tags are as in CIPA
+DC-008 (Exif 2.32); a damaged EXIF block is read as far as possible and never causes an error.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ if TYPE_CHECKING:
     from PIL.TiffImagePlugin import ImageFileDirectory_v2
     from rasterio.io import DatasetReader
 
-# Formats that can be decoded; HEIC and AVIF if Pillow supports them.
+# Formats that can be decoded; HEIC and AVIF only if Pillow supports them.
 READABLE: Final = frozenset({"JPEG", "PNG", "TIFF", "BigTIFF", "WebP", "HEIC", "AVIF"})
 HOW_TO_DEVELOP: Final = "develop to TIFF of 16 bits or JPEG first, without lens corrections"
 HOW_TO_READ_HEIC: Final = "install orthoflow-tls[heic], or convert it to JPEG at full size"
-# 800 MB as RGB: twice what the largest sensors have. A PNG of a hundred kilobytes can state more.
-#: pixels that a photo states before it is decoded
+# 800 MB as RGB, twice the size of the largest sensors; a PNG of 100 kB can declare more.
+#: pixels declared by a photo, before it is decoded
 MOST_PIXELS: Final = 1 << 28
 
 _PNG_MAGIC: Final = b"\x89PNG\r\n\x1a\n"
 _TIFF_MAGICS: Final = {b"II*\0": "TIFF", b"MM\0*": "TIFF", b"II+\0": "BigTIFF", b"MM\0+": "BigTIFF"}
-# First bytes of files named as photos that are not read.
+# First bytes of unsupported files that have a photo's suffix.
 _MAGICS: Final[tuple[tuple[bytes, str], ...]] = (
     (b"GIF8", "GIF"),
     (b"BM", "BMP"),
@@ -58,22 +58,22 @@ _MAGICS: Final[tuple[tuple[bytes, str], ...]] = (
     (b"FOVb", "camera raw (Sigma)"),
     (b"\0MRM", "camera raw (Minolta)"),
 )
-# Of the ISO base media container: brands by format.
+# Brands of ISO base media files, by format.
 _HEIC_BRANDS: Final = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1"})
 _AVIF_BRANDS: Final = frozenset({b"avif", b"avis"})
 
 _SUBFILE_TAG: Final = 254
 _PREVIEW, _MASK = 1, 4
 _WIDTH_TAG, _HEIGHT_TAG, _BITS_TAG, _PHOTOMETRIC_TAG = 256, 257, 258, 262
-# Grey, RGB, palette, CMYK (which GDAL converts to RGB) and YCbCr.
+# Values of grey, RGB, palette, CMYK (which GDAL converts to RGB) and YCbCr.
 _WHITE_IS_ZERO, _PALETTE = 0, 3
 _COLOURS_OF_TIFF: Final = (_WHITE_IS_ZERO, 1, 2, _PALETTE, 5, 6)
 _SUB_IFDS_TAG: Final = 330
 _DNG_TAG: Final = 50706
 _COLOUR_FILTER_ARRAY, _LINEAR_RAW = 32803, 34892
 _MAX_PAGES: Final = 200
-# Warnings of libjpeg about headers that affect no pixel; after any other the rest of the photo is
-# noise.
+# Warnings of libjpeg about headers, which affect no pixel. After any other warning, the remaining
+# part of the photo is noise.
 _HARMLESS: Final = ("jfif revision", "adobe color transform", "icc marker")
 _EXTRA_BYTES: Final = "extraneous bytes before marker 0xd9"
 _PADDING: Final = b"\0\xff"
@@ -82,7 +82,7 @@ _ANY_SIZE: Final = threading.Lock()
 
 
 def photo_format(encoded: bytes) -> str | None:
-    """Return the format of a file by its content; None if unknown.
+    """Return the format of a file from its content; None if it is unknown.
 
     >>> photo_format(bytes.fromhex("ffd8ffe000104a464946"))
     'JPEG'
@@ -101,7 +101,7 @@ def photo_format(encoded: bytes) -> str | None:
 
 
 def unreadable(encoded: bytes) -> str:
-    """Return what an unreadable file is, and how to convert it; empty for photos."""
+    """Return the format of an unreadable file and how to convert it; empty for photos."""
     kind = photo_format(encoded)
     if kind is None:
         return (
@@ -139,13 +139,13 @@ def _raw_in_tiff(encoded: bytes) -> str | None:
             return "camera raw (DNG)" if is_raw or _SUB_IFDS_TAG in page else None
         if page.get(_PHOTOMETRIC_TAG) == _COLOUR_FILTER_ARRAY:
             return "camera raw"
-    # NEF, ARW, PEF: only previews in the pages, the picture itself below them.
+    # NEF, ARW, PEF: the pages contain only previews; the image itself is in a sub-IFD.
     is_below = bool(pages) and _SUB_IFDS_TAG in pages[0][1]
     return "camera raw" if is_below and not any(_is_photo(page) for _, page in pages) else None
 
 
 def tiff_pages(encoded: bytes) -> list[tuple[int, ImageFileDirectory_v2]]:
-    """Return the directories of a TIFF file with their positions, as far as they can be read."""
+    """Return the directories of a TIFF file with their offsets, as far as they can be read."""
     from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
     is_big = encoded[2:4] in (b"+\0", b"\0+")
@@ -180,7 +180,7 @@ def _is_photo(page: ImageFileDirectory_v2) -> bool:
 
 
 def photo_page(encoded: bytes) -> tuple[int, ImageFileDirectory_v2] | None:
-    """Return the page of a TIFF file that holds the photo: the largest that is not a preview."""
+    """Return the page of a TIFF file with the photo: the largest page that is not a preview."""
     pages = tiff_pages(encoded)
     return max(
         [item for item in pages if _is_photo(item[1])] or pages,
@@ -190,14 +190,14 @@ def photo_page(encoded: bytes) -> tuple[int, ImageFileDirectory_v2] | None:
 
 
 def count_pages(encoded: bytes) -> int:
-    """Return the number of pages of a TIFF file without previews and masks; 1 for other formats."""
+    """Return the number of pages of a TIFF file, except previews and masks; 1 for other formats."""
     if encoded[:4] not in _TIFF_MAGICS:
         return 1
     return max(1, sum(_is_photo(page) for _, page in tiff_pages(encoded)))
 
 
 def _from_page(encoded: bytes, start: int) -> bytes:
-    """Return a TIFF file that begins with one of its pages, because decoders read the first."""
+    """Return a TIFF file that begins with a given page, because decoders read the first one."""
     order: Literal["little", "big"] = "little" if encoded[:2] == b"II" else "big"
     place, size = (8, 8) if encoded[2:4] in (b"+\0", b"\0+") else (4, 4)
     return encoded[:place] + start.to_bytes(size, order) + encoded[place + size :]
@@ -208,7 +208,7 @@ def _tiff_page(encoded: bytes, start: int) -> Iterator[DatasetReader]:
     """Open a page of a TIFF file with GDAL, which supports more layouts than OpenCV and Pillow.
 
     Raises:
-        ValueError: it cannot be opened or read.
+        ValueError: the page cannot be opened or read.
     """
     from rasterio.errors import RasterioError, RasterioIOError
     from rasterio.io import MemoryFile
@@ -227,10 +227,10 @@ def _tiff_page(encoded: bytes, start: int) -> Iterator[DatasetReader]:
 
 
 def tiff_pixels(encoded: bytes) -> Colours:
-    """Decode the photo of a TIFF file, (rows, cols, 3) of 8 or 16 bits.
+    """Decode the photo in a TIFF file to (rows, cols, 3) with 8 or 16 bits.
 
     Raises:
-        ValueError: it is damaged, or not a photo.
+        ValueError: the file is damaged, or not a photo.
     """
     found = photo_page(encoded)
     if found is None:
@@ -257,7 +257,7 @@ def tiff_pixels(encoded: bytes) -> Colours:
 
 
 def _tiff_alpha(encoded: bytes) -> NDArray[np.bool_] | None:
-    """Return the opaque pixels of a TIFF file, from its alpha, its nodata value or a mask page."""
+    """Return the opaque pixels of a TIFF file, from its alpha band, nodata value or mask page."""
     from rasterio.enums import ColorInterp
 
     found = photo_page(encoded)
@@ -274,8 +274,8 @@ def _tiff_alpha(encoded: bytes) -> NDArray[np.bool_] | None:
     opaque: NDArray[np.bool_] | None = None
     with _tiff_page(encoded, start) as page:
         is_stated = ColorInterp.alpha in page.colorinterp
-        # Some programs do not state what the last of two or four samples is: one that is nothing
-        # but off and full is an alpha, and infrared is none.
+        # Some programs do not declare the meaning of the last of two or four bands. If all its
+        # values are 0 or the maximum, it is alpha; an infrared band is not.
         band = page.colorinterp.index(ColorInterp.alpha) + 1 if is_stated else page.count
         if is_stated or (band in (2, 4) and page.dtypes[0] in ("uint8", "uint16")):
             alpha = page.read(band)
@@ -283,7 +283,7 @@ def _tiff_alpha(encoded: bytes) -> NDArray[np.bool_] | None:
             if is_stated or np.isin(alpha, (0, full)).all():
                 opaque = alpha > full // 2
         if opaque is None and page.nodata is not None:
-            # GDAL's tag, e.g. for the margins of undistorted photos.
+            # GDAL's nodata tag, used e.g. for the margins of undistorted photos.
             opaque = page.dataset_mask() > 0
     for at in masks:
         with _tiff_page(encoded, at) as page:
@@ -294,7 +294,7 @@ def _tiff_alpha(encoded: bytes) -> NDArray[np.bool_] | None:
 
 @contextmanager
 def opened(encoded: bytes) -> Iterator[Image | None]:
-    """Open a photo with Pillow, without decoding it; None if it cannot."""
+    """Open a photo with Pillow without decoding it; yields None if this fails."""
     from PIL import Image
 
     found = photo_page(encoded) if encoded[:4] in _TIFF_MAGICS else None
@@ -303,7 +303,7 @@ def opened(encoded: bytes) -> Iterator[Image | None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         with _ANY_SIZE:
-            # Pillow refuses less than `MOST_PIXELS`, which all decoders here check.
+            # Pillow's limit is below `MOST_PIXELS`, which all decoders here check.
             most, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
             try:
                 image = Image.open(
@@ -330,9 +330,9 @@ def _register_heic() -> None:
 
 
 def stated_size(encoded: bytes) -> tuple[int, int] | None:
-    """Return width and height as stated in a file; None without."""
+    """Return width and height declared in a file, or None."""
     if encoded.startswith(_PNG_MAGIC):
-        # Pillow refuses files larger than it decodes.
+        # Not with Pillow, which refuses large files.
         width, height = (int.from_bytes(encoded[at : at + 4], "big") for at in (16, 20))
         return (width, height) if encoded[12:16] == b"IHDR" else None
     if encoded[:4] in _TIFF_MAGICS:
@@ -346,7 +346,7 @@ def stated_size(encoded: bytes) -> tuple[int, int] | None:
 
 
 def stated_bits(encoded: bytes) -> int | None:
-    """Return the bits per channel as stated in a PNG or TIFF file; None without."""
+    """Return the bits per channel declared in a PNG or TIFF file, or None."""
     if encoded.startswith(_PNG_MAGIC):
         return encoded[24] if encoded[12:16] == b"IHDR" and len(encoded) > 24 else None
     if encoded[:4] in _TIFF_MAGICS:
@@ -356,16 +356,16 @@ def stated_bits(encoded: bytes) -> int | None:
 
 
 def icc_profile(encoded: bytes) -> bytes | None:
-    """Return the ICC colour profile of a photo; None without a complete one."""
+    """Return the ICC colour profile of a photo; None if there is none or it is incomplete."""
     with opened(encoded) as image:
         found = None if image is None else image.info.get("icc_profile")
     return found if isinstance(found, bytes) and found else None
 
 
 def opaque_pixels(encoded: bytes) -> NDArray[np.bool_] | None:
-    """Return which pixels (height, width) are not transparent; None if all are opaque."""
+    """Return the pixels (height, width) that are not transparent; None if all are opaque."""
     opaque: NDArray[np.bool_] | None = None
-    # Damage is detected when the colours are decoded.
+    # Damage is reported when the colours are decoded.
     if encoded[:4] in _TIFF_MAGICS:
         with suppress(ValueError):
             opaque = _tiff_alpha(encoded)
@@ -377,7 +377,7 @@ def opaque_pixels(encoded: bytes) -> NDArray[np.bool_] | None:
 
 
 def is_whole_png(encoded: bytes) -> bool:
-    """Whether the chunks of a PNG lead to its end: decoders allocate their stated size."""
+    """Whether the chunks of a PNG lead to its end: decoders allocate their declared size."""
     position = len(_PNG_MAGIC)
     while position + 12 <= len(encoded):
         if encoded[position + 4 : position + 8] == b"IEND":
@@ -390,14 +390,14 @@ def damage(encoded: bytes) -> tuple[str, bool]:
     """Decode a photo and return its damage, and whether pixels are lost.
 
     Returns:
-        The damage, empty for a sound file; True if a part of the photo is missing or noise.
-        Empty for TIFF files: `tiff_pixels` raises.
+        A description of the damage, empty for an intact file, and True if a part of the photo is
+        missing or noise. Always empty for TIFF files, for which `tiff_pixels` raises.
     """
     if encoded[:4] in _TIFF_MAGICS:
         return "", False
     size = stated_size(encoded)
     if size is not None and size[0] * size[1] > MOST_PIXELS:
-        # It is not decoded, here or later.
+        # Too large to be decoded, here or later.
         return "", False
     if photo_format(encoded) == "JPEG":
         import simplejpeg
@@ -413,7 +413,7 @@ def damage(encoded: bytes) -> tuple[str, bool]:
                 return "", False
             return text, not _is_padded(encoded, text)
         except KeyError:
-            # It reports the kinds of sub-sampling that it supports; Pillow detects truncation.
+            # simplejpeg does not support all kinds of sub-sampling; Pillow detects truncation.
             pass
         else:
             return "", False
@@ -430,10 +430,10 @@ def damage(encoded: bytes) -> tuple[str, bool]:
 
 
 def _is_padded(encoded: bytes, text: str) -> bool:
-    """Whether libjpeg only skipped bytes between the scan and the end, as cameras write them.
+    """Whether libjpeg only skipped bytes between scan and end of file, as some cameras write them.
 
-    These are a few of any kind, or much padding; if it decoded a part of the padding as pixels,
-    that replaces the scan.
+    These are a few bytes of any value, or a long padding. If libjpeg decoded a part of the padding
+    as pixels, these replace a part of the scan.
     """
     if _EXTRA_BYTES not in text:
         return False
@@ -443,28 +443,29 @@ def _is_padded(encoded: bytes, text: str) -> bool:
     return abs(passed_over - n_padding) <= _FEW_BYTES
 
 
-# Levels of a step between two blocks of a JPEG beyond the slope on both sides of it, and share of
-# such steps in one direction along a row of blocks. Of 32 photos none exceeds 0.13, of 23 with a
-# visible flipped bit 20 exceed 0.5.
+# Limit in grey levels for a step between two blocks of a JPEG, beyond the gradient on both sides,
+# and limit for the share of such steps in one direction along a row of blocks. None of 32 intact
+# photos exceeds a share of 0.13; 20 of 23 photos with a visible flipped bit exceed 0.5.
 _STEP_LEVELS: Final = 3
 _SHIFTED_SHARE: Final = 0.4
 _SHORTEST_SEAM: Final = 0.05
 _FEWEST_PARTS: Final = 8
-# With more rows it is the picture that has such steps.
+# If more rows have such steps, they belong to the image content.
 _MOST_ROWS: Final = 0.05
 _SEAM_PX: Final = 16
 
 
 def shifted_row(encoded: bytes, rgb: NDArray[np.uint8]) -> int | None:
-    """Return the row from which on the colours of a JPEG are shifted; None if they are not.
+    """Return the row where the colours of a JPEG begin to be shifted; None if they are not.
 
-    A flipped bit that decoders do not notice changes all subsequent blocks by one amount. So
-    colours step along the upper sides of the blocks from there on to the right, and along the lower
-    sides of those to the left; no photographed object is aligned like that with the grid of blocks.
+    A flipped bit that decoders do not notice changes all subsequent blocks by the same amount.
+    Therefore, the colours have a step along the upper edge of the blocks to the right of it, and
+    along the lower edge of the blocks to the left of it. Photographed objects are not aligned with
+    the block grid in this way.
 
     Args:
-        encoded: the file's bytes.
-        rgb: (rows, cols, 3) its pixels.
+        encoded: content of the file.
+        rgb: (rows, cols, 3) decoded pixels.
     """
     if photo_format(encoded) != "JPEG":
         return None
@@ -497,14 +498,14 @@ def shifted_row(encoded: bytes, rgb: NDArray[np.uint8]) -> int | None:
     return int(rows[share.argmax()]) if is_damage else None
 
 
-# Diagonal of 36 x 24 mm. CIPA DCG-001 defines the 35 mm equivalent by equal angle over the
-# diagonal, and the cameras that were checked comply: a Redmi Note 9S (4.74 mm, sensor diagonal 8.0
-# mm) writes 26 where the diagonal gives 25.6 and the width 26.7; a Kodak C743 (6.0 mm, 7.18 mm)
-# writes 36 where the diagonal gives 36.2 and the width 37.5. For 3:2 pictures both are the same.
+# Diagonal of 36 x 24 mm. CIPA DCG-001 defines the 35 mm equivalent by an equal angle over the
+# diagonal, and the tested cameras comply: a Redmi Note 9S (4.74 mm, sensor diagonal 8.0 mm) writes
+# 26, where the diagonal gives 25.6 and the width 26.7; a Kodak C743 (6.0 mm, 7.18 mm) writes 36,
+# where the diagonal gives 36.2 and the width 37.5. For an aspect ratio of 3:2, both are the same.
 FULL_FRAME_DIAGONAL_MM: Final = math.hypot(36.0, 24.0)
 
 _ORIENTATION: Final = 0x0112
-# They count from 1 to 8.
+# Orientations are 1 to 8.
 _ORIENTATIONS: Final = 9.0
 _MAKE: Final = 0x010F
 _MODEL: Final = 0x0110
@@ -526,9 +527,10 @@ _MAX_TEXT: Final = 200
 _ZEROS_BEHIND: Final = 1 << 16
 _UNIT_MM: Final = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _INCH: Final = 2
-# Longest side of sensors, from the smallest phone to large format scanning backs.
+# Range of the longer side of sensors, from the smallest phones to large format scanning backs.
 _SENSOR_MM: Final = (1.5, 130.0)
-# From fisheyes to telescopes, in front of any sensor; cameras without a value write 0, 1 or 65535.
+# Range from fisheye to telephoto lenses, for any sensor; cameras without a value write 0, 1 or
+# 65535.
 _FOCAL_MM: Final = (0.5, 3000.0)
 _EQUIVALENT_MM: Final = (4.0, 3000.0)
 _CROPPED: Final = 0.02
@@ -537,18 +539,18 @@ _CONTRADICTION: Final = 1.15
 
 @dataclass(frozen=True, kw_only=True)
 class Exif:
-    """The EXIF data of a photo; None, or an empty text, if missing.
+    """The EXIF data of a photo; missing values are None or an empty text.
 
     Attributes:
         orientation: 1..8, how to rotate the stored array for display.
-        make: maker of the camera.
+        make: manufacturer of the camera.
         model: model of the camera.
         focal_mm: focal length.
-        focal_35mm: its full-frame equivalent.
-        resolution_px_per_mm: pixels of the original picture per millimetre of the sensor.
-        width: pixels of the original picture, which may have been reduced since.
-        height: pixels.
-        is_damaged: some of it could not be read.
+        focal_35mm: full-frame equivalent of the focal length.
+        resolution_px_per_mm: pixels of the original image per millimetre on the sensor.
+        width: width in pixels of the original image, which may have been reduced since.
+        height: height in pixels of the original image.
+        is_damaged: some of the data could not be read.
     """
 
     orientation: int = 1
@@ -563,7 +565,7 @@ class Exif:
 
     @property
     def camera(self) -> str:
-        """Maker and model, without repeating the maker."""
+        """Manufacturer and model, without repeating the manufacturer."""
         first_word = self.make.partition(" ")[0].lower()
         is_repeated = bool(first_word) and self.model.lower().startswith(first_word)
         return self.model if is_repeated else f"{self.make} {self.model}".strip()
@@ -574,9 +576,9 @@ class FocalLength:
     """A focal length from EXIF.
 
     Attributes:
-        value_px: pixels of the stored array, or None if EXIF does not state it.
-        reason: what it was computed from, or why there is none.
-        doubt: an impossible EXIF value that was not used; empty without one.
+        value_px: focal length in pixels of the stored array, or None if unknown.
+        reason: data from which it was computed, or the reason why it is unknown.
+        doubt: message about an impossible EXIF value, which is ignored; else empty.
     """
 
     value_px: float | None
@@ -585,7 +587,7 @@ class FocalLength:
 
 
 def read_exif(encoded: bytes) -> Exif:
-    """Read the EXIF data of a photo; without any, all fields are empty."""
+    """Read the EXIF data of a photo; all fields are empty if there are none."""
     with opened(encoded) as image:
         if image is None:
             return Exif()
@@ -605,13 +607,13 @@ def read_exif(encoded: bytes) -> Exif:
 
 
 def _tags(image: Image) -> tuple[Mapping[int, object], bool]:
-    """Relevant tags, and whether the block is damaged, of which the readable part is used."""
+    """Return relevant tags, as far as readable, and whether the EXIF block is damaged."""
     block = image.info.get("exif")
     if not isinstance(block, bytes):
         return _readable_tags(image.getexif)
     found, is_damaged = _readable_tags(lambda: _loaded(block))
     if is_damaged:
-        # Missing bytes are replaced by zeros, so that one bad place does not end the reading.
+        # Replace missing bytes by zeros, so that reading does not stop at the first bad tag.
         found = _readable_tags(lambda: _loaded(block + bytes(_ZEROS_BEHIND)))[0] | found
     return found, is_damaged
 
@@ -625,7 +627,7 @@ def _loaded(block: bytes) -> PillowExif:
 
 
 def _readable_tags(read: Callable[[], PillowExif]) -> tuple[dict[int, object], bool]:
-    """Return tags of the main and of the inner directory, and whether some could not be read."""
+    """Return the tags of the main and Exif directories, and whether some could not be read."""
     tags: dict[int, object] = {}
     is_damaged = False
     with warnings.catch_warnings(record=True) as noticed:
@@ -646,17 +648,17 @@ def _readable_tags(read: Callable[[], PillowExif]) -> tuple[dict[int, object], b
 
 
 def focal_length(exif: Exif, width: int, height: int) -> FocalLength:
-    """Focal length of a photo in pixels of its stored array.
+    """Return the focal length of a photo in pixels of its stored array.
 
-    The pixel pitch of the focal plane has priority, as it is exact if it is right; it is scaled if
-    the picture was reduced or rotated since. It is not used if it contradicts the 35 mm equivalent,
-    which does not depend on the size of the picture. That one refers to the diagonal, see
-    `FULL_FRAME_DIAGONAL_MM`. Impossible values are reported and not used.
+    The pixel pitch of the focal plane has priority, since it is exact if it is correct; it is
+    scaled if the image was reduced or rotated since. It is ignored if it contradicts the 35 mm
+    equivalent, which does not depend on the image size and refers to the diagonal (see
+    `FULL_FRAME_DIAGONAL_MM`). Impossible values are reported and ignored.
 
     Args:
         exif: the EXIF data.
-        width: pixels of the stored array.
-        height: pixels.
+        width: width of the stored array in pixels.
+        height: height of the stored array in pixels.
     """
     of_length = _doubt("focal length", exif.focal_mm, _FOCAL_MM)
     of_equivalent = _doubt("35 mm equivalent", exif.focal_35mm, _EQUIVALENT_MM)
@@ -708,7 +710,7 @@ def _believed_focal_length(exif: Exif, width: int, height: int) -> FocalLength:
 
 
 def _positive(value: object) -> float | None:
-    """Return the number of a tag, the first one of several, if it is finite and positive."""
+    """Return the (first) number in a tag if it is finite and positive, else None."""
     if isinstance(value, bytes):
         value = tuple(value)
     first = value[0] if isinstance(value, tuple) and value else value
@@ -717,10 +719,10 @@ def _positive(value: object) -> float | None:
 
 
 def _text(value: object) -> str:
-    """Return the text of a tag up to its first NUL; empty if missing, long or a number."""
+    """Return the text of a tag up to its first NUL; empty if missing, too long or a number."""
     if not isinstance(value, str) or len(value) >= _MAX_TEXT:
         return ""
-    # Pillow decodes them as Latin-1, but these texts are ASCII.
+    # Pillow decodes texts as Latin-1, but EXIF texts are ASCII.
     plain = value.encode("latin-1", "replace").decode("ascii", "replace")
     return plain.split("\0")[0].strip()
 
@@ -730,7 +732,7 @@ def _is_cropped(exif: Exif, width: int, height: int) -> bool:
         return False
     taken = max(exif.width, exif.height) / min(exif.width, exif.height)
     stored = max(width, height) / min(width, height)
-    # One pixel of rounding more than the share, for pictures that were reduced very much.
+    # The tolerance includes one pixel of rounding, for strongly reduced images.
     return abs(taken / stored - 1.0) > _CROPPED + 1.0 / min(width, height)
 
 
@@ -749,7 +751,7 @@ def _whole(value: float | None) -> int | None:
 
 
 def _resolution(tags: Mapping[int, object]) -> float | None:
-    """Return pixels per millimetre, the mean of both axes if both are present."""
+    """Return pixels per millimetre, averaged over both axes if both are present."""
     unit_mm = _UNIT_MM.get(int(_positive(tags.get(_RESOLUTION_UNIT)) or _INCH))
     known = [
         value

@@ -1,4 +1,4 @@
-"""Polygons that people draw in other programs, from GeoJSON files, and back."""
+"""GeoJSON files: polygons drawn in other programs, and output of features."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Feature: TypeAlias = dict[str, JsonValue]
 
 #: bytes of a GeoJSON file of masks or seams
 MOST_BYTES: Final = 50_000_000
-# Each may be filled over a whole photo.
+# Each polygon may cover a whole photo.
 #: polygons of a GeoJSON file of masks or seams
 MOST_POLYGONS: Final = 10_000
 _CORNERS_LEAST: Final = 3
@@ -29,12 +29,12 @@ _CORNERS_LEAST: Final = 3
 
 @dataclass(frozen=True, kw_only=True)
 class NamedPolygon:
-    """A polygon with the name that one of its properties holds.
+    """A polygon with a name from one of its properties.
 
     Attributes:
-        name: the property that was asked for.
-        rings: (n, 2) float64 each, the outer one first, then holes.
-        properties: all of them.
+        name: value of the property that contains the name.
+        rings: (n, 2) float64 each, the outer ring first, then holes.
+        properties: all properties of the feature.
     """
 
     name: str
@@ -47,11 +47,11 @@ def read_polygons(path: Path, name: str, *, what: str) -> list[NamedPolygon]:
 
     Args:
         path: the file.
-        name: which property names them.
-        what: what the file should be, for errors: "a mask of photos".
+        name: key of the property that contains the name of a polygon.
+        what: expected content of the file, for error messages, e.g. "a mask of photos".
 
     Raises:
-        InputError: it is something else.
+        InputError: the file has another content.
     """
     expected = (
         f"{path.name} is not {what}: expected a GeoJSON FeatureCollection of polygons, each with "
@@ -80,7 +80,7 @@ def read_polygons(path: Path, name: str, *, what: str) -> list[NamedPolygon]:
 
 
 def _polygons_of(feature: Any, name: str) -> Iterator[NamedPolygon]:
-    """Polygons of a feature; what is none of the expected fails somehow."""
+    """Yield the polygons of a feature; an invalid feature raises various exceptions."""
     properties, geometry = feature["properties"], feature["geometry"]
     kinds = {"Polygon": [geometry["coordinates"]], "MultiPolygon": geometry["coordinates"]}
     for parts in kinds[geometry["type"]]:
@@ -94,10 +94,10 @@ def _polygons_of(feature: Any, name: str) -> Iterator[NamedPolygon]:
 
 
 def filled(rings: tuple[NDArray[np.float64], ...], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Cells (rows, cols) whose centre lies in a polygon, but in none of its holes.
+    """Return the cells (rows, cols) whose centre is in a polygon and not in its holes.
 
     Args:
-        rings: (n, 2) corners as (column, row), the centre of the first cell at (0.5, 0.5).
+        rings: (n, 2) corners as (column, row), with the centre of the first cell at (0.5, 0.5).
         shape: rows and columns.
     """
     from rasterio.features import rasterize
@@ -110,12 +110,12 @@ def filled(rings: tuple[NDArray[np.float64], ...], shape: tuple[int, int]) -> ND
 def outlines(
     values: NDArray[np.int16 | np.int32],
 ) -> list[tuple[int, tuple[NDArray[np.float64], ...]]]:
-    """Areas of one value each, as rings (n, 2) of (column, row) along the sides of their cells.
+    """Return areas of equal value, as rings (n, 2) of (column, row) along cell edges.
 
-    The outer ring comes first, then holes; each ends with its first corner, as GeoJSON wants it.
+    The outer ring comes first, then holes; each ring ends with its first corner, as in GeoJSON.
 
     Args:
-        values: (rows, cols); negative ones belong to no area.
+        values: (rows, cols); negative values belong to no area.
     """
     from rasterio.features import shapes
 
@@ -136,19 +136,19 @@ def write_features(
 ) -> None:
     """Write a GeoJSON FeatureCollection in metres.
 
-    It names the coordinate system as GDAL reads it, though RFC 7946 knows degrees only: without a
-    name a GIS takes metres for degrees.
+    The file contains the name of its coordinate system in the form that GDAL reads, although RFC
+    7946 only allows degrees: without it, a GIS would take metres for degrees.
 
     Args:
         path: the file.
-        features: in order, as RFC 7946 has them: type, properties and geometry.
-        crs: an EPSG code, `site` (coordinates of the scan), or the name of a wall's own, as
-            `WallFrame.crs`.
-        indent: of the text; None for one line.
-        digest: of the product that it shows.
+        features: features in order, each with type, properties and geometry as in RFC 7946.
+        crs: an EPSG code, `site` (coordinates of the scan), or the name of a wall's own system, as
+            in `WallFrame.crs`.
+        indent: indentation of the text; None for a single line.
+        digest: digest of the product shown, or None.
 
     Raises:
-        StoreError: it cannot be written.
+        StoreError: the file cannot be written.
     """
     epsg = epsg_of(crs)
     local = SITE_CRS_WKT if crs == SITE_CRS else local_crs_wkt(crs)

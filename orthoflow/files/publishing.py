@@ -1,7 +1,8 @@
-"""The files of a run that people open in other programs, one function per product type.
+"""Files of a run for use in other programs; one function per product type.
 
-Each takes the product, an existing empty folder and the product's digest, and writes the same bytes
-for the same product. The `k` in file names is the place of the wall's plane in `planes.json`.
+Each function takes the product, an existing empty folder and the product's digest, and writes the
+same bytes for the same product. `k` in file names is the index of the wall's plane in
+`planes.json`.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ from orthoflow.products import (
 )
 from orthoflow.untrusted_text import Value, csv_text
 
-# Letters of a source that its file is called after.
+# Maximum number of characters of a source that are used in a file name.
 _LONGEST_SOURCE: Final = 100
 ERROR_CONTENT: Final = (
     "expected error of a point measured in the orthoimage, one standard deviation along u and "
@@ -80,13 +81,13 @@ PIXEL_CONVENTION: Final = "OpenCV: the centre of the first (top-left) pixel is a
 TIE_COLUMNS: Final = (
     *("photo", "wall", "u_px", "v_px", "x", "y", "z"),
     *("role", "residual_u_px", "residual_v_px", "sigma_px"),
-    # A comment line would break plain CSV readers, so the header states it in a column of its own.
+    # A comment line would break simple CSV readers, so the pixel convention is a column.
     "opencv_pixel_convention",
 )
 
 
 def publish_cloud(product: PointCloud, folder: Path, digest: str) -> None:
-    """Write `scans.json`: what each scan of the files has, what was used of it and left out."""
+    """Write `scans.json`: data of each scan, and what was used and omitted."""
     scans = product.source.get("scans")
     if isinstance(scans, list):
         write_json(
@@ -124,9 +125,9 @@ def publish_planes(product: Planes, folder: Path, digest: str) -> None:
 
 
 def publish_walls(product: Walls, folder: Path, digest: str) -> None:
-    """Write `wall_<k>_depth.tif`, `wall_<k>_intensity.tif` if any, sidecars, previews in place.
+    """Write `wall_<k>_depth.tif`, `wall_<k>_intensity.tif` if available, sidecars and previews.
 
-    Percentiles of the depths follow as `wall_<k>_depth_p<percent>.tif` where they were wanted.
+    If requested, percentiles of the depths are written to `wall_<k>_depth_p<percent>.tif`.
     """
     for index, wall in enumerate(product.walls):
         slab = product.slab(index)
@@ -162,7 +163,7 @@ def publish_walls(product: Walls, folder: Path, digest: str) -> None:
 def publish_orthoimages(product: Orthoimages, folder: Path, digest: str) -> None:
     """Write `wall_<k>_ortho.tif`, the raster of its mask, sidecars, preview, and world files.
 
-    Layers that were asked for follow as `publish_layers` writes them.
+    If requested, layers are written as by `publish_layers`.
     """
     if product.layers:
         called = {image.wall: (image.number, image.name) for image in product.images}
@@ -198,9 +199,9 @@ def publish_orthoimages(product: Orthoimages, folder: Path, digest: str) -> None
 
 
 def publish_layers(product: Layers, folder: Path, digest: str) -> None:
-    """Write `wall_<k>_layer_<n>_<source>.tif` and its sidecar for each source: what it shows alone.
+    """Write `wall_<k>_layer_<n>_<source>.tif` and its sidecar for the layer of each source.
 
-    `n` counts the sources of a wall from 0, because names of photos need not differ in a file's.
+    `n` counts the sources of a wall from 0, since photo names may become identical in file names.
     """
     called = {
         layer.wall: (product.number(layer.wall), product.name(layer.wall))
@@ -247,8 +248,8 @@ def _write_layers(
 
 
 def publish_ties(product: Ties, folder: Path, digest: str) -> None:
-    """Write `ties.csv`: pixels in OpenCV's convention, residuals observed - computed."""
-    del digest  # A table of numbers has no place for it; the record names it.
+    """Write `ties.csv`: pixels in OpenCV's convention, residuals observed minus computed."""
+    del digest  # A table of numbers has no field for it; the record contains it.
     pixels = to_opencv(product.pixels_photo)
     rows: Iterator[Sequence[Value]] = (
         (
@@ -267,10 +268,11 @@ def publish_ties(product: Ties, folder: Path, digest: str) -> None:
 
 
 def publish_cameras(product: Cameras, folder: Path, digest: str) -> None:
-    """Write `cameras.json`, and what else the orientation found.
+    """Write `cameras.json` and other results of the orientation.
 
-    That is `calibration.yaml` with the lenses that it estimated, to orient other photos of them,
-    `ties.csv` with the residuals if it kept its ties, and `residuals.csv` with its table of them.
+    These are `calibration.yaml` with estimated lenses, for orienting other photos from the same
+    cameras, `ties.csv` with the residuals if the ties were kept, and `residuals.csv` with the table
+    of residuals.
     """
     write_json(
         folder / "cameras.json",
@@ -299,7 +301,7 @@ def publish_cameras(product: Cameras, folder: Path, digest: str) -> None:
 
 
 def _table_text(rows: Sequence[ResidualRow]) -> str:
-    """Rows as CSV; what is absent stays empty. Along a wall u and v are others than in a photo."""
+    """Return rows as CSV; missing values are empty. u and v differ between walls and photos."""
     columns = [
         "photo_axis" if column.name == "axis" else column.name for column in fields(ResidualRow)
     ]
@@ -319,13 +321,13 @@ def _publish_raster(
     """Write one float raster of a wall with its sidecar and preview.
 
     Args:
-        stem: path without a suffix.
+        stem: path without suffix.
         values: (rows, cols).
-        wall: whose raster it is.
-        about: what the sidecar states of the wall besides.
-        content: what the values are.
-        tags: of the GeoTIFF: the unit, and what else it states of the values.
-        digest: of the product.
+        wall: wall of the raster.
+        about: further content of the sidecar.
+        content: description of the values.
+        tags: tags of the GeoTIFF, such as the unit of the values.
+        digest: digest of the product.
     """
     all_tags = raster_tags(wall.frame, digest=digest, name=wall.name, content=content, extra=tags)
     write_raster(
@@ -351,12 +353,12 @@ def _publish_raster(
 
 
 def _cells_of(image: Orthoimage, shown: NDArray[np.bool_]) -> Cells:
-    """Return what previews are made of; of deep images part by part."""
+    """Return the source of a preview; deep images are converted part by part."""
     return lambda part: (eight_bits(image.rgb[part]), shown[part])
 
 
 def _write_preview(path: Path, picture: bytes, frame: WallFrame) -> None:
-    """Write the preview of a raster, and the world file that places it where the raster lies."""
+    """Write the preview of a raster, and a world file with the same position."""
     rows, columns = cells_per_preview_px(frame.shape)
     text = world_file_text(GridPlace.of(frame), rows=rows, columns=columns)
     write_bytes(path, picture)
@@ -383,7 +385,7 @@ def _write_ortho_sidecars(
 
 
 def accuracy_json(image: Orthoimage) -> dict[str, JsonValue]:
-    """What is known of the accuracy of one orthoimage, by evidence on its own wall alone."""
+    """Return the accuracy of an orthoimage, as far as it is known from its own wall."""
     median, high = image.expected_mm
     is_assessed = math.isfinite(median)
     return {
@@ -433,10 +435,10 @@ _DIGITS: Final = 4
 
 
 def publish_openings(product: Openings, folder: Path, digest: str) -> None:
-    """Write `wall_<k>_openings.geojson` per wall that has any, `openings.geojson`, `openings.csv`.
+    """Write `wall_<k>_openings.geojson` per wall with openings, `openings.geojson`, `openings.csv`.
 
-    Those of a wall are in the coordinates of its GeoTIFF, `openings.geojson` in those of the scan,
-    x, y, z on the planes of the walls.
+    The files of a wall are in the coordinates of its GeoTIFF; `openings.geojson` is in those of the
+    scan, with x, y, z on the planes of the walls.
     """
     for wall in product.walls:
         own = product.of_wall(wall)

@@ -1,4 +1,4 @@
-"""JSON beside the rasters: where a wall's raster lies in the world and what its values mean."""
+"""JSON sidecars of rasters: the position of a wall's raster in the world, and its values."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from orthoflow.untrusted_text import json_bytes, parse_json, text_of_file
 
 #: bytes of the JSON file beside it
 MOST_SIDECAR_BYTES: Final = 1 << 20
-# Numbers of walls are kept in 16 bits.
+# Wall numbers are stored in 16 bits.
 #: largest number of a wall
 MOST_WALLS: Final = 32_000
 _LONGEST_SHOWN: Final = 100
@@ -62,7 +62,7 @@ _GEOTIFF: Final[dict[RasterAxes, str]] = {
 
 
 def frame_json(frame: WallFrame) -> dict[str, JsonValue]:
-    """Frame of a wall's raster: world = origin + gsd * (column * u + row * v) + depth * n."""
+    """Return a wall's raster frame: world = origin + gsd * (column * u + row * v) + depth * n."""
     plane = frame.plane
     placed: dict[str, JsonValue] = {} if frame.map_crs is None else {"map_crs": frame.map_crs}
     if frame.up is not None:
@@ -81,7 +81,7 @@ def frame_json(frame: WallFrame) -> dict[str, JsonValue]:
         "height": frame.height,
         "plane": {"normal": numbers(plane.normal), "offset_m": plane.offset_m},
         "corners_world": numbers(frame.corners_world()),
-        # X and Y of the top-left corner: of a wall metres along it, and height.
+        # X and Y of the top-left corner; for a wall, metres along it, and height.
         "x_of_left_m": left_m,
         "height_of_top_m" if frame.raster_axes == "wall" else "y_of_top_m": top_m,
         "crs": frame.map_crs or local_crs_name(frame.crs),
@@ -94,20 +94,20 @@ def frame_json(frame: WallFrame) -> dict[str, JsonValue]:
 
 
 def read_sidecar(path: Path) -> dict[str, object]:
-    """Read the JSON object beside a raster.
+    """Read the JSON object next to a raster.
 
     Raises:
-        InputError: the file cannot be read, is too large, or holds something else.
+        InputError: the file cannot be read, is too large, or does not contain an object.
     """
     what = "a JSON object with origin_world, u_world ..."
     return sidecar_of(text_of_file(path, MOST_SIDECAR_BYTES, what), path.name)
 
 
 def sidecar_of(text: str, name: str) -> dict[str, object]:
-    """Read the text of a JSON object that states where a raster lies.
+    """Parse the text of a sidecar.
 
     Raises:
-        InputError: it is something else, nested too deeply, or has numbers of too many digits.
+        InputError: it is not a JSON object, too deeply nested, or has numbers with too many digits.
     """
     try:
         content = parse_json(text)
@@ -119,7 +119,7 @@ def sidecar_of(text: str, name: str) -> dict[str, object]:
 
 
 def shown_value(value: object) -> str:
-    """Return what a sidecar holds for a message, cut where it is long."""
+    """Return a value of a sidecar for a message, cut if it is long."""
     text = repr(value)
     return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]} ..."
 
@@ -131,19 +131,19 @@ def frame_of_raster(
     shape: tuple[int, int],
     name: str,
 ) -> WallFrame:
-    """Place a GeoTIFF in the world whose X and Y are metres in the plane of a wall.
+    """Return the frame of a GeoTIFF whose X and Y are metres in the plane of a wall.
 
     Args:
-        content: `origin_world`, `u_world`, `v_world` (down), `normal_world` of that plane, as in
-            the sidecars that orthoflow writes; X counts along u and Y against v from what
-            `x_of_left_m` and `height_of_top_m` (or `y_of_top_m`) state of that origin, or without
-            them from 0, or with `map_crs` from its place in the map.
-        raster: where the GeoTIFF lies.
-        shape: its rows and columns.
-        name: what to call it in an error.
+        content: sidecar with `origin_world`, `u_world`, `v_world` (down) and `normal_world` of
+            the plane, as written by orthoflow. X increases along u and Y against v, starting from
+            the values at the origin: `x_of_left_m` and `height_of_top_m` (or `y_of_top_m`), 0 if
+            they are missing, or its map coordinates if `map_crs` is given.
+        raster: position of the GeoTIFF.
+        shape: rows and columns of the GeoTIFF.
+        name: name of the file in error messages.
 
     Raises:
-        InputError: a vector is missing, or they are no frame.
+        InputError: a vector is missing, or the vectors do not form a frame.
     """
     vectors = {}
     for key in ("origin_world", "u_world", "v_world", "normal_world"):
@@ -192,10 +192,10 @@ def frame_of_raster(
 
 
 def placed_raster(path: Path) -> tuple[WallFrame, dict[str, object]]:
-    """Return where a published GeoTIFF lies, and the sidecar beside it that states so.
+    """Return the frame of a published GeoTIFF, and the content of its sidecar.
 
     Raises:
-        InputError: one of them cannot be read.
+        InputError: one of the files cannot be read.
     """
     content = read_sidecar(path.with_suffix(".json"))
     with RasterParts(path) as raster:
@@ -209,14 +209,14 @@ def placed_raster(path: Path) -> tuple[WallFrame, dict[str, object]]:
 
 
 def _number(value: object) -> float:
-    """A number of a sidecar; 0 where it holds none, or one that is no place."""
+    """Return a number of a sidecar; 0 if it is not a number or not a plausible position."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return 0.0
     return float(value) if abs(value) < FARTHEST_M else 0.0
 
 
 def _vector(value: object) -> NDArray[np.float64]:
-    """Numbers of a list, compared as they are; an empty array where it holds something else."""
+    """Return the numbers of a list; an empty array for any other value."""
     if not isinstance(value, list) or any(isinstance(item, bool) for item in value):
         return np.zeros(0)
     try:
@@ -228,7 +228,7 @@ def _vector(value: object) -> NDArray[np.float64]:
 def raster_tags(
     frame: WallFrame, *, digest: str, name: str, content: str, extra: Mapping[str, str]
 ) -> dict[str, str]:
-    """Tags of a GeoTIFF: enough to place it in the world without the JSON file beside it."""
+    """Return the tags of a GeoTIFF; they define its position in the world without the sidecar."""
     plane = frame.plane
     of_frame = ("map_crs", "up_world", "origin_world", "u_world", "v_world", "normal_world")
     of_raster = ("x_of_left_m", "height_of_top_m", "y_of_top_m")
@@ -252,22 +252,22 @@ def raster_tags(
 def mask_meanings(
     meanings: Mapping[SurfaceMask, str] | Mapping[OrthoMask, str] | Mapping[LayerMask, str],
 ) -> JsonValue:
-    """Meaning of each mask value, keyed by the value as JSON wants it, as text."""
+    """Return the meanings of mask values, with the values as text, since they are JSON keys."""
     return {str(int(value)): text for value, text in meanings.items()}
 
 
 def numbers(values: NDArray[np.generic]) -> JsonValue:
-    """Nested lists of an array; what is not finite becomes null, which JSON can hold."""
+    """Return an array as nested lists; values that are not finite become null, for JSON."""
     return _finite(values.tolist())
 
 
 def number(value: float | None) -> JsonValue:
-    """Return a number, or None for what is absent or not finite."""
+    """Return a number, or None if it is missing or not finite."""
     return None if value is None or not math.isfinite(value) else float(value)
 
 
 def write_json(path: Path, content: Mapping[str, JsonValue]) -> None:
-    """Write a JSON file as people like to read it.
+    """Write an indented JSON file.
 
     Raises:
         StoreError: the file cannot be written.
@@ -309,13 +309,13 @@ _COLOURS: Final = 3
 
 @dataclass(frozen=True, kw_only=True)
 class OrthoFile:
-    """One orthoimage.
+    """One published orthoimage.
 
     Attributes:
         path: its GeoTIFF.
-        about: its wall, size and accuracy.
-        frame: where its cells lie.
-        digest: of the product, empty where the sidecar does not state it.
+        about: description of the wall, with size and accuracy.
+        frame: frame of the raster.
+        digest: digest of the product; empty if missing in the sidecar.
     """
 
     path: Path
@@ -325,16 +325,16 @@ class OrthoFile:
 
     @property
     def wall(self) -> int:
-        """Number of its wall."""
+        """Number of the wall."""
         return self.about.number
 
     @property
     def name(self) -> str:
-        """What the run calls its wall."""
+        """Name of the wall in the run."""
         return self.about.name
 
     def shrunk(self, longest_px: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Colours (r, c, 3) and what is shown (r, c), averaged to at most `longest_px` a side.
+        """Return colours (r, c, 3) and content (r, c), averaged to at most `longest_px` per side.
 
         Raises:
             InputError: the file cannot be read.
@@ -347,11 +347,11 @@ class OrthoFile:
     def part(
         self, cells: tuple[int, int, int, int], shape: tuple[int, int]
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Colours (r, c, 3) and what is shown (r, c) of a part, averaged to fewer pixels.
+        """Return colours (r, c, 3) and content (r, c) of a part, averaged to fewer pixels.
 
         Args:
             cells: left, top, right and bottom of the part.
-            shape: requested rows and columns, at most as many as cells.
+            shape: requested rows and columns, at most the number of cells.
 
         Raises:
             InputError: the file cannot be read.
@@ -368,10 +368,10 @@ class OrthoFile:
 
 
 def ortho_files(paths: Iterable[Path]) -> tuple[OrthoFile, ...]:
-    """Open those files that are orthoimages, in the order of their walls.
+    """Open those files that are orthoimages, ordered by wall.
 
     Raises:
-        InputError: one of them, or the sidecar beside it, cannot be read.
+        InputError: an orthoimage or its sidecar cannot be read.
     """
     named = [path for path in paths if path.name.startswith("wall_")]
     found = [_opened(path) for path in named if ORTHO_FILE.fullmatch(path.name)]

@@ -1,4 +1,4 @@
-"""Tables of points, as surveyors export and people write them: a header, one point per line."""
+"""Tables of points, exported by surveyors or written by hand: a header, then a point per line."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ MOST_LINE: Final = 10_000
 
 @dataclass(frozen=True, kw_only=True)
 class SurveyPoint:
-    """A point with its name.
+    """A named point.
 
     Attributes:
-        name: unique in its file.
-        position: x, y, z as they stand in the file.
-        class_name: empty without one.
+        name: name of the point, unique in its file.
+        position: x, y, z as given in the file.
+        class_name: class of the point; empty if none is given.
         wall: wall in whose orthoimage the point was measured, or None.
-        pixel_wall: measured column and row there, or None.
-        place_m: measured X and Y there, as its GeoTIFF has them, or None.
-        shown_m: x, y, z in metres of what is shown where the point was measured, or None.
+        pixel_wall: measured column and row in that orthoimage, or None.
+        place_m: measured X and Y in the coordinates of its GeoTIFF, or None.
+        shown_m: x, y, z in metres of the measured point in that orthoimage, or None.
     """
 
     name: str
@@ -54,13 +54,13 @@ class SurveyPoint:
 
 @dataclass(frozen=True, kw_only=True)
 class MeasuredTie:
-    """A point of a photo that somebody measured.
+    """A point measured in a photo by hand.
 
     Attributes:
         where: file and line, for messages.
-        photo: name of the photo.
-        pixel: column and row as they stand in the file.
-        position: x, y, z as they stand in the file.
+        photo: photo name.
+        pixel: column and row as given in the file.
+        position: x, y, z as given in the file.
         sigma_px: standard deviation of each pixel coordinate, or None.
     """
 
@@ -72,10 +72,10 @@ class MeasuredTie:
 
 
 def read_measured_ties(path: Path) -> tuple[MeasuredTie, ...]:
-    """Read a file of ties: `photo,u_px,v_px,x,y,z[,sigma_px]`, otherwise as `read_survey_points`.
+    """Read a tie file: `photo,u_px,v_px,x,y,z[,sigma_px]`, in the form of `read_survey_points`.
 
     Raises:
-        InputError: the file cannot be used; one line per problem, `file:line: ...`.
+        InputError: the file is invalid; one line per problem, `file:line: ...`.
     """
     required = ("photo", *_IN_IMAGE, *_POSITION)
     table = _Table(path, content="ties", required=required, single=("sigma_px",))
@@ -105,13 +105,12 @@ def read_survey_points(path: Path) -> tuple[SurveyPoint, ...]:
     """Read a file of points.
 
     Columns are separated by commas, semicolons or tabs and named in the first line, in any order:
-    `name,x,y,z[,class][,wall,u_px,v_px]`; instead of the last three there may be `map_x,map_y` or
-    `shown_x,shown_y,shown_z`, each with or without `wall`.
-    Without such a line there are four or five columns in that order. Lines that are empty or begin
-    with # are skipped.
+    `name,x,y,z[,class][,wall,u_px,v_px]`. Instead of the last three, `map_x,map_y` or
+    `shown_x,shown_y,shown_z` are possible, each with or without `wall`. Without a header, there are
+    four or five columns in this order. Empty lines and lines that begin with # are skipped.
 
     Raises:
-        InputError: the file cannot be used; one line per problem, `file:line: ...`.
+        InputError: the file is invalid; one line per problem, `file:line: ...`.
     """
     measured = ("wall", *_IN_IMAGE, *_IN_MAP, *_IN_SPACE)
     table = _Table(
@@ -155,14 +154,14 @@ def read_survey_points(path: Path) -> tuple[SurveyPoint, ...]:
 
 @dataclass(kw_only=True)
 class _Table:
-    """Lines of a file as rows, with everything that is wrong with them.
+    """The rows of a file, and its problems.
 
     Attributes:
         path: the file.
-        content: what its lines are.
-        required: columns that are always there.
-        single: a column that may be there; also in a table without names.
-        measured: further columns, of which some belong together.
+        content: kind of its rows, for messages.
+        required: columns that must be present.
+        single: optional columns, also possible without a header.
+        measured: further optional columns, some of which belong together.
     """
 
     path: Path = field(kw_only=False)
@@ -173,18 +172,18 @@ class _Table:
     problems: list[str] = field(default_factory=list)
 
     def add(self, line: int, message: str) -> None:
-        """Keep a problem."""
+        """Add a problem."""
         self.problems.append(f"{self.path.name}:{line}: {message}")
 
     def check(self) -> None:
-        """Raise what was found, if anything."""
+        """Raise an error with all problems, if there are any."""
         left_out = len(self.problems) - _MAX_PROBLEMS
         more = [f"... and {left_out} more problems"] if left_out > 0 else []
         if self.problems:
             raise InputError("\n".join(self.problems[:_MAX_PROBLEMS] + more))
 
     def rows(self) -> Iterator[tuple[int, dict[str, str]]]:
-        """Return line and cells of each row that has a cell for every column."""
+        """Yield line number and cells of each row that has a cell for every column."""
         names = ",".join(self.required)
         text = text_of_file(
             self.path, MOST_BYTES, f"a CSV file of {self.content} with the columns {names}"
@@ -197,7 +196,7 @@ class _Table:
                     f"{self.path.name} holds no {self.content}: expected {names} per line"
                 )
             return
-        # A header has no number where points and ties have theirs.
+        # In a header, the columns of numbers contain no numbers.
         is_header = not any(_as_number(cell) is not None for cell in first[1:4])
         columns = self._columns(line, [cell.lower() for cell in first], is_header=is_header)
         if not columns:
@@ -215,7 +214,7 @@ class _Table:
             self.add(line, f"only the names of the columns, no {self.content}")
 
     def numbers(self, line: int, cells: Mapping[str, str], keys: Collection[str]) -> list[float]:
-        """Return finite numbers; NaN for what is none."""
+        """Return numbers; NaN for cells that are not finite numbers."""
         found = []
         for key in keys:
             cell = cells[key]
@@ -231,7 +230,7 @@ class _Table:
     def measured_by(
         self, line: int, given: Collection[str], *, is_row: bool = True
     ) -> tuple[str, ...]:
-        """Which columns say where a point was measured; none where they are not all there."""
+        """Return the columns with the measured position; empty if some are missing."""
         groups = [
             group
             for group in (_IN_IMAGE, _IN_MAP, _IN_SPACE)
@@ -256,7 +255,7 @@ class _Table:
             for number, line in enumerate(lines, start=1)
             if line.strip() and line.strip()[0] != "#"
         ]
-        # A comma may be part of a number; the others may not.
+        # Last, because a comma may also be a decimal comma.
         first = numbered[0][1] if numbered else ""
         separator = next((mark for mark in _SEPARATORS if mark in first), ",")
         for place, (number, line) in enumerate(numbered):
@@ -303,7 +302,7 @@ class _Table:
 
 def _as_number(cell: str) -> float | None:
     try:
-        # Python's own grouping mark has no place in a table.
+        # Digits grouped by underscores, which Python accepts, are not numbers here.
         return None if "_" in cell else float(cell)
     except ValueError:
         return None

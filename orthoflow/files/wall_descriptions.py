@@ -1,4 +1,4 @@
-"""The description of a wall's orthoimage that pages, sheets, tiles, tables and catalogues state."""
+"""Description of a wall's orthoimage for pages, sheets, tiles, tables and catalogues."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from orthoflow.files.drawings.words import Phrase
 from orthoflow.products import PAINTED_STATES
 
 ORTHO_FILE: Final = re.compile(r"(?:[a-z]+_)?wall_(\d{1,5})_ortho\.tif")
-# An image with a smaller painted share is not a view of its wall.
+# An image with a smaller painted share does not show its wall.
 _MIN_PAINTED_SHARE: Final = 0.5
 
 
 class WallDescription(BaseModel):
-    """A wall and its orthoimage: size, share painted, expected error, whether to deliver it.
+    """A wall and its orthoimage: size, painted share, expected error, recommendation.
 
     Attributes:
-        number: of the wall: the place of its plane in `planes.json`.
-        name: of the wall, with its number.
-        kind: `wall`, `floor`, `ceiling`, or its method's own name for it.
-        recommended: its orthoimage should be delivered.
-        reason: why, or why not.
-        width_m: of the image; None without one, like all that follows.
-        height_m: likewise.
-        area_m2: likewise.
-        painted_share: of the cells of the image.
-        height_of_top_m: height of its upper edge along the world's up; None for level surfaces.
+        number: number of the wall: index of its plane in `planes.json`.
+        name: name of the wall, including its number.
+        kind: `wall`, `floor`, `ceiling`, or another kind defined by the method.
+        recommended: whether the orthoimage should be delivered.
+        reason: reason for the recommendation.
+        width_m: width of the image; like the following numbers, None if there is no image.
+        height_m: height of the image.
+        area_m2: area of the image.
+        painted_share: share of painted cells in the image.
+        height_of_top_m: height of the upper edge along the world's up; None for level surfaces.
         expected_mm_median: expected error of a point measured in the image, one standard deviation,
             median over the image; None if it was not checked.
-        expected_mm_p95: the same, exceeded by 5 % of the image.
-        n_check_points: on this wall.
-        orthoimage: its GeoTIFF, relative to where the description is written.
+        expected_mm_p95: the same, exceeded in 5 % of the image.
+        n_check_points: number of check points on this wall; 0 if there is no image.
+        orthoimage: path of the GeoTIFF, relative to the file with this description.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
@@ -57,7 +57,7 @@ class WallDescription(BaseModel):
 
     @property
     def accuracy(self) -> Phrase:
-        """The expected error of its orthoimage as a phrase for drawings."""
+        """Expected error of the orthoimage, as a phrase for drawings."""
         if self.expected_mm_median is None or self.expected_mm_p95 is None:
             return Phrase(key="not_checked")
         errors = {"median": self.expected_mm_median, "high": self.expected_mm_p95}
@@ -66,7 +66,7 @@ class WallDescription(BaseModel):
 
     @property
     def sentence(self) -> str:
-        """Size, share painted, expected error, and why it should not be delivered."""
+        """Size, painted share, expected error, and the reason if it should not be delivered."""
         parts = [self.accuracy.text()]
         if self.painted_share is not None:
             parts.insert(0, f"{self.width_m:.2f} x {self.height_m:.2f} m")
@@ -78,11 +78,11 @@ def described(path: Path, sidecar: Mapping[str, object]) -> WallDescription:
     """Describe the wall of a published orthoimage.
 
     Args:
-        path: its GeoTIFF; beside those of photos lies the raster of their expected error.
-        sidecar: content of the JSON file beside it.
+        path: the GeoTIFF; for images from photos, the raster of expected errors is next to it.
+        sidecar: content of its JSON sidecar.
 
     Raises:
-        ValueError: the sidecar states no number where one must be.
+        ValueError: the sidecar lacks a required number.
     """
     found = ORTHO_FILE.fullmatch(path.name)
     number = int(found[1]) if found else 0
@@ -133,6 +133,6 @@ def _table(value: object) -> Mapping[str, object]:
 
 
 def _number(value: object) -> float | None:
-    """Return a number of a sidecar; None where it holds none, or one that is not finite."""
+    """Return a number of a sidecar; None if it is not a finite number."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     return float(str(value)) if is_number and abs(float(str(value))) < 1e15 else None

@@ -1,7 +1,7 @@
-"""YAML 1.2 text as values that know their line and column, with everything odd refused.
+"""YAML 1.2 text converted to values with line and column; unusual features are refused.
 
-ruamel.yaml composes the nodes; turning nodes into values happens here, so that duplicate keys,
-tags and anchor bombs are problems among others instead of the first exception.
+ruamel.yaml composes the nodes. They are converted to values here, so that duplicate keys, tags and
+alias bombs are reported together with other problems instead of as a single exception.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ MOST_DIGITS: Final = 1000
 #: values of a workflow file, aliases expanded
 MOST_VALUES: Final = 10_000
 _LONGEST_SHOWN: Final = 100
-# Letters, by YAML's own rule.
+# In characters; the limit is YAML's own.
 _LONGEST_KEY: Final = 1024
 _TAG: Final = "tag:yaml.org,2002:"
 
 Scalar: TypeAlias = bool | int | float | str | None
-# Keys and indices that lead to a value: `("steps", "wall", "in", "cloud", 0)`.
+# Keys and indices on the way to a value: `("steps", "wall", "in", "cloud", 0)`.
 Location: TypeAlias = tuple[str | int, ...]
 
 
 @dataclass(frozen=True, kw_only=True, order=True)
 class Position:
-    """A place in the text; line and column count from 1."""
+    """A position in the text; line and column count from 1."""
 
     line: int
     column: int
@@ -57,11 +57,11 @@ _START: Final = Position(line=1, column=1)
 
 @dataclass(frozen=True, kw_only=True)
 class Document:
-    """A document as plain values, and where they are.
+    """A document as plain values with positions.
 
     Attributes:
-        value: of the whole document.
-        places: location -> position of the value there; at least of `()`, the whole document.
+        value: value of the whole document.
+        places: location -> position of the value; contains at least `()`, the whole document.
         keys: location -> position of the key.
     """
 
@@ -70,11 +70,11 @@ class Document:
     keys: Mapping[Location, Position] = field(default_factory=dict)
 
     def resolve(self, location: Location) -> tuple[Location, Location]:
-        """Return a location without indices of single values, and as much of it as exists."""
+        """Return a location without indices of single values, and the part of it that exists."""
         value, stated, found = self.value, list[str | int](), Location()
         is_found = True
         for part in location:
-            # A single value in the place of a list has no index.
+            # A single value in place of a list has no index.
             if is_found and isinstance(part, int) and not isinstance(value, list):
                 continue
             stated.append(part)
@@ -93,23 +93,23 @@ class Document:
         return value if found == stated else None
 
     def position(self, location: Location, *, at_key: bool = False) -> Position:
-        """Return the position of a value, or of its key; of a missing one what is around it."""
+        """Return the position of a value or its key; if missing, that of the enclosing value."""
         _, found = self.resolve(location)
-        # Values from Python have the place of the whole alone.
+        # For values that come from Python, only the position of the whole document is known.
         while found not in self.places:
             found = found[:-1]
         return (at_key and self.keys.get(found)) or self.places[found]
 
 
 class Problems(Protocol):
-    """Takes in what is wrong with a document."""
+    """Receiver of problems with a document."""
 
     def add(self, position: Position, path: str, message: str) -> None:
-        """Keep a problem: its place, the keys that lead to it joined by dots, and one sentence."""
+        """Add a problem: its position, the path of keys joined by dots, and a sentence."""
 
 
 def path_text(location: Location) -> str:
-    """Write a location.
+    """Return a location as text.
 
     >>> path_text(("steps", "wall", "in", "cloud", 1))
     'steps.wall.in.cloud[1]'
@@ -119,7 +119,7 @@ def path_text(location: Location) -> str:
 
 
 def describe(value: object) -> str:
-    """State what a value is, for messages.
+    """Describe a value for messages.
 
     >>> describe("0.003"), describe(0.003), describe(None), describe([1])
     ('the text "0.003"', '0.003', 'nothing', 'a list')
@@ -140,7 +140,7 @@ def _cut(text: str) -> str:
 
 
 def read_yaml(text: str, log: Problems, most_values: int = MOST_VALUES) -> Document | None:
-    """Read a document; problems go to the log, None when nothing can be read."""
+    """Read a document; problems go to the log. Returns None if the text is unreadable."""
     try:
         converter = _Converter(log=log, most_values=most_values)
         value = converter.convert(_compose(text, most_values), ())
@@ -180,7 +180,7 @@ def _compose(text: str, most_values: int) -> Node:
     return node
 
 
-# The core schema of YAML 1.2.2, section 10.3.2. ruamel.yaml's own rules for 1.2 still read `1_000`
+# The core schema of YAML 1.2.2, section 10.3.2. ruamel.yaml's own rules for 1.2 still treat `1_000`
 # and `0b11` as numbers, and `.5e-1` as text.
 _CORE_SCHEMA: Final = (
     ("null", re.compile(r"null|Null|NULL|~|")),
@@ -197,11 +197,11 @@ _CORE_SCHEMA: Final = (
 
 
 class _CoreResolver(VersionedResolver):
-    """Finds out by the core schema what a plain scalar is."""
+    """Determines the type of plain scalars by the core schema."""
 
     # Any: as in ruamel.yaml.
     def resolve(self, kind: Any, value: Any, implicit: Any) -> Any:
-        """Return the tag of a node that has none of its own."""
+        """Return the tag of a node without an explicit tag."""
         if kind is ScalarNode and implicit[0]:
             for name, form in _CORE_SCHEMA:
                 if form.fullmatch(value):
@@ -210,10 +210,10 @@ class _CoreResolver(VersionedResolver):
 
 
 class _QuickScanner(Scanner):
-    """Looks only once per token how far it has read, however many brackets are open."""
+    """A scanner that checks its position only once per token, even if many brackets are open."""
 
     def stale_possible_simple_keys(self) -> None:
-        """Forget what cannot be a key any more."""
+        """Discard candidates that can no longer be keys."""
         line, index = self.reader.line, self.reader.index
         for key in self.possible_simple_keys.values():
             if key.line != line or index - key.index > _LONGEST_KEY:
@@ -222,12 +222,12 @@ class _QuickScanner(Scanner):
 
 
 class _LimitedParser(Parser):
-    """Hands events to the composer one by one; stops where composing would take minutes.
+    """Passes events to the composer one by one; stops where composing would take minutes.
 
     Attributes:
-        most_values: that a document may have.
-        depth: how many lists and mappings are open.
-        n_values: values so far, keys among them.
+        most_values: maximum number of values in a document.
+        depth: current nesting depth of lists and mappings.
+        n_values: number of values so far, including keys.
     """
 
     most_values = MOST_VALUES
@@ -276,7 +276,7 @@ _OPENED: Final = {
 
 
 def _unreadable(error: MarkedYAMLError, text: str) -> _UnreadableError:
-    """State what the parser stumbled over where it was written, not where it was noticed."""
+    """Return an error with the position of the mistake, not of its detection by the parser."""
     problem, context = str(error.problem or ""), str(error.context or "")
     noticed = _mark_position(error.problem_mark)
     words = ", ".join(" ".join(part.split()) for part in (context, problem) if part)
@@ -287,7 +287,7 @@ def _unreadable(error: MarkedYAMLError, text: str) -> _UnreadableError:
     stumbled = int(getattr(error.problem_mark, "index", 0) or 0)
     if re.search(r":[\[{]$", text[: stumbled + 1]):
         return _UnreadableError(noticed, "this is not YAML: put a space after the colon")
-    # `key:value` above is text, which cannot be followed by another key.
+    # `key:value` in the line above is a text, which cannot be followed by a key.
     above = noticed.line - 1
     if "mapping values" in problem and (glued := _GLUED.match(text.splitlines()[above - 1])):
         position = Position(line=above, column=glued.end())
@@ -307,7 +307,7 @@ def _first_line(error: YAMLError) -> str:
 
 @dataclass
 class _Converter:
-    """Turns composed nodes into values; aliases are expanded and counted."""
+    """Converts composed nodes to values; aliases are expanded and counted."""
 
     log: Problems
     most_values: int
@@ -359,7 +359,7 @@ class _Converter:
         return entries
 
     def _joined_items(self, items: list[Node], at: Location) -> list[Node]:
-        """Join what a decimal comma leaves of numbers: `[0,02]` is 0 and 02."""
+        """Join numbers split at a decimal comma: `[0,02]` is 0 and 02."""
         joined = items[:1]
         for item in items[1:]:
             if self._is_split(joined[-1], item) and re.fullmatch(r"0\d+", str(item.value)):
@@ -371,7 +371,7 @@ class _Converter:
     def _joined_entries(
         self, entries: list[tuple[Node, Node]], at: Location
     ) -> list[tuple[Node, Node]]:
-        """Join them between braces, where `{a: 0,003}` is the value 0 and a key without value."""
+        """Join them in braces, where `{a: 0,003}` is the value 0 and a key without a value."""
         joined = entries[:1]
         for key, value in entries[1:]:
             name, before = joined[-1]
@@ -382,7 +382,7 @@ class _Converter:
         return joined
 
     def _is_split(self, before: Node, behind: Node) -> bool:
-        """Whether whole numbers have a comma and nothing else between them."""
+        """Whether there is nothing but a comma between two whole numbers."""
         return (
             isinstance(before, ScalarNode)
             and isinstance(behind, ScalarNode)
@@ -391,7 +391,7 @@ class _Converter:
         )
 
     def _join(self, before: Node, behind: Node, at: Location) -> Node:
-        """Refuse the comma and go on with the number that was meant."""
+        """Report the comma and return the intended number."""
         meant = f"{before.value}.{behind.value}"
         self._report(
             before,
@@ -435,7 +435,7 @@ def _parse_scalar(kind: str, text: str) -> Scalar:
             return {"true": True, "false": False}[text.lower()]
         case "int":
             if len(text) > MOST_DIGITS:
-                # Decimal ones Python refuses by itself, others it could not put into words.
+                # Python refuses long decimal numbers itself, but could not print others.
                 raise ValueError(f"more than {MOST_DIGITS} digits")
             return int(text, {"0o": 8, "0x": 16}.get(text[:2], 10))
         case "float":
