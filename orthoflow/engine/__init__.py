@@ -1,1 +1,1 @@
-"""Plan, store and executors: turns cells into results."""
+"""Planning and execution of runs, and the store of their results."""

@@ -1,4 +1,4 @@
-"""Cleaning a store: what is damaged or needed no longer is removed."""
+"""Cleaning of a store: removal of damaged and unneeded files."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _DAY_S: Final = 86_400.0
 
 @dataclass(frozen=True, kw_only=True)
 class Damage:
-    """Something damaged that was removed.
+    """A damaged file or result that was removed.
 
     Attributes:
-        name: its path below the store's folder.
-        what: the damaged file; for a result, which of its files are damaged or missing.
+        name: path relative to the store's folder.
+        what: the damaged file; for a result, its damaged or missing files.
     """
 
     name: str
@@ -30,12 +30,12 @@ class Damage:
 
 @dataclass(frozen=True, kw_only=True)
 class Soundness:
-    """The result of checking a store.
+    """Result of checking a store.
 
     Attributes:
-        n_results: intact results.
-        n_objects: intact products and figures.
-        damaged: what was damaged, and is removed now.
+        n_results: number of intact results.
+        n_objects: number of intact products and figures.
+        damaged: damaged files and results, which have been removed.
     """
 
     n_results: int
@@ -44,13 +44,13 @@ class Soundness:
 
 
 def check_store(store: Store) -> Soundness:
-    """Check every object and every result; runs may use the store meanwhile.
+    """Check all objects and results; other processes may use the store at the same time.
 
-    What is damaged is removed, and results with missing products or figures are.
+    Damaged files are removed, and so are results whose products or figures are missing.
 
     Raises:
-        ArgumentError: the folder has other content.
-        StoreError: the store cannot be read, or something damaged cannot be removed.
+        ArgumentError: the folder is not a store.
+        StoreError: the store cannot be read, or a damaged file cannot be removed.
     """
     require_store(store.folder)
     if not is_store(store.folder):
@@ -70,19 +70,19 @@ def check_store(store: Store) -> Soundness:
 
 
 def _named_by_digest(folder: Path) -> tuple[str, ...]:
-    """Return names, without suffix, of the store's own files; others are not ours."""
+    """Return the digests that name files of the store; other files are ignored."""
     names = (path.name.removesuffix(".json") for path in folder.glob("*"))
     return tuple(sorted(name for name in names if re.fullmatch("[0-9a-f]{64}", name)))
 
 
 @dataclass(frozen=True, kw_only=True)
 class GarbageReport:
-    """What garbage collection removed, or would remove.
+    """Result of a garbage collection, or of a dry run.
 
     Attributes:
-        n_results: results.
-        n_objects: products and figures.
-        freed_bytes: bytes of everything removed.
+        n_results: number of results removed.
+        n_objects: number of products and figures removed.
+        freed_bytes: total size of the removed files.
     """
 
     n_results: int
@@ -93,16 +93,16 @@ class GarbageReport:
 def collect_garbage(
     store: Store, *, older_than_days: float | None = None, dry_run: bool = False
 ) -> GarbageReport:
-    """Remove incomplete results, products without results, and leftovers.
+    """Remove incomplete results, products without results, and leftovers of interrupted runs.
 
     Args:
-        store: the store; no run may use it meanwhile.
+        store: the store; it must not be in use by a run.
         older_than_days: also remove results that no run used for this many days; 0 removes all.
         dry_run: only report what would be removed.
 
     Raises:
-        ArgumentError: the number of days is negative, or the folder has other content.
-        StoreError: a run uses the store.
+        ArgumentError: the number of days is negative, or the folder is not a store.
+        StoreError: the store is in use by a run.
     """
     if older_than_days is not None and older_than_days < 0:
         raise ArgumentError(f"days must be 0 or more, got {older_than_days:g}")
@@ -126,7 +126,7 @@ def _collect(store: Store, older_than_days: float | None, *, is_dry: bool) -> Ga
             kept |= result.objects
     objects = [path for path in _children(store.objects) if path.name not in kept]
     half_written = store.results.glob(".*-*")
-    # Results first: after a kill in between, no result remains whose objects are gone.
+    # Remove results first: if the process is killed in between, no result is left without objects.
     unneeded = (*results, *objects, *_children(store.scratch), *half_written)
     freed_bytes = sum(size_of(path) for path in unneeded)
     for path in () if is_dry else unneeded:

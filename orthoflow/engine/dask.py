@@ -1,9 +1,10 @@
-"""The executor for a cluster: Dask carries tasks to workers that share the store's file system.
+"""The executor for clusters: runs tasks on Dask workers that share the store's file system.
 
-A worker runs a task in a process of its own as one machine does; its products go into the store,
-and Dask carries the task there and its result back. An attempt has a folder of its own in that of
-the task: a worker that was given up may still write into its own, and the number of folders shows
-how often the task was tried. Workers that the executor makes itself are threads of this process.
+A worker runs each task in a child process, as on a single machine. Products go to the store; Dask
+transfers only the task and its result. Each attempt has its own folder inside the folder of the
+task, because a worker that was given up may still write to its folder; the number of these folders
+is the number of attempts. Without a scheduler address, the executor creates its own workers, as
+threads of this process.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
     from orthoflow.engine.plan import RunPlan
 
 
-# In the folder of a task: a task that finds it stops.
+# File in the folder of a task; the task stops when the file appears.
 CANCEL_FILE: Final = "cancel"
 _ATTEMPT: Final = "attempt-"
 _POLL_S: Final = 0.1
@@ -51,11 +52,11 @@ _LOOK_S: Final = 1.0
 
 
 def look_around(path: str, methods: str) -> tuple[str, str]:
-    """Return the surroundings of a worker: runs on each before it gets a task.
+    """Check the environment of a worker; runs on each worker before it gets a task.
 
     Returns:
-        Content of the file, or why it cannot be read; how its methods or libraries differ, empty if
-        they are the same.
+        The content of the file, or the reason why it cannot be read; and how the methods or
+        libraries of the worker differ, empty if they are the same.
     """
     try:
         seen = Path(path).read_text(encoding="utf-8")
@@ -69,11 +70,11 @@ def run_attempt(task: Task, name: str, topic: str, retries: int, methods: str) -
 
     Args:
         task: what to run.
-        name: the scheduler's name for it.
+        name: name of the task in the scheduler.
         topic: topic for progress messages.
-        retries: how often it may be repeated after its worker was lost.
-        methods: the plan's statement about its methods, see `methods_text`; empty for a worker in
-            the process that made the plan.
+        retries: maximum number of repetitions after a loss of the worker.
+        methods: the plan's methods, see `methods_text`; empty for a worker in the process that made
+            the plan.
     """
     worker = get_worker()
     home = Path(task.folder)
@@ -99,7 +100,7 @@ def run_attempt(task: Task, name: str, topic: str, retries: int, methods: str) -
 
 
 def describe_loss(who: str, times: int) -> str:
-    """Report that a task was given up because workers were lost."""
+    """Return the error message for a task that was given up because workers were lost."""
     lost = "its worker was lost" if times == 1 else f"its workers were lost, {times} in a row"
     return f"{who} was given up: {lost}; the logs of the workers may state why"
 
@@ -118,7 +119,7 @@ def _result(executor: LocalExecutor, home: Path, worker: Worker, name: str) -> C
 
 
 def _is_given_up(worker: Worker, name: str) -> bool:
-    """Whether a task is obsolete: its run has ended, or another worker has it."""
+    """Whether a task is obsolete: its run has ended, or another worker runs it."""
     state = worker.state.tasks.get(name)
     is_closing = worker.status not in WORKER_ANY_RUNNING
     return is_closing or state is None or state.state == "cancelled"
@@ -128,18 +129,18 @@ def _refused(task: Task, error: StepFailedError | PluginError) -> str:
     return result_to_json(failed_result(task, error))
 
 
-# The resource that workers state: cores for steps.
+# Dask resource of the workers: cores available for steps.
 CORES: Final = "cores"
 _PROOF_FILE: Final = "workers-see-this"
 _CONNECT_S: Final = 15.0
-# Time to wait for a first worker, for a lost scheduler, and when all workers are gone.
+# Time to wait for the first worker, for a lost scheduler, and after all workers are lost.
 _PATIENCE_S: Final = 60.0
 _WATCH_S: Final = 2.0
-# Steps have 5 s to stop by themselves, and their workers are informed within one.
+# Steps have 5 s to stop, and their workers are notified within one second.
 _STOPPING_S: Final = 20.0
 _CLOSE_S: Final = 5.0
-# Otherwise each worker would check a hundred times a second what its thread does, which is to wait,
-# and fifty times its own loop.
+# Switches off frequent polling: by default, each worker profiles its thread 100 times a second and
+# checks its event loop 50 times a second.
 _QUIET: Final = {
     "distributed.worker.profile.enabled": False,
     "distributed.admin.tick.interval": "500ms",
@@ -148,27 +149,28 @@ _QUIET: Final = {
 
 
 class DaskExecutor:
-    """Runs tasks on the workers of a cluster, or on workers of its own."""
+    """Runs tasks on the workers of a cluster, or on its own workers."""
 
     def __init__(
         self, plan: RunPlan, scratch: Path, capacity: Capacity, listen: StepListener
     ) -> None:
-        """Connect to the scheduler, and check that each worker can execute the plan.
+        """Connect to the scheduler, and check that all workers can execute the plan.
 
         Args:
-            plan: its options name the scheduler; its methods must be those of the workers.
-            scratch: a folder of the run in the store.
-            capacity: of the workers that it makes itself without a scheduler.
+            plan: the plan; its options contain the scheduler address.
+            scratch: folder of the run in the store.
+            capacity: limits of its own workers, if no scheduler is given.
             listen: called with the address of a task and its message.
 
         Raises:
-            ArgumentError: there is no such scheduler, no worker, or one does not see the store.
-            PluginError: a worker has other versions than the plan, or no orthoflow.
+            ArgumentError: there is no such scheduler or no worker, or a worker cannot access the
+                store.
+            PluginError: a worker has no orthoflow, or other versions of methods or libraries.
         """
         self._listen = listen
         self._retries = plan.options.retries
         self._address = plan.options.scheduler
-        # Its own workers have the code that made the plan.
+        # Its own workers run the code that made the plan.
         self._methods = methods_text(plan.methods) if self._address else ""
         self._running: dict[str, tuple[Task, Future[str]]] = {}
         self._messages: queue.SimpleQueue[tuple[str, StepEvent | None]] = queue.SimpleQueue()
@@ -188,14 +190,14 @@ class DaskExecutor:
 
     @property
     def capacity(self) -> Capacity:
-        """Return what the present workers can run at the same time."""
+        """Return how many tasks the present workers can run at the same time."""
         return self._capacity
 
     def start(self, task: Task) -> None:
         """Submit a task to the scheduler.
 
         Raises:
-            StoreError: its files cannot be written.
+            StoreError: the files of the task cannot be written.
         """
         with writing_to(Path(task.folder).parent):
             Path(task.folder).mkdir(parents=True, exist_ok=True)
@@ -214,10 +216,10 @@ class DaskExecutor:
         )
 
     def poll(self, timeout_s: float) -> dict[str, CellResult]:
-        """Wait for tasks to end, up to a time; forwards messages of running tasks.
+        """Wait for tasks to end, up to a time limit; forward messages of running tasks.
 
         Raises:
-            ClusterError: the scheduler, or every worker, is gone.
+            ClusterError: the scheduler or all workers are lost.
         """
         ended: list[str] = []
         with suppress(queue.Empty):
@@ -235,19 +237,19 @@ class DaskExecutor:
         return ends
 
     def cancel(self) -> None:
-        """Ask all tasks to stop; those that do not answer for 20 s are given up."""
+        """Ask all tasks to stop; give up those that do not respond within 20 s."""
         self._stop_at = time.monotonic() + _STOPPING_S
         for task, _ in self._running.values():
             with suppress(OSError):
                 (Path(task.folder) / CANCEL_FILE).touch()
 
     def close(self) -> None:
-        """Release whatever still runs: workers stop obsolete tasks."""
+        """Release all tasks still running; their workers stop them by themselves."""
         for _, future in self._running.values():
             with suppress(Exception):
                 future.cancel()
         cluster = self._client.cluster
-        # Dask's messages about losses are of no use at this point.
+        # Suppress Dask's messages about lost connections: they are expected here.
         with suppress(Exception):
             self._client.close(timeout=_CLOSE_S)
         if cluster is not None:
@@ -285,7 +287,7 @@ class DaskExecutor:
                 task, StepFailedError(f"{task.who} could not be run by its worker ({reason})")
             )
 
-    # Any: what a worker sent.
+    # `Any`: the event comes from a worker.
     def _receive(self, event: tuple[float, Any]) -> None:
         with suppress(TypeError, ValueError):
             address, text = event[1]
@@ -302,7 +304,7 @@ class DaskExecutor:
         workers = self._workers() if self._client.status == "running" else {}
         if workers:
             self._with_workers = now
-            # Its own workers share the cores of this machine, however many they are.
+            # Its own workers share the cores of this machine, whatever their number.
             self._capacity = _capacity(workers) if self._address else self._capacity
         elif self._running and now - self._with_workers > _PATIENCE_S:
             raise self._lost()
@@ -314,9 +316,9 @@ class DaskExecutor:
             f"command with the same -o goes on, with any executor"
         )
 
-    # Any: the scheduler's statement about its workers.
+    # `Any`: the scheduler's description of its workers.
     def _workers(self) -> Mapping[str, Any]:
-        """Return address -> facts, of the workers that state their cores."""
+        """Return address -> properties of the workers that report their cores."""
         try:
             known = self._client.scheduler_info(n_workers=-1)["workers"]
         except Exception:  # noqa: BLE001 - whatever keeps it from answering: it does not
@@ -357,7 +359,7 @@ class DaskExecutor:
 
 
 def _client(address: str, capacity: Capacity) -> Client:
-    # It logs each lost worker with tracebacks; the relevant part is reported by us.
+    # Dask logs each lost worker with tracebacks; the executor itself reports what matters.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     if address:
         try:
@@ -372,11 +374,11 @@ def _client(address: str, capacity: Capacity) -> Client:
             n_workers=capacity.n_tasks,
             threads_per_worker=1,
             processes=False,
-            # The run's scheduler ensures that all together do not exceed the cores.
+            # The scheduler of the run ensures that the tasks together do not exceed the cores.
             resources={CORES: capacity.n_cores},
-            # Steps are processes of their own, whose memory is watched by us.
+            # Steps run in child processes; their memory is monitored by `LocalExecutor`.
             memory_limit=0,
-            # They are not accessible from outside.
+            # Not accessible from other machines.
             dashboard_address="127.0.0.1:0",
             worker_dashboard_address="127.0.0.1:0",
             silence_logs=logging.CRITICAL,
@@ -384,7 +386,7 @@ def _client(address: str, capacity: Capacity) -> Client:
     return Client(cluster, set_as_default=False)
 
 
-# Any: the scheduler's statement about its workers.
+# `Any`: the scheduler's description of its workers.
 def _capacity(workers: Mapping[str, Any]) -> Capacity:
     cores = [int(facts["resources"][CORES]) for facts in workers.values()]
     share = max(1, min(cores))

@@ -1,4 +1,4 @@
-"""Writing that survives a kill, JSON with its own digest, and locks between processes."""
+"""Crash-safe writing, JSON with its own digest, and locks between processes."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from typing import Final
 from orthoflow.errors import StoreError
 from orthoflow.untrusted_text import open_file
 
-# Errors in the store that are not the fault of a method.
+# Errors of the store's disk, which are not the fault of a method.
 _BROKEN = frozenset({errno.EIO, errno.ESTALE, errno.EROFS, errno.ENODEV, errno.ENXIO})
 
 
 def is_broken(error: OSError, folder: Path) -> bool:
-    """Whether an error means that the disk of a folder fails, and not that it is full."""
+    """Whether an error means that the disk of a folder fails, rather than that it is full."""
     if error.errno not in _BROKEN:
         return False
-    # Descriptors have no names.
+    # Errors of file descriptors contain no path.
     named = isinstance(error.filename, str | bytes)
     return not named or Path(os.fsdecode(error.filename)).is_relative_to(folder)
 
 
 def store_error(error: OSError, folder: Path) -> StoreError:
-    """Turn an error of the operating system into one sentence that names the folder."""
+    """Convert an OSError into a StoreError of one sentence that contains the folder."""
     reason = error.strerror or str(error)
     failure = StoreError(
         f"cannot write to {folder}: {reason}; make that possible, or choose another folder"
@@ -41,10 +41,10 @@ def store_error(error: OSError, folder: Path) -> StoreError:
 
 @contextmanager
 def writing_to(folder: Path) -> Iterator[None]:
-    """Turn every OSError inside into a StoreError that names the folder.
+    """Convert each OSError in the block into a StoreError that contains the folder.
 
     Raises:
-        StoreError: full disk, no permission, or another failure of the disk.
+        StoreError: the disk is full or fails, or permission is denied.
     """
     try:
         yield
@@ -64,13 +64,13 @@ def sync(path: Path) -> None:
 
 
 def sync_tree(folder: Path) -> None:
-    """Make everything below a folder survive a power cut, except its own name."""
+    """Make all files and folders in a folder survive a power cut, except its own name."""
     for path in (*folder.rglob("*"), folder):
         sync(path)
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a temporary file and rename it; readers see the old one or the new one.
+    """Write a temporary file and rename it, so that readers see either the old or the new file.
 
     Raises:
         StoreError: the disk cannot be written.
@@ -90,10 +90,10 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 def place_folder(aside: Path, final: Path) -> bool:
-    """Rename a finished folder into place.
+    """Rename a finished folder to its final name.
 
     Returns:
-        False if another writer was first; the new folder then stays where it is.
+        False if another process was first; the new folder then keeps its temporary name.
 
     Raises:
         StoreError: the disk cannot be written.
@@ -113,7 +113,7 @@ def place_folder(aside: Path, final: Path) -> bool:
 
 @contextmanager
 def whole_folder(final: Path) -> Iterator[Path]:
-    """Yield the name of a folder to create and fill; it gets its final name if the block succeeds.
+    """Yield the path of a folder to create and fill; it is renamed if the block succeeds.
 
     Raises:
         StoreError: the disk cannot be written.
@@ -123,8 +123,8 @@ def whole_folder(final: Path) -> Iterator[Path]:
     try:
         with writing_to(final):
             if os.path.lexists(aside):
-                # A part that could not be removed would be passed on with the rest: this states
-                # why.
+                # A leftover that cannot be removed would become part of the new folder; raise the
+                # error instead.
                 shutil.rmtree(aside)
             yield aside
             sync_tree(aside)
@@ -136,22 +136,22 @@ def whole_folder(final: Path) -> Iterator[Path]:
 
 
 def remove_tree(folder: Path) -> None:
-    """Remove a folder or file that may be gone already, or be removed by another meanwhile."""
+    """Remove a folder or file that may be missing or be removed by another process."""
     if folder.is_symlink() or folder.is_file():
         folder.unlink(missing_ok=True)
         return
-    # Before Python 3.13 it recurses for every level.
+    # Before Python 3.13, `rmtree` recurses once per folder level.
     with suppress(RecursionError):
         shutil.rmtree(folder, ignore_errors=True)
 
 
 def folder_size(folder: Path) -> int:
-    """Return the size of all files below a folder, 0 if it is missing."""
+    """Return the size of all files in a folder and its subfolders, 0 if it is missing."""
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 def size_of(path: Path) -> int:
-    """Bytes of a file, or of all files below a folder; a link counts for itself."""
+    """Return the size of a file, or of all files in a folder; links are not followed."""
     if path.is_dir() and not path.is_symlink():
         return folder_size(path)
     return path.lstat().st_size
@@ -170,7 +170,7 @@ def with_digest(text: str) -> str:
 
 
 def is_checked(text: str) -> bool:
-    """Whether a text has the digest that it begins with; False without a digest."""
+    """Whether a text matches the digest at its beginning; False if there is no digest."""
     found = _DIGEST.match(text)
     return found is not None and found[1] == _sha256(f"{{{text[found.end() :]}")
 
@@ -180,19 +180,19 @@ def _sha256(text: str) -> str:
 
 
 def lock_file(path: Path, descriptor: int, *, is_shared: bool = False, waits: bool = False) -> bool:
-    """Lock an open file until it is closed, or its process ends.
+    """Lock an open file until it is closed or the process ends.
 
     Args:
-        path: of the file, for the message.
-        descriptor: the same file, open.
-        is_shared: others may hold it too, if theirs is shared.
-        waits: until nobody else holds it.
+        path: path of the file, for the error message.
+        descriptor: file descriptor of the same file.
+        is_shared: allow other shared locks at the same time.
+        waits: wait until other processes release the file.
 
     Returns:
-        False if another one holds it.
+        False if another process holds the lock.
 
     Raises:
-        StoreError: the file system has no locks.
+        StoreError: the file system does not support locks.
     """
     import fcntl  # noqa: PLC0415 - only of Unix, where runs run
 
@@ -211,10 +211,10 @@ def lock_file(path: Path, descriptor: int, *, is_shared: bool = False, waits: bo
 
 @contextmanager
 def shared_lock(path: Path) -> Iterator[None]:
-    """Hold a lock file together with others; waits while another process holds it alone.
+    """Hold a shared lock on a file; wait while another process holds an exclusive lock.
 
     Raises:
-        StoreError: the lock file cannot be created, or the file system has no locks.
+        StoreError: the lock file cannot be created, or the file system does not support locks.
     """
     with _opened_lock(path) as descriptor:
         lock_file(path, descriptor, is_shared=True, waits=True)
@@ -223,14 +223,14 @@ def shared_lock(path: Path) -> Iterator[None]:
 
 @contextmanager
 def exclusive_lock(path: Path, busy: str) -> Iterator[None]:
-    """Hold a lock file alone; never waits.
+    """Hold an exclusive lock on a file; raise an error instead of waiting.
 
     Args:
         path: lock file, created if missing.
-        busy: the message if another process holds it.
+        busy: message of the error if another process holds the lock.
 
     Raises:
-        StoreError: another process holds it, or as for `shared_lock`.
+        StoreError: another process holds the lock, or as for `shared_lock`.
     """
     with _opened_lock(path) as descriptor:
         if not lock_file(path, descriptor):
@@ -239,9 +239,9 @@ def exclusive_lock(path: Path, busy: str) -> Iterator[None]:
 
 
 def is_locked(path: Path) -> bool:
-    """Whether a living process holds a lock file alone; False if there is none."""
+    """Whether a living process holds an exclusive lock; False if the file is missing."""
     with suppress(OSError, StoreError), open_file(path) as file:
-        # Shared, so that two such checks do not mistake each other for holders.
+        # Use a shared lock, so that two concurrent checks do not mistake each other for the holder.
         return not lock_file(path, file.fileno(), is_shared=True)
     return False
 

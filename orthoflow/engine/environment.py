@@ -1,4 +1,4 @@
-"""Where and when cells run: versions, processor, time; never a user, host or folder name."""
+"""Versions, processor and time of a run, without names of users, hosts or folders."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def environment(threads: int) -> RecordedEnvironment:
     """Describe this machine and installation for a record.
 
     Args:
-        threads: threads of the cell.
+        threads: number of threads of the cell.
     """
     unnamed = RecordedEnvironment(
         id="",
@@ -41,13 +41,13 @@ def environment(threads: int) -> RecordedEnvironment:
 
 @cache
 def packages() -> dict[str, str]:
-    """Return installed distributions with their versions; the first of a name wins as on import."""
+    """Return name -> version of installed distributions; the first of a name is used."""
     found: dict[str, str] = {}
     for distribution in metadata.distributions():
         try:
             name, version = _stated(distribution)
         except ValueError:
-            # Not even text, so its meaning is unknown.
+            # Skip metadata that is not text.
             continue
         if name and version and name not in found:
             found[name] = version
@@ -55,8 +55,8 @@ def packages() -> dict[str, str]:
 
 
 def _stated(distribution: metadata.Distribution) -> tuple[str, str]:
-    """Return name and version of a distribution, without reading its long description."""
-    files = ("METADATA", "PKG-INFO", "")  # the last where the file itself is on the path
+    """Read name and version of a distribution without loading its long description."""
+    files = ("METADATA", "PKG-INFO", "")  # the empty name is for metadata that is a single file
     text = next(filter(None, map(distribution.read_text, files)), "")
     stated = {"name": "", "version": ""}
     for line in text.splitlines():
@@ -105,17 +105,17 @@ def _git(root: Path, *arguments: str) -> str:
 
 
 def now() -> str:
-    """Return the time as ISO 8601 in UTC, to milliseconds."""
+    """Return the current time in UTC as ISO 8601, to the millisecond."""
     return _written(datetime.now(UTC), "milliseconds")
 
 
 def time_of_file(mtime_s: float) -> str:
-    """Return the time of a file, in seconds since 1970, as ISO 8601 in UTC, to seconds."""
+    """Return a file time, in seconds since 1970, as ISO 8601 in UTC, to the second."""
     return _written(datetime.fromtimestamp(mtime_s, tz=UTC), "seconds")
 
 
 def time_in_a_name() -> str:
-    """Return the time in UTC for use in names: digits that sort."""
+    """Return the current time in UTC as digits that sort, for use in file names."""
     return f"{datetime.now(UTC):%Y%m%d-%H%M%S}"
 
 

@@ -1,7 +1,7 @@
-"""SHA-256 of input files, cached as long as the file system reports them unchanged.
+"""SHA-256 of input files, cached while the file system reports no change.
 
-The paths of files are kept, too: records contain no folders, so this is how those of an earlier run
-are found.
+The paths of files are stored, too: records contain no folders, so replays and exports use these
+paths to find the input files of an earlier run.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from orthoflow.geometry.threads import in_order
 from orthoflow.sdk.lines import one_line, text_of_path
 from orthoflow.untrusted_text import parse_json
 
-# A file changed this shortly before hashing may change again within the same time stamp.
+# A file changed so shortly before hashing may change again without a new time stamp.
 _SETTLED_NS: Final = 2_000_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class FileRef(RecordedFile):
-    """An input file by name, content and path.
+    """An input file with its name, content and path.
 
     Attributes:
-        path: where it is.
-        identity: file system attributes, used only to notice a change while a step reads it.
+        path: path of the file.
+        identity: file system attributes, used only to detect changes while a step reads the file.
     """
 
     path: Path
@@ -41,7 +41,7 @@ class FileRef(RecordedFile):
 
 
 class FileDigests:
-    """Digests of files, memoised by (device, inode, size, mtime, ctime) in a disposable file."""
+    """Digests of files, cached by (device, inode, size, mtime, ctime) in a disposable file."""
 
     def __init__(self, memo: Path) -> None:
         self._memo = memo
@@ -49,7 +49,7 @@ class FileDigests:
         self._is_dirty = False
 
     def digest_all(self, paths: Iterable[Path]) -> tuple[FileRef, ...]:
-        """Return the digests of files, in their order; large new files are read in parallel.
+        """Return the digests of files, in the order given; large new files are read in parallel.
 
         Raises:
             InputError: a file cannot be read.
@@ -95,13 +95,13 @@ class FileDigests:
         )
 
     def note_place(self, sha256: str, path: Path) -> None:
-        """Record where a run found a file."""
+        """Record the path at which a run found a file."""
         place = str(path.absolute())
         self._is_dirty |= self._places.get(sha256) != place
         self._places[sha256] = place
 
     def place(self, sha256: str) -> Path | None:
-        """Return where a file of that digest was, which may be gone or changed since."""
+        """Return the recorded path of a digest; the file may be missing or changed."""
         place = self._places.get(sha256)
         return None if place is None else Path(place)
 
@@ -118,7 +118,7 @@ class FileDigests:
 
 
 def file_identity(path: Path) -> str:
-    """Return file system attributes that are constant while a file is unchanged.
+    """Return file system attributes that do not change unless the file is changed.
 
     Raises:
         OSError: the file is not accessible.
@@ -142,7 +142,7 @@ def file_sha256(path: Path) -> str:
 
 
 def _read_memo(memo: Path) -> tuple[dict[str, str], dict[str, str]]:
-    """Return identity -> digest, and digest -> path."""
+    """Read the cache file: identity -> digest, and digest -> path."""
     try:
         text = memo.read_text(encoding="utf-8")
         content = parse_json(text) if is_checked(text) else None

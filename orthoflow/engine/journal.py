@@ -1,4 +1,4 @@
-"""A run folder: names of its contents, its journal, and events of a run."""
+"""The run folder: names of its files, the journal, and the events of a run."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class RunStarted:
-    """The run begins, or continues after an interruption.
+    """A run starts, or continues after an interruption.
 
     Attributes:
         run_id: id of the run.
-        n_cells: cells in the plan.
-        is_resumed: the run folder held an unfinished run.
+        n_cells: number of cells in the plan.
+        is_resumed: whether the run folder contained an unfinished run.
     """
 
     run_id: str
@@ -43,14 +43,14 @@ class RunStarted:
 
 @dataclass(frozen=True, kw_only=True)
 class CellStarted:
-    """A cell begins to run."""
+    """A cell starts to run."""
 
     address: str
 
 
 @dataclass(frozen=True, kw_only=True)
 class CellReported:
-    """A running cell reports its progress, a line of its log or a diagnostic."""
+    """A running cell reports its progress, a log line or a diagnostic."""
 
     address: str
     event: StepEvent
@@ -58,12 +58,13 @@ class CellReported:
 
 @dataclass(frozen=True, kw_only=True)
 class CellFinished:
-    """A cell has its outcome.
+    """A cell is finished.
 
     Attributes:
         address: address of the cell.
-        result: ok, failed or skipped.
-        cached: the result was in the store, also if this run stored it before it was interrupted.
+        result: its result, with status ok, failed or skipped.
+        cached: whether the result was in the store, even if this run stored it before an
+            interruption.
     """
 
     address: str
@@ -84,7 +85,7 @@ RECORD_FILE: Final = "run.h5"
 LOGS: Final = "logs"
 _ANOTHER: Final = "choose another folder with -o (in Python: output=)"
 _FORMAT: Final = "orthoflow/journal/1"
-_LONGEST_FILE_NAME: Final = 200  # bytes, with room for a suffix; file systems stop at 255
+_LONGEST_FILE_NAME: Final = 200  # bytes; leaves room for a suffix, since file systems allow 255
 
 
 LineEvent: TypeAlias = Literal["run", "resumed", "interrupted", "ended", "started", "finished"]
@@ -92,21 +93,22 @@ LineEvent: TypeAlias = Literal["run", "resumed", "interrupted", "ended", "starte
 
 @dataclass(frozen=True, kw_only=True)
 class JournalLine:
-    """One line of a journal: its run began or went on, or one of its cells did.
+    """One line of a journal: an event of the run or of a cell.
 
     Attributes:
-        event: `run` in the first line; `resumed`, `interrupted` or `ended` of the run as a whole;
-            `started` or `finished` of a cell.
-        time: ISO 8601 UTC.
-        format: name and version of this file, in its first line, as are `run_id` and `workflow`.
+        event: `run` in the first line; `resumed`, `interrupted` or `ended` for the run; `started`
+            or `finished` for a cell.
+        time: ISO 8601, UTC.
+        format: name and version of the file format; first line only, as are `run_id` and
+            `workflow`.
         run_id: id of the run.
-        workflow: name of its workflow.
-        address: address of the cell, and of all that follows.
-        key: its cache key.
+        workflow: name of the workflow.
+        address: address of the cell; this and all further fields are empty for the run.
+        key: cache key of the cell.
         status: ok, failed or skipped.
-        cached: its result was in the store.
-        error: the sentence of a failure.
-        error_type: class of a failure.
+        cached: whether the result was in the store.
+        error: message of a failure.
+        error_type: error class of a failure.
     """
 
     event: LineEvent
@@ -126,10 +128,10 @@ class Journal:
     """An open run folder, locked for this process.
 
     Attributes:
-        run_id: id of the run; kept when it is resumed.
-        is_resumed: the folder held an unfinished run.
-        started: ISO 8601 UTC, of the first attempt.
-        finished_keys: keys of the cells that this run has computed before it was interrupted.
+        run_id: id of the run, kept when the run is resumed.
+        is_resumed: whether the folder contained an unfinished run.
+        started: start of the first attempt, ISO 8601, UTC.
+        finished_keys: keys of the cells that this run computed before it was interrupted.
     """
 
     def __init__(self, folder: Path, name: str, *, run_id: str = "") -> None:
@@ -141,8 +143,8 @@ class Journal:
             run_id: id of a new run, generated if empty; a resumed run keeps its own.
 
         Raises:
-            ArgumentError: the folder is in use by another run, or holds a finished run, another
-                workflow's run, or other files.
+            ArgumentError: the folder is in use by another run, or contains a finished run, a run of
+                another workflow, or other files.
             StoreError: the disk cannot be written.
         """
         self._folder = folder
@@ -167,8 +169,8 @@ class Journal:
         """Append a line and sync it to the disk.
 
         Args:
-            event: of the line.
-            facts: its fields, see `JournalLine`; its time is now unless given.
+            event: event of the line.
+            facts: other fields, see `JournalLine`; `time` is the current time unless given.
 
         Raises:
             StoreError: the disk cannot be written.
@@ -207,7 +209,7 @@ class Journal:
             sync(self._folder)
 
     def _read_lines(self) -> list[JournalLine]:
-        """Read complete lines; an incomplete last one is removed."""
+        """Read all complete lines; an incomplete last line is removed."""
         content = self._path.read_bytes()
         whole = content[: content.rfind(b"\n") + 1]
         with writing_to(self._folder):
@@ -232,14 +234,14 @@ def _parsed(lines: bytes) -> list[JournalLine]:
 
 
 def require_run_folder(folder: Path, name: str) -> None:
-    """Refuse what a journal would refuse, before anything is read for the run.
+    """Check a run folder in the same way as `Journal`, before any input is read.
 
     Args:
-        folder: the run folder, which need not exist.
+        folder: the run folder; it may be missing.
         name: name of the workflow.
 
     Raises:
-        ArgumentError: no run of the workflow can begin or continue there.
+        ArgumentError: no run of the workflow can start or continue in the folder.
     """
     _check_folder(folder)
     if is_running(folder):
@@ -251,10 +253,10 @@ def require_run_folder(folder: Path, name: str) -> None:
 
 @contextmanager
 def kept_from_others(folder: Path) -> Iterator[None]:
-    """Keep other runs out of a run folder while the results of its run are written there.
+    """Lock a run folder against other runs while results are written to it.
 
     Raises:
-        ArgumentError: another run uses it.
+        ArgumentError: the folder is in use by another run.
     """
     path = folder / JOURNAL
     if not path.exists():
@@ -280,7 +282,7 @@ def _check_workflow(folder: Path, first: JournalLine, name: str) -> None:
 
 
 def readable_lines(folder: Path) -> list[JournalLine]:
-    """Return the lines of a journal, even while it is written; none if it cannot be read."""
+    """Return the lines of a journal, even during a run; empty if it is unreadable."""
     with suppress(OSError, ValueError):
         return _parsed((folder / JOURNAL).read_bytes())
     return []
@@ -313,12 +315,12 @@ def _check_folder(folder: Path) -> None:
 
 
 def is_running(folder: Path) -> bool:
-    """Whether a living process works on the run in a folder."""
+    """Whether a living process executes the run in a folder."""
     return is_locked(folder / JOURNAL)
 
 
 def new_run_id() -> str:
-    """Generate the id of a run: its time in UTC, and a random part."""
+    """Generate the id of a run from the time in UTC and a random part."""
     return f"{time_in_a_name()}-{uuid.uuid4().hex[:6]}"
 
 
@@ -337,7 +339,7 @@ def new_run_folder(name: str, run_id: str) -> Path:
 
 
 def cell_file_name(address: str) -> str:
-    """Return the name, without suffix, of files of a cell: its address, shortened if too long.
+    """Return the base name of a cell's files: its address, shortened if too long.
 
     >>> cell_file_name("ortho@plane=ransac,orient=pnp")
     'ortho@plane=ransac,orient=pnp'

@@ -1,13 +1,13 @@
-"""Where numba keeps compiled kernels: in a private folder of the user, and nowhere else.
+"""Folders for compiled numba kernels: private to the user, and never shared.
 
-What numba keeps are pickles, and to read one is to run it. So they never lie in a store or in a
-working folder, which people hand on, and nothing is ever copied from there. The folder belongs to
-the user (or to root) and nobody else may write to it; where there is none, kernels are kept in a
+Compiled kernels are pickles, and loading a pickle runs code. They are therefore never stored in a
+store or working folder, which people share, and never copied from one. The folder belongs to the
+user or root, and nobody else may write to it; if there is no such folder, kernels are kept in a
 temporary folder of this process.
 
-Our own kernels are found there by their content, see `geometry.compiling`. Those that numba itself
-keeps for a plugin are found by the file of the kernel, whatever it calls in other files: a plugin
-has a folder for each state of its code.
+orthoflow's own kernels are found by their content, see `geometry.compiling`. Kernels of plugins are
+cached by numba itself, which checks only the file of the kernel and not the code that it calls in
+other files; each version of a plugin's code therefore has its own folder.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from pathlib import Path
 from typing import Final
 
 VARIABLE: Final = "NUMBA_CACHE_DIR"
-# Some 60 MB each.
+# Each takes about 60 MB.
 _MAX_STATES: Final = 8
 
 
 def private_folder(name: str) -> Path:
-    """Return a folder of the user's cache that nobody else can write to; made when missing.
+    """Return a folder of the user's cache that nobody else can write to; create it if missing.
 
-    It is `$XDG_CACHE_HOME/orthoflow/<name>`, else `~/.cache/orthoflow/<name>`. Where that cannot be
-    made, or others may write there, it is a temporary folder that ends with this process.
+    It is `$XDG_CACHE_HOME/orthoflow/<name>` or `~/.cache/orthoflow/<name>`. If that cannot be
+    created, or others may write to it, a temporary folder is used, which is removed at exit.
     """
     with suppress(OSError, RuntimeError):
         own = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "orthoflow"
@@ -44,10 +44,11 @@ def private_folder(name: str) -> Path:
 
 
 def kernel_folder(state: str) -> Path:
-    """Return the folder for kernels, see `all_kernels`.
+    """Return a folder for compiled kernels, see `all_kernels`.
 
     Args:
-        state: digest of the code of a plugin, whose last states are kept; empty for our own.
+        state: digest of a plugin's code, whose most recent versions are kept; empty for our
+            kernels.
     """
     root = all_kernels()
     if not state or str(root) == os.environ.get(VARIABLE):
@@ -66,8 +67,8 @@ def kernel_folder(state: str) -> Path:
 def all_kernels() -> Path:
     """Return the folder of all kernels of this user.
 
-    `NUMBA_CACHE_DIR` in the environment names another one, which is used as it is, without a folder
-    for each state, where it is private.
+    The environment variable `NUMBA_CACHE_DIR` sets another folder, which is used without subfolders
+    for plugins if it is private.
     """
     named = Path(os.environ.get(VARIABLE, ""))
     if named.is_absolute():
@@ -79,10 +80,10 @@ def all_kernels() -> Path:
 
 
 def is_private(folder: Path) -> bool:
-    """Whether a folder is one, belongs to this user or to root, and no one else may write to it.
+    """Whether a path is a folder of this user or of root that nobody else may write to.
 
     Raises:
-        OSError: it is not there.
+        OSError: the path does not exist.
     """
     state = folder.lstat()
     is_own = state.st_uid in (os.getuid(), 0)
@@ -96,7 +97,7 @@ def _temporary() -> tempfile.TemporaryDirectory[str]:
 
 @contextmanager
 def kernels_in(folder: Path) -> Iterator[None]:
-    """Let numba keep what it compiles in a folder, in this process, while the block runs."""
+    """Make numba cache kernels of this process in a folder while the block runs."""
     before = os.environ.get(VARIABLE)
     os.environ[VARIABLE] = str(folder)
     reload_numba_config()
@@ -111,7 +112,7 @@ def kernels_in(folder: Path) -> Iterator[None]:
 
 
 def reload_numba_config() -> None:
-    """Let numba, where it is loaded, read the environment again."""
+    """Make numba, if it is loaded, read the environment variables again."""
     if "numba" in sys.modules:
         from numba.core import config  # noqa: PLC0415 - only where it is loaded anyway
 

@@ -1,7 +1,7 @@
 """Cache keys: the SHA-256 of everything that determines a cell's result.
 
-Paths, step names, cores, timeouts and time stamps are excluded on purpose. The code of a method and
-the versions of the libraries that it may use are included for every method automatically.
+Paths, step names, cores, timeouts and time stamps are deliberately excluded. The code of each
+method and the versions of the libraries that it may use are always included.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ _WHAT: Final = "orthoflow/cell"
 _CODE: Final = "its code"
 _KEY_VERSION: Final = 1
 _ROOT: Final = Path(__file__).resolve().parents[1]
-# Parts of the framework on which a method's result can depend; engine and command line cannot
-# change it.
+# Parts of the framework that can affect the result of a method; the engine and the command line
+# cannot.
 _FRAMEWORK_PARTS: Final = ("errors.py", "files", "geometry", "products", "sdk")
 _FRAMEWORK: Final = "orthoflow."
 _CORE: Final = frozenset({"numpy", "numba", "scipy", "opencv-python-headless"})
-# Requirements that do not affect results: command line, files of runs, pages, drawings, metadata.
+# Requirements that do not affect results: command line, records, pages, drawings, metadata.
 _WITHOUT_EFFECT: Final = frozenset(
     {"click", "ezdxf", "filelock", "h5py", "iiif-prezi3", "jinja2", "libusb-package", "matplotlib"}
     | {"networkx", "pluggy", "prov", "psutil", "pydantic", "pystac", "reportlab", "rich", "rocrate"}
@@ -57,22 +57,22 @@ _IMPORTED: Final = re.compile(r"^\s*(?:import|from)\s+([A-Za-z_]\w*)", re.MULTIL
 _MADE_BY_PYTHON: Final = frozenset({"__pycache__", ".pyc", ".nbi", ".nbc"})
 _BUILT_IN_PACKAGE: Final = "orthoflow_plugins"
 
-# Path, size and time of files.
+# Path, size and modification time of files.
 _States: TypeAlias = tuple[tuple[Path, int, int], ...]
 
 
 @dataclass(frozen=True, kw_only=True)
 class MethodFacts(MethodIdentity):
-    """What the engine needs to know about a method, without its class.
+    """Properties of a method that the engine needs, without its class.
 
     Attributes:
         target: import string of the class.
-        tools: libraries whose version may change results, with their versions.
+        tools: library -> version, for libraries that can affect results.
         code: digests of the code of the plugin and of the framework.
         inputs: port -> product type.
         outputs: port -> product type.
-        sources: the files behind `code`.
-        repeatable: input ports whose files may repeat each other's content.
+        sources: source files from which `code` was computed.
+        repeatable: input ports that accept several files with the same content.
     """
 
     target: str
@@ -85,13 +85,13 @@ class MethodFacts(MethodIdentity):
 
     @property
     def kernels(self) -> str:
-        """Name of the folder for the kernels of a plugin; empty for our own methods."""
+        """Name of the folder for a plugin's kernels; empty for built-in methods."""
         if self.target.startswith(f"{_BUILT_IN_PACKAGE}."):
             return ""
         return hashlib.sha256("".join(self.code.values()).encode()).hexdigest()
 
     def is_code_unchanged(self) -> bool:
-        """Whether the code on the disk is still the code of the keys."""
+        """Whether the code on disk is unchanged since `code` was computed."""
         try:
             return all(files_digest(self.sources[name]) == self.code[name] for name in self.sources)
         except OSError:
@@ -100,7 +100,7 @@ class MethodFacts(MethodIdentity):
 
 @dataclass(frozen=True, kw_only=True)
 class CellKey:
-    """Key of a cell and the text whose SHA-256 it is."""
+    """Key of a cell, and the text whose SHA-256 it is."""
 
     key: str
     preimage: str
@@ -115,7 +115,7 @@ def method_facts(method_id: str, catalog: Catalog) -> MethodFacts:
     entry = catalog.method(method_id)
     cls: type[Method] = entry.load()
     distribution = entry.distribution
-    # Their content affects the results, whatever the version.
+    # The contents of these files can affect results, regardless of the version.
     sources = {"plugin": plugin_files(entry), "framework": framework_files()}
     is_ours = entry.spec.target.startswith(f"{_BUILT_IN_PACKAGE}.")
     libraries = library_versions(distribution.name, () if is_ours else entry.source_files())
@@ -141,7 +141,7 @@ def method_facts(method_id: str, catalog: Catalog) -> MethodFacts:
 
 
 def input_digest(files: Sequence[RecordedFile]) -> str:
-    """Digest of a workflow input: names without folders, sizes and contents, in order."""
+    """Return the digest of an input: file names without folders, sizes and contents, in order."""
     listing: JsonValue = [
         {"name": file.name, "size_bytes": file.size_bytes, "sha256": file.sha256} for file in files
     ]
@@ -150,7 +150,7 @@ def input_digest(files: Sequence[RecordedFile]) -> str:
 
 
 def cell_key(cell: Cell, facts: MethodFacts, inputs: Mapping[str, ProductRef]) -> CellKey:
-    """Return the key of a cell with known inputs.
+    """Return the key of a cell whose inputs are known.
 
     Args:
         cell: the cell.
@@ -172,14 +172,14 @@ def cell_key(cell: Cell, facts: MethodFacts, inputs: Mapping[str, ProductRef]) -
         },
     }
     if facts.determinism == "exact" and cell.repeat:
-        # The same result, computed again to be timed.
+        # A repeat recomputes the same result to time it, so it needs its own key.
         preimage["repeat"] = cell.repeat
     text = canonical_json(preimage)
     return CellKey(key=hashlib.sha256(text.encode()).hexdigest(), preimage=text)
 
 
 def read_preimage(text: str) -> Mapping[str, JsonValue]:
-    """Read a preimage's text; an empty mapping if it is invalid."""
+    """Parse the text of a preimage; return an empty mapping if it is invalid."""
     try:
         content = parse_json(text)
     except ValueError:
@@ -188,7 +188,7 @@ def read_preimage(text: str) -> Mapping[str, JsonValue]:
 
 
 def stated_versions(preimage: Mapping[str, JsonValue], name: str) -> dict[str, str]:
-    """Return the `code` or `tools` of a preimage; empty if it is not a mapping.
+    """Return `code` or `tools` of a preimage; empty if the entry is not a mapping.
 
     >>> stated_versions({"tools": {"numpy": "2.1"}, "code": [1]}, "tools")
     {'numpy': '2.1'}
@@ -211,15 +211,15 @@ def _tools(cls: type[Method]) -> dict[str, str]:
 
 @cache
 def library_versions(distribution: str, sources: tuple[Path, ...] = ()) -> Mapping[str, str]:
-    """Return the versions of the libraries on which results of a plugin's methods may depend.
+    """Return the versions of the libraries that can affect results of a plugin's methods.
 
-    These are the requirements of its distribution and ours, and further imports of its sources;
-    those that are not installed are omitted. Libraries that only show or store results are
+    These are the requirements of its distribution and of orthoflow, and other libraries that its
+    sources import, as far as they are installed. Libraries that only display or store results are
     excluded.
 
     Args:
         distribution: distribution of the plugin.
-        sources: its Python files, if it is not one of ours.
+        sources: Python files of the plugin; empty for built-in plugins.
     """
     required = [direct_requirements(name) or () for name in (DISTRIBUTION, distribution)]
     names = {*_CORE, *required[0], *required[1], *_imported(sources)}
@@ -231,7 +231,7 @@ def library_versions(distribution: str, sources: tuple[Path, ...] = ()) -> Mappi
 
 
 def _imported(sources: Iterable[Path]) -> set[str]:
-    """Return canonical names of the distributions whose modules Python files import anywhere."""
+    """Return the canonical names of all distributions that Python files import."""
     modules = {
         name
         for path in sources
@@ -251,7 +251,7 @@ def framework_tag() -> str:
 
 
 def publisher_tag(entry: ProductEntry) -> str:
-    """Return a digest of the code that writes the published files of a product type, if any."""
+    """Return a digest of the code that publishes files of a type; empty if there is none."""
     module = entry.spec.publisher.partition(":")[0]
     if not module:
         return ""
@@ -263,7 +263,7 @@ def publisher_tag(entry: ProductEntry) -> str:
 
 @cache
 def framework_files() -> tuple[Path, ...]:
-    """Return the files of the framework's code that methods use."""
+    """Return the files of the framework that methods use."""
     parts = [_ROOT / part for part in _FRAMEWORK_PARTS]
     return tuple(
         file for part in parts for file in ([part] if part.is_file() else part.rglob("*.py"))
@@ -271,10 +271,10 @@ def framework_files() -> tuple[Path, ...]:
 
 
 def plugin_files(entry: MethodEntry) -> tuple[Path, ...]:
-    """Return the files of a method's code, and the data in the same packages.
+    """Return the code files of a method, and the data files in the same packages.
 
-    For the built-in methods that is the package of their kind, since one kind never imports
-    another; for all others everything in their distribution's packages.
+    For a built-in method, this is the package of its kind, since no kind imports another; for other
+    methods, all packages of their distribution.
     """
     files = entry.source_files()
     module = entry.spec.target.partition(":")[0]
@@ -293,7 +293,7 @@ def plugin_files(entry: MethodEntry) -> tuple[Path, ...]:
 
 
 def files_digest(files: Iterable[Path]) -> str:
-    """Return the digest of files with their names; cached as long as they are unchanged."""
+    """Return the digest of names and contents of files; cached while they are unchanged."""
     return _digest(_states(files))
 
 
@@ -317,12 +317,12 @@ def _digest(files: _States) -> str:
 
 
 def methods_text(methods: Mapping[str, MethodFacts]) -> str:
-    """What decides the results of methods, as text that can be compared."""
+    """Return the code digests and library versions of methods as text, for comparison."""
     return json.dumps({name: _facts(facts) for name, facts in methods.items()}, sort_keys=True)
 
 
 def misfit(methods: str) -> str:
-    """State in what the methods installed here differ from those of a plan; empty if nowhere."""
+    """Return how the methods installed here differ from a plan's; empty if they agree."""
     catalog = discover_catalog()
     for name, planned in json.loads(methods).items():
         try:

@@ -1,6 +1,6 @@
-"""Executors of one machine: a guarded process per task, or none.
+"""Executors for a single machine: one child process per task, or all tasks in this process.
 
-Processes are forked from a server of `multiprocessing` that has loaded `engine.preload`.
+Child processes are forked from a `multiprocessing` server that has loaded `engine.preload`.
 """
 
 from __future__ import annotations
@@ -56,9 +56,10 @@ _THREAD_VARIABLES: Final = (
     "RAYON_NUM_THREADS",
     "VECLIB_MAXIMUM_THREADS",
 )
-# Read by the interpreter, or by libraries that the server loads. A module that lies in the working
-# folder must not take the place of one of Python's. Threads of OpenBLAS spin for 2**26 turns of the
-# clock when they begin and after each product, some 0.05 s of processor time; 2**20 are below 1 ms.
+# Environment variables that are read when Python starts or the server loads libraries. A module in
+# the working folder must not replace a standard module. OpenBLAS threads spin for 2**26 clock
+# cycles when they start and after each product, about 0.05 s of processor time; 2**20 cycles take
+# less than 1 ms.
 _AT_START: Final = {
     "PYTHONSAFEPATH": "1",
     "PYTHONHASHSEED": "0",
@@ -69,12 +70,12 @@ _starting: Final = threading.Lock()
 StepListener = Callable[[str, StepEvent], None]
 EVENTS: Final = TypeAdapter(StepEvent)
 _GRACE_S: Final = 5.0
-# Maximum number of messages per poll: a step that never stops must not delay its timeout.
+# Maximum number of messages per poll: a step that never stops sending must not delay its timeout.
 _MOST_MESSAGES: Final = 256
 _LARGEST_MESSAGE: Final = 64 << 20
 _LONGEST_LAST_LINE: Final = 300
 _FROM_OUTSIDE: Final = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
-# The end of a long log is kept in the record: errors are at the end.
+# A record keeps only the end of a long log, where the errors are.
 _KEPT_BYTES: Final = 256 << 10
 _MOST_LINES: Final = 2000
 
@@ -84,10 +85,10 @@ class Capacity:
     """Limits for concurrent tasks.
 
     Attributes:
-        n_tasks: tasks.
+        n_tasks: maximum number of tasks.
         n_cores: total number of cores.
-        cores_of_one: maximum for one task.
-        share: default for one task.
+        cores_of_one: maximum number of cores for one task.
+        share: default number of cores for one task.
     """
 
     n_tasks: int
@@ -97,7 +98,7 @@ class Capacity:
 
     @classmethod
     def of_jobs(cls, jobs: int, n_cores: int) -> Capacity:
-        """A number of jobs that share the cores of one machine."""
+        """Return the limits for jobs that share the cores of one machine."""
         share = max(1, n_cores // jobs)
         return cls(n_tasks=jobs, n_cores=n_cores, cores_of_one=n_cores, share=share)
 
@@ -105,7 +106,7 @@ class Capacity:
 class Executor(Protocol):
     """Runs tasks; used from one thread.
 
-    Nothing here assumes one machine: a task is JSON, its results are in the store.
+    Nothing here assumes a single machine: a task is JSON, and its results are in the store.
     """
 
     @property
@@ -116,21 +117,21 @@ class Executor(Protocol):
         """Start a task, or queue it.
 
         Raises:
-            StoreError: its files cannot be written.
+            StoreError: the files of the task cannot be written.
         """
 
     def poll(self, timeout_s: float) -> dict[str, CellResult]:
-        """Wait for tasks to end, up to a time; forwards messages of running tasks.
+        """Wait for tasks to end, up to a time limit; forward messages of running tasks.
 
         Returns:
-            Address -> result of the tasks that ended: ok or failed, never skipped.
+            Address -> result of the tasks that have ended: ok or failed, never skipped.
         """
 
     def cancel(self) -> None:
-        """Ask all tasks to stop; they still end through `poll`, after a grace period by force."""
+        """Ask all tasks to stop; they end through `poll`, after a grace period by force."""
 
     def close(self) -> None:
-        """Stop whatever still runs, at once."""
+        """Stop all tasks still running, immediately."""
 
 
 class InlineExecutor:
@@ -139,12 +140,12 @@ class InlineExecutor:
     def __init__(
         self, capacity: Capacity, listen: StepListener, is_interrupted: Callable[[], bool]
     ) -> None:
-        """Make one.
+        """Create the executor.
 
         Args:
             capacity: limits for a task.
             listen: called with the address of a task and its message.
-            is_interrupted: whether the user asked to stop, even while a task runs.
+            is_interrupted: whether the user asked to stop; called while a task runs, too.
         """
         self.capacity = capacity
         self._listen = listen
@@ -157,7 +158,7 @@ class InlineExecutor:
         self._waiting.append(task)
 
     def poll(self, timeout_s: float) -> dict[str, CellResult]:
-        """Run the next task to its end; timeouts are ignored."""
+        """Run the next task to its end, without a timeout."""
         if not self._waiting:
             return {}
         task = self._waiting.popleft()
@@ -178,7 +179,7 @@ class InlineExecutor:
         return {task.address: dataclasses.replace(result, log=text)}
 
     def cancel(self) -> None:
-        """End the queued tasks without running them; none runs while this is called."""
+        """End the queued tasks without running them; never called while a task runs."""
         self._is_cancelled = True
 
     def close(self) -> None:
@@ -187,7 +188,7 @@ class InlineExecutor:
 
 
 def _log_text(path: Path) -> str:
-    """End of a log, without NUL characters, which no text in a record may contain."""
+    """Return the end of a log without NUL characters, which records do not allow in text."""
     with suppress(OSError), open_file(path) as stream:
         n_before = max(0, os.fstat(stream.fileno()).st_size - _KEPT_BYTES)
         stream.seek(n_before)
@@ -212,7 +213,7 @@ def _kill(processes: Iterable[psutil.Process]) -> None:
 def start_process(
     target: Callable[..., object], arguments: tuple[object, ...], name: str
 ) -> BaseProcess:
-    """Start a process with the libraries of steps loaded, and nothing else of this process.
+    """Start a process that has the libraries of steps loaded, but no state of this process.
 
     Raises:
         StepFailedError: this machine cannot start another process.
@@ -221,7 +222,7 @@ def start_process(
     failure: Exception | None = None
     with _starting, _start_conditions():
         context.set_forkserver_preload(PRELOADED)
-        # A killed server is detected by its silence, and started again.
+        # If the server was killed, the process does not respond: start both again.
         for _ in range(2):
             process = context.Process(target=target, args=arguments, name=name)
             try:
@@ -238,10 +239,11 @@ def start_process(
 
 @contextmanager
 def _start_conditions() -> Iterator[None]:
-    """Set what `multiprocessing` takes over from this process when it starts another.
+    """Adjust the state that `multiprocessing` passes on to a new process.
 
-    A script that calls `orthoflow.run` must not run again in each step, as its main module would
-    be imported there; and workers of dask, which are daemons, must be allowed to have children.
+    A script that calls `orthoflow.run` must not run again in each step, where it would be imported
+    as the main module; and Dask workers, which are daemons, must be allowed to start child
+    processes.
     """
     variables = {**_AT_START, "MPLCONFIGDIR": str(private_folder("matplotlib"))}
     before = {name: os.environ.get(name) for name in variables}
@@ -265,9 +267,9 @@ def _start_conditions() -> Iterator[None]:
 
 
 def _variables(task: Task) -> Mapping[str, str]:
-    """Environment variables for the process of a task."""
+    """Return the environment variables for the process of a task."""
     variables = dict(os.environ)
-    # A setting for debugging kernels; use --executor inline for that.
+    # Only useful for debugging kernels, which requires `--executor inline`.
     variables.pop("NUMBA_DISABLE_JIT", None)
     return variables | {
         **dict.fromkeys(_THREAD_VARIABLES, str(task.cores)),
@@ -280,18 +282,18 @@ def _variables(task: Task) -> Mapping[str, str]:
 
 
 class _Step:
-    """A task and its process, in a session of its own.
+    """A task and its process, in its own session.
 
     Attributes:
         task: the task.
-        process: its process.
-        pipe: what it sends, as in `worker.run_step`.
-        clock: monotonic seconds at the start.
-        reason: why we stopped it; None otherwise.
-        is_victim: stopped because of lack of memory.
+        process: the process of the task.
+        pipe: messages of the process, see `worker.run_step`.
+        clock: start time, monotonic seconds.
+        reason: why the executor stopped the process; None otherwise.
+        is_victim: whether the process was stopped for lack of memory.
         kill_at: end of the grace period, monotonic seconds.
-        peak_bytes: largest own memory measured from outside.
-        result: the result that it sent.
+        peak_bytes: peak memory of the process, measured from outside.
+        result: result that the process sent.
     """
 
     def __init__(self, task: Task) -> None:
@@ -299,12 +301,12 @@ class _Step:
 
         Raises:
             StepFailedError: this machine cannot start another process.
-            StoreError: its files cannot be written.
+            StoreError: the files of the task cannot be written.
         """
         with writing_to(Path(task.folder).parent):
             task.scratch.mkdir(parents=True, exist_ok=True)
         self.task = task
-        # The log begins empty; a link that somebody put there is not followed.
+        # Truncate the log, but do not follow a link in its place.
         opened = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW
         with writing_to(Path(task.log).parent):
             os.close(os.open(task.log, opened, 0o666))
@@ -328,12 +330,12 @@ class _Step:
 
     @property
     def pid(self) -> int:
-        """Its number."""
+        """Process id."""
         assert self.process.pid is not None  # noqa: S101 - it was started
         return self.process.pid
 
     def stop(self, reason: OrthoflowError) -> None:
-        """Ask it to stop by itself, if nobody has; it is killed after a grace period."""
+        """Ask the process to stop, once; it is killed after a grace period."""
         if self.reason is None:
             self.reason = reason
             self.kill_at = time.monotonic() + _GRACE_S
@@ -341,20 +343,20 @@ class _Step:
                 self.process.terminate()
 
     def kill(self) -> None:
-        """Kill it with all that it started, also when it has ended by itself."""
+        """Kill the process and its descendants, even if the process has already ended."""
         self.kill_at = time.monotonic() + _GRACE_S
         _kill(_with_descendants(self.pid))
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self.pid, signal.SIGKILL)
 
     def close(self) -> None:
-        """Release its resources."""
+        """Release the resources of the process."""
         self.pipe.close()
         if not self.process.is_alive():
             self.process.close()
 
     def outcome(self) -> CellResult:
-        """Return the result of the process, which has ended."""
+        """Return the result of the process, which must have ended."""
         peak_mib, log = round(self.peak_bytes / MIB, 1), _log_text(Path(self.task.log))
         if self.reason is None and self.result is not None:
             peak_mib = max(self.result.peak_rss_mib, peak_mib)
@@ -374,13 +376,13 @@ class _Step:
         return StepFailedError(describe_exit(self.task.who, code, self.peak_bytes, tail))
 
 
-# By process, the tasks of all executors here: a cluster's workers in this process have one each.
+# Tasks of all executors in this process by process id; each Dask worker in this process has one.
 _all_running: Final[dict[int, _Step]] = {}
 
 
 @dataclass
 class LocalExecutor:
-    """Runs each task in a process of its own."""
+    """Runs each task in its own process."""
 
     capacity: Capacity
     listen: StepListener
@@ -391,7 +393,7 @@ class LocalExecutor:
         """Start the process of a task.
 
         Raises:
-            StoreError: its files cannot be written.
+            StoreError: the files of the task cannot be written.
         """
         try:
             step = _Step(task)
@@ -401,13 +403,13 @@ class LocalExecutor:
         self._running[task.address] = _all_running[step.pid] = step
 
     def poll(self, timeout_s: float) -> dict[str, CellResult]:
-        """Wait for tasks to end, up to a time; forwards messages of running tasks."""
+        """Wait for tasks to end, up to a time limit; forward messages of running tasks."""
         ends, self._unstarted = self._unstarted, {}
         steps = self._running.values()
         pipes = [step.pipe for step in steps if not step.pipe.closed]
         timeout_s = 0.0 if ends else timeout_s
         wait([*pipes, *(step.process.sentinel for step in steps)], timeout_s)
-        # Checked before the last messages are read: nothing is sent after the end.
+        # Determined before the last messages are read: no process sends a message after its end.
         ended = [step for step in steps if not step.process.is_alive()]
         for step in steps:
             self._read(step)
@@ -416,12 +418,12 @@ class LocalExecutor:
         return ends
 
     def cancel(self) -> None:
-        """Ask all tasks to stop: SIGTERM, and SIGKILL after 5 s."""
+        """Ask all tasks to stop: SIGTERM, then SIGKILL after 5 s."""
         for step in self._running.values():
             step.stop(CancelledStepError(f"step {step.task.address} was interrupted"))
 
     def close(self) -> None:
-        """Kill whatever still runs."""
+        """Kill all processes still running."""
         for step in list(self._running.values()):
             step.kill()
             step.process.join(_GRACE_S)
@@ -436,13 +438,13 @@ class LocalExecutor:
                     return
                 message = step.pipe.recv_bytes(_LARGEST_MESSAGE)
             except (EOFError, OSError):
-                # Ended, or sent an invalid message.
+                # The process has ended or sent an invalid message.
                 step.pipe.close()
                 return
             self._take(step, message)
 
     def _take(self, step: _Step, message: bytes) -> None:
-        # A method may write into the pipe by mistake: invalid messages are ignored.
+        # Ignore invalid messages: a method may write to the pipe by mistake.
         with suppress(ValueError, StoreError, RecursionError):
             if message.startswith(RESULT):
                 text = message.removeprefix(RESULT).decode()
@@ -464,15 +466,15 @@ class LocalExecutor:
         self._guard_memory()
 
     def _guard_memory(self) -> None:
-        """Stop the largest step if the machine runs out of memory."""
+        """Stop the largest step if the machine is running out of memory."""
         floor, steps = memory_shortage(), _all_running.copy()
-        # One at a time: the memory of a dying process is not released at once.
+        # One at a time, because a killed process does not release its memory immediately.
         if not floor or any(step.is_victim for step in steps.values()):
             return
         held = {pid: tree_memory(pid) for pid in steps}
         largest = max(held, key=held.__getitem__, default=0)
-        # Another program may be the cause: stopping a small step would not help. A step of another
-        # executor is stopped by that one.
+        # Another program may be the cause; stopping a small step would not help. Steps of another
+        # executor are left to that executor.
         if not largest or held[largest] < floor or steps[largest] not in self._running.values():
             return
         step = steps[largest]
@@ -494,13 +496,13 @@ class LocalExecutor:
 
 
 def describe_exit(who: str, code: int, n_bytes: int, tail: str) -> str:
-    """Return an error for a process that ended without a result.
+    """Return the error message for a process that ended without a result.
 
     Args:
         who: method and distribution, from `Task.who`.
-        code: as in `subprocess`, negative for signals.
-        n_bytes: largest measured memory.
-        tail: last line of its log.
+        code: exit code as in `subprocess`, negative for signals.
+        n_bytes: peak memory measured.
+        tail: last line of the log.
     """
     if code >= 0:
         last = f"; its log ends with: {tail}" if tail else ""
@@ -511,7 +513,7 @@ def describe_exit(who: str, code: int, n_bytes: int, tail: str) -> str:
 
 
 def describe_memory(who: str, n_bytes: int) -> StepFailedError:
-    """Return an error for a step stopped because of lack of memory."""
+    """Return the error for a step that was stopped for lack of memory."""
     return StepFailedError(
         f"{who} needed more memory than the machine has ({n_bytes / GIB:.1f} GiB when "
         f"stopped); give it less data or coarser parameters"
@@ -519,12 +521,12 @@ def describe_memory(who: str, n_bytes: int) -> StepFailedError:
 
 
 def describe_timeout(who: str, limit_s: float) -> StepFailedError:
-    """Return an error for a step that exceeded its timeout."""
+    """Return the error for a step that exceeded its timeout."""
     return StepFailedError(f"{who} ran past its timeout of {duration(limit_s)} and was stopped")
 
 
 def duration(seconds: float) -> str:
-    """Format a duration for people.
+    """Format a duration for display.
 
     >>> [duration(s) for s in (0.5, 90, 1800, 7200)]
     ['0.5 s', '90 s', '30 min', '2 h']

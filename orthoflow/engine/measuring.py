@@ -1,4 +1,4 @@
-"""Time and memory of methods, processes and the machine."""
+"""Measurement of time and memory of methods, processes and the machine."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ GIB: Final = 1 << 30
 
 
 def process_memory(process_id: int | None = None) -> int:
-    """Return the memory that a process, by default this one, has allocated; 0 if it is gone.
+    """Return the memory allocated by a process, by default this one; 0 if it has ended.
 
-    Mapped files are not counted: they can be read again.
+    Mapped files are not counted, because the system can discard and reread them.
     """
     try:
         memory = psutil.Process(process_id).memory_info()
@@ -32,7 +32,7 @@ def process_memory(process_id: int | None = None) -> int:
 
 
 def tree_memory(root: int) -> int:
-    """Return the memory that a process and all its descendants have allocated."""
+    """Return the memory allocated by a process and all its descendants."""
     try:
         children = psutil.Process(root).children(recursive=True)
     except psutil.Error:
@@ -41,9 +41,9 @@ def tree_memory(root: int) -> int:
 
 
 def memory_shortage() -> int:
-    """Return the least memory that should stay free, in bytes, if less is available; else 0.
+    """Return the minimum free memory in bytes if less than that is available, otherwise 0.
 
-    Below it, 512 MiB or 3 % of the total, a machine fails unpredictably.
+    The minimum is 512 MiB or 3 % of the total; with less, a machine fails unpredictably.
     """
     memory = psutil.virtual_memory()
     floor = min(max(512 * MIB, memory.total * 3 // 100), memory.total // 8)
@@ -51,9 +51,9 @@ def memory_shortage() -> int:
 
 
 def is_for_want_of_memory(error: BaseException) -> bool:
-    """Whether an error means lack of memory, even while a library or a thread was started.
+    """Whether an error means lack of memory, also in loading a library or starting a thread.
 
-    The loader and threads report it only as text.
+    In these two cases, lack of memory is known only from the message.
     """
     if isinstance(error, ImportError):
         return "failed to map segment" in str(error) or "allocate memory" in str(error)
@@ -62,22 +62,22 @@ def is_for_want_of_memory(error: BaseException) -> bool:
     return isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM
 
 
-# Every import passes through these, for new modules and for those that another thread still loads.
-# Private, but finders and loaders are only called when a module is searched, not when all its
-# imports are finished.
+# Every import calls these functions, even for a module that another thread is still loading. They
+# are private, but public hooks (finders and loaders) are not called at the end of a module's
+# imports.
 _BOOTSTRAP: Final = cast("Any", importlib)._bootstrap  # noqa: SLF001
 _IMPORTS: Final = ("_find_and_load", "_lock_unlock_module")
 _NUMBA_EVENTS: Final = "numba.core.event"
-# Held while a kernel is compiled, or read from its file.
+# Event of numba while a kernel is compiled or read from its file.
 _COMPILER_LOCK: Final = "numba:compiler_lock"
 _SAMPLE_S: Final = 0.05
 
 
 class LoadingMeter:
-    """Measures, while it is entered, how long this process loads modules and compiles.
+    """Measures how long this process loads modules and compiles kernels while the block runs.
 
-    Times of several threads that load concurrently count once. A daemon thread that loads blocks
-    nobody: its seconds stop no clock, only its processor time is counted.
+    Concurrent loading in several threads is counted once. Loading in a daemon thread does not delay
+    the method: only its processor time is counted.
     """
 
     def __init__(self) -> None:
@@ -107,24 +107,24 @@ class LoadingMeter:
 
     @property
     def total_s(self) -> float:
-        """Seconds so far, on the clock."""
+        """Elapsed seconds so far."""
         with self._lock:
             running_s = time.perf_counter() - self._opened_s if self._n_open else 0.0
             return self._total_s + running_s
 
     @property
     def processor_s(self) -> float:
-        """Processor seconds so far, of all threads, without what is being loaded right now."""
+        """Processor seconds so far, of all threads, without loading still in progress."""
         with self._lock:
             return self._processor_s
 
     def clock_s(self) -> float:
-        """Return seconds as `time.perf_counter`, but paused while something is loaded."""
+        """Return seconds as `time.perf_counter` does, but paused while anything is loaded."""
         with self._lock:
             return time.perf_counter() - self.total_s
 
     def begin(self) -> None:
-        """Record that this thread begins to load; nested loads are part of it."""
+        """Record that this thread starts loading; nested loading is part of it."""
         own = self._own
         own.depth = getattr(own, "depth", 0) + 1
         if own.depth > 1:
@@ -138,11 +138,11 @@ class LoadingMeter:
             self._n_open += 1
 
     def end(self) -> None:
-        """Record that this thread has finished its outermost load."""
+        """Record that this thread has finished its outermost loading."""
         own = self._own
         depth = getattr(own, "depth", 0)
         if depth == 0:
-            # It began before the measurement.
+            # The loading started before the measurement.
             return
         own.depth = depth - 1
         if own.depth:
@@ -168,7 +168,7 @@ class LoadingMeter:
         return timed
 
     def _listen_to_numba(self) -> None:
-        # Numba is not loaded for this: a method that compiles loads it.
+        # Do not load numba here: a method that compiles loads it.
         events = cast("Any", sys.modules.get(_NUMBA_EVENTS))
         if self._listener is not None or not hasattr(events, "install_listener"):
             return
@@ -182,11 +182,11 @@ class LoadingMeter:
 
 
 class MemorySampler:
-    """Samples this process's memory in a thread while a method runs.
+    """Samples the memory of this process in a thread while a method runs.
 
     Attributes:
-        processor_s: processor seconds of the samples so far. They grow with the clock, so a step
-            that compiles for minutes would seem to compute longer.
+        processor_s: processor seconds used for sampling so far; to be subtracted, since they grow
+            with elapsed time, including time spent compiling.
     """
 
     def __init__(self) -> None:
@@ -208,7 +208,7 @@ class MemorySampler:
 
     @property
     def peak_mib(self) -> float:
-        """Largest own memory."""
+        """Peak memory of this process."""
         return round(self._peak_bytes / MIB, 1)
 
     def _sample(self) -> None:

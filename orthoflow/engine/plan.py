@@ -1,4 +1,4 @@
-"""The frozen plan of a run: which results are stored, which cells will run, and why."""
+"""The immutable plan of a run: which cells are stored, which will run, and why."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _MOST_NAMED: Final = 4
 _LONGEST_VALUE: Final = 40
 _ABSENT: Final = "absent"
 _FORCED: Final = "forced"
-# Parameters of cameras and positions of pictures, which may be equal for several.
+# Files with camera parameters or positions of images, which may be the same for several images.
 _SIDECARS: Final = frozenset({".aae", ".jgw", ".pgw", ".prj", ".tfw", ".wld", ".xmp"})
 # Time to start a process and to read and store its products.
 _START_S: Final = 1.0
@@ -58,9 +58,9 @@ class RunOptions(Selection):
         jobs: number of concurrent cells, which share the cores.
         executor: `local` (a child process per cell), `inline` (this process, for debugging) or
             `dask` (a child process per cell, on the workers of a cluster).
-        scheduler: address of dask's scheduler; empty for own workers, as many as `jobs`.
-        retries: how often a cell is repeated after its worker was lost.
-        force: run these steps although their results are in the store.
+        scheduler: address of the Dask scheduler; if empty, `jobs` local workers are created.
+        retries: maximum number of repetitions of a cell after a loss of its worker.
+        force: steps to run even if their results are in the store.
         cores: total number of processors; None for all that this process may use.
     """
 
@@ -85,24 +85,23 @@ class RunOptions(Selection):
 
     @property
     def all_cores(self) -> int:
-        """Return the number of processors of the run."""
+        """Return the number of processors available to the run."""
         return self.cores or usable_cores()
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedCell:
-    """A cell and its planned treatment.
+    """A cell and how it will be treated.
 
     Attributes:
         cell: the cell.
-        status: `cached`, `will run`, `unknown yet` (its inputs are not known yet, and what it may
-            be given is in the store or not) or `skipped`.
-        reason: why; names what changed since the nearest earlier result.
-        key: its key if its inputs are known, else None.
-        inputs: port -> product if they are known.
-        result: the stored result of cached cells.
-        took_s: duration of the method with the most similar parameters; 0 for cells that do not
-            run, None if unknown.
+        status: `cached`, `will run`, `skipped`, or `unknown yet` if its inputs are not yet known.
+        reason: reason for the status, such as the changes since the most similar earlier result.
+        key: cache key; None if its inputs are not known.
+        inputs: port -> product, as far as known.
+        result: stored result of a cached cell.
+        took_s: expected duration, from the earlier call with the most similar parameters; 0 for
+            cells that do not run, None if unknown.
     """
 
     cell: Cell
@@ -116,11 +115,11 @@ class PlannedCell:
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedInput:
-    """A workflow input by content.
+    """A workflow input with the content of its files.
 
     Attributes:
-        ref: its digest, as a product of type `files`.
-        files: its files, in order.
+        ref: digest of the input, as a product of type `files`.
+        files: files of the input, in order.
     """
 
     ref: ProductRef
@@ -134,15 +133,15 @@ class PlannedInput:
 
 @dataclass(frozen=True, kw_only=True)
 class RunPlan:
-    """Everything a run needs, decided before it starts.
+    """Everything that is decided before a run starts.
 
     Attributes:
         name: name of the workflow.
-        cells: in topological order; cells that were not selected are omitted.
-        inputs: workflow input -> files; None if it is optional and absent.
-        methods: method id -> facts.
+        cells: selected cells in topological order.
+        inputs: workflow input -> files; None for an optional input that is not given.
+        methods: method id -> properties.
         products: type name -> import strings.
-        options: the given options.
+        options: options of the run.
     """
 
     name: str
@@ -160,10 +159,10 @@ def plan_run(
     store: Store,
     options: RunOptions | None = None,
 ) -> RunPlan:
-    """Plan a run: digest the inputs, compute the keys, check the store. Nothing is computed.
+    """Plan a run: hash the inputs, compute the keys and look them up. No cell is run.
 
     Raises:
-        ArgumentError: an option names a step that does not exist.
+        ArgumentError: an option refers to a step that does not exist.
         InputError: an input file is missing or cannot be read.
         PluginError: a method or product type cannot be loaded.
     """
@@ -194,7 +193,7 @@ def _require_distinct(
     inputs: Mapping[str, PlannedInput | None],
     methods: Mapping[str, MethodFacts],
 ) -> None:
-    """Refuse files that a step would count twice: a copy, or a link to the same file.
+    """Refuse input files that a step would count twice: copies, or links to one file.
 
     Raises:
         InputError: two files of an input have the same content.
@@ -217,7 +216,7 @@ def _require_distinct(
 
 
 def needed_addresses(cell: Cell) -> tuple[str, ...]:
-    """Return addresses of the cells whose outputs a cell takes, each once."""
+    """Return the addresses of all cells whose outputs a cell uses, without duplicates."""
     sources = (source for source in cell.inputs.values() if isinstance(source, CellOutput))
     return tuple(dict.fromkeys(source.address for source in sources))
 
@@ -227,7 +226,7 @@ def known_inputs(
     inputs: Mapping[str, PlannedInput | None],
     results: Mapping[str, CellResult],
 ) -> dict[str, ProductRef]:
-    """Return products on a cell's input ports once the previous cells have results."""
+    """Return port -> product for the inputs of a cell whose upstream results are known."""
     known: dict[str, ProductRef] = {}
     for port, source in cell.inputs.items():
         if isinstance(source, CellOutput):
@@ -245,7 +244,7 @@ def known_inputs(
 
 @dataclass(kw_only=True)
 class _Planner:
-    """Plans cell after cell, each after all it needs."""
+    """Plans cells one by one, in topological order."""
 
     inputs: Mapping[str, PlannedInput | None]
     methods: Mapping[str, MethodFacts]
@@ -255,14 +254,14 @@ class _Planner:
     _earlier: dict[str, tuple[CellResult, ...]] = field(default_factory=dict)
 
     def add(self, cell: Cell) -> None:
-        """Plan one more cell."""
+        """Add the plan of one more cell."""
         planned = self._without_inputs(cell) or self._with_inputs(cell)
         is_run = planned.status in ("will run", "unknown yet")
         took_s = self._took_s(cell) if is_run else 0.0
         if planned.status == "unknown yet" and cell.step in self.force:
             planned = replace(planned, status="will run", reason=_FORCED)
         elif planned.status == "unknown yet" and took_s is None:
-            # A method that never ran with this store has no stored results for any inputs.
+            # If a method has no results in the store, none can be found whatever its inputs are.
             reason = "no result of its method is stored"
             planned = replace(planned, status="will run", reason=reason)
         self.planned[cell.address] = replace(planned, took_s=took_s)
@@ -293,7 +292,7 @@ class _Planner:
         )
 
     def _took_s(self, cell: Cell) -> float | None:
-        """Duration of the method in the call with the most similar parameters; None if unknown."""
+        """Return the duration of the most similar call; None if there is none."""
         params = {
             f"params.{name}": json.dumps(value, ensure_ascii=False, sort_keys=True)
             for name, value in cell.params.items()
@@ -303,7 +302,7 @@ class _Planner:
             before = _ingredients(earlier.key_preimage)
             return sum(before.get(name) != value for name, value in params.items())
 
-        # The newest of equally similar ones.
+        # If several are equally similar, the most recent one is used.
         nearest = min(self._before(cell.method), key=n_changed, default=None)
         return None if nearest is None else nearest.wall_s + _START_S
 
@@ -314,7 +313,7 @@ class _Planner:
 
 
 def remember_places(inputs: Mapping[str, PlannedInput | None], store: Store) -> None:
-    """Note in the store where the files of a run are, for a replay or an export of it."""
+    """Record the paths of input files in the store, for replays and exports."""
     digests = store.file_digests()
     for given in inputs.values():
         for file in given.files if given else ():
@@ -336,7 +335,7 @@ def _digest_inputs(
         ref = ProductRef(type_name="files", encoding_version=0, digest=input_digest(refs))
         planned[name] = PlannedInput(ref=ref, files=refs)
     if store.folder.is_dir():
-        # Only a cache: a plan must also be possible on a full or read-only disk.
+        # The digests are only a cache: planning must also work on a full or read-only disk.
         with contextlib.suppress(StoreError):
             digests.save()
     return planned
@@ -367,11 +366,11 @@ def _product_targets(
 
 
 def explain(key: CellKey, earlier: Sequence[CellResult]) -> str:
-    """Return what changed since the most similar earlier result of the same method.
+    """Return the changes since the most similar earlier result of the same method.
 
     Args:
-        key: of the cell.
-        earlier: results of the method, the last used first.
+        key: key of the cell.
+        earlier: results of the method, most recently used first.
     """
     if not earlier:
         return "never ran before"

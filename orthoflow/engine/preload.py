@@ -1,6 +1,6 @@
 """Libraries that every step needs, loaded once in the process from which steps are forked.
 
-Never a plugin: no third-party code runs in the process from which others are forked.
+Plugins are never loaded here, so that no third-party code runs in that process.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ _LIBRARIES: Final = (
 
 
 def load_libraries() -> None:
-    """Load libraries; steps report their errors."""
+    """Load the libraries; errors are ignored here and reported by the steps."""
     if address_space() is not None:
-        # Some crash with too little memory, and every step with them.
+        # Some libraries crash if memory is short, and would take all steps with them.
         return
     for name in _LIBRARIES:
         with suppress(Exception):
@@ -46,10 +46,10 @@ def load_libraries() -> None:
 
 
 def _register_compiler() -> None:
-    """Let numba register what it can compile, as it does for the first kernel of a process.
+    """Make numba register its types and functions, as it does for the first kernel of a process.
 
-    That takes longer than loading numba. Its extensions, which third parties install, are loaded in
-    each step.
+    This takes longer than loading numba. Numba extensions of third parties are loaded in each step
+    instead.
     """
     from numba.core import entrypoints  # noqa: PLC0415 - only where numba is there
     from numba.core.registry import cpu_target  # noqa: PLC0415

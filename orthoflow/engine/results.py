@@ -1,4 +1,4 @@
-"""The result of a finished cell, and its form in the store: the link to journal and record."""
+"""The result of a finished cell, and its JSON form in the store."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from pydantic import TypeAdapter, ValidationError
 from orthoflow.engine.durability import is_checked, with_digest
 from orthoflow.errors import StoreError
 
-# The words of a record, for the rest of the engine.
+# Names from the record format, re-exported for the engine.
 __all__ = [
     "CellOutcome",
     "CellResult",
@@ -50,12 +50,12 @@ __all__ = [
 
 @dataclass(frozen=True, kw_only=True)
 class ProductTarget:
-    """A product type by import strings.
+    """A product type as import strings.
 
     Attributes:
-        type_name: its name.
-        target: its class.
-        publisher: writes its published files; empty without any.
+        type_name: name of the type.
+        target: class of the product.
+        publisher: function that writes its published files; empty if there is none.
         publisher_tag: version of the publisher.
     """
 
@@ -67,10 +67,10 @@ class ProductTarget:
 
 @dataclass(frozen=True, kw_only=True)
 class FigureRef(Figure):
-    """A picture in the store.
+    """A figure in the store.
 
     Attributes:
-        sha256: digest of the bytes, hexadecimal; the store's object of that name holds them.
+        sha256: SHA-256 of the bytes as hexadecimal digits, which is also the name of its object.
     """
 
     sha256: str
@@ -78,17 +78,17 @@ class FigureRef(Figure):
 
 @dataclass(frozen=True, kw_only=True)
 class CellResult(CellOutcome):
-    """The outcome of one cell.
+    """The result of one cell.
 
     Attributes:
-        format: name and version of its form in the store.
-        run_id: the run that computed it.
-        environment: where it was computed, None if it never was.
+        format: name and version of the JSON format.
+        run_id: id of the run that computed it.
+        environment: environment in which it was computed; None if it was not computed.
         inputs: port -> product.
         outputs: port -> product.
-        figures: pictures.
-        is_bug: the method raised none of our errors: its log has the traceback.
-        exit_code: of the error class, 0 when ok.
+        figures: figures of the method.
+        is_bug: whether the method raised an unexpected exception; the log contains the traceback.
+        exit_code: exit code of the error class, 0 if ok.
     """
 
     format: Literal["orthoflow/result/1"] = "orthoflow/result/1"
@@ -102,7 +102,7 @@ class CellResult(CellOutcome):
 
     @property
     def objects(self) -> frozenset[str]:
-        """Return names of the store's objects that it refers to: products and figures."""
+        """Return the names of its objects in the store: products and figures."""
         products = {ref.digest.removeprefix("sha256:") for ref in self.outputs.values()}
         return frozenset(products | {figure.sha256 for figure in self.figures})
 
@@ -116,11 +116,11 @@ def result_from_json(text: str, where: str) -> CellResult:
     """Read a result from JSON text.
 
     Args:
-        text: from `result_to_json`.
+        text: text from `result_to_json`.
         where: name of the file, for the error message.
 
     Raises:
-        StoreError: the text is damaged or of another format.
+        StoreError: the text is damaged or has another format.
     """
     if not is_checked(text):
         raise StoreError(f"{where} is damaged: its content does not match its digest")

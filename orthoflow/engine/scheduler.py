@@ -1,4 +1,4 @@
-"""Executes a plan: starts cells as their inputs become known, and continues after failures."""
+"""Executes a plan: starts cells when their inputs are known, and continues after failures."""
 
 from __future__ import annotations
 
@@ -74,12 +74,12 @@ class RunOutcome:
 
     Attributes:
         run_id: id of the run.
-        started: ISO 8601 UTC; of the first attempt when it was resumed.
-        ended: ISO 8601 UTC.
+        started: start of the first attempt, ISO 8601, UTC.
+        ended: end of the run, ISO 8601, UTC.
         results: address -> result, in the order of the plan.
-        cached: address -> id of the run that computed it, for results of other runs.
-        resumed: addresses that this run had computed before it was interrupted.
-        inputs: workflow input -> files; None if it is optional and absent.
+        cached: address -> id of the run that computed the result, for results of other runs.
+        resumed: addresses of cells that this run computed before it was interrupted.
+        inputs: workflow input -> files; None for an optional input that is not given.
     """
 
     run_id: str
@@ -92,19 +92,19 @@ class RunOutcome:
 
     @property
     def failed(self) -> Mapping[str, CellResult]:
-        """Return the failed cells; those that depend on them are skipped and not included."""
+        """Return the failed cells, without the cells skipped because of them."""
         return {
             address: result for address, result in self.results.items() if result.status == "failed"
         }
 
     @property
     def status(self) -> Literal["ok", "failed"]:
-        """`failed` if a cell failed."""
+        """`failed` if any cell failed, otherwise `ok`."""
         return "failed" if self.failed else "ok"
 
     @property
     def exit_code(self) -> int:
-        """Return 0 without failures, their common code (2 inputs, 4 plugins or libraries), or 1."""
+        """Return 0 if no cell failed, the common exit code of the failures (2 or 4), or 1."""
         codes = {result.exit_code for result in self.failed.values()}
         if not codes:
             return 0
@@ -119,26 +119,26 @@ def execute(
     *,
     run_id: str = "",
 ) -> RunOutcome:
-    """Run a plan to its end.
+    """Execute a plan.
 
-    A failed cell only stops cells that need it. After a kill at any time the same call with the
-    same folder resumes.
+    A failed cell stops only the cells that depend on it. If the process is killed at any time, the
+    same call with the same folder resumes the run.
 
     Args:
-        plan: from `plan_run`; its options control the execution.
-        run_folder: receives the journal and the logs; created if missing.
-        store: receives products and results.
-        listen: called with events as they happen.
+        plan: plan from `plan_run`; its options control the execution.
+        run_folder: folder for the journal and the logs; created if missing.
+        store: store for products and results.
+        listen: called with each event of the run.
         run_id: id of a new run, generated if empty; a resumed run keeps its own.
 
     Raises:
-        ArgumentError: the run folder holds a finished run or other files, or a path is not text.
+        ArgumentError: the run folder contains a finished run or other files, or a path is not text.
         StoreError: the disk cannot be written, or the run folder is in use.
         DamageError: an input of a step was damaged in the store and has been removed; the same call
-            computes it again.
-        CancelledStepError: interrupted by Ctrl-C or SIGTERM.
-        ClusterError: the scheduler was lost, or does not answer.
-        PluginError: workers have other versions of a method or library, or dask is missing.
+            recomputes it.
+        CancelledStepError: the run was interrupted by Ctrl-C or SIGTERM.
+        ClusterError: the scheduler was lost or does not respond.
+        PluginError: workers have other versions of a method or library, or Dask is not installed.
     """
     folder = Path(run_folder).absolute()
     for what, path in (("run folder", folder), ("store", store.folder)):
@@ -196,7 +196,7 @@ class _Run:
         """Run until every cell has a result.
 
         Raises:
-            CancelledStepError: interrupted.
+            CancelledStepError: the run was interrupted.
         """
         while self._waiting or self._running:
             if interruption.is_asked:
@@ -205,7 +205,7 @@ class _Run:
             self._poll(executor)
 
     def report(self, address: str, event: StepEvent) -> None:
-        """Pass on what a cell reports."""
+        """Pass on an event of a cell."""
         self._listen(CellReported(address=address, event=event))
 
     def _poll(self, executor: Executor) -> None:
@@ -238,7 +238,7 @@ class _Run:
         )
 
     def _advance(self, executor: Executor) -> None:
-        """Settle or start every cell whose inputs are known, as far as cores are free."""
+        """Finish or start each cell whose inputs are known, as far as cores are free."""
         for address, planned in list(self._waiting.items()):
             if address not in self._ready:
                 self._prepare(planned.cell)
@@ -247,7 +247,7 @@ class _Run:
             if ready is None or self._is_under_way(ready[0]):
                 continue
             key, refs = ready
-            # An equal cell of this run may have ended meanwhile.
+            # A cell of this run with the same key may have ended meanwhile.
             known = self._known(planned.cell, key) if key.key in self._made else None
             if known is not None:
                 self._settle(planned.cell, known, is_cached=True)
@@ -256,7 +256,7 @@ class _Run:
                 self._start(planned.cell, key, refs, executor)
 
     def _prepare(self, cell: Cell) -> None:
-        """Settle a cell from the store, or make it ready, as soon as its inputs are known."""
+        """Use a stored result, or make the cell ready, once its inputs are known."""
         needed = needed_addresses(cell)
         if not all(address in self._results for address in needed):
             return
@@ -292,7 +292,7 @@ class _Run:
         )
 
     def _known(self, cell: Cell, key: CellKey) -> CellResult | None:
-        # A forced cell that this run computed before it was interrupted is not computed twice.
+        # Do not recompute a forced cell that this run finished before it was interrupted.
         is_done = key.key in self._journal.finished_keys or key.key in self._made
         if cell.step in self._plan.options.force and not is_done:
             return None
@@ -303,13 +303,13 @@ class _Run:
         return result
 
     def _require_sound(self, cell: Cell, refs: Mapping[str, ProductRef]) -> None:
-        """Check every byte of the products that a cell takes; remove what is damaged."""
+        """Check all bytes of the products that a cell uses; remove damaged ones."""
         for port, ref in refs.items():
             if isinstance(cell.inputs[port], CellOutput) and not self._store.is_sound(ref.digest):
                 raise DamageError(f"{cell.inputs[port]}, which {cell.address} takes, was damaged")
 
     def _is_under_way(self, key: CellKey) -> bool:
-        """Whether an equal cell already runs; its result will then serve both."""
+        """Whether a cell with the same key is running; both then share its result."""
         return any(task.key == key.key for task in self._running.values())
 
     def _has_room(self, cell: Cell, capacity: Capacity) -> bool:
@@ -365,7 +365,7 @@ class _Run:
         remove_tree(Path(task.folder))
         cell = next(one.cell for one in self._plan.cells if one.cell.address == task.address)
         if result.error_type == DamageError.__name__:
-            # Not the fault of the method: its inputs were damaged after they had been checked.
+            # Not the method's fault: its inputs were damaged after they had been checked.
             self._require_sound(cell, {port: given.ref for port, given in task.inputs.items()})
             raise DamageError(result.error_message)
         if result.status == "ok" and self._plan.methods[cell.method].is_code_unchanged():
@@ -373,7 +373,7 @@ class _Run:
             self._store.put_result(task.key, result)
             self._store.trust(result)
         elif result.status == "ok":
-            # Stored under its key it would count as the result of that key's code.
+            # If stored, the result would be attributed to the code of its key, which has changed.
             changed = _CODE_CHANGED.of("", {})
             self.report(cell.address, _event_of(changed))
             result = _reporting(result, changed)
@@ -381,11 +381,11 @@ class _Run:
 
     def _settle(self, cell: Cell, result: CellResult, *, is_cached: bool = False) -> None:
         self._waiting.pop(cell.address, None)
-        # Their names are those of this workflow, the result may be another's.
+        # The result may come from another workflow; use the names of this one.
         named = (placed(one, cell.setting, self._step_of) for one in result.diagnostics)
         result = _reporting(dataclasses.replace(result, diagnostics=()), *named)
         self._results[cell.address] = result
-        # The result of an equal cell a moment ago counts as new.
+        # If a cell of this run with the same key has just computed the result, it counts as new.
         if is_cached and result.run_id != self._journal.run_id:
             self._cached[cell.address] = result.run_id
         elif is_cached and result.key not in self._made:
@@ -417,14 +417,14 @@ def _cores(cell: Cell, capacity: Capacity) -> int:
 
 @contextmanager
 def _scratch(store: Store, run_id: str) -> Iterator[Path]:
-    """A folder for work in progress; leftovers of killed runs are removed first."""
+    """Create a scratch folder; leftovers of killed runs are removed first."""
     with writing_to(store.folder):
         for old in store.scratch.iterdir():
             if old.is_dir() and old.name != "loose" and not is_locked(_lock_of(old)):
                 remove_tree(old)
                 _lock_of(old).unlink(missing_ok=True)
     folder = store.scratch / f"{run_id}-{uuid.uuid4().hex[:6]}"
-    # Locked before it exists, so that no other run mistakes it for a leftover.
+    # Lock the folder before it exists, so that no other run mistakes it for a leftover.
     with exclusive_lock(_lock_of(folder), f"the scratch folder {folder} is in use"):
         with writing_to(store.folder):
             folder.mkdir(parents=True)
@@ -442,16 +442,16 @@ def _lock_of(folder: Path) -> Path:
 def _executor_of(
     plan: RunPlan, scratch: Path, listen: StepListener, is_asked_to_stop: Callable[[], bool]
 ) -> Executor:
-    """Return the executor that the options of a run name.
+    """Return the executor selected in the options of a run.
 
     Args:
-        plan: of the run.
-        scratch: its scratch folder.
+        plan: plan of the run.
+        scratch: scratch folder of the run.
         listen: called with messages of steps.
         is_asked_to_stop: whether the run is interrupted.
 
     Raises:
-        PluginError: its library is not installed.
+        PluginError: Dask is not installed.
     """
     options = plan.options
     capacity = Capacity.of_jobs(options.jobs, options.all_cores)
@@ -469,20 +469,20 @@ def _executor_of(
 
 
 class Interruption:
-    """Whether the run was asked to stop.
+    """A signal handler that records whether the run was asked to stop.
 
     Attributes:
-        is_asked: a signal was received.
+        is_asked: whether a signal was received.
     """
 
     def __init__(self) -> None:
         self.is_asked = False
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        """Handle the signal; a second one does not wait.
+        """Record the first signal; end immediately on a second one.
 
         Raises:
-            KeyboardInterrupt: asked a second time.
+            KeyboardInterrupt: a second signal was received.
         """
         if self.is_asked:
             raise KeyboardInterrupt
@@ -491,7 +491,7 @@ class Interruption:
 
 @contextmanager
 def _watching_interruptions() -> Iterator[Interruption]:
-    """Catch SIGINT and SIGTERM inside the block, which only the main thread can."""
+    """Handle SIGINT and SIGTERM in the block; possible only in the main thread."""
     interruption = Interruption()
     if threading.current_thread() is not threading.main_thread():
         yield interruption

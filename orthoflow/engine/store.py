@@ -1,18 +1,18 @@
 """The store: products by digest, results by key; the engine's only access to the record format.
 
-Layout below the store's folder:
+Layout of the store's folder:
 
-    objects/<digest>/product.h5     a product, `object.json` beside it, `files/` what it publishes
+    objects/<digest>/product.h5     a product, with `object.json` and its published `files/`
     objects/<digest>/blob           a figure
-    results/<key>.json              what a cell gave, naming objects
-    digests.json                    memory of input files' digests; disposable
-    scratch/<run id>/               work in progress; removed with its run
+    results/<key>.json              the result of a cell, with the names of its objects
+    digests.json                    cache of the digests of input files; may be deleted
+    scratch/<run id>/               work in progress; removed at the end of the run
     lock                            shared by runs, exclusive for garbage collection
 
-Everything has the digest of its bytes and is checked when a run, or an export, uses it. What is
-damaged is removed; a run then starts again from what is left. Figures name themselves; results and
-descriptions of objects begin with the digest of the rest. They show damage, not forgery: whoever
-can write to the store can write digests, too.
+All files have a digest, which is checked when a run or an export uses them. Damaged files are
+removed; a new run then recomputes the missing results. The digest of a figure is its name; results
+and descriptions of objects begin with the digest of their remaining text. Digests reveal damage,
+not forgery: anyone who can write to the store can also write digests.
 """
 
 from __future__ import annotations
@@ -59,32 +59,32 @@ from orthoflow.engine.results import (
 from orthoflow.errors import ArgumentError, DamageError, ProductError, StoreError
 from orthoflow.products.product import Payload, Product
 
-# Created together when a store is first used. Together they identify a store: a git repository has
-# `objects`, and any folder may have `results`.
+# Folders created together on first use of a store. Together they identify a store: a git repository
+# also has `objects`, and any folder may have `results`.
 _MADE: Final = ("scratch", "objects", "results")
-# Other files that may be created first, such as a lock. A separate disk has `lost+found`, and
-# systems create hidden files everywhere.
+# Names that may exist before these folders, such as a lock. The root of a disk has `lost+found`,
+# and systems create hidden files everywhere.
 _OURS: Final = frozenset({*_MADE, "digests.json", "lock", "lost+found"})
 PRODUCT: Final = "product.h5"
 PUBLISHED: Final = "files"
 BLOB: Final = "blob"
 DESCRIPTION: Final = "object.json"
-# The machine lacks a resource: that does not mean damage.
+# Shortages of system resources, which do not mean that a file is damaged.
 _SHORTAGES: Final = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 
 
 def is_store(folder: Path) -> bool:
-    """Whether a folder is the store of a run."""
+    """Whether a folder is a store."""
     return all((folder / name).is_dir() for name in _MADE)
 
 
 def require_store(folder: Path) -> None:
-    """Refuse a folder with other content, because a store is written to and cleaned up.
+    """Refuse a folder with other files, because a store is written to and cleaned up.
 
-    A missing one, or one with only hidden files and parts of a store, may become one.
+    A missing folder, or one with only hidden files and parts of a store, is accepted.
 
     Raises:
-        ArgumentError: there are other files, and no store.
+        ArgumentError: the folder contains other files and is not a store.
         StoreError: the folder cannot be read.
     """
     if is_store(folder) or not folder.is_dir():
@@ -104,8 +104,8 @@ def make_store(folder: Path) -> None:
     """Create the folders of a store, if they are missing.
 
     Raises:
-        ArgumentError: the folder has other content.
-        StoreError: they cannot be created.
+        ArgumentError: the folder contains other files and is not a store.
+        StoreError: the folders cannot be created.
     """
     require_store(folder)
     with writing_to(folder):
@@ -139,11 +139,11 @@ class StoredProduct:
     """The content of a product's `object.json`.
 
     Attributes:
-        format: name and version of this file.
-        object: name of its object: a description does not describe another.
-        type: of the product.
-        publisher: tag of the code that wrote the published files; empty if none did.
-        files: size and SHA-256 of each file as it was stored, by path in the folder.
+        format: name and version of the file format.
+        object: name of the object that it describes.
+        type: type of the product.
+        publisher: tag of the code that wrote the published files; empty if there are none.
+        files: relative path -> size and SHA-256 of each file when it was stored.
     """
 
     format: Literal["orthoflow/object/1"] = "orthoflow/object/1"
@@ -154,18 +154,18 @@ class StoredProduct:
 
 
 class Store:
-    """A folder of products and results that runs share, also at the same time.
+    """A folder of products and results, which concurrent runs may share.
 
-    Incomplete data are never accepted: every file and folder is created under a temporary name,
-    synced and renamed.
+    The store never contains incomplete data: each file and folder is created under a temporary
+    name, synced and renamed.
     """
 
     def __init__(self, folder: Path, *, workspace: Path | None = None) -> None:
-        """Name a store; nothing is created before something is written.
+        """Open a store; no folder is created before the first write.
 
         Args:
             folder: the store's folder.
-            workspace: folder of unfinished objects, on the same file system; by default below the
+            workspace: folder for unfinished objects, on the same file system; by default in the
                 store's scratch folder.
         """
         self.folder = Path(folder).absolute()
@@ -174,19 +174,19 @@ class Store:
         self.objects = self.folder / "objects"
         self.lock_file = self.folder / "lock"
         self._workspace = workspace or self.scratch / "loose"
-        # Unchanged files need not be read twice; the first read checks them.
+        # Files already checked by this process; they are not read again unless they change.
         self._sound: set[tuple[Path, int, int, int, int]] = set()
 
     def file_digests(self) -> FileDigests:
-        """Return the cache of input files' digests; call its `save` when done."""
+        """Return the cache of input file digests; call its `save` at the end."""
         return FileDigests(self.folder / "digests.json")
 
     @contextlib.contextmanager
     def in_use(self) -> Iterator[None]:
-        """Prevent garbage collection.
+        """Prevent garbage collection while the block runs.
 
         Raises:
-            ArgumentError: the folder has other content.
+            ArgumentError: the folder contains other files and is not a store.
             StoreError: the store's folder cannot be created.
         """
         make_store(self.folder)
@@ -201,15 +201,15 @@ class Store:
         """Store a product and its published files.
 
         Args:
-            product: the product; an equal one that is there already stays.
-            publisher: writes its published files.
+            product: the product; if the store already contains the same product, that one is kept.
+            publisher: function that writes the published files.
             publisher_tag: version of the publisher; files of another version are written again.
 
         Raises:
-            StoreError: full disk, or another failure of the disk.
+            StoreError: the disk is full or fails.
             ProductError: the product has content that cannot be stored.
         """
-        # Loads h5py, which a plan does not need.
+        # Imports h5py, which is not needed for planning.
         from orthoflow_provenance.arrays import write_product_file  # noqa: PLC0415
 
         aside = self._new_folder()
@@ -236,16 +236,17 @@ class Store:
     def get_product(
         self, digest: str, cls: type[ProductT], *, is_checked: bool = False
     ) -> ProductT:
-        """Read a product; arrays are read-only, large ones memory-mapped.
+        """Read a product; arrays are read-only, large ones are memory-mapped.
 
         Args:
-            digest: of the product.
-            cls: its type.
-            is_checked: its bytes have been checked already, as the coordinator does for steps.
+            digest: digest of the product.
+            cls: class of the product.
+            is_checked: skip the check of its bytes, which the coordinator has already done for
+                steps.
 
         Raises:
-            DamageError: it is missing or damaged.
-            ProductError: it is of another type.
+            DamageError: the product is missing or damaged.
+            ProductError: the product has another type.
         """
         from orthoflow_provenance.arrays import read_product_file  # noqa: PLC0415 - as above
 
@@ -265,13 +266,13 @@ class Store:
         return cls.from_payload(Payload(**shared_fields(stored, Payload)))
 
     def product_file(self, digest: str) -> Path | None:
-        """Return the HDF5 file of a product, None if it is missing or damaged."""
+        """Return the HDF5 file of a product; None if it is missing or damaged."""
         return self._object(digest) / PRODUCT if self.is_sound(digest) else None
 
     def published_files(self, digest: str) -> Mapping[Path, str]:
-        """Published files of a product, sorted by name, and the required SHA-256 of each.
+        """Return the published files of a product, sorted by name, with the expected SHA-256.
 
-        They are not read here: copying them computes the digests.
+        The files are not read here: their digests are computed when they are copied.
 
         Raises:
             DamageError: the product is missing, or its published files are unknown.
@@ -286,7 +287,7 @@ class Store:
     # Figures ------------------------------------------------------------------------------------
 
     def put_blob(self, content: bytes) -> str:
-        """Store bytes, return their SHA-256 in hexadecimal digits.
+        """Store bytes and return their SHA-256 as hexadecimal digits.
 
         Raises:
             StoreError: the disk cannot be written.
@@ -310,7 +311,7 @@ class Store:
         """Return the bytes of a figure.
 
         Raises:
-            DamageError: they are missing or damaged.
+            DamageError: the figure is missing or damaged.
         """
         with contextlib.suppress(OSError):
             content = (self._object(sha256) / BLOB).read_bytes()
@@ -322,20 +323,20 @@ class Store:
     # Damage -------------------------------------------------------------------------------------
 
     def is_sound(self, name: str) -> bool:
-        """Whether a product or a figure has its original bytes; see `damage`."""
+        """Whether a product or figure is undamaged; see `damage`."""
         return not self.damage(name)
 
     def damage(self, name: str, *, with_published: bool = False, again: bool = False) -> str:
-        """Return which file of an object is damaged, and remove the object; empty if it is intact.
+        """Return the damaged file of an object, and remove the object; empty if it is intact.
 
         Args:
-            name: of the object: digest of a product, or SHA-256 of a figure.
+            name: name of the object: digest of a product, or SHA-256 of a figure.
             with_published: also check the published files.
-            again: also check files that this process has found intact and that are unchanged since.
+            again: also check unchanged files that this process has already checked.
 
         Raises:
-            StoreError: it cannot be removed.
-            OSError: the machine lacks memory or open files.
+            StoreError: the object cannot be removed.
+            OSError: the machine lacks memory or has too many open files.
         """
         folder = self._object(name)
         damaged_file = partial(
@@ -347,7 +348,7 @@ class Store:
         return found
 
     def trust(self, result: CellResult) -> None:
-        """Mark the objects of a result that was just computed as intact."""
+        """Mark the objects of a newly computed result as intact."""
         for name in result.objects:
             folder = self.objects / name
             with contextlib.suppress(OSError):
@@ -356,15 +357,15 @@ class Store:
     # Results ------------------------------------------------------------------------------------
 
     def result(self, key: str) -> CellResult | None:
-        """Result of a key; None without one, or if objects of it are visibly incomplete."""
+        """Return the result of a key; None if missing or obviously incomplete."""
         return self.look_up(key)[0]
 
     def look_up(self, key: str) -> tuple[CellResult | None, str]:
         """Return the result of a key.
 
         Returns:
-            The result, None if there is none or it cannot be used; and what of it is damaged or
-            missing, as files below the store's folder.
+            The result, None if it is missing or unusable; and its damaged or missing files, as
+            paths relative to the store's folder.
         """
         path = self.results / f"{key}.json"
         try:
@@ -385,7 +386,7 @@ class Store:
         return (None, ", ".join(named)) if named else (result, "")
 
     def take(self, key: str) -> tuple[CellResult | None, str]:
-        """Look up a result that a run uses, which garbage collection then keeps longer."""
+        """Look up a result for a run, and record its use for garbage collection."""
         result, damage = self.look_up(key)
         if result is not None:
             with contextlib.suppress(OSError):
@@ -393,10 +394,10 @@ class Store:
         return result, damage
 
     def remove_unusable(self, key: str) -> str:
-        """Remove a result that cannot be used, and return what of it is damaged or missing.
+        """Remove an unusable result, and return its damaged or missing files.
 
         Raises:
-            StoreError: it cannot be removed.
+            StoreError: the result cannot be removed.
         """
         _, damage = self.look_up(key)
         if damage:
@@ -404,7 +405,7 @@ class Store:
         return damage
 
     def size_bytes(self, result: CellResult) -> int:
-        """Return the size of a result's products, their published files and its figures."""
+        """Return the size of a result's products (with published files) and figures."""
         return sum(folder_size(self.objects / name) for name in result.objects)
 
     def put_result(self, key: str, result: CellResult) -> None:
@@ -418,7 +419,7 @@ class Store:
         write_whole(self.results / f"{key}.json", result_to_json(result).encode())
 
     def earlier_results(self, method: str, *, limit: int = 20) -> tuple[CellResult, ...]:
-        """Return results of a method, the last used first, whether or not they are complete."""
+        """Return results of a method, complete or not, most recently used first."""
         dated = []
         for path in self.results.glob("*.json"):
             with contextlib.suppress(OSError):
@@ -427,7 +428,7 @@ class Store:
         for _, path in sorted(dated, reverse=True):
             with contextlib.suppress(OSError, UnicodeDecodeError):
                 text = path.read_text(encoding="utf-8")
-                # Most are of other methods; reading all of them would take a while.
+                # Most results are of other methods; parsing all of them would be slow.
                 if f'"method":"{method}"' in text:
                     found.append(result_from_json(text, path.name))
             if len(found) == limit:
@@ -449,9 +450,9 @@ class Store:
         return folder
 
     def _place(self, aside: Path, final: Path, is_there: Callable[[], bool]) -> None:
-        """Give a finished object its name, in the place of one that cannot be used."""
+        """Rename a finished object to its final name, replacing an unusable one."""
         if os.path.lexists(final):
-            # Another run has stored an equal one meanwhile, and may be reading it.
+            # Another run has stored the same object meanwhile, and may be reading it.
             if is_there():
                 return
             with contextlib.suppress(FileNotFoundError):
@@ -459,14 +460,14 @@ class Store:
         place_folder(aside, final)
 
     def _remove(self, path: Path) -> None:
-        """Remove a file or folder at once: nobody finds a part of it."""
+        """Remove a file or folder atomically, so that no other process sees a part of it."""
         gone = self._workspace / f"removed-{uuid.uuid4().hex}"
         gone.parent.mkdir(parents=True, exist_ok=True)
         path.rename(gone)
         remove_tree(gone)
 
     def _is_there(self, folder: Path, publisher_tag: str) -> bool:
-        """Whether an equal object is stored, intact, and its published files are current."""
+        """Whether the same object is stored, intact, and has up-to-date published files."""
         found = _read_description(folder)
         is_current = found is not None and found.publisher == publisher_tag
         return is_current and not self._damaged_file(folder, with_published=True, again=True)
@@ -509,9 +510,9 @@ class Store:
         """Remove a file or folder, if it exists and is still damaged.
 
         Raises:
-            StoreError: it cannot be removed.
+            StoreError: the file or folder cannot be removed.
         """
-        # Another run may have been faster, and may have stored an intact one.
+        # Another process may have removed it first and stored an intact one.
         if not os.path.lexists(path) or not damaged():
             return
         try:
@@ -540,7 +541,7 @@ def _codec() -> TypeAdapter[StoredProduct]:
 
 
 def _describe(folder: Path, name: str, type_name: str, publisher: str) -> None:
-    """Write `object.json` for the files that lie in a folder."""
+    """Write `object.json` for the files in a folder."""
     published = sorted(path for path in (folder / PUBLISHED).rglob("*") if path.is_file())
     files = {
         path.relative_to(folder).as_posix(): (path.stat().st_size, file_sha256(path))
@@ -552,7 +553,7 @@ def _describe(folder: Path, name: str, type_name: str, publisher: str) -> None:
 
 
 def _read_description(folder: Path) -> StoredProduct | None:
-    """Read `object.json`; None if it is damaged, belongs to another object, or is missing."""
+    """Read `object.json`; None if it is missing, damaged or of another object."""
     try:
         text = (folder / DESCRIPTION).read_text(encoding="utf-8")
         found = _codec().validate_json(text, strict=True)
@@ -566,7 +567,7 @@ def _read_description(folder: Path) -> StoredProduct | None:
 
 
 def _files_of(folder: Path) -> Mapping[str, tuple[int, str]]:
-    """Return size, -1 if unknown, and SHA-256 of an object's files; empty if they are unknown."""
+    """Return path -> size (-1 if unknown) and SHA-256 of an object's files, if known."""
     if folder.is_symlink():
         return {}
     if (folder / BLOB).exists():
@@ -576,12 +577,12 @@ def _files_of(folder: Path) -> Mapping[str, tuple[int, str]]:
 
 
 def stores_at(folder: str | Path) -> tuple[Store, ...]:
-    """Return the store of a folder, if there is one; it is not created."""
+    """Return the store in a folder, empty if there is none; nothing is created."""
     return (Store(Path(folder)),) if Path(folder).is_dir() else ()
 
 
 def publish_into(folder: Path, product: Product, publisher: Publisher, digest: str) -> None:
-    """Let a product publish its files in a new folder: plain files only."""
+    """Let a product publish its files in a new folder; only regular files are allowed."""
     folder.mkdir(parents=True)
     publisher(product, folder, digest)
     for path in folder.rglob("*"):
@@ -593,7 +594,7 @@ def publish_into(folder: Path, product: Product, publisher: Publisher, digest: s
 
 
 def digest_of(product: Product) -> str:
-    """Return the digest of a product's logical content, `sha256:` + 64 hexadecimal digits."""
+    """Return the digest of a product's logical content: `sha256:` + 64 hexadecimal digits."""
     from orthoflow_provenance.arrays import payload_digest  # noqa: PLC0415 - as above
 
     return payload_digest(product.to_payload())
@@ -606,12 +607,12 @@ class StoredResult:
     Attributes:
         key: cache key.
         method: method id.
-        run_id: the run that computed it.
-        ended: ISO 8601 UTC.
-        last_used: ISO 8601 UTC, when a run last used or created it.
-        size_bytes: of its products with their published files; equal products of several results
-            count for each.
-        is_complete: all its products and figures are there.
+        run_id: id of the run that computed it.
+        ended: when it finished, ISO 8601, UTC.
+        last_used: when a run last used or computed it, ISO 8601, UTC.
+        size_bytes: size of its products, including published files; products shared by several
+            results are counted in each.
+        is_complete: whether all its products and figures exist.
     """
 
     key: str
@@ -624,7 +625,7 @@ class StoredResult:
 
 
 def list_results(store: Store) -> tuple[StoredResult, ...]:
-    """List the results of a store, last used first; unreadable ones are omitted."""
+    """List the results in a store, most recently used first; unreadable ones are omitted."""
     found: list[StoredResult] = []
     for path in store.results.glob("*.json"):
         try:

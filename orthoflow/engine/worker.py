@@ -1,6 +1,6 @@
-"""Running one task: read the inputs, call the method, store the outputs.
+"""Execution of one task: reads the inputs, calls the method, stores the outputs.
 
-`run_step` is what the process of a step does, `run_task` does it in any process.
+`run_step` is the main function of a step's process; `run_task` runs a task in any process.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ from orthoflow.sdk.lines import one_line
 from orthoflow.sdk.methods import Method, labelled
 from orthoflow.untrusted_text import shown
 
-# With a margin for the method's own message, which is cut shorter, and the words around it.
+# Leaves a margin for the method's own message, which is cut shorter, and the text around it.
 _LONGEST_ERROR: Final = 4000
 _LONGEST_TRACE: Final = 64 << 10
 _OOM_SCORE: Final = "900"
@@ -81,10 +81,10 @@ class TaskInput:
     """A product on an input port.
 
     Attributes:
-        ref: which product.
+        ref: reference to the product.
         target: import string of its class; empty for files.
         input_name: name of the workflow input; empty for products.
-        files: of a workflow input.
+        files: files of the workflow input.
     """
 
     ref: ProductRef
@@ -95,27 +95,26 @@ class TaskInput:
 
 @dataclass(frozen=True, kw_only=True)
 class Task(MethodIdentity):
-    """One method call.
-
-    Everything its process needs, nothing left to decide.
+    """One method call, with everything that its process needs.
 
     Attributes:
-        address: of the cell.
-        run_id: of the run.
-        target: import string of the class.
+        address: address of the cell.
+        run_id: id of the run.
+        target: import string of the method's class.
         key: cache key.
-        key_preimage: text it is the digest of.
-        params: resolved, JSON.
-        seed: of the generator.
+        key_preimage: text whose digest is the key.
+        params: resolved parameters, as JSON.
+        seed: seed of the random generator.
         inputs: port -> product.
-        outputs: port -> what is expected.
-        cores: threads it may use.
-        timeout_s: seconds, None for no limit.
+        outputs: port -> expected type.
+        cores: maximum number of threads.
+        timeout_s: time limit in seconds; None if there is none.
         store: folder of the store.
-        folder: folder of the task, on the store's file system: scratch and unfinished objects.
-        log: file that takes stdout and stderr.
-        kernels: names the folder for compiled kernels.
-        environment: where it will run.
+        folder: folder of the task, on the store's file system, for scratch files and unfinished
+            objects.
+        log: file for stdout and stderr.
+        kernels: name of the folder for compiled kernels.
+        environment: environment in which the task will run.
     """
 
     address: str
@@ -137,7 +136,7 @@ class Task(MethodIdentity):
 
     @property
     def who(self) -> str:
-        """Method and distribution, as the beginning of sentences."""
+        """Method and distribution, to begin a sentence with."""
         brought = (
             f" of {self.distribution} {self.distribution_version}" if self.distribution else ""
         )
@@ -145,20 +144,20 @@ class Task(MethodIdentity):
 
     @property
     def scratch(self) -> Path:
-        """Return the folder a method may write to."""
+        """Return the folder that the method may write to."""
         return Path(self.folder) / "scratch"
 
 
 Listener = Callable[[StepEvent], None]
 
 
-# Messages of the process of a step: one of these, then JSON.
+# Messages from the process of a step: one of these prefixes, then JSON.
 EVENT: Final = b"event "
 RESULT: Final = b"result "
 
 
 def run_step(task: Task, pipe: Connection, variables: Mapping[str, str]) -> None:
-    """Be the process of a step: run a task, send its messages and finally its result.
+    """Run a task as the main function of a step's process, and send its messages and result.
 
     Args:
         task: what to run.
@@ -168,7 +167,7 @@ def run_step(task: Task, pipe: Connection, variables: Mapping[str, str]) -> None
     _move_to(task, variables)
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    # From here on only the method can raise it.
+    # From here on, only the method itself can raise KeyboardInterrupt.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_coordinator, daemon=True).start()
     events = _EventPipe(pipe)
@@ -178,14 +177,14 @@ def run_step(task: Task, pipe: Connection, variables: Mapping[str, str]) -> None
         with suppress(AttributeError, OSError, ValueError):
             stream.flush()
     _kill_children()
-    # Without the interpreter's tear-down: libraries crash there, and threads may never end.
+    # Skip the shutdown of the interpreter: libraries crash there, and threads may never end.
     os._exit(0)
 
 
 def _move_to(task: Task, variables: Mapping[str, str]) -> None:
-    """Set up the environment of a step in this process."""
+    """Set up this process for a step: session, log, environment variables, thread limits."""
     os.setsid()
-    # What it starts in other sessions stays below it also when what started that has ended.
+    # Descendants in other sessions remain descendants of this process when their parents end.
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
     log = os.open(task.log, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW)
@@ -207,10 +206,10 @@ def _move_to(task: Task, variables: Mapping[str, str]) -> None:
     task.scratch.mkdir(parents=True, exist_ok=True)
     os.chdir(task.scratch)
     tempfile.tempdir = None
-    # Be the first process that the kernel kills when memory runs out, instead of the coordinator.
+    # Let the kernel kill this process before the coordinator when memory runs out.
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text(_OOM_SCORE, encoding="ascii")
-    # Loaded libraries have already read how many threads they may start.
+    # Libraries that are already loaded have read their thread limits, so set the limits again.
     reload_numba_config()
     threadpoolctl.threadpool_limits(task.cores)
     if "cv2" in sys.modules:
@@ -218,7 +217,7 @@ def _move_to(task: Task, variables: Mapping[str, str]) -> None:
 
 
 def _end_with_coordinator() -> None:
-    """Wait until the process that waits for the result is gone, then end this session."""
+    """Wait until the coordinator has ended, then kill this session."""
     coordinator = multiprocessing.parent_process()
     if coordinator is not None:
         coordinator.join()
@@ -234,7 +233,7 @@ def _kill_children() -> None:
 
 
 class _EventPipe:
-    """Sends events to the coordinator; threads may share it."""
+    """Sends events to the coordinator; thread-safe."""
 
     def __init__(self, pipe: Connection) -> None:
         self._pipe = pipe
@@ -243,9 +242,9 @@ class _EventPipe:
         self._sent = StepEvent(kind="progress", text="", fraction=0.0)
 
     def listen(self, event: StepEvent) -> None:
-        """Send an event; progress at most ten times a second, the rest also to the log.
+        """Send an event; progress at most ten times a second, other events also to the log.
 
-        A new text with the same fraction is another activity, and always sent.
+        A progress event with a new text but the same fraction is always sent, as a new activity.
         """
         if event.kind == "progress":
             is_soon = time.monotonic() - self._sent_s < _PROGRESS_EVERY_S
@@ -254,24 +253,24 @@ class _EventPipe:
                 return
             self._sent_s, self._sent = time.monotonic(), event
         else:
-            # The method may have closed it, or replaced it.
+            # The method may have closed or replaced stderr.
             with suppress(AttributeError, OSError, ValueError):
                 sys.stderr.write(shown(event.text, keep="\n") + "\n")
         self.send(EVENT + json.dumps(dataclasses.asdict(event)).encode())
 
     def send(self, message: bytes) -> None:
-        """Send a message, unless the method closed the pipe: then it works without messages."""
+        """Send a message; ignored if the method has closed the pipe."""
         with self._lock, suppress(OSError):
             self._pipe.send_bytes(message)
 
 
 def run_task(task: Task, listen: Listener, is_cancelled: Callable[[], bool]) -> CellResult:
-    """Run a task to its end; every failure becomes a failed result, never an exception.
+    """Run a task; every failure becomes a failed result, never an exception.
 
     Args:
-        task: what to run; its folder exists.
+        task: the task; its folder must exist.
         listen: called with progress, log lines and diagnostics.
-        is_cancelled: asks whether to stop.
+        is_cancelled: whether the task should stop.
     """
     started = now()
     sampler, progress = MemorySampler(), _ProgressWithCompiling(listen)
@@ -281,13 +280,13 @@ def run_task(task: Task, listen: Listener, is_cancelled: Callable[[], bool]) -> 
         with sampler, meter, on_compiling(progress.compiling):
             result = call.run()
     except BaseException as error:
-        # If Ctrl-C is ignored, only the method can have raised it.
+        # If Ctrl-C is ignored, only the method can have raised KeyboardInterrupt.
         is_users = signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
         if isinstance(error, KeyboardInterrupt) and is_users:
             raise
         result = failed_result(task, explain_failure(task, error))
         if not isinstance(error, OrthoflowError):
-            # To the log, and so to the record, where an author looks for the error.
+            # Write the traceback to the log, and so to the record, for the author of the method.
             progress.listen(StepEvent(kind="log", text=_trace(error)))
             result = dataclasses.replace(result, is_bug=True)
     return dataclasses.replace(
@@ -302,7 +301,7 @@ def run_task(task: Task, listen: Listener, is_cancelled: Callable[[], bool]) -> 
 
 def failed_result(task: Task, error: OrthoflowError) -> CellResult:
     """Return the result of a cell that failed."""
-    # A file reports all problems at once, a line each.
+    # Errors in input files list all problems, one per line.
     message = "; ".join(str(error).splitlines()) if type(error) is InputError else error
     return dataclasses.replace(
         blank_result(task),
@@ -314,7 +313,7 @@ def failed_result(task: Task, error: OrthoflowError) -> CellResult:
 
 
 def blank_result(task: Task) -> CellResult:
-    """Return a result with everything that is known before a task runs."""
+    """Return a result with everything that is known before the task runs."""
     return CellResult(
         status="ok",
         key=task.key,
@@ -328,7 +327,7 @@ def blank_result(task: Task) -> CellResult:
 
 
 def explain_failure(task: Task, error: BaseException) -> OrthoflowError:
-    """Convert any exception of the method into one of our errors with one sentence."""
+    """Convert any exception of a method into an OrthoflowError with one sentence."""
     if isinstance(error, OrthoflowError):
         return error
     if is_for_want_of_memory(error):
@@ -356,13 +355,13 @@ def explain_failure(task: Task, error: BaseException) -> OrthoflowError:
 
 def _disk_failure(error: OSError, store: Path) -> OrthoflowError | None:
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        # Not a StoreError: the method needed more than is available, and is recorded as failed.
+        # Not a StoreError: the method needed more than is available, so it counts as failed.
         return StepFailedError(str(store_error(error, store)))
     return store_error(error, store) if is_broken(error, store) else None
 
 
 class _ProgressWithCompiling:
-    """Forwards messages of a step, and in between which kernel it waits for."""
+    """Forwards messages of a step, and reports which kernel is being compiled."""
 
     def __init__(self, listen: Listener) -> None:
         self._listen = listen
@@ -375,16 +374,16 @@ class _ProgressWithCompiling:
         self._listen(event)
 
     def compiling(self, text: str) -> None:
-        """Report what is compiled; afterwards, the previous message."""
+        """Report the kernel being compiled, or the previous message once it is compiled."""
         self._listen(dataclasses.replace(self._last, text=text or self._last.text))
 
 
 @dataclass(kw_only=True)
 class _TimedContext(StepContext):
-    """A context that measures the time of figures, which does not belong to the method.
+    """A context that measures the time spent on figures, which is not the method's own time.
 
     Attributes:
-        drawing_s: seconds of the clock, and of the processor.
+        drawing_s: elapsed and processor seconds spent on figures.
     """
 
     drawing_s: tuple[float, float] = (0.0, 0.0)
@@ -402,7 +401,7 @@ class _TimedContext(StepContext):
 
 
 class _Call:
-    """One call of a method, with its measurements so far even if it fails."""
+    """One call of a method, with its measurements so far, even if it fails."""
 
     def __init__(
         self,
@@ -453,13 +452,13 @@ class _Call:
             outputs = cast("object", cls().run(cls.In(**inputs), params, self._context))
         finally:
             if os.getpid() != process:
-                # The method forked, and this is not the process whose result counts.
+                # This is a child process forked by the method, whose result does not count.
                 os._exit(1)
             drawing_s, drawing_cpu_s = self._context.drawing_s
             self._wall_s = round(self._meter.clock_s() - wall_s - drawing_s, 4)
-            # Clocks of threads are ahead of their process's by ticks.
+            # Thread clocks can be a few ticks ahead of their process's clock.
             self._processor_s = max(0.0, round(self._cpu_s() - cpu_s - drawing_cpu_s, 4))
-        # Not through `progress`: a step that was asked to stop, but finished, has a result.
+        # Do not use `progress`, which checks for cancellation: a finished step has a result.
         self._context.listen(StepEvent(kind="progress", text="keeping the results", fraction=1.0))
         for given in self.task.inputs.values():
             for file in given.files:
@@ -474,7 +473,7 @@ class _Call:
         return result
 
     def _cpu_s(self) -> float:
-        """Processor seconds of this process and its children, without loading and samples."""
+        """Processor seconds of this process and its children, without loading and sampling."""
         others_s = self._meter.processor_s + self._sampler.processor_s
         children = resource.getrusage(resource.RUSAGE_CHILDREN)
         return time.process_time() + children.ru_utime + children.ru_stime - others_s
@@ -558,7 +557,7 @@ def load_target(target: str) -> object:
 def _check_file(file: FileRef) -> None:
     path = file.path
     try:
-        # Touching or renaming it changes nothing.
+        # A change of name or time stamp does not matter.
         is_same = file_identity(path) == file.identity or file_sha256(path) == file.sha256
     except OSError as error:
         raise InputError(
@@ -573,5 +572,5 @@ def _trace(error: BaseException) -> str:
         text = "".join(traceback.format_exception(error))
     except Exception:  # noqa: BLE001 - its own text may raise one
         text = ""
-    # The relevant part is at the end.
+    # The end contains the error.
     return text[-_LONGEST_TRACE:].encode(errors="backslashreplace").decode()
