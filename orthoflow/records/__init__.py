@@ -14,7 +14,7 @@ from orthoflow_provenance.document import (
     RunRecord,
 )
 
-# The words of a record, for the floors above.
+# Names from the record format, re-exported for the packages above.
 __all__ = [
     "COSTS",
     "Metric",

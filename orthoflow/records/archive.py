@@ -1,4 +1,4 @@
-"""Runs for archives and other programs: RO-Crate and W3C PROV."""
+"""Exports of runs for archives and other programs: RO-Crate and W3C PROV."""
 
 from __future__ import annotations
 
@@ -84,25 +84,25 @@ def write_crate(
     author: str = "",
     record: Run | None = None,
 ) -> tuple[Path, ...]:
-    """Write a run as an RO-Crate: record, report, products, workflow and their description.
+    """Write a run as an RO-Crate: record, report, products, workflow and their metadata.
 
-    Input files are named by their digests, not copied: they may be large, and property of others.
-    An embedded record has them, see `write_embedded`.
+    Input files are referenced by their digests, not copied: they may be large and belong to others.
+    To include them, embed them in the record, see `write_embedded`.
 
     Args:
         run: the run.
-        folder: existing folder, empty but for `record`.
+        folder: existing folder, empty except for `record`.
         license_text: URL or name of the license of the results.
-        author: who made the results, by name or ORCID; empty if unknown.
-        record: the run with another record, which is in the folder already.
+        author: author of the results, as name or ORCID; empty if unknown.
+        record: the run with another record, which is already in the folder.
 
     Returns:
-        The files, the description first.
+        The files; the metadata file is first.
 
     Raises:
         StoreError: the disk cannot be written.
         RecordError: a name in the record cannot be a file name, a link replaces a file, or a cell
-            takes a product that none gave.
+            uses a product that no cell produced.
     """
     texts = {
         WORKFLOW_FILE: run.record.workflow_source,
@@ -124,22 +124,23 @@ def write_crate(
 
 def _write(folder: Path, name: str, text: str) -> None:
     with creating(folder, name) as stream:
-        # Unpaired surrogates, which parameters may contain, as JSON writes them.
+        # Write unpaired surrogates, which parameters may contain, as JSON escapes.
         stream.write(text.encode("utf-8", "backslashreplace"))
 
 
 def _copy_files(run: Run, folder: Path, record: Run) -> list[str]:
-    """Copy record, report with its figures and published files; return their paths in the crate."""
+    """Copy the record, the report with figures, and the published files; return their paths."""
     if record.path != folder / RECORD_FILE:
         with writing_to(folder):
             shutil.copyfile(record.path, folder / RECORD_FILE)
     pages = [REPORT_FILE, *pages_of(run).values()]
     wanted = [*pages]
-    # Linked from the report, if it was written with them.
+    # The report contains links to these files, if it was written with links.
     wanted += [f"{FIGURES_FOLDER}/{name}" for name in (GRAPH_FILE, *figure_files(run, run.cells))]
     signed: tuple[str, ...] = ()
     if record is run and run.path.name == RECORD_FILE:
-        # Recreated rasters are in a folder of their own.
+        # Recreated rasters are in a separate folder, so the signature is copied from the run
+        # folder.
         signature = f"{RECORD_FILE}{SIGNATURE_SUFFIX}"
         signed = copy_files(run.path.parent, folder, [signature], ())
     wanted += [
@@ -147,7 +148,7 @@ def _copy_files(run: Run, folder: Path, record: Run) -> list[str]:
         for address, files in run.files.items()
         for file in files
     ]
-    # Of no cell, such as the table of all metrics.
+    # Published files that belong to no cell, such as the table of all metrics.
     wanted += [file.path for file in run.record.published if file.path.count("/") == 1]
     copied = copy_files(run.folder, folder, wanted, run.record.published)
     for page in set(pages) & set(copied) if record is not run else ():
@@ -162,10 +163,10 @@ def crate_metadata(
     """Describe a run and the files of its crate as JSON-LD.
 
     Args:
-        record: of the run.
-        files: paths in the crate, with `/`.
+        record: record of the run.
+        files: paths in the crate, with `/` as separator.
         license_text: URL or name of the license of the results.
-        author: who made the results, by name or ORCID; empty if unknown.
+        author: author of the results, as name or ORCID; empty if unknown.
     """
     crate = _Crate()
     cells = [cell for cell in record.cells if cell.status != "skipped"]
@@ -192,13 +193,13 @@ def crate_metadata(
 
 
 class _Crate:
-    """The entities of a crate by their ids."""
+    """The entities of a crate by id."""
 
     def __init__(self) -> None:
         self.entities: dict[str, Entity] = {}
 
     def add(self, identifier: str, kind: JsonValue, /, **facts: JsonValue) -> str:
-        """Add an entity; one that is known keeps what it has, and its lists grow."""
+        """Add an entity; if it exists, add only missing properties and extend its lists."""
         entity = self.entities.setdefault(identifier, {"@id": identifier, "@type": kind})
         for name, value in facts.items():
             if name in entity and isinstance(value, list):
@@ -208,22 +209,22 @@ class _Crate:
         return identifier
 
     def extend(self, identifier: str, name: str, more: Iterable[JsonValue]) -> None:
-        """Extend a list of an entity, by what is not in it yet; nothing without the entity."""
+        """Extend a list of an entity, without duplicates; ignored if there is no such entity."""
         if identifier in self.entities:
             known = self.entities[identifier].setdefault(name, [])
             assert isinstance(known, list)  # noqa: S101 - lists alone are extended
             known += [item for item in more if item not in known]
 
     def link(self, identifier: str, name: str, *targets: str) -> None:
-        """Extend a list of references."""
+        """Extend a list of references of an entity."""
         self.extend(identifier, name, _refs(targets))
 
     def formal(self, identifier: str, name: str, kind: str) -> str:
-        """Add a formal parameter: an input, output or setting of a method or of the workflow."""
+        """Add a formal parameter: an input, output or parameter of a method or of the workflow."""
         return self.add(identifier, "FormalParameter", additionalType=kind, name=name)
 
     def connect(self, owner: str, identifier: str, source: str, target: str) -> None:
-        """Connect two formal parameters, in a step or in the workflow."""
+        """Connect two formal parameters of a step or of the workflow."""
         self.add(
             identifier,
             "ParameterConnection",
@@ -238,12 +239,12 @@ def _ref(identifier: str) -> dict[str, JsonValue]:
 
 
 def _refs(identifiers: Iterable[str]) -> list[JsonValue]:
-    """Reference entities, each once."""
+    """Return references to entities, without duplicates."""
     return [_ref(identifier) for identifier in dict.fromkeys(identifiers)]
 
 
 def _file_id(file: RecordedFile) -> str:
-    """Name a file that is not in the crate by its content (RFC 6920)."""
+    """Return an id made from the content of a file that is not in the crate (RFC 6920)."""
     digest = base64.urlsafe_b64encode(bytes.fromhex(file.sha256)).decode().rstrip("=")
     return f"ni:///sha-256;{digest}"
 
@@ -253,7 +254,7 @@ def _product_id(product: RecordedProduct) -> str:
 
 
 def _environment_file(environment_id: str) -> str:
-    """Name of the list of packages of an environment."""
+    """Return the file name of the package list of an environment."""
     return f"requirements-{environment_id.removeprefix('sha256:')[:12]}.txt"
 
 
@@ -266,7 +267,7 @@ def _status(*, is_ok: bool) -> str:
 
 
 def _value_type(value: JsonValue) -> str:
-    """Schema.org's name for the type of a setting; non-scalars are written as JSON text."""
+    """Return the Schema.org type of a parameter; non-scalar values are written as JSON text."""
     return {bool: "Boolean", int: "Integer", float: "Float"}.get(type(value), "Text")
 
 
@@ -282,7 +283,7 @@ def _add_author(crate: _Crate, author: str) -> None:
 
 
 def _add_run(crate: _Crate, record: RunRecord, files: list[str], license_text: str) -> None:
-    """Add the root, the workflow, its run, and the program that ran it."""
+    """Add the root, the workflow, its run, and orthoflow as the program that ran it."""
     crate.add(
         "./",
         "Dataset",
@@ -355,7 +356,7 @@ def _add_run(crate: _Crate, record: RunRecord, files: list[str], license_text: s
 
 
 def _add_files(crate: _Crate, record: RunRecord, files: list[str]) -> None:
-    """Add the files in the crate, and the input files, which are named by their content."""
+    """Add the files in the crate, and the input files, which are identified by content."""
     lists = {_environment_file(item.id) for item in record.environments}
     published = {file.path: file for file in record.published}
     for name in files:
@@ -400,11 +401,11 @@ def _add_cell(
     """Add a cell: its method, its step of the workflow, and its execution.
 
     Args:
-        crate: is extended.
-        record: the record of the cell.
-        cell: one that was executed.
-        position: place of the cell in the run, from 0.
-        given: formal parameter of each output of an earlier cell, by `address.port`.
+        crate: crate to extend.
+        record: record that contains the cell.
+        cell: a cell that was executed.
+        position: index of the cell in the run, from 0.
+        given: `address.port` of each output of an earlier cell -> formal parameter.
     """
     tool = _add_method(crate, cell)
     variant = cell.assignment.get(cell.step, "")
@@ -468,7 +469,7 @@ def _add_cell(
 
 
 def _add_method(crate: _Crate, cell: RecordedCell) -> str:
-    """Add the method of a cell with its ports and settings, and its distribution."""
+    """Add the method of a cell with its ports, parameters and distribution."""
     tool, origin = _tool_id(cell), f"#distribution-{cell.distribution}"
     version = cell.distribution_version
     crate.add(origin, "SoftwareApplication", name=cell.distribution, version=version)
@@ -547,7 +548,7 @@ def _add_action(crate: _Crate, cell: RecordedCell) -> str:
 
 
 def _add_final(crate: _Crate, source: str, of_tool: str, product: RecordedProduct) -> None:
-    """Add an output that no other cell takes as one of the workflow."""
+    """Add an output that no other cell uses as an output of the workflow."""
     output = crate.formal(f"{WORKFLOW_FILE}#out/{source}", source, "CreativeWork")
     crate.link(WORKFLOW_FILE, "output", output)
     crate.connect(WORKFLOW_FILE, f"#to-{output}", of_tool, output)
@@ -577,9 +578,9 @@ def _media_type(name: str) -> str:
     return known or mimetypes.guess_type(name)[0] or "application/octet-stream"
 
 
-# Any: `prov` defines what attributes may be.
+# `Any`: the `prov` library accepts many types as attribute values.
 Attributes = list[tuple[QualifiedName | str | Identifier, Any]]
-# Names of attributes are of this program; names of things are of the run.
+# Attribute names belong to orthoflow; names of entities belong to the run.
 _TERMS: Final = "urn:orthoflow:terms:"
 _NAMES: Final = {
     "orthoflow": _TERMS,
@@ -594,9 +595,9 @@ _PARTS: Final = ("cell", "product", "input", "file", "published", "workflow")
 def prov_document(record: RunRecord) -> ProvDocument:
     """Describe a run as a PROV document.
 
-    Entities are products, inputs, their files and published files, all with digests; activities are
-    the cells that were executed, with method, version, parameters, seed, times and metrics; agents
-    are this program and the distributions that brought the methods.
+    Entities are products, inputs and their files, and published files, all with digests; activities
+    are the executed cells with method, version, parameters, seed, times and metrics; agents are
+    orthoflow and the distributions of the methods.
     """
     document = ProvDocument()
     run = f"urn:orthoflow:run:{quote(record.run_id, safe='')}:"
@@ -626,7 +627,7 @@ def _add_workflow(document: ProvDocument, record: RunRecord) -> None:
 
 
 def _add_inputs(document: ProvDocument, record: RunRecord) -> None:
-    """Add inputs and their files, each content once; an absent optional input is no entity."""
+    """Add inputs and their files, without duplicates; an omitted optional input has no entity."""
     known: set[str] = set()
     for entry in record.inputs:
         if not entry.files:
@@ -643,7 +644,7 @@ def _add_inputs(document: ProvDocument, record: RunRecord) -> None:
 
 
 def _add_software(document: ProvDocument, record: RunRecord, cells: Iterable[RecordedCell]) -> None:
-    """Add this program, and distributions that act for it."""
+    """Add orthoflow and the distributions that act on its behalf."""
     program = record.created_by
     for name in dict.fromkeys([program, *map(_distribution, cells)]):
         title, _, version = name.rpartition(" ")
@@ -681,7 +682,7 @@ def _add_activity(document: ProvDocument, cell: RecordedCell) -> None:
 def _add_published(
     document: ProvDocument, record: RunRecord, cells: Iterable[RecordedCell]
 ) -> None:
-    """Add the files that the run published, each with its cell."""
+    """Add the published files of the run, each linked to its cell."""
     owners = {f"{PRODUCTS_FOLDER}/{cell_file_name(cell.address)}": cell.address for cell in cells}
     for file in record.published:
         name = _name("published", file.path)
@@ -693,7 +694,7 @@ def _add_published(
 
 
 def _source(product: RecordedProduct) -> str:
-    """Name of the entity of an input: `inputs.name`, or `address.port` of another cell."""
+    """Return the entity name of an input: `inputs.name`, or `address.port` of another cell."""
     owner, _, name = product.source.partition(".")
     return _name("input", name) if owner == "inputs" else _name("product", product.source)
 
@@ -707,7 +708,7 @@ def _type(name: str) -> QualifiedName:
 
 
 def _name(part: str, name: str) -> str:
-    """Return a qualified name; characters that a local name cannot contain are written as %XX."""
+    """Return a qualified name; characters not allowed in a local name are written as %XX."""
     return f"{part}:{quote(name, safe='') or '_'}"
 
 
@@ -717,7 +718,7 @@ def _attributes(kind: QualifiedName, label: str, facts: Mapping[str, str | float
 
 
 def _literal(value: JsonValue) -> JsonValue:
-    """Return a scalar as it is, all else as JSON text."""
+    """Return a scalar unchanged, and any other value as JSON text."""
     if isinstance(value, bool | int | float | str):
         return value
     return json.dumps(value, ensure_ascii=False)

@@ -1,4 +1,4 @@
-"""Comparison of two runs: differences of products, and of everything else."""
+"""Comparison of two runs: products, metrics, inputs, parameters and versions."""
 
 from __future__ import annotations
 
@@ -41,15 +41,15 @@ Verdict = Literal["identical", "within tolerance", "different", "not measured"]
 
 @dataclass(frozen=True, kw_only=True)
 class Distance:
-    """The largest difference among all fields of one unit.
+    """The largest difference among all fields with the same unit.
 
     Attributes:
         unit: `m`, `px`, `grey`, `deg`, or `1` for plain numbers.
         largest: largest absolute difference in that unit; None if values cannot be subtracted
-            (another shape or type, missing, NaN against a number).
-        limit: tolerance of the type in the field with the largest difference.
-        field: that field, e.g. `walls/0/depth_m`.
-        n_values: number of values of the unit beyond their limit.
+            (different shapes or types, missing values, NaN instead of a number).
+        limit: tolerance of the field with the largest difference.
+        field: name of that field, e.g. `walls/0/depth_m`.
+        n_values: number of values in that unit that differ by more than their tolerance.
     """
 
     unit: str
@@ -61,18 +61,18 @@ class Distance:
 
 @dataclass(frozen=True, kw_only=True)
 class ProductDistance:
-    """Two products that ought to be equal.
+    """Comparison of two products that are expected to be equal.
 
     Attributes:
         cell: address of their cell.
-        port: its output port.
+        port: output port of the cell.
         type_name: product type.
         verdict: `identical` (same bits), `within tolerance`, `different`, or `not measured` if the
             digests differ and the arrays of one of them are not available.
-        left: digest of the first, empty when it has none.
-        right: digest of the second, empty when it has none.
-        distances: one per unit in which they differ.
-        reason: one sentence for `different` and `not measured`, else empty.
+        left: digest of the first product; empty if it has none.
+        right: digest of the second product; empty if it has none.
+        distances: one distance per unit in which the products differ.
+        reason: one sentence for `different` and `not measured`, otherwise empty.
     """
 
     cell: str
@@ -87,12 +87,12 @@ class ProductDistance:
 
 @dataclass(frozen=True, kw_only=True)
 class RunProducts:
-    """The products of a run, from its record or a store.
+    """The products of a run, from its record or from a store.
 
     Attributes:
         run: the run.
-        stores: stores that may have arrays which the record names by digest only.
-        own: requested address of a cell -> its own one, if the two differ.
+        stores: stores that may contain arrays that the record references only by digest.
+        own: requested address -> address in this run, where the two differ.
     """
 
     run: Run
@@ -100,7 +100,7 @@ class RunProducts:
     own: Mapping[str, str] = field(default_factory=dict)
 
     def outputs(self, address: str) -> Mapping[str, RecordedProduct]:
-        """Return outputs of a cell by port; empty if the run has no such cell."""
+        """Return the outputs of a cell by port; empty if the run has no such cell."""
         cell = self.run.cells.get(self.own.get(address, address))
         return {} if cell is None else cell.outputs
 
@@ -118,13 +118,13 @@ class RunProducts:
 def product_distances(
     left: RunProducts, right: RunProducts, addresses: Sequence[str], catalog: Catalog
 ) -> tuple[ProductDistance, ...]:
-    """Compare the outputs of cells that both runs have.
+    """Compare the outputs of cells that exist in both runs.
 
     Args:
-        left: one run.
-        right: the other.
-        addresses: the cells, each in both runs.
-        catalog: has the product types and their tolerances.
+        left: the first run.
+        right: the second run.
+        addresses: addresses of cells that exist in both runs.
+        catalog: catalog with the product types and their tolerances.
     """
     return tuple(
         _distance(left, right, address, port, catalog)
@@ -178,7 +178,7 @@ def _distance(
 
 
 def _named(difference: ArrayDifference, payload: Payload) -> ArrayDifference:
-    """Identify a value in a list by the name and the unit beside it."""
+    """Add the name and unit given next to a value in the metadata to its difference."""
     path = difference.name.split("/")
     beside: JsonValue = dict(payload.metadata)
     for part in path[:-1]:
@@ -193,7 +193,7 @@ def _named(difference: ArrayDifference, payload: Payload) -> ArrayDifference:
 
 
 def _limit(name: str, tolerance: Tolerance, payload: Payload) -> float:
-    """Return the tolerance of values of a field; grey levels of 16 bits count in steps of 257."""
+    """Return the tolerance of a field; for 16-bit grey levels it is multiplied by 257."""
     is_deep = tolerance.unit == "grey" and any(
         array.dtype == np.uint16 and path.rpartition("/")[2] == name
         for path, array in payload.arrays.items()
@@ -222,19 +222,19 @@ def _by_unit(differences: Sequence[ArrayDifference]) -> tuple[Distance, ...]:
 
 
 Side = TypeVar("Side")
-# Seconds and memory measured by methods depend on the machine, too.
+# Methods also report times and memory, which depend on the machine.
 _COST_UNITS: Final = frozenset(cost.unit for cost in COSTS.values())
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pair(Generic[Side]):
-    """The values of two runs for one item.
+    """The values of one item in two runs.
 
     Attributes:
-        cell: address of the cell it belongs to, empty for what belongs to the whole run.
-        name: name of an input, a parameter, a metric or a package.
-        left: value of the first run, None without one.
-        right: value of the second run, None without one.
+        cell: address of its cell; empty if it belongs to the whole run.
+        name: name of the input, parameter, metric or package.
+        left: value in the first run; None if there is none.
+        right: value in the second run; None if there is none.
     """
 
     cell: str = ""
@@ -244,17 +244,17 @@ class Pair(Generic[Side]):
 
     @property
     def is_same(self) -> bool:
-        """Whether both are equal."""
+        """Whether both values are equal."""
         return self.left == self.right
 
     @property
     def is_shared(self) -> bool:
-        """Whether both have a value."""
+        """Whether both runs have a value."""
         return self.left is not None and self.right is not None
 
     @property
     def is_rounded(self) -> bool:
-        """Whether both are values of a metric that differ by rounding only."""
+        """Whether both are values of a metric that differ only by rounding."""
         left, right = self.left, self.right
         return (
             isinstance(left, ComparedMetric)
@@ -265,12 +265,12 @@ class Pair(Generic[Side]):
 
     @property
     def is_moved(self) -> bool:
-        """Whether they differ by more than rounding."""
+        """Whether the values differ by more than rounding."""
         return not (self.is_same or self.is_rounded)
 
     @property
     def either(self) -> Side:
-        """One of the values, preferably the first."""
+        """The value of the first run or, if there is none, of the second."""
         side = self.right if self.left is None else self.left
         if side is None:
             raise AssertionError("a pair stands for something that a run has")
@@ -279,14 +279,14 @@ class Pair(Generic[Side]):
 
 @dataclass(frozen=True, kw_only=True)
 class Difference:
-    """Numbers of differing rows of two runs.
+    """Numbers of rows that differ between two runs.
 
     Attributes:
-        n_different: rows with values in both runs that differ by more than rounding.
-        n_shared: rows with values in both runs.
-        n_left: rows with a value in the first run only.
-        n_right: rows with a value in the second run only.
-        n_rounded: rows that differ by rounding only.
+        n_different: number of rows with values in both runs that differ by more than rounding.
+        n_shared: number of rows with values in both runs.
+        n_left: number of rows with a value only in the first run.
+        n_right: number of rows with a value only in the second run.
+        n_rounded: number of rows that differ only by rounding.
     """
 
     n_different: int
@@ -297,7 +297,7 @@ class Difference:
 
     @classmethod
     def of(cls, rows: Iterable[Pair[Any]]) -> Difference:
-        """Count rows."""
+        """Count the rows."""
         rows = tuple(rows)
         shared = [row for row in rows if row.is_shared]
         return cls(
@@ -314,8 +314,9 @@ class ParameterValue:
     """The resolved value of a parameter.
 
     Attributes:
-        value: JSON.
-        is_set: set in the workflow or on the command line; otherwise it is the method's default.
+        value: value as JSON.
+        is_set: whether it was set in the workflow or on the command line; otherwise it is the
+            default.
     """
 
     value: JsonValue
@@ -324,7 +325,7 @@ class ParameterValue:
 
 @dataclass(frozen=True, kw_only=True)
 class CellFacts:
-    """What determines a cell's results besides inputs and parameters.
+    """Everything besides inputs and parameters that determines the results of a cell.
 
     Attributes:
         status: ok, failed or skipped.
@@ -332,10 +333,10 @@ class CellFacts:
         distribution: name and version of the method's distribution.
         result_version: result version of the method.
         determinism: exact, seeded or loose.
-        seed: None if the method uses none.
-        code: digests of code that was not a released install; empty if all was.
+        seed: seed; None if the method uses none.
+        code: digests of code that is not from a release; empty if all code is from releases.
         tools: versions of libraries that affect results.
-        error: why it failed or was skipped, otherwise empty.
+        error: reason why the cell failed or was skipped, otherwise empty.
     """
 
     status: str
@@ -350,7 +351,7 @@ class CellFacts:
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """Each of them in words, status and method first."""
+        """These properties as text, status and method first."""
         parts = (
             self.status,
             f"{self.method} result version {self.result_version}"
@@ -370,16 +371,16 @@ class CellFacts:
 
 @dataclass(frozen=True, kw_only=True)
 class ComparedMetric:
-    """One number of one cell; equal if value and unit are.
+    """A metric of one cell; two are equal if value and unit are equal.
 
     Attributes:
-        value: the number.
-        unit: its unit.
-        is_cost: a time or memory, which depend on the machine and its load.
-        is_cached: of a cell that an earlier run computed; its cost is that run's.
-        environment: id of the environment it was computed in.
-        better: which values are better; empty where none are.
-        headline: it states how good the result is.
+        value: value of the metric.
+        unit: unit of the value.
+        is_cost: whether it is a time or memory, which depend on the machine and its load.
+        is_cached: whether an earlier run computed the cell; costs are then those of that run.
+        environment: id of the environment in which it was computed.
+        better: which values are better; empty if there is no better direction.
+        headline: whether the metric describes the quality of the result.
     """
 
     value: float
@@ -391,7 +392,7 @@ class ComparedMetric:
     headline: bool = field(compare=False, default=False)
 
     def is_near(self, other: ComparedMetric | None) -> bool:
-        """Whether it is equal to another one apart from rounding."""
+        """Whether it is equal to another metric apart from rounding."""
         return (
             other is not None and self.unit == other.unit and is_rounding(self.value, other.value)
         )
@@ -399,22 +400,22 @@ class ComparedMetric:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class RunComparison:
-    """Two runs compared; rows that are equal on both sides are included.
+    """Comparison of two runs, including the rows that do not differ.
 
     Attributes:
         left: record of the first run.
-        right: record of the second.
-        workflow: unified diff of the workflow texts; empty if equal.
-        overrides: options that changed the workflow.
-        inputs: files of every input, without folders.
-        cells: method, version, seed and status of every cell, named as in the first run that has
-            it.
-        readdressed: address in the second run -> that of its counterpart in the first, if the two
-            differ: e.g. a step alone, and a variant with the same parameters.
-        parameters: resolved parameters of every cell.
-        environment: Python, system, processor and packages; several values are joined by commas.
-        metrics: numbers of every cell.
-        products: distance of every product of the cells that are in both runs.
+        right: record of the second run.
+        workflow: unified diff of the workflow texts; empty if they are the same.
+        overrides: command-line options that changed the workflow.
+        inputs: files of each input, without folders.
+        cells: method, version, seed and status of each cell, under its address in the first run if
+            it exists there.
+        readdressed: address in the second run -> address in the first run, where the two differ,
+            e.g. for a step and for a variant with the same parameters.
+        parameters: resolved parameters of each cell.
+        environment: Python, system, processor and packages; several values are separated by commas.
+        metrics: metrics of each cell.
+        products: comparison of each product of the cells that exist in both runs.
     """
 
     left: RunRecord
@@ -445,7 +446,7 @@ class RunComparison:
 
     @property
     def measured(self) -> tuple[Pair[ComparedMetric], ...]:
-        """Numbers of the cells that both runs have, without times and memory."""
+        """Metrics of the cells that exist in both runs, without times and memory."""
         return tuple(row for row in self.shared(self.metrics) if not row.either.is_cost)
 
     @property
@@ -455,22 +456,22 @@ class RunComparison:
 
     @property
     def of_shared_steps(self) -> str:
-        """Return to which steps the rows of `shared` belong; empty if both runs have all."""
+        """Return which steps the rows of `shared` belong to; empty if both runs have all steps."""
         n_shared = sum(row.is_shared for row in self.cells)
         all_shared = n_shared == len(self.cells)
         counted = "step" if n_shared == 1 else f"{n_shared} steps"
         return "" if all_shared else f", of the {counted} that both have"
 
     def shared(self, rows: Sequence[Pair[Side]]) -> tuple[Pair[Side], ...]:
-        """Leave out rows of cells that only one of the runs has: they cannot differ."""
+        """Leave out rows of cells that exist in only one of the runs."""
         alone = {row.cell for row in self.cells if not row.is_shared}
         return tuple(row for row in rows if row.cell not in alone)
 
     def metric_table(self) -> pd.DataFrame:
-        """Return every number of both runs side by side.
+        """Return all metrics of both runs next to each other.
 
         Returns:
-            Columns `cell`, `metric`, `left`, `right`, `difference` (right - left; NaN if one is
+            Columns `cell`, `metric`, `left`, `right`, `difference` (right minus left; NaN if one is
             missing) and `unit`.
         """
         import pandas as pd  # noqa: PLC0415 - takes a second, and few ask
@@ -488,13 +489,13 @@ class RunComparison:
 def compare_runs(left: Run, right: Run, *, stores: Sequence[Store] = ()) -> RunComparison:
     """Compare two runs.
 
-    Cells correspond if they have the same step, dataset and seed, and each step that varies before
-    them has the same method and parameters; otherwise if their addresses are equal.
+    Cells correspond if their step, dataset and seed are the same and each varied step upstream has
+    the same method and parameters; otherwise, if their addresses are the same.
 
     Args:
         left: the first run.
         right: the second run.
-        stores: stores that may have arrays which a record names by digest only.
+        stores: stores that may contain arrays that a record references only by digest.
 
     Raises:
         RecordError: a record is damaged.
@@ -502,7 +503,7 @@ def compare_runs(left: Run, right: Run, *, stores: Sequence[Store] = ()) -> RunC
     from orthoflow.catalog.discovery import discover_catalog  # noqa: PLC0415 - loads plugins
 
     readdressed = _readdressed(left, right)
-    # Name of the second run's cells here -> name in the run itself.
+    # Name of a cell of the second run in this comparison -> its address in that run.
     own = {_label(right, address, readdressed): address for address in right.cells}
     both = [address for address in left.cells if address in own]
     sides = (left.record, right.record)
@@ -527,14 +528,14 @@ def compare_runs(left: Run, right: Run, *, stores: Sequence[Store] = ()) -> RunC
 
 
 def compare_metrics(left: Run, right: Run) -> tuple[Pair[ComparedMetric], ...]:
-    """Return the numbers side by side of cells that both runs have; no times, no memory."""
+    """Return the metrics of cells that exist in both runs, without times and memory."""
     both = [address for address in left.cells if address in right.cells]
     rows = (
         row
         for address in both
         for row in _pairs(address, *(_metrics(run.cells[address]) for run in (left, right)))
     )
-    # A number that only one side calls a time is not a time.
+    # Keep a metric that is declared as a cost in only one of the runs.
     return tuple(
         row for row in rows if not all(side.is_cost for side in (row.left, row.right) if side)
     )
@@ -564,15 +565,15 @@ def _per_cell(
 
 
 def _readdressed(left: Run, right: Run) -> dict[str, str]:
-    """Find cells of the second run that the first has under another address.
+    """Find cells of the second run that have another address in the first.
 
-    Names of variants are labels, not identity: cells with the same methods and parameters
-    correspond, then those with the same address.
+    Names of variants are only labels: cells with the same methods and parameters correspond, then
+    cells with the same address.
     """
     varied = {
         step for run in (left, right) for cell in run.cells.values() for step in cell.assignment
     }
-    # A skipped cell has no inputs, so its origin is unknown.
+    # The inputs of a skipped cell are not recorded, so its upstream cells are unknown.
     ours, theirs = (
         {
             address: _identity(run, cell, varied)
@@ -593,21 +594,21 @@ def _readdressed(left: Run, right: Run) -> dict[str, str]:
 
 
 def _label(right: Run, address: str, readdressed: Mapping[str, str]) -> str:
-    """Return the name of a cell of the second run: that of its counterpart in the first run."""
+    """Return the name of a cell of the second run: the address of its counterpart in the first."""
     if address not in readdressed and address in readdressed.values():
-        # It has no counterpart, and its address means another cell in the first run.
+        # There is no counterpart, and the address belongs to another cell of the first run.
         return f"{address} ({right.record.run_id})"
     return readdressed.get(address, address)
 
 
 def _identity(run: Run, cell: RecordedCell, varied: Collection[str]) -> tuple[object, ...]:
-    """Return what a cell is, without the names of its variants.
+    """Return the identity of a cell, which does not depend on the names of its variants.
 
     Args:
-        run: the run of the cell.
+        run: run of the cell.
         cell: the cell.
-        varied: steps that vary in either run; they count with their method and parameters, a step
-            without variants as its only variant.
+        varied: steps with variants in either run; they are identified by method and parameters, and
+            a step without variants is treated as having one.
     """
     called = {
         one.step: (one.method, canonical_json(dict(one.params)))
@@ -625,7 +626,7 @@ def _text_differences(left: RunRecord, right: RunRecord) -> tuple[str, ...]:
 
 def _facts(cell: RecordedCell) -> CellFacts:
     if cell.status == "skipped":
-        # A skipped method decides nothing, and has versions only if another cell has loaded it.
+        # Ignore the versions of a skipped method: they are known only if another cell loaded it.
         unloaded = MethodIdentity(method=cell.method)
         cell = replace(cell, seed=None, **shared_fields(unloaded, MethodIdentity))
     preimage = read_preimage(cell.key_preimage)

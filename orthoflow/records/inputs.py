@@ -1,4 +1,4 @@
-"""Finding the input files of a record again: by content at any place, or in the record."""
+"""Search for the input files of a record by content, and extraction of embedded ones."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ from orthoflow.workflow.inputs import (
 from orthoflow.workflow.model import Workflow, WorkflowInputSpec
 from orthoflow.workflow.source import ProblemLog
 
-# Maximum number of files of a folder that is searched by content; in a larger one only by name.
+# Maximum number of files in a folder that is searched by content; larger ones only by name.
 _MOST_LISTED: Final = 10_000
-# By default a run is in runs/<name>/ below the folder of its workflow.
+# By default, a run is in runs/<name>/ in the folder of its workflow.
 _FOLDERS_ABOVE: Final = 3
 
 
 class ProblemsError(OrthoflowError):
-    """Several things are wrong; `problems` has a sentence each."""
+    """Several problems; `problems` has one sentence for each."""
 
     def __init__(self, problems: Iterable[str]) -> None:
         self.problems = tuple(problems)
@@ -53,21 +53,22 @@ class ProblemsError(OrthoflowError):
 
 
 class RefusedRunError(ProblemsError, RecordError):
-    """A run cannot be repeated unchanged, or input files differ from its record."""
+    """A run cannot be repeated unchanged, or input files differ from the record."""
 
 
 class MissingMethodsError(ProblemsError, PluginError):
-    """Methods or product types of a record are not installed."""
+    """Methods or product types in a record are not installed."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class InputSearch:
-    """The result of a search.
+    """Result of a search for input files.
 
     Attributes:
-        paths: input -> its files in the order of the record; inputs that were not given have none.
-        problems: one sentence per file that is missing or was changed.
-        is_changed: one of them exists with other content.
+        paths: input -> its files in the order of the record; inputs that were not given are
+            missing.
+        problems: one sentence for each missing or changed file.
+        is_changed: whether one of the files exists with different content.
     """
 
     paths: Mapping[str, tuple[Path, ...]]
@@ -85,24 +86,24 @@ def find_inputs(
     extracted: Mapping[str, tuple[Path, ...]] | None = None,
     noted: Sequence[FileDigests] = (),
 ) -> InputSearch:
-    """Search files with the content that a record states, under any name.
+    """Search for files with the content given in a record, under any name.
 
-    Searches the paths in `given`; otherwise the `extracted` files, the paths of the workflow, below
-    the working directory, the run's folder and its parents, and these folders themselves; and where
-    a store has noted that a run found them.
+    If paths are given for an input, only these are searched; otherwise the extracted files;
+    otherwise the paths in the workflow, relative to the working directory, the run folder and its
+    parents, then these folders themselves, and the paths recorded in stores.
 
     Args:
-        workflow: of the record.
-        recorded: the record's inputs.
-        run_folder: the folder of the record.
-        digests: caches digests, so that each file is read once.
-        given: `NAME=PATH`, each as after `--input`.
-        extracted: input -> files from the record itself.
-        noted: caches of stores that may have noted positions of files, besides `digests`.
+        workflow: workflow of the record.
+        recorded: recorded inputs.
+        run_folder: folder of the record.
+        digests: cache of digests, so that each file is read only once.
+        given: `NAME=PATH` as for `--input`.
+        extracted: input -> files extracted from the record.
+        noted: caches of other stores that may contain paths of the files.
 
     Raises:
-        InvalidArgumentsError: `given` names no input of the workflow.
-        InputError: there is nothing at a given path.
+        InvalidArgumentsError: `given` contains a name that is not an input of the workflow.
+        InputError: a given path does not exist.
     """
     places = _places(workflow, run_folder, given, extracted or {})
     paths: dict[str, tuple[Path, ...]] = {}
@@ -122,10 +123,10 @@ def find_inputs(
 
 
 class PlacedInputs:
-    """Input files of a record under its names, in a temporary folder.
+    """Input files of a record under their recorded names, in a temporary folder.
 
     Attributes:
-        extracted: input -> files from the record itself.
+        extracted: input -> files extracted from the record.
     """
 
     def __init__(self, beside: Path, stack: ExitStack) -> None:
@@ -135,7 +136,7 @@ class PlacedInputs:
         self._folders: list[Path] = []
 
     def folder(self) -> Path:
-        """Make a new folder.
+        """Create a new folder.
 
         Raises:
             StoreError: the disk cannot be written.
@@ -150,13 +151,14 @@ class PlacedInputs:
         return self._folders[-1]
 
     def named(self, entry: RecordedInput, paths: tuple[Path, ...]) -> tuple[Path, ...]:
-        """Return the found files of an input under their recorded names, in the recorded order.
+        """Return the files found for an input, under their recorded names and in recorded order.
 
         Raises:
             StoreError: the disk cannot be written.
         """
         names = [file.name for file in entry.files]
-        # Files of one name are sorted by their folders.
+        # Files with the same name are sorted by folder, so they need new folders to keep their
+        # order.
         if [path.name for path in paths] == names and len(set(names)) == len(names):
             return paths
         links = tuple(self.folder() / name for name in names)
@@ -168,7 +170,7 @@ class PlacedInputs:
 
 @contextmanager
 def embedded_inputs(run: Run, beside: Path) -> Iterator[PlacedInputs]:
-    """Return the input files in a record as files, as long as the context lasts.
+    """Extract the input files embedded in a record while the block runs.
 
     Args:
         run: the run.
@@ -190,7 +192,7 @@ def embedded_inputs(run: Run, beside: Path) -> Iterator[PlacedInputs]:
 def _find(
     file: RecordedFile, places: _Places, memories: Sequence[FileDigests]
 ) -> tuple[Path | None, Path | None]:
-    """Return the file, and one of its name with other content; None for what there is not."""
+    """Return the file, and a file with its name but different content; None if not found."""
     rival = None
     seen: set[Path] = set()
     for path in places.candidates(file, memories):
@@ -202,7 +204,7 @@ def _find(
             if size_bytes == file.size_bytes and memories[0].digest(path).sha256 == file.sha256:
                 return path.absolute(), None
         except InputError:
-            # Nobody named this file explicitly.
+            # Ignore unreadable files that were not given explicitly and have another name.
             if path.name == file.name or places.files:
                 raise
             continue
@@ -231,7 +233,7 @@ def _problem(name: str, file: RecordedFile, rival: Path | None, given: tuple[Pat
 
 
 def _size_of_file(path: Path) -> int | None:
-    """Return the size of a regular, accessible file, else None."""
+    """Return the size of a regular, accessible file; otherwise None."""
     try:
         state = path.stat()
     except (OSError, ValueError):
@@ -241,12 +243,12 @@ def _size_of_file(path: Path) -> int | None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Places:
-    """Candidate positions of the files of one input: in folders, or only given paths.
+    """Candidate paths for the files of one input: folders to search, or given files.
 
     Attributes:
-        folders: to search.
-        files: what a user gave, or the record itself; there are no folders then.
-        listed: files directly in a folder by size.
+        folders: folders to search.
+        files: files given by the user or extracted from the record; `folders` is then empty.
+        listed: function that returns the files directly in a folder, by size.
     """
 
     folders: tuple[Path, ...] = ()
@@ -254,7 +256,7 @@ class _Places:
     listed: Callable[[Path], Mapping[int, list[Path]]]
 
     def candidates(self, file: RecordedFile, memories: Sequence[FileDigests]) -> Iterator[Path]:
-        """Yield paths at which a file may be, the likeliest first: of its name, then others."""
+        """Yield candidate paths of a file, most likely first: with its name, then others."""
         if name_problem(file.name):
             return
         yield from (path for path in self.files if path.name == file.name)
@@ -270,7 +272,7 @@ class _Places:
 
 
 def _listed(folder: Path) -> Mapping[int, list[Path]]:
-    """Return the files directly in a folder by size, as far as it can be read."""
+    """Return the files directly in a folder by size; empty if it cannot be read."""
     found: dict[int, list[Path]] = {}
     try:
         with os.scandir(folder) as entries:
@@ -298,10 +300,10 @@ def _places(
     roots = dict.fromkeys(
         (Path(), run_folder, *run_folder.absolute().parents[: _FOLDERS_ABOVE - 1])
     )
-    # The resolved form has options instead of the file's own text, and no folders.
+    # The resolved workflow contains options instead of the paths in the file, and no folders.
     written = written_files(workflow.source)
     places: dict[str, _Places] = {}
-    # Each folder is read once.
+    # List each folder only once.
     listed = cache(_listed)
     for name, spec in specs.items():
         by_name = by_hand.get(name)
@@ -324,7 +326,7 @@ def _places(
 def _of_all_datasets(
     options: Sequence[InputOption], specs: Mapping[str, WorkflowInputSpec]
 ) -> tuple[InputOption, ...]:
-    """Let `scan=FOLDER` apply to the `scan@...` of every dataset, if there is no other scan."""
+    """Apply `scan=FOLDER` to `scan@...` of all datasets, if there is no input `scan`."""
 
     def meant(name: str) -> Sequence[str]:
         own = [found for found in specs if found.partition("@")[0] == name]

@@ -1,4 +1,4 @@
-"""Opening a run, finished or not."""
+"""Opening of finished and unfinished runs."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ _INTERRUPTED: Final = CancelledStepError.__name__
 
 
 def open_run(path: str | Path) -> Run:
-    """Open a run; a running or interrupted one as far as it has results.
+    """Open a run; of a running or interrupted one, the results so far.
 
     Args:
         path: a run folder, or the `run.h5` in it.
 
     Raises:
-        ArgumentError: nothing is there, or the folder holds no finished run.
-        RecordError: the record is damaged, no record at all, or of a newer format.
+        ArgumentError: the path does not exist, or the folder contains no run.
+        RecordError: the record is damaged, not a record, or of a newer format.
     """
     if has_outline(Path(path)):
         return open_unfinished(Path(path))
@@ -50,22 +50,22 @@ def open_run(path: str | Path) -> Run:
 
 
 def has_outline(folder: Path) -> bool:
-    """Return whether a folder holds a run that began and has no record yet."""
+    """Return whether a folder contains a run that has started and has no record yet."""
     return (folder / OUTLINE_FILE).is_file() and not (folder / RECORD_FILE).is_file()
 
 
 def open_unfinished(folder: Path, *, publish: bool = False) -> Run:
-    """Open an unfinished run; cells without a result yet are skipped in it.
+    """Open an unfinished run; cells without a result are given as skipped.
 
-    Its record is in a folder that is removed with this process.
+    Its record is in a temporary folder, which is removed at exit.
 
     Args:
-        folder: of the run.
-        publish: write its products into the run folder, of a run that was interrupted; otherwise
-            they are beside the temporary record, if the run folder does not have them.
+        folder: run folder.
+        publish: write the products of an interrupted run into the run folder; otherwise they are
+            written next to the temporary record, unless the run folder already contains them.
 
     Raises:
-        ArgumentError: its outline or its store is missing or unreadable, or the run goes on.
+        ArgumentError: its outline or its store is missing or unreadable, or the run is running.
         StoreError: the disk cannot be written.
     """
     from orthoflow.engine.store import Store  # noqa: PLC0415 - only who looks at such a run
@@ -107,7 +107,7 @@ def open_unfinished(folder: Path, *, publish: bool = False) -> Run:
     began = next((line for line in lines if line.event == "run"), None)
     record = dataclasses.replace(
         record,
-        # A resumed run keeps its first id.
+        # A resumed run keeps the id of its first attempt.
         run_id=began.run_id if began else record.run_id,
         started=began.time if began else record.started,
         ended=lines[-1].time if lines else record.ended,
@@ -126,7 +126,7 @@ def open_unfinished(folder: Path, *, publish: bool = False) -> Run:
         write_record(path, dataclasses.replace(record, published=published), store.product_file)
     except RecordFormatError as error:
         raise StoreError(f"the record of {folder} cannot be assembled: {error}") from error
-    # An interrupted run has left them; a running one is not touched.
+    # An interrupted run may have published its files; the folder of a running one is not changed.
     is_there = all(published_state(folder, file) == "same" for file in published)
     return dataclasses.replace(
         read_run(path), files_folder=folder if is_there else aside, home=folder

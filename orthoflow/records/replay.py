@@ -1,4 +1,4 @@
-"""Replay: a recorded run planned again from its record alone, after all checks."""
+"""Replay: planning a recorded run again from its record, after all checks."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ class Replay:
     """A replay that is ready to start.
 
     Attributes:
-        workflow: from the record, for the record of the replay.
-        plan: its cells with the parameters and seeds as recorded.
+        workflow: workflow in the record.
+        plan: plan of its cells with the recorded parameters and seeds.
         notes: changes that may affect results: code, libraries, Python, processor.
-        changed_methods: methods with different code but the same version as in the record.
-        is_embedded: the record has the arrays of every product and all input files.
+        changed_methods: ids of methods whose code has changed but whose result version has not.
+        is_embedded: whether the record contains the arrays of all products and all input files.
     """
 
     workflow: Workflow
@@ -64,25 +64,25 @@ def plan_replay(
     placed: PlacedInputs | None = None,
     earlier: Sequence[Store] = (),
 ) -> Replay:
-    """Check that a run can be repeated, and plan it. Nothing is computed.
+    """Check that a run can be repeated, and plan it without running any cell.
 
     Args:
         run: the run.
         catalog: the installed plugins.
-        store: where the replay keeps its results.
-        options: of the replay.
-        inputs: `NAME=PATH`, each as after `--input`.
-        placed: the files from the record, and those with other names now, see `embedded_inputs`;
-            without it the files must have their names.
-        earlier: stores that may have noted positions of input files.
+        store: store for the results of the replay.
+        options: options of the replay.
+        inputs: `NAME=PATH` as for `--input`.
+        placed: extracted and renamed input files, see `embedded_inputs`; None if all files have
+            their recorded names.
+        earlier: other stores that may contain paths of input files.
 
     Raises:
-        RefusedRunError: the record was changed, a method has another result version or takes
-            other parameters, or an input file was changed.
-        MissingInputsError: only input files are missing.
-        MissingMethodsError: only methods or product types are missing.
-        InvalidArgumentsError: `inputs` names no input of the workflow.
-        InputError: there is nothing at a given path.
+        RefusedRunError: the record was changed, a method has another result version or other
+            parameters, or an input file was changed.
+        MissingInputsError: the only problem is missing input files.
+        MissingMethodsError: the only problem is missing methods or product types.
+        InvalidArgumentsError: `inputs` contains a name that is not an input of the workflow.
+        InputError: a given path does not exist.
     """
     findings = verify_run(run.path, also_published=False).findings
     if problems := findings or (*_inconsistencies(run), *_loose_ends(run)):
@@ -142,7 +142,7 @@ def _variant(cell: RecordedCell, workflow: Workflow) -> StepVariant | None:
 
 
 def _with_files(workflow: Workflow, paths: Mapping[str, tuple[Path, ...]]) -> Workflow:
-    """Name the files that were found; inputs without files had none originally."""
+    """Set the files that were found; inputs without files were not given originally."""
     specs = {
         name: dataclasses.replace(
             spec,
@@ -155,7 +155,7 @@ def _with_files(workflow: Workflow, paths: Mapping[str, tuple[Path, ...]]) -> Wo
 
 
 def _inconsistencies(run: Run) -> Iterator[str]:
-    """Find cells that contradict the key under which they were computed."""
+    """Yield cells that contradict the cache key under which they were computed."""
     files = {f"inputs.{entry.name}": input_digest(entry.files) for entry in run.record.inputs}
     for cell in run.record.cells:
         for port, product in cell.inputs.items():
@@ -180,12 +180,12 @@ def _inconsistencies(run: Run) -> Iterator[str]:
 
 
 def _loose_ends(run: Run) -> Iterator[str]:
-    """Find inputs of cells that neither an input of the run nor an earlier cell gives."""
+    """Yield inputs of cells that are neither inputs of the run nor outputs of earlier cells."""
     given = {"inputs": {entry.name for entry in run.record.inputs}}
     for cell in run.record.cells:
         for port, product in cell.inputs.items():
             owner, _, name = product.source.rpartition(".")
-            # Of a step before it a skipped cell may lack just this.
+            # A skipped cell may lack an output of an upstream cell, which is why it was skipped.
             is_lacking = cell.status == "skipped" and owner != "inputs" and owner in given
             if not is_lacking and name not in given.get(owner, ()):
                 yield f"{cell.address}: nothing before it gives {product.source!r}, its {port}"
@@ -193,7 +193,7 @@ def _loose_ends(run: Run) -> Iterator[str]:
 
 
 def _method_problems(run: Run, catalog: Catalog) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Compare recorded methods with installed ones: what is missing, what differs; each once."""
+    """Return missing methods, and differences of installed methods, without duplicates."""
     missing: list[str] = []
     others: list[str] = []
     for cell in run.record.cells:
@@ -209,7 +209,7 @@ def _method_problems(run: Run, catalog: Catalog) -> tuple[tuple[str, ...], tuple
 
 
 def _differences(cell: RecordedCell, catalog: Catalog, origin: str) -> Iterator[str]:
-    """Return in what the installed method differs from a recorded one, so far as it decides."""
+    """Yield differences between an installed and a recorded method that prevent a replay."""
     if cell.seed is not None and cell.seed < 0:
         yield f"step {cell.address}: a seed is not negative, got {cell.seed}"
     cls = catalog.method(cell.method).load()
@@ -248,7 +248,7 @@ def _cell(recorded: RecordedCell, workflow: Workflow) -> Cell:
         params=recorded.params,
         params_set=recorded.params_set,
         inputs={port: _source(product.source) for port, product in recorded.inputs.items()},
-        # A method without a seed gets a generator all the same, and does not use it.
+        # A method without a seed also gets a generator, but does not use it.
         seed=recorded.seed or 0,
         cores=variant.cores if variant else None,
         timeout_s=variant.timeout_s if variant else None,
@@ -265,7 +265,7 @@ def _source(text: str) -> CellOutput | WorkflowInput:
 
 
 def _changes(run: Run, plan: RunPlan) -> tuple[frozenset[str], tuple[str, ...]]:
-    """Return methods with other code than in the record, and all that may affect results."""
+    """Return methods whose code has changed, and all changes that may affect results."""
     here = environment(1)
     notes = [
         f"{name}: {getattr(here, name)} here, {getattr(recorded, name)} in the record"
@@ -296,24 +296,25 @@ def _changes(run: Run, plan: RunPlan) -> tuple[frozenset[str], tuple[str, ...]]:
 MetricVerdict = Literal[
     "same", "rounding", "products", "not in the record", "code changed", "different"
 ]
-# Verdicts that make a replay differ.
+# Verdicts that count as a difference of the replay.
 DIFFERING: Final = frozenset({"code changed", "different"})
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayedMetric:
-    """One number that a record states or a replay computed.
+    """A metric that is in a record or that a replay computed.
 
     Attributes:
-        cell: address of its cell.
-        metric: its name.
-        recorded: value in the record, None without one.
-        recorded_unit: its unit.
-        replayed: value of the replay, None without one.
-        replayed_unit: its unit.
-        verdict: `same` bits; within `rounding`; changed with `products` of its step that do not
-            have the same bits, though within their tolerance or not measured; `not in the record`;
-            of a step with a method whose `code changed`; else `different`.
+        cell: address of the cell.
+        metric: name of the metric.
+        recorded: value in the record; None if there is none.
+        recorded_unit: unit in the record.
+        replayed: value of the replay; None if there is none.
+        replayed_unit: unit in the replay.
+        verdict: `same` (same bits); `rounding`; `products` if inputs or outputs of the step do not
+            have the same bits but are within tolerance or not measured; `not in the record`; `code
+            changed` if the code of the step or of a step upstream has changed; otherwise
+            `different`.
     """
 
     cell: str
@@ -331,13 +332,13 @@ def replayed_metrics(
     distances: Sequence[ProductDistance],
     changed_methods: Collection[str] = (),
 ) -> tuple[ReplayedMetric, ...]:
-    """Compare the numbers of a record with those of its replay, times and memory left out.
+    """Compare the metrics of a record and its replay, without times and memory.
 
     Args:
         original: the run that was replayed.
         made: the replay.
-        distances: differences of all their products.
-        changed_methods: ids of the methods with different code than in the record.
+        distances: comparison of all products.
+        changed_methods: ids of methods whose code has changed.
     """
     identical = {f"{item.cell}.{item.port}" for item in distances if item.verdict == "identical"}
     is_changed = {
@@ -371,7 +372,7 @@ def replayed_metrics(
 
 
 def _is_of_identical(cell: RecordedCell, identical: set[str]) -> bool:
-    """Whether a step took and gave the same bits in both runs; input files always are the same."""
+    """Whether inputs and outputs of a step have the same bits in both runs."""
     taken = {given.source for given in cell.inputs.values()}
     given = {f"{cell.address}.{port}" for port in cell.outputs}
     return all(one in identical or one.startswith("inputs.") for one in taken | given)

@@ -1,4 +1,4 @@
-"""A run as a Python object: its cells, metrics, products, files and datasets."""
+"""A run as a Python object: cells, metrics, products, files and datasets."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ from orthoflow.workflow.model import (
 if TYPE_CHECKING:
     pass
 
-# As for fractions in the metadata of products (SPEC 11.3): libraries round their last digits.
+# As for floats in product metadata (SPEC 11.3): the last digits depend on libraries.
 _ROUNDING: Final = 1e-6
 _UNITLESS: Final = ("1", "yes/no")
 _COLUMNS: Final = ("cell", "step", "method", "metric", "value", "unit")
@@ -74,12 +74,12 @@ _COLUMNS: Final = ("cell", "step", "method", "metric", "value", "unit")
 
 @dataclass(frozen=True, kw_only=True)
 class MetricRow(Metric):
-    """One number of one cell.
+    """A metric of one cell.
 
     Attributes:
         cell: address of the cell.
-        step: name of its step.
-        method: method id.
+        step: step of the cell.
+        method: id of the method.
     """
 
     cell: str
@@ -88,24 +88,24 @@ class MetricRow(Metric):
 
     @property
     def metric(self) -> str:
-        """Its name, as columns of tables are called."""
+        """Name of the metric, as in the columns of tables."""
         return self.name
 
     @property
     def title(self) -> str:
-        """Its label; its name if its method declares none."""
+        """Label of the metric, or its name if the method declares no label."""
         return self.label or self.metric
 
     @property
     def titled(self) -> str:
-        """Its title with the unit; counts, shares and yes/no have none."""
+        """Title with the unit; counts, shares and yes/no have no unit."""
         return self.title if self.unit in _UNITLESS else f"{self.title} / {self.unit}"
 
 
 def cell_metrics(cell: RecordedCell) -> tuple[MetricRow, ...]:
-    """Return what the method reported and then what the engine measured (time and memory).
+    """Return the metrics reported by the method, then those measured by the engine (time, memory).
 
-    Cells without a result have no rows: their cost is not comparable with that of a result.
+    Cells without a result have no rows: their costs are not comparable.
     """
     if cell.status != "ok":
         return ()
@@ -116,9 +116,9 @@ def cell_metrics(cell: RecordedCell) -> tuple[MetricRow, ...]:
 
 
 def is_rounding(left: float, right: float) -> bool:
-    """Whether two values of a metric are equal or differ by rounding only.
+    """Whether two values of a metric are equal or differ only by rounding.
 
-    That is by a millionth of the larger one, or by a millionth if it is below 1; counts are never
+    The limit is a millionth of the larger value, or 1e-6 for values below 1; counts are never
     rounded.
 
     >>> is_rounding(0.84536087, 0.84536104), is_rounding(1.0, 1.00001), is_rounding(3e7, 3e7 + 1)
@@ -131,7 +131,7 @@ def is_rounding(left: float, right: float) -> bool:
 
 
 def write_metrics_csv(path: Path, rows: Iterable[MetricRow]) -> None:
-    """Write rows with a header; numbers with all digits."""
+    """Write the rows with a header, in full precision."""
     text = csv_text([_COLUMNS, *([getattr(row, name) for name in _COLUMNS] for row in rows)])
     path.write_text(text, encoding="utf-8", newline="")
 
@@ -141,7 +141,7 @@ METRICS_FILE: Final = "metrics.csv"
 
 
 def published_files(run_folder: Path, address: str) -> tuple[Path, ...]:
-    """Return files of one cell below `products/`, wall 2 before wall 10; empty without any.
+    """Return the published files of a cell, naturally sorted (wall 2 before wall 10), or ().
 
     Links are ignored, whatever their target.
     """
@@ -151,7 +151,7 @@ def published_files(run_folder: Path, address: str) -> tuple[Path, ...]:
 
 
 def _by_number(name: str) -> tuple[tuple[str, int], ...]:
-    """Return a sort key that treats numbers in a name as numbers."""
+    """Return a sort key that compares numbers in a name by value."""
     return tuple((text, int(digits or 0)) for text, digits in re.findall(r"(\D*)(\d*)", name))
 
 
@@ -159,15 +159,15 @@ PublishedState: TypeAlias = Literal["same", "changed", "missing", "unreadable", 
 
 
 def published_state(folder: Path, file: PublishedFile) -> PublishedState:
-    """Compare a published file with the record; follows no link and opens no device.
+    """Compare a published file with the record, without following links or opening devices.
 
     Args:
-        folder: of the run.
-        file: its entry in the record.
+        folder: run folder.
+        file: entry of the file in the record.
     """
     try:
         with open_below(folder, file.path) as stream:
-            # A sparse file of a terabyte is recognised by its size.
+            # Compare sizes first, so that a sparse file of a terabyte is not read.
             if os.fstat(stream.fileno()).st_size != file.size_bytes:
                 return "changed"
             digest = hashlib.file_digest(stream, "sha256").hexdigest()
@@ -181,14 +181,14 @@ def published_state(folder: Path, file: PublishedFile) -> PublishedState:
 
 
 def require_unchanged(run: Run, *paths: Path) -> None:
-    """Refuse published files that differ from the record: their derivatives would be wrong.
+    """Refuse published files that differ from the record, before other files are derived from them.
 
     Args:
         run: the run.
-        paths: below its folder.
+        paths: files in its folder.
 
     Raises:
-        RecordError: one was changed, is a link or a device, or is not in the record.
+        RecordError: a file was changed, is a link or a device, or is not in the record.
     """
     known = {file.path: file for file in run.record.published}
     for path in paths:
@@ -211,7 +211,7 @@ _DAMAGED: Final = "the file is damaged"
 _AWAY: Final = "; use another copy, and check it with `orthoflow verify`"
 FIGURES_FOLDER: Final = "figures"
 GRAPH_FILE: Final = "graph.svg"
-# Of a run on several datasets, a page for each.
+# Folder of the pages of single datasets, for a run on several.
 PAGES_FOLDER: Final = "pages"
 _MOST_NAMED: Final = 12
 _LONGEST_REASON: Final = 400
@@ -223,13 +223,14 @@ class Run:
 
     Attributes:
         path: the record file.
-        record: everything the record states except the products' arrays.
-        output: reads an output by address and port from the open record; None to open it for each.
-        files_folder: replaces the folder of the record if its files are elsewhere.
-        home: the run folder of an unfinished run, whose record is elsewhere.
-        content_sha256: the digest that seals the record; empty if it was not read from a file.
-        later_name: final name of the record file, once everything beside it is written; empty if it
-            has it already.
+        record: everything in the record except the arrays of products.
+        output: reads an output by address and port from the open record; None to open the record
+            for each output.
+        files_folder: folder of the run's files, if it is not the folder of the record.
+        home: run folder of an unfinished run, whose record is elsewhere.
+        content_sha256: digest that seals the record; empty if it was not read from a file.
+        later_name: final name of the record file, which it gets after all other files are written;
+            empty if it already has its final name.
     """
 
     path: Path
@@ -242,17 +243,17 @@ class Run:
 
     @property
     def file_name(self) -> str:
-        """The name of the record file in documents about the run, such as a page."""
+        """Name of the record file, as given in documents about the run."""
         return self.later_name or self.path.name
 
     @contextmanager
     def held_open(self) -> Iterator[Run]:
-        """Return the run with its record held open, for frequent reading.
+        """Return the run with its record kept open, for repeated reading.
 
-        Opening a record checks all of it, which would take too long for each of many datasets.
+        Opening a record checks all of it, which would be too slow if repeated for many datasets.
 
         Raises:
-            RecordError: the record is damaged, or gone.
+            RecordError: the record is damaged or missing.
         """
         with ExitStack() as stack:
             with record_errors(self.path):
@@ -261,12 +262,12 @@ class Run:
 
     @property
     def folder(self) -> Path:
-        """The folder of the record, with `products/` and the report beside it."""
+        """Folder of the record, with `products/` and the report."""
         return self.files_folder or self.path.parent
 
     @property
     def home_folder(self) -> Path:
-        """The folder for files derived from the run."""
+        """Folder for files derived from the run."""
         return self.home or self.folder
 
     @cached_property
@@ -291,10 +292,10 @@ class Run:
         return self.cells[address]
 
     def upstream(self, address: str) -> Iterator[RecordedCell]:
-        """Return a cell and all cells it depends on, the nearest first."""
+        """Yield a cell and all cells upstream of it, nearest first."""
         waiting, seen = [address], {address}
         for name in waiting:
-            # Grows during iteration.
+            # The list grows during the iteration.
             yield self.cells[name]
             for given in self.cells[name].inputs.values():
                 before = given.source.rpartition(".")[0]
@@ -311,7 +312,7 @@ class Run:
         return shown(f"<Run {sentence}>")
 
     def with_failure(self, sentence: str) -> str:
-        """Append to a sentence about a run which step failed first and why, if one did."""
+        """Append the first failed step and its error to a sentence about the run, if any failed."""
         failed = [cell for cell in self.record.cells if cell.status == "failed"]
         if not failed:
             return sentence
@@ -320,14 +321,14 @@ class Run:
         return f"{sentence}; {failed[0].address} failed{more}: {why}"
 
     def metric_rows(self) -> tuple[MetricRow, ...]:
-        """Return every number of every cell, including those measured by the engine."""
+        """Return all metrics of all cells, including those measured by the engine."""
         return tuple(row for cell in self.record.cells for row in cell_metrics(cell))
 
     def figure(self, address: str, name: str) -> RecordedFigure:
-        """Return one picture of a cell.
+        """Return a figure of a cell.
 
         Raises:
-            ArgumentError: the run has no such cell, or the cell no such picture.
+            ArgumentError: the run has no such cell, or the cell has no such figure.
         """
         figures = {figure.name: figure for figure in self.cell(address).figures}
         if name not in figures:
@@ -341,18 +342,18 @@ class Run:
         """Return an output as named arrays and JSON; needs no plugin.
 
         Raises:
-            ArgumentError: the run has no such cell, or the cell no such output.
-            RecordError: the record holds only the digest of the output, or is damaged.
+            ArgumentError: the run has no such cell, or the cell has no such output.
+            RecordError: the record contains only the digest of the output, or is damaged.
         """
         return next(self.payloads([(address, port)]))
 
     def payloads(self, places: Sequence[tuple[str, str]]) -> Iterator[Payload]:
-        """Yield outputs, each an address and a port, one after the other; opens the record once.
+        """Yield outputs, each given by address and port, one by one; opens the record once.
 
         Raises:
-            ArgumentError: the run has no such cell, or the cell no such output.
-            RecordError: the record holds only the digest of an output, is damaged, or has an output
-                that does not match its digest.
+            ArgumentError: the run has no such cell, or the cell has no such output.
+            RecordError: the record contains only the digest of an output, is damaged, or contains
+                an output that does not match its digest.
         """
         for address, port in places:
             self._check_embedded(address, port)
@@ -390,9 +391,9 @@ class Run:
         """Return an output as an object of its product class.
 
         Raises:
-            ArgumentError: the run has no such cell, or the cell no such output.
-            RecordError: the record holds only the digest of the output, or is damaged.
-            PluginError: no installed plugin knows the product's type.
+            ArgumentError: the run has no such cell, or the cell has no such output.
+            RecordError: the record contains only the digest of the output, or is damaged.
+            PluginError: no installed plugin provides the product type.
         """
         from orthoflow.catalog.discovery import discover_catalog  # noqa: PLC0415 - only products need it
 
@@ -407,7 +408,7 @@ class Run:
 
     @property
     def files(self) -> Mapping[str, tuple[Path, ...]]:
-        """Published files by cell address; cells without files are left out."""
+        """Published files by cell address; cells without files are omitted."""
         found = {address: published_files(self.folder, address) for address in self.cells}
         return {address: files for address, files in found.items() if files}
 
@@ -423,7 +424,7 @@ class Run:
 
     @property
     def products_folder(self) -> Path:
-        """The folder of the published files."""
+        """Folder of the published files."""
         return self.folder / PRODUCTS_FOLDER
 
 
@@ -435,7 +436,7 @@ def read_run(path: Path, *, later_name: str = "") -> Run:
         later_name: see `Run`.
 
     Raises:
-        RecordError: the record is damaged, no record at all, or of another format.
+        RecordError: the record is damaged, not a record, or of another format.
     """
     with record_errors(path), open_record(path) as opened:
         return Run(
@@ -450,7 +451,7 @@ def find_record(path: str | Path) -> Path:
     """Return the record file of a run folder; a file is returned unchanged.
 
     Raises:
-        ArgumentError: nothing is there, or the folder holds no finished run.
+        ArgumentError: the path does not exist, or the folder contains no finished run.
     """
     given = Path(path)
     if given.is_dir():
@@ -476,10 +477,10 @@ def find_record(path: str | Path) -> Path:
 
 @contextmanager
 def record_errors(path: Path) -> Iterator[None]:
-    """Convert any error while reading a record into one sentence.
+    """Convert any error while reading a record into an error of one sentence.
 
     Raises:
-        RecordError: instead of every error except orthoflow's own and missing permission.
+        RecordError: replaces all errors except orthoflow's own and missing permission.
     """
     try:
         yield
@@ -491,14 +492,14 @@ def record_errors(path: Path) -> Iterator[None]:
     except PermissionError as error:
         raise ArgumentError(f"{path} cannot be read: permission denied") from error
     except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
-        # h5py reports damage with any of these, depending on the affected structure.
+        # h5py raises any of these for damaged files, depending on the damaged structure.
         if isinstance(error, OSError) and error.errno in (errno.ENOENT, errno.EISDIR):
             raise ArgumentError(f"{path} is not a file; give a run folder or its run.h5") from error
         raise RecordError(f"{path} is not a record or is damaged: {error}{_AWAY}") from error
 
 
 def _with_path(path: Path, sentence: str) -> str:
-    """Name the file as the user did; sentences of the format begin with its bare name."""
+    """Replace the bare file name at the start of a message by the path given by the user."""
     if sentence.startswith(path.name):
         return f"{path}{sentence.removeprefix(path.name)}"
     return f"{path}: {sentence}"
@@ -508,10 +509,10 @@ _ALWAYS_COPIED_BYTES: Final = 64 << 20
 
 
 def path_inside(folder: Path, name: str) -> Path:
-    """Return the path of a file named after something in a record.
+    """Return the path of a file whose name comes from a record.
 
     Raises:
-        RecordError: no file can have this name.
+        RecordError: the name is not allowed as a file name.
     """
     try:
         return path_below(folder, name)
@@ -520,10 +521,10 @@ def path_inside(folder: Path, name: str) -> Path:
 
 
 def figure_files(run: Run, addresses: Iterable[str]) -> Mapping[str, RecordedFigure]:
-    """Return names of the files of figures of cells: path below a folder -> figure.
+    """Return the files for figures of cells: relative path -> figure.
 
     Raises:
-        RecordError: a cell or a figure has a name or a type that no file can have.
+        RecordError: the name or type of a cell or figure cannot be used for a file.
     """
     named: list[tuple[str, RecordedFigure]] = []
     problems: list[str] = []
@@ -541,18 +542,18 @@ def figure_files(run: Run, addresses: Iterable[str]) -> Mapping[str, RecordedFig
 
 
 def write_files(folder: Path, contents: Mapping[str, Callable[[], bytes | None]]) -> int:
-    """Write files below a folder, without following links; existing files are replaced.
+    """Write files into a folder without following links; existing files are replaced.
 
     Args:
-        folder: made when missing.
-        contents: path below it -> function that returns the bytes, called in threads; None for no
-            file.
+        folder: the folder, created if missing.
+        contents: relative path -> function that returns the bytes, or None for no file; called in
+            threads.
 
     Returns:
-        How many were written.
+        The number of files written.
 
     Raises:
-        StoreError: the disk cannot be written, or a link is in the way.
+        StoreError: the disk cannot be written, or a link is in the path.
     """
     with writing_to(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -572,19 +573,19 @@ def write_files(folder: Path, contents: Mapping[str, Callable[[], bytes | None]]
 def copy_files(
     source: Path, target: Path, paths: Iterable[str], published: Iterable[PublishedFile]
 ) -> tuple[str, ...]:
-    """Copy regular files from below one folder to below another.
+    """Copy regular files from one folder to another.
 
     Args:
-        source: the source folder.
+        source: source folder.
         target: existing folder.
-        paths: below both.
-        published: the record's statement about those that it names.
+        paths: paths relative to both folders.
+        published: entries of published files in the record, against which copies are checked.
 
     Returns:
-        Those that exist.
+        The paths of files that exist.
 
     Raises:
-        RecordError: a link or a device replaces a file, or it differs from the record.
+        RecordError: a file is a link or a device, or differs from the record.
         StoreError: the disk cannot be written.
     """
     copied: list[str] = []
@@ -608,10 +609,10 @@ def copy_files(
 
 @contextmanager
 def creating(folder: Path, path: str) -> Iterator[BinaryIO]:
-    """Write one file below a folder; it gets its name when it is complete.
+    """Write a file into a folder; it gets its final name when it is complete.
 
     Raises:
-        StoreError: the disk cannot be written, or a link is in the way.
+        StoreError: the disk cannot be written, or a link is in the path.
     """
     try:
         with writing_to(folder), create_below(folder, path) as stream:
@@ -633,7 +634,7 @@ def _check_size(path: Path, found: os.stat_result, expected: PublishedFile | Non
             f"{path} has {found.st_size} bytes, but was published with {expected.size_bytes}: it "
             "was changed"
         )
-    # A sparse file of a terabyte would fill the disk.
+    # A copy of a sparse file of a terabyte would fill the disk.
     if found.st_size > _ALWAYS_COPIED_BYTES and found.st_size > 8 * 512 * found.st_blocks:
         raise RecordError(f"{path} claims {found.st_size} bytes, but most of it is a hole")
 
@@ -644,7 +645,7 @@ def _suffix(run: Run, figure: RecordedFigure) -> str:
             f"{run.path}: the figure {figure.name!r} must be {', '.join(FIGURE_SUFFIXES)}, got "
             f"{figure.media_type!r}"
         )
-    # Format for papers and word processors.
+    # WebP is converted to PNG for papers and word processors.
     shown = "image/png" if figure.media_type == "image/webp" else figure.media_type
     return FIGURE_SUFFIXES[shown]
 
@@ -653,9 +654,9 @@ _DATASETS = "datasets"
 
 
 def datasets_of(run: Run) -> tuple[str, ...]:
-    """Return the datasets of a run that has cells of them, in order; usually none.
+    """Return the datasets that have cells in a run, in order; usually none.
 
-    Names that are invalid are left out, because folders and pages are named after them.
+    Invalid names are omitted, because folders and pages are named after datasets.
     """
     if not _resolved(run).get(_DATASETS):
         return ()
@@ -664,9 +665,9 @@ def datasets_of(run: Run) -> tuple[str, ...]:
 
 
 def parts_of(run: Run) -> dict[str, Run]:
-    """Return the part of each dataset of a run, including common cells, as a run of its own.
+    """Return the part of a run for each dataset, including shared cells, as a separate run.
 
-    Their products are read from the record of the whole run.
+    Products are read from the record of the whole run.
     """
     cells: dict[str, list[RecordedCell]] = {name: [] for name in datasets_of(run)}
     for cell in run.record.cells:
@@ -714,7 +715,7 @@ def _record_of(
 
 
 def pages_of(run: Run) -> dict[str, str]:
-    """Return the page of each dataset: name -> path below the run folder, if several."""
+    """Return dataset -> path of its page in the run folder; empty without several datasets."""
     names = datasets_of(run)
     return {name: f"{PAGES_FOLDER}/{name}.html" for name in names} if len(names) > 1 else {}
 

@@ -1,7 +1,7 @@
-"""Orthoimages of a run as a STAC collection: an item beside each GeoTIFF, links relative.
+"""Export of orthoimages as a STAC collection: one item per GeoTIFF, with relative links.
 
-STAC 1.1.0 with the extensions projection 2.0.0 and file 2.1.0. Only rasters in a map are on Earth;
-those in the plane of a wall are items without a geometry, as STAC allows.
+STAC 1.1.0 with the extensions projection 2.0.0 and file 2.1.0. Only rasters in map coordinates are
+georeferenced; rasters in the plane of a wall become items without a geometry, as STAC allows.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _PROJECTION: Final = "https://stac-extensions.github.io/projection/v2.0.0/schema
 _FILE: Final = "https://stac-extensions.github.io/file/v2.1.0/schema.json"
 _GEOTIFF: Final = "image/tiff; application=geotiff; profile=cloud-optimized"
 _ORTHO: Final = "_ortho.tif"
-# Files beside an orthoimage, by the end of its name: key, media type, roles.
+# Files of an orthoimage, by the end of their names: key, media type, roles.
 _BESIDE: Final = {
     "_ortho.tif": ("image", _GEOTIFF, ["data"]),
     "_ortho_mask.tif": ("mask", "image/tiff; application=geotiff", ["metadata"]),
@@ -35,18 +35,18 @@ _BESIDE: Final = {
 }
 _DESCRIBED: Final = ("painted_share", "expected_mm_median", "expected_mm_p95", "recommended")
 _EVERYWHERE: Final = (-180.0, -90.0, 180.0, 90.0)
-# Prefix of sha2-256 in a multihash: its code and 32 bytes.
+# Prefix of a SHA-256 in a multihash: its code and the length of 32 bytes.
 _MULTIHASH: Final = "1220"
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Ortho:
-    """One orthoimage that was copied.
+    """An orthoimage that was copied.
 
     Attributes:
-        path: below the folder of the export.
-        address: of the cell that made it.
-        place: its position.
+        path: path in the export folder.
+        address: address of its cell.
+        place: position of the raster.
     """
 
     path: PurePosixPath
@@ -55,19 +55,19 @@ class _Ortho:
 
     @property
     def item_path(self) -> PurePosixPath:
-        """The file of its item; `wall_0_ortho.json` already states where the wall is."""
+        """Path of its item; the name `wall_0_ortho.json` is taken by the file with its position."""
         return self.path.with_name(f"{self.path.stem}.item.json")
 
 
 def write_stac(run: Run, folder: Path) -> int:
-    """Copy the orthoimages of a run and write items and a collection; return their number.
+    """Copy the orthoimages of a run and write a collection with items; return their number.
 
     Args:
         run: the run, with its published files.
-        folder: existing, empty.
+        folder: existing empty folder.
 
     Raises:
-        ArgumentError: the run published no orthoimage, or they are gone.
+        ArgumentError: the run published no orthoimage, or the files are missing.
         RecordError: a published file was changed.
         StoreError: the disk cannot be written.
     """
@@ -75,7 +75,7 @@ def write_stac(run: Run, folder: Path) -> int:
         f"{PRODUCTS_FOLDER}/{path.parent.name}/{path.name}": address
         for address, files in run.files.items()
         for path in files
-        # A repeat shows the same, and # would begin a fragment in a link.
+        # Repeats have the same content, and the # in their names would begin a fragment of a link.
         if run.cells[address].repeat == 0 and path.name.endswith(tuple(_BESIDE))
     }
     copied = copy_files(run.folder, folder, inside, run.record.published)

@@ -1,4 +1,4 @@
-"""Records as tables: CSV, several records joined, diagnostics as JSON, common points."""
+"""Records as tables: CSV files, joined runs, diagnostics as JSON, common points."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class CommonPoints:
-    """Statistics of one cell's inspection over the points that all comparable cells found.
+    """Statistics of an inspection over the points that all comparable cells found.
 
     Attributes:
         cell: address of the inspection.
-        step: of the inspection.
-        kind: class of the points; empty for all together.
-        n_found: points that this cell found.
-        n_common: points that every cell found.
-        rms_u_mm: root mean square of displacements along u over the common points.
-        rms_v_mm: the same along v.
-        rms_mm: the same of their lengths.
+        step: step of the inspection.
+        kind: class of the points; empty for all points.
+        n_found: number of points that this cell found.
+        n_common: number of points that all cells found.
+        rms_u_mm: root mean square of the displacements along u over the common points.
+        rms_v_mm: root mean square of the displacements along v.
+        rms_mm: root mean square of the lengths of the displacements.
     """
 
     cell: str
@@ -59,15 +59,15 @@ class CommonPoints:
 
     @property
     def n_lost(self) -> int:
-        """Points of this cell that are not counted, because another cell did not find them."""
+        """Number of points of this cell that are not counted because another cell missed them."""
         return self.n_found - self.n_common
 
 
 def common_points(run: Run) -> tuple[CommonPoints, ...]:
-    """Compare the inspections of each step over common points, per dataset, seed and repeat.
+    """Compare the inspections of each step over their common points.
 
-    Inspections without common points, such as those that match features, give no rows; neither do
-    those whose products are not in the record.
+    Inspections are compared per dataset, seed and repeat. Those without common points, such as
+    those that match features, and those whose products are not in the record give no rows.
 
     Raises:
         RecordError: the record is damaged.
@@ -90,12 +90,12 @@ def common_points(run: Run) -> tuple[CommonPoints, ...]:
 def over_common_points(
     inspections: Mapping[str, Inspection], *, step: str = ""
 ) -> Iterator[CommonPoints]:
-    """Yield rows of all inspections over the points that each of them found, class by class.
+    """Yield the statistics of inspections over the points that all of them found, by class.
 
     Args:
-        inspections: address of the cell -> its points; points are the same if their coordinates and
-            their class are.
-        step: of the cells.
+        inspections: address of the cell -> inspection; points with the same coordinates and class
+            are the same.
+        step: step of the cells.
     """
     places = {cell: _rows_of_points(found) for cell, found in inspections.items()}
     common = set.intersection(*(set(rows) for rows in places.values()))
@@ -134,15 +134,15 @@ Row: TypeAlias = Sequence[Value]
 
 
 def write_csv_tables(run: Run, folder: Path) -> tuple[Path, ...]:
-    """Write the tables of a run, each with a header; numbers with all digits.
+    """Write the tables of a run as CSV files with headers, in full precision.
 
     Args:
         run: the run.
         folder: existing folder.
 
     Returns:
-        The files: cells, metrics, parameters, inputs, products, environments, and if cells of a
-        comparison found the same check points, the statistics of each over the common ones.
+        The files: cells, metrics, parameters, inputs, products, environments; and statistics over
+        common check points, if several cells found them.
     """
     tables = {
         "cells.csv": _cells(run.record),
@@ -214,7 +214,7 @@ def _environments(record: RunRecord) -> Iterator[Row]:
             yield (entry.id, package, version)
 
 
-# The call of a step: its method and, as JSON, the parameters.
+# A method and its parameters as JSON, for a step with variants.
 Choice: TypeAlias = tuple[str, str]
 _BEHIND: Final = ("unit", "better", "step", "cell", "repeat", "runs", "environments")
 _RANGE: Final = ("lowest", "highest")
@@ -222,13 +222,13 @@ _RANGE: Final = ("lowest", "highest")
 
 @dataclass(frozen=True, kw_only=True)
 class JoinedCell:
-    """One cell of a comparison, in every record that has it.
+    """A cell in all records that contain it.
 
     Attributes:
         found: run and cell, in the order of the runs.
-        choices: step that varies -> its call for this cell.
-        dataset: name; empty if the run has only one.
-        seed: of the workflow, or as swept.
+        choices: step with variants -> method and parameters used for this cell.
+        dataset: name of the dataset; empty if the run has only one.
+        seed: seed of the workflow or of the sweep.
     """
 
     found: tuple[tuple[Run, RecordedCell], ...]
@@ -238,16 +238,16 @@ class JoinedCell:
 
     @property
     def cell(self) -> RecordedCell:
-        """The cell of the first record that has it."""
+        """The cell in the first record that contains it."""
         return self.found[0][1]
 
     @property
     def n_environments(self) -> int:
-        """In how many environments it was computed; their results may differ by rounding."""
+        """Number of environments in which it was computed; results may differ by rounding."""
         return len({cell.environment for _, cell in self.found})
 
     def values(self) -> Iterator[tuple[MetricRow, list[float]]]:
-        """Return each metric as the first record states it, and its values in all of them."""
+        """Yield each metric as given in the first record, and its values in all records."""
         rows = [cell_metrics(cell) for _, cell in self.found]
         first = {row.metric: row for found in reversed(rows) for row in found}
         for name in dict.fromkeys(row.metric for found in rows for row in found):
@@ -257,14 +257,14 @@ class JoinedCell:
 
 @dataclass(frozen=True, kw_only=True)
 class RunSet:
-    """Several runs whose cells are one table.
+    """Several runs whose cells are joined into one table.
 
-    Cells are the same if method, result version, parameters, seed and repeat, and those of all
-    cells before them, down to the bytes of the input files, are the same, whatever the names of
-    variants, inputs and datasets. The name of a variant comes from the first record that has it.
+    Cells are the same if they and all cells upstream have the same method, result version,
+    parameters, seed and repeat, and the input files have the same content, whatever the names of
+    variants, inputs and datasets. Variants are named as in the first record that contains them.
 
     Attributes:
-        runs: in the given order.
+        runs: the runs, in the order given.
     """
 
     runs: tuple[Run, ...]
@@ -275,13 +275,13 @@ class RunSet:
 
     @cached_property
     def steps(self) -> tuple[str, ...]:
-        """Steps that vary in any of the runs."""
+        """Steps with variants in any of the runs."""
         factors = (name for run in self.runs for one in run.record.cells for name in one.assignment)
         return tuple(name for name in dict.fromkeys(factors) if name not in (DATA, SEED))
 
     @cached_property
     def cells(self) -> tuple[JoinedCell, ...]:
-        """Yield each cell once that has a result in any of the runs."""
+        """Each cell that has a result in any of the runs, without duplicates."""
         found: dict[str, list[tuple[Run, RecordedCell]]] = {}
         for run in self.runs:
             for cell in run.record.cells:
@@ -290,14 +290,14 @@ class RunSet:
         return tuple(self._joined(tuple(same)) for same in found.values())
 
     def metrics(self) -> pd.DataFrame:
-        """Return a row per cell and metric.
+        """Return one row per cell and metric.
 
         Returns:
-            Columns `dataset`, `seed`, `variant.<step>` of each step that varies, `method`,
-            `metric`, `value` as the first record states it, `unit`, `better`, `step`, `cell` (its
-            address in the first record), `repeat`, `runs` and `environments` (how many records
-            have the cell, and from how many environments), `lowest` and `highest` of the values in
-            these records.
+            Columns `dataset`, `seed`, `variant.<step>` for each step with variants, `method`,
+            `metric`, `value` as given in the first record, `unit`, `better`, `step`, `cell`
+            (address in the first record), `repeat`, `runs` and `environments` (numbers of records
+            that contain the cell, and of their environments), `lowest` and `highest` of the values
+            in these records.
         """
         import pandas as pd  # noqa: PLC0415 - takes a second, and few ask
 
@@ -305,11 +305,11 @@ class RunSet:
         return pd.DataFrame(rows, columns=header)
 
     def statistics(self) -> pd.DataFrame:
-        """Return statistics over datasets, seeds and repeats of all records, each cell once.
+        """Return statistics over datasets, seeds and repeats of all records; cells count once.
 
         Returns:
-            A row per combination of variants, step, method and metric, with `n`, `median`, `mean`,
-            `standard_deviation` (NaN for one value), `lowest` and `highest`.
+            One row per combination of variants, step, method and metric, with `n`, `median`,
+            `mean`, `standard_deviation` (NaN for a single value), `lowest` and `highest`.
         """
         names = [f"variant.{step}" for step in self.steps]
         keys = [*names, "step", "method", "metric", "unit", "better"]
@@ -324,7 +324,7 @@ class RunSet:
         ).reset_index()
 
     def rows(self) -> Iterator[tuple[Value, ...]]:
-        """Return the table of `metrics`, its header first."""
+        """Yield the rows of `metrics`, beginning with the header."""
         variants = tuple(f"variant.{step}" for step in self.steps)
         yield ("dataset", "seed", *variants, "method", "metric", "value", *_BEHIND, *_RANGE)
         names = self._variant_names
@@ -343,7 +343,7 @@ class RunSet:
 
     @cached_property
     def _variant_names(self) -> dict[tuple[str, Choice], str]:
-        """Name of each choice of a step; one name for several is completed by their parameters."""
+        """Return the name of each choice, with its parameters where names are ambiguous."""
         first: dict[tuple[str, Choice], str] = {}
         for run in self.runs:
             for cell in run.record.cells:
@@ -375,7 +375,7 @@ class RunSet:
         known = self._identities.get((run.path, cell.address))
         if known is not None:
             return known
-        # Against circular records: no cell depends on itself.
+        # Ends the recursion if cells of a forged record depend on themselves.
         self._identities[run.path, cell.address] = ""
         inputs: dict[str, JsonValue] = {}
         for port, given in cell.inputs.items():
@@ -400,7 +400,7 @@ def join_runs(runs: Sequence[Run]) -> RunSet:
     """Join runs into one table.
 
     Raises:
-        ArgumentError: there is none.
+        ArgumentError: no runs are given.
     """
     if not runs:
         raise ArgumentError("give at least one run, a run folder or its run.h5")
@@ -417,7 +417,7 @@ def _choice(cell: RecordedCell) -> Choice:
 
 
 def _distinction(choice: Choice, others: Sequence[Choice]) -> str:
-    """Return how a choice differs from others of its name; empty if there are none."""
+    """Return how a choice differs from others with the same name; empty if there are none."""
     if len(set(others)) < 2:
         return ""
     params = json.loads(choice[1])
@@ -435,9 +435,9 @@ _WORD: Final = re.compile(r"(?<!^)(?=[A-Z])")
 
 
 def diagnostics_of(cell: CellOutcome, step: str, address: str) -> Iterator[dict[str, JsonValue]]:
-    """Return diagnostics of a cell, and why it failed.
+    """Yield the diagnostics of a cell, and the error if it failed.
 
-    The code of a failure is the class of its error in lower case: `InputError` is `input-error`.
+    The code of an error is the name of its class in lower case: `InputError` is `input-error`.
     """
     found = list(cell.diagnostics)
     if cell.status == "failed":

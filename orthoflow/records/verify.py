@@ -51,17 +51,17 @@ if TYPE_CHECKING:
     )
 
 SIGNATURE_SUFFIX: Final = ".sig"
-# Keys and signatures are a few hundred bytes.
+# Keys and signatures have a few hundred bytes.
 _LARGEST_BYTES: Final = 64 << 10
 
 
 class Signature(BaseModel):
-    """The content of a signature file, untrusted until it was checked.
+    """The content of a signature file, untrusted until it is checked.
 
     Attributes:
-        content_sha256: content digest of the record that was signed.
+        content_sha256: content digest of the signed record.
         public_key: key of the signer in OpenSSH format: `ssh-ed25519 ...`.
-        signature: base64 of 64 bytes.
+        signature: 64 bytes in base64.
     """
 
     format: Literal["orthoflow-signature"] = "orthoflow-signature"
@@ -77,19 +77,19 @@ class Signature(BaseModel):
 
 
 def sign_record(path: Path, key_file: Path, password: Callable[[], str]) -> Signature:
-    """Sign the seal of a verified record, into a file beside it.
+    """Sign the seal of a verified record; the signature is written next to the record.
 
     Args:
         path: the record file.
         key_file: private Ed25519 key in OpenSSH format.
-        password: called if the key is protected.
+        password: called if the key is protected by a password.
 
     Raises:
         InputError: the file is not such a key, or the password is wrong.
-        ArgumentError: a signature of another key is beside the record.
+        ArgumentError: there is already a signature with another key.
         RecordError: the record is damaged.
         StoreError: the disk cannot be written.
-        PluginError: the library cryptography is missing.
+        PluginError: the library cryptography is not installed.
     """
     key = _private_key(key_file, password)
     earlier = read_signature(path)
@@ -108,7 +108,7 @@ def sign_record(path: Path, key_file: Path, password: Callable[[], str]) -> Sign
 
 
 def read_signature(record: Path) -> Signature | None:
-    """Read the signature beside a record, unchecked; None without one.
+    """Read the signature of a record without checking it; None if there is none.
 
     Raises:
         RecordError: the file is not a signature.
@@ -125,16 +125,16 @@ def read_signature(record: Path) -> Signature | None:
 
 
 def check_signature(record: Path, signer: Path) -> Signature:
-    """Return the signature of a verified record, if it is that of a signer.
+    """Return the signature of a verified record if it was made with the key of a signer.
 
     Args:
         record: the record file.
-        signer: the public Ed25519 key that it must be signed with, in OpenSSH format.
+        signer: file with the public Ed25519 key of the signer, in OpenSSH format.
 
     Raises:
-        RecordError: it is missing, another's, or does not fit the record.
+        RecordError: the signature is missing, made with another key, or does not match the record.
         InputError: the file is not such a key.
-        PluginError: the library cryptography is missing.
+        PluginError: the library cryptography is not installed.
     """
     key = _public_key(signer)
     found = read_signature(record)
@@ -196,7 +196,7 @@ def _private_key(path: Path, password: Callable[[], str]) -> Ed25519PrivateKey:
         try:
             key = load(data, password=None)
         except TypeError:
-            # Protected; an empty password would count as none.
+            # The key is protected; an empty password would be treated as no password.
             key = load(data, password=password().encode("utf-8") or b"\0")
     if not isinstance(key, ed25519.Ed25519PrivateKey):
         raise InputError(f"{path} must be an Ed25519 key; `ssh-keygen -t ed25519` makes one")
@@ -243,11 +243,11 @@ def _key_bytes(path: Path) -> bytes:
         raise InputError(f"the key file {path} cannot be read: {error.strerror}") from error
 
 
-# Contradictions within a record: it may have been written like that.
+# Contradictions within a record; they may have been there when it was written.
 _OWN_FAULTS: Final = frozenset({"field", "name", "key", "reference"})
-# Before the names of findings in metrics.
+# Prefix of metrics that repeat findings of an inspection.
 _OF_WALLS: Final = re.compile(r"(all|(wall|floor|ceiling)_\d+)_")
-# Before the digests at the end of a page.
+# Text before the digests at the end of a page.
 _PAGE_MARK: Final = "orthoflow report of"
 _LARGEST_PAGE_BYTES: Final = 1 << 30
 _WRONG: Final[dict[PublishedState, str]] = {
@@ -259,11 +259,11 @@ _WRONG: Final[dict[PublishedState, str]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Note:
-    """Something beside a record that does not make the record wrong.
+    """A remark about files next to a record that does not make the record invalid.
 
     Attributes:
-        code: `missing` or `foreign` published files, a `page` that is not of this record or was
-            changed, or a `signature` that was not checked.
+        code: `missing` or `foreign` published files, a `page` that was changed or shows another
+            record, or a `signature` that was not checked.
         text: one sentence.
     """
 
@@ -278,17 +278,16 @@ class Verification:
     Attributes:
         path: the record file.
         findings: one sentence per difference; empty if nothing was changed.
-        wrong: subject of the findings, in words; empty without any.
-        notes: what could not be checked, or does not belong to the record.
-        seal: the digest that seals the record, 64 hexadecimal digits, as printed on sheets; empty
-            if the record itself was changed.
-        n_named: products that the record names by their digests alone.
-        n_products: products whose arrays are in the record and were compared with their digest.
-        n_inputs: input files that are in the record and were compared with their digest.
-        n_published: unchanged published files beside the record.
-        n_pages: unchanged report pages beside the record that show it.
-        signed_with: fingerprint of the key with which the record is signed, empty unless requested
-            and valid.
+        wrong: subject of the findings, in words; empty if there are none.
+        notes: files that could not be checked or do not belong to the record.
+        seal: digest that seals the record, 64 hexadecimal digits, as printed on sheets; empty if
+            the record itself was changed.
+        n_named: number of products that the record references only by digest.
+        n_products: number of products in the record whose digest was checked.
+        n_inputs: number of input files in the record whose digest was checked.
+        n_published: number of unchanged published files.
+        n_pages: number of unchanged report pages of this record.
+        signed_with: fingerprint of the signer's key; empty unless requested and valid.
     """
 
     path: Path
@@ -309,17 +308,17 @@ def verify_run(
 ) -> Verification:
     """Check seal, digests, cache keys and required fields of a record, and the published files.
 
-    Missing published files are a note, because a record may be passed on alone.
+    Missing published files only cause a note, because a record may be passed on alone.
 
     Args:
         path: a run folder, or the `run.h5` in it.
-        also_published: also check the files beside the record.
-        signer: public key that the record must be signed with.
+        also_published: also check the files next to the record.
+        signer: file with the public key that the record must be signed with.
 
     Raises:
-        ArgumentError: nothing is there, or the folder holds no finished run.
+        ArgumentError: the path does not exist, or the folder contains no finished run.
         InputError: `signer` is not a public key.
-        PluginError: `signer` is given, and the library cryptography is missing.
+        PluginError: `signer` is given, and the library cryptography is not installed.
     """
     record_path = find_record(path)
     if found := verify_record(record_path):
@@ -369,9 +368,9 @@ def verify_run(
 
 
 def _contradictions(opened: OpenRecord, cell: RecordedCell) -> Iterator[str]:
-    """Compare the metrics of an inspection with the findings of its product.
+    """Yield metrics of an inspection that contradict the findings in its product.
 
-    A metric is a finding of one wall, of all together, or prefixed by the wall's number.
+    A metric is a finding of one wall or of all walls, or a finding with the wall's name as prefix.
     """
     places = [
         port
@@ -394,20 +393,20 @@ def _contradictions(opened: OpenRecord, cell: RecordedCell) -> Iterator[str]:
 
 
 def sealed_page(text: str, runs: Sequence[Run]) -> str:
-    """Return a report page with the digests of its records and of its own text."""
+    """Return a report page with the digests of its records and of its own text appended."""
     digests = [run.content_sha256 for run in runs if run.content_sha256]
     sealed = f"{text}\n<!-- {_PAGE_MARK} {' '.join(digests)} "
     return f"{sealed}page {hashlib.sha256(sealed.encode('utf-8')).hexdigest()} -->\n"
 
 
 def page_of(page: str, run: Run) -> str:
-    """Return a page of another record of the same run, sealed as one of this record."""
+    """Return a page of another record of the same run, sealed as a page of this record."""
     text, mark, _ = page.rpartition(f"\n<!-- {_PAGE_MARK}")
     return sealed_page(text, [run]) if mark else page
 
 
 def _page_states(folder: Path, content_sha256: str) -> dict[str, bool]:
-    """Return for pages beside a record whether they show that record and are unchanged."""
+    """Return for each page next to a record whether it is unchanged and shows that record."""
     names = [REPORT_FILE] if os.path.lexists(folder / REPORT_FILE) else []
     names += [f"{PAGES_FOLDER}/{name}" for name in sorted(files_below(folder, PAGES_FOLDER))]
     return {name: _is_own_page(folder, name, content_sha256) for name in names}
@@ -436,14 +435,14 @@ def _page_note(folder: Path, name: str) -> Note:
 
 
 def broken_seal(run: Run, *, of_all: bool = False) -> str:
-    """Return what of a record was changed since it was sealed; empty if nothing was found.
+    """Return what was changed in a record since it was sealed; empty if nothing was found.
 
-    The arrays of products and input files are not checked, so that this is fast: reading those of a
-    product compares their digest (`Run.payloads`), and `verify_run` checks all.
+    This is fast because the arrays of products and the input files are not checked: reading a
+    product checks its digest (`Run.payloads`), and `verify_run` checks everything.
 
     Args:
         run: the run.
-        of_all: check everything, for passing on the whole record.
+        of_all: check everything, before the whole record is passed on.
     """
     findings = verify_record(run.path, with_arrays=of_all)
     places = [finding.place for finding in findings if finding.code not in _OWN_FAULTS]
@@ -453,7 +452,7 @@ def broken_seal(run: Run, *, of_all: bool = False) -> str:
 
 
 def _check_signature(record: Path, signer: Path | None) -> tuple[str, list[str], list[Note]]:
-    """Return the fingerprint of a signature that holds, what is wrong with it, and notes."""
+    """Return the fingerprint of a valid signature, problems with it, and notes."""
     try:
         if signer is not None:
             return check_signature(record, signer).fingerprint, [], []
@@ -471,7 +470,7 @@ def _check_signature(record: Path, signer: Path | None) -> tuple[str, list[str],
 
 
 def _published_notes(path: Path, record: RunRecord, missing: list[str]) -> Iterator[Note]:
-    """Note published files that are gone, and files that the record does not name."""
+    """Yield notes on missing published files, and on files that are not in the record."""
     n_published = len(record.published)
     if missing:
         text = (
@@ -483,7 +482,7 @@ def _published_notes(path: Path, record: RunRecord, missing: list[str]) -> Itera
             text += "were not checked"
         yield Note(code="missing", text=text)
         if len(missing) == n_published:
-            # A record that is passed on alone is among unrelated files.
+            # A record that was passed on alone may be next to unrelated files.
             return
     if unnamed := _unnamed(path, record):
         rest = first_few(unnamed)
@@ -493,7 +492,7 @@ def _published_notes(path: Path, record: RunRecord, missing: list[str]) -> Itera
 
 
 def _unnamed(path: Path, record: RunRecord) -> list[str]:
-    """Return the files below `products/` that a record does not name, sorted."""
+    """Return the files in `products/` that are not in a record, sorted."""
     named = {file.path for file in record.published}
     unnamed: set[str] = set()
     for place, _, below in os.walk(path.parent / PRODUCTS_FOLDER):

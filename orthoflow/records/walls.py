@@ -1,4 +1,4 @@
-"""The results of a run per wall: what to deliver, with rasters, accuracy and openings."""
+"""Results of a run per wall: rasters, accuracy and openings, and which walls to deliver."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _WALLS: Final = TypeAdapter(dict[str, tuple[WallDescription, ...]])
 
 
 def delivered_walls(products: Path) -> tuple[WallDescription, ...]:
-    """Read `walls.json` of a run; empty if it is missing, unreadable or not as one is written."""
+    """Read the `walls.json` of a run; empty if it is missing, unreadable or invalid."""
     path = products / WALLS_FILE
     try:
         if path.is_symlink() or path.stat().st_size > _WALLS_LARGEST_BYTES:
@@ -48,13 +48,13 @@ def delivered_walls(products: Path) -> tuple[WallDescription, ...]:
 
 
 def write_walls_json(products: Path, cells: Sequence[RecordedCell]) -> None:
-    """Write `walls.json` into the products of a run; nothing without orthoimages.
+    """Write `walls.json` into the products of a run, if there are orthoimages.
 
-    With several combinations the last one is used, as for drawings.
+    Of several combinations, the last one is used, as for drawings.
 
     Args:
         products: folder with the files of all cells.
-        cells: of the run, in order.
+        cells: cells of the run, in order.
     """
     pictured = [
         cell
@@ -94,7 +94,7 @@ def write_walls_json(products: Path, cells: Sequence[RecordedCell]) -> None:
 def _with_sidecars(
     products: Path, cell: RecordedCell, pattern: re.Pattern[str]
 ) -> Iterator[tuple[int, Path, Mapping[str, object]]]:
-    """Return numbers of walls, published rasters and their sidecars of a cell."""
+    """Yield wall number, published raster and sidecar for the rasters of a cell."""
     for path in sorted((products / cell_file_name(cell.address)).glob("*.json")):
         raster = path.with_suffix(".tif")
         if found := pattern.fullmatch(raster.name):
@@ -105,13 +105,13 @@ def _with_sidecars(
 
 
 def _rank(wall: WallDescription) -> tuple[bool, float, int]:
-    """Sort key: recommended ones first, of these the largest painted area."""
+    """Return a sort key: recommended walls first, then by painted area, largest first."""
     return not wall.recommended, -(wall.area_m2 or 0.0) * (wall.painted_share or 0.0), wall.number
 
 
 _RASTER: Final = re.compile(r"(?:[a-z]+_)?wall_(\d{1,5})_(ortho|depth|intensity)\.tif")
-# Accuracy statements from inspections for drawings: names of two numbers, the statement, and the
-# number of items with its name.
+# Accuracy figures of inspections for drawings: two metric names, the key of the phrase, and the
+# metric names of the number of items.
 _ACCURACY: Final = (
     ("rmse_x_mm", "rmse_y_mm", "rmse", ("n_found", "n_pairs")),
     ("rmse_u_mm", "rmse_v_mm", "rmse", ()),
@@ -133,14 +133,14 @@ class WallResult:
     Attributes:
         number: number of the wall, as in its files.
         name: name of the wall.
-        about: its orthoimage in numbers; None without one.
-        plane_index: its plane's place in `planes.json`, or None if unknown.
-        frame: frame of the largest of its rasters.
+        about: description of its orthoimage; None if there is none.
+        plane_index: index of its plane in `planes.json`; None if unknown.
+        frame: frame of its largest raster.
         rasters: `ortho`, `depth`, `intensity` -> GeoTIFF, if present.
-        accuracy: statements on the expected error of its orthoimage, its plane's noise, and the
-            inspections of this wall; all from evidence on this wall alone.
-        colours: how the colours of the photos were changed; None without an orthoimage.
-        intensity_source: `laser`, or `luminance` if the grey of colours is used instead.
+        accuracy: phrases on the expected error of its orthoimage, the noise of its plane, and the
+            inspections of this wall; each is based on data of this wall only.
+        colours: how the colours of the photos were changed; None if there is no orthoimage.
+        intensity_source: `laser`, or `luminance` if it is the grey value of the colours.
     """
 
     number: int
@@ -156,11 +156,11 @@ class WallResult:
 
 @dataclass(frozen=True, kw_only=True)
 class UncountedPoints:
-    """Check points of a run of which none is used.
+    """Check points of a run, none of which is used.
 
     Attributes:
-        cell: address of the inspection that failed because of them; empty if none used them.
-        sentence: the end of a sentence about what was not measured, with the reason.
+        cell: address of the inspection that failed; empty if no inspection uses check points.
+        sentence: end of a sentence about unmeasured accuracy, with the reason.
     """
 
     cell: str
@@ -169,15 +169,15 @@ class UncountedPoints:
 
 @dataclass(frozen=True, kw_only=True)
 class RoomResults:
-    """The results of a run for a room.
+    """The results of a run for the walls of a room.
 
     Attributes:
-        address: cell of the pictures.
-        walls: those with a raster, by number.
-        planes: all planes, None if the record has none.
-        checkpoints: surveyed points, or None.
-        inspections: address -> displacements found in these pictures, with numbers of walls.
-        openings: openings of these walls, by number, from the left.
+        address: address of the cell with the orthoimages or rasters.
+        walls: walls with a raster, by number.
+        planes: all planes; None if the record has none.
+        checkpoints: surveyed points; None if there are none.
+        inspections: address -> displacements found in these orthoimages, with wall numbers.
+        openings: openings of these walls, by wall number, then from left to right.
     """
 
     address: str
@@ -189,11 +189,11 @@ class RoomResults:
 
     @property
     def crs(self) -> str | None:
-        """Coordinate system of the scan; None if it is in no map."""
+        """Coordinate reference system of the scan; None if it has none."""
         return next((wall.frame.map_crs for wall in self.walls if wall.frame.map_crs), None)
 
     def openings_of(self, wall: WallResult) -> tuple[Opening, ...]:
-        """Openings of one of the walls."""
+        """Openings of one wall."""
         return tuple(opening for opening in self.openings if opening.wall == wall.number)
 
 
@@ -201,7 +201,7 @@ def uncounted_points(run: Run) -> UncountedPoints | None:
     """Return why none of the check points of a run is used.
 
     Returns:
-        None if it has none, or if an inspection has used some.
+        None if there are no check points, or if an inspection used some.
     """
     looking = [
         (cell, given.source)
@@ -209,7 +209,7 @@ def uncounted_points(run: Run) -> UncountedPoints | None:
         for given in cell.inputs.values()
         if given.type_name == CheckPoints.type_name
     ]
-    # Those of a simulated room were not given by a person.
+    # Only check points from files count; those of a simulated room were not given by the user.
     read = [name for name, cell in run.cells.items() if cell.method.startswith("read.")]
     sources = [source.rpartition(".")[0] for _, source in looking]
     place = _upstream_product(run, tuple(sources or read), CheckPoints.type_name)
@@ -228,14 +228,14 @@ def room_results(run: Run, cell: str | None = None, wall: int | None = None) -> 
     """Collect the results of a run for its walls.
 
     Args:
-        run: a finished run with the published files that its record names.
-        cell: address of the cell of the orthoimages, or else of rasters of walls; by default the
-            last one that gave orthoimages, or else walls.
-        wall: number of the only requested wall, so that no file of another is needed; all if there
-            is no such wall.
+        run: a finished run, with the published files of its record.
+        cell: address of the cell with orthoimages or rasters of walls; by default the last cell
+            that produced orthoimages, otherwise the last that produced walls.
+        wall: number of the only wall requested, so that files of other walls are not needed; if
+            there is no such wall, all are returned.
 
     Raises:
-        ArgumentError: there is no such cell, or nothing to draw.
+        ArgumentError: there is no such cell, or there are no rasters.
         RecordError: a published file differs from the record, or an orthoimage is missing.
     """
     address = _pictured(run, cell)
@@ -247,7 +247,7 @@ def room_results(run: Run, cell: str | None = None, wall: int | None = None) -> 
         for name in upstream
         if {"orthoimages", "walls"} & {out.type_name for out in run.cells[name].outputs.values()}
     ]
-    # Later cells are searched first, so that products of the chosen cell itself take precedence.
+    # The chosen cell comes last, so that its own files replace those of cells upstream.
     for name in reversed(pictured):
         for path in published_files(run.folder, name):
             if found := _RASTER.fullmatch(path.name):
@@ -259,7 +259,7 @@ def room_results(run: Run, cell: str | None = None, wall: int | None = None) -> 
         )
     planes = _upstream_product(run, upstream, "planes")
     points = _upstream_product(run, (*upstream, *run.cells), "checkpoints")
-    # Rasters are made in the order of the planes, so an index in `Walls` is an index among them.
+    # Rasters are created in the order of the planes, so an index in `Walls` is an index here.
     numbers = sorted(
         {number for name in pictured for number, kind in _rasters(run, name) if kind == "depth"}
     )
@@ -284,7 +284,7 @@ def room_results(run: Run, cell: str | None = None, wall: int | None = None) -> 
 
 
 def _rasters(run: Run, address: str) -> dict[tuple[int, str], str]:
-    """Return rasters published by a cell, by wall and kind; below the folder of the run."""
+    """Return the rasters published by a cell: wall and kind -> path relative to the run folder."""
     folder = f"{PRODUCTS_FOLDER}/{cell_file_name(address)}/"
     return {
         (int(found[1]), found[2]): file.path
@@ -294,7 +294,7 @@ def _rasters(run: Run, address: str) -> dict[tuple[int, str], str]:
 
 
 def _require_orthoimages(run: Run, address: str, wall: int | None) -> None:
-    """Refuse to continue without a published orthoimage: another raster would replace it."""
+    """Refuse a missing published orthoimage: an older raster would be shown in its place."""
     for (number, kind), path in _rasters(run, address).items():
         is_wanted = kind == "ortho" and wall in {None, number}
         if is_wanted and not (run.folder / path).exists():
@@ -305,7 +305,7 @@ def _require_orthoimages(run: Run, address: str, wall: int | None) -> None:
 
 
 def _openings(run: Run, upstream: tuple[str, ...]) -> tuple[Opening, ...]:
-    """Return those that the last cell found on the walls of the pictures."""
+    """Return the openings that the last cell found on the walls of the orthoimages."""
     walls = {
         output.digest
         for address in upstream
@@ -367,7 +367,7 @@ def _inspections(run: Run, address: str) -> Iterator[tuple[str, Inspection]]:
 
 
 def _numbered(inspection: Inspection, numbers: list[int]) -> Inspection:
-    """Return an inspection with numbers of walls instead of indices in `Walls`."""
+    """Return an inspection with wall numbers instead of indices in `Walls`."""
     number_of = dict(enumerate(numbers))
     walls = [number_of.get(place, -1) for place in inspection.wall.tolist()]
     return replace(
@@ -429,7 +429,7 @@ def _check_kind(kind: str, path: Path) -> None:
 
 
 def _with_inspections(run: Run, wall: WallResult, measured: tuple[Phrase, ...]) -> WallResult:
-    """Add the findings of inspections, or that the accuracy of an orthoimage is unknown."""
+    """Add findings of inspections, or a note that the orthoimage's accuracy is unknown."""
     if not measured and "ortho" in wall.rasters:
         unmeasured = _unmeasured(run)
         is_stated = {"expected_error", "not_checked"} & {phrase.key for phrase in wall.accuracy}
@@ -466,7 +466,7 @@ def _of_how_many(values: Mapping[str, float], counts: tuple[str, ...]) -> Iterat
 
 
 def _colours(run: Run, address: str) -> Phrase:
-    """Return how the colours of photos or of points were changed, according to the record."""
+    """Return how the colours of photos or points were changed, according to the record."""
     cell = run.cells[address]
     whence = tuple(run.upstream(address))
     given = (one for before in whence for one in before.inputs.values())

@@ -1,4 +1,4 @@
-"""Writing a run: published products, then the record, whose name marks completion."""
+"""Writing of a run: first the published products, then the record, which completes the run."""
 
 from __future__ import annotations
 
@@ -87,19 +87,19 @@ def publish_products(
     files_of: Mapping[str, Mapping[str, Mapping[Path, str]]],
     run_id: str,
 ) -> tuple[PublishedFile, ...]:
-    """Fill `products/` of a run folder; an older one of an interrupted run is replaced.
+    """Fill `products/` of a run folder; one from an interrupted attempt is replaced.
 
     Args:
         run_folder: existing folder.
         cells: all cells of the run.
-        files_of: address -> output port -> files in the store, and the required SHA-256 of each.
-        run_id: is inserted into the names of the coordinate systems of walls.
+        files_of: address -> output port -> files in the store, with the expected SHA-256 of each.
+        run_id: inserted into the names of the coordinate systems of walls.
 
     Returns:
-        The present files, sorted by path.
+        The published files, sorted by path.
 
     Raises:
-        StoreError: a file cannot be copied, e.g. because the disk is full, or differs from its
+        StoreError: a file cannot be copied, e.g. because the disk is full, or does not match its
             digest.
     """
     target = run_folder / PRODUCTS_FOLDER
@@ -107,7 +107,7 @@ def publish_products(
     with writing_to(target):
         if target.is_symlink():
             target.unlink()
-        # A file that cannot be removed would be published as part of this run.
+        # Do not ignore other errors: files that remain would be published as part of this run.
         with suppress(FileNotFoundError):
             shutil.rmtree(target)
         target.mkdir(parents=True, exist_ok=True)
@@ -142,10 +142,10 @@ def _digested(run_folder: Path, target: Path) -> tuple[PublishedFile, ...]:
 
 
 def _replaced(cells: Iterable[RecordedCell]) -> set[str]:
-    """Return outputs, `address.port`, that a later cell replaces by one of the same type.
+    """Return the outputs, as `address.port`, that a later cell replaces by one of the same type.
 
-    Beside its successor, e.g. planes whose sides were found later, the first would contradict it.
-    Products read from files stay.
+    An output such as planes whose sides were found later would contradict its successor. Products
+    read from files are kept.
     """
     made = {
         cell.address
@@ -170,17 +170,18 @@ def _publish_cell(
     files_of: Mapping[str, Mapping[Path, str]],
     run_id: str,
 ) -> None:
-    """Copy the files of a cell, by port, and insert the run's name."""
+    """Copy the files of a cell, by port, and insert the run id."""
     folder.mkdir()
     taken = [METRICS_FILE]
     for port, files in files_of.items():
         for file, sha256 in files.items():
-            # Two outputs of one type publish equal names: the port distinguishes them.
+            # Two outputs of one type publish files with the same names; prefix them with the port.
             marks = chain(("", f"{port}_"), (f"{port}_{number}_" for number in count(2)))
             names = (f"{mark}{file.name}" for mark in marks)
             name = next(name for name in names if not colliding([*taken, name]))
             taken.append(name)
-            # A copy, not a hard link: editing a product must not change the store.
+            # Copy instead of hard-linking, so that editing a published file does not change the
+            # store.
             copy = path_below(folder, name)
             shutil.copyfile(file, copy)
             if (found := file_sha256(copy)) != sha256:
@@ -195,7 +196,7 @@ OUTLINE_FILE: Final = ".outline.json"
 def recorded_environments(
     results: Mapping[str, CellResult],
 ) -> tuple[RecordedEnvironment, ...]:
-    """Return the environments of results, each once."""
+    """Return the environments of results, without duplicates."""
     given = (result.environment for result in results.values())
     return tuple({one.id: one for one in given if one is not None}.values())
 
@@ -209,15 +210,15 @@ def recorded_cell(
     embedded: Collection[str],
     cached_from: str,
 ) -> RecordedCell:
-    """Return a cell as recorded with its result.
+    """Return the record entry of a cell with its result.
 
     Args:
         cell: the cell without a result.
-        result: what the store keeps of it.
-        store: has the figures.
+        result: its result in the store.
+        store: store with the figures.
         sources: source of each input port.
-        embedded: product types whose arrays go into the record.
-        cached_from: the earlier run that computed it, if any.
+        embedded: product types whose arrays are written into the record.
+        cached_from: id of the earlier run that computed it; empty if this run did.
 
     Raises:
         DamageError: a figure is missing or damaged.
@@ -266,30 +267,31 @@ def write_run(
 ) -> Run:
     """Write `products/` and `run.h5` of a run.
 
-    `run.h5` gets its name last: a folder with it is finished, everything else is written again by
-    the same command.
+    `run.h5` gets its name last: a folder that contains it is finished; in any other folder, the
+    same command writes all files again.
 
     Args:
-        outcome: the result of the engine.
-        plan: the plan of the run.
-        workflow: the document of the plan.
-        run_folder: the folder, created if missing.
-        store: holds the products and pictures of the run.
-        embed: put every product into the record, including large ones, and the input files.
-        before_finish: called with the run before the record gets its name, e.g. for the report.
+        outcome: outcome of the engine.
+        plan: plan of the run.
+        workflow: workflow of the plan.
+        run_folder: run folder, created if missing.
+        store: store with the products and figures of the run.
+        embed: write all products, including large ones, and the input files into the record.
+        before_finish: called with the run before the record gets its name, e.g. to write the
+            report.
 
     Returns:
         The finished run.
 
     Raises:
-        DamageError: something that the record needs was damaged in the store; it has been set
-            aside, and the same run, continued, computes it again.
+        DamageError: an object that the record needs was damaged in the store and has been removed;
+            resuming the run recomputes it.
         StoreError: the disk cannot be written, or a step could not read or write it.
         InputError: an input file to embed was changed during the run.
-        ArgumentError: another run uses the folder.
+        ArgumentError: another run is using the folder.
     """
     for address, result in outcome.failed.items():
-        # Because of the disk, not of its method.
+        # The disk has failed, not the method.
         if result.error_type in (StoreError.__name__, DamageError.__name__):
             raise StoreError(
                 f"{address} failed: {result.error_message}; finished steps are kept, and "
@@ -301,7 +303,8 @@ def write_run(
             with writing_to(run_folder):
                 if before_finish is not None:
                     before_finish(read_run(unfinished, later_name=RECORD_FILE))
-                # Everything that the record names must exist before the record gets its name.
+                # All files referenced in the record must be on the disk before the record gets its
+                # name.
                 sync_tree(run_folder)
                 finished = unfinished.replace(run_folder / RECORD_FILE)
                 (run_folder / OUTLINE_FILE).unlink(missing_ok=True)
@@ -357,7 +360,7 @@ def _publish(
 def files_of_outputs(
     results: Mapping[str, CellResult], store: Store
 ) -> dict[str, dict[str, Mapping[Path, str]]]:
-    """Return the published files of results in a store: address -> port -> file -> SHA-256."""
+    """Return the published files of results: address -> port -> file in the store -> SHA-256."""
     return {
         address: {port: store.published_files(ref.digest) for port, ref in result.outputs.items()}
         for address, result in results.items()
@@ -367,9 +370,9 @@ def files_of_outputs(
 def begin_run(
     plan: RunPlan, workflow: Workflow, run_folder: Path, store: Store, run_id: str
 ) -> None:
-    """Keep the outline of a run that begins: its record, with every cell skipped.
+    """Write the outline of a run that starts: its record, with all cells skipped.
 
-    The run can be shown from it before it is finished, see `open.open_unfinished`.
+    It is used to show the run before it is finished, see `open.open_unfinished`.
 
     Raises:
         StoreError: the disk cannot be written.
@@ -394,7 +397,7 @@ def _sources(cell: Cell) -> dict[str, str]:
 
 
 def _embedded_types(plan: RunPlan, *, embed: bool = False) -> frozenset[str]:
-    """Return the product types whose arrays go into a record."""
+    """Return the product types whose arrays are written into the record."""
     specs = plan.products.items()
     return frozenset(name for name, one in specs if embed or resolve_name(one.target).embedded)
 
@@ -402,14 +405,14 @@ def _embedded_types(plan: RunPlan, *, embed: bool = False) -> frozenset[str]:
 def executed_and_written(
     execute: Callable[[], RunOutcome], write: Callable[[RunOutcome], Run]
 ) -> tuple[RunOutcome, Run]:
-    """Execute a run and write it; what turns out to be damaged in the store is computed again.
+    """Execute a run and write it; results found damaged in the store are recomputed.
 
     Args:
-        execute: continues the run each time it is called, as `engine.scheduler.execute` does.
+        execute: resumes the run each time it is called, as `engine.scheduler.execute` does.
         write: calls `write_run`.
 
     Raises:
-        DamageError: the store loses results faster than they can be computed.
+        DamageError: results in the store are damaged repeatedly.
     """
     for _ in range(_MOST_ATTEMPTS - 1):
         with suppress(DamageError):
@@ -427,12 +430,12 @@ def build_record(
     *,
     embed: bool = False,
 ) -> RunRecord:
-    """Convert the engine's outcome into a record; cells without a result are skipped in it.
+    """Convert the outcome of the engine into a record; cells without a result are skipped.
 
     Raises:
-        DamageError: the store lost a picture of the run.
+        DamageError: a figure of the run is missing or damaged in the store.
     """
-    # Deliberate omissions are not differences of the results; the record states them.
+    # Record deselected steps as an option, so that they do not count as different results.
     overrides = (*workflow.overrides, *plan.options.words)
     workflow = dataclasses.replace(workflow, overrides=overrides)
     results = outcome.results
@@ -482,13 +485,13 @@ def build_record(
 
 
 def write_embedded(run: Run, path: Path, store: Store, inputs: Sequence[str] = ()) -> Run:
-    """Write the record of a run again with every product and every input file in it.
+    """Write the record of a run again, with all products and input files embedded.
 
     Args:
         run: the run.
-        path: the new record; its folder exists.
-        store: holds the products that the run's record names by digest only.
-        inputs: `NAME=PATH`, each as after `--input`; other files are searched by content.
+        path: path of the new record, in an existing folder.
+        store: store with the products that the run's record references only by digest.
+        inputs: `NAME=PATH` as for `--input`; other input files are searched for by their content.
 
     Returns:
         The run, with the new record.
@@ -496,9 +499,9 @@ def write_embedded(run: Run, path: Path, store: Store, inputs: Sequence[str] = (
     Raises:
         InputError: an input file is missing.
         RefusedRunError: an input file was changed.
-        ArgumentError: a product is in neither record nor store.
+        ArgumentError: a product is neither in the record nor in the store.
         StoreError: the disk cannot be written.
-        InvalidArgumentsError: `inputs` names no input of the workflow.
+        InvalidArgumentsError: `inputs` contains a name that is not an input of the workflow.
     """
     missing = [
         f"{address}.{port}"
@@ -529,7 +532,7 @@ def _write_again(
     *,
     embed: bool = True,
 ) -> None:
-    """Write a record made from that of a run, with products from there or from a store."""
+    """Write a record derived from that of a run, with products from there or from a store."""
     try:
         with writing_to(path.parent):
             write_record(
@@ -581,12 +584,12 @@ def _input_files(
 
 
 def write_part(part: Run, folder: Path, store: Store) -> Run:
-    """Write one dataset of a run as a run folder, whose record can be verified and replayed alone.
+    """Write one dataset as a run folder whose record can be verified and replayed alone.
 
     Args:
-        part: from `parts_of`.
-        folder: a new folder for the record and the published files.
-        store: has the products that were embedded and are no longer in the run's record.
+        part: part from `parts_of`.
+        folder: new folder for the record and the published files.
+        store: store with embedded products that are no longer in the run's record.
 
     Raises:
         RecordError: the run is damaged.
@@ -616,10 +619,10 @@ _TYPES: Final = frozenset((Orthoimages.type_name, Walls.type_name))
 
 @contextmanager
 def with_files(run: Run, report: Callable[[str], None] = lambda _: None) -> Iterator[Run]:
-    """Return a run with the rasters that it published.
+    """Yield a run with its published rasters.
 
-    Those beside the record are used. If there are none, they are created from the walls and
-    orthoimages in the record, in a folder that exists as long as the block.
+    The files next to the record are used. If there are none, they are created from the walls and
+    orthoimages in the record, in a temporary folder that is removed after the block.
 
     Args:
         run: the run.
@@ -650,7 +653,7 @@ def with_files(run: Run, report: Callable[[str], None] = lambda _: None) -> Iter
 
 
 def _made_again(run: Run, folder: Path) -> dict[str, dict[str, dict[Path, str]]]:
-    """Let the products of a record publish their files: address -> port -> file -> SHA-256."""
+    """Publish the files of products in a record: address -> port -> file -> SHA-256."""
     from orthoflow.catalog.discovery import discover_catalog  # noqa: PLC0415 - loads plugins
 
     catalog = discover_catalog()
