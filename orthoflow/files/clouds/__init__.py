@@ -1,1 +1,1 @@
-"""Clouds as files for other programs: fields and colours of each point, a writer per format."""
+"""Clouds as files for other programs: point attributes and colours, and a writer per format."""

@@ -1,6 +1,6 @@
-"""Points prepared for writing, piece by piece: selected, coloured, with plane and normal.
+"""Points prepared for writing in blocks: selected, coloured, with plane and normal.
 
-`cloud.json` beside the points states what they are, and the meaning of their colours and fields.
+`cloud.json`, next to the points, describes them and the meaning of their colours and fields.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products import JsonValue, Planes, PointCloud, PointLabels
 
 Colouring: TypeAlias = Literal["photos", "rgb", "intensity", "plane", "deviation"]
-# Points per piece: ten copies of them take some hundred megabytes.
+# Points per block: ten copies need some hundred megabytes.
 BLOCK: Final = 1 << 20
 _SCALE_PERCENT: Final = 99.0
 _NOTHING: Final = np.zeros(0, dtype=np.float32)
 
 
-# Columns of a point, in the order of files.
+# Columns of a point, in the order of the files.
 _COLUMNS: Final = {
     **dict.fromkeys("xyz", "<f8"),
     **dict.fromkeys(("nx", "ny", "nz"), "<f4"),
@@ -43,21 +43,21 @@ _COLUMNS: Final = {
 
 @dataclass(frozen=True, kw_only=True)
 class AttributedCloud:
-    """A cloud and the values added to its points.
+    """A cloud and the attributes added to its points.
 
     Attributes:
         cloud: the points.
-        colouring: what their colours represent.
+        colouring: what the colours represent.
         neighbourhoods: neighbourhoods of the cloud.
-        planes: None if the run found none; then there are no deviations.
-        labels: labels of the cloud's points, likewise.
-        photo_colours: for the colouring `photos`.
+        planes: planes of the run; None if it found none; then there are no deviations.
+        labels: labels of the points, or None, as for `planes`.
+        photo_colours: colours for the colouring `photos`.
         photo_names: names of these photos, by number.
-        wall: only points over this raster, within its depths in front and behind; deviations are
-            then those from its plane.
+        wall: if given, only points over this raster and within its buffer are written, and
+            deviations are measured from its plane.
         wall_plane: number of the plane of that wall.
-        box_world: (2, 3) only points between these corners.
-        is_cleaned: without isolated points.
+        box_world: (2, 3) if given, only points between these corners are written.
+        is_cleaned: isolated points are omitted.
         crs_wkt: coordinate system of the world, as WKT; empty if unknown.
         name: name of the cloud in files.
     """
@@ -80,7 +80,7 @@ class AttributedCloud:
     def scale_m(self) -> float:
         """Return the deviation with full colour: the 99th percentile, rounded up to 1-2-5.
 
-        Estimated from short pieces all over the cloud, from their selected points.
+        It is estimated from selected points in short sections all over the cloud.
         """
         found = [
             deviations[self._chosen(piece, None)]
@@ -98,7 +98,7 @@ class AttributedCloud:
 
     @cached_property
     def scans(self) -> tuple[int, ...]:
-        """Return numbers of the scans that have points, before cropping."""
+        """Return the numbers of the scans with points, before cropping."""
         found: set[int] = set()
         if self.cloud.scan is None:
             return (0,)
@@ -107,7 +107,7 @@ class AttributedCloud:
         return tuple(sorted(found))
 
     def station(self, scan: int) -> NDArray[np.float64] | None:
-        """Return the station of a scan (3,), None if the files do not state one for each scan."""
+        """Return the station of a scan (3,); None unless the files give one for each scan."""
         cloud = self.cloud
         if cloud.stations is None or cloud.stations_source != "file":
             return None
@@ -132,11 +132,11 @@ class AttributedCloud:
 
     @cached_property
     def columns(self) -> np.dtype[np.void]:
-        """Return the columns that are known of this cloud.
+        """Return the columns that are available for this cloud.
 
-        World coordinates in metres; unit normals towards the viewer, 0 0 0 without a surface;
-        colours; intensity 0..1; scan; plane, -1 for none; deviation from it in metres, positive
-        towards the viewer, NaN without one; photo that gave the colour, -1 for none.
+        World coordinates in metres; unit normals towards the viewer, 0 0 0 where there is no
+        surface; colours; intensity 0..1; scan; plane, or -1; deviation from the plane in metres,
+        positive towards the viewer, or NaN; photo with the colour, or -1.
         """
         photos, is_labelled = self.photo_colours, self.labels is not None
         is_known = {
@@ -149,7 +149,7 @@ class AttributedCloud:
         return np.dtype([item for item in _COLUMNS.items() if is_known.get(item[0], True)])
 
     def blocks(self, scan: int | None = None) -> Iterator[NDArray[np.void]]:
-        """Yield the selected points (n,) with their `columns` in order, of all scans or of one."""
+        """Yield the selected points (n,) of one scan or all, with their `columns`, in order."""
         for part in self._parts():
             chosen = self._chosen(part, scan)
             if chosen.any():
@@ -211,7 +211,7 @@ class AttributedCloud:
         return found
 
     def _deviations(self, part: slice) -> NDArray[np.float32] | None:
-        """Return signed distances (n,) from the wall's plane, else from each point's own plane."""
+        """Return signed distances (n,) from the wall's plane, or from each point's plane."""
         if self.wall is not None:
             plane = self.wall.frame.plane
             distances = self.cloud.points_world(part) @ plane.normal - plane.offset_m
@@ -234,7 +234,7 @@ class AttributedCloud:
         if self.colouring == "rgb" and cloud.rgb is not None:
             rgb = np.array(cloud.rgb[part])
             if cloud.has_rgb is not None:
-                # Grey for a scan without colours.
+                # Points without a colour are grey.
                 is_grey = ~np.asarray(cloud.has_rgb[part])
                 rgb[is_grey] = np.rint(255.0 * np.clip(greys(cloud, part)[is_grey], 0, 1))[:, None]
             return rgb
@@ -255,7 +255,7 @@ class AttributedCloud:
         scan: NDArray[np.uint16] | None,
         plane: NDArray[np.int16] | None,
     ) -> NDArray[np.float32]:
-        """Return 1 or -1 (n,): normals point to the scanner, else as that of the plane, else up."""
+        """Return 1 or -1 (n,), to orient normals to the scanner, or as the plane's, or up."""
         stations = self.cloud.stations
         towards = np.broadcast_to(self.cloud.up, world.shape)
         if self.station(0) is not None and stations is not None:
@@ -276,27 +276,27 @@ class AttributedCloud:
 
     @cached_property
     def _palette(self) -> NDArray[np.float64]:
-        # Limit of int16.
+        # The labels are int16, so the palette is small.
         highest = -1 if self.labels is None else int(self.labels.plane_index.max(initial=-1))
         return np.array([plane_colour(k) for k in range(-1, highest + 1)], dtype=np.float64)
 
 
-# Hues by the golden ratio: planes with close numbers have different colours.
+# Hues differ by the golden ratio, so planes with similar numbers have different colours.
 _HUE_STEP: Final = 0.618033988749895
 _SATURATION: Final = 0.6
 UNKNOWN: Final = (128, 128, 128)
-# The darkest intensity keeps this share of its plane's colour.
+# The darkest intensity still has this fraction of its plane's colour.
 _DARKEST: Final = 0.4
 _PIECES: Final = 64
 _PIECE: Final = 4096
-# Behind the plane, on it, in front of it.
+# Colours of deviations.
 BEHIND: Final = (33, 102, 172)
 ON_PLANE: Final = (247, 247, 247)
 BEFORE: Final = (178, 24, 43)
 
 
 def plane_colour(index: int) -> tuple[int, int, int]:
-    """Return the colour (red, green, blue) of a plane by its position in `Planes`; -1 is grey.
+    """Return the colour (red, green, blue) of a plane by its index in `Planes`; -1 is grey.
 
     >>> plane_colour(-1), plane_colour(0)
     ((128, 128, 128), (255, 102, 102))
@@ -310,19 +310,19 @@ def plane_colour(index: int) -> tuple[int, int, int]:
 def plane_colours(
     plane: NDArray[np.int16], palette: NDArray[np.float64], grey: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
-    """Return colours (n, 3) of points on planes, darkened by their grey (n,), 0..1.
+    """Return colours (n, 3) of points on planes, darkened by their grey values.
 
     Args:
-        plane: (n,) number of the plane, -1 for none.
+        plane: (n,) number of the plane, or -1.
         palette: (p + 1, 3) `plane_colour` of -1, 0, 1 ...
-        grey: of the points.
+        grey: (n,) brightness of the points, 0..1.
     """
     shade = _DARKEST + (1.0 - _DARKEST) * grey
     return np.rint(palette[plane + 1] * shade[:, None]).astype(np.uint8)
 
 
 def deviation_colours(deviation_m: NDArray[np.float32], full_m: float) -> NDArray[np.uint8]:
-    """Return colours (n, 3) of signed distances: blue behind, white on, red in front; grey for NaN.
+    """Return colours (n, 3) of signed distances: blue behind, white on, red in front; NaN grey.
 
     >>> deviation_colours(np.array([-0.01, 0.0, 0.02, np.nan], dtype=np.float32), 0.01).tolist()
     [[33, 102, 172], [247, 247, 247], [178, 24, 43], [128, 128, 128]]
@@ -335,7 +335,7 @@ def deviation_colours(deviation_m: NDArray[np.float32], full_m: float) -> NDArra
 
 
 def round_scale_m(largest_m: float) -> float:
-    """Return the next of 1, 2, 5, 10 ... mm, for a readable scale.
+    """Round up to 1, 2, 5, 10 ... mm, for a readable scale.
 
     >>> round_scale_m(0.0031), round_scale_m(0.0), round_scale_m(0.09)
     (0.005, 0.001, 0.1)
@@ -348,7 +348,7 @@ def round_scale_m(largest_m: float) -> float:
 
 
 def greys(cloud: PointCloud, part: slice) -> NDArray[np.float64]:
-    """Return the brightness (n,) of points: root of intensity, else mean of the colours, else 1."""
+    """Return the brightness (n,) of points: root of intensity, or mean of the colours, or 1."""
     if cloud.intensity is not None:
         intensity = np.nan_to_num(np.asarray(cloud.intensity[part], dtype=np.float64))
         return np.sqrt(np.maximum(intensity, 0.0))
@@ -359,7 +359,7 @@ def greys(cloud: PointCloud, part: slice) -> NDArray[np.float64]:
 
 
 def grey_range(cloud: PointCloud) -> tuple[float, float]:
-    """Return the range of grey of most points, estimated from pieces all over the cloud."""
+    """Return the range of grey of most points, estimated from sections all over the cloud."""
     if (cloud.intensity is None and cloud.rgb is None) or not len(cloud):
         return 0.0, 1.0
     sample = np.concatenate([greys(cloud, piece) for piece in sampled_pieces(len(cloud))])
@@ -368,7 +368,7 @@ def grey_range(cloud: PointCloud) -> tuple[float, float]:
 
 
 def sampled_pieces(n_points: int) -> list[slice]:
-    """Return short disjoint pieces all over a cloud; all of a small one."""
+    """Return short disjoint sections all over a cloud; a small cloud is covered completely."""
     firsts = range(0, n_points, max(_PIECE, n_points // _PIECES))
     return [slice(k, min(k + _PIECE, n_points)) for k in firsts]
 
@@ -385,7 +385,7 @@ _MEANINGS: Final = {
 
 
 def describe_cloud(path: Path, attributed: AttributedCloud, name: str, n_points: int) -> None:
-    """Write the description of a cloud's file beside it.
+    """Write the description of a cloud next to its file.
 
     Raises:
         StoreError: the file cannot be written.

@@ -1,9 +1,9 @@
-"""A cloud as COPC 1.0: a LAZ file whose chunks are the nodes of an octree, coarse ones first.
+"""A cloud as COPC 1.0: a LAZ file whose chunks are octree nodes, in order of increasing density.
 
-Each node holds one point of each cell of its grid, its children hold points between those, and a
-node of few points keeps all of them. Points are buffered in files beside the output, so that memory
-does not grow with their number: they are sorted in groups along a Morton curve, none of which cuts
-a cell of the root's grid.
+A node contains one point per cell of its grid, and its child nodes add points in between; a node
+with few points keeps them all. Points are buffered in files next to the output, so memory does not
+grow with their number. They are sorted into groups along a Morton curve; a cell of the root's grid
+is never split between groups.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from orthoflow.files.clouds.attributes import BLOCK, AttributedCloud
 from orthoflow.files.clouds.writers import las_header, las_record
 from orthoflow.files.points.scan_file import load_library
 
-# Bits of a position along an axis; the grid of a node has 2^7 cells per side.
+# Bits of a position along an axis; a node's grid has 2^7 cells per side.
 _PLACE_BITS: Final = 21
 _GRID_BITS: Final = 7
 _DEEPEST: Final = _PLACE_BITS - _GRID_BITS
@@ -40,21 +40,21 @@ _SPREADS: Final = (
 )
 _INFO: Final = struct.Struct("<5d2Q2d88x")
 _ENTRY: Final = struct.Struct("<4iQ2i")
-# The chunks follow eight bytes with the position of their table.
+# Eight bytes before the first chunk contain the offset of the chunk table.
 _TABLE_BYTES: Final = 8
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Waiting:
-    """Buffered points, in mapped files.
+    """Buffered points in memory-mapped files.
 
     Attributes:
-        records: (n,) points as in LAS.
+        records: (n,) points as LAS records.
         codes: (n,) uint64 positions along the Morton curve of the root.
-        order: (n,) int64 numbers of the points, group after group.
-        counts: points of each cell of the root's grid, along the curve.
-        low: (3,) int64 lowest corner of the root, in steps of the file.
-        side: side of the root, likewise.
+        order: (n,) int64 point indices, group after group.
+        counts: number of points in each cell of the root's grid, along the curve.
+        low: (3,) int64 lowest corner of the root, in steps of the file's scale.
+        side: side of the root, in the same steps.
     """
 
     records: NDArray[np.void]
@@ -66,18 +66,18 @@ class _Waiting:
 
     @property
     def groups(self) -> NDArray[np.int64]:
-        """Return the group of each cell; a group begins with a cell, none cuts one."""
+        """Return the group of each cell of the root's grid."""
         return (np.cumsum(self.counts) - self.counts) // _IN_MEMORY_POINTS
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Nodes:
-    """Runs of points of one node each, coarse nodes first; a node has a run per group.
+    """Runs of points of one node each, coarse nodes first; a node has one run per group.
 
     Attributes:
         key: (r,) uint64 level of the node, followed by 42 bits of its position along the curve.
-        first: (r,) int64 where the run begins in `_Waiting.order`.
-        count: (r,) int64.
+        first: (r,) int64 start of the run in `_Waiting.order`.
+        count: (r,) int64 number of points.
     """
 
     key: NDArray[np.uint64]
@@ -86,11 +86,11 @@ class _Nodes:
 
 
 def write_copc(path: Path, attributed: AttributedCloud) -> int:
-    """Write the chosen points, and return their number.
+    """Write the selected points and return their number.
 
     Raises:
-        PluginError: laspy or lazrs does not load.
-        OSError: the disk cannot be written.
+        PluginError: laspy or lazrs cannot be imported.
+        OSError: the file cannot be written.
     """
     laspy = load_library("laspy", path)
     header = las_header(laspy, attributed)
@@ -106,7 +106,7 @@ def write_copc(path: Path, attributed: AttributedCloud) -> int:
 # Any: laspy and lazrs have no types.
 def _write(file: BinaryIO, laspy: Any, header: Any, waiting: _Waiting) -> None:
     lazrs = load_library("lazrs", Path(file.name))
-    # A cube in steps of the file is one in metres, too, because all axes have the same step.
+    # A cube in steps of the file is also a cube in metres, since all axes have the same scale.
     half = 0.5 * waiting.side * float(header.scales[0])
     middle = header.offsets + header.scales * waiting.low + half
     sizes = (*middle.tolist(), half, 2.0 * half / 2**_GRID_BITS)
@@ -117,13 +117,13 @@ def _write(file: BinaryIO, laspy: Any, header: Any, waiting: _Waiting) -> None:
     )
     header.vlrs.append(laspy.vlrs.known.LasZipVlr(packed.record_data()))
     header.are_points_compressed = True
-    # Extents begin empty instead of with 0.
+    # Reset the extents, so that they do not include 0.
     header.partial_reset()
     header.write_to(file)
     compressor = lazrs.LasZipCompressor(file, packed)
     nodes = _nodes(waiting)
     for index in _points_of(waiting, nodes):
-        # The end of the last chunk is that of all; another would be empty.
+        # The last chunk ends with the compression; finishing it here would add an empty one.
         if header.point_count:
             compressor.finish_current_chunk()
         points = waiting.records[index]
@@ -142,7 +142,7 @@ def _write(file: BinaryIO, laspy: Any, header: Any, waiting: _Waiting) -> None:
 
 
 def _waiting(laspy: Any, header: Any, attributed: AttributedCloud, folder: Path) -> _Waiting | None:
-    """Write the chosen points to files, with their positions on the curve, sorted into groups."""
+    """Write the selected points with their positions on the curve to files, sorted into groups."""
     lowest, highest = [], []
     kind = None
     with (folder / "records").open("wb") as stream:
@@ -156,8 +156,8 @@ def _waiting(laspy: Any, header: Any, attributed: AttributedCloud, folder: Path)
         return None
     records = np.memmap(folder / "records", dtype=kind, mode="r")
     n_points = len(records)
-    # A margin of one step, and an odd number of steps: then no point is on a border of nodes, which
-    # readers compute from rounded metres.
+    # With a margin of one step and an odd number of steps, no point is on a node border as computed
+    # by readers from rounded metres.
     low = np.min(lowest, axis=0) - 1
     span = int((np.max(highest, axis=0) - low).max())
     waiting = _Waiting(
@@ -186,7 +186,7 @@ def _waiting(laspy: Any, header: Any, attributed: AttributedCloud, folder: Path)
 
 
 def _codes(waiting: _Waiting, part: slice) -> NDArray[np.uint64]:
-    """Positions of points along the curve: bits of x, y and z interleaved, from the lowest."""
+    """Return positions along the curve: the bits of x, y and z, interleaved, lowest first."""
     records = waiting.records[part]
     codes = np.zeros(len(records), dtype=np.uint64)
     for axis, name in enumerate("XYZ"):
@@ -203,16 +203,16 @@ def _root_cells(codes: NDArray[np.uint64]) -> NDArray[np.int64]:
 
 
 def _ancestors(codes: NDArray[np.uint64], level: int) -> NDArray[np.uint64]:
-    """Return the cubes of a level, of which there are 8^level, that contain positions."""
+    """Return the nodes of a level (8^level in total) that contain positions."""
     return codes >> np.uint64(3 * (_PLACE_BITS - level))
 
 
 def _nodes(waiting: _Waiting) -> _Nodes:
-    """Sort each group by its nodes."""
+    """Sort the points of each group by node."""
     counts, order = waiting.counts, waiting.order
     totals = [counts.reshape(8**level, -1).sum(axis=1) for level in range(_GRID_BITS + 1)]
     sizes = np.bincount(waiting.groups, weights=counts).astype(np.int64)
-    # A cell with more points than a group occupies the numbers of others.
+    # A cell with more points than a group leaves the following group numbers unused.
     sizes = sizes[sizes > 0]
     keys, firsts, runs = [], [], []
     for end, size in zip(np.cumsum(sizes), sizes, strict=True):
@@ -240,7 +240,7 @@ def _nodes(waiting: _Waiting) -> _Nodes:
 
 
 def _levels(codes: NDArray[np.uint64], totals: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Return levels of the nodes that keep points, which are sorted along the curve."""
+    """Return the level of the node that keeps each point; points are sorted along the curve."""
     levels = np.full(len(codes), _DEEPEST, dtype=np.int64)
     left = np.arange(len(codes))
     for level in range(_DEEPEST):
@@ -248,7 +248,7 @@ def _levels(codes: NDArray[np.uint64], totals: Sequence[NDArray[np.int64]]) -> N
         if level < len(totals):
             total = totals[level][node]
         else:
-            # Smaller than a cell of the root's grid, so all of it is in this group.
+            # Smaller than a cell of the root's grid, so all its points are in this group.
             every = _ancestors(codes, level)
             total = np.searchsorted(every, node, "right") - np.searchsorted(every, node, "left")
         cell = _ancestors(codes[left], level + _GRID_BITS)
@@ -263,12 +263,12 @@ def _levels(codes: NDArray[np.uint64], totals: Sequence[NDArray[np.int64]]) -> N
 
 
 def _points_of(waiting: _Waiting, nodes: _Nodes) -> Iterator[NDArray[np.int64]]:
-    """Yield the points of one node after the other."""
+    """Yield the points of each node."""
     begins = np.flatnonzero(np.append(True, np.diff(nodes.key) != 0))
     for begin, end in itertools.pairwise([*begins.tolist(), len(nodes.key)]):
         runs = zip(nodes.first[begin:end], nodes.count[begin:end], strict=True)
         index = np.concatenate([waiting.order[first : first + count] for first, count in runs])
-        # In the order of the cloud, which compresses best and does not reveal the groups.
+        # The order of the cloud compresses best and does not reveal the groups.
         yield np.sort(index)
 
 
@@ -276,7 +276,7 @@ def _tree(nodes: _Nodes, chunks: Sequence[tuple[int, int]], offset: int) -> byte
     """Return the hierarchy: level, x, y, z, offset, bytes and points of each chunk, in order."""
     entries = []
     for key, (n_points, n_bytes) in zip(np.unique(nodes.key).tolist(), chunks, strict=True):
-        # No level has more bits of a position than there are below its number.
+        # A position on level n has n bits per axis.
         level = key >> _KEY_BITS
         x, y, z = (
             sum((key >> (3 * bit + axis) & 1) << bit for bit in range(level)) for axis in range(3)

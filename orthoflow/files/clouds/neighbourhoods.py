@@ -1,7 +1,7 @@
-"""The neighbourhood of each point of a cloud: surface normal, and whether it is isolated.
+"""Neighbourhoods of points in a cloud: surface normal, and whether a point is isolated.
 
-The cloud is read piece by piece into voxels that keep count and moments of their points, so that
-memory depends on the number of voxels, about a million at most.
+The cloud is read in sections. Voxels accumulate count and moments of their points, so memory
+depends on the number of voxels, about a million at most.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from numpy.typing import NDArray
 from orthoflow.files.clouds.photo_colours import spacing_of
 from orthoflow.products import PointCloud
 
-# Side of a voxel in point spacings: with its 26 neighbours, a surface is twelve spacings wide.
+# Side of a voxel in point spacings; a voxel and its 26 neighbours cover twelve spacings.
 _VOXEL_SPACINGS: Final = 4.0
 _VOXELS_MOST: Final = 1_000_000
-# For outliers, 3 x 3 x 3 voxels are joined: sparse ends of a scan have few neighbours, too.
+# For outliers, 3 x 3 x 3 voxels are merged, since sparse ends of a scan have few neighbours, too.
 _COARSER: Final = 3
 _ALONE_FEWER_THAN: Final = 10
 _POINTS_LEAST: Final = 6
-# Across the surface points spread at most half as far as along its narrower side.
+# Maximum ratio of the variances across the surface and along its narrower side (spreads: 1/2).
 _FLAT: Final = 0.25
 _AT_ONCE: Final = 1 << 20
-# Of 21 bits each.
+# A voxel index has 21 bits per axis.
 _LARGEST: Final = (1 << 21) - 8
 _MOMENTS: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
@@ -36,11 +36,11 @@ class Neighbourhoods:
     """The neighbourhoods of the voxels of a cloud.
 
     Attributes:
-        low: (3,) float64 metres from the cloud's origin.
+        low: (3,) float64 lowest corner in metres from the cloud's origin.
         side_m: side of a voxel.
-        keys: (v,) int64, sorted.
-        normals: (v, 3) float32 unit vectors of unknown sign, 0 0 0 without a surface.
-        alone: (v,) True if fewer than 10 points are within about 18 spacings.
+        keys: (v,) int64 keys of the voxels, sorted.
+        normals: (v, 3) float32 unit vectors of arbitrary sign, 0 0 0 where there is no surface.
+        alone: (v,) True if there are fewer than 10 points within about 18 spacings.
     """
 
     low: NDArray[np.float64]
@@ -50,7 +50,7 @@ class Neighbourhoods:
     alone: NDArray[np.bool_]
 
     def places(self, offsets: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the voxel (n,) of each point (n, 3); metres from the cloud's origin."""
+        """Return the voxel (n,) of each point (n, 3), given in metres from the cloud's origin."""
         return np.searchsorted(self.keys, _keys(offsets, self.low, self.side_m))
 
 
@@ -71,7 +71,7 @@ def neighbourhoods_of(cloud: PointCloud) -> Neighbourhoods:
 
 
 def offsets_of(cloud: PointCloud, part: slice) -> NDArray[np.float64]:
-    """Return points (n, 3) of a piece, metres from the cloud's origin."""
+    """Return the points (n, 3) of a section in metres from the cloud's origin."""
     return np.column_stack([cloud.x[part], cloud.y[part], cloud.z[part]]).astype(np.float64)
 
 

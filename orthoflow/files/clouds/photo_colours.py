@@ -1,4 +1,4 @@
-"""The photo that shows a point best, and the point's colour there."""
+"""Colours of points from the photo that shows each of them best."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ if TYPE_CHECKING:
     from orthoflow.geometry.occluders import Box
 
 UNSEEN_GREY: Final = 128
-# Points at most this far behind the nearest one are seen, too.
+# Points up to this distance behind the nearest one are visible, too.
 _TOLERANCE_M: Final = 0.05
-# Towards the border of a photo its lens is less certain: quality decreases to 0 over this share.
+# Lens models are less accurate near a photo's border: quality decreases to 0 over this share.
 _BORDER_SHARE: Final = 0.05
-# OpenCV accepts pictures of fewer than 32,767 rows.
+# OpenCV requires images with fewer than 32,767 rows.
 _REMAPPED_AT_ONCE: Final = 30_000
 _PROJECTED_AT_ONCE: Final = 1 << 19
 _SAMPLED_MOST: Final = 200_000
-# This share of the points at either end of an axis may be outliers.
+# Percentage of points at each end of an axis that may be outliers.
 _OUTSIDE_PERCENT: Final = 0.5
-# The cloud's longest side is divided into this many cubes to estimate the size of its surfaces.
+# Number of cubes along the cloud's longest side, for estimating the area of its surfaces.
 _CUBES: Final = 64
 
 
 @dataclass(frozen=True, kw_only=True)
 class PointColours:
-    """Colours of a cloud's points; the arrays are filled in place and may be mapped from files.
+    """Colours of a cloud's points; the arrays are filled in place and may be memory-mapped.
 
     Attributes:
-        rgb: (n, 3) uint8, `UNSEEN_GREY` where no photo sees the point.
-        best: (n,) float32 quality of the chosen photo, 0 if none sees the point.
-        photo: (n,) int16 chosen photo, -1 for none; None if not requested.
+        rgb: (n, 3) uint8, `UNSEEN_GREY` for points that no photo sees.
+        best: (n,) float32 quality of the chosen photo, 0 if no photo sees the point.
+        photo: (n,) int16 chosen photo, or -1; None if not requested.
     """
 
     rgb: NDArray[np.uint8]
@@ -57,16 +57,16 @@ def colour_points(
 ) -> None:
     """Assign each point the colour of the photo that shows it best.
 
-    A point is seen if no nearer point of the whole cloud hides it, outliers excluded. Of several
-    photos that see it, the one with the most pixels per metre is used, away from its border; its
-    colour is interpolated between four pixels.
+    A point is visible unless a nearer point of the cloud hides it; outliers are ignored. If several
+    photos see it, the one with the most pixels per metre is used, with a lower weight near its
+    border; the colour is interpolated between four pixels.
 
     Args:
         cloud: the points.
         oriented: photos with their cameras.
         colours: output.
-        threads: number of threads; it does not change the result.
-        progress: called with the finished share and the photo's name before each photo.
+        threads: number of threads; the result does not depend on it.
+        progress: called before each photo with the completed fraction and the photo's name.
     """
     from orthoflow.geometry.occluders import depth_buffer, occluders_in
 
@@ -83,7 +83,7 @@ def colour_points(
 
 
 def spacing_of(cloud: PointCloud) -> float:
-    """Estimate the spacing of points of a surface, metres, from the cubes that they occupy."""
+    """Estimate the point spacing on surfaces in metres, from the cubes that contain points."""
     return _extent(cloud)[3]
 
 
@@ -95,14 +95,14 @@ def _colour(
     colours: PointColours,
     place: int,
 ) -> None:
-    """Colour the points that a photo sees better than those before it, replacing their colours.
+    """Colour the points for which a photo has a higher quality than the previous ones.
 
     Args:
-        cloud: the points, which are projected part by part.
+        cloud: the points; they are projected in blocks.
         photo: the photo.
-        camera: its camera, relative to the cloud's origin.
-        buffer: its depths.
-        colours: of the photos before it; replaced.
+        camera: camera of the photo, relative to the cloud's origin.
+        buffer: depth buffer of the camera.
+        colours: colours from the previous photos, updated in place.
         place: number of the photo.
     """
     import cv2
@@ -116,10 +116,10 @@ def _colour(
         inside = np.flatnonzero(camera.sees(projected[:, :2]))
         pixels, depth_m = projected[inside, :2], projected[inside, 2]
         index = start + inside
-        # No nearer surface hides them by more than the tolerance.
+        # Visible unless a surface is nearer by more than the tolerance.
         cells = (pixels / buffer.reduction).astype(np.int64)
         is_seen = depth_m <= buffer.nearest[cells[:, 1], cells[:, 0]] + _TOLERANCE_M
-        # Pixels per metre squared, decreasing near the photo's border.
+        # Pixels per metre, squared, decreasing near the photo's border.
         rim = np.minimum(pixels, size - pixels).min(axis=1) / size.min()
         quality = (camera.fx / depth_m) ** 2 * np.clip(rim / _BORDER_SHARE, 1e-3, 1.0)
         wins = is_seen & (quality.astype(np.float32) > colours.best[index])
@@ -141,11 +141,11 @@ def _colour(
 def _extent(
     cloud: PointCloud,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, float]:
-    """Return the extent of most of a cloud, metres from its origin, and its point spacing.
+    """Return the extent of a cloud without outliers, in metres from its origin, and its spacing.
 
     Returns:
         (3,) lowest and (3,) highest coordinates, the side of the cubes used for the estimate, and
-        the approximate spacing of the points of a surface.
+        the approximate point spacing on surfaces.
     """
     every = slice(None, None, max(1, len(cloud) // _SAMPLED_MOST))
     sample = np.column_stack([cloud.x[every], cloud.y[every], cloud.z[every]]).astype(np.float64)

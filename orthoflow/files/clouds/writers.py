@@ -1,8 +1,8 @@
-"""A cloud as LAZ 1.4, binary PLY with double coordinates, and E57, piece by piece.
+"""Writers of clouds, block by block: LAZ 1.4, binary PLY with double coordinates, and E57.
 
-LAZ: scans by point source; plane, deviation, normals and photo as extra bytes. E57: a Data3D per
-scan with its pose; normals, plane and deviation as extensions. PLY is written here because
-libraries for it need all points at once, or do not support custom fields.
+LAZ stores the scan as point source and plane, deviation, normals and photo as extra bytes. E57 has
+a Data3D with pose for each scan, and extensions for normals, plane and deviation. PLY is written
+without a library, because libraries need all points at once or do not support custom fields.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ _EXTRA_BYTES: Final = {
 
 
 def write_laz(path: Path, attributed: AttributedCloud) -> int:
-    """Write the selected points, piece by piece; return their number.
+    """Write the selected points block by block and return their number.
 
-    World coordinates are stored to a tenth of a millimetre, relative to the offset of the header.
+    World coordinates are stored in steps of 0.1 mm relative to the offset in the header.
 
     Raises:
-        PluginError: laspy does not load.
+        PluginError: laspy cannot be imported.
     """
     laspy = load_library("laspy", path)
     header = las_header(laspy, attributed)
@@ -61,7 +61,7 @@ def write_laz(path: Path, attributed: AttributedCloud) -> int:
 
 # Any: laspy has no types.
 def las_record(laspy: Any, header: Any, points: NDArray[np.void]) -> Any:
-    """Return points as laspy writes them under a header."""
+    """Return points as a laspy record for a header."""
     record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
     for name in points.dtype.names or ():
         values = points[name]
@@ -92,11 +92,11 @@ def las_header(laspy: Any, attributed: AttributedCloud) -> Any:
     )
     header.scales = np.full(3, _scale_m(cloud))
     header.offsets = np.floor(cloud.origin)
-    # LAS 1.4 requires it with this point format, with or without a known coordinate system.
+    # Required by LAS 1.4 for this point format, even if the coordinate system is unknown.
     header.global_encoding.wkt = True
     if attributed.crs_wkt:
         header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(attributed.crs_wkt))
-    # Independent of the date, so that the same cloud gives the same bytes.
+    # A fixed date, so that the same cloud gives the same bytes.
     header.creation_date = _NO_DATE
     header.generating_software = "orthoflow"
     return header
@@ -105,20 +105,20 @@ def las_header(laspy: Any, attributed: AttributedCloud) -> Any:
 def _scale_m(cloud: PointCloud) -> float:
     spans = [float(max(abs(v.min()), abs(v.max()))) for v in (cloud.x, cloud.y, cloud.z) if len(v)]
     coarsest = max(spans, default=0.0) / _LARGEST
-    # 32 bits hold two hundred kilometres at this scale.
+    # With this scale, 32 bits cover two hundred kilometres.
     return _SCALE_M if coarsest <= _SCALE_M else 10.0 ** math.ceil(math.log10(coarsest))
 
 
 _TYPES: Final = {"f8": "double", "f4": "float", "u1": "uchar", "u2": "ushort", "i2": "short"}
-# As many digits as any number of points has; overwritten when the number is known.
+# Wide enough for any number of points; overwritten once the number is known.
 _DIGITS: Final = 12
 
 
 def write_ply(path: Path, attributed: AttributedCloud) -> int:
-    """Write the selected points, piece by piece; return their number.
+    """Write the selected points block by block and return their number.
 
     Raises:
-        OSError: the disk cannot be written.
+        OSError: the file cannot be written.
     """
     head = [
         *("ply", "format binary_little_endian 1.0", "comment orthoflow, metres"),
@@ -139,14 +139,14 @@ def write_ply(path: Path, attributed: AttributedCloud) -> int:
     return n_written
 
 
-# Prefix -> URI of the extensions of the format.
+# Prefix and URI of the extensions.
 EXTENSIONS: Final = {
     "nor": "http://www.libe57.org/E57_NOR_surface_normals.txt",
     "orthoflow": "urn:orthoflow:points:1",
 }
 _COLOURS: Final = ("colorRed", "colorGreen", "colorBlue")
 _STATE: Final = "cartesianInvalidState"
-# The Data3D states the scan.
+# The scan is not a field, since each has its own Data3D.
 _E57_NAMES: Final = {
     **{axis: f"cartesian{axis.upper()}" for axis in "xyz"},
     **dict(zip(("red", "green", "blue"), _COLOURS, strict=True)),
@@ -176,14 +176,14 @@ class _Writer:
 
 
 def write_e57(path: Path, attributed: AttributedCloud) -> int:
-    """Write the selected points, scan by scan and piece by piece; return their number.
+    """Write the selected points scan by scan, block by block, and return their number.
 
-    A scan with a known station has it as its pose, and points relative to it, along the axes of the
-    world, because the cloud does not keep the rotation of the instrument. Others have the cloud's
-    origin as pose, so that survey coordinates keep their digits.
+    The pose of a scan is its station if this is known, with the axes of the world, because the
+    cloud does not contain the rotation of the instrument. Otherwise, it is the cloud's origin.
+    Points are relative to the pose, so survey coordinates keep all digits.
 
     Raises:
-        PluginError: pye57 does not load.
+        PluginError: pye57 cannot be imported.
     """
     libe57 = load_library("pye57", path).libe57
     writer = _Writer(libe57=libe57, image=libe57.ImageFile(str(path), "w"))
@@ -195,7 +195,7 @@ def write_e57(path: Path, attributed: AttributedCloud) -> int:
 
 
 def _write_head(writer: _Writer, attributed: AttributedCloud) -> Any:
-    """Write what precedes the scans, independent of the date; return the list of scans."""
+    """Write the data before the scans, independent of the date; return the list of scans."""
     libe57, image = writer.libe57, writer.image
     for prefix, uri in {"": libe57.E57_V1_0_URI, **EXTENSIONS}.items():
         image.extensionsAdd(prefix, uri)
@@ -226,12 +226,12 @@ def _write_scan(writer: _Writer, scans: Any, attributed: AttributedCloud, scan: 
     low, high = limits - centre
     node = writer.libe57.StructureNode(writer.image)
     name = f"scan {scan}" if station is not None else f"scan {scan}, station not known"
-    # The same cloud gets the same name.
+    # The same cloud always gets the same id.
     unique = uuid.uuid5(uuid.NAMESPACE_URL, f"urn:orthoflow:{attributed.name}:{scan}")
     node.set("guid", writer.text(f"{{{unique}}}"))
     node.set("name", writer.text(name))
     node.set("description", writer.text(f"orthoflow {__version__}"))
-    # Of the points as stored in the file.
+    # Bounds of the points as stored in the file.
     corners = zip("xyz", low, high, strict=True)
     bounds = {f"{axis}{end}": float(v) for axis, a, b in corners for end, v in _ends(a, b)}
     node.set("cartesianBounds", writer.group(**bounds))
@@ -257,7 +257,7 @@ def _write_points(
     scan, centre = placed
     libe57, image, columns = writer.libe57, writer.image, attributed.columns
     names = {name: _E57_NAMES[name] for name in columns.names or () if name in _E57_NAMES}
-    # Readers require a state, though all points are valid.
+    # Readers require a validity field, although all points are valid.
     kept = {_STATE: np.zeros(BLOCK, dtype=np.int8)} | {
         own: np.zeros(BLOCK, dtype=columns[name].type) for name, own in names.items()
     }

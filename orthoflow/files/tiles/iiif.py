@@ -1,7 +1,7 @@
-"""IIIF: a Presentation 3 manifest with physical scale over level 0 image services.
+"""IIIF: a Presentation 3 manifest with physical scale, and level 0 image services.
 
-A canvas per wall; its pictures (orthoimage, intensity, depth, relief) are layers of a choice. An
-image service is a folder of static tiles and an `info.json`, which any web server hands out.
+Each wall is a canvas; its pictures (orthoimage, intensity, depth, relief) are layers of a choice.
+An image service is a folder with static tiles and an `info.json`, for any web server.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ class Layer:
     """A picture of a wall.
 
     Attributes:
-        label: what it shows.
-        raster: its GeoTIFF: three bands of colours, or one that is stretched to grey.
+        label: description of the picture.
+        raster: its GeoTIFF, with three colour bands or one band that is stretched to grey.
         stem: name of its folder.
     """
 
@@ -47,9 +47,9 @@ class Canvas:
     """A wall.
 
     Attributes:
-        label: what it is called.
-        summary: one line, e.g. its accuracy.
-        layers: its pictures, all over the same cells, the first shown first.
+        label: name of the wall.
+        summary: one line, e.g. on its accuracy.
+        layers: pictures with the same cells; the first one is shown first.
     """
 
     label: str
@@ -58,13 +58,13 @@ class Canvas:
 
 
 def write_manifest(folder: Path, title: str, canvases: Sequence[Canvas], base: str) -> int:
-    """Write `manifest.json` and the tiles of all layers; return how many tiles there are.
+    """Write `manifest.json` and the tiles of all layers; return the number of tiles.
 
     Args:
         folder: existing folder.
-        title: of the manifest.
+        title: title of the manifest.
         canvases: the walls.
-        base: address under which the folder is handed out, e.g. `https://example.org/room`.
+        base: URL of the folder on the web server, e.g. `https://example.org/room`.
 
     Raises:
         InputError: a raster cannot be read.
@@ -151,7 +151,7 @@ def _body(layer: Layer, shape: tuple[int, int], base: str) -> dict[str, JsonValu
 
 
 def _write_service(folder: Path, layer: Layer, base: str) -> tuple[tuple[int, int], float, int]:
-    """Write `info.json` and tiles; return the picture's rows and columns, its cells, the tiles."""
+    """Write `info.json` and tiles; return the picture's shape, its cell size, the tile count."""
     service = folder / layer.stem
     with RasterParts(layer.raster) as source:
         rows, columns = source.shape
@@ -170,7 +170,7 @@ def _write_service(folder: Path, layer: Layer, base: str) -> tuple[tuple[int, in
                     place = service / f"{left},{top},{wide},{high}" / f"{shape[1]},{shape[0]}"
                     _write_jpeg(place / "0" / "default.jpg", tile)
                     count += 1
-        # What viewers show first, and the picture as a whole where it is one tile.
+        # The overview that viewers load first, and the whole picture if it fits into one tile.
         small = factors[-1]
         sizes = [(-(-rows // factor), -(-columns // factor)) for factor in (small, *factors[:1])]
         for shape in dict.fromkeys(sizes):

@@ -1,9 +1,9 @@
-"""A pyramid of tiles of one orthoimage, as Deep Zoom images have it.
+"""A tile pyramid of an orthoimage, in the Deep Zoom format.
 
-`NAME.dzi` states the size, `NAME_files/LEVEL/COLUMN_ROW.webp` are the tiles: the last level has the
-cells as they are, each before it half as many a side, level 0 is one pixel. Tiles are transparent
-where the orthoimage is empty. The page beside them pans, zooms and measures: one file, no server,
-nothing from elsewhere.
+`NAME.dzi` contains the size, `NAME_files/LEVEL/COLUMN_ROW.webp` are the tiles. The last level has
+full resolution, each level before it half of that, and level 0 is one pixel. Tiles are transparent
+where the orthoimage is empty. The page next to them pans, zooms and measures; it is a single file
+without server or external resources.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ _PLACE: Final = "/*IMAGES*/[]"
 
 
 def write_tiles(folder: Path, name: str, ortho: OrthoFile) -> int:
-    """Write the tiles of an orthoimage, and return their number.
+    """Write the tiles of an orthoimage and return their number.
 
-    Memory holds one tile, however large the orthoimage is.
+    Only one tile at a time is in memory.
 
     Args:
         folder: existing folder.
-        name: of the image: the stem of its files.
+        name: name of the image, used as the stem of its files.
         ortho: the orthoimage.
 
     Raises:
@@ -61,7 +61,7 @@ def write_tiles(folder: Path, name: str, ortho: OrthoFile) -> int:
 
 
 def last_level(width: int, height: int) -> int:
-    """Number of the level that has the cells as they are.
+    """Return the number of the level with full resolution.
 
     >>> last_level(1, 1), last_level(1024, 3), last_level(1025, 3)
     (0, 10, 11)
@@ -79,18 +79,18 @@ def _descriptor(width: int, height: int) -> str:
 
 
 def write_viewer(folder: Path, images: Mapping[str, OrthoFile]) -> None:
-    """Write `index.html` for images whose tiles lie in the folder.
+    """Write `index.html` for images whose tiles are in the folder.
 
     Args:
         folder: existing folder.
-        images: name of the tiles -> orthoimage.
+        images: orthoimages by name of their tiles.
 
     Raises:
         StoreError: the file cannot be written.
     """
     described = [_image(name, ortho) for name, ortho in images.items()]
     text = json.dumps(described, allow_nan=False)
-    # Names come from records, and the page must not end within one.
+    # Escape names, which come from records, so that they cannot end the script.
     for letter in "<>&":
         text = text.replace(letter, f"\\u{ord(letter):04x}")
     page = files(__package__).joinpath("viewer.html").read_text(encoding="utf-8")
