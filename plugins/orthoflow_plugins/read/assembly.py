@@ -1,4 +1,4 @@
-"""A cloud in the making: blocks of several files into its arrays, held once; how fine they are."""
+"""Assembly of a cloud from blocks of several files without copies; rounding of coordinates."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from orthoflow.geometry.frames import FARTHEST_M
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.read.scales import ColourScale
 
-# Coordinates rounded more coarsely than this limit what an orthoimage can show.
+# Coarser rounding of coordinates limits what an orthoimage can show.
 COARSE_M: Final = 0.005
-# Offsets keep half a tenth of a millimetre; beyond, a warning is reported.
+# Offsets are accurate to half a tenth of a millimetre; otherwise, a warning is reported.
 FINE_M: Final = 5e-5
 _POINT_BYTES: Final = 40
 _MOST_SCANS: Final = 2**16
-# MADV_POPULATE_WRITE of Linux 5.14, which Python does not name.
+# MADV_POPULATE_WRITE of Linux 5.14, for which Python has no name.
 _POPULATE_WRITE: Final = 23
 _ROUNDING_SAMPLE: Final = 20_000
 _ROUNDING_VALUES: Final = 10
-# No surface has a twentieth of a scan's points at one place, however coordinates are rounded.
+# No surface has a twentieth of a scan's points at one position, however coordinates are rounded.
 _REPEATED_SAMPLE: Final = 2000
 _REPEATED_SHARE: Final = 0.05
 _FEWEST_REPEATED: Final = 20
-# Decimal rounding, and the powers of two that float32 leaves of large coordinates.
+# Decimal rounding, and the powers of two to which float32 rounds large coordinates.
 _ROUNDING_STEPS: Final = sorted(
     {digit * 10.0**power for digit in (1, 2, 5) for power in range(-4, 3)}
     | {2.0**power for power in range(-10, 4)},
@@ -43,22 +43,23 @@ _ROUNDING_STEPS: Final = sorted(
 
 @dataclass(kw_only=True)
 class ScanCount:
-    """What became of the points of one scan.
+    """Statistics of the points of one scan.
 
     Attributes:
-        file: name of its file.
-        index: place in the file.
-        format_name: of the file.
-        scan: what the file states of it.
+        file: name of the file.
+        index: index of the scan in the file.
+        format_name: format of the file.
+        scan: metadata of the scan.
         unit_m: metres per unit along x, y and z.
-        start: of its points in the cloud; `stop` is behind the last one.
-        n_read: points that the file holds.
-        left_out: those that are not in the cloud, by cause.
-        n_without_rgb: points in the cloud that have no valid colour.
-        rounding_m: step to which coordinates are rounded, 0 where it is fine.
-        colours: how they were scaled, or None without colours.
-        first_far_m: the first of the points that lie too far away.
-        repeated_m: the place at which so many of its points lie that they are no returns.
+        start: index of the first point in the cloud.
+        stop: index behind the last point in the cloud.
+        n_read: number of points in the file.
+        left_out: number of points not in the cloud, by cause.
+        n_without_rgb: number of points in the cloud without a valid colour.
+        rounding_m: step to which coordinates are rounded, 0 if it is small.
+        colours: scale of the colours, or None if there are none.
+        first_far_m: first point that is too far away; empty if there is none.
+        repeated_m: position of so many points that they cannot be returns, or None.
     """
 
     file: str
@@ -78,12 +79,12 @@ class ScanCount:
 
     @property
     def n_kept(self) -> int:
-        """Points in the cloud."""
+        """Number of points in the cloud."""
         return self.stop - self.start
 
     @property
     def title(self) -> str:
-        """How messages call it."""
+        """Name of the scan in messages."""
         name = f" ({self.scan.name})" if self.scan.name else ""
         return f"{self.file}, scan {self.index}{name}"
 
@@ -93,8 +94,8 @@ class CloudAssembly:
 
     Attributes:
         origin: (3,) whole metres near the data; set by the first points.
-        n_points: points so far.
-        counts: of each scan, in the order of the files.
+        n_points: number of points so far.
+        counts: statistics of each scan, in the order of the files.
     """
 
     origin: NDArray[np.float64]
@@ -106,18 +107,18 @@ class CloudAssembly:
         unit_m: Callable[[Scan], NDArray[np.float64]],
         box_m: NDArray[np.float64] | None = None,
     ) -> None:
-        """Allocate for the most points that may come; what is not filled is cut off later.
+        """Allocate arrays for the maximum number of points; unused parts are cut off later.
 
         Args:
-            ctx: of the step.
-            files: what will be read.
-            unit_m: gives metres per unit of a scan, along x, y and z.
+            ctx: context of the step.
+            files: files to read.
+            unit_m: returns metres per unit of a scan, along x, y and z.
             box_m: (2, 3) lowest and highest coordinates of the points to keep; None for all.
         """
         self._ctx, self._box_m, self._unit_m = ctx, box_m, unit_m
         self._reach_m = np.array([[np.inf] * 3, [-np.inf] * 3])
         self._capacity = sum(file.n_most for file in files)
-        # Refused before writing: a mapped file on a full disk ends the process by a signal.
+        # Checked before writing: if the disk gets full, a mapped file ends the process by a signal.
         needed, free = self._capacity * _POINT_BYTES, shutil.disk_usage(ctx.scratch).free
         if free < needed:
             raise StoreError(
@@ -140,7 +141,7 @@ class CloudAssembly:
         """Read all blocks of a file.
 
         Raises:
-            InputError: the file is damaged, or none of its points can be used.
+            InputError: the file is damaged, or none of its points are usable.
         """
         counts = [
             ScanCount(
@@ -174,7 +175,7 @@ class CloudAssembly:
             )
 
     def require_points(self) -> None:
-        """Refuse a choice of points that leaves none of any file.
+        """Check that points are left in the cloud.
 
         Raises:
             InputError: all points are of other classes or outside the box.
@@ -193,16 +194,16 @@ class CloudAssembly:
 
     @property
     def offsets(self) -> list[NDArray[Any]]:
-        """x, y and z from the origin, cut to the points that came."""
+        """Return x, y and z from the origin, cut to the actual number of points."""
         return [self._arrays[name][: self.n_points] for name in "xyz"]
 
     def array(self, name: str) -> NDArray[Any] | None:
-        """One of the other arrays, cut to the points that came; None when the files lack it."""
+        """Return another array, cut to the actual number of points; None if no file has it."""
         array = self._arrays.get(name)
         return None if array is None else array[: self.n_points]
 
     def colour_mask(self) -> NDArray[Any]:
-        """Return the mask of valid colours, cut to the points; all True where it was missing."""
+        """Return the mask of valid colours, cut to the points; it is created if all are valid."""
         if "has_rgb" not in self._arrays:
             self._arrays["has_rgb"] = self._new("has_rgb", np.bool_)
             self._arrays["has_rgb"][: self.n_points] = True
@@ -226,10 +227,10 @@ class CloudAssembly:
         if part.stop > self._capacity:
             raise InputError(f"{count.file} holds more points than its header states")
         if scan > 0 and "scan" not in self._arrays:
-            # Zeros are right for everything that came before.
+            # Zeros are correct for all previous points.
             self._arrays["scan"] = self._new("scan", np.uint16)
         if self.n_points == 0:
-            # The median, so that stray points far away cannot cost the scan its precision.
+            # The median, so that distant stray points do not reduce the precision of the scan.
             self.origin = np.floor(np.median(usable, axis=0))
         self._store(usable, block, kept, part)
         if "scan" in self._arrays:
@@ -260,9 +261,9 @@ class CloudAssembly:
     def _kept(
         self, points: NDArray[np.float64], bounds: NDArray[np.float64], count: ScanCount
     ) -> NDArray[np.bool_] | slice:
-        """Which points (n, 3) are usable and lie in the box, counted; a slice for all of them."""
+        """Return and count which points (n, 3) are usable and in the box; a slice if all are."""
         usable: NDArray[np.bool_] | slice = slice(None)
-        # NaN passes through minimum and maximum, and compares as False.
+        # NaN propagates through minimum and maximum, and compares as False.
         if not np.all(np.abs(bounds) < FARTHEST_M) and len(points):
             usable = is_near = np.asarray((np.abs(points) < FARTHEST_M).all(axis=1))
             lost = points[~is_near]
@@ -284,7 +285,7 @@ class CloudAssembly:
         self._reach_m = np.stack(
             [np.minimum(self._reach_m[0], bounds[0]), np.maximum(self._reach_m[1], bounds[1])]
         )
-        # Its faces are included.
+        # The faces of the box are included.
         low, high = self._box_m
         is_inside = np.asarray(((points >= low) & (points <= high)).all(axis=1))
         if not isinstance(usable, slice):
@@ -318,15 +319,15 @@ class CloudAssembly:
 
 
 def rounding_m(points: NDArray[np.float64], unit_m: float) -> float:
-    """Step to which a block's coordinates (n, 3) are rounded, in metres, if it is coarse.
+    """Return the step in metres to which coordinates (n, 3) of a block are rounded, if coarse.
 
     Args:
-        points: in the file's unit.
+        points: coordinates in the file's unit.
         unit_m: the file's unit in metres.
 
     Returns:
-        The largest step on which all values of an axis lie, the finest of the axes; 0 when that
-        is finer than `COARSE_M` or unknown.
+        The largest step that fits all values of an axis, minimum over the axes; 0 if it is smaller
+        than `COARSE_M` or unknown.
     """
     sample = points[:: max(1, len(points) // _ROUNDING_SAMPLE)]
     found = []
@@ -339,9 +340,9 @@ def rounding_m(points: NDArray[np.float64], unit_m: float) -> float:
 
 
 def repeated_place(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Place (3,) at which so many of some points (n, 3) lie that they are no returns, or None.
+    """Return the position (3,) of so many points (n, 3) that they cannot be returns, or None.
 
-    Programs that move a scan move points without a return, written as 0 0 0, with it.
+    Points without a return are written as 0 0 0; programs that move a scan move them, too.
     """
     sample = points[:: max(1, len(points) // _REPEATED_SAMPLE)]
     sample = sample[np.isfinite(sample).all(axis=1)]
@@ -352,14 +353,14 @@ def repeated_place(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
 
 
 def resolution_m(farthest_m: float) -> float:
-    """Distance between neighbouring float32 numbers at an offset."""
+    """Return the distance between neighbouring float32 numbers at an offset."""
     return float(np.spacing(np.float32(farthest_m)))
 
 
 def _make_ready(array: NDArray[Any], part: slice) -> None:
-    """Ask for the pages of a mapped file that are about to be written, all at once.
+    """Request all pages of a memory-mapped file that will be written next, at once.
 
-    One by one, each when it is first written to, they take four times as long.
+    If each page is requested when it is first written, this takes four times as long.
     """
     mapping: object = array.base
     if not isinstance(mapping, mmap.mmap):

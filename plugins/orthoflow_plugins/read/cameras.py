@@ -1,4 +1,4 @@
-"""`read.cameras`: orientations of the photos that another program found."""
+"""`read.cameras`: photo orientations from other programs."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ NOT_ORIENTED: Final = DiagnosticSpec(
 class ReadCameras(Method):
     """Read poses and lenses: `cameras.json`, COLMAP, Metashape, Bundler, RealityCapture.
 
-    They must be in the frame of the scan; `orient.given` reports those without a wall. Photos are
-    found by their file names, with or without suffix, and by their folders where several have one
-    name. A photo that the files do not mention, that was disabled there, or whose lens differs
-    from OpenCV's models by more than half a pixel, is not oriented, and the reason is stated; what
-    differs by less is reported.
+    They must be in the frame of the scan; `orient.given` reports cameras that see no wall. Photos
+    are identified by their file names, with or without suffix, and by their folders if several have
+    the same name. A photo is not oriented if the files do not contain it, if it was disabled there,
+    or if its lens differs from OpenCV's models by more than half a pixel; the reason is reported.
+    Smaller differences are reported, too.
 
-    The photo of a fisheye lens must have become the faces of a cube, as `read.photos` does it that
-    knows the lens; each face has the pose of the whole.
+    Photos with a fisheye lens must have been split into cube faces by `read.photos`, which needs
+    the lens for this; each face gets the pose of the whole photo.
     """
 
     id = "read.cameras"
@@ -78,14 +78,14 @@ class ReadCameras(Method):
     )
 
     class Params(MethodParams):
-        """What the files do not state."""
+        """Parameters that are not in the files."""
 
         unit: Unit = Field(
             "m", description="Unit of the files' coordinates; the poses are in metres."
         )
 
     class In(Ports):
-        """The files, and the photos that they speak of."""
+        """The files, and the photos that they orient."""
 
         files: InputFiles
         photos: Photos
@@ -96,7 +96,7 @@ class ReadCameras(Method):
         cameras: Cameras
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Read the files; see the class."""
+        """Read the files as described for the class."""
         ctx.progress(0.0, inputs.files.name)
         given = read_given_cameras(inputs.files.paths)
         photos = inputs.photos.photos
@@ -156,7 +156,7 @@ def _camera(photo: Photo, given: GivenByName, unit_m: float, notes: dict[str, li
             "and not turned"
         )
     translation_m = unit_m * np.asarray(found.translation, dtype=np.float64)
-    # Also not where it is no number.
+    # Negated, so that NaN is refused, too.
     if not np.abs(translation_m).max() < FARTHEST_M:
         raise InputError(
             f"photo {photo.name} was taken {np.abs(translation_m).max():.3g} m from the origin, "
@@ -173,14 +173,14 @@ def _camera(photo: Photo, given: GivenByName, unit_m: float, notes: dict[str, li
 
 
 class GivenByName:
-    """Given cameras by the names of their photos."""
+    """Given cameras, by photo name."""
 
     def __init__(self, given: Sequence[GivenCamera], photos: Sequence[Photo] = ()) -> None:
-        """Take the cameras.
+        """Index the cameras.
 
         Args:
             given: the cameras.
-            photos: all photos; of those that share a file name each needs its own camera.
+            photos: all photos; photos with the same file name need separate cameras.
         """
         self._exact: dict[str, list[GivenCamera]] = {}
         self._lower: dict[str, list[GivenCamera]] = {}
@@ -191,11 +191,11 @@ class GivenByName:
         self._n_named = Counter(_file_name(photo.name).lower() for photo in photos)
 
     def of_photo(self, name: str, folder: str = "") -> GivenCamera | None:
-        """Return the camera of a photo: of its name, or else of its name without suffix.
+        """Return the camera of a photo, by its name or its name without suffix; None if not found.
 
         A photo NAME_front.png may be a face of NAME, whose lens is a fisheye or a panorama. Of
-        several cameras the one counts whose folders are most like the photo's; where these are
-        equally so, the camera that is returned only has the reason why it is none.
+        several cameras, the one whose folders match the photo's best is returned; if this is
+        ambiguous, the result has no pose, but a reason.
         """
         found, face = self._named(_file_name(name)), face_in(_file_name(name))
         if not found and face is not None:
@@ -215,7 +215,7 @@ class GivenByName:
         return []
 
     def _of_stem(self, stem: str) -> list[GivenCamera]:
-        """Cameras of a photo that has this name but for its suffix."""
+        """Return the cameras of a photo with this name except for its suffix."""
         named = {
             name: cameras
             for name, cameras in self._exact.items()
@@ -230,12 +230,12 @@ def _file_name(path: str) -> str:
 
 
 def _nearest(found: Sequence[GivenCamera], folder: str, *, is_only: bool) -> GivenCamera | None:
-    """The one of some cameras whose folders are most like a photo's.
+    """Return the camera whose folders match a photo's best, or a reason why there is none.
 
     Args:
-        found: cameras of the photo's file name.
-        folder: of the photo.
-        is_only: whether no other photo has its file name.
+        found: cameras with the photo's file name.
+        folder: folder of the photo.
+        is_only: no other photo has this file name.
     """
     if not found:
         return None

@@ -16,16 +16,16 @@ from orthoflow_plugins.read.scan import Unit
 
 
 class ReadCheckpoints(Method):
-    """Read check points: `name,x,y,z[,class]`, and where one was measured in an orthoimage.
+    """Read check points: `name,x,y,z[,class]`, optionally with a position in an orthoimage.
 
-    World coordinates are those of the scan's files. `wall` is the number of the wall, `u_px,v_px`
-    the column and row in its orthoimage, counted from the image's corner as GIS programs do: the
-    centre of the first cell is at (0.5, 0.5). Instead of them `map_x,map_y` are X and Y in metres
-    as a GIS shows them in the GeoTIFF: in the plane of the wall, or east and north of a map
-    (`crs` of `raster.grid`); then `wall` may be left out. East and north hold for any cell size
-    and for images of other programs. Or `shown_x,shown_y,shown_z` are the coordinates, in metres,
-    of what the orthoimage shows there, as the report saves them: they hold for any cell size and
-    crop of the same scan.
+    World coordinates are those of the scan's files. The position in an orthoimage can be given in
+    three ways. `wall,u_px,v_px` are the number of the wall and the column and row in its
+    orthoimage, counted from the corner as in GIS programs: the centre of the first cell is at
+    (0.5, 0.5). `map_x,map_y` are the X and Y that a GIS shows for the GeoTIFF, in metres: in the
+    plane of the wall, or easting and northing (`crs` of `raster.grid`), which do not need `wall`.
+    Eastings and northings remain valid for any cell size, and for images from other programs.
+    `shown_x,shown_y,shown_z` are the coordinates in metres of the point shown there, as saved from
+    the report; they are valid for any cell size and crop of the same scan.
     """
 
     id = "read.checkpoints"
@@ -38,7 +38,7 @@ class ReadCheckpoints(Method):
     citations: ClassVar[tuple[str, ...]] = ()
 
     class Params(MethodParams):
-        """What the files do not state."""
+        """Parameters that are not in the files."""
 
         unit: Unit = Field(
             "m", description="Unit of x, y, z in the files; the points are in metres."
@@ -55,7 +55,7 @@ class ReadCheckpoints(Method):
         checkpoints: CheckPoints
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Read all files; see the class."""
+        """Read all files as described for the class."""
         if not inputs.files.paths:
             raise InputError(f"the input {inputs.files.name} names no files: expected check points")
         points: list[SurveyPoint] = []

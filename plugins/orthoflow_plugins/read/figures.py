@@ -1,4 +1,4 @@
-"""Pictures of what was read: a cloud from above and as its scanner saw it, photos side by side."""
+"""Pictures of input data: a cloud from above and from its scanner, contact sheet of photos."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _PLAN_SAMPLE: Final = 250_000
 _POLAR_SIDE_PX: Final = 1200
 _POLAR_SAMPLE: Final = 2_000_000
 
-# Of the rows and columns of a scan as lines over a wall: how many of each, and their colours.
+# Rows and columns of a scan drawn as lines over a wall: maximum number of each, and colours.
 _LINES: Final = 24
 _ROW_RGB: Final = (235, 165, 20)
 _COLUMN_RGB: Final = (20, 150, 215)
@@ -27,10 +27,10 @@ _WALL_STEP_DEG: Final = 2.0
 _WALL_FARTHEST_M: Final = 1000.0
 _WALL_CELL_M: Final = 0.05
 _WALL_REACH_M: Final = 0.15
-# Points of a line that lie farther apart than this many usual steps are not joined.
+# Points of a line that are farther apart than this many median steps are not connected.
 _BREAK_STEPS: Final = 6.0
 
-# A column of a journal at 300 dpi, with letters of 6 points.
+# A journal column at 300 dpi, with 6-point text.
 _SHEET_SIDE_PX: Final = 1004
 _CELL_PX: Final = 251
 _LABEL_PX: Final = 30
@@ -43,22 +43,22 @@ _INK: Final = (40, 40, 40)
 
 @in_column_style()
 def plan_chart(cloud: PointCloud) -> bytes:
-    """Return a picture of the cloud seen from above with axes in metres, as WebP."""
+    """Return a picture of the cloud from above, with axes in metres, as WebP."""
     grey, frame = plan_view(cloud)
     return encode_chart(picture_figure(grey, frame=frame)[0])
 
 
 def plan_view(cloud: PointCloud) -> tuple[NDArray[np.uint8], WallFrame]:
-    """Return the cloud seen from above, brighter where it is denser (logarithmic).
+    """Return the cloud from above, brighter where it is denser (logarithmic).
 
     Returns:
-        (rows, cols) grey, and its position in the world.
+        (rows, cols) grey, and the frame of the picture.
     """
     step = max(1, len(cloud) // _PLAN_SAMPLE)
     offsets = np.column_stack([cloud.x[::step], cloud.y[::step], cloud.z[::step]])
     first, second, up = basis_from_up(cloud.up)
     plan = offsets.astype(np.float64) @ np.column_stack([first, second])
-    # Percentiles, so that stray points do not shrink the building to a dot.
+    # Percentiles, so that stray points do not reduce the scale.
     low, high = np.percentile(plan, [0.1, 99.9], axis=0)
     span = max(float((high - low).max()), 1e-6)
     size = np.maximum(np.ceil((high - low) / span * _PLAN_SIDE_PX).astype(int), 1)
@@ -68,7 +68,7 @@ def plan_view(cloud: PointCloud) -> tuple[NDArray[np.uint8], WallFrame]:
     counts = np.bincount(rows * size[0] + columns, minlength=int(size.prod())).astype(np.float64)
     shades = np.log1p(counts)
     grey = np.rint(255.0 * shades / max(float(shades.max()), 1.0)).astype(np.uint8)
-    # Row 0 is at the bottom of a map and at the top of an image.
+    # Row 0 is at the bottom of a map, but at the top of an image.
     gsd_m = span / _PLAN_SIDE_PX
     frame = WallFrame(
         origin_world=cloud.origin + low[0] * first + (low[1] + gsd_m * size[1]) * second,
@@ -84,11 +84,11 @@ def plan_view(cloud: PointCloud) -> tuple[NDArray[np.uint8], WallFrame]:
 
 
 def polar_view_png(cloud: PointCloud) -> bytes | None:
-    """Return a PNG of the intensity over the rows and columns of the scan with most points.
+    """Return a PNG of the intensity by row and column of the scan with the most points.
 
-    This is what the scanner saw, by its own angles (Figure 2 of markiewicz2015): straight edges are
-    curved. Where the station is known, up is up and left is left. None where the cloud has no grid
-    or no intensity.
+    This is the view in the scanner's own angles, in which straight edges are curved (Figure 2 of
+    markiewicz2015). If the station is known, the picture is oriented with up and left as seen from
+    it. None if the cloud has no grid or no intensity.
     """
     if cloud.row is None or cloud.column is None or cloud.intensity is None or not len(cloud):
         return None
@@ -99,7 +99,7 @@ def polar_view_png(cloud: PointCloud) -> bytes | None:
     row, column = (array[index].astype(np.int64) for array in (cloud.row, cloud.column))
     row, column = row - row.min(), column - column.min()
     size = np.array([row.max() + 1, column.max() + 1])
-    # No more pixels than sampled points fill.
+    # Not more pixels than sampled points.
     coarser = max(float(size.max()) / _POLAR_SIDE_PX, math.sqrt(float(size.prod()) / len(index)))
     across = max(1, math.ceil(coarser))
     rows, columns = -(-size // across)
@@ -109,7 +109,7 @@ def polar_view_png(cloud: PointCloud) -> bytes | None:
     mean = total / np.maximum(counts, 1)
     low, high = np.quantile(mean[counts > 0], (0.01, 0.99))
     bright = np.clip((mean - low) / max(float(high - low), 1e-9), 0.0, 1.0)
-    # Black is what no point came from.
+    # Pixels without points are black.
     grey = np.where(counts > 0, np.rint(32.0 + 223.0 * bright), 0.0).astype(np.uint8)
     upward, leftward = _ways_of_grid(cloud, scan, index, row // across, column // across)
     image = grey.reshape(rows, columns)[:: -1 if upward else 1, :: -1 if leftward else 1]
@@ -119,10 +119,10 @@ def polar_view_png(cloud: PointCloud) -> bytes | None:
 def scan_lines_png(cloud: PointCloud) -> bytes | None:
     """Return a PNG of a wall in rectangular coordinates, with lines along rows and columns.
 
-    The wall is the vertical plane with most points of the scan with most points, seen squarely, up
-    is up; beside it lies what else of that scan is within 15 cm of the plane. Some
-    rows are yellow lines, some columns blue ones (markiewicz2015, Figure 2b): where they
-    bend, something stands before the wall. None where the cloud has no grid.
+    Of the scan with the most points, it shows the vertical plane with the most points and all
+    points within 15 cm of that plane, orthogonally and with up at the top. Some rows are yellow
+    lines, some columns blue ones (markiewicz2015, Figure 2b); they bend at objects in front of
+    the wall. None if the cloud has no grid.
     """
     import cv2
 
@@ -135,7 +135,7 @@ def scan_lines_png(cloud: PointCloud) -> bytes | None:
     station = _station(cloud, scan)
     viewer = level.mean(axis=0) if station is None else basis_from_up(cloud.up) @ station
     on_wall = np.abs(level[:, :2] @ [along[1], -along[0]] - distance_m) <= _WALL_REACH_M
-    # To the right of who stands where the scanner stood.
+    # To the right, seen from the scanner.
     right = along if viewer[:2] @ [along[1], -along[0]] > distance_m else -along
     places = np.column_stack([level[:, :2] @ right, -level[:, 2]])[on_wall]
     low, high = np.percentile(places, [0.1, 99.9], axis=0)
@@ -155,7 +155,7 @@ def scan_lines_png(cloud: PointCloud) -> bytes | None:
 
 
 class ContactSheet:
-    """Thumbnails with their names, in rows; photos show as they are stored, never turned."""
+    """Thumbnails of photos with their names, in rows, as stored, without rotation."""
 
     def __init__(self, n_photos: int) -> None:
         self.n_photos = n_photos
@@ -172,7 +172,7 @@ class ContactSheet:
 
     @property
     def caption(self) -> str:
-        """One sentence on what the sheet shows."""
+        """Caption of the sheet, one sentence."""
         if self.n_shown < self.n_photos:
             which = f"The first {self.n_shown} of {self.n_photos} photos, as they are stored"
         else:
@@ -183,7 +183,7 @@ class ContactSheet:
         )
 
     def add(self, name: str, image: NDArray[np.uint8]) -> None:
-        """Put the next photo (rows, cols, 3) RGB on the sheet, if there is room left."""
+        """Add a photo (rows, cols, 3) RGB to the sheet, if there is space."""
         import cv2
 
         if self._count == self.n_shown:
@@ -200,12 +200,12 @@ class ContactSheet:
         cv2.putText(self._sheet, label, place, cv2.FONT_HERSHEY_SIMPLEX, 0.8, _INK, 1, cv2.LINE_AA)
 
     def encoded(self) -> bytes:
-        """Encode the sheet as WebP; no side is longer than 1004 pixels."""
+        """Encode the sheet as WebP; its sides are at most 1004 pixels long."""
         return encode_webp(self._sheet)
 
 
 def _largest_scan(cloud: PointCloud) -> tuple[int, NDArray[np.int64]]:
-    """The scan with most points, and an even sample of its points."""
+    """Return the scan with the most points, and an even sample of its points."""
     index = np.arange(0, len(cloud), max(1, len(cloud) // _POLAR_SAMPLE))
     if cloud.scan is None:
         return 0, index
@@ -214,7 +214,7 @@ def _largest_scan(cloud: PointCloud) -> tuple[int, NDArray[np.int64]]:
 
 
 def _station(cloud: PointCloud, scan: int) -> NDArray[np.float64] | None:
-    """Where a scan was taken from, as an offset (3,); None where the files do not state."""
+    """Return the station of a scan as an offset (3,); None if the files do not contain it."""
     stations = cloud.stations
     if stations is None or scan >= len(stations) or cloud.stations_source == "view_from":
         return None
@@ -223,9 +223,9 @@ def _station(cloud: PointCloud, scan: int) -> NDArray[np.float64] | None:
 
 
 def _fullest_wall(plan: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Direction (2,) along the vertical plane with most points (n, 2), and its distance."""
+    """Return the direction (2,) of the vertical plane with the most points, and its distance."""
     some = plan[:: max(1, len(plan) // _PLAN_SAMPLE)]
-    # Points of damaged files lie anywhere: the table of cells between them has to end.
+    # Points of damaged files can be anywhere, so limit the table of cells between them.
     is_near = np.all(np.abs(some - np.median(some, axis=0)) <= _WALL_FARTHEST_M, axis=1)
     some = some[is_near] if is_near.any() else some[:1]
     angles = np.radians(np.arange(0.0, 180.0, _WALL_STEP_DEG))
@@ -236,7 +236,7 @@ def _fullest_wall(plan: NDArray[np.float64]) -> tuple[NDArray[np.float64], float
 
 
 def _fullest_cell(distances_m: NDArray[np.float64]) -> tuple[int, float]:
-    """How many of some distances (n,) lie in the cell with most, and its middle."""
+    """Return the number of distances (n,) in the fullest cell, and the centre of that cell."""
     cells = np.floor(distances_m / _WALL_CELL_M).astype(np.int64)
     counts = np.bincount(cells - cells.min())
     fullest = int(counts.argmax())
@@ -244,7 +244,7 @@ def _fullest_cell(distances_m: NDArray[np.float64]) -> tuple[int, float]:
 
 
 def _some_lines(lines: NDArray[np.int64], order: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
-    """Points (indices) of evenly chosen lines of a scan, one after the other."""
+    """Yield the points (indices) of evenly chosen lines of a scan."""
     numbers = np.unique(lines)
     for number in numbers[:: max(1, len(numbers) // _LINES)]:
         mine = np.flatnonzero(lines == number)
@@ -252,7 +252,7 @@ def _some_lines(lines: NDArray[np.int64], order: NDArray[np.int64]) -> Iterator[
 
 
 def _unbroken(pixels: NDArray[np.int64]) -> list[NDArray[np.int32]]:
-    """Pieces of a line of points (n, 2) in pixels, whose steps are similar."""
+    """Split a line of points (n, 2) in pixels at its gaps."""
     steps = np.linalg.norm(np.diff(pixels, axis=0), axis=1)
     usual = max(1.0, float(np.median(steps))) if len(steps) else 1.0
     return np.split(pixels.astype(np.int32), np.flatnonzero(steps > _BREAK_STEPS * usual) + 1)
@@ -265,7 +265,7 @@ def _ways_of_grid(
     row: NDArray[np.int64],
     column: NDArray[np.int64],
 ) -> tuple[bool, bool]:
-    """Whether rows run upwards, and columns to the left, as the station sees its points."""
+    """Return whether rows run upwards and columns to the left, as seen from the station."""
     station = _station(cloud, scan)
     if station is None:
         return True, False
@@ -273,7 +273,7 @@ def _ways_of_grid(
     rays = (offsets - station) @ basis_from_up(cloud.up).T
     elevation = np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1]))
     upward = float(np.cov(row, elevation)[0, 1]) >= 0.0
-    # Mean directions of the columns: their steps turn the same way also where a panorama closes.
+    # Mean directions of the columns; their steps have the same sign where a panorama closes, too.
     east, north = (np.bincount(column, rays[:, axis]) for axis in (0, 1))
     azimuth = np.arctan2(north, east)[np.bincount(column) > 0]
     steps = (np.diff(azimuth) + np.pi) % (2.0 * np.pi) - np.pi
@@ -281,7 +281,7 @@ def _ways_of_grid(
 
 
 def _shortened(name: str, n_letters: int) -> str:
-    """Cut a name in the middle: photos differ at the end of theirs. OpenCV letters are ASCII."""
+    """Cut a name in the middle, since photo names differ at their ends; OpenCV needs ASCII."""
     label = name.encode("ascii", "replace").decode()
     if len(label) <= n_letters:
         return label

@@ -1,4 +1,4 @@
-"""Masks of photos from files: pictures beside the photos, or polygons."""
+"""Masks of photos from files: pictures next to the photos, or polygons."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ NO_MASKS: Final = DiagnosticSpec(
 
 
 class Masks:
-    """Pictures and polygons, which of them photos have taken, and files that are neither."""
+    """Mask pictures and polygons, the used ones among them, and files that are not masks."""
 
     def __init__(
         self,
@@ -47,15 +47,15 @@ class Masks:
 
     @classmethod
     def of(cls, beside: Iterable[Path], given: Iterable[Path]) -> Masks:
-        """Sort mask files by what they are.
+        """Sort mask files by type.
 
         Args:
             beside: pictures found among the photos.
-            given: files of an input of their own.
+            given: files of the input for masks.
 
         Raises:
-            InputError: no file that is given is a mask, polygons are none, or two masks are for
-                one photo.
+            InputError: none of the given files is a mask, a polygon file is invalid, or a photo has
+                two masks.
         """
         pictures: dict[str, Path] = {}
         polygons: list[NamedPolygon] = []
@@ -79,10 +79,10 @@ class Masks:
         return cls(pictures, polygons, others)
 
     def encoded(self, photo: str, size: tuple[int, int]) -> bytes | None:
-        """Mask of a photo of some width and height as PNG, white where it may be used.
+        """Return the mask of a photo as PNG, white for usable pixels; None if all are usable.
 
         Raises:
-            InputError: the picture is none, has another size, or leaves nothing of the photo.
+            InputError: the mask is not a picture, has another size, or covers the whole photo.
         """
         used: NDArray[np.bool_] | None = None
         for key in dict.fromkeys((photo, Path(photo).name, Path(photo).stem)):
@@ -102,7 +102,7 @@ class Masks:
         return encode_png(np.where(used, np.uint8(255), np.uint8(0)))
 
     def warn_of_unused(self, ctx: StepContext) -> None:
-        """State which masks are of no photo, and which files are no masks."""
+        """Report masks without a photo, and files that are not masks."""
         unused = [path.name for path in self._pictures.values() if path.name not in self._taken] + [
             polygon.name for polygon in self._polygons if polygon.name not in self._taken
         ]
@@ -127,7 +127,7 @@ class Masks:
 
 
 def beside_photos(paths: Sequence[Path]) -> frozenset[Path]:
-    """Files among photos that are masks of others: NAME_mask.png of NAME.jpg."""
+    """Return the files among photos that are masks of others: NAME_mask.png of NAME.jpg."""
     stems = {path.stem for path in paths}
     return frozenset(
         path
@@ -139,5 +139,5 @@ def beside_photos(paths: Sequence[Path]) -> frozenset[Path]:
 
 
 def _key(stem: str) -> str:
-    """Name or stem of the photo that a mask of this stem is for."""
+    """Return the name or stem of the photo for a mask with this stem."""
     return stem.removesuffix(_ENDING)

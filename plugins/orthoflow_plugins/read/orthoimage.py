@@ -1,4 +1,4 @@
-"""`read.orthoimage`: orthoimages that another program made, to be inspected beside ours."""
+"""`read.orthoimage`: orthoimages from other programs, for comparison with orthoflow's."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ _IMAGES: Final = (".tif", ".tiff")
 class ReadOrthoimage(Method):
     """Read orthoimages from GeoTIFF files whose X and Y are metres in the plane of a wall.
 
-    A JSON file of the same name states where that plane lies, among the input's files
-    (`wall.tif`, `wall.json`), with `origin_world`, `u_world`, `v_world`, `normal_world` as beside
-    every raster that orthoflow writes: a copy of `wall_0_intensity.json` will do. Files of
-    orthoflow itself need none. X and Y of the GeoTIFF are those of orthoflow's own: at that origin
-    they are `x_of_left_m` and `height_of_top_m`, 0 where the JSON file has neither. So another
-    size, cell size or part of the wall is no obstacle. `wall` in the JSON file states which wall
-    it is of: the place of its plane in `planes.json`, which names of files have too.
+    The plane is given by a JSON file with the same name (`wall.tif`, `wall.json`) among the input
+    files, with `origin_world`, `u_world`, `v_world`, `normal_world` as in the JSON files of
+    orthoflow's rasters; a copy of `wall_0_intensity.json` is sufficient. Files from orthoflow need
+    no JSON file. X and Y have the same meaning as in orthoflow's GeoTIFF files: at the origin, they
+    are `x_of_left_m` and `height_of_top_m`, or 0 if these are missing in the JSON file. Thus, size,
+    cell size and extent may differ from those of the wall. `wall` in the JSON file is the number of
+    the wall: the index of its plane in `planes.json`, as in file names.
     """
 
     id: ClassVar[str] = "read.orthoimage"
@@ -47,7 +47,7 @@ class ReadOrthoimage(Method):
     citations: ClassVar[tuple[str, ...]] = ()
 
     class Params(MethodParams):
-        """What the files do not state."""
+        """Parameters that are not in the files."""
 
         wall: int = Field(
             0,
@@ -57,17 +57,17 @@ class ReadOrthoimage(Method):
         )
 
     class In(Ports):
-        """The GeoTIFF files, and the JSON files that place them."""
+        """The GeoTIFF files, and the JSON files with their positions."""
 
         files: InputFiles
 
     class Out(Ports):
-        """The images, by wall."""
+        """The images, ordered by wall."""
 
         orthoimages: Orthoimages
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Read all files; see the class."""
+        """Read all files as described for the class."""
         paths = [
             path
             for path in inputs.files.paths
@@ -127,7 +127,7 @@ def _read(path: Path, among: Sequence[Path], wall: int) -> Orthoimage:
 
 
 def _place(path: Path, among: Sequence[Path], raster: RasterFile) -> dict[str, object]:
-    """What the JSON file beside an image states, or the tag that orthoflow writes."""
+    """Return the content of the JSON file next to an image, or of the tag written by orthoflow."""
     for other in among:
         if other.stem == path.stem and other.suffix.lower() == ".json":
             return read_sidecar(other)
@@ -142,7 +142,7 @@ def _place(path: Path, among: Sequence[Path], raster: RasterFile) -> dict[str, o
 
 
 def _rgb(path: Path, raster: RasterFile) -> Colours:
-    """Colours (rows, cols, 3) of 8 or 16 bits; a fourth band is transparency."""
+    """Return colours (rows, cols, 3) with 8 or 16 bits; a fourth band is transparency."""
     values = raster.values
     bands = values[..., None] if values.ndim == 2 else values
     if bands.shape[2] not in (1, 3, 4) or bands.dtype not in (np.uint8, np.uint16):

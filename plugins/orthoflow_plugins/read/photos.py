@@ -1,4 +1,4 @@
-"""`read.photos`: a folder of photographs, with their cameras from EXIF and a calibration."""
+"""`read.photos`: a folder of photos, with cameras from EXIF and a calibration."""
 
 from __future__ import annotations
 
@@ -105,24 +105,25 @@ UNUSED_ENTRIES: Final = DiagnosticSpec(
 
 
 class ReadPhotos(Method):
-    """Read JPEG, PNG, TIFF, WebP and HEIC photos as they are, also of E57 files, ordered by name.
+    """Read JPEG, PNG, TIFF, WebP and HEIC photos, also from E57 files, ordered by name.
 
-    Photos of one file name in several folders are called by their paths within the input.
+    If photos in several folders have the same file name, their names include the path within the
+    input.
 
-    A panorama, in an E57 file or named in `panoramas`, becomes six photos, the faces of a cube, as
-    PNG; their lenses are exact. So does a photo whose lens is a fisheye (OpenCV's model), as the
-    calibration or the given cameras state, but of faces only what it shows; and what the given
-    cameras state is a panorama.
+    A panorama, from an E57 file or listed in `panoramas`, is split into six photos, the faces of a
+    cube, as PNG files without distortion. The same is done with photos that have a fisheye lens
+    (OpenCV's model) or are panoramas according to the calibration or the given cameras; of a
+    fisheye photo, only the visible parts of faces are used.
 
-    The files' bytes are kept and never encoded again. Pixels are those of the stored array: the
-    EXIF orientation is written down, not applied. Of a TIFF with several pages the largest that is
-    no preview is the photo. Every photo is decoded once, so that a damaged file is found here and
-    not after an hour.
+    The content of the files is kept and never encoded again. Pixels are those of the stored array:
+    the EXIF orientation is recorded, but not applied. In a TIFF file with several pages, the photo
+    is the largest page that is not a preview. Every photo is decoded once, so that damaged files
+    are found here and not after an hour.
 
-    What is transparent, black in a mask, or within polygons, is used of a photo neither for ties
-    nor for colours: pictures NAME_mask.png beside NAME.jpg, or files of the input masks, named
-    likewise or as the photo, or GeoJSON with polygons in pixels. Masks of a panorama or a fisheye
-    hold for its faces.
+    Pixels that are transparent, black in a mask, or inside polygons are used neither for ties nor
+    for colours. Masks are pictures NAME_mask.png next to NAME.jpg, or files of the input `masks`:
+    pictures with that name or the name of the photo, or GeoJSON files with polygons in pixels.
+    Masks of a panorama or a fisheye photo apply to its faces.
     """
 
     id = "read.photos"
@@ -146,7 +147,7 @@ class ReadPhotos(Method):
     )
 
     class Params(MethodParams):
-        """What files and calibration do not state."""
+        """Parameters that are in neither the files nor the calibration."""
 
         panoramas: tuple[str, ...] = Field(
             (),
@@ -156,9 +157,9 @@ class ReadPhotos(Method):
         )
 
     class In(Ports):
-        """The photos, and a calibration file, masks and given cameras if there are any.
+        """The photos, and optionally a calibration file, masks and given cameras.
 
-        Of given cameras only those count here whose lenses are fisheyes or panoramas.
+        Of the given cameras, only those with a fisheye lens or a panorama are used here.
         """
 
         files: InputFiles
@@ -172,7 +173,7 @@ class ReadPhotos(Method):
         photos: Photos
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Read all photos; see the class."""
+        """Read all photos as described for the class."""
         ctx.progress(0.0, inputs.files.name)
         beside = beside_photos(inputs.files.paths)
         masks = Masks.of(sorted(beside), () if inputs.masks is None else inputs.masks.paths)
@@ -224,14 +225,14 @@ class _ReadPhoto:
 
 @dataclass(frozen=True, kw_only=True)
 class _Source:
-    """Where a photo comes from.
+    """Origin of a photo.
 
     Attributes:
-        name: of the photo.
-        content: a file, the bytes of one inside an E57 file, or a face of a cube.
-        lens: what that file states of its lens.
-        whole: name of the photo that it is a face of, whose lens nobody else knows; or "".
-        folder: of the file, within the input.
+        name: name of the photo.
+        content: a file, the content of a photo in an E57 file, or a cube face.
+        lens: lens parameters read from that file, or None.
+        whole: name of the wide photo that a cube face was cut from, or "".
+        folder: folder of the file within the input.
     """
 
     name: str
@@ -241,7 +242,7 @@ class _Source:
     folder: str = ""
 
     def encoded(self) -> bytes:
-        """The bytes of the photo as they are."""
+        """Return the content of the photo's file."""
         if isinstance(self.content, bytes):
             return self.content
         return _bytes_of(self.content) if isinstance(self.content, Path) else self.content.encoded()
@@ -256,13 +257,13 @@ def _bytes_of(path: Path) -> bytes:
 
 @dataclass(frozen=True, kw_only=True)
 class _Cubes:
-    """What becomes faces of a cube when it is read.
+    """Photos that are split into cube faces.
 
     Attributes:
         panoramas: names or patterns of photos that are panoramas.
-        calibration: lenses by the names of photos, or None.
-        given: cameras of other programs, or None.
-        masks: of the photos.
+        calibration: lenses by photo name, or None.
+        given: cameras from other programs, or None.
+        masks: masks of the photos.
     """
 
     panoramas: Sequence[str]
@@ -271,7 +272,7 @@ class _Cubes:
     masks: Masks
 
     def sources(self, path: Path, folder: str) -> list[_Source]:
-        """Return a photo of a file of its own, or its faces; or the photos of an E57 file."""
+        """Return the photo in a file or its faces, or the photos in an E57 file."""
         if path.suffix.lower() == E57_SUFFIX:
             return [source for image in read_e57_images(path) for source in self._of_e57(image)]
         lens = self._lens(path.name, folder)
@@ -289,7 +290,7 @@ class _Cubes:
         return [_Source(name=image.name, content=image.content, lens=lens)]
 
     def _lens(self, name: str, folder: str) -> WideLens | None:
-        """Return the lens of a wide photo: of the given cameras, else of the calibration."""
+        """Return the lens of a wide photo, from the given cameras or the calibration, or None."""
         camera = None if self.given is None else self.given.of_photo(name, folder)
         if camera is not None and isinstance(camera.lens, WideLens):
             return camera.lens
@@ -302,7 +303,7 @@ class _Cubes:
         return lens if isinstance(lens, FisheyeLens) else None
 
     def _faces(self, name: str, encoded: bytes, lens: WideLens) -> list[_Source]:
-        """Return the faces of a wide photo of which masks leave something."""
+        """Return the faces of a wide photo that are not completely masked."""
         _require_whole(name, encoded)
         height, width = decode_image(encoded, f"photo {name}").shape[:2]
         if lens == _PANORAMA and width != 2 * height:
@@ -328,19 +329,19 @@ class _Cubes:
         ]
 
 
-# Of a photo that the user states is one, of any size.
+# Any size, for photos that the user declares as panoramas.
 _PANORAMA: Final = PanoramaLens(width=0, height=0)
 
 
 def _both(
     one: NDArray[np.bool_] | None, other: NDArray[np.bool_] | None
 ) -> NDArray[np.bool_] | None:
-    """Which pixels two masks leave; None stands for all."""
+    """Return the pixels that are usable in two masks; None means all."""
     return other if one is None else one if other is None else one & other
 
 
 def _masked(read: _ReadPhoto, source: _Source, masks: Masks) -> _ReadPhoto:
-    """Return a photo with its mask, where it has one."""
+    """Return a photo with its mask, if it has one."""
     photo = read.photo
     mask = masks.encoded(photo.name, (photo.width, photo.height))
     face = source.content if isinstance(source.content, CubeFace) else None
@@ -357,7 +358,7 @@ def _masked(read: _ReadPhoto, source: _Source, masks: Masks) -> _ReadPhoto:
 
 
 def _sources(ctx: StepContext, files: InputFiles, masks: Set[Path], cubes: _Cubes) -> list[_Source]:
-    """Photos ordered by name; warns of other files."""
+    """Return the photos ordered by name; warn about other files."""
     if not files.paths:
         raise InputError(f"the input {files.name} names no files: expected photos")
     photos = [path for path in files.paths if path not in masks]
@@ -378,7 +379,7 @@ def _sources(ctx: StepContext, files: InputFiles, masks: Set[Path], cubes: _Cube
     if others:
         counts = {"n": len(others), "n_files": len(files.paths)}
         ctx.report(NO_PHOTOS, subject=files.name, names=first_few(others), **counts)
-    # Photos of one file name are called by their paths within the input.
+    # Photos with the same file name are named by their paths within the input.
     counts = Counter(source.name for source in sources)
     named = (
         replace(source, name=f"{source.folder}/{source.name}")
@@ -390,17 +391,17 @@ def _sources(ctx: StepContext, files: InputFiles, masks: Set[Path], cubes: _Cube
 
 
 def _folders(paths: Sequence[Path]) -> dict[Path, str]:
-    """Folder of each file below the one that they have in common; empty for that one."""
+    """Return the folder of each file relative to the common folder; empty for that folder."""
     common = os.path.commonpath([path.parent for path in paths]) if paths else ""
     relative = {path: path.parent.relative_to(common).as_posix() for path in paths}
     return {path: "" if folder == "." else folder for path, folder in relative.items()}
 
 
 def _refuse_raw(input_name: str, photos: Sequence[str], others: Sequence[str]) -> None:
-    """Refuse camera raw that nobody has developed: what is meant to be used must not be left out.
+    """Refuse undeveloped camera raw files, because photos must not be omitted unnoticed.
 
     Raises:
-        InputError: there is some, without a photo of the same name.
+        InputError: there is a raw file without a photo of the same name.
     """
     developed = {Path(name).stem.lower() for name in photos}
     raw = [
@@ -417,7 +418,7 @@ def _refuse_raw(input_name: str, photos: Sequence[str], others: Sequence[str]) -
 
 
 def _given(files: InputFiles | None) -> GivenByName | None:
-    """Return cameras of other programs; those of E57 files belong to the photos in them."""
+    """Return cameras from other programs; those in E57 files belong to the photos in them."""
     if files is None or all(path.suffix.lower() == E57_SUFFIX for path in files.paths):
         return None
     return GivenByName(read_given_cameras(files.paths))
@@ -435,10 +436,10 @@ def _calibration(files: InputFiles | None) -> CalibratedLenses | None:
 
 
 def _require_whole(name: str, encoded: bytes) -> str:
-    """Return what is odd about a photo that is whole nevertheless, or an empty text.
+    """Return a remark on an intact but unusual photo, or an empty text.
 
     Raises:
-        InputError: it is no photo, of a format that is not read, or a part of it is lost.
+        InputError: it is not a photo, its format is not supported, or a part of it is lost.
     """
     problem = unreadable(encoded)
     if problem:
@@ -508,7 +509,7 @@ def _read_photo(
 
 
 def _camera(exif: Exif) -> str:
-    """Camera and focal length, which photos of one lens have in common; empty where unknown."""
+    """Return camera and focal length, common to photos with one lens; empty if unknown."""
     if not exif.camera:
         return ""
     return exif.camera if exif.focal_mm is None else f"{exif.camera}, {exif.focal_mm:g} mm"

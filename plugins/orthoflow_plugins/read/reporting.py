@@ -1,4 +1,4 @@
-"""What is reported of scans that were read: what limits them, and a summary of each."""
+"""Reports on the scans that were read: limitations, and a summary of each scan."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.read.assembly import COARSE_M, FINE_M, CloudAssembly, ScanCount, resolution_m
 from orthoflow_plugins.read.scales import IntensityScale
 
-# Where two sides of a scan are shorter, or longer, it is rather in another unit than of a wall or a
-# building.
+# If two sides of a scan are shorter or longer than these, its unit is probably wrong: walls and
+# buildings have other sizes.
 _SMALL_M: Final = 1.0
 _LARGE_M: Final = 1000.0
-# Names that a sentence lists.
+# Maximum number of names listed in a sentence.
 _MOST_NAMES: Final = 12
 
 SUMMARY: Final = DiagnosticSpec(
@@ -175,7 +175,7 @@ RULES: Final = {
 
 
 def report_notes(ctx: StepContext, file: ScanFile) -> None:
-    """Report what the reader noticed."""
+    """Report the notes of the reader."""
     for note in file.notes:
         ctx.report(FILE_NOTE, subject=file.name, text=note)
 
@@ -186,7 +186,7 @@ def report_scales(
     scales: Sequence[IntensityScale | None],
     clipped: Sequence[int],
 ) -> None:
-    """Report where intensities do not fit what the scans state, or each other."""
+    """Report intensities outside the range in the metadata, and scans on different scales."""
     for count, scale, n_clipped in zip(counts, scales, clipped, strict=True):
         if scale is None:
             continue
@@ -219,7 +219,7 @@ def report_scales(
 
 
 def report_fields(ctx: StepContext, counts: Sequence[ScanCount], cloud: PointCloud) -> None:
-    """Report which scans lack what others have, and fields that could be the intensity."""
+    """Report attributes that only some scans have, and fields that could be the intensity."""
     counts = [count for count in counts if count.n_kept]
     without = {"colour": [count.n_without_rgb for count in counts]}
     if cloud.intensity is not None:
@@ -250,7 +250,7 @@ def report_precision(
     extents: Sequence[NDArray[np.float64]],
     unit: str | None,
 ) -> dict[str, JsonValue]:
-    """Report coordinates that are coarse, and a size that no wall or building has."""
+    """Report coarse coordinates, and sizes that are implausible for walls and buildings."""
     farthest_m = max(float(np.abs(values).max()) for values in assembly.offsets)
     resolution = resolution_m(farthest_m)
     if resolution > FINE_M:
@@ -274,7 +274,7 @@ def report_precision(
 
 
 def unit_and_source(count: ScanCount, unit: str | None) -> tuple[str, str]:
-    """Unit of a scan and where it is from; `unit` is what the user states, or None."""
+    """Return the unit of a scan and its source; `unit` is given by the user, or None."""
     if unit is not None:
         return unit, "cloud.unit"
     stated = count.scan.unit
@@ -284,7 +284,7 @@ def unit_and_source(count: ScanCount, unit: str | None) -> tuple[str, str]:
 def scan_json(
     count: ScanCount, scale: IntensityScale | None, unit: str | None
 ) -> dict[str, JsonValue]:
-    """Summary of a scan, as `scans.json` has it."""
+    """Return the summary of a scan, as in `scans.json`."""
     name, unit_from = unit_and_source(count, unit)
     return {
         "file": count.file,
@@ -311,7 +311,7 @@ def scan_json(
 def report_summary(
     ctx: StepContext, assembly: CloudAssembly, cloud: PointCloud, *, up: str, unit: str | None
 ) -> None:
-    """Report counts and extent as metrics, and everything in one line."""
+    """Report counts and extent as metrics, and a summary in one line."""
     counts = assembly.counts
     left_out: Counter[str] = Counter()
     for count in counts:
@@ -364,7 +364,7 @@ def report_summary(
 
 
 def warn_of_up(quality: CloudQuality | None, up: UpDirection, ctx: StepContext) -> None:
-    """Warn where surfaces are level and upright by another axis than the one that is up."""
+    """Warn if surfaces are horizontal and vertical with respect to an axis other than up."""
     axis = None if quality is None else quality.plainly_up(up_vector(up))
     if quality is None or axis is None:
         return
@@ -373,7 +373,7 @@ def warn_of_up(quality: CloudQuality | None, up: UpDirection, ctx: StepContext) 
 
 
 def report_quality(quality: CloudQuality | None, ctx: StepContext) -> None:
-    """Report the numbers, and warn in words of a thick cloud and of scans that disagree."""
+    """Report quality metrics; warn if the cloud is thick or scans disagree."""
     if quality is None:
         return
     sigma_mm, step_mm = 1e3 * quality.sigma_m, 1e3 * quality.scan_step_m

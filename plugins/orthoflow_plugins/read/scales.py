@@ -1,7 +1,7 @@
-"""Intensities and colours of unknown scale: intensity to 0..1, colours to 8 bits.
+"""Normalisation of intensities to 0..1 and of colours to 8 bits.
 
-Each scan is scaled by itself: by the limits that it states where its data keep to them, else by
-what its data are. Few extreme values, as of a reflector, never set a scale.
+Each scan is scaled separately: by the limits in its metadata if its data are within them, otherwise
+by its data. A few extreme values, e.g. from a reflector, never determine a scale.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from orthoflow.geometry.levels import REC_601
 
 RgbScale = Literal["0..1", "8 bit", "10 bit", "12 bit", "16 bit", "stated limit"]
 
-# Values of full brightness; a wider scale corrects a narrower one.
+# Values of full brightness; a scale is replaced when a wider one is found.
 _FULL: Final[dict[RgbScale, float]] = {
     "0..1": 1.0,
     "8 bit": 255.0,
@@ -28,23 +28,24 @@ _FULL: Final[dict[RgbScale, float]] = {
 
 _BLOCK: Final = 1 << 16
 _SAMPLE: Final = 200_000
-# lion-takanawa, whose intensity is the grey of its colours, has 0.99997; laser intensity at
-# 532..1550 nm stays far below, unless a scene has two colours only. What two roundings to 8 bits
-# leave between the two is 0.4 grey levels.
+# Correlation of intensity and grey of the colours, from which they count as the same. It is 0.99997
+# for lion-takanawa, whose intensity is that grey; laser intensity at 532..1550 nm is far lower,
+# unless a scene has only two colours. Two roundings to 8 bits cause differences of 0.4 grey levels.
 _LUMINANCE_CORRELATION: Final = 0.999
 _ROUNDING_LEVELS: Final = 0.7
-# Values are extreme that lie farther beyond these percentiles than these are apart.
+# Values outside these percentiles by more than the distance between them are extreme.
 _PERCENTILES: Final = (2.0, 98.0)
-# Stated limits of which the data of all scans take a smaller part are the sensor's: the picture
-# would be black.
+# If the data of all scans cover a smaller part of the limits in the metadata, those are the limits
+# of the sensor, and the picture would be black.
 _SMALLEST_PART: Final = 0.25
-# Scans whose ranges overlap by more of both share one scale, so that equal surfaces stay equal.
+# Scans whose ranges overlap by a larger part have a common scale, so that the same surfaces have
+# the same brightness.
 _COMMON_PART: Final = 0.4
-# Ranges that scanners and programs write, for scans that state none and differ from others: a scan
-# is in the first that holds its data, if these take so much of it.
+# Ranges written by scanners and programs, for scans without limits that differ from others: the
+# first range that contains a scan's data is used if the data cover enough of it.
 _NOMINAL: Final = ((0.0, 1.0), (0.0, 255.0), (-2048.0, 2047.0), (0.0, 4095.0), (0.0, 65535.0))
 _NOMINAL_PART: Final = 0.4
-# A smaller share of colours beyond a scale does not change it.
+# A smaller share of colours outside a scale does not change it.
 _STRAY_SHARE: Final = 0.001
 
 
@@ -53,10 +54,10 @@ class IntensityScale:
     """The linear scale from a scan's intensities to 0..1.
 
     Attributes:
-        low: what becomes 0.
-        high: what becomes 1.
-        rule: where the two come from: `intensity_max`, `stated`, `nominal`, `data`.
-        stated: limits that the scan states and that are not used, since its data do not fit them.
+        low: intensity that maps to 0.
+        high: intensity that maps to 1.
+        rule: source of the scale: `intensity_max`, `stated`, `nominal`, `data`.
+        stated: limits in the scan's metadata that are not used because the data do not fit.
     """
 
     low: float
@@ -66,7 +67,7 @@ class IntensityScale:
 
 
 def robust_range(values: NDArray[np.float32]) -> tuple[float, float] | None:
-    """Smallest and largest finite value that is not extreme; None where none is finite."""
+    """Return the smallest and largest value that is not extreme; None if no value is finite."""
     sample = values[:: max(1, len(values) // _SAMPLE)]
     sample = sample[np.isfinite(sample)]
     if not len(sample):
@@ -85,18 +86,18 @@ def choose_scales(
     """Choose the scale of each scan.
 
     Args:
-        ranges: `robust_range` of each scan's data; None without intensity.
-        stated: limits that each states.
-        intensity_max: what the user states is full intensity, or None.
+        ranges: `robust_range` of each scan's data; None if a scan has no intensity.
+        stated: limits in the metadata of each scan, or None.
+        intensity_max: full intensity given by the user, or None.
 
     Returns:
-        The user's; else the stated limits, where the data keep to them and take more than a small
-        part; else the range of the data, common to those scans whose ranges are similar. Where
-        scans differ, the usual range that their data take most of stands for that of the data.
+        The user's scale. Otherwise the limits in the metadata, if the data are within them and
+        cover more than a small part. Otherwise the range of the data, common to scans with similar
+        ranges; if scans differ, it is replaced by the first usual range that the data fill.
     """
     scales: list[IntensityScale | None] = [None] * len(ranges)
     known = [(seen, one) for seen, one in zip(ranges, stated, strict=True) if seen and one]
-    # Where the largest values lie between limits, 0..1.
+    # Position of the largest values between the limits, 0..1.
     parts = [(s[1] - one[0]) / (one[1] - one[0]) for s, one in known if _is_within(s, one)]
     largest_part = max(parts, default=0.0)
     groups: list[tuple[list[int], tuple[float, float]]] = []
@@ -138,7 +139,7 @@ def _is_within(seen: tuple[float, float], limits: tuple[float, float]) -> bool:
 def _join(
     groups: list[tuple[list[int], tuple[float, float]]], k: int, seen: tuple[float, float]
 ) -> None:
-    """Add a scan to the first group whose range is similar, or begin another."""
+    """Add a scan to the first group with a similar range, or to a new group."""
     for place, (members, (low, high)) in enumerate(groups):
         common = min(high, seen[1]) - max(low, seen[0])
         together = max(high, seen[1]) - min(low, seen[0])
@@ -149,14 +150,14 @@ def _join(
 
 
 def normalise(intensity: NDArray[np.float32], scale: IntensityScale) -> int:
-    """Scale in place to 0..1; what is not finite becomes NaN.
+    """Scale in place to 0..1; values that are not finite become NaN.
 
     Args:
-        intensity: (n,) as read.
-        scale: what becomes 0 and 1.
+        intensity: (n,) values as read.
+        scale: the intensities that map to 0 and 1.
 
     Returns:
-        How many values lay beyond the scale and were clipped.
+        The number of values outside the scale, which were clipped.
     """
     n_clipped = 0
     width = scale.high - scale.low
@@ -167,7 +168,7 @@ def normalise(intensity: NDArray[np.float32], scale: IntensityScale) -> int:
         if width != 0.0:
             scaled /= width
         lowest, highest = scaled.min(), scaled.max()
-        # NaN compares as False.
+        # Comparisons with NaN are False.
         if not (lowest >= -1e-6 and highest <= 1.0 + 1e-6):
             is_finite = np.isfinite(scaled)
             n_clipped += int(
@@ -183,10 +184,10 @@ def correlation_with_grey(
     rgb: NDArray[np.uint8],
     has_rgb: NDArray[np.bool_] | None = None,
 ) -> float | None:
-    """Correlation of intensity with the grey of the colours, where it is nothing but that grey.
+    """Return the correlation of intensity and grey of the colours, if the intensity is that grey.
 
     Returns:
-        None where more lies between the two than roundings, or too few points have both.
+        None if they differ by more than rounding, or if too few points have both.
     """
     step = max(1, len(intensity) // _SAMPLE)
     values = intensity[::step].astype(np.float64)
@@ -204,31 +205,31 @@ def correlation_with_grey(
 
 
 def is_grey(rgb: NDArray[np.uint8]) -> bool:
-    """Whether every colour of a sample is a grey."""
+    """Return whether all colours of a sample are grey."""
     part = rgb[:: max(1, len(rgb) // _SAMPLE)]
     return bool(np.all(part[:, 0] == part[:, 1]) and np.all(part[:, 1] == part[:, 2]))
 
 
 class ColourScale:
-    """Finds the scale of one scan's colours while they come.
+    """Determines the scale of a scan's colours while they are read.
 
-    LAS keeps 8-bit colours in the low byte, or multiplied by 256 or 257; text and PLY keep 0..1 or
-    0..255; cameras of 10 and 12 bits are met whose values were not multiplied to 16. A block that
-    goes beyond the scale believed so far corrects what was stored before.
-    A stated limit is used where the data reach more than a 255th of it and none goes beyond.
+    LAS stores 8-bit colours in the low byte, or multiplied by 256 or 257; text and PLY have 0..1 or
+    0..255; some files have values from 10-bit and 12-bit cameras that were not scaled to 16 bits. A
+    block that exceeds the current scale corrects the colours stored before. A limit in the metadata
+    is used if the data reach more than 1/255 of it and do not exceed it.
 
     Attributes:
-        scale: what the values seen so far are.
-        misfit: the stated limit, where the data do not fit it.
-        largest: of the values seen, but for a few.
+        scale: scale of the values so far.
+        misfit: the limit in the metadata, if the data do not fit it.
+        largest: largest value so far, except for a few outliers.
     """
 
     def __init__(self, stored: NDArray[np.uint8], limit: float | None) -> None:
         """Start a scan.
 
         Args:
-            stored: (n, 3) where the scan's colours go, from its first point on.
-            limit: the value of full brightness, if the file states it.
+            stored: (n, 3) output for the scan's colours, from its first point on.
+            limit: value of full brightness in the metadata, or None.
         """
         self._stored = stored
         self._limit = limit
@@ -238,7 +239,7 @@ class ColourScale:
         self.largest = 0.0
 
     def add(self, rgb: NDArray[np.generic], has_rgb: NDArray[np.bool_] | None = None) -> None:
-        """Store the next colours (n, 3), of which those of `has_rgb` (n,) are valid."""
+        """Store the next colours (n, 3); `has_rgb` (n,) marks the valid ones."""
         values = rgb.astype(np.float32)
         valid = values if has_rgb is None else values[has_rgb]
         if valid.size:
@@ -254,7 +255,7 @@ class ColourScale:
         if largest > 255.0:
             depths: tuple[RgbScale, ...] = ("10 bit", "12 bit", "16 bit")
             fitting = (one for one in depths if largest <= _FULL[one])
-            # A limit of 16 bits holds for dark colours, too.
+            # A 16-bit limit applies to dark colours, too.
             is_stated = limit is not None and largest <= limit
             seen = "16 bit" if is_stated else next(fitting, "16 bit")
         elif largest <= 1.0 and (limit == 1.0 or (limit is None and not is_whole)):
@@ -265,12 +266,12 @@ class ColourScale:
         if self.scale is None:
             self.scale = seen
         elif full[seen] > full[self.scale]:
-            # What looked like full brightness was 0 or 1 of 255.
+            # Values that seemed to be full brightness were 0 or 1 of 255.
             before = self._stored[: self._count]
             before[:] = np.rint(before * np.float32(full[self.scale] / full[seen]))
             self.scale = seen
         fits = limit is None or full[self.scale] == limit or self.largest <= 1.0
-        # 16 bits are stated by files of any 16-bit data.
+        # Files with any 16-bit data have a 16-bit limit.
         self.misfit = None if fits or (limit == 65280.0 and self.scale == "16 bit") else limit
 
 
@@ -281,7 +282,7 @@ def _correlation(first: NDArray[np.float64], second: NDArray[np.float64]) -> flo
 
 
 def _largest(rgb: NDArray[np.float32]) -> float:
-    """Largest value (n, 3), but for a few stray ones."""
+    """Return the largest value of (n, 3), except for a few outliers."""
     largest = float(np.nanmax(rgb, initial=0.0))
     if largest > 255.0:
         n_beyond = int(np.count_nonzero(rgb > np.float32(255.0)))

@@ -1,4 +1,4 @@
-"""`read.scan`: point files of scanners and other programs into one cloud."""
+"""`read.scan`: point files from scanners and other programs, joined to one cloud."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class ReadScan(Method):
     )
 
     class Params(MethodParams):
-        """What the files do not state."""
+        """Parameters that are not in the files."""
 
         up: UpDirection = Field("z", description="World direction that is up in the files.")
         unit: Unit | None = Field(
@@ -156,7 +156,7 @@ class ReadScan(Method):
         cloud: PointCloud
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Read all files; see the class."""
+        """Read all files as described for the class."""
         columns = None if params.columns is None else columns_of_user(params.columns)
         if not inputs.files.paths:
             raise InputError(f"the input {inputs.files.name} names no files: expected a scan")
@@ -165,7 +165,7 @@ class ReadScan(Method):
         _check_settings(ctx, files, params)
         assembly = CloudAssembly(ctx, files, partial(_unit_m, params=params), box_m)
         for file in files:
-            # Damaged numbers overflow on their way; what is not finite is dropped and counted.
+            # Damaged numbers may overflow; values that are not finite are omitted and counted.
             with np.errstate(all="ignore"):
                 assembly.add_file(file)
             report_notes(ctx, file)
@@ -196,14 +196,14 @@ class ReadScan(Method):
 
     @classmethod
     def tools(cls) -> dict[str, str]:
-        """Libraries that decode the files."""
+        """Return the versions of the libraries that decode the files."""
         return {name: version(name) for name in ("laspy", "lazrs", "pandas", "pye57")}
 
 
 def _opened(
     path: Path, columns: Columns | None, box_m: NDArray[np.float64] | None, params: ReadScan.Params
 ) -> ScanFile:
-    """Open a file; of COPC only the parts that are asked for, in the file's unit."""
+    """Open a file; of a COPC file, only the requested parts are read, in the file's unit."""
     opened = partial(
         open_scan,
         path,
@@ -226,7 +226,7 @@ def _opened(
 
 
 def _unit_m(scan: Scan, params: ReadScan.Params) -> NDArray[np.float64]:
-    """Metres per unit of a scan, along x, y and z."""
+    """Return metres per unit of a scan, along x, y and z."""
     if params.unit is not None:
         return np.full(3, UNITS_M[params.unit])
     return np.ones(3) if scan.unit is None else np.array(scan.unit.metres)
@@ -255,7 +255,7 @@ def _check_settings(ctx: StepContext, files: list[ScanFile], params: ReadScan.Pa
 
 
 def _finish(ctx: StepContext, assembly: CloudAssembly, params: ReadScan.Params) -> PointCloud:
-    """Turn raw arrays into a cloud, and report what limits it."""
+    """Convert the raw arrays to a cloud, and report its limitations."""
     rgb, has_rgb = _colours(ctx, assembly)
     intensity, scales = _intensity(ctx, assembly, params)
     intensity, intensity_source = _judged_intensity(ctx, intensity, rgb, has_rgb)
@@ -279,7 +279,7 @@ def _finish(ctx: StepContext, assembly: CloudAssembly, params: ReadScan.Params) 
         intensity=intensity,
         rgb=rgb,
         has_rgb=has_rgb,
-        # Numbers that would not point to rows of the stations are worse than none.
+        # Scan numbers that are not indices of the stations are not stored.
         scan=assembly.array("scan") if is_per_scan or not is_from_files else None,
         row=assembly.array("row"),
         column=assembly.array("column"),
@@ -368,7 +368,7 @@ def _judged_intensity(
     rgb: NDArray[np.uint8] | None,
     has_rgb: NDArray[np.bool_] | None,
 ) -> tuple[NDArray[np.float32] | None, str]:
-    """Leave out an intensity that only repeats the colours, and return where it comes from."""
+    """Discard an intensity that only repeats the colours; return the source of the intensity."""
     if intensity is None:
         return None, "none"
     if rgb is None:
@@ -390,16 +390,16 @@ def _choose_stations(
     extents: Sequence[NDArray[np.float64]],
     view_from: tuple[float, float, float] | None,
 ) -> tuple[NDArray[np.float64] | None, str | None]:
-    """Return the files' stations (s, 3) if there are any, else the user's viewpoint, and whose.
+    """Return stations (s, 3) and their source: those of the files, or the user's viewpoint.
 
-    A scan without a pose stands for its origin only if it is the only one, and if it can have been
-    seen from there: a scan in its scanner's frame surrounds or faces the origin; a cloud in survey
-    coordinates lies anywhere.
+    The origin is used as the station of a scan without a pose only if there is a single such scan
+    and it can have been taken from there: a scan in its scanner's frame surrounds or faces the
+    origin, whereas a cloud in survey coordinates can be anywhere.
 
     Args:
-        counts: of the scans with points.
-        extents: (2, 3) smallest and largest coordinates of each, but for a few.
-        view_from: the user's.
+        counts: statistics of the scans with points.
+        extents: (2, 3) smallest and largest coordinates of each scan, except for a few outliers.
+        view_from: viewpoint given by the user, or None.
     """
     is_only = sum(c.scan.station is not None and not c.scan.station_is_posed for c in counts) == 1
     known = []
@@ -417,7 +417,7 @@ def _choose_stations(
 
 
 def _extent(assembly: CloudAssembly, count: ScanCount) -> NDArray[np.float64]:
-    """Smallest and largest coordinates (2, 3) of a scan, but for a few."""
+    """Return smallest and largest coordinates (2, 3) of a scan, except for a few outliers."""
     part = slice(count.start, count.stop, max(1, count.n_kept // _SAMPLE))
     ends = [np.percentile(values[part], _PERCENTILES) for values in assembly.offsets]
     return np.asarray(assembly.origin + np.array(ends).T)

@@ -1,4 +1,4 @@
-"""`read.ties`: points of photos that a person measured."""
+"""`read.ties`: points measured by hand in photos."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ _MOST_PROBLEMS = 20
 
 
 class ReadTies(Method):
-    """Read ties that a person measured: `photo,u_px,v_px,x,y,z[,sigma_px]`.
+    """Read ties measured by hand: `photo,u_px,v_px,x,y,z[,sigma_px]`.
 
-    World coordinates are those of the scan. Pixels are counted as in `ties.csv` and `cameras.json`
-    (OpenCV): the centre of the photo's first pixel is at (0, 0), and the EXIF orientation is not
-    applied.
+    World coordinates are those of the scan. Pixel coordinates are as in `ties.csv` and
+    `cameras.json` (OpenCV): the centre of the photo's first pixel is at (0, 0), and the EXIF
+    orientation is not applied.
     """
 
     id = "read.ties"
@@ -37,7 +37,7 @@ class ReadTies(Method):
     citations: ClassVar[tuple[str, ...]] = ()
 
     class Params(MethodParams):
-        """What the files do not state."""
+        """Parameters that are not in the files."""
 
         unit: Unit = Field("m", description="Unit of x, y, z in the files; the ties are in metres.")
         sigma_px: float = Field(
@@ -53,7 +53,7 @@ class ReadTies(Method):
         )
 
     class In(Ports):
-        """The files, and the photos that they speak of."""
+        """The files, and the photos in which the ties were measured."""
 
         files: InputFiles
         photos: Photos
@@ -64,7 +64,7 @@ class ReadTies(Method):
         ties: Ties
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Read all files; see the class."""
+        """Read all files as described for the class."""
         if not inputs.files.paths:
             raise InputError(f"the input {inputs.files.name} names no files: expected ties")
         ctx.progress(0.0, inputs.files.name)
@@ -74,7 +74,7 @@ class ReadTies(Method):
         if wrong:
             left_out = len(wrong) - _MOST_PROBLEMS
             more = [f"... and {left_out} more problems"] if left_out > 0 else []
-            # Similar names take long to find: only for those that are shown.
+            # Similar names take long to find, so search only for those in the message.
             shown = [_problem(tie, photos) for tie in wrong[:_MOST_PROBLEMS]]
             raise InputError("\n".join(shown + more))
         ties = _ties(found, tuple(photos), params)
@@ -96,7 +96,7 @@ def _is_in_photo(tie: MeasuredTie, photos: Mapping[str, Photo]) -> bool:
 
 
 def _problem(tie: MeasuredTie, photos: Mapping[str, Photo]) -> str:
-    """State why a tie is in no photo."""
+    """Return why a tie is not in any photo."""
     photo = photos.get(tie.photo)
     if photo is None:
         near = difflib.get_close_matches(tie.photo, photos, n=1)
