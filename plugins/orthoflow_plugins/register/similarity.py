@@ -1,4 +1,4 @@
-"""`register.similarity`: bring a cloud into the coordinate system of surveyed points."""
+"""`register.similarity`: transform a cloud to the coordinate system of surveyed points."""
 
 from __future__ import annotations
 
@@ -15,20 +15,21 @@ from orthoflow.products import CheckPoints, Finding, Inspection, JsonValue, Poin
 from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 
 _AT_ONCE: Final = 1 << 20
-# Lists that fit this many times better as mirror images of each other are that.
+# Points are mirrored if a mirrored copy fits this many times better.
 _MIRRORED_TIMES: Final = 10.0
-# Points whose second-largest spread is a smaller share of the largest lie on one line.
+# Points are on one line if their second-largest spread is a smaller share of the largest.
 _LINE_SHARE: Final = 1e-6
 
 
 class RegisterSimilarity(Method):
-    """Fit shift, rotation and scale to pairs of points, and move the cloud by them.
+    """Fit translation, rotation and scale to pairs of points, and transform the cloud.
 
-    The seven-parameter transformation of skarlatos2012: `points` are places in the cloud's own
-    coordinates, `control` the surveyed ones; equal names make a pair. All pairs have equal
-    weights; `sigma0_mm` is the standard deviation of one coordinate, `left_out_rms_mm` the
-    distance of each control point from where the other pairs put it, which no pair can flatter.
-    Up in the cloud is then that of the control.
+    This is the seven-parameter transformation of skarlatos2012. `points` are positions in the
+    cloud's coordinates, `control` the surveyed positions; points with the same name form a pair.
+    All pairs have the same weight. `sigma0_mm` is the standard deviation of one coordinate;
+    `left_out_rms_mm` is computed from the distance between each control point and its position
+    predicted by the other pairs, so it is independent of that pair. The transformed cloud has the
+    up direction of the control points.
     """
 
     id: ClassVar[str] = "register.similarity"
@@ -51,7 +52,7 @@ class RegisterSimilarity(Method):
     )
 
     class Params(MethodParams):
-        """What is estimated."""
+        """What to estimate."""
 
         with_scale: bool = Field(
             default=True,
@@ -69,13 +70,13 @@ class RegisterSimilarity(Method):
         control: CheckPoints
 
     class Out(Ports):
-        """The cloud in the control's system, and the residuals there."""
+        """The transformed cloud, and the residuals in the control's system."""
 
         cloud: PointCloud
         inspection: Inspection
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Pair, fit, move."""
+        """Match the points by name, fit the transformation and apply it."""
         inputs.cloud.require_points(2)
         names = [name for name in inputs.points.names if name in inputs.control.names]
         source, target = (
@@ -127,22 +128,22 @@ class Similarity:
     translation: NDArray[np.float64]
 
     def apply(self, points_source: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points (n, 3) in target coordinates."""
+        """Return points (n, 3) in target coordinates."""
         return self.scale * points_source @ self.rotation.T + self.translation
 
 
 def fit_similarity(
     points_source: NDArray[np.float64], points_target: NDArray[np.float64], *, with_scale: bool
 ) -> Similarity:
-    """Fit target_from_source by least squares, all coordinates weighted equally (Umeyama 1991).
+    """Fit target_from_source by least squares with equal weights (Umeyama 1991).
 
     Args:
         points_source: (n, 3) metres, n >= 3, not on one line.
         points_target: (n, 3) metres, the same points.
-        with_scale: seven parameters; else six, with a scale of 1.
+        with_scale: fit seven parameters; otherwise six, with a scale of 1.
 
     Raises:
-        GeometryError: there are too few points, or they lie on one line.
+        GeometryError: there are too few points, or they are on one line.
     """
     if len(points_source) < 3 or points_source.shape != points_target.shape:
         raise GeometryError(
@@ -173,10 +174,10 @@ def _require_same_hand(
     *,
     with_scale: bool,
 ) -> None:
-    """Refuse lists of which one mirrors the other: they would fit, badly, with a wrong scale.
+    """Refuse lists that mirror each other, whose fit would be poor and have a wrong scale.
 
     Raises:
-        GeometryError: they fit far better after one of them is mirrored.
+        GeometryError: the fit is far better if one of the lists is mirrored.
     """
     if len(source) < 4:
         return
@@ -195,7 +196,7 @@ def _require_same_hand(
 def _left_out(
     source: NDArray[np.float64], target: NDArray[np.float64], *, with_scale: bool
 ) -> NDArray[np.float64]:
-    """Distance (n,) of each point from where the others put it; empty with three pairs."""
+    """Return distances (n,) between points and predictions from the others; empty for 3 pairs."""
     if len(source) < 4:
         return np.zeros(0)
     apart = []
@@ -247,7 +248,7 @@ def _details(
 
 
 def _moved(cloud: PointCloud, fitted: Similarity, ctx: StepContext) -> PointCloud:
-    """The cloud in target coordinates; offsets from the moved origin keep their digits."""
+    """Return the cloud in target coordinates; offsets from the new origin keep their digits."""
     origin = fitted.apply(cloud.origin[None])[0]
     turn = fitted.scale * fitted.rotation
     offsets = {
