@@ -1,1 +1,1 @@
-"""Methods of the kind `colour`."""
+"""Methods of the kind `dense`."""

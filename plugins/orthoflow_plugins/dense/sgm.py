@@ -1,4 +1,4 @@
-"""`dense.sgm`: the surface that oriented photos show, by semi-global matching."""
+"""`dense.sgm`: point cloud from oriented photos by semi-global matching."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from orthoflow.geometry.cameras import ViewingCamera, opencv_matrix
 from orthoflow.products import Cameras, Photo, Photos, PointCloud
 from orthoflow.sdk import Method, MethodParams, MetricSpec, Ports, StepContext
 
-# Rows of a rectified pair run along its base: photos above each other are no pair.
+# The rows of a rectified pair are parallel to its base, so photos above each other are no pair.
 _ALONG_ROWS: Final = np.cos(np.radians(30.0))
 _SIDEWAYS: Final = np.sin(np.radians(25.0))
 _SAME_VIEW: Final = np.cos(np.radians(30.0))
-# Parallax as a share of a photo's width: 70 % of overlap is what blocks are flown with; with less
-# than half a surface looks different, and of bases much shorter depths are poor.
+# Parallax as a share of the photo width. Image blocks are usually flown with 70 % overlap; below 50
+# %, the photos look too different, and much shorter bases give inaccurate depths.
 _BEST_PARALLAX: Final = 0.3
 _LEAST_PARALLAX: Final = 0.05
 _MOST_PARALLAX: Final = 0.5
@@ -38,13 +38,13 @@ class _View(NamedTuple):
 
 
 class DenseSgm(Method):
-    """Match the surface that oriented photos show, from neighbouring photos (SGM of OpenCV).
+    """Compute surface points from pairs of neighbouring oriented photos (OpenCV's SGM).
 
-    Each photo is matched with the one to its right that looks the same way and whose overlap comes
-    nearest to 70 %: bases within 30 deg of the rows of the photo and at least 25 deg off its axis,
-    axes within 30 deg, 50 to 95 % of overlap. Points take the colour of the left photo; there is
-    one scan per pair, whose station is that photo's centre. Photos above each other are not
-    matched.
+    Each photo is paired with the photo to its right that has a similar viewing direction and an
+    overlap closest to 70 %. The base must be within 30 deg of the photo's rows and at least 25 deg
+    off its axis, the axes within 30 deg of each other, and the overlap 50 to 95 %. Points take the
+    colour of the left photo. Each pair is one scan, with the projection centre of the left photo as
+    its station. Photos above each other are not matched.
     """
 
     id: ClassVar[str] = "dense.sgm"
@@ -52,7 +52,7 @@ class DenseSgm(Method):
     metrics = (
         MetricSpec("n_pairs", label="pairs of photos"),
         MetricSpec("n_points", label="points"),
-        MetricSpec("matched_share", label="pixels of left photos that were matched"),
+        MetricSpec("matched_share", label="share of matched pixels of the left photos"),
     )
     citations: ClassVar[tuple[str, ...]] = (
         (
@@ -62,17 +62,17 @@ class DenseSgm(Method):
     )
 
     class Params(MethodParams):
-        """Where the surface lies, and how dense its points are."""
+        """Distance of the surface and density of its points."""
 
         nearest_m: float = Field(1.0, gt=0.0, description="Distance of the nearest surface.")
         farthest_m: float = Field(
-            10.0, gt=0.0, description="Distance of the farthest surface; the range costs time."
+            10.0, gt=0.0, description="Distance of the farthest surface; larger ranges take longer."
         )
         spacing_m: float = Field(
             0.0,
             ge=0.0,
-            description="Of points of a pair in one cube of this side the first is kept; 0 keeps "
-            "one per pixel.",
+            description="Only one point of each pair is kept per cube of this side length; 0 keeps "
+            "one point per pixel.",
         )
         up: UpDirection = Field("z", description="World direction that is up.")
 
@@ -104,9 +104,9 @@ class DenseSgm(Method):
         pairs = [(left, right) for left, right in neighbours if right is not None]
         if not pairs:
             raise MethodError(
-                f"of {len(views)} oriented photos none stands beside another that looks the same "
-                "way: photos that overlap sideways by 50 to 95 % are needed, seen from "
-                f"{distance_m:.2g} m (nearest_m and farthest_m)"
+                f"no pairs were found among {len(views)} oriented photos: neighbouring photos with "
+                "similar viewing directions must overlap sideways by 50 to 95 % at a distance of "
+                f"{distance_m:.2g} m (from nearest_m and farthest_m)"
             )
         parts = []
         n_pixels = n_matched = 0
@@ -123,7 +123,7 @@ class DenseSgm(Method):
         if not n_points:
             raise MethodError(
                 f"no pair of photos matches between {params.nearest_m:g} and "
-                f"{params.farthest_m:g} m: set nearest_m and farthest_m to where the surface is"
+                f"{params.farthest_m:g} m: set nearest_m and farthest_m to the range of the surface"
             )
         ctx.metric("n_pairs", len(pairs), "1")
         ctx.metric("n_points", n_points, "1")
@@ -156,13 +156,13 @@ def _oriented(inputs: DenseSgm.In) -> list[_View]:
 
 
 def _right_of(left: _View, views: list[_View], distance_m: float) -> _View | None:
-    """Return the photo to the right whose overlap is the best one for matching, or None."""
+    """Return the photo to the right with the best overlap for matching, or None."""
     lens, axes = left.camera, left.camera.rotation
     found: list[tuple[float, int]] = []
     for place, other in enumerate(views):
         base = axes @ (other.camera.centre_world - lens.centre_world)
         sideways = float(np.hypot(base[0], base[1]))
-        # The share of the photo by which a surface moves from the one to the other.
+        # Displacement of a surface between the two photos, relative to the photo width.
         parallax = lens.fx * sideways / distance_m / lens.width
         if (
             _LEAST_PARALLAX <= parallax <= _MOST_PARALLAX
@@ -181,7 +181,7 @@ def _matched(
     """Match a pair.
 
     Returns:
-        Points (n, 3) in the world, their colours (n, 3), and the number of pixels that were tried.
+        Points (n, 3) in world coordinates, their colours (n, 3), and the number of pixels tried.
     """
     import cv2
 
@@ -203,7 +203,7 @@ def _matched(
     ]
     reach = abs(p2[0, 3])
     most, least = (int(reach / distance) for distance in (params.nearest_m, params.farthest_m))
-    # A multiple of 16 that leaves pixels to match.
+    # A multiple of 16, small enough that pixels to match remain.
     n_disparities = 16 * min(-(-(most - least) // 16), (size[0] - least - _BLOCK_PX) // 16 - 1)
     if n_disparities < 16:
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8), size[0] * size[1]

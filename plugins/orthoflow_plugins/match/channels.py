@@ -1,9 +1,10 @@
-"""Channels: features of a picture that persist in another spectral band, and their texture.
+"""Channels: features of a picture that are the same in other spectral bands, and their texture.
 
-Dense channels of oriented gradients (after Ye et al. 2019, CFOG): the gradient strength in several
-directions, smoothed and normalised locally. A light joint on dark stone and a dark joint on light
-stone have equal channels. Where the bands are similar, the grey values are sharper; where they are
-not, a combination of a photo's colours, estimated at each place, may resemble the laser intensity.
+The main channels are dense oriented gradients (after Ye et al. 2019, CFOG): the gradient strength
+in several directions, smoothed and normalised locally. A light joint on dark stone and a dark joint
+on light stone have the same channels. Where the spectral bands are similar, grey values are more
+accurate. Where they differ, a combination of a photo's colours, estimated for each patch, may
+resemble the laser intensity.
 """
 
 from __future__ import annotations
@@ -24,23 +25,24 @@ from orthoflow.geometry.narrow_gaps import narrow_gaps
 from orthoflow.products import SurfaceMask, Wall
 from orthoflow_plugins.match.pictures import filled_smoothly, usual_spread_m
 
-# Gaps between joined cells in which no disc of this radius fits are filled, as in rasters.
+# Gaps between joined cells are filled, as in rasters, if no disc of this radius fits into them.
 _GAP_CELLS: Final = 2
-# Cells that are joined at once: some 100 MB.
+# Number of cells joined at once; takes about 100 MB.
 _CELLS_AT_ONCE: Final = 1 << 22
 
 
 def in_cells_of_points(wall: Wall) -> Wall:
-    """Join the cells of a wall until about one point lies in each.
+    """Join cells of a wall so that each joined cell contains about one point.
 
-    Values are interpolated from the centroids of the points to the centres of joined cells.
+    Values are interpolated from the centroids of the points to the centres of the joined cells.
 
     Args:
-        wall: with intensity or not.
+        wall: the wall, with or without intensity.
 
     Returns:
-        The same wall if its cells are not much finer than its point spacing; else depths, spreads,
-        counts and intensity of joined cells, without colours.
+        The same wall if it has no intensity or its cells are not much finer than its point spacing;
+        otherwise a wall with depths, spreads, counts and intensity of joined cells, without
+        colours.
     """
     gsd_m = wall.frame.gsd_m
     factor = math.floor(scan_step_m(wall.count, gsd_m=gsd_m) / gsd_m)
@@ -80,19 +82,20 @@ def _join(
 
     Args:
         wall: the wall.
-        factor: cells along the side of a joined one.
+        factor: number of cells along the side of a joined cell.
         joined: the wall whose rows are filled.
         places: (rows, cols, 2) centroids as in `Surroundings`, filled as well.
-        which: the rows, and the difference of depths beyond which surfaces differ.
+        which: the rows, and the depth difference beyond which points are on different surfaces.
     """
     rows, layer_m = which
-    assert wall.intensity is not None  # noqa: S101 - asked before
-    assert joined.intensity is not None  # noqa: S101 - it has what the wall has
+    assert wall.intensity is not None  # noqa: S101 - checked before
+    assert joined.intensity is not None  # noqa: S101 - as in the wall
     blocks = _Blocks(rows, factor, joined.frame.width)
     measured = blocks.of(wall.mask) == SurfaceMask.MEASURED
     depths_m = np.where(measured, blocks.of(wall.depth_m), np.float32(np.nan))
     n_known = np.isfinite(depths_m).sum(axis=2)
-    # A measured depth, none between two surfaces; NaN is sorted to the end.
+    # The lower median, which is a measured depth and never between two surfaces; NaN is sorted
+    # last.
     middle = np.maximum(n_known - 1, 0) // 2
     depth_m = np.take_along_axis(np.sort(depths_m, axis=2), middle[:, :, None], axis=2)
     on_surface = np.abs(depths_m - depth_m) <= layer_m
@@ -116,19 +119,19 @@ def _join(
 
 
 class _Blocks:
-    """Blocks of cells that are joined.
+    """Blocks of cells to be joined.
 
     Args:
-        rows: of joined cells.
-        factor: cells along the side of a joined one.
-        width: columns of joined cells.
+        rows: rows of joined cells.
+        factor: number of cells along the side of a joined cell.
+        width: number of columns of joined cells.
     """
 
     def __init__(self, rows: slice, factor: int, width: int) -> None:
         self._rows, self._factor, self._width = rows, factor, width
 
     def of(self, raster: NDArray[np.generic]) -> NDArray[np.generic]:
-        """Values (rows, cols, factor^2) of a raster's cells; 0 beyond its border."""
+        """Return the values (rows, cols, factor^2) of a raster's cells; 0 beyond its border."""
         factor, height = self._factor, self._rows.stop - self._rows.start
         part = raster[self._rows.start * factor : self._rows.stop * factor]
         framed = np.zeros((height * factor, self._width * factor), dtype=raster.dtype)
@@ -139,7 +142,7 @@ class _Blocks:
 
 def _complete(joined: Wall, around: Surroundings) -> None:
     """Fill narrow gaps, and interpolate intensity from centroids of points to cell centres."""
-    assert joined.intensity is not None  # noqa: S101 - asked before
+    assert joined.intensity is not None  # noqa: S101 - checked before
     depth_m, intensity = joined.depth_m.reshape(-1), joined.intensity.reshape(-1)
     known = np.isfinite(joined.depth_m)
     values = cell_values(depth_m, intensity=intensity)
@@ -158,27 +161,27 @@ _POOL_SIGMA_CELLS: Final = 0.8
 _EVEN_SIGMA_CELLS: Final = 12.0
 _BROAD_STEP: Final = 4
 _MARGIN_CELLS: Final = 2
-# Depths about a cell that differ by more than this many cells and point spreads are a step of the
-# relief; nine depths of a smooth surface differ by three spreads, seldom by five.
+# The depths around a cell form a relief step if they differ by more than this many cells and this
+# many point spreads; nine depths of a smooth surface differ by three spreads, rarely by five.
 _STEP_CELLS: Final = 1.0
 _STEP_SPREADS: Final = 6.0
-# Surfaces with more cells beside steps than this share, within so many cells, have no texture but
-# relief: rooms with mouldings have 0.06 to 0.11, a carved fountain 0.21.
+# A surface consists mainly of relief if more than this share of the cells in a window of this width
+# is next to steps: 0.06 to 0.11 in rooms with mouldings, 0.21 on a carved fountain.
 _RELIEF_CELLS: Final = 121
 _RELIEF_SHARE: Final = 0.16
-# Least distance between places with texture, which are taken in turns from the cells of a grid.
+# Minimum distance between textured positions; these are taken in turn from the cells of a grid.
 _APART_CELLS: Final = 5
 HALF_PATCH_CELLS: Final = 10
-"""Patches that are compared are (2 h + 1) cells wide."""
+"""Compared patches are (2 h + 1) cells wide."""
 _GRID: Final = 16
 
 
 class Channels(NamedTuple):
-    """A picture to be matched, in the form that compiled kernels take.
+    """A picture to be matched, in the form required by compiled kernels.
 
     Attributes:
-        values: (rows, cols, c) float32, 0 where not known.
-        known: (rows, cols) float32, 1 where values are known, else 0.
+        values: (rows, cols, c) float32, 0 where unknown.
+        known: (rows, cols) float32, 1 where values are known, otherwise 0.
     """
 
     values: NDArray[np.float32]
@@ -193,7 +196,7 @@ class Channels(NamedTuple):
 
 
 def gradient_channels(grey: NDArray[np.float32]) -> Channels:
-    """Return the oriented gradients of a picture that is NaN where unknown."""
+    """Return the oriented gradients of a picture; unknown values are NaN."""
     import cv2
 
     gradient, known = _gradient(grey)
@@ -211,12 +214,12 @@ def gradient_channels(grey: NDArray[np.float32]) -> Channels:
 
 
 def grey_channels(grey: NDArray[np.float32]) -> Channels:
-    """Return grey values less their local mean, normalised, for similar spectral bands."""
+    """Return grey values minus their local mean, normalised; for similar spectral bands."""
     return colour_channels(grey[:, :, None])
 
 
 def colour_channels(colours: NDArray[np.float32]) -> Channels:
-    """Return colours (rows, cols, c) less their local means, normalised together."""
+    """Return colours (rows, cols, c) minus their local means, normalised jointly."""
     import cv2
 
     known = _safe(np.asarray(np.isfinite(colours).all(axis=2)))
@@ -232,19 +235,21 @@ CHANNELS: Final[Mapping[str, Callable[[NDArray[np.float32]], Channels]]] = {
     "gradients": gradient_channels,
     "grey": grey_channels,
 }
-"""Channels of a wall's intensity by name."""
+"""Functions that compute channels of a wall's intensity, by name."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class WallTarget:
-    """A wall ready to be matched.
+    """A wall prepared for matching.
 
     Attributes:
         wall: the wall.
-        grey: its intensity, NaN where it has no depth; None without intensity.
-        channels: of its intensity by name, computed when needed.
-        textures: of these channels, likewise.
-        grain: result of `grain_of`, likewise.
+        grey: its intensity, NaN where the depth is unknown or at relief steps; None if the wall has
+            no intensity.
+        channels: channels of the intensity by name, computed when needed.
+        textures: texture of these channels by name, computed when needed.
+        grain: result of `grain_of`, computed when needed.
+        lock: lock of the values computed when needed.
     """
 
     wall: Wall
@@ -275,12 +280,13 @@ def target_of(wall: Wall) -> WallTarget:
 
 
 def _at_steps(wall: Wall) -> NDArray[np.bool_]:
-    """Find cells (rows, cols) beside a step of the relief.
+    """Find the cells (rows, cols) next to a relief step.
 
-    The position of the edge within its cell is unknown, and its points are of both sides, so an
-    edge of the picture is off by part of a cell. An oblique photo shows the face of the step, or
-    hides what is behind it. Slopes, however steep, are no steps; where steps are everywhere, as on
-    carved stone, they are kept, since little else would be left to compare.
+    The position of the edge within a cell is unknown, and the cell contains points of both sides,
+    so the edge in the picture is displaced by part of a cell. An oblique photo shows the face of
+    the step or does not show the area behind it. Steep slopes are not steps. Where steps are
+    everywhere, as on carved stone, their cells are not excluded, since too few would be left to
+    compare.
     """
     import cv2
 
@@ -290,10 +296,10 @@ def _at_steps(wall: Wall) -> NDArray[np.bool_]:
     low = cv2.erode(np.where(known, wall.depth_m, inf), kernel)
     bent = np.zeros(wall.frame.shape, dtype=np.bool_)
     for depth_m, found in ((wall.depth_m, bent), (wall.depth_m.T, bent.T)):
-        # Deviation from the line between neighbours; NaN beside void.
+        # Deviation from the line between the two neighbours; NaN next to void cells.
         off_m = np.abs(depth_m[:-2] - 2.0 * depth_m[1:-1] + depth_m[2:])
         found[1:-1] |= off_m > 0.5 * step_m
-    # Far from all depths both are infinite.
+    # Where no depth is near, both are infinite.
     with np.errstate(over="ignore"):
         beside = known & bent & (high - low > step_m)
     n_beside, n_known = (
@@ -304,14 +310,15 @@ def _at_steps(wall: Wall) -> NDArray[np.bool_]:
 
 
 def least_step_m(wall: Wall) -> float:
-    """Return the smallest difference of depths at a step of the relief."""
+    """Return the minimum depth difference of a relief step."""
     return max(_STEP_CELLS * wall.frame.gsd_m, _STEP_SPREADS * usual_spread_m(wall))
 
 
 def grain_of(wall: Wall) -> NDArray[np.float32]:
     """Return the number of cells per measured cell around each cell (rows, cols), at least 1.
 
-    Filled cells follow from measured ones and share their errors: they add no information.
+    Filled cells are interpolated from measured ones and share their errors, so they add no
+    information.
     """
     import cv2
 
@@ -324,7 +331,8 @@ def grain_of(wall: Wall) -> NDArray[np.float32]:
 def texture(channels: Channels) -> NDArray[np.float32]:
     """Return how well the patch of each cell (rows, cols) determines a displacement.
 
-    The smaller eigenvalue of the gradients' second moments over the patch (Shi & Tomasi 1994).
+    The measure is the smaller eigenvalue of the second moments of the gradients in the patch (Shi &
+    Tomasi 1994).
     """
     import cv2
 
@@ -344,7 +352,8 @@ def textured_places(
 ) -> NDArray[np.intp]:
     """Select cells (n, 2) = (column, row) with the most texture.
 
-    The best are taken in turns from a grid, so that they cover the usable part evenly.
+    The best cells are taken in turn from the fields of a grid, so that they cover the usable area
+    evenly.
 
     Args:
         strength: (rows, cols) as returned by `texture`.
@@ -375,7 +384,7 @@ def _gradient(
 
 
 def _safe(known: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Select cells away from void, whose filling would look like an edge."""
+    """Select cells away from void areas, since filling these may create edges."""
     import cv2
 
     kernel = np.ones((2 * _MARGIN_CELLS + 1, 2 * _MARGIN_CELLS + 1), dtype=np.uint8)
@@ -383,7 +392,7 @@ def _safe(known: NDArray[np.bool_]) -> NDArray[np.float32]:
 
 
 def _evened(values: NDArray[np.float32], known: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Divide by the local strength, so that weak and strong edges have equal weight."""
+    """Divide by the local strength, so that weak and strong edges have the same weight."""
     strength = np.einsum("ijk,ijk->ij", values, values) * known
     local = np.sqrt(_broadly(strength) / np.maximum(_broadly(known), 1e-3))
     floor = 0.1 * float(np.median(local[known > 0.0])) if (known > 0.0).any() else 1.0
@@ -392,7 +401,10 @@ def _evened(values: NDArray[np.float32], known: NDArray[np.float32]) -> NDArray[
 
 
 def _broadly(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Blur by the wide Gaussian, on every fourth cell: a tenth of the time, the same to 1 %."""
+    """Blur with a wide Gaussian, at a quarter of the resolution.
+
+    This takes a tenth of the time, and the result differs by less than 1 %.
+    """
     import cv2
 
     size = (values.shape[1], values.shape[0])

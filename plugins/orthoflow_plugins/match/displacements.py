@@ -1,7 +1,7 @@
-"""Displacements between two pictures of one wall at chosen places, to a fraction of a cell.
+"""Subpixel displacements between two pictures of a wall at given positions.
 
-The best whole cell by correlation within a radius, then least-squares matching (Grün 1985): the
-shift that aligns both patches, with its standard deviation.
+Correlation within a radius finds the best shift in whole cells. Least-squares matching (Grün 1985)
+then refines the shift and computes its standard deviation.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from orthoflow.geometry.rows import Rows
 from orthoflow.geometry.threads import even_parts, in_threads
 from orthoflow_plugins.match.channels import HALF_PATCH_CELLS, Channels
 
-# Patches are smooth: every second cell suffices to find the whole-cell shift.
+# Patches are smooth, so every second cell is enough to find the whole-cell shift.
 _STRIDE: Final = 2
 _ITERATIONS: Final = 12
 _CONVERGED_CELLS: Final = 0.002
 _MAX_STEP_CELLS: Final = 0.7
 _MIN_KNOWN_SHARE: Final = 0.3
 _RIDGE: Final = 1e-3
-# Correlation between neighbouring cells of a search leaves one independent cell in this many.
+# Neighbouring cells of a search are correlated: there is one independent cell per this many.
 _INDEPENDENT: Final = 1.5
 
 
@@ -45,12 +45,12 @@ def search_shifts(
 
     Args:
         first: (rows, cols, c) float32.
-        second: likewise, or (rows, cols, 3).
+        second: (rows, cols, c) float32, or (rows, cols, 3) for combinations.
         places: (n, 2) int64 (column, row), at least half + radius cells from the border.
         reach: half, radius: patches are 2 half + 1 cells wide, shifts up to the radius are tried.
-        found: (n, 4) float64, filled with the shift (across, down), its correlation, and its lead
-            over the best of the others, -1 if it lies on the border of the search; for
-            combinations (n, 7), with the gains of the three channels at the best shift.
+        found: (n, 4) float64, filled with the shift (across, down), its correlation, and the
+            difference to the highest correlation away from it, -1 at the border of the search area;
+            for combinations (n, 7), also filled with the gains of the three channels.
     """
     side, is_mixed = 2 * reach[1] + 1, found.shape[1] == 7
     scores, gains = np.empty(side * side), np.empty(3)
@@ -83,7 +83,7 @@ def _take_best(scores: NDArray[np.float64], found: NDArray[np.float64]) -> None:
     found[2] = scores[top]
     found[3] = -1.0
     if 0 < down < side - 1 and 0 < across < side - 1:
-        # The lead over nothing is that over the smallest correlation.
+        # Without other shifts, the difference is that to the lowest possible correlation.
         elsewhere = -1.0
         for k in range(side * side):
             if max(abs(k // side - down), abs(k % side - across)) > 2:
@@ -98,7 +98,7 @@ def _mixed(
     where: tuple[tuple[int, int], tuple[int, int], int],
     gains: NDArray[np.float64],
 ) -> float:
-    """Correlate a patch with the best combination of three channels, whose gains are filled in."""
+    """Correlate a patch with the best combination of three channels, and fill in its gains."""
     at, to, half = where
     n, sa, sb, sc, sd = 0, 0.0, 0.0, 0.0, 0.0
     saa, sab, sac, sad = 0.0, 0.0, 0.0, 0.0
@@ -117,10 +117,11 @@ def _mixed(
     saa, sab, sac, sad = saa - sa * sa / n, sab - sa * sb / n, sac - sa * sc / n, sad - sa * sd / n
     sbc, sbd, scd = sbc - sb * sc / n, sbd - sb * sd / n, scd - sc * sd / n
     sbb, scc, sdd = sbb - sb * sb / n, scc - sc * sc / n, sdd - sd * sd / n
-    # Channels of one material are nearly collinear: their small differences must not decide.
+    # The channels of one material are nearly collinear; ridge regression keeps their small
+    # differences from dominating.
     ridge = _RIDGE * (sbb + scc + sdd) + 1e-12
     sbb, scc, sdd = sbb + ridge, scc + ridge, sdd + ridge
-    # Cofactors of the symmetric matrix of products.
+    # Cofactors of the symmetric normal matrix.
     kbb, kcc, kdd = scc * sdd - scd * scd, sbb * sdd - sbd * sbd, sbb * scc - sbc * sbc
     kbc, kbd, kcd = scd * sbd - sbc * sdd, sbc * scd - scc * sbd, sbc * sbd - sbb * scd
     determinant = sbb * kbb + sbc * kbc + sbd * kbd
@@ -128,7 +129,7 @@ def _mixed(
     gains[1] = (kbc * sab + kcc * sac + kcd * sad) / determinant
     gains[2] = (kbd * sab + kcd * sac + kdd * sad) / determinant
     explained = gains[0] * sab + gains[1] * sac + gains[2] * sad
-    # Adjusted for the degrees of freedom of three gains, which fit some of the noise.
+    # Adjusted for the degrees of freedom, since three gains also fit some of the noise.
     free = n / _INDEPENDENT
     share = explained / max(saa, 1e-20)
     return math.sqrt(max(0.0, 1.0 - (1.0 - share) * (free - 1.0) / max(free - 4.0, 1.0)))
@@ -142,7 +143,7 @@ def _correlation(
     to: tuple[int, int],
     half: int,
 ) -> float:
-    """Correlate two patches, each channel without its mean."""
+    """Correlate two patches after subtracting the mean of each channel."""
     cross, own, other = 0.0, 0.0, 0.0
     for c in range(first.shape[2]):
         n, sa, sb, saa, sbb, sab = 0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -171,16 +172,16 @@ def match_patches(
     patch: tuple[NDArray[np.float64], ...],
     found: NDArray[np.float64],
 ) -> None:
-    """Least-squares matching of each patch: shift, a gain, an offset per channel.
+    """Match each patch by least squares, with a shift, a gain, and an offset per channel.
 
     Args:
         first: the first picture.
-        second: the second one.
+        second: the second picture.
         places: (n, 2) int64 (column, row) of the patches' centres in the first picture.
         window: (p, p) float64 weights of a patch's cells.
         patch: scratch arrays: (p, p), (p + 3, p, c) and (p, p, c) float64.
-        found: (n, 4) float64: the shift (across, down), refined in place; filled with the standard
-            deviation of a coordinate for independent cells, inf if undetermined, and the
+        found: (n, 4) float64: the shift (across, down), refined in place; then filled with the
+            standard deviation of a coordinate for independent cells (inf if undetermined) and the
             correlation.
     """
     weight, lines, moved = patch
@@ -217,7 +218,7 @@ def _sample(
     shift: tuple[float, float],
     patch: tuple[NDArray[np.float64], ...],
 ) -> float:
-    """Resample the second picture around a shifted place and return the sum of the weights."""
+    """Resample the second picture around a shifted position; return the sum of the weights."""
     window, weight, lines, moved = patch
     rows, columns, n_channels = second.values.shape
     side = len(window)
@@ -265,7 +266,7 @@ def _sample(
 
 @kernel_part
 def _cubic(t: float) -> tuple[float, float, float, float]:
-    """Cubic convolution (Keys 1981, a = -1/2): weights of four neighbours at fraction t."""
+    """Return weights of four neighbours at fraction t (cubic convolution, Keys 1981, a = -1/2)."""
     return (
         ((-0.5 * t + 1.0) * t - 0.5) * t,
         (1.5 * t - 2.5) * t * t + 1.0,
@@ -285,7 +286,7 @@ def _improvement(
     """Return a Gauss-Newton step (down, across), its standard deviation, and the correlation."""
     side, n_channels = len(weight), values.shape[2]
     top, left = place[0] - side // 2, place[1] - side // 2
-    # Sums of products of: a, reference; b, moved; x and y, slopes across and down.
+    # Sums of products of a (reference), b (moved), x and y (slopes across and down).
     saa, sab, sbb, nxx, nxy, nyy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     sax, say, sbx, sby = 0.0, 0.0, 0.0, 0.0
     for k in range(n_channels):
@@ -312,7 +313,7 @@ def _improvement(
     gain = sab / sbb
     across, down = gain * sbx - sax, gain * sby - say
     noise = max(saa - gain * sab, 0.0) / (total * n_channels)
-    # Inverse compositional: the slopes are those of the unmoved picture.
+    # Inverse compositional algorithm: the slopes are those of the reference picture.
     return (
         (nxx * down - nxy * across) / determinant,
         (nyy * across - nxy * down) / determinant,
@@ -321,13 +322,13 @@ def _improvement(
     )
 
 
-# Patches of which less is known are not measured.
+# Patches with a smaller share of known cells are not measured.
 _MIN_KNOWN: Final = 0.6
 CORRELATION_AREA_CELLS: Final = 6.0
-"""Area over which residuals of smoothed pictures correlate: one independent cell in this many."""
+"""Residuals of smoothed pictures are correlated: there is one independent cell per this many."""
 _MAX_DRIFT_CELLS: Final = 1.5
 _MAX_DISAGREEMENT_CELLS: Final = 0.5
-# Margin of patches that are cut out: the drift, and the neighbours of the interpolation.
+# Margin of patches that are cut out, for the drift and the neighbours used in interpolation.
 _CUT_MARGIN_CELLS: Final = 6
 
 
@@ -337,7 +338,8 @@ class Displacements(Rows):
 
     Attributes:
         places: (n, 2) intp (column, row) cells of the first picture.
-        shift_cells: (n, 2) float64 from a cell to the same place in the second picture.
+        shift_cells: (n, 2) float64 shift from a cell to the corresponding position in the second
+            picture.
         score: (n,) correlation.
         sigma_cells: (n,) float64 standard deviation of a coordinate of the shift.
     """
@@ -365,12 +367,12 @@ def measure(
 
     Args:
         first: the first picture.
-        second: the second one.
-        places: (column, row) of the first picture.
+        second: the second picture.
+        places: (column, row) cells of the first picture.
         radius_cells: search radius.
-        min_score: smallest correlation; half of that of right places (0.35), less where patches are
-            many and judged by their neighbours.
-        min_distinct: by how much the best correlation must exceed the next peak.
+        min_score: minimum correlation. The default of 0.35 is half that of correct positions; it
+            may be lower if there are many patches that are checked by their neighbours.
+        min_distinct: minimum difference between the best correlation and the next peak.
         threads: number of threads.
     """
     places = _well_known(first, second, places, radius_cells)
@@ -396,7 +398,7 @@ def _mixed_and_refined(
     min_score: float,
     threads: int,
 ) -> Displacements:
-    """Refine each patch in its own combination of channels: patches are cut out and stacked."""
+    """Refine each patch in its own combination of channels, with patches cut out and stacked."""
     begun = found[:, :2].astype(np.intp)
     reach = HALF_PATCH_CELLS + _CUT_MARGIN_CELLS
     one = _cut_out(first, places, reach, np.ones((len(places), 1), dtype=np.float32))
@@ -412,7 +414,7 @@ def _mixed_and_refined(
 def _cut_out(
     picture: Channels, centres: NDArray[np.intp], reach: int, gains: NDArray[np.float32]
 ) -> Channels:
-    """Cut out patches about centres (n, 2), each combined by its gains (n, c) to one channel."""
+    """Cut out patches around centres (n, 2), combined to one channel by their gains (n, c)."""
     side = 2 * reach + 1
     rows, columns = picture.known.shape
     values, known = (np.zeros((len(centres), side, side), dtype=np.float32) for _ in range(2))
@@ -433,7 +435,7 @@ def _cut_out(
 def _well_known(
     first: Channels, second: Channels, places: NDArray[np.intp], radius_cells: int
 ) -> NDArray[np.intp]:
-    """Select places whose search stays inside the pictures and whose patches are mostly known."""
+    """Select positions with a search area inside the pictures and a mostly known patch."""
     import cv2
 
     reach = radius_cells + HALF_PATCH_CELLS + 2
@@ -455,7 +457,7 @@ def _refined(
 ) -> Displacements:
     begun = found[:, :2]
     forth, sigma_forth, score = _matched(first, second, places, begun, threads)
-    # Half the difference of both directions: effects of interpolating one picture cancel.
+    # Half the difference of both directions, so that effects of interpolation cancel out.
     middle = np.rint(forth).astype(np.intp)
     back, sigma_back, _ = _matched(second, first, places + middle, -forth, threads)
     shifts = 0.5 * (forth - back)
@@ -483,7 +485,7 @@ def _matched(
     places = np.ascontiguousarray(places)
     found = np.zeros((len(places), 4))
     found[:, :2] = begun
-    # Gaussian weights: the border of a patch hardly counts.
+    # Gaussian weights, so that the border of a patch has little influence.
     steps = np.arange(-HALF_PATCH_CELLS, HALF_PATCH_CELLS + 1) / (0.6 * HALF_PATCH_CELLS)
     bell = np.exp(-0.5 * steps**2)
     window = np.outer(bell, bell)

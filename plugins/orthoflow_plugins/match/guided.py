@@ -1,4 +1,4 @@
-"""`match.guided`: photos with approximate poses, matched near their positions on the walls."""
+"""`match.guided`: match photos with approximate poses near their expected wall positions."""
 
 from __future__ import annotations
 
@@ -24,33 +24,33 @@ if TYPE_CHECKING:
     from orthoflow_plugins.match.tracing import Trace
     from orthoflow_plugins.match.warping import Before
 
-# Points of the cloud with fewer neighbours are outliers and hide nothing, as in `ortho`.
+# Points of the cloud with fewer neighbours are outliers and do not hide anything, as in `ortho`.
 _MIN_POINTS = 6
 NOTHING_AGREES: Final = DiagnosticSpec(
     code="photo-without-matches",
     severity="warning",
-    text="photo {subject}: no part of the walls matches it at its pose",
-    remedy="check its pose, or remove it",
+    text="photo {subject}: with its pose, no part of the walls matches it",
+    remedy="check its pose, or remove the photo",
 )
 
 
 class MatchGuided(Method):
-    """Warp each photo onto the walls by its pose and measure its displacements there.
+    """Project each photo onto the walls with its pose and measure its displacements there.
 
-    Only the visible part of a wall is searched, within a small radius (the mask of markiewicz2015
-    taken further), in oriented gradients, grey values and combinations of the photo's colours,
-    which allow for the different wavelengths of laser and camera. Cells finer than the point
-    spacing are joined; patches avoid steps of the relief and, with the cloud wired, parts that
-    objects before the walls hide. The pose is refitted and the photo warped again until held-out
-    ties stop improving. Photos without a pose are matched with what the others show of the walls
-    first; those not found there give no ties.
+    Only the visible part of a wall is searched, within a small radius (an extension of the mask of
+    markiewicz2015). Oriented gradients, grey values and combinations of the photo's colours are
+    compared, since laser and camera have different wavelengths. Cells finer than the point spacing
+    are joined. Patches at relief steps are excluded and, if the cloud is connected, those hidden by
+    objects in front of the walls. The pose is estimated again and the photo projected again until
+    held-out ties no longer improve. Photos without a pose are first matched with the other photos
+    projected onto the walls; if that fails, they get no ties.
     """
 
     id: ClassVar[str] = "match.guided"
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_ties", label="ties"),
-        MetricSpec("rejected_share", label="share of the ties that is rejected"),
+        MetricSpec("rejected_share", label="share of rejected ties"),
         MetricSpec("n_photos_matched", label="photos with accepted matches"),
         MetricSpec("ties_per_photo_median", label="ties per photo, median"),
         MetricSpec(
@@ -66,7 +66,7 @@ class MatchGuided(Method):
             counted_by="n_photos_matched",
         ),
         MetricSpec(
-            "sigma_px_median", label="stated sigma of a tie per axis, median", better="lower"
+            "sigma_px_median", label="predicted sigma of a tie per axis, median", better="lower"
         ),
         MetricSpec("n_by_hand", label="ties measured by hand"),
     )
@@ -81,31 +81,32 @@ class MatchGuided(Method):
     )
 
     class Params(MethodParams):
-        """Channels that are compared, and number of ties."""
+        """Channels to compare, and number of ties."""
 
         preset: Literal["none", "paper"] = Field(
             default="none",
-            description="paper: only the mask of markiewicz2015: OpenCV's default SIFT, the best "
-            "match in the photo of each key point of a wall that it shows by its pose, once; of "
-            "the other options `ratio` applies.",
+            description="paper: only the mask of markiewicz2015. Each SIFT key point (OpenCV's "
+            "defaults) in the part of a wall that the photo shows is matched once with its best "
+            "match in the photo; of the other parameters, only `ratio` is used.",
         )
         ratio: float | None = Field(
             default=None,
             gt=0,
             le=1,
-            description="Only with preset: paper: largest distance of the best match over the "
-            "second best, 1 for any; 0.8 unless given, as in openMVG.",
+            description="Only with preset: paper. Maximum ratio of the distances of the best and "
+            "the second best match; 1 accepts any. Default: 0.8, as in openMVG.",
         )
         channels: Literal["auto", "gradients", "grey", "colours"] = Field(
             default="auto",
-            description="Channels that are compared: oriented gradients; grey values, which are "
-            "sharper where laser and camera are similar; colours, combined in each patch to fit "
-            "the wall best, where they are not. auto: gradients and grey, and colours where grey "
-            "is not better; each photo keeps the channels with the smallest error of held-out "
-            "ties over the root of their number and over their spread.",
+            description="Channels to compare. gradients: oriented gradients; grey: grey values, "
+            "more accurate if laser and camera have similar contrast; colours: in each patch, the "
+            "combination of colours that fits the wall best, for different contrast. auto: "
+            "gradients and grey, and also colours if grey is not better; each photo keeps the "
+            "channels with the smallest error of held-out ties, divided by the square root of "
+            "their number and by their spread.",
         )
         max_ties: int = Field(
-            default=1200, ge=50, description="Places measured per photo, spread evenly."
+            default=1200, ge=50, description="Positions measured per photo, evenly distributed."
         )
 
     class In(Ports):
@@ -123,7 +124,7 @@ class MatchGuided(Method):
         ties: Ties
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Match the oriented photos with the walls, then those without a pose."""
+        """Match the oriented photos with the walls, then the photos without a pose."""
         photos, walls = inputs.photos, inputs.walls
         require_photos(photos)
         if inputs.cloud is not None:
@@ -146,7 +147,7 @@ class MatchGuided(Method):
 
     @classmethod
     def tools(cls) -> dict[str, str]:
-        """OpenCV warps and filters."""
+        """OpenCV for warping and filtering."""
         return {"opencv-python-headless": version("opencv-python-headless")}
 
 
@@ -156,7 +157,7 @@ def _traced(
     params: MatchGuided.Params,
     ctx: StepContext,
 ) -> dict[str, Trace]:
-    """Match oriented photos with the walls, and those found by them; results by name."""
+    """Match oriented photos with the walls, then the others; return results by name."""
     from orthoflow_plugins.match.channels import in_cells_of_points, target_of
     from orthoflow_plugins.match.tracing import (
         CONTENTS,
@@ -193,7 +194,7 @@ def _traced(
         return traces
     recovered = recovered_traces(inputs.photos, oriented, setup, list(traces.values()))
     for name in recovered:
-        ctx.log(f"photo {name}: found by what other photos show of the walls")
+        ctx.log(f"photo {name}: found by matching with other photos projected onto the walls")
     return traces | recovered
 
 
@@ -207,14 +208,14 @@ def _oriented(cameras: Cameras) -> dict[str, Camera]:
     if not oriented:
         reasons = "; ".join(f"{camera.photo}: {camera.status}" for camera in cameras.cameras[:3])
         raise MethodError(
-            "no photo is oriented, so none can be matched by its pose"
+            "no photo is oriented, so none can be matched with its pose"
             + (f" ({reasons})" if reasons else "")
         )
     return oriented
 
 
 def _before(inputs: MatchGuided.In, cameras: list[Camera]) -> Before | None:
-    """Return the points before the walls if the cloud is wired."""
+    """Return the points in front of the walls; None if no cloud is connected."""
     from orthoflow.geometry.occluders import occluders_before
     from orthoflow_plugins.match.warping import Before
 

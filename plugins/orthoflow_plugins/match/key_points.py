@@ -1,4 +1,4 @@
-"""Matches of photos with walls by key points: recognition, mirror images, mixtures of colours."""
+"""Matching of photos and walls by key points, with mirrored photos and mixtures of colours."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ from orthoflow.products import Photo, Wall
 from orthoflow.sdk import MethodParams
 from orthoflow_plugins.match.pictures import CLIP_LIMIT, equalised, wall_picture
 
-# A photo is matched at this size first, then at twice the size, until a wall is recognised.
+# A photo is first matched at this size, which is then doubled until a wall is recognised.
 _FIRST_SIDE_PX: Final = 800
-# Key points of a photo and of each wall that suffice to recognise the walls in a photo.
+# These numbers of key points of a photo and of each wall are enough to recognise the walls.
 _FIRST_IN_PHOTO: Final = 3000
 _FIRST_ON_WALL: Final = 4000
-# A homography is approximate on a wall with relief: tolerance over the photo's diagonal.
+# Tolerance relative to the photo's diagonal, since a homography is approximate on relief.
 _LOOSE_SHARE: Final = 0.02
-# A factor of 1.4 between pixels and cells does not matter to scale-invariant key points.
+# Scale-invariant key points tolerate a factor of 1.4 between the sizes of pixels and cells.
 _LOG_SCALE_APART: Final = 0.35
 # Tolerances of a key point's size (log2) and direction in the guided match.
 _MAX_LOG_SIZE: Final = 0.7
 _MAX_ANGLE_DEG: Final = 30.0
 _VOID_MARGIN_CELLS: Final = 3
 MIN_AGREEING: Final = 8
-"""Fewest matches with a common homography by which a wall is recognised."""
+"""Minimum number of matches with a common homography to recognise a wall."""
 _SEED: Final = 1
 _MAX_RATIO: Final = 0.85
-# Matches in one square of this side count once.
+# Several matches in a square of this side length count as one.
 _PLACE_PX: Final = 2.0
 
-# Descriptors are invariant to the strength of contrast, not to its sign. If materials differ in
-# brightness between laser and photo, half of all edges may be inverted; a combination of the
-# photo's colours may restore most signs. Which one is unknown: the one with most matches is taken.
+# Descriptors are invariant to the strength of contrast, but not to its sign. If the brightness of
+# materials differs between laser and photo, half of the edges may be inverted; a combination of the
+# photo's colours may restore most of the signs. The combination with the most matches is used.
 MIXTURES: Final[Mapping[str, tuple[float, float, float]]] = {
     "green less red": (-1.0, 1.0, 0.0),
     "red as dark": (-1.0, 0.0, 0.0),
@@ -56,14 +56,14 @@ MIXTURES: Final[Mapping[str, tuple[float, float, float]]] = {
 }
 """Weights of red, green and blue by name, in the order in which they are tried."""
 
-# In rooms of inverted contrast up to 15 matches agreed on a wrong place, and once 19. A mixture
-# needs more than 15 matches, as several are tried.
+# In rooms with inverted contrast, up to 15 matches agreed on a wrong position, and 19 in one case.
+# A mixture needs more than 15 matches, since several are tried.
 LEAST: Final = 16
-# With this many matches, neither another mixture nor structure is tried.
+# With this many matches, no other mixture is tried, nor matching by structure.
 CLEARLY: Final = 24
-# Mixtures find the place and need not measure it.
+# Mixtures only need to find the approximate position, so a reduced resolution is enough.
 _LONGEST_SIDE_PX: Final = 2000
-# A photo without colours has only one mixture.
+# Mixtures with a smaller contrast, as of photos without colours, are not tried.
 _MIN_GREY_LEVELS: Final = 8.0
 
 
@@ -71,26 +71,26 @@ class PairingParams(MethodParams):
     """How photos are matched with walls by key points."""
 
     max_features: int = Field(
-        default=8000, ge=50, description="Key points per photo and per wall, spread evenly."
+        default=8000, ge=50, description="Key points per photo and per wall, evenly distributed."
     )
     ratio: float | None = Field(
         default=None,
         gt=0,
         le=1,
-        description="Largest distance of the best match over the second best, 1 for any; 0.85 "
-        "unless given, and with preset: paper 0.8, as its openMVG has it.",
+        description="Maximum ratio of the distances of the best and the second best match; 1 "
+        "accepts any. Default: 0.85; with preset: paper 0.8, as in openMVG.",
     )
     max_side_px: int = Field(
         default=4000,
         ge=200,
-        description="Larger photos are reduced to this size for matching. Smaller sizes come "
-        "first, from 800 px on, until a wall is recognised; then the size at which a pixel is "
-        "about as wide as a cell of the walls.",
+        description="Larger photos are reduced to this size for matching. Sizes from 800 px "
+        "upwards are tried until a wall is recognised; then the photo is matched at the size at "
+        "which a pixel is about as wide as a cell of the walls.",
     )
 
     @property
     def max_ratio(self) -> float:
-        """Largest ratio of a match; 1 allows any."""
+        """Maximum ratio of a match; 1 accepts any."""
         return _MAX_RATIO if self.ratio is None else self.ratio
 
 
@@ -100,10 +100,11 @@ class Pair:
 
     Attributes:
         wall: index of the wall.
-        matches: first = key points of the photo, second = of the wall.
+        matches: matches; first: key points of the photo, second: key points of the wall.
         agreeing: (n,) bool, inliers of an approximate homography.
-        is_shown: enough agree, and the wall is not seen from behind.
-        homography: (3, 3) approximate, photo pixels from wall pixels, of a wall that is shown.
+        is_shown: whether enough matches agree and the wall is not seen from behind.
+        homography: (3, 3) approximate homography, photo pixels from wall pixels; None if the wall
+            is not shown.
     """
 
     wall: int
@@ -118,14 +119,14 @@ class PhotoPairs:
     """Matches of a photo with all walls.
 
     Attributes:
-        features: key points of the photo, pixels of the full image.
+        features: key points of the photo, in pixels of the full image.
         scale: factor by which the photo was reduced.
         pairs: one per wall with matches.
-        radius_px: radius of the guided match; matches with a wrong homography are evenly
+        radius_px: radius of the guided matching; matches with a wrong homography are evenly
             distributed within it.
-        is_mirrored: the mirrored photo matches better; then no wall counts as shown.
-        n_recognised: inliers before the guided match.
-        picture: grey or name of the mixture.
+        is_mirrored: whether the mirrored photo matches better; then no wall counts as shown.
+        n_recognised: number of inliers before the guided matching.
+        picture: "grey" or name of the mixture.
     """
 
     features: Features
@@ -138,17 +139,17 @@ class PhotoPairs:
 
     @property
     def n_verified(self) -> int:
-        """Inliers over the walls shown."""
+        """Number of inliers on all walls shown."""
         return sum(int(pair.agreeing.sum()) for pair in self.pairs if pair.is_shown)
 
 
 def wall_features(wall: Wall, max_features: int, *, as_opencv: bool = False) -> Features | None:
-    """Find key points of a wall's intensity; None without intensity.
+    """Find key points in a wall's intensity; None if the wall has no intensity.
 
     Args:
         wall: the wall.
-        max_features: maximum number.
-        as_opencv: as in `find_features`, in the intensity without equalisation.
+        max_features: maximum number of key points.
+        as_opencv: as in `find_features`; also disables the equalisation of the intensity.
     """
     clip_limit = 0.0 if as_opencv else CLIP_LIMIT
     picture = wall_picture(wall, clip_limit=clip_limit, void_margin_cells=_VOID_MARGIN_CELLS)
@@ -163,15 +164,16 @@ def wall_features(wall: Wall, max_features: int, *, as_opencv: bool = False) -> 
 def pair_photo(
     grey: NDArray[np.uint8], walls: Sequence[Features | None], params: PairingParams
 ) -> PhotoPairs:
-    """Recognise the walls in a photo, coarse to fine, then match them at their own resolution.
+    """Recognise the walls in a photo from coarse to fine, then match them at their resolution.
 
-    Key points of a photo much finer than the raster have no partner there, but many false ones; at
-    one cell per pixel both show the same detail, which gives 2 to 5 times the tie points.
+    If a photo is much finer than the raster, its key points have no counterpart there and lead to
+    many false matches. At one cell per pixel, both show the same detail, which gives 2 to 5 times
+    as many tie points.
 
     Args:
-        grey: (height, width) of the photo.
-        walls: key points per wall, None without intensity.
-        params: how to match.
+        grey: (height, width) grey values of the photo.
+        walls: key points per wall, None for walls without intensity.
+        params: parameters of the matching.
     """
     seeker = _Seeker(grey=grey, params=params)
     first, features = seeker.first_look(walls)
@@ -201,15 +203,15 @@ def pair_photo(
 def pair_in_colours(
     photo: Photo, walls: Sequence[Features | None], params: PairingParams
 ) -> PhotoPairs:
-    """Match a photo with walls in grey; if that shows none clearly, in mixtures of its colours.
+    """Match a photo with walls in grey and, if the result is unclear, in mixtures of its colours.
 
     Args:
         photo: the photo.
-        walls: key points per wall, None without intensity.
-        params: how to match.
+        walls: key points per wall, None for walls without intensity.
+        params: parameters of the matching.
 
     Returns:
-        The matches of the picture with most inliers, grey unless a mixture has more.
+        The matches of the picture with the most inliers: grey, unless a mixture has more.
     """
     best = pair_photo(photo_grey(photo), walls, params)
     if best.n_recognised >= CLEARLY:
@@ -229,11 +231,11 @@ def pair_in_colours(
 
 
 def mixed(rgb: NDArray[np.uint8], name: str) -> NDArray[np.uint8] | None:
-    """Combine a photo's colours, stretched to all grey levels; None without contrast.
+    """Combine a photo's colours, stretched to all grey levels; None if there is no contrast.
 
     Args:
         rgb: (height, width, 3).
-        name: of a mixture.
+        name: name of a mixture.
     """
     mixture = rgb.astype(np.float32) @ np.array(MIXTURES[name], dtype=np.float32)
     low, high = np.percentile(mixture[::4, ::4], (0.5, 99.5))
@@ -246,23 +248,23 @@ def mixed(rgb: NDArray[np.uint8], name: str) -> NDArray[np.uint8] | None:
 def side_matches(
     grey: NDArray[np.uint8], walls: Sequence[Features | None], params: PairingParams
 ) -> NDArray[np.intp]:
-    """Count the inliers of a photo with walls seen from the front, and from behind.
+    """Count a photo's inliers with walls as seen from the front and from behind.
 
-    A wall whose normal points away from the viewer is a mirror image of what the photo shows.
+    A wall whose normal points away from the viewer is a mirror image of the photo.
 
     Args:
-        grey: (height, width) of the photo.
-        walls: key points per wall, None without intensity or if its side is known.
-        params: how to match.
+        grey: (height, width) grey values of the photo.
+        walls: key points per wall, None for walls without intensity or with a known side.
+        params: parameters of the matching.
 
     Returns:
-        (walls, 2): front, behind; 0 below `MIN_AGREEING`.
+        (walls, 2) counts from the front and from behind; 0 if below `MIN_AGREEING`.
     """
     seeker = _Seeker(grey=grey, params=params)
     counts = np.zeros((len(walls), 2), dtype=np.intp)
     scale = min(seeker.finest, _FIRST_SIDE_PX / max(grey.shape))
     while True:
-        # All key points: a coarsely rastered wall shares few of the strongest.
+        # Use all key points, since a coarsely rastered wall contains few of the strongest ones.
         features = seeker.key_points(scale)
         for side, seen in enumerate((features, features.mirrored(grey.shape[1]))):
             for pair in seeker.pairs(seen, scale, walls).pairs:
@@ -282,18 +284,18 @@ def rematched(
     radius_px: float,
     ratio: float,
 ) -> Matches:
-    """Add matches near their expected position, size and direction (guided match).
+    """Add matches near their expected position, size and direction (guided matching).
 
-    Motifs that repeat farther away take no part in the ratio test, which gives several times the
-    matches.
+    The ratio test ignores repetitions of a motif outside the radius, which gives several times as
+    many matches.
 
     Args:
         matches: the matches so far, which are kept.
         sets: key points of the photo and of the wall.
         expected: (m, 2) expected photo pixels of the wall's key points.
-        agreeing: (n,) bool, inliers of the matches so far.
+        agreeing: (n,) bool, inliers among the matches so far.
         radius_px: search radius.
-        ratio: largest distance of the best over the second best within the radius.
+        ratio: maximum ratio of the distances of the best and the second best match in the radius.
     """
     photo, wall = sets
     good = matches.take(agreeing)
@@ -336,12 +338,12 @@ class _Seeker:
         return min(1.0, self.params.max_side_px / float(max(self.grey.shape)))
 
     def key_points(self, scale: float) -> Features:
-        """Find key points of the photo reduced by a scale, in pixels of the full photo."""
+        """Find key points in the photo reduced by `scale`; return them in full-photo pixels."""
         small = equalised(reduced(self.grey, scale), CLIP_LIMIT)
         return find_features(small, self.params.max_features).scaled(1.0 / scale)
 
     def first_look(self, walls: Sequence[Features | None]) -> tuple[PhotoPairs, Features]:
-        """Recognise walls at increasing scales, by the strongest key points, or else by all.
+        """Recognise walls at increasing scales, first by the strongest key points, then by all.
 
         Returns:
             The best matches, and all key points at their scale.
@@ -362,7 +364,7 @@ class _Seeker:
     def pairs(
         self, features: Features, scale: float, walls: Sequence[Features | None]
     ) -> PhotoPairs:
-        """Match key points found at a scale with the walls that are not None."""
+        """Match key points found at `scale` with the walls that are not None."""
         radius_px = _LOOSE_SHARE * math.hypot(*self.grey.shape)
         pairs = []
         for index, wall in enumerate(walls):
@@ -378,7 +380,7 @@ class _Seeker:
     def n_verified_mirrored(self, first: PhotoPairs, walls: Sequence[Features | None]) -> int:
         """Count the inliers of the mirrored photo on the walls shown.
 
-        A symmetric facade matches its own mirror image in part, with a plausible pose.
+        A symmetric facade partly matches its own mirror image, with a plausible pose.
         """
         mirrored = first.features.mirrored(self.grey.shape[1])
         few = len(mirrored) <= _FIRST_IN_PHOTO
@@ -402,10 +404,10 @@ def verified(
     """Find the inliers of an approximate homography of a wall.
 
     Args:
-        index: of the wall.
-        matches: of key points of the photo and of the wall.
+        index: index of the wall.
+        matches: matches between key points of the photo and of the wall.
         sets: these key points.
-        loose_px: largest distance of an inlier in the photo.
+        loose_px: maximum distance of an inlier in the photo.
     """
     features, wall = sets
     source, target = wall.pixels[matches.second], features.pixels[matches.first]
@@ -416,14 +418,15 @@ def verified(
     if homography is not None:
         with np.errstate(divide="ignore", invalid="ignore"):
             agreeing = np.hypot(*(mapped(homography, source) - target).T) < loose_px
-    # Many key points of a texture may match one position in the other image: count positions.
+    # Many key points of a texture may match a single position in the other image, so count
+    # positions.
     n_places = min(
         len(np.unique(np.floor(pixels[agreeing] / _PLACE_PX), axis=0))
         for pixels in (source, target)
     )
     is_shown = homography is not None and n_places >= MIN_AGREEING
     if homography is not None and is_shown:
-        # From behind, the sense of rotation is reversed.
+        # If the wall is seen from behind, the sense of rotation is reversed.
         middle = source[agreeing].mean(axis=0)
         here, *there = mapped(homography, middle + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
         is_shown = bool(np.linalg.det(np.array(there) - here) > 0.0)
@@ -482,7 +485,7 @@ def _homography(
 
 
 def sampling(threshold_px: float, *, trials: int) -> Any:
-    """Return parameters of robust sampling by OpenCV: MSAC with local optimisation, seeded."""
+    """Return parameters for OpenCV's robust sampling: MSAC with local optimisation and a seed."""
     import cv2
 
     params: Any = cv2.UsacParams()

@@ -1,4 +1,4 @@
-"""Pictures to match: photos and wall rasters with equalised contrast, and points on the walls."""
+"""Pictures for matching: photos and wall rasters with equalised contrast, and wall points."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from orthoflow.errors import MethodError
 from orthoflow.geometry.threads import in_order
 from orthoflow.products import Photos, Wall, Walls
 
-# Each thread takes up to a gigabyte for its picture.
+# Maximum number of threads; each needs up to a gigabyte for its picture.
 _MAX_AT_ONCE: Final = 4
 CLIP_LIMIT: Final = 3.0
 """Limit of local contrast equalisation (CLAHE)."""
 _TILES: Final = 8
 _CELL_SIGMA: Final = 1.0 / np.sqrt(12.0)
-# Depths about a point that differ by more cells are an edge of the relief.
+# The depths around a point form a relief edge if they differ by more than this many cells.
 _SMOOTH_CELLS: Final = 1.0
-# Most and fewest cells on a smooth surface from which the usual spread of points is estimated.
+# Maximum and minimum number of smooth cells from which the typical point spread is estimated.
 _MAX_SPREADS: Final = 100_000
 _MIN_SPREADS: Final = 100
-# Standard deviation of the depth where it cannot be estimated, in cells.
+# Standard deviation of the depth if it cannot be estimated, in cells.
 _UNKNOWN_SIGMA_CELLS: Final = 0.5
 
 
@@ -55,15 +55,16 @@ def require_intensity(walls: Walls) -> None:
 def wall_picture(
     wall: Wall, *, clip_limit: float, void_margin_cells: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]] | None:
-    """Return a wall's intensity as a picture without holes; None without intensity.
+    """Return a wall's intensity as a picture without gaps; None if the wall has no intensity.
 
     Args:
         wall: the wall.
-        clip_limit: of the local equalisation; 0 only stretches the grey levels.
-        void_margin_cells: half the side of the neighbourhood that must be measured.
+        clip_limit: limit of the local equalisation; 0 only stretches the grey levels.
+        void_margin_cells: half the side of the neighbourhood that must be mostly measured.
 
     Returns:
-        Grey (rows, cols) with void interpolated; and cells whose neighbourhood was measured.
+        Grey values (rows, cols) with void cells interpolated, and a mask of cells whose
+        neighbourhood is mostly measured.
     """
     import cv2
 
@@ -75,7 +76,7 @@ def wall_picture(
     low, high = np.percentile(wall.intensity[known], (0.5, 99.5))
     scaled = (wall.intensity - low) / max(float(high - low), 1e-9)
     filled = filled_smoothly(np.where(known, np.clip(scaled, 0.0, 1.0), np.nan))
-    # Cells hold single points of a scan, whose speckle hides the texture.
+    # Cells contain single scan points, whose speckle would hide the texture.
     grey = np.asarray(cv2.medianBlur(np.rint(filled * 255.0).astype(np.uint8), 3), dtype=np.uint8)
     side = 2 * void_margin_cells + 1
     share = cv2.blur(known.astype(np.float32), (side, side), borderType=cv2.BORDER_REPLICATE)
@@ -83,7 +84,7 @@ def wall_picture(
 
 
 def filled_smoothly(values: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Interpolate NaN, coarser with the distance from known values (push-pull)."""
+    """Interpolate NaN values, more coarsely with the distance from known values (push-pull)."""
     import cv2
 
     known = np.isfinite(values)
@@ -114,10 +115,10 @@ def equalised(grey: NDArray[np.uint8], clip_limit: float) -> NDArray[np.uint8]:
 def points_on_wall(
     wall: Wall, pixels_wall: NDArray[np.float64], *, usual_m: float | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Lift positions (n, 2) = (column, row) of a wall's raster onto its surface.
+    """Return the surface points at positions (n, 2) = (column, row) of a wall's raster.
 
-    The depth is interpolated where the surface is smooth; at an edge of the relief it is that of
-    the nearest cell, and the step is part of its standard deviation.
+    The depth is interpolated where the surface is smooth. At a relief edge, it is that of the
+    nearest cell, and its standard deviation includes the step.
 
     Args:
         wall: the wall.
@@ -125,8 +126,8 @@ def points_on_wall(
         usual_m: result of `usual_spread_m` for the wall, computed if None.
 
     Returns:
-        World points (n, 3) and their standard deviations (n,) in metres, and whether (n,) the wall
-        has a depth there; points are NaN without one.
+        World points (n, 3) in metres, their standard deviations (n,) in metres, and whether (n,)
+        the depth is known there; points without a depth are NaN.
     """
     columns, rows = pixels_wall[:, 0] - 0.5, pixels_wall[:, 1] - 0.5
     height, width = wall.frame.shape
@@ -142,7 +143,7 @@ def points_on_wall(
     count = np.maximum(wall.count[cell].astype(np.float64), 1.0)
     own = wall.sigma_m[cell].astype(np.float64)
     own = np.where(np.isfinite(own) & (count > 1.0), own, usual)
-    # The depth of a cell is a mean or median of points that lie anywhere in the cell.
+    # The depth of a cell is a mean or median of points at arbitrary positions in the cell.
     noise = np.maximum(own / np.sqrt(count), 0.3 * usual)
     step = np.where(smooth, 0.0, spread)
     sigma = np.sqrt(noise**2 + (0.5 * _CELL_SIGMA * gsd_m) ** 2 + (step * _CELL_SIGMA) ** 2)
@@ -150,10 +151,10 @@ def points_on_wall(
 
 
 def usual_spread_m(wall: Wall) -> float:
-    """Return the median spread of the points of a cell over cells on a smooth surface.
+    """Return the median depth spread of the points in a cell, over cells on a smooth surface.
 
-    Where the point spacing exceeds the cells, most cells with several points are on steps of the
-    relief, whose height is their spread.
+    If the point spacing exceeds the cell size, most cells with several points are at relief steps,
+    and their spread is the height of the step.
     """
     gsd_m = wall.frame.gsd_m
     rows, columns = np.nonzero(np.isfinite(wall.sigma_m))
@@ -168,7 +169,7 @@ def usual_spread_m(wall: Wall) -> float:
 def _spread_about(
     wall: Wall, rows: NDArray[np.intp], columns: NDArray[np.intp]
 ) -> NDArray[np.float64]:
-    """Return the range (n,) of depths in 3 x 3 cells about each."""
+    """Return the range (n,) of the depths in the 3 x 3 cells around each cell."""
     height, width = wall.frame.shape
     nearest = wall.depth_m[rows, columns].astype(np.float64)
     steps = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)])
@@ -202,9 +203,10 @@ _Result = TypeVar("_Result")
 def one_by_one(
     function: Callable[[_Item], _Result], items: Sequence[_Item], cores: int
 ) -> Iterator[_Result]:
-    """Return a function's results in order, computed by several threads.
+    """Yield a function's results in order, computed by several threads.
 
-    OpenCV's own threads gain little with pictures of this size, so they are divided among these.
+    OpenCV's own threads gain little with pictures of this size, so they are divided among the
+    threads.
     """
     import cv2
 

@@ -1,13 +1,13 @@
-"""Coarse poses of photos by structure, where key points do not match them with a wall.
+"""Coarse poses of photos from structure, if key points do not match them with a wall.
 
-Structure that correlates in nine parts is no proof: a repeating motif correlates elsewhere, too. So
-at the likeliest places overlapping patches are matched, each independently; where most of them fit
-one pose, the place is right.
+Structure that correlates in nine parts does not prove a position, since a repeating motif also
+correlates elsewhere. Therefore overlapping patches are matched independently at the most likely
+positions; a position is probably correct if most of the patches fit one pose.
 
-A repeating motif, or another wall with the same tiles, may still win. Photos share many more key
-points with each other than with laser intensity. So a place is accepted when another photo, at a
-place of its own, shows the same key points at the same positions of the wall: two wrong photos
-would have to be wrong in the same way.
+A repeating motif, or another wall with the same tiles, may still fit best. Photos share many more
+key points with each other than with the laser intensity. Therefore a position is accepted if
+another photo, at its own position, shows the same key points at the same positions on the wall: two
+wrong photos would have to be wrong in the same way.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ from orthoflow_plugins.match.ties import TiePiece, piece_on_wall
 from orthoflow_plugins.match.tracing import agrees_around, fitted_pose
 from orthoflow_plugins.match.warping import project_walls, warp_photo
 
-# Places of a photo that are examined patch by patch, over all walls, and that each wall contributes
-# at each rotation.
+# Number of positions of a photo that are examined patch by patch (all walls together), and number
+# of candidates from each wall at each rotation.
 _PLACES: Final = 4
 _PLACES_EACH: Final = 4
 # Search radius of each round, in coarse cells.
@@ -53,13 +53,13 @@ _SIDE_PX: Final = 1200
 _APART_CELLS: Final = 5
 _MIN_SCORE: Final = 0.3
 _MIN_DISTINCT: Final = 0.03
-# Fewer tie points of a round determine no pose.
+# Minimum number of tie points in a round to determine a pose.
 _MIN_FIT: Final = 8
-# Fewer tie points, or a smaller share of the patches, are no place at all.
+# A position with fewer tie points or a smaller share of the patches is dropped.
 _TIES_FEW: Final = 20
 _SHARE_FEW: Final = 0.05
-# Wrong places of simulated rooms had leads of up to 6.1 with 0.15 of the patches agreeing; right
-# ones had 6.2 and more, or 0.3 of the patches agreeing at leads of 5.5 and more.
+# In simulated rooms, wrong positions had leads of up to 6.1 with 15 % of the patches agreeing.
+# Correct positions had leads of at least 6.2, or of at least 5.5 with 30 % of the patches agreeing.
 _MIN_LEAD: Final = 6.5
 _MIN_LEAD_OF_MANY: Final = 5.5
 _MANY_SHARE: Final = 0.25
@@ -68,36 +68,36 @@ _MIN_SHARE: Final = 0.08
 _OVER_NEXT: Final = 1.5
 # Standard deviation of a matched patch, in coarse cells.
 _SIGMA_CELLS: Final = 0.5
-# Quarter turns, anticlockwise, that bring a photo upright, by EXIF's orientation.
+# Anticlockwise quarter turns that make a photo upright, by EXIF orientation.
 _QUARTERS: Final = {3: 2, 4: 2, 5: 3, 6: 3, 7: 1, 8: 1}
-# Poses by which the wall appears less than this far apart, over the longer side, are one place.
+# Two poses are the same position if the wall's displacement is below this share of the longer side.
 _SAME_SHARE: Final = 0.1
 _LONGEST_SIDE_PX: Final = 1600
 _PARAMS: Final = PairingParams(max_features=4000, ratio=0.8, max_side_px=_LONGEST_SIDE_PX)
-# Fewer common key points may be a repeated motif.
+# Minimum number of common key points; fewer may be a repeated motif.
 _MIN_SHARED: Final = 24
-# Tolerance between the positions on the wall that two photos give a common key point, in coarse
-# cells; more where a photo has only a homography, which ignores relief.
+# Tolerance in coarse cells between the wall positions of a common key point according to two
+# photos; larger for photos that have only a homography, which ignores relief.
 _CONFIRMED_CELLS: Final = 3.0
 _APART_ROUGHLY_CELLS: Final = 6.0
 _MIN_AGREEING: Final = 0.6
-# Fewer coarse cells in common are no overlap.
+# Minimum number of common coarse cells of overlapping photos.
 _OVERLAP_CELLS: Final = 200
-# Photos that agree are accepted if they are this many, or one of them is clear by itself.
+# Agreeing photos are accepted if there are this many, or if one of them is clear by itself.
 _MANY: Final = 3
 
 
 @dataclass(frozen=True, kw_only=True)
 class Placed:
-    """A possible place of a photo.
+    """A possible position of a photo on a wall.
 
     Attributes:
         piece: its tie points.
-        camera: the pose from them.
-        lead: of the place before patches were matched, as in `Place`.
-        share: of the patches in the overlap, those that agree.
+        camera: the pose from the tie points.
+        lead: lead of the position before patches were matched, as in `Place`.
+        share: share of the patches in the overlap that agree.
         radius_px: search radius of the patches, photo pixels.
-        is_clear: whether no other place comes near it.
+        is_clear: whether it is far better than all other positions.
     """
 
     piece: TiePiece
@@ -111,21 +111,21 @@ class Placed:
 def places_of(
     index: int, photo: Photo, structures: Sequence[WallStructure | None], cores: int = 1
 ) -> list[Placed]:
-    """Return the possible places of a photo on the walls, the best first.
+    """Return the possible positions of a photo on the walls, the best first.
 
     Only the first may be clear. A photo without EXIF is tried in all four orientations.
 
     Args:
-        index: of the photo.
+        index: index of the photo.
         photo: the photo.
-        structures: of the walls, None where one shows nothing.
+        structures: structures of the walls, None for walls without usable structure.
         cores: number of threads.
     """
     rgb, longest = photo_rgb(photo), max(photo.width, photo.height)
     small = reduced(rgb, min(1.0, _SIDE_PX / longest))
     tiny = reduced(rgb, min(1.0, PHOTO_SIDE_PX / longest))
     lens, freedom = photo.lens_prior()
-    # Coarse tie points determine no more of a lens.
+    # Coarse tie points determine no other lens parameters.
     freedom = LensFreedom(focal_sigma=freedom.focal_sigma)
     upright = _QUARTERS.get(photo.exif_orientation, 0)
     has_exif = photo.exif_orientation != 1 or photo.exif_focal_px is not None
@@ -158,7 +158,7 @@ def places_of(
 
 
 def _judged(found: Sequence[Placed]) -> list[Placed]:
-    """Drop duplicates and places with little agreement, sort, and decide if the best is clear."""
+    """Sort positions, drop duplicates and poor ones, and decide whether the best is clear."""
     best_first = sorted(found, key=lambda each: -each.share)
     kept = [
         replace(each, lead=max(other.lead for other in best_first if _is_same(each, other)))
@@ -182,16 +182,16 @@ def _judged(found: Sequence[Placed]) -> list[Placed]:
 def _camera_at(
     place: Place, structure: WallStructure, lens: ViewingCamera, quarters: int
 ) -> ViewingCamera | None:
-    """Return the pose from the positions of a photo's parts, starting square to the wall.
+    """Return the pose from the positions of a photo's parts, starting perpendicular to the wall.
 
     Args:
-        place: of the photo rotated by `np.rot90`.
-        structure: of the wall.
-        lens: the photo's.
+        place: position of the photo rotated by `np.rot90`.
+        structure: structure of the wall.
+        lens: lens of the photo.
         quarters: anticlockwise quarter turns of the rotated photo.
     """
     wall, frame = structure.wall, structure.wall.frame
-    # Axes of the photo as stored along those of the rotated one.
+    # Transforms axes of the rotated photo to those of the stored one.
     axes = np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), quarters % 4)
     stored_px = np.array([lens.width, lens.height])
     rotated_px = np.abs(axes) @ stored_px
@@ -199,7 +199,7 @@ def _camera_at(
     # Right, down and into the wall.
     rotation = np.array([*(axes @ [frame.u_world, frame.v_world]), -frame.normal_world])
     px_per_m = rotated_px[0] / place.width_m
-    # Near the wall: survey coordinates would lose digits.
+    # Use an origin near the wall, since large survey coordinates would lose digits.
     origin = frame.origin_world
     middle = frame.world_from_wall(place.centre_m[None] / frame.gsd_m)[0] - origin
     start = replace(
@@ -209,7 +209,7 @@ def _camera_at(
     )
     cells = place.parts_m / frame.gsd_m
     lifted, _, known = points_on_wall(wall, cells, usual_m=structure.usual_spread_m)
-    # On the plane where the wall is void.
+    # Use the plane of the wall where its surface is unknown.
     points = np.where(known[:, None], lifted, frame.world_from_wall(cells))
     seen = SeenPoints(
         pixels_photo=pixels,
@@ -232,7 +232,7 @@ def _tied(
     """Match patches of a reduced photo with a wall and refine its pose, round by round.
 
     Returns:
-        None where too few patches match.
+        The position, or None if too few patches match.
     """
     wall, origin = structure.wall, structure.wall.frame.origin_world
     camera, freedom = start
@@ -280,7 +280,7 @@ def _tied(
 
 
 def _measured(first: Channels, second: Channels, radius: int) -> Displacements:
-    """Measure displacements of patches over the part of a wall that a photo shows."""
+    """Measure displacements of patches in the part of a wall that a photo shows."""
     border = radius + HALF_PATCH_CELLS + 2
 
     def framed(channels: Channels) -> Channels:
@@ -307,7 +307,7 @@ def _measured(first: Channels, second: Channels, radius: int) -> Displacements:
 
 
 def _is_same(first: Placed, second: Placed) -> bool:
-    """Whether two poses project the tie points of one to the same positions."""
+    """Return whether two poses project the tie points of one to the same positions."""
     if first.piece.wall != second.piece.wall:
         return False
     camera, pixels = second.camera, first.piece.pixels_photo
@@ -317,15 +317,15 @@ def _is_same(first: Placed, second: Placed) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class _Footprint:
-    """What a photo shows of a wall, by a place found or by matched key points.
+    """The part of a wall that a photo shows, from a possible position or matched key points.
 
     Attributes:
-        photo: index.
-        wall: index.
+        photo: index of the photo.
+        wall: index of the wall.
         pixels: (rows, cols, 2) float64 pixels of the wall's coarse cells, NaN outside the photo.
         cell_px: width of a coarse cell in the photo.
-        tolerance_cells: how far the position may be off.
-        placed: the place; None for a photo with matched key points.
+        tolerance_cells: tolerance of the position.
+        placed: the possible position; None for a photo with matched key points.
     """
 
     photo: int
@@ -337,7 +337,7 @@ class _Footprint:
 
     @property
     def shown(self) -> NDArray[np.bool_]:
-        """Coarse cells (rows, cols) in the photo."""
+        """Mask of the coarse cells (rows, cols) in the photo."""
         return np.isfinite(self.pixels[:, :, 0])
 
 
@@ -348,18 +348,19 @@ def confirmed(
     on: tuple[Sequence[Wall], Sequence[WallStructure | None]],
     cores: int = 1,
 ) -> dict[int, Placed]:
-    """Choose the places that photos confirm for each other.
+    """Choose the positions that photos confirm for each other.
 
     Args:
         photos: all photos.
-        places: possible places of photos without clear matches, by index.
-        recognised: matches of photos with key points on a wall, by index; possibly of photos in
-            `places` as well, since key points may agree by chance.
+        places: possible positions of photos without clear matches, by index.
+        recognised: key point matches of photos with walls, by index; may include photos in
+            `places`, since key points may agree by chance.
         on: all walls, and their structures.
         cores: number of threads.
 
     Returns:
-        The confirmed place by index of the photo; none for photos whose key points are confirmed.
+        The confirmed positions by index of the photo, without photos whose key points are
+        confirmed.
     """
     if not any(places.values()):
         return {}
@@ -447,7 +448,7 @@ def _footprints_by_homography(
 def _shared(
     photos: Photos, wanted: Sequence[tuple[int, int]], cores: int
 ) -> dict[tuple[int, int], NDArray[np.float64]]:
-    """Match key points of pairs of photos: pixels (n, 2, 2) in the first and the second."""
+    """Match key points of photo pairs; return pixels (n, 2, 2) in the first and second photo."""
     asked = sorted({index for pair in wanted for index in pair})
 
     def look(index: int) -> tuple[NDArray[np.uint8], Features, float]:
@@ -474,7 +475,7 @@ def _shared(
 
 
 def _agree(one: _Footprint, other: _Footprint, shared: NDArray[np.float64]) -> bool:
-    """Whether two photos show the same key points at the same positions of the wall."""
+    """Return whether two photos show the same key points at the same positions of the wall."""
     from scipy.spatial import cKDTree
 
     both = one.shown & other.shown
@@ -492,7 +493,7 @@ def _agree(one: _Footprint, other: _Footprint, shared: NDArray[np.float64]) -> b
 def _chosen(
     footprints: Sequence[_Footprint], agreeing: Sequence[tuple[int, int]]
 ) -> dict[int, Placed]:
-    """Take the places of the largest groups that agree, one per photo."""
+    """Choose the positions of the groups that agree best, one per photo."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -507,7 +508,7 @@ def _chosen(
     ]
 
     def rank(members: list[int]) -> float:
-        """Rank a group by photos with matched key points, then by shares of patches."""
+        """Rank a group by whether it has photos with matched key points, then by patch shares."""
         is_anchored = any(footprints[member].placed is None for member in members)
         return 1e3 * is_anchored + sum(one.share for m in members if (one := footprints[m].placed))
 
@@ -522,13 +523,13 @@ def _chosen(
         }
         for member in members:
             placed = footprints[member].placed
-            # Confirmed key points need no structure.
+            # A photo with confirmed key points does not need structure.
             if placed is None or footprints[member].photo in recognised:
                 continue
             rival = by_photo.get(footprints[member].photo)
             if rival is None or placed.share > rival.share:
                 by_photo[footprints[member].photo] = placed
-        # A group that contradicts a higher ranked one is wrong as a whole.
+        # A group that contradicts a higher-ranking one is wrong as a whole.
         if not any(photo in chosen for photo in by_photo):
             chosen.update(by_photo)
     return chosen

@@ -1,4 +1,4 @@
-"""`face.photos`: the visible side of walls from photos, where scanner stations are unknown."""
+"""`face.photos`: find the visible side of walls from photos if scanner stations are unknown."""
 
 from __future__ import annotations
 
@@ -41,36 +41,36 @@ from orthoflow_plugins.match.pictures import (
     require_photos,
 )
 
-# Cells as fine as the point spacing, gaps filled, and the largest number of them.
+# Cell size relative to the point spacing, radius of gap filling, and maximum number of cells.
 _SPACINGS_PER_CELL: Final = 0.6
 _FILLED_CELLS: Final = 2
 _MAX_CELLS: Final = 4_000_000
 _MIN_POINTS: Final = 3
-# Inliers over all photos that decide on a side, and their ratio to those of the other side: a
-# symmetric facade matches its mirror image in part.
+# Minimum number of inliers in all photos to decide on a side, and their minimum ratio to those of
+# the other side, since a symmetric facade partly matches its mirror image.
 _MIN_AGREEING: Final = 16
 _MIN_MARGIN_RATIO: Final = 2.0
-# Planes within 45 degrees of the opposite direction face the other way.
+# A plane faces the other way if its normal is within 45 degrees of the opposite direction.
 _OPPOSITE_COSINE: Final = -math.sqrt(0.5)
 SIDES_GUESSED: Final = DiagnosticSpec(
     code="plane-sides-guessed",
     severity="warning",
-    text="neither stations nor photos show from which side {n} of {n_planes} planes were seen "
-    "({planes}); the side with more of the other points was taken",
-    remedy="if an image comes out mirrored, set view_from of read.scan",
+    text="neither stations nor photos determine from which side {n} of {n_planes} planes were seen "
+    "({planes}); the side with more of the other points was assumed",
+    remedy="if an image is mirrored, set view_from of read.scan",
     rank_by="n",
 )
 
 
 class FaceByPhotos(Method):
-    """Turn planes whose side was guessed to the side that the photos show.
+    """Turn planes whose side was guessed towards the side that the photos show.
 
-    A wall seen from behind is a mirror image of what photos show. If no scanner station determines
-    the side of a plane, the cloud is rastered coarsely on it, and photos are matched with that
-    picture as they are and mirrored, in mixtures of their colours if grey decides no plane; the
-    side with clearly more inliers is taken. A plane that photos do not decide is turned if it lies
-    between two planes of known sides that both face the other way. Planes whose side is known,
-    floors and ceilings are left unchanged.
+    A wall seen from behind is a mirror image of its photos. If no scanner station determines the
+    side of a plane, the cloud is rastered coarsely on the plane, and the photos are matched with
+    this picture both unchanged and mirrored, in mixtures of their colours if grey decides no plane.
+    The side with clearly more inliers is used. A plane that the photos do not decide is turned if
+    it is between two planes with known sides that both face the other way. Planes with a known
+    side, floors and ceilings remain unchanged.
     """
 
     id: ClassVar[str] = "face.photos"
@@ -88,7 +88,7 @@ class FaceByPhotos(Method):
         """No parameters."""
 
     class In(Ports):
-        """The planes, the cloud that they were found in, and the photos."""
+        """The planes, the cloud in which they were found, and the photos."""
 
         planes: Planes
         cloud: PointCloud
@@ -131,8 +131,8 @@ class FaceByPhotos(Method):
                 planes = planes.turned(index)
                 n_turned += 1
                 ctx.log(
-                    f"{planes.names[index]}: turned, {behind} matches of the photos agree on its "
-                    f"other side, {front} on the guessed one"
+                    f"{planes.names[index]}: turned, since {behind} matches of the photos agree "
+                    f"with its other side and {front} with the guessed one"
                 )
         for index in asked:
             if sources[index] == "guess" and _is_turned_away(planes, index, sources):
@@ -152,9 +152,10 @@ class FaceByPhotos(Method):
         pictures: Sequence[Features | None],
         ctx: StepContext,
     ) -> NDArray[np.intp]:
-        """Count inliers (planes, 2) on the front and on the other side of each plane.
+        """Count the inliers (planes, 2) on the front and on the other side of each plane.
 
-        In grey; if that decides no plane, in the first mixture of colours that does.
+        The photos are matched in grey and, if that decides no plane, in the first mixture of
+        colours that decides one.
         """
         counts = np.zeros((len(pictures), 2), dtype=np.intp)
 
@@ -178,21 +179,22 @@ class FaceByPhotos(Method):
 
     @classmethod
     def tools(cls) -> dict[str, str]:
-        """OpenCV detects and describes key points."""
+        """OpenCV for detection and description of key points."""
         return {"opencv-python-headless": version("opencv-python-headless")}
 
 
 def _is_decided(front: int, behind: int) -> bool:
-    """Whether the numbers of inliers decide the side of a plane."""
+    """Return whether the numbers of inliers decide the side of a plane."""
     least = max(_MIN_AGREEING, _MIN_MARGIN_RATIO * min(front, behind))
     return max(front, behind) >= least
 
 
 def _is_turned_away(planes: Planes, index: int, sources: Sequence[SideSource]) -> bool:
-    """Whether a plane lies between planes of known sides that both face the other way.
+    """Return whether a plane is between planes with known sides that both face the other way.
 
-    Who sees the front one stands beyond the plane. So the step of a fountain is seen from where its
-    facade is, although most points of the cloud, those of the facade, are on its other side.
+    The viewer of the plane in front of it is beyond this plane. For example, the step of a fountain
+    is seen from the same side as the facade, although most points of the cloud, those of the
+    facade, are on its other side.
     """
     known = np.array([source != "guess" for source in sources])
     opposite = known & (planes.normal @ planes.normal[index] < _OPPOSITE_COSINE)
@@ -236,7 +238,7 @@ def _features(planes: Planes, index: int, cloud: PointCloud, cores: int) -> Feat
 def _grey_on(
     frame: WallFrame, tolerance_m: float, cloud: PointCloud, cores: int
 ) -> NDArray[np.float32]:
-    """Return grey 0..1 (rows, cols) of the topmost points, gaps filled; NaN where none is near."""
+    """Return grey values 0..1 (rows, cols) of the topmost points; NaN away from any point."""
     import cv2
 
     from orthoflow.geometry.rastering import topmost_points

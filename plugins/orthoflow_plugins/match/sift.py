@@ -1,4 +1,4 @@
-"""`match.sift`: points of the photos on the walls by SIFT key points (markiewicz2015, 3.5, 3.6)."""
+"""`match.sift`: match photos with walls by SIFT key points (markiewicz2015, 3.5, 3.6)."""
 
 from __future__ import annotations
 
@@ -40,32 +40,33 @@ if TYPE_CHECKING:
 BY_EDGES: Final = DiagnosticSpec(
     code="photo-placed-by-edges",
     severity="warning",
-    text="photo {subject}: placed by edges alone, which can be wrong where patterns repeat",
+    text="photo {subject}: its position was found only by edges, which can be wrong where patterns "
+    "repeat",
     remedy="check its overlay",
 )
 MIRRORED: Final = DiagnosticSpec(
     code="photo-mirrored",
     severity="warning",
     text="photo {subject}: its mirror image matches the walls better than the photo itself, so it "
-    "gets no ties: it is mirrored, shows a repeating pattern or another wall, or the sides of the "
-    "planes are wrong",
+    "gets no ties: the photo is mirrored, it shows a repeating pattern or another wall, or the "
+    "sides of the planes are wrong",
     remedy="flip the photo if it is mirrored; check view_from of read.scan",
 )
 NO_WALL: Final = DiagnosticSpec(
     code="photo-shows-no-wall",
     severity="warning",
-    text="photo {subject}: no wall is recognised in it, so it gets no ties",
+    text="photo {subject}: no wall was recognised in it, so it gets no ties",
 )
 
 
 class MatchSift(Method):
-    """Match photos with the intensity rasters of the walls: RootSIFT, mutual, ratio test.
+    """Match photos with the intensity rasters of the walls (RootSIFT, mutual, ratio test).
 
-    Every photo is matched with every wall, by its strongest key points first, then by all on the
-    walls recognised. If grey shows no wall clearly, mixtures of its colours are tried, then the
-    course of edges, whichever side is brighter, if another photo confirms the place. Matches that
-    do not fit a homography of the wall are kept as rejected ties. Ties include the depth of the
-    surface.
+    Each photo is matched with each wall, first by its strongest key points, then by all of them on
+    the recognised walls. If no wall is clearly recognised in grey, mixtures of the photo's colours
+    are tried. After that, edges are compared regardless of which side is brighter; the position
+    must be confirmed by another photo. Matches that do not fit a homography of the wall are kept as
+    rejected ties. Ties include the depth of the surface.
     """
 
     id: ClassVar[str] = "match.sift"
@@ -73,7 +74,7 @@ class MatchSift(Method):
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_ties", label="ties"),
         MetricSpec("n_rejected", label="ties rejected"),
-        MetricSpec("rejected_share", label="share of the ties that is rejected"),
+        MetricSpec("rejected_share", label="share of rejected ties"),
         MetricSpec("n_photos_matched", label="photos with accepted matches"),
         MetricSpec("ties_per_photo_median", label="ties per photo, median"),
         MetricSpec("n_wall_key_points", label="key points of the walls"),
@@ -89,22 +90,22 @@ class MatchSift(Method):
     )
 
     class Params(PairingParams):
-        """Key points, and criteria of a match."""
+        """Key points and criteria for matches."""
 
         preset: Literal["none", "paper"] = Field(
             default="none",
-            description="paper: OpenCV's default SIFT without equalisation, and the best match in "
-            "the photo of each key point of a wall, as in markiewicz2015; of the other options "
-            "`ratio` applies.",
+            description="paper: as in markiewicz2015, OpenCV's default SIFT without equalisation, "
+            "and the best match in the photo for each key point of a wall; of the other "
+            "parameters, only `ratio` is used.",
         )
         structure: Literal["never", "confirmed", "alone"] = Field(
             default="confirmed",
-            description="Whether photos without clear matches of key points are compared with the "
-            "walls at many scales by the course of edges, in colours, intensity and relief. "
-            "confirmed: a place is accepted if another photo, at its own place, shows the same "
-            "key points there. alone: also without confirmation, which may accept a photo of "
-            "another object with the same pattern: check the overlays. The errors of such ties "
-            "are correlated, so the error stated by an orientation from them is too small: "
+            description="Whether photos without clear key point matches are compared with the "
+            "walls by their edges, at many scales, in colours, intensity and relief. confirmed: a "
+            "position is accepted if another photo, at its own position, shows the same key "
+            "points there. alone: also without confirmation; this may accept a photo of another "
+            "object with the same pattern, so check the overlays. The errors of such ties are "
+            "correlated, so the predicted error of an orientation from them is too small; "
             "match.guided measures them again.",
         )
 
@@ -121,7 +122,7 @@ class MatchSift(Method):
         ties: Ties
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Match photos with every wall, and make ties."""
+        """Match each photo with each wall, and return the ties."""
         photos, walls = inputs.photos, inputs.walls
         require_photos(photos)
         alone = ties_by_hand_alone(inputs.hand, photos, walls, ctx)
@@ -142,7 +143,7 @@ class MatchSift(Method):
 
     @classmethod
     def tools(cls) -> dict[str, str]:
-        """OpenCV detects and describes key points."""
+        """OpenCV for detection and description of key points."""
         return {"opencv-python-headless": version("opencv-python-headless")}
 
 
@@ -153,10 +154,10 @@ def _matched(
     params: MatchSift.Params,
     ctx: StepContext,
 ) -> tuple[list[TiePiece], dict[str, JsonValue], list[float]]:
-    """Match photos with the walls, and place photos without clear matches by structure.
+    """Match photos with the walls by key points, or by structure if these are unclear.
 
     Returns:
-        Ties, details of each photo, and the search radius of each.
+        Ties, details of each photo, and the search radius of each photo.
     """
 
     def pair(photo: Photo) -> PhotoPairs:
@@ -185,7 +186,7 @@ def _placed(
     params: MatchSift.Params,
     ctx: StepContext,
 ) -> dict[int, Placed]:
-    """Place photos without clear matches of key points by structure; by index."""
+    """Find positions of photos without clear key point matches by structure; by index."""
     from orthoflow_plugins.match.placing import confirmed, places_of
     from orthoflow_plugins.match.structures import wall_structure
 
@@ -218,7 +219,7 @@ def _placed(
             ctx.report(BY_EDGES, subject=name)
         else:
             ctx.log(
-                f"photo {name}: edges suggest a place on "
+                f"photo {name}: edges suggest a position on "
                 f"{walls.walls[found[0].piece.wall].name}, but no other photo confirms it; "
                 f"structure: alone would accept it"
             )

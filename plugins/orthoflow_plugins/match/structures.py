@@ -1,11 +1,11 @@
-"""Structure of photos and walls: where edges run, whichever side of them is brighter.
+"""Structure of photos and walls: position and direction of edges, regardless of their sign.
 
-A laser measures at another wavelength than a camera: contrast may be weaker, absent or inverted,
-differently for each material. Edges keep their position and orientation (modulo 180 degrees); steps
-of the relief are edges of the wall, too. A photo is compared with the wall at many scales: nine
-overlapping parts of it are correlated with the whole wall and may shift a little against each other
-to allow for perspective. Scales are compared by how far the best sum of correlations stands out
-from those at all other positions.
+A laser measures at another wavelength than a camera, so contrast may be weaker, missing or
+inverted, depending on the material. Edges keep their position and orientation (modulo 180 degrees);
+relief steps are also edges of the wall. A photo is compared with the wall at many scales: nine
+overlapping parts of the photo are correlated with the whole wall and may shift slightly relative to
+each other to allow for perspective. The scale with the largest lead is chosen: the difference
+between the best sum of correlations and those at all other positions, relative to their spread.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from orthoflow.products import Wall
 from orthoflow_plugins.match.channels import Channels
 from orthoflow_plugins.match.pictures import filled_smoothly, usual_spread_m
 
-# Cells of the shorter side of a wall, unless its raster is coarser.
+# Number of cells along the shorter side of a wall, unless its raster is coarser.
 _CELLS: Final = 200.0
-# Scales that are tried, by the size of the photo on the wall over the shorter side of the wall:
-# smallest longer side and largest shorter side of the photo.
+# Range of scales, as the size of the photo on the wall relative to the shorter side of the wall:
+# minimum of the photo's longer side and maximum of its shorter side.
 _SIZES: Final = (0.2, 1.6)
 _STEP: Final = 1.1
 _MAX_PART_CELLS: Final = 250
 _MIN_PART_CELLS: Final = 16
-# How far a part may shift, over the photo's width.
+# Maximum shift of a part, relative to the photo's width.
 _SLIP_SHARE: Final = 0.03
-# A step of the relief that weighs as much as a step from black to white.
+# A relief step of this height has the same weight as a step from black to white.
 _STEP_M: Final = 0.5
 _MIN_KNOWN: Final = 0.8
 _NOISE_SIGMA_CELLS: Final = 1.0
@@ -41,29 +41,30 @@ _EVEN_SIGMA_CELLS: Final = 12.0
 _POOL_SIGMA_CELLS: Final = 1.5
 _BROAD_SIGMA_CELLS: Final = 15.0
 _STRONGEST: Final = 3.0
-# Parts that lie mostly beside the wall must not win by the little overlap.
+# Prevents high scores of parts that are mostly outside the wall and overlap it only slightly.
 _MIN_ENERGY: Final = 0.25
-# Places differ by at least this distance, over the photo's width, or by this logarithm of scales.
+# Two positions are distinct if they differ by this distance, relative to the photo's width, or by
+# this logarithm of scales.
 _ELSEWHERE: Final = (0.25, 0.25)
-# Cells of a photo's longer side when it is compared: larger photos are compared in cells that are
+# Maximum number of cells along a photo's longer side; larger photos are compared in cells that are
 # two or four times as wide.
 _PHOTO_CELLS: Final = 250
-# Channels are pooled so broadly that every second cell suffices.
+# Channels are smoothed so much that every second cell is enough.
 _SAMPLE_CELLS: Final = 2
 _LEVELS: Final = 3
 PHOTO_SIDE_PX: Final = 2 * _MAX_PART_CELLS
-"""Longer side to which a photo is reduced first: no scale needs more."""
+"""Longer side to which photos are reduced first; no scale needs more pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class WallStructure:
-    """The structure of a wall, ready for correlation.
+    """The structure of a wall, prepared for correlation.
 
     Attributes:
-        wall: in coarse cells.
+        wall: the wall in coarse cells.
         channels: its structure.
-        levels: the same in cells of this size, of twice and of four times the size.
-        usual_spread_m: as returned by `usual_spread_m`.
+        levels: spectra of the structure in cells of this size, twice and four times the size.
+        usual_spread_m: as returned by the function `usual_spread_m`.
     """
 
     wall: Wall
@@ -77,11 +78,12 @@ class Spectra:
     """Fourier transforms of the structure of a wall.
 
     Attributes:
-        layers: (c, ...) complex64 of the channels, conjugated.
-        energy: the same of the sum of their squares.
+        layers: (c, ...) complex64 conjugate transforms of the channels.
+        energy: complex64 transform of the sum of their squares.
         shape: rows and columns of samples.
-        padded: the same with padding, so that a part leaves the wall before it wraps around.
-        sample_m: width of a sample.
+        padded: rows and columns with padding, so that a part leaves the wall before it wraps
+            around.
+        sample_m: width of a sample in metres.
     """
 
     layers: NDArray[np.complex64]
@@ -97,10 +99,11 @@ class Place:
 
     Attributes:
         centre_m: (2,) float64 metres right and down from the corner of the wall's raster.
-        width_m: of the photo on the wall, approximately.
-        lead: by how many robust deviations it stands out from other positions at its scale.
+        width_m: approximate width of the photo on the wall.
+        lead: difference of its score to the median of all positions at this scale, in robust
+            standard deviations.
         parts_photo: (9, 2) float64 centres of the photo's parts, relative to its width and height.
-        parts_m: (9, 2) float64 their positions on the wall, as `centre_m`.
+        parts_m: (9, 2) float64 positions of the parts on the wall, as in `centre_m`.
     """
 
     centre_m: NDArray[np.float64]
@@ -111,7 +114,7 @@ class Place:
 
 
 def wall_structure(wall: Wall) -> WallStructure | None:
-    """Prepare a wall; None if it has no intensity or is too small."""
+    """Compute the structure of a wall; None if it has no intensity or is too small."""
     if wall.intensity is None or not np.isfinite(wall.intensity).any():
         return None
     factor = max(1, round(min(wall.frame.shape) / _CELLS))
@@ -122,7 +125,7 @@ def wall_structure(wall: Wall) -> WallStructure | None:
     levels = [(channels, coarse.frame.gsd_m)]
     intensity, depth_m = coarse.intensity, coarse.depth_m
     for _ in range(1, _LEVELS):
-        # Means of intensity; one of four depths where most of them are known.
+        # The mean of four intensities, and the first of four depths if most of them are known.
         known = _halved(np.isfinite(depth_m)) >= _MIN_KNOWN
         rows, columns = known.shape
         depth_m = np.where(known, depth_m[: 2 * rows : 2, : 2 * columns : 2], np.float32(np.nan))
@@ -143,7 +146,7 @@ def _wall_channels(intensity: NDArray[np.float32], depth_m: NDArray[np.float32])
 
 
 def _halved(values: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Means of 2 x 2 values (rows, cols, ...); an odd last row or column is left out."""
+    """Return means of 2 x 2 values (rows, cols, ...); an odd last row or column is dropped."""
     import cv2
 
     rows, columns = (length // 2 for length in values.shape[:2])
@@ -172,7 +175,7 @@ def _spectra(channels: Channels, cell_m: float) -> Spectra:
 
 
 def _samples(channels: Channels) -> NDArray[np.float32]:
-    """Layers (c, rows, cols) of every second cell."""
+    """Return layers (c, rows, cols) at half the resolution."""
     return np.ascontiguousarray(np.moveaxis(_halved(channels.values), -1, 0))
 
 
@@ -181,7 +184,7 @@ def _slip(width: int) -> int:
 
 
 def structure_of(layers: NDArray[np.float32], known: NDArray[np.bool_]) -> Channels:
-    """Return the structure of a picture (rows, cols, layers) NaN or not known where void."""
+    """Return the structure of a picture (rows, cols, layers) with known cells (rows, cols)."""
     import cv2
 
     soft = []
@@ -195,7 +198,7 @@ def structure_of(layers: NDArray[np.float32], known: NDArray[np.bool_]) -> Chann
 
 
 def _coarser(wall: Wall, factor: int) -> Wall:
-    """Join factor x factor cells of a wall: the mean intensity, 0 to 1, and one of the depths."""
+    """Join factor x factor cells of a wall; take the mean intensity (0..1) and one depth."""
     import cv2
 
     assert wall.intensity is not None  # noqa: S101 - checked before
@@ -204,7 +207,7 @@ def _coarser(wall: Wall, factor: int) -> Wall:
     low, high = np.percentile(wall.intensity[np.isfinite(wall.intensity)], (1.0, 99.0))
     scaled = np.clip((wall.intensity - low) / max(float(high - low), 1e-9), 0.0, 1.0)
     grey = np.rint(255.0 * filled_smoothly(np.where(known, scaled, np.nan))).astype(np.uint8)
-    # Cells hold single points of a scan, whose speckle is no structure.
+    # Cells contain single scan points, whose speckle is not structure.
     grey = np.asarray(cv2.medianBlur(grey, 3), dtype=np.uint8)
     cells = (slice(0, height * factor), slice(0, width * factor))
 
@@ -232,10 +235,10 @@ def _coarser(wall: Wall, factor: int) -> Wall:
 
 
 def likely_places(rgb: NDArray[np.uint8], wall: WallStructure, *, n_most: int) -> list[Place]:
-    """Return the positions on a wall that a photo may show, the likeliest first.
+    """Return possible positions of a photo on a wall, the most likely first.
 
     Args:
-        rgb: (height, width, 3) of the photo, upright to some 9 degrees.
+        rgb: (height, width, 3) colours of the photo, upright to about 9 degrees.
         wall: the wall.
         n_most: maximum number of positions.
     """
@@ -252,10 +255,10 @@ def likely_places(rgb: NDArray[np.uint8], wall: WallStructure, *, n_most: int) -
 
 
 def _widths_cells(photo: Sequence[int], wall: tuple[int, ...]) -> list[int]:
-    """Return the widths in cells at which a photo is compared."""
+    """Return the photo widths, in cells, that are tried."""
     height, width = photo[0], photo[1]
     least = _SIZES[0] * min(wall) * width / max(height, width)
-    # Each part has half the sides of the photo.
+    # Each part is half as wide and high as the photo.
     most = min(
         _SIZES[1] * min(wall) * width / min(height, width),
         2.0 * (_MAX_PART_CELLS - 1) * width / max(height, width),
@@ -270,7 +273,7 @@ def _best_at(rgb: NDArray[np.uint8], width_cells: float, wall: Spectra) -> Place
     import cv2
     from scipy import fft
 
-    # Whole samples.
+    # Sizes that are multiples of a sample.
     width, height = (
         max(2, round(length / _SAMPLE_CELLS))
         for length in (width_cells, width_cells * rgb.shape[0] / rgb.shape[1])
@@ -286,14 +289,15 @@ def _best_at(rgb: NDArray[np.uint8], width_cells: float, wall: Spectra) -> Place
         for top in (0, (height - side[0]) // 2, height - side[0])
         for left in (0, (width - side[1]) // 2, width - side[1])
     ]
-    # Energy of the wall under a part at every position of its corner (wrapped), the same for all.
+    # Energy of the wall under a part at each position of its corner (wrapped); the same for all
+    # parts.
     box = _spectrum(np.ones((1, *side), dtype=np.float32), wall.padded)[0]
     under = np.asarray(fft.irfft2(wall.energy * np.conj(box), wall.padded), dtype=np.float32)
     maps = [
         _part_map(channels[:, top : top + side[0], left : left + side[1]], under, wall)
         for top, left in corners
     ]
-    # Corners of a photo whose centre is on the wall.
+    # Corner positions of the photo for which its centre is on the wall.
     rows, columns = (
         np.arange(n) - m // 2 for n, m in zip(wall.shape, (height, width), strict=True)
     )
@@ -326,7 +330,7 @@ def _best_at(rgb: NDArray[np.uint8], width_cells: float, wall: Spectra) -> Place
 def _part_map(
     part: NDArray[np.float32], under: NDArray[np.float32], wall: Spectra
 ) -> NDArray[np.float32]:
-    """Correlate a part of a photo with the wall, at every position of its corner (wrapped)."""
+    """Correlate a part of a photo with the wall at each position of its corner (wrapped)."""
     from scipy import fft
 
     own = float(np.einsum("cij,cij->", part, part))
@@ -338,7 +342,7 @@ def _part_map(
 
 
 def _spectrum(layers: NDArray[np.float32], padded: tuple[int, int]) -> NDArray[np.complex64]:
-    """Transform layers (c, rows, cols) with padding; padded rows are not transformed."""
+    """Transform layers (c, rows, cols) with padding; padded rows are skipped along the rows."""
     from scipy import fft
 
     along = fft.rfft(layers, padded[1], axis=2)
@@ -346,7 +350,7 @@ def _spectrum(layers: NDArray[np.float32], padded: tuple[int, int]) -> NDArray[n
 
 
 def _slipped(part: NDArray[np.float32], at: tuple[int, int], slip: int) -> NDArray[np.float64]:
-    """Return the best (column, row) of a part's corner within a distance of a position."""
+    """Return the best (column, row) of a part's corner within `slip` of a position."""
     steps = np.arange(-slip, slip + 1)
     rows, columns = at[0] + steps, at[1] + steps
     near = part[np.ix_(rows % part.shape[0], columns % part.shape[1])]
@@ -365,10 +369,10 @@ def _is_elsewhere(place: Place, other: Place) -> bool:
 def _channels(
     layers: Sequence[NDArray[np.float32]], known: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Return channels (5, rows, cols) of the orientation of edges, of all layers together.
+    """Return channels (5, rows, cols) of the orientation of edges, for all layers together.
 
-    Doubled and fourfold angles of the gradient and its strength, normalised locally: the first
-    terms of a histogram of orientations modulo 180 degrees.
+    They consist of the double and fourfold angle of the gradient and its strength, normalised
+    locally: the first terms of a histogram of orientations modulo 180 degrees.
     """
     import cv2
 

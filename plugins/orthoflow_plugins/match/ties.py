@@ -1,10 +1,10 @@
-"""Ties between photos and walls: from key points or measured by hand, joined without duplicates.
+"""Ties between photos and walls: from key points or measured by hand, without duplicates.
 
-`preset: paper` matches as markiewicz2015 did (3.5, 3.6, 4.3): OpenCV's default SIFT, and the best
-match of its reference [36], openMVG: the nearest descriptor in the photo of a key point of the
-wall, if the ratio of the distances of the nearest and the second nearest allows (0.8 in openMVG's
-documentation). Without poses all key points of a wall are matched; with poses, those in the part
-that the photo shows.
+`preset: paper` matches as in markiewicz2015 (3.5, 3.6, 4.3): with OpenCV's default SIFT, and with
+the best match as in its reference [36], openMVG. This is the nearest descriptor in the photo for a
+key point of the wall if the ratio of the distances of the nearest and the second nearest is below a
+limit (0.8 in openMVG's documentation). Without poses, all key points of a wall are matched; with
+poses, those in the part that the photo shows.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from orthoflow_plugins.match.warping import Projection, project_walls
 if TYPE_CHECKING:
     from orthoflow.sdk import StepContext
 
-# Standard deviation of a SIFT key point, in pixels of its image: of the smallest ones, and in
-# proportion to their size.
+# Standard deviation of a SIFT key point, in pixels of its image: its minimum, and its ratio to the
+# size of the key point.
 _MIN_SIGMA_PX: Final = 0.35
 _SIGMA_PER_SIZE: Final = 0.06
-# At an edge of the relief a key point belongs to neither side.
+# Key points at relief edges, which have a larger standard deviation, are dropped.
 _MAX_SIGMA_CELLS: Final = 3.0
 # The ratio of openMVG's documentation, and the maximum number of key points of a picture.
 _PAPER_RATIO: Final = 0.8
@@ -40,7 +40,7 @@ _PAPER_FEATURES: Final = 50_000
 BY_HAND_ALONE: Final = DiagnosticSpec(
     code="scan-without-texture",
     severity="warning",
-    text="the scan has neither intensity nor colour that a photo could be matched with: only the "
+    text="the scan has neither intensity nor colour, so photos cannot be matched with it: only "
     "ties measured by hand are used",
 )
 
@@ -52,7 +52,7 @@ class TiePiece(SeenPoints):
     Attributes:
         photo: index of the photo.
         wall: index of the wall.
-        role: of the ties.
+        role: role of the ties.
     """
 
     photo: int
@@ -80,16 +80,16 @@ def piece_on_wall(
     usual_m: float | None = None,
     role: TieRole = TieRole.CONTROL,
 ) -> TiePiece:
-    """Return ties of one photo with positions on one wall, without those unknown on either.
+    """Return ties of one photo with one wall; drop those without a finite pixel or depth.
 
     Args:
         at: index of the photo and of the wall.
         wall: the wall.
-        pixels_photo: (n, 2).
+        pixels_photo: (n, 2) pixels of the photo.
         cells: (n, 2) (column, row) of the wall's raster, first cell centre at (0.5, 0.5).
-        sigma_px: (n,) standard deviation of a coordinate of a pixel.
+        sigma_px: (n,) standard deviation of a pixel coordinate.
         usual_m: as in `points_on_wall`.
-        role: of the ties.
+        role: role of the ties.
     """
     points_world, sigma_m, known = points_on_wall(wall, cells, usual_m=usual_m)
     piece = TiePiece(
@@ -112,14 +112,14 @@ def key_point_ties(
     scale: float = 1.0,
     role: TieRole = TieRole.CONTROL,
 ) -> TiePiece:
-    """Return ties of one photo with one wall, without those whose depth is unknown or uncertain.
+    """Return ties of one photo with one wall; drop those with an unknown or uncertain depth.
 
     Args:
         at: index of the photo and of the wall.
         wall: the wall.
         sets: matched key points in the photo (pixels of the full image) and on the wall.
-        scale: factor by which the photo was reduced to find them.
-        role: of the ties.
+        scale: factor by which the photo was reduced to find the key points.
+        role: role of the ties.
     """
     in_photo, on_wall = sets
     known = points_on_wall(wall, on_wall.pixels)[2]
@@ -138,18 +138,19 @@ def paper_ties(
     ratio: float | None,
     ctx: StepContext,
 ) -> tuple[list[TiePiece], list[Features | None]]:
-    """Find the best matches of photos with every wall as in markiewicz2015.
+    """Find the best matches of each photo with each wall as in markiewicz2015.
 
     Args:
         photos: the photos.
         walls: the walls.
-        cameras: by photo; key points outside the photo by its pose are not matched, nor photos
-            without a pose. None matches everything.
-        ratio: largest distance of the best match over the second best; None for that of openMVG.
-        ctx: the context, for progress.
+        cameras: cameras by photo name; photos without a pose and key points outside the photo are
+            not matched. None matches all photos and key points.
+        ratio: maximum ratio of the distances of the best and the second best match; None for that
+            of openMVG.
+        ctx: context for progress.
 
     Returns:
-        Ties, and key points of each wall, None without intensity.
+        Ties, and key points of each wall, None for walls without intensity.
     """
 
     def look(wall: Wall) -> Features | None:
@@ -197,13 +198,13 @@ def ties_of(
     *,
     search_radius_px: tuple[float | None, ...] = (),
 ) -> Ties:
-    """Join pieces into one product, in their order, without masked pixels.
+    """Join pieces into one product, in their order; drop ties in masked parts of photos.
 
     Args:
         pieces: the ties.
         photos: all photos.
         walls: all walls.
-        details: for the report.
+        details: details for the report.
         search_radius_px: one per photo, as in `Ties`.
     """
     masks = [used_pixels(photo) for photo in photos.photos]
@@ -235,20 +236,20 @@ def ties_of(
 
 
 def joined(pieces: Sequence[TiePiece]) -> SeenPoints:
-    """Return all ties of pieces."""
+    """Return the ties of all pieces together."""
     return TiePiece.joined([_NOTHING, *pieces])
 
 
 def parted(pieces: Sequence[TiePiece], kept: NDArray[np.bool_]) -> list[TiePiece]:
-    """Take the kept ties (n,) of all pieces piece by piece."""
+    """Select ties by a mask (n,) over all pieces; return the pieces."""
     parts = np.split(kept, np.cumsum([len(piece) for piece in pieces])[:-1])
     return [piece.take(part) for piece, part in zip(pieces, parts, strict=True)]
 
 
 def without_twins(pieces: Sequence[TiePiece]) -> list[TiePiece]:
-    """Keep one of several ties of the same key point with the same surface on overlapping walls.
+    """Drop duplicate ties of a key point with the same surface on overlapping walls.
 
-    Rasters of planes close to each other contain the same surface, which would count twice in the
+    Rasters of neighbouring planes may contain the same surface, which would count twice in the
     orientation. The tie with the smallest `sigma_m` is kept.
     """
     if len(pieces) < 2:
@@ -275,7 +276,7 @@ def ties_by_hand_alone(
     """Return the ties measured by hand if no wall has intensity.
 
     Returns:
-        None if a wall has intensity.
+        The ties, or None if a wall has intensity.
 
     Raises:
         MethodError: no wall has intensity, and there are no ties measured by hand.
@@ -291,10 +292,10 @@ def with_ties_by_hand(ties: Ties, hand: Ties | None, walls: Walls, ctx: StepCont
     """Append ties measured by hand to those of matching.
 
     Args:
-        ties: of all photos, with their walls.
-        hand: measured by hand, in photos of the same names; may be None.
+        ties: ties of all photos, with their walls.
+        hand: ties measured by hand in photos with the same names, or None.
         walls: the walls of `ties`.
-        ctx: the context, for their number.
+        ctx: context for the metric of their number.
     """
     if hand is None or not len(hand.photo):
         return ties
@@ -303,7 +304,7 @@ def with_ties_by_hand(ties: Ties, hand: Ties | None, walls: Walls, ctx: StepCont
     kept = np.flatnonzero(known[hand.photo] >= 0)
     ctx.metric("n_by_hand", len(kept), "1")
     own_walls = walls.nearest(hand.points_world[kept])
-    # Any: the arrays of a product by name.
+    # Any, since the arrays of the product are collected by name.
     columns: dict[str, Any] = {
         name: np.concatenate([getattr(ties, name), getattr(hand, name)[kept]])
         for name in ("pixels_photo", "points_world", "sigma_px", "sigma_m", "role")

@@ -1,9 +1,9 @@
-"""Match one photo with all walls by its pose: measure, reject, refit the pose, measure again.
+"""Match one photo with all walls, starting from its pose: measure, reject, refit, and repeat.
 
 A photo may share too few key points with the laser intensity of a wall for a first pose, but
-hundreds with another photo of the wall. So oriented photos are painted on the walls, and a photo
-without a pose is matched with these pictures; then it is matched with the scan as any other photo,
-so that its ties depend on the scan alone.
+hundreds with another photo of the wall. Therefore oriented photos are projected onto the walls, and
+a photo without a pose is first matched with these pictures. It is then matched with the scan like
+any other photo, so that its ties depend only on the scan.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from orthoflow_plugins.match.ties import (
 from orthoflow_plugins.match.warping import Before, Projection, View, view_of
 
 _Painted = tuple[Wall, Features | None]
-"""A wall with intensity from photos, NaN where none shows it, and its key points."""
+"""A wall whose intensity is taken from photos, NaN where no photo shows it, and its key points."""
 
 
 _NEIGHBOURS: Final = 12
@@ -56,42 +56,42 @@ _REJECTION: Final = 3.5
 _HELD_OUT: Final = 4
 _LEAST: Final = 12
 _MAX_SIGMA_CELLS: Final = 2.0
-# Standard deviation of the raster's own interpolation.
+# Standard deviation due to the interpolation of the raster.
 _SIGMA_FLOOR_CELLS: Final = 0.1
 _OCCUPIED_CELLS: Final = 5.0
-# Search radius of the first round, halved in every further one down to the least.
+# Search radius of the first round, halved in each further round down to the minimum.
 _FIRST_RADIUS_CELLS: Final = 8
 _MIN_RADIUS: Final = 2
 _MAX_ROUNDS: Final = 4
-# A pose that moves the photo less than this on the walls is final.
+# A pose is final if it moves the photo by less than this on the walls.
 _SETTLED_CELLS: Final = 0.3
 # Relative decrease of the held-out error required for another round.
 _MIN_GAIN: Final = 0.03
-# Compared only where the others are not clearly good.
+# Compared only if the other channels do not give clearly good results.
 _LAST: Final = "colours"
 _FEW_SHARE: Final = 0.25
 
-# Two photos of one wall share hundreds of key points; fewer than so many may be a repeated motif.
+# Two photos of a wall share hundreds of key points; fewer than this may be a repeated motif.
 _MIN_AGREEING: Final = 24
 _POSE_LIMIT_SHARE: Final = 0.002
 _POSE_TRIALS: Final = 2000
 _PARAMS: Final = PairingParams()
-# Relative difference to the focal length of EXIF within which a lens is that of the same camera.
+# A lens may be that of the same camera if it deviates by less than this from the EXIF focal length.
 _NEAR_FOCAL: Final = 0.1
 
 CONTENTS: Final = ("gradients", "grey", _LAST)
-"""Channels that may be compared, in the order in which they are tried."""
+"""Channels to compare, in the order in which they are tried."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Setup:
-    """The walls that photos are matched with, and how.
+    """The walls to match photos with, and parameters of the matching.
 
     Attributes:
-        targets: all walls; any of them may hide another.
-        before: points before the walls; cells that they hide are not matched; None if unknown.
-        max_ties: places measured per photo.
-        contents: channels that are compared, of `CONTENTS`; the best one is kept.
+        targets: all walls; they may hide one another.
+        before: points in front of the walls, None if unknown; cells that they hide are not matched.
+        max_ties: positions measured per photo.
+        contents: channels to compare, from `CONTENTS`; the best result is kept.
         threads: number of threads per photo.
     """
 
@@ -103,7 +103,7 @@ class Setup:
 
     @property
     def walls(self) -> list[Wall]:
-        """The walls as they are matched."""
+        """The walls in the resolution in which they are matched."""
         return [target.wall for target in self.targets]
 
 
@@ -113,11 +113,11 @@ class Trace:
 
     Attributes:
         photo: index of the photo.
-        pieces: ties per wall without outliers.
-        n_measured: displacements measured in the last round.
-        n_outliers: rejected displacements.
-        held_out_px: RMS of a residual coordinate of held-out ties, per round.
-        content: channels that were compared.
+        pieces: ties per wall, without outliers.
+        n_measured: number of displacements measured in the last round.
+        n_outliers: number of rejected displacements.
+        held_out_px: RMS residual per coordinate of held-out ties, for each round.
+        content: name of the channels used.
         camera: the initial pose.
         settled: the final pose.
     """
@@ -133,7 +133,7 @@ class Trace:
 
     @property
     def n_ties(self) -> int:
-        """Ties on all walls."""
+        """Number of ties on all walls."""
         return sum(len(piece) for piece in self.pieces)
 
     def json(self) -> JsonValue:
@@ -150,9 +150,9 @@ class Trace:
 _Round = tuple[list[TiePiece], int]
 """Ties per wall without outliers, and the number of measured displacements."""
 _Known = tuple[LensFreedom, ViewingCamera]
-"""Free parameters of a lens, and a camera with the lens as known beforehand."""
+"""Free parameters of a lens, and a camera with the prior of the lens."""
 _Refitted = tuple[ViewingCamera, float, _Known | None]
-"""A pose by the ties of a round, the RMS of a residual coordinate of held-out ties in pixels, and
+"""A pose from the ties of a round, the RMS residual per coordinate of held-out ties in pixels, and
 the free parameters of the lens.
 """
 
@@ -164,25 +164,26 @@ def trace_photo(
     setup: Setup,
     lens: LensFreedom | None = None,
 ) -> Trace:
-    """Match a photo with the walls it shows by its pose, until held-out ties stop improving.
+    """Match a photo with the walls it shows, until held-out ties no longer improve.
 
     Args:
-        index: of the photo.
+        index: index of the photo.
         photo: the photo.
         camera: its pose, accurate to a few cells on the walls.
-        setup: the walls, and how to match.
-        lens: how far an estimated lens may be off. If it were fixed, right ties that contradict the
-            first estimate would be rejected.
+        setup: the walls, and parameters of the matching.
+        lens: uncertainty of an estimated lens. If the lens were fixed, correct ties that contradict
+            the first estimate would be rejected.
     """
     view = view_of(index, photo, camera, setup.walls, setup.before)
     found: tuple[Trace, View] | None = None
     for content in setup.contents:
         if content == _LAST and found is not None:
-            # Laser and camera may differ: grey values match worse than edges, or at few places.
+            # If laser and camera differ, grey values match worse than edges, or only at few
+            # positions.
             is_little = found[0].n_ties < _FEW_SHARE * setup.max_ties
             if found[0].content == "grey" and not is_little:
                 continue
-        # The pose of one content is the start of the next.
+        # The pose from one set of channels is the start for the next.
         start = (view, _FIRST_RADIUS_CELLS) if found is None else (found[1], _MIN_RADIUS)
         tried = _traced(start, setup, content, lens)
         if found is None or _rank(tried[0]) < _rank(found[0]):
@@ -192,10 +193,10 @@ def trace_photo(
 
 
 def estimated_lens(photo: Photo, found: Intrinsics | None) -> LensFreedom | None:
-    """Return how far the estimated lens of a first orientation may be off.
+    """Return the uncertainty of a lens estimated in a first orientation.
 
     Returns:
-        None if the lens was calibrated or given.
+        The standard deviations, or None if the lens was calibrated or given.
     """
     if photo.intrinsics is not None or found is None or found.source != "estimated":
         return None
@@ -206,8 +207,8 @@ def lens_by_ties(trace: Trace, lens: LensFreedom) -> tuple[ViewingCamera, float]
     """Return the camera adjusted to a photo's own ties, and the standard deviation of ln f.
 
     Args:
-        trace: of the photo.
-        lens: free parameters of the lens, the focal length among them.
+        trace: matching result of the photo.
+        lens: free parameters of the lens, including the focal length.
     """
     try:
         found = adjust(joined(trace.pieces), trace.settled, lens=lens, soft_limit=2.0)
@@ -217,7 +218,7 @@ def lens_by_ties(trace: Trace, lens: LensFreedom) -> tuple[ViewingCamera, float]
 
 
 def _rank(trace: Trace) -> tuple[float, int]:
-    """Rank by the held-out error over the root of the number of ties and over their spread."""
+    """Rank by the held-out error divided by the root of the number of ties and their spread."""
     pixels, error = joined(trace.pieces).pixels_photo, math.inf
     if len(pixels) >= _LEAST and trace.held_out_px:
         spread_px = math.sqrt(math.sqrt(max(float(np.linalg.det(np.cov(pixels.T))), 1.0)))
@@ -231,7 +232,7 @@ def _traced(
     content: str,
     lens: LensFreedom | None = None,
 ) -> tuple[Trace, View]:
-    """Match a photo by one content; return its final projection onto the walls as well."""
+    """Match a photo in one set of channels; also return its final projection onto the walls."""
     view, radius = start
     known = None if lens is None else (lens, view.camera)
     best: _Round | None = None
@@ -241,7 +242,7 @@ def _traced(
         found = _measured(view, setup, radius, content)
         fit = _refitted(joined(found[0]), view.camera, known)
         if fit is None:
-            # A round with too few ties does not replace the one before.
+            # A round with too few ties does not replace the previous one.
             best = best or found
             break
         camera, held_out_px, freed = fit
@@ -269,7 +270,7 @@ def _traced(
 
 
 def _moved_cells(pieces: list[TiePiece], view: View, refitted: ViewingCamera) -> float:
-    """Return by how much another pose moves the photo on the walls, at the ties (RMS)."""
+    """Return the RMS displacement on the walls, at the ties, caused by another pose."""
     squares = []
     for piece in pieces:
         projection = view.projections[piece.wall]
@@ -292,7 +293,7 @@ def _measured(view: View, setup: Setup, radius: int, content: str) -> _Round:
     occupied: set[tuple[int, int]] = set()
     pieces: list[TiePiece] = []
     n_measured = 0
-    # Largest first: planes close to each other contain the same surface.
+    # Largest wall first, since planes close to each other contain the same surface.
     for index in sorted(range(len(targets)), key=lambda k: (-sizes[k], k)):
         projection, target = view.projections[index], targets[index]
         if projection is None or target.grey is None or sizes[index] == 0:
@@ -327,8 +328,8 @@ def _piece(
 ) -> TiePiece:
     """Return the ties of one photo with one wall.
 
-    Residuals correlate over the cells that fill a gap and, independently, over those of the
-    smoothing: the areas add up.
+    Residuals are correlated over the cells that fill a gap and, independently, over those of the
+    smoothing, so the correlation areas add up.
     """
     moved, projection = found
     alone = grain[moved.places[:, 1], moved.places[:, 0]].astype(np.float64)
@@ -347,9 +348,9 @@ def _piece(
 def _refitted(
     seen: SeenPoints, camera: ViewingCamera, known: _Known | None = None
 ) -> _Refitted | None:
-    """Return the pose from three quarters of the ties and its misfit at the rest; None if too few.
+    """Return the pose from 3/4 of the ties and its misfit at the others; None for too few ties.
 
-    The lens is adjusted as well if that fits the rest better.
+    The lens is adjusted as well if that reduces the misfit at the held-out ties.
     """
     if len(seen) < _LEAST:
         return None
@@ -364,7 +365,7 @@ def _refitted(
             continue
         residuals = misfit(seen.take(held_out), fitted).residuals_px
         lengths = np.linalg.norm(residuals, axis=1)
-        # Remaining outliers must not decide whether to continue.
+        # Remaining outliers must not influence whether to continue.
         kept = residuals[lengths <= 3.0 * float(np.median(lengths))]
         held_out_px = float(np.sqrt(np.mean(kept**2)))
         if best is None or held_out_px < (1.0 - _MIN_GAIN) * best[1]:
@@ -377,15 +378,15 @@ def fitted_pose(
     camera: ViewingCamera,
     lens: _Known | None = None,
 ) -> ViewingCamera:
-    """Adjust a pose to points and reject outliers in turns.
+    """Alternate adjustment of a pose to points and rejection of outliers.
 
     Args:
         seen: the points.
-        camera: the start.
+        camera: initial camera.
         lens: free parameters of the lens, and a camera with its prior.
 
     Raises:
-        GeometryError: the points determine no pose.
+        GeometryError: the points do not determine a pose.
     """
     freedom, prior = (None, None) if lens is None else lens
     for _ in range(3):
@@ -401,7 +402,10 @@ def fitted_pose(
 def _without_misfits(
     pieces: list[TiePiece], camera: ViewingCamera, free: _Known | None = None
 ) -> list[TiePiece]:
-    """Reject ties that do not fit the pose; groups of wrong ties pass the median of neighbours."""
+    """Reject ties that do not fit the pose.
+
+    This removes groups of wrong ties, which the comparison with neighbours does not detect.
+    """
     seen = joined(pieces)
     if len(seen) < _LEAST:
         return pieces
@@ -430,7 +434,7 @@ def agrees_around(moved: Displacements) -> NDArray[np.bool_]:
     median = np.median(shifts, axis=1)
     spread = NMAD_FACTOR * np.median(np.abs(shifts - median[:, None]), axis=1)
     tolerance = np.maximum(_MEDIAN_TOLERANCE_CELLS, 3.0 * spread)
-    # Neighbours that disagree with each other may agree with anything by chance.
+    # Neighbours that disagree with each other may agree with any displacement by chance.
     agrees = (np.abs(moved.shift_cells - median) <= tolerance) & (spread < 2.0)
     return np.asarray(agrees.all(axis=1))
 
@@ -438,7 +442,7 @@ def agrees_around(moved: Displacements) -> NDArray[np.bool_]:
 def _unoccupied(
     places: NDArray[np.intp], projection: Projection, occupied: set[tuple[int, int]]
 ) -> NDArray[np.intp]:
-    """Select places in parts of the photo that no other wall occupies, and occupy them."""
+    """Select positions in parts of the photo not used by another wall, and mark them as used."""
     side = _OCCUPIED_CELLS * max(projection.pixels_per_cell, 1e-6)
     u = projection.u[places[:, 1], places[:, 0]]
     v = projection.v[places[:, 1], places[:, 0]]
@@ -454,16 +458,16 @@ def recovered_traces(
     setup: Setup,
     traces: Sequence[Trace],
 ) -> dict[str, Trace]:
-    """Match photos without a pose, starting from their poses in the matched photos.
+    """Match photos without a pose, starting from poses relative to the matched photos.
 
     Args:
         photos: all photos.
-        oriented: cameras of those with a pose, by name.
-        setup: the walls.
-        traces: of the oriented photos.
+        oriented: cameras of the photos with a pose, by name.
+        setup: the walls, and parameters of the matching.
+        traces: results of the oriented photos.
 
     Returns:
-        Results of the photos that were found, by name.
+        Results of the photos whose pose was found, by name.
     """
     recovered: dict[str, Trace] = {}
     known = [trace for trace in traces if trace.n_ties]
@@ -494,7 +498,7 @@ def recovered_traces(
 def _settled(
     photos: Photos, oriented: Mapping[str, Camera], traces: Sequence[Trace]
 ) -> dict[str, Camera]:
-    """Return cameras of matched photos by name, those with the most precise focal length first.
+    """Return cameras of matched photos by name, starting with the most precise focal length.
 
     Estimated lenses are adjusted to the new ties.
     """
@@ -513,14 +517,14 @@ def _settled(
 
 
 def _view(trace: Trace, photos: Photos, setup: Setup) -> View:
-    """Project a photo onto the walls by its final pose, with the occlusions of its first."""
+    """Project a photo onto the walls with its final pose, with occlusions from its first pose."""
     photo = photos.photos[trace.photo]
     first = view_of(trace.photo, photo, trace.camera, setup.walls, setup.before)
     return first.posed(trace.settled, setup.walls)
 
 
 def painted_walls(views: Sequence[View], walls: Sequence[Wall]) -> list[_Painted]:
-    """Paint oriented photos on the walls, in each cell that of the highest resolution."""
+    """Project oriented photos onto the walls; each cell takes the photo of highest resolution."""
     painted = []
     for index, wall in enumerate(walls):
         grey = np.full(wall.frame.shape, np.nan, dtype=np.float32)
@@ -543,12 +547,12 @@ def recovered_pose(
     painted: Sequence[_Painted],
     lens: ViewingCamera,
 ) -> ViewingCamera | None:
-    """Find the pose of a photo by its matches with painted walls; None if there are too few.
+    """Find the pose of a photo from matches with projected photos; None for too few matches.
 
     Args:
-        grey: (height, width) of the photo.
-        painted: the walls.
-        lens: its approximate interior orientation; the pose is ignored.
+        grey: (height, width) grey values of the photo.
+        painted: the walls with the projected photos.
+        lens: approximate interior orientation of the photo; its pose is ignored.
     """
     pairs = pair_photo(grey, [features for _, features in painted], _PARAMS)
     pieces = []
@@ -572,7 +576,7 @@ def lens_of(photo: Photo, oriented: Mapping[str, Camera], photos: Photos) -> Int
     The estimate is preferred to EXIF, which may be wrong for all photos of a lens.
 
     Returns:
-        None without either.
+        The lens, or None if it is neither calibrated nor estimated.
     """
     focal_px = {each.name: each.exif_focal_px for each in photos.photos}
     similar = [
@@ -595,7 +599,7 @@ def pose_of_most(
     lens: ViewingCamera,
     limit_px: float,
 ) -> ViewingCamera | None:
-    """Return the pose with most inliers, accurate enough to start from; None if too few."""
+    """Return the pose with the most inliers, as an initial pose; None if there are too few."""
     import cv2
 
     params = sampling(limit_px, trials=_POSE_TRIALS)

@@ -1,4 +1,4 @@
-"""A photo projected onto the raster of a wall by its pose, with occlusion."""
+"""Projection of photos onto wall rasters, with occlusion."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ from orthoflow.products import Photo, Wall
 if TYPE_CHECKING:
     from orthoflow.geometry.occluders import Occluders
 
-# Flatter views of the wall are not matched.
+# Parts of a wall seen at a smaller angle are not matched.
 _GRAZING_COSINE: Final = 0.15
-# Side of a cell of the depth buffer, in wall cells: projected cells of a surface leave no gaps.
+# Cell size of the depth buffer, in wall cells, so that projected surfaces have no gaps.
 _BUFFER_CELLS: Final = 2.0
-# Surface farther than this behind the nearest of a buffer cell is hidden, in wall cells.
+# A surface is hidden if it is farther than this behind the nearest one, in wall cells.
 _HIDDEN_CELLS: Final = 6.0
 _ROWS_AT_ONCE: Final = 256
-# Objects before a wall were scanned from elsewhere, and the pose is accurate to a few cells: cells
-# this near to hidden ones may be hidden.
+# Cells this close to hidden cells may be hidden as well, since objects in front of a wall were
+# scanned from other positions and the pose is only accurate to a few cells.
 _BESIDE_CELLS: Final = 3
-# Step in cells by which the part of a wall in a photo is found first.
+# Step in cells for the first search for the part of a wall in a photo.
 _COARSE: Final = 8
 _MIN_CELLS: Final = 100
-# Where OpenCV samples cells outside the photo; the value is not used.
+# Pixel at which OpenCV samples cells outside the photo; the sampled value is not used.
 _OUTSIDE_PX: Final = -10.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Projection:
-    """Positions of the cells of a wall in a photo, for the part of the wall that it shows.
+    """Positions of a wall's cells in a photo, for the part of the wall that the photo shows.
 
     Attributes:
-        part: rows and columns of the wall's raster that the arrays cover.
-        u: (rows, cols) float32 photo pixels, NaN where the cell is not in the photo.
-        v: (rows, cols) float32.
+        part: rows and columns of the wall's raster covered by the arrays.
+        u: (rows, cols) float32 photo column, NaN where the cell is not in the photo.
+        v: (rows, cols) float32 photo row, NaN where the cell is not in the photo.
         distance: (rows, cols) float32 metres along the camera's axis.
-        pixels_per_cell: median over the cells in the photo.
+        pixels_per_cell: median cell size in pixels over the cells in the photo.
     """
 
     part: tuple[slice, slice]
@@ -58,7 +58,7 @@ class Projection:
         return np.array([self.part[1].start, self.part[0].start], dtype=np.intp)
 
     def pixels_at(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return pixels (n, 2) of fractional cells (n, 2) = (column, row); NaN beside void."""
+        """Return pixels (n, 2) of fractional cells (n, 2) = (column, row); NaN next to void."""
         return np.column_stack([between(self.u, at), between(self.v, at)])
 
     def hide(self, mask: NDArray[np.bool_]) -> None:
@@ -69,11 +69,11 @@ class Projection:
 
 @dataclass(frozen=True, kw_only=True)
 class Before:
-    """Points before the walls that may hide them.
+    """Points in front of the walls that may hide them.
 
     Attributes:
         occluders: the points.
-        front_m: distance before the plane of each wall up to which points belong to its raster.
+        front_m: distance in front of each wall's plane up to which points belong to its raster.
     """
 
     occluders: Occluders
@@ -82,16 +82,16 @@ class Before:
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """A photo projected onto the walls by a pose.
+    """A photo projected onto the walls with a given pose.
 
     Attributes:
-        index: of the photo.
-        grey: (height, width) of the photo.
-        colours: returns its colours (height, width, 3), which few photos need.
+        index: index of the photo.
+        grey: (height, width) grey values of the photo.
+        colours: function that returns its colours (height, width, 3), which few photos need.
         camera: the pose.
-        projections: of each wall, None if the photo does not show it.
-        hidden: cells of each wall that points before it hide; empty if unknown.
-        warped: the grey in the raster of each wall, computed when needed.
+        projections: projection of each wall, None if the photo does not show it.
+        hidden: cells of each wall that are hidden by points in front of it; empty if unknown.
+        warped: grey values in the raster of each wall, computed when needed.
     """
 
     index: int
@@ -103,7 +103,7 @@ class View:
     warped: dict[int, NDArray[np.float32]] = field(default_factory=dict)
 
     def on_wall(self, index: int, projection: Projection) -> NDArray[np.float32]:
-        """Return the photo's grey in the raster of a wall."""
+        """Return the photo's grey values in the raster of a wall."""
         if index not in self.warped:
             self.warped[index] = warp_photo(self.grey, projection)
         return self.warped[index]
@@ -113,7 +113,7 @@ class View:
         return warp_photo(self.colours(), projection)
 
     def posed(self, camera: ViewingCamera, walls: Sequence[Wall]) -> View:
-        """Project the photo onto the walls by another pose."""
+        """Project the photo onto the walls with another pose."""
         projections = _bared(project_walls(camera, walls), self.hidden)
         return replace(self, camera=camera, projections=projections, warped={})
 
@@ -125,14 +125,14 @@ def view_of(
     walls: Sequence[Wall],
     before: Before | None = None,
 ) -> View:
-    """Project a photo onto the walls by a pose.
+    """Project a photo onto the walls with a given pose.
 
     Args:
-        index: of the photo.
+        index: index of the photo.
         photo: the photo.
         camera: the pose.
         walls: all walls.
-        before: points before the walls, which hide them; None if unknown.
+        before: points in front of the walls, which may hide them; None if unknown.
     """
     projections = project_walls(camera, walls)
     hidden = [] if before is None else _hidden(projections, camera, walls, before)
@@ -153,7 +153,7 @@ def _hidden(
     walls: Sequence[Wall],
     before: Before,
 ) -> list[NDArray[np.bool_]]:
-    """Find the cells of each wall that points before its raster hide, and those near them."""
+    """Find the cells of each wall hidden by points in front of it, and cells close to these."""
     import cv2
 
     from orthoflow.geometry.occluders import depth_buffer
@@ -165,7 +165,8 @@ def _hidden(
         mask = np.zeros(wall.frame.shape, dtype=np.uint8)
         if projection is not None:
             seen = np.isfinite(projection.u)
-            # Rounded to single precision, a pixel may lie on the far border.
+            # After rounding to single precision, a pixel may be exactly on the right or lower
+            # border.
             rows, columns = (
                 np.minimum((pixels[seen] / buffer.reduction).astype(np.intp), length - 1)
                 for pixels, length in zip(
@@ -186,7 +187,7 @@ def _hidden(
 def _bared(
     projections: Sequence[Projection | None], hidden: Sequence[NDArray[np.bool_]]
 ) -> Sequence[Projection | None]:
-    """Mark the hidden cells of projections."""
+    """Mark the hidden cells in the projections."""
     for projection, mask in zip(projections, hidden, strict=bool(hidden)):
         if projection is not None:
             projection.hide(mask[projection.part])
@@ -194,9 +195,9 @@ def _bared(
 
 
 def project_walls(camera: ViewingCamera, walls: Sequence[Wall]) -> list[Projection | None]:
-    """Project the surfaces of all walls into a photo; None if a wall is not in it.
+    """Project the surfaces of all walls into a photo; None for walls outside the photo.
 
-    Cells hidden by another surface, of the same wall or another one, are NaN.
+    Cells hidden by another surface, of the same or another wall, are NaN.
     """
     seen = [_in_photo(camera, wall) for wall in walls]
     shown = [(wall, item) for wall, item in zip(walls, seen, strict=True) if item is not None]
@@ -256,7 +257,7 @@ def _in_photo(camera: ViewingCamera, wall: Wall) -> Projection | None:
     )
     if float(towards @ frame.normal_world) <= 0.0:
         return None
-    # Relative to the wall: survey coordinates would lose digits.
+    # Use an origin on the wall, since large survey coordinates would lose digits.
     near = camera.shifted(frame.origin_world)
     coarse = _project_cells(near, wall, (slice(0, frame.height), slice(0, frame.width)), _COARSE)
     part = _part_in_photo(np.isfinite(coarse[0]), frame.shape)
@@ -275,7 +276,7 @@ def _in_photo(camera: ViewingCamera, wall: Wall) -> Projection | None:
 
 
 def _part_in_photo(seen: NDArray[np.bool_], shape: tuple[int, int]) -> tuple[slice, slice] | None:
-    """Return rows and columns of the coarse cells in the photo, with a margin of one of them."""
+    """Return rows and columns of the coarse cells in the photo, with a margin of one cell."""
     if not seen.any():
         return None
     spans = []
@@ -289,7 +290,7 @@ def _part_in_photo(seen: NDArray[np.bool_], shape: tuple[int, int]) -> tuple[sli
 def _project_cells(
     near: ViewingCamera, wall: Wall, part: tuple[slice, slice], step: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Return u, v and distance of every step-th cell of a part; the wall is the world's origin."""
+    """Return u, v and distance of every step-th cell; `near` has its origin at the wall's."""
     frame = wall.frame
     rows = np.arange(part[0].start, part[0].stop, step)
     columns = np.arange(part[1].start, part[1].stop, step)
@@ -309,7 +310,7 @@ def _project_cells(
 
 
 def between(raster: NDArray[np.float32], at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Interpolate (n,) at fractional cell indices (n, 2) = (column, row); NaN beside unknown."""
+    """Interpolate (n,) at fractional cells (n, 2) = (column, row); NaN next to unknown values."""
     height, width = raster.shape
     inside = (at >= 0.0).all(axis=1) & (at[:, 0] < width - 1) & (at[:, 1] < height - 1)
     left = np.where(inside, at[:, 0], 0.0).astype(np.intp)
