@@ -1,1 +1,1 @@
-"""The record format of orthoflow, readable without the program: h5py, numpy, pydantic."""
+"""The record format of orthoflow, which needs only h5py, numpy and pydantic."""

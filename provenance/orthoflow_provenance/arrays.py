@@ -1,6 +1,6 @@
-"""Products as named arrays: their digests, their group in HDF5, and how far two lie apart.
+"""Products as named arrays: digests, HDF5 groups, and differences between two products.
 
-The same product has the same digest however it is stored.
+The digest of a product does not depend on how the product is stored.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ from orthoflow_provenance.paths import check_name
 PRODUCT_GROUP: Final = "product"
 BLOCK_BYTES: Final = 8 << 20
 _CHUNK_BYTES: Final = 1 << 20
-# Smaller arrays gain nothing from compression or mapping.
+# Compression or memory mapping is of no use for smaller arrays.
 _SMALL_BYTES: Final = 4096
 _EXACT: Final = 0.0
 _ALONE: Final = "only one of the products has it"
-# Of numbers in the metadata, which describe a product and are not the product itself:
-# other versions of numerical libraries round their last digits in another way.
+# Tolerance for floats in the metadata, which describe a product but are not the product itself: the
+# last digits depend on the version of numerical libraries.
 _STATED_SHARE: Final = 1e-6
 _UNITS: Final = ("mm", "m", "px", "deg")
 
@@ -61,15 +61,15 @@ Tolerances: TypeAlias = Mapping[str, tuple[float, str]]
 
 @dataclass(frozen=True, kw_only=True)
 class StoredPayload:
-    """A product as it was read; fulfils `PayloadLike`.
+    """A product that was read; implements `PayloadLike`.
 
     Attributes:
         type_name: name of the product type.
-        encoding_version: version of the type's layout.
-        metadata: JSON; holds everything that is not an array.
-        arrays: name -> array, read-only; mapped ones are views of a `numpy.memmap`.
-        mapped: stored contiguous and uncompressed.
-        digest: digest that was stored with the product; `payload_digest` checks it.
+        encoding_version: version of the type's encoding.
+        metadata: JSON with everything that is not an array.
+        arrays: name -> read-only array; mapped ones are views of a `numpy.memmap`.
+        mapped: whether arrays are stored contiguously and uncompressed.
+        digest: digest stored with the product; check it with `payload_digest`.
     """
 
     type_name: str
@@ -82,15 +82,15 @@ class StoredPayload:
 
 @dataclass(frozen=True, kw_only=True)
 class ArrayDifference:
-    """One array or metadata value in which two products differ.
+    """An array or metadata value that differs between two products.
 
     Attributes:
-        name: name of the array, or path of the value in the metadata.
-        largest: largest absolute difference of two numbers in `unit`; infinite where they cannot
-            be subtracted (another shape or type, missing, NaN against a number).
-        limit: largest difference that is allowed.
+        name: name of the array, or path of the metadata value.
+        largest: largest absolute difference in `unit`; infinite if values cannot be subtracted
+            (different shapes or types, missing values, NaN instead of a number).
+        limit: largest allowed difference.
         unit: unit of both.
-        n_values: how many values differ by more than the limit; 0 when the products agree here.
+        n_values: number of values that differ by more than the limit.
         problem: one sentence.
     """
 
@@ -103,9 +103,9 @@ class ArrayDifference:
 
 
 def block_indices(shape: tuple[int, ...], itemsize: int) -> Iterator[Index]:
-    """Return indices that cut an array into blocks of at most about 8 MiB.
+    """Yield indices that divide an array into blocks of at most about 8 MiB.
 
-    Joined in order, the blocks' elements are the array's elements in C order. An array without
+    In the order given, the blocks contain the elements of the array in C order. An array without
     elements has no blocks; a scalar has one, `()`.
 
     >>> list(block_indices((3,), 8))
@@ -128,10 +128,10 @@ def block_indices(shape: tuple[int, ...], itemsize: int) -> Iterator[Index]:
 
 
 def _byte_blocks(array: NDArray[np.generic]) -> Iterator[NDArray[np.uint8]]:
-    """Return the array's bytes: little-endian, C order, flat.
+    """Yield the bytes of an array: little-endian, C order, flat.
 
-    A contiguous little-endian array is given whole and not copied, memory-mapped or not; any other
-    is copied block by block.
+    A contiguous little-endian array, memory-mapped or not, is yielded as a whole without copying;
+    any other array is copied block by block.
     """
     wanted = array.dtype.newbyteorder("<")
     if array.size == 0:
@@ -144,15 +144,16 @@ def _byte_blocks(array: NDArray[np.generic]) -> Iterator[NDArray[np.uint8]]:
 
 
 def payload_digest(payload: PayloadLike) -> str:
-    """Digest a product: type, encoding version, metadata, and every array's type, shape and bytes.
+    """Return the digest of a product: type, encoding version, metadata, and all arrays.
 
-    Arrays are digested in threads, streaming, so memory-mapped ones are never loaded as a whole.
+    Arrays contribute dtype, shape and bytes. They are hashed block by block in threads, so
+    memory-mapped arrays are never loaded as a whole.
 
     Returns:
         `sha256:` and 64 hexadecimal digits.
 
     Raises:
-        RecordFormatError: the metadata are not JSON or an array's type cannot be stored.
+        RecordFormatError: the metadata is not JSON, or the type of an array cannot be stored.
     """
 
     def fingerprint(name: str) -> list[JsonValue]:
@@ -163,7 +164,7 @@ def payload_digest(payload: PayloadLike) -> str:
             digest.update(block.data)
         return [array.dtype.newbyteorder("<").str, [*array.shape], digest.hexdigest()]
 
-    # Largest first, so that no thread is left alone with a long tail.
+    # Start with the largest array, so that no thread has to finish it alone at the end.
     names = sorted(payload.arrays, key=lambda name: -payload.arrays[name].nbytes)
     with ThreadPoolExecutor() as threads:
         fingerprints = dict(zip(names, threads.map(fingerprint, names), strict=True))
@@ -179,7 +180,7 @@ def payload_digest(payload: PayloadLike) -> str:
 
 
 def check_storable(dtype: np.dtype[np.generic]) -> None:
-    """Refuse array types that the format does not know.
+    """Refuse array types that are not part of the format.
 
     Raises:
         RecordFormatError: the type is not bool, an integer of up to 8 bytes, or a float of 2, 4 or
@@ -194,16 +195,16 @@ def check_storable(dtype: np.dtype[np.generic]) -> None:
 
 
 def write_product_file(path: Path, payload: PayloadLike) -> str:
-    """Write one product into a file of its own and bring it to the disk.
+    """Write a product to its own file, and sync it to the disk.
 
-    The digest is computed in other threads while the arrays are written. Nothing is copied except
-    arrays that are not contiguous, block by block.
+    The digest is computed in other threads while the arrays are written. Only arrays that are not
+    contiguous are copied, block by block.
 
     Returns:
-        The product's digest.
+        The digest of the product.
 
     Raises:
-        RecordFormatError: the payload has names or types that the format does not know.
+        RecordFormatError: the product has names or types that are not part of the format.
         OSError: the file cannot be written, e.g. because the disk is full; it is removed.
     """
     _check_payload(payload)
@@ -218,14 +219,14 @@ def write_product_file(path: Path, payload: PayloadLike) -> str:
 
 
 def read_product_file(path: Path, *, map_arrays: bool = True) -> StoredPayload:
-    """Read what `write_product_file` wrote.
+    """Read a file written by `write_product_file`.
 
     Args:
-        path: the file; it must stay in place while mapped arrays are in use.
+        path: the file; it must not be moved or changed while mapped arrays are in use.
         map_arrays: memory-map the arrays of mapped products instead of loading them.
 
     Raises:
-        RecordFormatError: the file is damaged, of another format or a newer one.
+        RecordFormatError: the file is damaged, or of another or newer format.
         OSError: the file cannot be opened.
     """
     with safe_open(path, PRODUCT_FORMAT) as file:
@@ -233,7 +234,7 @@ def read_product_file(path: Path, *, map_arrays: bool = True) -> StoredPayload:
 
 
 def read_payload(group: h5py.Group, *, map_arrays: bool) -> StoredPayload:
-    """Read a product from its group in a file that `safe_open` opened.
+    """Read a product from its group in a file opened with `safe_open`.
 
     Raises:
         RecordFormatError: the group is damaged or incomplete.
@@ -253,7 +254,7 @@ def read_payload(group: h5py.Group, *, map_arrays: bool) -> StoredPayload:
 
 
 def array_datasets(group: h5py.Group) -> Iterator[tuple[str, h5py.Dataset]]:
-    """Return a product's arrays with their names, sorted, without reading them.
+    """Yield names and datasets of a product's arrays, sorted by name, without reading them.
 
     Raises:
         RecordFormatError: the group is damaged.
@@ -272,19 +273,18 @@ def array_datasets(group: h5py.Group) -> Iterator[tuple[str, h5py.Dataset]]:
 def measure_payloads(
     left: PayloadLike, right: PayloadLike, tolerances: Tolerances
 ) -> tuple[ArrayDifference, ...]:
-    """Measure how far two products lie apart; arrays are read block by block.
+    """Measure the differences between two products; arrays are read block by block.
 
     Args:
-        left: one product.
-        right: the other.
-        tolerances: field -> (limit, unit). A field is the last part of a name that is not a
-            number: `depth_m` for the array `walls/0/depth_m`, and the same for numbers in the
-            metadata. Fields not named must be equal, but for fractions in the metadata, which
-            may differ by a millionth of the larger one, or by a millionth where that is below 1.
-            NaN equals NaN.
+        left: the first product.
+        right: the second product.
+        tolerances: field -> (limit, unit). A field is the last part of a name that is not a number:
+            `depth_m` for the array `walls/0/depth_m`; likewise for numbers in the metadata. Other
+            fields must be equal, except that floats in the metadata may differ by a millionth of
+            the larger value, or by 1e-6 for values below 1. NaN equals NaN.
 
     Returns:
-        All differences, also those within the limits, by name; empty when the products are equal.
+        All differences by name, including those within the limits; empty if the products are equal.
     """
     if (left.type_name, left.encoding_version) != (right.type_name, right.encoding_version):
         problem = (
@@ -330,7 +330,7 @@ def _check_payload(payload: PayloadLike) -> None:
 
 
 def _write_content(group: h5py.Group, payload: PayloadLike) -> None:
-    """Write all but the digest."""
+    """Write everything except the digest."""
     set_attributes(
         group,
         type=payload.type_name,
@@ -380,7 +380,8 @@ def _create_contiguous(
     properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     properties.set_layout(h5py.h5d.CONTIGUOUS)
     properties.set_obj_track_times(False)
-    # Early: the offset exists as soon as the dataset does. Never: no pass of zeros before the data.
+    # Early allocation: the offset exists as soon as the dataset does. Never fill: no zeros are
+    # written before the data.
     properties.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
     properties.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
     space = h5py.h5s.create_simple(shape) if shape else h5py.h5s.create(h5py.h5s.SCALAR)
@@ -391,7 +392,7 @@ def _create_contiguous(
 
 
 def _chunk_shape(shape: tuple[int, ...], itemsize: int) -> tuple[int, ...]:
-    """Cut along the first axis first: chunks are runs of whole rows of about a megabyte."""
+    """Divide along the first axis first, into chunks of whole rows of about 1 MB."""
     chunk = list(shape)
     for axis in range(len(chunk)):
         others = itemsize * math.prod(chunk) // chunk[axis]
@@ -406,7 +407,7 @@ def _read_array(dataset: h5py.Dataset, *, is_mapping: bool) -> NDArray[np.generi
         and offset is not None
         and dataset.nbytes >= _SMALL_BYTES
         and dataset.dtype.isnative
-        # Misaligned arrays, which other writers may leave, are slower than a copy.
+        # Misaligned arrays, which other programs may write, are slower than a copy.
         and offset % dataset.dtype.itemsize == 0
     )
     if is_mappable:
@@ -461,9 +462,9 @@ def _array_differences(
 
 
 def _distances(left: NDArray[np.generic], right: NDArray[np.generic]) -> NDArray[np.float64]:
-    """Absolute differences, infinite where only one value is NaN; of any type, without overflow."""
+    """Return absolute differences, infinite if only one value is NaN; never overflows."""
     if left.dtype.kind in "iu" and left.dtype.itemsize == 8:
-        # Neighbours beyond 2^53 are one float64.
+        # Above 2^53, neighbouring integers are the same float64.
         larger, smaller = np.maximum(left, right), np.minimum(left, right)
         gaps: NDArray[np.uint64] = larger.view(np.uint64) - smaller.view(np.uint64)
         return gaps.astype(np.float64)
@@ -518,7 +519,7 @@ def _tolerance(name: str, tolerances: Tolerances) -> tuple[float, str]:
 
 
 def _field(name: str) -> str:
-    """The last part of a name that is not a number."""
+    """Return the last part of a name that is not a number."""
     parts = (part for part in reversed(name.split("/")) if not part.isdigit())
     return next(parts, "")
 

@@ -1,8 +1,8 @@
 """The content of a record, as dataclasses and as one JSON document.
 
-The only declaration of metric, figure, cell and record: methods, store and record use these types,
-or add to them what only they know. Pydantic reads and writes the document by the fields, so a field
-that is added here is recorded, and those of `Costs` are shown wherever the others are.
+This is the only declaration of metric, figure, cell and record: methods, store and record use these
+types or extend them with their own fields. Pydantic reads and writes the document by field, so a
+field added here is recorded, and new fields of `Costs` are also shown with the others.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PRODUCT_FORMAT: Final = "orthoflow-product"
 FORMAT_VERSION: Final = "1.0"
 DIGEST_PREFIX: Final = "sha256:"
 
-# What a figure may be, and what its file is called.
+# Allowed media types of figures -> suffix of their files.
 FIGURE_SUFFIXES: Final[Mapping[str, str]] = {
     "image/png": ".png",
     "image/svg+xml": ".svg",
@@ -39,33 +39,33 @@ if TYPE_CHECKING:
         bool | int | float | str | list["JsonValue"] | dict[str, "JsonValue"] | None
     )
 else:
-    # Pydantic cannot resolve an alias that contains itself; the document is JSON already.
+    # Pydantic cannot resolve a recursive alias; the content is checked as JSON elsewhere.
     JsonValue = Any
 CellStatus = Literal["ok", "failed", "skipped"]
 
 
 class RecordFormatError(ValueError):
-    """A file or a value does not fit the record format: damaged, forbidden or incomplete.
+    """A file or value does not conform to the record format: damaged, not allowed or incomplete.
 
-    The message is one sentence: what was found, what was expected, where, and the way out if there
-    is one.
+    The message is one sentence with what was found, what was expected, where, and the remedy if
+    there is one.
     """
 
 
 class UnknownFormatError(RecordFormatError):
-    """The file is of another program, or of another version of the format: it cannot be checked."""
+    """The file is from another program or of another format version, so it cannot be checked."""
 
 
 class LockedFileError(RecordFormatError):
-    """The file is open for writing elsewhere, or was left so by a program that crashed."""
+    """The file is open for writing elsewhere, or was left open by a crash."""
 
 
 class InputFileError(RecordFormatError):
-    """An input file that is to be embedded is missing, or not the one that was digested."""
+    """An input file to be embedded is missing or differs from the file that was digested."""
 
 
 class UnsafeFileError(RecordFormatError):
-    """A name leads elsewhere than to a file in its folder, or no regular file stands there."""
+    """A path leads out of its folder, or does not lead to a regular file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,9 +73,9 @@ class Quantity:
     """Label, unit and direction of a measured number.
 
     Attributes:
-        label: what tables call it, beside its unit.
-        unit: as in metrics.
-        better: likewise.
+        label: name in tables, without the unit.
+        unit: unit as in metrics.
+        better: which values are better, as in metrics.
     """
 
     label: str
@@ -84,7 +84,7 @@ class Quantity:
 
 
 class PayloadLike(Protocol):
-    """A product as named arrays and JSON; `orthoflow.products.Payload` is one."""
+    """A product as named arrays and JSON, such as `orthoflow.products.Payload`."""
 
     @property
     def type_name(self) -> str:
@@ -92,7 +92,7 @@ class PayloadLike(Protocol):
 
     @property
     def encoding_version(self) -> int:
-        """Version of the type's layout."""
+        """Version of the type's encoding."""
 
     @property
     def metadata(self) -> Mapping[str, JsonValue]:
@@ -100,27 +100,28 @@ class PayloadLike(Protocol):
 
     @property
     def arrays(self) -> Mapping[str, NDArray[np.generic]]:
-        """Arrays by name; names may have `/`."""
+        """Arrays by name; names may contain `/`."""
 
     @property
     def mapped(self) -> bool:
-        """Store contiguous and uncompressed."""
+        """Whether arrays are stored contiguously and uncompressed."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Metric:
-    """One number with its unit.
+    """A number with its unit.
 
     Attributes:
-        name: of the number, with its unit at the end where it has one.
-        value: finite.
+        name: name of the metric, ending with its unit if it has one.
+        value: finite value.
         unit: `mm`, `px`, `s`, ...; `1` for counts and shares.
-        label: what tables call it, where its method declares that; empty without.
-        better: which values are better, `lower`, `higher` or `one`; empty where none are.
-        description: what else to know of it, one sentence.
-        headline: it is one of the numbers that state how good a result is.
-        counted_by: metric of the same step with the number of items it summarises; values over
-            unequal numbers of them are not comparable.
+        label: name in tables, if the method declares one; otherwise empty.
+        better: which values are better: `lower`, `higher` or `one`; empty if there is no better
+            direction.
+        description: further explanation, one sentence.
+        headline: whether the metric describes the quality of the result.
+        counted_by: metric of the same step with the number of items summarised; values over
+            different numbers of items are not comparable.
     """
 
     name: str
@@ -135,19 +136,19 @@ class Metric:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedDiagnostic:
-    """Something that deserves attention, as data.
+    """A warning, error or note as data.
 
     Attributes:
         code: stable name, e.g. `scan-without-colour`.
         severity: `error`, `warning` or `note`.
-        subject: what it is about, e.g. `scan 0`.
-        values: numbers and names that the text is made of.
+        subject: the item concerned, e.g. `scan 0`.
+        values: numbers and names in the text.
         text: one sentence.
-        remedy: what to do about it; empty where nothing can be done.
-        rank_by: name of the value by which the worst of several is chosen, larger is worse; with
-            `-` before it smaller is worse.
-        settled_by: methods or codes of later steps that settle it.
-        is_summary: it sums up what the step did.
+        remedy: what to do; empty if nothing can be done.
+        rank_by: name of the value that selects the worst of several diagnostics; the largest value
+            is the worst, or the smallest if the name is prefixed with `-`.
+        settled_by: methods or codes of later steps that resolve it.
+        is_summary: whether it summarises the step.
     """
 
     code: str
@@ -163,10 +164,10 @@ class RecordedDiagnostic:
 
 @dataclass(frozen=True, kw_only=True)
 class Figure:
-    """Name, caption and type of a picture.
+    """Name, caption and type of a figure.
 
     Attributes:
-        name: name the method gave.
+        name: name given by the method.
         caption: one sentence.
         media_type: `image/png`, `image/webp` or `image/svg+xml`.
     """
@@ -178,10 +179,10 @@ class Figure:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedFigure(Figure):
-    """A picture in a record.
+    """A figure in a record.
 
     Attributes:
-        data: the bytes of the file.
+        data: bytes of the file.
     """
 
     data: bytes = field(repr=False)
@@ -192,9 +193,9 @@ class ProductRef:
     """A product by its content.
 
     Attributes:
-        type_name: product type, `files` for a workflow input.
-        encoding_version: version of the type's layout, 0 for files.
-        digest: `sha256:` + 64 hexadecimal digits of the logical content.
+        type_name: product type; `files` for a workflow input.
+        encoding_version: version of the type's encoding; 0 for files.
+        digest: `sha256:` and 64 hexadecimal digits, of the logical content.
     """
 
     type_name: str
@@ -204,11 +205,11 @@ class ProductRef:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedProduct(ProductRef):
-    """One output or input of a cell.
+    """An output or input of a cell.
 
     Attributes:
-        source: for inputs `address.port` or `inputs.name`; empty for outputs.
-        embedded: the arrays are in the record (outputs only).
+        source: `address.port` or `inputs.name` for inputs; empty for outputs.
+        embedded: whether the arrays are in the record (outputs only).
     """
 
     source: str = ""
@@ -217,7 +218,7 @@ class RecordedProduct(ProductRef):
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedFile:
-    """One input file, without its folder."""
+    """An input file, without its folder."""
 
     name: str
     size_bytes: int
@@ -226,12 +227,12 @@ class RecordedFile:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedInput:
-    """One workflow input; no files when it was optional and absent.
+    """A workflow input; without files if it is optional and was not given.
 
     Attributes:
         name: name in the workflow.
-        files: in the order of their names.
-        embedded: the bytes of the files are in the record.
+        files: files sorted by name.
+        embedded: whether the bytes of the files are in the record.
     """
 
     name: str
@@ -241,12 +242,12 @@ class RecordedInput:
 
 @dataclass(frozen=True, kw_only=True)
 class PublishedFile:
-    """One file that the run wrote for other programs.
+    """A file that the run wrote for other programs.
 
     Attributes:
-        path: from the folder of the record, with `/`.
-        size_bytes: its size.
-        sha256: hexadecimal digest of its bytes.
+        path: path relative to the folder of the record, with `/` as separator.
+        size_bytes: size of the file.
+        sha256: SHA-256 of its bytes in hexadecimal digits.
     """
 
     path: str
@@ -256,17 +257,17 @@ class PublishedFile:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedEnvironment:
-    """Where a cell ran.
+    """The environment in which a cell ran.
 
     Attributes:
-        id: digest of the rest; cells refer to it.
-        python: version.
-        os: system and release.
-        cpu: model name.
-        cores: logical processors.
-        threads: threads given to the cell.
-        git_commit: commit of the code when run from a checkout, with `+changes` when dirty; else
-            empty.
+        id: digest of the other fields; used as reference in cells.
+        python: version of Python.
+        os: operating system and release.
+        cpu: model name of the processor.
+        cores: number of logical processors.
+        threads: number of threads of the cell.
+        git_commit: commit of orthoflow if run from a checkout, with `+changes` if modified;
+            otherwise empty.
         packages: distribution name -> version.
     """
 
@@ -282,15 +283,15 @@ class RecordedEnvironment:
 
 @dataclass(frozen=True, kw_only=True)
 class MethodIdentity:
-    """Which code gave a result.
+    """The code that computed a result.
 
     Attributes:
         method: method id.
-        distribution: name of the distribution that brought the method.
-        distribution_version: its version.
-        result_version: the method's own counter.
+        distribution: name of the distribution that contains the method.
+        distribution_version: version of the distribution.
+        result_version: version number of the method's results.
         determinism: exact, seeded or loose.
-        citations: where the method comes from.
+        citations: publications of the method.
     """
 
     method: str = ""
@@ -303,20 +304,21 @@ class MethodIdentity:
 
 @dataclass(frozen=True, kw_only=True)
 class Costs:
-    """What one execution of a method took; in a record that of the run that computed it.
+    """Cost of one execution of a method; in a record, of the run that computed the result.
 
-    What was not measured is None.
+    Values that were not measured are None.
 
     Attributes:
-        wall_s: seconds on the clock that the method ran, without `compile_s`; with it where
-            `compile_s` is None.
-        cpu_s: processor seconds of the step's process meanwhile, likewise and without drawing
-            figures: rankings use it.
-        peak_rss_mib: largest memory of the step's process.
-        stored_mib: what its products, their published files and its figures take in the store;
-            equal ones of several cells lie there once. None for cells without a result too.
-        compile_s: seconds on the clock that the step's process loaded modules and compiled kernels,
-            before, in and after the call. It depends on earlier steps, so nothing is ranked by it.
+        wall_s: elapsed seconds of the method, without `compile_s`, or including it if `compile_s`
+            is None.
+        cpu_s: processor seconds of the step's process in this time, with `compile_s` treated in the
+            same way, and without drawing of figures; used for rankings.
+        peak_rss_mib: peak memory of the step's process.
+        stored_mib: size in the store of products, published files and figures; the store keeps
+            content shared by several cells only once. None also for cells without a result.
+        compile_s: elapsed seconds in which the step's process loaded modules and compiled kernels,
+            before, during and after the call; not used for rankings, because it depends on earlier
+            steps.
     """
 
     wall_s: Annotated[float, Quantity(label="time", unit="s", better="lower")] = 0.0
@@ -334,22 +336,22 @@ COSTS: Final[Mapping[str, Quantity]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class CellOutcome(MethodIdentity, Costs):
-    """What a cell came to: the store keeps it, and the record of a run repeats it.
+    """The outcome of a cell, as kept in the store and repeated in the record of a run.
 
     Attributes:
         status: ok, failed or skipped.
-        error_type: class of the error, empty when ok; of skipped cells `not-asked-for` where
-            optional data decide, else empty.
-        error_message: one sentence; for skipped cells the reason.
-        key: cache key, SHA-256 in hexadecimal digits; empty when never known.
-        key_preimage: canonical JSON the key is the digest of.
-        seed: seed the generator was made from, None when the method uses none.
-        started: ISO 8601 UTC; of the original run for cached cells.
-        ended: likewise.
-        metrics: what the method reported.
-        warnings: what limits the result.
-        diagnostics: the same as data, and notes.
-        log: text.
+        error_type: class of the error; empty if ok; for skipped cells, `not-asked-for` if optional
+            data was not given, otherwise empty.
+        error_message: one sentence; for skipped cells, the reason.
+        key: cache key, SHA-256 in hexadecimal digits; empty if it was never known.
+        key_preimage: canonical JSON whose SHA-256 is the key.
+        seed: seed of the random generator; None if the method uses none.
+        started: ISO 8601, UTC; for cached cells, from the run that computed them.
+        ended: ISO 8601, UTC; as `started`.
+        metrics: metrics reported by the method.
+        warnings: texts of the warnings, which limit the use of the result.
+        diagnostics: warnings and notes as data.
+        log: text of the log.
     """
 
     status: CellStatus
@@ -368,18 +370,18 @@ class CellOutcome(MethodIdentity, Costs):
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class RecordedCell(CellOutcome):
-    """One cell of a run: a method applied once.
+    """A cell of a run: one execution of a method.
 
     Attributes:
-        address: `step` or `step@step=variant,...`, `#n` behind it for repeats after the first.
+        address: `step` or `step@step=variant,...`, followed by `#n` for repeats after the first.
         step: name of the step.
         assignment: step -> variant, in graph order.
-        repeat: 0 for the first.
+        repeat: index of the repeat, 0 for the first.
         params: all parameters, resolved.
-        params_set: parameters as written, and from the command line.
+        params_set: parameters set in the workflow or on the command line, as written.
         environment: id of the environment.
-        cached_from: run id of the run that computed it; empty when computed in this run.
-        figures: pictures.
+        cached_from: id of the run that computed it; empty if this run did.
+        figures: figures of the method.
         inputs: port -> product.
         outputs: port -> product.
     """
@@ -397,7 +399,7 @@ class RecordedCell(CellOutcome):
     outputs: Mapping[str, RecordedProduct] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        # Logs and lists of parameters are too long for a line.
+        # Logs and parameters are too long to print in one line.
         metrics, figures = len(self.metrics), len(self.figures)
         return (
             f"<RecordedCell {self.address!r}: {self.method}, {self.status}, {self.wall_s:.3g} s, "
@@ -407,24 +409,23 @@ class RecordedCell(CellOutcome):
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class RunRecord:
-    """The whole record except the products' arrays.
+    """A whole record, except the arrays of products.
 
     Attributes:
-        run_id: opaque, unique.
+        run_id: unique id, without further meaning.
         name: name of the workflow.
         created_by: program and version, e.g. `orthoflow 0.1.0`.
-        status: ok, or failed when some cell failed.
-        started: ISO 8601 UTC.
-        ended: ISO 8601 UTC.
+        status: `ok`, or `failed` if any cell failed.
+        started: ISO 8601, UTC.
+        ended: ISO 8601, UTC.
         seed: seed of the workflow.
-        workflow_source: the file as written.
-        workflow_resolved: JSON of the workflow with all overrides applied.
-        overrides: `--set` and other options that changed the workflow or chose among its steps,
-            as given.
-        inputs: the workflow's inputs.
-        environments: each distinct one once.
-        cells: in the order of the graph.
-        published: files beside the record, for other programs.
+        workflow_source: text of the workflow file.
+        workflow_resolved: workflow as JSON with all overrides applied.
+        overrides: `--set` and other options that changed the workflow or selected steps, as given.
+        inputs: inputs of the workflow.
+        environments: environments of the cells, without duplicates.
+        cells: cells in the order of the graph.
+        published: files next to the record, for other programs.
     """
 
     run_id: str
@@ -450,7 +451,7 @@ class RunRecord:
 
 
 def cost_metrics(costs: Costs) -> tuple[Metric, ...]:
-    """Return what was measured as metrics, in the order of the fields, without what was not."""
+    """Return the measured costs as metrics, in the order of the fields."""
     measured = {name: getattr(costs, name) for name in COSTS}
     return tuple(
         Metric(
@@ -465,17 +466,17 @@ def cost_metrics(costs: Costs) -> tuple[Metric, ...]:
     )
 
 
-# Any: keywords for a constructor, whose own annotations state their types.
+# `Any`: keyword arguments of a constructor with annotated parameters.
 def shared_fields(source: object, part: type) -> dict[str, Any]:
     """Return the fields of an object that belong to one of its base classes, as keywords."""
     return {item.name: getattr(source, item.name) for item in fields(part)}
 
 
 def to_json(record: RunRecord) -> dict[str, Any]:
-    """Return the document of a record: an object per dataclass, digests in the place of bytes.
+    """Return the document of a record: one object per dataclass, with digests instead of bytes.
 
     Raises:
-        RecordFormatError: it holds what cannot be JSON.
+        RecordFormatError: the record contains values that JSON cannot represent.
     """
 
     def digested(figure: RecordedFigure) -> RecordedFigure:
@@ -495,8 +496,8 @@ def from_json(text: str, contents: Callable[[str], bytes]) -> RunRecord:
     """Read a document.
 
     Args:
-        text: JSON of what `to_json` returned.
-        contents: SHA-256 -> bytes, for what was written as digest.
+        text: JSON text of a document from `to_json`.
+        contents: SHA-256 -> bytes, for bytes that were replaced by digests.
 
     Raises:
         RecordFormatError: the text is not JSON, or a field is missing, unknown, or has another
@@ -545,10 +546,10 @@ def _codec() -> TypeAdapter[RunRecord]:
 
 
 def parse_json(text: str, place: str) -> JsonValue:
-    """Parse JSON as the format understands it: no NaN, no infinity, no endless nesting.
+    """Parse strict JSON: without NaN, infinity and excessive nesting.
 
     Raises:
-        RecordFormatError: the text is not such JSON.
+        RecordFormatError: the text is not valid JSON in this sense.
     """
 
     def refuse(constant: str) -> JsonValue:
@@ -562,14 +563,15 @@ def parse_json(text: str, place: str) -> JsonValue:
 
 
 def canonical_json(value: object) -> str:
-    """Write a JSON value in the one way that digests are made of.
+    """Return the canonical JSON text of a value, for digests.
 
-    Keys sorted by code point, no white space, no escapes beyond JSON's own, the shortest digits
-    that give the same float. `1`, `1.0` and `-0.0` stay apart, as do `true` and `1`.
+    Keys are sorted by code point; there is no white space, no escapes beyond those required by
+    JSON, and floats have the shortest digits that restore them. `1`, `1.0` and `-0.0` remain
+    distinct, as do `true` and `1`.
 
     Raises:
-        RecordFormatError: the value holds NaN, infinity, keys that are not text, half a surrogate
-            pair, or anything that is not JSON.
+        RecordFormatError: the value contains NaN, infinity, keys that are not text, unpaired
+            surrogates, or a type that is not JSON.
 
     >>> canonical_json({"b": 1.0, "a": [True, None, "é"]})
     '{"a":[true,null,"é"],"b":1.0}'
@@ -591,16 +593,16 @@ def canonical_json(value: object) -> str:
 
 
 def sha256_text(text: str) -> str:
-    """Digest of a text's UTF-8 bytes, 64 hexadecimal digits."""
+    """Return the SHA-256 of a text in UTF-8 as 64 hexadecimal digits."""
     return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
 
 
 def plain_json(value: object, place: str = "") -> JsonValue:
-    """Copy a value as plain JSON types, so that subclasses cannot print themselves differently.
+    """Copy a value as plain JSON types, since subclasses could print themselves differently.
 
     Raises:
-        RecordFormatError: the value holds NaN, infinity, keys that are not text, or what is no
-            JSON.
+        RecordFormatError: the value contains NaN, infinity, keys that are not text, or a type that
+            is not JSON.
     """
     if value is None or isinstance(value, bool):
         return value

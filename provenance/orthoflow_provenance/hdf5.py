@@ -1,8 +1,8 @@
-"""HDF5 files: writing them so that a full disk is an ordinary error, and opening untrusted ones.
+"""HDF5 files: robust writing when the disk is full, and safe opening of untrusted files.
 
-HDF5 cannot close a file that cannot be written to: the library keeps it open, complains again from
-destructors, and may crash the process at exit. It therefore writes through a sink that always
-succeeds, remembers the first error, and raises it once HDF5 is out of the way.
+HDF5 cannot close a file after a write error: the library keeps it open, reports errors again in
+destructors, and may crash the process at exit. HDF5 therefore writes to a file object that never
+fails; it remembers the first error, which is raised after HDF5 has closed the file.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from orthoflow_provenance.document import (
 )
 from orthoflow_provenance.paths import check_name
 
-# Everything that h5py raises for damaged files; which one depends on where the damage is.
+# All exceptions that h5py raises for damaged files, depending on the position of the damage.
 HDF5_ERRORS: Final = (
     OSError,
     RuntimeError,
@@ -39,28 +39,28 @@ HDF5_ERRORS: Final = (
     MemoryError,
     SystemError,
 )
-# Readable by HDF5 1.10 and newer; from 1.10 on all of HDF5's own structures carry checksums.
+# Readable by HDF5 1.10 and newer, in which all internal structures of HDF5 have checksums.
 _LIBRARY_VERSIONS: Final = (h5py.h5f.LIBVER_V110, h5py.h5f.LIBVER_V110)
-# Arrays that are worth mapping start at a multiple of this, so that mapped arrays are aligned.
+# Arrays large enough for mapping start at a multiple of this, so that mapped arrays are aligned.
 _ALIGNMENT_BYTES: Final = 64
 _ALIGNED_FROM_BYTES: Final = 2048
-# After a failed write, data blocks are dropped, but HDF5 must be able to read its structures back.
+# After a write error, data blocks are discarded, but HDF5 must be able to reread its structures.
 _KEPT_AFTER_FAILURE_BYTES: Final = 64 << 10
 
 _SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
-# Of the superblock of version 2 and 3: its version, the marks of open writers, the end of the file.
+# Superblock of version 2 and 3: its size, and the flags for files opened for writing.
 _SUPERBLOCK_BYTES: Final = 36
 _WRITER_MARKS: Final = 0b101
 _DEEPEST: Final = 32
-# No honest file comes near: deflate packs at most 1032 to 1.
+# Upper limit for valid files: deflate compresses by a factor of at most 1032.
 _LARGEST_RATIO: Final = 1100
 _ALWAYS_ALLOWED_BYTES: Final = 64 << 20
 _LARGEST_CHUNK_BYTES: Final = 64 << 20
 _LARGEST_ATTRIBUTE_BYTES: Final = 1 << 20
 _LONGEST_NAME: Final = 256
-# Nobody packs what is this small and read at once; more would be a flood from a few bytes.
+# Compression of such small data is pointless, and larger data could expand to excessive sizes.
 _PACKED_BYTES_MOST: Final = 4 << 20
-# Groups, datasets and attributes; a cell with its products has some fifty.
+# Objects are groups, datasets and attributes; a cell with its products has about 50.
 #: groups, datasets and attributes of a record (more limits in `provenance/SPEC.md`, section 2)
 MAX_OBJECTS: Final = 1_000_000
 _FILTERS: Final = {
@@ -73,10 +73,10 @@ _PLAIN_CLASSES: Final = frozenset({h5py.h5t.INTEGER, h5py.h5t.FLOAT})
 
 @contextmanager
 def reading(place: str) -> Iterator[None]:
-    """Turn any error of HDF5 about a damaged place into one sentence.
+    """Convert any HDF5 error while reading an object into one sentence.
 
     Raises:
-        RecordFormatError: something inside failed.
+        RecordFormatError: reading failed.
     """
     try:
         yield
@@ -88,23 +88,23 @@ def reading(place: str) -> Iterator[None]:
 
 
 def fixed_text(text: str) -> NDArray[np.bytes_]:
-    """Return a text as HDF5 holds it: UTF-8 of fixed length, without NUL and halves of letters.
+    """Return a text as stored in HDF5: fixed-length UTF-8, without NUL and unpaired surrogates.
 
-    Text of variable length lies in HDF5's global heap, the one structure without a checksum, in
-    which one changed byte can make the library loop for ever.
+    Variable-length text is stored in the global heap of HDF5, the only structure without a
+    checksum, where a single changed byte can make the library loop forever.
     """
     data = text.replace("\0", "").encode("utf-8", "replace")
     return np.array(data, dtype=h5py.string_dtype("utf-8", max(1, len(data))))
 
 
 def set_attributes(item: h5py.Group | h5py.Dataset, **values: str | float) -> None:
-    """Write scalar attributes: text of fixed length, whole numbers as int64, others as float64."""
+    """Write scalar attributes: fixed-length text, integers as int64, other numbers as float64."""
     for name, value in values.items():
         item.attrs[name] = attribute_value(value)
 
 
 def attribute_value(value: str | float) -> NDArray[np.generic]:
-    """Return a value of an attribute as it is stored."""
+    """Return an attribute value as it is stored."""
     if isinstance(value, str):
         return fixed_text(value)
     return np.array(value, dtype="<i8" if isinstance(value, int) else "<f8")
@@ -114,7 +114,7 @@ def text_attribute(item: h5py.Group | h5py.Dataset, name: str) -> str:
     """Read a text attribute.
 
     Raises:
-        RecordFormatError: it is missing or no text.
+        RecordFormatError: the attribute is missing or not text.
     """
     value = _attribute(item, name)
     if not isinstance(value, bytes):
@@ -123,10 +123,10 @@ def text_attribute(item: h5py.Group | h5py.Dataset, name: str) -> str:
 
 
 def int_attribute(item: h5py.Group | h5py.Dataset, name: str) -> int:
-    """Read a whole-number attribute.
+    """Read an integer attribute.
 
     Raises:
-        RecordFormatError: it is missing or no whole number.
+        RecordFormatError: the attribute is missing or not an integer.
     """
     value = _attribute(item, name)
     if not isinstance(value, np.integer | int):
@@ -137,7 +137,7 @@ def int_attribute(item: h5py.Group | h5py.Dataset, name: str) -> int:
 
 
 def write_array(group: h5py.Group, name: str, data: NDArray[np.generic]) -> h5py.Dataset:
-    """Write a text, a table or bytes as a contiguous dataset without time stamps."""
+    """Write text, a table or bytes as a contiguous dataset without time stamps."""
     return group.create_dataset(name, data=data, track_times=False)
 
 
@@ -145,7 +145,7 @@ def read_text(group: h5py.Group, name: str) -> str:
     """Read a text of any length.
 
     Raises:
-        RecordFormatError: the dataset is missing, damaged or no text.
+        RecordFormatError: the dataset is missing, damaged or not text.
     """
     dataset = dataset_of(group, name)
     value = read_whole(dataset)
@@ -158,7 +158,7 @@ def open_group(parent: h5py.Group, name: str) -> h5py.Group:
     """Open a sub-group.
 
     Raises:
-        RecordFormatError: there is none of that name.
+        RecordFormatError: there is no group with this name.
     """
     return _child(parent, name, h5py.Group, "group")
 
@@ -167,12 +167,12 @@ def dataset_of(group: h5py.Group, name: str) -> h5py.Dataset:
     """Open a dataset.
 
     Raises:
-        RecordFormatError: there is none of that name.
+        RecordFormatError: there is no dataset with this name.
     """
     return _child(group, name, h5py.Dataset, "dataset")
 
 
-# Any: h5py has no types.
+# `Any`: h5py has no type annotations.
 def _child(parent: h5py.Group, name: str, kind: type, what: str) -> Any:
     with reading(f"{parent.name.rstrip('/')}/{name}"):
         found = parent.get(name)
@@ -182,10 +182,10 @@ def _child(parent: h5py.Group, name: str, kind: type, what: str) -> Any:
 
 
 def read_whole(dataset: h5py.Dataset) -> object:
-    """Read a text, a table or a figure at once.
+    """Read a dataset (text, table or figure) as a whole.
 
     Raises:
-        RecordFormatError: it is damaged, or unpacks to much more than the file holds for it.
+        RecordFormatError: it is damaged, or expands to far more than its stored size allows.
     """
     with reading(dataset.name):
         if dataset.nbytes > max(_PACKED_BYTES_MOST, dataset.id.get_storage_size()):
@@ -198,22 +198,22 @@ def read_whole(dataset: h5py.Dataset) -> object:
 
 
 class FileSink:
-    """A file that HDF5 writes to; writing never raises.
+    """A file object for HDF5 whose write operations never raise an error.
 
     Attributes:
-        failure: the first error of the operating system, None while all is well.
+        failure: the first error of the operating system; None if there was none.
     """
 
     def __init__(self, path: Path) -> None:
-        # Through a link it would be another's file that is emptied.
+        # Do not follow links: the target, another file, would be truncated.
         flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC
         self._descriptor = os.open(path, flags, 0o666)
-        # What could not be written since a failure, in order: offset and bytes.
+        # Offset and bytes of the blocks that could not be written after the first error, in order.
         self._kept: list[tuple[int, bytes]] = []
         self.failure: OSError | None = None
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Move the position; HDF5 uses it to ask for the size as well."""
+        """Move the position; HDF5 also uses this to get the size."""
         if whence == os.SEEK_END:
             ends = (start + len(data) for start, data in self._kept)
             offset += max(os.fstat(self._descriptor).st_size, *ends, 0)
@@ -225,7 +225,7 @@ class FileSink:
         return self.seek(0, os.SEEK_CUR)
 
     def write(self, data: memoryview) -> int:
-        """Write all of the data at the position."""
+        """Write all data at the position."""
         view = memoryview(data).cast("B")
         start, done = self.tell(), 0
         try:
@@ -239,7 +239,7 @@ class FileSink:
         return len(view)
 
     def readinto(self, buffer: memoryview) -> int:
-        """Read at the position; what was never written is zeros."""
+        """Read at the position; bytes that were never written are zero."""
         view = memoryview(buffer).cast("B")
         position = self.tell()
         stored = os.read(self._descriptor, len(view))
@@ -262,13 +262,13 @@ class FileSink:
         return size
 
     def flush(self) -> None:
-        """Do nothing: `close` brings the data to the disk, once."""
+        """Do nothing, because `close` syncs the data to the disk."""
 
     def close(self) -> None:
-        """Bring the data to the disk and close the file.
+        """Sync the data to the disk and close the file.
 
         Raises:
-            OSError: writing failed now or before.
+            OSError: this or an earlier operation failed.
         """
         try:
             if self.failure is None:
@@ -281,9 +281,9 @@ class FileSink:
 
 @contextmanager
 def create_file(path: Path) -> Iterator[h5py.File]:
-    """Create an HDF5 file and bring it to the disk; what stood at `path` before is lost.
+    """Create an HDF5 file and sync it to the disk; an existing file is overwritten.
 
-    A file that could not be completed is removed.
+    An incomplete file is removed.
 
     Raises:
         OSError: the file cannot be created or written, e.g. because the disk is full.
@@ -297,7 +297,7 @@ def create_file(path: Path) -> Iterator[h5py.File]:
             finally:
                 file.close()
         finally:
-            # Whatever HDF5 made of it, the first error of the disk is the reason.
+            # The first error of the disk is the cause, whatever HDF5 raised because of it.
             sink.close()
     except BaseException:
         path.unlink(missing_ok=True)
@@ -305,7 +305,7 @@ def create_file(path: Path) -> Iterator[h5py.File]:
 
 
 def create_group(parent: h5py.Group, name: str) -> h5py.Group:
-    """Create a group without time stamps: equal content gives equal files."""
+    """Create a group without time stamps, so that equal content results in equal files."""
     properties = h5py.h5p.create(h5py.h5p.GROUP_CREATE)
     properties.set_obj_track_times(False)
     return h5py.Group(h5py.h5g.create(parent.id, name.encode("utf-8"), gcpl=properties))
@@ -313,16 +313,16 @@ def create_group(parent: h5py.Group, name: str) -> h5py.Group:
 
 @contextmanager
 def safe_open(path: Path, format_name: str) -> Iterator[h5py.File]:
-    """Open a file of a format for reading, after a check of every object in it.
+    """Open a file of a format for reading, after checking all objects in it.
 
     Raises:
-        UnknownFormatError: the file is no HDF5 file, or another program or another version of the
-            format wrote it.
-        LockedFileError: the file is open for writing elsewhere, or was left so by a crash.
-        RecordFormatError: the file is damaged, or holds links other than hard links, an object
-            that is reached twice or has an impossible name, external or virtual storage, filters
-            other than shuffle, gzip and fletcher32, types outside the format, or datasets that
-            unpack to far more than the file could hold.
+        UnknownFormatError: the file is not an HDF5 file, or is from another program or of another
+            version of the format.
+        LockedFileError: the file is open for writing elsewhere, or was left open by a crash.
+        RecordFormatError: the file is damaged, or contains links other than hard links, an object
+            with two paths or an invalid name, external or virtual storage, filters other than
+            shuffle, gzip and fletcher32, types outside the format, or datasets that expand to far
+            more than the file could contain.
         OSError: the file cannot be opened.
     """
     _check_superblock(path)
@@ -350,14 +350,14 @@ def _check_superblock(path: Path) -> None:
 
 
 def bytes_behind_end(path: Path) -> int:
-    """Count the bytes behind the end that an HDF5 file states; negative where some are missing."""
+    """Return the number of bytes after the end of the HDF5 data; negative if bytes are missing."""
     with path.open("rb") as stream:
         start = stream.read(_SUPERBLOCK_BYTES)
     return path.stat().st_size - int.from_bytes(start[28:36], "little")
 
 
 def _require_format(file: h5py.File, file_name: str, name: str) -> None:
-    """Refuse a file of another program, or of another version of the format."""
+    """Refuse a file from another program or of another version of the format."""
     with reading(file_name):
         found, version = (_short_text(file, one) for one in ("format", "format_version"))
     if found is None or version is None:
@@ -374,7 +374,7 @@ def _require_format(file: h5py.File, file_name: str, name: str) -> None:
 
 
 def _short_text(file: h5py.File, name: str) -> str | None:
-    """Read an attribute that nobody has checked: None unless it is a short text as we write it."""
+    """Read an unchecked attribute; return None unless it is a short fixed-length text."""
     if not h5py.h5a.exists(file.id, name.encode()):
         return None
     attribute = h5py.h5a.open(file.id, name.encode())
@@ -384,7 +384,7 @@ def _short_text(file: h5py.File, name: str) -> str | None:
 
 
 class _Inspection:
-    """One walk over all links, objects and attributes of a file."""
+    """Inspection of all links, objects and attributes of a file."""
 
     def __init__(self, file: h5py.File, path: Path) -> None:
         self._file = file
@@ -396,12 +396,12 @@ class _Inspection:
         self._seen: set[tuple[int, int]] = set()
 
     def run(self) -> None:
-        """Look at everything, deepest last.
+        """Inspect all objects of the file.
 
         Raises:
-            RecordFormatError: something forbidden was found.
+            RecordFormatError: an object is not allowed.
         """
-        # Low-level identifiers: the objects of h5py on top of them would take three times as long.
+        # Low-level identifiers are used because h5py's high-level objects take three times as long.
         pending: list[tuple[h5py.h5g.GroupID, str, int]] = [(self._file.id, "/", 0)]
         self._visit_once(self._file.id, "/")
         while pending:
@@ -425,7 +425,7 @@ class _Inspection:
         self, group: h5py.h5g.GroupID, name: bytes, place: str
     ) -> h5py.h5g.GroupID | h5py.h5d.DatasetID:
         try:
-            # `..` between names would be one group up for other programs.
+            # Other programs would interpret `..` in a path as the parent group.
             check_name(name.decode("utf-8"), "the object")
         except RecordFormatError as error:
             raise self._refusal(place, f"is not a place in a record: {error}") from error
@@ -440,7 +440,7 @@ class _Inspection:
         return child
 
     def _visit_once(self, item: h5py.h5g.GroupID | h5py.h5d.DatasetID, place: str) -> None:
-        # Two ways to one object make loops, and trees that grow without end from a few bytes.
+        # Objects with several paths allow loops and trees that grow without limit from a few bytes.
         info = h5py.h5o.get_info(item)
         identity = (int(info.fileno), int(info.addr))
         is_known = identity in self._seen
@@ -472,7 +472,7 @@ class _Inspection:
         unfounded = declared > max(_ALWAYS_ALLOWED_BYTES, _LARGEST_RATIO * stored)
         sizes = f"declares {declared} bytes, but the file holds {stored} for it"
         self._refuse(place, unfounded, sizes)
-        # Many that each stay below what is always allowed would be a flood together.
+        # Many datasets, each below the limit that is always allowed, could be excessive together.
         self._unfounded_bytes += max(0, declared - _LARGEST_RATIO * stored)
         self._stored_bytes += stored
         together = "and those before it declare more than 64 MiB that the file cannot hold"
@@ -500,7 +500,7 @@ class _Inspection:
 
 
 def _is_allowed(kind: h5py.h5t.TypeID) -> bool:
-    """Give whether values of a type lie in the dataset itself: numbers, bool, fixed text, rows."""
+    """Return whether values are stored in the dataset itself: numbers, bool, fixed text, rows."""
     type_class = kind.get_class()
     if type_class == h5py.h5t.COMPOUND:
         return all(_is_plain(kind.get_member_type(index)) for index in range(kind.get_nmembers()))

@@ -1,8 +1,8 @@
-"""Files below a folder whose names are untrusted: nothing leads out, only files are read.
+"""Safe access to files with untrusted names: never outside a folder, and only regular files.
 
-Every name that a record, a crate, an archive or a plugin gives becomes a path here and nowhere
-else. Reading and writing go down folder by folder through descriptors, so that nothing can be
-exchanged for a link between the look and the use.
+All names from records, crates, archives and plugins are converted to paths here. Reading and
+writing descend folder by folder through file descriptors, so that no folder can be replaced by a
+link between check and use.
 """
 
 from __future__ import annotations
@@ -27,31 +27,31 @@ _PATH: Final = re.compile(
 )
 LONGEST_NAME_BYTES: Final = 255
 LONGEST_PATH_BYTES: Final = 4095
-# Windows takes these for devices whatever stands behind a dot, on every drive and in every folder.
+# Windows treats these names as devices, with any suffix, on every drive and in every folder.
 _DEVICES: Final = re.compile(
     r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³])[ ]*(\..*)?", re.IGNORECASE | re.DOTALL
 )
 _DRIVE: Final = re.compile(r"[A-Za-z]:")
 _SAFE: Final = os.O_NOFOLLOW | os.O_CLOEXEC
 _FOLDER_FLAGS: Final = os.O_RDONLY | os.O_DIRECTORY | _SAFE
-# The first folder is what the user named, and may be a link.
+# The first folder is given by the user and may be a link.
 _FIRST_FLAGS: Final = _FOLDER_FLAGS & ~os.O_NOFOLLOW
 _FILE_FLAGS: Final = os.O_RDONLY | os.O_NONBLOCK | _SAFE
 _NEW_FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _SAFE
 
 
 def holds_control(text: str) -> bool:
-    """Return whether a text has control characters, separators of lines, or halves of letters."""
+    """Return whether a text has control characters, line separators or unpaired surrogates."""
     return not text.isprintable() and any(
         unicodedata.category(letter) in {"Cc", "Cs", "Zl", "Zp"} for letter in text
     )
 
 
 def check_name(name: str, what: str) -> str:
-    """Refuse names that cannot be one link in HDF5 or one line in the seal.
+    """Refuse names that cannot be the name of an HDF5 link or one line in the seal.
 
     Raises:
-        RecordFormatError: the name is empty, `.` or `..`, or holds `/` or a control character.
+        RecordFormatError: the name is empty, `.` or `..`, or contains `/` or a control character.
     """
     if name in {"", ".", ".."} or "/" in name or holds_control(name):
         raise RecordFormatError(
@@ -77,7 +77,7 @@ _PROBLEMS: Final[tuple[tuple[str, Callable[[str], object]], ...]] = (
 
 
 def name_problem(name: str) -> str:
-    """State why a name cannot be that of a file or folder on every system; empty when it can.
+    """Return why a name is not allowed as a file or folder name on all systems; empty if it is.
 
     >>> name_problem("hall.e57"), name_problem(".."), name_problem("a/b")
     ('', 'is . or ..', 'holds / or a backslash')
@@ -86,7 +86,7 @@ def name_problem(name: str) -> str:
 
 
 def path_problem(path: str) -> str:
-    """State why a relative path with `/` cannot be one below a folder; empty when it can.
+    """Return why a relative path with `/` is not allowed inside a folder; empty if it is.
 
     >>> path_problem("products/wall/a.tif"), path_problem("/etc/x"), path_problem("a/../b")
     ('', 'is absolute', 'has a part that is . or ..')
@@ -106,17 +106,17 @@ def path_problem(path: str) -> str:
 
 
 def path_below(folder: Path, path: str) -> Path:
-    """Make the path of something below a folder of a name that came from elsewhere.
+    """Return the path of a file in a folder, given by an untrusted relative path.
 
     Raises:
-        UnsafeFileError: it would lead out of the folder, or cannot be a path everywhere: absolute,
-            `..`, empty, control characters, reserved names, too long.
+        UnsafeFileError: the path leads out of the folder or is not allowed on all systems:
+            absolute, with `..`, empty, with control characters or reserved names, or too long.
     """
     return folder.joinpath(*_parts(path))
 
 
 def colliding(paths: Iterable[str]) -> str:
-    """Return the first path that some system takes for one before it; empty when there is none.
+    """Return the first path that some system does not distinguish from an earlier one, or "".
 
     >>> colliding(["a.png", "b.png", "A.png"])
     'A.png'
@@ -131,15 +131,15 @@ def colliding(paths: Iterable[str]) -> str:
 
 
 def open_below(folder: Path, path: str) -> BufferedReader:
-    """Open a regular file below a folder for reading, through no link.
+    """Open a regular file in a folder for reading, without following links.
 
     Raises:
-        UnsafeFileError: the path leads elsewhere, or a link, a folder or a device stands there.
+        UnsafeFileError: the path leads out of the folder, or to a link, a folder or a device.
         OSError: there is no such file, or it cannot be read.
     """
     *folders, name = _parts(path)
     with _folder_below(folder, folders) as parent:
-        # Opening a device may do something.
+        # Check before opening, because opening a device may have side effects.
         _check_regular(os.stat(name, dir_fd=parent, follow_symlinks=False), path)
         with _link_refused(parent, name, path):
             descriptor = os.open(name, _FILE_FLAGS, dir_fd=parent)
@@ -153,12 +153,12 @@ def open_below(folder: Path, path: str) -> BufferedReader:
 
 @contextmanager
 def create_below(folder: Path, path: str) -> Iterator[BinaryIO]:
-    """Write a file below a folder, through no link; it gets its name when it is complete.
+    """Write a file in a folder without following links; it gets its name when it is complete.
 
-    Folders on the way are made. A file, or a link, of that name is replaced.
+    Missing folders are created. An existing file or link with the name is replaced.
 
     Raises:
-        UnsafeFileError: the path leads elsewhere, or a link stands in the place of a folder.
+        UnsafeFileError: the path leads out of the folder, or one of its folders is a link.
         OSError: the file cannot be written.
     """
     *folders, name = _parts(path)
@@ -175,9 +175,9 @@ def create_below(folder: Path, path: str) -> Iterator[BinaryIO]:
 
 
 def files_below(folder: Path, path: str) -> tuple[str, ...]:
-    """Name the regular files in a folder below another; none when there is no such folder.
+    """Return the paths of regular files in a subfolder; empty if there is no such folder.
 
-    Links, and files whose names could not be those of a record, are left out.
+    Links, and files whose names are not allowed in a record, are omitted.
 
     Raises:
         OSError: the folder cannot be read.
@@ -212,7 +212,7 @@ def _kind_of(found: os.stat_result) -> str:
 
 @contextmanager
 def _folder_below(folder: Path, names: list[str], *, is_made: bool = False) -> Iterator[int]:
-    """Go down folder by folder; the first one may be a link, it is what the user named."""
+    """Descend folder by folder; the first one, given by the user, may be a link."""
     descriptor = os.open(folder, _FIRST_FLAGS)
     try:
         for depth, name in enumerate(names):
@@ -230,7 +230,7 @@ def _folder_below(folder: Path, names: list[str], *, is_made: bool = False) -> I
 
 @contextmanager
 def _link_refused(parent: int, name: str, path: str) -> Iterator[None]:
-    """State that a link stands there; which error the system gives for one depends on the flags."""
+    """Raise an error that reports a link; which OSError a link causes depends on the flags."""
     try:
         yield
     except OSError as error:
@@ -245,9 +245,9 @@ def without_folders(text: str, folders: Sequence[Path] = ()) -> str:
     """Reduce absolute paths in a text to their last part.
 
     Args:
-        text: a log, a message, an option as it was typed.
-        folders: folders to take out literally first, for names with spaces, which no pattern
-            finds the end of; the home and the working directory are always among them.
+        text: a log, a message or a command-line option.
+        folders: folders to remove literally first, for names with spaces, whose end no pattern can
+            find; the home directory and the working directory are always included.
 
     >>> without_folders("cannot read /home/jane/scans/hall.e57: 1/2 of it is missing")
     'cannot read hall.e57: 1/2 of it is missing'
@@ -260,7 +260,7 @@ def without_folders(text: str, folders: Sequence[Path] = ()) -> str:
 
 def _own_folders() -> set[str]:
     folders = {str(Path.cwd())}
-    # Where no home directory is known no text can name it.
+    # If the home directory is unknown, no text can contain it.
     with suppress(RuntimeError):
         folders.add(str(Path.home()))
     return folders

@@ -1,8 +1,8 @@
-"""The record of a run as one HDF5 file: the document, what it names by digest, and the seal.
+"""The record of a run as one HDF5 file: the document, the contents it references, and the seal.
 
-`/document` is the record. Everything else in the file is either named in it by digest, the products
-and the bytes of files, or repeats it so that people find their way in HDFView and h5py: a group per
-cell, one table of metrics. `/seal` is the digest of the whole file.
+`/document` is the record. Everything else in the file is either referenced in it by digest
+(products and the bytes of files) or repeats parts of it for users of HDFView and h5py (a group per
+cell, and a table of metrics). `/seal` is the digest of the whole file.
 """
 
 from __future__ import annotations
@@ -70,18 +70,18 @@ FILES: Final = "files"
 CELLS: Final = "cells"
 _UNSEALED: Final = "0" * 64
 _BLOCK_BYTES: Final = 16 << 20
-# Attributes are read at a glance; what is longer stands in the document.
+# Attributes are for quick reading; longer values are only in the document.
 _LONGEST_ATTRIBUTE: Final = 1000
 _PLAIN: Final = (str, int, float, bool)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Node:
-    """One object of a record as it must be.
+    """An object in a record as it is expected.
 
     Attributes:
-        attributes: all of its attributes.
-        data: content of a dataset, None for a group.
+        attributes: all attributes of the object.
+        data: content of a dataset; None for a group.
     """
 
     attributes: Mapping[str, NDArray[np.generic]]
@@ -93,8 +93,8 @@ class OpenRecord:
     """An open record.
 
     Attributes:
-        record: everything but the arrays.
-        content_sha256: SHA-256 of the document, as stated; 64 hexadecimal digits.
+        record: everything except the arrays.
+        content_sha256: SHA-256 of the document as stored, 64 hexadecimal digits.
         file: the HDF5 file.
     """
 
@@ -106,8 +106,8 @@ class OpenRecord:
         """Read an output of a cell; arrays of mapped products stay valid after closing.
 
         Raises:
-            RecordFormatError: there is no such output, it is not embedded, it is damaged, or it is
-                not that of its digest.
+            RecordFormatError: there is no such output, it is not embedded, it is damaged, or it
+                does not match its digest.
         """
         cell = next((cell for cell in self.record.cells if cell.address == address), None)
         output = None if cell is None else cell.outputs.get(port)
@@ -120,7 +120,7 @@ class OpenRecord:
             )
         group = open_group(self.file, product_path(output.digest))
         payload = read_payload(group, map_arrays=True)
-        # Who shows or hands on arrays has not looked at the seal of the file.
+        # Check it here, because the caller may not have checked the seal of the file.
         if (found := payload_digest(payload)) != output.digest:
             raise RecordFormatError(
                 f"{group.name} has the digest {found}, the record states {output.digest}: it was "
@@ -139,26 +139,26 @@ def write_record(
     input_file: InputFile | None = None,
     earlier: Path | None = None,
 ) -> str:
-    """Write a record next to its final place and move it there when it is complete.
+    """Write a record under a temporary name, and rename it when it is complete.
 
     Args:
-        path: the record, usually `run.h5`; its folder exists.
-        record: everything but the arrays.
-        product_file: digest -> file that `write_product_file` wrote, None when there is none.
-        embed: put in the arrays of all outputs, not only of those marked `embedded`.
-        keep_folders: leave absolute paths in logs, messages and options.
-        input_file: SHA-256 -> file with it, for the inputs marked `embedded`.
-        earlier: another record of this run; the outputs embedded in it are taken from there.
+        path: path of the record, usually `run.h5`, in an existing folder.
+        record: everything except the arrays.
+        product_file: digest -> file written by `write_product_file`, or None if there is none.
+        embed: embed the arrays of all outputs, not only of those marked `embedded`.
+        keep_folders: keep absolute paths in logs, messages and options.
+        input_file: SHA-256 -> file with this digest, for the inputs marked `embedded`.
+        earlier: another record of this run, from which outputs embedded in it are copied.
 
     Returns:
         The content digest, 64 hexadecimal digits.
 
     Raises:
-        RecordFormatError: a name is impossible in a record, or a product to embed is missing,
-            damaged or another one.
-        InputFileError: an input file to embed is missing or another one.
-        OSError: the file cannot be written, e.g. because the disk is full; what stood at `path`
-            before is untouched.
+        RecordFormatError: a name is not allowed in a record, or a product to embed is missing,
+            damaged or does not match.
+        InputFileError: an input file to embed is missing or does not match.
+        OSError: the file cannot be written, e.g. because the disk is full; an existing file at
+            `path` is not changed.
     """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     written = _as_written(record, embed=embed, keep_folders=keep_folders)
@@ -189,10 +189,10 @@ def write_record(
 
 
 def read_record(path: Path) -> RunRecord:
-    """Read all of a record but the arrays.
+    """Read everything in a record except the arrays.
 
     Raises:
-        RecordFormatError: the file is no record, damaged, incomplete, or of another format.
+        RecordFormatError: the file is not a record, damaged, incomplete, or of another format.
         OSError: the file cannot be opened.
     """
     with open_record(path) as opened:
@@ -204,7 +204,7 @@ def open_record(path: Path) -> Iterator[OpenRecord]:
     """Open a record for reading.
 
     Raises:
-        RecordFormatError: the file is no record, damaged, incomplete, or of another format.
+        RecordFormatError: the file is not a record, damaged, incomplete, or of another format.
         OSError: the file cannot be opened.
     """
     with safe_open(path, RUN_FORMAT) as file:
@@ -228,18 +228,18 @@ def record_of(file: h5py.File) -> RunRecord:
 
 
 def document_text(record: RunRecord) -> str:
-    """Write the document of a record."""
+    """Return the document of a record as JSON text."""
     return json.dumps(to_json(record), ensure_ascii=False, allow_nan=False, indent=1)
 
 
 def expected_nodes(record: RunRecord, text: str) -> dict[str, Node]:
-    """Return what repeats a record so that people find their way: path -> group or dataset.
+    """Return the objects that repeat parts of a record for human readers: path -> node.
 
-    Parents come before what lies in them. Products, files and the seal are not among them.
+    Parents come before their children. Products, files and the seal are not included.
 
     Args:
-        record: of the document.
-        text: the document.
+        record: the record.
+        text: the document of the record.
     """
     stated = plain_fields(record)
     root = {"format": RUN_FORMAT, "format_version": FORMAT_VERSION, **stated}
@@ -273,10 +273,10 @@ def expected_nodes(record: RunRecord, text: str) -> dict[str, Node]:
 
 
 def product_path(digest: str) -> str:
-    """Return where a record has the product of a digest.
+    """Return the path of a product in a record, given its digest.
 
     Raises:
-        RecordFormatError: the digest is none.
+        RecordFormatError: the text is not a digest.
     """
     scheme, _, digits = digest.partition(":")
     if f"{scheme}:" != DIGEST_PREFIX or not is_sha256(digits):
@@ -285,16 +285,16 @@ def product_path(digest: str) -> str:
 
 
 def is_sha256(text: str) -> bool:
-    """Return whether a text is 64 hexadecimal digits in lower case."""
+    """Return whether a text is 64 lower-case hexadecimal digits."""
     return len(text) == 64 and not set(text) - set("0123456789abcdef")
 
 
 def file_sha256(path: Path, offset: int) -> str:
-    """Digest the bytes of a record file, with zeros as digits in the place of its seal.
+    """Return the SHA-256 of a record file, with the seal replaced by zero digits.
 
     Args:
         path: the file.
-        offset: of the 64 bytes of the seal.
+        offset: offset of the 64 bytes of the seal.
     """
     digest, position = hashlib.sha256(), 0
     with path.open("rb") as stream:
@@ -314,15 +314,16 @@ def extract_files(
 
     Args:
         path: the record.
-        inputs: of the record.
-        folder: made when missing; each file gets a folder of its own, as names may come twice.
+        inputs: inputs of the record.
+        folder: the folder, created if missing; each file is in a separate subfolder, because names
+            may not be unique.
 
     Returns:
-        Input -> files, in the order of the record; inputs that are not embedded are left out.
+        Input -> files, in the order of the record; inputs that are not embedded are omitted.
 
     Raises:
-        RecordFormatError: a file is damaged, is not the one that the record describes, or has a
-            name that cannot be that of a file.
+        RecordFormatError: a file is damaged, does not match the record, or has a name that is not
+            allowed as a file name.
         OSError: a file cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -336,7 +337,7 @@ def extract_files(
 
 def _as_written(record: RunRecord, *, embed: bool, keep_folders: bool) -> RunRecord:
     def clean(text: str) -> str:
-        # HDF5 text cannot hold NUL, and UTF-8 no halves of surrogate pairs.
+        # NUL is not possible in HDF5 text, nor are unpaired surrogates in UTF-8.
         text = text.replace("\0", "").encode("utf-8", "replace").decode("utf-8")
         return text if keep_folders else without_folders(text)
 
@@ -366,7 +367,7 @@ def _as_written(record: RunRecord, *, embed: bool, keep_folders: bool) -> RunRec
 
 
 def _check_names(record: RunRecord) -> None:
-    """Refuse names that cannot be one link in HDF5, and those that come twice."""
+    """Refuse names that cannot be the name of an HDF5 link, and duplicate names."""
     named = {
         "the input": [entry.name for entry in record.inputs],
         "the environment": [entry.id for entry in record.environments],
@@ -413,7 +414,7 @@ def plain_fields(entry: object) -> dict[str, str | float]:
     for item in dataclasses.fields(entry):  # type: ignore[arg-type] # any dataclass
         value = getattr(entry, item.name)
         if item.name == "seed":
-            # A seed may have more digits than a number in HDF5.
+            # A seed may exceed the integer types of HDF5, so it is stored as text.
             value = "" if value is None else str(value)
         if isinstance(value, _PLAIN) and not item.name.startswith(("workflow_", "key_", "log")):
             found[item.name] = value[:_LONGEST_ATTRIBUTE] if isinstance(value, str) else value
@@ -468,7 +469,7 @@ def _table(
     numbers: Sequence[str] = ("size_bytes",),
     reals: Sequence[str] = (),
 ) -> NDArray[np.generic]:
-    """Return rows, dataclasses or mappings, as a flat table; text columns as wide as need be."""
+    """Return dataclasses or mappings as a flat table, with text columns as wide as needed."""
     values = [dict(row) if isinstance(row, Mapping) else vars(row) for row in rows]
     filled: dict[str, NDArray[np.generic]] = {}
     for name in columns:
@@ -518,7 +519,7 @@ def _copy_product(products: h5py.Group, digest: str, source: h5py.Group) -> None
     if stored != digest:
         name = Path(source.file.filename).name
         raise RecordFormatError(f"{name} must hold the product {digest}, got {stored}")
-    # Copies chunks as they are; unpacking and packing again would be ten times slower.
+    # Copies chunks unchanged; decompressing and compressing again would take ten times as long.
     source.file.copy(source, products, name=digest.removeprefix(DIGEST_PREFIX))
 
 
@@ -533,9 +534,10 @@ def _embed_file(files: h5py.Group, input_name: str, file: RecordedFile, path: Pa
         f"{file.sha256[:12]}..., but it was changed since it was digested"
     )
     if not path.is_file():
-        # A pipe in its place would be waited for.
+        # Do not open it: reading from a pipe would block.
         raise another
-    # Neither chunked nor packed: photos and scans are packed already, and digests guard the bytes.
+    # Not chunked or compressed: photos and scans are already compressed, and digests protect the
+    # bytes.
     dataset = files.create_dataset(
         file.sha256, shape=(file.size_bytes,), dtype=np.uint8, track_times=False
     )
@@ -573,7 +575,7 @@ def _extracted(opened: h5py.File, entry: RecordedInput, folder: Path) -> Iterato
     for index, file in enumerate(entry.files):
         check_name(file.sha256, "the file")
         dataset = dataset_of(files, file.sha256)
-        # Before anything is written: the record states how much room it takes.
+        # Check before writing, because the record determines how much disk space is used.
         if dataset.dtype != np.uint8 or dataset.shape != (file.size_bytes,):
             raise RecordFormatError(
                 f"{dataset.name} must be the {file.size_bytes} bytes of {file.name!r}, got "
@@ -591,10 +593,11 @@ def _extracted(opened: h5py.File, entry: RecordedInput, folder: Path) -> Iterato
 
 
 def dataset_sha256(dataset: h5py.Dataset, also: Callable[[bytes], object] = len) -> str:
-    """Digest a dataset of bytes, block by block.
+    """Return the SHA-256 of a dataset of bytes, read block by block.
 
     Args:
-        dataset: one-dimensional, uint8.
+        dataset: one-dimensional dataset of uint8.
+        also: called with each block.
         also: gets each block.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Checking a record against itself: the seal, every digest, every object, every required field."""
+"""Consistency checks of a record: the seal, all digests, all objects, all required fields."""
 
 from __future__ import annotations
 
@@ -62,12 +62,12 @@ _PRODUCT_ATTRIBUTES: Final = frozenset({"type", "encoding_version", "digest", "m
 
 
 class Finding(NamedTuple):
-    """Something in a record that is not as it should be.
+    """A problem found in a record.
 
     Attributes:
-        code: what it is: `foreign` and `locked` for files that cannot be checked, else `damaged`,
-            `seal`, `appended`, `document`, `object`, `product`, `file`, `field`, `name`, `key`
-            or `reference`.
+        code: kind of problem: `foreign` or `locked` for files that cannot be checked, otherwise
+            `damaged`, `seal`, `appended`, `document`, `object`, `product`, `file`, `field`, `name`,
+            `key` or `reference`.
         place: path in the file, with `@` before the name of an attribute.
         problem: one sentence.
     """
@@ -78,20 +78,20 @@ class Finding(NamedTuple):
 
 
 def verify_record(path: Path, *, with_arrays: bool = True) -> tuple[Finding, ...]:
-    """Check a record; never raises, whatever the file is.
+    """Check a record; any problem of the file becomes a finding, never an exception.
 
     Args:
         path: the record.
-        with_arrays: check the seal of the file and the arrays of products, too; without, what is
-            read is the document, what repeats it, and figures.
+        with_arrays: also check the seal of the file and the arrays of products; otherwise only the
+            document, the objects that repeat it, and figures are read.
 
     Returns:
-        What was found, in the order of the checks; empty when the record is whole and unchanged.
+        All findings, in the order of the checks; empty if the record is intact and unchanged.
     """
     try:
         with safe_open(path, RUN_FORMAT) as file:
             found = list(_document_findings(file, with_arrays=with_arrays))
-            # Last: what was changed has been named where it can be.
+            # Check the seal last, because the other checks give the exact position of a change.
             found += _seal_findings(file, path) if with_arrays else ()
             return tuple(found)
     except RecordFormatError as error:
@@ -106,7 +106,7 @@ def _document_findings(file: h5py.File, *, with_arrays: bool) -> Iterator[Findin
         text = read_text(file, DOCUMENT)
         record = record_of(file)
         nodes = expected_nodes(record, text)
-        # Any: the reader has looked at its form.
+        # `Any`: its form has been checked by the reader.
         document: Any = parse_json(text, f"/{DOCUMENT}")
         contents = _contents(document)
     except RecordFormatError as error:
@@ -128,7 +128,7 @@ def _document_findings(file: h5py.File, *, with_arrays: bool) -> Iterator[Findin
 
 
 def _seal_findings(file: h5py.File, path: Path) -> Iterator[Finding]:
-    """Check the bytes of the file."""
+    """Check the seal against the bytes of the file."""
     n_bytes = bytes_behind_end(path)
     if n_bytes:
         how = f"{n_bytes} bytes stand behind" if n_bytes > 0 else f"{-n_bytes} bytes are missing at"
@@ -148,7 +148,7 @@ def _seal_findings(file: h5py.File, path: Path) -> Iterator[Finding]:
 def _object_findings(
     file: h5py.File, record: RunRecord, nodes: Mapping[str, Node], contents: Container[str]
 ) -> Iterator[Finding]:
-    """Compare every object that is not named by digest with what the document states."""
+    """Compare all objects that are not referenced by digest with the document."""
     places = {product_path(digest).rpartition("/")[2] for digest in _embedded(record)}
     known = set(nodes) | {f"/{SEAL}", f"/{PRODUCTS}", f"/{FILES}"}
     missing = set(known)
@@ -206,7 +206,7 @@ def _data_problem(item: h5py.Group | h5py.Dataset, data: NDArray[np.generic]) ->
 
 def _is_same(found: NDArray[Any], expected: NDArray[Any]) -> bool:
     if found.dtype.names is not None or expected.dtype.names is not None:
-        # Column by column, so that padding between the columns does not count.
+        # Compare column by column, so that padding between the columns is ignored.
         return found.dtype.names == expected.dtype.names and all(
             _is_same(found[name], expected[name]) for name in expected.dtype.names or ()
         )
@@ -230,7 +230,7 @@ def _objects(file: h5py.File) -> Iterator[tuple[str, h5py.Group | h5py.Dataset]]
 
 
 def _embedded(record: RunRecord) -> dict[str, str]:
-    """Digest -> type of the products whose arrays lie in the record."""
+    """Return digest -> type of the products whose arrays are in the record."""
     return {
         output.digest: output.type_name
         for cell in record.cells
@@ -240,7 +240,7 @@ def _embedded(record: RunRecord) -> dict[str, str]:
 
 
 def _contents(document: Mapping[str, Any]) -> dict[str, tuple[str, int | None]]:
-    """SHA-256 -> what the bytes are of and how many, for all that a document has in `/files`."""
+    """Return SHA-256 -> description and size, for all contents of a document in `/files`."""
     found: dict[str, tuple[str, int | None]] = {}
     for cell in document["cells"]:
         for figure in cell["figures"]:
@@ -254,7 +254,7 @@ def _contents(document: Mapping[str, Any]) -> dict[str, tuple[str, int | None]]:
 def _content_findings(
     file: h5py.File, contents: Mapping[str, tuple[str, int | None]], *, with_arrays: bool
 ) -> Iterator[Finding]:
-    """Check the files that the document names by digest; large ones with the arrays."""
+    """Check the files that the document references by digest; large ones only with the arrays."""
     for sha256, (name, size_bytes) in contents.items():
         problem = ""
         try:
@@ -284,7 +284,7 @@ def _product_findings(file: h5py.File, record: RunRecord) -> Iterator[Finding]:
 
 
 def _run_findings(record: RunRecord) -> Iterator[Finding]:
-    """Check fields of the run, its inputs and its published files, and what files are named by."""
+    """Check fields and names of the run, its inputs and its published files."""
     for name in ("run_id", "name", "created_by", "started", "ended", "workflow_source"):
         if not getattr(record, name):
             yield Finding("field", "/", f"{name} must not be empty")
@@ -312,12 +312,12 @@ def _run_findings(record: RunRecord) -> Iterator[Finding]:
 
 
 def _name_findings(record: RunRecord) -> Iterator[Finding]:
-    """Check what folders and files of other programs are called after."""
+    """Check names that are used for folders and files."""
     named = [("/@name", record.name), ("/@run_id", record.run_id)]
     named += [(f"/inputs/{entry.name}", entry.name) for entry in record.inputs]
     for cell in record.cells:
         place = f"/{CELLS}/{cell.address}"
-        # Names of files cut the longest addresses.
+        # File names use only the beginning of long addresses.
         named += [(place, cell.address[:_LETTERS_MOST]), (f"{place}@step", cell.step)]
         named += [(f"{place}/outputs/{port}", port) for port in cell.outputs]
         for figure in cell.figures:
@@ -333,7 +333,7 @@ def _name_findings(record: RunRecord) -> Iterator[Finding]:
             problem = f"two figures are named {twice!r}, as some systems see it"
             yield Finding("field", f"{place}/figures", problem)
     for place, name in named:
-        # That names must not be empty is checked elsewhere.
+        # Empty names are reported by other checks.
         if name and (problem := name_problem(name)):
             yield Finding("name", place, f"{name!r} {problem}, so no file can be named so")
 
@@ -361,7 +361,7 @@ def _cell_findings(cell: RecordedCell, record: RunRecord) -> Iterator[Finding]:
 
 
 def _reference_findings(cell: RecordedCell, outputs: Mapping[str, str]) -> Iterator[Finding]:
-    """Check that digests are digests and that an input is what its source gave."""
+    """Check that digests are valid, and that each input matches the output of its source."""
     for folder, products in (("inputs", cell.inputs), ("outputs", cell.outputs)):
         for port, product in products.items():
             place, digest = f"/{CELLS}/{cell.address}/{folder}/{port}", product.digest
