@@ -1,1 +1,1 @@
-"""The workflow document: reading it, checking it, and expanding it into cells."""
+"""Workflow files: reading, checking, and expansion into cells."""

@@ -1,4 +1,4 @@
-"""How the parts of a workflow fit together: wiring, comparison, and implausible values."""
+"""Checks across the parts of a workflow: connections, comparison, implausible values."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from orthoflow.workflow.source import ProblemLog
 _WILDCARDS: Final = frozenset("*?[")
 
 
-# Wiring -------------------------------------------------------------------------------------------
+# Connections --------------------------------------------------------------------------------------
 
 
 def check_wiring(
@@ -38,7 +38,7 @@ def check_wiring(
     input_names: Collection[str],
     log: ProblemLog,
 ) -> None:
-    """Report all mistakes in the wiring of steps.
+    """Report all mistakes in the connections between steps.
 
     Args:
         steps: all steps that could be read.
@@ -77,11 +77,11 @@ def _types(
     input_names: Collection[str],
     log: ProblemLog,
 ) -> Callable[[Location, Reference], str | None]:
-    """Return what finds the product types of references."""
+    """Return a function that finds the product types of references."""
     given = {step.name: _ports(step, are_given=True) for step in steps}
 
     def type_of(location: Location, reference: Reference) -> str | None:
-        """Return the product type of a reference; None if unknown, which is reported."""
+        """Return the product type of a reference; None if it is unknown, which is reported."""
         name, source = reference.name, reference.source
         if reference.is_input and name in input_names:
             return FILES
@@ -112,7 +112,7 @@ def _types(
 
 
 def _check_required(step: DraftStep, log: ProblemLog) -> None:
-    # Ports with unreadable references count as wired.
+    # Ports with unreadable references count as connected.
     written = log.get((*step.location, "in"))
     wired = written if isinstance(written, dict) else step.inputs
     for call in step.calls:
@@ -127,7 +127,7 @@ def _check_required(step: DraftStep, log: ProblemLog) -> None:
 
 
 def _placed(step: DraftStep) -> Iterator[tuple[str, Location, Reference]]:
-    """Yield all references of a step, each with its port and its place."""
+    """Yield all references of a step, each with its port and its location."""
     for port, references in step.inputs.items():
         for index, reference in enumerate(references):
             yield port, (*step.location, "in", port, index), reference
@@ -177,7 +177,7 @@ def _check_cycles(steps: Sequence[DraftStep], log: ProblemLog) -> None:
         log.report(wires[edges[0]][0], f"the steps form a cycle: {listed}")
 
 
-# The comparison -----------------------------------------------------------------------------------
+# Comparison ---------------------------------------------------------------------------------------
 
 
 def check_comparison(
@@ -188,11 +188,11 @@ def check_comparison(
     seeds: Sequence[int],
     log: ProblemLog,
 ) -> Comparison | None:
-    """Check the section `compare` against steps, datasets and seeds; None without one."""
+    """Check the section `compare` against steps, datasets and seeds; return None if absent."""
     if section is None:
         return None
     names = {
-        # A swept variant is still known by its own name.
+        # The name of a swept variant is still valid; it refers to the variants of all its values.
         step.name: list(dict.fromkeys((*(call.name for call in step.calls), *_families(step))))
         for step in steps
         if step.is_varied
@@ -238,7 +238,7 @@ def _check_baseline(comparison: Comparison, log: ProblemLog) -> None:
 
 
 def _families(step: DraftStep) -> dict[str, list[str]]:
-    """Return for swept variants: name -> the variants of its values."""
+    """Return name of a swept variant -> variants of its values."""
     found: dict[str, list[str]] = {}
     for call in step.calls:
         if call.family:
@@ -247,10 +247,10 @@ def _families(step: DraftStep) -> dict[str, list[str]]:
 
 
 def _current(steps: Sequence[DraftStep], step: str, variant: str) -> str:
-    """Return the variant that a name refers to once overrides are applied.
+    """Return the variant that a name refers to after overrides have been applied.
 
-    If the file sweeps a call and the command line sets one value, the names of swept values refer
-    to the call: empty for a step without other variants.
+    If a call is swept in the file and the command line sets a single value, names of swept values
+    refer to that call, whose name is empty for a step without other variants.
     """
     draft = next((one for one in steps if one.name == step), None)
     fitting = [
@@ -264,7 +264,7 @@ def _current(steps: Sequence[DraftStep], step: str, variant: str) -> str:
 def _spelled_out(
     assignment: Mapping[str, str], steps: Sequence[DraftStep]
 ) -> Iterator[dict[str, str]]:
-    """Return an assignment for each value of a swept variant that it names, in order."""
+    """Yield an assignment for each value of the swept variants in an assignment, in order."""
     families = {step.name: _families(step) for step in steps}
     several = [
         families.get(step, {}).get(variant, [variant]) for step, variant in assignment.items()
@@ -274,7 +274,7 @@ def _spelled_out(
 
 
 def first_variants(steps: Sequence[DraftStep]) -> dict[str, str]:
-    """Return the first variant of every varied step."""
+    """Return the first variant of each step with variants."""
     return {step.name: step.calls[0].name for step in steps if step.is_varied and step.calls}
 
 
@@ -284,7 +284,7 @@ def _known(
     names: Mapping[str, Sequence[str]],
     log: ProblemLog,
 ) -> dict[str, str]:
-    """Keep entries that name a factor and one of its levels; report the others."""
+    """Return the entries with a known factor and a known level; report the others."""
     chosen: dict[str, str] = {}
     for factor, level in assignment.items():
         known = names.get(factor)
@@ -310,7 +310,7 @@ def _known(
 
 
 def _metric_problem(pattern: str, steps: Sequence[DraftStep], step_names: Sequence[str]) -> str:
-    """Return why a pattern of metrics finds nothing; empty if it may find something."""
+    """Return why a metric pattern matches nothing; empty if it may match a metric."""
     step, _, metric = pattern.partition(".")
     if not _has_wildcard(step) and step not in step_names:
         return f"there is no step {step} for {pattern}{did_you_mean(step, step_names)}"
@@ -345,10 +345,10 @@ def _metric_problem(pattern: str, steps: Sequence[DraftStep], step_names: Sequen
 
 
 def _may_match(declared: str, metric: str) -> bool:
-    """Whether a declared name and a requested one may be the same; either may have wildcards."""
+    """Whether a declared and a requested name can be the same; both may contain wildcards."""
     if fnmatchcase(metric, declared) or fnmatchcase(declared, metric):
         return True
-    # The intersection of two patterns is not searched.
+    # Assume that two patterns with wildcards can match the same name.
     return _has_wildcard(declared) and _has_wildcard(metric)
 
 
@@ -356,20 +356,20 @@ def _has_wildcard(text: str) -> bool:
     return not _WILDCARDS.isdisjoint(text)
 
 
-# What is allowed and can hardly be meant ----------------------------------------------------------
+# Valid but implausible settings -------------------------------------------------------------------
 
 _GSD: Final = "gsd_m"
 _CROP: Final = "crop"
-# The kind whose methods find photos on walls.
+# Prefix of the methods that find photos on walls.
 _MATCHING: Final = "match."
-# Cells of walls and plans: finer than any scan, coarser than anything drawn of a building.
+# Limits for pixel sizes of walls and plans: finer than any scan, coarser than any building drawing.
 _MIN_GSD_M: Final = 0.0001
 _MAX_GSD_M: Final = 0.5
 _MILLIMETRES: Final = 1000.0
 
 
 def lint_workflow(workflow: Workflow) -> tuple[str, ...]:
-    """Return a sentence for each implausible setting."""
+    """Yield a sentence for each implausible setting."""
     return (*_idle_inputs(workflow), *_cell_sizes(workflow), *_cropped_matching(workflow))
 
 
@@ -413,7 +413,7 @@ def _cropped_matching(workflow: Workflow) -> Iterator[str]:
         for step in workflow.steps.values()
         if any(variant.method.startswith(_MATCHING) for variant in step.variants)
     ]
-    # Given cameras need no matching.
+    # If cameras are given, no matching is needed.
     if any(step.unless and workflow.inputs[step.unless].files for step in matching):
         return
     for first in matching[:1]:
@@ -426,7 +426,7 @@ def _cropped_matching(workflow: Workflow) -> Iterator[str]:
 
 
 def _calls(workflow: Workflow, parameter: str) -> Iterator[tuple[str, str, StepVariant]]:
-    """Return whose parameter it is, of which step and how: all calls, or datasets that set it."""
+    """Yield origin, step and call: all calls, and those whose `parameter` a dataset sets."""
     for step in workflow.steps.values():
         for variant in step.variants:
             yield "", step.name, variant

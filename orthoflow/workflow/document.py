@@ -1,4 +1,4 @@
-"""Reading a workflow file: one pass that finds every problem, or a workflow that can run."""
+"""Reading of a workflow file in one pass that reports all problems."""
 
 from __future__ import annotations
 
@@ -68,22 +68,22 @@ def load_workflow(  # noqa: PLR0913 - an argument for each option of the command
     """Read and check a workflow.
 
     Args:
-        name_or_path: an existing file, else the name of a shipped recipe.
+        name_or_path: an existing file, or the name of a shipped recipe.
         catalog: the installed plugins.
-        sets: `step[.variant].param=value`, each as given with `--set`.
-        inputs: `NAME=PATH`, each as given with `--input`; relative to the working directory.
-        datasets: a table in the place of the file's datasets, as given with `--datasets`, or what
-            the file would state in their place.
-        only_data: names of datasets, each as given with `--only-data`.
-        set_files: YAML files of `step.parameter: value`, as given with `--set-file`; what is
-            given with `--set` takes precedence.
-        also_files: for a file with problems, missing input files are reported with them.
+        sets: `step[.variant].param=value`, as for `--set`.
+        inputs: `NAME=PATH`, as for `--input`; relative to the working directory.
+        datasets: table that replaces the datasets in the file, as for `--datasets`, or the content
+            of the section itself.
+        only_data: names of datasets, as for `--only-data`.
+        set_files: YAML files of `step.parameter: value`, as for `--set-file`; values in `sets` take
+            precedence.
+        also_files: report missing input files together with other problems of the file.
 
     Raises:
         InvalidWorkflowError: the file has problems; the message lists all of them.
-        InvalidArgumentsError: the file is correct, the options are not.
-        UnusablePluginError: only plugins that the workflow needs are broken or missing.
-        WorkflowError: there is no such file, or it cannot be read at all.
+        InvalidArgumentsError: the file is valid, but the options are not.
+        UnusablePluginError: the only problem is that plugins are broken or missing.
+        WorkflowError: the file does not exist or cannot be read at all.
     """
     path = find_workflow(name_or_path)
     source = read_text(path)
@@ -98,14 +98,14 @@ def load_workflow(  # noqa: PLR0913 - an argument for each option of the command
         if not log.has((key,)):
             log.report((key,), needed)
     if not log.has((_STEPS,)):
-        # All others name steps: each of these names would be another problem.
+        # The other sections refer to steps: checking them too would report each name as a problem.
         _sections(log)
         log.raise_any()
     profiles = [_read_profile(Path(name), log) for name in set_files]
     reader = _Reader(path=path, source=source, catalog=catalog, log=log)
     workflow = reader.read(tuple(sets), tuple(inputs), datasets, tuple(only_data), tuple(profiles))
     if also_files and log.has_any:
-        # Otherwise they are searched when needed.
+        # Otherwise, input files are located when they are needed.
         add_missing_inputs(workflow, log)
     log.raise_any()
     return workflow
@@ -119,7 +119,7 @@ def _is_mapping(log: ProblemLog, text: str) -> bool:
 
 
 def _sections(log: ProblemLog) -> WorkflowFile:
-    """Validate the file; `datasets` may be replaced and is read apart."""
+    """Validate the file; `datasets` is read separately, because it may be replaced."""
     data = log.get(())
     assert isinstance(data, dict)  # noqa: S101 - checked before
     sections = {key: value for key, value in data.items() if key != "datasets"}
@@ -127,7 +127,7 @@ def _sections(log: ProblemLog) -> WorkflowFile:
 
 
 def _read_profile(path: Path, log: ProblemLog) -> ProblemLog:
-    """Read a file of `--set-file`."""
+    """Read a settings file given with `--set-file`."""
     try:
         text = read_text(path, "a file of parameters")
     except WorkflowError as error:
@@ -145,7 +145,7 @@ def _settings(profile: ProblemLog) -> dict[str, JsonValue]:
 
 @dataclass(frozen=True, kw_only=True)
 class _Reader:
-    """Reads one document; all problems go to the log."""
+    """Reads one document and adds all problems to the log."""
 
     path: Path
     source: str
@@ -160,7 +160,7 @@ class _Reader:
         only_data: Sequence[str],
         profiles: Sequence[ProblemLog],
     ) -> Workflow:
-        """Read all sections; the result may be used only when the log stays empty."""
+        """Read all sections; the result is only valid if the log is empty."""
         log = self.log
         file = _sections(log)
         folder = self.path.resolve().parent
@@ -226,7 +226,7 @@ class _Reader:
             steps=read,
             compare=compare,
             overrides=(
-                # A record contains no settings files: their entries are kept as if each was set.
+                # Records do not contain settings files, so each entry is recorded as `--set`.
                 *(
                     f"--set {key}={json.dumps(value, ensure_ascii=False)}"
                     for profile in profiles

@@ -1,4 +1,4 @@
-"""A first workflow for given files: their types, and a shipped recipe that names them."""
+"""Drafting of a workflow: recognises given files and fills them into a shipped recipe."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _SCAN_SUFFIXES: Final = tuple(
 )
 _FIRST_LINE_BYTES: Final = 10_000
 _WORKFLOW_BYTES: Final = 1_000_000
-# Files in a run folder: pictures in there are not photos.
+# Files that identify a run folder: images in it are not photos.
 _OF_RUNS: Final = frozenset(("run.h5", "journal.jsonl"))
 #: levels of folders in a folder given to `orthoflow new`
 DEEPEST: Final = 3
@@ -53,19 +53,19 @@ MOST_FILES: Final = 20_000
 
 @dataclass(frozen=True, kw_only=True)
 class Recognised:
-    """A file, or a folder that is one item.
+    """A recognised file, or a folder that is a single item.
 
     Attributes:
         kind: its type; `unknown` if no method reads it.
-        path: its path as found.
-        summary: its content, in words; why nothing is known of it.
-        n_points: points of a scan.
-        n_photos: number of photos, including those in a scan.
-        n_posed: photos in a scan whose lens and pose it states.
-        fields: the point attributes of a scan besides coordinates, without empty ones.
+        path: path of the file.
+        summary: description of the content, or why it is not recognised.
+        n_points: number of points of a scan.
+        n_photos: number of photos, including photos in a scan.
+        n_posed: number of photos in a scan that have lens and pose.
+        fields: non-empty point attributes of a scan, without coordinates.
         lens: camera and focal length of a photo, from its EXIF data.
-        up: the up axis suggested by surfaces, if it is clearly not z.
-        advice: suggested settings and inputs, as far as the data show them.
+        up: up axis suggested by the surfaces, if it is clearly not z.
+        advice: suggested settings and inputs, as far as they follow from the data.
     """
 
     kind: FileKind
@@ -81,7 +81,7 @@ class Recognised:
 
 
 def recognised(paths: Sequence[Path]) -> list[Recognised]:
-    """Recognise files, and the contents of folders, by inspecting them.
+    """Recognise files, and the files in folders, by their content.
 
     Raises:
         InputError: a path does not exist, there are too many files, or a scan is damaged.
@@ -133,7 +133,7 @@ def _file(path: Path) -> Recognised:
         (_YAML, _yaml),
         (_CAMERAS, lambda file: _read("cameras", file, lambda one: _cameras_summary([one]))),
     ]
-    # Scanners and sidecars write JSON of all kinds.
+    # Scanners and sidecars also use JSON, so an unknown JSON file is not an error.
     is_odd = suffix == ".json" and path.name != "cameras.json"
     for suffixes, reader in readers:
         if suffix in suffixes and not is_odd:
@@ -144,7 +144,7 @@ def _file(path: Path) -> Recognised:
 def _photo(path: Path) -> Recognised:
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
-    # HEIC is opened, and related formats are recognised by the first bytes.
+    # HEIC files are opened; related formats are recognised by their first bytes.
     problem = unreadable(path.read_bytes() if photo_format(head) == "HEIC" else head)
     if problem:
         return _unknown(path, problem)
@@ -178,7 +178,7 @@ def _scan(path: Path) -> Recognised:
         count = f"{photos.n_images} photos" if photos.n_images > 1 else "a photo"
         words.append(count if photos.n_posed else f"{count} without a pose")
     up = _axis_up(points_m)
-    # The largest extent along an axis.
+    # Largest extent along a coordinate axis.
     extent_m = float(np.ptp(points_m, axis=0).max()) if len(points_m) else 0.0
     advice = _about_extent(path.name, extent_m, "m" if unit is None else unit.name)
     if up:
@@ -200,7 +200,7 @@ def _scan(path: Path) -> Recognised:
 
 
 def _axis_up(points_m: NDArray[np.float64]) -> str:
-    """Return the up axis if surfaces show that it is clearly not z, else ""."""
+    """Return the up axis if the surfaces show that it is clearly not z; otherwise ""."""
     if not len(points_m):
         return ""
     offsets = (points_m - np.median(points_m, axis=0)).astype(np.float32)
@@ -212,7 +212,7 @@ def _axis_up(points_m: NDArray[np.float64]) -> str:
 def _seen_in(
     scan: ScanFile, unit_m: NDArray[np.float64]
 ) -> tuple[frozenset[str], NDArray[np.float64]]:
-    """Return the non-empty fields of the first points of a scan, and these (n, 3) in metres."""
+    """Return non-empty fields of a scan's first points, and their (n, 3) positions in metres."""
     kept: list[NDArray[np.float64]] = []
     found: set[str] = set()
     n_seen = 0
@@ -229,7 +229,7 @@ def _seen_in(
 
 
 def _about_extent(name: str, extent_m: float, unit: str) -> list[str]:
-    """Ask for the unit if a scan is larger or smaller than usual."""
+    """Return advice to check the unit if a scan is unusually large or small."""
     if extent_m > _MAX_EXTENT_M:
         size, hint = f"{extent_m:,.0f} m", "if its coordinates are millimetres, set cloud.unit=mm"
     elif 0 < extent_m < _MIN_EXTENT_M:
@@ -240,17 +240,17 @@ def _about_extent(name: str, extent_m: float, unit: str) -> list[str]:
     return [f"{_word(name)} is {size} long if its unit is {unit}: {hint}"]
 
 
-# Larger, and smaller, than what is scanned from a tripod.
+# Usual extents of terrestrial scans.
 _MAX_EXTENT_M: Final = 2000.0
 _MIN_EXTENT_M: Final = 0.2
-# Number of points of a scan that are read, and bytes of a photo: EXIF is at its beginning.
+# Number of points read of a scan, and number of bytes read of a photo, which begins with EXIF.
 _LOOKED_AT: Final = 1_000_000
 _HEAD_BYTES: Final = 1 << 20
 _FIELDS: Final[Mapping[str, str]] = {"intensity": "intensity", "rgb": "colours"}
 
 
 def _table(path: Path) -> Recognised:
-    """Recognise a table of points or ties, else a scan in text, which has no names in its lines."""
+    """Recognise a table of points or ties; otherwise a text scan, whose lines contain no names."""
     with path.open("rb") as file:
         first = file.readline(_FIRST_LINE_BYTES).decode("utf-8", "replace")
     columns = {word.strip().lower() for word in re.split(r"[,;\t]", first)}
@@ -258,7 +258,7 @@ def _table(path: Path) -> Recognised:
         try:
             rows = reader(path)
         except InputError as error:
-            # Nothing else would name these columns.
+            # Only a file of this type has these columns.
             if columns >= own:
                 return _unknown(path, error)
             continue
@@ -287,18 +287,18 @@ _TABLES: Final[
     ),
     ("checkpoints", read_survey_points, "surveyed points", frozenset(("name", "x", "y", "z"))),
 )
-# Columns of a list of cameras; no scan has them.
+# Columns of a camera list; scans do not have them.
 _CAMERA_COLUMNS: Final = frozenset(("heading", "pitch", "roll"))
 
 
 def _is_cloud(rows: Sequence[object]) -> bool:
-    """Whether the names that were read are coordinates: no point is named 12.345."""
+    """Whether all point names are numbers with decimals, so that they are coordinates instead."""
     names = [str(getattr(row, "name", "")) for row in rows]
     return all(re.fullmatch(r"[-+]?\d+\.\d*(e[-+]?\d+)?", name) for name in names)
 
 
 def _yaml(path: Path) -> Recognised:
-    """Recognise a calibration; a workflow, e.g. an earlier one of `new`, is reported as one."""
+    """Recognise a calibration; an existing workflow is reported as one."""
     found = _read(
         "calibration",
         path,
@@ -323,30 +323,30 @@ def _read(kind: FileKind, path: Path, summary: Callable[[Path], str]) -> Recogni
         return _unknown(path, error)
 
 
-# The workflow ------------------------------------------------------------------------------------
+# Workflow ----------------------------------------------------------------------------------------
 
 Recipe: TypeAlias = Literal["photos-on-scan", "direct", "plan"]
 
-# Replaces a missing scan.
+# Steps that replace a missing scan.
 _STAND_INS: Final = ("room", "check")
 _PLAIN: Final = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./-]*")
 _INPUT: Final = re.compile(r"  (\w+): \{.*?\}( *#.*)?")
 _MOST_LISTED: Final = 12
 _FEW_SCANS: Final = 3
-# Paragraphs of a recipe's heading that are not about one's own files: its commands, replacements.
+# Beginnings of paragraphs in the heading of a recipe that are not copied into a draft.
 _NOT_OWN: Final = ("#   ", "# Without a scan of your own")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Draft:
-    """A workflow to be written.
+    """A drafted workflow.
 
     Attributes:
-        recipe: name of the shipped recipe that it follows.
-        text: of the file.
-        inputs: content of each input, in words.
-        left_out: files that no input takes, and why.
-        advice: suggested settings and inputs, as far as the data show them.
+        recipe: name of the shipped recipe on which it is based.
+        text: text of the workflow file.
+        inputs: description of each input.
+        left_out: files that are not used as input, with the reason.
+        advice: suggested settings and inputs, as far as they follow from the data.
     """
 
     recipe: Recipe
@@ -357,16 +357,16 @@ class Draft:
 
 
 def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | None) -> Draft:
-    """Write the workflow that fits some files.
+    """Draft a workflow for a set of files.
 
     Args:
-        found: the recognised files.
+        found: recognised files.
         target: path of the workflow; paths in it are relative to its folder.
-        recipe: the recipe to follow, or None: photos on the scan if there are photos, the scan's
-            own colours otherwise.
+        recipe: recipe to use; None for orthoimages from photos if there are photos, otherwise from
+            the colours of the scan.
 
     Raises:
-        InputError: there is no scan, or no photo although the recipe needs some.
+        InputError: there is no scan, or there are no photos and the recipe needs some.
     """
     by_kind: dict[FileKind, list[Recognised]] = {}
     for item in found:
@@ -380,7 +380,7 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
         )
     own_formats = [scan for scan in scans if scan.path.suffix.lower() not in TEXT.suffixes]
     if own_formats and len(own_formats) < len(scans):
-        # Notes hold numbers too.
+        # Text files next to scans in other formats are probably notes with numbers.
         by_kind["unknown"] = [
             *by_kind.get("unknown", []),
             *(
@@ -392,7 +392,7 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
         scans = by_kind["scan"] = own_formats
     own_photos = [scan for scan in scans if scan.n_photos]
     has_posed = any(scan.n_posed for scan in own_photos)
-    # Pictures without a pose are mostly for people, and matching would not find them on the walls.
+    # Images without a pose are mostly for viewing, and matching would not find them on the walls.
     is_usual = bool(by_kind.get("photos") or has_posed)
     chosen: Recipe = recipe or ("photos-on-scan" if is_usual else "direct")
     if chosen == "photos-on-scan" and not (own_photos or is_usual):
@@ -405,7 +405,7 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
             "scan with its colours (--recipe direct writes the workflow all the same)"
         )
     if own_photos and "photos" not in by_kind:
-        # Photos taken by a scanner are in its file, with their poses.
+        # Photos taken by a scanner are in the scan file, with their poses.
         inside = [replace(scan, summary="the photos in it", n_points=0) for scan in own_photos]
         by_kind["photos"] = inside
         if len(inside) == 1 and has_posed:
@@ -417,7 +417,7 @@ _ByKind: TypeAlias = Mapping[FileKind, Sequence[Recognised]]
 
 
 def _drafted(by_kind: _ByKind, target: Path, recipe: Recipe) -> Draft:
-    """Return the recipe with its inputs filled in, and a heading of its own."""
+    """Return the text of the recipe with its inputs filled in and a new heading."""
     shipped = shipped_workflow(recipe).read_text(encoding="utf-8")
     start, inputs, steps = re.split(r"^(?=orthoflow:|steps:)", shipped, flags=re.MULTILINE)
     taken, left_out = _assigned(by_kind, inputs, recipe)
@@ -446,7 +446,7 @@ def _drafted(by_kind: _ByKind, target: Path, recipe: Recipe) -> Draft:
     ]
     paragraphs = start.rstrip("\n").split("\n#\n")
     comments = "\n#\n".join(text for text in paragraphs if not text.startswith(_NOT_OWN))
-    # The steps of the recipe, with the up axis if scans show it.
+    # Steps of the recipe, with the up axis if it follows from the scans.
     steps = _without_stand_ins(steps)
     axes = {item.up for item in by_kind["scan"]}
     (up,) = axes if len(axes) == 1 else ("",)
@@ -472,7 +472,7 @@ def _advice(by_kind: _ByKind) -> list[str]:
 def _assigned(
     by_kind: _ByKind, inputs: str, recipe: Recipe
 ) -> tuple[dict[str, Sequence[Recognised]], list[str]]:
-    """Assign files to inputs, and return the remaining ones."""
+    """Assign files to inputs; also return the files that are not used."""
     names = [match[1] for line in inputs.splitlines() if (match := _INPUT.fullmatch(line))]
     taken: dict[str, Sequence[Recognised]] = {}
     left_out = []
@@ -510,19 +510,19 @@ def _place(path: Path, target: Path) -> str:
     """Return a path relative to the workflow's folder."""
     here, place = (Path(os.path.normpath(one.absolute())) for one in (target.parent, path))
     if not place.is_relative_to(here):
-        # `..` after a link leads elsewhere than it reads.
+        # `..` after a symbolic link leads to another folder than the text of the path suggests.
         here, place = here.resolve(), place.resolve()
     return Path(os.path.relpath(place, here)).as_posix()
 
 
 def _folders_of_photos(items: Sequence[Recognised]) -> list[Path]:
-    """Return paths of photos; a folder stands for all files in it."""
+    """Return paths of photos, or the path of a folder if it contains only these photos."""
     paths = [item.path for item in items]
     places: dict[Path, None] = {}
     for path in paths:
         inside = [p for p in path.parent.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES]
         whole = path.suffix.lower() in PHOTO_SUFFIXES and set(inside) <= set(paths)
-        # A folder that also contains scans would include these.
+        # A folder given as input includes all its files, so it must contain only photos.
         beside = (file for file in path.parent.iterdir() if file.is_file())
         whole = whole and len(inside) > 1
         whole = whole and all(file.suffix.lower() in PHOTO_SUFFIXES for file in beside)
@@ -531,7 +531,7 @@ def _folders_of_photos(items: Sequence[Recognised]) -> list[Path]:
 
 
 def _described(items: Sequence[Recognised]) -> str:
-    """Describe some files in one line."""
+    """Describe files in one line."""
     if len(items) == 1 or (len(items) <= _FEW_SCANS and all(item.n_points for item in items)):
         return "; ".join(f"{_word(item.path.name)}, {item.summary}" for item in items)
     n_photos = sum(item.n_photos for item in items)
@@ -543,12 +543,12 @@ def _described(items: Sequence[Recognised]) -> str:
 
 
 def _some(names: Sequence[str]) -> str:
-    """Name the first of some files."""
+    """Return the names of the first few files."""
     return first_few([*map(_word, names)], most=4)
 
 
 def _word(name: str) -> str:
-    """Return a file's name for a comment, without line ends."""
+    """Return the name of a file for a comment, without line breaks."""
     return json.dumps(name, ensure_ascii=False)[1:-1]
 
 
@@ -557,7 +557,7 @@ def _quoted(text: str) -> str:
 
 
 def _seen(text: str) -> str:
-    """Escape every invisible character as in YAML: some of them end lines and comments."""
+    """Escape all invisible characters as in YAML: some of them end lines and comments."""
     return "".join(
         letter if letter.isprintable() else letter.encode("unicode_escape").decode("ascii")
         for letter in text
@@ -565,7 +565,7 @@ def _seen(text: str) -> str:
 
 
 def _without_stand_ins(steps: str) -> str:
-    """Remove the simulated room from the steps, and inspections that only it allows."""
+    """Remove the simulated room from the steps, and inspections that are only possible with it."""
     blocks = re.split(r"^(?=  \w+:)", steps, flags=re.MULTILINE)
     has_room = any(block.startswith("  room:") for block in blocks)
     kept = [

@@ -1,6 +1,6 @@
-"""Cells: the method calls that result from a workflow's steps and variants.
+"""Cells: the method calls that result from the steps and variants of a workflow.
 
-All of them first; `--only`, `--from` and `--until` then select among them.
+All cells are created first; `--only`, `--from` and `--until` then select among them.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from orthoflow.workflow.model import (
 )
 from orthoflow.workflow.parameters import SWEEP
 
-# Factor -> level: the dataset, the seed, and step -> variant.
+# Factor -> level, for the dataset, the seed and each step with variants.
 Assignment: TypeAlias = dict[str, str]
 #: steps of a workflow with all variants, datasets, seeds and repeats, excluded ones included
 MOST_CELLS: Final = 20_000
-# The product of methods that measure the quality of others' results.
+# Product type of methods that measure the quality of results.
 _JUDGEMENT: Final = "inspection"
-# Why a cell is skipped that optional data decide about, unlike one after a failure.
+# `error_type` of a cell skipped because of optional data, unlike one skipped after a failure.
 NOT_ASKED_FOR: Final = "not-asked-for"
-_SEED_BITS: Final = 53  # exact in every JSON reader, also those that only know doubles
+_SEED_BITS: Final = 53  # exact in all JSON readers, including those that only use doubles
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +53,7 @@ class CellOutput:
 
 @dataclass(frozen=True, kw_only=True)
 class WorkflowInput:
-    """One of the workflow's inputs, by its own name: `scan`, or `scan@hall` of a dataset."""
+    """An input of the workflow by its name: `scan`, or `scan@hall` for a dataset."""
 
     name: str
 
@@ -66,23 +66,24 @@ class Cell:
     """One method call of a run.
 
     Attributes:
-        address: `step`, or `step@step=variant,...` with the variants before it in graph order,
-            preceded by `data=name` and `seed=n` if it depends on them, and followed by `#n` for
-            repeats 1, 2, ...
+        address: `step`, or `step@step=variant,...` with the variants of upstream steps in graph
+            order, preceded by `data=name` and `seed=n` if it depends on them, and followed by `#n`
+            for repeats 1, 2, ...
         step: name of the step.
-        assignment: step -> variant for every varied step that influences this cell, including
-            itself, preceded by `data` -> dataset and `seed` -> seed.
-        repeat: 0 for the first, which later cells use; repeats reach the steps that the workflow
-            compares, and those between.
+        assignment: step -> variant for each step with variants that affects this cell, including
+            its own, preceded by `data` -> dataset and `seed` -> seed.
+        repeat: 0 for the first execution, which downstream cells use; repeats extend to the steps
+            that the workflow compares, and to those in between.
         method: method id.
-        params: resolved parameters, defaults included, JSON.
-        params_set: parameters as written in the file or set on the command line, JSON.
-        inputs: port -> source; ports that the method ignores and absent optional ones are omitted.
-        seed: derived from (seed of the workflow or of the assignment, method id, repeat).
-        cores: requested number of cores, or None for all.
-        timeout_s: seconds, or None.
-        skip_reason: why the cell will not run (optional data absent), empty if it will.
-        skip_type: the same for programs, as the `error_type` of its result.
+        params: resolved parameters with defaults, as JSON.
+        params_set: parameters set in the file or on the command line, as JSON.
+        inputs: port -> source; without ports that the method ignores and optional ones without a
+            source.
+        seed: seed derived from (seed of the workflow or assignment, method id, repeat).
+        cores: requested number of cores; None for all.
+        timeout_s: time limit in seconds; None if there is none.
+        skip_reason: why the cell will not run (optional data is not given); empty if it will run.
+        skip_type: the same as the `error_type` of its result.
     """
 
     address: str
@@ -101,28 +102,28 @@ class Cell:
 
     @property
     def setting(self) -> str:
-        """Return the prefix of its parameters in settings: `step`, or `step.variant`."""
+        """Return the prefix for its parameters in settings: `step`, or `step.variant`."""
         variant = self.assignment.get(self.step)
         return f"{self.step}.{variant}" if variant else self.step
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Return addresses of the cells whose products it takes."""
+        """Return the addresses of the cells whose products it uses."""
         return tuple(one.address for one in self.inputs.values() if isinstance(one, CellOutput))
 
 
 def is_plain(cells: Iterable[Cell]) -> bool:
-    """Whether nothing varies, so that each step has a single cell."""
+    """Whether nothing varies, so that each step has only one cell."""
     return all(cell.address == cell.step for cell in cells)
 
 
 def variants_text(assignment: Mapping[str, str]) -> str:
-    """Format the chosen variants, `plane=ransac, orient=pnp`; empty without any."""
+    """Format the chosen variants as `plane=ransac, orient=pnp`; empty if there are none."""
     return ", ".join(f"{step}={variant}" for step, variant in assignment.items())
 
 
 def swept_indices(workflow: Workflow) -> list[tuple[str, str]]:
-    """Return the variants named by an index, each with its values."""
+    """Return the variants that are named by an index, each with its values."""
     return [
         (
             f"{step.name}={variant.name}",
@@ -135,13 +136,13 @@ def swept_indices(workflow: Workflow) -> list[tuple[str, str]]:
 
 
 def derive_seed(workflow_seed: int, method_id: str, repeat: int) -> int:
-    """Derive the seed of a cell: the same method gets the same seed in every step."""
+    """Derive the seed of a cell; a method gets the same seed in every step."""
     preimage = json.dumps(["orthoflow/seed", 1, workflow_seed, method_id, repeat])
     digest = hashlib.sha256(preimage.encode()).digest()
     return int.from_bytes(digest[:8], "big") >> (64 - _SEED_BITS)
 
 
-# The graph of steps -------------------------------------------------------------------------------
+# Graph of steps -----------------------------------------------------------------------------------
 
 
 def _reached(edges: Mapping[str, Collection[str]], starts: Iterable[str]) -> set[str]:
@@ -156,7 +157,7 @@ def _reached(edges: Mapping[str, Collection[str]], starts: Iterable[str]) -> set
 
 
 def topological_steps(steps: Mapping[str, WorkflowStep]) -> tuple[str, ...]:
-    """Sort steps so that each follows all it needs, otherwise in the order of the file."""
+    """Sort steps so that each follows its upstream steps, otherwise in the order of the file."""
     waiting = list(steps)
     ordered: dict[str, None] = {}
     while waiting:
@@ -171,14 +172,14 @@ def topological_steps(steps: Mapping[str, WorkflowStep]) -> tuple[str, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class Selection:
-    """Names of selected steps; several options together narrow the selection.
+    """Names of selected steps; a step must meet all options that are given.
 
     Attributes:
-        only: these steps.
-        from_: these steps and what follows from them.
-        until: these steps and those they depend on.
+        only: select these steps.
+        from_: select these steps and all steps downstream.
+        until: select these steps and all steps upstream.
 
-    The steps that the chosen ones need are included, from the cache if possible.
+    Steps on which the selected ones depend are included, from the cache if possible.
     """
 
     only: tuple[str, ...] = ()
@@ -198,7 +199,7 @@ class Selection:
 
 
 def check_step_names(workflow: Workflow, names: Iterable[str], option: str) -> None:
-    """Refuse unknown names of steps, e.g. of `--force`.
+    """Refuse unknown step names, e.g. in `--force`.
 
     Raises:
         ArgumentError: a name is unknown.
@@ -214,10 +215,10 @@ def check_step_names(workflow: Workflow, names: Iterable[str], option: str) -> N
 def select_cells(
     workflow: Workflow, cells: tuple[Cell, ...], selection: Selection
 ) -> tuple[Cell, ...]:
-    """Keep the cells of the chosen steps and the cells that those need.
+    """Return the cells of the selected steps and the cells on which they depend.
 
     Raises:
-        ArgumentError: a step is unknown, or nothing is left.
+        ArgumentError: a step is unknown, or no cell is left.
     """
     for option, names in selection.by_option.items():
         check_step_names(workflow, names, option)
@@ -244,11 +245,11 @@ def select_cells(
 
 
 def combinations(workflow: Workflow, steps: Sequence[str]) -> Iterator[Assignment]:
-    """Return the combinations of variants that reach a step, each once, the last step fastest.
+    """Yield the combinations of variants that affect a step; the last step varies fastest.
 
     Args:
         workflow: the workflow.
-        steps: the relevant steps, in graph order: the step itself and its predecessors.
+        steps: the step itself and its upstream steps, in graph order.
     """
     varied = {
         name: tuple(variant.name for variant in workflow.steps[name].variants)
@@ -270,10 +271,10 @@ def combinations(workflow: Workflow, steps: Sequence[str]) -> Iterator[Assignmen
 
 
 def _require_few(workflow: Workflow, count: int) -> None:
-    """Refuse more cells than are practical.
+    """Refuse an impractical number of cells.
 
     Raises:
-        WorkflowError: there are too many.
+        WorkflowError: there are too many cells.
     """
     if count < MOST_CELLS:
         return
@@ -298,12 +299,12 @@ def _is_excluded(workflow: Workflow, assignment: Mapping[str, str]) -> bool:
 
 
 def expand_cells(workflow: Workflow, catalog: Catalog) -> tuple[Cell, ...]:
-    """Expand a workflow into cells, each after all it needs.
+    """Expand a workflow into cells in topological order.
 
-    Checks the files of optional inputs, because absent data decide which cells can run.
+    Checks which optional input files exist, because this determines which cells can run.
 
     Raises:
-        InputError: an optional input was named on the command line and is missing.
+        InputError: an optional input was given on the command line, but is missing.
         PluginError: a method cannot be loaded.
     """
     expansion = _Expansion(
@@ -321,13 +322,13 @@ def expand_cells(workflow: Workflow, catalog: Catalog) -> tuple[Cell, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class _Node:
-    """A cell together with what determines whether it exists.
+    """A cell, with the conditions under which it exists.
 
     Attributes:
         cell: the cell.
-        dependence: the factors on which its product depends; for a skipped cell, those on which the
-            skipping depends, which may be fewer than its address names.
-        causes: inputs with or without which it would not be skipped.
+        dependence: factors on which its product depends; for a skipped cell, factors on which
+            skipping depends, which may be fewer than those in its address.
+        causes: changes of inputs that would avoid the skip, such as `with the input scan`.
     """
 
     cell: Cell
@@ -335,8 +336,8 @@ class _Node:
     causes: tuple[str, ...] = ()
 
 
-# The source of a port, the first candidate that is present, or none; the factors on which that
-# depends; inputs with or without which there would be one.
+# Source of a port (the first available candidate, or None), factors on which this choice depends,
+# and changes of inputs that would provide a source.
 _Choice: TypeAlias = tuple[CellOutput | WorkflowInput | None, Assignment, tuple[str, ...]]
 
 
@@ -353,7 +354,7 @@ class _Expansion:
     nodes: dict[str, dict[frozenset[tuple[str, str]], _Node]] = field(default_factory=dict)
 
     def expand(self) -> tuple[Cell, ...]:
-        """Return all cells in topological order, the first of each repeat before the others."""
+        """Return all cells in topological order, each before its repeats."""
         workflow = self.workflow
         graph = {name: step.upstream() for name, step in workflow.steps.items()}
         compared = _compared_steps(workflow, self.methods)
@@ -378,7 +379,7 @@ class _Expansion:
                         for cell in self._repeats(node.cell, cells, is_reached=name in repeated):
                             cells[cell.address] = cell
         _require_few(workflow, len(cells))
-        # Cells that only lead to a skipped inspection need no repeats.
+        # Cells upstream of skipped inspections need no repeats.
         judged = [cell.address for cell in cells.values() if cell.step in compared and cell.repeat]
         needed = {*judged, *_reached({name: cell.sources for name, cell in cells.items()}, judged)}
         return tuple(
@@ -388,12 +389,12 @@ class _Expansion:
         )
 
     def _own_repeats(self, cell: Cell) -> int:
-        """Return how many repeats the file requests for a cell."""
+        """Return the number of executions of a cell requested in the file."""
         step = self.workflow.steps[cell.step]
         return step.variant(cell.assignment.get(step.name, "")).repeat
 
     def _outer(self, steps: Iterable[str]) -> list[Assignment]:
-        """Return the datasets and seeds on which a step runs, as far as they may influence it."""
+        """Return the datasets and seeds for a step, as far as they can affect it."""
         workflow = self.workflow
         variants = [variant for name in steps for variant in workflow.steps[name].variants]
         is_random = workflow.has_seeds and any(map(self._uses_seed, variants))
@@ -414,7 +415,7 @@ class _Expansion:
         return port_specs(self.methods[variant.method].In)
 
     def _takes_data(self, name: str) -> bool:
-        """Whether datasets change a step itself."""
+        """Whether a step directly depends on the dataset."""
         step = self.workflow.steps[name]
         names = step.conditions | {one.name for one in step.references if one.is_input}
         calls = ((name, variant.name) for variant in step.variants)
@@ -426,9 +427,10 @@ class _Expansion:
     def _repeats(
         self, cell: Cell, before: Mapping[str, Cell], *, is_reached: bool
     ) -> Iterator[Cell]:
-        """Yield the repeats 1, 2, ... of a cell: its own, and those of its predecessors.
+        """Yield the repeats 1, 2, ... of a cell: its own, and those caused by upstream repeats.
 
-        Repeat n of a cell takes repeat n of all that have one, and the first of all others.
+        Repeat n uses repeat n of each upstream cell that has one, and otherwise its first
+        execution.
         """
         if cell.skip_reason:
             return
@@ -452,9 +454,9 @@ class _Expansion:
             yield replace(cell, address=address, repeat=repeat, inputs=inputs, seed=seed)
 
     def _differs(self, address: str, before: Mapping[str, Cell]) -> bool:
-        """Whether a repeat of that address exists and may differ from the first.
+        """Whether there is a repeat with an address whose result may differ from the first.
 
-        Repeats of a method without randomness only time it.
+        Repeats of a deterministic method only measure its time, unless its inputs differ.
         """
         cell = before.get(address)
         if cell is None:
@@ -473,7 +475,7 @@ class _Expansion:
             variant = calls.get((step.name, variant.name), variant)
         if workflow.has_seeds and self._uses_seed(variant):
             own |= {SEED: full[SEED], **(by_data if workflow.has_data_seeds else {})}
-        # Whether a step is needed may depend on the data too.
+        # The condition of a step may depend on the dataset, too.
         always = {} if step.conditions.isdisjoint(workflow.data_inputs) else by_data
         own |= always
         if _is_excluded(workflow, own):
@@ -508,7 +510,7 @@ class _Expansion:
         return _Node(cell=cell, dependence=dependence, causes=causes)
 
     def _stopped_by(self, step: WorkflowStep, full: Mapping[str, str]) -> str:
-        """Return why a step is skipped, whatever its inputs; empty if it is not."""
+        """Return the change of inputs that would avoid a skip by condition; empty if none."""
         if step.unless and self._input_name(step.unless, full) in self.present:
             return f"without the input {step.unless}"
         if step.only_if and self._input_name(step.only_if, full) not in self.present:
@@ -528,7 +530,7 @@ class _Expansion:
                 causes[f"with the input {reference.name}"] = None
                 continue
             node = self._upstream(reference.source, full)
-            # The dependences of a rejected candidate determine this choice as well.
+            # The choice also depends on the factors of rejected candidates.
             dependence |= node.dependence
             if not node.cell.skip_reason:
                 output = CellOutput(address=node.cell.address, port=reference.name)
@@ -537,7 +539,7 @@ class _Expansion:
         return None, dependence, tuple(causes)
 
     def _input_name(self, name: str, full: Mapping[str, str]) -> str:
-        """Return the name of an input: that of the dataset, if it names files for it."""
+        """Return the name of an input for a dataset, or its plain name if the dataset has none."""
         dataset = self.workflow.datasets.get(full.get(DATA, ""))
         return dataset.inputs[name].name if dataset and name in dataset.inputs else name
 
@@ -557,7 +559,7 @@ class _Expansion:
         inputs: Mapping[str, CellOutput | WorkflowInput],
         skip_reason: str,
     ) -> Cell:
-        # The dataset and the seed precede the steps.
+        # The dataset and the seed come before the steps.
         rank = {DATA: -2, SEED: -1, **self.rank}
         ordered = dict(sorted(assignment.items(), key=lambda item: rank[item[0]]))
         listed = ",".join(f"{name}={chosen}" for name, chosen in ordered.items())
@@ -578,10 +580,10 @@ class _Expansion:
 
 
 def _compared_steps(workflow: Workflow, methods: Mapping[str, type[Method]]) -> set[str]:
-    """Return the steps that the workflow compares, which repeats of their predecessors reach.
+    """Return the steps that the workflow compares; repeats of upstream steps extend to these.
 
-    The steps that `compare.metrics` names and all inspections that its wildcards cover, without
-    `metrics` all inspections.
+    They are the steps in `compare.metrics` and all inspections that match its wildcards; without
+    `metrics`, all inspections.
     """
     metrics = workflow.compare.metrics if workflow.compare else ()
     patterns = [pattern.partition(".")[0] for pattern in metrics] or ["*"]
@@ -601,5 +603,5 @@ def _compared_steps(workflow: Workflow, methods: Mapping[str, type[Method]]) -> 
 
 
 def _reason(*causes: str) -> str:
-    """Return why a cell is skipped: any of the causes suffices."""
+    """Return the reason why a cell is skipped, from its possible causes."""
     return f"only {' or '.join(causes)}"

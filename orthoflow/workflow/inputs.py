@@ -1,4 +1,4 @@
-"""Inputs and datasets of a workflow: names of files, overrides, and existing files."""
+"""Inputs and datasets of a workflow: file names, overrides, and the search for files."""
 
 from __future__ import annotations
 
@@ -50,12 +50,12 @@ _MOST_BESIDE: Final = 200
 _DATASETS: Final = "datasets"
 _NOWHERE: Final = Position(line=0, column=0)
 _NUMBER: Final = re.compile(r"-?(0|[1-9]\d{0,14})(\.\d{1,15})?")
-# The first of them in the header is used.
+# The first one that occurs in the header is used.
 _SEPARATORS: Final = (";", "\t", ",")
 
 
 class MissingInputsError(InputError):
-    """Input files are missing; `problems` names them, or the first of many."""
+    """Input files are missing; `problems` lists them, or the first few."""
 
     def __init__(self, problems: Sequence[str], *, most: int = 100) -> None:
         self.problems = tuple(problems)
@@ -64,13 +64,14 @@ class MissingInputsError(InputError):
         super().__init__("\n".join([*problems[:most], *more]))
 
 
-# Inputs of the file and of the command line -------------------------------------------------------
+# Inputs in the file and on the command line
+# --------------------------------------------------------
 
 
 def input_specs(
     sections: Mapping[str, InputSection], folder: Path, log: ProblemLog
 ) -> dict[str, WorkflowInputSpec]:
-    """Return the inputs of a workflow file that lies in a folder."""
+    """Return the inputs of a workflow file in a given folder."""
     return {
         name: WorkflowInputSpec(
             name=name,
@@ -84,7 +85,7 @@ def input_specs(
 
 
 def written_files(source: str) -> Mapping[str, tuple[str, ...]]:
-    """Return the files that a workflow names for each input, without `--input`."""
+    """Return the files given for each input in a workflow file, ignoring `--input`."""
     log = ProblemLog(file="")
     log.parse(source)
     file = validate(WorkflowFile, {"inputs": log.get(("inputs",)) or {}}, log) or WorkflowFile()
@@ -93,10 +94,10 @@ def written_files(source: str) -> Mapping[str, tuple[str, ...]]:
 
 @dataclass(frozen=True, kw_only=True)
 class InputOption:
-    """One `--input`.
+    """A value of `--input`.
 
     Attributes:
-        name: of the workflow's input.
+        name: name of the workflow input.
         path: a file, a folder or a glob, relative to the working directory.
     """
 
@@ -108,7 +109,7 @@ class InputOption:
 
     @property
     def is_of_dataset(self) -> bool:
-        """Whether it names the input of one dataset, as in `scan@hall`."""
+        """Whether it refers to the input of one dataset, as in `scan@hall`."""
         return "@" in self.name
 
     @property
@@ -118,7 +119,7 @@ class InputOption:
 
 
 def read_input_options(texts: Sequence[str], log: ProblemLog) -> tuple[InputOption, ...]:
-    """Read the value of each `--input`; report what is not NAME=PATH."""
+    """Parse the values of `--input`; report values that are not NAME=PATH."""
     options = []
     for text in texts:
         name, _, path = text.partition("=")
@@ -132,7 +133,7 @@ def read_input_options(texts: Sequence[str], log: ProblemLog) -> tuple[InputOpti
 def override_inputs(
     specs: Mapping[str, WorkflowInputSpec], options: Sequence[InputOption], log: ProblemLog
 ) -> dict[str, WorkflowInputSpec]:
-    """Replace inputs of the file by files of the command line; several of one name add up."""
+    """Replace input files by those on the command line; several options of one name are joined."""
     changed = dict(specs)
     for option in options:
         name = option.name
@@ -152,7 +153,7 @@ def override_inputs(
 def check_shared_inputs(
     workflow: Workflow, options: Sequence[InputOption], log: ProblemLog
 ) -> None:
-    """Refuse files for an input of which every dataset has its own."""
+    """Refuse files for an input that each dataset sets itself."""
     for option in options:
         if option.name in workflow.inputs and option.name not in workflow.input_specs:
             example = workflow.chosen_data[0].inputs[option.name].name
@@ -164,7 +165,7 @@ def check_shared_inputs(
 
 
 def some_of(names: Collection[str]) -> str:
-    """Name the existing ones, or the first of many.
+    """Return the names as a list, shortened if there are many.
 
     >>> some_of(["scan", "photos"]), some_of([])
     ('scan, photos', 'none')
@@ -172,19 +173,19 @@ def some_of(names: Collection[str]) -> str:
     return first_few(list(names), most=_MOST_LISTED) or "none"
 
 
-# Looking for files --------------------------------------------------------------------------------
+# Search for files ---------------------------------------------------------------------------------
 
 
 def resolve_input_files(workflow: Workflow) -> Mapping[str, InputFiles | None]:
-    """Find the files of every input, sorted by name; None for absent optional data.
+    """Find the files of each input, sorted by name; None for an optional input without files.
 
-    A file stands for itself, a folder for the files in it and its subfolders (hidden ones left
-    out), a pattern for the files it matches (`**` for folders at any depth).
+    A path may be a file, a folder (all files in it and its subfolders, except hidden ones) or a
+    pattern (all files that match it, with `**` for folders at any depth).
 
     Raises:
-        InputError: a file is missing, a folder is empty, a pattern matches nothing, or an input
-            that is not optional was given no files; names every input. An optional input may be
-            missing unless it was named on the command line or by a dataset.
+        InputError: a file is missing, a folder is empty, a pattern has no match, or a required
+            input has no files; the message lists all such inputs. An optional input may be missing
+            unless it was given on the command line or in a dataset.
     """
     found: dict[str, InputFiles | None] = {}
     missing: list[str] = []
@@ -211,7 +212,7 @@ def add_missing_inputs(workflow: Workflow, log: ProblemLog) -> None:
 
 
 def present_inputs(workflow: Workflow) -> frozenset[str]:
-    """Return names of the present inputs; those that are not optional always count as present."""
+    """Return the names of available inputs; required ones are assumed to be available."""
     return frozenset(
         spec.name
         for spec in workflow.input_specs.values()
@@ -251,8 +252,8 @@ def _find(spec: WorkflowInputSpec, pattern: str) -> list[Path]:
         files = []
         missing = f"{pattern}{where} is a link to {path.readlink()}, which is not there"
     elif glob.has_magic(pattern):
-        # Names may contain brackets; only a path that does not exist is treated as a pattern.
-        # Path.glob knows no absolute patterns.
+        # Names may contain brackets, so only a path that does not exist is treated as a pattern.
+        # Path.glob does not support absolute patterns.
         matches = glob.iglob(pattern, root_dir=spec.folder, recursive=True)  # noqa: PTH207
         files = [spec.folder / match for match in matches if (spec.folder / match).is_file()]
         missing = f"no file matches {pattern}{where}"
@@ -264,7 +265,7 @@ def _find(spec: WorkflowInputSpec, pattern: str) -> list[Path]:
 
 
 def _meant(path: Path) -> str:
-    """Suggest a file with a similar name beside it, or return ""."""
+    """Return a suggestion with a similar file name in the same folder, or ""."""
     with suppress(OSError):
         beside = [item.name for item in islice(path.parent.iterdir(), _MOST_BESIDE)]
         return did_you_mean(path.name, beside)
@@ -284,7 +285,7 @@ def _below(folder: Path) -> Iterator[Path]:
 def check_no_step(
     steps: Sequence[DraftStep], factor: str, log: ProblemLog, location: Location
 ) -> None:
-    """Refuse a step that has the name of a factor of addresses."""
+    """Refuse a step whose name is also a factor in addresses."""
     if any(step.name == factor for step in steps):
         what = {DATA: "the dataset", SEED: "the seed"}[factor]
         log.report(
@@ -297,13 +298,13 @@ def check_no_step(
 
 @dataclass(frozen=True, kw_only=True)
 class _Origin:
-    """Where datasets are named.
+    """Origin of a list of datasets.
 
     Attributes:
-        log: of the file.
-        folder: what relative paths start from.
-        table: the file's name, empty for the workflow itself.
-        is_given: its paths were given with the call, from the working directory.
+        log: log of the file.
+        folder: base folder of relative paths.
+        table: name of the table; empty for the workflow itself.
+        is_given: whether the datasets were given from Python, relative to the working directory.
     """
 
     log: ProblemLog
@@ -317,12 +318,12 @@ class DatasetReader:
     """Reads datasets and checks them against a workflow.
 
     Attributes:
-        folder: of the workflow.
-        inputs: inputs of the workflow, with those of `--input`.
-        steps: of the workflow.
-        overrides: overrides of `--set`, which precede those of datasets.
-        calls: (step, variant) -> the call without datasets; those with mistakes are missing.
-        log: receives the problems.
+        folder: folder of the workflow.
+        inputs: inputs of the workflow, including `--input`.
+        steps: steps of the workflow.
+        overrides: overrides by `--set`, which take precedence over those of datasets.
+        calls: (step, variant) -> valid method call without datasets.
+        log: log for the problems.
     """
 
     folder: Path
@@ -333,15 +334,16 @@ class DatasetReader:
     log: ProblemLog
 
     def read(self, table: str | Mapping[str, JsonValue]) -> dict[str, Dataset]:
-        """Read the table of `--datasets`, otherwise the section, which may name a table itself.
+        """Read the table given with `--datasets`, or else the section, which may refer to a table.
 
         Args:
-            table: from the command line, relative to the working directory; empty for none. From
-                Python it may be the content of the section, with paths relative to the same folder.
+            table: path from the command line, relative to the working directory; empty if there is
+                none. From Python it may be the content of the section, with paths relative to the
+                same directory.
         """
         if isinstance(table, Mapping):
             log = self.log.beside("datasets=", "")
-            # It comes from no document.
+            # There is no document for datasets given from Python.
             log.document = Document(value={_DATASETS: dict(table)}, places={(): _NOWHERE})
             log.unnamed = _DATASETS
             return self._named(_Origin(log=log, folder=Path.cwd(), is_given=True))
@@ -375,14 +377,14 @@ class DatasetReader:
         return self._named(_Origin(log=log, folder=path.resolve().parent, table=name))
 
     def _named(self, origin: _Origin) -> dict[str, Dataset]:
-        """Read the mapping under `datasets` in the origin's tree."""
+        """Read the mapping `datasets` of an origin."""
         log = origin.log
         check_no_step(self.steps, DATA, log, (_DATASETS,))
         written = log.get((_DATASETS,))
         assert isinstance(written, dict)  # noqa: S101 - by the callers
         if not written:
             log.report((_DATASETS,), "expected at least one dataset")
-        # A key that names no input gets no second problem for its value.
+        # An unknown key is reported once, without problems of its value.
         known = {"set", *self.inputs}
         data = dict(written)
         for name, items in written.items():
@@ -435,14 +437,14 @@ class DatasetReader:
         if key == SEED or (parameter and any(one.name == step for one in self.steps)):
             meant = f"; parameters go in set: {{set: {{{key}: VALUE}}}}"
         elif origin.table:
-            # In a table, columns of parameters have a dot in their names.
+            # In a table, names of parameter columns contain a dot.
             meant = "; columns of parameters are called step.parameter"
         origin.log.report(
             location,
             f"there is no input {key}{did_you_mean(key, self.inputs)}; inputs: "
             f"{', '.join(self.inputs) or 'none'}{meant}",
             at_key=True,
-            # A column of a table is reported once, not for every line.
+            # Problems of a table column are reported once, not for each row.
             shown=(key,) if origin.table else None,
         )
 
@@ -462,7 +464,7 @@ class DatasetReader:
                     continue
                 call = self.calls.get(name)
                 overrides = (*assigned[name], *self.overrides.get(name, ()))
-                # Mistakes of the call itself are reported at their places, and once.
+                # Mistakes of the call itself are reported once, at their own positions.
                 resolved = resolve_call(draft, overrides, self.log, blame if call else None)
                 if call is not None:
                     calls[name] = resolved
@@ -472,14 +474,14 @@ class DatasetReader:
 def choose_data(
     texts: Sequence[str], datasets: Mapping[str, Dataset], log: ProblemLog
 ) -> tuple[str, ...]:
-    """Read the value of each `--only-data`: names of datasets with commas between them."""
+    """Parse the values of `--only-data`: dataset names, separated by commas."""
     chosen: dict[str, None] = {}
     for text in texts:
         for name in (part.strip() for part in text.split(",")):
             if name in datasets:
                 chosen[name] = None
             elif not datasets and log.has_any:
-                # The names in an unreadable table are unknown.
+                # The dataset names are unknown if the table is unreadable.
                 continue
             elif not datasets:
                 log.report_option(f"--only-data {text}", "the workflow has no datasets")
@@ -496,11 +498,12 @@ def choose_data(
 
 
 def read_rows(log: ProblemLog) -> Document:
-    """Read the lines of a table as the section `datasets`: a mapping from names to datasets.
+    """Read a table as the section `datasets`: a mapping from names to datasets.
 
-    Columns are separated by semicolons, tabs or commas. A column with a dot in its name, or named
-    `seed`, goes into the dataset's `set`, its values read as YAML; empty fields are omitted. Keys
-    have the position of their column in the header, so that a problem of a column is reported once.
+    Columns are separated by semicolons, tabs or commas. A column whose name contains a dot or is
+    `seed` goes into `set` of the dataset, with its values read as YAML; empty fields are omitted.
+    Keys have the position of their column in the header, so that a problem of a column is reported
+    once.
     """
     rows = _rows(log)
     header = next(rows, None)
@@ -554,7 +557,7 @@ class _Field(NamedTuple):
 
 
 def _rows(log: ProblemLog) -> Iterator[list[_Field]]:
-    """Return the fields of every non-empty line."""
+    """Yield the fields of each non-empty line."""
     separator = ""
     for number, line in enumerate(log.lines, start=1):
         if not line.strip() or line.lstrip()[0] == "#":
@@ -568,7 +571,7 @@ def _rows(log: ProblemLog) -> Iterator[list[_Field]]:
             continue
         placed, at = [], 0
         for field in fields:
-            # A field with doubled quotes is not found as written; its place is approximate.
+            # A field with doubled quotes is not found literally; its position is then approximate.
             at = max(at, line.find(field, at))
             placed.append(_Field(field.strip(), Position(line=number, column=at + 1)))
             at += len(field)
@@ -576,7 +579,7 @@ def _rows(log: ProblemLog) -> Iterator[list[_Field]]:
 
 
 def _columns(header: Sequence[_Field], log: ProblemLog) -> list[_Field]:
-    """Return the columns, some of them without a name; none if the table cannot be used."""
+    """Return the columns, including unnamed ones; empty if the table cannot be used."""
     names = [field.text for field in header]
     for index, (name, position) in enumerate(header):
         if name and name in names[:index]:
@@ -593,7 +596,7 @@ def _columns(header: Sequence[_Field], log: ProblemLog) -> list[_Field]:
 
 
 def _row_name(row: Sequence[_Field], columns: Sequence[_Field], log: ProblemLog) -> _Field | None:
-    """Return the name of the dataset of a line; None if it is unusable, which is reported."""
+    """Return the dataset name of a row; None if it is invalid, which is reported."""
     names = [column.text for column in columns]
     for index, field in enumerate(row):
         if field.text and not "".join(names[index : index + 1]):
@@ -607,9 +610,9 @@ def _row_name(row: Sequence[_Field], columns: Sequence[_Field], log: ProblemLog)
 
 
 def _as_yaml(field: _Field, key: str, log: ProblemLog) -> list[JsonValue]:
-    """Read what stands in a column of parameters, as given with `--set`; nothing on an error."""
+    """Read a value in a parameter column, as for `--set`; return an empty list on an error."""
     if _NUMBER.fullmatch(field.text):
-        # A thousand rooms have a thousand numbers, and reading each as YAML takes milliseconds.
+        # Fast path for numbers: reading each as YAML takes milliseconds, and tables may be long.
         return [float(field.text) if "." in field.text else int(field.text)]
     own = ProblemLog(file="")
     if own.parse(field.text) is None or own.has_any:

@@ -1,7 +1,7 @@
-"""The workflow format: the content of a file, and the checked workflow that it becomes.
+"""The workflow format: models of the file, and the checked workflow that is made from them.
 
-The models of the file are the format: its checks, the JSON Schema and `docs/workflow-format.md` are
-made of them. Relations between keys are checked in `document` and `checks`.
+The models of the file define the format: checks, JSON Schema and `docs/workflow-format.md` are
+derived from them. Relations between keys are checked in `document` and `checks`.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ from orthoflow.workflow.source import Problem
 FORMAT: Final = 1
 #: `repeat` of a method call
 MOST_REPEATS: Final = 10_000
-# More values than are readable in a curve, and more runs than are practical.
+# Limit of what is readable in a curve and practical to run.
 #: values of a sweep
 MOST_SWEPT: Final = 100
 #: combinations in `exclude`
 MOST_EXCLUDED: Final = 500
-# Records keep numbers of fewer than a hundred digits.
+# Records store numbers of less than 100 digits.
 _MOST_OF_A_NUMBER: Final = 10**80
 INPUTS: Final = "inputs"
-# Factors of addresses besides the steps: dataset and seed.
+# Factors in addresses besides the steps: dataset and seed.
 DATA: Final = "data"
 SEED: Final = "seed"
 NAME_RULE: Final = (
@@ -61,10 +61,10 @@ _Item = TypeVar("_Item")
 
 
 def check_name(name: str) -> str:
-    """Return a name if addresses and files can have it.
+    """Return a name if it is allowed in addresses and file names.
 
     Raises:
-        PydanticCustomError: it is invalid; a `ValueError`.
+        PydanticCustomError: the name is invalid; a subclass of `ValueError`.
     """
     if not re.fullmatch(NAME_PATTERN, name):
         raise PydanticCustomError(
@@ -78,7 +78,7 @@ def _refusal(code: str, form: str) -> PydanticCustomError:
 
 
 def _seconds(raw: object) -> float:
-    """Return a time in seconds: 1800 for `30min`."""
+    """Return a time in seconds, e.g. 1800 for `30min`."""
     seconds = 0.0
     if isinstance(raw, int | float) and not isinstance(raw, bool):
         seconds = float(raw)
@@ -91,7 +91,7 @@ def _seconds(raw: object) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Reference:
-    """The source of a port's product.
+    """Source of the product on a port.
 
     Attributes:
         source: name of a step, or `inputs`.
@@ -103,7 +103,7 @@ class Reference:
 
     @property
     def is_input(self) -> bool:
-        """Whether it names an input of the workflow."""
+        """Whether it refers to an input of the workflow."""
         return self.source == INPUTS
 
     def __str__(self) -> str:
@@ -140,7 +140,7 @@ def _format_version(version: int) -> int:
 
 
 def _listed(raw: object) -> object:
-    # A tuple, for strict validation.
+    # Strict validation requires a tuple.
     return tuple(raw) if isinstance(raw, list | tuple) else (raw,)
 
 
@@ -155,7 +155,7 @@ _Name: TypeAlias = Annotated[
 ]
 _Text: TypeAlias = Annotated[str, Strict(), Field(min_length=1)]
 _Flag: TypeAlias = Annotated[bool, Strict()]
-# Integers; `true` is not one.
+# Integers, except `true`, which Python treats as one.
 _Positive: TypeAlias = Annotated[
     int,
     Strict(),
@@ -197,7 +197,7 @@ _Metric: TypeAlias = Annotated[
     AfterValidator(_metric),
     WithJsonSchema({"type": "string", "pattern": rf"^{_METRIC}$"}),
 ]
-# A seed is a level like any other.
+# Levels are text, so a seed is converted.
 _Level: TypeAlias = Annotated[
     str,
     Field(min_length=1),
@@ -208,7 +208,7 @@ _Assignment: TypeAlias = dict[str, _Level]
 _Texts: TypeAlias = Annotated[tuple[_Text, ...], Field(min_length=1)]
 _References: TypeAlias = Annotated[tuple[_Source, ...], Field(min_length=1)]
 _Patterns: TypeAlias = tuple[_Metric, ...]
-# One value, or a list of at least one.
+# A single value, or a non-empty list.
 _Files: TypeAlias = Annotated[
     _Texts, BeforeValidator(_listed, json_schema_input_type=_Text | _Texts)
 ]
@@ -461,26 +461,26 @@ class WorkflowFile(FileSection):
     )
 
 
-# The checked workflow -----------------------------------------------------------------------------
+# Checked workflow -------------------------------------------------------------------------------
 
-# As records keep it.
+# A reference in the form used in records.
 _Recorded: TypeAlias = Annotated[Reference, BeforeValidator(_reference), PlainSerializer(str)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class WorkflowInputSpec:
-    """An input as named in the file or on the command line; files are not searched yet.
+    """An input as given in the file or on the command line, before its files are searched for.
 
     Attributes:
         name: name of the input.
-        files: files, folders and glob patterns; empty if none were given.
-        optional: steps that need it are skipped when it is absent.
-        folder: base of relative paths: the workflow's folder, or the working directory for paths
-            from the command line.
-        is_given: named with `--input`, so it must exist even if it is optional.
-        table: the table of datasets and the line in it that name the files, `rooms.csv:3`; empty
-            for the workflow itself.
-        place: where they are named; None for what comes from no file.
+        files: files, folders and glob patterns; empty if none are given.
+        optional: whether steps that need it are skipped if it is missing.
+        folder: base folder of relative paths: the folder of the workflow, or the working directory
+            for paths from the command line.
+        is_given: whether it was given with `--input`, so that it must exist even if it is optional.
+        table: datasets table and line that contain the files, e.g. `rooms.csv:3`; empty for the
+            workflow itself.
+        place: position of the files in the document; None if they do not come from a file.
     """
 
     name: str
@@ -494,24 +494,24 @@ class WorkflowInputSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class StepVariant:
-    """One of a step's alternatives; a step without variants has exactly one, named ``.
+    """A variant of a step; a step without variants has exactly one, with an empty name.
 
     Attributes:
-        name: name of the variant, empty for a step without variants.
+        name: name of the variant; empty for a step without variants.
         method: method id.
-        params: resolved parameters, defaults included, JSON.
-        params_set: parameters as written in the file or set on the command line, JSON.
-        repeat: number of runs, with seeds of their own if the method is random.
-        cores: requested number of cores, None for all.
-        timeout_s: seconds, None for no limit.
-        swept: parameters that are swept -> the values of this variant; a part of `params_set`.
+        params: resolved parameters with defaults, as JSON.
+        params_set: parameters set in the file or on the command line, as JSON.
+        repeat: number of executions, with different seeds if the method is random.
+        cores: requested number of cores; None for all.
+        timeout_s: time limit in seconds; None if there is none.
+        swept: swept parameter -> value of this variant; a subset of `params_set`.
     """
 
     __pydantic_config__ = ConfigDict(extra="forbid")
 
     name: str
     method: Annotated[str, Field(alias="use")]
-    # Any: JSON.
+    # `Any`: JSON.
     params: Mapping[str, Any] = field(default_factory=dict)
     params_set: Mapping[str, Any] = field(default_factory=dict)
     repeat: Annotated[int, Field(ge=1, le=MOST_REPEATS)] = 1
@@ -522,15 +522,15 @@ class StepVariant:
 
 @dataclass(frozen=True, kw_only=True)
 class WorkflowStep:
-    """A step.
+    """A step of a workflow.
 
     Attributes:
         name: name of the step.
-        variants: alternatives in the order of the file.
-        inputs: port -> references; the first that is present is used.
-        only_if: the step is skipped if this input is absent; empty for always.
-        unless: the step is skipped if this input is present; empty for always.
-        is_varied: the file lists variants, even if only one.
+        variants: variants in the order of the file.
+        inputs: port -> references; the first available one is used.
+        only_if: input without which the step is skipped; empty if there is no condition.
+        unless: input with which the step is skipped; empty if there is no condition.
+        is_varied: whether the file lists variants, even if only one.
     """
 
     name: Annotated[str, Field(exclude=True)] = ""
@@ -543,35 +543,35 @@ class WorkflowStep:
     is_varied: bool = False
 
     def variant(self, name: str) -> StepVariant:
-        """Return the variant of that name."""
+        """Return the variant with a given name."""
         return next(variant for variant in self.variants if variant.name == name)
 
     @property
     def conditions(self) -> frozenset[str]:
-        """Return inputs whose presence alone decides whether the step runs."""
+        """Return the inputs on whose presence the step depends through `if` and `unless`."""
         return frozenset((self.only_if, self.unless)) - {""}
 
     @property
     def references(self) -> tuple[Reference, ...]:
-        """Return the possible sources of the ports."""
+        """Return the possible sources of all ports."""
         return tuple(item for references in self.inputs.values() for item in references)
 
     def upstream(self) -> tuple[str, ...]:
-        """Return names of the steps whose products the ports may take, each once."""
+        """Return the names of the steps whose products the ports may use, without duplicates."""
         return tuple(dict.fromkeys(one.source for one in self.references if not one.is_input))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Dataset:
-    """One of the datasets that a workflow runs on.
+    """One of the datasets of a workflow.
 
     Attributes:
         name: name of the dataset.
-        inputs: input -> its files; that of the input `scan` has the name `scan@<dataset>`.
+        inputs: input -> files; the name of the input `scan` is `scan@<dataset>`.
         sets: parameters as written, `step.parameter` -> JSON.
-        seeds: roots of all seeds on this dataset; empty for those of the workflow.
-        calls: (step, variant) -> the method call with these parameters, if they change it; not kept
-            in records, whose cells state it.
+        seeds: root seeds for this dataset; empty to use those of the workflow.
+        calls: (step, variant) -> method call with these parameters, if they change it; not stored
+            in records, whose cells contain the parameters.
     """
 
     name: str
@@ -583,21 +583,21 @@ class Dataset:
 
 @dataclass(frozen=True, kw_only=True)
 class Workflow:
-    """A workflow that was checked against the catalog.
+    """A workflow that has been checked against the catalog.
 
     Attributes:
         name: name of the workflow.
-        path: the file it was read from.
+        path: path of the file.
         source: text of the file as written.
-        seed: root of all seeds; of a sweep, the first.
-        seeds: roots of all seeds if they are swept; empty otherwise.
-        inputs: by name.
-        steps: by name, in the order of the file.
-        compare: what to compare; None if only the baseline runs.
-        overrides: `--set ...` and `--input ...` that changed the document, in order; of files only
-            the names are kept.
-        datasets: by name; empty when the workflow runs once, on its inputs.
-        only_data: names of the datasets to run on; empty for all.
+        seed: root seed; the first one of a sweep.
+        seeds: root seeds if they are swept; otherwise empty.
+        inputs: inputs by name.
+        steps: steps by name, in the order of the file.
+        compare: the comparison; None if only the baseline runs.
+        overrides: `--set ...` and `--input ...` that changed the document, in order; files without
+            their folders.
+        datasets: datasets by name; empty if the workflow runs once, on its inputs.
+        only_data: names of the selected datasets; empty for all.
     """
 
     name: str
@@ -614,23 +614,23 @@ class Workflow:
 
     @property
     def chosen_data(self) -> tuple[Dataset, ...]:
-        """The datasets to run on, in the order of the file."""
+        """The selected datasets, in the order of the file."""
         chosen = self.only_data or tuple(self.datasets)
         return tuple(item for item in self.datasets.values() if item.name in chosen)
 
     @cached_property
     def data_inputs(self) -> frozenset[str]:
-        """Inputs that datasets name; of all datasets, so that a selection changes no address."""
+        """Inputs that any dataset sets, selected or not, so that a selection changes no address."""
         return frozenset(name for item in self.datasets.values() for name in item.inputs)
 
     @cached_property
     def data_calls(self) -> frozenset[tuple[str, str]]:
-        """Return (step, variant) of the method calls whose parameters datasets change."""
+        """Return (step, variant) of the method calls whose parameters are changed by datasets."""
         return frozenset(call for item in self.datasets.values() for call in item.calls)
 
     @cached_property
     def has_data_seeds(self) -> bool:
-        """Whether datasets have seeds of their own."""
+        """Whether datasets have their own seeds."""
         return any(item.seeds for item in self.datasets.values())
 
     @cached_property
@@ -639,12 +639,12 @@ class Workflow:
         return bool(self.seeds) or self.has_data_seeds
 
     def seeds_of(self, dataset: Dataset | None) -> tuple[int, ...]:
-        """Return the roots of the seeds on a dataset."""
+        """Return the root seeds for a dataset."""
         return (dataset.seeds if dataset else ()) or self.seeds or (self.seed,)
 
     @cached_property
     def input_specs(self) -> Mapping[str, WorkflowInputSpec]:
-        """Return every input that cells may take, by its own name: `scan`, `scan@hall`."""
+        """Return all inputs that cells may use, by name: `scan`, `scan@hall`."""
         chosen = self.chosen_data
         shared = {
             name: spec
@@ -654,7 +654,7 @@ class Workflow:
         return shared | {spec.name: spec for item in chosen for spec in item.inputs.values()}
 
     def with_input_specs(self, specs: Mapping[str, WorkflowInputSpec]) -> Workflow:
-        """Return the workflow with other inputs, by their own names."""
+        """Return the workflow with its inputs replaced, given by name."""
         datasets = {
             item.name: replace(
                 item, inputs={name: specs.get(one.name, one) for name, one in item.inputs.items()}
@@ -666,7 +666,7 @@ class Workflow:
 
     @property
     def baseline(self) -> dict[str, str]:
-        """Return the variant of every varied step that runs without a comparison."""
+        """Return the variants that run without a comparison, for each step with variants."""
         chosen = self.compare.baseline if self.compare else {}
         return {
             step.name: chosen.get(step.name, step.variants[0].name)
@@ -676,13 +676,13 @@ class Workflow:
 
 
 def factors_of(workflow: Workflow) -> frozenset[str]:
-    """Return the factors of addresses that are not steps: `data`, `seed`."""
+    """Return the factors in addresses that are not steps: `data`, `seed`."""
     data = {DATA} if workflow.datasets else set()
     return frozenset(data | ({SEED} if workflow.has_seeds else set()))
 
 
 def is_acyclic(sources: Mapping[str, Sequence[str]]) -> bool:
-    """Whether no step depends on itself, directly or through others."""
+    """Whether no step depends on itself, directly or indirectly."""
     try:
         TopologicalSorter(sources).prepare()
     except CycleError:

@@ -1,4 +1,4 @@
-"""Parameters of method calls: from the file, `--set` and sweeps, and the defaults."""
+"""Parameters of method calls: values from the file, `--set` and sweeps, and defaults."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ from orthoflow.workflow.source import InvalidWorkflowError, ProblemLog, validate
 Report: TypeAlias = Callable[[str], None]
 
 SWEEP: Final = "sweep"
-# Letters of a name, see `NAME_PATTERN`.
+# Maximum length of a name in characters, see `NAME_PATTERN`.
 _LETTERS: Final = 32
 
 
 @dataclass(frozen=True, kw_only=True)
 class DraftCall:
-    """A method call as stated in the file, with its place.
+    """A method call as written in the file, with its location.
 
     Attributes:
-        location: of the mapping that holds `use`.
-        name: of the variant, empty for a step without variants.
-        call: its content; its parameters without sweeps.
-        method: the method's class, None when it cannot be loaded.
-        kind: ports of its kind, known even if the method is not.
-        swept: for a variant made by a sweep, the parameters and their values.
-        family: for such a variant, the name of the original variant.
-        is_unswept: the file sweeps it, and the command line sets one value.
+        location: location of the mapping that contains `use`.
+        name: name of the variant; empty for a step without variants.
+        call: content of the mapping, with parameters that are not swept.
+        method: class of the method; None if it cannot be loaded.
+        kind: ports of its kind, which is known even if the method is not.
+        swept: parameters and values of this variant, if it comes from a sweep.
+        family: name of the original variant, if it comes from a sweep.
+        is_unswept: whether the file sweeps it and the command line sets a single value.
     """
 
     location: Location
@@ -58,12 +58,12 @@ class DraftCall:
 
     @property
     def id(self) -> str:
-        """Method id, empty where the file names none."""
+        """Method id; empty if the file contains none."""
         return self.call.use or ""
 
     @property
     def is_source(self) -> bool:
-        """Whether its kind takes no variants."""
+        """Whether its kind does not allow variants."""
         return self.kind is not None and self.kind.is_source
 
     @property
@@ -73,10 +73,11 @@ class DraftCall:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Return names by which `--set` may refer to it.
+        """Return the names that `--set` may use for it.
 
-        A step without variants has its method's name, so that `plane.hough2d.cell_m` works in
-        recipes with and without variants; a swept variant keeps its previous name, too.
+        A step without variants can be addressed by the name of its method, so that
+        `plane.hough2d.cell_m` works in recipes with and without variants; a swept variant can also
+        be addressed by its original name.
         """
         method = self.id.partition(".")[2]
         before = (self.family or method,) if self.swept else ()
@@ -85,7 +86,7 @@ class DraftCall:
 
 @dataclass(frozen=True, kw_only=True)
 class DraftStep:
-    """A step as stated in the file, with its place."""
+    """A step as written in the file, with its location."""
 
     location: Location
     name: str
@@ -96,7 +97,7 @@ class DraftStep:
     is_varied: bool
 
 
-# Setting parameters -------------------------------------------------------------------------------
+# Settings -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,9 +105,9 @@ class Override:
     """One parameter of one method call, set from the command line or by a dataset.
 
     Attributes:
-        report: reports a problem at its place.
-        keys: parameter name, and keys inside it if it is a mapping.
-        value: JSON.
+        report: function that reports a problem at its position.
+        keys: parameter name, followed by keys inside the parameter if it is a mapping.
+        value: value as JSON.
     """
 
     report: Report
@@ -121,7 +122,7 @@ Overrides: TypeAlias = dict[tuple[str, str], tuple[Override, ...]]
 def overrides_of_options(
     sets: Sequence[str], steps: Sequence[DraftStep], log: ProblemLog
 ) -> Overrides:
-    """Find the method calls of each `--set`; those that match nothing go to the log."""
+    """Find the method calls of each `--set`; report options that match none."""
     assigned: Overrides = {}
     for text in sets:
         report = partial(log.report_option, f"--set {text}")
@@ -145,10 +146,10 @@ def overrides_of_settings(
 
     Args:
         settings: the mapping.
-        location: of the mapping in the log's tree.
-        steps: of the workflow.
-        log: receives the problems.
-        is_column: the keys are columns of a table; problems of these name the key alone, so that
+        location: location of the mapping in the document.
+        steps: steps of the workflow.
+        log: log for the problems.
+        is_column: whether the keys are table columns; problems then refer only to the key, so that
             each is reported once.
     """
     assigned: Overrides = {}
@@ -188,7 +189,7 @@ def _parse(text: str) -> tuple[list[str], JsonValue]:
     try:
         log.raise_any()
     except InvalidWorkflowError as error:
-        # A shell would have split it at the space.
+        # A value with a space was quoted already, or the shell would have split it.
         way_out = "" if " " in raw.strip() else "; quote it"
         raise ArgumentError(
             f"the value cannot be read as YAML: {error.problems[0].message}{way_out}"
@@ -211,7 +212,7 @@ def _assign(
             f"{', '.join(by_name)}"
         )
     calls, keys = _select_calls(step, parts[1:])
-    # A method that cannot be loaded may have any.
+    # If a method cannot be loaded, any parameter may be valid.
     chosen = [call for call in calls if call.method is None or keys[0] in call.parameters]
     if not chosen:
         known = sorted({name for call in calls for name in call.parameters})
@@ -246,7 +247,7 @@ def _select_calls(step: DraftStep, parts: list[str]) -> tuple[tuple[DraftCall, .
     )
 
 
-# Resolving ----------------------------------------------------------------------------------------
+# Resolution ---------------------------------------------------------------------------------------
 
 
 def resolve_call(
@@ -259,12 +260,12 @@ def resolve_call(
 
     Args:
         draft: the method call.
-        overrides: applied to the file's parameters, one after the other.
-        log: receives the problems of the file's parameters.
-        blame: receives these instead of the log, for a call that is correct without the overrides.
+        overrides: overrides, applied in order to the parameters in the file.
+        log: log for problems of the parameters in the file.
+        blame: used instead of `log`, for a call that is valid without the overrides.
 
     Returns:
-        The call; without resolved parameters if they are wrong, or the method is unknown.
+        The call; without resolved parameters if they are invalid or the method is unknown.
     """
     as_set: dict[str, JsonValue] = deepcopy(draft.call.params)
     for override in overrides:
@@ -297,13 +298,15 @@ def _resolved(
         with guarded():
             checked = model.model_validate_json(json.dumps(as_set), strict=True)
             resolved: dict[str, JsonValue] = checked.model_dump(mode="json")
-            # As in the step: a default may be refused once it is given like any other value.
+            # Check defaults like given values, so that the resolved parameters can be validated
+            # again.
             model.model_validate_json(json.dumps(resolved), strict=True)
     except ValidationError as error:
         for loc, message, _ in mistakes(error, model, dict(as_set), draft.id):
             name = str(loc[0]) if loc else ""
             if report := reports.get(name, blame):
-                # It names the parameter itself, but nothing inside it, and datasets not even that.
+                # The position of a report identifies the parameter, but no key inside it, and for
+                # datasets not even the parameter.
                 inside = ProblemLog(file="").path(loc) or f"the parameters of {draft.id}"
                 is_named = name in reports and len(loc) == 1
                 report(message if is_named else f"{inside}: {message}")
@@ -330,7 +333,7 @@ def _put(params: dict[str, JsonValue], override: Override) -> None:
             override.report(f"{key} is not a mapping, so nothing in it can be set")
             return
         place = inner
-    # Several calls may take the same value, and later settings modify it.
+    # Copy it, because several calls may use the same value and later settings modify it.
     place[last] = deepcopy(override.value)
 
 
@@ -343,9 +346,9 @@ _Sweeps: TypeAlias = dict[str, list[tuple[JsonValue, Report]]]
 def expand_sweeps(
     steps: Sequence[DraftStep], overrides: Overrides, log: ProblemLog
 ) -> tuple[tuple[DraftStep, ...], Overrides]:
-    """Replace every call that sweeps a parameter by a variant for each value.
+    """Replace each call with a swept parameter by one variant per value.
 
-    A `--set` of a swept parameter replaces the sweep, and may be one itself.
+    `--set` for a swept parameter replaces the sweep, and may itself be a sweep.
 
     Returns:
         The steps, and the overrides of their calls, including the swept values.
@@ -374,7 +377,7 @@ def expand_sweeps(
 def _sweeps_of(
     draft: DraftCall, overrides: Sequence[Override], log: ProblemLog
 ) -> tuple[_Sweeps, tuple[Override, ...]]:
-    """Return the sweeps of a call, and the overrides that sweep nothing."""
+    """Return the sweeps of a call, and the overrides that are not sweeps."""
     found: _Sweeps = {}
     for name, value in draft.call.params.items():
         if _is_sweep(value):
@@ -411,7 +414,7 @@ def _is_sweep(value: JsonValue) -> bool:
 
 
 def _once(values: list[tuple[JsonValue, Report]]) -> list[tuple[JsonValue, Report]]:
-    """Drop duplicates, and report them at their places."""
+    """Remove duplicate values, and report them at their positions."""
     kept: dict[str, tuple[JsonValue, Report]] = {}
     for value, report in values:
         text = _canonical(value)
@@ -450,7 +453,7 @@ def _may_vary(step: DraftStep, draft: DraftCall, log: ProblemLog) -> bool:
 def _variants(
     draft: DraftCall, sweeps: _Sweeps, taken: set[str]
 ) -> Iterator[tuple[DraftCall, tuple[Override, ...]]]:
-    """Make a variant of each combination of the values."""
+    """Yield one variant per combination of values."""
     combinations = [
         dict(zip(sweeps, chosen, strict=True)) for chosen in itertools.product(*sweeps.values())
     ]
@@ -475,11 +478,13 @@ def _numbered(name: str) -> Iterator[str]:
 
 
 def variant_names(before: str, combinations: Sequence[Mapping[str, JsonValue]]) -> list[str]:
-    """Name the combinations of a sweep, independent of their order: exact values, else an index.
+    """Name the combinations of a sweep by their exact values, or else by an index.
+
+    The names do not depend on the order of the combinations.
 
     Args:
-        before: name of the variant that is swept, or nothing.
-        combinations: parameter -> value, the same parameters in each.
+        before: name of the swept variant, or empty.
+        combinations: parameter -> value, with the same parameters in each.
 
     >>> variant_names("", [{"tolerance_m": 0.02}, {"tolerance_m": 1e-07}])
     ['tolerance_m-0_02', 'tolerance_m-1em07']
@@ -495,7 +500,7 @@ def variant_names(before: str, combinations: Sequence[Mapping[str, JsonValue]]) 
     is_short = all(re.fullmatch(NAME_PATTERN, name) for name in names)
     if is_stated and is_short and len({*names}) == len(names):
         return names
-    # Counted in the order of the values, so that the order of the list changes nothing.
+    # Number them in the order of their values, so that the order of the list does not matter.
     keys = [[_ordered(one[name]) for name in sorted(one)] for one in combinations]
     in_order = sorted(range(len(keys)), key=keys.__getitem__)
     before = before[: _LETTERS - len(f"-{SWEEP}-{len(keys)}")]
@@ -510,11 +515,11 @@ def _ordered(value: JsonValue) -> tuple[int, float, str]:
 
 
 def _word(value: JsonValue) -> str:
-    """Return a value as a word of a name that states it exactly; empty if there is none."""
+    """Return an exact value as part of a name; empty if that is not possible."""
     if value is None or isinstance(value, bool):
         return {True: "true", False: "false", None: "none"}[value]
     if isinstance(value, int | float):
-        # A name has neither points nor signs.
+        # Names cannot contain points and signs.
         text = _canonical(value).lower()
         return text.replace("+", "").replace("-", "m").replace(".", "_")
     if isinstance(value, str):

@@ -1,4 +1,4 @@
-"""The text of a workflow: where it is found, how it is read, and all that is wrong with it."""
+"""The text of a workflow: finding and reading it, and the list of its problems."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ _CHECKOUT: Final = Path(__file__).parents[2] / "workflows"
 
 
 def shipped_workflows() -> dict[str, Path]:
-    """Return all shipped recipes by name, e.g. `direct` -> .../direct.yaml."""
+    """Return the shipped recipes by name, e.g. `direct` -> .../direct.yaml."""
     folder = _INSTALLED if _INSTALLED.is_dir() else _CHECKOUT
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 
 def shipped_workflow(name: str) -> Path:
-    """Return the shipped recipe of a name: `direct`, `direct.yaml` or `workflows/direct.yaml`.
+    """Return the path of a shipped recipe: `direct`, `direct.yaml` or `workflows/direct.yaml`.
 
     Raises:
-        WorkflowError: there is none.
+        WorkflowError: there is no such recipe.
     """
     recipes = shipped_workflows()
     wanted = Path(name)
@@ -45,10 +45,10 @@ def shipped_workflow(name: str) -> Path:
 
 
 def find_workflow(name_or_path: str | Path) -> Path:
-    """Return an existing file, else the shipped recipe of that name.
+    """Return the path of an existing file, or else of a shipped recipe.
 
     Raises:
-        WorkflowError: there is neither.
+        WorkflowError: there is no such file or recipe.
     """
     path = Path(name_or_path)
     if path.is_file():
@@ -62,10 +62,10 @@ def read_text(path: Path, what: str = "a workflow file", most_bytes: int = MOST_
     """Read a text file of bounded size.
 
     Raises:
-        WorkflowError: it cannot be read, is too large, or is not UTF-8.
+        WorkflowError: the file cannot be read, is too large, or is not UTF-8.
     """
     try:
-        # No more than needed: a file named by mistake may be a scan.
+        # Read no more than the limit: a file given by mistake may be a scan.
         with open_file(path) as stream:
             content = stream.read(most_bytes + 1)
     except OSError as error:
@@ -90,21 +90,21 @@ MOST_PROBLEMS: Final = 100
 _SNIPPET_WIDTH: Final = 120
 Model = TypeVar("Model", bound=BaseModel)
 _Origin: TypeAlias = Literal["file", "plugin", "input", "option"]
-# Of what cannot be read.
+# Stands for a document that cannot be read.
 NOTHING: Final = Document(value=None, places={(): Position(line=1, column=1)})
 
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """One problem.
+    """A problem of a workflow file or command-line option.
 
     Attributes:
-        file: the workflow file as the user named it, or the command-line option.
-        line: from 1; 0 for a command-line option.
-        column: from 1; 0 for a command-line option.
+        file: the workflow file as given by the user, or the command-line option.
+        line: line, from 1; 0 for a command-line option.
+        column: column, from 1; 0 for a command-line option.
         path: location in the document, keys joined by dots, e.g. `steps.wall.params.gsd_m`.
         message: one sentence.
-        text: the offending line, empty for a command-line option.
+        text: the line with the problem; empty for a command-line option.
     """
 
     file: str
@@ -116,13 +116,13 @@ class Problem:
 
     @property
     def place(self) -> str:
-        """Return its place, as the sentence begins: `hall.yaml:3:9: steps.wall: `."""
+        """Return the position as a prefix of the message: `hall.yaml:3:9: steps.wall: `."""
         where = f"{self.file}:{self.line}:{self.column}" if self.line else self.file
         return f"{where}: {self.path}: " if self.path else f"{where}: "
 
     def __str__(self) -> str:
         head = f"{self.place}{self.message}"
-        # Around the column, so that a line of a thousand characters does not hide the message.
+        # Show only a part of a long line around the column, so that it does not hide the message.
         is_long = len(self.text) > _SNIPPET_WIDTH
         start = max(0, self.column - 1 - _SNIPPET_WIDTH // 2) if is_long else 0
         cut = self.text[start : start + _SNIPPET_WIDTH]
@@ -135,7 +135,7 @@ class Problem:
 
 
 class _ProblemsError(OrthoflowError):
-    """Some problems, a line each or more; `problems` holds them for tools."""
+    """Several problems, one or more lines each; `problems` contains them as data."""
 
     def __init__(self, problems: tuple[Problem, ...]) -> None:
         self.problems = problems
@@ -147,7 +147,7 @@ class InvalidWorkflowError(_ProblemsError, WorkflowError):
 
 
 class UnusablePluginError(_ProblemsError, PluginError):
-    """A workflow is correct, but plugins it needs are not; `problems` names where it needs them."""
+    """A workflow is valid, but plugins it needs are not; `problems` lists where they are used."""
 
 
 class InvalidArgumentsError(_ProblemsError, ArgumentError):
@@ -156,13 +156,13 @@ class InvalidArgumentsError(_ProblemsError, ArgumentError):
 
 @dataclass
 class ProblemLog:
-    """Collects problems while a workflow is read.
+    """Collects the problems found while a workflow is read.
 
     Attributes:
-        file: the workflow file as the user named it.
-        lines: its text.
-        document: its values with their positions; empty before it is parsed.
-        unnamed: the first key of locations, if paths do not state it.
+        file: the workflow file as given by the user.
+        lines: lines of the file.
+        document: values with their positions; empty before parsing.
+        unnamed: first key of locations that is omitted in paths, if any.
     """
 
     file: str
@@ -172,27 +172,27 @@ class ProblemLog:
     _found: list[tuple[_Origin, Problem]] = field(default_factory=list)
 
     def parse(self, text: str) -> Document | None:
-        """Parse YAML; problems are added, None if nothing can be read."""
+        """Parse YAML; problems are added, and None is returned if nothing can be read."""
         found = read_yaml(text, self)
         self.document = found or NOTHING
         return found
 
     def beside(self, file: str, text: str) -> ProblemLog:
-        """Return a log of another file, whose problems are raised together with these."""
+        """Return a log for another file, whose problems are raised together with these."""
         return replace(
             self, file=file, lines=tuple(text.splitlines()), document=NOTHING, unnamed=""
         )
 
     @property
     def has_any(self) -> bool:
-        """Whether there is a problem besides missing input files."""
+        """Whether there are problems other than missing input files."""
         return any(origin != "input" for origin, _ in self._found)
 
     def add(self, position: Position, path: str, message: str) -> None:
         """Add a problem at a position.
 
         Raises:
-            InvalidWorkflowError: there are so many that the file must be something else.
+            InvalidWorkflowError: there are so many problems that the file cannot be a workflow.
         """
         self._add("file", self._at(position, path, message))
         if sum(origin == "file" for origin, _ in self._found) > MOST_PROBLEMS:
@@ -212,24 +212,24 @@ class ProblemLog:
         at_key: bool = False,
         shown: Location | None = None,
     ) -> None:
-        """Add a problem of the value, or of the key, at a location in the tree.
+        """Add a problem of the value, or of its key, at a location in the document.
 
         Args:
-            location: where it is in the tree.
+            location: location in the document.
             message: one sentence.
-            at_key: the position is that of the key.
-            shown: the path stated in the problem, if it differs.
+            at_key: whether to report the position of the key.
+            shown: path to show in the problem, if it differs from the location.
         """
         path = self.path(location if shown is None else shown)
         self.add(self.position(location, at_key=at_key), path, message)
 
     def report_plugin(self, location: Location, message: str) -> None:
-        """Add a problem of a plugin that the file needs here."""
+        """Add a problem of a plugin that is needed at a location."""
         problem = self._at(self.position(location), self.path(location), message)
         self._add("plugin", problem)
 
     def report_input(self, place: Problem | None, message: str) -> None:
-        """Add a problem of input files; the file itself decides the type of the error."""
+        """Add a problem of input files; it does not make the file itself invalid."""
         if len(self._found) < 2 * MOST_PROBLEMS:
             nowhere = Problem(file=self.file, message="")
             self._add("input", replace(place or nowhere, message=message))
@@ -239,12 +239,12 @@ class ProblemLog:
         self._add("option", Problem(file=option, message=message))
 
     def place(self, location: Location) -> Problem | None:
-        """Return a problem without its message; None if the value comes from no file."""
+        """Return an empty problem at a location; None if the value does not come from a file."""
         position = self.position(location)
         return self._at(position, self.path(location), "") if position.line else None
 
     def position(self, location: Location, *, at_key: bool = False) -> Position:
-        """Return the position of a value, or of its key; of a missing one what is around it."""
+        """Return the position of a value or its key; if missing, of the enclosing value."""
         return self.document.position(location, at_key=at_key)
 
     def path(self, location: Location) -> str:
@@ -253,7 +253,7 @@ class ProblemLog:
         return path_text(stated[1:] if stated[:1] == (self.unnamed,) else stated)
 
     def has(self, location: Location) -> bool:
-        """Whether there is a value at a location, be it null."""
+        """Whether there is a value at a location, even if it is null."""
         return self.document.resolve(location)[1] == location
 
     def get(self, location: Location) -> JsonValue:
@@ -261,18 +261,18 @@ class ProblemLog:
         return self.document.get(location)
 
     def raise_any(self) -> None:
-        """End with all problems found so far, if there are any.
+        """Raise an error with all problems found so far, if there are any.
 
         Raises:
             InvalidWorkflowError: the file has problems.
-            InvalidArgumentsError: only command-line options have.
-            UnusablePluginError: only plugins have.
+            InvalidArgumentsError: only command-line options have problems.
+            UnusablePluginError: only plugins have problems.
         """
         if self.has_any:
             self._raise()
 
     def _raise(self) -> NoReturn:
-        # Those of the command line stand last.
+        # Problems of command-line options come last.
         in_order = sorted(
             self._found,
             key=lambda one: ("" if one[0] == "option" else one[1].file, one[1].line, one[1].column),
@@ -299,18 +299,18 @@ class ProblemLog:
 def validate(
     model: type[Model], data: JsonValue, log: ProblemLog, location: Location = ()
 ) -> Model | None:
-    """Validate the content of a document; all mistakes are reported at their places.
+    """Validate the content of a document; all mistakes are reported at their positions.
 
-    The model is then made without the invalid parts, so that the following checks see the rest.
+    Invalid parts are then left out of the model, so that later checks can use the valid parts.
 
     Args:
-        model: the expected form.
-        data: the value at the location.
-        log: has the tree of the document, and receives the problems.
-        location: of the value in the tree.
+        model: expected model.
+        data: value at the location.
+        log: log of the document, to which problems are added.
+        location: location of the value in the document.
 
     Returns:
-        The model of all valid parts; None if the whole is invalid.
+        The model of all valid parts; None if the value as a whole is invalid.
     """
     data, is_first = deepcopy(data), True
     while True:
@@ -324,7 +324,7 @@ def validate(
         unfit = {existing(data, loc) for loc, _, _ in found}
         if () in unfit:
             return None
-        # Later items of a list first.
+        # Remove later list items first, so that indices remain valid.
         for *outer, last in sorted(
             unfit,
             key=lambda loc: (len(loc), [part for part in loc if isinstance(part, int)]),

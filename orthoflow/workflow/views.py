@@ -1,4 +1,4 @@
-"""A workflow for others: JSON for records, a JSON Schema for editors, and a flowchart."""
+"""Representations of a workflow: JSON for records, a JSON Schema for editors, a flowchart."""
 
 from __future__ import annotations
 
@@ -33,25 +33,25 @@ from orthoflow.workflow.model import (
     is_acyclic,
 )
 
-# Any: JSON.
+# `Any`: JSON.
 Schema: TypeAlias = dict[str, Any]
 _SWEEP: Final = {"$ref": "#/$defs/SweepSection"}
-# Parts of a parameter's schema that stay where editors look for them if a sweep may replace it.
+# Parts of a parameter's schema that remain at the top level if a sweep is allowed, for editors.
 _SHOWN: Final = ("description", "default")
 
 
 class _Untitled(GenerateJsonSchema):
-    """Without titles made of the names of fields, which are of no use to an editor."""
+    """Omits titles generated from field names, which are of no use in editors."""
 
     def field_title_should_be_set(self, schema: object) -> bool:
         return False
 
 
 def workflow_schema(catalog: Catalog) -> dict[str, JsonValue]:
-    """Return the schema, JSON Schema 2020-12, for editors and other programs.
+    """Return the JSON Schema (2020-12) of workflows, for editors and other programs.
 
-    Methods that cannot be loaded are left out. The schema is weaker than `load_workflow`: it
-    cannot know whether references and ports fit together.
+    Methods that cannot be loaded are omitted. The schema checks less than `load_workflow`: it does
+    not check whether references and ports match.
     """
     methods = list(_loadable(catalog))
     schema = WorkflowFile.model_json_schema(by_alias=True, schema_generator=_Untitled)
@@ -66,7 +66,7 @@ def workflow_schema(catalog: Catalog) -> dict[str, JsonValue]:
         properties = params.get("properties", {})
         params["properties"] = {name: _or_sweep(inner) for name, inner in properties.items()}
         defs[info.id] = _renamed(params, info)
-    # One rule per method, which steps and variants share.
+    # One definition per method, shared by steps and variants.
     defs["parameters"] = {
         "allOf": [
             {
@@ -88,7 +88,7 @@ def workflow_schema(catalog: Catalog) -> dict[str, JsonValue]:
         }
         section["allOf"] = [{"$ref": "#/$defs/parameters"}]
     call["required"] = ["use"]
-    # With variants, the keys of a call are in each of them.
+    # If there are variants, the keys of a call belong to each of them.
     step["oneOf"] = [
         {"required": ["use"], "properties": {"variants": False}},
         {
@@ -127,7 +127,7 @@ def _is_source(method: type[Method], catalog: Catalog) -> bool:
 
 
 def _renamed(schema: Any, info: type[Method]) -> Any:
-    """Update the references of a method's own definitions to their new place."""
+    """Update references to a method's own definitions, which have been renamed."""
     if isinstance(schema, dict):
         return {
             key: f"#/$defs/{info.id}.{value.rpartition('/')[2]}"
@@ -139,7 +139,7 @@ def _renamed(schema: Any, info: type[Method]) -> Any:
 
 
 def _or_sweep(schema: Schema) -> Schema:
-    """A value or a sweep."""
+    """Return a schema that also allows a sweep."""
     shown: Schema = {key: schema[key] for key in _SHOWN if key in schema}
     own = {key: value for key, value in schema.items() if key not in (*_SHOWN, "title")}
     choices = own.pop("anyOf") if set(own) == {"anyOf"} else [own]
@@ -147,14 +147,14 @@ def _or_sweep(schema: Schema) -> Schema:
 
 
 def _first_of(schema: Schema) -> Schema:
-    """Return it without `null`: a key that is present has a value."""
+    """Return the schema without `null`, because a key that is present must have a value."""
     choices = schema.pop("anyOf", [])
     chosen = [choice for choice in choices if choice.get("type") != "null"]
     return {**schema, **(chosen[0] if len(chosen) == 1 else {"anyOf": chosen})}
 
 
 def _name_keys(schema: Schema, *, is_needed: bool = False, taken: str = "") -> None:
-    """State which keys a mapping may have; pydantic states patterns that need not be met."""
+    """Restrict the keys of a mapping; in pydantic's schemas, `patternProperties` does not."""
     for patterns in (schema.pop("patternProperties", None),):
         if patterns:
             schema["additionalProperties"] = next(iter(patterns.values()))
@@ -170,12 +170,12 @@ def _name_keys(schema: Schema, *, is_needed: bool = False, taken: str = "") -> N
 
 
 def mermaid(workflow: Workflow, catalog: Catalog) -> str:
-    """Draw inputs, steps with their variants, and their connections, for Mermaid.
+    """Return a Mermaid flowchart of inputs, steps with variants, and connections.
 
-    Dotted edges may stay empty: the port has several candidates, or the input disables the step.
-    Ports that all methods of a step ignore are not drawn.
+    A dotted edge may be unused: the port has several candidates, or the input disables the step.
+    Ports that all methods of a step ignore are omitted.
     """
-    # Names may be words that Mermaid reserves, such as `end`; only the labels show them.
+    # Names may be reserved words of Mermaid, such as `end`, so they only appear in labels.
     nodes = {f"{INPUTS}.{name}": f"input{k}" for k, name in enumerate(workflow.inputs)}
     nodes |= {name: f"step{k}" for k, name in enumerate(workflow.steps)}
     lines = ["flowchart LR"]
@@ -204,7 +204,7 @@ def _call_label(variant: StepVariant) -> str:
 
 
 def _wires(step: WorkflowStep, catalog: Catalog) -> Iterator[tuple[str, str, str]]:
-    """Yield source, arrow and label of each wire of a step."""
+    """Yield source, arrow and label of each connection to a step."""
     taken = {
         port
         for variant in step.variants
@@ -219,7 +219,7 @@ def _wires(step: WorkflowStep, catalog: Catalog) -> Iterator[tuple[str, str, str
             yield f"{INPUTS}.{name}", "-.->", word
 
 
-# As records keep it -----------------------------------------------------------------------------
+# Resolved form in records -----------------------------------------------------------------------
 
 _STEP: Final = TypeAdapter(WorkflowStep)
 _PLACE: Final = "the resolved workflow"
@@ -243,7 +243,7 @@ _ResolvedName: TypeAlias = Annotated[str, AfterValidator(check_name)]
 
 
 class _Resolved(BaseModel):
-    """The form of a resolved workflow: a record may contain anything."""
+    """The resolved form of a workflow; untrusted, because it is read from records."""
 
     orthoflow: Literal[1]
     name: _ResolvedName
@@ -259,7 +259,7 @@ class _Resolved(BaseModel):
 def resolved_json(workflow: Workflow) -> str:
     """Return the workflow with all defaults and overrides as canonical JSON.
 
-    Paths from the command line are reduced to their last part: records contain no paths of the
+    Paths from the command line are reduced to their last part: records contain no folders of the
     machine on which they were made.
     """
     document: dict[str, object] = {
@@ -292,7 +292,7 @@ def resolved_json(workflow: Workflow) -> str:
 
 def _input_json(spec: WorkflowInputSpec) -> JsonValue:
     def recorded(name: str) -> str:
-        # A table, unlike the workflow, is not in the record with its folders.
+        # A record contains the text of the workflow with its paths, but not the table of datasets.
         is_private = spec.is_given or (spec.table and Path(name).is_absolute())
         return Path(name).name if is_private else name
 
@@ -300,14 +300,14 @@ def _input_json(spec: WorkflowInputSpec) -> JsonValue:
 
 
 def workflow_from_resolved(resolved: str, source: str) -> Workflow:
-    """Build a workflow that was checked and resolved before; plugins are not needed.
+    """Restore a workflow that has been checked and resolved before; plugins are not needed.
 
     Args:
-        resolved: result of `resolved_json`.
+        resolved: JSON text from `resolved_json`.
         source: text of the workflow file as written.
 
     Raises:
-        WorkflowError: the text is not a resolved workflow, or one of a newer format.
+        WorkflowError: the text is not a resolved workflow, or is of a newer format.
     """
     try:
         workflow = _from_resolved(_Resolved.model_validate_json(resolved, strict=True), source)
@@ -345,10 +345,10 @@ def _from_resolved(document: _Resolved, source: str) -> Workflow:
 
 
 def _check_resolved(workflow: Workflow) -> None:
-    """Repeat the checks of a file, since a record may have been changed.
+    """Repeat the checks of a workflow file, since a record may have been changed.
 
     Raises:
-        ValueError: a value is out of range, or names something that does not exist.
+        ValueError: a value is out of range, or refers to something that does not exist.
     """
     factors = factors_of(workflow)
     for dataset in workflow.datasets.values():
