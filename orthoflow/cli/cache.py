@@ -40,7 +40,7 @@ cache: Final[click.Command] = LazyGroup(
 def cache_list(store: Path, *, as_json: bool) -> int:
     """List the stored results, last used first.
 
-    Equal products of several results are stored once, but count for each.
+    A product shared by several results is stored once, but counted for each.
     """
     from orthoflow.engine.store import Store, list_results
 
@@ -77,7 +77,7 @@ def cache_list(store: Path, *, as_json: bool) -> int:
 @click.option("--dry-run", is_flag=True, help="Only show what would be removed.")
 @json_option
 def cache_gc(store: Path, older_than: float | None, *, dry_run: bool, as_json: bool) -> int:
-    """Remove incomplete results, products that no result needs, and what killed runs left."""
+    """Remove incomplete results, products that no result needs, and remains of killed runs."""
     from orthoflow.engine.cleaning import collect_garbage
     from orthoflow.engine.store import Store
 
@@ -100,8 +100,8 @@ def cache_gc(store: Path, older_than: float | None, *, dry_run: bool, as_json: b
 def cache_verify(store: Path, *, as_json: bool) -> int:
     """Check every byte of the stored results, products, published files and figures.
 
-    What is damaged is removed: the next run that needs it computes it again. Ends with 3 when
-    something was damaged. Runs may use the store meanwhile.
+    Damaged parts are removed; the next run that needs them recomputes them. The exit code is 3 if
+    anything was damaged. Runs may use the store at the same time.
     """
     from orthoflow.engine.cleaning import check_store
     from orthoflow.engine.store import Store

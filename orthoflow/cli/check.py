@@ -1,4 +1,4 @@
-"""`orthoflow check`: report everything that is wrong with a workflow file."""
+"""`orthoflow check`: report all mistakes in a workflow file."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from orthoflow.errors import OrthoflowError
 @workflow_arguments
 @json_option
 def check(workflow: str, changes: Changes, *, as_json: bool) -> int:
-    """Report everything that is wrong with WORKFLOW, a file or the name of a shipped one.
+    """Report all mistakes in WORKFLOW, a file or the name of a shipped one.
 
-    Every problem is named in one pass, as file:line:column: path: message; input files are looked
-    for as well. Warnings name what is allowed but hardly intended. Ends with 2 when something is
-    wrong, with 4 when a plugin is missing.
+    All problems are reported in one pass, as file:line:column: path: message; input files are
+    searched for as well. Warnings mark valid but probably unintended settings. The exit code is 2
+    if there are mistakes, and 4 if a plugin is missing.
     """
     try:
         summary, warnings = _check(workflow, changes)
@@ -37,7 +37,7 @@ def check(workflow: str, changes: Changes, *, as_json: bool) -> int:
 
 
 def _check(workflow: str, changes: Changes) -> tuple[str, tuple[str, ...]]:
-    """Return a workflow without mistakes in a sentence, and what is probably a mistake in it."""
+    """Return a summary of a valid workflow, and the probable mistakes in it."""
     from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.workflow.checks import lint_workflow
     from orthoflow.workflow.expand import expand_cells, is_plain, variants_text
@@ -52,7 +52,7 @@ def _check(workflow: str, changes: Changes) -> tuple[str, tuple[str, ...]]:
     n_data = len(loaded.chosen_data)
     datasets = f"{counted(n_data, 'dataset')}, " if n_data else ""
     n_runs = "" if is_plain(cells) else f", {datasets}run {counted(len(cells), 'time')} in all"
-    # The variants with which others are compared: in a sweep, the user chose none.
+    # In a sweep, the user chose no baseline, so none is shown.
     named = variants_text(loaded.baseline)
     summary = (
         f"{loaded.name} is fine: {counted(len(loaded.steps), 'step')}"

@@ -1,4 +1,4 @@
-"""What commands are made of: lazy groups, shared options, errors as sentences and exit codes."""
+"""Building blocks of commands: lazy groups, shared options, error messages and exit codes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 DEBUG_HELP: Final = "Show tracebacks of errors."
-# Of each command, as click keeps what the first call of a command has found.
+# Per command, because click caches the help option that the first call creates.
 HELP_OPTIONS: Final = {"help_option_names": ["-h", "--help"]}
 
 
@@ -35,8 +35,8 @@ class Session:
     """State of one call of the program.
 
     Attributes:
-        debug: show tracebacks.
-        resume_hint: sentence that states how to go on after Ctrl-C, empty when there is no way.
+        debug: whether to show tracebacks.
+        resume_hint: sentence on how to continue after Ctrl-C; empty if that is not possible.
     """
 
     debug: bool = False
@@ -44,14 +44,14 @@ class Session:
 
 
 def current_session() -> Session:
-    """Return the session of the running command; one of its own for a command called alone."""
+    """Return the session of the running command, or a new one if it is called on its own."""
     context = click.get_current_context(silent=True)
     session = context.find_object(Session) if context is not None else None
     return session if session is not None else Session()
 
 
 def command_again(output: Path) -> str:
-    """Write the running command as a shell takes it, with a folder after -o."""
+    """Return the running command as a shell command line, with this folder after -o."""
     context = click.get_current_context()
     words = [context.command_path]
     for item in context.command.params:
@@ -68,30 +68,31 @@ def command_again(output: Path) -> str:
 
 
 def debug_parameter() -> click.Option:
-    """Return the `--debug` flag, which may stand before or behind the name of a command."""
+    """Return the `--debug` flag, which is accepted before and after the name of a command."""
     return click.Option(
         ["--debug"], is_flag=True, expose_value=False, callback=_keep_debug, help=DEBUG_HELP
     )
 
 
 class Command(click.Command):
-    """A command that also takes `--debug` behind its name."""
+    """A command that accepts `--debug` after its name."""
 
-    # Any: click passes its own keyword arguments through.
+    # Any: keyword arguments are passed on to click.
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **{"context_settings": HELP_OPTIONS, **kwargs})
         self.params.append(debug_parameter())
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse the arguments; where a shell took a list apart, report it."""
+        """Parse the arguments; report if the shell split a list into several arguments."""
         given = list(args)
         try:
             return super().parse_args(ctx, args)
         except click.UsageError as error:
             broken = (one for one in given if one.count("[") > one.count("]"))
             found = next(broken, "")
-            # Behind a space, a negative number looks like an option, any other like an argument,
-            # of which click has no error of its own.
+            # A list that the shell split leaves a negative number that looks like an option, or
+            # another number that looks like an argument; click has no error class of its own for
+            # the latter.
             is_number = isinstance(error, click.NoSuchOption) and error.option_name[1:2].isdigit()
             if not found or not (is_number or type(error) is click.UsageError):
                 raise
@@ -103,13 +104,14 @@ class Command(click.Command):
 
 
 class RecordCommand(Command):
-    """A command whose arguments are runs: what fails on a damaged record is reported as its fault.
+    """A command whose arguments are runs; errors due to a damaged record are reported as such.
 
-    Reading checks the form of a record, not whether its parts agree; verifying does.
+    Reading checks the format of a record; only verification checks whether its parts are
+    consistent.
     """
 
     def invoke(self, ctx: click.Context) -> object:
-        """Run the command; where it fails on what a record holds, report what is wrong with it."""
+        """Run the command; if it fails, report what is wrong with its records."""
         try:
             return super().invoke(ctx)
         except (GeometryError, ProductError) as error:
@@ -132,18 +134,19 @@ class RecordCommand(Command):
 
 
 class LazyGroup(click.Group):
-    """A group whose `--help` lists summaries without importing a single command.
+    """A group whose `--help` lists summaries without importing the commands.
 
     Args:
-        summaries: name of a command -> one line, in the order of work.
-        target: where the commands are, `package.module:attribute`; `{}` stands for the name.
+        summaries: name of a command -> one line, in the order of the help.
+        target: import string of the commands, `package.module:attribute`; `{}` is replaced by the
+            name.
     """
 
-    # Any: click passes its own keyword arguments through.
+    # Any: keyword arguments are passed on to click.
     def __init__(
         self, *args: Any, summaries: Mapping[str, str], target: str, **kwargs: Any
     ) -> None:
-        # Click wants a callback on a group, though nothing happens before its command.
+        # Click requires a callback for a group, although it does nothing.
         super().__init__(
             *args, **{"callback": lambda: None, "context_settings": HELP_OPTIONS, **kwargs}
         )
@@ -151,7 +154,7 @@ class LazyGroup(click.Group):
         self._target = target
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Return the names in the order of the table, which is the order of work."""
+        """Return the names of the commands in the order of the table."""
         return list(self._summaries)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
@@ -165,7 +168,7 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find the command, and suggest which one was probably meant when there is none."""
+        """Find the command; if it does not exist, suggest similar names."""
         if args and self.get_command(ctx, args[0]) is None:
             from orthoflow.errors import nearest
 
@@ -175,7 +178,7 @@ class LazyGroup(click.Group):
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the list of commands from the table."""
+        """Write the list of commands."""
         with formatter.section("Commands"):
             formatter.write_dl(list(self._summaries.items()))
 
@@ -194,7 +197,7 @@ DEFAULT_STORE: Final = Path(".orthoflow")
 
 @dataclass(frozen=True, kw_only=True)
 class Changes:
-    """What the command line puts in the place of what a workflow file states."""
+    """Settings of the command line that override those of a workflow file."""
 
     sets: tuple[str, ...]
     inputs: tuple[str, ...]
@@ -203,16 +206,16 @@ class Changes:
     set_files: tuple[str, ...] = ()
 
     def load(self, workflow: str, catalog: Catalog) -> Workflow:
-        """Load the workflow with these changes, see `load_workflow` for what may be wrong."""
+        """Load the workflow with these changes; `load_workflow` documents the errors."""
         from orthoflow.workflow.document import load_workflow
 
         return load_workflow(workflow, catalog, also_files=True, **vars(self))
 
 
 def workflow_arguments(run: Callable[..., int]) -> Callable[..., int]:
-    """Add the workflow and `changes` to it: `WORKFLOW --set --set-file --input --datasets ...`."""
+    """Add WORKFLOW and `changes`: `WORKFLOW --set --set-file --input --datasets ...`."""
 
-    # Any: the command's parameters, whose types click has checked.
+    # Any: parameters of the command, whose types click has checked.
     @wraps(run)
     def command(**given: Any) -> int:
         changes = Changes(**{item.name: given.pop(item.name) for item in fields(Changes)})
@@ -237,7 +240,7 @@ input_option = click.option(
     "inputs",
     multiple=True,
     metavar="NAME=PATH",
-    help="Give an input: a file, a folder or a quoted glob, relative to the current folder.",
+    help="Set an input: a file, a folder or a quoted glob, relative to the working directory.",
 )
 store_option = click.option(
     "--store",
@@ -262,60 +265,60 @@ _workflow_options = _together(
         "set_files",
         multiple=True,
         metavar="FILE",
-        help="Change the parameters that a YAML file names: step.parameter: value.",
+        help="Change parameters as listed in a YAML file, as step.parameter: value.",
     ),
     input_option,
     click.option(
         "--datasets",
         default="",
         metavar="FILE",
-        help="Run on each dataset of a CSV file: the column name, and a column per input.",
+        help="Run on each dataset of a CSV file with a column name and a column per input.",
     ),
     click.option(
         "--only-data",
         "only_data",
         multiple=True,
         metavar="NAMES",
-        help="Run on these of the datasets, with commas between their names.",
+        help="Run only on these datasets; comma-separated names.",
     ),
 )
-#: the options that choose steps
+#: options that select steps
 selection_options = _together(
     *(
         click.option(option, name, metavar="STEP", multiple=True, help=f"{text} Repeatable.")
         for option, name, text in (
-            ("--only", "only", "Run this step, and what it needs and is not stored."),
+            ("--only", "only", "Run this step and the steps that it needs, unless stored."),
             (
                 "--from",
                 "from_",
-                "Run this step, what follows, and what these need and is not stored.",
+                "Run this step, all that depend on it, and steps that these need, unless stored.",
             ),
             (
                 "--until",
                 "until",
-                "Run this step and what it needs; what is stored is not computed again.",
+                "Run this step and all steps that it needs; stored results are not recomputed.",
             ),
-            ("--force", "force", "Run this step although its result is stored."),
+            ("--force", "force", "Run this step even if its result is already stored."),
         )
     )
 )
-#: how steps run
+#: options for the execution of steps
 execution_options = _together(
     click.option(
-        "--jobs", type=int, default=1, metavar="N", help="Steps that run at the same time."
+        "--jobs", type=int, default=1, metavar="N", help="Number of steps that run in parallel."
     ),
     click.option(
         "--executor",
         type=click.Choice(["local", "inline", "dask"]),
         default="local",
-        help="A process per step, all in this one (for debugging; a step's memory then "
-        "includes that of earlier ones), or on the workers of dask.",
+        help="One process per step, all steps in this process (for debugging; the memory of a "
+        "step then includes that of earlier ones), or dask workers.",
     ),
     click.option(
         "--scheduler",
         default="",
         metavar="ADDRESS",
-        help="With dask: the cluster's scheduler, tcp://HOST:PORT; without it, N workers here.",
+        help="With dask: address of the scheduler, tcp://HOST:PORT; by default, N local workers.",
     ),
     click.option(
         "--retries",
@@ -323,19 +326,19 @@ execution_options = _together(
         default=2,
         show_default=True,
         metavar="N",
-        help="With dask: how often a step is repeated after its worker was lost.",
+        help="With dask: how often a step is repeated after losing its worker.",
     ),
 )
 
 
 def output_option(name: str) -> Callable[[_Decorated], _Decorated]:
-    """Add `-o`; `name` is the folder's name where none is given."""
+    """Add `-o`; `name` is the name of the default folder."""
     return click.option(
         "-o",
         "--output",
         type=click.Path(path_type=Path, file_okay=False),
         metavar="RUNDIR",
-        help=f"Folder of this run.  [default: runs/{name}]",
+        help=f"Run folder.  [default: runs/{name}]",
     )
 
 
@@ -393,23 +396,23 @@ def _sentences(error: OrthoflowError) -> list[str]:
     n_problems = len(getattr(error, "problems", ()))
     if not n_problems:
         return [f"error: {error_text(error)}"]
-    # Lines that begin with file:line:column, as editors and other tools expect them.
+    # Lines that begin with file:line:column, which editors and other tools parse.
     return [*str(error).split("\n"), f"error: {counted(n_problems, 'problem')}"]
 
 
 def error_text(error: Exception) -> str:
-    """Return the sentence of an error; `str` of an OSError without arguments would be empty."""
+    """Return the message of an error; `str` of an OSError without arguments would be empty."""
     return str(error) or type(error).__name__
 
 
 def echo_error(*lines: str) -> None:
-    """Write lines to standard error; ignore a closed one."""
+    """Write lines to standard error; ignore a closed stream."""
     with contextlib.suppress(BrokenPipeError):
         echo(*lines, err=True)
 
 
 def echo_lint(workflow: Workflow) -> None:
-    """Write to standard error what is allowed in a workflow but probably a mistake."""
+    """Write probable mistakes in a valid workflow to standard error."""
     from orthoflow.workflow.checks import lint_workflow
 
     for warning in lint_workflow(workflow):
@@ -417,7 +420,7 @@ def echo_lint(workflow: Workflow) -> None:
 
 
 def code_for(findings: Iterable[str], consequence: str) -> int:
-    """Report records that are not as they were written, and return the exit code."""
+    """Report records that were changed, and return the exit code."""
     lines = [f"error: {one}; {consequence}" for one in findings if one]
     if not lines:
         return EXIT_GOOD
@@ -426,7 +429,7 @@ def code_for(findings: Iterable[str], consequence: str) -> int:
 
 
 def silence_stdout() -> None:
-    """Send what is still to be printed nowhere, so that a closed pipe makes no noise at exit."""
+    """Discard further output, so that a closed pipe causes no error at exit."""
     with contextlib.suppress(OSError, ValueError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 Value = TypeVar("Value")
 _NOTHING: Final = "-"
 _READDRESSED_MOST: Final = 3
-# What JSON has of each run.
+# Fields of each run in JSON.
 _OF_RUNS: Final = ("run_id", "name", "created_by", "status", "started", "ended", "seed")
 
 
@@ -47,19 +47,19 @@ _OF_RUNS: Final = ("run_id", "name", "created_by", "status", "started", "ended",
 @click.argument("first", metavar="A", type=click.Path(path_type=Path))
 @click.argument("second", metavar="B", type=click.Path(path_type=Path))
 @store_option
-@click.option("--all", "is_whole", is_flag=True, help="Print every row that differs, rounding too.")
+@click.option("--all", "is_whole", is_flag=True, help="Print every difference, including rounding.")
 @json_option
 def compare(first: Path, second: Path, store: Path, *, is_whole: bool, as_json: bool) -> int:
     """Compare the runs A and B, run folders or their run.h5.
 
-    Shows the differences of inputs, workflows, parameters, versions and environments, and how far
-    metrics and products differ. A parameter with * was set, others are defaults. Steps are
-    paired by address, else by methods and parameters of everything that varies before them; what
-    only one run has is counted separately. Of long tables the first rows are printed, of metrics
-    those that show how good results are; differences by rounding (a millionth) are left out, and
-    equal differences of many steps or repeats are one row. --json also has what is equal. Ends
-    with 3 where the seal of a record does not hold; large arrays, which are not read where
-    digests are equal, are checked by `orthoflow verify`.
+    Shows differences in inputs, workflows, parameters, versions and environments, and how far
+    metrics and products differ. An asterisk marks a parameter that was set; the others are
+    defaults. Steps are paired by address, or else by the methods and parameters of all varied steps
+    before them; steps of one run only are counted separately. Long tables are truncated, and tables
+    of metrics show those that measure quality; differences by rounding (a millionth) are omitted,
+    and identical differences of several steps or repeats share a row. --json also contains values
+    without differences. The exit code is 3 if the seal of a record is broken; `orthoflow verify`
+    also checks large arrays, which are not read here if their digests are the same.
     """
     from orthoflow.engine.store import stores_at
     from orthoflow.records.compare import compare_runs
@@ -77,7 +77,7 @@ def compare(first: Path, second: Path, store: Path, *, is_whole: bool, as_json: 
 
 
 def comparison_json(comparison: RunComparison) -> dict[str, object]:
-    """Return a comparison as JSON; every row states whether both sides are the same."""
+    """Return a comparison as JSON; every row contains whether both values are the same."""
     return {
         "runs": [
             {name: getattr(record, name) for name in _OF_RUNS}
@@ -145,15 +145,16 @@ def _print_pairs(
     step_of: Mapping[str, str] | None = None,
     whose: str = "",
 ) -> None:
-    """Print the rows that differ under a title, what both have first, or that none does.
+    """Print the rows that differ under a title, or that none differs; rows of both runs first.
 
     Args:
-        title: what they are.
-        rows: all.
-        text: how a side is written.
-        most: rows that are printed, equal differences of a step as one; all of them without it.
-        step_of: the step of each cell.
-        whose: of which steps the rows are, if not of all.
+        title: name of the kind of values.
+        rows: all rows.
+        text: formats the value of one run.
+        most: maximum number of rows to print, with identical differences of a step grouped; None
+            for all.
+        step_of: step of each cell.
+        whose: steps to which the rows are restricted; empty for all.
     """
     from orthoflow.report.differences import RowGroup, grouped_rows
 
@@ -185,7 +186,7 @@ def _print_pairs(
 
 # Any: rows of all kinds.
 def _counts(rows: Sequence[Pair[Any]]) -> str:
-    """Count the rows in which the runs differ, and in how many by rounding."""
+    """Return in how many rows the runs differ, and in how many of these by rounding only."""
     from orthoflow.records.compare import Difference
 
     found = Difference.of(rows)
@@ -198,7 +199,7 @@ def _counts(rows: Sequence[Pair[Any]]) -> str:
 
 
 def _differing_parts(pair: Pair[CellFacts]) -> Pair[str]:
-    """Describe the sides of a step by what differs; a step of one run by status and method."""
+    """Describe how a step differs; a step of one run only by its status and method."""
     left, right = pair.left, pair.right
     sides: list[str | None] = []
     for ours, theirs in ((left, right), (right, left)):
@@ -224,7 +225,7 @@ def _parameter_text(parameter: ParameterValue) -> str:
 
 
 def _print_metrics(comparison: RunComparison, most: int | None) -> None:
-    """Print metrics that differ by more than rounding; times and memory apart and last."""
+    """Print metrics that differ by more than rounding; times and memory separately at the end."""
     from orthoflow.report.differences import RowGroup, grouped_rows, moved_first
 
     measured, step_of = comparison.measured, comparison.step_of

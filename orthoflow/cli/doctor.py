@@ -1,4 +1,4 @@
-"""`orthoflow doctor`: what is installed, what is missing, and what that costs."""
+"""`orthoflow doctor`: show what is installed, what is missing, and the consequences."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _COMFORTABLE_DISK_BYTES: Final = 5 * 1024**3
 _COMFORTABLE_MEMORY_BYTES: Final = 2 * 1024**3
 
 _EVERYTHING: Final = "everything"
-# Distribution on the package index -> the module that is imported, and what needs it.
+# Distribution on the package index -> imported module, and features that need it.
 LIBRARIES: Final[Mapping[str, tuple[str, str]]] = {
     "click": ("click", _EVERYTHING),
     "h5py": ("h5py", _EVERYTHING),
@@ -74,17 +74,17 @@ LIBRARIES: Final[Mapping[str, tuple[str, str]]] = {
 _CORE: Final = frozenset(
     (*(name for name, (_, use) in LIBRARIES.items() if use == _EVERYTHING), "jinja2", "rich")
 )
-# What a plain installation lacks, and how `pip install` names it.
+# Optional packages, with the extras that `pip install` needs.
 _EXTRAS: Final = {"cryptography": "cryptography[ssh]", "distributed": "distributed"}
-# Part of the message of an import that fails -> the system package that is missing.
+# Part of the message of a failed import -> missing system package.
 _SYSTEM_PACKAGES: Final = {
     "libGL.so": "libgl1",
     "libX11.so": "libx11-6",
     "libusb": "libusb-1.0-0",
     "libgomp": "libgomp1",
 }
-# The wheel of open3d needs libusb-1.0.so.0, which libusb-package carries: loaded globally, it is
-# found when open3d is imported.
+# The wheel of open3d needs libusb-1.0.so.0, which libusb-package contains; loading it globally
+# makes it available to open3d.
 _OPEN3D_PRELUDE: Final = """
 import ctypes
 try:
@@ -99,15 +99,15 @@ Verdict = Literal["ok", "limited", "missing"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at.
+    """Result of one check.
 
     Attributes:
-        name: what was looked at.
-        verdict: ok, limited (works, with a restriction) or missing.
+        name: name of the checked item.
+        verdict: ok, limited (works with a restriction) or missing.
         found: version, size or setting.
-        cost: what does not work because of it, and what to do; empty when ok.
-        use: what needs it, where that is a library.
-        is_core: orthoflow cannot work without it.
+        cost: consequence and remedy; empty if ok.
+        use: features that need it, for libraries.
+        is_core: whether orthoflow cannot work without it.
     """
 
     name: str
@@ -124,15 +124,15 @@ class Finding:
 def doctor(store: Path, *, as_json: bool) -> int:
     """Show what is installed, what is missing, and the consequences.
 
-    Ends with 4 when something is missing without which nothing works.
+    The exit code is 4 if something essential is missing.
     """
-    # A library that is broken may crash the process that imports it.
+    # A broken library may crash the process that imports it.
     with ThreadPoolExecutor(max_workers=max(2, os.cpu_count() or 1)) as pool:
         libraries = list(pool.map(_library, LIBRARIES))
     findings = [*_machine(), *_store(store), *libraries, *_plugins()]
     is_broken = any(item.is_core and item.verdict == "missing" for item in findings)
     if as_json:
-        # As the columns of the table are called.
+        # Same names as the columns of the table.
         keys = {"use": "for", "is_core": "core"}
         listed = [
             {keys.get(name, name): value for name, value in vars(item).items()} for item in findings
@@ -210,7 +210,7 @@ def _machine() -> Iterator[Finding]:
 
         n_bytes = psutil.virtual_memory().available
     except (ImportError, OSError):
-        # A library that is missing is a finding of its own.
+        # A missing library is reported separately.
         yield Finding("memory", "limited", "unknown", "cannot be measured")
         return
     cost = "scans of many millions of points will not fit"
@@ -218,7 +218,7 @@ def _machine() -> Iterator[Finding]:
 
 
 def _enough(name: str, n_bytes: int, comfortable_bytes: int, found: str, cost: str) -> Finding:
-    """Return whether there is enough of something."""
+    """Return the finding on whether there is enough of a resource."""
     text = f"{n_bytes / 1024**3:.1f} GiB {found}"
     return (
         Finding(name, "ok", text)

@@ -1,4 +1,4 @@
-"""`orthoflow export`: write a run's results in the formats of other programs."""
+"""`orthoflow export`: write the results of a run in formats of other programs."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
     from orthoflow.records.runs import Run
 
 _Command = TypeVar("_Command", bound=Callable[..., Any] | click.Command)
-# In the run's folder, with a folder per format.
+# Subfolder of the run folder, with a folder per format.
 _EXPORT_FOLDER: Final = "export"
 
 
 class _Scale(click.IntRange):
-    """The N of a scale 1:N, given as N or as 1:N."""
+    """The N of a scale 1:N, entered as N or as 1:N."""
 
-    # Any: as click has it.
+    # Any: as declared by click.
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
         text: Any = value.replace(" ", "").removeprefix("1:") if isinstance(value, str) else value
         return int(super().convert(text, param, ctx))
@@ -39,9 +39,9 @@ _STEPWISE: Final = (
 )
 
 
-# Any: an option takes what click takes.
+# Any: options accept any click parameter.
 def _for(formats: str, *names: str, help: str, **more: Any) -> Callable[[_Command], _Command]:
-    """Add an option that belongs to some formats only."""
+    """Add an option that applies to some formats only."""
     text = f"{formats.replace(' ', ', ')}: {help}"
     return click.option(*names, cls=FormatOption, formats=formats.split(), help=text, **more)
 
@@ -51,14 +51,13 @@ _HELP: Final = "\n\n".join(
         "Write the results of RUN, a run folder or its run.h5, for other programs.",
         *(f"{name}: {entry.summary}." for name, entry in FORMATS.items()),
         (
-            "--embed: run.h5 alone, which can be verified and replayed without any "
-            "other file; missing parts come from the store and from the input files, found "
-            "by content, under "
-            "any name: where --input points, else as `replay` finds them."
+            "--embed: only run.h5, which can be verified and replayed without any other file. "
+            "Missing parts are taken from the store and from the input files, which are located "
+            "by their content: at the paths given with --input, or else as by `replay`."
         ),
         (
-            "--split: of a run on several datasets, a run "
-            "folder for each, with record, report and products."
+            "--split: for a run on several datasets, a run folder for each, with record, report "
+            "and products."
         ),
     ]
 )
@@ -66,17 +65,17 @@ _HELP: Final = "\n\n".join(
 
 @click.command(cls=RecordCommand, help=_HELP)
 @click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
-@click.option("--to", "target", type=click.Choice(list(FORMATS)), help="What to write.")
+@click.option("--to", "target", type=click.Choice(list(FORMATS)), help="Format to write.")
 @click.option(
     "--embed",
     is_flag=True,
-    help="Write a self-contained record with every product and input file; by itself, or instead "
-    "of the record with --to ro-crate.",
+    help="Write a self-contained record with every product and input file; with --to ro-crate, it "
+    "replaces the record in the crate.",
 )
 @click.option(
     "--split",
     is_flag=True,
-    help="Write a run folder per dataset, whose record can be verified and replayed by itself.",
+    help="Write a run folder per dataset, with a record that can be verified and replayed alone.",
 )
 @input_option
 @store_option
@@ -86,67 +85,65 @@ _HELP: Final = "\n\n".join(
     "--cell",
     "cell",
     metavar="ADDRESS",
-    help="the step whose results are written; by default the last one that has them (figures: all "
-    "steps).",
+    help="step whose results are written; by default the last one that has results of this type "
+    "(figures: all steps).",
 )
 @_for(
     "ro-crate",
     "--license",
     "license_text",
     metavar="URL",
-    help="the license of the results, its URL or name.",
+    help="license of the results, as URL or name.",
 )
 @_for(
     "ro-crate",
     "--author",
     metavar="NAME",
-    help="who made the results: a name, https://orcid.org/..., or both, the name first.",
+    help="author of the results: name, https://orcid.org/..., or both, name first.",
 )
 @_for(
     _DRAWN,
     "--scale",
     type=_Scale(min=1, max=100_000),
     metavar="N",
-    help="draw at 1:N (50 or 1:50); by default the largest usual scale at which each drawing fits "
-    "onto one sheet.",
+    help="scale 1:N (50 or 1:50); by default the largest common scale at which each drawing fits "
+    "on one sheet.",
 )
 @_for(
     _DRAWN,
     "--paper",
     metavar="PAPER",
-    help="A0 to A4, a long one as A3.1 (297 x 841 mm), or width x height in mm as 700x500; by "
-    "default the smallest that takes each drawing on one sheet (without --scale at most A3).",
+    help="A0 to A4, an elongated size as A3.1 (297 x 841 mm), or width x height in mm as 700x500; "
+    "by default the smallest on which each drawing fits (without --scale at most A3).",
 )
 @_for(
     "plan section sheet",
     "--grid",
     type=click.FloatRange(min=0.0),
     metavar="DISTANCE",
-    help="distance of the crosses with coordinates in --units, 0 for none; by default about 2 cm "
-    "on the paper.",
+    help="spacing of the grid crosses in --units, 0 for none; by default about 2 cm on the paper.",
 )
 @_for(
     "sheet",
     "--units",
     type=click.Choice(["m", "ft"]),
-    help="unit of coordinates, heights and the scale bar; m by default. With ft the usual scales "
-    "are 1:48 (1/4 inch to the foot) and so on.",
+    help="unit of coordinates, heights and scale bar; m by default. With ft, the common scales are "
+    "1:48 (1/4 inch to the foot) and so on.",
 )
 @_for(
     _DRAWN,
     "--title-block",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="YAML file with any of project, title, site, client, organisation, author, checked_by, "
-    "date, drawing, revision, note, logo, fields, revisions, layout (column or strip).",
+    help="YAML file with any of the fields project, title, site, client, organisation, author, "
+    "checked_by, date, drawing, revision, note, logo, fields, revisions, layout (column or strip).",
 )
 @_for(
     "sheet",
     "--beside",
     multiple=True,
     type=click.Choice(["depth", "intensity"]),
-    help="show depth as contours, or the laser intensity, beside the orthoimage; can be given "
-    "twice.",
+    help="show depth contours or the laser intensity beside the orthoimage; repeatable.",
 )
 @_for(
     "plan",
@@ -155,17 +152,17 @@ _HELP: Final = "\n\n".join(
     type=float,
     multiple=True,
     metavar="METRES",
-    help="height of the cut above the floor, 1.2 by default; can be given several times.",
+    help="height of the cut above the floor, 1.2 by default; repeatable.",
 )
 @_for(
     "section",
     "--through",
     multiple=True,
     metavar="X,Y,X,Y",
-    help="two points of the plan, metres in the coordinates of the scan; the viewer has the first "
-    "on the left; can be given several times.",
+    help="two points of the plan, in metres in scan coordinates; seen by the viewer, the first is "
+    "on the left; repeatable.",
 )
-@_for("plan section", "--dimensions", is_flag=True, help="write lengths beside the lines.")
+@_for("plan section", "--dimensions", is_flag=True, help="write lengths next to the lines.")
 @_for(
     _DRAWN,
     "--language",
@@ -176,14 +173,14 @@ _HELP: Final = "\n\n".join(
     "relief",
     "--light",
     metavar="AZIMUTH,ALTITUDE",
-    help="direction of the light in degrees: clockwise from the top on the wall, and altitude "
-    "above its plane; 315,25 (top left) by default.",
+    help="direction of the light in degrees: azimuth on the wall, clockwise from the top, and "
+    "altitude above its plane; 315,25 (top left) by default.",
 )
 @_for(
     "iiif",
     "--base-url",
     metavar="URL",
-    help="where the folder will be published, e.g. https://example.org/room; "
+    help="address at which the folder will be published, e.g. https://example.org/room; "
     "http://localhost:8000 by default.",
 )
 @_for(
@@ -191,49 +188,52 @@ _HELP: Final = "\n\n".join(
     "--format",
     "figure_format",
     type=click.Choice(["pdf", "svg", "png"]),
-    help="format of charts and drawings, png at 300 dpi; svg by default. Pictures become pages of "
-    "a PDF, and stay PNG otherwise.",
+    help="format of charts and drawings, png with 300 dpi; svg by default. Pictures are written as "
+    "PDF pages with pdf, and as PNG otherwise.",
 )
 @_for(
     _CLOUDS,
     "--colour",
     type=click.Choice(["photos", "rgb", "intensity", "plane", "deviation"]),
-    help="the colours are of the oriented photos (grey where none sees the point), of the scan, "
-    "its intensity, a colour per plane, or blue behind and red in front of the plane; by default "
-    "the first of these that is available.",
+    help="colours from the oriented photos (grey if no photo shows the point), colours of the "
+    "scan, its intensity, a colour per plane, or blue behind and red in front of the plane; by "
+    "default the first of these that is available.",
 )
 @_for(
     f"{_CLOUDS} dxf geojson gltf tiles relief iiif sheet",
     "--wall",
     type=click.IntRange(min=0),
     metavar="K",
-    help="only wall K, as its files are numbered; of a cloud only the points over its raster.",
+    help="only the wall with number K, as in file names; for clouds, only points in its raster.",
 )
 @_for(
     _CLOUDS,
     "--box",
     metavar="X,Y,Z,X,Y,Z",
-    help="only points between two corners, in the coordinates of the scan, metres.",
+    help="only points in the box between two corners, metres in scan coordinates.",
 )
 @_for(
     _CLOUDS,
     "--clean",
     is_flag=True,
-    help="without points that have fewer than ten neighbours.",
+    help="omit isolated points, with fewer than ten neighbours.",
 )
 @_for(
-    "gltf", "--relief", is_flag=True, help="walls with the relief of their depths, not as planes."
+    "gltf",
+    "--relief",
+    is_flag=True,
+    help="model the relief of walls from their depths instead of planes.",
 )
 @click.option(
     "-o",
     "--output",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="FOLDER",
-    help="Where to write it, a new or empty folder; by default export/FORMAT in RUN (or "
-    "embedded, datasets).",
+    help="Output folder, new or empty; by default export/FORMAT in RUN (or export/embedded, "
+    "export/datasets).",
 )
 def export(run: Path, target: str | None, output: Path | None, **choices: Any) -> int:
-    """Write the results of a run for other programs; 3 where the record's seal does not hold."""
+    """Write the results of a run for other programs; 3 if the seal of the record is broken."""
     from orthoflow.cli.progress import working_on
     from orthoflow.engine.durability import whole_folder
     from orthoflow.records.open import open_run
@@ -245,7 +245,7 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     name = target or ("datasets" if chosen.split else "embedded")
     folder = output or _folder_inside(opened, *((_EXPORT_FOLDER,) if target else ()), name)
     _refuse_filled(folder)
-    # These copy the record itself, with arrays that were not read, or print its seal.
+    # These copy the record, including arrays that were not read, or print its seal.
     hands_on = chosen.embed or chosen.split or target in ("ro-crate", "sheet")
     finding = broken_seal(opened, of_all=hands_on)
     if finding and hands_on:
@@ -260,7 +260,7 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
 
 
 def format_options() -> list[FormatOption]:
-    """Return the options that belong to some formats only."""
+    """Return the options that apply to some formats only."""
     return [option for option in export.params if isinstance(option, FormatOption)]
 
 
@@ -315,7 +315,7 @@ def _export_split(run: Run, folder: Path, chosen: Choices) -> str:
 
 
 def _folder_inside(run: Run, *names: str) -> Path:
-    """Return a default folder inside the run; refuse links, which lead out of it."""
+    """Return a default folder inside the run; reject links that lead out of it."""
     folder = run.home_folder
     for name in names:
         folder /= name

@@ -1,4 +1,4 @@
-"""`orthoflow.run`: the command `run` as a function."""
+"""`orthoflow.run`: the command `run` as a Python function."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 def run(
     workflow: str | Path,
     *,
-    # Any: whatever a parameter may be.
+    # Any: values of parameters.
     set: Mapping[str, Any] | None = None,
     inputs: Mapping[str, str | Path | Sequence[str | Path]] | None = None,
     datasets: str | Path | Mapping[str, Mapping[str, Any]] = "",
@@ -32,31 +32,30 @@ def run(
     store: str | Path = DEFAULT_STORE,
     **options: Any,
 ) -> OpenedRun:
-    """Run a workflow, as `orthoflow run` does, and open what came out.
+    """Run a workflow, as `orthoflow run` does, and open the finished run.
 
-    Progress goes to standard error as the command's does; in a notebook it is one output.
-    A step that fails leaves a run whose `record.status` is `failed`; results that are stored are
-    not computed again.
+    Progress is written to standard error; in a notebook, it is a single output. If a step fails,
+    `record.status` of the run is `failed`. Stored results are not recomputed.
 
     Args:
-        workflow: a file, or the name of a shipped one.
+        workflow: a file, or the name of a shipped workflow.
         set: parameters by `step.parameter` or `step.variant.parameter`; `{"sweep": [...]}` makes a
-            variant of each value; arrays are as good as lists.
+            variant of each value; arrays may be used instead of lists.
         inputs: files by name of the input.
-        datasets: a table of datasets, a CSV file; or what a workflow would state,
-            `{"hall": {"scan": "hall.e57", "set": {"wall.gsd_m": 0.005}}}`, with a path or a
-            list of paths, from the working directory.
-        only_data: of these datasets only.
-        output: folder of the run; `runs/<name>-<run id>` without one.
+        datasets: a CSV file with a table of datasets, or a mapping as in a workflow, `{"hall":
+            {"scan": "hall.e57", "set": {"wall.gsd_m": 0.005}}}`; paths are relative to the working
+            directory.
+        only_data: names of the datasets to run; empty for all.
+        output: run folder; `runs/<name>-<run id>` if None.
         store: folder of stored results.
-        **options: the command's `jobs`, `executor`, `scheduler`, `retries` and `embed`; `only`,
-            `from_`, `until` and `force`, a step or several; `set_files`, one or several YAML files
-            of `step.parameter: value`, which `set` overrides.
+        **options: options of the command: `jobs`, `executor`, `scheduler`, `retries` and `embed`;
+        `only`, `from_`, `until` and `force`, with one or more steps; `set_files`, one or more YAML
+        files of `step.parameter: value`, which `set` overrides.
 
     Raises:
-        WorkflowError: something is wrong with the workflow, or with what was set; lists all of it.
+        WorkflowError: the workflow or a setting is invalid; the message lists all problems.
         InputError: files are missing.
-        ArgumentError: the folder holds a finished run, or an option is none.
+        ArgumentError: the folder contains a finished run, or an option is invalid.
     """
     several = {
         "sets": [f"{name}={_json(f'set.{name}', value)}" for name, value in (set or {}).items()],
@@ -93,7 +92,7 @@ def run(
     return open_run(made.path)
 
 
-# Any below: of whoever calls.
+# Any below: values from the caller.
 def _listed(value: Any) -> list[Any]:
     is_many = hasattr(value, "__iter__") and not isinstance(value, str | os.PathLike)
     return list(value) if is_many else [value]
@@ -109,5 +108,5 @@ def _json(where: str, value: Any) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Return an array or a number of whatever library as Python's own, and a path as text."""
+    """Convert arrays and numbers of libraries to Python's types, and paths to text."""
     return value.tolist() if callable(getattr(value, "tolist", None)) else os.fspath(value)

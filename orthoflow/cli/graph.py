@@ -11,7 +11,7 @@ from orthoflow.cli.tables import echo
 @click.command(cls=Command)
 @workflow_arguments
 def graph(workflow: str, changes: Changes) -> int:
-    """Draw WORKFLOW as a Mermaid graph, which GitHub, GitLab and many editors show."""
+    """Print WORKFLOW as a Mermaid graph, which GitHub, GitLab and many editors display."""
     from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.workflow.views import mermaid
 

@@ -1,4 +1,4 @@
-"""`orthoflow new`: write a first workflow for one's own files."""
+"""`orthoflow new`: write a first workflow for given files."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ _RECIPES: Final = ("photos-on-scan", "direct", "plan")
 @click.option(
     "--recipe",
     type=click.Choice(_RECIPES),
-    help="Shipped recipe to follow.  [default: photos-on-scan where there are photos, else direct]",
+    help="Shipped recipe to use.  [default: photos-on-scan if there are photos, else direct]",
 )
 @json_option
 def new(files: tuple[Path, ...], output: Path, *, recipe: Recipe | None, as_json: bool) -> int:
-    """Look at each FILE, or what lies in a folder, and write a commented workflow for them.
+    """Inspect each FILE, or the files in a folder, and write a commented workflow for them.
 
-    Scans, photos, a calibration, check points, ties measured by hand, cameras of other programs
-    and their orthoimages are recognised by their content. The workflow is a shipped one that
-    names them; change it as you like.
+    Scans, photos, calibrations, check points, manually measured ties, and cameras and orthoimages
+    from other programs are recognised by their content. The result is a shipped workflow with these
+    files as inputs, to be edited as needed.
     """
     from orthoflow.cli.progress import working_on
 
@@ -69,7 +69,7 @@ def new(files: tuple[Path, ...], output: Path, *, recipe: Recipe | None, as_json
 
 
 def _write(output: Path, text: str) -> None:
-    """Write the file, unless one came into being meanwhile."""
+    """Write the file, unless it has been created meanwhile."""
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
         with output.open("x", encoding="utf-8") as stream:

@@ -40,8 +40,8 @@ def plan(
 ) -> int:
     """Show for every step of WORKFLOW whether its result is stored, and if not, why it would run.
 
-    Nothing is computed. "unknown yet" means that it depends on results that are not there yet;
-    some of its own are stored, and it may be one of these.
+    Nothing is computed. "unknown yet" means that the step depends on results that do not exist yet,
+    so that it is not known whether one of its stored results will match.
     """
     from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.engine.plan import RunOptions, plan_run

@@ -37,12 +37,12 @@ _SUMMARIES: Final = {
     "check": "Run the conformance suite on a method.",
 }
 
-# Parameters of a method that are shown apart from the others.
+# Number of parameters of a method that are shown first.
 _FIRST_SHOWN: Final = 5
 
 plugins: Final[click.Command] = LazyGroup(
     name="plugins",
-    help="List, show and check methods, and write a plugin of your own.",
+    help="List, show and check methods, or write your own plugin.",
     summaries=_SUMMARIES,
     target="orthoflow.cli.plugins:plugins_{}",
 )
@@ -51,9 +51,9 @@ plugins: Final[click.Command] = LazyGroup(
 @click.command("list", cls=Command)
 @json_option
 def plugins_list(*, as_json: bool) -> int:
-    """List methods, kinds and product types, and problems of plugins that do not load.
+    """List methods, kinds and product types, and plugins that cannot be loaded.
 
-    `orthoflow plugins show PLUGIN` prints the traceback of one that is broken.
+    `orthoflow plugins show PLUGIN` prints the traceback of such a plugin.
     """
     found = _listing(discover_catalog())
     if as_json:
@@ -138,8 +138,8 @@ def _cell(entry: Mapping[str, Any], key: str) -> str:
 def plugins_show(method_id: str, *, as_json: bool) -> int:
     """Show the method ID, e.g. plane.hough2d: parameters, ports, origin and citations.
 
-    Of a plugin or a method that does not load, its traceback is shown; ID may then be the plugin's
-    name. Ends with 2 when there is no such method, with 4 when it cannot be used.
+    If a plugin or method cannot be loaded, its traceback is shown; ID may then be the name of the
+    plugin. The exit code is 2 if the method does not exist, and 4 if it cannot be used.
     """
     catalog = discover_catalog()
     if failure := _failure(catalog, method_id):
@@ -157,7 +157,7 @@ def plugins_show(method_id: str, *, as_json: bool) -> int:
 
 
 def _failure(catalog: Catalog, name: str) -> dict[str, str]:
-    """Return why a plugin or a method cannot be loaded; empty where it can."""
+    """Return why a plugin or a method cannot be loaded; empty if it can."""
     found: tuple[DistributionInfo, str, str, str] | None = None
     if entry := catalog.methods.get(name):
         try:
@@ -165,7 +165,7 @@ def _failure(catalog: Catalog, name: str) -> dict[str, str]:
                 entry.load()
         except PluginError as error:
             cause = error.__cause__
-            # A class that loads and breaks a rule has none.
+            # A class that can be imported but violates a rule has no traceback.
             trace = "".join(traceback.format_exception(cause)) if cause else ""
             found = entry.distribution, str(error), entry.spec.target, trace
     else:
@@ -195,7 +195,7 @@ def _print_failure(failure: Mapping[str, str]) -> None:
 
 
 def _described(entry: MethodEntry) -> dict[str, Any]:
-    """Return everything that a method declares, as JSON.
+    """Return the complete declaration of a method as JSON.
 
     Raises:
         PluginError: the method's class cannot be loaded.
@@ -262,7 +262,7 @@ def _print_method(method: Mapping[str, Any]) -> None:
             ],
         )
     echo(*([""] if method["params"] else ["", "no parameters"]))
-    # Those that users set most come first, by the order in which their method declares them.
+    # Methods declare the most frequently set parameters first.
     first, others = method["params"][:_FIRST_SHOWN], method["params"][_FIRST_SHOWN:]
     for title, params in (("parameter", first), ("other parameters", others)):
         if others and title != "parameter":
@@ -296,33 +296,35 @@ def _metric_text(spec: Mapping[str, str]) -> str:
     default="cloud",
     show_default=True,
     metavar="TYPES",
-    help="Product types that methods of the new kind take, with commas between them.",
+    help="Comma-separated input product types of the new kind.",
 )
 @click.option(
     "--gives",
     default="",
     metavar="TYPES",
-    help="Product types that they give, with commas between them; one that no plugin has becomes "
-    "the plugin's own.  [default: KINDs]",
+    help="Comma-separated output product types of the new kind; the plugin defines those that do "
+    "not exist yet.  [default: KINDs]",
 )
 @click.option(
     "--folder",
     type=click.Path(path_type=Path, file_okay=False, exists=True),
     default=Path(),
-    help="Where the folder NAME is made; by default the current folder.",
+    help="Parent folder of the new folder NAME; by default the working directory.",
 )
-@click.option("--author", default="The authors", help="Name for pyproject, licence and citation.")
-@click.option("--licence", default="MIT", show_default=True, help="SPDX expression.")
-@click.option("--citation", default="", help="Where the method comes from: DOI, title or URL.")
+@click.option(
+    "--author", default="The authors", help="Name in pyproject.toml, licence and citation."
+)
+@click.option("--licence", default="MIT", show_default=True, help="SPDX licence expression.")
+@click.option("--citation", default="", help="Source of the method: DOI, title or URL.")
 @json_option
 def plugins_new(
     name: str, *, as_json: bool, folder: Path, new_kind: str, takes: str, gives: str, **about: str
 ) -> int:
-    """Write a plugin NAME that installs, works and passes its tests at once, e.g. my-detector.
+    """Write a plugin NAME, e.g. my-detector, that can be installed and passes its tests.
 
-    `orthoflow plugins list` names the kinds and the product types. The method does something
-    simple; put your own in its place. With `--new-kind` the plugin brings a kind, too, and a
-    product type where `--gives` names a new one.
+    `orthoflow plugins list` shows the kinds and product types. The method is a simple placeholder,
+    to be replaced by your own. With `--new-kind`, the plugin also defines a kind, and a product
+    type if `--gives` is a new one.
     """
     from orthoflow.scaffold import Project, write_project
 
@@ -375,25 +377,25 @@ def plugins_new(
 @click.option(
     "--golden",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="File of golden digests; a method that it lacks is added.",
+    help="File with digests of golden results; a missing method is added.",
 )
 @click.option(
     "--quick",
     is_flag=True,
-    help="Skip and name checks that need more than two runs of the method.",
+    help="Skip (and list) checks that need more than two runs of the method.",
 )
 @json_option
 def plugins_check(method_id: str, *, as_json: bool, golden: Path | None, quick: bool) -> int:
-    """Run every conformance check that applies to the method ID, and report the rules it breaks.
+    """Run every conformance check that applies to the method ID, and report violated rules.
 
-    With `--quick` those while you write it: parameters, outputs, inputs left as they were, progress
-    and cancelling, two runs on one core and on two, clouds that must be refused. The others, before
-    you hand it on: a run in a new process and an empty folder, wild input, what is known of the
-    example.
+    `--quick` runs the checks that are useful during development: parameters, outputs, unmodified
+    inputs, progress and cancellation, runs on one core and on two, rejection of invalid clouds. The
+    full set, for use before publication, adds a run in a new process and an empty folder, random
+    input, and known properties of the example.
 
-    What stops every run is reported once, and other rules are skipped. Ends with 1 when a rule
-    is broken, with 4 when the method cannot be loaded. What still stands as `plugins new` wrote it
-    is named, and breaks no rule.
+    A problem that prevents all runs is reported once, and other rules are skipped. The exit code is
+    1 if a rule is violated, and 4 if the method cannot be loaded. Placeholder text from `plugins
+    new` causes a warning only.
     """
     from orthoflow.scaffold import unwritten
     from orthoflow.testing import conformance_cases
@@ -432,7 +434,7 @@ def plugins_check(method_id: str, *, as_json: bool, golden: Path | None, quick: 
 
 @contextmanager
 def _sharing_kernels(method_id: str) -> Iterator[None]:
-    """Let the suite use what this user's runs have compiled, and leave them what it compiles."""
+    """Let the checks use the compiled kernels of this user, and keep newly compiled ones."""
     from orthoflow.engine.kernels import VARIABLE, kernel_folder, kernels_in
     from orthoflow.engine.keys import method_facts
 

@@ -1,4 +1,4 @@
-"""The program: its commands by name, and the root that runs them."""
+"""The program: the table of commands, and the root group that runs them."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ from orthoflow.version import __version__
 
 _SUMMARIES: Final = {
     "new": "Write a first workflow for your own files.",
-    "check": "Report everything that is wrong with a workflow file.",
+    "check": "Report all mistakes in a workflow file.",
     "plan": "Show which steps would run, which are cached, and why.",
     "graph": "Draw a workflow as a Mermaid graph.",
-    "run": "Run a workflow; makes orthoimages, report and record.",
+    "run": "Run a workflow and write orthoimages, report and record.",
     "show": "Summarise a finished run.",
     "runs": "List the runs below a folder: date, quality and differences.",
-    "compare": "Compare two runs: what differs, and by how much.",
+    "compare": "Compare two runs and measure their differences.",
     "report": "Write the HTML report of one or more runs.",
     "verify": "Check that a record is complete and unchanged.",
-    "sign": "Sign a record with your key, for those who verify it.",
+    "sign": "Sign a record with your key, so that others can verify it.",
     "replay": "Repeat a run from its record and show what differs.",
     "export": "Write a run's results for other programs.",
-    "plugins": "List, show and check methods, and write a plugin of your own.",
+    "plugins": "List, show and check methods, or write your own plugin.",
     "schema": "Print the JSON Schema of workflow files.",
-    "warm": "Compile in advance what runs would compile.",
+    "warm": "Compile kernels in advance of runs.",
     "cache": "List, check or clean the store of results.",
     "doctor": "Show what is installed, what is missing, and the consequences.",
 }
@@ -51,18 +51,18 @@ that can be compared and repeated.
 
 A first run, on a simulated room: orthoflow run quickstart.yaml
 
-Exit codes: 0 good; 1 some step failed; 2 the workflow, an argument or an input is invalid; 3 a
+Exit codes: 0 success; 1 a step failed; 2 the workflow, an argument or an input is invalid; 3 a
 record is damaged, differs or cannot be replayed; 4 a plugin or a library is missing; 130
 interrupted.
 """
 
 
 class Program(LazyGroup):
-    """The root group; every error ends in one sentence and one of the exit codes."""
+    """The root group; every error ends with a one-sentence message and an exit code."""
 
-    # Any: the signature is click's.
+    # Any: click's signature.
     def main(self, *args: Any, **extra: Any) -> NoReturn:
-        """Run the command line and leave the process with an exit code."""
+        """Run the command line and exit with an exit code."""
         session = Session()
         extra.update(standalone_mode=False, obj=session)
         code: object
@@ -77,9 +77,9 @@ class Program(LazyGroup):
             error.show(shown)
             echo_error(*shown.getvalue().rstrip("\n").split("\n"))
             code = error.exit_code
-        except Exception as error:  # noqa: BLE001 - the last stop before the user
+        except Exception as error:  # noqa: BLE001 - last handler before the user
             code = explain(error, session)
-        # A command that returns no code did not end well.
+        # A command that returns no exit code has failed.
         sys.exit(code if isinstance(code, int) else EXIT_CELL_FAILED)
 
     def invoke(self, ctx: click.Context) -> object:
@@ -87,7 +87,7 @@ class Program(LazyGroup):
         try:
             return super().invoke(ctx)
         except BrokenPipeError:
-            # Caught here because click would turn it into exit code 1, "some cell failed".
+            # Handled here because click would turn it into exit code 1, "some cell failed".
             silence_stdout()
             return 0
 
@@ -121,7 +121,7 @@ program: Final = Program(
 def main() -> NoReturn:
     """Run the `orthoflow` command."""
     take_up_streams()
-    # Loading makes much that stays and little garbage: looking for it took a tenth of a `plan`.
+    # Imports create many permanent objects and little garbage; collection took 10 % of a `plan`.
     gc.set_threshold(50_000, *gc.get_threshold()[1:])
     try:
         program.main(prog_name="orthoflow")
@@ -131,22 +131,22 @@ def main() -> NoReturn:
 
 
 def take_up_streams() -> None:
-    """Put the null device in the place of closed standard streams.
+    """Replace closed standard streams by the null device.
 
-    A file that is opened later would get the number of a closed one, and what is printed with it.
+    Otherwise a file opened later would get the descriptor of a closed stream, and its output.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
         except OSError:
-            # The lowest free number is taken, which is this one.
+            # The lowest free descriptor is used, which is this one.
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # noqa: FBT003
         if getattr(sys, name) is None:
             setattr(sys, name, open(number, "r" if number == 0 else "w", encoding="utf-8"))  # noqa: SIM115, PTH123
 
 
 def _leave_library_threads(code: object) -> None:
-    """Leave at once where a plugin left threads behind, for which Python would wait for ever."""
+    """Exit immediately if a plugin left threads running, for which Python would wait forever."""
     main_thread = threading.main_thread()
     if all(thread.daemon or thread is main_thread for thread in threading.enumerate()):
         return

@@ -1,4 +1,4 @@
-"""How a running workflow shows itself: a live table on a terminal, plain lines elsewhere."""
+"""Progress of a running workflow: a live table on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ if TYPE_CHECKING:
 
     from orthoflow.engine.plan import PlannedCell
 
-# Below these, the progress of a step does not yet predict its remaining time.
+# Below these limits, the progress of a step is too small to predict its remaining time.
 _MIN_FRACTION: Final = 0.05
 _MIN_ELAPSED_S: Final = 2.0
 _REFRESH_PER_S: Final = 4
-# A log file gets a line at least so often.
+# Maximum time between lines in a log file.
 _EVERY_S: Final = 10.0
 _NOTEBOOK_EVERY_S: Final = 1.0
-# While it runs, a notebook shows the last lines, so that the running steps stay in view below them.
+# While running, a notebook shows only the last lines, so that the running steps below stay visible.
 _NOTEBOOK_LINES: Final = 40
-# Shorter times of loading and compiling are not mentioned.
+# Shorter times of loading and compiling are not reported.
 _MIN_COMPILE_S: Final = 2.0
 _STYLES: Final = {
     "running": "cyan",
@@ -54,15 +54,15 @@ _STYLES: Final = {
 
 @dataclass
 class CellState:
-    """One cell of a run in progress.
+    """A cell of a run in progress.
 
     Attributes:
-        state: `waiting`, `running`, or how it ended.
-        fraction: 0..1 as the step reports it.
-        text: what it does, or why it ended so.
-        started: seconds of a clock.
-        wall_s: how long it took.
-        took_s: how long it, or one like it, took before; None when unknown.
+        state: `waiting`, `running`, or its outcome.
+        fraction: progress reported by the step, 0 to 1.
+        text: current activity, or the reason for its outcome.
+        started: clock time in seconds.
+        wall_s: duration.
+        took_s: previous duration of this or a similar cell; None if unknown.
     """
 
     state: str = "waiting"
@@ -73,7 +73,7 @@ class CellState:
     took_s: float | None = None
 
     def left_s(self, now_s: float) -> float | None:
-        """Seconds that it still takes: by its earlier duration, then by its progress."""
+        """Return the remaining time in seconds, from its earlier duration or else its progress."""
         if self.state == "waiting":
             return self.took_s
         if self.state != "running":
@@ -87,24 +87,24 @@ class CellState:
 
 
 def left_of_run(cells: Iterable[CellState], now_s: float, *, jobs: int = 1) -> str:
-    """Estimate how long a run still takes; empty where nothing is left.
+    """Estimate the remaining time of a run; empty if nothing remains.
 
     Args:
-        cells: all of them.
-        now_s: on the clock that started them.
-        jobs: how many run at the same time.
+        cells: all cells.
+        now_s: time of the clock that gave `started`.
+        jobs: number of cells that run at the same time.
     """
     left = [
         cell.left_s(now_s)
         for cell in cells
-        # Stored and skipped steps take no time and predict nothing of the others.
+        # Stored and skipped steps take no time, and do not help to predict others.
         if cell.state == "running" or (cell.state == "waiting" and cell.took_s != 0.0)
     ]
     known = [seconds for seconds in left if seconds is not None]
     n_unknown = len(left) - len(known)
     if not left:
         return ""
-    # A few short steps would suggest that a run of minutes is nearly over.
+    # Otherwise a few short steps would suggest that a run of minutes is nearly finished.
     if not known or n_unknown > len(known):
         return "remaining time not yet known"
     seconds = about(max(*known, sum(known) / jobs, 0.0))
@@ -114,7 +114,7 @@ def left_of_run(cells: Iterable[CellState], now_s: float, *, jobs: int = 1) -> s
 
 
 def about(seconds: float) -> str:
-    """Write a forecast, rounded up.
+    """Format an estimated duration, rounded up.
 
     >>> [about(seconds) for seconds in (0.3, 7, 42, 130, 4000)]
     ['5 s', '10 s', '45 s', '2 min 10 s', '1 h 07 min']
@@ -125,11 +125,11 @@ def about(seconds: float) -> str:
 
 
 class Progress:
-    """Shows a run: a live table on a terminal, one output in a notebook, lines for logs elsewhere.
+    """Display of a run: a table on a terminal, one output in a notebook, log lines elsewhere.
 
     Attributes:
-        every_s: a notebook's output, and the running steps in a log, are shown so often.
-        console: of the terminal; None without one.
+        every_s: interval of updates in a notebook, and of running steps in a log.
+        console: console of the terminal; None if there is no terminal.
     """
 
     def __init__(self, cells: Sequence[PlannedCell] = (), *, jobs: int = 1) -> None:
@@ -164,7 +164,7 @@ class Progress:
             self._notebook.show(self._lines)
 
     def take(self, event: RunEvent) -> None:
-        """Show an event of the run."""
+        """Update the display with an event."""
         line = self._applied(event)
         if isinstance(event, RunStarted):
             self._n_cells = event.n_cells
@@ -175,7 +175,7 @@ class Progress:
         if self._notebook:
             self._lines += [] if isinstance(event, CellStarted) else [line]
         elif self.console:
-            # Warnings and failures stand above the table, to stay readable.
+            # Warnings and failures are printed above the table, so that they stay readable.
             has_failed = isinstance(event, CellFinished) and event.result.status == "failed"
             style = _STYLES["failed"] if has_failed else "yellow"
             if has_failed or isinstance(event, CellReported | RunStarted):
@@ -185,7 +185,7 @@ class Progress:
             echo_error(f"{line} ({self.n_ended} of {self._n_cells})" if is_end else line)
 
     def _applied(self, event: RunEvent) -> str:
-        """Apply an event; return the line that a log shows of it, empty for none."""
+        """Apply an event; return its line for a log, or an empty text."""
         with self._lock:
             match event:
                 case RunStarted():
@@ -214,7 +214,7 @@ class Progress:
         return ""
 
     def _reported_line(self, address: str, one: Diagnostic) -> str:
-        """A diagnostic in a line; empty for notes, and for codes reported before."""
+        """Format a diagnostic in a line; empty for notes, and for codes reported before."""
         if one.is_summary:
             return f"{address}: {one.text}"
         if one.severity == "note":
@@ -225,26 +225,26 @@ class Progress:
             self._n_similar[address] += 1
             return ""
         self._reported.add(key)
-        # The summary has the sentences.
+        # The summary contains the complete sentences.
         about = f" ({one.subject})" if one.subject else ""
         return f"{address}: {one.severity}: {one.text if is_plain else one.code + about}"
 
     def cells(self) -> dict[str, CellState]:
-        """Return all cells as they are now."""
+        """Return all cells in their current state."""
         with self._lock:
             return dict(self._cells)
 
     def left(self) -> str:
-        """Estimate how long the run still takes; empty when nothing is left."""
+        """Estimate the remaining time of the run; empty if nothing remains."""
         return left_of_run(self.cells().values(), time.monotonic(), jobs=self._jobs)
 
     @property
     def n_ended(self) -> int:
-        """How many cells have an outcome."""
+        """Return the number of cells that have ended."""
         return sum(cell.state not in ("waiting", "running") for cell in self.cells().values())
 
     def refresh(self) -> None:
-        """Show how far the running steps are."""
+        """Show the progress of running steps."""
         now_s = time.monotonic()
         running = []
         for address, cell in self.cells().items():
@@ -265,7 +265,7 @@ class Progress:
             echo_error(*running)
 
     def drawn(self) -> Group:
-        """Return the table of a terminal, and below it how far the whole run is."""
+        """Return the table for a terminal, with the progress of the run below it."""
         from rich.console import Group
         from rich.text import Text
 
@@ -274,7 +274,7 @@ class Progress:
         return Group(self.table(), Text(f"{ended}, {left}" if left else ended, style="dim"))
 
     def table(self) -> Table:
-        """Return the table as it is now; of too many rows the running, failed and waiting ones."""
+        """Return the table; if too long, only running, failed and waiting cells."""
         from rich.table import Table
         from rich.text import Text
 
@@ -304,22 +304,22 @@ class Progress:
 
 
 def _end_text(event: CellFinished) -> str:
-    """Describe how a cell ended, how long it took, and why it failed."""
+    """Describe the outcome of a cell, its duration, and the reason for a failure."""
     result = event.result
     if event.cached:
         return f"{event.address}: cached"
     took = f" in {duration(result.wall_s)}" if result.started else ""
     if took and (result.compile_s or 0.0) >= _MIN_COMPILE_S:
         took += f", plus {duration(result.compile_s or 0.0)} of loading and compiling"
-    # The summary states why something was skipped.
+    # The summary contains the reasons for skipped cells.
     why = f": {result.error_message}" if result.status == "failed" else ""
     return f"{event.address}: {result.status}{took}{why}"
 
 
 class _NotebookOutput:
-    """One output of a notebook's cell, replaced by each text shown."""
+    """An output of a notebook cell; each text replaces the previous one."""
 
-    # Any: IPython need not be installed, and is untyped.
+    # Any: IPython is optional and untyped.
     handle: Any = None
 
     def show(self, lines: Sequence[str]) -> None:
@@ -332,16 +332,16 @@ class _NotebookOutput:
 
 
 def in_notebook() -> bool:
-    """Whether a notebook's kernel shows the output of this process; IPython in a terminal not."""
+    """Return whether a notebook shows the output; False for IPython in a terminal."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return hasattr(shell, "kernel")
 
 
 @contextmanager
 def working_on(what: str, *, every_s: float = _EVERY_S) -> Iterator[None]:
-    """Show while the block runs what is done outside of any cell, and since when.
+    """Show an activity outside of cells, with its start time, while the block runs.
 
-    A notebook keeps it where it took long, with the time it took.
+    If it took long, a notebook keeps the line with its duration.
     """
     started = time.monotonic()
 
@@ -369,7 +369,7 @@ def working_on(what: str, *, every_s: float = _EVERY_S) -> Iterator[None]:
 
 
 def _live(console: Console, drawn: Callable[[], RenderableType]) -> Live:
-    """A display that redraws itself and vanishes at its end."""
+    """Return a display that refreshes itself and disappears at its end."""
     from rich.live import Live
 
     return Live(

@@ -1,4 +1,4 @@
-"""`orthoflow replay`: make a run again from its record and measure the differences."""
+"""`orthoflow replay`: repeat a run from its record and measure the differences."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _METRICS_MOST: Final = 5
     "--store",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="DIR",
-    help="Folder of stored results; without it an empty one, so that everything is computed again.",
+    help="Folder of stored results; by default an empty one, so that everything is recomputed.",
 )
 @execution_options
 @json_option
@@ -56,18 +56,19 @@ def replay(
     # Any: the fields of RunOptions about how steps run, whose types click has checked.
     **choices: Any,
 ) -> int:
-    """Make RUN, a run folder or its run.h5, again from its record and its input files.
+    """Repeat RUN, a run folder or its run.h5, from its record and its input files.
 
-    Takes workflow, parameters and seeds as recorded. The inputs come from the record, if they are
-    in it, or are found by content, under any name: where --input points, else where the workflow
-    names them, beside the run, here, and where the store in .orthoflow saw them last.
-    What is missing or not as it was is named before anything runs. States for every product whether
-    it has the same bits, is equal within the tolerance of its type, or differs, and which metrics
-    differ, times and memory left out. Ends with 3 when a product differs, or a metric of a step
-    whose products are identical or whose method's code has changed: by more than a millionth, or a
-    count at all; and where it cannot
-    be replayed because an input or the record was changed, or a method is of another version; else
-    with 2 where an input is not to be found, with 4 where methods are missing.
+    Workflow, parameters and seeds are taken from the record. Inputs that are not in the record are
+    located by their content, under any name: at the paths given with --input, or else at the paths
+    in the workflow, next to the run, in the working directory, and where the store in .orthoflow
+    last found them. Missing and changed files are reported before anything runs.
+
+    The result lists for every product whether it is identical, equal within the tolerance of its
+    type, or different, and which metrics differ, apart from times and memory. The exit code is 3 if
+    a product differs, or if a metric differs (a count at all, other numbers by more than a
+    millionth) in a step whose products are identical or whose method's code has changed. It is also
+    3 if the run cannot be repeated because an input or the record was changed, or a method has
+    another version; it is 2 if an input is not found, and 4 if methods are missing.
     """
     from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.engine.journal import new_run_folder, new_run_id
@@ -143,7 +144,7 @@ def replay(
 
 @contextmanager
 def _store_folder(given: Path | None, folder: Path) -> Iterator[Path]:
-    """The store: a given one, or a new one beside the run that is removed at the end."""
+    """Return the given store, or a new one next to the run that is removed at the end."""
     if given is not None:
         yield given
         return
@@ -154,20 +155,20 @@ def _store_folder(given: Path | None, folder: Path) -> Iterator[Path]:
     try:
         yield fresh
     except (CancelledStepError, ClusterError, KeyboardInterrupt):
-        # What is finished serves the same command, called again.
+        # Finished results are kept for another call of the same command.
         is_interrupted = True
         raise
     finally:
         if not is_interrupted:
             shutil.rmtree(fresh, ignore_errors=True)
             with contextlib.suppress(OSError):
-                # `runs`, where nothing was run after all.
+                # Folders such as `runs`, if nothing was run.
                 for place in made:
                     place.rmdir()
 
 
 def _metric_lines(metrics: Sequence[ReplayedMetric]) -> list[str]:
-    """Count how many metrics differ and which: what nothing excuses first, on a line of its own."""
+    """Count and list metrics that differ; unexpected differences first, on a line of their own."""
     what = "metrics, without times"
     kinds = (
         ("different", "differ though the products of their steps are identical"),

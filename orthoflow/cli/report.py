@@ -18,16 +18,17 @@ from orthoflow.errors import ArgumentError
     "--output",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="Output file; for a single run by default its own report.html.",
+    help="Output file; for a single run, its report.html by default.",
 )
 @store_option
 def report(runs: tuple[str, ...], output: Path | None, store: Path) -> int:
     """Write the HTML report of one or more runs, each a run folder or its run.h5.
 
-    Without -o it lies in the run's folder, with figures/ beside it: the figures as PNG or
-    SVG, of a comparison those of the baseline (`orthoflow export RUN --to figures` has all).
-    Of two runs it compares products, too, those that records only name from the store.
-    Where a record's seal does not hold, the page states it, and this ends with 3.
+    Without -o, it is written to the run folder, with figures/ next to it, which contains the
+    figures as PNG or SVG files; if there are variants, only those of the baseline (`orthoflow
+    export RUN --to figures` writes all). For two runs, it also compares products; those that the
+    records reference but do not contain are loaded from the store. If the seal of a record is
+    broken, the page says so, and the exit code is 3.
     """
     from orthoflow.engine.store import stores_at
     from orthoflow.records.open import open_run

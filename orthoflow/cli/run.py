@@ -1,4 +1,4 @@
-"""`orthoflow run`: run a workflow; makes orthoimages, report and record."""
+"""`orthoflow run`: run a workflow and write orthoimages, report and record."""
 
 from __future__ import annotations
 
@@ -62,12 +62,12 @@ if TYPE_CHECKING:
 @click.option(
     "--embed",
     is_flag=True,
-    help="Put everything into the record, including point clouds, photos and the input files.",
+    help="Store everything in the record, including point clouds, photos and input files.",
 )
 @click.option(
     "--json-log",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="Write each diagnostic as a line of JSON: code, severity, step, subject, values, text, "
+    help="Write each diagnostic as a JSON line: code, severity, step, subject, values, text, "
     "remedy.",
 )
 def run(
@@ -83,9 +83,9 @@ def run(
 ) -> int:
     """Run WORKFLOW, a file or the name of a shipped one.
 
-    Results that are stored already are not computed again. An interrupted run goes on with the
-    same command and the same -o. The folder of the run gets run.h5 (the record), report.html, and
-    products/ with the files for other programs.
+    Stored results are not recomputed. To resume an interrupted run, repeat the command with the
+    same -o. The run folder contains run.h5 (the record), report.html, and products/ with files for
+    other programs.
     """
     with prepared(workflow, changes, output, store, embed=embed, **choices) as call:
         return replace(call, json_log=json_log).go()
@@ -105,12 +105,12 @@ def prepared(
     """Read and plan a workflow, and hold its store until the run is over.
 
     Raises:
-        ArgumentError: an option is none.
+        ArgumentError: an option is invalid.
     """
     from orthoflow.cli.progress import working_on
 
     with working_on("reading the workflow, its inputs and what is stored"):
-        # What takes a second to load is loaded in here.
+        # Import slow modules here.
         import orthoflow.report  # noqa: F401
         from orthoflow.catalog.discovery import discover_catalog
         from orthoflow.engine.journal import require_run_folder
@@ -122,19 +122,19 @@ def prepared(
         catalog = discover_catalog()
         loaded = changes.load(workflow, catalog)
         if output is not None:
-            # Gigabytes of inputs are looked at next.
+            # Checked first, because reading gigabytes of inputs comes next.
             require_run_folder(output.absolute(), loaded.name)
         opened = Store(store)
         cells = expand_cells(loaded, catalog)
         planned = plan_run(cells, loaded, catalog, opened, options)
-    # Held until the record is written, so that no `cache gc` takes what it needs.
+    # Held until the record is written, so that `cache gc` does not remove its results.
     with opened.in_use():
         yield Call(workflow=loaded, plan=planned, store=opened, folder=output, embed=embed)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Call:
-    """One call of the command, ready to go."""
+    """One call of the command, ready to run."""
 
     workflow: Workflow
     plan: RunPlan
@@ -144,7 +144,7 @@ class Call:
     json_log: Path | None = None
 
     def go(self) -> int:
-        """Execute, record, report and print the summary."""
+        """Execute the run, write record and report, and print the summary."""
         from orthoflow.engine.journal import LOGS, cell_file_name
         from orthoflow.records.runs import REPORT_FILE
 
@@ -158,12 +158,12 @@ class Call:
         try:
             _print_summary(run, report, outcome.resumed)
         except BrokenPipeError:
-            # The reader has closed the pipe; the exit code still states how the run ended.
+            # The reader has closed the pipe; the exit code still gives the outcome of the run.
             silence_stdout()
         return outcome.exit_code
 
     def make(self) -> tuple[RunOutcome, Run]:
-        """Execute, record and report."""
+        """Execute the run, and write record and report."""
         from orthoflow.engine.journal import new_run_folder, new_run_id
         from orthoflow.records.runs import REPORT_FILE
         from orthoflow.records.write import begin_run
@@ -171,7 +171,7 @@ class Call:
 
         run_id = new_run_id()
         folder = self.folder or new_run_folder(self.workflow.name, run_id)
-        # Before minutes pass.
+        # Shown before the run, which may take minutes.
         echo_lint(self.workflow)
         with _json_log(self.json_log, self.plan) as log:
             has_begun = False
@@ -201,9 +201,9 @@ class Call:
 
 
 def _report_unfinished(folder: Path) -> None:
-    """Write the report of an interrupted run: what is there, and how to go on.
+    """Write the report of an interrupted run: existing results, and how to resume.
 
-    Nothing if that fails, e.g. on a full disk: the run itself loses nothing.
+    Failures, e.g. due to a full disk, are ignored, since the results are already stored.
     """
     from orthoflow.records.open import open_unfinished
     from orthoflow.records.runs import REPORT_FILE
@@ -215,7 +215,7 @@ def _report_unfinished(folder: Path) -> None:
         echo_error(f"report of the finished steps: {report}")
 
 
-def executed(  # noqa: PLR0913 - what a run is made of
+def executed(  # noqa: PLR0913 - parts of a run
     plan: RunPlan,
     workflow: Workflow,
     store: Store,
@@ -226,7 +226,7 @@ def executed(  # noqa: PLR0913 - what a run is made of
     report: Callable[[Run], None],
     listen: RunListener = lambda _: None,
 ) -> tuple[RunOutcome, Run]:
-    """Execute a plan, show how far it is, and write products, record and report."""
+    """Execute a plan, show its progress, and write products, record and report."""
     from orthoflow.cli.progress import Progress, working_on
     from orthoflow.engine.scheduler import execute
     from orthoflow.records.write import executed_and_written, write_run
@@ -256,7 +256,7 @@ def executed(  # noqa: PLR0913 - what a run is made of
 
 @contextmanager
 def _json_log(path: Path | None, plan: RunPlan) -> Iterator[RunListener]:
-    """Write the diagnostics of each cell as it ends, a line of JSON each; cached ones, too.
+    """Write the diagnostics of each cell, including cached ones, as JSON lines when it ends.
 
     Raises:
         ArgumentError: the file cannot be written.
@@ -283,12 +283,12 @@ def _json_log(path: Path | None, plan: RunPlan) -> Iterator[RunListener]:
 
 
 def _print_summary(run: Run, report: Path, kept: Collection[str]) -> None:
-    """Write the table of cells, the warnings, and last the report, the record and the images.
+    """Print the table of cells, the warnings, and the paths of report, record and images.
 
     Args:
         run: the finished run.
-        report: its report.
-        kept: addresses of the cells that an interrupted attempt had computed.
+        report: path of its report.
+        kept: addresses of the cells computed before an interruption.
     """
     cells = run.record.cells
     echo()
@@ -322,7 +322,7 @@ def _print_summary(run: Run, report: Path, kept: Collection[str]) -> None:
 
 
 def _cached_text(cells: Iterable[RecordedCell], kept: Collection[str]) -> str:
-    """Count the cells that came from the store, or from before an interruption; no skipped ones."""
+    """Count cells from the store or from before an interruption; skipped cells are not counted."""
     counted_cells = [cell for cell in cells if cell.status != "skipped"]
     n_cells = len(counted_cells)
     n_cached = sum(bool(cell.cached_from) for cell in counted_cells)

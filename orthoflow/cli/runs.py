@@ -1,4 +1,4 @@
-"""`orthoflow runs`: a table of the runs below some folders."""
+"""`orthoflow runs`: a table of the runs in and below given folders."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 
 _STATES: Final = ("ok", "failed", "running", "unfinished", "damaged")
 _COLUMNS: Final = ("folder", "started", "workflow", "status")
-# As many numbers stand beside the rest on a wide terminal.
+# Number of metrics that fit next to the other columns on a wide terminal.
 _METRICS_MOST: Final = 4
 _LONGEST_FACT: Final = 40
 _FACTS_MOST: Final = 4
-# Texts of a record may have any length.
+# Texts in a record may have any length.
 _LONGEST_NAME: Final = 60
 _LONGEST_REASON: Final = 1000
 _CONDITION: Final = re.compile(
@@ -43,32 +43,42 @@ _SIGNS: Final[Mapping[str, Callable[[float, float], bool]]] = {
 
 @click.command(cls=Command)
 @click.argument("folders", metavar="[FOLDER ...]", nargs=-1, type=click.Path(path_type=Path))
-@click.option("--workflow", "workflows", metavar="NAME", multiple=True, help="Only its runs.")
 @click.option(
-    "--status", "states", type=click.Choice(_STATES), multiple=True, help="Only such runs."
+    "--workflow", "workflows", metavar="NAME", multiple=True, help="Only runs of this workflow."
+)
+@click.option(
+    "--status",
+    "states",
+    type=click.Choice(_STATES),
+    multiple=True,
+    help="Only runs with this status.",
 )
 @click.option(
     "--where",
     metavar="'METRIC > X'",
     multiple=True,
-    help="Only runs of which it holds: < <= > >= = !=, of a metric, step.metric or parameter (of "
-    "variants, datasets and sweeps, of one of the values).",
+    help="Only runs that meet a condition (< <= > >= = !=) on a metric, step.metric or parameter; "
+    "with variants, datasets or sweeps, one of the values must meet it.",
 )
 @click.option(
     "--sort",
     metavar="COLUMN",
     default="started",
     show_default=True,
-    help="Order: folder, started, workflow, status, or a metric; -COLUMN for the other end first.",
+    help="Sort by folder, started, workflow, status, or a metric; -COLUMN for descending order.",
 )
 @click.option(
-    "--metric", "metrics", metavar="NAME", multiple=True, help="Show this number.  [default: some]"
+    "--metric",
+    "metrics",
+    metavar="NAME",
+    multiple=True,
+    help="Show this metric.  [default: headline metrics]",
 )
 @click.option(
     "--table",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="Write one CSV table of every cell and metric of the runs named, each cell once.",
+    help="Write one CSV table with every cell and metric of the given runs, each cell once.",
 )
 @json_option
 def runs(
@@ -83,13 +93,13 @@ def runs(
 ) -> int:
     """List the runs in and below each FOLDER, by default the working directory.
 
-    A row states when a run was made, with which workflow, how it ended, how good its baseline is
-    (of several datasets, the median), and which parameters and inputs differ from those of other
-    runs of the workflow. What --split wrote into a run is listed where its folder is named. Runs
-    without a record, and records that cannot be read, state why.
-    --table FILE joins the runs named, or those below the folders named, into one table with a row
-    per cell and metric: what was computed with the same methods, parameters, seeds and data in
-    several of them is one cell, and `environments` counts the machines.
+    A row shows when a run was made, with which workflow, its outcome, the quality of its baseline
+    (the median over several datasets), and the parameters and inputs in which it differs from other
+    runs of the workflow. Results of `export --split` inside a run are listed only if their folder
+    is given. For runs without a record, and for unreadable records, the reason is shown. --table
+    FILE merges the given runs, or those below the given folders, into one table with a row per cell
+    and metric; cells with the same methods, parameters, seeds and data in several runs are merged,
+    and `environments` is the number of machines.
     """
     table = chosen.pop("table")
     if table is not None:
@@ -104,7 +114,7 @@ def runs(
 
 
 def _write_table(folders: Sequence[Path], table: Path) -> int:
-    """Join runs into one CSV table."""
+    """Merge runs into one CSV table."""
     from orthoflow.engine.durability import write_whole, writing_to
     from orthoflow.engine.journal import RECORD_FILE
     from orthoflow.errors import ArgumentError
@@ -134,7 +144,7 @@ def _write_table(folders: Sequence[Path], table: Path) -> int:
 
 
 def list_runs(folders: Sequence[Path]) -> list[RunSummary]:
-    """Sum up all runs in and below some folders, the oldest first."""
+    """Summarise all runs in and below folders, oldest first."""
     from orthoflow.cli.progress import working_on
 
     with working_on("reading the records"):
@@ -144,7 +154,7 @@ def list_runs(folders: Sequence[Path]) -> list[RunSummary]:
 
 
 def runs_json(kept: Sequence[RunSummary], found: Sequence[RunSummary]) -> list[dict[str, object]]:
-    """Return runs as JSON, with every metric and parameter, and in what they differ from others."""
+    """Return runs as JSON, with all metrics and parameters, and differences from other runs."""
     from orthoflow.report.browsing import differing_facts
 
     differs = differing_facts(found)
@@ -154,7 +164,7 @@ def runs_json(kept: Sequence[RunSummary], found: Sequence[RunSummary]) -> list[d
 def print_runs(
     kept: Sequence[RunSummary], found: Sequence[RunSummary], *, metrics: Sequence[str] = ()
 ) -> None:
-    """Print a table of runs of those found, what went wrong in them, and how many there are."""
+    """Print a table of some of the runs found, their problems, and their number."""
     from orthoflow.report.browsing import differing_facts, key_metrics
 
     names = list(metrics) or key_metrics(kept, most=_METRICS_MOST)
@@ -187,7 +197,7 @@ def print_runs(
 
 
 def _condition(text: str) -> tuple[str, Callable[[float], bool]]:
-    """Read one `--where`: a name, and what its value has to be."""
+    """Parse one `--where`: a name and a condition on its value."""
     match = _CONDITION.fullmatch(text)
     if match is None:
         raise click.UsageError(
@@ -225,7 +235,7 @@ def _filtered(
 
 
 def _sorted(kept: Sequence[RunSummary], key: str) -> list[RunSummary]:
-    """Order runs; those that lack the number stand last, whichever end is first."""
+    """Sort runs; those without the metric come last in both directions."""
     name = key.removeprefix("-")
     if name in _COLUMNS:
         attribute = "state" if name == "status" else name
@@ -246,7 +256,7 @@ def _require_known(names: Sequence[str], found: Sequence[RunSummary]) -> None:
         if name not in known:
             from orthoflow.errors import nearest
 
-            # Users often give the last part of a parameter's name, without its step and method.
+            # Users often enter only the last part of a parameter's name, without step and method.
             ends = sorted(one for one in known if one.endswith(f".{name}"))
             near = ends[0] if ends else nearest(name, known)
             hint = f"did you mean {near!r}?" if near else "--json has the names of all"
@@ -254,7 +264,7 @@ def _require_known(names: Sequence[str], found: Sequence[RunSummary]) -> None:
 
 
 def _facts_text(facts: Mapping[str, object]) -> str:
-    """Describe in what a run differs, as far as a line bears it."""
+    """Describe the differences of a run, as far as they fit on a line."""
     parts = []
     for name, value in facts.items():
         text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)

@@ -15,14 +15,14 @@ from orthoflow.cli.tables import echo
 def schema(*, as_json: bool) -> int:
     """Print the JSON Schema of workflow files, with the parameters of every installed method.
 
-    Save it and name it in an editor to get completion and checks while writing. The output is
-    JSON with or without --json.
+    Save it and refer to it in an editor for completion and checks while editing. The output is JSON
+    with or without --json.
     """
     from orthoflow.catalog.discovery import discover_catalog
     from orthoflow.workflow.views import workflow_schema
 
     del as_json
-    # For programs: without blanks it is half as large.
+    # For programs; without whitespace it is half as large.
     schema_text = json.dumps(
         workflow_schema(discover_catalog()), separators=(",", ":"), ensure_ascii=False
     )

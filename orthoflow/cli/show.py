@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from orthoflow.records.runs import Run
     from orthoflow.report.paired import MethodOverDatasets
 
-# Of metrics beside each other, so that lines stay within a wide window.
+# Number of columns of metrics that fit in a wide window.
 _COLUMNS_MOST: Final = 5
 _NOTHING: Final = "-"
 
@@ -47,10 +47,11 @@ _NOTHING: Final = "-"
 def show(run: Path, *, is_whole: bool, as_json: bool) -> int:
     """Summarise RUN, a run folder or its run.h5: inputs, steps, metrics, warnings, environment.
 
-    Of many metrics those that show how good results are are printed, with --all every one; of a
-    comparison a row per combination of variants, over datasets with their medians. Of a
-    folder that runs lie in, their table, as `orthoflow runs` has it. Ends with 3 where the seal of
-    the record does not hold; large arrays, which are not read, are checked by `orthoflow verify`.
+    If there are many metrics, only those that measure quality are printed; --all prints all of
+    them. With variants, there is a row per combination; over datasets, its values are medians. For
+    a folder that contains runs, their table is printed, as by `orthoflow runs`. The exit code is 3
+    if the seal of the record is broken; `orthoflow verify` also checks large arrays, which are not
+    read here.
     """
     from orthoflow.engine.journal import RECORD_FILE
     from orthoflow.records.open import open_run
@@ -128,7 +129,7 @@ def _print_cells(run: Run, *, is_whole: bool) -> None:
 
 
 def _print_comparison(run: Run) -> bool:
-    """Print a row per combination of variants, and who leads; whether there are several."""
+    """Print a row per combination and the best ones; return whether there are several."""
     if all(set(cell.assignment) <= {DATA} for cell in run.record.cells):
         return False
     from orthoflow.records.runs import parts_of
@@ -249,7 +250,7 @@ def _as_json(run: Run) -> dict[str, object]:
 
 def _cell_json(cell: RecordedCell) -> dict[str, object]:
     values = dataclasses.asdict(dataclasses.replace(cell, figures=()))
-    # Empty fields of metrics are left out, as in the record.
+    # Empty fields of metrics are omitted, as in the record.
     values["metrics"] = [
         {
             name: value
@@ -258,7 +259,7 @@ def _cell_json(cell: RecordedCell) -> dict[str, object]:
         }
         for metric in cell.metrics
     ]
-    # The bytes of pictures are in the record and the report; here their names do.
+    # Pictures are in the record and the report; only their names are listed here.
     values["figures"] = [
         {"name": figure.name, "caption": figure.caption, "media_type": figure.media_type}
         for figure in cell.figures

@@ -20,13 +20,14 @@ from orthoflow.untrusted_text import shown
     required=True,
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="Your private Ed25519 key in OpenSSH format; you are asked for its password.",
+    help="Your private Ed25519 key in OpenSSH format; you are prompted for its passphrase.",
 )
 def sign(run: Path, key: Path) -> int:
     """Sign the record of RUN, a run folder or its run.h5, with your key.
 
-    The signature lies beside the record as run.h5.sig and changes nothing in it. Only a record that
-    verifies is signed. `orthoflow verify RUN --signer FILE` checks it with your public key.
+    The signature is written to run.h5.sig next to the record, which is not changed. Only a record
+    that passes verification is signed. `orthoflow verify RUN --signer FILE` checks the signature
+    with your public key.
     """
     from orthoflow.records.verify import SIGNATURE_SUFFIX, sign_record, verify_run
 

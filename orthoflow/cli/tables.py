@@ -1,4 +1,4 @@
-"""Plain text on the terminal: aligned tables, distances of products, quantities in words, JSON."""
+"""Plain text for terminals: aligned tables, distances of products, quantities, JSON."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ if TYPE_CHECKING:
 
 Row = TypeVar("Row")
 _VERDICTS: Final = ("identical", "within tolerance", "different", "not measured")
-# Of longer tables the rest is printed when it is asked for.
+# Longer tables are truncated unless all rows are requested.
 ROWS_MOST: Final = 20
-# Units of tolerances as they are printed; `1` stands for plain numbers.
+# Units of tolerances as printed; `1` is for plain numbers.
 _UNITS: Final = {"grey": " grey levels", "1": ""}
 
 
 def echo(*lines: str, err: bool = False) -> None:
-    """Print lines, on standard error if asked to, with control characters escaped.
+    """Print lines, optionally on standard error, with control characters escaped.
 
-    All output of commands goes through here: names, messages and logs are untrusted.
+    All output of commands is printed here, because names, messages and logs are untrusted.
     """
     for line in lines or ("",):
-        click.echo(shown(line), err=err)  # noqa: TID251 - the one place
+        click.echo(shown(line), err=err)  # noqa: TID251 - the only place
 
 
 def echo_folded(line: str) -> None:
-    """Print a sentence; on a terminal its lines end at words."""
+    """Print a sentence; on a terminal, break its lines between words."""
     width = shutil.get_terminal_size().columns if sys.stdout.isatty() else 0
     echo(*(folded(shown(line), width) if width else (line,)))
 
 
 def folded(line: str, width: int) -> list[str]:
-    """Break a line at words, longer words left whole; what follows the first is set in.
+    """Break a line between words, leaving long words whole; further lines are indented.
 
     >>> folded("warning, wall: no point lies within its buffer", 24)
     ['warning, wall: no point', '  lies within its buffer']
@@ -54,12 +54,12 @@ def folded(line: str, width: int) -> list[str]:
 
 
 def echo_diagnostics(cells: Iterable[RecordedCell], run: Path, *, is_whole: bool = False) -> None:
-    """Print what limits the results of cells, the most harmful first, a line per code.
+    """Print what limits the results of cells, the most severe first, one line per code.
 
     Args:
-        cells: of the run.
-        run: its folder, or its record, for the command that prints the rest.
-        is_whole: print all of them, and notes too.
+        cells: cells of the run.
+        run: its folder or record, for the hint on how to print the remaining ones.
+        is_whole: whether to print all of them, including notes.
     """
     from orthoflow.diagnostics import FIRST_SHOWN, grouped, standing
 
@@ -74,19 +74,19 @@ def echo_diagnostics(cells: Iterable[RecordedCell], run: Path, *, is_whole: bool
 
 
 def echo_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print rows under a header, columns aligned; nothing when there are no rows."""
+    """Print rows under a header in aligned columns; nothing if there are no rows."""
     if rows:
         for line in table_lines(header, rows):
             echo(line)
 
 
 def table_lines(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Write rows under a header, columns aligned.
+    """Return rows under a header in aligned columns.
 
     >>> table_lines(("step", "time"), [("cloud", "1.0 s")])
     ['step   time', 'cloud  1.0 s']
     """
-    # Escaped first: what is written out is longer.
+    # Escape first, since escapes change the widths.
     laid = [[shown(text) for text in row] for row in (header, *rows)]
     widths = [max(len(row[i]) for row in laid) for i in range(len(header))]
     return [
@@ -96,17 +96,17 @@ def table_lines(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[st
 
 
 def echo_json(value: object) -> None:
-    """Print a value as JSON, readable and stable."""
+    """Print a value as JSON, indented and in a fixed order."""
     text = shown_json(json.dumps(value, indent=2, ensure_ascii=False))
     click.echo(text)  # noqa: TID251 - control characters are escaped as in JSON
 
 
 def echo_distances(distances: Sequence[ProductDistance], most: int | None = None) -> None:
-    """Print a row per product, the reasons of what differs, and how many there are of each.
+    """Print a row per product, the reasons for differences, and the number of each verdict.
 
     Args:
-        distances: of products.
-        most: rows that are printed, those that differ first; all without it.
+        distances: distances of products.
+        most: maximum number of rows, those with differences first; None for all.
     """
     rows = first_rows(distances, most, lambda item: item.verdict == "identical")
     echo_table(
@@ -131,20 +131,20 @@ def echo_distances(distances: Sequence[ProductDistance], most: int | None = None
 def first_rows(
     rows: Sequence[Row], most: int | None, place: Callable[[Row], int | tuple[int, ...]]
 ) -> Sequence[Row]:
-    """Return the rows of a table that are printed: all, or the first by their place of too many."""
+    """Return the rows of a table to print: all, or the first ones by rank if there are too many."""
     if most is None or len(rows) <= most:
         return rows
     return sorted(rows, key=place)[:most]
 
 
 def echo_left_out(n_rows: int, most: int | None) -> None:
-    """Print how many rows of a table were left out, and how to see them."""
+    """Print how many rows of a table were omitted, and how to see them."""
     if most is not None and n_rows > most:
         echo(f"and {n_rows - most} more, which --all prints")
 
 
 def verify_hint(*runs: Path) -> str:
-    """Return a sentence that names the command which checks large arrays, too.
+    """Return a sentence about the command that also checks large arrays.
 
     >>> verify_hint(Path("first"))
     '`orthoflow verify first` checks that nothing changed since it was written'
@@ -155,7 +155,7 @@ def verify_hint(*runs: Path) -> str:
 
 
 def verdict_counts(distances: Sequence[ProductDistance]) -> str:
-    """Count the products of each verdict.
+    """Return the number of products of each verdict.
 
     >>> verdict_counts(())
     '0 products'
@@ -169,7 +169,7 @@ def verdict_counts(distances: Sequence[ProductDistance]) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Write a duration in hours, minutes and seconds.
+    """Format a duration in hours, minutes and seconds.
 
     >>> [duration(seconds) for seconds in (0.001, 0.042, 59.97, 75, 3700)]
     ['< 0.01 s', '0.04 s', '1 min 00 s', '1 min 15 s', '1 h 02 min']
@@ -186,7 +186,7 @@ def duration(seconds: float) -> str:
 
 
 def size(n_bytes: float) -> str:
-    """Write a number of bytes in binary units.
+    """Format a number of bytes in binary units.
 
     >>> [size(n) for n in (512, 2048, 5 * 1024**3)]
     ['512 B', '2.0 KiB', '5.0 GiB']
@@ -200,7 +200,7 @@ def size(n_bytes: float) -> str:
 
 
 def number(value: float) -> str:
-    """Write a number to six significant digits, counts to the last one.
+    """Format a number with six significant digits; counts with all digits.
 
     >>> number(2251930.0), number(0.0012345678), number(-3.0)
     ('2251930', '0.00123457', '-3')
@@ -209,7 +209,7 @@ def number(value: float) -> str:
 
 
 def counted(count: int, noun: str) -> str:
-    """Write a count with its noun.
+    """Format a count with its noun.
 
     >>> counted(1, "step"), counted(3, "step")
     ('1 step', '3 steps')
@@ -220,12 +220,12 @@ def counted(count: int, noun: str) -> str:
 def medians(
     counts: Mapping[str, Collection[int]], n_datasets: int, flags: Collection[str] = ()
 ) -> str:
-    """Describe of how many datasets medians are.
+    """Describe over how many datasets medians are taken.
 
     Args:
-        counts: name of a number -> how many datasets have it, in each of its rows.
-        n_datasets: of the run.
-        flags: those that are 1 where something is so and 0 where not.
+        counts: name of a metric -> number of datasets that have it, for each of its rows.
+        n_datasets: number of datasets of the run.
+        flags: names of yes/no metrics.
 
     >>> medians({"rms_mm": [2, 2], "depth_rmse_mm": [1, 1], "n_oriented": [0, 2]}, 2)
     'medians of 2 datasets, of fewer where some have no value: depth_rmse_mm 1, n_oriented 0 to 2'

@@ -1,4 +1,4 @@
-"""`orthoflow verify`: check that a record is whole and unchanged."""
+"""`orthoflow verify`: check that a record is complete and unchanged."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     "--signer",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="The public key, in OpenSSH format, that the record must be signed with.",
+    help="Public key, in OpenSSH format, of the required signer.",
 )
 @click.option(
     "--strict",
@@ -30,15 +30,14 @@ if TYPE_CHECKING:
 )
 @json_option
 def verify(run: Path, signer: Path | None, *, strict: bool, as_json: bool) -> int:
-    """Check that the record of RUN, a run folder or its run.h5, is whole and unchanged.
+    """Check that the record of RUN, a run folder or its run.h5, is complete and unchanged.
 
-    Recomputes the seal of the file, the digest of every product and input file in the record and
-    every cache key, compares what repeats the document with it, and the published files and report
-    pages beside the record with what was written. Files that are missing, or that the record does
-    not name, and a report that was changed are noted; with --strict they fail. Figures beside the
-    report, and other files in the folder, such as logs, are not covered. With --signer the record
-    must be signed with that key.
-    Ends with 3 when something differs, or RUN is not a record or has another version.
+    Recomputes the seal of the file, the digest of every product and input file in the record, and
+    every cache key; compares redundant entries of the record, and the published files and report
+    pages next to it with their digests. Missing files, files unknown to the record, and a changed
+    report are only noted; with --strict they are errors. Figures next to the report and other files
+    in the folder, such as logs, are not checked. With --signer, the record must be signed with that
+    key. The exit code is 3 if something differs, or if RUN is not a record or has another version.
     """
     from orthoflow.records.verify import verify_run
 

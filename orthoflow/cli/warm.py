@@ -1,4 +1,4 @@
-"""`orthoflow warm`: compile what runs would compile, before there is a run."""
+"""`orthoflow warm`: compile kernels in advance of runs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from orthoflow.catalog.catalog import Catalog
     from orthoflow.engine.results import CellResult
 
-# Shipped recipes that between them run our methods on simulated rooms, and what makes these small.
+# Shipped recipes that together run all built-in methods on simulated rooms, and settings that make
+# the rooms small.
 _COARSE: Final = ("room.scan_step_m=0.05", "wall.gsd_m=0.05")
 _WITH_PHOTOS: Final = ("room.scan_step_m=0.004", "room.photo_gsd_m=0.003")
 _RECIPES: Final[Mapping[str, tuple[str, ...]]] = {
@@ -35,11 +36,11 @@ _UNKNOWN: Final = "no simulated room uses it: it is compiled when it first runs"
 @click.argument("workflow", metavar="[WORKFLOW]", required=False)
 @json_option
 def warm(workflow: str | None, *, as_json: bool) -> int:
-    """Compile the kernels of all our methods, or of those in WORKFLOW, on small simulated rooms.
+    """Compile the kernels of all built-in methods, or of those in WORKFLOW, on simulated rooms.
 
-    Runs of this user then find them, instead of compiling. They are kept in the user's cache
-    (~/.cache/orthoflow), or in the folder that the variable NUMBA_CACHE_DIR names, as long as
-    nobody else may write there; never in a store.
+    Later runs of the same user then need not compile them. They are kept in the user's cache
+    (~/.cache/orthoflow), or in the folder given by the variable NUMBA_CACHE_DIR if only this user
+    may write there; never in a store.
     """
     warmed = _warm(workflow)
     if as_json:
@@ -51,17 +52,17 @@ def warm(workflow: str | None, *, as_json: bool) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class Warmed:
-    """What one call did.
+    """Result of the command.
 
     Attributes:
-        folder: where the kernels are.
-        n_compiled: kernels that were compiled, each type of arguments for itself.
-        n_before: kernels that were there already.
-        size_bytes: of all of them.
-        wall_s: how long it took.
-        methods: that ran.
-        failed: method -> why it could not be run, where that is no missing library.
-        left_out: method -> why nothing was compiled for it.
+        folder: folder of the kernels.
+        n_compiled: number of compiled kernels; each combination of argument types counts.
+        n_before: number of kernels that existed before.
+        size_bytes: total size of the kernels.
+        wall_s: duration.
+        methods: methods that were run.
+        failed: method -> reason of its failure, unless a library is missing.
+        left_out: method -> reason why nothing was compiled for it.
     """
 
     folder: str
@@ -107,11 +108,11 @@ def _warm(workflow: str | None) -> Warmed:
 
 
 def _results(catalog: Catalog, wanted: Collection[str] | None) -> dict[str, CellResult]:
-    """Run the recipes in a temporary store; return one result per method, preferably a good one.
+    """Run the recipes in a temporary store; return one result per method, preferably a success.
 
     Args:
         catalog: the installed plugins.
-        wanted: methods, which run with all that they need; None for all.
+        wanted: methods to run, with all methods that they need; None for all.
     """
     from orthoflow.cli.progress import Progress
     from orthoflow.engine.plan import RunOptions, needed_addresses, plan_run
@@ -129,7 +130,7 @@ def _results(catalog: Catalog, wanted: Collection[str] | None) -> dict[str, Cell
             cells = {cell.address: cell for cell in expand_cells(loaded, catalog)}
             chosen: set[str] = set()
             for address, cell in cells.items():
-                # Words, switches and inputs decide which kernels compute; numbers do not.
+                # Texts, flags and inputs decide which kernels are used; numbers do not.
                 words = {k: v for k, v in cell.params_set.items() if isinstance(v, str | bool)}
                 call = (cell.method, frozenset(words.items()), frozenset(cell.inputs))
                 is_wanted = wanted is None or cell.method in wanted

@@ -137,18 +137,17 @@ class OpenedRun(Run):
         """Return an output as an object of its product class.
 
         Args:
-                address: address of the cell.
-                port: name of the output.
-                store: folder of stored results, for products that the record references but does
-                    not contain.
+            address: address of the cell.
+            port: name of the output.
+            store: folder of stored results, for products that the record references but does not
+                contain.
 
         Raises:
-                ArgumentError: the run does not have this cell, or the cell does not have this
-                    output.
-                RecordError: neither the record nor the store contains the output, or the record is
-                    damaged.
-                PluginError: no installed plugin defines the type of the product.
-                DamageError: the stored output is damaged.
+            ArgumentError: the run does not have this cell, or the cell does not have this output.
+            RecordError: neither the record nor the store contains the output, or the record is
+                damaged.
+            PluginError: no installed plugin defines the type of the product.
+            DamageError: the stored output is damaged.
         """
         from orthoflow.catalog.discovery import discover_catalog  # noqa: PLC0415 - loads plugins
         from orthoflow.engine.store import stores_at  # noqa: PLC0415 - rarely needed
@@ -175,10 +174,10 @@ class OpenedRun(Run):
         """Return the orthoimage of a wall as an array with its frame.
 
         Args:
-                number: number of the wall, as in the names of its files; None for the first one.
-                cell: address of the cell that made it. None for the cell of the baseline, or, with
-                    a warning, of another combination if the baseline has no orthoimage.
-                data: name of the dataset, if the run has several; None for the first one.
+            number: number of the wall, as in the names of its files; None for the first one.
+            cell: address of the cell that made it. None for the cell of the baseline, or, with a
+                warning, of another combination if the baseline has no orthoimage.
+            data: name of the dataset, if the run has several; None for the first one.
 
         Raises:
             ArgumentError: the run does not have this orthoimage; the message lists those it has.

@@ -1,1 +1,1 @@
-"""What `orthoflow export` writes: the table of formats, their options, a module per family."""
+"""The writers of `orthoflow export`: table of formats, options, and a module per family."""

@@ -1,4 +1,4 @@
-"""The options of `orthoflow export` that belong to some formats only."""
+"""The options of `orthoflow export` that apply to some formats only."""
 
 from __future__ import annotations
 
@@ -15,34 +15,34 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Choices:
-    """The options that belong to some formats only; what nobody gave is None, False or empty.
+    """Options that apply to some formats only; None, False or empty if not given.
 
     Attributes:
-        cell: address of the cell that is meant.
-        license_text: of a crate.
-        author: of a crate.
-        scale: of sheets, n of 1 : n.
-        paper: of sheets.
-        grid: distance of the crosses on sheets in their unit, 0 for none.
-        units: of what is written on sheets.
-        title_block: file with what an office writes on its sheets.
-        beside: rasters that sheets show beside the orthoimage.
-        embed: with every product and input.
-        split: a record per dataset.
+        cell: address of the cell to export.
+        license_text: license of a crate.
+        author: author of a crate.
+        scale: n of 1 : n of sheets.
+        paper: paper size of sheets.
+        grid: distance of the grid crosses on sheets in their unit, 0 for none.
+        units: unit of numbers on sheets.
+        title_block: file with the office's title block.
+        beside: rasters to show beside the orthoimage on sheets.
+        embed: whether to include every product and input.
+        split: whether to write a record per dataset.
         inputs: input files, `NAME=PATH`.
-        store: where products are that the record only names.
-        colour: what the colours of points show.
-        wall: number of the only wall that is meant.
-        box: corners of the only part that is meant, as text.
-        clean: without gross outliers.
-        relief: with the depths of walls.
-        heights_m: where plans are cut, above the floor.
-        through: where sections are cut, `x,y,x,y`.
-        dimensions: with lengths beside the lines of plans and sections.
-        language: of labels.
+        store: store with products that the record references but does not contain.
+        colour: source of the colours of points.
+        wall: number of the only wall to export.
+        box: corners of the part to export, as text.
+        clean: whether to remove isolated points.
+        relief: whether to model walls from their depths.
+        heights_m: heights of plans above the floor.
+        through: lines of sections, `x,y,x,y`.
+        dimensions: whether to write lengths next to the lines of plans and sections.
+        language: language of labels.
         light: azimuth and altitude of a raking light, `315,25`.
-        base_url: where an IIIF folder will be handed out.
-        figure_format: of figures: `pdf`, `svg` or `png`.
+        base_url: address at which an IIIF folder will be published.
+        figure_format: format of figures: `pdf`, `svg` or `png`.
     """
 
     cell: str | None = None

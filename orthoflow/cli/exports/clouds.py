@@ -1,4 +1,4 @@
-"""Exports of the registered cloud: chosen, coloured, and written by the writer of the format."""
+"""Export of the registered cloud: selection of points, colours, and file formats."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def _export(
     folder: Path,
     chosen: Choices,
 ) -> str:
-    """Write the cloud to a file of that name, and what it holds as `cloud.json`."""
+    """Write the cloud to a file with this name, and a description of it to `cloud.json`."""
     is_labelled = chosen.cell is not None or any(
         output.type_name == "labels"
         for cell in run.cells.values()
@@ -70,7 +70,7 @@ def _export(
         raise ArgumentError(
             f"the labels are of {len(labels.plane_index)} points, but the cloud has {len(cloud)}"
         )
-    # Read only where their colours may be wanted; a refusal names them all the same.
+    # Read only if their colours may be used; an error message lists them in any case.
     is_wanted = chosen.colour in {None, "photos"}
     oriented = _oriented(run, cells, chosen) if is_wanted else ()
     has: dict[Colouring, bool] = {
@@ -135,7 +135,7 @@ def _makers_of_cameras(cells: Any) -> dict[str, Any]:
 
 
 def _oriented(run: Run, cells: Any, chosen: Choices) -> tuple[tuple[Photo, ViewingCamera], ...]:
-    """Photos and cameras of the last cell of a branch that oriented any."""
+    """Return photos and cameras of the last cell of a branch that oriented any."""
     makers = _makers_of_cameras(cells)
     if not makers:
         return ()
@@ -154,7 +154,7 @@ def _oriented(run: Run, cells: Any, chosen: Choices) -> tuple[tuple[Photo, Viewi
 def _photo_colours(
     cloud: PointCloud, oriented: Sequence[tuple[Photo, ViewingCamera]], scratch: Path
 ) -> PointColours:
-    """Colours in files that are mapped, so that memory does not follow the points."""
+    """Return colours that are memory-mapped from files, so that they do not occupy memory."""
     n_points = len(cloud)
 
     def mapped(name: str, kind: type[np.generic], *more: int) -> NDArray[Any]:
@@ -186,7 +186,7 @@ def _box(text: str | None) -> NDArray[np.float64] | None:
 
 
 def _crs_wkt(walls: Walls | None) -> str:
-    """What the workflow said of the scan's coordinates (`crs` of `raster.grid`)."""
+    """Return the coordinate system of the scan set in the workflow (`crs` of `raster.grid`)."""
     if walls is None:
         return ""
     known = {epsg_of(wall.frame.map_crs) for wall in walls.walls} - {None}

@@ -1,4 +1,4 @@
-"""Exports that draw: sheets, CAD files, vectors."""
+"""Exports of drawings: sheets, CAD files and vectors."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from orthoflow.records.walls import RoomResults, WallResult, room_results
 
 
 def chosen_walls(results: RoomResults, chosen: Choices) -> Sequence[WallResult]:
-    """The walls of a run that are drawn: all, or the one that is asked for."""
+    """Return the walls to draw: all, or the selected one."""
     if chosen.wall is None:
         return results.walls
     numbered = {wall.number: wall for wall in results.walls}
@@ -41,7 +41,7 @@ def chosen_walls(results: RoomResults, chosen: Choices) -> Sequence[WallResult]:
 
 
 def export_dxf(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write `wall_<k>.dxf` and `room.dxf`, and the pictures that they refer to."""
+    """Write `wall_<k>.dxf` and `room.dxf`, and the pictures to which they refer."""
     results = room_results(run, chosen.cell, chosen.wall)
     walls = chosen_walls(results, chosen)
     lines = _lines(results)
@@ -133,7 +133,7 @@ def export_qgis(run: Run, folder: Path, chosen: Choices) -> str:
 
 
 def _images(run: Run, address: str) -> Sequence[Orthoimage]:
-    """The orthoimages of a cell; none where it gives other rasters."""
+    """Return the orthoimages of a cell; empty if its rasters are of another type."""
     for port, output in run.cell(address).outputs.items():
         if output.type_name == Orthoimages.type_name and output.embedded:
             return Orthoimages.from_payload(run.payload(address, port)).images

@@ -1,4 +1,4 @@
-"""The formats of `orthoflow export`: one entry each, which help and refusals follow."""
+"""The table of formats of `orthoflow export`, used by help and error messages."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 
 class Writer(Protocol):
-    """Writes a format."""
+    """Writer of a format."""
 
     def __call__(self, run: Run, folder: Path, chosen: Choices, /) -> str:
-        """Make a folder with `make_empty` once all is there, fill it, and say what was written."""
+        """Write to a folder, created by `make_empty` after all checks; return a summary."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class Format:
     """One format of `--to`.
 
     Attributes:
-        writer: import string `module:function` below `orthoflow.cli.exports`, of a `Writer`.
-        summary: what it holds, for the help.
-        takes_rasters: it reads GeoTIFFs that the run published.
+        writer: import string `module:function` of a `Writer`, relative to `orthoflow.cli.exports`.
+        summary: its content, for the help.
+        takes_rasters: whether it reads GeoTIFFs that the run published.
     """
 
     writer: str
@@ -39,7 +39,7 @@ class Format:
     takes_rasters: bool = False
 
     def load(self) -> Writer:
-        """Import the module and give the function."""
+        """Import the module and return the function."""
         module_name, _, function = self.writer.partition(":")
         writer: Writer = getattr(import_module(f"{__package__}.{module_name}"), function)
         return writer
@@ -48,7 +48,7 @@ class Format:
 FORMATS: Final[Mapping[str, Format]] = {
     "colmap": Format(
         "results:export_colmap",
-        "the oriented photos with their lenses and ties as a text model that COLMAP opens",
+        "the oriented photos with their lenses and ties as a COLMAP text model",
     ),
     "csv": Format(
         "results:export_csv",
@@ -56,8 +56,8 @@ FORMATS: Final[Mapping[str, Format]] = {
     ),
     "dxf": Format(
         "drawings:export_dxf",
-        "each wall in its own coordinates with its orthoimage to scale, and the room in "
-        "space: planes, where they meet, outline, check points",
+        "each wall in its own coordinates with its orthoimage to scale, and the room in 3D: "
+        "planes, their intersections, outline, check points",
         takes_rasters=True,
     ),
     "figures": Format(
@@ -71,65 +71,66 @@ FORMATS: Final[Mapping[str, Format]] = {
     ),
     "geojson": Format(
         "drawings:export_geojson",
-        "outlines of walls and lines in which planes meet, from above and in the "
+        "outlines of walls and intersections of planes, in plan view and in the "
         "coordinates of each wall",
         takes_rasters=True,
     ),
     "layers": Format(
         "results:export_layers",
-        "the part of each photo on each wall, as GeoTIFFs, from the store unless "
-        "the run was made with --embed",
+        "each photo projected onto each wall, as GeoTIFFs; from the store unless the run was "
+        "made with --embed",
     ),
     "laz": Format(
         "clouds:export_laz",
-        "the registered cloud as LAZ 1.4 with colours, normals, plane, deviation from it "
+        "the registered cloud as LAZ 1.4, with colour, normal, plane, distance from the plane "
         "and scan of each point",
     ),
     "copc": Format(
         "clouds:export_copc",
-        "the same as COPC, a LAZ with an octree: viewers load what they show",
+        "the same as COPC (LAZ with an octree), of which viewers load only the visible part",
     ),
     "ply": Format(
         "clouds:export_ply",
-        "the same as binary PLY with double coordinates",
+        "the same as binary PLY with double-precision coordinates",
     ),
     "e57": Format(
         "clouds:export_e57",
-        "the same as E57, one scan each with its pose",
+        "the same as E57, with a pose for each scan",
     ),
     "gltf": Format(
         "viewers:export_gltf",
-        "the walls of the room with their orthoimages as a model that browsers open, room.glb",
+        "the walls of the room with their orthoimages as a 3D model, with a page to view it",
         takes_rasters=True,
     ),
     "tiles": Format(
         "viewers:export_tiles",
-        "each orthoimage as Deep Zoom tiles, with a page that measures on them without a server",
+        "each orthoimage as Deep Zoom tiles, with a page to measure on that needs no server",
         takes_rasters=True,
     ),
     "plan": Format(
         "sections:export_plans",
-        ("the room cut horizontally at --height above the floor, as DXF, SVG and PDF to scale"),
+        "a horizontal section of the room at --height above the floor, as DXF, SVG and PDF "
+        "to scale",
         takes_rasters=True,
     ),
     "section": Format(
         "sections:export_sections",
-        "the room cut vertically through two points of the plan, likewise",
+        "a vertical section of the room through two points of the plan, in the same formats",
         takes_rasters=True,
     ),
     "elevation": Format(
         "sheets:export_elevations",
-        "the walls of the room unfolded on one sheet, at their true heights, as PDF",
+        "the walls of the room side by side at their heights on one sheet, as PDF",
         takes_rasters=True,
     ),
     "relief": Format(
         "drawings:export_relief",
-        "each wall as shaded relief, with contour lines and depths in colour",
+        "a shaded relief of each wall, with contour lines and coloured depths",
         takes_rasters=True,
     ),
     "qgis": Format(
         "drawings:export_qgis",
-        "a QGIS project in which the walls stand side by side at their heights",
+        "a QGIS project with the walls side by side at their heights",
         takes_rasters=True,
     ),
     "iiif": Format(
@@ -139,14 +140,11 @@ FORMATS: Final[Mapping[str, Format]] = {
     ),
     "prov": Format(
         "results:export_prov",
-        (
-            "W3C PROV-JSON: which products were derived from which, by which method of "
-            "which software"
-        ),
+        ("W3C PROV-JSON: the origin of every product, with the methods and software that made it"),
     ),
     "stac": Format(
         "results:export_stac",
-        "the orthoimages with a STAC item beside each, and a collection",
+        "the orthoimages with a STAC item for each, and a collection",
         takes_rasters=True,
     ),
     "ro-crate": Format(
@@ -156,8 +154,8 @@ FORMATS: Final[Mapping[str, Format]] = {
     ),
     "sheet": Format(
         "sheets:export_sheets",
-        "each wall on paper in exact scale, as PDF, with coordinates, title block, "
-        "legend, accuracy and the seal of the record",
+        "each wall to scale as PDF, with coordinates, title block, legend, accuracy and the "
+        "seal of the record",
         takes_rasters=True,
     ),
 }

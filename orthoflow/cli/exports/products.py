@@ -1,4 +1,4 @@
-"""What an export takes from a run: products by type or digest, and an empty folder."""
+"""Access of exports to a run: products by type or digest, and creation of an empty folder."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _Wall = TypeVar("_Wall")
 
 _MOST_NAMED: Final = 5
 
-# What a product type is called where a cell has none, and where a run has none.
+# Names of product types in errors about cells, and in errors about runs.
 _SAID: Final = {
     "cameras": ("orientations", "has oriented no photos"),
     "layers": ("layers", "has projected nothing onto walls"),
@@ -33,10 +33,10 @@ _SAID: Final = {
 
 
 def product_of(run: Run, digest: str, cls: type[ProductT], store: Path) -> ProductT:
-    """A product from the record, or from the store where the record only names it.
+    """Return a product from the record, or from the store if the record does not contain it.
 
     Raises:
-        ArgumentError: it is in neither.
+        ArgumentError: neither contains it.
     """
     from orthoflow.engine.store import Store
 
@@ -54,12 +54,12 @@ def product_of(run: Run, digest: str, cls: type[ProductT], store: Path) -> Produ
 
 
 def output_of(run: Run, type_name: str, cell: str | None) -> tuple[str, str]:
-    """The wanted cell, or the last one, that gives a product of a type, and the port.
+    """Return the selected cell, or the last one with an output of this type, and the port.
 
-    Where others give one too, it is said which is taken.
+    If several cells have such an output, a note says which one is used.
 
     Raises:
-        ArgumentError: there is none, or the cell gives none.
+        ArgumentError: no cell has such an output, or the selected cell does not.
     """
     named, missing = _SAID[type_name]
     found = {
@@ -85,13 +85,13 @@ def output_of(run: Run, type_name: str, cell: str | None) -> tuple[str, str]:
 
 
 def wanted_wall(number: int, known: Mapping[int, _Wall], who: str, does: str) -> _Wall:
-    """The wall of a number, which is the place of its plane in `planes.json`, as files have it.
+    """Return the wall with a number, which is the index of its plane in `planes.json`.
 
     Args:
-        number: as `--wall` gives it.
+        number: value of `--wall`.
         known: number -> wall.
-        who: what has these walls.
-        does: `shows`, `has`.
+        who: subject of the error message.
+        does: verb of the error message: `shows`, `has`.
 
     Raises:
         ArgumentError: there is no such wall.
@@ -105,15 +105,15 @@ def wanted_wall(number: int, known: Mapping[int, _Wall], who: str, does: str) ->
 
 
 def numbers_of(text: str, count: int, expected: str) -> list[float]:
-    """Read numbers with commas between.
+    """Parse comma-separated numbers.
 
     Args:
-        text: as an option gives it.
-        count: how many there have to be.
-        expected: the option and what it takes, for the error.
+        text: value of an option.
+        count: required number of numbers.
+        expected: the option and its format, for the error message.
 
     Raises:
-        ArgumentError: there are others.
+        ArgumentError: the text has another format.
     """
     try:
         values = [float(word) for word in text.split(",")]
@@ -125,10 +125,10 @@ def numbers_of(text: str, count: int, expected: str) -> list[float]:
 
 
 def make_empty(folder: Path) -> None:
-    """Make a folder, and what it lies in.
+    """Create a folder and its parents.
 
     Raises:
-        ArgumentError: something is in the way.
+        ArgumentError: it cannot be created.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -137,7 +137,7 @@ def make_empty(folder: Path) -> None:
 
 
 def branch_of(run: Run, address: str) -> dict[str, RecordedCell]:
-    """The cells of the same variants, dataset and repeat as one cell, as far as they have them."""
+    """Return the cells with the same variants, dataset and repeat as a cell, where applicable."""
     chosen = run.cell(address)
     return {
         name: cell
@@ -152,10 +152,10 @@ def branch_of(run: Run, address: str) -> dict[str, RecordedCell]:
 def last_product(
     run: Run, cells: Mapping[str, RecordedCell], cls: type[ProductT], store: Path
 ) -> ProductT | None:
-    """The product of a type that the last of some cells gave; None where none did.
+    """Return the product of a type from the last of the cells that has one, or None.
 
     Raises:
-        ArgumentError: it is neither in the record nor in the store.
+        ArgumentError: neither the record nor the store contains it.
     """
     found = [
         output.digest

@@ -1,4 +1,4 @@
-"""Exports of results as they are, and of where they come from and lie: no drawing, no cloud."""
+"""Exports of results and their provenance, other than drawings and clouds."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def _write_texts(folder: Path, files: Mapping[str, str]) -> None:
 
 
 def export_figures(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write the figures of all cells, the plan of photos and curves of sweeps, or of one cell."""
+    """Write the figures of a cell, or of all cells with the plan of photos and curves of sweeps."""
     from functools import partial
 
     from orthoflow.records.runs import figure_files, write_files
@@ -60,7 +60,7 @@ def export_figures(run: Run, folder: Path, chosen: Choices) -> str:
 
     suffix = chosen.figure_format or "svg"
     addresses = run.cells if chosen.cell is None else (run.cell(chosen.cell).address,)
-    # Refused before a folder is made for them.
+    # Invalid names are rejected before a folder is created.
     n_figures = len(figure_files(run, addresses))
     make_empty(folder)
     n_written = write_figures(run, folder, addresses, as_pdf=suffix == "pdf")
@@ -79,7 +79,7 @@ def export_figures(run: Run, folder: Path, chosen: Choices) -> str:
 
 
 def export_tables(run: Run, folder: Path, _chosen: Choices) -> str:
-    """Write tables and citations as a paper takes them."""
+    """Write tables and citations for publications."""
     from orthoflow.report.paper_tables import paper_files
 
     files = paper_files(run)
@@ -89,7 +89,7 @@ def export_tables(run: Run, folder: Path, _chosen: Choices) -> str:
 
 
 def export_crate(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write a crate, with an embedded record if wanted."""
+    """Write a crate, optionally with an embedded record."""
     from orthoflow.records.archive import NO_LICENSE, write_crate
     from orthoflow.records.runs import REPORT_FILE
     from orthoflow.report import write_page
@@ -97,7 +97,7 @@ def export_crate(run: Run, folder: Path, chosen: Choices) -> str:
     make_empty(folder)
     license_text = chosen.license_text or NO_LICENSE
     if run.files_folder is not None:
-        # Of a record that lies alone its rasters were made anew, in a folder of their own.
+        # If the record was alone in its folder, its rasters were restored to a folder of their own.
         write_page(run, run.folder / REPORT_FILE)
     record = embedded(run, folder, chosen) if chosen.embed else None
     author = (chosen.author or "").strip()
@@ -141,7 +141,7 @@ def export_prov(run: Run, folder: Path, _chosen: Choices) -> str:
 
 
 def export_stac(run: Run, folder: Path, _chosen: Choices) -> str:
-    """Write `collection.json`, and the orthoimages with an item beside each."""
+    """Write `collection.json`, and the orthoimages with an item for each."""
     from orthoflow.records.stac import COLLECTION_FILE, write_stac
 
     make_empty(folder)
@@ -150,7 +150,7 @@ def export_stac(run: Run, folder: Path, _chosen: Choices) -> str:
 
 
 def embedded(run: Run, folder: Path, chosen: Choices) -> Run:
-    """Write a record with every product and input file in it; gives it opened."""
+    """Write a record with every product and input file, and return it opened."""
     from orthoflow.engine.journal import RECORD_FILE
     from orthoflow.engine.store import Store
     from orthoflow.records.write import write_embedded

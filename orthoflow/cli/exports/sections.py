@@ -1,4 +1,4 @@
-"""Exports of plans and sections, cut from the planes and the cloud of a run."""
+"""Exports of plans and sections of the planes and the cloud of a run."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def export_plans(run: Run, folder: Path, chosen: Choices) -> str:
 
 
 def export_sections(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write `section_<n>.dxf`, `.svg` and `.pdf` for each pair of places."""
+    """Write `section_<n>.dxf`, `.svg` and `.pdf` for each pair of points."""
     if not chosen.through:
         raise ArgumentError(
             "--to section needs --through X,Y,X,Y, two places of the plan in metres "
@@ -118,7 +118,7 @@ def _write(
 def _points(
     run: Run, address: str, chosen: Choices
 ) -> tuple[PointCloud | None, PointLabels | None]:
-    """The cloud in which planes were found, and its labels; None where they are kept nowhere."""
+    """Return the cloud in which planes were detected, and its labels; None if not stored."""
     cells = branch_of(run, address)
     for cell in reversed(cells.values()):
         labels = [out.digest for out in cell.outputs.values() if out.type_name == "labels"]

@@ -1,4 +1,4 @@
-"""The exports of sheets: which paper, which scale, what is written, and how drawings are cut."""
+"""Exports of sheets: choice of paper and scale, texts, and division into sheets."""
 
 from __future__ import annotations
 
@@ -59,11 +59,11 @@ def write_drawings(
     """Choose scale and paper of drawings, and write their sheets into a new folder.
 
     Args:
-        folder: made once all is laid out.
+        folder: output folder, created after the layout.
         drawn: returns the drawings at a scale.
         chosen: the options.
-        alone: names of files where a drawing takes one sheet.
-        several: where it takes several.
+        alone: file name of a drawing with one sheet.
+        several: file name of a drawing with several sheets.
 
     Returns:
         n of 1 : n, and the number of sheets.
@@ -83,7 +83,7 @@ def write_drawings(
 
 
 def text_of(run: Run, name: str, chosen: Choices, notes: tuple[Phrase, ...] = ()) -> SheetText:
-    """Return the texts of the sheets of a run."""
+    """Return the texts on the sheets of a run."""
     return SheetText(
         name=name,
         block=read_title_block(chosen.title_block) if chosen.title_block else TitleBlock(),
@@ -94,15 +94,15 @@ def text_of(run: Run, name: str, chosen: Choices, notes: tuple[Phrase, ...] = ()
 
 
 def origin_of(run: Run) -> str:
-    """Return one line about the origin of drawings."""
+    """Return one line about the origin of the drawings."""
     return f"run {run.record.run_id} of {run.record.name}, {run.record.created_by}"
 
 
 def grid_of(chosen: Choices, scale: int) -> float:
-    """Return the distance of crosses in the unit of the sheets.
+    """Return the distance of the grid crosses in the unit of the sheets.
 
     Raises:
-        ArgumentError: the wanted one is too small for the scale.
+        ArgumentError: the requested distance is too small for the scale.
     """
     unit_m = FOOT_M if chosen.units == "ft" else 1.0
     grid = nice_step(1e-3 * _GRID_MM * scale / unit_m) if chosen.grid is None else chosen.grid
@@ -151,7 +151,7 @@ def export_elevations(run: Run, folder: Path, chosen: Choices) -> str:
         )
     up = results.planes.up
     order, is_inside = unfolded(walls, up)
-    # Each wall has its own evidence; those of which the same is known share a note.
+    # Accuracy is known per wall; walls with the same notes are listed together.
     known: dict[str, list[str]] = {}
     for wall in results.walls:
         if wall.frame.raster_axes == "wall":
@@ -177,7 +177,7 @@ def export_elevations(run: Run, folder: Path, chosen: Choices) -> str:
 
 
 def _coarse(walls: Sequence[WallResult], scale: int) -> str:
-    """Say which pictures have less than 150 pixels per inch, and at which scale they have."""
+    """Return which pictures have fewer than 150 pixels per inch, and at which scale they do not."""
     coarse = [wall for wall in walls if _ppi(wall, scale) < _LEAST_PPI]
     if not coarse:
         return ""
@@ -195,7 +195,7 @@ def _ppi(wall: WallResult, scale: int) -> float:
 
 
 def _drawing(text: SheetText, results: RoomResults, wall: WallResult, chosen: Choices) -> Drawing:
-    """What is drawn of a wall, at no scale yet."""
+    """Return the drawing of a wall without a scale."""
     language, unit = chosen.language or "en", chosen.units or "m"
     frame = wall.frame
     areas = [_area(wall, opening, chosen) for opening in results.openings_of(wall)]
@@ -240,7 +240,7 @@ def _drawing(text: SheetText, results: RoomResults, wall: WallResult, chosen: Ch
 
 
 def _scaled(drawing: Drawing, wall: WallResult, chosen: Choices, scale: int) -> Drawing:
-    """Give a drawing its scale, and what follows from it: the grid, and how fine cells print."""
+    """Set the scale of a drawing, and its grid and note on resolution, which depend on it."""
     ppi = _ppi(wall, scale)
     values = {"mm": f"{1e3 * wall.frame.gsd_m:g}", "ppi": f"{ppi:.0f}"}
     coarse = (Phrase(key="coarse", values={"least": f"{_LEAST_PPI:.0f}"}),)
@@ -250,7 +250,7 @@ def _scaled(drawing: Drawing, wall: WallResult, chosen: Choices, scale: int) -> 
 
 
 def _area(wall: WallResult, opening: Opening, chosen: Choices) -> Area:
-    """An opening of a wall, from the top-left corner of the drawn wall."""
+    """Return an opening, relative to the top-left corner of the drawn wall."""
     frame, language = wall.frame, chosen.language or "en"
     outline_m = frame.gsd_m * frame.wall_from_raster(opening.outline_m)
     unit_m, unit = (FOOT_M, "ft") if chosen.units == "ft" else (1.0, "m")
@@ -259,12 +259,12 @@ def _area(wall: WallResult, opening: Opening, chosen: Choices) -> Area:
 
 
 def _first_kind(wall: WallResult) -> str:
-    """Its orthoimage, or else what the scan shows."""
+    """Return `ortho`, or else a raster of the scan."""
     return next(kind for kind in ("ortho", "intensity", "depth") if kind in wall.rasters)
 
 
 def _kinds(wall: WallResult, chosen: Choices) -> list[str]:
-    """What is shown of a wall, and what is asked."""
+    """Return the kinds of pictures to draw of a wall."""
     for kind in chosen.beside:
         if kind not in wall.rasters:
             raise ArgumentError(

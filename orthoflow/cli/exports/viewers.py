@@ -1,4 +1,4 @@
-"""Exports to look at: the room as a textured model, orthoimages as tiles with a page."""
+"""Exports for viewing: the room as a textured model, orthoimages as tiles with a page."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _LAYERS: Final = {
 
 
 def export_gltf(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write `room.glb`, and `room.html` that shows it."""
+    """Write `room.glb`, and `room.html` to view it."""
     address, orthos = _orthos(run, chosen)
     planes = last_product(run, branch_of(run, address), Planes, chosen.store)
     if planes is None:
@@ -54,7 +54,7 @@ def export_gltf(run: Run, folder: Path, chosen: Choices) -> str:
 def _depths(
     run: Run, address: str, orthos: Sequence[OrthoFile], wall: int | None
 ) -> dict[int, Path]:
-    """The published depths of walls, by number."""
+    """Return the published depth rasters of walls, by number."""
     walls = room_results(run, address, wall).walls
     found = {wall.number: wall.rasters["depth"] for wall in walls if "depth" in wall.rasters}
     for ortho in orthos:
@@ -91,7 +91,7 @@ def export_iiif(run: Run, folder: Path, chosen: Choices) -> str:
 
 
 def _canvas(wall: WallResult, scratch: Path) -> Canvas:
-    """The pictures of a wall; its relief is made for it."""
+    """Return the pictures of a wall, including a shaded relief made for this export."""
     rasters = dict(wall.rasters)
     if "depth" in rasters:
         rasters["relief"] = scratch / f"wall_{wall.number}_relief.tif"
@@ -111,7 +111,7 @@ def _canvas(wall: WallResult, scratch: Path) -> Canvas:
 
 
 def _orthos(run: Run, chosen: Choices) -> tuple[str, tuple[OrthoFile, ...]]:
-    """The published orthoimages of the wanted cell, or the last one that gave any."""
+    """Return the published orthoimages of the selected cell, or of the last one that has any."""
     address, _ = output_of(run, "orthoimages", chosen.cell)
     paths = [path for path in run.files.get(address, ()) if path.name.endswith("_ortho.tif")]
     for path in paths:

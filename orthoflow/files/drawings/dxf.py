@@ -43,13 +43,13 @@ LAYERS: Final[Layers] = {
     "A-ANNO-DIMS": ("dimensions", 2, 18),
     "A-ANNO-TEXT": ("names and notes", 7, 18),
 }
-# Letters of 2.5 mm at 1:50.
+# 2.5 mm text at 1:50.
 _TEXT_M: Final = 0.125
 _LETTER_M: Final = 0.9 * _TEXT_M
 _ROW_M: Final = 1.8 * _TEXT_M
 _METRES: Final = 6
 _VERSION: Final = "R2010"
-# For programs that do not show attributes the same is written as text beside the mark.
+# Some programs do not show attributes, so the content is also written as text next to the mark.
 _UNSEEN: Final = {"flags": 1}
 _MOST_LINES: Final = 12
 DIMENSION_STYLE: Final = "ORTHOFLOW"
@@ -60,11 +60,11 @@ _LEVEL_BLOCK: Final = "LEVEL"
 def write_wall_dxf(path: Path, wall: DrawnWall, lines: RoomLines | None) -> None:
     """Write a wall in the coordinates of its GeoTIFF, with its orthoimage to scale.
 
-    Layers are those of `LAYERS` for elevations. Openings are rectangles or arches if those fit; a
-    text states their deviation from the outline that was found. Marks are blocks with attributes.
+    The layers are those of `LAYERS` for elevations. Openings are rectangles or arches if these fit;
+    a text gives their deviation from the detected outline. Marks are blocks with attributes.
 
     Raises:
-        StoreError: it cannot be written.
+        StoreError: the file cannot be written.
     """
     document, space = _wall_document()
     frame = wall.frame
@@ -76,7 +76,7 @@ def write_wall_dxf(path: Path, wall: DrawnWall, lines: RoomLines | None) -> None
         image = space.add_image(
             definition, tuple(corners[1]), size, dxfattribs={"layer": "A-ELEV-IMAG"}
         )
-        # The rows of a ceiling go up along Y.
+        # The Y axis of a ceiling increases with the rows.
         image.dxf.v_pixel = (0.0, -frame.raster_down * frame.gsd_m, 0.0)
     low, high = corners.min(axis=0), corners.max(axis=0)
     is_upright = frame.raster_axes == "wall"
@@ -104,13 +104,13 @@ def write_wall_dxf(path: Path, wall: DrawnWall, lines: RoomLines | None) -> None
 
 
 def write_room_dxf(path: Path, walls: Sequence[DrawnWall], lines: RoomLines) -> None:
-    """Write a room in the coordinates of its scan, with a coordinate system `wall_<k>` per wall.
+    """Write a room in scan coordinates, with a user coordinate system `wall_<k>` per wall.
 
-    Layers are those of `LAYERS` for walls: edges, the outline at floor height, faces between floor
-    and ceiling, openings, surveyed points, and each orthoimage at its position.
+    The layers are those of `LAYERS` for walls: edges, the outline at floor height, faces between
+    floor and ceiling, openings, surveyed points, and each orthoimage at its position.
 
     Raises:
-        StoreError: it cannot be written.
+        StoreError: the file cannot be written.
     """
     document, space = _wall_document()
     for wall in walls:
@@ -130,7 +130,7 @@ def write_room_dxf(path: Path, walls: Sequence[DrawnWall], lines: RoomLines) -> 
 
 
 def new_document(layers: Layers, text_m: float, version: str = _VERSION) -> Drawing:
-    """Make a document in metres, with layers and a style of dimensions with texts of a height."""
+    """Return a new document in metres, with layers and a dimension style of this text height."""
     from ezdxf.filemanagement import new
 
     document = new(version, setup=True, units=_METRES)
@@ -143,15 +143,15 @@ def new_document(layers: Layers, text_m: float, version: str = _VERSION) -> Draw
 def _wall_document() -> tuple[Drawing, Modelspace]:
     document = new_document(LAYERS, _TEXT_M)
     _add_blocks(document)
-    # LibreCAD takes the limits of paper space as its paper, in metres: A3.
+    # LibreCAD uses the limits of paper space, in metres, as the paper size: A3.
     document.paperspace().dxf.limmax = (0.42, 0.297)
     return document, document.modelspace()
 
 
 def _add_dimension_style(document: Drawing, text_m: float) -> None:
-    """Define the style of dimensions: metres with three decimals, text above the line.
+    """Define the dimension style: metres with three decimals, text above the line.
 
-    The header has the same, because some programs redraw dimensions from it alone.
+    The header contains the same values, because some programs redraw dimensions from it alone.
     """
     style = document.dimstyles.add(DIMENSION_STYLE)
     values = {
@@ -176,7 +176,7 @@ def _add_dimension_style(document: Drawing, text_m: float) -> None:
 
 
 def _add_blocks(document: Drawing) -> None:
-    """Define the marks: a surveyed point with its name, a level with its height."""
+    """Define the marks: a surveyed point with its name, and a level with its height."""
     size = 0.4 * _TEXT_M
     point = document.blocks.new(_POINT_BLOCK)
     point.add_line((-size, 0), (size, 0))
@@ -217,7 +217,7 @@ def _add_level(space: Modelspace, x: float, height_m: float) -> None:
 def _add_opening(
     space: Modelspace, outline_m: NDArray[np.float64], sigma_m: float | None, words: str
 ) -> None:
-    """Add an opening in regular form, with its size and its deviation from the found outline."""
+    """Add an opening in regular form, with its size and deviation from the detected outline."""
     regular = regular_opening(outline_m, sigma_m)
     _add_polygon(space, regular.outline_m, "A-ELEV-OPNG")
     low, high = regular.outline_m.min(axis=0), regular.outline_m.max(axis=0)
@@ -295,7 +295,7 @@ def _add_points(space: Modelspace, names: Iterable[str], places: NDArray[np.floa
 
 
 def _add_text(space: Modelspace, text: str, place: NDArray[np.float64], layer: str) -> None:
-    """Add a text, moved down until it is clear of those already there, as seen from above."""
+    """Add a text, moved down until it does not overlap other texts in plan view."""
     added = space.add_text(shown(text), height=_TEXT_M, dxfattribs={"layer": layer})
     placed = space.query("TEXT")[:-1]
     others = [(*one.dxf.insert.vec2, len(one.dxf.text)) for one in placed]
@@ -314,7 +314,7 @@ def save_document(document: Drawing, path: Path) -> None:
     """Write a document.
 
     Raises:
-        StoreError: it cannot be written.
+        StoreError: the file cannot be written.
     """
     stream = StringIO()
     document.write(stream)
@@ -322,7 +322,7 @@ def save_document(document: Drawing, path: Path) -> None:
 
 
 _SAMPLE_M: Final = 0.01
-# Permitted deviation of a side from a straight line: stones and outlines are about this accurate.
+# Permitted deviation of a side from a straight line: about the accuracy of masonry and outlines.
 _TOLERANCE_M: Final = 0.02
 _SPRINGINGS: Final = 40
 _ARC_POINTS: Final = 33
@@ -335,8 +335,8 @@ class RegularOpening:
     Attributes:
         kind: `rectangle`, `arch` (a rectangle under a circular segment), or `outline` if neither
             fits.
-        outline_m: (n, 2) X and Y, counter-clockwise, not closed; an arch has its arc as a polygon.
-        deviation_m: largest distance of the found outline from this one.
+        outline_m: (n, 2) X and Y, counter-clockwise, not closed; arcs are polygons.
+        deviation_m: maximum distance of the detected outline from this one.
     """
 
     kind: Literal["rectangle", "arch", "outline"]
@@ -348,10 +348,10 @@ def regular_opening(outline_m: NDArray[np.float64], sigma_m: float | None) -> Re
     """Fit a rectangle, or else an arch, to an outline.
 
     Args:
-        outline_m: (n, 2) X and Y of an upright wall, counter-clockwise.
+        outline_m: (n, 2) X and Y on an upright wall, counter-clockwise.
         sigma_m: standard deviation of its sides, None if unknown.
 
-    A form is accepted if 95 % of the outline is within three sigma, at least 20 mm, of it.
+    A form is accepted if 95 % of the outline is within three sigma (at least 20 mm) of it.
     """
     limit_m = max(_TOLERANCE_M, 3.0 * (sigma_m or 0.0))
     samples, directions = _sampled(outline_m)
@@ -370,7 +370,7 @@ def regular_opening(outline_m: NDArray[np.float64], sigma_m: float | None) -> Re
 
 
 def _sampled(outline_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return points along an outline, and the direction of the side of each."""
+    """Return points sampled along an outline, and the direction of each point's side."""
     points, directions = [], []
     for begin, end in zip(outline_m, np.roll(outline_m, -1, axis=0), strict=True):
         length = float(np.linalg.norm(end - begin))
@@ -385,9 +385,10 @@ def _sampled(outline_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArr
 def _sides(
     samples: NDArray[np.float64], directions: NDArray[np.float64]
 ) -> tuple[float, float, float, float]:
-    """Return left, bottom, right and top, each the median of the samples of that side.
+    """Return left, bottom, right and top, each the median of the samples on that side.
 
-    In a counter-clockwise outline the left side goes down, the lower one right, and so on.
+    In a counter-clockwise outline, the left side runs down, the bottom side to the right, and so
+    on.
     """
     found = []
     for axis, direction in ((0, (0.0, -1.0)), (1, (1.0, 0.0)), (0, (0.0, 1.0)), (1, (-1.0, 0.0))):
@@ -401,7 +402,7 @@ def _sides(
 def _arches(
     samples: NDArray[np.float64], left: float, bottom: float, right: float
 ) -> list[NDArray[np.float64]]:
-    """Rectangles under circular segments with the apex of the outline, for springing heights."""
+    """Return rectangles under circular segments up to the outline's apex, by springing height."""
     apex = float(samples[:, 1].max())
     half = 0.5 * (right - left)
     rises = np.linspace(0.0, min(half, apex - bottom), _SPRINGINGS + 1)[1:]

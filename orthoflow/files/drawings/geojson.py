@@ -1,8 +1,7 @@
 """Files for GIS programs: GeoJSON of walls and rooms, and a QGIS project of the walls.
 
-Every wall has a coordinate system of its own, which cannot be transformed into another. So the
-project opens each raster through a GDAL virtual raster beside it that shifts X only: Y stays the
-height.
+Every wall has its own coordinate system, which cannot be transformed into another. The project
+therefore opens each raster through a GDAL virtual raster that shifts X only; Y remains the height.
 """
 
 from __future__ import annotations
@@ -57,11 +56,12 @@ def write_wall_geojson(path: Path, wall: DrawnWall, lines: RoomLines | None) -> 
 
 
 def write_seams_geojson(path: Path, image: Orthoimage) -> None:
-    """Write the areas of a wall that each photo paints, in the coordinates of its GeoTIFF.
+    """Write the areas of a wall by photo, in the coordinates of its GeoTIFF.
 
-    Edited and passed as the input `seams` of `mosaic.seams`, it overrides the automatic seams.
+    After editing, the file can be passed to `mosaic.seams` as the input `seams`; it then overrides
+    the automatic seams.
     """
-    # For very large walls, corners are accurate to some cells.
+    # On very large walls, corners are accurate to a few cells only.
     step = max(1, math.ceil(math.sqrt(image.source.size / _SEAM_CELLS_MOST)))
     source = np.ascontiguousarray(image.source[::step, ::step])
     features: list[Feature] = []
@@ -76,7 +76,7 @@ def write_seams_geojson(path: Path, image: Orthoimage) -> None:
 
 
 def write_room_geojson(path: Path, lines: RoomLines, map_crs: str | None) -> None:
-    """Write a room in the coordinates of its scan: planes, edges, corners, outline, openings."""
+    """Write a room in scan coordinates: planes, edges, corners, outline, openings."""
     features = [
         _polygon(corners, {"kind": "rectangle", "plane": index, "name": lines.planes.names[index]})
         for index, corners in enumerate(lines.planes.corners)
@@ -107,9 +107,9 @@ def opening_feature(opening: Opening, place: int, *, in_world: bool = False) -> 
     """Return an opening of a wall as a polygon with all its properties.
 
     Args:
-        opening: it.
+        opening: the opening.
         place: its index among the openings of its wall, from the left.
-        in_world: in coordinates of the scan, x, y, z; otherwise in those of the wall's GeoTIFF.
+        in_world: whether to use scan coordinates x, y, z instead of those of the wall's GeoTIFF.
     """
     sources = [OutlineSource(source).name.lower() for source in opening.side_source.tolist()]
     about: dict[str, JsonValue] = {
@@ -146,7 +146,7 @@ def _points(names: Iterable[str], places: NDArray[np.float64]) -> list[Feature]:
 
 
 def _polygon(corners: NDArray[np.float64], about: Mapping[str, JsonValue]) -> Feature:
-    """Return a closed ring, as the format requires."""
+    """Return a polygon as a closed ring, as GeoJSON requires."""
     return _feature("Polygon", np.vstack([corners, corners[:1]])[None], about)
 
 
@@ -170,8 +170,8 @@ class ProjectLayer:
         wall: name of the wall.
         kind: content of the raster: `ortho`, `intensity`, `depth`, `error`.
         raster: its GeoTIFF.
-        about: one line on it, e.g. its accuracy.
-        is_shown: it is visible when the project opens.
+        about: one line of information, e.g. its accuracy.
+        is_shown: whether it is visible when the project is opened.
     """
 
     wall: str
@@ -195,7 +195,7 @@ def write_project(folder: Path, title: str, layers: Sequence[ProjectLayer]) -> N
     for number, layer in enumerate(layers):
         vrt = folder / f"{number:02d}_{layer.raster.stem}.vrt"
         boxes.append(_write_virtual(vrt, layer.raster, places[layer.wall]))
-        # Ids must be unique in the project; the same run gives the same project.
+        # Ids must be unique in the project, and the same for the same run.
         identity = f"{layer.raster.stem}_{uuid5(NAMESPACE_URL, vrt.name).hex}"
         described.append({**vars(layer), "file": vrt.name, "identity": identity})
     extent = np.array(boxes)
@@ -217,7 +217,7 @@ def write_project(folder: Path, title: str, layers: Sequence[ProjectLayer]) -> N
 
 
 def _places(layers: Sequence[ProjectLayer]) -> dict[str, float]:
-    """Return the offset of X of each wall."""
+    """Return the offset in X of each wall."""
     found: dict[str, float] = {}
     right = 0.0
     for layer in layers:

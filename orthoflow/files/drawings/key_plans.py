@@ -1,4 +1,4 @@
-"""The lines of a room, computed once for all formats, and a small plan with one wall marked."""
+"""The lines of a room, computed once for all formats, and key plans with one wall marked."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from orthoflow.geometry.outlines import (
 )
 from orthoflow.products import CheckPoints, Opening, Planes
 
-# Every pair and some triples are compared, and a record may state any number.
+# All pairs and some triples are compared, and a record may contain any number of planes.
 #: planes of a drawn room (`--to dxf`, `geojson`, `sheet`)
 MOST_PLANES: Final = 200
 #: connected parts of them
 MOST_PARTS: Final = 20_000
-# Label of the upwards direction of a plan in a map; other plans have an axis of the scan there.
+# Label of the upwards direction of a plan in a map; in other plans, this is an axis of the scan.
 NORTH: Final = "N"
 
 
@@ -45,7 +45,7 @@ class KeyPlan:
         marked: (n, 2) the marked wall: two ends, or the four corners of a level plane.
         arrow: (2, 2) from the viewer to the wall; None for level planes.
         up_label: label of the upwards direction of the plan: `N` in a map, else an axis.
-        number: of the marked wall, -1 for none.
+        number: number of the marked wall, -1 if none.
     """
 
     walls: NDArray[np.float64]
@@ -58,7 +58,7 @@ class KeyPlan:
 
 
 def surfaces_of(planes: Planes) -> tuple[Surface, ...]:
-    """Return planes with the rectangles of their parts, or of all their points without parts.
+    """Return planes with the rectangles of their parts, or their own if they have no parts.
 
     Raises:
         InputError: there are more than `MOST_PLANES`, or `MOST_PARTS` of them.
@@ -106,7 +106,7 @@ def key_plan(planes: Planes, frame: WallFrame, number: int = -1) -> KeyPlan:
 
 
 def is_map_crs(crs: str | None) -> bool:
-    """Return whether world x and y are the east and north of a map."""
+    """Return whether world x and y are easting and northing."""
     return crs is not None and crs != "site"
 
 
@@ -123,14 +123,14 @@ def marked_plan(
     *,
     is_map: bool = False,
 ) -> KeyPlan:
-    """Draw planes from above, and mark what has two ends, or the corners of a level plane.
+    """Draw planes from above, and mark a line with two ends or a level plane with four corners.
 
     Args:
-        planes: of the room.
-        marked_world: (2 or 4, 3) what is marked.
-        towards_world: (3,) from it to the viewer; None for level planes.
-        number: of the marked wall, -1 for none.
-        is_map: world x and y are the east and north of a map.
+        planes: planes of the room.
+        marked_world: (2 or 4, 3) the marked ends or corners.
+        towards_world: (3,) direction from it to the viewer; None for level planes.
+        number: number of the marked wall, -1 if none.
+        is_map: whether world x and y are easting and northing.
     """
     outline = outline_of(planes)
     basis = basis_from_up(planes.up)
@@ -165,7 +165,7 @@ def marked_plan(
 
 
 def axis_words(direction: NDArray[np.float64]) -> str:
-    """Return the scan's axis that a direction (3,) is nearest to, with its sign."""
+    """Return the axis of the scan nearest to a direction (3,), with its sign."""
     axis = int(np.argmax(np.abs(direction)))
     return f"{'-' if direction[axis] < 0.0 else ''}{'xyz'[axis]}"
 
@@ -210,11 +210,11 @@ class DrawnWall:
     """A wall in its own coordinates: X and Y of its GeoTIFF.
 
     Attributes:
-        number: of the wall.
-        name: what it is called.
-        plane_index: its plane, None if unknown.
-        frame: of its raster.
-        image: file name of its picture, beside the drawing; empty without one.
+        number: number of the wall.
+        name: name of the wall.
+        plane_index: index of its plane, None if unknown.
+        frame: frame of its raster.
+        image: file name of its picture next to the drawing; empty if there is none.
         openings: its openings, from the left.
     """
 
@@ -230,12 +230,12 @@ class DrawnWall:
         return self.frame.raster_from_wall(self.frame.wall_from_world(points_world)[:, :2])
 
     def near(self, points_world: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Report which points (n, 3) are on the raster's rectangle, or near it."""
+        """Return which points (n, 3) are on the raster's rectangle or near it."""
         return self.frame.distances_m(points_world) <= REACH_M
 
 
 def edges_of(lines: RoomLines, plane_index: int | None) -> Sequence[Edge]:
-    """Return the edges that lie on a plane."""
+    """Return the edges of a plane."""
     return [edge for edge in lines.edges if plane_index in (edge.first, edge.second)]
 
 

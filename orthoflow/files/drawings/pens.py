@@ -1,6 +1,6 @@
 """Pages, lines and text on paper, in millimetres from its bottom-left corner.
 
-Lines have the widths of ISO 128-2, text the heights of ISO 3098: nothing is smaller than 2.5 mm.
+Line widths are those of ISO 128-2, text heights those of ISO 3098, with a minimum of 2.5 mm.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 POINTS_PER_MM: Final = 72.0 / 25.4
 FONT: Final = "DejaVuSans"
-# ISO 128-2: each about the square root of two wider than the one before.
+# ISO 128-2: the ratio of successive widths is about the square root of two.
 FINE_MM: Final = 0.13
 THIN_MM: Final = 0.25
 MEDIUM_MM: Final = 0.35
@@ -58,7 +58,7 @@ def sheet_canvas(stream: BytesIO, size_mm: tuple[float, float]) -> Iterator[Canv
     from reportlab import rl_config
     from reportlab.pdfgen.canvas import Canvas
 
-    # Pictures as binary data: as text they would be a quarter larger, and slow to write.
+    # Binary pictures; encoded as text they would be 25 % larger and slow to write.
     rl_config.useA85 = 0
     register_fonts()
     size = tuple(POINTS_PER_MM * edge for edge in size_mm)
@@ -122,7 +122,7 @@ def arrow(canvas: Canvas, ends_mm: NDArray[np.float64], colour: Colour = BLACK) 
 
 
 def cross(canvas: Canvas, x: float, y: float) -> None:
-    """Draw a cross of 3 mm, black on white, so that it is visible on any picture."""
+    """Draw a 3 mm cross, black on white, so that it is visible on any picture."""
     for colour, width_mm in ((WHITE, WIDE_MM), (BLACK, FINE_MM)):
         line(canvas, [(x - 1.5, y), (x + 1.5, y)], width_mm=width_mm, colour=colour)
         line(canvas, [(x, y - 1.5), (x, y + 1.5)], width_mm=width_mm, colour=colour)
@@ -137,7 +137,7 @@ def height_mark(canvas: Canvas, at_mm: tuple[float, float], text: str) -> None:
     write_text(canvas, text, (x + 2.2, y + 0.3))
 
 
-def write_text(  # noqa: PLR0913 - what a text has
+def write_text(  # noqa: PLR0913 - properties of a text
     canvas: Canvas,
     text: str,
     at_mm: tuple[float, float],
@@ -148,9 +148,9 @@ def write_text(  # noqa: PLR0913 - what a text has
     is_centred: bool = False,
     colour: Colour = BLACK,
 ) -> None:
-    """Write a line of text, its height that of its capital letters; untrusted text is escaped.
+    """Write a line of text with capital letters of a given height; untrusted text is escaped.
 
-    It is rotated counter-clockwise about its beginning, or about its middle if centred.
+    It is rotated counter-clockwise about its beginning, or about its centre if centred.
     """
     canvas.saveState()
     canvas.translate(at_mm[0] * POINTS_PER_MM, at_mm[1] * POINTS_PER_MM)
@@ -182,7 +182,7 @@ def write_on_white(
         for side, up in ((-1, -1), (1, -1), (1, 1), (-1, 1))
     ]
     fill(canvas, [np.array(corners)], WHITE)
-    # Its capital letters extend as far above the middle as below it.
+    # The capital letters are centred vertically on the position.
     x, y = np.array(middle_mm) - 0.5 * TEXT_MM * aside
     at = (float(x), float(y))
     write_text(canvas, text, at, turned_deg=turned_deg, is_centred=True, colour=colour)
@@ -208,7 +208,7 @@ def text_width_mm(text: str, high_mm: float = TEXT_MM, *, is_bold: bool = False)
 def paragraph(
     text: str, *, high_mm: float = TEXT_MM, is_bold: bool = False, colour: Colour = BLACK
 ) -> Any:
-    """Make a flowable of wrapped text, with the fonts that its letters need."""
+    """Return a flowable of wrapped text, with fonts that contain its letters."""
     from reportlab.lib.colors import Color
     from reportlab.lib.styles import ParagraphStyle
     from reportlab.platypus import Paragraph
@@ -234,7 +234,7 @@ def paragraph(
 
 @lru_cache(maxsize=1)
 def register_fonts() -> frozenset[int]:
-    """Register the letters of Latin, Greek and Cyrillic, and return their code points."""
+    """Register the fonts for Latin, Greek and Cyrillic, and return their code points."""
     import matplotlib as mpl
     from reportlab.pdfbase.pdfmetrics import registerFont
     from reportlab.pdfbase.ttfonts import TTFont
@@ -250,7 +250,7 @@ def register_fonts() -> frozenset[int]:
 
 
 def _runs(text: str, *, is_bold: bool) -> Iterator[tuple[str, str]]:
-    """Split a text by the fonts that have its letters."""
+    """Split a text into runs of letters with the same font."""
     usual = f"{FONT}-Bold" if is_bold else FONT
     known = register_fonts()
     for font, letters in groupby(
@@ -261,7 +261,7 @@ def _runs(text: str, *, is_bold: bool) -> Iterator[tuple[str, str]]:
 
 @lru_cache(maxsize=4096)
 def fallback_font(letter: str) -> str:
-    """Make a font of one letter out of those that are installed, and return its name.
+    """Create a font of one letter from an installed font, and return its name.
 
     reportlab only embeds fonts with TrueType outlines, so others are converted.
 
@@ -307,7 +307,7 @@ def fallback_font(letter: str) -> str:
 
 @lru_cache(maxsize=1)
 def _installed_letters() -> dict[str, frozenset[int]]:
-    """Return code points of each system font, by path; for collections those of the first font."""
+    """Return the code points of each system font by path; of collections, only the first font's."""
     from fontTools.ttLib import TTFont, TTLibError
     from matplotlib.font_manager import findSystemFonts
 

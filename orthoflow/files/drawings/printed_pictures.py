@@ -49,32 +49,33 @@ PRINT_DPI: Final = 400.0
 _MM_PER_INCH: Final = 25.4
 # Cells read at a time.
 _BAND_CELLS: Final = 1 << 23
-# A picture of up to this many pixels is lossless; beyond, a sheet would be too large to send.
+# Pictures up to this size are lossless; larger ones would make the files too large to send.
 _LOSSLESS_PX: Final = 8_000_000
 _JPEG_QUALITY: Final = 95
 _CONTOUR_PITCH_MM: Final = 0.5
 _SHORTEST_CONTOUR_MM: Final = 6.0
 _OVERVIEW_PX: Final = 1000
-# Contours lie so many standard deviations of the noise apart, at least.
+# Minimum interval of contours in standard deviations of the noise.
 _CLEAR_OF_NOISE: Final = 4.0
-# Values of one surface differ by so many; they are averaged over a Gaussian of so many cells.
+# Maximum difference of averaged depths in standard deviations, and size of the Gaussian in cells.
 _SAME_SURFACE: Final = 5.0
 _CALM_CELLS: Final = 4.0
-# The side of a square of cells that may be level, and the share of an interval that it rises then.
+# Side of the square of cells tested for being level, and the permitted rise relative to the contour
+# interval.
 _LEVEL_CELLS: Final = 5
 _LEVEL_SHARE: Final = 0.02
-# A contour must be this many times as long as its number is wide, or it has none.
+# Minimum length of a contour with a number, in widths of the number.
 _LEAST_WIDTHS: Final = 5.0
 _APART_MM: Final = 12.0
 _TRIED: Final = (0.5, 0.25, 0.75, 0.125, 0.375, 0.625, 0.875)
-# Minimum ratio of the chord to the length of the line below a number, which would be beside it
-# otherwise.
+# Minimum ratio of chord to length of the line below a number; on curved lines the number would be
+# next to the line.
 _STRAIGHT: Final = 0.9
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stretch:
-    """Values for black and white, the noise of values, and the interval of contours."""
+    """Values shown black and white, standard deviation of their noise, and contour interval."""
 
     low: float
     high: float
@@ -82,23 +83,24 @@ class Stretch:
 
     @property
     def interval(self) -> float:
-        """Interval of contours, a round number, about ten over the range.
+        """Interval of contours: a round number that gives about ten levels over the range.
 
-        At least 1 mm, and so much that noise does not reach from one contour to the next.
+        It is at least 1 mm, and large enough that noise does not reach from one contour to the
+        next.
         """
         return nice_step(max((self.high - self.low) / 12.0, 1e-3, _CLEAR_OF_NOISE * self.noise))
 
 
 def encode_part(raster: Path, part: Part, *, scale: int, is_flipped: bool = False) -> bytes:
-    """Encode a part of a wall's raster as a picture, white where empty.
+    """Encode a part of a wall's raster as a picture, white in empty cells.
 
-    Cells are unchanged if print resolves them, otherwise averaged to 400 pixels per inch.
+    Cells are unchanged if print resolves them, and otherwise averaged to 400 pixels per inch.
 
     Args:
-        raster: GeoTIFF of one band, which is stretched to grey, or of three.
-        part: of the raster.
+        raster: GeoTIFF with one band, which is stretched to grey, or three.
+        part: part of the raster.
         scale: n of 1 : n.
-        is_flipped: the rows of the raster go up the paper; `part` refers to the drawing.
+        is_flipped: whether the rows of the raster go up the paper; `part` refers to the drawing.
 
     Returns:
         PNG, or JPEG if large.
@@ -111,7 +113,7 @@ def encode_part(raster: Path, part: Part, *, scale: int, is_flipped: bool = Fals
         cells = np.clip(cells, 0.0, [*source.shape[::-1], *source.shape[::-1]])
         shape = _printed_shape(part, cells, scale)
         stretch = stretch_of(raster) if source.bands == 1 else None
-        # Blue first, as OpenCV has it: a copy of an A0 sheet would take 750 MB.
+        # In OpenCV's order (blue first): converting an A0 sheet would take another 750 MB.
         picture = np.full((*shape, 3), 255, dtype=np.uint8)
         for rows, values, shown in _bands(source, cells, shape):
             colours = _grey(values, stretch) if stretch else eight_bits(cast("Colours", values))
@@ -125,15 +127,15 @@ def encode_part(raster: Path, part: Part, *, scale: int, is_flipped: bool = Fals
 
 
 def _flipped(part: Part, source: RasterParts) -> Part:
-    """The same part, relative to the opposite edge of the raster."""
+    """Return the same part, relative to the opposite edge of the raster."""
     high_m = source.shape[0] * source.gsd_m
     return replace(part, top_m=high_m - part.bottom_m, bottom_m=high_m - part.top_m)
 
 
 def stretch_of(raster: Path) -> Stretch:
-    """Return the values of one band for black and white: its 2nd and 98th percentile.
+    """Return the values of one band shown black and white: its 2nd and 98th percentiles.
 
-    Their noise is that of an overview.
+    The noise is estimated from an overview.
     """
     with RasterParts(raster) as source:
         rows, columns = source.shape
@@ -148,9 +150,9 @@ def stretch_of(raster: Path) -> Stretch:
 
 
 def noise_of(values: NDArray[np.float32]) -> float:
-    """Estimate the standard deviation of noise, which neighbouring cells (rows, cols) do not share.
+    """Estimate the standard deviation of noise, which is uncorrelated between cells (rows, cols).
 
-    What runs smoothly from cell to cell is no noise, nor are edges, which few cells have.
+    Smooth variation and edges, which affect few cells, do not count as noise.
     """
     between = values[:-2, 1:-1] + values[2:, 1:-1] + values[1:-1, :-2] + values[1:-1, 2:]
     away = values[1:-1, 1:-1] - 0.25 * between
@@ -159,25 +161,25 @@ def noise_of(values: NDArray[np.float32]) -> float:
 
 
 def calmed(values: NDArray[np.float32], noise: float) -> NDArray[np.float32]:
-    """Average values with neighbours from which they differ by noise alone: edges stay sharp.
+    """Average values with neighbours that differ only by noise, so that edges stay sharp.
 
     Args:
-        values: (rows, cols), NaN where unknown, which stays so.
-        noise: their standard deviation.
+        values: (rows, cols), NaN if unknown; NaN is preserved.
+        noise: standard deviation of the noise.
     """
     import cv2
 
     if noise <= 0.0:
         return values
     known = np.isfinite(values)
-    # Too far away from all others to be averaged with them.
+    # Too far from all other values to be averaged with them.
     filled = np.where(known, values, np.float32(values[known].max() + 20.0 * noise))
     calm = cv2.bilateralFilter(filled, -1, _SAME_SURFACE * noise, _CALM_CELLS)
     return np.where(known, calm, np.float32(np.nan))
 
 
 def _is_level(values: NDArray[np.float32], least: float) -> NDArray[np.bool_]:
-    """Return where all values around a cell differ by less."""
+    """Return where all values around a cell differ by less than a limit."""
     import cv2
 
     around = np.ones((_LEVEL_CELLS, _LEVEL_CELLS), dtype=np.uint8)
@@ -188,14 +190,14 @@ def _is_level(values: NDArray[np.float32], least: float) -> NDArray[np.bool_]:
 def contours(
     raster: Path, part: Part, *, scale: int, interval_m: float, is_flipped: bool = False
 ) -> list[tuple[float, NDArray[np.float64]]]:
-    """Return contours of a depth raster, each a level in metres and a line.
+    """Return contours of a depth raster, each with its level in metres and its line.
 
     Lines are (n, 2) metres on the wall, to the right and down from the corner of the raster, or of
-    the drawing if the raster's rows go up the paper. Levels begin half an interval from the plane,
-    because on the plane itself they would only show noise. Depths are averaged over half a
-    millimetre of paper, and with those that differ by noise alone. There is no line where they are
-    level within it, or where lines would be more than 12 cm apart: it would only wander. Lines
-    shorter than six millimetres are omitted.
+    the drawing if the rows of the raster go up the paper. The first level is half an interval from
+    the plane, because a contour on the plane itself would only show noise. Depths are averaged over
+    0.5 mm on paper with depths that differ only by noise. Contours are omitted where the surface is
+    level within the noise or they would be more than 12 cm apart, since they would wander, and if
+    they are shorter than 6 mm.
     """
     from contourpy import contour_generator
 
@@ -220,7 +222,7 @@ def contours(
     surface = np.where(known, depths, np.nan).astype(np.float32)
     noise = noise_of(surface)
     surface = calmed(surface, noise)
-    # Of noise alone, one averaged cell in ten thousand rises by more.
+    # With noise alone, one averaged cell in ten thousand exceeds this.
     drawn = known & ~_is_level(surface, max(0.6 * noise, _LEVEL_SHARE * interval_m))
     generator = contour_generator(x, y, np.ma.array(surface.astype(np.float64), mask=~drawn))
     low, high = (
@@ -242,16 +244,16 @@ def contours(
 def label_place(
     points_mm: NDArray[np.float64], wide_mm: float, placed_mm: Sequence[NDArray[np.float64]]
 ) -> tuple[tuple[float, float], float] | None:
-    """Find a position for a number on a line: its centre on the paper, and degrees, or None.
+    """Return a position for a number on a line (centre on the paper, and degrees), or None.
 
-    It is rotated counter-clockwise, so that it is never upside down.
+    The number is rotated counter-clockwise such that it is not upside down.
 
     Args:
         points_mm: the line, (n, 2) on the paper.
         wide_mm: width of the number.
         placed_mm: centres of other numbers, (2,) each.
     """
-    # Right and up as real and imaginary parts.
+    # Complex numbers: right is the real part, up the imaginary part.
     line = points_mm[:, 0] + 1j * points_mm[:, 1]
     along = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(line)))])
     if along[-1] < _LEAST_WIDTHS * wide_mm:
@@ -301,7 +303,7 @@ def _grey(values: NDArray[np.generic], stretch: Stretch) -> NDArray[np.uint8]:
 
 
 def write_cad_picture(raster: Path, path: Path) -> None:
-    """Write an orthoimage as PNG, one pixel per cell, transparent where empty.
+    """Write an orthoimage as PNG, one pixel per cell, with empty cells transparent.
 
     Raises:
         StoreError: the file cannot be written.
@@ -318,7 +320,7 @@ def write_cad_picture(raster: Path, path: Path) -> None:
         whole = np.array([0.0, 0.0, columns, rows])
         with rasterio.open(aside, "w", width=columns, height=rows, **profile) as target:
             for band, values, shown in _bands(source, whole, source.shape):
-                # White behind transparency, for programs that do not support it.
+                # White in transparent cells, for programs that do not support transparency.
                 pixels = np.full((*shown.shape, 4), 255, dtype=np.uint8)
                 pixels[..., :3][shown] = eight_bits(cast("Colours", values))[shown]
                 pixels[..., 3] = np.where(shown, 255, 0)
@@ -328,8 +330,9 @@ def write_cad_picture(raster: Path, path: Path) -> None:
             copy(aside, path, driver="PNG", ZLEVEL="4")
 
 
-# An area outlined on a picture: a text, written into it if it is wide enough, its parts (", ")
-# below each other; and its outline (n, 2) in metres right and down from the top-left corner.
+# An area outlined on a picture: its text, which is written inside if there is room, with parts
+# separated by ", " on lines of their own; and its outline (n, 2) in metres right and down from the
+# top-left corner.
 Area = tuple[str, NDArray[np.float64]]
 _MIDDLE: Final = [(1.0, 2.0), (13.0, 2.0)]
 _BOX: Final = [(3.0, 0.3), (11.0, 0.3), (11.0, 3.7), (3.0, 3.7)]
@@ -347,10 +350,10 @@ def wall_picture(
 
     Args:
         raster: GeoTIFF.
-        is_depth: it has depths, which are drawn with contours.
-        is_flipped: its rows go up the paper, as those of ceilings do.
+        is_depth: whether it contains depths, which are drawn with contours.
+        is_flipped: whether its rows go up the paper, as for ceilings.
         areas: openings of the wall.
-        language: of the legend.
+        language: language of the legend.
     """
 
     def draw(placed: Placed) -> None:
@@ -384,7 +387,7 @@ def _grey_ramp(canvas: Canvas) -> None:
 
 
 def draw_raster(placed: Placed, raster: Path, *, is_flipped: bool = False) -> None:
-    """Draw the part of a raster that a picture shows, white where empty."""
+    """Draw the part of a raster that a picture shows, with empty cells white."""
     from reportlab.lib.utils import ImageReader
 
     picture = encode_part(raster, placed.view.part, scale=placed.scale, is_flipped=is_flipped)
@@ -424,12 +427,12 @@ def _draw_areas(placed: Placed, areas: Sequence[Area]) -> None:
     with placed.clipped() as canvas:
         for text, outline_m in areas:
             outline = placed.on_paper(outline_m)
-            # White below, so that the line is visible on any picture.
+            # A white line below makes the outline visible on any picture.
             pens.line(canvas, outline, width_mm=1.0, colour=pens.WHITE, is_closed=True)
             pens.line(canvas, outline, width_mm=pens.MEDIUM_MM, colour=pens.OPENING, is_closed=True)
             low = np.maximum(outline.min(axis=0), (left, bottom))
             high = np.minimum(outline.max(axis=0), (right, top))
-            # The parts of the text on white, from the top, if there is room.
+            # The parts of the text on a white background, from the top, if there is room.
             rows = shown(text).split(", ")
             wide_mm = max(pens.text_width_mm(row) for row in rows) + 2.0
             high_mm = 1.7 * pens.TEXT_MM * len(rows) + 1.0
@@ -443,11 +446,11 @@ def _draw_areas(placed: Placed, areas: Sequence[Area]) -> None:
 
 
 _GAP_MM: Final = 8.0
-# Below the walls, for their names.
+# Space for names below the walls.
 _NAMES_MM: Final = 12.0
-# Between heights that have marks of their own.
+# Minimum distance between heights with separate marks.
 _LEVELS_MM: Final = 1.5
-# Walls this close to parallel follow each other along one facade.
+# Walls within this angle belong to the same facade.
 _PARALLEL_DEG: Final = 10.0
 
 
@@ -456,7 +459,7 @@ class ElevationWall:
     """A wall of an elevation.
 
     Attributes:
-        name: what it is called.
+        name: name of the wall.
         frame: frame of its picture.
         raster: GeoTIFF of the picture.
     """
@@ -474,10 +477,10 @@ class ElevationWall:
 def unfolded(
     walls: Sequence[ElevationWall], up: NDArray[np.float64]
 ) -> tuple[tuple[ElevationWall, ...], bool]:
-    """Sort walls in the order in which a viewer who turns or walks to the right sees them.
+    """Sort walls in the order in which a viewer sees them when turning or walking to the right.
 
-    Inside a room the viewer turns clockwise, seen from above; around a building the facades follow
-    each other counter-clockwise. The order begins after the widest gap of directions.
+    Inside a room, the viewer turns clockwise in plan view; around a building, the facades follow
+    each other counter-clockwise. The order begins after the widest gap in direction.
 
     Returns:
         The walls, and whether they form a room seen from inside.
@@ -518,10 +521,10 @@ def elevation(
 
     Args:
         walls: from left to right.
-        up: (3,) unit vector of the scan.
-        text: of its sheets.
+        up: (3,) unit vector in scan coordinates.
+        text: texts of the sheets.
         scale: n of 1 : n.
-        language: of labels.
+        language: language of labels.
     """
     mm = 1e-3 * scale
     heights = np.array([wall.frame.corners_world() @ up for wall in walls])
@@ -534,7 +537,7 @@ def elevation(
         for number, (wall, left) in enumerate(zip(walls, lefts.tolist(), strict=False)):
             down = top - float(heights[number].max())
             wide, high = wall.size_m
-            # What of the wall lies on this part of the drawing.
+            # Visible region of the wall on this part of the drawing.
             own = Part(
                 left_m=max(part.left_m - left, 0.0),
                 top_m=max(part.top_m - down, 0.0),
@@ -548,7 +551,7 @@ def elevation(
             draw_raster(replace(placed, view=view), wall.raster)
             outline = placed.on_paper([(left + x, down + y) for x, y in own.corners_m])
             pens.line(placed.canvas, outline, width_mm=pens.THIN_MM, is_closed=True)
-            # A name that would lie on another is left out: the title block has all of them.
+            # Names that would overlap are omitted: the title block lists all of them.
             long = pens.text_width_mm(wall.name) + 2.0
             x, y = placed.on_paper([(left + own.left_m, top - low)])[0].tolist()
             x = min(x, placed.edges_mm[2] - long)
@@ -556,7 +559,7 @@ def elevation(
                 end = x + long
                 pens.write_on_white(placed.canvas, wall.name, (x + 0.5 * long, y - 3.0))
 
-    # Walls that end nearly level share a mark.
+    # Walls with nearly the same top height share a mark.
     levels: list[float] = []
     for down in sorted({*(top - heights.max(axis=1)), *(top - heights.min(axis=1))}):
         if not levels or down - levels[-1] >= mm * _LEVELS_MM:
@@ -580,12 +583,12 @@ def elevation(
 NOTHING: Final = 0
 _BAND_ROWS: Final = 1024
 _AROUND_ROWS: Final = 8
-# Noise is estimated from so many rows on either side of the middle.
+# Number of rows above and below the middle from which noise is estimated.
 _SAMPLED_ROWS: Final = 128
 _FIGURE_PX: Final = 1600
-# Contours as in a drawing at this scale: smoothed over half a millimetre of its paper.
+# Contours are smoothed as in a drawing at this scale, over 0.5 mm on paper.
 _CONTOUR_SCALE: Final = 20
-# In front of the plane, behind it.
+# In front of the plane, and behind it.
 _CONTOUR_COLOURS: Final = ("#5a0014", "#00204a")
 
 
@@ -605,20 +608,20 @@ class Light:
 def shaded(
     depths_m: NDArray[np.floating], gsd_m: float, light: Light, noise_m: float = 0.0
 ) -> NDArray[np.uint8]:
-    """Shade a depth raster, 1 to 255 by Lambert's cosine law; 0 without a depth.
+    """Return a shaded depth raster, 1 to 255 by Lambert's cosine law; 0 if the depth is unknown.
 
     Args:
-        depths_m: (rows, cols) metres towards the viewer, NaN without data.
-        gsd_m: side of a cell.
+        depths_m: (rows, cols) metres towards the viewer, NaN if unknown.
+        gsd_m: side length of a cell.
         light: direction of the light.
-        noise_m: standard deviation of depths, which are averaged with those that differ by it.
+        noise_m: standard deviation of the depths; depths that differ only by noise are averaged.
 
-    A surface parallel to the wall's plane has the sine of the light's altitude.
+    For a surface parallel to the wall's plane, the cosine is the sine of the light's altitude.
     """
     depths = calmed(np.asarray(depths_m, dtype=np.float32), noise_m)
     down, right = (_slope(depths, axis) / np.float32(gsd_m) for axis in (0, 1))
     azimuth, altitude = np.radians([light.azimuth_deg, light.altitude_deg])
-    # Towards the light: right and up on the wall, and towards the viewer.
+    # Direction of the light: right and up on the wall.
     towards = (np.sin(azimuth), np.cos(azimuth))
     slope = -right * np.float32(towards[0]) + down * np.float32(towards[1])
     cosine = np.cos(altitude) * slope + np.sin(altitude)
@@ -629,7 +632,7 @@ def shaded(
 
 
 def _slope(depths: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
-    """Return the change per cell: the mean to both neighbours, to one beside a hole, or zero."""
+    """Return the change per cell: mean of both sides, of one side next to a hole, or zero."""
     steps = np.diff(depths, axis=axis)
     before = np.concatenate([np.full_like(depths.take([0], axis), np.nan), steps], axis=axis)
     behind = np.concatenate([steps, np.full_like(depths.take([0], axis), np.nan)], axis=axis)
@@ -639,7 +642,7 @@ def _slope(depths: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
 
 
 def write_relief(depth: Path, path: Path, light: Light) -> None:
-    """Write the shaded relief of a depth raster as a GeoTIFF with the same position, band by band.
+    """Write the shaded relief of a depth raster as a GeoTIFF on the same grid, band by band.
 
     Raises:
         InputError: the depth raster cannot be read.
@@ -654,7 +657,7 @@ def write_relief(depth: Path, path: Path, light: Light) -> None:
         with rasterio.open(path, "w", **profile) as target:
             for first in range(0, rows, _BAND_ROWS):
                 last = min(rows, first + _BAND_ROWS)
-                # Slopes and means need more rows on either side.
+                # Slopes and averages need additional rows on both sides.
                 top, bottom = max(0, first - _AROUND_ROWS), min(rows, last + _AROUND_ROWS)
                 box = (0.0, float(top), float(columns), float(bottom))
                 depths, _ = source.read(box, (bottom - top, columns))
@@ -668,7 +671,7 @@ def write_relief(depth: Path, path: Path, light: Light) -> None:
 
 
 def _noise_m(source: RasterParts) -> float:
-    """Return the noise of depths from cell to cell, of the rows in the middle of the raster."""
+    """Return the standard deviation of noise of depths, from the middle rows of the raster."""
     rows, columns = source.shape
     top, bottom = max(0, rows // 2 - _SAMPLED_ROWS), min(rows, rows // 2 + _SAMPLED_ROWS)
     box = (0.0, float(top), float(columns), float(bottom))

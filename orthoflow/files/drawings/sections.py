@@ -1,9 +1,9 @@
-"""Plans and sections: the intersection of a plane with a room, as lines, and what is beyond it.
+"""Plans and sections: the intersection of a plane with a room, and lines beyond it.
 
-Cut lines are exact: each is the intersection of the cutting plane with a detected plane, between
-the positions where its points end or another plane meets it. Points of the slab that no such line
-explains are kept as points. X and Y of the drawing are metres: for a plan (e1, e2) of the
-right-handed frame (e1, e2, up), for a section the distance from its first point and the height.
+Cut lines are exact intersections of the cutting plane with detected planes; they end where the
+points end or where another plane meets them. Points of the slab that are not near such a line are
+kept as points. X and Y of the drawing are metres: for a plan, (e1, e2) of the right-handed frame
+(e1, e2, up); for a section, the distance from its first point and the height.
 """
 
 from __future__ import annotations
@@ -43,17 +43,18 @@ if TYPE_CHECKING:
     from ezdxf.layouts.layout import Modelspace
     from ezdxf.math import Vec2
 
-# Planes that the cut meets at a smaller angle have no sharp line in it.
+# Planes that meet the cut at a smaller angle have no sharp line in it.
 _LEAST_ANGLE_DEG: Final = 20.0
 # Longer stretches without points are drawn as openings; shorter ones are gaps between points.
 _LEAST_OPENING_M: Final = 0.15
-# A line is extended to the corner with another if its points end this close, e.g. behind furniture.
+# A line is extended to a corner with another line if its points end this close to it, e.g. behind
+# furniture.
 _REACH_M: Final = 0.3
 _SHORTEST_M: Final = 0.05
 # The two sides of a wall face away from each other and are at most this far apart.
 _THICKNESS_M: Final = (0.04, 1.5)
 _MOST_POINTS: Final = 30_000
-# Unexplained points are drawn if this many are in a cell: others are noise.
+# Points away from lines are drawn if a cell contains this many; fewer are noise.
 _CROWD_M: Final = 0.05
 _CROWD_POINTS: Final = 3
 _BLOCK: Final = 4_000_000
@@ -70,7 +71,7 @@ class Cut:
         x_world: (3,) unit vector to the right of the drawing.
         y_world: (3,) unit vector upwards on it.
         forward_world: (3,) unit vector, the direction of view.
-        title: its title in the drawing.
+        title: title in the drawing.
     """
 
     origin_world: NDArray[np.float64]
@@ -90,10 +91,10 @@ class CutLine:
     """A cut line.
 
     Attributes:
-        plane: place of its plane in `planes.json`.
+        plane: index of its plane in `planes.json`.
         ends_m: (2, 2) X and Y.
-        behind: (2,) unit vector away from the room, into the solid.
-        thickness_m: distance to the other side of the wall if that was found too; else NaN.
+        behind: (2,) unit vector away from the room, into the wall.
+        thickness_m: distance to the other side of the wall; NaN if that was not detected.
     """
 
     plane: int
@@ -116,8 +117,8 @@ class Section:
         lines: the cut lines.
         gaps_m: (g, 2, 2) stretches of cut planes without points: doors, windows, shadows.
         beyond_m: (b, 2, 2) edges and outlines of openings beyond the cut.
-        points_m: (p, 2) points of the slab that no line explains, thinned.
-        slab_m: thickness of the slab whose points were used; 0 without a cloud.
+        points_m: (p, 2) thinned points of the slab that are away from all lines.
+        slab_m: thickness of the slab from which points were used; 0 if there is no cloud.
         n_points: number of points in it.
     """
 
@@ -140,7 +141,7 @@ class Section:
 
 
 def plan_cut(planes: Planes, height_m: float, language: Language = "en") -> Cut:
-    """Cut horizontally above the lowest large floor; without a floor at that world height."""
+    """Return a horizontal cut above the lowest large floor, or at this height if there is none."""
     e1, e2, up = basis_from_up(planes.up)
     area = _areas_m2(planes)
     level = planes.normal @ up > math.cos(math.radians(_LEAST_ANGLE_DEG))
@@ -158,7 +159,7 @@ def plan_cut(planes: Planes, height_m: float, language: Language = "en") -> Cut:
 
 
 def section_cut(planes: Planes, through: Sequence[float], language: Language = "en") -> Cut:
-    """Cut vertically through two points (x, y, x, y) of a plan; the first is on the left.
+    """Return a vertical cut through two points (x, y, x, y) of a plan, the first on the left.
 
     Raises:
         ArgumentError: both points are the same.
@@ -191,12 +192,12 @@ def section_of(
     Args:
         cut: the cutting plane.
         planes: planes of the room.
-        openings: of its walls.
-        cloud: the points; without them lines extend as far as the rectangles of the planes.
+        openings: openings of its walls.
+        cloud: the points; if None, lines extend as far as the rectangles of the planes.
         labels: the plane of each point.
 
     Raises:
-        ArgumentError: nothing is cut.
+        ArgumentError: the cut meets no plane.
     """
     slab_m, places, plane = _slab(cut, cloud, labels)
     lines, gaps = _drawn(cut, planes, places, plane, slab_m)
@@ -224,7 +225,7 @@ def _areas_m2(planes: Planes) -> NDArray[np.float64]:
 def _slab(
     cut: Cut, cloud: PointCloud | None, labels: PointLabels | None
 ) -> tuple[float, NDArray[np.float64], NDArray[np.int64]]:
-    """Return the slab's thickness, X and Y of its points, and their planes (-1 for none)."""
+    """Return the slab's thickness, X and Y of its points, and their planes (-1 if none)."""
     if cloud is None or len(cloud) == 0:
         return 0.0, np.empty((0, 2)), np.empty(0, dtype=np.int64)
     slab_m = 0.02
@@ -232,7 +233,7 @@ def _slab(
     while True:
         found = list(_within(cut, cloud, labels, 0.5 * slab_m))
         n_points = sum(len(places) for places, _ in found)
-        # Thin enough for a point every few centimetres along walls, and never a thick slice.
+        # Thick enough for a point every few centimetres along walls, but not thicker than a slice.
         if n_points >= 2000 or slab_m >= 0.16:
             break
         slab_m *= 2.0
@@ -263,7 +264,7 @@ def _drawn(
     plane: NDArray[np.int64],
     slab_m: float,
 ) -> tuple[list[CutLine], list[NDArray[np.float64]]]:
-    """Return the cut lines, and the gaps in them."""
+    """Return the cut lines and the gaps in them."""
     traces = {}
     for index, surface in enumerate(surfaces_of(planes)):
         trace = _trace(cut, planes, index)
@@ -280,9 +281,9 @@ def _drawn(
         if len(places):
             own = places[plane == index] if (plane >= 0).any() else places
             offset = (own - point) @ behind
-            # The plane's own noise, and its distance from the cut line within the slab.
+            # Tolerance: the noise of the plane, and its inclination within the slab.
             near = np.abs(offset) <= 3.0 * float(planes.rms_m[index]) + 0.5 * slab_m
-            # To a millimetre, of which there are few.
+            # Rounding to millimetres leaves few values.
             along = np.unique(np.round((own[near] - point) @ direction, 3)).tolist()
             seen = _joined(zip(along, along, strict=True), _LEAST_OPENING_M)
             known = [part for span in spans for part in _shared(span, seen)]
@@ -313,15 +314,14 @@ _Span = tuple[float, float]
 
 
 def _trace(cut: Cut, planes: Planes, index: int) -> _Trace | None:
-    """Return a point of the line in which a plane is cut, its direction, and the solid side."""
+    """Return a point on the line where a plane is cut, its direction, and the side of the solid."""
     normal = planes.normal[index]
     in_cut = np.array([normal @ cut.x_world, normal @ cut.y_world])
     size = float(np.linalg.norm(in_cut))
     if size < math.sin(math.radians(_LEAST_ANGLE_DEG)):
         return None
     middle = cut.place_m(planes.corners[index].mean(axis=0)[None])[0]
-    # n . p = offset, with p in the cut: from the middle of the plane to the nearest point of the
-    # line.
+    # The nearest point to the middle of the plane that satisfies n . p = offset and is in the cut.
     away = float(normal @ cut.forward_world) * middle[2] / size**2
     point = middle[:2] + away * in_cut
     towards = in_cut / size
@@ -355,7 +355,7 @@ def _joined(spans: Iterable[_Span], gap_m: float) -> list[_Span]:
 
 
 def _shared(span: _Span, others: Sequence[_Span]) -> list[_Span]:
-    """Return parts of a span that others cover."""
+    """Return the parts of a span that are covered by others."""
     parts = [(max(span[0], begin), min(span[1], end)) for begin, end in others]
     return [part for part in parts if part[1] > part[0]]
 
@@ -363,7 +363,7 @@ def _shared(span: _Span, others: Sequence[_Span]) -> list[_Span]:
 def _meeting(
     point: NDArray[np.float64], direction: NDArray[np.float64], other: _Trace
 ) -> float | None:
-    """Return where a line meets another, along itself."""
+    """Return the position along a line where it meets another."""
     other_point, _, normal = other
     slope = float(direction @ normal)
     if abs(slope) < math.sin(math.radians(_LEAST_ANGLE_DEG)):
@@ -383,7 +383,7 @@ def _snapped(span: _Span, meets: Sequence[float]) -> _Span:
 
 
 def _with_thickness(lines: Sequence[CutLine]) -> Iterator[CutLine]:
-    """Set the distance of lines to the other side of their wall, if that is among them."""
+    """Set the distance of lines to the other side of their wall, if that was detected."""
     for line in lines:
         middle = line.ends_m.mean(axis=0)
         found = []
@@ -435,7 +435,7 @@ def _unexplained(
 
 
 def _thinned(places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return one point per cell of a grid adapted to their number, without isolated ones."""
+    """Return one point per cell of a grid adapted to their number, without isolated points."""
     if len(places) == 0:
         return places
     _, cell, n_in_cell = np.unique(
@@ -457,10 +457,10 @@ LAYERS: Final[Layers] = {
 # On paper, millimetres.
 _TEXT_MM: Final = 2.5
 _SOLID_MM: Final = 3.0
-# Around the cut lines: for hatches, and for dimensions.
+# Margin around the cut lines for hatching and dimensions.
 _AROUND_MM: Final = 2.0 + _SOLID_MM
 _DIMENSIONS_MM: Final = 14.0
-# Widths of ISO 128 that a page has.
+# Line widths of ISO 128 used on the page.
 _WIDTHS_MM: Final = np.array([0.13, 0.25, 0.35, 0.5])
 
 
@@ -473,7 +473,7 @@ class SectionDrawing:
         section: its content.
         scale: n of 1 : n.
         origin: one line about the origin of the data.
-        has_dimensions: the lengths of cut lines are written beside them.
+        has_dimensions: whether the lengths of cut lines are written next to them.
         language: language of labels.
     """
 
@@ -485,19 +485,19 @@ class SectionDrawing:
     language: Language = "en"
 
     def mm(self, value: float) -> float:
-        """Return metres in the drawing of millimetres on the paper."""
+        """Return the length in the drawing, metres, of millimetres on paper."""
         return 1e-3 * self.scale * value
 
     @property
     def bounds_m(self) -> tuple[float, float, float, float]:
-        """Left, bottom, right and top of the drawing, with what stands around the cut lines."""
+        """Left, bottom, right and top of the drawing, with the margin around the cut lines."""
         around = self.mm(_DIMENSIONS_MM if self.has_dimensions else _AROUND_MM)
         left, bottom, right, top = self.section.bounds_m
         return left - around, bottom - around, right + around, top + around
 
     @property
     def notes(self) -> tuple[Phrase, ...]:
-        """Statements about what is drawn, and from how many points."""
+        """Notes on what is drawn, and from how many points."""
         if not self.section.slab_m:
             return (Phrase(key="thickness"),)
         values = {"mm": f"{1e3 * self.section.slab_m:.0f}", "count": f"{self.section.n_points:,}"}
@@ -513,15 +513,15 @@ def section_sheet(
     grid: float,
     crs: str | None = None,
 ) -> Drawing:
-    """Return the sheet of a plan or section, with the text of its run.
+    """Return the sheet of a plan or section, with the texts of its run.
 
     Args:
-        stem: of its files.
-        drawing: what is drawn.
-        planes: of the room, for the key plan.
-        text: of the run.
-        grid: distance of the crosses, 0 for none.
-        crs: coordinate system of the scan, None if it is in no map.
+        stem: name of its files without suffix.
+        drawing: the plan or section.
+        planes: planes of the room, for the key plan.
+        text: texts of the run.
+        grid: distance of the grid crosses, 0 for none.
+        crs: coordinate system of the scan, None if it is not a map.
     """
     left, bottom, right, top = drawing.bounds_m
     cut, language = drawing.section.cut, drawing.language
@@ -559,7 +559,7 @@ def write_section(folder: Path, name: str, drawing: SectionDrawing) -> None:
 
 
 def _draw(drawing: SectionDrawing, placed: Placed) -> None:
-    """Draw a plan or section, as its document has it, in the place of the picture."""
+    """Draw a plan or section from its document into a picture."""
     from ezdxf.addons.drawing import recorder
 
     left, _, _, top = drawing.bounds_m
@@ -606,7 +606,7 @@ def _render(document: Document, backend: Any) -> None:
         color_policy=config.ColorPolicy.BLACK,
         lineweight_policy=config.LineweightPolicy.ABSOLUTE,
     )
-    # ezdxf shifts hatches by a small random amount; the same run must give the same picture.
+    # ezdxf shifts hatches by a small random amount; the output must be reproducible.
     state = random.getstate()
     random.seed(0)
     Frontend(RenderContext(document), backend, config=configuration).draw_layout(
@@ -640,9 +640,9 @@ def _document(drawing: SectionDrawing) -> Document:
 
 
 def _add_solid(space: Modelspace, cut: CutLine, drawing: SectionDrawing) -> None:
-    """Hatch behind a line: to the other side of the wall, or a strip if that is unknown.
+    """Hatch behind a line up to the other side of the wall, or a strip if that is unknown.
 
-    A wall with both sides found is hatched from the first of them.
+    A wall whose sides were both detected is hatched from the first of them.
     """
     is_known = math.isfinite(cut.thickness_m)
     if is_known and cut.behind @ [0.83, 0.56] < 0.0:
@@ -651,14 +651,14 @@ def _add_solid(space: Modelspace, cut: CutLine, drawing: SectionDrawing) -> None
     begin, end = cut.ends_m
     outline = [begin, end, end + deep_m * cut.behind, begin + deep_m * cut.behind]
     hatch = space.add_hatch(dxfattribs={"layer": "A-SECT-PATT"})
-    # Lines of the pattern are 3.175 units apart: 1.3 mm on the paper.
+    # Lines of the pattern are 3.175 units apart; 1.3 mm on paper.
     hatch.set_pattern_fill("ANSI31", scale=drawing.mm(1.3) / 3.175)
     hatch.paths.add_polyline_path([tuple(place) for place in outline], is_closed=True)
 
 
 def _add_dimension(space: Modelspace, cut: CutLine, drawing: SectionDrawing) -> None:
     begin, end = cut.ends_m
-    # From the left, or upwards: text along it is never upside down.
+    # From left to right or upwards, so that text along it is not upside down.
     if (end[0] - begin[0], end[1] - begin[1]) < (-1e-9 * cut.length_m, 0.0):
         begin, end = end, begin
     direction = (end - begin) / cut.length_m

@@ -39,7 +39,7 @@ _COLUMNS_MM: Final = (90.0, 110.0, 130.0, 150.0, 180.0)
 # ISO 7200: a title block is 180 mm wide at most.
 _TITLE_MM: Final = 180.0
 _STRIP_COLUMN_MM: Final = 85.0
-# Strips are this high at least, and grow by this step.
+# Minimum height of strips, and the step by which they grow.
 _LOWEST_MM: Final = 40.0
 _STRIP_STEP_MM: Final = 2.5
 # Maximum share of the paper that is not for pictures.
@@ -60,7 +60,7 @@ _PLAIN: Final = [
 
 
 class _Picture(Flowable):  # type: ignore[misc] # reportlab has no types
-    """Something drawn in millimetres from its bottom-left corner, with the available width."""
+    """A drawing in millimetres from its bottom-left corner, as wide as the available space."""
 
     def __init__(
         self, high_mm: float, draw: Callable[[Canvas, float], None], *, can_grow: bool = False
@@ -74,7 +74,7 @@ class _Picture(Flowable):  # type: ignore[misc] # reportlab has no types
         return wide, self.high_mm * pens.POINTS_PER_MM
 
     def draw(self) -> None:
-        """Draw it."""
+        """Draw the content."""
         self.draw_mm(self.canv, self.width / pens.POINTS_PER_MM)
 
 
@@ -83,7 +83,7 @@ class Furniture:
     """The blocks beside the pictures of a sheet.
 
     Attributes:
-        paper: paper with the space that they take.
+        paper: paper with the space reserved for the blocks.
         placed: flowables, with left and bottom on the paper and width, in mm.
     """
 
@@ -111,8 +111,9 @@ def furnished(
 ) -> Furniture | None:
     """Pack the blocks beside the pictures; None if the paper is too small.
 
-    Text has at least 2.5 mm; the narrowest column, or the lowest strip, that fits is used, or the
-    one that the paper has. Without key plans, `is_brief`, a smaller paper suffices.
+    Text is at least 2.5 mm high. The narrowest column or the lowest strip that fits is used, unless
+    the paper fixes its size. With `is_brief`, key plans are omitted, so that a smaller paper
+    suffices.
     """
     is_column = paper.layout == "column"
     wide, high = paper.width_mm - 2 * MARGIN_MM, paper.height_mm - 2 * MARGIN_MM
@@ -121,7 +122,7 @@ def furnished(
     for block_mm in [paper.block_mm] if paper.block_mm else sizes:
         if block_mm > most_mm:
             break
-        # A column has the title block at its foot, a strip at its right end.
+        # The title block is at the bottom of a column, or at the right end of a strip.
         title_mm = block_mm - 2 * _PADDING_MM if is_column else min(_TITLE_MM, 0.5 * wide)
         title = _title_block(drawing, sheet, title_mm)
         title_high = _high_mm(title, title_mm)
@@ -156,9 +157,9 @@ def _packed(
     top_mm: float,
     high_mm: float,
 ) -> list[tuple[Any, tuple[float, float, float]]] | None:
-    """Fill columns from the left, each from its top; None if they do not fit.
+    """Fill columns from the left, each from the top; None if they do not fit.
 
-    Key plans, which come last, use the remaining height of a column up to their maximum.
+    Key plans, which are last, use the remaining height of a column up to their maximum.
     """
     placed: list[tuple[Any, tuple[float, float, float]]] = []
     column, used = 0, 0.0
@@ -202,7 +203,7 @@ def _notes(drawing: Drawing, sheet: Sheet, *, is_brief: bool) -> list[Any]:
 
 
 def _scale_bar(drawing: Drawing) -> _Picture:
-    """Draw segments of a round length, black and white, with the length at each end."""
+    """Return a bar of black and white segments of a round length, with its length at both ends."""
     mm_per_unit = 1e3 * drawing.unit_m / drawing.scale
     length = round_below(_SEGMENT_MM / mm_per_unit)
     segment = length * mm_per_unit
@@ -235,7 +236,7 @@ def _legend(drawing: Drawing, sheet: Sheet) -> Iterator[Any]:
         symbol = partial(pens.arrow, ends_mm=np.array([[7.0, -0.5], [7.0, 4.5]]))
         meaning = "legend_north" if drawing.up_label == NORTH else "legend_axis"
         rows.append((symbol, f"{drawing.up_label}: {label(meaning, language)}"))
-    # What several pictures have in common once.
+    # Symbols common to several pictures are listed once.
     own = {row[1]: row for view in sheet.views for row in drawing.pictures[view.kind].legend}
     rows += own.values()
     if sheet.numbered:
@@ -247,7 +248,7 @@ def _legend(drawing: Drawing, sheet: Sheet) -> Iterator[Any]:
         )
         rows.append((symbol, label("legend_match", language)))
     for place, (draw, text) in enumerate(rows):
-        # The heading is never separated from the first row.
+        # Keep the heading with the first row.
         heading = (
             [[pens.paragraph(label("legend", language), is_bold=True), ""]] if place == 0 else []
         )
@@ -271,7 +272,7 @@ def _plan(
         [Canvas, Callable[[NDArray[np.float64]], NDArray[np.float64]], float], None
     ],
 ) -> _Picture:
-    """A heading, and lines (n, 2) in metres below it, as large as the space permits."""
+    """Return a heading with a plan of lines (n, 2) in metres, as large as the space permits."""
     title = pens.paragraph(heading)
 
     def draw(canvas: Canvas, wide_mm: float) -> None:
@@ -279,7 +280,7 @@ def _plan(
         title.drawOn(canvas, 0.0, (plan.high_mm - title_mm) * pens.POINTS_PER_MM)
         low = points.min(axis=0)
         size = np.maximum(points.max(axis=0) - low, 1e-6)
-        # The arrow that points up is on the right.
+        # Leave room for the direction arrow on the right.
         limits = np.array([wide_mm - 14.0, plan.high_mm - title_mm - 5.0])
         mm_per_m = float((limits / size).min())
         corner = np.array([2.0, 0.5 * (limits[1] - mm_per_m * size[1]) + 2.0])
@@ -290,7 +291,7 @@ def _plan(
 
 
 def _key_plan(drawing: Drawing, plan: KeyPlan) -> tuple[str, NDArray[np.float64], Any]:
-    """The room from above, with the number of the marked wall."""
+    """Return a plan of the room with the number of the marked wall."""
     lines = [*plan.walls, *plan.outlines, plan.marked]
     if plan.arrow is not None:
         lines.append(plan.arrow)
@@ -309,7 +310,7 @@ def _key_plan(drawing: Drawing, plan: KeyPlan) -> tuple[str, NDArray[np.float64]
         right = wide_mm - 4.0
         pens.arrow(canvas, np.array([[right, 2.0], [right, 10.0]]))
         pens.write_text(canvas, plan.up_label, (right, 11.0), is_centred=True)
-        # The marked one first: where walls are close together, not all numbers fit.
+        # The marked wall first: where walls are close together, not all numbers fit.
         placed = {n: place(wall) for n, wall in zip(plan.numbers, plan.walls, strict=True)}
         numbered: list[NDArray[np.float64]] = []
         for number in sorted(placed, key=lambda n: (n != plan.number, -_length(placed[n]))):
@@ -331,7 +332,7 @@ def _length(ends: NDArray[np.float64]) -> float:
 
 
 def _sheet_key(drawing: Drawing, sheet: Sheet) -> tuple[str, NDArray[np.float64], Any]:
-    """The division of a wall into sheets, with this one filled."""
+    """Return the division of a wall into sheets, with this sheet filled."""
     boxes = {number: np.array(part.corners_m) * [1.0, -1.0] for number, part in sheet.numbered}
 
     def draw(canvas: Canvas, place: Any, _wide_mm: float) -> None:
@@ -364,7 +365,7 @@ def _title_block(drawing: Drawing, sheet: Sheet, wide_mm: float) -> Any:
 
 
 def _revisions(drawing: Drawing, wide_mm: float) -> Any:
-    """The table of revisions, the newest on top."""
+    """Return the table of revisions, the newest on top."""
     rows = [
         [pens.paragraph(text) for text in (one.mark, one.date, one.text, one.by)]
         for one in reversed(drawing.text.block.revisions)
@@ -411,7 +412,7 @@ def _title_table(drawing: Drawing, sheet: Sheet, wide_mm: float) -> Any:
 
 
 def _named(drawing: Drawing, sheet: Sheet) -> Iterator[tuple[str, str]]:
-    """The fields that have a name, those of the client in the middle."""
+    """Yield the named fields, with those of the client in the middle."""
     language, block = drawing.language, drawing.text.block
     number = f"{label('sheet', language)} {sheet.number}"
     last = block.revisions[-1].mark if block.revisions else ""
@@ -428,7 +429,7 @@ def _named(drawing: Drawing, sheet: Sheet) -> Iterator[tuple[str, str]]:
 
 def _scale_and_sheet(drawing: Drawing, sheet: Sheet) -> Iterator[tuple[list[Any], bool]]:
     language = drawing.language
-    # Scales of imperial rulers: inches on the paper per foot.
+    # Imperial scales: inches on paper per foot.
     is_ruler = drawing.unit == "ft" and 12 <= drawing.scale <= 192 and drawing.scale in SCALES_FT
     inches = Fraction(12, drawing.scale) if is_ruler else None
     text = f"1:{drawing.scale}" + (f' ({inches}" = 1\'-0")' if inches else "")
@@ -443,7 +444,7 @@ def _scale_and_sheet(drawing: Drawing, sheet: Sheet) -> Iterator[tuple[list[Any]
 def _rows(
     cells: Sequence[tuple[list[Any], bool]], n_columns: int, wide_mm: float
 ) -> Iterator[list[Any]]:
-    """Arrange cells in rows: wide ones take two columns, and the last of a row the rest of it."""
+    """Arrange cells in rows: wide cells take two columns, and the last cell fills its row."""
     rows: list[list[tuple[list[Any], int]]] = [[]]
     for content, is_wide in cells:
         span = 2 if is_wide else 1
@@ -474,7 +475,7 @@ def _bold(text: str) -> Any:
 
 
 def _small(text: str) -> Any:
-    """The name of a field, grey over its value."""
+    """Return the name of a field in small grey text above its value."""
     return pens.paragraph(text, colour=pens.GREY)
 
 
@@ -489,7 +490,7 @@ def _logo(path: str, most_mm: float) -> Any:
 
 
 def _seal(drawing: Drawing, wide_mm: float) -> Any:
-    """The digest of the record as a QR code and as text."""
+    """Return the digest of the record as a QR code and as text."""
     from reportlab.graphics.barcode.qr import QrCodeWidget
     from reportlab.graphics.shapes import Drawing
 

@@ -37,7 +37,7 @@ SIZES_MM: Final = {
     "A3": (420.0, 297.0),
     "A4": (297.0, 210.0),
 }
-# Of the elongated papers of ISO 5457 those that rolls of 297, 420 and 594 mm give.
+# Elongated sizes of ISO 5457 that can be printed on rolls of 297, 420 and 594 mm.
 LONG_MM: Final = {
     "A3.2": (594.0, 297.0),
     "A3.1": (841.0, 297.0),
@@ -49,12 +49,13 @@ LONG_MM: Final = {
 #: sheets of a picture of a wall
 MOST_SHEETS: Final = 200
 SCALES: Final = (1, 2, 5, 10, 20, 25, 50, 100, 200, 250, 500, 1000, 2000, 5000, 10_000)
-# Inches to the foot: 12", 6", 3", 1 1/2", 1", 3/4" ... 1/16", and engineers' 1" = 20 ft ...
+# Denominators of imperial scales: 12", 6", 3", 1 1/2", 1", 3/4" ... 1/16" to the foot, and
+# engineers' 1" = 20 ft ...
 SCALES_FT: Final = (1, 2, 4, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 240, 480, 1200, 2400, 6000)
 FOOT_M: Final = 0.3048
 _EDGE_MM: Final = (150.0, 5000.0)
 MARGIN_MM: Final = 10.0
-# Around a picture: for its frame and the coordinates and heights beside it.
+# Margins around a picture for its frame, coordinates and heights.
 LEFT_MM: Final = 11.0
 BELOW_MM: Final = 11.0
 _AROUND_MM: Final = (LEFT_MM + 24.0, BELOW_MM + 11.0)
@@ -65,11 +66,11 @@ class Paper:
     """A sheet of paper and the position of its title block.
 
     Attributes:
-        width_mm: width of the sheet in reading direction.
-        height_mm: likewise.
-        name: of the paper, empty for any other size.
-        layout: the title block is in a column on the right, or in a strip along the lower edge.
-        block_mm: width of that column, or height of that strip.
+    width_mm: width of the sheet in reading direction.
+    height_mm: height of the sheet.
+    name: name of the paper size, empty for other sizes.
+    layout: position of the title block: a column on the right or a strip along the lower edge.
+    block_mm: width of the column, or height of the strip.
     """
 
     width_mm: float
@@ -128,7 +129,7 @@ class View:
     """A picture on a sheet.
 
     Attributes:
-        kind: which picture of the drawing.
+        kind: name of the picture in the drawing.
         part: the part of the wall.
         corner_mm: its bottom-left corner on the paper.
     """
@@ -139,10 +140,10 @@ class View:
 
 
 def paper_of(text: str) -> Paper:
-    """Parse the name of a paper, `A0` to `A4`, `A3.1` ..., or its size as `700x500`, in mm.
+    """Parse a paper size: `A0` to `A4`, elongated as `A3.1`, or in mm as `700x500`.
 
     Raises:
-        ArgumentError: it is neither.
+        ArgumentError: the text is not a paper size.
     """
     known = SIZES_MM | LONG_MM
     if (name := text.upper()) in known:
@@ -177,7 +178,7 @@ def placed(kinds: Sequence[str], part: Part, paper: Paper, scale: int) -> tuple[
     )
     across, up = paper.area_mm
     for columns, rows in ((len(kinds), 1), (1, len(kinds))):
-        # A tolerance of a micrometre: 12.0 m at 1:50 are 240.00000000000003 mm.
+        # With a tolerance, because 12.0 m at 1:50 are 240.00000000000003 mm.
         if columns * wide > across + 1e-3 or rows * high > up + 1e-3:
             continue
         left = paper.corner_mm[0] + 0.5 * (across - columns * wide) + LEFT_MM
@@ -193,16 +194,17 @@ def placed(kinds: Sequence[str], part: Part, paper: Paper, scale: int) -> tuple[
 def cut_up(
     size_m: tuple[float, float], paper: Paper, *, scale: int, grid_m: float
 ) -> tuple[Part, ...]:
-    """Distribute a wall evenly over as many sheets as it needs.
+    """Divide a wall evenly among as many sheets as it needs.
 
     Args:
         size_m: width and height of the drawn wall.
         paper: paper of the sheets.
         scale: n of 1 : n.
-        grid_m: the wall is cut at whole steps of the grid if the sheets have room; 0 for anywhere.
+        grid_m: step of the grid at which the wall is cut, if the sheets have room; 0 for any
+            position.
 
     Raises:
-        ArgumentError: it needs more than `MOST_SHEETS`.
+        ArgumentError: the wall needs more than `MOST_SHEETS`.
     """
     limits = [
         1e-3 * scale * max(1.0, limit - around)
@@ -228,7 +230,7 @@ def cut_up(
 
 
 def _even_cuts(size_m: float, limit_m: float, count: int, grid_m: float) -> list[float]:
-    """Return where an edge is cut: into equal parts, or at whole steps of the grid if these fit."""
+    """Return the cuts of an edge: into equal parts, or at multiples of the grid if these fit."""
     step_m = size_m / count
     if grid_m > 0.0 and math.ceil(step_m / grid_m - 1e-9) * grid_m <= limit_m + 1e-9:
         step_m = math.ceil(step_m / grid_m - 1e-9) * grid_m
@@ -263,7 +265,7 @@ _MOST_LOGO_BYTES: Final = 4_000_000
 
 
 def _checked_text(value: object) -> object:
-    """Convert numbers to text, and refuse text that does not fit on a sheet."""
+    """Convert numbers to text, and reject text that does not fit on a sheet."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         value = str(value)
     if isinstance(value, str) and len(value) > MOST_LETTERS:
@@ -291,21 +293,21 @@ class TitleBlock(_Model):
     """The content of the title block; empty fields are omitted.
 
     Attributes:
-        layout: its position; None for the one that wastes less paper.
-        logo: PNG or JPEG of the office, beside the YAML file.
-        project: what is surveyed.
+        layout: position of the block; None for the one that wastes less paper.
+        logo: PNG or JPEG file next to the YAML file.
+        project: name of the project.
         title: title of the drawing, instead of the name of the wall.
-        site: its location.
-        client: the client.
-        organisation: the organisation responsible for the drawing.
-        author: the author.
-        checked_by: the person who checked it.
+        site: location of the building.
+        client: name of the client.
+        organisation: organisation responsible for the drawing.
+        author: author of the drawing.
+        checked_by: person who checked it.
         date: date of the drawing.
-        drawing: its number, followed by the numbers of wall and sheet.
-        revision: its state; by default the mark of the last of the revisions.
-        note: anything else.
-        fields: further fields of the client, by name.
-        revisions: the oldest first.
+        drawing: drawing number, to which the numbers of wall and sheet are appended.
+        revision: current revision; by default the mark of the last one in `revisions`.
+        note: any text.
+        fields: further fields required by the client, by name.
+        revisions: oldest first.
     """
 
     layout: Literal["column", "strip"] | None = None
@@ -329,8 +331,8 @@ def read_title_block(path: Path) -> TitleBlock:
     """Read a title block.
 
     Raises:
-        InputError: the file cannot be read, or has other content; one sentence, about the first
-            place.
+        InputError: the file cannot be read, or a field is invalid; the message is one sentence
+            about the first problem.
     """
     text = text_of_file(path, MOST_BYTES, "a title block (YAML)")
     block, problems = read_model(text, TitleBlock)
@@ -346,17 +348,17 @@ def read_title_block(path: Path) -> TitleBlock:
 
 
 Unit = Literal["m", "ft"]
-# What draws a symbol of 14 x 4 mm at the origin, and its text.
+# Function that draws a 14 x 4 mm symbol at the origin, and its text.
 LegendRow = tuple[Callable[["Canvas"], None], str]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Placed:
-    """A picture at its place on the paper.
+    """A picture at its position on the paper.
 
     Attributes:
         canvas: the page.
-        view: the picture's part, and its place.
+        view: part and position of the picture.
         scale: n of 1 : n.
     """
 
@@ -373,7 +375,7 @@ class Placed:
 
     @contextmanager
     def clipped(self) -> Iterator[Canvas]:
-        """Draw inside the picture alone."""
+        """Restrict drawing to the picture."""
         left, bottom, right, top = (POINTS_PER_MM * edge for edge in self.edges_mm)
         self.canvas.saveState()
         frame = self.canvas.beginPath()
@@ -385,9 +387,9 @@ class Placed:
     def on_paper(
         self, places_m: Sequence[tuple[float, float]] | NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return positions on the paper (n, 2), mm, of metres right and down from the corner."""
+        """Return positions on the paper (n, 2), mm, of metres right and down from its corner."""
         part = self.view.part
-        # No positions are an empty list, e.g. of a hatch too small for a line of its pattern.
+        # The list may be empty, e.g. for a hatch that is too small for a line of its pattern.
         places = np.asarray(places_m, dtype=np.float64).reshape(-1, 2)
         offset = places - [part.left_m, part.bottom_m]
         return np.asarray(self.view.corner_mm + 1e3 / self.scale * offset * [1.0, -1.0])
@@ -399,7 +401,7 @@ class Picture:
 
     Attributes:
         draw: draws a part of it.
-        legend: of its symbols.
+        legend: rows of its legend.
     """
 
     draw: Callable[[Placed], None]
@@ -411,10 +413,10 @@ class Axes:
     """The coordinates beside a picture, in metres.
 
     Attributes:
-        across: coordinate at the left edge of the drawing, and its change per metre to the right;
-            None if it means nothing, as over several walls.
-        down: coordinate at its top edge, and its change per metre downwards.
-        phrase: their meaning, for the sheet.
+    across: coordinate at the left edge of the drawing, and its change per metre to the right; None
+        if it has no meaning, as for several walls.
+    down: coordinate at its top edge, and its change per metre downwards.
+    phrase: meaning of the coordinates, for the notes.
     """
 
     across: tuple[float, float] | None
@@ -427,9 +429,9 @@ class SheetText:
     """Texts on every sheet of a drawing.
 
     Attributes:
-        name: of the wall, or what is cut.
+        name: name of the wall or cut.
         block: the office's title block.
-        notes: accuracy, colours, cells.
+        notes: notes on accuracy, colours and cells.
         digest: seal of the record.
         run: run, workflow and program.
     """
@@ -443,22 +445,22 @@ class SheetText:
 
 @dataclass(frozen=True, kw_only=True)
 class Drawing:
-    """What is drawn to scale, on one sheet or more.
+    """A drawing to scale on one or more sheets.
 
     Attributes:
-        stem: of its files.
+        stem: name of its files without suffix.
         size_m: width and height.
-        pictures: what each shows, in words -> picture; all of this size.
+        pictures: name of the content -> picture; all have this size.
         axes: coordinates.
-        text: its texts.
+        text: texts.
         scale: n of 1 : n.
-        plan: the key plan, None without one.
-        grid: distance of the crosses in `unit`, 0 for none.
+        plan: key plan, or None.
+        grid: distance of the grid crosses in `unit`, 0 for none.
         unit: unit of all numbers beside pictures.
         language: language of labels.
-        heights: metres down from the top edge that have a height mark.
-        north: (2,) right and up on the paper of the direction `up_label`; None with heights.
-        up_label: of the key plan's up direction.
+        heights: positions with a height mark, metres down from the top edge.
+        north: (2,) direction `up_label` on the paper, right and up; None if there are heights.
+        up_label: label of the upwards direction of the key plan.
     """
 
     stem: str
@@ -477,20 +479,20 @@ class Drawing:
 
     @property
     def unit_m(self) -> float:
-        """Metres of its unit."""
+        """Length of its unit in metres."""
         return FOOT_M if self.unit == "ft" else 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sheet:
-    """One sheet.
+    """A sheet of a drawing.
 
     Attributes:
         paper: its paper.
         views: pictures on it.
         number: 1 for the first.
         count: number of sheets.
-        numbered: of one of several sheets, the part on each of them.
+        numbered: numbers and parts of all sheets, if there are several.
     """
 
     paper: Paper
@@ -501,7 +503,7 @@ class Sheet:
 
 
 def axes_of(frame: WallFrame) -> Axes:
-    """Coordinates of a raster, those of its GeoTIFF; Y goes up the paper, also for ceilings."""
+    """Return the coordinates of a raster in its GeoTIFF; Y goes up the paper, also for ceilings."""
     left_m, top_m = frame.raster_corner_m
     if frame.raster_down > 0.0:
         top_m += frame.height * frame.gsd_m
@@ -514,7 +516,7 @@ def axes_of(frame: WallFrame) -> Axes:
 
 
 def up_words(up: NDArray[np.float64]) -> str:
-    """Return the scan's axis along which heights count, with its sign, or its components."""
+    """Return the axis of the scan along which heights are measured, with its sign, or a vector."""
     if up.shape != (3,):
         return "?"
     if float(np.abs(up).max()) < 1.0 - 1e-9:
@@ -523,7 +525,7 @@ def up_words(up: NDArray[np.float64]) -> str:
 
 
 def north_of(frame: WallFrame) -> tuple[float, float] | None:
-    """Return the key plan's up direction on the drawing: right and up; None for upright walls."""
+    """Return the upwards direction of the key plan, right and up; None for upright walls."""
     if frame.up is None or frame.raster_axes == "wall":
         return None
     north_world = basis_from_up(np.array(frame.up))[1]

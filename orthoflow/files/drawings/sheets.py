@@ -1,4 +1,4 @@
-"""Sheets: drawings on paper to scale, as PDF, divided if they fit on no paper.
+"""Sheets: drawings to scale on paper, as PDF, divided if they do not fit on one sheet.
 
 Pictures are embedded once; everything else is vectors and text. Lengths on the paper are
 millimetres from its bottom-left corner until they are passed to reportlab, in points.
@@ -46,8 +46,8 @@ def write_sheet(path: Path, drawing: Drawing, sheet: Sheet, furniture: Furniture
     """Write one sheet.
 
     Raises:
-        StoreError: it cannot be written.
-        InputError: no font has a letter of its texts.
+        StoreError: the file cannot be written.
+        InputError: no font contains a letter of the texts.
     """
     stream = BytesIO()
     size_mm = (sheet.paper.width_mm, sheet.paper.height_mm)
@@ -81,7 +81,7 @@ def _draw_around(placed: Placed, drawing: Drawing, sheet: Sheet) -> None:
         middle = foot + np.array([0.0, 6.0])
         direction = np.array(drawing.north)
         pens.arrow(canvas, middle + np.outer([-6.0, 6.0], direction))
-        # The middle of its label lies 3.2 mm before its tip, clear of a descender.
+        # The middle of the label is 3.2 mm from the tip, so that descenders do not touch it.
         at = tuple(middle + 9.2 * direction - [0.0, 0.5 * pens.TEXT_MM])
         pens.write_text(canvas, drawing.up_label, at, is_centred=True)
 
@@ -93,7 +93,7 @@ def _draw_grid(placed: Placed, drawing: Drawing) -> None:
     columns: dict[float, float] = {}
     bottom_m = part.bottom_m
     if drawing.axes.across is None:
-        # Below the lowest height are the names of what is drawn.
+        # The space below the lowest height is for names.
         bottom_m = min(bottom_m, max(drawing.heights, default=bottom_m) + 1e-6)
     else:
         limits = (part.left_m, part.right_m)
@@ -118,7 +118,7 @@ def _draw_grid(placed: Placed, drawing: Drawing) -> None:
     for text, x in _with_room(columns, digits, (left - 4.0, right + 4.0)):
         at = (x, bottom - _TICK_MM - 1.0 - pens.TEXT_MM)
         pens.write_text(canvas, text, at, is_centred=True)
-    # Beside the picture, not overlapping those below it.
+    # Beside the picture, without overlapping the coordinates below it.
     for text, y in _with_room(rows, digits, (bottom, top)):
         pens.write_text(canvas, text, (left - _TICK_MM - 1.0, y), turned_deg=90.0, is_centred=True)
     for x in columns.values():
@@ -129,12 +129,12 @@ def _draw_grid(placed: Placed, drawing: Drawing) -> None:
 def _with_room(
     places: dict[float, float], digits: int, limits_mm: tuple[float, float]
 ) -> Iterator[tuple[str, float]]:
-    """Return numbers at multiples of the smallest step of 1, 2, 5 ... marks at which all fit.
+    """Yield coordinates at multiples of the smallest step of 1, 2, 5 ... marks with which all fit.
 
     Args:
         places: coordinate -> its position along the edge.
-        digits: decimal places.
-        limits_mm: a number at an end is moved inside them.
+        digits: number of decimals.
+        limits_mm: limits of the text; a coordinate at an end is moved inside them.
     """
     values = sorted(places)
     step = values[1] - values[0] if len(values) > 1 else 1.0
@@ -158,7 +158,7 @@ def _with_room(
 def _marks(
     axis: tuple[float, float], limits_m: tuple[float, float], drawing: Drawing
 ) -> Iterator[tuple[float, float]]:
-    """Positions in a drawing where a coordinate is a whole number of steps, and the coordinate."""
+    """Yield positions at which a coordinate is a multiple of the step, and the coordinate."""
     start, slope = axis
     step_m = drawing.grid * drawing.unit_m
     low, high = sorted(start + slope * place for place in limits_m)
@@ -178,7 +178,7 @@ def _draw_heights(placed: Placed, drawing: Drawing) -> None:
     )
     room = max(1, int((top - bottom) / _MARK_ROW_MM))
     if len(levels) > room + 1:
-        # Of many the lowest and the highest, and every nth of the others.
+        # If there are too many, keep the lowest, the highest and every nth in between.
         every = math.ceil((len(levels) - 2) / max(1, room - 1))
         levels = [levels[0], *levels[1:-1][::every], levels[-1]]
     places: list[float] = []
@@ -194,19 +194,19 @@ def _draw_heights(placed: Placed, drawing: Drawing) -> None:
 
 
 def _draw_match_lines(placed: Placed, drawing: Drawing, sheet: Sheet) -> None:
-    """Draw dash-dotted lines where the drawing continues, each with the number of the sheet."""
+    """Draw dash-dotted match lines, each with the number of the adjacent sheet."""
     own = np.array(placed.view.part.corners_m)[[0, 2]]
     for number, part in sheet.numbered:
         other = np.array(part.corners_m)[[0, 2]]
         edge = np.array([np.maximum(own[0], other[0]), np.minimum(own[1], other[1])])
-        # Neighbours share an edge, which has a length and no width.
+        # Adjacent parts share an edge, which has a length but no width.
         along = int(np.argmax(edge[1] - edge[0]))
         if edge[1, along] <= edge[0, along] or edge[1, 1 - along] != edge[0, 1 - along]:
             continue
         (left, bottom), (right, top) = np.sort(placed.on_paper(edge), axis=0).tolist()
         middle = (0.5 * (left + right), 0.5 * (bottom + top))
         is_before = bool(other[0, 1 - along] < own[0, 1 - along])
-        # Left and below the number is beyond the coordinates.
+        # To the left and below, the number is outside the coordinates.
         if along == 1:
             ends, turned_deg = [(left, bottom - 5.0), (left, top + 5.0)], 90.0
             at = (left + (-6.8 if is_before else 6.0), middle[1])
@@ -218,7 +218,7 @@ def _draw_match_lines(placed: Placed, drawing: Drawing, sheet: Sheet) -> None:
         pens.write_text(placed.canvas, text, at, turned_deg=turned_deg, is_centred=True)
 
 
-# A wall that fits on no paper is divided into sheets of this one.
+# Paper of the sheets if a wall does not fit on a single one.
 _CUT_PAPER: Final = "A1"
 #: a sheet with its pictures, and the blocks beside them
 LaidOut: TypeAlias = tuple[Sheet, Furniture]
@@ -245,12 +245,12 @@ def lay_out(drawing: Drawing, given: Sequence[Paper] = ()) -> tuple[LaidOut, ...
 
     Args:
         drawing: the drawing.
-        given: permitted papers; without any the smallest usual one that fits the wall.
+        given: permitted papers; if empty, the smallest usual one that fits the wall.
 
     Raises:
         ArgumentError: the title block does not fit on the paper, or the wall needs too many sheets.
     """
-    # Key plans are omitted only if the office's paper has no room for them.
+    # Key plans are omitted only if they do not fit on the office's paper.
     for is_brief in (False, True) if given else (False,):
         if alone := _on_one(drawing, given or usual_papers(), is_brief=is_brief):
             return (alone,)
@@ -276,7 +276,7 @@ def _ways(drawing: Drawing, papers: Sequence[Paper]) -> Iterator[Paper]:
 
 
 def _on_one(drawing: Drawing, papers: Sequence[Paper], *, is_brief: bool = False) -> LaidOut | None:
-    """Return all pictures of a wall on one sheet of the first of some papers that fits."""
+    """Return all pictures of a wall on one sheet, of the first paper on which they fit."""
     content = (tuple(drawing.pictures), whole_of(drawing.size_m))
     for paper in _ways(drawing, papers):
         if views := placed(*content, paper, drawing.scale):
@@ -288,9 +288,9 @@ def _on_one(drawing: Drawing, papers: Sequence[Paper], *, is_brief: bool = False
 
 
 def _cut(drawing: Drawing, paper: Paper, *, is_brief: bool) -> tuple[LaidOut, ...]:
-    """Return the sheets of a divided wall; none if the paper has no room for them."""
+    """Return the sheets of a divided wall; none if the paper is too small."""
     kinds, whole = tuple(drawing.pictures), whole_of(drawing.size_m)
-    # As much text as on any of them: with a key of several sheets.
+    # The blocks of this sheet are the largest: it has a key of several sheets.
     view = View(kind=max(kinds, key=len), part=whole, corner_mm=(0.0, 0.0))
     longest = Sheet(paper=paper, views=(view,), count=99, numbered=((1, whole), (2, whole)))
     first = furnished(paper, drawing, longest, is_brief=is_brief)

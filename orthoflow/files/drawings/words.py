@@ -52,7 +52,7 @@ class Phrase:
     Attributes:
         key: key of its text.
         values: values to fill in.
-        asides: statements in parentheses after it.
+        asides: phrases in parentheses after it.
     """
 
     key: str
@@ -60,7 +60,7 @@ class Phrase:
     asides: tuple[Phrase, ...] = ()
 
     def text(self, language: Language = "en") -> str:
-        """State it in a language."""
+        """Return the text in a language."""
         text = label(self.key, language, **self.values)
         more = ", ".join(item.text(language) for item in self.asides)
         return f"{text} ({more})" if more else text
