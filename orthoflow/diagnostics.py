@@ -1,7 +1,7 @@
-"""What deserves attention, as data: declared once by who reports it, grouped and ordered by code.
+"""Diagnostics as data: declared once with a code, and grouped and ordered by it.
 
 A method declares a `DiagnosticSpec` and reports it with `ctx.report(SPEC, subject=..., **values)`.
-Terminal, report and record work on code, severity and values; no code reads the text.
+Terminal, report and record use code, severity and values; no code parses the text.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ __all__ = [
 Severity = Literal["error", "warning", "note"]
 Value = bool | int | float | str | None
 
-# What a summary shows of groups before it refers to the rest.
+# Number of groups that a summary shows.
 FIRST_SHOWN: Final = 5
 _ORDER: Final = ("error", "warning", "note")
 _LONGEST: Final = 2000
@@ -44,22 +44,22 @@ _STEP: Final = re.compile(r"\{step(?:\[([^\]]+)\])?\}")
 
 @dataclass(frozen=True, kw_only=True)
 class DiagnosticSpec:
-    """One kind of thing to report.
+    """Declaration of a diagnostic.
 
-    In `text` and `remedy`, `{step}` stands for the name of the reporting step, and `{step[raster]}`
-    or `{step[raster.grid]}` for the step of that kind or method, so that a remedy can name a
-    setting as it is set: `{step[raster]}.margin_m=0.2`.
+    In `text` and `remedy`, `{step}` is replaced by the name of the reporting step, and
+    `{step[raster]}` or `{step[raster.grid]}` by the name of the step of that kind or method, so
+    that a remedy can refer to a setting, as in `{step[raster]}.margin_m=0.2`.
 
     Attributes:
-        code: stable name that documents and tests refer to, e.g. `scan-without-colour`.
+        code: stable name for documents and tests, e.g. `scan-without-colour`.
         severity: `error` (the result is wrong), `warning` (it is limited) or `note`.
-        text: format string over the values and `{subject}`: what is wrong, with the numbers.
+        text: format string with the values and `{subject}`: the problem, with numbers.
         remedy: format string: what to do about it.
-        rank_by: name of the value by which the worst of a group is chosen, larger is worse; with
-            `-` before it smaller is worse.
-        settled_by: method ids or codes: a later step of such a method, or one that reports such a
-            code, settles it.
-        is_summary: it sums up what the step did: printed when it is reported, also as a note.
+        rank_by: name of the value by which the worst of a group is chosen: the largest, or with a
+            leading `-` the smallest.
+        settled_by: method ids or codes: a later step with such a method or diagnostic resolves it.
+        is_summary: whether it summarises the step; it is then printed when reported, even if it is
+            a note.
     """
 
     code: str
@@ -81,10 +81,10 @@ class DiagnosticSpec:
             )
 
     def of(self, subject: str, values: Mapping[str, object]) -> Diagnostic:
-        """Fill in values.
+        """Return the diagnostic with these values.
 
         Raises:
-            ProductError: the text names a value that is not given, or one is no number or text.
+            ProductError: a value in the text is missing, or is neither a number nor a text.
         """
         fields = {**values, "subject": subject, "step": _StepPlaceholder()}
         try:
@@ -115,13 +115,13 @@ class DiagnosticSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class DiagnosticGroup:
-    """Diagnostics of one code.
+    """Diagnostics with the same code.
 
     Attributes:
-        worst: the one with the worst value.
-        count: how many there are.
-        subjects: of the others, each once, in their order.
-        places: addresses of the cells that reported them, that of the worst first, each once.
+        worst: the diagnostic with the worst value.
+        count: number of diagnostics.
+        subjects: distinct subjects of the others, in order.
+        places: distinct addresses of the cells that reported them, that of the worst first.
     """
 
     worst: Diagnostic
@@ -131,9 +131,9 @@ class DiagnosticGroup:
 
     @property
     def sentence(self) -> str:
-        """The worst of them, how many there are, what else they are about, and what to do."""
+        """The worst diagnostic, the number of others and their subjects, and the remedy."""
         text = self.worst.text
-        # The same of one subject in several combinations is one thing.
+        # The same diagnostic of a subject in several combinations counts once.
         if self.count > 1 and (self.subjects or self.count > len(self.places)):
             also = f"; also {first_few(self.subjects)}" if self.subjects else ""
             text = f"{text} ({'the worst of ' if self.worst.rank_by else ''}{self.count}{also})"
@@ -141,19 +141,19 @@ class DiagnosticGroup:
 
     @property
     def where(self) -> str:
-        """The first of the places, and how many more there are."""
+        """The first address, and the number of further ones."""
         return first_few(self.places, most=1)
 
 
 def grouped(reported: Iterable[tuple[str, Diagnostic]]) -> tuple[DiagnosticGroup, ...]:
-    """Group diagnostics by code, most harmful first.
+    """Group diagnostics by code, most severe first.
 
     Args:
-        reported: address of the cell and what it reported, in the order of the run.
+        reported: address of the cell and its diagnostic, in the order of the run.
 
     Returns:
-        A group per code (those without a code of their own: per text), by severity, then those
-        with a remedy, then the frequent ones, then in the order of the run.
+        A group per code (per text for those without a code of their own), sorted by severity; then
+        groups with a remedy, then frequent ones, then in the order of the run.
     """
     groups: dict[tuple[str, str], list[tuple[str, Diagnostic]]] = {}
     for place, one in reported:
@@ -173,7 +173,7 @@ def grouped(reported: Iterable[tuple[str, Diagnostic]]) -> tuple[DiagnosticGroup
 
 
 def unique(reported: Iterable[Diagnostic]) -> list[Diagnostic]:
-    """Return each of some diagnostics once."""
+    """Return the distinct diagnostics."""
     found: list[Diagnostic] = []
     for one in reported:
         if one not in found:
@@ -182,7 +182,7 @@ def unique(reported: Iterable[Diagnostic]) -> list[Diagnostic]:
 
 
 def warning_texts(reported: Iterable[Diagnostic]) -> tuple[str, ...]:
-    """Return the sentences of all that is more than a note, with their remedies, each once."""
+    """Return the distinct texts of warnings and errors, with their remedies."""
     return tuple(
         dict.fromkeys(
             f"{one.text}: {one.remedy}" if one.remedy else one.text
@@ -192,9 +192,9 @@ def warning_texts(reported: Iterable[Diagnostic]) -> tuple[str, ...]:
     )
 
 
-# Any: cells of a run or of a record, with their outcome.
+# Any: cells of a run or of a record.
 def standing(cells: Iterable[Any]) -> tuple[tuple[str, Diagnostic], ...]:
-    """Return address and diagnostic of all that no later step has settled."""
+    """Return address and diagnostic of all diagnostics that no later step resolved."""
     cells = tuple(cells)
     settled = {
         (given.digest, name)
@@ -216,7 +216,7 @@ def standing(cells: Iterable[Any]) -> tuple[tuple[str, Diagnostic], ...]:
 
 
 def step_names(steps: Iterable[tuple[str, str]]) -> Callable[[str], str]:
-    """Return a look-up of steps by method or kind, for `placed`.
+    """Return a function that maps a method or kind to the name of its step, for `placed`.
 
     Args:
         steps: name of a step and id of its method, of all cells.
@@ -225,15 +225,15 @@ def step_names(steps: Iterable[tuple[str, str]]) -> Callable[[str], str]:
     for step, method in steps:
         for name in (method, method.partition(".")[0]):
             found.setdefault(name, set()).add(step)
-    # Of two steps of a kind it is ambiguous which is meant.
+    # If several steps have this kind, the reference is ambiguous and left as it is.
     return lambda name: min(found[name]) if len(found.get(name, ())) == 1 else name
 
 
 def placed(one: Diagnostic, step: str, step_of: Callable[[str], str]) -> Diagnostic:
     """Insert the names of steps into the texts of a diagnostic.
 
-    Results are shared between workflows, whose steps may have other names: so they are put in when
-    a result is used, not when it is made.
+    Results are shared between workflows in which steps may have different names, so the names are
+    inserted when a result is used.
     """
 
     def name(found: re.Match[str]) -> str:
@@ -254,7 +254,7 @@ class _StepPlaceholder:
 
 
 _FORMATTER: Final = string.Formatter()
-# Of `ctx.warn`, whose text is all that is known.
+# Spec of `ctx.warn`, which has a text only.
 PLAIN_WARNING: Final = DiagnosticSpec(code="warning", severity="warning", text="{text}")
 TOO_MANY: Final = DiagnosticSpec(
     code="more-diagnostics",
@@ -270,7 +270,7 @@ def _line(text: str) -> str:
 
 
 def _plain(code: str, name: str, value: object) -> Value:
-    # Numbers of numpy, which has no place here.
+    # Scalars of numpy, which is not imported here.
     item = getattr(value, "item", None)
     plain = item() if callable(item) and getattr(value, "ndim", 1) == 0 else value
     if isinstance(plain, float) and not math.isfinite(plain):

@@ -1,4 +1,4 @@
-"""What is installed: methods, kinds and product types of all plugins, and what is wrong with them.
+"""The installed methods, kinds and product types of all plugins, and problems of plugins.
 
-Light on purpose: nothing here loads numpy, pydantic or networkx until a method is loaded.
+The package imports numpy, pydantic and networkx only when a method is loaded.
 """

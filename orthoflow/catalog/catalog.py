@@ -1,4 +1,4 @@
-"""The catalog: one entry per method, kind, product type and broken plugin, found by name."""
+"""The catalog: methods, kinds, product types and broken plugins, by name."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ if TYPE_CHECKING:
     from orthoflow.sdk.methods import Method
 
     class Publisher(Protocol):
-        """Writes the files of a product that people open in other programs."""
+        """Writes the files of a product for other programs."""
 
         def __call__(self, product: Product, folder: Path, digest: str) -> object:
-            """Write into an existing folder."""
+            """Write to an existing folder."""
 
 
 EntryState = Literal["fine", "broken", "clash"]
-# Environment variable: distributions or entry points, with commas between.
+# Environment variable with comma-separated distributions or entry points.
 DISABLED: Final = "ORTHOFLOW_DISABLED_PLUGINS"
 
 
@@ -39,10 +39,10 @@ class BrokenPlugin:
 
     Attributes:
         entry_point: name of the entry point.
-        module: what the entry point names.
-        distribution: who brought it.
-        error: one line, class and message of what went wrong.
-        traceback: for `--debug` and bug reports.
+        module: module to which the entry point refers.
+        distribution: distribution that contains it.
+        error: class and message of the error, one line.
+        traceback: traceback for `--debug` and bug reports.
     """
 
     entry_point: str
@@ -55,7 +55,7 @@ class BrokenPlugin:
         return f"plugin {self.entry_point} of {self.distribution} fails to load: {self.error}"
 
     def mentions(self, method_id: str) -> bool:
-        """Whether the plugin's code names this method, so that it most likely brings it."""
+        """Return whether the plugin's code contains this method id, and so probably declares it."""
         quoted = (f'"{method_id}"', f"'{method_id}'")
         for path in source_files((package_path(self.module.partition(":")[0]),)):
             try:
@@ -69,13 +69,14 @@ class BrokenPlugin:
 
 @dataclass(frozen=True, kw_only=True)
 class Announced:
-    """Who announced an entry, and what is wrong with it.
+    """Origin and state of an entry.
 
     Attributes:
-        distribution: who announced it; of a clash, the first.
-        state: `clash` when several announce it and none takes precedence; `broken` when it
-            cannot be used.
-        problem: one sentence that names the distributions; of what is fine, who else claims it.
+        distribution: distribution that declares it; the first one in a clash.
+        state: `clash` if several declare it and none takes precedence; `broken` if it cannot be
+            used.
+        problem: one sentence with the distributions concerned; for a usable entry, who else
+            declares it.
     """
 
     distribution: DistributionInfo
@@ -85,27 +86,27 @@ class Announced:
 
 @dataclass(frozen=True, kw_only=True)
 class KindEntry(Announced):
-    """A kind as announced; broken when a port carries a product type that nobody announces."""
+    """A kind; broken if no plugin declares the product type of one of its ports."""
 
     spec: KindSpec
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProductEntry(Announced):
-    """A product type as announced: where class and publisher are."""
+    """A product type, with the import strings of class and publisher."""
 
     spec: ProductSpec
 
 
 @dataclass(frozen=True, kw_only=True)
 class MethodEntry(Announced):
-    """A method as announced; its class loads on first use. Broken when its kind cannot be used.
+    """A method, whose class is loaded on first use; broken if its kind cannot be used.
 
     Attributes:
         spec: id, import string, summary.
-        kind: ports that the method must keep; None when nobody announces its kind.
-        product_types: all product types that ports may carry.
-        contested: of those that several plugins announce, the class that is used.
+        kind: kind with the ports of the method; None if no plugin declares it.
+        product_types: all product types that ports may have.
+        contested: product types declared by several plugins -> class that is used.
     """
 
     spec: MethodSpec
@@ -114,11 +115,11 @@ class MethodEntry(Announced):
     contested: Mapping[str, str] = field(default_factory=dict)
 
     def load(self) -> type[Method]:
-        """Import the class and check what the framework relies on, once.
+        """Import the class and check the rules on which the framework relies, once.
 
         Raises:
-            PluginError: the entry is not fine, the import fails, or the class breaks a rule; the
-                sentence names the distribution.
+            PluginError: the entry is not usable, the import fails, or the class violates a rule;
+                the message names the distribution.
         """
         return self._loaded
 
@@ -133,9 +134,10 @@ class MethodEntry(Announced):
         )
 
     def looked_at(self) -> MethodEntry:
-        """Return the entry, `broken` where its class does not load.
+        """Return the entry, with the state `broken` if its class cannot be loaded.
 
-        Our own are loaded by the tests of every release, and a listing takes half a second.
+        Built-in methods are not checked, to save half a second; the tests of each release load
+        them.
         """
         if self.state != "fine" or self.distribution.name == DISTRIBUTION:
             return self
@@ -146,9 +148,9 @@ class MethodEntry(Announced):
         return self
 
     def source_files(self) -> tuple[Path, ...]:
-        """Python files whose content can change the method's results, sorted.
+        """Python files whose content can change the results of the method, sorted.
 
-        The packages of the hooks and of the class. Never empty for a method that loads from files.
+        These are all files in the packages of the hooks and of the class.
         """
         return source_files(
             (self.distribution.source_folder, package_path(self.spec.target.partition(":")[0]))
@@ -157,14 +159,14 @@ class MethodEntry(Announced):
 
 @dataclass(frozen=True, kw_only=True)
 class Catalog:
-    """Everything that the installed plugins bring.
+    """Content of the installed plugins.
 
     Attributes:
-        methods: by id, in the order of announcement.
-        kinds: by name.
-        products: by type name.
-        broken: plugins that failed to load; they spoil only a workflow that needs them.
-        disabled: names of plugins that the environment switches off.
+        methods: methods by id, in the order of declaration.
+        kinds: kinds by name.
+        products: product types by name.
+        broken: plugins that failed to load; they affect only workflows that need them.
+        disabled: names of plugins that are disabled by the environment variable.
     """
 
     methods: Mapping[str, MethodEntry]
@@ -177,9 +179,8 @@ class Catalog:
         """Return a method that can be loaded.
 
         Raises:
-            WorkflowError: nobody brings a method of that id.
-            PluginError: several bring it, its kind is unusable, or the plugin that brings it
-                fails to load.
+            WorkflowError: no plugin has a method with that id.
+            PluginError: several plugins have it, its kind is unusable, or its plugin fails to load.
         """
         entry = self.methods.get(method_id)
         if entry is None:
@@ -199,7 +200,7 @@ class Catalog:
         """Return the class of a product type.
 
         Raises:
-            PluginError: nobody brings the type, several do, or it fails to import.
+            PluginError: no plugin or several declare the type, or its class cannot be imported.
         """
         from orthoflow.catalog.loading import (  # noqa: PLC0415 - loads pydantic
             import_target,
@@ -220,10 +221,10 @@ class Catalog:
         return cls
 
     def publisher(self, type_name: str) -> Publisher | None:
-        """Return what writes the files of a product type; None when there are none to write.
+        """Return the publisher of a product type; None if it has none.
 
         Raises:
-            PluginError: nobody brings the type, several do, or its publisher fails to import.
+            PluginError: no plugin or several declare the type, or its publisher cannot be imported.
         """
         from orthoflow.catalog.loading import import_target  # noqa: PLC0415 - loads pydantic
 
@@ -248,7 +249,7 @@ class Catalog:
         return entry
 
     def _suggest(self, method_id: str) -> str:
-        # Inside a kind only the second part tells names apart; `plane.` is the same in all of them.
+        # Compare only the part after the dot, since the kind is the same for all methods of a kind.
         kind, _, name = method_id.partition(".")
         siblings = {other.partition(".")[2]: other for other in self._of_kind(kind)}
         if not siblings:

@@ -1,4 +1,4 @@
-"""Finding plugins: a loop over entry points in which no plugin can harm another."""
+"""Discovery of plugins through entry points, isolated from each other's errors."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from orthoflow.sdk.hooks import (
 from orthoflow.sdk.lines import describe_error
 from orthoflow.version import DISTRIBUTION
 
-# Windows takes the first ones for devices; addresses and files are named after names.
+# Windows reserves the first ones for devices, and files are named after methods and steps.
 NAME_PATTERN: Final = (
     r"(?!(?:con|prn|aux|nul|com[0-9]|lpt[0-9])(?![a-z0-9_-]))[a-z][a-z0-9_-]{0,31}"
 )
@@ -51,18 +51,18 @@ _KIND: Final = re.compile(NAME_PATTERN)
 _TARGET: Final = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 _Spec = TypeVar("_Spec", MethodSpec, KindSpec, ProductSpec)
-# A spec and who announced it.
+# A spec and the distribution that declares it.
 _AnyClaim: TypeAlias = tuple[MethodSpec | KindSpec | ProductSpec, DistributionInfo]
 
 
 def discover_catalog(entry_points: Iterable[EntryPoint] | None = None) -> Catalog:
-    """List everything that the installed plugins bring.
+    """Return the content of the installed plugins.
 
-    Plugins that `ORTHOFLOW_DISABLED_PLUGINS` names, by distribution or entry point and with `,`
-    between, are left out.
+    Plugins listed in `ORTHOFLOW_DISABLED_PLUGINS` (comma-separated distributions or entry points)
+    are omitted.
 
     Args:
-        entry_points: plugins to look at; None for all installed ones.
+        entry_points: entry points of plugins; None for all installed ones.
     """
     found = _installed_entry_points() if entry_points is None else entry_points
     claims: list[_AnyClaim] = []
@@ -83,7 +83,7 @@ def discover_catalog(entry_points: Iterable[EntryPoint] | None = None) -> Catalo
             raise
         except BaseException as error:  # noqa: BLE001 - plugins may raise anything, even SystemExit
             broken.append(_describe_failure(entry, distribution, error))
-    # Orthoflow's own come first.
+    # Built-in entries come first.
     claims.sort(key=lambda claim: claim[1].name != DISTRIBUTION)
     products = _collect_products(_by_name(claims, ProductSpec))
     by_kind = _by_name(claims, KindSpec)
@@ -102,8 +102,8 @@ def _installed_entry_points() -> Iterable[EntryPoint]:
     try:
         return metadata.entry_points(group=ENTRY_POINT_GROUP)
     except ValueError:
-        # One unreadable file spoils that for all. A distribution may be found twice; the first
-        # counts, as on import.
+        # Python's own function fails for all if one file is unreadable. A distribution may be found
+        # twice; the first one is used, as in imports.
         found: dict[str, list[EntryPoint]] = {}
         for distribution in metadata.distributions():
             with suppress(ValueError):
@@ -113,7 +113,7 @@ def _installed_entry_points() -> Iterable[EntryPoint]:
 
 
 def _announced(entry: EntryPoint) -> list[MethodSpec | KindSpec | ProductSpec]:
-    # One manager per plugin: with a shared one, the second plugin of a name is dropped in silence.
+    # One manager per plugin: a shared one silently drops the second plugin with the same name.
     manager = pluggy.PluginManager(PROJECT)
     manager.add_hookspecs(PluginHooks)
     manager.register(entry.load(), entry.name)
@@ -140,7 +140,7 @@ def _announced(entry: EntryPoint) -> list[MethodSpec | KindSpec | ProductSpec]:
 
 
 def _check(spec: MethodSpec | KindSpec | ProductSpec) -> None:
-    """Check types and spelling of a spec's fields, which a dataclass takes as they come."""
+    """Check types and spelling of the fields of a spec, which dataclasses do not check."""
     for item in dataclasses.fields(spec):
         value: object = getattr(spec, item.name)
         texts = (*value, *value.values()) if isinstance(value, Mapping) else (value,)
@@ -181,7 +181,7 @@ def _describe_failure(
 def _by_name(
     claims: Iterable[_AnyClaim], spec_class: type[_Spec]
 ) -> dict[str, list[tuple[_Spec, DistributionInfo]]]:
-    """Who claims each name, in order."""
+    """Return the claims for each name, in order."""
     found: dict[str, list[tuple[_Spec, DistributionInfo]]] = {}
     for spec, distribution in claims:
         if isinstance(spec, spec_class):
@@ -223,7 +223,7 @@ def _collect_kinds(
         problem = _unknown_products(claims[0], product_types)
         state: EntryState = "broken" if problem else "fine"
         if not problem and any(_ports(other) != _ports(spec) for other, _ in claims):
-            # The same ports again do no harm: two plugins may both need a kind of their own.
+            # Identical ports are harmless: two plugins may declare the same kind.
             problem = _contested(
                 f"kind {name}", claims, "methods have the ports that their own plugin gives it"
             )
@@ -263,7 +263,7 @@ def _collect_methods(
     contested = {name: entry.spec.target for name, entry in products.items() if entry.problem}
 
     def entry_of(spec: MethodSpec, distribution: DistributionInfo) -> MethodEntry:
-        # A plugin's own kind comes before one of another plugin.
+        # A kind of the same plugin takes precedence over that of another plugin.
         claims = by_kind.get(spec.kind, [])
         own = next((claim for claim in claims if claim[1].name == distribution.name), None)
         shared = kinds.get(spec.kind)

@@ -1,4 +1,4 @@
-"""Which distribution brought a plugin, and where its code is."""
+"""The distribution of a plugin, and the location of its code."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
-# The name at the beginning of a requirement.
+# Name at the beginning of a requirement.
 _REQUIREMENT: Final = re.compile(r"[\w.-]+")
 
 
 @dataclass(frozen=True, kw_only=True)
 class DistributionInfo:
-    """The distribution behind a plugin.
+    """The distribution that contains a plugin.
 
     Attributes:
         name: name of the distribution.
-        version: its version.
-        source_folder: folder of the package that holds the hooks; None for a plugin of a single
-            module, which lies beside unrelated code (see `MethodEntry.source_files`).
+        version: version of the distribution.
+        source_folder: folder of the package with the hooks; None for a plugin that is a single
+            module next to unrelated code (see `MethodEntry.source_files`).
     """
 
     name: str
@@ -34,7 +34,7 @@ class DistributionInfo:
 
 
 def describe_distribution(entry_point: EntryPoint) -> DistributionInfo:
-    """State where an entry point comes from, without importing it."""
+    """Return the distribution of an entry point, without importing it."""
     code = package_path(entry_point.module)
     folder = code if code is not None and code.is_dir() else None
     distribution = entry_point.dist
@@ -49,7 +49,7 @@ def describe_distribution(entry_point: EntryPoint) -> DistributionInfo:
 
 
 def _name_and_version(distribution: Distribution) -> tuple[str, str]:
-    """Name and version in the metadata; empty where they are missing or unreadable."""
+    """Return name and version from the metadata; empty if missing or unreadable."""
     try:
         stated = distribution.metadata
     except ValueError:
@@ -58,10 +58,9 @@ def _name_and_version(distribution: Distribution) -> tuple[str, str]:
 
 
 def package_path(module: str) -> Path | None:
-    """Folder of the outermost regular package of a module, or the file of a single module.
+    """Return the folder of the outermost regular package of a module, or the file of a module.
 
-    Nothing is imported except namespace packages, which hold no code. None when there is no such
-    module.
+    Only namespace packages, which contain no code, are imported. None if the module does not exist.
     """
     name, _, rest = module.partition(".")
     while True:
@@ -81,7 +80,7 @@ def package_path(module: str) -> Path | None:
 
 
 def canonical_name(name: str) -> str:
-    """Spell the name of a distribution as indexes do.
+    """Return the normalised name of a distribution.
 
     >>> canonical_name("Ruamel.YAML_clib")
     'ruamel-yaml-clib'
@@ -90,9 +89,9 @@ def canonical_name(name: str) -> str:
 
 
 def direct_requirements(name: str) -> frozenset[str] | None:
-    """Distributions that one requires itself, by canonical name, for whatever system.
+    """Return the canonical names of the direct requirements of a distribution, for all platforms.
 
-    Its extras are left out. None when it is not installed, or its metadata cannot be read.
+    Extras are excluded. None if it is not installed or its metadata cannot be read.
     """
     try:
         stated = requires(name) or []
@@ -104,9 +103,9 @@ def direct_requirements(name: str) -> frozenset[str] | None:
 
 @cache
 def required_distributions(names: frozenset[str]) -> frozenset[str] | None:
-    """Distributions and all that they require, directly or through others, by canonical name.
+    """Return the canonical names of distributions and all their direct and indirect requirements.
 
-    None when one of the named is not installed here: its requirements are unknown.
+    None if one of the given distributions is not installed, so that its requirements are unknown.
     """
     left = [canonical_name(name) for name in names]
     if any(direct_requirements(name) is None for name in left):
@@ -122,9 +121,9 @@ def required_distributions(names: frozenset[str]) -> frozenset[str] | None:
 
 @cache
 def source_files(paths: tuple[Path | None, ...]) -> tuple[Path, ...]:
-    """All Python files in packages and single modules, sorted, each once.
+    """Return all Python files of packages and single modules, sorted, without duplicates.
 
-    The folders are walked once per process: a plan asks for every method.
+    The folders are searched once per process, since a plan needs the files of every method.
     """
     files: set[Path] = set()
     for path in paths:

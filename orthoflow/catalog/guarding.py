@@ -1,6 +1,6 @@
-"""Running third-party code while it loads, kept from side effects.
+"""Protection from side effects of third-party code while it is being loaded.
 
-Light on purpose, as all of the catalog.
+This module has no heavy imports, like all of the catalog.
 """
 
 from __future__ import annotations
@@ -19,19 +19,18 @@ from orthoflow.errors import PluginError
 
 
 class UserInterrupt(KeyboardInterrupt):
-    """Ctrl-C of the user, not an exception that a plugin raises."""
+    """Ctrl-C by the user, as opposed to a KeyboardInterrupt raised by a plugin."""
 
 
 @contextmanager
 def guarded() -> Iterator[None]:
-    """Keep what the code inside does from the rest of the program.
+    """Protect the program from side effects of the code in the block.
 
-    What it prints goes to standard error; the working folder, which paths of users count from, and
-    the limit of recursion stay.
+    Its output goes to standard error; the working directory and the recursion limit are restored.
 
     Raises:
         UserInterrupt: the user pressed Ctrl-C.
-        PluginError: it lowered the limit of recursion.
+        PluginError: the code lowered the recursion limit.
     """
     limit = sys.getrecursionlimit()
     try:
@@ -41,13 +40,13 @@ def guarded() -> Iterator[None]:
         left = sys.getrecursionlimit()
         sys.setrecursionlimit(limit)
         if left < limit:
-            # Also in the place of the RecursionError that it leads to.
+            # This replaces a RecursionError caused by the lower limit.
             raise PluginError(f"it lowers Python's recursion limit from {limit} to {left}")
 
 
 @contextmanager
 def _working_folder_kept() -> Iterator[None]:
-    """Return to the working folder, even if it has no name any more."""
+    """Restore the working directory, even if it has been deleted."""
     folder = os.open(".", os.O_PATH)
     try:
         yield

@@ -1,4 +1,4 @@
-"""Importing what import strings name, and checking that a method's class keeps its promises."""
+"""Import of classes by import string, and checks of the classes of methods."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ def import_target(target: str, what: str, distribution: DistributionInfo) -> obj
 
     Args:
         target: import string.
-        what: what it is, for the error, e.g. `method plane.hough2d`.
-        distribution: who announced it, for the error.
+        what: description for error messages, e.g. `method plane.hough2d`.
+        distribution: distribution that declares it, for error messages.
 
     Raises:
-        PluginError: the module fails to import or lacks the name.
+        PluginError: the module cannot be imported or does not contain the name.
     """
     module_name, _, name = target.partition(":")
     module: object = None
@@ -62,10 +62,10 @@ def load_method(
     product_types: frozenset[str],
     contested: Mapping[str, str],
 ) -> type[Method]:
-    """Import a method's class and check it against its spec and its kind.
+    """Import the class of a method and check it against its spec and its kind.
 
     Raises:
-        PluginError: the import fails or the class breaks a rule.
+        PluginError: the import fails or the class violates a rule.
     """
     method = import_target(spec.target, f"method {spec.id}", distribution)
     broken = f"method {spec.id} of {distribution} breaks a rule: "
@@ -117,7 +117,7 @@ def _class_complaint(method: type[Method], spec: MethodSpec) -> str:
 
 
 def product_complaint(cls: type[Product]) -> str:
-    """State which name in the class of a product is none of its fields; empty when all are."""
+    """Return an error if a name in `tolerances` of a product class is not a field, or ''."""
     if not hasattr(cls, "__dataclass_fields__"):
         return f"{cls.__qualname__} must be a frozen dataclass"
     known = dict.fromkeys(_names_within(cls, set()))
@@ -133,7 +133,7 @@ def product_complaint(cls: type[Product]) -> str:
 
 
 def _names_within(hint: object, seen: set[object]) -> Iterator[str]:
-    """Names of the fields of a dataclass, and of those in its fields."""
+    """Yield the names of the fields of a dataclass, including nested ones."""
     for part in typing.get_args(hint):
         yield from _names_within(part, seen)
     if isinstance(hint, type) and dataclasses.is_dataclass(hint) and hint not in seen:

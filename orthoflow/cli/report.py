@@ -28,7 +28,7 @@ def report(runs: tuple[str, ...], output: Path | None, store: Path) -> int:
     figures as PNG or SVG files; if there are variants, only those of the baseline (`orthoflow
     export RUN --to figures` writes all). For two runs, it also compares products; those that the
     records reference but do not contain are loaded from the store. If the seal of a record is
-    broken, the page says so, and the exit code is 3.
+    broken, the page shows a warning, and the exit code is 3.
     """
     from orthoflow.engine.store import stores_at
     from orthoflow.records.open import open_run

@@ -1,4 +1,4 @@
-"""What an author of methods needs: base classes, the step's context, hooks and specs."""
+"""The interface for authors of methods: base classes, context of a step, hooks and specs."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ __all__ = [
     "port_specs",
 ]
 
-# The hooks must load without numpy and pydantic, so that `plugins list` stays instant; all other
-# names are looked up only when a method module asks for them.
+# Hooks must be importable without numpy and pydantic, so that `plugins list` is fast; all other
+# names are imported on first use.
 _HOMES = ("orthoflow.sdk.methods", "orthoflow.sdk.context", "orthoflow.diagnostics")
 
 

@@ -1,4 +1,4 @@
-"""What a method gets besides its inputs: a seeded generator, a scratch folder, and listeners."""
+"""The context of a step: seeded generator, scratch folder, metrics, figures and progress."""
 
 from __future__ import annotations
 
@@ -31,21 +31,21 @@ from orthoflow.untrusted_text import MOST_SVG_BYTES, is_plain_svg
 
 __all__ = ["Drawing", "DrawnFigure", "Metric", "StepContext", "StepEvent"]
 
-# Of every step, whatever its method.
+# Measured for every step.
 MEASURED_BY_THE_ENGINE: Final = tuple(COSTS)
 _MEDIA_TYPES: Final = {".png": "image/png", ".webp": "image/webp", ".svg": "image/svg+xml"}
-# Far above what a step can have to say; far below what a record or a terminal suffers from.
+# More than any step needs, but few enough for records and terminals.
 _MOST_METRICS: Final = 20_000
 _MOST_FIGURES: Final = 2_000
 _MOST_DIAGNOSTICS: Final = 1_000
 _LARGEST_FIGURE: Final = 64 << 20
 _SAID_WHERE: Final = re.compile(r" \([^()]+:\d+\)$")
 _Given = ParamSpec("_Given")
-_HEAD_BYTES: Final = 16  # by which a picture is known
+_HEAD_BYTES: Final = 16  # signature of an image file
 
 
 def _names_the_line(report: Callable[_Given, None]) -> Callable[_Given, None]:
-    """Add to an error about a report the line of source that reported it."""
+    """Add the source line of the call to errors about a report."""
 
     @wraps(report)
     def located(*args: _Given.args, **kwargs: _Given.kwargs) -> None:
@@ -53,7 +53,7 @@ def _names_the_line(report: Callable[_Given, None]) -> Callable[_Given, None]:
             report(*args, **kwargs)
         except ProductError as error:
             frame = inspect.currentframe()
-            # A trial watches through a context of its own.
+            # Skip frames of this module and methods of subclasses of this context.
             while frame and (
                 frame.f_code.co_filename == __file__ or args[0] is frame.f_locals.get("self")
             ):
@@ -67,7 +67,7 @@ def _names_the_line(report: Callable[_Given, None]) -> Callable[_Given, None]:
 
 
 class Drawing(Protocol):
-    """Anything that can write itself as an image file, such as a matplotlib figure."""
+    """An object that can write itself to an image file, such as a matplotlib figure."""
 
     def savefig(self, fname: Path) -> None:
         """Write the image; the suffix decides the format."""
@@ -75,20 +75,20 @@ class Drawing(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class DrawnFigure(Figure):
-    """One picture a method made, a PNG, WebP or SVG file in the scratch folder."""
+    """A figure of a method: a PNG, WebP or SVG file in the scratch folder."""
 
     path: Path
 
 
 @dataclass(frozen=True, kw_only=True)
 class StepEvent:
-    """What a running step reports.
+    """A report of a running step.
 
     Attributes:
         kind: `progress`, `log` or `diagnostic`.
         text: one line.
-        fraction: 0..1 for progress.
-        diagnostic: of that kind.
+        fraction: progress, 0 to 1, if `kind` is `progress`.
+        diagnostic: the diagnostic, if `kind` is `diagnostic`.
     """
 
     kind: Literal["progress", "log", "diagnostic"]
@@ -98,7 +98,7 @@ class StepEvent:
 
 
 def _ignore(event: StepEvent) -> None:
-    """Take an event and do nothing with it."""
+    """Ignore an event."""
 
 
 def _never() -> bool:
@@ -107,22 +107,22 @@ def _never() -> bool:
 
 @dataclass(kw_only=True)
 class StepContext:
-    """Handed to `Method.run`.
+    """The context passed to `Method.run`.
 
     Attributes:
-        rng: generator seeded for this cell; the only source of randomness a method may use.
-        cores: how many threads the method may use.
-        scratch: existing empty folder, the only place a method may write to.
-        listen: where progress, log lines and diagnostics go as they happen.
-        is_cancelled: asks whether the step should stop.
-        clock_s: seconds as `time.perf_counter`, which stand still while modules are loaded and
-            kernels compiled: what a method measures of its own speed must not depend on what ran
-            before. The engine states that time as `compile_s`.
-        processor_s: processor seconds of all threads, and of processes that have ended, without
-            those of loading and compiling: what is left to compare where others use the machine.
-        metrics: what `metric` collected.
-        figures: what `figure` collected.
-        diagnostics: what `report` and `warn` collected.
+        rng: generator seeded for this cell; methods must not use other sources of randomness.
+        cores: maximum number of threads of the method.
+        scratch: existing empty folder; methods must not write elsewhere.
+        listen: receives progress, log lines and diagnostics.
+        is_cancelled: returns whether the step should stop.
+        clock_s: seconds as from `time.perf_counter`, without the time of loading modules and
+            compiling kernels, which depends on earlier steps. The engine reports that time as
+            `compile_s`.
+        processor_s: processor seconds of all threads and of ended child processes, without those of
+            loading and compiling; it hardly depends on other programs on the machine.
+        metrics: metrics reported by `metric`.
+        figures: figures reported by `figure`.
+        diagnostics: diagnostics reported by `report` and `warn`.
     """
 
     rng: np.random.Generator
@@ -141,17 +141,17 @@ class StepContext:
 
     @_names_the_line
     def metric(self, name: str, value: float, unit: str) -> None:
-        """Report a number about the result.
+        """Report a metric of the result.
 
         Args:
-            name: letters, digits, `-`, `_`, `.`, with its unit at the end where it has one, e.g.
+            name: letters, digits, `-`, `_`, `.`, with the unit at the end if there is one, e.g.
                 `rms_mm`.
             value: a finite number.
             unit: `mm`, `px`, `s`, ...; `1` for counts and shares.
 
         Raises:
-            ProductError: the value is not finite, the name is none or was reported before, or
-                there are too many.
+            ProductError: the value is not finite, the name is invalid or was reported before, or
+                there are too many metrics.
         """
         self._take_name(name)
         if not is_name(unit, also_of_file=False):
@@ -171,19 +171,19 @@ class StepContext:
     def figure(
         self, name: str, content: bytes | Callable[[], bytes] | Drawing, caption: str = ""
     ) -> None:
-        """Keep a picture for the record and the report.
+        """Add a figure to the record and the report.
 
         Args:
             name: short name, unique in the step; letters, digits, `-`, `_`.
-            content: the bytes of a PNG, WebP or SVG file, a function that gives them and is called
-                where figures are wanted, or a matplotlib figure. Charts are PNG or SVG; what looks
-                like a photo is WebP, which takes a tenth of the bytes.
-            caption: one sentence on what it shows.
+            content: content of a PNG, WebP or SVG file, a function that returns it and is called
+                only if figures are needed, or a matplotlib figure. Charts are PNG or SVG; images
+                that look like photos are WebP, a tenth of the size.
+            caption: one sentence on what the figure shows.
 
         Raises:
-            ProductError: the name has other letters or none, or a figure was drawn under it
-                before, there are too many figures, or one is no picture (an SVG with script or
-                links is none) or larger than 64 MiB.
+            ProductError: the name is invalid or was used before, there are too many figures, or the
+                content is not an image (SVG files with scripts or links are not accepted) or is
+                larger than 64 MiB.
         """
         _require_room("figure", len(self.figures), _MOST_FIGURES)
         path = _path_below(self.scratch / "figures", name)
@@ -212,7 +212,7 @@ class StepContext:
         )
 
     def progress(self, fraction: float, text: str = "") -> None:
-        """Report how far the step is, 0..1; never goes back. Stops a cancelled step.
+        """Report the progress, 0 to 1, which never decreases; stop a cancelled step.
 
         Raises:
             CancelledStepError: the step was asked to stop.
@@ -223,22 +223,23 @@ class StepContext:
         self.listen(StepEvent(kind="progress", text=one_line(text), fraction=self._fraction))
 
     def log(self, text: str) -> None:
-        """Write one line to the step's log."""
+        """Write a line to the log of the step."""
         self.listen(StepEvent(kind="log", text=one_line(text)))
 
     @_names_the_line
     def report(self, spec: DiagnosticSpec, *, subject: str = "", **values: object) -> None:
-        """Report something that deserves attention; shown in terminal, record and report.
+        """Report a diagnostic, which is shown on the terminal, in the record and in the report.
 
-        After the thousandth of a step, only their number is kept.
+        After the thousandth diagnostic of a step, only their number is kept.
 
         Args:
-            spec: what it is.
-            subject: what it is about, e.g. `scan 0` or `wall 3`; those of one spec are grouped.
-            values: numbers and texts that its sentences name.
+            spec: the kind of diagnostic.
+            subject: the object concerned, e.g. `scan 0` or `wall 3`; diagnostics with the same spec
+                are grouped.
+            values: numbers and texts to insert into the sentence.
 
         Raises:
-            ProductError: a value is missing, or is no number and no text.
+            ProductError: a value is missing, or is neither a number nor a text.
         """
         one = spec.of(subject, values)
         self._n_diagnostics += 1
@@ -250,16 +251,16 @@ class StepContext:
             self.diagnostics[_MOST_DIAGNOSTICS:] = [TOO_MANY.of("", {"n": n_more})]
 
     def warn(self, text: str) -> None:
-        """Report a warning that has no code, one line; `report` serves readers better."""
+        """Report a one-line warning without a code; prefer `report`."""
         self.report(PLAIN_WARNING, text=one_line(text))
 
     @property
     def warnings(self) -> list[str]:
-        """Texts of the warnings and errors among the diagnostics."""
+        """Texts of the diagnostics that are warnings or errors."""
         return list(warning_texts(self.diagnostics))
 
     def cancelled(self) -> bool:
-        """Whether the step was asked to stop."""
+        """Return whether the step was asked to stop."""
         return self.is_cancelled()
 
     def allocate(
@@ -267,18 +268,18 @@ class StepContext:
     ) -> NDArray[np.generic]:
         """Return a zeroed array for an output too large to hold in memory twice.
 
-        The array lies in a file of the scratch folder and is mapped into memory, so that it does
-        not count against the memory of the step while it is filled.
+        The array is memory-mapped from a file in the scratch folder, so that it does not count
+        towards the memory of the step while it is being filled.
 
         Args:
             port: output port.
-            name: field of the product, or a name of your own for intermediate data.
+            name: field of the product, or any name for intermediate data.
             shape: shape of the array.
             dtype: numpy type.
 
         Raises:
-            OSError: the disk has no room for it.
-            ProductError: no file can have the name.
+            OSError: the disk is full.
+            ProductError: the name is not valid for a file.
         """
         file_name = f"{port}.{name.replace('/', '.')}"
         size_bytes = math.prod(shape) * np.dtype(dtype).itemsize
@@ -289,7 +290,7 @@ class StepContext:
         path = _path_below(self.scratch / "allocated", file_name)
         path.parent.mkdir(exist_ok=True)
         with path.open("wb") as file:
-            # Writing into the hole of a sparse file on a full disk would kill the process.
+            # Writing to a sparse file on a full disk would kill the process.
             os.posix_fallocate(file.fileno(), 0, size_bytes)
         return np.memmap(path, dtype=np.dtype(dtype), mode="r+", shape=shape)
 

@@ -1,8 +1,8 @@
-"""What a plugin announces: hooks and specs. Light on purpose: no numpy, no pydantic.
+"""Hooks and specs with which a plugin declares its content; free of numpy and pydantic.
 
 A plugin is an installed distribution with an entry point in the group `orthoflow.plugins` that
-names a module; the module implements one or more of the hooks below with `hookimpl`. Classes are
-named by import strings and loaded on first use.
+refers to a module, which implements one or more of the hooks below with `hookimpl`. Classes are
+given as import strings and imported on first use.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import pluggy
 
 PROJECT: Final = "orthoflow"
 ENTRY_POINT_GROUP: Final = "orthoflow.plugins"
-# What a port takes that is wired to an input of the workflow itself.
+# Type of a port that is connected to an input of the workflow.
 FILES: Final = "files"
 
 hookimpl: Final = pluggy.HookimplMarker(PROJECT)
@@ -24,7 +24,7 @@ hookspec: Final = pluggy.HookspecMarker(PROJECT)
 
 @dataclass(frozen=True, kw_only=True)
 class MethodSpec:
-    """Where a method's class is.
+    """Declaration of a method.
 
     Attributes:
         id: `kind.method`, e.g. `plane.hough2d`.
@@ -38,21 +38,21 @@ class MethodSpec:
 
     @property
     def kind(self) -> str:
-        """The kind, the part of the id before the dot."""
+        """The kind: the part of the id before the dot."""
         return self.id.partition(".")[0]
 
 
 @dataclass(frozen=True, kw_only=True)
 class KindSpec:
-    """Ports that all methods of a kind share, so that they are interchangeable.
+    """Declaration of a kind: ports that all its methods share, so that they are interchangeable.
 
     Attributes:
-        name: the kind.
+        name: name of the kind.
         summary: one line for listings.
         inputs: port name -> product type name, or `files` for an input of the workflow; empty for
-            sources, whose methods have their own.
-        outputs: port name -> product type name; likewise.
-        is_source: methods declare ports of their own and take no variants.
+            sources, whose methods declare their own ports.
+        outputs: port name -> product type name; empty for sources.
+        is_source: whether methods declare their own ports; steps of such kinds have no variants.
     """
 
     name: str
@@ -64,14 +64,14 @@ class KindSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class ProductSpec:
-    """Where a product type's class is, and what writes its files.
+    """Declaration of a product type.
 
     Attributes:
         type_name: name of the type, e.g. `planes`.
         target: import string of the class.
         summary: one line for listings.
-        publisher: import string of `publish(product, folder, digest)`, which writes the files
-            that people open in other programs; empty when there are none.
+        publisher: import string of `publish(product, folder, digest)`, which writes files for other
+            programs; empty if there are none.
     """
 
     type_name: str
@@ -81,19 +81,19 @@ class ProductSpec:
 
 
 class PluginHooks:
-    """The hooks a plugin may implement."""
+    """Hooks that a plugin may implement."""
 
     @hookspec
     def orthoflow_methods(self) -> list[MethodSpec]:
-        """Methods that the plugin brings."""
+        """Return the methods of the plugin."""
         raise AssertionError("a hook specification is never called")
 
     @hookspec
     def orthoflow_kinds(self) -> list[KindSpec]:
-        """Kinds that the plugin brings."""
+        """Return the kinds of the plugin."""
         raise AssertionError("a hook specification is never called")
 
     @hookspec
     def orthoflow_products(self) -> list[ProductSpec]:
-        """Product types that the plugin brings."""
+        """Return the product types of the plugin."""
         raise AssertionError("a hook specification is never called")

@@ -1,4 +1,4 @@
-"""What methods report, made fit to be shown and kept: one line, printable, of bounded length."""
+"""Sanitising of reported texts: one line, printable, with limited length."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _LONGEST_NAME_BYTES: Final = 200
 
 
 def one_line(text: object, longest: int = _LONGEST) -> str:
-    r"""Return a text as one printable line; of a longer one the beginning.
+    r"""Return a text as one printable line, truncated if it is too long.
 
     >>> one_line("no\n  plane \x1b[31m at all")
     'no plane \\x1b[31m at all'
@@ -21,13 +21,13 @@ def one_line(text: object, longest: int = _LONGEST) -> str:
     'far too ... (12 characters)'
     """
     whole = _text_of(text)
-    # Cut first: what is dropped need not be looked at.
+    # Truncate first, so that the remainder need not be processed.
     line = shown(" ".join(whole[: longest + 1].split()))
     return line if len(whole) <= longest else f"{line[:longest]}... ({len(whole)} characters)"
 
 
 def describe_error(error: BaseException) -> str:
-    r"""Return class and message of an error in one line.
+    r"""Return class and message of an error as one line.
 
     >>> describe_error(ValueError("no such\n  plane"))
     'ValueError: no such plane'
@@ -37,11 +37,12 @@ def describe_error(error: BaseException) -> str:
 
 
 def is_name(name: object, *, also_of_file: bool = True) -> bool:
-    r"""Whether something can name a metric, or its unit, in tables and records.
+    r"""Return whether an object is valid as the name or unit of a metric in tables and records.
 
     Args:
-        name: anything.
-        also_of_file: `/`, `.` and `..` are no names; a unit such as `m/s` may have them.
+        name: any object.
+        also_of_file: whether the name must be valid for a file (no `/`, `.` or `..`); units such as
+            `m/s` need not be.
 
     >>> [is_name(name) for name in ("rms_mm", "", "a\nb", "../a", "..", 5, "n" * 300)]
     [True, False, False, False, False, False, False]
@@ -56,7 +57,7 @@ def is_name(name: object, *, also_of_file: bool = True) -> bool:
 
 
 def text_of_path(path: Path) -> str | None:
-    """A path as text that can be kept and read again; None where it is no UTF-8."""
+    """Return a path as text that can be stored and read again; None if it is not UTF-8."""
     try:
         str(path).encode()
     except UnicodeEncodeError:
@@ -67,5 +68,5 @@ def text_of_path(path: Path) -> str | None:
 def _text_of(text: object) -> str:
     try:
         return str(text)
-    except Exception:  # noqa: BLE001 - the text of a third-party exception may raise one itself
+    except Exception:  # noqa: BLE001 - the text of a third-party exception may raise an exception itself
         return f"a {type(text).__name__} without words"

@@ -1,4 +1,4 @@
-"""The classes a method is made of: its parameters, its ports, and what it does."""
+"""Base classes of a method, its parameters and its ports."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ _WILDCARD: Final = re.compile(r"(\*|\[[^\]]+\])")
 
 
 class MethodParams(BaseModel):
-    """Base of a method's parameters: frozen, unknown keys refused.
+    """Base class of a method's parameters: frozen, unknown keys are rejected.
 
-    Every field has a default, a description and its unit at the end of its name.
+    Every field has a default and a description, and its name ends with its unit.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -35,9 +35,9 @@ class MethodParams(BaseModel):
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 class Ports:
-    """Base of a method's `In` and `Out`: annotate one product class per port.
+    """Base class of a method's `In` and `Out`, which annotate one product class per port.
 
-    `X | None = None` makes a port optional. Subclasses become frozen dataclasses by themselves.
+    `X | None = None` declares an optional port. Subclasses become frozen dataclasses automatically.
     """
 
     def __init_subclass__(cls, **kwargs: object) -> None:
@@ -47,12 +47,12 @@ class Ports:
 
 @dataclass(frozen=True, kw_only=True)
 class PortSpec:
-    """One port as a method declares it.
+    """A port declared by a method.
 
     Attributes:
         name: name of the port.
-        type_name: product type it carries; `files` for a workflow input.
-        required: must be wired and present.
+        type_name: product type of the port; `files` for an input of the workflow.
+        required: whether the port must be connected.
     """
 
     name: str
@@ -61,12 +61,12 @@ class PortSpec:
 
 
 def port_specs(ports: type[Ports]) -> Mapping[str, PortSpec]:
-    """Ports of an `In` or `Out` class by name, read from its annotations.
+    """Return the ports of an `In` or `Out` class by name, from its annotations.
 
     Raises:
-        PluginError: an annotation is not a product class, or product class | None.
+        PluginError: an annotation is neither a product class nor product class | None.
     """
-    # Any: mypy does not let a class be the key of a cache.
+    # Any: mypy does not accept a class as the key of a cache.
     return _port_specs(typing.cast("Any", ports))
 
 
@@ -98,19 +98,18 @@ class MetricSpec:
     """A metric that a method may report.
 
     Attributes:
-        name: of the metric; with the wildcards of file names (`*`, `[xy]`) where a part depends on
-            the data.
-        unit: `mm`, `px`, `s`, ...; `1` for counts and shares, `yes/no` for 1 and 0; empty where the
-            name ends in it.
-        label: what reports call it, e.g. `damp patches`; its name where it is empty. `{0}`, `{1}`
-            stand for what the wildcards match.
-        better: `lower`, `higher` or `one`: which values are better; empty where none are: then it
-            is shown, and nobody is best in it.
-        description: what else to know of it, e.g. how it is measured: one sentence.
-        headline: it shows how good the result is: it stands on the first screen of a report, and
-            comparisons show it unless they ask for others.
-        counted_by: metric of the same step that counts the items (photos, points) it sums up:
-            values over unequal numbers of them are not ranked.
+        name: name of the metric, with wildcards (`*`, `[xy]`) if a part depends on the data.
+        unit: `mm`, `px`, `s`, ...; `1` for counts and shares, `yes/no` for 1 and 0; empty if the
+            name ends with the unit.
+        label: name in reports, e.g. `damp patches`; `{0}`, `{1}` are replaced by the matches of the
+            wildcards. If empty, reports show the name.
+        better: `lower`, `higher` or `one`: the better direction; empty for metrics that are shown
+            but not ranked.
+        description: one sentence of further information, e.g. how it is measured.
+        headline: whether it measures the quality of the result; it is then in the first section of
+            a report, and in comparisons that do not select metrics.
+        counted_by: metric of the same step with the number of items (photos, points) over which
+            this one sums; values over different numbers are not ranked.
         needs: optional input ports without which it is not reported.
     """
 
@@ -141,23 +140,22 @@ class MetricSpec:
 
 
 class Method:
-    """Base of all methods.
+    """Base class of all methods.
 
     A method implements `run`.
 
     Attributes:
         id: `kind.method`.
-        result_version: raised by the author whenever results change for equal inputs.
-        determinism: `exact` (same bits always), `seeded` (same bits for the same seed) or
-            `loose` (equal within the products' tolerances).
-        metrics: all metrics that it may report: a `MetricSpec` each, or just its name. A
-            comparison that asks for another one is refused; empty where the author declares none:
-            then nothing is refused.
-        citations: where the method comes from: DOI, title or URL.
-        unaffected_by: distributions whose version does not change results, although the method's
-            own distribution requires them; all others are part of a result's key.
-        repeatable: input ports of files of which several may have the same content, such as masks;
-            of all others a second copy would count twice, and is refused.
+        result_version: number that the author increments when results change for the same inputs.
+        determinism: `exact` (always the same bits), `seeded` (the same bits for the same seed) or
+            `loose` (equal within the tolerances of the products).
+        metrics: all metrics that it may report, as `MetricSpec` or as a name. A comparison that
+            selects another metric is rejected, unless the list is empty.
+        citations: source of the method: DOI, title or URL.
+        unaffected_by: required distributions whose version does not change results; all others are
+            part of the cache key.
+        repeatable: input ports of files that may contain several files with the same content, such
+            as masks; in other ports, a second copy would count twice and is rejected.
         Params: parameters.
         In: input ports.
         Out: output ports.
@@ -174,49 +172,49 @@ class Method:
     In: ClassVar[type[Ports]]
     Out: ClassVar[type[Ports]]
 
-    # Any: each method narrows inputs and params to its own nested classes, which no common
-    # supertype can express without making every author write three type parameters.
+    # Any: each method narrows inputs and params to its own nested classes; a generic base class
+    # would require three type parameters of every author.
     def run(self, inputs: Any, params: Any, ctx: StepContext) -> Any:
         """Compute the outputs.
 
         Args:
-            inputs: an instance of `In`; arrays are read-only.
-            params: an instance of `Params`.
-            ctx: seed, cores, scratch folder, and where metrics, figures and progress go.
+            inputs: instance of `In`; arrays are read-only.
+            params: instance of `Params`.
+            ctx: seed, cores, scratch folder, and methods to report metrics, figures and progress.
 
         Returns:
             An instance of `Out`.
 
         Raises:
-            OrthoflowError: no result is possible; one sentence states why.
+            OrthoflowError: no result is possible; the message is one sentence with the reason.
         """
         raise AssertionError(f"{type(self).__name__} must implement run")
 
     @classmethod
     def may_report(cls, metric: str) -> bool:
-        """Whether a metric is one of those declared; True where none are."""
+        """Return whether a metric is declared; True if the method declares none."""
         return not cls.metrics or cls.metric_spec(metric) is not None
 
     @classmethod
     def metric_specs(cls) -> tuple[MetricSpec, ...]:
-        """All metrics that it declares, a bare name as the spec of that name."""
+        """Return all declared metrics; a bare name becomes a spec with that name."""
         return tuple(one if isinstance(one, MetricSpec) else MetricSpec(one) for one in cls.metrics)
 
     @classmethod
     def metric_spec(cls, metric: str) -> MetricSpec | None:
-        """The declaration of a metric by its name, by a pattern where no name is the same."""
+        """Return the declaration of a metric, by its exact name or else by a pattern."""
         specs = cls.metric_specs()
         exact = next((spec for spec in specs if spec.name == metric), None)
         return exact or next((spec for spec in specs if fnmatchcase(metric, spec.name)), None)
 
     @classmethod
     def tools(cls) -> Mapping[str, str]:
-        """Return versions besides those of the libraries that the distribution requires."""
+        """Return versions of tools other than the libraries that the distribution requires."""
         return {}
 
 
 def labelled(method: type[Method], metrics: Iterable[Metric]) -> tuple[Metric, ...]:
-    """Add to metrics what their method declares of them, so that records know it."""
+    """Add the declarations of a method to its metrics, so that records contain them."""
     found = []
     for metric in metrics:
         spec = method.metric_spec(metric.name)
@@ -239,7 +237,7 @@ def labelled(method: type[Method], metrics: Iterable[Metric]) -> tuple[Metric, .
 
 
 def matched(pattern: str, name: str) -> tuple[str, ...]:
-    """Return what the wildcards of a pattern match in a name, with `_` as spaces.
+    """Return the parts of a name that match the wildcards of a pattern, with spaces for `_`.
 
     >>> matched("wall_*_rmse_[uv]_mm", "wall_3_rmse_u_mm")
     ('3', 'u')

@@ -56,7 +56,7 @@ def product_of(run: Run, digest: str, cls: type[ProductT], store: Path) -> Produ
 def output_of(run: Run, type_name: str, cell: str | None) -> tuple[str, str]:
     """Return the selected cell, or the last one with an output of this type, and the port.
 
-    If several cells have such an output, a note says which one is used.
+    If several cells have such an output, a note names the one that is used.
 
     Raises:
         ArgumentError: no cell has such an output, or the selected cell does not.

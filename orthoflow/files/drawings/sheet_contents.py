@@ -66,11 +66,11 @@ class Paper:
     """A sheet of paper and the position of its title block.
 
     Attributes:
-    width_mm: width of the sheet in reading direction.
-    height_mm: height of the sheet.
-    name: name of the paper size, empty for other sizes.
-    layout: position of the title block: a column on the right or a strip along the lower edge.
-    block_mm: width of the column, or height of the strip.
+        width_mm: width of the sheet in reading direction.
+        height_mm: height of the sheet.
+        name: name of the paper size, empty for other sizes.
+        layout: position of the title block: a column on the right or a strip along the lower edge.
+        block_mm: width of the column, or height of the strip.
     """
 
     width_mm: float
@@ -413,10 +413,10 @@ class Axes:
     """The coordinates beside a picture, in metres.
 
     Attributes:
-    across: coordinate at the left edge of the drawing, and its change per metre to the right; None
-        if it has no meaning, as for several walls.
-    down: coordinate at its top edge, and its change per metre downwards.
-    phrase: meaning of the coordinates, for the notes.
+        across: coordinate at the left edge of the drawing, and its change per metre to the right;
+            None if it has no meaning, as for several walls.
+        down: coordinate at its top edge, and its change per metre downwards.
+        phrase: meaning of the coordinates, for the notes.
     """
 
     across: tuple[float, float] | None
