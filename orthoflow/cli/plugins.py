@@ -322,7 +322,7 @@ def plugins_new(
 ) -> int:
     """Write a plugin NAME, e.g. my-detector, that can be installed and passes its tests.
 
-    `orthoflow plugins list` shows the kinds and product types. The method is a simple placeholder,
+    `orthoflow plugins list` shows the kinds and product types. The method is a simple example,
     to be replaced by your own. With `--new-kind`, the plugin also defines a kind, and a product
     type if `--gives` is a new one.
     """
@@ -394,7 +394,7 @@ def plugins_check(method_id: str, *, as_json: bool, golden: Path | None, quick: 
     input, and known properties of the example.
 
     A problem that prevents all runs is reported once, and other rules are skipped. The exit code is
-    1 if a rule is violated, and 4 if the method cannot be loaded. Placeholder text from `plugins
+    1 if a rule is violated, and 4 if the method cannot be loaded. Unchanged text from `plugins
     new` causes a warning only.
     """
     from orthoflow.scaffold import unwritten

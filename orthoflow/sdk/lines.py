@@ -68,5 +68,5 @@ def text_of_path(path: Path) -> str | None:
 def _text_of(text: object) -> str:
     try:
         return str(text)
-    except Exception:  # noqa: BLE001 - the text of a third-party exception may raise an exception itself
+    except Exception:  # noqa: BLE001 - the text of an exception may raise an exception
         return f"a {type(text).__name__} without words"
