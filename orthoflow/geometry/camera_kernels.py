@@ -1,4 +1,4 @@
-"""Compiled projection through a camera with distortion, shared by all steps that project points."""
+"""Compiled projection by a camera with distortion, for all steps that project points."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.compiling import inlined
 
-# Layout of a camera as a flat float64 array, so that kernels take one argument:
+# Layout of a camera as a flat float64 array, so that kernels have a single argument:
 # 0..8 rotation rows, 9..11 translation, 12 fx, 13 fy, 14 cx, 15 cy, 16..20 k1 k2 p1 p2 k3,
-# 21 width, 22 height, 23 largest undistorted radius that is not folded back, 24 skew.
+# 21 width, 22 height, 23 largest undistorted radius before the lens model folds back, 24 skew.
 CAMERA_LENGTH = 25
 
 
 @inlined
 def project_point(camera, x, y, z):  # type: ignore[no-untyped-def]  # numba infers the types
-    """Project one world point: (u, v, depth); u and v are NaN behind the camera or beyond the lens.
+    """Project one world point to (u, v, depth); u and v are NaN if it is not visible.
 
-    Brown's model as in OpenCV, but pixels have the first centre at (0.5, 0.5). A point farther from
-    the axis than the radius at which the distortion polynomial folds back would appear inside the
-    image a second time, so it counts as not visible.
+    The model is Brown's as in OpenCV, but with the first pixel centre at (0.5, 0.5). A point is not
+    visible if it is behind the camera, or farther from the axis than the radius at which the
+    distortion polynomial folds back; otherwise it would appear a second time inside the image.
     """
     xc = camera[0] * x + camera[1] * y + camera[2] * z + camera[9]
     yc = camera[3] * x + camera[4] * y + camera[5] * z + camera[10]
@@ -42,8 +42,8 @@ def project_point(camera, x, y, z):  # type: ignore[no-untyped-def]  # numba inf
 def largest_radius(distortion: NDArray[np.float64], *, limit: float = 10.0) -> float:
     """Return the undistorted radius up to which radial distortion (k1, k2, k3) is monotonic.
 
-    The derivative of r (1 + k1 r^2 + k2 r^4 + k3 r^6) is a cubic in r^2; its smallest positive
-    root is where the lens model folds back.
+    The derivative of r (1 + k1 r^2 + k2 r^4 + k3 r^6) is a cubic polynomial in r^2; the lens model
+    folds back at its smallest positive root.
     """
     k1, k2, k3 = distortion[0], distortion[1], distortion[4]
     roots = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])

@@ -1,7 +1,7 @@
 """Cameras with distortion: world points to pixels, pixels to rays, derivatives of lens models.
 
-Pixels have the first centre at (0.5, 0.5); in OpenCV's convention it is (0, 0), and conversion to
-and from it stands here alone.
+The centre of the first pixel is at (0.5, 0.5). In OpenCV it is at (0, 0); all conversions between
+the two conventions use the functions of this module.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from numpy.typing import NDArray
 from orthoflow.errors import GeometryError
 from orthoflow.geometry.frames import rotation_from_vector
 
-# Difference between our pixel coordinates and OpenCV's.
+# Difference between orthoflow's pixel coordinates and OpenCV's.
 HALF_PIXEL: Final = 0.5
 
 
 def to_opencv(pixels: NDArray[Any]) -> NDArray[Any]:
-    """Convert our pixel coordinates to OpenCV's; the type is kept."""
+    """Convert orthoflow's pixel coordinates to OpenCV's; the data type is kept."""
     return pixels - HALF_PIXEL
 
 
 def from_opencv(pixels: NDArray[Any]) -> NDArray[Any]:
-    """Convert OpenCV's pixel coordinates to ours; the type is kept."""
+    """Convert OpenCV's pixel coordinates to orthoflow's; the data type is kept."""
     return pixels + HALF_PIXEL
 
 
 _ITERATIONS: Final = 30
 _CONVERGED: Final = 1e-12
-# Points closer than this to the plane of the projection centre count as behind the camera.
+# Points with a smaller depth count as behind the camera.
 _NEAREST_M: Final = 1e-9
 _PROJECTED_AT_ONCE: Final = 1 << 15
 _UNTURNED: Final = np.eye(3)
@@ -47,14 +47,16 @@ class ViewingCamera:
     (0.5, 0.5).
 
     Attributes:
-        width: pixels.
-        height: pixels.
-        fx: focal length in pixels along u; fy along v.
-        cx: principal point in pixels; cy along v.
-        distortion: (5,) float64 k1, k2, p1, p2, k3 (Brown 1971, as OpenCV).
-        rotation: (3, 3) float64 camera_from_world, det +1.
+        width: image width in pixels.
+        height: image height in pixels.
+        fx: focal length along u, in pixels.
+        fy: focal length along v, in pixels.
+        cx: principal point along u, in pixels.
+        cy: principal point along v, in pixels.
+        distortion: (5,) float64 k1, k2, p1, p2, k3 (Brown 1971, as in OpenCV).
+        rotation: (3, 3) float64 camera_from_world, determinant +1.
         translation: (3,) float64 metres, camera_from_world.
-        skew: pixels along u per unit of y / z; 0 where rows and columns of pixels are square.
+        skew: pixels along u per unit of y / z; 0 if pixel rows and columns are perpendicular.
     """
 
     width: int
@@ -69,7 +71,7 @@ class ViewingCamera:
     skew: float = 0.0
 
     def __post_init__(self) -> None:
-        # Written as a negated comparison, so that NaN fails it.
+        # Negated comparison, so that NaN is refused.
         if not np.abs(self.rotation @ self.rotation.T - _UNTURNED).max() <= 1e-6:
             raise GeometryError("a camera's rotation must be orthonormal")
         if np.linalg.det(self.rotation) < 0.0:
@@ -82,7 +84,7 @@ class ViewingCamera:
 
     @cached_property
     def flat(self) -> NDArray[np.float64]:
-        """Return the camera as the array that compiled kernels take, see `camera_kernels`."""
+        """Return the camera as an array for compiled kernels, see `camera_kernels`."""
         from orthoflow.geometry.camera_kernels import largest_radius  # noqa: PLC0415 - numba
 
         return np.concatenate(
@@ -96,32 +98,32 @@ class ViewingCamera:
         )
 
     def shifted(self, origin_world: NDArray[np.float64]) -> ViewingCamera:
-        """Return the same camera in a world with its origin at `middle` (3,) of this one.
+        """Return the same camera in coordinates whose origin is at `origin_world` (3,).
 
-        With survey coordinates of 10^6 m, project offsets through the shifted camera: the sum R x +
-        t of large numbers would lose the precision of float32 offsets.
+        For survey coordinates of 10^6 m, project offsets with the shifted camera: R x + t, a sum of
+        large numbers, would lose the precision of float32 offsets.
         """
         return replace(self, translation=self.rotation @ origin_world + self.translation)
 
     def at_opencv_pose(
         self, turn: NDArray[Any], shift: NDArray[Any], middle: NDArray[np.float64]
     ) -> ViewingCamera:
-        """Return the same lens at a pose of OpenCV.
+        """Return a camera with the same lens and a pose from OpenCV.
 
         Args:
             turn: rotation vector, (3,) or (3, 1).
-            shift: translation, likewise.
-            middle: (3,) metres, subtracted from the points given to OpenCV.
+            shift: translation, (3,) or (3, 1).
+            middle: (3,) metres, subtracted from the points that were passed to OpenCV.
         """
         rotation = rotation_from_vector(np.asarray(turn, dtype=np.float64).ravel())
         local = replace(self, rotation=rotation, translation=np.asarray(shift).ravel())
         return local.shifted(-middle)
 
     def project(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Pixels and depth (n, 3) = (u, v, depth in metres) of world points (n, 3).
+        """Return (u, v, depth in metres) (n, 3) of world points (n, 3).
 
-        u and v are NaN for points behind the camera or beyond the lens model; points outside the
-        image have pixels outside it.
+        u and v are NaN for points behind the camera or outside the valid range of the lens model.
+        Points outside the image have pixels outside it.
         """
         points = np.asarray(points_world, dtype=np.float64)
         projected = np.empty((len(points), 3))
@@ -131,7 +133,7 @@ class ViewingCamera:
         return projected
 
     def _project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Project points (3, n); the formula of `camera_kernels.project_point`."""
+        """Project points (3, n) by the formula of `camera_kernels.project_point`."""
         k1, k2, p1, p2, k3 = self.distortion
         # Infinite and missing points become NaN without a warning.
         with np.errstate(all="ignore"):
@@ -152,16 +154,16 @@ class ViewingCamera:
         return np.column_stack([u, v, z])
 
     def sees(self, pixels_photo: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Report which pixels (n, 2) lie inside the image; NaN does not."""
+        """Return which pixels (n, 2) are inside the image; NaN counts as outside."""
         u, v = pixels_photo[:, 0], pixels_photo[:, 1]
         return (u >= 0) & (u < self.width) & (v >= 0) & (v < self.height)
 
     def rays_camera(self, pixels_photo: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Directions (n, 3) with z = 1 in camera axes of pixels (n, 2).
+        """Return ray directions (n, 3) with z = 1, in camera axes, of pixels (n, 2).
 
         Raises:
-            GeometryError: the distortion cannot be undone there, e.g. beyond the radius where the
-                model folds back.
+            GeometryError: the distortion cannot be inverted there, for example beyond the radius at
+                which the model folds back.
         """
         found = undistorted(*self.bent_rays(pixels_photo.T), self.distortion)
         if found.size and not np.abs(found[2]).max() < 1e-9:
@@ -180,7 +182,7 @@ class ViewingCamera:
         return (u - self.cx - self.skew * b) / self.fx, b
 
     def rays_world(self, pixels_photo: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Unit directions (n, 3) in world axes of pixels (n, 2)."""
+        """Return unit ray directions (n, 3) in world axes of pixels (n, 2)."""
         rays = self.rays_camera(pixels_photo) @ self.rotation
         unit: NDArray[np.float64] = rays / np.linalg.norm(rays, axis=1, keepdims=True)
         return unit
@@ -189,7 +191,7 @@ class ViewingCamera:
 def undistorted(
     wanted_a: NDArray[np.float64], wanted_b: NDArray[np.float64], distortion: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Undo a distortion by Newton steps.
+    """Invert a lens distortion by Newton's method.
 
     Args:
         wanted_a: (n,) distorted x / z, NaN where missing.
@@ -197,8 +199,8 @@ def undistorted(
         distortion: (5,) k1, k2, p1, p2, k3.
 
     Returns:
-        (3, n) rows: x / z, y / z, and the last step, which stays large where the distortion cannot
-        be undone.
+        (3, n) rows: x / z, y / z, and the last step, which remains large where the distortion
+        cannot be inverted.
     """
     found = np.empty((3, len(wanted_a)))
     a, b, last_step = found
@@ -226,7 +228,7 @@ def looking_at(
     """Return the rotation (3, 3) camera_from_world of a level camera aimed at a point.
 
     Raises:
-        GeometryError: the camera would look straight up or down, where level is undefined.
+        GeometryError: the camera would look straight up or down, so that level is undefined.
     """
     forward = target_world - centre_world
     forward = forward / np.linalg.norm(forward)
@@ -239,25 +241,26 @@ def looking_at(
 
 
 def opencv_matrix(lens: ViewingCamera) -> NDArray[np.float64]:
-    """Return the camera matrix (3, 3) for OpenCV, whose own functions ignore the skew in it."""
+    """Return the camera matrix (3, 3) for OpenCV; OpenCV's functions ignore its skew."""
     cx, cy = lens.cx - HALF_PIXEL, lens.cy - HALF_PIXEL
     return np.array([[lens.fx, lens.skew, cx], [0.0, lens.fy, cy], [0.0, 0.0, 1.0]])
 
 
 POSE_PARAMETERS: Final = 6
-# EXIF states the focal length in whole millimetres, or as the full-frame equivalent, and not the
-# focusing distance; without it the range of usual lenses remains.
+# Standard deviations of ln(focal length) with and without EXIF. EXIF contains the focal length in
+# whole millimetres or as full-frame equivalent, and not the focusing distance; without EXIF, the
+# range of common lenses is used.
 _EXIF_SIGMA: Final = 0.05
 _UNKNOWN_SIGMA: Final = 0.35
-# Further properties of an uncalibrated lens. Fixed at zero they distort the pose: photos had 2.4
-# times the error that they stated, and 1.7 times the error that was necessary. Pixels are square to
-# a thousandth, which at the edge of a picture is more than a pixel.
+# Standard deviations of the other parameters of an uncalibrated lens. Fixing them at zero distorts
+# the pose: photos had 2.4 times their predicted error and 1.7 times the error with free parameters.
+# Pixels are square to 1/1000, which is more than a pixel at the edge of an image.
 _ASPECT_SIGMA: Final = 1e-3
 _CENTRE_SHARE: Final = 0.01
 _K1_SIGMA: Final = 0.1
 _K2_SIGMA: Final = 0.1
 _TANGENTIAL_SIGMA: Final = 1e-3
-# Which of the five distortion coefficients k1, k2, p1, p2, k3 a name refers to.
+# Index of a name in the distortion coefficients k1, k2, p1, p2, k3.
 _COEFFICIENTS: Final = {"k1": 0, "k2": 1, "p1": 2, "p2": 3}
 
 
@@ -266,13 +269,13 @@ class LensFreedom:
     """Prior standard deviations of the interior orientation; 0 fixes a parameter.
 
     Attributes:
-        focal_sigma: prior standard deviation of ln(focal length), common to fx and fy.
-        aspect_sigma: of ln(fy / fx).
-        centre_sigma_px: of each coordinate of the principal point, pixels.
-        k1_sigma: of k1.
-        k2_sigma: of k2.
-        tangential_sigma: of p1 and of p2.
-        skew_sigma_px: of the skew, pixels.
+        focal_sigma: standard deviation of ln(focal length), common to fx and fy.
+        aspect_sigma: standard deviation of ln(fy / fx).
+        centre_sigma_px: standard deviation of each coordinate of the principal point, pixels.
+        k1_sigma: standard deviation of k1.
+        k2_sigma: standard deviation of k2.
+        tangential_sigma: standard deviation of p1 and p2.
+        skew_sigma_px: standard deviation of the skew, pixels.
     """
 
     focal_sigma: float = 0.0
@@ -285,7 +288,7 @@ class LensFreedom:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the free parameters, in the order of every vector and matrix."""
+        """Names of the free parameters, in the order used in all vectors and matrices."""
         return tuple(name for name, sigma in self._all() if sigma > 0.0)
 
     @property
@@ -308,11 +311,11 @@ class LensFreedom:
 
 
 def unmeasured(longer_px: int, *, has_exif: bool) -> LensFreedom:
-    """Return how far an uncalibrated lens may deviate from an ideal one.
+    """Return the prior standard deviations of an uncalibrated lens.
 
     Args:
-        longer_px: longer side of its photos.
-        has_exif: whether their EXIF states the focal length.
+        longer_px: longer side of its photos, pixels.
+        has_exif: whether the focal length is known from EXIF.
     """
     return LensFreedom(
         focal_sigma=_EXIF_SIGMA if has_exif else _UNKNOWN_SIGMA,
@@ -326,13 +329,14 @@ def unmeasured(longer_px: int, *, has_exif: bool) -> LensFreedom:
 
 @dataclass(frozen=True, kw_only=True)
 class Linear:
-    """The projection of points by a camera.
+    """The projection of points by a camera, with derivatives.
 
     Attributes:
-        pixels: (n, 2); NaN behind the camera.
-        by_camera_point: (n, 2, 3) derivatives by the point in camera axes, pixels per metre.
-        by_parameters: (n, 2, 6 + free) by rotation vector (left of camera_from_world), translation,
-            then the free parameters of the lens.
+        pixels: (n, 2) pixels; NaN behind the camera.
+        by_camera_point: (n, 2, 3) derivatives with respect to the point in camera axes, pixels per
+            metre.
+        by_parameters: (n, 2, 6 + free) derivatives with respect to the rotation vector (applied
+            left of camera_from_world), the translation, and the free lens parameters.
     """
 
     pixels: NDArray[np.float64]
@@ -341,7 +345,7 @@ class Linear:
 
 
 def lens_values(camera: ViewingCamera, lens: LensFreedom) -> NDArray[np.float64]:
-    """Return the free lens parameters of a camera, the focal length as its logarithm."""
+    """Return the free lens parameters of a camera; the focal length as its logarithm."""
     values = {
         "focal": math.log(camera.fx),
         "aspect": math.log(camera.fy / camera.fx),
@@ -359,14 +363,14 @@ def lens_values(camera: ViewingCamera, lens: LensFreedom) -> NDArray[np.float64]
 
 
 def stepped(camera: ViewingCamera, step: NDArray[np.float64], lens: LensFreedom) -> ViewingCamera:
-    """Return a camera after a step (6 + free,) of an adjustment."""
+    """Return the camera after an adjustment step (6 + free,)."""
     moves = dict(zip(lens.names, step[POSE_PARAMETERS:].tolist(), strict=True))
     scale = _factor(moves.get("focal", 0.0))
     distortion = camera.distortion.copy()
     for name, index in _COEFFICIENTS.items():
         distortion[index] += moves.get(name, 0.0)
     turned = rotation_from_vector(step[:3]) @ camera.rotation
-    left, _, right = np.linalg.svd(turned)  # keeps rounding from adding up
+    left, _, right = np.linalg.svd(turned)  # keeps rounding errors from accumulating
     return replace(
         camera,
         fx=camera.fx * scale,
@@ -381,16 +385,16 @@ def stepped(camera: ViewingCamera, step: NDArray[np.float64], lens: LensFreedom)
 
 
 def linearised(camera: ViewingCamera, points: NDArray[np.float64], lens: LensFreedom) -> Linear:
-    """Project points (n, 3), with derivatives."""
+    """Project points (n, 3) and compute the derivatives."""
     turned = (camera.rotation @ points.T).T
     x, y, z = turned.T + camera.translation[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
-        # Behind the camera there is no pixel: NaN makes the cost infinite.
+        # Points behind the camera have no pixel; NaN makes the cost infinite.
         z = np.where(z > 1e-9, z, np.nan)
         a, b = x / z, y / z
     bent = _bent(a, b, camera.distortion)
     ad, bd = bent.a, bent.b
-    # Points are the last axis in memory, so every operation below runs over all of them.
+    # Points are the last axis in memory, so each operation below is vectorised over all points.
     by_point = np.empty((2, 3, len(points))).transpose(2, 0, 1)
     by_point[:, 0, 0] = camera.fx * bent.a_by_a / z
     by_point[:, 0, 1] = camera.fx * bent.a_by_b / z
@@ -403,7 +407,7 @@ def linearised(camera: ViewingCamera, points: NDArray[np.float64], lens: LensFre
     by_point[:, 0] += leaning * by_point[:, 1]
     n_free = POSE_PARAMETERS + len(lens.names)
     by_parameters = np.empty((2, n_free, len(points))).transpose(2, 0, 1)
-    # Derivative by a rotation: -by_point times the matrix of the cross product, written out.
+    # Derivative with respect to a rotation: -by_point times the cross product matrix, written out.
     for axis in range(3):
         after, last = (axis + 1) % 3, (axis + 2) % 3
         by_parameters[:, :, axis] = (
@@ -434,7 +438,7 @@ def linearised(camera: ViewingCamera, points: NDArray[np.float64], lens: LensFre
 
 @dataclass(frozen=True, kw_only=True)
 class _Bent:
-    """Rays x / z and y / z after distortion, with derivatives; 1 and 0 without distortion."""
+    """Rays x / z and y / z after distortion, with derivatives (1 and 0 without distortion)."""
 
     a: NDArray[np.float64]
     b: NDArray[np.float64]
@@ -476,5 +480,5 @@ def _lens_columns(
 
 
 def _factor(logarithm: float) -> float:
-    """Return the change limited to a factor of e, so that an excessive step cannot diverge."""
+    """Return the factor for a change of a logarithm, at most e, to prevent divergence."""
     return math.exp(min(1.0, max(-1.0, logarithm)))

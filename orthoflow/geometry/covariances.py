@@ -1,4 +1,4 @@
-"""Covariances of adjustments whose points have errors in common with their neighbours."""
+"""Covariances of adjustments in which neighbouring points have common errors."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ import numpy as np
 import threadpoolctl
 from numpy.typing import NDArray
 
-# Correlation lengths, as shares of the extent of what a photo sees: of errors that are rough
-# (exponential correlation: matching, structure, steps between scans) and of smooth ones (Gaussian:
-# bending, drift of a path, stereo). Shorter ones are as good as independent, and longer ones are
-# shifts and tilts of the whole, which no residual shows.
+# Correlation lengths, as shares of the extent of the points of a photo: for rough errors
+# (exponential correlation: matching, structure, steps between scans) and smooth errors (Gaussian
+# correlation: bending, drift of a path, stereo). Shorter ones are practically independent errors;
+# longer ones are shifts and tilts of all points, which do not appear in residuals.
 _ROUGH: Final = (0.04, 0.15, 0.5, 1.5)
 _SMOOTH: Final = (0.05, 0.15, 0.4, 1.0)
-# Standard deviation of the common error over that of the independent one: equally likely on a
-# logarithmic scale beforehand, but for an exponential decay at 1.
+# Ratios of the standard deviation of the common error to that of the independent error. Their prior
+# is uniform on a logarithmic scale, with an exponential decay at ratios above about 1.
 _RATIOS: Final = np.geomspace(0.003, 10.0, 25)
-# Neighbouring points of a photo are taken together, in as many cells at most.
+# Neighbouring points of a photo are averaged in cells; these are the maximum numbers of cells.
 _MAX_CELLS: Final = 130
 _MAX_CELLS_OF_SEVERAL: Final = 280
 _FINEST_CELL: Final = 0.02
 _COARSER: Final = 1.15
-# Directions of the residuals that an adjustment absorbs, as share of their variance.
+# Directions of the residuals are absorbed by the adjustment if less than this share remains.
 _ABSORBED: Final = 1e-3
 
 
@@ -32,13 +32,14 @@ class AdjustedPoints:
     """Points of photos after their adjustment, whose world positions may have common errors.
 
     Attributes:
-        photo: (n,) index of the photo that sees each point.
-        places: (n, 3) metres.
-        residuals: (n, 2) observed - computed, in standard deviations.
-        jacobian: (n, 2, p) derivatives by the unknowns, in standard deviations.
-        by_place: (n, 2, 3) derivatives by the place, standard deviations per metre.
-        pulls: (n, p, 3) effect of an error of the position on the normal equations, per metre.
-        towards: (n, 3) unit vectors out of the surface: errors of a cloud are largest in depth.
+        photo: (n,) index of the photo that shows each point.
+        places: (n, 3) positions in metres.
+        residuals: (n, 2) observed minus computed, in standard deviations.
+        jacobian: (n, 2, p) derivatives with respect to the unknowns, in standard deviations.
+        by_place: (n, 2, 3) derivatives with respect to the position, standard deviations per metre.
+        pulls: (n, p, 3) effect of a position error on the normal equations, per metre.
+        towards: (n, 3) unit vectors out of the surface, the direction of depth errors, which are
+            the largest errors of a cloud.
         cofactors: (p, p) inverse of the normal matrix.
     """
 
@@ -53,7 +54,7 @@ class AdjustedPoints:
 
     @property
     def extent_m(self) -> float:
-        """Return the extent of the points of a photo, median over the photos."""
+        """Return the extent of the points of a photo in metres, median over the photos."""
         reaches = []
         for photo in np.unique(self.photo):
             mine = self.places[self.photo == photo]
@@ -65,22 +66,22 @@ class AdjustedPoints:
 def honest_covariance(points: AdjustedPoints, sigma0: float) -> NDArray[np.float64]:
     """Return the covariance (p, p) of an adjustment whose points may have common errors.
 
-    Each residual has an independent error and one in common with its neighbours: of the places,
-    which all photos share, of their depth alone, or of one photo (its lens, its matching). What an
-    adjustment absorbs of a common error leaves no residual, so that its size and its correlation
-    length are never known for certain. No test decides whether there is one: the covariance is a
-    mean over all kinds, lengths and sizes, each weighted by the likelihood of the residuals that
-    remain after the adjustment (restricted likelihood: Harville 1977,
-    doi:10.1080/01621459.1977.10480998; averaged: Hoeting et al. 1999, doi:10.1214/ss/1009212519).
+    Each residual has an independent error and an error in common with its neighbours: of the
+    positions (common to all photos), of their depth only, or of one photo (its lens or matching).
+    The part of a common error that the adjustment absorbs leaves no residual, so its size and
+    correlation length are never known exactly. Therefore the covariance is not chosen by a test. It
+    is a mean over all kinds, lengths and sizes of common errors, each weighted by the likelihood of
+    the residuals (restricted likelihood: Harville 1977, doi:10.1080/01621459.1977.10480998; model
+    averaging: Hoeting et al. 1999, doi:10.1214/ss/1009212519).
 
-    A shift of all places at once leaves no residual at all, and is not stated.
+    A common shift of all positions leaves no residual at all and is not included.
 
     Args:
-        points: those whose places are known.
+        points: the points with known positions.
         sigma0: standard deviation of unit weight of the whole adjustment. Its variance counts as
-            independent: ties between photos have no part in errors of places.
+            independent, since ties between photos are not affected by position errors.
     """
-    # Threads that wait for each other make eigenvalues ten times as slow on a busy machine.
+    # One thread only: on a busy machine, synchronisation makes eigenvalues ten times as slow.
     with threadpoolctl.threadpool_limits(1):
         return _averaged(points, sigma0)
 
@@ -97,7 +98,7 @@ def _averaged(points: AdjustedPoints, sigma0: float) -> NDArray[np.float64]:
         np.add.at(sums, cells, values)
         return sums / counts.reshape(-1, *[1] * (values.ndim - 1))
 
-    # Means in their own standard deviations, were all errors independent.
+    # Means per cell, in units of the standard deviation of a mean of independent errors.
     roots = np.sqrt(counts)[:, None, None]
     residuals = means(points.residuals)
     scatter = float(((points.residuals - residuals[cells]) ** 2).sum())
@@ -114,11 +115,11 @@ def _averaged(points: AdjustedPoints, sigma0: float) -> NDArray[np.float64]:
     white = whitening.T @ (roots[:, :, 0] * residuals).ravel()
     n_free = white.size + n_scattered
     if not n_free:
-        # No residual says how large a common error is.
+        # Without residuals, the size of a common error is unknown.
         return sigma0**2 * points.cofactors
 
     evidence, variances, errors = [], [], []
-    # Mean square, in standard deviations, of an error of one metre.
+    # Mean square, in standard deviations, of the effect of an error of one metre.
     unit = float((points.by_place**2).sum()) / (2 * len(cells))
     apart = np.linalg.norm(places[:, None] - places, axis=2) / extent_m
     correlations = [np.exp(-apart / length) for length in _ROUGH]
@@ -137,7 +138,7 @@ def _averaged(points: AdjustedPoints, sigma0: float) -> NDArray[np.float64]:
             values, vectors = np.linalg.eigh(whitening.T @ expected @ whitening / unit)
             spread = 1.0 + _RATIOS[:, None] ** 2 * np.maximum(values, 0.0)
             squares = ((vectors.T @ white) ** 2 / spread).sum(axis=1) + scatter
-            # Of points without any error.
+            # Avoids the logarithm of 0 for points without any error.
             squares = np.maximum(squares, np.finfo(np.float64).tiny)
             evidence.append(
                 -0.5 * np.log(spread).sum(axis=1) - 0.5 * n_free * np.log(squares) - _RATIOS
@@ -146,9 +147,9 @@ def _averaged(points: AdjustedPoints, sigma0: float) -> NDArray[np.float64]:
             errors.append(pulled / unit)
     weights = np.exp(np.array(evidence) - np.max(evidence))
     weights *= np.array(variances) / weights.sum()
-    # The mean of a standard deviation: that of a variance is the tail of what is known beforehand.
+    # Mean of the standard deviation; a mean of the variance would depend on the tail of the prior.
     of_kinds = (weights @ _RATIOS) ** 2 / np.maximum(weights.sum(axis=1), 1e-300)
-    # Rounded, so that later results do not depend on the order of summation.
+    # Rounded so that later results do not depend on the order of summation.
     shares_of = [float(f"{value:.4g}") for value in of_kinds]
     common = sum(share * error for share, error in zip(shares_of, errors, strict=True))
     moves = points.cofactors @ _stable(np.asarray(common)) @ points.cofactors
@@ -156,7 +157,7 @@ def _averaged(points: AdjustedPoints, sigma0: float) -> NDArray[np.float64]:
 
 
 _Direction = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Derivatives (2 n,) of observations by errors along it, and their pulls (n, p)."""
+"""Derivatives (2 n,) of observations by errors in this direction, and their pulls (n, p)."""
 
 
 def _kinds(
@@ -165,7 +166,7 @@ def _kinds(
     towards: NDArray[np.float64],
     photo: NDArray[np.float64],
 ) -> list[tuple[list[_Direction], NDArray[np.bool_]]]:
-    """Return the directions of each kind of common error, and which points (n, n) share it."""
+    """Return the directions of each kind of common error, and which pairs (n, n) share it."""
     axes = [(by_place[:, :, axis].ravel(), pulls[:, :, axis]) for axis in range(3)]
     by_depth = np.einsum("nid,nd->ni", by_place, towards).ravel()
     depth = [(by_depth, np.einsum("npd,nd->np", pulls, towards))]
@@ -176,7 +177,7 @@ def _kinds(
 
 
 def _cells(points: AdjustedPoints, extent_m: float, n_most: int) -> NDArray[np.intp]:
-    """Return the cell (n,) of each point: cubes of places, each photo by itself."""
+    """Return the cell (n,) of each point; cells are cubes in space, separate for each photo."""
     side = _FINEST_CELL
     while True:
         cubes = np.floor(points.places / (side * extent_m)).astype(np.intp)
@@ -188,7 +189,7 @@ def _cells(points: AdjustedPoints, extent_m: float, n_most: int) -> NDArray[np.i
 
 
 def outwards(places: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the normal (3,) of the plane that fits positions best, towards a camera."""
+    """Return the normal (3,) of the best-fitting plane of positions, towards a camera."""
     middle = places.mean(axis=0)
     across = np.linalg.svd(places - middle, full_matrices=False)[2][2]
     return np.asarray(across if (centre - middle) @ across > 0.0 else -across)

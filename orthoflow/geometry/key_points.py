@@ -1,8 +1,8 @@
-"""Key points of pictures, spread evenly, and pairs of their descriptors.
+"""Evenly distributed key points of pictures, and matching of their descriptors.
 
-OpenCV's SIFT shifts every key point by a quarter of a pixel, right and down, unless its precise
-upscaling is on (opencv issue 23123; measured with 5.0: 0.25 px, for all sizes). That would be a
-systematic error of an orientation, so it is subtracted where the upscaling is the default one.
+OpenCV's SIFT shifts all key points by a quarter of a pixel to the right and down unless its precise
+upscaling is enabled (opencv issue 23123; measured with 5.0: 0.25 px, for all sizes). This would be
+a systematic error of an orientation, so it is subtracted if the default upscaling is used.
 """
 
 from __future__ import annotations
@@ -17,36 +17,37 @@ from numpy.typing import NDArray
 from orthoflow.geometry.cameras import HALF_PIXEL
 from orthoflow.geometry.rows import Rows
 
-# OpenCV's default contrast, half of which still gives right matches, and its ratio of curvatures.
+# OpenCV's default contrast threshold, half of it, which still gives correct matches, and OpenCV's
+# default ratio of curvatures.
 _OPENCV_CONTRAST: Final = 0.04
 _MIN_CONTRAST: Final = 0.02
 _MAX_EDGE_RATIO: Final = 10.0
 _SHIFT_BY_UPSCALING_PX: Final = 0.25
-# SIFT doubles the image and keeps all scales: 0.23 GB per million pixels. A tile bounds it.
+# SIFT doubles the image and keeps all scales: 0.23 GB per million pixels. Tiles limit the memory.
 _TILE_PX: Final = 2048
 _TILE_OVERLAP_PX: Final = 96
 _SPREAD_CELLS: Final = 12
-# Smaller pictures have no key points.
+# No key points are searched in smaller pictures.
 _MIN_SIDE_PX: Final = 16
-# Squared RootSIFT entries in units of 1/512: their sums stay below 2^24, so that float32 products
-# are exact, whatever the order a BLAS library adds in.
+# Unit of RootSIFT entries is 1/512. Sums of their products are below 2^24, so float32 products are
+# exact, regardless of the order of summation in a BLAS library.
 _QUANTA: Final = 512.0
-# Pairs whose descriptors are gathered at once: 2 x 32 MB.
+# Number of pairs whose descriptors are gathered at once: 2 x 32 MB.
 _PAIRS_AT_ONCE: Final = 65_536
-# Entries of a block of distances: 12 MB, which a processor's cache holds while they are searched.
+# Number of entries in a block of distances: 12 MB, which fits into a processor's cache.
 _BLOCK_ENTRIES: Final = 3_000_000
 
 
 def in_turns(
     cell: NDArray[np.intp], keys: Sequence[NDArray[np.floating] | NDArray[np.intp]], n_most: int
 ) -> NDArray[np.intp]:
-    """Return positions (k,) of up to `n_most` of n items, in rotation from the cells of a grid.
+    """Return indices (k,) of up to `n_most` of n items, taken in turn from the cells of a grid.
 
-    The selection covers what the cells cover; within a cell the first items are taken first.
+    The selection covers the same area as the cells; within a cell, items are taken in sort order.
 
     Args:
-        cell: (n,) cell of each.
-        keys: (n,) each, the sort keys; the last one is the primary key, as in `numpy.lexsort`.
+        cell: (n,) cell of each item.
+        keys: sort keys (n,); the last one is the primary key, as in `numpy.lexsort`.
         n_most: maximum number of items.
     """
     order = np.lexsort((*keys, cell))
@@ -56,9 +57,9 @@ def in_turns(
 
 
 def root_sift(raw: NDArray[np.float32]) -> NDArray[np.float32]:
-    """RootSIFT of SIFT descriptors (n, 128) as whole numbers (Arandjelovic & Zisserman 2012).
+    """Return RootSIFT of SIFT descriptors (n, 128) as integers (Arandjelovic & Zisserman 2012).
 
-    The Euclidean distance becomes Hellinger's.
+    Euclidean distances between the results correspond to Hellinger distances of the originals.
     """
     total = np.maximum(raw.sum(axis=1, keepdims=True), 1e-9)
     rooted: NDArray[np.float32] = np.rint(np.sqrt(raw / total) * _QUANTA).astype(np.float32)
@@ -67,13 +68,13 @@ def root_sift(raw: NDArray[np.float32]) -> NDArray[np.float32]:
 
 @dataclass(frozen=True, kw_only=True)
 class Features(Rows):
-    """Key points of an image: the first n are the n strongest, spread over the image.
+    """Key points of an image; any first n are the strongest n, distributed over the image.
 
     Attributes:
         pixels: (n, 2) float64 (u, v), first pixel centre at (0.5, 0.5).
         sizes_px: (n,) float64 diameter of the described neighbourhood.
         angles_deg: (n,) float64 main direction of the gradient, clockwise from u.
-        descriptors: (n, 128) float32 RootSIFT or SIFT, whole numbers.
+        descriptors: (n, 128) float32 RootSIFT or SIFT, integer values.
     """
 
     pixels: NDArray[np.float64]
@@ -83,7 +84,7 @@ class Features(Rows):
 
     @classmethod
     def none(cls) -> Features:
-        """Return no key points."""
+        """Return an empty set of key points."""
         return cls(
             pixels=np.empty((0, 2)),
             sizes_px=np.empty(0),
@@ -92,22 +93,22 @@ class Features(Rows):
         )
 
     def undescribed(self) -> Features:
-        """Return positions and sizes without the descriptors, which take most memory."""
+        """Return the key points without descriptors, which take most of the memory."""
         return replace(self, descriptors=self.descriptors[:, :0].copy())
 
     def strongest(self, n_most: int) -> Features:
-        """Return the first key points without a copy."""
+        """Return the first `n_most` key points without copying."""
         return self.take(slice(n_most))
 
     def scaled(self, factor: float) -> Features:
-        """Return the same key points in the image enlarged by a factor."""
+        """Return the same key points in the image enlarged by `factor`."""
         return replace(self, pixels=self.pixels * factor, sizes_px=self.sizes_px * factor)
 
     def mirrored(self, width_px: float) -> Features:
-        """Return the key points of the image of this width with left and right swapped.
+        """Return the key points of the image of this width, mirrored left to right.
 
-        Relative to the main direction, mirroring swaps the rows of the 4 x 4 fields of 8 directions
-        and reverses the sense of the directions.
+        In a descriptor, mirroring reverses the order of the rows of the 4 x 4 fields and the sense
+        of the 8 directions, both relative to the main direction.
         """
         fields = self.descriptors.reshape(-1, 4, 4, 8)[:, ::-1]
         turned = fields[..., (8 - np.arange(8)) % 8]
@@ -126,13 +127,14 @@ def find_features(
     *,
     as_opencv: bool = False,
 ) -> Features:
-    """Find key points, tile by tile, in an order that depends on the image only.
+    """Find key points, tile by tile, in an order that depends only on the image.
 
     Args:
-        picture: (rows, cols) grey.
-        max_features: maximum number.
-        usable: (rows, cols), False where no key point may lie; None allows all.
-        as_opencv: OpenCV's default SIFT (markiewicz2015): higher contrast, SIFT descriptors.
+        picture: (rows, cols) grey values.
+        max_features: maximum number of key points.
+        usable: (rows, cols), False where key points are not allowed; None allows all positions.
+        as_opencv: use OpenCV's default SIFT (markiewicz2015): higher contrast threshold, SIFT
+            descriptors.
     """
     import cv2
 
@@ -149,13 +151,13 @@ def find_features(
     ]
     points = np.vstack([tile[1] for tile in tiles])
     pixels = points[:, :2]
-    # OpenCV's threads return key points in any order.
+    # OpenCV's threads return key points in arbitrary order.
     chosen = np.lexsort(points[:, :4].T)
     if usable is not None:
         most = np.array(usable.shape[::-1]) - 1
         columns, rows = np.clip(pixels[chosen].astype(np.intp), 0, most).T
         chosen = chosen[usable[rows, columns]]
-    # The strongest, in turns from the cells of a coarse grid.
+    # Take the strongest in turn from the cells of a coarse grid.
     scale = _SPREAD_CELLS / np.array([picture.shape[1], picture.shape[0]])
     cells = np.minimum((pixels[chosen] * scale).astype(np.intp), _SPREAD_CELLS - 1)
     u, v, strengths = points[chosen][:, [0, 1, 4]].T
@@ -172,8 +174,8 @@ def find_features(
 
 
 _Tile = tuple[tuple[slice, slice], NDArray[np.float64], list[Any]]
-"""Key points in a tile of an image: rows and columns that were searched, with a margin; (n, 5) u,
-v, size, angle, response; and OpenCV's key points in the frame of the searched part.
+"""Key points in a tile of an image: the searched rows and columns, including a margin; (n, 5) u, v,
+size, angle, response; and OpenCV's key points in coordinates of the searched part.
 """
 
 
@@ -203,10 +205,10 @@ def _in_tile(
 def _described(
     sift: Any, picture: NDArray[np.uint8], tiles: list[_Tile], chosen: NDArray[np.intp]
 ) -> NDArray[np.float32]:
-    """Compute SIFT descriptors (n, 128) of chosen key points, numbered through all tiles.
+    """Compute SIFT descriptors (n, 128) of the chosen key points, numbered over all tiles.
 
-    In a picture with much texture one key point in ten is kept, and description takes longer than
-    detection.
+    Only chosen key points are described: in a picture with much texture, one in ten is kept, and
+    description takes longer than detection.
     """
     raw = np.empty((len(chosen), 128), dtype=np.float32)
     first = 0
@@ -221,13 +223,13 @@ def _described(
 
 @dataclass(frozen=True, kw_only=True)
 class Matches(Rows):
-    """Pairs of descriptors.
+    """Pairs of matching descriptors.
 
     Attributes:
         first: (n,) index into the first set.
         second: (n,) index into the second set.
-        ratio: (n,) distance of the best over the second best of the second set; 1 where there is
-            no second best.
+        ratio: (n,) ratio of the distances of the best and the second best match in the second set;
+            1 if there is no second best.
     """
 
     first: NDArray[np.intp]
@@ -237,18 +239,18 @@ class Matches(Rows):
 
 @dataclass(frozen=True, kw_only=True)
 class Window:
-    """Which pairs are possible at all, from what is roughly known of the geometry.
+    """Limits for possible pairs, from the approximately known geometry.
 
     Attributes:
         first: (n, 2) positions of the first set.
-        second: (m, 2) positions of the second set, where they are expected in the first's frame.
-        radius: largest difference of a pair's coordinates.
+        second: (m, 2) expected positions of the second set in the frame of the first.
+        radius: maximum difference of a pair's coordinates.
         first_log_size: (n,) float32 log2 of the sizes.
-        second_log_size: (m,) float32, as expected in the first's frame.
-        first_angle_deg: (n,) float32.
-        second_angle_deg: (m,) float32, as expected in the first's frame.
-        max_log_size: largest difference of log2 sizes.
-        max_angle_deg: largest difference of angles.
+        second_log_size: (m,) float32 log2 of the expected sizes in the frame of the first.
+        first_angle_deg: (n,) float32 angles.
+        second_angle_deg: (m,) float32 expected angles in the frame of the first.
+        max_log_size: maximum difference of log2 sizes.
+        max_angle_deg: maximum difference of angles.
     """
 
     first: NDArray[np.float32]
@@ -262,8 +264,8 @@ class Window:
     max_angle_deg: float
 
     def pairs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Possible pairs: indices into the first set and into the second."""
-        from scipy.spatial import cKDTree  # noqa: PLC0415 - few who load this need it
+        """Return the possible pairs as indices into the first and the second set."""
+        from scipy.spatial import cKDTree  # noqa: PLC0415 - rarely needed
 
         near = cKDTree(self.first).sparse_distance_matrix(
             cKDTree(self.second), self.radius, p=np.inf, output_type="ndarray"
@@ -279,18 +281,18 @@ class Window:
 def mutual_matches(
     first: NDArray[np.float32], second: NDArray[np.float32], *, ratio: float
 ) -> Matches:
-    """Pair descriptors that are each other's nearest and clearly nearer than the next.
+    """Match descriptors that are mutually nearest and clearly nearer than the second nearest.
 
     Args:
-        first: (n, d) whole numbers, small enough that products are exact in float32.
-        second: (m, d) likewise.
-        ratio: largest distance of the best over the distance of the second best (Lowe 2004).
+        first: (n, d) integer values, small enough that products are exact in float32.
+        second: (m, d) integer values like `first`.
+        ratio: maximum ratio of the distances of the best and the second best match (Lowe 2004).
     """
     if not (len(first) and len(second)):
         return _no_matches()
     found = two_nearest(first, second)
     ratios = _ratio(found.best, found.next_best)
-    # Few are distinct, so that only they are looked up backwards.
+    # Few pairs pass the ratio test, so only these are tested in the other direction.
     distinct = np.flatnonzero(ratios <= ratio)
     asked, place = np.unique(found.index[distinct], return_inverse=True)
     back = nearest(second[asked], first)[place]
@@ -301,13 +303,13 @@ def mutual_matches(
 def best_matches(
     first: NDArray[np.float32], second: NDArray[np.float32], *, ratio: float
 ) -> Matches:
-    """Pair each descriptor of the first set with its nearest in the second, in one direction.
+    """Match each descriptor of the first set with its nearest in the second, in one direction.
 
     Args:
-        first: (n, d) whole numbers, small enough that products are exact in float32.
-        second: (m, d) likewise, at least one.
-        ratio: largest distance of the best over the distance of the second best (Lowe 2004);
-            1 for any.
+        first: (n, d) integer values, small enough that products are exact in float32.
+        second: (m, d) integer values like `first`, m > 0.
+        ratio: maximum ratio of the distances of the best and the second best match (Lowe 2004); 1
+            accepts any.
     """
     found = two_nearest(first, second)
     ratios = _ratio(found.best, found.next_best)
@@ -322,13 +324,13 @@ def mutual_matches_within(
     *,
     ratio: float,
 ) -> Matches:
-    """Pair descriptors as `mutual_matches` does, as if there were no pairs but the possible ones.
+    """Match descriptors like `mutual_matches`, but consider only the pairs in a window.
 
     Args:
-        first: (n, d) whole numbers, small enough that products are exact in float32.
-        second: (m, d) likewise.
-        window: only pairs inside it count, also as second best.
-        ratio: largest distance of the best over the distance of the second best.
+        first: (n, d) integer values, small enough that products are exact in float32.
+        second: (m, d) integer values like `first`.
+        window: the possible pairs, also for the second best match.
+        ratio: maximum ratio of the distances of the best and the second best match.
     """
     if not (len(first) and len(second)):
         return _no_matches()
@@ -351,12 +353,12 @@ def mutual_matches_within(
 
 @dataclass(frozen=True, kw_only=True)
 class TwoNearest:
-    """The two nearest of a set, for each descriptor that was asked for.
+    """The two nearest descriptors of a set for each query descriptor.
 
     Attributes:
-        index: (n,) the nearest.
-        best: (n,) float32 squared distance to it.
-        next_best: (n,) float32 to the second nearest; inf where there is none.
+        index: (n,) index of the nearest.
+        best: (n,) float32 squared distance to the nearest.
+        next_best: (n,) float32 squared distance to the second nearest; inf if there is none.
     """
 
     index: NDArray[np.intp]
@@ -365,9 +367,9 @@ class TwoNearest:
 
 
 def two_nearest(asked: NDArray[np.float32], among: NDArray[np.float32]) -> TwoNearest:
-    """Find the two nearest of `among` (m, d), at least one, for each of `asked` (n, d).
+    """Find the two nearest of `among` (m, d), m > 0, for each of `asked` (n, d).
 
-    Both are whole numbers, small enough that products are exact in float32.
+    Both have integer values, small enough that products are exact in float32.
     """
     left, right = _left(asked), _right(among)
     index = np.zeros(len(asked), dtype=np.intp)
@@ -382,7 +384,7 @@ def two_nearest(asked: NDArray[np.float32], among: NDArray[np.float32]) -> TwoNe
 
 
 def nearest(asked: NDArray[np.float32], among: NDArray[np.float32]) -> NDArray[np.intp]:
-    """Index (n,) of the nearest of `among` (m, d), at least one, for each of `asked` (n, d)."""
+    """Return the index (n,) of the nearest of `among` (m, d), m > 0, for each of `asked` (n, d)."""
     left, right = _left(asked), _right(among)
     parts = [(left[rows] @ right).argmin(axis=1) for rows in _blocks(len(asked), len(among))]
     return np.concatenate([np.empty(0, dtype=np.intp), *parts])
@@ -394,7 +396,7 @@ def _distances(
     i: NDArray[np.intp],
     j: NDArray[np.intp],
 ) -> NDArray[np.float32]:
-    """Squared distances of pairs."""
+    """Return the squared distances (n,) of pairs."""
     distances = np.empty(len(i), dtype=np.float32)
     for start in range(0, len(i), _PAIRS_AT_ONCE):
         some = slice(start, start + _PAIRS_AT_ONCE)
@@ -405,7 +407,7 @@ def _distances(
 
 def _ratio(best: NDArray[np.float32], next_best: NDArray[np.float32]) -> NDArray[np.float64]:
     ratio = np.sqrt(np.maximum(best, 0.0) / np.maximum(next_best, 1e-12)).astype(np.float64)
-    # The only candidate is distinct from nothing, and of two equal ones none is.
+    # A single candidate cannot be compared, and of two identical candidates neither is distinct.
     ratio[~np.isfinite(next_best) | (next_best <= 0.0)] = 1.0
     return ratio
 
@@ -416,7 +418,10 @@ def _no_matches() -> Matches:
 
 
 def _left(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Rows whose product with `_right` is the squared distance: (-2 a, |a|^2, 1) (b, 1, |b|^2)."""
+    """Return rows whose product with `_right` is the squared distance.
+
+    The product is (-2 a, |a|^2, 1) (b, 1, |b|^2).
+    """
     squares = (descriptors * descriptors).sum(axis=1)
     return np.column_stack([-2.0 * descriptors, squares, np.ones_like(squares)])
 

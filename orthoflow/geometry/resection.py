@@ -1,8 +1,8 @@
-"""Resection: the pose of one camera from points of its photo that are known in the world.
+"""Resection: the pose of one camera from points of its photo with known world coordinates.
 
-A weighted least-squares adjustment (Gauss-Markov, damped after Levenberg and Marquardt) with the
-full lens model. The observations are the pixels; the uncertainty of the points enters the
-covariance of each pixel.
+The method is a weighted least-squares adjustment (Gauss-Markov model, damped as by Levenberg and
+Marquardt) with the full lens model. The observations are the pixels; the covariance of each pixel
+includes the uncertainty of its point.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from orthoflow.geometry.frames import cross_matrix
 from orthoflow.geometry.rows import Rows
 
 _ITERATIONS: Final = 40
-# A step that reduces the sum of squares by so little, with a few hundred points, moves no parameter
-# by more than a hundredth of its standard deviation, and the next one by far less.
+# Relative change of the sum of squares at convergence. With a few hundred points, such a step moves
+# no parameter by more than 1 % of its standard deviation, and the next step by far less.
 _CONVERGED: Final = 1e-7
 _DAMPING_START: Final = 1e-6
 _DAMPING_MOST: Final = 1e8
-# A point whose own uncertainty covers more than this share of the image's longer side agrees with
-# any pixel.
+# A point is not used if its uncertainty exceeds this share of the image's longer side, since it
+# would agree with any pixel.
 _BLUR_MOST_SHARE: Final = 0.02
 
 
@@ -66,13 +66,14 @@ class Resection:
 
     Attributes:
         camera: the camera.
-        covariance: (p, p) float64 of rotation vector (left of camera_from_world), translation, then
-            the free lens parameters in the order of `LensFreedom.names`; scaled by the residuals.
-        sigma0: standard deviation of unit weight: 1 if the sigmas of the points are right.
-        variance_factor: ratio of `covariance` to the one that follows from the given sigmas, mean
-            over its axes: sigma0 squared, or more if residuals of neighbouring points agree, so
-            that the points are not independent.
-        lens: which parameters were free.
+        covariance: (p, p) float64 covariance of rotation vector (left of camera_from_world),
+            translation, and free lens parameters in the order of `LensFreedom.names`; scaled by the
+            residuals.
+        sigma0: standard deviation of unit weight; 1 if the sigmas of the points are correct.
+        variance_factor: ratio of `covariance` to the covariance from the given sigmas, mean over
+            its axes. It is sigma0 squared, or more if residuals of neighbouring points are similar,
+            so that the points are not independent.
+        lens: the free lens parameters.
     """
 
     camera: ViewingCamera
@@ -87,10 +88,11 @@ class Misfit:
     """The fit of points to a camera.
 
     Attributes:
-        residuals_px: (n, 2) float64 observed - computed; NaN where the camera cannot see the point.
+        residuals_px: (n, 2) float64 observed minus computed; NaN if the camera cannot see the
+            point.
         normalised: (n,) float64 length of the residual in units of its expected standard deviation
-            (chi with 2 degrees of freedom); inf where the camera cannot see the point, and where
-            the point is so close to it that it could be anywhere in the image.
+            (chi distribution with 2 degrees of freedom); inf if the camera cannot see the point, or
+            if the point is so close that it could be anywhere in the image.
     """
 
     residuals_px: NDArray[np.float64]
@@ -110,16 +112,16 @@ def adjust(
 
     Args:
         seen: the points, at least as many as the unknowns require.
-        start: the camera to start from.
-        prior: its interior orientation is the prior of the free lens parameters; by default that of
-            `start`.
-        lens: which parameters of the interior orientation are free; none by default.
-        independent: whether the points have independent errors; if not, neighbours may have errors
-            in common (`geometry.covariances`).
+        start: initial camera.
+        prior: camera whose interior orientation is the prior of the free lens parameters; `start`
+            by default.
+        lens: free parameters of the interior orientation; none by default.
+        independent: whether the errors of the points are independent; otherwise neighbouring points
+            may have common errors (`geometry.covariances`).
         soft_limit: residuals beyond this many standard deviations get less weight (Huber).
 
     Raises:
-        GeometryError: too few points, or they do not determine the pose.
+        GeometryError: there are too few points, or they do not determine the pose.
     """
     camera = fitted(seen, start, prior=prior, lens=lens, soft_limit=soft_limit)
     prior = start if prior is None else prior
@@ -137,10 +139,10 @@ def stated(
     independent: bool = True,
     soft_limit: float = math.inf,
 ) -> Resection:
-    """Return the accuracy of the camera that `fitted` found, with the same arguments as `adjust`.
+    """Return a camera found by `fitted` with its accuracy; the arguments are those of `adjust`.
 
     Raises:
-        GeometryError: too few points, or they do not determine the pose.
+        GeometryError: there are too few points, or they do not determine the pose.
     """
     middle, problem = _problem(seen, camera if prior is None else prior, lens, soft_limit)
     lens, n_free = problem.lens, problem.n_free
@@ -150,7 +152,7 @@ def stated(
         cofactors = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     except np.linalg.LinAlgError as error:
         raise GeometryError("the points of a photo do not determine its pose") from error
-    # The points need not determine what the prior does.
+    # Part of the unknowns is determined by the prior instead of the points.
     from_prior = float((np.diag(cofactors)[POSE_PARAMETERS:] / lens.sigmas**2).sum())
     redundancy = 2 * len(seen) - n_free + from_prior
     sigma0 = math.sqrt(float((errors.residuals**2).sum()) / redundancy)
@@ -180,18 +182,18 @@ def fitted(
     """Return the camera that `adjust` finds, without its accuracy.
 
     Raises:
-        GeometryError: too few points, or they do not determine the pose.
+        GeometryError: there are too few points, or they do not determine the pose.
     """
     middle, problem = _problem(seen, start if prior is None else prior, lens, soft_limit)
     return problem.solve(start.shifted(middle)).shifted(-middle)
 
 
 def misfit(seen: SeenPoints, camera: ViewingCamera) -> Misfit:
-    """Compute the fit of points to a camera, each against its own expected deviation."""
+    """Compute the fit of points to a camera, relative to the expected deviation of each point."""
     middle = seen.points_world.mean(axis=0) if len(seen) else np.zeros(3)
     near = camera.shifted(middle)
     linear = linearised(near, seen.points_world - middle, LensFreedom())
-    # Beyond the radius where a lens model folds back there is no pixel.
+    # There is no pixel beyond the radius at which a lens model folds back.
     folds = camera.distortion.any()
     pixels = near.project(seen.points_world - middle)[:, :2] if folds else linear.pixels
     residuals = seen.pixels_photo - pixels
@@ -215,7 +217,7 @@ def predicted_covariances(
 def pixels_by_point(
     camera: ViewingCamera, points_world: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Derivatives (n, 2, 3) in pixels per metre of the pixels of world points (n, 3)."""
+    """Return derivatives (n, 2, 3), pixels per metre, of the pixels of world points (n, 3)."""
     linear = linearised(camera, points_world, LensFreedom())
     return linear.by_camera_point @ camera.rotation
 
@@ -223,9 +225,10 @@ def pixels_by_point(
 def moved_origin(
     camera: ViewingCamera, middle: NDArray[np.float64], n_free: int
 ) -> NDArray[np.float64]:
-    """Return the derivative (n_free, n_free) of a camera by those of the one shifted by `middle`.
+    """Return the derivative (n_free, n_free) of a camera's parameters by its shifted ones.
 
-    t = t_local - R middle; a rotation w left of R moves R middle by w x (R middle).
+    The shifted coordinates have their origin at `middle`: t = t_local - R middle, and a rotation w
+    left of R moves R middle by w x (R middle).
     """
     derivative = np.eye(n_free)
     derivative[3:6, :3] = cross_matrix(camera.rotation @ middle)
@@ -251,7 +254,7 @@ class _Errors:
 
 
 class _Problem:
-    """The adjustment of one camera, in a world with its origin near the points."""
+    """The adjustment of one camera, in coordinates with an origin near the points."""
 
     def __init__(
         self, seen: SeenPoints, lens: LensFreedom, prior: ViewingCamera, soft_limit: float
@@ -292,7 +295,7 @@ class _Problem:
         return step
 
     def errors(self, camera: ViewingCamera) -> _Errors:
-        """Return residuals and derivatives in standard deviations, large ones downweighted."""
+        """Return whitened residuals and derivatives; large residuals get less weight."""
         seen = self._seen
         linear = linearised(camera, seen.points_world, self.lens)
         residuals = seen.pixels_photo - linear.pixels
@@ -334,7 +337,7 @@ class _Problem:
 
     def normal(self, errors: _Errors) -> NDArray[np.float64]:
         along, down = errors.jacobian.transpose(1, 2, 0)
-        # Not by BLAS: its sums depend on the number of threads.
+        # einsum instead of BLAS, where the order of summation depends on the number of threads.
         normal: NDArray[np.float64] = np.einsum("jn,kn->jk", along, along)
         normal += np.einsum("jn,kn->jk", down, down)
         free = np.arange(POSE_PARAMETERS, len(normal))
@@ -342,19 +345,19 @@ class _Problem:
         return normal
 
     def _from_prior(self, camera: ViewingCamera) -> NDArray[np.float64]:
-        """Return prior minus current value of the free interior parameters."""
+        """Return the prior minus the current values of the free lens parameters."""
         return lens_values(self._prior, self.lens) - lens_values(camera, self.lens)
 
 
 def _problem(
     seen: SeenPoints, prior: ViewingCamera, lens: LensFreedom | None, soft_limit: float
 ) -> tuple[NDArray[np.float64], _Problem]:
-    """Return the adjustment relative to the middle of the points, and that middle.
+    """Return the centroid of the points, and the adjustment in coordinates relative to it.
 
-    Survey coordinates would lose digits.
+    Large survey coordinates would lose digits.
     """
     freedom = LensFreedom() if lens is None else lens
-    # Prior knowledge of the lens determines what the points do not.
+    # The lens parameters have a prior, so the points only need to determine the pose.
     if 2 * len(seen) < POSE_PARAMETERS + 2:
         raise GeometryError(
             f"a resection with {POSE_PARAMETERS} unknowns got only {len(seen)} points"

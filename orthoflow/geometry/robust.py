@@ -1,4 +1,4 @@
-"""Measures of scatter that single outliers do not change."""
+"""Measures of scatter and solutions that are robust to single outliers."""
 
 from __future__ import annotations
 
@@ -8,21 +8,22 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-# Standard deviation of a normal distribution per median absolute deviation: 1 / Phi^-1(3/4).
+# Ratio of standard deviation to median absolute deviation of a normal distribution:
+# 1 / Phi^-1(3/4).
 NMAD_FACTOR: Final = 1.4826
-# Median length of a vector whose two components are normal with standard deviation 1 (Rayleigh).
+# Median length of a vector with two standard normal components (Rayleigh distribution).
 MEDIAN_LENGTH: Final = 1.1774
-# Iterations of weights for the L1 norm, and the residual with the largest weight.
+# Number of iterations for the L1 norm, and residual below which the weight is constant.
 _ROUNDS: Final = 20
 _FLOOR: Final = 0.01
 
 
 def median_deviation(values: NDArray[np.floating], middle: float | None = None) -> float:
-    """Standard deviation as 1.4826 times the median absolute deviation (NMAD).
+    """Return the NMAD, 1.4826 times the median absolute deviation.
 
     Args:
-        values: at least one.
-        middle: deviations are taken from this value; None for the median.
+        values: at least one value.
+        middle: reference of the deviations; None for the median.
     """
     middle = float(np.median(values)) if middle is None else middle
     return NMAD_FACTOR * float(np.median(np.abs(values - middle)))
@@ -34,9 +35,9 @@ def least_absolute(
     """Solve design x = wanted in the L1 norm, by least squares with weights of 1 / residual.
 
     Args:
-        design: (n, k).
-        wanted: (n,).
-        held: (k,) weights that hold unknowns at 0.
+        design: (n, k) design matrix.
+        wanted: (n,) observations.
+        held: (k,) weights that pull the unknowns towards 0.
     """
     weights = np.ones(len(wanted))
     solution: NDArray[np.float64] = np.zeros(design.shape[1])
@@ -51,10 +52,10 @@ _SAMPLES: Final = 300_000
 
 
 def depth_noise_m(depth_m: NDArray[np.float32]) -> float:
-    """Estimate the standard deviation of a depth from the scatter of neighbours about a line.
+    """Estimate the standard deviation of a depth from second differences of neighbours.
 
-    The median of second differences ignores edges; a raster (rows, cols) without three adjacent
-    measured cells gives 0.
+    Their median is not influenced by edges. The result is 0 if a raster (rows, cols) has no three
+    adjacent measured cells.
     """
     # Half of the samples are horizontal, half vertical.
     step = max(1, 2 * depth_m.size // _SAMPLES)
@@ -65,7 +66,7 @@ def depth_noise_m(depth_m: NDArray[np.float32]) -> float:
     n_known = int(np.count_nonzero(np.isfinite(bends)))
     if not n_known:
         return 0.0
-    # The median; NaN is sorted to the end.
+    # The median; NaN is sorted last.
     half = n_known // 2
     bends = np.partition(bends, half)
     upper = float(bends[half])

@@ -1,14 +1,15 @@
-"""Ray casting in a simulated scene: which surface a ray meets, and its colour there.
+"""Ray casting in a simulated scene: the surface that a ray hits, and its colour.
 
-Rays go through a tree of bounding boxes. The nearest hit is exact: the tree only skips what a ray
-cannot meet, and of two rectangles at the same distance the one with the smaller index wins.
+Rays are traced through a tree of bounding boxes. The nearest hit is exact: the tree only skips
+rectangles that a ray cannot hit, and if two rectangles are at the same distance, the one with the
+smaller index is returned.
 
-Every texture is a fixed function of position, without grids or images, so that an orthoimage's
-truth can be evaluated at any resolution. Stains are value noise on hashed lattices with quintic
-interpolation: twice continuously differentiable, shortest wave about twice the lattice spacing.
+A texture is a function of position, without grids or images, so the true orthoimage can be computed
+at any resolution. Stains are value noise on hashed lattices with quintic interpolation: twice
+continuously differentiable, with a shortest wavelength of about twice the lattice spacing.
 Ornaments have sharp edges.
 
-This module loads numba: methods import it inside functions.
+This module loads numba, so methods import it inside functions.
 """
 
 from __future__ import annotations
@@ -24,12 +25,12 @@ from numpy.typing import NDArray
 from orthoflow.geometry.compiling import compiled, kernel_part, typed_kernel_part
 from orthoflow.geometry.scenes import Scene, SurfaceRole
 
-# The small functions have explicit types: otherwise each constant argument would compile a version
-# of its own, which costs seconds at the first run.
+# The small functions have explicit types, since numba would otherwise compile a separate version
+# for each constant argument, which takes seconds in the first run.
 
 
 class Shade(NamedTuple):
-    """Colour of a spot: red, green, blue 0..255, and its laser reflectance 0..1."""
+    """Colour of a point (red, green, blue, 0..255) and its laser reflectance (0..1)."""
 
     red: float
     green: float
@@ -41,7 +42,7 @@ class PaintTable(NamedTuple):
     """The textures of a scene.
 
     Attributes:
-        frames: (r, 9) float64: centre, axis a, axis b of each rectangle, as `Scene` has them.
+        frames: (r, 9) float64: centre, axis a and axis b of each rectangle, as in `Scene`.
         kinds: (r,) int32 `TextureKind`.
         params: (r, 8) float64 texture parameters.
     """
@@ -55,11 +56,11 @@ class Pattern(NamedTuple):
     """The pattern at a point.
 
     Attributes:
-        light: lighter or darker, about -1..1.
-        warmth: redder or bluer, about -1..1.
-        paint: how much of the ground a coloured ornament covers, 0..1.
-        hue: colour of that ornament, 0..1 round the colour circle.
-        other: `light` as seen at another wavelength.
+        light: brightness deviation, about -1..1.
+        warmth: colour deviation, from blue (-1) to red (1).
+        paint: opacity of a coloured ornament, 0..1.
+        hue: hue of that ornament, 0..1 around the colour circle.
+        other: `light` at the wavelength of the laser.
     """
 
     light: float
@@ -92,20 +93,20 @@ def _column_state(i: int, seed: int) -> np.uint64:
 
 @typed_kernel_part("u8(i8, i8, i8)")
 def cell_state(i: int, j: int, seed: int) -> np.uint64:
-    """Random state (64 bits) of the lattice cell (i, j)."""
+    """Return the random 64-bit state of the lattice cell (i, j)."""
     return mixed_bits(_column_state(i, seed) ^ (np.uint64(j) * np.uint64(0x8CB92BA72F3D8DD7)))
 
 
 @typed_kernel_part("f8(u8, i8)")
 def _lattice_value(column: np.uint64, j: int) -> float:
-    """Return a number in [0, 1) of the lattice point j of a column."""
+    """Return a random number in [0, 1) for the lattice point j of a column."""
     bits = mixed_bits(column ^ (np.uint64(j) * np.uint64(0x8CB92BA72F3D8DD7)))
     return float(bits >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
 @typed_kernel_part("f8(f8, f8, i8)")
 def _value_noise(a: float, b: float, seed: int) -> float:
-    """Return smooth noise -1..1 on the unit lattice."""
+    """Return smooth noise, -1..1, on the unit lattice."""
     i, j = math.floor(a), math.floor(b)
     s, t = a - i, b - j
     s = s * s * s * (s * (s * 6.0 - 15.0) + 10.0)
@@ -128,7 +129,7 @@ def _stains(a: float, b: float, period: float, seed: int) -> float:
 
 @typed_kernel_part("f8(f8, f8, i8)")
 def _wear(a: float, b: float, seed: int) -> float:
-    """Return the fine detail of a surface: grain on a lattice of 11 mm, cracks 2 to 4 mm wide."""
+    """Return fine detail of a surface: grain on an 11 mm lattice and cracks 2 to 4 mm wide."""
     grain = 0.3 * _value_noise(a / 0.011, b / 0.011, seed)
     crack = abs(_value_noise(a / 0.13, b / 0.13, seed + 1))
     return grain - 0.8 * max(0.0, 1.0 - crack / 0.03)
@@ -136,10 +137,10 @@ def _wear(a: float, b: float, seed: int) -> float:
 
 @typed_kernel_part("UniTuple(f8, 2)(f8, f8, f8, i8)")
 def _rosette(a: float, b: float, period: float, seed: int) -> tuple[float, float]:
-    """Return the ornament of the lattice cell at (a, b): (paint 0 or 1, its hue 0..1).
+    """Return the ornament of the lattice cell at (a, b): (paint 0 or 1, hue 0..1).
 
-    Each cell has a flower of its own: number of petals, size, rotation, hue and position are
-    hashed.
+    Each cell contains a different flower: its number of petals, size, rotation, hue and position
+    are random.
     """
     i, j = math.floor(a / period), math.floor(b / period)
     state = cell_state(i, j, seed)
@@ -154,7 +155,7 @@ def _rosette(a: float, b: float, period: float, seed: int) -> tuple[float, float
         return 1.0, (uniform(state, 5) + 0.5) % 1.0
     if radius < outline * (0.72 + 0.28 * wave):
         return 1.0, uniform(state, 5)
-    # A painted ring and the lines of a lattice around the flowers, a fortieth of the period wide.
+    # A painted ring and lattice lines around the flowers, 1/40 of the period wide.
     if abs(radius - 0.42) < 0.0125 and uniform(state, 6) > 0.4:
         return 1.0, uniform(state, 7)
     edge = 0.5 - max(abs(a / period - i - 0.5), abs(b / period - j - 0.5))
@@ -165,7 +166,7 @@ def _rosette(a: float, b: float, period: float, seed: int) -> tuple[float, float
 
 @typed_kernel_part("f8(f8, f8, f8)")
 def _motif(a: float, b: float, period: float) -> float:
-    """Damask motif, exactly periodic in both directions, every other column half a step down."""
+    """Return a damask motif, exactly periodic; alternate columns are shifted by half a period."""
     i = math.floor(a / period)
     x = 2.0 * (a / period - i) - 1.0
     y = b / period + 0.5 * (i % 2)
@@ -178,7 +179,7 @@ def _motif(a: float, b: float, period: float) -> float:
 
 @typed_kernel_part("f8(f8, f8, f8, i8)")
 def _grain(a: float, b: float, period: float, seed: int) -> float:
-    """Wood grain -1..1 along b."""
+    """Return wood grain along b, -1..1."""
     bend = 0.35 * _value_noise(a / period, 0.25 * b / period, seed)
     return math.sin(6.283185307179586 * (4.0 * a / period + 2.0 * bend)) * (
         0.7 + 0.3 * _value_noise(3.0 * a / period, 0.5 * b / period, seed + 1)
@@ -211,13 +212,13 @@ def _pattern(kind: int, params: NDArray[np.float64], a: float, b: float) -> Patt
     elif kind == 4:
         light = _grain(a, b, period, seed + 40)
         other = 0.5 * light + 0.5 * warmth
-    # Dirt in cracks is dark for the laser too, but less so.
+    # Dirt in cracks is also dark at the wavelength of the laser, but less so.
     return Pattern(light + wear, warmth, paint, hue, other + 0.5 * wear)
 
 
 @kernel_part
 def colour_at(kind: int, params: NDArray[np.float64], a: float, b: float) -> Shade:
-    """Colour and reflectance at (a, b) of a texture: `TextureKind` and its 8 parameters."""
+    """Return colour and reflectance at (a, b) of a texture (`TextureKind` and its parameters)."""
     light, warmth, paint, hue, other = _pattern(kind, params, a, b)
     contrast, gap = params[4], params[7]
     gain = 1.0 + contrast * light
@@ -248,10 +249,10 @@ def paint_points(
     points: NDArray[np.float64],
     painted: NDArray[np.float32],
 ) -> None:
-    """Fill `painted` (4, n) = red, green, blue 0..255, reflectance 0..1 of points (3, n).
+    """Fill `painted` (4, n) with red, green, blue (0..255), reflectance (0..1) of points (3, n).
 
-    Points on rectangle -1 are unchanged; one off its rectangle gets the colour of its projection
-    onto it.
+    Values for rectangle -1 remain unchanged. A point outside the plane of its rectangle gets the
+    colour at its projection onto that plane.
     """
     frames = table.frames
     for i in range(rectangle.shape[0]):
@@ -272,21 +273,21 @@ def paint_points(
 
 Index: TypeAlias = int | np.int64
 
-# A ray does not meet the surface on which it starts.
+# Minimum distance of a hit, so that a ray does not hit the surface on which it starts.
 _NEAREST: Final = 1e-9
 
 
 class CastTable(NamedTuple):
-    """A scene prepared for ray casting, relative to its origin, along the axes of the boxes.
+    """A scene prepared for ray casting, relative to its origin, in the axes of the boxes.
 
     Attributes:
-        axes: (3, 3) float64 rotation from the scene's axes into those of the boxes.
+        axes: (3, 3) float64 rotation from the scene's axes to those of the boxes.
         rectangles: (r, 18) float64: centre, axis a, axis b, normal (3 each), extent (4), and the
             first and the last + 1 of its holes.
-        holes: (h, 4) float64 extents.
-        nodes: (m, 9) float64 of the tree: bounds of a box, low then high; the next node for a ray
-            that misses it; the first and the last + 1 of its rectangles in `order`, none unless it
-            is a leaf. Parents come before children, node 0 is the root.
+        holes: (h, 4) float64 extents of the holes.
+        nodes: (m, 9) float64 nodes of the tree: bounds of a box (low, then high); the next node for
+            a ray that misses the box; the first and the last + 1 of its rectangles in `order`
+            (empty unless the node is a leaf). Parents precede children, and node 0 is the root.
         order: (r,) int64 rectangles in the order of the leaves.
     """
 
@@ -298,7 +299,7 @@ class CastTable(NamedTuple):
 
 
 class Ray(NamedTuple):
-    """Start and direction, metres from the scene's origin; lengths are in units of direction."""
+    """Start (metres from the scene's origin) and direction, whose length is the distance unit."""
 
     x: float
     y: float
@@ -313,7 +314,7 @@ def _hit_distance(
     rectangles: NDArray[np.float64], holes: NDArray[np.float64], index: Index, ray: Ray
 ) -> float:
     """Return the distance to a rectangle along a ray, in units of its direction, or inf."""
-    # Scalars on purpose: a row as an array would be reference-counted with each use.
+    # Scalars, since a row as an array would be reference-counted in each use.
     r = rectangles
     facing = r[index, 9] * ray.dx + r[index, 10] * ray.dy + r[index, 11] * ray.dz
     if abs(facing) < 1e-12:
@@ -335,7 +336,7 @@ def _hit_distance(
 
 @kernel_part
 def _misses_box(nodes: NDArray[np.float64], node: Index, ray: Ray, t_max: float) -> bool:
-    """Whether a ray, given by its start and the inverse of its direction, stays out of a box."""
+    """Return whether a ray, given by its start and inverse direction, misses a box."""
     near, far = (nodes[node, 0] - ray.x) * ray.dx, (nodes[node, 3] - ray.x) * ray.dx
     low, high = min(near, far), max(near, far)
     near, far = (nodes[node, 1] - ray.y) * ray.dy, (nodes[node, 4] - ray.y) * ray.dy
@@ -354,7 +355,7 @@ def _along(axes: NDArray[np.float64], axis: int, x: float, y: float, z: float) -
 
 @typed_kernel_part("f8(f8)")
 def _inverse(value: float) -> float:
-    # Not infinity: zero times infinity would be NaN for a ray inside the slab's plane.
+    # A large number instead of infinity: 0 times infinity is NaN for a ray in the plane of a slab.
     if abs(value) < 1e-30:
         return 1e30 if value >= 0.0 else -1e30
     return 1.0 / value
@@ -368,14 +369,14 @@ def cast_rays(
     t: NDArray[np.float64],
     rectangle: NDArray[np.int32],
 ) -> None:
-    """Find the first rectangle that each ray meets.
+    """Find the first rectangle that each ray hits.
 
     Args:
         table: the scene.
-        starts: (3, n), or (3, 1) for all rays, metres from the scene's origin along its axes.
-        ways: (3, n) directions along the scene's axes; their lengths are the units of t.
-        t: (n,) maximum distance; set to the distance of a hit, unchanged without one.
-        rectangle: (n,) filled; -1 without a hit.
+        starts: (3, n), or (3, 1) for all rays, metres from the scene's origin, in its axes.
+        ways: (3, n) directions in the scene's axes; their lengths are the units of t.
+        t: (n,) maximum distance; set to the distance of the hit, unchanged if there is none.
+        rectangle: (n,) filled with the rectangle; -1 if there is no hit.
     """
     rectangles, holes, nodes, axes = table.rectangles, table.holes, table.nodes, table.axes
     each = 1 if starts.shape[1] > 1 else 0
@@ -392,7 +393,8 @@ def cast_rays(
         ray = Ray(x, y, z, dx, dy, dz)
         inverse = Ray(x, y, z, _inverse(dx), _inverse(dy), _inverse(dz))
         best_t, best = t[i], np.int64(-1)
-        # Trying the previous ray's hit first skips most boxes; it does not change the result.
+        # Test the rectangle hit by the previous ray first: this skips most boxes without changing
+        # the result.
         if guess >= 0:
             distance = _hit_distance(rectangles, holes, guess, ray)
             if distance < best_t:
@@ -412,17 +414,17 @@ def cast_rays(
         rectangle[i] = guess = best
 
 
-# Rays per batch, so that arrays of one number per ray stay in the processor's cache.
+# Rays per batch, so that arrays with one number per ray fit into the processor's cache.
 RAYS_AT_ONCE: Final = 1 << 14
 
 
 @dataclass(frozen=True, kw_only=True)
 class Hits:
-    """Where rays first meet a scene.
+    """The first hits of rays in a scene.
 
     Attributes:
-        t: (n,) float64 distance in units of the ray's direction, inf without a hit.
-        rectangle: (n,) int32 row of the scene, -1 without a hit.
+        t: (n,) float64 distance in units of the ray's direction; inf if there is no hit.
+        rectangle: (n,) int32 row of the scene; -1 if there is no hit.
     """
 
     t: NDArray[np.float64]
@@ -430,10 +432,10 @@ class Hits:
 
 
 class SceneRays:
-    """A scene prepared once for many rays.
+    """A scene prepared for many rays.
 
-    Starts and points are metres from the scene's origin. Arrays hold one row per coordinate,
-    (3, n): numpy works on such rows several times as fast as on one row per point.
+    Starts and points are in metres from the scene's origin. Arrays have one row per coordinate,
+    (3, n), since numpy processes them several times as fast as arrays with one row per point.
 
     Args:
         scene: the scene.
@@ -450,7 +452,7 @@ class SceneRays:
 
     @cached_property
     def objects(self) -> SceneRays:
-        """Return the free-standing objects alone; rectangles are numbered among them."""
+        """Return only the free-standing objects, with their own numbering of rectangles."""
         return SceneRays(self._scene.only(self._scene.role == SurfaceRole.OBJECT))
 
     def cast(
@@ -463,9 +465,9 @@ class SceneRays:
         """Find the first hit of rays.
 
         Args:
-            starts: (3, n), or (3, 1) for all.
-            ways: (3, n) directions of any length, the unit of distances.
-            within: (n,) or one maximum distance.
+            starts: (3, n), or (3, 1) for all rays.
+            ways: (3, n) directions; their lengths are the units of distances.
+            within: maximum distance, (n,) or one for all rays.
         """
         n_rays = ways.shape[1]
         t = np.empty(n_rays)
@@ -484,7 +486,10 @@ class SceneRays:
     def colours(
         self, rectangle: NDArray[np.int32], points: NDArray[np.float64]
     ) -> NDArray[np.float32]:
-        """Red, green, blue 0..255 and reflectance 0..1 (4, n) of points; 0 on rectangle -1."""
+        """Return red, green, blue (0..255) and reflectance (0..1), (4, n), of points.
+
+        Values for rectangle -1 are 0.
+        """
         painted = np.zeros((4, len(rectangle)), dtype=np.float32)
         paint_points(
             self._paint,
@@ -498,7 +503,7 @@ class SceneRays:
 def points_on(
     starts: NDArray[np.float64], ways: NDArray[np.float64], hits: Hits
 ) -> NDArray[np.float64]:
-    """Return the points (3, n) that rays meet; the start of rays without a hit."""
+    """Return the points (3, n) that rays hit; for rays without a hit, their start."""
     return starts + np.where(hits.rectangle < 0, 0.0, hits.t) * ways
 
 
@@ -529,10 +534,10 @@ def _cast_table(scene: Scene) -> CastTable:
 
 
 class _BoxTree:
-    """Bounding boxes over rectangles, split where the cost of rays is lowest.
+    """Bounding boxes of rectangles, split where the cost of rays is lowest.
 
-    The boxes are aligned with the rectangle that makes them smallest: in a room most others are
-    parallel or perpendicular to it, and their boxes are thin.
+    The boxes are aligned with the rectangle that makes them smallest. In a room, most rectangles
+    are parallel or perpendicular to it, so their boxes are thin.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -544,7 +549,7 @@ class _BoxTree:
             return
         self.axes = _tightest_axes(scene)
         corners = scene.corners_m() @ self.axes.T
-        # A tolerance of a micrometre: a rectangle along the axes must not have an empty box.
+        # A tolerance of 1 micrometre, so that rectangles along the axes have no empty boxes.
         self._low = corners.min(axis=1) - 1e-6
         self._high = corners.max(axis=1) + 1e-6
         self._add(np.arange(len(scene)))
@@ -574,7 +579,7 @@ class _BoxTree:
             return None
         low, high = self._low[members], self._high[members]
         whole = _surface_m2(high.max(axis=0) - low.min(axis=0))
-        # Along all three axes at once, (n, axis): most nodes have few members.
+        # Process all three axes at once, (n, axis), since most nodes have few members.
         order = np.argsort(low + high, axis=0, kind="stable")
         heads = _running_surfaces(low[order], high[order])[:-1]
         tails = _running_surfaces(low[order[::-1]], high[order[::-1]])[:-1][::-1]
@@ -603,7 +608,7 @@ def _running_surfaces(low: NDArray[np.float64], high: NDArray[np.float64]) -> ND
 def _tightest_axes(scene: Scene) -> NDArray[np.float64]:
     corners = scene.corners_m()
     axes = np.stack([scene.axis_a, scene.axis_b, scene.normal], axis=1)
-    # Many rectangles share their axes; each set is tried once.
+    # Many rectangles have the same axes, so each set of axes is tried once.
     _, first = np.unique(axes.reshape(-1, 9).round(9), axis=0, return_index=True)
     axes = axes[np.sort(first)]
     surfaces = []

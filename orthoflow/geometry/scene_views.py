@@ -1,6 +1,6 @@
 """Views of a simulated scene: the true orthoimage of a wall, and photos.
 
-Import this module where it is used: it loads compiled kernels.
+Import this module inside functions, since it loads compiled kernels.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ from orthoflow.geometry.scene_rays import RAYS_AT_ONCE, Hits, SceneRays, points_
 from orthoflow.geometry.scenes import Scene, Viewers, cell_states, uniforms
 from orthoflow.geometry.threads import in_runs
 
-# A viewer sees a point if the first hit is at most this far in front of it, metres.
+# A viewer sees a point unless a hit is more than this far in front of it, in metres.
 _SEEN_WITHIN_M: Final = 0.0005
-# A camera does if the first hit is at most this share of its distance in front of it.
+# A camera sees a point unless a hit is more than this share of the distance in front of it.
 _SEEN_WITHIN_SHARE: Final = 2e-4
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrueOrthoimage:
-    """What an error-free orthoimage of a scene shows in each cell of a frame.
+    """An error-free orthoimage of a scene.
 
     Attributes:
-        frame: where the cells lie.
-        rgb: (rows, cols, 3) float32, 0..255, mean over the cell; NaN where nothing is hit or no
+        frame: the frame of the cells.
+        rgb: (rows, cols, 3) float32, 0..255, mean over the cell; NaN if there is no surface or no
             colour was requested.
-        depth_m: (rows, cols) float32 along the normal at the cell's centre; NaN where nothing is
-            hit.
-        rectangle: (rows, cols) int32 row of the scene at the centre; -1 where nothing is.
-        seen: (rows, cols) bool, a viewer sees that surface point; undefined in cells that were not
-            judged.
-        behind_object: (rows, cols) bool, a free-standing object hides that point from a viewer or
-            from the front; undefined in cells that were not judged.
+        depth_m: (rows, cols) float32 along the normal at the cell's centre; NaN if there is no
+            surface.
+        rectangle: (rows, cols) int32 row of the scene at the centre; -1 if there is no surface.
+        seen: (rows, cols) bool, whether a viewer sees this surface point; undefined unless
+            requested.
+        behind_object: (rows, cols) bool, whether a free-standing object hides this point from a
+            viewer or from the front; undefined unless requested.
     """
 
     frame: WallFrame
@@ -54,13 +54,13 @@ class Rendering:
     """Options of a true orthoimage.
 
     Attributes:
-        buffer_front_m: surfaces further in front of the plane are ignored.
-        buffer_behind_m: likewise behind.
-        viewers: positions from which the surface is seen; without them no cell is seen.
+        buffer_front_m: distance in front of the plane beyond which surfaces are ignored.
+        buffer_behind_m: distance behind the plane beyond which surfaces are ignored.
+        viewers: positions from which the surface is seen; if None, no cell is seen.
         supersample: colours are the mean of supersample^2 rays per cell.
-        coloured: (rows, cols) bool, cells whose colour is requested; None for all.
+        coloured: (rows, cols) bool, cells whose colour is requested; None for all cells.
         judged: (rows, cols) bool, cells whose `seen` and `behind_object` are requested; None for
-            all.
+            all cells.
         cores: number of threads; does not change the result.
     """
 
@@ -83,12 +83,12 @@ def render_frame(
     supersample: int = 3,
     cores: int = 1,
 ) -> TrueOrthoimage:
-    """Render the true orthoimage of a frame completely.
+    """Render the true orthoimage of all cells of a frame.
 
     Args:
         scene: the scene.
-        frame: where the cells lie; it need not lie exactly on a true wall.
-        buffer_front_m: see `Rendering`; the rest likewise.
+        frame: the frame of the cells; it may deviate from a true wall.
+        buffer_front_m: see `Rendering`.
         buffer_behind_m: see `Rendering`.
         viewers: see `Rendering`.
         supersample: see `Rendering`.
@@ -105,7 +105,7 @@ def render_frame(
 
 
 def render(scene: Scene, frame: WallFrame, rendering: Rendering) -> TrueOrthoimage:
-    """Render the true orthoimage of a frame, which need not lie exactly on a true wall."""
+    """Render the true orthoimage of a frame, which may deviate from a true wall."""
     truth = TrueOrthoimage(
         frame=frame,
         rgb=np.full((*frame.shape, 3), np.nan, dtype=np.float32),
@@ -133,8 +133,8 @@ class SeenPoints:
     """The surface points that pixels show.
 
     Attributes:
-        points: (n, 3) float64 metres from the scene's origin, NaN without a hit.
-        rectangle: (n,) int32 row of the scene, -1 without a hit.
+        points: (n, 3) float64 metres from the scene's origin; NaN if there is no hit.
+        rectangle: (n,) int32 row of the scene; -1 if there is no hit.
     """
 
     points: NDArray[np.float64]
@@ -142,7 +142,7 @@ class SeenPoints:
 
 
 class SceneCameras:
-    """A scene prepared once for many cameras.
+    """A scene prepared for many cameras.
 
     Args:
         scene: the scene.
@@ -157,7 +157,7 @@ class SceneCameras:
     def expose(
         self, camera: ViewingCamera, *, supersample: int = 2, seed: int = 0
     ) -> NDArray[np.float32]:
-        """Take a photo (rows, columns, 3), grey levels 0..255, without noise.
+        """Render a photo (rows, columns, 3) with values 0..255, without noise.
 
         Colours are means of supersample^2 rays per pixel, at random positions that depend on the
         seed.
@@ -173,7 +173,7 @@ class SceneCameras:
         return image
 
     def trace(self, camera: ViewingCamera, pixels_photo: NDArray[np.float64]) -> SeenPoints:
-        """Find what pixels (n, 2) show; they may lie outside the image, NaN shows nothing."""
+        """Find the surface points of pixels (n, 2), which may be outside the image or NaN."""
         pixels = np.asarray(pixels_photo, dtype=np.float64)
         points = np.full((len(pixels), 3), np.nan)
         rectangle = np.full(len(pixels), -1, dtype=np.int32)
@@ -192,9 +192,9 @@ class SceneCameras:
         return SeenPoints(points=points, rectangle=rectangle)
 
     def sees(self, camera: ViewingCamera, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Report which surface points (n, 3), metres from the scene's origin, a camera sees.
+        """Return which surface points (n, 3), in metres from the scene's origin, a camera sees.
 
-        A point hidden by less than 0.02 % of its distance counts as seen.
+        A point counts as seen if the hiding surface is within 0.02 % of its distance.
         """
         shifted = camera.shifted(self._origin)
         inside = shifted.sees(shifted.project(np.nan_to_num(points, nan=np.inf))[:, :2])
@@ -209,7 +209,7 @@ class SceneCameras:
 
         Args:
             starts: (n, 3) or (3,) metres from the scene's origin.
-            directions: (n, 3) of any length, the unit of the hits' distances.
+            directions: (n, 3); their lengths are the units of the hits' distances.
         """
         n_rays = len(directions)
         starts = np.broadcast_to(starts, (n_rays, 3))
@@ -228,7 +228,7 @@ class SceneCameras:
 def pixel_directions(
     camera: ViewingCamera, u: NDArray[np.float64], v: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Directions (3, n) in world axes, one metre deep along the optical axis, of pixels."""
+    """Return ray directions (3, n) of pixels in world axes, 1 m long along the optical axis."""
     found = undistorted(*camera.bent_rays(np.stack([u, v])), camera.distortion)
     rotation = camera.rotation
     ways = np.empty((3, len(u)))
@@ -247,7 +247,7 @@ class _Renderer:
         self._n_sub = rendering.supersample
         self._front_m = front_m
         self._reach_m = front_m + rendering.buffer_behind_m
-        # One long row each, as views of the same memory.
+        # Flat views of the arrays, which share their memory.
         self._rgb = truth.rgb.reshape(-1, 3)
         self._depth_m = truth.depth_m.reshape(-1)
         self._rectangle = truth.rectangle.reshape(-1)
@@ -273,12 +273,12 @@ class _Renderer:
     def shows_something(
         self, cells: NDArray[np.int64], wanted: NDArray[np.bool_] | None
     ) -> NDArray[np.bool_]:
-        """Report which cells (n,) show a surface and are requested."""
+        """Return which cells (n,) show a surface and are requested."""
         shows: NDArray[np.bool_] = self._rectangle[cells] >= 0
         return shows if wanted is None else shows & wanted.reshape(-1)[cells]
 
     def look_back(self, cells: NDArray[np.int64], points: NDArray[np.float64]) -> None:
-        """Report which cells (n,), surface points (3, n), a viewer sees or an object hides."""
+        """Set which cells (n,) with surface points (3, n) a viewer sees and an object hides."""
         ways = np.broadcast_to(self._normal, points.shape)
         before = self._rays.objects.cast(points, ways).rectangle >= 0
         self._behind_object[cells[before]] = True
@@ -293,7 +293,7 @@ class _Renderer:
         cells: NDArray[np.int64],
         points: NDArray[np.float64],
     ) -> None:
-        # A small tolerance: straight up must be seen although its sine may round above one.
+        # With a small tolerance, since the sine of straight up may be rounded to more than 1.
         lowest = math.sin(math.radians(viewers.lowest_elevation_deg)) - 1e-12
         highest = math.sin(math.radians(viewers.highest_elevation_deg)) + 1e-12
         ways = points - position
@@ -312,8 +312,8 @@ class _Renderer:
         sums, n_hits = np.zeros((3, len(cells)), dtype=np.float32), np.zeros(len(cells))
         ways = np.broadcast_to(-self._normal, (3, len(cells)))
         for sub in range(n_sub * n_sub):
-            # A sheared grid: n^2 different positions in either direction, so that edges along rows
-            # or columns, which are frequent on walls, are not rounded to thirds of a cell.
+            # A sheared grid has n^2 different positions in each direction, so edges along rows or
+            # columns, which are frequent on walls, are not rounded to 1/n of a cell.
             i, j = sub % n_sub, sub // n_sub
             starts = self._starts(
                 cells, (i + (j + 0.5) / n_sub) / n_sub, (j + (n_sub - i - 0.5) / n_sub) / n_sub
@@ -325,7 +325,7 @@ class _Renderer:
         self._rgb[cells[shown]] = (sums[:, shown] / n_hits[shown]).T
 
     def _starts(self, cells: NDArray[np.int64], right: float, down: float) -> NDArray[np.float64]:
-        """Return the starts (3, n) of rays in front of positions in cells."""
+        """Return the starts (3, n) of rays, in front of the plane, for positions in cells."""
         rows, columns = np.divmod(cells, self._width)
         return self._corner + (columns + right) * self._step_u + (rows + down) * self._step_v
 
@@ -333,7 +333,7 @@ class _Renderer:
 def _exposed(
     rays: SceneRays, camera: ViewingCamera, rows: tuple[int, int], n_sub: int, seed: int
 ) -> NDArray[np.float32]:
-    """Return mean colours (rows, columns, 3) of the rays of some rows of pixels."""
+    """Return the mean colours (rows, columns, 3) of the rays of some pixel rows."""
     first, last = rows
     shape = (last - first, camera.width)
     columns, lines = np.arange(camera.width), np.arange(first, last)
@@ -353,8 +353,8 @@ def _exposed(
 def _pixel_ways(camera: ViewingCamera, first: int, last: int) -> tuple[NDArray[np.float64], ...]:
     """Return the direction of the first corner of each pixel, and its change inside the pixel.
 
-    A ray at (s, t) of a pixel has the direction base + s right + t down + s t twist, (3, rows,
-    columns) each: those of the corners are exact, and between them the lens deviates by less than
+    A ray at (s, t) of a pixel has the direction base + s right + t down + s t twist, each (3, rows,
+    columns). The directions of the corners are exact; between them, the lens deviates by less than
     1e-5 of a pixel.
     """
     u, v = np.meshgrid(

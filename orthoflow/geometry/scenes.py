@@ -1,7 +1,7 @@
 """Simulated scenes of textured rectangles, independent of the position of the world's origin.
 
-Their random numbers are a function of a lattice cell, a seed and the index of the draw: the same
-in any order and on any number of threads, by the formulas of `scene_rays` for whole arrays.
+Random numbers are a function of a lattice cell, a seed and the index of the draw. They are the same
+in any order and with any number of threads. The formulas are those of `scene_rays`, for arrays.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ class SurfaceRole(IntEnum):
 
 
 class TextureKind(IntEnum):
-    """The pattern of a rectangle; `texture_params` has its parameters.
+    """The pattern of a rectangle; its parameters are in `texture_params`.
 
-    All are functions of the position (a, b) in the rectangle, so they can be evaluated exactly
-    anywhere, and of 8 numbers: red, green, blue (0..255), laser reflectance (0..1), contrast
-    (0..1), period in metres, seed, spectral gap. The gap is 0 when the laser sees the pattern that
-    the eye sees, and 1 when it sees another one.
+    A pattern is a function of the position (a, b) in the rectangle, so it can be evaluated exactly
+    at any position, and of 8 numbers: red, green, blue (0..255), laser reflectance (0..1), contrast
+    (0..1), period in metres, seed, spectral gap. The gap is 0 if the laser measures the visible
+    pattern, and 1 if it measures a different one.
 
     Attributes:
-        PLAIN: one colour with smooth stains.
-        FRESCO: stains, rosettes that all differ, painted lines.
-        TEXTILE: one motif, repeated exactly.
-        TILES: checker of stained tiles with joints.
-        WOOD: grain along b.
+        PLAIN: a single colour with smooth stains.
+        FRESCO: stains, rosettes that all differ, and painted lines.
+        TEXTILE: a motif that is repeated exactly.
+        TILES: chequered, stained tiles with joints.
+        WOOD: wood grain along b.
     """
 
     PLAIN = 0
@@ -50,7 +50,7 @@ class TextureKind(IntEnum):
     WOOD = 4
 
 
-# Fields of a scene with a row per rectangle.
+# Fields of a scene with one row per rectangle.
 _PER_RECTANGLE: Final = "centre axis_a axis_b extent plane_index role texture texture_params"
 
 
@@ -59,18 +59,19 @@ class Scene:
     """Rectangles with holes and procedural textures; one row per rectangle.
 
     Attributes:
-        origin: (3,) float64 metres, world; all positions of the scene are relative to it, so that
-            a shift of the world changes nothing else.
-        centre: (r, 3) float64 metres from `origin`, world axes: where a = b = 0.
+        origin: (3,) float64 metres, world coordinates; all positions of the scene are relative to
+            it, so a shift of the world changes nothing else.
+        centre: (r, 3) float64 metres from `origin`, world axes; the position of a = b = 0.
         axis_a: (r, 3) float64 unit vector in the rectangle, world axes.
-        axis_b: (r, 3) likewise, perpendicular to `axis_a`.
+        axis_b: (r, 3) float64 unit vector in the rectangle perpendicular to `axis_a`, world axes.
         extent: (r, 4) float64 metres: a_min, a_max, b_min, b_max from the centre.
-        plane_index: (r,) int16 index of the true plane the rectangle belongs to, -1 for none.
+        plane_index: (r,) int16 index of the rectangle's true plane, -1 for none.
         role: (r,) uint8 `SurfaceRole`.
         texture: (r,) int32 `TextureKind`.
         texture_params: (r, 8) float64, see `TextureKind`.
-        hole_rectangle: (h,) int32 rectangle a hole is in, ascending.
-        hole_extent: (h, 4) float64 metres, as `extent`; a hole's rim belongs to the rectangle.
+        hole_rectangle: (h,) int32 index of the rectangle that contains the hole, ascending.
+        hole_extent: (h, 4) float64 metres, as in `extent`; the rim of a hole belongs to the
+            rectangle.
     """
 
     origin: NDArray[np.float64]
@@ -110,17 +111,17 @@ class Scene:
 
     @property
     def normal(self) -> NDArray[np.float64]:
-        """Unit normals (r, 3), axis_a x axis_b, world axes."""
+        """Unit normals (r, 3), axis_a x axis_b, in world axes."""
         return np.cross(self.axis_a, self.axis_b)
 
     def corners_m(self) -> NDArray[np.float64]:
-        """Corners (r, 4, 3) of all rectangles, metres from `origin`, in order round each."""
+        """Return the corners (r, 4, 3) of the rectangles in order, in metres from `origin`."""
         a = self.extent[:, [0, 1, 1, 0], None] * self.axis_a[:, None, :]
         b = self.extent[:, [2, 2, 3, 3], None] * self.axis_b[:, None, :]
         return self.centre[:, None, :] + a + b
 
     def only(self, chosen: NDArray[np.bool_]) -> Scene:
-        """Return the chosen rectangles (r,) alone, with their holes."""
+        """Return a scene with only the chosen rectangles (r,) and their holes."""
         place = np.cumsum(chosen) - 1
         holes = chosen[self.hole_rectangle]
         kept = {name: getattr(self, name)[chosen] for name in _PER_RECTANGLE.split()}
@@ -132,7 +133,7 @@ class Scene:
         )
 
     def turned(self, rotation: NDArray[np.float64]) -> Scene:
-        """Turn the scene about its origin by a rotation matrix (3, 3)."""
+        """Return the scene rotated about its origin by a matrix (3, 3)."""
         return replace(
             self,
             centre=self.centre @ rotation.T,
@@ -143,13 +144,13 @@ class Scene:
 
 @dataclass(frozen=True, kw_only=True)
 class Viewers:
-    """Positions from which a scene is seen all around, within a range of elevations.
+    """Positions from which a scene is seen in all directions within a range of elevations.
 
     Attributes:
         positions_world: (s, 3) float64 metres.
         up: (3,) float64 unit vector.
-        lowest_elevation_deg: lowest visible direction, above the horizon positive.
-        highest_elevation_deg: highest visible direction.
+        lowest_elevation_deg: lowest visible elevation, positive above the horizon.
+        highest_elevation_deg: highest visible elevation.
     """
 
     positions_world: NDArray[np.float64]
@@ -170,20 +171,20 @@ _TURN: Final = 2.0 * np.pi
 def cell_states(
     columns: NDArray[np.int64], rows: NDArray[np.int64], seed: int
 ) -> NDArray[np.uint64]:
-    """Return random states (64 bits) of lattice cells; columns and rows are broadcast."""
+    """Return random 64-bit states of lattice cells; columns and rows are broadcast."""
     state = mixed_bits(columns.astype(np.uint64) * _COLUMN + np.uint64(seed % _WORD))
     return mixed_bits(state ^ (rows.astype(np.uint64) * _ROW))
 
 
 def uniforms(states: NDArray[np.uint64], draw: int) -> NDArray[np.float64]:
-    """Return numbers in [0, 1), one per state; another draw gives other numbers."""
+    """Return one number in [0, 1) per state; each draw gives different numbers."""
     bits = mixed_bits(states + np.uint64((draw + 1) * _GOLDEN % _WORD))
     bits >>= np.uint64(11)
     return np.multiply(bits, 1.0 / 9007199254740992.0, dtype=np.float64)
 
 
 def normals(states: NDArray[np.uint64], draw: int) -> NDArray[np.float64]:
-    """Return normally distributed numbers (Box and Muller), one per state and even draw."""
+    """Return one standard normal number per state (Box and Muller); `draw` must be even."""
     lengths = np.sqrt(-2.0 * np.log1p(-uniforms(states, draw)))
     return np.asarray(lengths * np.cos(_TURN * uniforms(states, draw + 1)), dtype=np.float64)
 
