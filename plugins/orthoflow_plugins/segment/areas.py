@@ -1,6 +1,6 @@
-"""Areas of a wall that lie behind its face or are empty, and the kind of opening of each.
+"""Areas of a wall that are behind its face or empty, and the kind of opening of each.
 
-Lines of sight that crossed the wall, or ended in front of it, classify empty cells.
+Empty cells are classified by lines of sight that passed through the wall or ended in front of it.
 """
 
 from __future__ import annotations
@@ -15,36 +15,36 @@ from numpy.typing import NDArray
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import OpeningKind, PointCloud, SurfaceMask, Wall
 
-# Narrower connections do not join areas.
+# Areas with a narrower connection are separate.
 _NECK_CELLS: Final = 3
-# Shares of the cells of an area, crossed by rays or empty, that decide its kind.
+# Minimum shares of crossed or empty cells that determine the kind of an area.
 _CROSSED_LEAST: Final = 0.1
 _EMPTY_LEAST: Final = 0.5
-# If this share of the measured cells lies behind a plane, the plane is not the wall's face.
+# If more than this share of the measured cells is behind the plane, it is not the wall's face.
 _FACE_LEAST: Final = 0.5
 _CELLS_TOLD: Final = 1 << 25
-# Rays are counted on tiles of about this side, which hold many rays.
+# Rays are counted on tiles of about this side length, which contain many rays.
 _TILE_M: Final = 0.05
-# Of larger clouds one point of this many is used, spread by Fibonacci hashing.
+# Larger clouds are sampled to about this number of points, distributed by Fibonacci hashing.
 _POINTS_MOST: Final = 1 << 22
 _TURN: Final = np.uint64(0x9E3779B97F4A7C15)
 _BLOCK: Final = 1 << 18
-# Without stations, points this far behind or in front of an empty place decide.
+# Maximum distance behind and in front of an empty area of points that are used without stations.
 _BEHIND_MOST_M: Final = 4.0
 _BEFORE_MOST_M: Final = 1.5
-# Isolated distant points are gross errors: this many rays of a tile must agree.
+# Minimum number of rays of a tile that must agree, since isolated distant points are gross errors.
 _RAYS_LEAST: Final = 2
 _SHARE_LEAST: Final = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
 class SightLines:
-    """What lines of sight show about a wall, on tiles of its raster.
+    """Results of tracing lines of sight to a wall, on tiles of its raster.
 
     Attributes:
-        side: cells along the side of a tile.
+        side: number of cells along the side of a tile.
         crossed: (rows, cols) bool, rays passed through the wall here.
-        stopped: (rows, cols) bool, rays ended in front of it here, and none passed through.
+        stopped: (rows, cols) bool, rays ended in front of the wall here, and none passed through.
     """
 
     side: int
@@ -54,20 +54,21 @@ class SightLines:
     def over(
         self, tiles: NDArray[np.bool_], shape: tuple[int, int], step: int
     ) -> NDArray[np.bool_]:
-        """Return tiles as cells of the wall's raster (rows, cols), of every nth row and column."""
+        """Return tile values for the cells in every `step`-th row and column of the raster."""
         rows, columns = (np.arange(0, count, step) // self.side for count in shape)
         return tiles[np.ix_(rows, columns)]
 
 
 def sight_lines(cloud: PointCloud, slab: Slab) -> SightLines:
-    """Follow the rays of a cloud to a wall.
+    """Trace the rays of a cloud to a wall.
 
-    If the station of each point is known, the point is the end of a ray that is followed from there
-    to the wall's plane, or extended to it. Otherwise rays perpendicular to the wall are assumed.
+    If the station of each point is known, the ray from the station to the point is intersected with
+    the wall's plane, beyond the point if necessary. Otherwise rays perpendicular to the wall are
+    assumed.
 
     Args:
         cloud: the points.
-        slab: the wall's raster, and its depths in front of and behind its plane.
+        slab: the wall's raster, and its extent in front of and behind its plane.
     """
     frame = slab.frame
     side = max(1, min(round(_TILE_M / frame.gsd_m), *frame.shape))
@@ -81,7 +82,7 @@ def sight_lines(cloud: PointCloud, slab: Slab) -> SightLines:
             asked = (depth_m > -_BEHIND_MOST_M) & (depth_m < _BEFORE_MOST_M)
         else:
             from_station = tiles.wall_from_world(starts)
-            # A ray from behind, or along the plane, shows nothing.
+            # A ray from behind or parallel to the plane is not used.
             asked = (from_station[:, 2] > np.maximum(depth_m, 0.0)) & (from_station[:, 2] > 0.0)
             fall = np.where(asked, from_station[:, 2] - depth_m, 1.0)
             share = np.where(asked, from_station[:, 2] / fall, 0.0)[:, None]
@@ -112,8 +113,8 @@ def sight_lines(cloud: PointCloud, slab: Slab) -> SightLines:
 def _rays(
     cloud: PointCloud,
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64] | None]]:
-    """Yield ends (n, 3) of rays, block by block, and their starts if known."""
-    # Without the scan of each point, some scans may have been taken from elsewhere.
+    """Yield ends (n, 3) of rays, block by block, and their starts (n, 3), or None if unknown."""
+    # Stations are only used if they are from the file; others may not be those of all scans.
     stations = cloud.stations if cloud.stations_source == "file" else None
     scan = cloud.scan
     every = -(-len(cloud) // _POINTS_MOST)
@@ -132,17 +133,17 @@ def _rays(
 
 @dataclass(frozen=True, kw_only=True)
 class Relief:
-    """The class of each cell of a wall, or of every nth of its rows and columns.
+    """The class of each cell of a wall, or of the cells in every nth row and column.
 
     Attributes:
-        gsd_m: side of these cells.
-        step: cells of the wall per cell of these.
-        is_face: (rows, cols) bool, measured, and not behind the wall.
-        is_open: (rows, cols) bool, behind it or empty, and not hidden.
+        gsd_m: side length of these cells.
+        step: number of wall cells along the side of one of these cells.
+        is_face: (rows, cols) bool, measured and not behind the wall's face.
+        is_open: (rows, cols) bool, behind the face or empty, and not hidden.
         is_empty: (rows, cols) bool, depth unknown.
         is_crossed: (rows, cols) bool, rays passed through.
-        depth_m: (rows, cols) float32 in front of the plane, NaN where empty.
-        face_m: depth of the wall's face, 0 where that is the plane.
+        depth_m: (rows, cols) float32 depth in front of the plane; NaN where empty.
+        face_m: depth of the wall's face; 0 if the face is the plane.
     """
 
     gsd_m: float
@@ -157,12 +158,12 @@ class Relief:
 
 @dataclass(frozen=True, kw_only=True)
 class Area:
-    """An opening as cells.
+    """An opening as a set of cells.
 
     Attributes:
         corner: row and column of the first cell of `cells` in the relief.
-        cells: (rows, cols) bool, those of the opening, without holes, with a margin.
-        kind: see `OpeningKind`.
+        cells: (rows, cols) bool, True in the opening, without holes and with a margin.
+        kind: kind of the opening.
         depth_m: distance of its back behind the wall's face; None if nothing was measured.
     """
 
@@ -176,8 +177,8 @@ def relief_of(wall: Wall, lines: SightLines | None, behind_m: float) -> Relief:
     """Classify cells as face, open or hidden.
 
     Args:
-        wall: the wall; with more than 32 million cells every nth row and column is used.
-        lines: what rays show about empty cells; without them (None) no cell is hidden.
+        wall: the wall; if it has more than 32 million cells, only every nth row and column is used.
+        lines: results of tracing lines of sight; None if unknown, then no cell counts as hidden.
         behind_m: cells at least this far behind the wall's face do not belong to it.
     """
     import cv2
@@ -191,15 +192,15 @@ def relief_of(wall: Wall, lines: SightLines | None, behind_m: float) -> Relief:
     if lines is not None:
         is_crossed = lines.over(lines.crossed, wall.frame.shape, step) & is_empty
         is_hidden = lines.over(lines.stopped, wall.frame.shape, step) & is_empty
-    # A detector may have placed the plane on the fronts of pilasters, or between them and the wall:
-    # then the face is the median of the cells behind it.
+    # A detected plane may be at the fronts of pilasters, or between these and the wall. In this
+    # case, the face is the median of the cells behind the plane.
     measured_m = depth_m[~is_empty]
     deeper_m = measured_m[measured_m <= -behind_m]
     is_deeper = len(deeper_m) > _FACE_LEAST * len(measured_m)
     face_m = float(np.median(deeper_m)) if is_deeper else 0.0
     with np.errstate(invalid="ignore"):
         is_behind = ~is_empty & (depth_m <= face_m - behind_m)
-    # Single cells, from noise or between points, are ignored.
+    # Ignore single cells, which are due to noise or gaps between points.
     is_open = cv2.medianBlur((is_behind | (is_empty & ~is_hidden)).astype(np.uint8), 5) > 0
     return Relief(
         gsd_m=step * wall.frame.gsd_m,
@@ -214,14 +215,14 @@ def relief_of(wall: Wall, lines: SightLines | None, behind_m: float) -> Relief:
 
 
 def open_areas(relief: Relief, width_least_m: float, area_least_m2: float) -> Iterator[Area]:
-    """Return the areas that are large enough and hold a square of some width, largest first."""
+    """Yield areas of sufficient size that contain a square of a given width, largest first."""
     import cv2
 
     neck = cv2.getStructuringElement(cv2.MORPH_RECT, (_NECK_CELLS, _NECK_CELLS))
     cells = cv2.morphologyEx(relief.is_open.astype(np.uint8), cv2.MORPH_OPEN, neck)
     wide = max(1, round(width_least_m / relief.gsd_m))
     square = cv2.getStructuringElement(cv2.MORPH_RECT, (wide, wide))
-    # Cells beyond the raster must not widen an area.
+    # Cells outside the raster must not enlarge an area.
     cores = cv2.erode(cells, square, borderType=cv2.BORDER_CONSTANT, borderValue=0)
     n_areas, labels, boxes, _ = cv2.connectedComponentsWithStats(cells, connectivity=4)
     is_wide = np.zeros(n_areas, dtype=np.bool_)
@@ -238,7 +239,7 @@ def open_areas(relief: Relief, width_least_m: float, area_least_m2: float) -> It
             kind = "through"
         elif np.count_nonzero(relief.is_empty[part] & own) >= _EMPTY_LEAST * sizes[label]:
             kind = "no data"
-        # Bars and panes across are included.
+        # Bars and panes inside the opening are included.
         outside = np.pad(own, 1).astype(np.uint8)
         cv2.floodFill(outside, None, (0, 0), 2)
         known = relief.depth_m[part][own & ~relief.is_empty[part]]

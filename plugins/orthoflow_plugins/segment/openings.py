@@ -1,4 +1,4 @@
-"""`segment.openings`: windows, doors and niches of walls as outlines."""
+"""`segment.openings`: find windows, doors and niches of walls as outlines."""
 
 from __future__ import annotations
 
@@ -38,13 +38,14 @@ from orthoflow.sdk import (
 from orthoflow_plugins.segment.areas import Area, Relief, open_areas, relief_of, sight_lines
 from orthoflow_plugins.segment.outlines import Outline, moved_to_edges, outline_of
 
-# Planes that lean more than this from upright are floors, ceilings and slopes.
+# Planes inclined by more than this from the vertical are floors, ceilings and slopes.
 _UPRIGHT: Final = math.sin(math.radians(30.0))
-# What lies farther behind a plane is not the face of the same wall.
+# A surface farther behind the plane is not the face of the same wall.
 _FACE_FARTHEST_M: Final = 0.3
-# Empty areas must fill this share of their rectangle, as round windows do. Shadows do not.
+# Minimum share of its bounding rectangle that an empty area must fill, as round windows do and scan
+# shadows do not.
 _FILLED_LEAST: Final = 0.7
-# With less of its outline measured an opening is the border of the scan.
+# An area is part of the scan's border rather than an opening if less of its outline is measured.
 _SEEN_LEAST_SHARE: Final = 0.5
 _LONGEST_PX: Final = 1004
 _SMALLEST_PX: Final = 500
@@ -83,20 +84,21 @@ OTHER_CELLS: Final = DiagnosticSpec(
 
 
 class SegmentOpenings(Method):
-    """Find windows, doors and niches: areas of a wall behind its face, or without points.
+    """Find windows, doors and niches: areas of a wall that are behind its face or without points.
 
-    Connected cells behind the face of a wall, or empty ones, are an opening if a square of some
-    width fits in and the face was measured along most of their border. The face is the plane, or
-    the median of the cells behind it if these are more than half of the wall. With the cloud, lines
-    of sight are followed: an area through which some passed is `through`; where they ended in front
-    of the wall it is hidden, and not an opening. An empty area without either that is about as
-    compact as a round window is `no data`, most often glass or a mirror; one with a measured back
-    is a `niche`, including closed doors and windows set back.
+    Connected cells that are behind the face of a wall or empty form an opening if they contain a
+    square of a given width and the face was measured along most of their border. The face is the
+    plane, or the median of the cells behind it if these are more than half of the wall. If a cloud
+    is given, lines of sight are traced: an area that some of them pass through is `through`; an
+    area in front of which they end is hidden and is not reported as an opening. An empty area
+    without lines of sight is `no data` if it is about as compact as a round window; usually it is
+    glass or a mirror. An area with a measured back is a `niche`; this includes closed doors and
+    windows that are set back.
 
-    Sides are lines through the borders of the cells along them. The accuracy of each is stated,
-    from the size of cells, the point spacing and its own scatter. With orthoimages of photos, long
-    sides move to the corresponding edge of the picture if it is unambiguous and the scan is less
-    accurate.
+    Sides are lines fitted to the borders of the cells. The standard deviation of each side follows
+    from the cell size, the point spacing and the scatter of the border. With orthoimages from
+    photos, long sides are moved to the corresponding edge of the picture if it is unambiguous and
+    more accurate than the scan.
     """
 
     id: ClassVar[str] = "segment.openings"
@@ -118,7 +120,7 @@ class SegmentOpenings(Method):
     )
 
     class Params(MethodParams):
-        """The criteria of an opening."""
+        """Criteria for openings."""
 
         behind_m: float = Field(
             default=0.05,
@@ -138,7 +140,7 @@ class SegmentOpenings(Method):
         level: bool = Field(default=False, description="Also search floors, ceilings and slopes.")
 
     class In(Ports):
-        """Walls; the cloud shows what is hidden, orthoimages refine sides."""
+        """Walls, a cloud to detect hidden areas, and orthoimages to refine sides."""
 
         walls: Walls
         cloud: PointCloud | None = None
@@ -150,7 +152,7 @@ class SegmentOpenings(Method):
         openings: Openings
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Search wall after wall."""
+        """Find the openings of each wall."""
         walls = inputs.walls
         chosen = [
             place
@@ -185,7 +187,7 @@ class SegmentOpenings(Method):
 def _found_on(
     inputs: SegmentOpenings.In, place: int, params: SegmentOpenings.Params, ctx: StepContext
 ) -> tuple[list[Opening], int]:
-    """Return the openings of one wall, and the number of areas rejected by border or by shape."""
+    """Return the openings of one wall, and the number of areas rejected by border or shape."""
     wall, slab = inputs.walls.walls[place], inputs.walls.slab(place)
     lines = None if inputs.cloud is None else sight_lines(inputs.cloud, slab)
     relief = relief_of(wall, lines, params.behind_m)
@@ -217,7 +219,7 @@ def _found_on(
     openings.sort(key=lambda opening: float(opening.outline_m[:, 0].min()))
     if openings:
         frame, step = wall.frame, relief.step
-        # Over the orthoimage, or else over the intensity.
+        # Draw over the orthoimage, or else over the intensity.
         shown = np.where(relief.is_face, np.float32(0.8), np.float32(0.2))
         if grey is not None:
             shown = grey / 255.0
@@ -236,7 +238,7 @@ def _opening(
     wall: Wall, relief: Relief, area: Area, outline: Outline, by_image: NDArray[np.bool_]
 ) -> Opening:
     frame = wall.frame
-    # Of every nth cell, beginning with the first.
+    # Convert from every nth cell, starting with the first, to all cells.
     cells = np.clip(relief.step * (outline.corners - 0.5) + 0.5, 0.0, [frame.width, frame.height])
     places = frame.raster_from_wall(cells)
     spans_m = frame.gsd_m * (cells.max(axis=0) - cells.min(axis=0))
@@ -262,10 +264,13 @@ def _opening(
 def _grey(
     images: Orthoimages | None, wall: Wall, relief: Relief, ctx: StepContext
 ) -> NDArray[np.float32] | None:
-    """Return grey (rows, cols) 0..255 of the wall's orthoimage on the relief's cells, or None."""
+    """Return grey values (rows, cols), 0..255, of the wall's orthoimage in the relief's cells.
+
+    The result is None if there is no suitable orthoimage; unpainted cells are NaN.
+    """
     known = () if images is None else images.images
     image = next((each for each in known if each.number == wall.plane_index), None)
-    # An orthoimage painted from the cloud has the edges of its cells, not finer ones.
+    # Edges in an orthoimage coloured from the cloud are no more accurate than those of its cells.
     if image is None or set(image.sources) <= {"cloud"}:
         return None
     if not image.frame.has_cells_of(wall.frame):
@@ -304,11 +309,11 @@ def outline_map(
     grey: NDArray[np.float32],
     outlines: Sequence[tuple[OpeningKind, NDArray[np.float64]]],
 ) -> bytes:
-    """Draw outlines with their numbers over a pale picture of the wall.
+    """Draw numbered outlines over a pale picture of the wall.
 
     Args:
-        grey: (rows, cols) 0..1, NaN where nothing is shown.
-        outlines: kind and (n, 2) column and row of the corners, each.
+        grey: (rows, cols) grey values 0..1, NaN where unknown.
+        outlines: kind and corners (n, 2) = (column, row) of each outline.
     """
     import cv2
 

@@ -1,4 +1,4 @@
-"""Outlines of areas of cells with straight sides, moved to edges of the orthoimage; sigmas."""
+"""Straight-sided outlines of cell areas, aligned to orthoimage edges, with their accuracy."""
 
 from __future__ import annotations
 
@@ -14,45 +14,47 @@ from orthoflow.geometry.frames import signed_area
 from orthoflow.geometry.robust import median_deviation
 from orthoflow_plugins.segment.areas import Area, Relief
 
-# Corners closer to the line between their neighbours are caused by cells and noise.
+# Corners closer to the line between their neighbours are due to cells and noise.
 _STRAIGHT_CELLS: Final = 2.0
-# Once sides are straight lines, a smaller turn is not a corner.
+# After lines have been fitted to the sides, a smaller deviation is not a corner.
 _JOINED_CELLS: Final = 1.0
-# The corners of shorter sides are not moved.
+# Lines are fitted only to longer sides, and a corner is moved by no more than this.
 _FITTED_CELLS: Final = 8.0
-# Sides that meet at a smaller angle keep the corner between them.
+# Sides that meet at a smaller angle are not intersected; their corner is kept.
 _TURN_LEAST: Final = math.sin(math.radians(15.0))
-# The ends of a side belong to its corners, and cells farther away than this are not part of it.
+# Length at the ends of a side that belongs to its corners, and rejection limit for cells as a
+# multiple of the median deviation.
 _ENDS_CELLS: Final = 3.0
 _FAR_CELLS: Final = 3.0
-# How far beyond a side the wall's face is searched, and how much of it suffices.
+# Distances outside a side at which the wall's face is searched, and the required share.
 _BESIDE_CELLS: Final = (2.0, 3.0, 4.0)
 _BESIDE_LEAST: Final = 0.5
-# Standard deviation of a position known to an interval of length 1.
+# Standard deviation of a position that is uniformly distributed in an interval of length 1.
 _UNIFORM: Final = 1.0 / math.sqrt(12.0)
-# The cell crossed by a border may be on either side, so the border is within two cells.
+# A cell crossed by a border may be on either side, so the border is uncertain by two cells.
 _BORDER_CELLS: Final = 2.0
 
 # --- edges of the picture ---
 
 _LONG_CELLS: Final = 20.0
 _PROFILE_ENDS_CELLS: Final = 4.0
-# Length of the profiles across a side, in steps to both sides.
+# Length of the profiles to both sides of a side, and their step.
 _REACH_CELLS: Final = 4.0
 _STEP_CELLS: Final = 0.25
-# The edge must be found in this many pieces of a side.
+# Number of pieces of a side, and number of pieces in which the edge must be found.
 _PIECES: Final = 5
 _PIECES_LEAST: Final = 4
-# Grey levels per cell: weaker edges are stains. An edge must exceed the others by this factor.
+# Minimum grey levels per cell of an edge, since weaker edges are stains, and minimum ratio of its
+# slope to the median slope.
 _CONTRAST_LEAST_GREY: Final = 4.0
 _CONTRAST_LEAST: Final = 3.0
-# Slopes of at least this share of the steepest belong to an edge.
+# Slopes of at least this share of the steepest slope belong to an edge.
 _EDGE_SHARE: Final = 0.2
-# At a step the picture was projected with the same depths, so it is no better than this.
+# Minimum standard deviation of an edge, since the picture was projected with the same depths.
 _SIGMA_LEAST_CELLS: Final = 0.5
-# If depth and picture differ by more sigmas of the depth, they show different edges.
+# Depth and picture show different edges if they differ by more than this many sigmas of the depth.
 _APART_SIGMAS: Final = 1.5
-# Another edge within reach that is nearly as strong makes the choice ambiguous.
+# The choice is ambiguous if another edge in the profile exceeds this share of the slope.
 _SECOND_MOST: Final = 0.6
 _PARALLEL: Final = 0.26
 
@@ -62,9 +64,10 @@ class Outline:
     """An outline in cells of the relief.
 
     Attributes:
-        corners: (n, 2) column and row, the centre of the first cell at (0.5, 0.5),
-            counter-clockwise for the viewer.
-        sigma: (n,) cells, perpendicular to each side, from corner i to the next.
+        corners: (n, 2) column and row, centre of the first cell at (0.5, 0.5), counter-clockwise
+            as seen by the viewer.
+        sigma: (n,) standard deviation in cells perpendicular to each side; side i begins at corner
+            i.
         seen_share: (n,) share of each side along which the wall's face was measured.
     """
 
@@ -74,28 +77,28 @@ class Outline:
 
     @property
     def lengths(self) -> NDArray[np.float64]:
-        """Length (n,) of each side, cells."""
+        """Length (n,) of each side in cells."""
         ways = np.roll(self.corners, -1, axis=0) - self.corners
         return np.asarray(np.hypot(ways[:, 0], ways[:, 1]))
 
     @property
     def is_seen(self) -> NDArray[np.bool_]:
-        """Sides (n,) beside which the wall was measured."""
+        """Mask (n,) of sides along which the wall was measured."""
         return self.seen_share >= _BESIDE_LEAST
 
     @property
     def seen_of_all(self) -> float:
-        """Share of the whole outline beside which the wall was measured."""
+        """Share of the whole outline along which the wall was measured."""
         return float(self.lengths @ self.seen_share / self.lengths.sum())
 
 
 def outline_of(area: Area, relief: Relief, spacing_m: float) -> Outline | None:
-    """Draw the outline of an area; None if nothing is left of it.
+    """Return the outline of an area; None if fewer than three sides remain.
 
     Args:
-        area: its cells.
+        area: the area.
         relief: the relief in which it was found.
-        spacing_m: point spacing of the scan; a border can be anywhere between two points.
+        spacing_m: point spacing of the scan; the border may be anywhere between two points.
     """
     ring = _ring(area.cells)
     kept = _corner_places(ring)
@@ -115,9 +118,9 @@ def outline_of(area: Area, relief: Relief, spacing_m: float) -> Outline | None:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Side:
-    """A piece of a ring, by the indices of its ends, and the line fitted through it.
+    """A part of a ring, given by the indices of its ends, and the line fitted to it.
 
-    `middle` and `direction` are None if it is too short for a line of its own.
+    `middle` and `direction` are None if the part is too short to fit a line.
     """
 
     first: int
@@ -130,12 +133,12 @@ class _Side:
 
     @property
     def length(self) -> float:
-        """Its length, cells."""
+        """Length in cells."""
         return float(np.linalg.norm(self.end - self.begin))
 
 
 def _ring(cells: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Midpoints (n, 2) of cell sides along the border, counter-clockwise for the viewer."""
+    """Return midpoints (n, 2) of cell sides along the border, counter-clockwise for the viewer."""
     from orthoflow.files.polygons import outlines
 
     found = outlines(cells.astype(np.int16) - 1)
@@ -147,20 +150,20 @@ def _ring(cells: NDArray[np.bool_]) -> NDArray[np.float64]:
     along = np.concatenate([np.arange(count) + 0.5 for count in steps])
     unit = ways / steps[:, None]
     middles = np.repeat(ring, steps, axis=0) + along[:, None] * np.repeat(unit, steps, axis=0)
-    # Rows count down, so that a positive area is clockwise for the viewer.
+    # Rows increase downwards, so a positive area is clockwise for the viewer.
     return np.asarray(middles[::-1] if signed_area(middles) > 0.0 else middles, dtype=np.float64)
 
 
 def _corner_places(ring: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the indices of a ring at which it turns (Douglas and Peucker)."""
+    """Return the indices of the corners of a ring (Douglas and Peucker)."""
     import cv2
 
-    # Half cells are exact as integers, by which the corners are found again.
+    # Doubled coordinates are integers, with which the corners are looked up.
     doubled = np.rint(2.0 * ring).astype(np.int32)
     simple = cv2.approxPolyDP(doubled[:, None, :], 2.0 * _STRAIGHT_CELLS, closed=True)[:, 0]
     place_of = {(int(x), int(y)): place for place, (x, y) in enumerate(doubled)}
     kept = sorted(place_of[(int(x), int(y))] for x, y in simple)
-    # The point at which the algorithm starts is kept, although it need not be a corner.
+    # The algorithm always keeps its starting point, which may not be a corner.
     for place in list(kept):
         at = kept.index(place)
         before, after = ring[kept[at - 1]], ring[kept[(at + 1) % len(kept)]]
@@ -174,7 +177,7 @@ def _corner_places(ring: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _without_short_cuts(sides: list[_Side]) -> list[_Side]:
-    """Drop short sides that only cut the corner in which their neighbours meet."""
+    """Drop short sides that only cut off the corner at which their neighbours meet."""
     kept = list(sides)
     for side in sides:
         at = kept.index(side)
@@ -188,7 +191,7 @@ def _without_short_cuts(sides: list[_Side]) -> list[_Side]:
 
 
 def _side(ring: NDArray[np.float64], first: int, last: int) -> _Side:
-    """Fit a line through the midpoints between two corners, without outliers."""
+    """Fit a line to the midpoints between two corners, and reject outliers."""
     along = ring[first : last + 1] if first <= last else np.vstack([ring[first:], ring[: last + 1]])
     begin, end = along[0], along[-1]
     length = float(np.linalg.norm(end - begin))
@@ -220,7 +223,7 @@ def _side(ring: NDArray[np.float64], first: int, last: int) -> _Side:
 
 
 def _joined(ring: NDArray[np.float64], sides: list[_Side]) -> list[_Side]:
-    """Join two sides between which the outline hardly turns."""
+    """Join neighbouring sides that are nearly collinear."""
     joined = list(sides)
     while len(joined) > 3:
         corners = _corners(joined)
@@ -238,12 +241,12 @@ def _joined(ring: NDArray[np.float64], sides: list[_Side]) -> list[_Side]:
 
 
 def _corners(sides: list[_Side]) -> NDArray[np.float64]:
-    """Return the corners (n, 2) at which sides begin."""
+    """Return the corners (n, 2) at which the sides begin."""
     return np.array([_corner(sides[k - 1], sides[k]) for k in range(len(sides))])
 
 
 def _corner(before: _Side, after: _Side) -> NDArray[np.float64]:
-    """Return where two sides meet, close to the corner of the cells."""
+    """Return the intersection of two sides if it is close to the corner of the cells."""
     met = _meeting(before, after)
     if met is not None and np.linalg.norm(met - after.begin) <= _FITTED_CELLS:
         return met
@@ -267,7 +270,7 @@ def _meeting(first: _Side, second: _Side) -> NDArray[np.float64] | None:
 
 
 def _sigma(side: _Side, spacing: float) -> float:
-    """Sigma of a side: of a cell, of the points, which may run along it, and of its scatter."""
+    """Return the sigma of a side, from the cells, the point spacing and its scatter."""
     scatter = side.scatter
     if side.middle is not None:
         scatter /= math.sqrt(max(1.0, side.length / spacing))
@@ -283,7 +286,7 @@ def _seen_shares(corners: NDArray[np.float64], is_face: NDArray[np.bool_]) -> ND
         length = float(np.linalg.norm(way))
         if length <= 0.0:
             continue
-        # Counter-clockwise for the viewer with rows downwards: outside is to the right.
+        # The outline is counter-clockwise for the viewer, so the outside is to the right.
         outwards = np.array([-way[1], way[0]]) / length
         at = begin + ((np.arange(math.ceil(length)) + 0.5) / math.ceil(length))[:, None] * way
         found = np.zeros(len(at), dtype=np.bool_)
@@ -298,14 +301,14 @@ def _seen_shares(corners: NDArray[np.float64], is_face: NDArray[np.bool_]) -> ND
 def moved_to_edges(
     outline: Outline, grey: NDArray[np.float32]
 ) -> tuple[Outline, NDArray[np.bool_]]:
-    """Move each long side that was seen to the matching edge of the picture, if unambiguous.
+    """Move each long, measured side to the corresponding edge of the picture, if unambiguous.
 
     Args:
-        outline: in cells of the picture.
-        grey: (rows, cols) 0..255, NaN where nothing is shown.
+        outline: the outline, in cells of the picture.
+        grey: (rows, cols) grey values 0..255, NaN where unknown.
 
     Returns:
-        The outline, and (n,) which sides the picture placed.
+        The outline, and a mask (n,) of the sides that were moved.
     """
     count = len(outline.corners)
     shifts, sigma = np.zeros(count), outline.sigma.copy()
@@ -325,7 +328,7 @@ def moved_to_edges(
 def _edge(
     grey: NDArray[np.float32], begin: NDArray[np.float64], end: NDArray[np.float64]
 ) -> tuple[float, float] | None:
-    """Return how far outwards a side's edge is in the picture, and its sigma, in cells."""
+    """Return the outward offset of a side's edge in the picture, and its sigma, in cells."""
     import cv2
 
     way = end - begin
@@ -357,14 +360,14 @@ def _edge(
             found.append(_STEP_CELLS * _middle(slopes, top))
     if len(found) < _PIECES_LEAST:
         return None
-    # Slopes are half a cell inwards of the first offset.
+    # A slope is at the middle of the cell over which it is computed.
     place = float(np.median(found)) - _REACH_CELLS + 0.5
     spread = float(np.std(found, ddof=1)) / np.sqrt(len(found))
     return place, float(np.hypot(_SIGMA_LEAST_CELLS, spread))
 
 
 def _slopes(profiles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the change of the mean profile over a cell, at the middle of each."""
+    """Return the changes of the mean profile over one cell, at the middle of the cell."""
     mean = profiles.mean(axis=0)
     apart = round(1.0 / _STEP_CELLS)
     slopes: NDArray[np.float64] = mean[apart:] - mean[:-apart]
@@ -372,7 +375,7 @@ def _slopes(profiles: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _middle(slopes: NDArray[np.float64], top: int) -> float:
-    """Return the position of an edge: the centroid of its slopes."""
+    """Return the position of an edge, the centroid of its slopes."""
     is_low = slopes < _EDGE_SHARE * slopes[top]
     before = np.flatnonzero(is_low[:top])
     behind = np.flatnonzero(is_low[top:])
@@ -383,7 +386,7 @@ def _middle(slopes: NDArray[np.float64], top: int) -> float:
 
 
 def _shifted(corners: NDArray[np.float64], shifts: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the corners after each side moved outwards."""
+    """Return the corners after each side has been moved outwards."""
     ways = np.roll(corners, -1, axis=0) - corners
     along = ways / np.linalg.norm(ways, axis=1, keepdims=True)
     outwards = np.column_stack([-along[:, 1], along[:, 0]])
@@ -391,7 +394,7 @@ def _shifted(corners: NDArray[np.float64], shifts: NDArray[np.float64]) -> NDArr
     for corner in range(len(corners)):
         pair = [corner - 1, corner]
         rows = outwards[pair]
-        # A corner between sides that form one line moves with their mean.
+        # A corner between nearly parallel sides is moved by their mean.
         if abs(float(np.linalg.det(rows))) < _PARALLEL:
             moved[corner] += (shifts[pair] @ rows) / 2.0
         else:

@@ -1,4 +1,4 @@
-"""Building a scene out of rectangles: walls with relief and recesses."""
+"""Construction of scenes from rectangles: walls with relief and recesses."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from orthoflow.geometry import Plane
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
 
-# In rectangle or wall coordinates: a_min, a_max, b_min, b_max, metres.
+# a_min, a_max, b_min, b_max in rectangle or wall coordinates, metres.
 Extent = tuple[float, float, float, float]
 
 
@@ -22,12 +22,12 @@ class Paint:
     """A texture with its parameters.
 
     Attributes:
-        kind: pattern.
+        kind: kind of pattern.
         rgb: ground colour, 0..255.
-        reflectance: for the laser, 0..1.
-        contrast: 0..1.
+        reflectance: laser reflectance, 0..1.
+        contrast: contrast, 0..1.
         period_m: size of the motif.
-        seed: which of the textures of its kind.
+        seed: seed that selects one of the textures of this kind.
     """
 
     kind: TextureKind
@@ -39,12 +39,12 @@ class Paint:
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """The parameters of the texture, in the order of `Scene.texture_params`."""
+        """Parameters of the texture, in the order of `Scene.texture_params`."""
         return (*self.rgb, self.reflectance, self.contrast, self.period_m, self.seed)
 
 
 class Surface(NamedTuple):
-    """One rectangle of a scene under construction: position, size and meaning."""
+    """A rectangle of a scene under construction: position, size and role."""
 
     centre: NDArray[np.float64]
     axis_a: NDArray[np.float64]
@@ -61,9 +61,9 @@ class TruePlane:
     """A plane that a detector should find.
 
     Attributes:
-        name: label.
-        plane: the plane, normal towards the room.
-        outline: (4, 3) float64 metres, a rectangle on it that contains all of its surface.
+        name: label of the plane.
+        plane: the plane, with the normal towards the room.
+        outline: (4, 3) float64 metres, a rectangle in the plane that contains its whole surface.
     """
 
     name: str
@@ -77,17 +77,17 @@ class SceneDraft:
 
     Attributes:
         surfaces: the rectangles so far.
-        planes: the true planes so far; `Surface.plane` counts in them.
+        planes: the true planes so far; `Surface.plane` is an index into them.
     """
 
     surfaces: list[Surface] = field(default_factory=list)
     planes: list[TruePlane] = field(default_factory=list)
 
     def finished(self, *, spectral_gap: float) -> Scene:
-        """Return the scene, its origin at (0, 0, 0).
+        """Return the scene, with its origin at (0, 0, 0).
 
         Args:
-            spectral_gap: 0 when the laser sees the patterns of the photos, 1 when other ones.
+            spectral_gap: 0 if the laser measures the visible patterns, 1 if different ones.
         """
         surfaces = self.surfaces
         holes = [(i, hole) for i, surface in enumerate(surfaces) for hole in surface.holes]
@@ -110,14 +110,14 @@ class SceneDraft:
 
 @dataclass(frozen=True, kw_only=True)
 class Side:
-    """A wall, floor or ceiling under construction, with coordinates of its own.
+    """A wall, floor or ceiling under construction, with its own coordinates.
 
     Attributes:
-        draft: the draft that receives the rectangles.
-        foot: (3,) point of the wall nearest to the room's origin; a = b = 0.
-        axis_a: (3,) to the right for a viewer in the room.
-        axis_b: (3,) up in the wall.
-        normal: (3,) into the room.
+        draft: the draft to which rectangles are added.
+        foot: (3,) point of the wall nearest to the room's origin, where a = b = 0.
+        axis_a: (3,) unit vector to the right for a viewer in the room.
+        axis_b: (3,) unit vector upwards in the wall.
+        normal: (3,) unit vector into the room.
     """
 
     draft: SceneDraft
@@ -144,7 +144,7 @@ class Side:
     def rims(
         self, extent: Extent, depths_m: tuple[float, float], paint: Paint, role: SurfaceRole
     ) -> None:
-        """Add the four faces that run from one depth to another along an extent's outline."""
+        """Add the four faces between two depths along the outline of an extent."""
         a0, a1, b0, b1 = extent
         low, high = min(depths_m), max(depths_m)
         for along, axis, places, ends in (
@@ -159,7 +159,7 @@ class Side:
             ]
 
     def box(self, extent: Extent, depth_m: float, paint: Paint, *, base_m: float = 0.0) -> None:
-        """Add relief that stands `depth_m` out of the depth `base_m`; none when that is zero."""
+        """Add relief that projects `depth_m` from the depth `base_m`; nothing if `depth_m` is 0."""
         if depth_m <= 0.0:
             return
         role = SurfaceRole.RELIEF if base_m >= 0.0 else SurfaceRole.RECESS
@@ -180,7 +180,7 @@ class Side:
             self.box(bar, depth_m, paint, base_m=base_m)
 
     def recess(self, extent: Extent, depth_m: float, paint: Paint, *, plane: int = -1) -> Extent:
-        """Add a recess `depth_m` behind the wall; return the hole that the wall needs."""
+        """Add a recess `depth_m` behind the wall; return the hole to cut into the wall."""
         self.place(extent, -depth_m, paint, SurfaceRole.RECESS, plane=plane)
         self.rims(extent, (-depth_m, 0.0), paint, SurfaceRole.RECESS)
         return extent
@@ -201,12 +201,12 @@ class Side:
 
 
 def wall_side(draft: SceneDraft, *, omega_deg: float, phi_deg: float, distance_m: float) -> Side:
-    """Begin a wall.
+    """Return an empty wall.
 
     Args:
-        draft: the draft that receives the rectangles.
+        draft: the draft to which rectangles are added.
         omega_deg: direction of the outward normal, as in markiewicz2015.
-        phi_deg: its inclination.
+        phi_deg: inclination of the outward normal.
         distance_m: distance of the wall from the room's origin.
     """
     omega, phi = math.radians(omega_deg), math.radians(phi_deg)
@@ -224,7 +224,7 @@ def wall_side(draft: SceneDraft, *, omega_deg: float, phi_deg: float, distance_m
 
 
 def flat_side(draft: SceneDraft, *, normal: tuple[float, float, float], height_m: float) -> Side:
-    """Begin a floor or ceiling at a height over the room's origin, normal into the room."""
+    """Return an empty floor or ceiling at a height above the room's origin, normal inwards."""
     n = np.array(normal) / np.linalg.norm(normal)
     right = np.array([1.0, 0.0, 0.0]) - n[0] * n
     right /= np.linalg.norm(right)
@@ -248,9 +248,9 @@ def add_block(
     """Add a free-standing box.
 
     Args:
-        draft: the draft that receives the rectangles.
-        base: (3,) middle of its bottom, metres.
-        yaw_deg: turn about the vertical; 0 puts the first size along x.
+        draft: the draft to which rectangles are added.
+        base: (3,) centre of its bottom, metres.
+        yaw_deg: rotation about the vertical; at 0 the length is along x.
         size_m: length, depth, height.
         paint: texture of all its faces.
     """

@@ -1,4 +1,4 @@
-"""The results of the simulation: cloud, truth and check points, and their metrics."""
+"""Results of the simulation: cloud, truth and check points, with their metrics."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ _TILE_M = 0.1
 _THUMB_PX = 300
 _FLAT: Final = "flat"
 _VERTICAL_EDGE: Final = "vertical edge"
-# The lattice of painted lines of a fresco, in periods (see `geometry.scene_rays`).
+# Spacing of the painted lines of a fresco, in periods (see `geometry.scene_rays`).
 _LATTICE: Final = 0.9
 _CLEAR_M: Final = 0.04
-# Number of its plane in `scene.plane_index`: it is built first.
+# Index of the main wall in `scene.plane_index`; it is built first.
 _MAIN_WALL: Final = 0
 _INSIDE_M: Final = 0.004
 _LIFT_M: Final = 0.01
@@ -49,8 +49,8 @@ class Delivery:
 
     Attributes:
         room: the room, in its own frame.
-        scan: the scans, in the same frame.
-        world_from_room: (3, 3) rotation; exact if it consists of zeros, ones and minus ones.
+        scan: the scans, in the room frame.
+        world_from_room: (3, 3) rotation; without rounding errors if its elements are 0, 1 or -1.
         shift_world_m: (3,) world position of the room's origin.
     """
 
@@ -61,20 +61,20 @@ class Delivery:
 
     @property
     def stations_world(self) -> NDArray[np.float64]:
-        """Station (s, 3) of each scan, metres."""
+        """Stations (s, 3) of the scans in world coordinates, metres."""
         return self.scan.stations @ self.world_from_room.T + self.shift_world_m
 
     @property
     def up_world(self) -> NDArray[np.float64]:
-        """Up (3,) in world axes."""
+        """Up direction (3,) in world axes."""
         return self.world_from_room[:, 2].copy()
 
 
 def cloud_of(delivery: Delivery) -> PointCloud:
-    """Return the cloud; a shift of the world changes its origin and its stations, nothing else."""
+    """Return the cloud; a shift of the world only changes its origin and its stations."""
     points = delivery.scan.points
     x, y, z = (
-        # Exact where axes only change places.
+        # Without rounding errors if axes are only permuted.
         np.asarray(
             sum(
                 share * axis
@@ -113,13 +113,13 @@ def truth_of(
 
     Args:
         delivery: the scanned room.
-        cloud: its points in the world.
-        shots: its photos, room frame.
-        parameters: of the simulation, for people.
+        cloud: its points in world coordinates.
+        shots: its photos, in the room frame.
+        parameters: parameters of the simulation, for information.
     """
     rectangle = delivery.scan.points.rectangle
     scene = delivery.room.scene
-    # One more entry, for spoilt points: index -2 counts from the end.
+    # An additional entry for spoilt points.
     plane_of = np.append(scene.plane_index, np.int16(-1)).astype(np.int16)
     raw = plane_of[np.where(rectangle == SPOILT, len(scene), rectangle)]
     n_points = np.bincount(raw + 1, minlength=len(delivery.room.planes) + 1)[1:]
@@ -148,7 +148,7 @@ def truth_of(
 
 
 def report_room(truth: Truth, cloud: PointCloud, ctx: StepContext) -> None:
-    """Report metrics and the true orthoimage of the main wall, which need not have most points."""
+    """Report metrics and the true orthoimage of the main wall."""
     main = truth.planes.names.index("main wall")
     ctx.metric("n_points", len(cloud), "1")
     ctx.metric("n_true_planes", len(truth.planes), "1")
@@ -167,7 +167,7 @@ def report_room(truth: Truth, cloud: PointCloud, ctx: StepContext) -> None:
 
 
 def report_photos(photos: Photos, shots: tuple[Shot, ...], ctx: StepContext) -> None:
-    """Report how the photos were taken, and show them side by side; nothing without photos."""
+    """Report metrics and a contact sheet of the photos, if there are any."""
     if not photos.photos:
         return
     ctx.metric("n_photos", len(photos.photos), "1")
@@ -195,11 +195,11 @@ def _contact_sheet(photos: Photos) -> bytes:
 
 
 def measured_step(truth: Truth, cloud: PointCloud, plane: int) -> tuple[float, float] | None:
-    """Measure the point spacing on a plane from tiles of 10 cm; None without whole tiles.
+    """Measure the point spacing on a plane from 10 cm tiles; None if no tile is fully on it.
 
     Returns:
-        The spacing in metres, as if the points formed a square grid, of which half of the wall is
-        scanned at least as finely, and nine tenths of it.
+        The spacing of a square grid with the same density, in metres: its median and its 90th
+        percentile over the wall.
     """
     frame = frame_over(truth.planes.corners[plane], truth.planes.normal[plane], gsd_m=_TILE_M)
     counts = np.zeros(frame.shape, dtype=np.int64)
@@ -208,7 +208,7 @@ def measured_step(truth: Truth, cloud: PointCloud, plane: int) -> tuple[float, f
         pixels = np.floor(frame.wall_from_world(cloud.points_world(chosen))[:, :2]).astype(int)
         inside = np.all((pixels >= 0) & (pixels < [frame.width, frame.height]), axis=1)
         np.add.at(counts, (pixels[inside, 1], pixels[inside, 0]), 1)
-    # Tiles whose neighbours all hold points are not cut by the wall's border.
+    # Tiles whose neighbours all contain points are not cut by the wall's border.
     whole = counts[binary_erosion(counts > 0, np.ones((3, 3), dtype=np.bool_))]
     if whole.size == 0:
         return None
@@ -233,7 +233,7 @@ def _true_planes(
     normals = [item.plane.normal @ turn.T for item in chosen]
     corners = []
     for item, normal in zip(chosen, normals, strict=True):
-        # The rectangle along the wall axes that contains the outline.
+        # The bounding rectangle of the outline along the wall axes.
         axes = wall_axes(normal, delivery.up_world)
         along = item.outline @ turn.T @ axes.T
         (left, low), (right, high) = along.min(axis=0), along.max(axis=0)
@@ -271,24 +271,24 @@ def _rms_m(cloud: PointCloud, planes: Planes, labels: NDArray[np.int16]) -> NDAr
             distances = Plane(
                 normal=planes.normal[index], offset_m=float(offsets[index])
             ).distances_m(points[label == index].astype(np.float64))
-            # Not as a product: the order of sums in BLAS depends on the number of threads.
+            # Not a dot product: in BLAS the order of summation depends on the number of threads.
             sums[index] += float(np.square(distances).sum())
     return np.sqrt(sums / np.maximum(planes.n_points, 1))
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Spots(Rows):
-    """Positions on rectangles: rectangle (n,), and (a, b) metres (n, 2) on it."""
+    """Positions on rectangles: rectangle (n,) and coordinates (a, b) in metres (n, 2)."""
 
     rectangle: NDArray[np.int64]
     in_rectangle: NDArray[np.float64]
 
     def moved(self, step: NDArray[np.float64]) -> _Spots:
-        """Move all positions by (2,) or each by (n, 2)."""
+        """Return positions moved by (2,), or each by its row of (n, 2)."""
         return _Spots(rectangle=self.rectangle, in_rectangle=self.in_rectangle + step)
 
     def points(self, scene: Scene) -> NDArray[np.float64]:
-        """Return points (n, 3) from the scene's origin."""
+        """Return points (n, 3) relative to the scene's origin."""
         chosen = self.rectangle
         return (
             scene.centre[chosen]
@@ -300,13 +300,13 @@ class _Spots(Rows):
 def check_points(delivery: Delivery, views: SceneCameras, *, n_most: int) -> CheckPoints:
     """Choose check points of each class on the main wall.
 
-    `flat` points are crossings of the painted lines of a fresco, with 4 cm of bare wall around;
-    `vertical edge` points are front corners of mouldings. A station sees each of them.
+    `flat` points are crossings of the painted lines of a fresco with 4 cm of plain wall around;
+    `vertical edge` points are front corners of mouldings. Each is seen from at least one station.
 
     Args:
         delivery: the scanned room.
         views: its scene, prepared for rendering.
-        n_most: maximum number of each class.
+        n_most: maximum number of points per class.
     """
     scene, stations = delivery.room.scene, np.unique(delivery.scan.stations, axis=0)
     chosen = {
@@ -341,7 +341,7 @@ def _crossings(
 
 
 def _lattice(scene: Scene, index: int) -> _Spots:
-    """Return crossings of the painted lines of a fresco."""
+    """Return the crossings of the painted lines of a fresco."""
     step = _LATTICE * scene.texture_params[index, 5]
     a0, a1, b0, b1 = scene.extent[index] / step
     a, b = np.meshgrid(np.arange(np.ceil(a0), a1), np.arange(np.ceil(b0), b1))
@@ -352,7 +352,7 @@ def _lattice(scene: Scene, index: int) -> _Spots:
 def _corners(
     scene: Scene, views: SceneCameras, stations: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return front corners of mouldings parallel to the plane."""
+    """Return the front corners of mouldings that are parallel to the wall."""
     walls = np.flatnonzero((scene.plane_index == _MAIN_WALL) & (scene.role == SurfaceRole.WALL))
     normal, foot = scene.normal[walls[0]], scene.centre[walls[0]]
     heights = (scene.centre - foot) @ normal
@@ -367,7 +367,7 @@ def _corners(
         in_rectangle=scene.extent[fronts][:, [[0, 2], [0, 3], [1, 2], [1, 3]]].reshape(-1, 2),
     )
     seen = _are_seen(scene, views, spots.moved(_INSIDE_M * inwards), stations)
-    # Where bars meet, their common corner is in the middle of a face and shows no edge.
+    # A common corner of two bars is in the middle of a face, without an edge.
     beside = spots.moved(_INSIDE_M * inwards * np.array([-1.0, 1.0]))
     return spots.points(scene)[seen & ~_are_level(scene, views, beside)]
 
@@ -375,7 +375,7 @@ def _corners(
 def _are_seen(
     scene: Scene, views: SceneCameras, spots: _Spots, stations: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Report which positions (n,) any station sees."""
+    """Return which positions (n,) are seen from any station."""
     points = spots.points(scene)
     seen = np.zeros(len(points), dtype=np.bool_)
     for station in stations:
@@ -385,7 +385,7 @@ def _are_seen(
 
 
 def _are_level(scene: Scene, views: SceneCameras, spots: _Spots) -> NDArray[np.bool_]:
-    """Report which positions (n,) have a surface at their own height, of any rectangle."""
+    """Return which positions (n,) are on a surface of the same height, of any rectangle."""
     points, normals = spots.points(scene), scene.normal[spots.rectangle]
     inwards = np.where(np.einsum("ij,ij->i", normals, points) > 0.0, -1.0, 1.0)[:, None] * normals
     hits = views.cast(points + _LIFT_M * inwards, -inwards)
@@ -393,7 +393,7 @@ def _are_level(scene: Scene, views: SceneCameras, spots: _Spots) -> NDArray[np.b
 
 
 def _spread(points: NDArray[np.float64], n_most: int) -> NDArray[np.float64]:
-    """Return points far from each other: each next one is the farthest from all."""
+    """Return points far from each other; each is the farthest from all chosen before."""
     if len(points) <= n_most:
         return points
     chosen = [0]

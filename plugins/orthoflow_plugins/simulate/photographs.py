@@ -1,6 +1,6 @@
-"""The simulated photographer: positions, camera, and the JPEG files.
+"""Simulated photography: camera positions, camera and JPEG files.
 
-Layouts are those of markiewicz2015; pictures are degraded as by lenses and sensors.
+The layouts are those of markiewicz2015; pictures are degraded as by real lenses and sensors.
 """
 
 from __future__ import annotations
@@ -33,34 +33,35 @@ if TYPE_CHECKING:
 
 PhotoLayout = Literal["none", "quick", "variant1", "variant2"]
 
-# Free of furniture and walls: along the main wall, towards it, and above the room's origin.
+# Bounds of the space free of furniture and walls, in metres from the room's origin: along the main
+# wall, towards it, and upwards.
 _FREE_LOW_M: Final = (-2.3, -1.65, -1.15)
 _FREE_HIGH_M: Final = (2.3, 1.95, 1.3)
-# Between the floor and this height furniture stands behind the middle of the room.
+# Up to this height above the room's origin, there is furniture behind the middle of the room.
 _FURNITURE_M: Final = -0.45
 _WORST_ROLL_DEG: Final = 3.0
 _UP: Final = np.array([0.0, 0.0, 1.0])
 _JPEG_QUALITY: Final = 95
-# Lowest and highest of legs and of the upper body, above the room's origin, and half widths.
+# Lower and upper end above the room's origin, and half width, of the legs and of the upper body.
 _BODY_M: Final = ((-1.45, -0.6, 0.17), (-0.6, 0.3, 0.25))
 _ABSENT: Final = 0.5
 _OF_PEOPLE: Final = (
     *("centre", "axis_a", "axis_b", "extent"),
     *("plane_index", "role", "texture", "texture_params"),
 )
-# Maximum relative error of a focal length in a file.
+# Maximum relative error of the focal length in EXIF.
 _EXIF_ERROR: Final = 0.02
-# Grey levels are about this root of the light.
+# Grey levels are approximately this root of the light intensity.
 _GAMMA: Final = 2.2
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shot:
-    """One photo to take.
+    """A photo to be taken.
 
     Attributes:
-        taken: its name, and how it is taken.
-        camera: the camera, room frame.
+        taken: its name and acquisition parameters.
+        camera: the camera, in the room frame.
     """
 
     taken: TakenPhoto
@@ -72,10 +73,10 @@ class Film:
     """The degradation of the pictures.
 
     Attributes:
-        noise_grey: standard deviation per pixel and channel.
+        noise_grey: standard deviation of the noise per pixel and channel, grey levels.
         vignetting: share of the light lost in the corners.
-        supersample: rays per side of a pixel.
-        exposures: photos get between 1 less and 1 plus this times the light.
+        supersample: number of rays per side of a pixel.
+        exposures: maximum relative deviation of the exposure of a photo.
     """
 
     noise_grey: float
@@ -90,14 +91,14 @@ def _block(
     return tuple((wall, a, b) for wall in walls for b in up for a in along)
 
 
-# Width and height of a photo on the wall, distance from it, metres; targets: number of the wall and
-# (a, b) on it.
+# Width and height of a photo on the wall and distance from it, metres; targets: number of the wall
+# and (a, b) on it.
 _LAYOUTS: Final = {
-    # Six photos of the main wall that overlap by a quarter.
+    # Six photos of the main wall with 25 % overlap.
     "quick": ((2.4, 1.8), 2.6, _block((-1.75, 0.0, 1.75), (-0.65, 0.75))),
-    # Eight photos, each of a whole wall; four walls.
+    # Eight photos of four walls, each showing a whole wall.
     "variant1": ((5.9, 3.5), 3.95, _block((-0.1, 0.1), (0.05,), range(4))),
-    # A block over the main wall: 70 % overlap along, 50 % across.
+    # A block over the main wall with 70 % overlap along the rows and 50 % between them.
     "variant2": (
         (2.4, 1.8),
         2.6,
@@ -115,17 +116,17 @@ def planned_shots(
     obliquity_deg: float,
     geometry: Geometry = DESIGNED,
 ) -> tuple[Shot, ...]:
-    """Plan the photos of a layout; the generator varies their positions.
+    """Plan the photos of a layout, with random variations of their positions.
 
-    The photographer aims at a place, but stands aside and holds the camera slightly askew. All
-    photos share one camera with Brown distortion.
+    The camera aims at a target, but is displaced sideways and slightly rotated about its axis. All
+    photos are taken with one camera with Brown distortion.
 
     Args:
-        layout: which walls, and how many photos.
-        rng: draws lens and positions.
-        gsd_m: side of a pixel on the wall.
-        obliquity_deg: largest intended angle between optical axis and wall normal.
-        geometry: where the walls stand.
+        layout: the layout of the photos.
+        rng: random generator of lens and positions.
+        gsd_m: pixel size on the wall.
+        obliquity_deg: maximum intended angle between optical axis and wall normal.
+        geometry: positions of the walls.
     """
     if layout == "none":
         return ()
@@ -175,14 +176,14 @@ def planned_shots(
 def with_passers_by(
     scene: Scene, n_photos: int, count: int, rng: np.random.Generator
 ) -> tuple[Scene, ...]:
-    """Return the scene of each photo, with people in front of the main wall, if any.
+    """Return the scene of each photo with people in front of the main wall; empty without people.
 
-    Each person is in every other photo, somewhere along the wall and 0.5 to 1.4 m in front of it,
-    in the same clothes.
+    Each person appears in about half of the photos, chosen at random, 0.5 to 1.4 m in front of the
+    wall and always in the same clothes.
     """
     if not count:
         return ()
-    # From a random stream of their own: without people photos are unchanged.
+    # A separate random stream, so that people do not change the other random numbers.
     drawn = rng.spawn(1)[0]
     clothes = drawn.uniform(15.0, 240.0, (count, 2, 3))
     along, towards = main_wall_axes()
@@ -230,13 +231,13 @@ def take_photos(
         shots: the photos.
         film: their degradation.
         ctx: context of the step.
-        rng: generator of all noise.
-        intrinsics: what is known of their camera.
+        rng: random generator of all noise.
+        intrinsics: known calibration of the camera, or None.
     """
     if not shots:
         return Photos(photos=())
     exif_focal = shots[0].camera.fx * (1.0 + rng.uniform(-_EXIF_ERROR, _EXIF_ERROR))
-    # From a random stream of their own: photos of equal exposure are unchanged.
+    # A separate random stream, so that exposures do not change the other random numbers.
     light = 1.0 + film.exposures * rng.spawn(1)[0].uniform(-1.0, 1.0, len(shots))
     photos = []
     for place, shot in enumerate(shots):
@@ -264,10 +265,10 @@ def true_cameras(
     world_from_room: NDArray[np.float64],
     shift_world_m: NDArray[np.float64],
 ) -> Cameras:
-    """Return the true orientations in the world.
+    """Return the true orientations in world coordinates.
 
     Args:
-        shots: the photos, room frame.
+        shots: the photos, in the room frame.
         world_from_room: (3, 3) rotation.
         shift_world_m: (3,) world position of the room's origin.
     """
@@ -287,7 +288,7 @@ def true_cameras(
 
 
 def place_to_stand(wanted: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the position nearest to a given one (3,) inside the room and outside the furniture."""
+    """Return the free position in the room that is nearest to a given position (3,)."""
     axes = np.vstack([main_wall_axes(), _UP])
     place = np.clip(axes @ wanted, _FREE_LOW_M, _FREE_HIGH_M)
     if place[1] < -0.35 or place[1] > 1.2:
@@ -298,7 +299,7 @@ def place_to_stand(wanted: NDArray[np.float64]) -> NDArray[np.float64]:
 def _developed(
     image: NDArray[np.float32], film: Film, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Darken towards the corners, add noise, and round to grey levels."""
+    """Apply vignetting, add noise, and round to grey levels."""
     height, width = image.shape[:2]
     rows = (np.arange(height, dtype=np.float32) + 0.5) / height - 0.5
     columns = (np.arange(width, dtype=np.float32) + 0.5) / width - 0.5

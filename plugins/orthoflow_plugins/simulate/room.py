@@ -1,4 +1,4 @@
-"""`simulate.room`: a scanned palace room with complete truth."""
+"""`simulate.room`: a simulated, scanned and photographed palace room with its truth."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from orthoflow_plugins.simulate.room_model import (
 SpectralGap = Literal["none", "easy", "hard", "inverted"]
 
 _PANORAMA_FACTOR: Final = 3.0
-# Share of what the laser sees that has a pattern of its own.
+# Share of the laser's pattern that differs from the visible pattern.
 _SPECTRAL_GAPS: Final[Mapping[SpectralGap, float]] = {
     "none": 0.0,
     "easy": 0.3,
@@ -51,15 +51,16 @@ _SPECTRAL_GAPS: Final[Mapping[SpectralGap, float]] = {
 class SimulateRoom(Method):
     """Scan and photograph a decorated room with relief, niche, door and a free-standing object.
 
-    Two scans per station: a panorama, and a detail scan of the main wall. Points come scan by scan,
-    column by column, from the lowest row up. The noise of distances depends on range, incidence and
-    material; some points are gross outliers, and at edges the distances of two surfaces mix. All
-    noise is a function of the seed and the position in the scan, so it does not depend on threads.
+    There are two scans per station: a panorama and a detail scan of the main wall. Points are
+    ordered by scan, then by column, then by row from the lowest up. The noise of a distance depends
+    on range, incidence angle and material; some points are gross outliers, and at edges the
+    distances of two surfaces are mixed. All noise is a function of the seed and the position in the
+    scan, so it does not depend on threads.
 
-    Photos come from one free-hand camera with Brown distortion, slightly off target and askew, as
-    JPEG files in the sRGB colours of the scene. `photos` is empty for `photo_layout: none`,
-    `calibration` is empty if the camera is not calibrated; the focal length in the EXIF data, wrong
-    by up to 2 %, is known in any case.
+    Photos are taken with one hand-held camera with Brown distortion, slightly off target and
+    rotated, as JPEG files in the sRGB colours of the scene. `photos` is empty for `photo_layout:
+    none`, and `calibration` is empty if the camera is not calibrated. The EXIF focal length, with
+    an error of up to 2 %, is always known.
     """
 
     id: ClassVar[str] = "simulate.room"
@@ -81,7 +82,7 @@ class SimulateRoom(Method):
     )
 
     class Params(MethodParams):
-        """How the room is scanned and photographed, and where it is in the world."""
+        """Parameters of the room, its position in the world, the scans and the photos."""
 
         scan_step_m: float = Field(
             0.0042,
@@ -257,7 +258,7 @@ class SimulateRoom(Method):
         """No inputs."""
 
     class Out(Ports):
-        """The scan, the photos, and the truth about them; `cameras` are the true ones."""
+        """The scan, the photos and their truth; `cameras` are the true orientations."""
 
         cloud: PointCloud
         photos: Photos
@@ -268,7 +269,7 @@ class SimulateRoom(Method):
 
     @classmethod
     def tools(cls) -> Mapping[str, str]:
-        """Versions of the compiler, whose functions compute the points, and of the JPEG writer."""
+        """Numba and NumPy for the points, OpenCV for the JPEG files."""
         return {name: version(name) for name in ("numba", "numpy", "opencv-python-headless")}
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
@@ -291,7 +292,7 @@ class SimulateRoom(Method):
         )
 
         scan_rng, photo_rng, wall_rng = ctx.rng.spawn(3)
-        # Of a stream of its own: noise and photos are those of the room as designed.
+        # A separate random stream, so that noise and photos are those of the designed room.
         place_rng = ctx.rng.spawn(1)[0]
         if params.design_seed is not None:
             wall_rng = np.random.default_rng(params.design_seed)
@@ -379,7 +380,7 @@ class SimulateRoom(Method):
 
 
 def _turn_about_up(turn_deg: float) -> NDArray[np.float64]:
-    """Return the (3, 3) rotation about the room's z; exactly the unit matrix without rotation."""
+    """Return the (3, 3) rotation about the room's z axis; exactly the identity for 0 degrees."""
     if turn_deg == 0.0:
         return np.eye(3)
     cosine, sine = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))

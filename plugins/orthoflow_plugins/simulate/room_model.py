@@ -1,8 +1,9 @@
-"""The simulated room: four decorated walls, none quite perpendicular to the next, and objects.
+"""The simulated room: four decorated walls that are not exactly perpendicular, and objects.
 
-Room frame: metres, z up, origin in the middle of the room 1.5 m above the floor. The main wall is
-that of markiewicz2015: omega 102 deg, leaning by 0.8 deg. Other rooms have walls drawn from a
-family: cornices, pilasters, niches, panels, and recessed doors; where all planes lie may be drawn.
+The room frame is in metres, z up, with the origin in the middle of the room 1.5 m above the floor.
+The main wall is that of markiewicz2015: omega 102 deg, inclined by 0.8 deg. Alternatively, walls
+are generated at random, with cornices, pilasters, niches, panels and recessed doors; the positions
+of all planes can be random as well.
 """
 
 from __future__ import annotations
@@ -31,22 +32,22 @@ from orthoflow_plugins.simulate.building import (
 FLOOR_M: Final = -1.5
 CEILING_M: Final = 1.6
 _MAIN_OMEGA_DEG: Final = 102.0
-# Ranges of where the planes of a drawn geometry lie, degrees and metres: hidden parts of surfaces
-# reach beyond the corners of every such room.
+# Ranges of the plane positions in a random geometry, in degrees and metres; small enough that
+# surfaces extend beyond the corners of every such room.
 _DRAWN_OMEGA_DEG: Final = 0.5
 _DRAWN_PHI_DEG: Final = 1.0
 _DRAWN_DISTANCE_M: Final = 0.08
 _DRAWN_SLOPE: Final = 0.008
-# The floor only rises, so that furniture stands on it.
+# The floor is only raised, so that there is no gap below the furniture.
 _DRAWN_FLOOR_M: Final = (0.03, 0.07)
 _DRAWN_CEILING_M: Final = (-0.05, 0.05)
-# Visible area of the main wall, and the share of textile on it: at most, and by design.
+# Visible area of the main wall, and its textile share: maximum and in the designed room.
 _MAIN_WALL_M2: Final = 16.7
 MOST_TEXTILE: Final = 0.35
 TEXTILE_BY_DESIGN: Final = 0.095
 
 _UP: Final = np.array([0.0, 0.0, 1.0])
-# Walls extend slightly past the corners of the room, where others hide them.
+# Walls extend slightly beyond the corners of the room, where other walls hide them.
 _FULL: Final[Extent] = (-2.9, 2.9, FLOOR_M - 0.1, CEILING_M + 0.1)
 
 STUCCO: Final = Paint(TextureKind.PLAIN, (214, 206, 190), 0.7, 0.18, seed=11)
@@ -55,7 +56,8 @@ OAK: Final = Paint(TextureKind.WOOD, (132, 92, 58), 0.35, 0.4, 0.12, 13)
 _DARK: Final = Paint(TextureKind.PLAIN, (92, 88, 84), 0.2, 0.4, seed=14)
 _OBJECT: Final = Paint(TextureKind.TILES, (38, 96, 160), 0.3, 0.5, 0.09, 15)
 _DAMASK: Final = Paint(TextureKind.TEXTILE, (150, 62, 58), 0.4, period_m=0.15, seed=102)
-# Walls: name; ground and from corner to corner of a drawn one; ground of the designed one.
+# Walls: name; ground and extent from corner to corner of a random wall; ground of the designed
+# wall.
 _WALLS: Final = (
     (
         "main wall",
@@ -87,16 +89,17 @@ _LEVELS: Final = (
     ("floor", Paint(TextureKind.TILES, (150, 138, 122), 0.35, period_m=0.35, seed=501)),
     ("ceiling", Paint(TextureKind.FRESCO, (206, 206, 210), 0.8, period_m=0.5, seed=502)),
 )
-# Furniture of the room as designed: along the main wall and towards it, turn, size and paint. The
-# first is a screen 0.6 m in front of the main wall; no face is parallel to a wall.
+# Furniture: position along the main wall and towards it, rotation, size and paint. The first object
+# is a screen 0.6 m in front of the main wall; no face is parallel to a wall.
 _FURNITURE: Final = (
     (0.1, 1.78, 6.0, (0.9, 0.1, 1.3), _OBJECT),
     (2.3, -0.9, -4.0, (0.5, 0.9, 0.75), OAK),
     (-0.2, -1.3, 20.0, (0.8, 0.5, 0.7), _DARK),
 )
-# How far drawn objects extend behind the adjoining walls, the floor and the ceiling.
+# Distance by which random objects extend behind adjoining walls, floor and ceiling.
 _BEYOND_M: Final = 0.1
-# A bay narrower than this stays bare, and so does the wall beside and above what is in it.
+# Bays narrower than the first value remain empty; the second is the margin on both sides of
+# objects.
 _BAY_LEAST_M: Final = 0.7
 _BESIDE_M: Final = 0.12
 _PLAQUE_GAP_M: Final = 0.1
@@ -105,13 +108,13 @@ _PLAQUE_TRIES: Final = 40
 
 @dataclass(frozen=True, kw_only=True)
 class Geometry:
-    """Where the planes of a room lie, in its frame.
+    """Positions of the planes of a room, in its frame.
 
     Attributes:
-        walls: omega and phi in degrees and distance in metres of the main wall, the one opposite,
-            the right and the left one.
-        floor: normal and height of the floor; ceiling likewise.
-        ceiling: see floor.
+        walls: omega and phi in degrees and distance in metres of the main, opposite, right and left
+            wall.
+        floor: normal and height of the floor.
+        ceiling: normal and height of the ceiling.
     """
 
     walls: tuple[tuple[float, float, float], ...] = (
@@ -125,7 +128,7 @@ class Geometry:
 
     @classmethod
     def drawn(cls, rng: np.random.Generator) -> Geometry:
-        """Draw a room about as large as the designed one, with planes in other places."""
+        """Return a random room about as large as the designed one, with other plane positions."""
 
         def about(value: float, width: float) -> float:
             return value + float(rng.uniform(-width, width))
@@ -147,7 +150,7 @@ class Geometry:
         )
 
     def sides(self, draft: SceneDraft) -> list[Side]:
-        """Begin the main wall, the one opposite, the right and the left one."""
+        """Return the empty main, opposite, right and left wall."""
         return [
             wall_side(draft, omega_deg=omega_deg, phi_deg=phi_deg, distance_m=distance_m)
             for omega_deg, phi_deg, distance_m in self.walls
@@ -159,10 +162,10 @@ DESIGNED: Final = Geometry()
 
 @dataclass(frozen=True, kw_only=True)
 class Room:
-    """The room as built.
+    """The finished room.
 
     Attributes:
-        scene: its surfaces, in the room frame; `scene.plane_index` counts in `planes`.
+        scene: its surfaces, in the room frame; `scene.plane_index` is an index into `planes`.
         planes: planes that a detector should find, clipped to the room.
     """
 
@@ -183,13 +186,13 @@ def build_room(
     """Build the room.
 
     Args:
-        rng: draws the four walls from a family; without it they are as designed.
-        relief: scale of all mouldings, 1 = as designed (up to 15 cm).
-        obstacle: an object stands free in front of the main wall.
-        spectral_gap: 0 when the laser sees the painted patterns, 1 when others.
+        rng: random generator of the four walls; None for the designed walls.
+        relief: scale of all mouldings; 1 for the designed size (up to 15 cm).
+        obstacle: whether a free-standing object is in front of the main wall.
+        spectral_gap: 0 if the laser measures the painted patterns, 1 if different ones.
         textile_share: share of the main wall covered by one repeated motif, at most `MOST_TEXTILE`.
-        n_plaques: plaques on a drawn main wall, at most.
-        geometry: where its planes lie.
+        n_plaques: maximum number of plaques on a random main wall.
+        geometry: positions of its planes.
     """
     draft = SceneDraft()
     sides = geometry.sides(draft)
@@ -197,7 +200,7 @@ def build_room(
         for number, side in enumerate(sides):
             _build_wall(side, number, relief, [] if number else _cloths(textile_share))
     else:
-        # Of streams of their own: walls with and without cloth or plaques are otherwise the same.
+        # Separate random streams, so that cloth and plaques do not change the rest of the walls.
         cloth_rng, plaque_rng = rng.spawn(2)
         cloth = _drawn_cloth(textile_share, cloth_rng)
         for side, (name, ground, span, _) in zip(sides, _WALLS, strict=True):
@@ -219,15 +222,15 @@ def build_room(
 
 
 def main_wall_axes() -> NDArray[np.float64]:
-    """Horizontal directions (2, 3): along the main wall to the viewer's right, and towards it."""
+    """Return horizontal unit vectors (2, 3): rightwards along the main wall, and towards it."""
     omega = math.radians(_MAIN_OMEGA_DEG)
     return np.array(
         [[math.sin(omega), -math.cos(omega), 0.0], [math.cos(omega), math.sin(omega), 0.0]]
     )
 
 
-# A moulding: extent, width of the bars of a frame (0: solid), height, paint, and on which depth.
-# A recess: name if it is a plane of its own, extent, depth, and paint unless the wall's.
+# A moulding: extent, width of the bars of a frame (0: solid), height, paint, and depth of its base.
+# A recess: name if it is a separate plane, extent, depth, and paint (None for that of the wall).
 Moulding = tuple[Extent, float, float, Paint, float]
 Recess = tuple[str, Extent, float, Paint | None]
 
@@ -248,7 +251,7 @@ _CORNICE: Final[tuple[Moulding, ...]] = (
     ((-2.9, 2.9, 1.3, CEILING_M + 0.1), 0.0, 0.08, STUCCO, 0.0),
     ((-2.9, 2.9, 1.44, CEILING_M + 0.1), 0.0, 0.15, GILT, 0.0),
 )
-# The walls as designed, in the order of `_WALLS`.
+# The designed walls, in the order of `_WALLS`.
 _DESIGNS: Final[tuple[tuple[tuple[Recess, ...], tuple[Moulding, ...]], ...]] = (
     (
         (
@@ -292,7 +295,7 @@ def _build_wall(
     relief: float,
     cloths: list[Extent],
 ) -> None:
-    """Build a wall as designed."""
+    """Build a designed wall."""
     name, _, _, ground = _WALLS[number]
     recesses, mouldings = _DESIGNS[number]
     plane = wall.true_plane(name, _FULL)
@@ -320,7 +323,7 @@ def _build_wall(
 
 
 def _cloths(share: float) -> list[Extent]:
-    """Cover a share of the main wall with cloth: the panel in the middle first, then beside it."""
+    """Return extents of cloth for a share of the main wall: the middle first, then beside it."""
     middle: Extent = (-0.73, 0.83, -1.3, 1.3)
     by_design: Extent = (-0.45, 0.65, -0.45, 1.0)
     beside: list[Extent] = [
@@ -344,7 +347,7 @@ def _cloths(share: float) -> list[Extent]:
 
 
 def _grown(small: Extent, large: Extent, area_m2: float) -> Extent:
-    """Shrink the small rectangle about its middle, or grow it towards the large one."""
+    """Return a rectangle of a given area, from the small one scaled or grown to the large one."""
     one, other = np.array(small), np.array(large)
     full = _area_m2(small)
     if area_m2 <= full:
@@ -366,7 +369,7 @@ def _area_m2(extent: Sequence[float]) -> float:
 
 
 def _clipped(planes: list[TruePlane]) -> tuple[TruePlane, ...]:
-    """Cut each outline to the room; return the smallest upright rectangle of what remains."""
+    """Clip each outline to the room; return the bounding upright rectangles of the results."""
     bounds = [item.plane for item in planes if not item.name.startswith(("niche", "door"))]
     return tuple(
         TruePlane(name=item.name, plane=item.plane, outline=_visible_rectangle(item, bounds))
@@ -415,20 +418,20 @@ def draw_wall(
     relief: float = 1.0,
     cloth: Extent | None = None,
 ) -> list[Extent]:
-    """Build a wall with relief up to 0.3 m in front of it and recesses up to 0.45 m behind it.
+    """Build a random wall with relief up to 0.3 m and recesses up to 0.45 m deep.
 
     Returns the extents of its recesses.
 
-    Niches and doors are registered as planes of their own.
+    Niches and doors are registered as separate planes.
 
     Args:
         wall: the wall.
-        name: of its plane.
-        ground: texture of the wall itself, and of its niches.
-        span: from the one adjoining wall to the other, metres.
-        rng: draws the objects.
+        name: name of its plane.
+        ground: texture of the wall and its niches.
+        span: positions of the two adjoining walls, metres.
+        rng: random generator of the objects.
         relief: scale of all relief.
-        cloth: extent of a cloth with a repeated motif; openings in the wall open it too.
+        cloth: extent of a cloth with a repeated motif; openings of the wall are cut out of it, too.
     """
     plane = wall.true_plane(name, _FULL)
     top_m = _draw_cornice(wall, relief, rng)
@@ -451,7 +454,7 @@ def _draw_plaques(
     relief: float,
     rng: np.random.Generator,
 ) -> None:
-    """Fix plaques to a wall beside its recesses; one that finds no place is left out."""
+    """Add plaques to a wall beside its recesses, as many as there is room for."""
     taken = list(holes)
     for _ in range(n_plaques):
         for _ in range(_PLAQUE_TRIES):
@@ -475,7 +478,7 @@ def _overlap(one: Extent, other: Extent) -> bool:
 
 
 def _drawn_cloth(share: float, rng: np.random.Generator) -> Extent | None:
-    """Hang one cloth over a share of the main wall, anywhere on it; None hangs none."""
+    """Return a random extent of cloth for a share of the main wall; None if the share is 0."""
     if share <= 0.0:
         return None
     a0, a1 = _WALLS[0][2]
@@ -486,7 +489,7 @@ def _drawn_cloth(share: float, rng: np.random.Generator) -> Extent | None:
 
 
 def _draw_cornice(wall: Side, relief: float, rng: np.random.Generator) -> float:
-    """Build up to three steps under the ceiling, or none; return where they begin."""
+    """Build a cornice of up to three steps; return the height at which it begins."""
     n_steps = int(rng.integers(0, 4))
     height_m, depth_m = rng.uniform(0.12, 0.45), relief * rng.uniform(0.06, 0.3)
     for step in range(n_steps):
@@ -499,7 +502,7 @@ def _draw_cornice(wall: Side, relief: float, rng: np.random.Generator) -> float:
 def _draw_pilasters(
     wall: Side, span: tuple[float, float], top_m: float, relief: float, rng: np.random.Generator
 ) -> list[tuple[float, float]]:
-    """Build pilasters, maybe in the corners too, and a skirting; return the bays between them."""
+    """Build pilasters and skirting boards; return the bays between the pilasters."""
     a0, a1 = span
     n_inner, is_cornered = int(rng.integers(0, 4)), bool(rng.random() < 0.5)
     width_m, depth_m = rng.uniform(0.16, 0.4), relief * rng.uniform(0.03, 0.2)
@@ -525,7 +528,7 @@ def _draw_pilasters(
 def _draw_bay(
     wall: Side, name: str, bay: Extent, ground: Paint, relief: float, rng: np.random.Generator
 ) -> list[Extent]:
-    """Build a niche, a door, a panel or nothing between two pilasters; return the wall's holes."""
+    """Build a niche, a door, a panel or nothing in a bay; return the holes of the wall."""
     left, right, floor_m, top_m = bay
     kind = str(rng.choice(["niche", "door", "panel", "bare"]))
     width_m = min(rng.uniform(0.6, 1.3), right - left - 2.0 * _BESIDE_M)

@@ -1,11 +1,12 @@
 """The simulated scanner: stations, scan patterns, measurements and their errors.
 
-Noise depends only on the position in the grid of angles, so it does not depend on threads.
+Noise depends only on the position in the angular grid, so it does not depend on threads.
 
-The laser does not see a material as the eye does. Red lead, gold, wet plaster and retouchings
-change order between the laser's one wavelength and the three broad bands of a camera. Per material,
-reflectance falls with red and rises with green, each by a gain and a power of its own; wet patches
-are darker, retro-reflecting spots blind the detector.
+A laser measures other reflectances than a camera. Which of red lead, gold, wet plaster and
+retouchings is brighter differs between the laser's single wavelength and the three broad bands of a
+camera. In the simulation, reflectance decreases with red and increases with green, each with a gain
+and a power that depend on the material; wet patches are darker, and retro-reflecting spots saturate
+the detector.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ from orthoflow.geometry.threads import in_runs
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.simulate.room_model import main_wall_axes
 
-# `Scanned.rectangle` of a ray without a hit, and of a gross outlier or a mixed distance.
+# Values of `Scanned.rectangle` for a ray without a hit, and for a gross outlier or mixed distance.
 _MISSED: Final = -1
 SPOILT: Final = -2
 _TURN: Final = 2.0 * np.pi
 
-# Arrays of a cloud: of what is measured (`Scanned`), and of its places in the grids.
+# Arrays of a cloud: the measurements (`Scanned`), and their positions in the scan grids.
 _MEASURED: Final = (
     ("x", np.float32),
     ("y", np.float32),
@@ -42,21 +43,21 @@ _MEASURED: Final = (
 )
 _PLACES: Final = (("scan", np.uint16), ("row", np.uint32), ("column", np.uint32))
 
-# No scan of the zenith: its points would crowd the ceiling above the station.
+# The zenith is not scanned, since its points would be too dense on the ceiling above the station.
 LOWEST_ELEVATION_DEG: Final = -62.0
 HIGHEST_ELEVATION_DEG: Final = 62.0
 
-# Along the main wall, towards it, and above the origin, metres; clear of all objects in the room.
+# Stations along the main wall, towards it, and above the origin, metres; away from all objects.
 _STATIONS_M: Final = (
     (-1.15, -0.10, 0.0),
     (1.20, 0.15, 0.12),
     (0.10, -0.60, -0.15),
     (0.05, 0.80, 0.20),
 )
-# Largest distance of a drawn station from there, along the same axes.
+# Maximum random displacement of a station along the same axes.
 _STATIONS_DRAWN_M: Final = (0.3, 0.3, 0.15)
-# Ranges of the values drawn per material: reflectance of black, decrease with red, increase with
-# green.
+# Ranges of the random values per material: reflectance of black, decrease with red, increase with
+# green, and their powers.
 _BLACK: Final = (0.75, 0.9)
 _RED: Final = (0.6, 0.85)
 _GREEN: Final = (0.4, 0.65)
@@ -67,7 +68,7 @@ _WET_M: Final = 0.7
 _WET_FROM: Final = 0.6
 _WET_DARKER: Final = 0.45
 _WAVES: Final = 24
-# Half the length of a room, where it is bent by the whole `bending_m`.
+# Distance from the middle at which the room is bent by `bending_m`.
 _BENT_M: Final = 5.0
 _SPOT_EVERY_M: Final = 0.4
 _SPOT_SHARE: Final = 0.05
@@ -76,16 +77,16 @@ _SPOT_RADIUS_M: Final = 0.012
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep:
-    """One scan: a station and its directions, in the room frame.
+    """A scan: a station and its directions, in the room frame.
 
     Attributes:
-        station: (3,) metres.
-        azimuth: of column 0, radians from x towards y.
-        elevation: of row 0, radians above the horizon.
-        step: between columns and between rows, radians.
+        station: (3,) position in metres.
+        azimuth: azimuth of column 0, radians from x towards y.
+        elevation: elevation of row 0, radians above the horizon.
+        step: angle between columns and between rows, radians.
         n_columns: number of columns.
         n_rows: number of rows.
-        seed: for all noise of this scan.
+        seed: seed of all noise of this scan.
     """
 
     station: NDArray[np.float64]
@@ -104,16 +105,15 @@ class Errors:
     Attributes:
         noise_m: standard deviation of a distance at 3 m, perpendicular to a plain wall.
         outlier_share: share of points at a random distance.
-        beam_m: diameter of the spot; where it falls on two surfaces the distance mixes.
+        beam_m: diameter of the laser spot; distances are mixed if it is on two surfaces.
         colour_noise: standard deviation of a colour, grey levels.
-        inversion: share of inverted contrast in what the laser sees, as in `laser_reflectance`.
-        band_seed: seed of the materials in the laser's band, and of errors that points have in
-            common.
+        inversion: share of inverted contrast in the laser reflectance, see `laser_reflectance`.
+        band_seed: seed of the laser reflectances of materials and of the common errors of points.
         registration_m: standard deviation of each coordinate of a station.
-        bending_m: how far the room's ends are bent from its middle, as by drift along a path.
-        shared_m: standard deviation of each coordinate that neighbouring points of all scans have
-            in common, as in clouds from photos.
-        shared_length_m: correlation length of that.
+        bending_m: displacement 5 m from the middle of the room, as caused by drift along a path.
+        shared_m: standard deviation, per coordinate, of errors common to neighbouring points of all
+            scans, as in clouds from photos.
+        shared_length_m: correlation length of these errors.
     """
 
     noise_m: float
@@ -133,12 +133,12 @@ class Scanned(Rows):
     """The result of a scan, one entry per ray, column by column.
 
     Attributes:
-        x: float32 metres from the room's origin; y and z likewise.
-        y: see x.
-        z: see x.
-        intensity: float32 0..1.
-        rgb: (n, 3) uint8.
-        rectangle: int32 rectangle hit, `SPOILT` or `_MISSED`.
+        x: float32 metres from the room's origin.
+        y: float32 metres from the room's origin.
+        z: float32 metres from the room's origin.
+        intensity: float32 intensity, 0..1.
+        rgb: (n, 3) uint8 colours.
+        rectangle: int32 index of the rectangle hit, `SPOILT` or `_MISSED`.
     """
 
     x: NDArray[np.float32]
@@ -151,14 +151,14 @@ class Scanned(Rows):
 
 @dataclass(frozen=True, kw_only=True)
 class Scan:
-    """Several scans one after the other.
+    """Several scans, one after the other.
 
     Attributes:
-        points: what was measured.
-        scan: (n,) number of the scan.
-        row: (n,) position in the scan's grid; column likewise.
-        column: see row.
-        stations: (s, 3) where each scan was made, room frame.
+        points: the measurements.
+        scan: (n,) index of the scan.
+        row: (n,) row in the grid of the scan.
+        column: (n,) column in the grid of the scan.
+        stations: (s, 3) station of each scan, in the room frame.
     """
 
     points: Scanned
@@ -171,13 +171,13 @@ class Scan:
 def station_positions(
     n_stations: int, rng: np.random.Generator | None = None
 ) -> NDArray[np.float64]:
-    """Return stations (s, 3) in the room frame, metres; a generator moves each a little."""
+    """Return stations (s, 3) in the room frame, metres, displaced at random if `rng` is given."""
     places = np.array(_STATIONS_M[:n_stations])
     if rng is not None:
         places += rng.uniform(-1.0, 1.0, places.shape) * _STATIONS_DRAWN_M
     along, towards = main_wall_axes()
     up = np.array([0.0, 0.0, 1.0])
-    # Not as a product of matrices, whose last digit depends on the processor.
+    # Not a matrix product, whose last digit depends on the processor.
     return np.array([a * along + t * towards + h * up for a, t, h in places])
 
 
@@ -192,16 +192,16 @@ def planned_sweeps(
 
     Args:
         stations: (s, 3) in the room frame, metres.
-        steps_m: spacing of the panorama at the foot of the perpendicular on the main wall, and of
-            the detail scan.
-        main_wall: its plane.
+        steps_m: point spacing of the panorama and of the detail scan, where the perpendicular from
+            the station meets the main wall.
+        main_wall: plane of the main wall.
         outline: (4, 3) corners of the main wall in the room frame.
         seeds: two per station.
     """
     lowest, highest = math.radians(LOWEST_ELEVATION_DEG), math.radians(HIGHEST_ELEVATION_DEG)
     _, towards = main_wall_axes()
     forward = math.atan2(towards[1], towards[0])
-    # Along the edges too: seen from below, the middle of an upper edge is higher than its ends.
+    # Points along the edges, too: the middle of an upper edge appears higher than its ends.
     shares = np.linspace(0.0, 1.0, 33)[:, None]
     rim = np.concatenate(
         [a + shares * (b - a) for a, b in zip(outline, np.roll(outline, -1, 0), strict=True)]
@@ -219,7 +219,7 @@ def planned_sweeps(
             n_rows=max(1, math.floor((highest - lowest) / coarse)),
             seed=int(seeds[2 * index]),
         )
-        # The smallest window of angles that contains the main wall.
+        # The smallest angular window that contains the main wall.
         rays = rim - station
         azimuths = np.arctan2(rays[:, 1], rays[:, 0]) - forward
         azimuths = (azimuths + math.pi) % (2.0 * math.pi) - math.pi
@@ -238,7 +238,7 @@ def planned_sweeps(
 
 
 def scan_scene(scene: Scene, sweeps: list[Sweep], errors: Errors, ctx: StepContext) -> Scan:
-    """Scan a scene whose origin is the room's; rays without a hit are left out."""
+    """Scan a scene whose origin is that of the room; rays without a hit are dropped."""
     scanner = Scanner(scene, errors)
     starts = np.concatenate([[0], np.cumsum([sweep.n_columns * sweep.n_rows for sweep in sweeps])])
     arrays = {
@@ -262,7 +262,7 @@ def scan_scene(scene: Scene, sweeps: list[Sweep], errors: Errors, ctx: StepConte
         )
     places = {name: arrays[name] for name, *_ in _PLACES}
     hit = points.rectangle != _MISSED
-    # A closed room has none without: then nothing is copied.
+    # In a closed room all rays hit a surface, and copying is avoided.
     if not bool(hit.all()):
         points, places = points.take(hit), {name: values[hit] for name, values in places.items()}
     stations = np.array([sweep.station for sweep in sweeps])
@@ -273,7 +273,7 @@ class Scanner:
     """Scans a scene.
 
     Args:
-        scene: the scene, its origin at (0, 0, 0).
+        scene: the scene, with its origin at (0, 0, 0).
         errors: errors of the scanner.
     """
 
@@ -285,12 +285,12 @@ class Scanner:
         self._scene = scene
 
     def sweep(self, sweep: Sweep, scanned: Scanned, first: int, last: int) -> None:
-        """Scan some columns; every ray's noise is a function of seed, column and row alone.
+        """Scan some columns; the noise of a ray depends only on seed, column and row.
 
         Args:
             sweep: the scan.
             scanned: output, entries of the whole scan.
-            first: column.
+            first: first column.
             last: last column, exclusive.
         """
         errors, start = self._errors, sweep.station[:, None]
@@ -306,7 +306,7 @@ class Scanner:
         cosine = np.abs(np.einsum("ni,in->n", self._normal[hits.rectangle], ways))
         into = scanned.take(slice(first * sweep.n_rows, last * sweep.n_rows))
         into.rectangle[:] = hits.rectangle
-        # Noise grows with range and slope, and on cloth.
+        # Noise increases with range and incidence angle, and is larger on cloth.
         slope = 1.0 + 0.45 * np.minimum(1.0 / np.maximum(cosine, 0.05) - 1.0, 4.0)
         cloth = np.where(self._is_cloth[into.rectangle], 1.4, 1.0)
         sigma = errors.noise_m * slope * cloth * np.sqrt(0.5 + (distance / 3.0) ** 2 / 2)
@@ -316,7 +316,7 @@ class Scanner:
             is_mixed = np.isfinite(mixed) & is_hit
             measured[is_mixed] = mixed[is_mixed]
             into.rectangle[is_mixed] = SPOILT
-        # Gross outliers: most are too short, some too long.
+        # Gross outliers: most distances are too short, some too long.
         short = distance * (0.3 + 0.68 * uniforms(states, 2))
         gross = np.where(uniforms(states, 1) < 0.8, short, distance + 2.0 * uniforms(states, 2))
         is_gross = (uniforms(states, 0) < errors.outlier_share) & is_hit
@@ -346,7 +346,7 @@ class Scanner:
         states: NDArray[np.uint64],
         distance: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """Mixed distances where the edge of the spot, at a hashed side, meets another depth."""
+        """Return mixed distances (n,) where the edge of the spot hits another depth, else NaN."""
         turn, reach = _TURN * uniforms(states, 3), 0.5 * self._errors.beam_m / distance
         aside = reach * np.cos(turn) / np.maximum(0.05, np.cos(elevation))
         rims = _directions(azimuth + aside, elevation + reach * np.sin(turn))
@@ -369,11 +369,11 @@ def shared_errors(
         of_station = np.random.default_rng([errors.band_seed, *place_mm.tolist()])
         off += errors.registration_m * of_station.normal(size=(3, 1))
     if errors.bending_m:
-        # A parabola along the longer axis of the room, upwards and sideways.
+        # A parabola along the longer axis of the room, with upward and sideways displacement.
         along = (points[0] / _BENT_M) ** 2
         off[1:] += errors.bending_m * along / math.sqrt(2.0)
     if errors.shared_m:
-        # Waves of random directions: their sum is practically Gaussian, with a Gaussian
+        # The sum of waves with random directions is practically Gaussian and has a Gaussian
         # correlation.
         waves = np.random.default_rng([errors.band_seed, 1])
         for axis in range(3):
@@ -401,16 +401,16 @@ def laser_reflectance(
     inversion: float,
     seed: int,
 ) -> NDArray[np.float64]:
-    """Return what the laser sees of points of a scene, (n,) 0..1.
+    """Return the laser reflectance (n,), 0..1, of points of a scene.
 
     Args:
-        scene: the scene with the rectangles; its origin at (0, 0, 0).
+        scene: the scene with the rectangles, with its origin at (0, 0, 0).
         rectangle: (n,) rectangle of each point.
         points: (3, n) metres.
-        colours: (4, n) red, green, blue 0..255, and the texture's own reflectance.
-        inversion: 0 if the laser sees what the scene's textures show, 1 if all contrast follows
-            from the materials' own response.
-        seed: of materials, patches and spots.
+        colours: (4, n) red, green, blue 0..255, and the reflectance of the texture.
+        inversion: 0 if the laser measures the reflectance of the textures, 1 if all contrast
+            follows from the response of the materials.
+        seed: seed of materials, patches and spots.
     """
     plain: NDArray[np.float64] = colours[3].astype(np.float64)
     if inversion == 0.0:
@@ -448,7 +448,7 @@ def laser_reflectance(
 def smooth_noise(
     x: NDArray[np.float64], y: NDArray[np.float64], seed: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return noise 0..1 that is smooth between the points of a lattice, and differs per seed."""
+    """Return noise, 0..1, that is smooth between lattice points and different for each seed."""
     column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
     s, t = x - column, y - row
     s, t = s * s * (3.0 - 2.0 * s), t * t * (3.0 - 2.0 * t)
