@@ -1,4 +1,4 @@
-"""Writing a plugin's first files: a project that installs, works and passes its tests at once."""
+"""Creation of new plugins: a project that can be installed and passes its tests immediately."""
 
 from orthoflow.scaffold.projects import Project, unwritten, write_project
 

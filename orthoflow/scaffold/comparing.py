@@ -1,4 +1,4 @@
-"""A workflow that compares a new method with an installed one: a shipped recipe with variants."""
+"""Workflow for a new plugin: a shipped recipe that compares the new method with another."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from orthoflow.sdk import port_specs
 from orthoflow.sdk.hooks import FILES
 from orthoflow.workflow.source import shipped_workflow
 
-# The first recipe that has a step of the kind is taken; coarse cells of one wall let it run in
-# seconds, and without a warning.
+# The first recipe that contains a step of the kind is used; with one wall and large cells it runs
+# in seconds and without a warning.
 _RECIPES: Final = ("direct", "quickstart")
 _COARSE: Final = {
     "direct": {
@@ -25,25 +25,26 @@ _COARSE: Final = {
     }
 }
 _METRICS_MOST: Final = 4
-# Letters of a workflow's name.
+# Maximum length of a workflow's name in characters.
 _NAME_MOST: Final = 32
-# What a detector says of its own planes (RMS) is good where it found but the easy ones.
+# Metrics to compare. The RMS reported by a detector is no criterion: it is low if only easy planes
+# are found.
 _JUDGED: Final = {
     "plane": ("true_planes_found", "label_iou_mean", "plane_angle_deg", "plane_offset_mm")
 }
 
 
 def comparison_text(method_id: str, name: str, catalog: Catalog) -> str:
-    """Return a workflow in which a method stands beside the shipped recipe's own of its kind.
+    """Return a shipped recipe with a new method as a variant next to the method of its kind.
 
     Args:
         method_id: the new method.
-        name: its variant's name.
-        catalog: knows which kinds are sources, which take no variants.
+        name: name of its variant.
+        catalog: the installed plugins.
 
     Returns:
-        YAML; empty for a source, and when neither a shipped recipe has a step of the kind nor an
-        installed method of the kind can stand behind one.
+        YAML; empty for a source, which cannot have variants, and if no shipped recipe has a step of
+        the kind and no installed method of the kind can be added to one.
     """
     kind = method_id.partition(".")[0]
     if catalog.kinds[kind].spec.is_source:
@@ -65,14 +66,14 @@ def comparison_text(method_id: str, name: str, catalog: Catalog) -> str:
         name: {"use": method_id},
     }
     takes = {port.name: port.type_name for port in ports}
-    # A pattern may have none that fits; a name is reported.
+    # A metric whose name is a pattern may not occur, and the comparison would report that.
     metrics = [one.name for one in sibling.load().metric_specs() if one.name.isidentifier()]
     asked = [f"{kind}.{one}" for one in metrics[:_METRICS_MOST]]
     return _dumped(_behind_a_recipe(kind, takes, variants, catalog), name, asked)
 
 
 def _judged(kind: str, steps: Mapping[str, Mapping[str, Any]], catalog: Catalog) -> list[str]:
-    """The numbers that show which method is better, of a recipe that measures them."""
+    """Return the metrics in a recipe that show which method is better."""
     wanted = _JUDGED.get(kind, ())
     measured = {
         metric.name: f"{name}.{metric.name}"
@@ -84,15 +85,15 @@ def _judged(kind: str, steps: Mapping[str, Mapping[str, Any]], catalog: Catalog)
 
 
 def own_comparison_text(method_id: str, takes: Sequence[str], catalog: Catalog) -> str:
-    """Return a workflow in which a method of a new kind follows a shipped recipe, in two ways.
+    """Return a shipped recipe that continues with a method of a new kind in two variants.
 
     Args:
         method_id: the new method, which has a parameter `factor`.
-        takes: product types that it takes.
-        catalog: knows what the recipes' methods give.
+        takes: product types of its inputs.
+        catalog: the installed plugins.
 
     Returns:
-        YAML; empty when no shipped recipe leads to all of them.
+        YAML; empty if no shipped recipe provides all inputs.
     """
     kind = method_id.partition(".")[0]
     variants = {
@@ -106,13 +107,13 @@ def own_comparison_text(method_id: str, takes: Sequence[str], catalog: Catalog) 
 def _behind_a_recipe(
     step: str, takes: Mapping[str, str], variants: Mapping[str, object], catalog: Catalog
 ) -> dict[str, Any]:
-    """What a step needs of a shipped recipe, and the step; empty where no recipe leads to it.
+    """Return the part of a recipe that a step needs, and the step; empty if none provides it.
 
     Args:
-        step: its name.
-        takes: port -> product type; what the recipe does not give installed methods make of it.
-        variants: of the step.
-        catalog: knows what methods take and give.
+        step: name of the step.
+        takes: port -> product type; types missing in the recipe are made by installed methods.
+        variants: variants of the step.
+        catalog: the installed plugins.
     """
     for recipe in _RECIPES:
         document = _coarse_document(recipe)
@@ -140,7 +141,7 @@ def _reach(
     catalog: Catalog,
     asked: frozenset[str] = frozenset(),
 ) -> bool:
-    """Add steps of installed methods until one gives a product type; whether one does."""
+    """Add steps until one outputs a product type; return whether that succeeded."""
     if type_name in _given(steps, catalog):
         return True
     if type_name in asked:
@@ -162,7 +163,7 @@ def _reach(
 
 
 def _given(steps: Mapping[str, Mapping[str, Any]], catalog: Catalog) -> dict[str, list[str]]:
-    """References to the outputs of steps, by product type."""
+    """Return references to the outputs of steps, by product type."""
     given: dict[str, list[str]] = {}
     for name, node in steps.items():
         for port in port_specs(catalog.method(node["use"]).load().Out).values():
@@ -173,7 +174,7 @@ def _given(steps: Mapping[str, Mapping[str, Any]], catalog: Catalog) -> dict[str
 def _wires(
     takes: Mapping[str, str], steps: Mapping[str, Mapping[str, Any]], catalog: Catalog
 ) -> dict[str, str | list[str]]:
-    """Of what is read or simulated, what is there; of what several steps make, the last."""
+    """Return the sources of ports: all clouds, otherwise the last output of the type."""
     given = _given(steps, catalog)
     return {
         port: given[kind] if kind == "cloud" else given[kind][-1] for port, kind in takes.items()
@@ -181,9 +182,9 @@ def _wires(
 
 
 def _coarse_document(recipe: str) -> dict[str, Any]:
-    """A shipped recipe that runs in seconds."""
+    """Return a shipped recipe, changed so that it runs in seconds."""
     text = shipped_workflow(recipe).read_text(encoding="utf-8")
-    # Any: a document of nested mappings.
+    # `Any`: a document of nested mappings.
     document: dict[str, Any] = YAML(typ="safe").load(text)
     for node in document["steps"].values():
         if coarse := _COARSE.get(recipe, {}).get(node["use"]):
@@ -194,7 +195,7 @@ def _coarse_document(recipe: str) -> dict[str, Any]:
 def _needed(
     steps: Mapping[str, Mapping[str, Any]], wires: Iterable[str | Sequence[str]]
 ) -> set[str]:
-    """Steps that some references come from, and all before them."""
+    """Return the steps that references come from, and all steps upstream of them."""
     found: set[str] = set()
     waiting = list(wires)
     while waiting:
@@ -216,7 +217,7 @@ def _vary(node: dict[str, Any], name: str, method_id: str) -> None:
 
 
 def _dumped(document: dict[str, Any], name: str, metrics: Sequence[str]) -> str:
-    """The document as a comparison of that name; empty where there is none."""
+    """Return the document as a comparison with a new name; empty for an empty document."""
     if not document:
         return ""
     document["name"] = f"compare-{name}"[:_NAME_MOST].rstrip("_-")

@@ -1,4 +1,4 @@
-"""What a new method of a kind takes and gives, as Python classes, and what it starts from."""
+"""Ports of a new method as Python classes, and the installed method that it starts from."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from orthoflow.version import DISTRIBUTION
 
 @dataclass(frozen=True, kw_only=True)
 class Port:
-    """One port of the new method.
+    """A port of the new method.
 
     Attributes:
-        name: of the port.
+        name: name of the port.
         class_name: product class.
-        required: must be wired.
-        same_as: for an output, the required input of the same type that can be handed on.
+        required: whether it must be connected.
+        same_as: for an output, the required input of the same type that can be returned unchanged.
     """
 
     name: str
@@ -33,17 +33,17 @@ class Port:
 
 @dataclass(frozen=True, kw_only=True)
 class KindPorts:
-    """Ports of a new method, and the method that does its work at first.
+    """Ports of a new method, and the installed method that it calls at first.
 
     Attributes:
-        inputs: in the kind's order.
-        outputs: likewise.
-        imports: module -> names, for the product classes.
-        needs: requirements of other plugins that bring the kind, its start or a product.
-        start_module: module of an installed method of the kind, empty without one.
-        start_class: its class.
-        start_id: its id.
-        start_inputs: those of the inputs that it takes.
+        inputs: input ports in the order of the kind.
+        outputs: output ports in the order of the kind.
+        imports: module -> names of product classes.
+        needs: requirements for other plugins that provide the kind, the first method or a product.
+        start_module: module of the installed method; empty if there is none.
+        start_class: class of that method.
+        start_id: id of that method.
+        start_inputs: input ports that this method uses.
     """
 
     inputs: tuple[Port, ...]
@@ -57,12 +57,12 @@ class KindPorts:
 
     @property
     def hands_on(self) -> bool:
-        """Whether every output can be an input handed on."""
+        """Whether each output can be an input returned unchanged."""
         return all(port.same_as for port in self.outputs)
 
 
 def kind_ports(catalog: Catalog, kind: str) -> KindPorts:
-    """Derive the ports of a new method from a kind and the methods that it has.
+    """Derive the ports of a new method from a kind and its installed methods.
 
     Raises:
         PluginError: the kind cannot be used.
@@ -89,7 +89,7 @@ def kind_ports(catalog: Catalog, kind: str) -> KindPorts:
 
 
 def loadable_method(catalog: Catalog, kind: str) -> MethodEntry | None:
-    """The first installed method of a kind whose class loads; None without one."""
+    """Return the first installed method of a kind whose class can be loaded, or None."""
     for entry in catalog.methods.values():
         if entry.spec.kind == kind:
             try:
@@ -101,16 +101,16 @@ def loadable_method(catalog: Catalog, kind: str) -> MethodEntry | None:
 
 
 def new_kind_ports(catalog: Catalog, takes: Sequence[str], gives: Sequence[str]) -> KindPorts:
-    """Return a port of its name for each product type, all required, and what can fill the outputs.
+    """Return the ports for a method of a new kind: one per product type, all required.
 
     Args:
-        catalog: what is installed.
+        catalog: the installed plugins.
         takes: product types of the inputs.
-        gives: product types of the outputs that are there; what no input has, an installed method
-            may make of the inputs.
+        gives: product types of the outputs; types that are not inputs are made from the inputs by
+            an installed method.
 
     Raises:
-        ArgumentError: none does.
+        ArgumentError: no installed method makes them.
     """
     made = [name for name in gives if name not in takes]
     start = _maker(catalog, takes, made) if made else None
@@ -136,11 +136,11 @@ def _kind_ports(
     """Return the ports of a new method.
 
     Args:
-        catalog: what is installed.
+        catalog: the installed plugins.
         taken: input ports by name.
         given: output ports by name.
-        start: the method that does its work at first.
-        besides: distributions that it needs besides those of its product types.
+        start: installed method that the new method calls at first.
+        besides: required distributions in addition to those of the product types.
     """
     types = dict.fromkeys(port.type_name for port in (*taken.values(), *given.values()))
     classes = {type_name: _class_of(catalog, type_name) for type_name in types}
@@ -174,7 +174,7 @@ def _kind_ports(
 
 
 def _maker(catalog: Catalog, takes: Sequence[str], gives: Sequence[str]) -> MethodEntry | None:
-    """Return an installed method that makes some products of others; None without one."""
+    """Return an installed method that makes some product types from others, or None."""
     for entry in catalog.methods.values():
         try:
             taken, given = _declared(entry)
@@ -194,9 +194,9 @@ def _maker(catalog: Catalog, takes: Sequence[str], gives: Sequence[str]) -> Meth
 def _needs(
     catalog: Catalog, type_names: Iterable[str], besides: Iterable[DistributionInfo]
 ) -> tuple[str, ...]:
-    """Requirements of what others than orthoflow bring, in the order of their names."""
+    """Return requirements for other distributions than orthoflow, sorted by name."""
     of_types = (catalog.products[name].distribution for name in type_names if name != FILES)
-    # `>=` takes no local part of a version.
+    # A version after `>=` cannot contain a local part.
     versions = {
         one.name: one.version.partition("+")[0]
         for one in (*of_types, *besides)

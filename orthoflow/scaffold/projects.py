@@ -1,4 +1,4 @@
-"""The files of a new plugin, filled from templates and from what the catalog has about its kind."""
+"""The files of a new plugin, written from templates and the ports of its kind."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from orthoflow.scaffold.kinds import KindPorts, kind_ports, new_kind_ports
 from orthoflow.version import __version__
 
 _TEMPLATES: Final = Path(__file__).parent / "templates"
-# What a written module may import by name.
+# Names that a written module may import.
 _IMPORTED: Final = frozenset({*products.__all__, *sdk.__all__})
-# What stands where the author shall write; `unwritten` finds it again.
+# Placeholder texts for the author to replace; `unwritten` finds those that are left.
 _UNWRITTEN: Final = {
     "summary": "one line for `orthoflow plugins list`",
     "description": "State here what the method does, for `orthoflow plugins show`.",
@@ -34,17 +34,17 @@ _NAME: Final = re.compile(r"[a-z][a-z0-9-]{1,31}")
 
 @dataclass(frozen=True, kw_only=True)
 class Project:
-    """What the author states about a new plugin.
+    """Description of a new plugin, given by its author.
 
     Attributes:
-        name: of distribution and method, e.g. `my-detector`.
-        kind: kind of its method, any that an installed plugin announces, or a new one.
-        author: for pyproject, licence and citation.
+        name: name of the distribution and the method, e.g. `my-detector`.
+        kind: kind of its method, either one of an installed plugin or a new one.
+        author: author in pyproject, licence and citation.
         licence: SPDX expression.
-        citation: where the method comes from: DOI, title or URL; may be empty.
-        takes: of a new kind, the product types that its methods take.
-        gives: of a new kind, those that they give; empty for a kind that is there.
-        product: of a new kind, one more that they give, of the plugin's own; empty for none.
+        citation: publication of the method as DOI, title or URL; may be empty.
+        takes: product types of the inputs of a new kind.
+        gives: existing product types of the outputs of a new kind; empty for an existing kind.
+        product: name of a new product type that a new kind also outputs; empty if there is none.
     """
 
     name: str
@@ -58,7 +58,7 @@ class Project:
 
     @property
     def is_new_kind(self) -> bool:
-        """Whether the plugin brings the kind of its method."""
+        """Whether the plugin provides the kind of its method."""
         return bool(self.product or self.gives)
 
     @property
@@ -73,7 +73,7 @@ class Project:
 
     @property
     def class_name(self) -> str:
-        """Name of the method's class, no other class's of its module."""
+        """Name of the method's class, different from other class names in its module."""
         name = _class_name(self.name)
         named = map(_class_name, (*self.takes, *self.gives))
         others = {self.product_class, *named, *_IMPORTED}
@@ -81,7 +81,7 @@ class Project:
 
     @property
     def product_class(self) -> str:
-        """Name of the class of its own product, likewise."""
+        """Name of the class of its own product, different from other class names in its module."""
         name = _class_name(self.product)
         return f"{name}Product" if name in _IMPORTED else name
 
@@ -91,18 +91,18 @@ def _class_name(name: str) -> str:
 
 
 def write_project(project: Project, parent: Path, catalog: Catalog) -> tuple[Path, ...]:
-    """Write a new plugin into a folder of its name.
+    """Write a new plugin into a new folder.
 
     Args:
-        project: what the author states.
-        parent: gets the folder.
-        catalog: what is installed.
+        project: description of the plugin.
+        parent: parent of the new folder.
+        catalog: the installed plugins.
 
     Returns:
-        The files written, the folder's name first in each path relative to `parent`.
+        The files written, as paths relative to `parent`.
 
     Raises:
-        ArgumentError: name or kind cannot be used, or the folder exists already.
+        ArgumentError: the name or kind is not allowed, or the folder already exists.
     """
     folder = parent / project.name
     _check(project, folder, catalog)
@@ -121,7 +121,7 @@ def write_project(project: Project, parent: Path, catalog: Catalog) -> tuple[Pat
 
 
 def unwritten(method_id: str, catalog: Catalog) -> tuple[str, ...]:
-    """List what the plugin of a method still shows in the words that `write_project` put there.
+    """List the placeholder texts of `write_project` that are left in the plugin of a method.
 
     Raises:
         PluginError: the method cannot be loaded.

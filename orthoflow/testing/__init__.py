@@ -1,4 +1,4 @@
-"""The conformance suite that every method passes, built in or third-party.
+"""The conformance suite for methods, both built-in and third-party.
 
 Use it in the tests of a plugin:
 
@@ -6,9 +6,9 @@ Use it in the tests of a plugin:
     def test_conformance(case):
         case.run()
 
-It reads only what the method declares, needs no pytest itself, and states in one sentence what is
-wrong. A check that a method cannot pass is named with its reason in `expected_failures`; it fails
-when it starts to pass, so that reasons do not outlive their cause.
+The suite reads only what the method declares, does not need pytest itself, and reports each problem
+in one sentence. A check that a method cannot pass is listed with the reason in `expected_failures`;
+it fails as soon as the check passes, so that outdated entries are noticed.
 """
 
 from orthoflow.testing.cases import ConformanceCase, ConformanceError, conformance_cases

@@ -1,4 +1,4 @@
-"""A method and a check become a case; a case that fails states why in one sentence."""
+"""Test cases, each a method and a check; a failure is reported in one sentence."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Inputs = Mapping[str, Product | InputFiles]
 
 
 class ConformanceError(AssertionError):
-    """A method does not keep a rule; the message names method, rule and what happened."""
+    """A method breaks a rule; the message contains the method, the rule and the problem."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,10 +35,10 @@ class ConformanceCase:
 
     Attributes:
         method_id: id of the method.
-        check: what is checked.
-        witness: gives the runs of the method, which its cases share.
-        expected_failure: why the check is known to fail; empty when it must pass.
-        golden: file of digests that results are held to; None for none.
+        check: the check.
+        witness: returns the runs of the method, which are shared by its cases.
+        expected_failure: why the check is expected to fail; empty if it must pass.
+        golden: file with golden results; None if there is none.
     """
 
     method_id: str
@@ -54,8 +54,7 @@ class ConformanceCase:
         """Run the check.
 
         Raises:
-            ConformanceError: the method breaks the rule, or a failure that was expected did not
-                happen.
+            ConformanceError: the method breaks the rule, or an expected failure did not occur.
         """
         problem = self.problem()
         if self.expected_failure and not problem:
@@ -67,20 +66,21 @@ class ConformanceCase:
             raise ConformanceError(f"{self}: {problem}")
 
     def problem(self) -> str:
-        """Run the check and give what is wrong in one sentence, empty when nothing is."""
+        """Run the check and return the problem in one sentence; empty if there is none."""
         with TemporaryDirectory(prefix="orthoflow-conformance-") as folder:
             try:
                 subject = Subject(witness=self.witness(), folder=Path(folder), golden=self.golden)
                 self.check.run(subject)
             except AssertionError as error:
-                # What stops every run says nothing of a rule about odd inputs.
+                # If the example inputs already make it fail, the reason is not the rule about
+                # unusual inputs.
                 return (error.__cause__ is not None and self._what_stops()) or str(error)
             except Exception as error:  # noqa: BLE001 - a third-party method may raise anything
                 return _failure(error, self.witness)
         return ""
 
     def _what_stops(self) -> str:
-        """What the method's run on its examples fails with; empty when it does not."""
+        """Return the error of a run on the example inputs; empty if it succeeds."""
         try:
             _ = self.witness().first
         except Exception as error:  # noqa: BLE001 - as above
@@ -89,7 +89,7 @@ class ConformanceCase:
 
 
 def _failure(error: Exception, witness: Callable[[], Witness]) -> str:
-    """State in one sentence, and in which line, what stopped a run of the method."""
+    """Return a sentence with the error of a run and the line where it was raised."""
     if isinstance(error, ExampleError):
         return str(error)
     trial = witness().trial
@@ -115,20 +115,21 @@ def conformance_cases(
     expected_failures: Mapping[str, str] | None = None,
     golden: Path | None = None,
 ) -> tuple[ConformanceCase, ...]:
-    """Return every check that applies to an installed method.
+    """Return all checks that apply to an installed method.
 
     Args:
-        method_id: e.g. `plane.flat`; found through the installed entry points.
-        inputs: port -> product for ports the suite has no fitting example of, or what gives them
-            when the first case runs.
-        params: parameters that differ from the defaults, for a quick run.
-        expected_failures: check name -> why the method cannot pass it.
-        golden: file of digests that results are held to as long as `result_version` stays; what it
-            lacks is added at the first run. Keep it beside the tests, under version control.
+        method_id: id of a method in the installed entry points, e.g. `plane.flat`.
+        inputs: port -> product, for ports for which the suite has no suitable example, or a
+            function that returns this mapping, called by the first case.
+        params: parameters that differ from the defaults, for a fast run.
+        expected_failures: name of a check -> why the method cannot pass it.
+        golden: file with golden results, which must be reproduced as long as `result_version` is
+            unchanged; missing results are added by the first run. Keep it with the tests, under
+            version control.
 
     Raises:
-        ArgumentError: `expected_failures` names a check that does not exist or gives no reason.
-        WorkflowError: no installed plugin has the method.
+        ArgumentError: `expected_failures` contains an unknown check or an empty reason.
+        WorkflowError: no installed plugin provides the method.
         PluginError: the method cannot be loaded.
     """
     expected = dict(expected_failures or {})

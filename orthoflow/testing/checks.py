@@ -1,4 +1,4 @@
-"""The rules: what every method must keep, one function each."""
+"""The rules that all methods must follow, one function each."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ from orthoflow.testing.physics import (
 )
 from orthoflow.testing.witnesses import Subject, output_of, require
 
-# What a float parameter's name has in it: its unit, or a word that says it has none.
+# The name of a float parameter must contain one of these: a unit, or a word for a unitless value.
 UNIT_SUFFIXES: Final = (*UNITS, "world", "intensity")
-# Product types whose publishers have tests of their own.
+# Product types whose publishers have their own tests.
 _OURS: Final = frozenset(
     cls.type_name
     for cls in vars(products).values()
@@ -51,15 +51,15 @@ _OURS: Final = frozenset(
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """One rule.
+    """A rule and the function that checks it.
 
     Attributes:
-        name: for listings and `expected_failures`.
+        name: name for listings and `expected_failures`.
         rule: the rule in one sentence.
-        run: raises AssertionError with one sentence when the method breaks the rule.
-        applies: whether the rule is about this method.
-        is_quick: whether it looks at no more than two runs on the example, and at inputs that are
-            refused before anything is computed.
+        run: raises AssertionError with one sentence if the method breaks the rule.
+        applies: whether the rule applies to a method.
+        is_quick: whether it needs at most two runs on the example, and otherwise only inputs that
+            are refused before any computation.
     """
 
     name: str
@@ -90,7 +90,7 @@ def _parameter_faults(name: str, info: FieldInfo) -> Iterator[str]:
 
 
 def parameters_round_trip(subject: Subject) -> None:
-    """Parameters survive JSON, are frozen, and unknown keys are refused."""
+    """Parameters can be stored as JSON, are frozen, and reject unknown keys."""
     model = subject.method.Params
     params = model(**subject.witness.trial.params)
     text = json.dumps(params.model_dump(mode="json"), allow_nan=False)
@@ -104,7 +104,7 @@ def parameters_round_trip(subject: Subject) -> None:
 
 
 def outputs_are_valid(subject: Subject) -> None:
-    """Outputs have the declared types and survive storing; metrics are declared, with units."""
+    """Outputs have the declared types and can be stored; metrics are declared, with units."""
     run = subject.witness.first.run
     for name, port in port_specs(subject.method.Out).items():
         product = run.outputs.get(name)
@@ -126,7 +126,7 @@ def outputs_are_valid(subject: Subject) -> None:
 
 
 def no_covariance_is_zero(subject: Subject) -> None:
-    """No plane and no pose is stated to be without error, by a covariance of zeros."""
+    """No plane or pose has a covariance of zero, which would mean that it has no error."""
     for product in subject.witness.first.run.outputs.values():
         stated: list[tuple[str, NDArray[np.float64] | None]] = []
         if isinstance(product, Planes):
@@ -143,7 +143,7 @@ def no_covariance_is_zero(subject: Subject) -> None:
 
 
 def publishers_write_into_their_folder(subject: Subject) -> None:
-    """Publishers of products that are not ours write plain files, into their folder alone."""
+    """Publishers of the plugin's own products write only regular files, into the given folder."""
     catalog = discover_catalog()
     for name, product in subject.witness.first.run.outputs.items():
         is_ours = product.type_name in _OURS
@@ -170,13 +170,13 @@ def publishers_write_into_their_folder(subject: Subject) -> None:
 
 
 def inputs_stay_untouched(subject: Subject) -> None:
-    """No array of an input is written to."""
+    """Input arrays are not changed."""
     for name in subject.witness.first.changed_inputs:
         raise AssertionError(f"input {name} was changed")
 
 
 def global_state_stays_untouched(subject: Subject) -> None:
-    """Numpy's global generator is not used."""
+    """The global random generator of numpy is not used."""
     require(
         not subject.witness.first.drew_globally,
         "the method draws from numpy's global generator, not from ctx.rng",
@@ -184,16 +184,16 @@ def global_state_stays_untouched(subject: Subject) -> None:
 
 
 def nothing_is_written_outside_scratch(subject: Subject) -> None:
-    """Working directory, home and temporary folder stay empty."""
-    _ = subject.witness.first  # what stops every run is reported as for every rule
+    """No files are written to the working directory, the home or the temporary folder."""
+    _ = subject.witness.first  # an error of every run is reported in the same way by all rules
     strays = subject.witness.elsewhere.strays
     require(not strays, f"files were written outside the scratch folder: {', '.join(strays)}")
 
 
 def results_repeat(subject: Subject) -> None:
-    """Same seed, same digest: in this process and in a new one, elsewhere, with another hash seed.
+    """The same seed gives the same digest, also in a new process with another hash seed.
 
-    With determinism `loose` only the types of the outputs have to agree.
+    If determinism is `loose`, only the types of the outputs must be the same.
     """
     witness = subject.witness
     first, second, elsewhere = witness.first.run, witness.again, witness.elsewhere
@@ -210,10 +210,10 @@ def results_repeat(subject: Subject) -> None:
 
 
 def threads_do_not_show(subject: Subject) -> None:
-    """One core or two give the same digest."""
+    """The digest is the same with one core and with two."""
     one, two = subject.witness.first.run, subject.witness.on_two_cores
     for name, digest in one.digests.items():
-        # What differs between runs on one core says nothing about two: see the rule above.
+        # An output that already differs between two runs on one core is covered by the rule above.
         is_same = two.digests[name] == digest or subject.witness.again.digests[name] != digest
         require(is_same, f"output {name} depends on the number of cores")
 
@@ -238,17 +238,17 @@ def _refuses(subject: Subject, cloud: PointCloud, what: str) -> None:
 
 
 def empty_cloud_is_refused(subject: Subject) -> None:
-    """A cloud without points ends in an OrthoflowError."""
+    """A cloud without points causes an OrthoflowError."""
     _refuses(subject, few_points(np.zeros((0, 3))), "no points")
 
 
 def single_point_is_refused(subject: Subject) -> None:
-    """A cloud of one point ends in an OrthoflowError."""
+    """A cloud of one point causes an OrthoflowError."""
     _refuses(subject, few_points(np.ones((1, 3))), "one point")
 
 
 def nan_is_refused(subject: Subject) -> None:
-    """A cloud with a coordinate that is not a number ends in an OrthoflowError."""
+    """A cloud with a coordinate that is NaN causes an OrthoflowError."""
     cloud, _ = example_room(n_points=5000)
     y = cloud.y.copy()
     y[100] = np.nan
@@ -256,7 +256,7 @@ def nan_is_refused(subject: Subject) -> None:
 
 
 def a_huge_coordinate_does_no_harm(subject: Subject) -> None:
-    """A cloud with one coordinate of 1e30 m gives a result or ends in an OrthoflowError."""
+    """A cloud with one coordinate of 1e30 m gives a result or causes an OrthoflowError."""
     for port in _cloud_ports(subject.method):
         cloud = subject.witness.trial.inputs.get(port)
         if not isinstance(cloud, PointCloud):
@@ -274,9 +274,9 @@ def a_huge_coordinate_does_no_harm(subject: Subject) -> None:
 
 
 def missing_ties_are_reported(subject: Subject) -> None:
-    """Without any ties no photo is called oriented."""
+    """Without ties, no photo is reported as oriented."""
     ties = example_ties()
-    # Any: arrays of all types.
+    # `Any`: arrays of all types.
     rows: dict[str, Any] = {
         name: given[:0] for name, given in vars(ties).items() if isinstance(given, np.ndarray)
     }
@@ -291,7 +291,7 @@ def missing_ties_are_reported(subject: Subject) -> None:
 
 
 def progress_never_goes_back(subject: Subject) -> None:
-    """Progress is reported in fractions from 0 to 1 that never become smaller."""
+    """Progress is reported as fractions from 0 to 1 that never decrease."""
     fractions = subject.witness.first.run.fractions
     for before, after in pairwise((0.0, *fractions, 1.0)):
         require(
@@ -301,7 +301,7 @@ def progress_never_goes_back(subject: Subject) -> None:
 
 
 def cancel_is_honoured(subject: Subject) -> None:
-    """A cancelled step stops as soon as the method asks, and the method asks."""
+    """The method checks regularly whether its step was cancelled, and then stops."""
     try:
         subject.run_cancelled()
     except CancelledStepError:
@@ -313,7 +313,7 @@ def cancel_is_honoured(subject: Subject) -> None:
 
 
 def golden_digest_holds(subject: Subject) -> None:
-    """Results are those of the golden file, unless result_version was raised."""
+    """Results agree with the golden file, unless `result_version` was incremented."""
     if subject.golden is not None:
         witness = subject.witness
         problem = golden_problem(subject.golden, witness.trial, witness.first.run.outputs)

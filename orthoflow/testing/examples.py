@@ -1,4 +1,4 @@
-"""Small inputs to try a method on: an analytic room, and an example of every product type."""
+"""Small inputs for testing methods: an analytic room, and an example of each product type."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from orthoflow.testing.trials import Trial, run_trial
 
 
 class ExampleError(OrthoflowError, LookupError):
-    """There is no example of a product type: the caller has to give one."""
+    """There is no example of a product type, so the caller must provide one."""
 
 
 def example_inputs(
     method: type[Method], *, besides: Collection[str] = ()
 ) -> dict[str, Product | InputFiles]:
-    """Return what a method requires, from one scene: the photographed wall or the simulated room.
+    """Return the required inputs of a method, all from one scene: photographed wall or room.
 
-    A truth is given wherever a method takes it. A product type of a plugin is made by an installed
-    method that gives it.
+    True values are included wherever a method has a port for them. A product type of a plugin is
+    created by an installed method that outputs it.
 
     Args:
-        method: the class.
+        method: class of the method.
         besides: ports that need no example.
 
     Raises:
@@ -58,17 +58,17 @@ def _example_inputs(
 
 
 def example(type_name: str) -> Product | InputFiles:
-    """Return a small product of a type, the same in every process.
+    """Return a small product of a type, identical in every process.
 
     Raises:
-        ExampleError: the type is a plugin's own, and no installed method makes one of the other
+        ExampleError: the type belongs to a plugin, and no installed method creates it from other
             examples.
     """
     return _example(type_name, within=())
 
 
 def _example(type_name: str, within: tuple[str, ...]) -> Product | InputFiles:
-    """Return an example; `within` are the types whose examples are being made of it."""
+    """Return an example; `within` are the types whose examples are currently being created."""
     if type_name == "files":
         return _example_files()
     make = SURVEYED.get(type_name) or PHOTOGRAPHED.get(type_name)
@@ -90,7 +90,7 @@ def _example(type_name: str, within: tuple[str, ...]) -> Product | InputFiles:
 
 
 def _givers(catalog: Catalog, type_name: str) -> Iterator[tuple[type[Method], str]]:
-    """Installed methods that give a type of a plugin, each with the port that carries it."""
+    """Yield installed methods that output a type of a plugin, each with its output port."""
     if type_name not in catalog.products:
         return
     for entry in catalog.methods.values():
@@ -113,17 +113,17 @@ def example_room(
     turned_deg: float = 0.0,
     shift_m: NDArray[np.float64] | None = None,
 ) -> tuple[PointCloud, Planes]:
-    """Return a box-shaped room whose planes are known exactly.
+    """Return a box-shaped room with exactly known planes.
 
     Args:
-        seed: of noise and point positions; turning and shifting do not change them.
-        n_points: on all six sides together.
-        turned_deg: the room is turned about up by this angle, then shifted.
-        shift_m: (3,) metres.
+        seed: seed of noise and point positions, which rotation and shift do not affect.
+        n_points: total number of points on the six sides.
+        turned_deg: angle by which the room is rotated about the vertical before it is shifted.
+        shift_m: (3,) shift in metres.
 
     Returns:
-        The cloud (2 mm noise, grey colours, a station in the middle) and its true planes, in the
-        order two long walls, two short walls, floor, ceiling; normals into the room.
+        The cloud (2 mm noise, grey colours, a station in the centre) and its true planes in the
+        order two long walls, two short walls, floor, ceiling; normals point into the room.
     """
     rng = np.random.default_rng(seed)
     size = np.array([5.0, 3.6, 2.6])
@@ -178,7 +178,7 @@ def _grey_cloud(
 
 
 def few_points(coordinates: NDArray[np.float64]) -> PointCloud:
-    """Return a cloud of the given offsets (n, 3) with every optional array present."""
+    """Return a cloud of points with given offsets (n, 3) and all optional arrays."""
     offsets_m = coordinates.astype(np.float32).reshape(-1, 3)
     return _grey_cloud(offsets_m, np.full((len(offsets_m), 1), 128, np.uint8), np.zeros(3))
 

@@ -1,10 +1,10 @@
-"""Golden results: what a method gave when its author last looked, to notice when results move.
+"""Golden results: recorded samples of a method's results that reveal unintended changes.
 
-The bits of a result depend on more than the method: on the processor and on the version of every
-library that computes. So the file keeps a sample of the numbers, which must come again within the
-tolerances of the product types. Numbers that a product states about itself have no tolerance, and a
-share over few cells may move by any amount with the last bits of what goes in: they are held to the
-file where the same sample goes in.
+The exact bits of a result also depend on the processor and on the versions of numerical libraries.
+The file therefore contains samples of the numbers, which must be reproduced within the tolerances
+of the product types. Metadata values that describe a result have no tolerance, and shares of few
+cells can change considerably with the last bits of the inputs; these are only compared if the
+samples of the inputs are the same.
 """
 
 from __future__ import annotations
@@ -27,28 +27,28 @@ from orthoflow.products.product import Payload, Tolerance
 from orthoflow.testing.trials import Trial
 
 _AT_MOST: Final = 32
-# A cell on the rim of something falls to either side by the last bit of a number: one in so many.
+# Share of cells that may differ: on an edge, a cell can change sides with the last bit of a number.
 _STRAY_SHARE: Final = 1 / 16
-# As records are compared: what no tolerance is stated for may differ in its last digits.
+# As in comparisons of records: without a declared tolerance, only the last digits may differ.
 _UNSTATED: Final = 1e-6
-# Numbers in the metadata say something about a result, such as a median or a count. Without a
-# processor's wide instructions one of ours moved by 3e-4, every array staying within its tolerance.
+# Metadata values, such as medians or counts, describe a result. Without wide processor
+# instructions, one of a built-in method changed by 3e-4 with all arrays within their tolerances.
 _METADATA_SHARE: Final = 1e-2
 _DIGITS: Final = 9
 _ROUNDING: Final = 10.0 ** (1 - _DIGITS)
-# Odd, and no divisor of the sides of rasters: neighbouring samples fall far apart.
+# Odd, and not a divisor of raster sizes, so that consecutive samples are far apart.
 _STRIDE: Final = 2_654_435_761
 _METADATA: Final = "metadata"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sample:
-    """Numbers from an array.
+    """Sample of the numbers in an array.
 
     Attributes:
-        shape: of the array.
-        values: up to 32 of its values to nine digits, by a rule that knows the size only; None
-            for NaN.
+        shape: shape of the array.
+        values: up to 32 of its values with nine digits, at positions that depend only on its size;
+            None for NaN.
     """
 
     shape: Sequence[int]
@@ -57,14 +57,14 @@ class Sample:
 
 @dataclass(frozen=True, kw_only=True)
 class Golden:
-    """A method's recorded results, and what they were made of.
+    """Recorded results of a method, and the conditions under which they were computed.
 
     Attributes:
-        result_version: of the method.
-        tools: as the method declares them; with others it may give something else.
-        params: those that differ from the defaults, as JSON.
-        inputs: samples of each array by port; files are left out.
-        outputs: likewise.
+        result_version: result version of the method.
+        tools: library versions declared by the method; other versions may give other results.
+        params: parameters that differ from the defaults, as JSON.
+        inputs: samples of each array by port, without files.
+        outputs: samples of each array by port.
     """
 
     result_version: int
@@ -78,21 +78,21 @@ _FORMAT: Final = TypeAdapter(dict[str, Golden])
 
 
 def golden_problem(file: Path, trial: Trial, outputs: Mapping[str, Product]) -> str:
-    """Hold results to the file, or put them there where it knows nothing to hold them to.
+    """Compare results with the file, or record them if the file has no comparable results.
 
-    That is so when the method is new to it, its version, its tools or its parameters are others, or
-    the inputs moved, which are results of other methods.
+    Results are recorded if the method is new in the file, if its result version, tools or
+    parameters are different, or if the inputs, which are results of other methods, have changed.
 
     Args:
-        file: JSON by method id; made when it is not there.
-        trial: the method, with what it was tried on.
-        outputs: port -> what it gave.
+        file: JSON file by method id, created if missing.
+        trial: the method and its inputs.
+        outputs: port -> product.
 
     Returns:
-        One sentence when a result moved though `result_version` did not; else empty.
+        One sentence if a result changed without a new `result_version`; otherwise empty.
 
     Raises:
-        InputError: the file is something else.
+        InputError: the file is not a golden file.
     """
     inputs = {port: given for port, given in trial.inputs.items() if isinstance(given, Product)}
     now = Golden(
@@ -141,7 +141,7 @@ def _read(file: Path) -> dict[str, Golden]:
 
 
 def _record(file: Path, method_id: str, golden: Golden) -> None:
-    """Write a result into the file, which processes that try other methods change meanwhile."""
+    """Write a result to the file, which processes testing other methods may change meanwhile."""
     with file.open("a+", encoding="utf-8") as stream:
         lock_file(file, stream.fileno(), waits=True)
         stream.seek(0)
@@ -162,14 +162,14 @@ def _parsed(text: str, file: Path) -> dict[str, Golden]:
 
 def _text(known: Mapping[str, Golden]) -> str:
     text = json.dumps(_FORMAT.dump_python(dict(known)), indent=1, sort_keys=True)
-    # A line per list of numbers: what moved shows in a comparison of versions.
+    # One line per list of numbers, so that version control shows which of them changed.
     return re.sub(r"\[[^\[\]]+\]", lambda found: " ".join(found[0].split()), text) + "\n"
 
 
 def sample_of(product: Product) -> dict[str, Sample]:
-    """Return a sample of every array, and of the numbers in the metadata; bytes are left out.
+    """Return a sample of each array, and of the numbers in the metadata; bytes are omitted.
 
-    The bytes of a compressed picture all change when one pixel does.
+    A single changed pixel changes all bytes of a compressed image.
     """
     payload = product.to_payload()
     samples = {
@@ -188,13 +188,13 @@ def sample_problem(
     *,
     numbers_stated: bool = True,
 ) -> str:
-    """State what moved between two samples by more than a product's tolerances; empty for nothing.
+    """Return the differences between two samples that exceed the tolerances; empty if none.
 
     Args:
-        before: of one product.
-        after: of the other.
-        tolerances: of its type.
-        numbers_stated: the numbers in the metadata count as well, not only how many there are.
+        before: sample of the first product.
+        after: sample of the second product.
+        tolerances: tolerances of the product type.
+        numbers_stated: also compare the numbers in the metadata, not only their count.
     """
     for name in sorted({*before, *after}):
         if name not in before or name not in after:
@@ -226,7 +226,7 @@ def _sample(array: NDArray[np.generic]) -> Sample:
 
 
 def _limit(name: str, tolerances: Mapping[str, Tolerance]) -> tuple[float, float]:
-    """How far two numbers may lie apart: an amount, and a share of the larger one."""
+    """Return the tolerance of two numbers: an absolute value, and a share of the larger number."""
     if name == _METADATA:
         return _UNSTATED, _METADATA_SHARE
     tolerance = tolerances.get(name.rpartition("/")[2])

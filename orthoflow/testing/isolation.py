@@ -1,4 +1,4 @@
-"""Running a method in a process of its own, in an empty world, to see what it leaves behind."""
+"""Running a method in a separate process with empty folders, to find files that it leaves."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from orthoflow.engine.kernels import VARIABLE, reload_numba_config
 from orthoflow.engine.local import start_process
 from orthoflow.testing.trials import Trial, run_trial
 
-# With these, libraries compute with other instructions than the processor has, and to other bits.
+# Environment variables that make libraries use other instructions, and so give other bits.
 _INSTRUCTION_SWITCHES: Final = (
     "NPY_DISABLE_CPU_FEATURES",
     "NUMBA_CPU_FEATURES",
@@ -33,11 +33,11 @@ _LIMIT_S: Final = 600
 
 @dataclass(frozen=True, kw_only=True)
 class ElsewhereRun:
-    """What a run in another process left.
+    """Result of a run in another process.
 
     Attributes:
         digests: port -> digest of the output.
-        strays: files found in the working directory, the home or the temporary folder.
+        strays: files found in the working, home or temporary folder.
     """
 
     digests: Mapping[str, str]
@@ -45,10 +45,10 @@ class ElsewhereRun:
 
 
 def run_elsewhere(trial: Trial, folder: Path) -> ElsewhereRun:
-    """Run a trial in a new process: other working directory, home, hash seed, BLAS threads.
+    """Run a trial in a new process with other folders, hash seed and number of BLAS threads.
 
     Raises:
-        AssertionError: the process failed; the sentence ends with the last line of its output.
+        AssertionError: the process failed; the message ends with the last line of its output.
     """
     world = folder / "elsewhere"
     places = {name: world / name for name in ("cwd", "home", "tmp")}
@@ -56,7 +56,7 @@ def run_elsewhere(trial: Trial, folder: Path) -> ElsewhereRun:
         place.mkdir(parents=True, exist_ok=True)
     kept = ("PATH", "LD_LIBRARY_PATH", VARIABLE, *_INSTRUCTION_SWITCHES)
     environment = {name: os.environ[name] for name in kept if name in os.environ}
-    # Two where the session has one, else one.
+    # Use two threads if this session uses one, otherwise one.
     algebra_threads = 2 if os.environ.get("OPENBLAS_NUM_THREADS") == "1" else 1
     arguments = (world, pickle.dumps(trial), environment, algebra_threads)
     process = start_process(_run_apart, arguments, trial.method.id)
@@ -93,7 +93,7 @@ def _run_apart(
             os.dup2(descriptor, replaced)
         os.environ.clear()
         os.environ.update(environment, HOME=str(world / "home"), TMPDIR=str(world / "tmp"))
-        # As the engine does for its steps: a font cache is matplotlib's, not the method's.
+        # As for steps of the engine: matplotlib's font cache does not belong to the method.
         os.environ["MPLCONFIGDIR"] = str(world / "matplotlib")
         os.environ.setdefault(VARIABLE, str(world / "numba"))
         reload_numba_config()
@@ -101,7 +101,7 @@ def _run_apart(
         os.chdir(world / "cwd")
         importlib.invalidate_caches()
         with threadpoolctl.threadpool_limits(algebra_threads):
-            # The method is imported here, too.
+            # Unpickling also imports the method.
             run = run_trial(pickle.loads(pickled), world / "scratch", draws=False)
         (world / "digests.json").write_text(json.dumps(dict(run.digests)))
         code = 0

@@ -1,7 +1,7 @@
-"""A textured wall with relief, exactly known: as a raster, a cloud, and through a distorted camera.
+"""A textured wall with known relief: as a raster, as a cloud, and seen by a distorted camera.
 
-What methods for photographs are tried on. Everything is a function of the position on the wall, so
-the truth of a cell, of a pixel and of a pose is known to the last digit.
+It is the example for methods that use photographs. Depth and colour are functions of the position
+on the wall, so the true values of cells, pixels and poses are known exactly.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ SIZE_M: Final = (3.0, 2.0)
 GSD_M: Final = 0.006
 DISTORTION: Final = (-0.09, 0.03, 6e-4, -4e-4, 0.0)
 RELIEF_M: Final = 0.06
-# Finest octave of the texture: four cells, so that neither raster nor photo aliases.
+# Wavelengths of the texture; the finest is four cells, to avoid aliasing in raster and photo.
 _OCTAVES_M: Final = (0.024, 0.06, 0.2)
-# Ties lie on the wall and on a board before it: a method that solves for the lens with the pose
-# cannot do so from control near one plane.
+# Ties are on the wall and on a board in front of it: control points close to a single plane do not
+# determine lens and pose together.
 _BOARD_M: Final = 0.6
 _TIE_SIGMA_PX: Final = 0.3
 _TIE_SIGMA_M: Final = 0.001
@@ -53,10 +53,10 @@ _WRONG_SHARE: Final = 0.04
 
 @dataclass(frozen=True, kw_only=True)
 class TexturedWall:
-    """A wall whose depth and grey are smooth functions of the position on it.
+    """A wall whose depth and grey value are smooth functions of the position on it.
 
     Attributes:
-        frame: the raster's frame; the wall looks to -y, so a viewer stands at negative y.
+        frame: frame of the raster; the wall faces -y, so viewers are at negative y.
         noises: one grid of random numbers per octave of the texture.
     """
 
@@ -66,7 +66,7 @@ class TexturedWall:
     def depth_m(
         self, across_m: NDArray[np.float64], down_m: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the relief towards the viewer at metres from the top-left corner."""
+        """Return the relief towards the viewer, at metres from the top-left corner."""
         wave = np.sin(2.1 * across_m) * np.cos(2.9 * down_m + 0.4) + 0.4 * np.sin(
             5.0 * across_m + 1
         )
@@ -75,7 +75,7 @@ class TexturedWall:
     def grey(
         self, across_m: NDArray[np.float64], down_m: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the grey, 0..1."""
+        """Return the grey value from 0 to 1, at metres from the top-left corner."""
         total = np.zeros(np.broadcast(across_m, down_m).shape)
         for step, noise in zip(_OCTAVES_M, self.noises, strict=True):
             at = [down_m / step + 8.0, across_m / step + 8.0]
@@ -86,7 +86,7 @@ class TexturedWall:
 def textured_wall(
     seed: int, *, origin_world: NDArray[np.float64] | None = None, gsd_m: float = GSD_M
 ) -> TexturedWall:
-    """Return a wall of 3 m x 2 m with 6 cm of relief; its plane goes through `origin_world`."""
+    """Return a 3 m x 2 m wall with 6 cm relief, whose plane contains `origin_world`."""
     rng = np.random.default_rng(seed)
     frame = WallFrame(
         origin_world=np.array([0.0, 0.0, SIZE_M[1]]) if origin_world is None else origin_world,
@@ -105,7 +105,7 @@ def textured_wall(
 
 
 def walls_of(scene: TexturedWall, *, noise: float = 0.02, seed: int = 5) -> Walls:
-    """Return the wall as the scan shows it: its contrast curve is not the photos', one window."""
+    """Return the wall as scanned, with a window and another contrast curve than in the photos."""
     frame = scene.frame
     across, down = places_of_cells(frame)
     rng = np.random.default_rng(seed)
@@ -137,7 +137,7 @@ def walls_of(scene: TexturedWall, *, noise: float = 0.02, seed: int = 5) -> Wall
 
 
 def places_of_cells(frame: WallFrame) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return metres across and down, (rows, cols) each, of the centres of a raster's cells."""
+    """Return metres across and down, each (rows, cols), of the centres of raster cells."""
     across, down = np.meshgrid(np.arange(frame.width) + 0.5, np.arange(frame.height) + 0.5)
     return across * frame.gsd_m, down * frame.gsd_m
 
@@ -148,7 +148,7 @@ def _cut_window(values: NDArray[np.float64], gsd_m: float) -> None:
 
 
 def cloud_of(scene: TexturedWall, *, spacing_m: float = 0.005) -> PointCloud:
-    """Return the wall as coloured points in a regular grid, a station before its middle."""
+    """Return the wall as coloured points on a regular grid, with a station opposite its centre."""
     across, down = (
         places.ravel()
         for places in np.meshgrid(
@@ -182,7 +182,7 @@ def camera_before(
     towards: tuple[float, float, float] = (1.5, 0.0, 1.0),
     roll: float = 0.0,
 ) -> ViewingCamera:
-    """Return a distorted camera; its places are metres from the wall's bottom-left corner."""
+    """Return a distorted camera; positions are in metres from the wall's bottom-left corner."""
     corner = scene.frame.origin_world - [0.0, 0.0, SIZE_M[1]]
     rotation = looking_at(
         corner + np.array(centre), corner + np.array(towards), np.array([0.0, 0.0, 1.0])
@@ -207,7 +207,7 @@ def camera_before(
 def photo_of(
     scene: TexturedWall, camera: ViewingCamera, *, name: str = "a.png", calibrated: bool = True
 ) -> Photo:
-    """Return what the camera sees, each pixel's centre traced; black beside the wall."""
+    """Return the image seen by the camera, traced at pixel centres; black outside the wall."""
     return Photo(
         name=name,
         encoded=_picture(pickle.dumps((scene, camera))),
@@ -218,10 +218,10 @@ def photo_of(
     )
 
 
-# Half a second each, and most tests of a method look at the same few.
+# Takes half a second per image, and most tests of a method use the same few.
 @lru_cache(maxsize=32)
 def _picture(pickled: bytes) -> bytes:
-    """Return the picture of a scene and a camera, which are pickled so that equal ones share it."""
+    """Return the image of a scene and a camera, pickled so that equal ones share an entry."""
     scene: TexturedWall
     camera: ViewingCamera
     scene, camera = pickle.loads(pickled)
@@ -249,17 +249,17 @@ def _without_pose(camera: ViewingCamera) -> ViewingCamera:
     return replace(camera, rotation=np.eye(3), translation=np.zeros(3))
 
 
-# The photos of a scene have one lens, and to undo its distortion takes a third of a picture's time.
+# All photos of a scene have the same lens, and removing distortion takes a third of the time.
 @lru_cache(maxsize=2)
 def _rays_camera(pickled: bytes) -> NDArray[np.float64]:
-    """Directions in camera axes of all pixels of a camera, whose pose is nobody's."""
+    """Return the directions of all pixels in camera axes; the pose of the camera is ignored."""
     camera: ViewingCamera = pickle.loads(pickled)
     columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     return camera.rays_camera(np.column_stack([columns.ravel(), rows.ravel()]))
 
 
 def oriented(camera: ViewingCamera, *, name: str = "a.png") -> Camera:
-    """Return a photo's orientation as the product has it."""
+    """Return a photo's orientation as it is stored in the `Cameras` product."""
     return Camera(
         photo=name,
         status="ok",
@@ -270,24 +270,24 @@ def oriented(camera: ViewingCamera, *, name: str = "a.png") -> Camera:
 
 
 def photos(*items: Photo) -> Photos:
-    """Return some photos as a product."""
+    """Return photos as a product."""
     return Photos(photos=items)
 
 
 def cameras(*items: Camera) -> Cameras:
-    """Return some orientations as a product."""
+    """Return orientations as a product."""
     return Cameras(cameras=items)
 
 
 def nudged(camera: ViewingCamera, vector: tuple[float, ...]) -> ViewingCamera:
-    """Return the camera turned by a small rotation vector (rad) and shifted (m)."""
+    """Return the camera rotated by a small rotation vector (rad) and shifted (m)."""
     rotation = rotation_from_vector(np.array(vector[:3])) @ camera.rotation
     centre = camera.centre_world + np.array(vector[3:])
     return replace(camera, rotation=rotation, translation=-rotation @ centre)
 
 
 def wall_error_m(scene: TexturedWall, found: ViewingCamera, true: ViewingCamera) -> float:
-    """Return the RMS per coordinate of where pixels land on the wall's plane, found minus true."""
+    """Return the RMS per coordinate, in the wall's plane, of projected pixels: found minus true."""
     steps = np.linspace(20.0, 620.0, 9)
     pixels = np.array([(u, v) for u in np.linspace(20.0, 880.0, 9) for v in steps])
     landed = []
@@ -309,7 +309,7 @@ def wall_error_m(scene: TexturedWall, found: ViewingCamera, true: ViewingCamera)
 
 @cache
 def photographed_scene(gsd_m: float = 0.006) -> TexturedWall:
-    """Return the wall, its raster with cells of a given size."""
+    """Return the wall with the given cell size of its raster."""
     return textured_wall(1, gsd_m=gsd_m)
 
 
@@ -343,7 +343,7 @@ def _cameras() -> Cameras:
 
 
 def settled_camera(camera: Camera) -> Camera:
-    """Return an orientation the same bits on every processor."""
+    """Return an orientation with rounded values, which has the same bits on every processor."""
     rotation, translation = (
         camera.rotation_camera_from_world,
         camera.translation_camera_from_world,
@@ -379,16 +379,16 @@ def _checkpoints() -> CheckPoints:
 
 @cache
 def example_ties() -> Ties:
-    """Return ties with 0.3 px of noise, every 25th of them wrong by up to 40 px."""
+    """Return ties with 0.3 px noise, every 25th of them wrong by up to 40 px."""
     return drawn_ties(11, noise_m=0.0)
 
 
 def drawn_ties(seed: int, *, noise_m: float = _TIE_SIGMA_M) -> Ties:
-    """Return ties as those of the example, drawn again.
+    """Return ties like those of the example, with other random numbers.
 
     Args:
-        seed: of places, noise and wrong ties.
-        noise_m: standard deviation of each coordinate of a point; as stated, unless given.
+        seed: seed of positions, noise and wrong ties.
+        noise_m: standard deviation of the coordinates of points; by default, the one in the ties.
     """
     rng = np.random.default_rng(seed)
     views = list(photographing_cameras().values())
@@ -411,7 +411,7 @@ def drawn_ties(seed: int, *, noise_m: float = _TIE_SIGMA_M) -> Ties:
         photo_names=tuple(photographing_cameras()),
         photo=photo.astype(np.int32),
         wall=wall.astype(np.int32),
-        # Rounding errors of pixels are a millionth of what is left.
+        # Rounding errors of pixels are a millionth of the last digit kept.
         pixels_photo=settled(pixels, 6),
         points_world=settled(points),
         sigma_px=np.full(count, _TIE_SIGMA_PX),

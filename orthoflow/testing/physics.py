@@ -1,4 +1,4 @@
-"""What a result must be like in the world: planes that follow a motion, poses, cells in place."""
+"""Physical checks of results: planes that follow a motion, poses, positions of cells."""
 
 from __future__ import annotations
 
@@ -36,32 +36,33 @@ from orthoflow.testing.photographed import (
 )
 from orthoflow.testing.witnesses import Subject, output_of, require
 
-# Ties of 0.3 px and 1 mm at 2.5 m: single ones are off by 1.3 mm on the wall, a hundred together by
-# a tenth of that. A half pixel of the wrong convention is 1.5 mm.
+# Ties with 0.3 px and 1 mm at 2.5 m: a single tie is off by 1.3 mm on the wall, the mean of a
+# hundred by a tenth of that. A half-pixel error from a wrong pixel convention is 1.5 mm.
 _POSE_LIMIT_M: Final = 0.0008
-# 2,300 on the smallest side: its direction is known to 0.003 deg.
+# The smallest side has 2,300 points, which determine its direction to 0.003 deg.
 _ROOM_POINTS: Final = 20_000
 _CELL_SIZES_M: Final = (0.006, 0.01)
 _SHIFT_LIMIT_CELLS: Final = 0.2
 _PAINTED_SHARE: Final = 0.3
 _JOINED_SHARE: Final = 0.97
-# Seeds of rooms, or sets of ties, whose errors are compared with what is stated of them.
+# Seeds of rooms, or of sets of ties, whose errors are compared with the predicted ones.
 _DRAWS: Final = (2, 3, 4)
-# A plane farther from a true one is another plane.
+# A plane farther away than this from a true plane is treated as another plane.
 _SAME_PLANE_M: Final = 0.02
-# In the place of a variance of zero, so that its error counts as far too large.
+# Replaces a variance of zero, so that the ratio of its error is far too large.
 _NO_VARIANCE: Final = 1e-30
-# The RMS over what is drawn is known to an eighth; our own methods have 0.82 to 0.93.
+# Limits of actual to predicted RMS error. The RMS is known to 1/8; built-in methods have 0.82 to
+# 0.93.
 _STATED_LIMITS: Final = (0.1, 2.0)
 
 _Kinds: TypeAlias = Mapping[str, Callable[[], Product]]
 
 
 def planes_follow_a_rigid_motion(subject: Subject) -> None:
-    """Planes of a room turned about up and shifted are the planes, turned and shifted.
+    """Planes found in a room that is rotated about the vertical and shifted move with it.
 
-    Tolerances: 0.02 deg and 1 mm, far above the fit's own noise (2 mm / sqrt(n)) and far below
-    what a method that thinks in axes or loses digits would show.
+    Tolerances are 0.02 deg and 1 mm, far above the noise of the fit (2 mm / sqrt(n)) and far below
+    the errors of a method that depends on the axes or loses digits.
     """
     shift = np.array([634512.347, 486215.781, 112.193])
     for turned_deg, moved_by in ((0.0, shift), (33.0, np.zeros(3)), (191.7, shift)):
@@ -87,7 +88,7 @@ def _match_planes(found: Planes, truth: Planes) -> None:
 
 
 def stated_errors_of_planes_hold(subject: Subject) -> None:
-    """Planes of drawn rooms are off by a tenth to twice what their covariances state."""
+    """The errors of planes of random rooms are 0.1 to 2 times those predicted by covariances."""
     ratios: list[float] = []
     for seed in _DRAWS:
         cloud, truth = example_room(seed=seed, n_points=_ROOM_POINTS)
@@ -97,14 +98,14 @@ def stated_errors_of_planes_hold(subject: Subject) -> None:
 
 
 def _plane_ratios(found: Planes, truth: Planes) -> list[float]:
-    """Return errors over their stated standard deviations, at true corners and centres."""
+    """Return errors divided by predicted standard deviations, at true corners and centres."""
     ratios = []
     for index in range(len(found)):
         nearest = int(np.argmax(truth.normal @ found.normal[index]))
         corners = truth.corners[nearest]
         places = np.vstack([corners, corners.mean(axis=0)])
         off_m = places @ found.normal[index] - found.offset[index]
-        # What is no plane of the room is not judged here.
+        # Planes that are not planes of the room are ignored here.
         if np.abs(off_m).max() < _SAME_PLANE_M:
             at = np.column_stack([places, -np.ones(len(places))])
             variances = np.einsum("ij,jk,ik->i", at, found.covariance[index], at)
@@ -113,7 +114,7 @@ def _plane_ratios(found: Planes, truth: Planes) -> list[float]:
 
 
 def stated_errors_of_poses_hold(subject: Subject) -> None:
-    """Poses from drawn ties are off by a tenth to twice what their covariances state."""
+    """The errors of poses from random ties are 0.1 to 2 times those predicted by covariances."""
     ratios: list[float] = []
     for seed in _DRAWS:
         run = subject.run_on_photographs(f"stated{seed}", ties=drawn_ties(seed))
@@ -121,7 +122,7 @@ def stated_errors_of_poses_hold(subject: Subject) -> None:
             if camera.status == "ok" and camera.covariance is not None:
                 found, true = camera.viewing(), photographing_cameras()[camera.photo]
                 turn = true.rotation @ found.rotation.T
-                # Half the skew part is the vector of a small turn.
+                # The rotation vector of a small rotation is half of its skew-symmetric part.
                 turned = 0.5 * (turn - turn.T)[(2, 0, 1), (1, 2, 0)]
                 error = np.concatenate([turned, true.translation - found.translation])
                 scale = np.sqrt(np.maximum(np.diag(camera.covariance), _NO_VARIANCE))
@@ -145,7 +146,7 @@ def _check_ratios(ratios: list[float], what: str) -> None:
 
 
 def poses_are_recovered(subject: Subject) -> None:
-    """Two photos with ties of 0.3 px, some of them wrong, are oriented to 0.8 mm on the wall."""
+    """Two photos with 0.3 px ties, some of them wrong, are oriented to 0.8 mm on the wall."""
     for camera in output_of(subject.run_on_photographs(), "cameras", Cameras).cameras:
         require(camera.status == "ok", f"{camera.photo} was not oriented: {camera.status}")
         true = photographing_cameras()[camera.photo]
@@ -158,7 +159,7 @@ def poses_are_recovered(subject: Subject) -> None:
 
 
 def cells_show_their_own_place(subject: Subject) -> None:
-    """At two cell sizes each painted cell has the colour of its own place, to 0.2 cells."""
+    """With two cell sizes, each painted cell has the colour of its own position, to 0.2 cells."""
     for gsd_m in _CELL_SIZES_M:
         scene = photographed_scene(gsd_m)
         kinds: _Kinds = {
@@ -174,7 +175,7 @@ def cells_show_their_own_place(subject: Subject) -> None:
 
 
 def mosaics_show_cells_in_place(subject: Subject) -> None:
-    """Two layers that overlap become one orthoimage whose cells have the colour of their place."""
+    """Two overlapping layers become an orthoimage whose cells have the colour of their position."""
     for gsd_m in _CELL_SIZES_M:
         scene = photographed_scene(gsd_m)
         kinds: _Kinds = {"layers": partial(_two_halves, scene), "walls": partial(walls_of, scene)}
@@ -192,13 +193,13 @@ def mosaics_show_cells_in_place(subject: Subject) -> None:
 
 
 def _inputs(subject: Subject, kinds: _Kinds) -> dict[str, Product]:
-    """What the method takes of these kinds, by port."""
+    """Return inputs of a method by port, for its ports of these types."""
     ports = port_specs(subject.method.In).items()
     return {name: kinds[port.type_name]() for name, port in ports if port.type_name in kinds}
 
 
 def _two_halves(scene: TexturedWall) -> Layers:
-    """Layers of the left and the right 60 % of the wall, in its true colours."""
+    """Return layers of the left and the right 60 % of the wall, in its true colours."""
     frame = scene.frame
     grey = np.rint(255.0 * scene.grey(*places_of_cells(frame))).astype(np.uint8)
     across = np.broadcast_to(np.arange(frame.width) / frame.width, frame.shape)
@@ -227,7 +228,7 @@ def _check_cells(
     require(share > _PAINTED_SHARE, f"{where}: only {share:.0%} of the wall is painted")
     gradient: list[NDArray[np.float64]] = list(np.gradient(truth_grey))
     down, across = gradient
-    # What is shown - true = gradient * displacement: one displacement for the layer, least squares.
+    # Shown minus true = gradient * displacement: one displacement per layer, by least squares.
     design = np.column_stack([across[painted], down[painted], np.ones(int(painted.sum()))])
     difference = image.rgb[..., 0][painted].astype(np.float64) - truth_grey[painted]
     shift_cells = np.linalg.solve(design.T @ design, design.T @ difference)[:2]

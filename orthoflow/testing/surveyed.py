@@ -1,9 +1,9 @@
-"""Small inputs from the simulated room, for methods that work on what other methods give.
+"""Small inputs from the simulated room, for methods that use the results of other methods.
 
-The room is simulated; what methods would compute from it (planes, rasters, orthoimages) is
-computed here by closed forms instead. So an example does not move when another method does, and
-has the same bits on every processor: what comes from sums, roots or angles is rounded far above
-its last digits, the rest is exact in any order.
+The room is simulated, but planes, rasters and orthoimages, which methods would compute from it, are
+computed here by closed formulas. An example therefore does not change if another method changes,
+and has the same bits on every processor: results of sums, roots and angles are rounded to far fewer
+digits than they have, and all others are exact in any order.
 """
 
 from __future__ import annotations
@@ -46,19 +46,19 @@ _GSD_M: Final = 0.05
 _BUFFER_M: Final = 0.2
 # The first two are the main wall and the floor.
 _N_PLANES: Final = 2
-# Rounding errors of metres and unit vectors are a ten-millionth of this.
+# Decimals kept: rounding errors of metres and unit vectors are ten million times smaller.
 _DECIMALS: Final = 9
-# Of axes: coarse enough to hide rounding, fine enough for a frame to be right-angled.
+# Decimals kept of axes: few enough to remove rounding errors, enough for orthogonal frames.
 _AXIS_DECIMALS: Final = 11
-# Cells between the numbers that stains are drawn from, a power of two: their shares are exact.
+# Cells between the random numbers of the stains; a power of two, so that weights are exact.
 _STAIN_CELLS: Final = 8
-# The right-hand picture is lighter, as where a photo was exposed longer.
+# The right-hand image is lighter, as with a longer exposure.
 _LIGHTER_GREY: Final = 6
 
 
 def settled(values: NDArray[np.float64], decimals: int = _DECIMALS) -> NDArray[np.float64]:
-    """Round away what the order of sums and a processor's fused instructions change."""
-    # Minus zero has other bits than zero.
+    """Round away differences caused by the order of sums and by fused instructions."""
+    # Adding zero converts minus zero, which has other bits than zero.
     return np.asarray(np.round(values, decimals) + 0.0)
 
 
@@ -115,7 +115,7 @@ def _frame(plane: int) -> WallFrame:
     normal = planes.normal[plane]
     frame = frame_over(planes.corners[plane], normal, gsd_m=_GSD_M)
     u = settled(frame.u_world, _AXIS_DECIMALS)
-    # A cross product is two products and a difference, the same everywhere.
+    # Each component of a cross product is a difference of two products, the same everywhere.
     return replace(frame, u_world=u, v_world=np.cross(u, normal))
 
 
@@ -134,7 +134,7 @@ def _wall(plane: int) -> Wall:
     frame = _frame(plane)
     rows, cols = frame.shape
     stains = _stains(frame.shape, seed=plane)
-    # Waves of 8 mm, in steps that a float32 holds exactly.
+    # Waves of 8 mm, in steps that float32 represents exactly.
     depth = (np.abs(np.arange(cols) % 16 - 8)[None, :] + np.arange(rows)[:, None] % 4) / 1024.0
     window, rim = np.zeros(frame.shape, np.bool_), np.zeros(frame.shape, np.bool_)
     window[rows // 3 : rows // 2, cols // 2 : 2 * cols // 3] = True
@@ -157,7 +157,7 @@ def _wall(plane: int) -> Wall:
 
 
 def _stains(shape: tuple[int, int], *, seed: int) -> NDArray[np.float64]:
-    """Smooth light and dark, 40..215: hashed numbers in a coarse grid, linear between them."""
+    """Return smooth stains, 40..215: hashed numbers on a coarse grid, interpolated linearly."""
     rows, cols = (np.arange(n) / _STAIN_CELLS for n in shape)
     coarse = np.random.default_rng(seed).integers(40, 216, [n // _STAIN_CELLS + 2 for n in shape])
     i, j = (np.floor(places).astype(int) for places in (rows, cols))
@@ -169,7 +169,7 @@ def _stains(shape: tuple[int, int], *, seed: int) -> NDArray[np.float64]:
 
 
 def _colours(stains: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """A reddish colour for each grey."""
+    """Return a reddish colour for each grey value."""
     return np.floor(stains[..., None] * [1.0, 0.875, 0.75]).astype(np.uint8)
 
 
@@ -186,7 +186,7 @@ def _layers() -> Layers:
 
 
 def _layer(plane: int, *, is_right: bool) -> Layer:
-    """Two thirds of a wall, from the left or the right; best at its outer side.
+    """Return two thirds of a wall, left or right; the quality is best at the outer side.
 
     Three of its rows are filled from their neighbours.
     """
@@ -221,7 +221,7 @@ def _orthoimages() -> Orthoimages:
 
 
 def _orthoimage(plane: int) -> Orthoimage:
-    """The better layer of each cell; where both are hidden, one row of four is filled."""
+    """Return the better layer in each cell; where both are hidden, one row in four is filled."""
     left, right = _layers().layers[2 * plane : 2 * plane + 2]
     frame = left.frame
     is_right = (right.quality > left.quality)[..., None]
@@ -244,7 +244,7 @@ def _orthoimage(plane: int) -> Orthoimage:
 
 @cache
 def _openings() -> Openings:
-    """The void of the first wall."""
+    """Return the opening of the first wall."""
     wall = _walls().walls[0]
     frame = wall.frame
     rows, cols = frame.shape

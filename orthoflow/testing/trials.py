@@ -1,4 +1,4 @@
-"""Running a method outside a workflow, as a check needs it: once, watched, in a known folder."""
+"""Running a method outside a workflow for a check: once, observed, in a known folder."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from orthoflow.sdk.context import Drawing, DrawnFigure
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """What to run.
+    """A method with inputs and parameters to run it with.
 
     Attributes:
-        method: the class.
+        method: class of the method.
         inputs: port -> product.
         params: parameters that differ from the defaults.
-        seed: of the generator.
-        cores: threads the method may use.
+        seed: seed of the random generator.
+        cores: maximum number of threads.
     """
 
     method: type[Method]
@@ -36,15 +36,15 @@ class Trial:
 
 @dataclass(frozen=True, kw_only=True)
 class TrialRun:
-    """What came out.
+    """Result of running a trial.
 
     Attributes:
         outputs: port -> product.
         digests: port -> digest of the product.
-        metrics: what the method reported.
-        figures: pictures, still in the scratch folder.
+        metrics: metrics reported by the method.
+        figures: figures, in the scratch folder.
         events: progress, log lines and warnings, in order.
-        fractions: progress as the method stated it, before the context kept it from going back.
+        fractions: progress as reported by the method, before the context makes it monotonic.
     """
 
     outputs: Mapping[str, Product]
@@ -57,7 +57,7 @@ class TrialRun:
 
 @dataclass(kw_only=True)
 class _WatchedContext(StepContext):
-    """Remembers every fraction that it was given."""
+    """A context that records all progress fractions."""
 
     fractions: list[float] = field(default_factory=list)
     draws: bool = True
@@ -79,13 +79,13 @@ def run_trial(
     """Run a method once in an empty scratch folder.
 
     Args:
-        trial: what to run.
-        scratch: made when it is not there.
-        is_cancelled: the step was cancelled before it began.
-        draws: keep figures; drawing takes longer than many a method.
+        trial: the trial.
+        scratch: scratch folder, created if missing.
+        is_cancelled: whether the step is cancelled before it starts.
+        draws: keep figures; drawing takes longer than many methods.
 
     Raises:
-        OrthoflowError: what the method raises.
+        OrthoflowError: raised by the method.
         AssertionError: the method returned something that is not its `Out`.
     """
     scratch.mkdir(parents=True, exist_ok=True)
@@ -99,7 +99,7 @@ def run_trial(
         draws=draws,
     )
     method = trial.method
-    # Any: what a method returns is judged here.
+    # `Any`: the type of the returned value is checked here.
     returned: Any = method().run(method.In(**trial.inputs), method.Params(**trial.params), ctx)
     if not isinstance(returned, method.Out):
         got = type(returned).__name__

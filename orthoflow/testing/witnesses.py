@@ -1,4 +1,4 @@
-"""What checks look at: runs of one method, each made once and only when asked for."""
+"""Runs of a method for checks, each made only once and only if needed."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ _Product = TypeVar("_Product", bound=Product)
 
 @dataclass(frozen=True, kw_only=True)
 class WatchedRun:
-    """A run, and what it changed around itself.
+    """A run, and its side effects.
 
     Attributes:
-        run: what came out.
-        changed_inputs: names of inputs whose digest is another one afterwards.
-        drew_globally: whether the state of numpy's global generator is another one afterwards.
+        run: result of the run.
+        changed_inputs: names of inputs whose digest has changed.
+        drew_globally: whether the state of numpy's global generator has changed.
     """
 
     run: TrialRun
@@ -38,10 +38,10 @@ class WatchedRun:
 
 
 class Witness:
-    """Runs a trial in the ways that checks compare.
+    """Runs a trial in the different ways that checks compare.
 
     Args:
-        trial: on one core.
+        trial: a trial with one core.
     """
 
     def __init__(self, trial: Trial) -> None:
@@ -49,7 +49,7 @@ class Witness:
 
     @cached_property
     def first(self) -> WatchedRun:
-        """The run, watched."""
+        """The first run, with its side effects."""
         inputs, state = deepcopy(dict(self.trial.inputs)), _global_state()
         before = _digests(inputs)
         run = _run(replace(self.trial, inputs=inputs))
@@ -59,25 +59,25 @@ class Witness:
 
     @cached_property
     def again(self) -> TrialRun:
-        """The same in the same process; the run on two cores where the results were the same."""
+        """A second run in the same process; with two cores if that gave the same results."""
         if self.on_two_cores.digests == self.first.run.digests:
             return self.on_two_cores
         return _run(self.trial)
 
     @cached_property
     def on_two_cores(self) -> TrialRun:
-        """The same on two cores."""
+        """The same run on two cores."""
         return _run(replace(self.trial, cores=2))
 
     @cached_property
     def elsewhere(self) -> ElsewhereRun:
-        """The same in a new process, in an empty world."""
+        """The same run in a new process with empty folders."""
         with TemporaryDirectory(prefix="orthoflow-conformance-") as folder:
             return run_elsewhere(self.trial, Path(folder))
 
 
 def _run(trial: Trial) -> TrialRun:
-    # Outputs may be files mapped from the scratch folder: they stay readable when it is gone.
+    # Outputs may be files mapped from the scratch folder; they stay readable after its removal.
     with TemporaryDirectory(prefix="orthoflow-conformance-") as folder:
         return run_trial(trial, Path(folder))
 
@@ -92,12 +92,12 @@ def _global_state() -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Subject:
-    """A method with what to try it on.
+    """A method to be checked, with its inputs.
 
     Attributes:
         witness: runs of the method on its inputs.
-        folder: empty, for further runs.
-        golden: file of digests that results are held to, or None.
+        folder: empty folder for further runs.
+        golden: file with golden results, or None.
     """
 
     witness: Witness
@@ -106,17 +106,17 @@ class Subject:
 
     @property
     def method(self) -> type[Method]:
-        """The class."""
+        """Class of the method."""
         return self.witness.trial.method
 
     def run_on(self, name: str, **inputs: Product) -> TrialRun:
-        """Run the method with other inputs on some ports, in a scratch folder of that name."""
+        """Run the method with other inputs on some ports; `name` is used for the scratch folder."""
         trial = self.witness.trial
         changed = replace(trial, inputs={**trial.inputs, **inputs})
         return run_trial(changed, self.folder / name)
 
     def run_on_photographs(self, name: str = "photographs", **inputs: Product) -> TrialRun:
-        """Run the method on the suite's own photographs, with other inputs on some ports."""
+        """Run the method on the photographs of the suite, with other inputs on some ports."""
         examples = example_inputs(self.method)
         given = self.witness.trial.inputs
         if not inputs and all(given.get(port) is one for port, one in examples.items()):
@@ -125,15 +125,15 @@ class Subject:
         return run_trial(changed, self.folder / name)
 
     def run_cancelled(self) -> TrialRun:
-        """Run the method in a step that was cancelled before it began."""
+        """Run the method in a step that is cancelled before it starts."""
         return run_trial(self.witness.trial, self.folder / "cancelled", is_cancelled=True)
 
 
 def output_of(run: TrialRun, port: str, kind: type[_Product]) -> _Product:
-    """Return an output that a method of its kind has to give.
+    """Return an output that all methods of its kind must have.
 
     Raises:
-        AssertionError: it is missing, or of another type.
+        AssertionError: the output is missing or of another type.
     """
     product = run.outputs.get(port)
     if not isinstance(product, kind):
@@ -142,10 +142,10 @@ def output_of(run: TrialRun, port: str, kind: type[_Product]) -> _Product:
 
 
 def require(holds: object, sentence: str) -> None:
-    """Fail a check with one sentence unless something holds.
+    """Raise an error with one sentence unless a condition is true.
 
     Raises:
-        AssertionError: it does not.
+        AssertionError: the condition is false.
     """
     if not holds:
         raise AssertionError(sentence)
