@@ -24,7 +24,7 @@ from orthoflow.version import __version__
 _TEMPLATES: Final = Path(__file__).parent / "templates"
 # Names that a written module may import.
 _IMPORTED: Final = frozenset({*products.__all__, *sdk.__all__})
-# Placeholder texts for the author to replace; `unwritten` finds those that are left.
+# Initial texts for the author to replace; `unwritten` finds those that are left.
 _UNWRITTEN: Final = {
     "summary": "one line for `orthoflow plugins list`",
     "description": "State here what the method does, for `orthoflow plugins show`.",
@@ -121,7 +121,7 @@ def write_project(project: Project, parent: Path, catalog: Catalog) -> tuple[Pat
 
 
 def unwritten(method_id: str, catalog: Catalog) -> tuple[str, ...]:
-    """List the placeholder texts of `write_project` that are left in the plugin of a method.
+    """List the initial texts of `write_project` that are left in the plugin of a method.
 
     Raises:
         PluginError: the method cannot be loaded.
