@@ -84,6 +84,8 @@ class Cell:
         timeout_s: time limit in seconds; None if there is none.
         skip_reason: why the cell will not run (optional data is not given); empty if it will run.
         skip_type: the same as the `error_type` of its result.
+        variant: name of its variant in the file, which a sweep may have multiplied; empty if the
+            step has none.
     """
 
     address: str
@@ -99,12 +101,12 @@ class Cell:
     timeout_s: float | None = None
     skip_reason: str = ""
     skip_type: str = ""
+    variant: str = ""
 
     @property
     def setting(self) -> str:
         """Return the prefix for its parameters in settings: `step`, or `step.variant`."""
-        variant = self.assignment.get(self.step)
-        return f"{self.step}.{variant}" if variant else self.step
+        return f"{self.step}.{self.variant}" if self.variant else self.step
 
     @property
     def sources(self) -> tuple[str, ...]:
@@ -576,6 +578,7 @@ class _Expansion:
             timeout_s=variant.timeout_s,
             skip_reason=skip_reason,
             skip_type=NOT_ASKED_FOR if skip_reason else "",
+            variant=variant.family if variant.swept else variant.name,
         )
 
 

@@ -505,6 +505,7 @@ class StepVariant:
         cores: requested number of cores; None for all.
         timeout_s: time limit in seconds; None if there is none.
         swept: swept parameter -> value of this variant; a subset of `params_set`.
+        family: name in the file of the variant that a sweep multiplied; not in the record.
     """
 
     __pydantic_config__ = ConfigDict(extra="forbid")
@@ -518,6 +519,7 @@ class StepVariant:
     cores: Annotated[int, Field(ge=1)] | None = None
     timeout_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
     swept: Mapping[str, Any] = field(default_factory=dict)
+    family: Annotated[str, Field(exclude=True)] = ""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -279,6 +279,7 @@ def resolve_call(
         cores=draft.call.resources.cores,
         timeout_s=draft.call.timeout,
         swept=draft.swept or {},
+        family=draft.family,
     )
 
 

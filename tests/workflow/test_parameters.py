@@ -15,7 +15,7 @@ from orthoflow.catalog.discovery import NAME_PATTERN
 from orthoflow.files.documents import meant_number, meant_parameter
 from orthoflow.products.product import JsonValue
 from orthoflow.workflow.document import load_workflow
-from orthoflow.workflow.expand import swept_indices
+from orthoflow.workflow.expand import expand_cells, swept_indices
 from orthoflow.workflow.model import Workflow
 from orthoflow.workflow.parameters import variant_names
 from orthoflow.workflow.source import InvalidWorkflowError
@@ -115,6 +115,13 @@ def test_a_value_that_is_not_swept_any_more_stands_for_its_variant(catalog: Cata
     assert load_swept(catalog, alone, sets=["plane.tolerance_m=0.03"]).baseline == {}
     with pytest.raises(InvalidWorkflowError, match="has no variant ransac-tolerance_m-0_07"):
         load_swept(catalog, TWO.replace("hough2d-tolerance_m-0_05}", "ransac-tolerance_m-0_07}"))
+
+
+def test_a_remedy_names_a_swept_variant_as_set_takes_it(catalog: Catalog) -> None:
+    for text, setting in ((TWO, "plane.hough2d"), (SWEPT, "plane")):
+        cells = expand_cells(load_swept(catalog, text), catalog)
+        assert setting in {cell.setting for cell in cells if cell.step == "plane"}
+        load_swept(catalog, text, sets=[f"{setting}.tolerance_m=0.03"])
 
 
 def test_a_value_takes_the_place_of_a_sweep_and_a_sweep_that_of_a_value(catalog: Catalog) -> None:
