@@ -1,6 +1,6 @@
-"""A cloud prepared for detection: blocks, a representative sample, the plan, and its noise.
+"""Preparation of a cloud for detection: blocks of points, a sample, the plan, and the noise.
 
-Detectors search the sample alone. Fits and labels then use all points.
+Detectors search only the sample. Fits and labels then use all points.
 """
 
 from __future__ import annotations
@@ -36,34 +36,36 @@ _TAIL_SHARE: Final = 0.05
 _GOLDEN: Final = 0.6180339887498949
 # Cell size of the robust box for detectors that do not use the plan.
 _BOX_CELL_M: Final = 0.5
-# Share of the points that may lie outside the box on each side, well below what a plane must have:
-# mirror ghosts and stray points, 0.4 % in simulated rooms, would make it several times as large.
+# Share of the points allowed outside the box on each side, far below the minimum share of a plane.
+# Otherwise ghosts in mirrors and stray points (0.4 % in simulated rooms) would make the box several
+# times as large.
 _OUTSIDE_SHARE: Final = 0.00125
-# Thread-private plans and surface rasters must stay small compared with the cloud.
+# Maximum number of threads, so that their own plans and rasters are small relative to the cloud.
 _PARTS_MOST: Final = 8
 # A cloud thinner than this in two directions is a line or a point.
 _THINNEST_M: Final = 1e-4
 
-# Number of places at which noise is measured; radii and numbers of points of neighbourhoods.
+# Number of positions at which noise is measured, radii of neighbourhoods, and their minimum and
+# maximum numbers of points.
 _NOISE_SEEDS: Final = 600
 _RADII_M: Final = (0.05, 0.1, 0.2, 0.4, 0.8)
 _NEAR_LEAST: Final = 12
 _NEAR_MOST: Final = 400
 # A neighbourhood is flat if it extends this many times farther along its plane than across it.
 _FLATNESS: Final = 5.0
-# Minimum number of flat places for an estimate.
+# Minimum number of flat neighbourhoods for an estimate.
 _FLAT_LEAST: Final = 20
 _QUARTER: Final = 0.25
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sample:
-    """A few hundred thousand points that represent all.
+    """Points that represent the cloud, at most `SAMPLE_POINTS`.
 
     Attributes:
-        index: (m,) int64 positions in the cloud, ascending.
-        offsets_m: (m, 3) float64 metres from the cloud's origin.
-        n_represented: points of the cloud per sample point.
+        index: (m,) int64 indices of the points in the cloud, ascending.
+        offsets_m: (m, 3) float64 coordinates relative to the cloud's origin, metres.
+        n_represented: number of points of the cloud per sample point.
     """
 
     index: NDArray[np.int64]
@@ -73,17 +75,18 @@ class Sample:
 
 @dataclass(frozen=True, kw_only=True)
 class PreparedCloud:
-    """A cloud in the form that compiled passes take, and the plane of each of its points.
+    """A cloud in the form that kernels need, and the plane of each point.
 
     Attributes:
         points: all points.
-        sample: the sample of them.
-        grid: cells of the plan and bins of height.
+        sample: a sample of the points.
+        grid: the plan and the height bins.
         up: (3,) unit vector.
-        parts: parts of parallel passes.
-        claims: (n,) int8, plane of each point, -1 for none yet; `search.label` fills them.
-        plan: (cells along e1, cells along e2) points per cell of the plan; empty if not counted.
-        heights: (bins,) points per bin of height, of those inside the plan.
+        parts: number of parts that are processed in parallel.
+        claims: (n,) int8 plane of each point, -1 if not yet assigned; set by `search.label`.
+        plan: (cells along e1, cells along e2) number of points per plan cell; empty if there is no
+            plan.
+        heights: (bins,) number of points inside the plan per height bin.
     """
 
     points: BlockedPoints
@@ -97,11 +100,11 @@ class PreparedCloud:
 
     @property
     def sample_claims(self) -> NDArray[np.int8]:
-        """(m,) int8, plane of each sample point, -1 for none yet."""
+        """Planes of the sample points (m,) int8, -1 if not yet assigned."""
         return self.claims[self.sample.index]
 
     def box_corners(self) -> NDArray[np.float64]:
-        """(8, 3) offsets of the corners of the robust box, metres."""
+        """Return the corners (8, 3) of the robust box, offsets in metres."""
         steps = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
         return (self.grid.low_m + steps * self.grid.extent_m) @ self.grid.basis
 
@@ -111,9 +114,10 @@ class PreparedCloud:
         bounds_m: NDArray[np.float64],
         names: NDArray[np.int8] | None = None,
     ) -> None:
-        """Assign each point to the nearest of some slabs (k, 12) in whose bounds (k, 5) it lies.
+        """Assign each point to the nearest of the slabs (k, 12) whose bounds (k, 5) contain it.
 
-        Claims are the indices of the slabs, or their (k + 1,) names, the last for -1.
+        Claims are the indices of the slabs, or their (k + 1,) names; the last name is for points
+        outside all slabs.
         """
 
         def claim(_part: int, piece: slice) -> None:
@@ -125,7 +129,7 @@ class PreparedCloud:
         each_part(len(self.claims), self.parts, claim)
 
     def write_labels(self, names: NDArray[np.int16], labels: NDArray[np.int16]) -> None:
-        """Write the label (n,) of each point; the last of (k + 1,) names is for -1."""
+        """Write labels (n,) of points from (k + 1,) names; the last is for points on no plane."""
 
         def write(_part: int, piece: slice) -> None:
             name_labels(self.claims[piece], names, labels[piece])
@@ -145,10 +149,10 @@ def prepare(
 
     Args:
         cloud: the cloud.
-        parts: threads.
-        plan_cell_m: side of the cells of the plan, counted in the same pass; None for no plan.
-        box_cell_m: the sides of the robust box are multiples of this without a plan.
-        outside_share: share of the points that may lie outside the box on each side.
+        parts: number of threads.
+        plan_cell_m: cell size of the plan, which is counted in the same pass; None for no plan.
+        box_cell_m: if there is no plan, the sides of the robust box are multiples of this.
+        outside_share: share of the points allowed outside the box on each side.
 
     Raises:
         ProductError: the cloud has fewer than three points, or coordinates that are not finite.
@@ -181,7 +185,7 @@ def prepare(
 
 
 def draw_sample(cloud: PointCloud) -> Sample:
-    """Take one point from each of `SAMPLE_POINTS` equal parts of the cloud, all of a small one.
+    """Draw one point from each of `SAMPLE_POINTS` equal parts of the cloud; all of a small cloud.
 
     The position within a part follows the golden ratio: a fixed stride would coincide with the
     columns of a scan, and random positions would need a seed.
@@ -199,7 +203,7 @@ def draw_sample(cloud: PointCloud) -> Sample:
 
 
 def thinned(cloud: PointCloud, every: int) -> PointCloud:
-    """Keep every n-th point, at least three, spread as those of a sample: coordinates and scan."""
+    """Return every n-th point, at least three, as in `draw_sample`: coordinates and scan."""
     if every == 1:
         return cloud
     index = _spread_index(len(cloud), min(len(cloud), max(3, len(cloud) // every)))
@@ -224,7 +228,7 @@ def _spread_index(n_points: int, count: int) -> NDArray[np.int64]:
 
 
 def blocked(offsets_m: NDArray[np.float64]) -> BlockedPoints:
-    """Return points (m, 3) of a sample in blocks."""
+    """Return the points (m, 3) of a sample in blocks."""
     offsets = read_only(*np.ascontiguousarray(offsets_m.T, dtype=np.float32))
     return count_points(offsets, None, parts=1)[0]
 
@@ -232,25 +236,26 @@ def blocked(offsets_m: NDArray[np.float64]) -> BlockedPoints:
 def plan_grid(
     sample: Sample, basis: NDArray[np.float64], *, cell_m: float, outside_share: float
 ) -> PlanGrid:
-    """Return plan cells over the cloud without its gross outliers.
+    """Return the plan of a cloud without gross outliers.
 
     Args:
         sample: points of the cloud.
         basis: (3, 3) rows e1, e2, up.
         cell_m: requested side of a cell; enlarged if the plan would have too many.
-        outside_share: share of the points that may lie outside on each side.
+        outside_share: share of the points allowed outside on each side.
     """
     framed = sample.offsets_m[:: max(1, len(sample.index) // _BOX_POINTS)] @ basis.T
     low, high = np.quantile(framed, (_TAIL_SHARE, 1.0 - _TAIL_SHARE), axis=0)
     # The tails may be a side room or stray echoes; only points farther away than the size of the
-    # scene are certainly stray. A single wall is thin one way, so the largest extent counts.
+    # scene are certainly stray. A single wall is thin in one direction, so the largest extent is
+    # used.
     reach_m = float((high - low).max())
     framed = framed[((framed >= low - reach_m) & (framed <= high + reach_m)).all(axis=1)]
     low, high = np.quantile(framed, (outside_share, 1.0 - outside_share), axis=0)
     margin = 0.02 * (high - low) + 5.0 * cell_m
     low, high = low - margin, high + margin
     extent = high - low
-    # A long, thin plan, or a tall tower, must not need millions of bins of height either.
+    # A long, narrow plan or a tall tower must not need millions of height bins either.
     fewest_m = math.sqrt(float(extent[0] * extent[1]) / PLAN_CELLS_MOST)
     cell_m = max(cell_m, fewest_m, float(extent.max()) / PLAN_CELLS_MOST)
     a, b, c = np.maximum(1, np.ceil(extent / cell_m)).astype(int).tolist()
@@ -258,17 +263,17 @@ def plan_grid(
 
 
 def measure_noise(points_m: NDArray[np.float64]) -> tuple[float, float] | None:
-    """Measure the noise of a cloud on a sample (n, 3) of its points; None if nothing is flat.
+    """Measure the noise of a cloud on a sample (n, 3) of its points; None if it has no flat parts.
 
-    A plane is fitted to the points around a seed (principal components). Their scatter across it
-    is noise if they are flat: they extend at least five times farther along the plane than across
-    it. Small neighbourhoods give the noise of single points. Large ones also contain errors that
-    neighbouring points share (a bent trajectory, stereo, misregistered scans), but relief as well,
-    so the flatter quarter of them is used.
+    A plane is fitted to the points around a seed (principal components). Their scatter across the
+    plane is noise if they are flat, which means that they extend at least five times farther along
+    the plane than across it. Small neighbourhoods give the noise of single points. Large ones also
+    contain errors that are common to neighbouring points (a bent trajectory, stereo matching,
+    misregistered scans). They contain relief as well, so the lower quartile is used.
 
     Returns:
-        Standard deviations across the surfaces, metres: of single points against their neighbours,
-        and with errors that the points within 0.8 m share.
+        Standard deviations across the surfaces, metres: of single points relative to their
+        neighbours, and including errors that are common to points within 0.8 m.
     """
     from scipy.spatial import cKDTree
 
@@ -301,7 +306,7 @@ def _flat_scatter_m(points_m: NDArray[np.float64]) -> float:
     """Return the robust scatter of points across their plane; NaN if they are not flat.
 
     This is 1.4826 times the median deviation from the plane of principal components. A second
-    surface or an edge widens the components, so the test of flatness rejects such places.
+    surface or an edge widens the components, so the test of flatness rejects such neighbourhoods.
     """
     relative = points_m - points_m.mean(axis=0)
     values, axes = np.linalg.eigh(relative.T @ relative / (len(points_m) - 3))

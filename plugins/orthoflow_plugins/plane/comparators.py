@@ -1,4 +1,4 @@
-"""Plane detectors of open3d, as comparators: segment_plane, and detect_planar_patches."""
+"""Plane detectors of open3d for comparison: `segment_plane` and `detect_planar_patches`."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ from orthoflow_plugins.plane.detector import (
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.search import Search
 
-# Minimum number of points of a candidate as a share of those that a plane needs.
+# Minimum number of points of a candidate as a share of the minimum of a plane.
 PART_SHARE: Final = 0.2
-# open3d's defaults: spread of the normals in a patch, its flatness (90 is flat) and its share of
+# Defaults of open3d: scatter of the normals in a patch, its flatness (90 is flat), and its share of
 # points off the plane.
 _NORMAL_VARIANCE_DEG: Final = 60.0
 _COPLANARITY_DEG: Final = 75.0
 _OUTLIER_SHARE: Final = 0.75
-# Neighbours for normals and growing.
+# Number of neighbours for normals and region growing.
 _NEIGHBOURS: Final = 30
 
 
-# Any: the library has no types.
+# Any, because open3d has no types.
 def load_open3d(purpose: str) -> Any:
     """Import open3d.
 
@@ -45,16 +45,16 @@ def load_open3d(purpose: str) -> Any:
     libusb-package contains it, and open3d finds it once it is loaded globally.
 
     Args:
-        purpose: what needs it, for the message.
+        purpose: the feature that needs open3d, for error messages.
 
     Raises:
-        PluginError: it is not installed or does not load.
+        PluginError: open3d is not installed or does not load.
     """
     try:
         usb = import_module("libusb_package")
         ctypes.CDLL(str(usb.get_library_path()), mode=ctypes.RTLD_GLOBAL)
     except (ImportError, OSError):
-        # The system may have libusb itself; if not, open3d says so below.
+        # The system may have libusb; otherwise, the import of open3d fails below.
         pass
     try:
         return import_module("open3d")
@@ -72,7 +72,7 @@ def load_open3d(purpose: str) -> Any:
 
 
 class _Open3dMethod(Method):
-    """Common base of the methods of open3d."""
+    """Base class of the methods of open3d."""
 
     determinism = "loose"
     metrics = DETECTOR_METRICS
@@ -91,12 +91,12 @@ class _Open3dMethod(Method):
 
 
 class Open3dRansac(_Open3dMethod):
-    """Find planes with open3d's `segment_plane` on the remaining points, plane after plane.
+    """Find one plane after another in the remaining points with open3d's `segment_plane`.
 
     For comparison: it uses the same sample of the cloud as the other detectors, takes longer than
-    plane.ransac, and is not exactly repeatable, whatever the seed. `refit: false` shows its own
-    planes; with the common refit, the planes that it finds are as accurate as those of any other
-    detector.
+    plane.ransac, and is not exactly repeatable, even with a fixed seed. `refit: false` returns the
+    planes of open3d; after the common refit, its planes are as accurate as those of other
+    detectors.
     """
 
     id = "plane.open3d-ransac"
@@ -121,17 +121,17 @@ class Open3dRansac(_Open3dMethod):
 
 
 class SegmentProposer:
-    """Proposes the plane of `segment_plane` among the remaining points, repeatedly."""
+    """Proposes the plane that `segment_plane` finds in the remaining points."""
 
     # Any: the library has no types.
     def __init__(self, search: Search, params: Open3dRansac.Params, open3d: Any) -> None:
-        """Store the settings; open3d has no constraint, so unsuitable planes are skipped."""
+        """Store the settings; open3d has no constraints: unsuitable planes are rejected later."""
         self._params, self._open3d = params, open3d
         self._passed_over = np.zeros(len(search.claims), dtype=bool)
         self._last = np.zeros(0, dtype=np.int64)
 
     def propose(self, search: Search) -> Candidate | None:
-        """Return the plane with most inliers, or None if it has too few."""
+        """Return the plane with the most inliers, or None if it has too few."""
         free = np.flatnonzero((search.claims < 0) & ~self._passed_over)
         if len(free) < max(3.0, search.least_points):
             return None
@@ -150,17 +150,17 @@ class SegmentProposer:
         )
 
     def reject(self, candidate: Candidate) -> None:
-        """Exclude the inliers of the refused plane from the next search."""
+        """Exclude the inliers of the rejected plane from further searches."""
         del candidate
         self._passed_over[self._last] = True
 
 
 class Open3dPatches(_Open3dMethod):
-    """Find planes with open3d's `detect_planar_patches`, which grows patches by robust statistics.
+    """Find planes with open3d's `detect_planar_patches`, a region growing.
 
-    For comparison: it uses the same sample of the cloud as the other detectors, with normals of
-    nearest neighbours there. `refit: false` shows its own planes, through the centre of the box
-    around a patch, which mouldings bias.
+    For comparison: it uses the same sample of the cloud as the other detectors, with normals from
+    nearest neighbours in it. `refit: false` returns the planes of open3d, which pass through the
+    centre of the box around a patch and are biased by mouldings.
     """
 
     id = "plane.open3d-patches"
@@ -183,14 +183,14 @@ class Open3dPatches(_Open3dMethod):
 
 
 class PatchProposer:
-    """Proposes the patches of `detect_planar_patches`, by the number of points in their boxes."""
+    """Proposes the patches of `detect_planar_patches`, those with the most points first."""
 
     # Any: the library has no types.
     def __init__(self, search: Search, params: DetectorParams, open3d: Any) -> None:
         """Find all patches at once.
 
         Raises:
-            MethodError: open3d failed.
+            MethodError: open3d fails.
         """
         points_m = search.cloud.sample.offsets_m
         cloud = open3d.geometry.PointCloud()
@@ -230,4 +230,4 @@ class PatchProposer:
         return self._candidates.pop(0) if self._candidates else None
 
     def reject(self, candidate: Candidate) -> None:
-        """Do nothing: each patch is proposed once."""
+        """Do nothing, because each patch is proposed only once."""

@@ -1,4 +1,4 @@
-"""What all detectors share: ports, parameters, metrics, candidates."""
+"""Ports, parameters, metrics and candidates common to all detectors."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from orthoflow.geometry import Plane
 from orthoflow.products import Planes, PointCloud, PointLabels
 from orthoflow.sdk import MethodParams, MetricSpec, Ports
 
-# Which planes are searched for.
+# Orientation of the planes to search for.
 Constraint = Literal["any", "vertical", "horizontal"]
 # Lowest and highest intensity of each material.
 Materials = Mapping[str, tuple[float, float]]
@@ -81,15 +81,15 @@ PAPER: Final = (
     "of Cultural Heritage Objects. Remote Sensing 7(12), doi:10.3390/rs71215869"
 )
 
-# Tolerances of a clean scan: that of markiewicz2015, and one that excludes the mouldings of rooms.
+# Tolerances for a clean scan: that of markiewicz2015, and one that excludes mouldings.
 _TOLERANCE_M: Final = 0.05
 _FIT_TOLERANCE_M: Final = 0.015
-# Tolerances per standard deviation of the noise.
+# Ratio of the tolerances to the standard deviation of the noise.
 _NOISE_TIMES: Final = 4.0
 
 
 class DetectorIn(Ports):
-    """The cloud to search."""
+    """The cloud."""
 
     cloud: PointCloud
 
@@ -116,7 +116,7 @@ class DetectorParams(MethodParams):
         "more.",
     )
     constraint: Constraint = Field(
-        "any", description="Which planes are searched for, within `max_tilt_deg`."
+        "any", description="Orientation of the planes to search for, within `max_tilt_deg`."
     )
     max_tilt_deg: float = Field(
         10.0,
@@ -134,8 +134,8 @@ class DetectorParams(MethodParams):
     min_area_m2: float = Field(
         1.0,
         ge=0.0,
-        description="Minimum area of a plane, square metres; the search ends when no candidate has "
-        "as much. Less in a cloud none of whose faces has 50 times that.",
+        description="Minimum area of a plane, square metres; the search ends when all candidates "
+        "are smaller. It is reduced for a cloud without a face of at least 50 times this area.",
     )
     min_share: float = Field(
         0.001, gt=0.0, lt=1.0, description="Minimum share of all points on a plane."
@@ -144,29 +144,29 @@ class DetectorParams(MethodParams):
         0.0,
         ge=0.0,
         lt=1.0,
-        description="Stop when a smaller share of the points is on no plane yet. markiewicz2015 "
-        "uses 0.1, which misses walls far from the scanner. 0 never stops.",
+        description="Stop when the share of points not yet on a plane is smaller than this. "
+        "markiewicz2015 uses 0.1, which misses walls far from the scanner. 0 disables this.",
     )
     stop_rest_share: float = Field(
         0.0,
         ge=0.0,
         lt=1.0,
-        description="Stop at a plane that has a smaller share of the points not yet assigned: the "
-        "other reading of the 10 % in markiewicz2015. 0 never stops.",
+        description="Stop at a plane that contains a smaller share of the points not yet "
+        "assigned: the other interpretation of the 10 % in markiewicz2015. 0 disables this.",
     )
     thinning: int = Field(
         1,
         ge=1,
         le=10_000,
-        description="Find and fit planes on every n-th point only; all points are labelled.",
+        description="Find and fit planes using only every n-th point; all points are labelled.",
     )
     join_parts: bool = Field(
         default=True,
-        description="Treat parts of a plane that do not touch as one plane instead of several.",
+        description="Treat disconnected parts of a plane as one plane instead of several.",
     )
     materials: dict[str, tuple[float, float]] = Field(
         default_factory=dict,
-        description="Lowest and highest intensity (0..1) of each material, by its name, e.g. "
+        description="Lowest and highest intensity (0..1) of each material by name, such as "
         "{fabric: [0, 0.3], plaster: [0.3, 1]}: the thickness of the cloud is reported for each.",
     )
     refit: bool = Field(
@@ -205,17 +205,17 @@ class DetectorParams(MethodParams):
         return self
 
     def tolerances_m(self, single_m: float, shared_m: float) -> tuple[float, float]:
-        """Return `tolerance_m` and `fit_tolerance_m` of a cloud with a noise.
+        """Return `tolerance_m` and `fit_tolerance_m` for a cloud with the given noise.
 
-        A plane is distinguished from a filled slab by the concentration of its points in the inner
-        half of the tolerance: 95 % of them (normal distribution) if the tolerance is four standard
-        deviations, but only 80 %, which is refused, if it is 2.5. Errors that neighbouring points
-        share bend a surface, so they count for `tolerance_m`, and by half for the fit, which
-        averages bends over the whole plane.
+        A plane differs from a filled slab in the concentration of its points in the inner half of
+        the tolerance. With a normal distribution this half contains 95 % of them if the tolerance
+        is four standard deviations, but only 80 %, which is rejected, if it is 2.5. Errors common
+        to neighbouring points bend a surface, so they count fully for `tolerance_m`, and by half
+        for the fit, which averages bends over the whole plane.
 
         Args:
             single_m: noise of single points, standard deviation; 0 if unknown.
-            shared_m: the same, including errors that neighbouring points share.
+            shared_m: the same, including errors that are common to neighbouring points.
         """
         if self.fit_tolerance_m == "auto":
             fit_m = max(_FIT_TOLERANCE_M, _NOISE_TIMES * single_m, 0.5 * _NOISE_TIMES * shared_m)
@@ -231,11 +231,11 @@ class Candidate:
     """A plane that a detector proposes.
 
     Attributes:
-        plane: in the cloud's offsets, accurate to a few centimetres or a degree.
-        constraint: which planes it may become.
-        votes: the detector's own score.
-        own_tolerance_m: the tolerance estimated by the detector, or None.
-        start: the plane from which the common fit starts; None for `plane`.
+        plane: the plane in the cloud's offsets, accurate to a few centimetres or a degree.
+        constraint: permitted orientation of the fitted plane.
+        votes: score of the detector.
+        own_tolerance_m: tolerance estimated by the detector, or None.
+        start: initial plane of the common fit; None for `plane`.
     """
 
     plane: Plane
@@ -251,7 +251,7 @@ def leans_as_asked(
     constraint: Constraint,
     max_tilt_deg: float,
 ) -> NDArray[np.bool_]:
-    """Return which planes with (n, 3) normals are vertical, or horizontal, within a tilt; (n,)."""
+    """Return (n,) whether planes with normals (n, 3) satisfy a constraint within `max_tilt_deg`."""
     tilts_deg = np.degrees(np.arcsin(np.clip(np.abs(normals @ up), 0.0, 1.0)))
     if constraint == "any":
         return np.ones(len(normals), dtype=bool)

@@ -1,4 +1,4 @@
-"""Pictures of what was found and how: deviations, planes, thickness, accumulators, normals."""
+"""Figures of planes and their detection: deviations, thickness, accumulators, normals."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _PANELS_MOST: Final = 4
 _POINTS_MOST: Final = 25_000
 _NAMED_MOST: Final = 12
 _NAMES_ABREAST: Final = 3
-# The view is from above, a little aside, along parallel lines.
+# A parallel projection, obliquely from above.
 _AZIMUTH_DEG: Final = -60.0
 _ELEVATION_DEG: Final = 35.0
 _GREY: Final = "#c8c8c8"
@@ -47,17 +47,17 @@ def draw_deviations(
     deviations: Deviations,
     normalities: Sequence[Normality | None],
 ) -> None:
-    """Draw how the points of the first planes lie about them, with the Gauss curve of the fit."""
+    """Draw the distances of points from the first planes, with the normal distribution."""
     count = min(_PANELS_MOST, len(planes))
     figure = column_figure(0.3 + 1.15 * count)
-    # One scale for all planes, so that they compare.
+    # The same scale for all planes, so that they can be compared.
     panels = figure.subplots(count, 2, squeeze=False, sharex="col", sharey="col")
     tolerance_mm = 1000.0 * deviations.tolerance_m
     edges_mm = np.linspace(-tolerance_mm, tolerance_mm, HISTOGRAM_BINS + 1)
     middles_mm = 0.5 * (edges_mm[1:] + edges_mm[:-1])
     width_mm = edges_mm[1] - edges_mm[0]
     for index, (axes, beside) in enumerate(panels):
-        # Per cent of the points in a millimetre, so that planes of any size compare.
+        # Percentage of points per millimetre, so that planes of any size can be compared.
         share = 100.0 / (max(1.0, float(deviations.histogram[index].sum())) * width_mm)
         axes.stairs(
             share * deviations.histogram[index], edges_mm, fill=True, color=plane_ink(index)
@@ -109,14 +109,14 @@ def draw_planes(
     plane_of_point: NDArray[np.int64],
     cloud: PointCloud,
 ) -> None:
-    """Draw points coloured by their plane above the rectangles of the planes' parts.
+    """Draw the points coloured by plane and, below, the rectangles of the planes' parts.
 
     Args:
-        ctx: takes the figure.
-        planes: the planes, world.
+        ctx: receives the figure.
+        planes: the planes, in world coordinates.
         points_m: (m, 3) a sample of the cloud, offsets.
-        plane_of_point: (m,) plane of each, -1 for none.
-        cloud: where they are from.
+        plane_of_point: (m,) plane of each point, -1 for none.
+        cloud: the cloud.
     """
     every = max(1, len(points_m) // _POINTS_MOST)
     shown = points_m[::every]
@@ -126,7 +126,7 @@ def draw_planes(
     low, high = corners.min(axis=0), corners.max(axis=0)
     margin = 0.04 * (high - low)
     n_named = min(_NAMED_MOST, len(planes))
-    # Not a constrained layout, which draws all the points once more to measure them.
+    # No constrained layout, since it would draw all points twice.
     panel_in = COLUMN_INCHES * float(np.clip((high[1] - low[1]) / (high[0] - low[0]), 0.3, 1.0))
     legend_in = 0.08 + 0.14 * -(-n_named // _NAMES_ABREAST)
     figure = column_figure(2.0 * panel_in + legend_in)
@@ -138,7 +138,7 @@ def draw_planes(
     above.plot(*flat[on_none].T, ".", markersize=1.0, markeredgewidth=0.0, color=_GREY)
     below.plot(*flat.T, ",", color="#e4e4e4")
     from_the_front = planes.normal @ np.cross(*view) > 0.0
-    # The smallest last, so that the floor does not hide what stands on it.
+    # The smallest planes last, so that the floor does not hide objects on it.
     for k in range(len(planes)):
         colour = plane_ink(k)
         if from_the_front[k]:
@@ -175,7 +175,7 @@ def draw_thickness(
     row: RowPoints | None,
     materials: Materials,
 ) -> None:
-    """Draw what is known about the thickness; nothing where no plane has enough points."""
+    """Draw the thickness of the cloud; nothing if no plane has enough points."""
     known = [(k, item) for k, item in enumerate(found) if item is not None][:_PLANES_MOST]
     if not known:
         return
@@ -229,7 +229,7 @@ def draw_thickness(
 
 
 def _view(up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(2, 3) directions to the right and up in the picture, in world axes."""
+    """Return the right and up directions (2, 3) of the figure, in world axes."""
     azimuth, elevation = math.radians(_AZIMUTH_DEG), math.radians(_ELEVATION_DEG)
     right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
     towards = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
@@ -237,7 +237,7 @@ def _view(up: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array([right, rise]) @ basis_from_up(up)
 
 
-# What the thickness is drawn along, by its label.
+# Attributes against which the thickness is plotted, by axis label.
 _CLASSES: Final = {
     "angle of incidence [deg]": "incidence_deg",
     "range [m]": "range_m",
@@ -259,7 +259,7 @@ def _draw_bars(
 
 
 def _draw_row(axes: Axes, planes: Planes, row: RowPoints, materials: Materials) -> None:
-    """Distances of the points of a scan row from the first plane, coloured by material."""
+    """Draw the distances of a scan row from the first plane, coloured by material."""
     axes.plot(row.along_m, 1000.0 * row.distance_m, ".", markersize=1, color="#333333")
     if row.intensity is not None:
         for name, (low, high) in materials.items():
@@ -276,14 +276,15 @@ _PIXELS_MOST: Final = 900
 _SECTION_POINTS_MOST: Final = 2_000_000
 _SECTION_CELLS_MOST: Final = 2_000
 _BIN_DEG: Final = 1.0
-# The map shows voxels this near to the plane, so that niches and what stands before it are there.
+# The map shows voxels up to this distance from the plane, so that it includes niches and objects in
+# front of the wall.
 _MAP_DEPTH_M: Final = 0.6
 _MAP_MOST_DEG: Final = 15.0
 _MAP_PIXELS_MOST: Final = 700
 
 
 class PlanVotes(Protocol):
-    """What a plan looked like before any plane was taken from it; see `hough2d.PlanProposer`."""
+    """A plan before any plane was removed from it; see `hough2d.PlanProposer`."""
 
     grid: PlanGrid
     plan: NDArray[np.int64]
@@ -295,13 +296,14 @@ class PlanVotes(Protocol):
 
 @in_column_style()
 def draw_accumulator(ctx: StepContext, votes: PlanVotes, planes: Planes, cloud: PointCloud) -> None:
-    """Draw the plan with the walls found, and the parameter space with their maxima.
+    """Draw the plan with the detected walls, and the parameter space with their maxima.
 
     Args:
-        ctx: takes the figure.
-        votes: the plan, and its votes before any plane was taken; nothing is drawn without.
-        planes: the planes, world.
-        cloud: where they are from.
+        ctx: receives the figure.
+        votes: the plan and its votes before any plane was removed; nothing is drawn if there are no
+            votes.
+        planes: the planes, in world coordinates.
+        cloud: the cloud.
     """
     if votes.first is None:
         return
@@ -322,7 +324,7 @@ def draw_accumulator(ctx: StepContext, votes: PlanVotes, planes: Planes, cloud: 
     figure.colorbar(plan, ax=above, label="points per cell", format="{x:g}")
     shown = _show_votes(below, _thinned_sum(votes.first), (0.0, 180.0, -reach_m, reach_m))
     figure.colorbar(shown, ax=below, label="votes")
-    # The one maximum, as a line of the plan and as a place of the parameter space.
+    # The global maximum, as a line in the plan and as a point in the parameter space.
     n_angles, n_bins = votes.first.shape
     row, column = np.unravel_index(int(votes.first.argmax()), votes.first.shape)
     angle, distance_m = math.pi * row / n_angles, reach_m * (2.0 * (column + 0.5) / n_bins - 1.0)
@@ -335,7 +337,7 @@ def draw_accumulator(ctx: StepContext, votes: PlanVotes, planes: Planes, cloud: 
         corners = (planes.corners[index] - cloud.origin) @ basis.T
         colour, name = plane_ink(int(index)), planes.names[index]
         above.plot(*corners[[1, 2], :2].T, linewidth=1.2, color=colour, label=name)
-        # Where the wall lies in the parameter space.
+        # Position of the wall in the parameter space.
         normal = basis @ planes.normal[index]
         angle = math.atan2(normal[1], normal[0]) % math.pi
         direction = np.array([math.cos(angle), math.sin(angle)])
@@ -347,7 +349,7 @@ def draw_accumulator(ctx: StepContext, votes: PlanVotes, planes: Planes, cloud: 
     above.set_ylabel("e2 [m]")
     below.set_xlabel("direction of the normal [deg]")
     below.set_ylabel("distance from the centre [m]")
-    # Below the panels: the plan of a single long wall is too narrow to hold it.
+    # Below the panels, because the plan of a single long wall is too narrow for a legend.
     figure.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     ctx.figure(
         "accumulator",
@@ -368,15 +370,15 @@ def draw_space(
     reach_m: float,
     planes: Planes,
 ) -> None:
-    """Draw an accumulator's best votes with the planes found, and its sections.
+    """Draw the best votes of an accumulator with the detected planes, and its sections.
 
     Args:
-        ctx: takes the figures.
-        best: see `hough3d.sections_of`, which gives the next three, too.
+        ctx: receives the figures.
+        best: see `hough3d.sections_of`, also for the next three arguments.
         over_omega: see best.
         over_phi: see best.
         reach_m: see best.
-        planes: the planes, world.
+        planes: the planes, in world coordinates.
     """
     figure = column_figure(2.4)
     axes = figure.subplots()
@@ -399,7 +401,7 @@ def draw_space(
     )
     figure = column_figure(5.0)
     panels = figure.subplots(3, 2, sharex="col", sharey=True)
-    # One scale for all, so that sections compare.
+    # The same scale for all sections, so that they can be compared.
     most = max(float(votes.max()) for votes in (*over_omega.values(), *over_phi.values()))
     for (left, right), phi_deg, omega_deg in zip(panels, over_omega, over_phi, strict=True):
         shown = _show_votes(left, over_omega[phi_deg], (0.0, 180.0, -reach_m, reach_m), most)
@@ -426,7 +428,7 @@ def _show_votes(
     extent: tuple[float, float, float, float],
     most: float | None = None,
 ) -> AxesImage:
-    """Show (across, up) votes, the brighter the more, by the square root; white for the most."""
+    """Show votes (across, up) in grey by their square root; white is the maximum."""
     norm = PowerNorm(0.5, vmin=0.0, vmax=most)
     return axes.imshow(
         votes.T, origin="lower", aspect="auto", cmap="gray", norm=norm, extent=extent
@@ -438,16 +440,16 @@ def draw_sections(ctx: StepContext, planes: Planes, cloud: PointCloud, *, cell_m
     """Draw the points per voxel in three sections through the middle of the planes' parts.
 
     Args:
-        ctx: takes the figure.
-        planes: the planes, world; at least one.
+        ctx: receives the figure.
+        planes: the planes, in world coordinates; at least one.
         cloud: the cloud.
-        cell_m: side of a voxel; drawn larger where a scene would need too many.
+        cell_m: side of a voxel; enlarged if the scene would need too many voxels.
     """
     every = max(1, len(cloud) // _SECTION_POINTS_MOST)
     points_m = np.column_stack([cloud.x[::every], cloud.y[::every], cloud.z[::every]])
     basis = basis_from_up(planes.up)
     framed = points_m.astype(np.float64) @ basis.T
-    # Not what the points span: some lie far outside, behind mirrors and windows.
+    # Not the extent of all points, some of which are far outside, behind mirrors and windows.
     corners = (planes.corners.reshape(-1, 3) - cloud.origin) @ basis.T
     low, high = corners.min(axis=0), corners.max(axis=0)
     cell_m = max(cell_m, float((high - low).max()) / _SECTION_CELLS_MOST)
@@ -456,7 +458,7 @@ def draw_sections(ctx: StepContext, planes: Planes, cloud: PointCloud, *, cell_m
     names = ("e1", "e2", "up")
     views = ((0, 1, 2), (0, 2, 1), (1, 2, 0))
     sides_m = high - low
-    # To one scale: each as high as its section is.
+    # All sections have the same scale, so the heights of the panels differ.
     heights = [float(np.clip(sides_m[up] / sides_m[:2].max(), 0.25, 1.5)) for _, up, _ in views]
     figure = column_figure(2.3 * sum(heights) + 0.5 * len(views))
     panels = figure.subplots(len(views), 1, height_ratios=heights)
@@ -489,14 +491,14 @@ def draw_sections(ctx: StepContext, planes: Planes, cloud: PointCloud, *, cell_m
 def draw_normals(
     ctx: StepContext, voxels: SurfaceVoxels, n_regions: int, planes: Planes, cloud: PointCloud
 ) -> None:
-    """Report how normals scatter about the first plane, and draw their histogram and map.
+    """Report the scatter of normals about that of the first plane; draw histogram and map.
 
     Args:
-        ctx: takes metrics and figure.
+        ctx: receives metrics and figure.
         voxels: the voxels with their normals.
-        n_regions: regions of them with points enough.
-        planes: the planes, world.
-        cloud: where they are from.
+        n_regions: number of regions with enough points.
+        planes: the planes, in world coordinates.
+        cloud: the cloud.
     """
     centroids_m = voxels.table.centroids() @ voxels.table.grid.basis
     normals = voxels.normals.astype(np.float64) @ voxels.table.grid.basis
@@ -513,7 +515,7 @@ def draw_normals(
     ctx.metric("cell_mm", 1000.0 * voxels.table.grid.cell_m, "mm")
     ctx.metric("normal_scatter_deg", scatter_deg, "deg")
     shown = over & (np.abs(depth_m) < _MAP_DEPTH_M) & np.isfinite(voxels.spreads[:, 0])
-    # The angle of the voxel nearest to the viewer, NaN without one.
+    # Angle at the voxel nearest to the viewer; NaN where there is none.
     pixel_m = max(voxels.table.grid.cell_m, float(size_m.max()) / _MAP_PIXELS_MOST)
     picture = np.full(np.maximum(1, np.ceil(size_m / pixel_m).astype(int))[::-1], np.nan)
     order = np.flatnonzero(shown)[np.argsort(depth_m[shown], kind="stable")]
@@ -569,7 +571,7 @@ def _draw_normals(
 
 
 def _thinned_sum(values: NDArray[np.int64] | NDArray[np.int32]) -> NDArray[np.float64]:
-    """Sum blocks of an image until it is small enough to draw."""
+    """Return the sums of blocks of an image, so that it is small enough to draw."""
     rows, columns = (max(1, -(-size // _PIXELS_MOST)) for size in values.shape)
     padded = np.pad(values, ((0, -values.shape[0] % rows), (0, -values.shape[1] % columns)))
     blocks = padded.reshape(padded.shape[0] // rows, rows, padded.shape[1] // columns, columns)

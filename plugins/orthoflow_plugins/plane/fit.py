@@ -1,27 +1,27 @@
-"""Fits of a plane: to points of the sample, with a shrinking tolerance, and to the cells on it.
+"""Fits of a plane to points of the sample, with decreasing tolerance, and to the cells on it.
 
-All planes here are in the cloud's own offsets (metres from its origin), so that survey coordinates
-lose no digits; `planes` adds the origin once, at the end.
+All planes here are in the cloud's offsets (metres from its origin), so that large survey
+coordinates keep their precision; `planes` adds the origin at the end.
 
-The fit to cells is robust total least squares, cell by cell. Neighbouring points of a scan share
-errors: relief, bow and waves of the plaster exceed the scanner's noise. Each cell is therefore one
-observation, whose variance is that of the surface plus the noise of its points.
+The fit to cells is robust total least squares. Neighbouring points of a scan have common errors,
+because relief, bow and waves of the plaster exceed the noise of the scanner. Each cell is therefore
+one observation, whose variance is that of the surface plus that due to the noise of its points.
 
-Mouldings, edges and mixed distances put points beside the surface, nearly always on one side of it.
-They are excluded in three ways: the fit starts at the densest layer of cells instead of their
-median, distant cells lose their weight, and so do cells whose points scatter more than usual.
+Mouldings, edges and mixed pixels cause points off the surface, nearly always on one side of it.
+Their influence is reduced in three ways: the fit starts at the densest layer of cells instead of
+their median, distant cells have no weight, and cells with a larger scatter than usual have less.
 
 A covariance from single points would be far too small. It is estimated in three steps.
 
-- Tiles of cells are the independent units: the covariance is that of leaving out one tile at a
-  time (cluster jackknife, CR3 in Cameron & Miller 2015, section VI.B), which remains valid with
-  few tiles. Of several sizes of tile the one with the largest variance is used, because the
+- Tiles of cells are the independent units: the covariance is estimated by leaving out one tile at a
+  time (cluster jackknife, CR3 in Cameron & Miller 2015, section VI.B), which remains valid with few
+  tiles. Several tile sizes are tried, and the one with the largest variance is used, because the
   variance grows with the size as long as tiles are smaller than the correlation length.
 - Cells whose weight decreases with their residual carry less information than their weights
   suggest: the covariance is enlarged by the derivative of the influence function (Huber &
   Ronchetti 2009, section 7.6).
-- Mouldings and mixed distances lie on one side and bias the fit, which does not show in the
-  scatter. It shows in how far the plane moves if cells at twice the distance are used; this is
+- Mouldings and mixed pixels are on one side and bias the fit, which the scatter does not reveal.
+  The bias is estimated from the shift of the plane if cells at twice the distance are used, and is
   added as a separate component (GUM, JCGM 100:2008, 4.3).
 """
 
@@ -45,8 +45,8 @@ from orthoflow_plugins.plane.kernels import (
 )
 from orthoflow_plugins.plane.support import CellSums, Support, SurfaceRaster
 
-# What a fit may change: everything, or a normal kept exactly horizontal, or kept along up; that of
-# the compiled fit, and which of height, slope along u and slope along v are unknowns.
+# Constraint on the normal in a fit: none, exactly horizontal, or exactly along up. For each, the
+# constant of the kernel, and the unknowns among height, slope along u and slope along v.
 Freedom = Literal["free", "vertical", "horizontal"]
 _FREEDOMS: Final[dict[Freedom, tuple[int, list[int]]]] = {
     "free": (FREE, [0, 1, 2]),
@@ -54,31 +54,31 @@ _FREEDOMS: Final[dict[Freedom, tuple[int, list[int]]]] = {
     "horizontal": (LEVEL, [0]),
 }
 
-# In standard deviations of a cell: beyond, a cell has no weight (Beaton & Tukey 1974).
+# Residual, in standard deviations of a cell, beyond which it has no weight (Beaton & Tukey 1974).
 _TUKEY: Final = 3.5
-# Cells nearer than this share of the limit have full weight. If it decreased from the plane on, as
-# Tukey's does, the same points would be weighted differently for each division into cells: a
-# seventh of the information would be lost, and a rotated wall would move by half its sigma.
+# Cells closer than this share of the limit have full weight. With Tukey's weight, which decreases
+# from zero distance on, the weights of points would depend on the division into cells: a seventh of
+# the information would be lost, and rotating a wall would move the plane by half its sigma.
 _FULL_SHARE: Final = 0.571
-# The densest layer holds this share of the cells; a normal distribution holds it within +-0.385.
+# The densest layer contains this share of the cells; a normal distribution has it within +-0.385.
 _LAYER_SHARE: Final = 0.3
 _LAYER_SIGMAS: Final = 0.7706
-# The usual variance near a cell is combined with the cell's own as if it came from so many points.
+# Number of points as which the usual variance near a cell is weighted against that of the cell.
 _USUAL_POINTS: Final = 40
-# The usual variance is the median of blocks of this width, if they have this many cells.
+# The usual variance is the median in a block of this width, if it has at least this many cells.
 _BLOCK_CELLS: Final = 8
 _BLOCK_LEAST: Final = 12
 _CHANCE_SIGMAS: Final = 3.0
 _STEPS_MOST: Final = 30
-# A fit has settled when none of its cells moves by more than this.
+# A fit has converged when no cell moves by more than this.
 SETTLED_M: Final = 1e-7
-# Lower limit of the roughness of a surface, so that a perfectly flat simulation has weights too.
+# Lower limit of the roughness of a surface, so that weights of perfectly flat surfaces are finite.
 _FLATTEST_M: Final = 2e-5
 
-# Widths of tiles for the covariance, in cells; minimum number of tiles.
+# Widths of tiles for the covariance in cells, and minimum number of tiles.
 _TILE_CELLS: Final = (2, 4, 8, 16)
 _TILES_LEAST: Final = 8
-# The derivative of the influence function is trusted down to this share of the weights.
+# Lower limit of the ratio of the derivative of the influence function to the weights.
 _FLATTENING_LEAST: Final = 0.3
 _STEADY: Final = 1e-6
 _WIDER: Final = 2.0
@@ -88,8 +88,8 @@ _WIDER_STEPS: Final = 3
 def shrinking_tolerances(tolerance_m: float, fit_tolerance_m: float) -> tuple[float, ...]:
     """Return the tolerances of successive fits: 5 cm, 2.7 cm and 1.5 cm for the defaults.
 
-    A fit at 5 cm finds the wall but is biased by mouldings and the edge of the floor; a fit at
-    1.5 cm is exact but does not converge from a rough start.
+    A fit at 5 cm finds the wall but is biased by mouldings and the edge of the floor; a fit at 1.5
+    cm is accurate but does not converge from a poor initial plane.
     """
     if fit_tolerance_m >= tolerance_m:
         return (tolerance_m,)
@@ -107,36 +107,37 @@ def refine_plane(
 
     Args:
         points: (m, 3) offsets, metres.
-        start: plane to start from.
-        tolerances_m: of successive fits; points farther away have no weight (Tukey's weights).
-        freedom: what may change.
+        start: initial plane.
+        tolerances_m: tolerances of successive fits; points farther away have no weight (Tukey).
+        freedom: constraint on the normal.
         up: (3,) unit vector.
 
     Returns:
-        The plane, or None if fewer than three points or only points on a line support it.
+        The plane, or None if it is supported by fewer than three points or by collinear points
+        only.
     """
     basis = np.eye(3) if freedom == "free" else basis_from_up(up)
-    # One memory layout, so that one kernel is compiled.
+    # Always the same memory layout, so that only one version of the kernel is compiled.
     packed = np.ascontiguousarray(points if freedom == "free" else points @ basis.T)
     row = np.append(basis @ start.normal, start.offset_m)
     for tolerance_m in tolerances_m:
         if not refine_robustly(packed, row, tolerance_m, _FREEDOMS[freedom][0]):
             return None
     normal = row[:3] @ basis
-    # Twice, because Plane accepts no length that is off by more than rounding.
+    # Normalised twice, because Plane accepts only rounding errors in the length.
     normal /= np.linalg.norm(normal)
     return Plane(normal=normal / np.linalg.norm(normal), offset_m=float(row[3]))
 
 
 @dataclass(frozen=True, kw_only=True)
 class CellFit:
-    """A robust fit to cells, which are observations of the height above an approximate plane.
+    """A robust fit to cells, whose heights above an approximate plane are the observations.
 
     Attributes:
-        design: (n, p) derivatives of a height by the unknowns.
+        design: (n, p) derivatives of heights with respect to the unknowns.
         heights_m: (n,) mean height of the points of each cell.
-        rows: (n,) position of the cell on the plane.
-        columns: see rows.
+        rows: (n,) row of each cell.
+        columns: (n,) column of each cell.
         limit_m: (n,) residual beyond which a cell has no weight.
         variance_m2: (n,) variance of each cell.
         solution: (p,) the unknowns.
@@ -151,20 +152,20 @@ class CellFit:
     solution: NDArray[np.float64]
 
     def residuals_m(self) -> NDArray[np.float64]:
-        """Return (n,) heights above the plane."""
+        """Return the heights (n,) above the plane."""
         return np.asarray(self.heights_m - self.design @ self.solution)
 
     def faded(self) -> NDArray[np.float64]:
-        """Return (n,) positions of residuals between full weight, 0, and no weight, 1."""
+        """Return (n,) how far residuals are between full weight (0) and no weight (1)."""
         beyond = (np.abs(self.residuals_m() / self.limit_m) - _FULL_SHARE) / (1.0 - _FULL_SHARE)
         return np.clip(beyond, 0.0, 1.0)
 
     def weights(self) -> NDArray[np.float64]:
-        """Return (n,) robust weights over variances: full, then Tukey's towards the limit."""
+        """Return weights (n,): inverse variances, reduced by Tukey's function near the limit."""
         return (1.0 - self.faded() ** 2) ** 2 / self.variance_m2
 
     def stepped(self) -> CellFit | None:
-        """Solve with the current weights; None if the cells do not determine a plane."""
+        """Solve with the current weights; return None if the cells do not determine a plane."""
         weighted = self.weights() * self.design.T
         normal_matrix = weighted @ self.design
         extremes = np.abs(np.linalg.eigvalsh(normal_matrix))
@@ -179,12 +180,12 @@ class AdjustedPlane:
     """A plane fitted to cells.
 
     Attributes:
-        plane: in the cloud's offsets.
+        plane: the plane in the cloud's offsets.
         moved_m: largest displacement of a cell by the fit.
-        bend_per_m: strongest curvature of the surface, 1 over its radius.
-        bend_share: share of the variance of the cells that this curvature explains.
+        bend_per_m: largest curvature of the surface, the inverse of its radius.
+        bend_share: share of the variance of the cells explained by the curvature.
         fit: the fit to the cells.
-        jacobian: (4, p) of (normal, offset) by the unknowns of the fit.
+        jacobian: (4, p) derivatives of (normal, offset) with respect to the unknowns.
     """
 
     plane: Plane
@@ -195,10 +196,10 @@ class AdjustedPlane:
     jacobian: NDArray[np.float64]
 
     def stated(self) -> tuple[NDArray[np.float64], float]:
-        """Return the covariance (4, 4) of (normal, offset), in offsets.
+        """Return the covariance (4, 4) of (normal, offset) in the cloud's offsets.
 
         Returns:
-            The covariance, and the number of independent cells that would give the same one.
+            The covariance, and the number of independent cells with the same covariance.
         """
         covariance, n_independent = stated_covariance(self.fit)
         return self.jacobian @ covariance @ self.jacobian.T, n_independent
@@ -209,11 +210,11 @@ class FoundPlane:
     """An accepted plane.
 
     Attributes:
-        raster: its cells; `raster.plane` is the plane, in the cloud's offsets.
-        support: which cells belong, parts, rectangle.
+        raster: cells on the plane; `raster.plane` is the plane in the cloud's offsets.
+        support: cells that belong to the plane, its parts and rectangle.
         adjusted: the fit.
-        candidate: the detector's proposal.
-        freedom: the unknowns of the fit.
+        candidate: proposal of the detector.
+        freedom: constraint of the fit.
     """
 
     raster: SurfaceRaster
@@ -232,14 +233,14 @@ def adjust_plane(
     freedom: Freedom,
     settled_m: float = SETTLED_M,
 ) -> AdjustedPlane | None:
-    """Fit the plane to the mean distances of cells; to second order this is total least squares.
+    """Fit a plane to the mean distances of cells; to second order, this is total least squares.
 
     Args:
         raster: cells on an approximate plane.
-        sums: their sums.
-        cells: (rows, columns) bool, which of them belong.
+        sums: sums over the points of each cell.
+        cells: (rows, columns) bool, True for cells that belong to the plane.
         fit_tolerance_m: tolerance of the sums.
-        freedom: the unknowns.
+        freedom: constraint on the normal.
         settled_m: the fit has converged if no cell moves by more.
 
     Returns:
@@ -274,7 +275,7 @@ def adjust_plane(
     normal = normal / length
     bend_per_m, bend_share = _bend(full, heights_m)
     return AdjustedPlane(
-        # Twice, because Plane accepts no length that is off by more than rounding.
+        # Normalised twice, because Plane accepts only rounding errors in the length.
         plane=Plane(normal=normal / np.linalg.norm(normal), offset_m=offset_m / length),
         moved_m=float(np.abs(full @ change).max()),
         bend_per_m=bend_per_m,
@@ -291,12 +292,12 @@ def _cell_variances(
     columns: NDArray[np.int64],
     fit_tolerance_m: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the variance of each cell's mean from noise, and from points that do not belong.
+    """Return the variances of cell means due to noise, and due to points off the surface.
 
-    A share of points spread evenly from the surface to the tolerance D, like mixed distances, adds
-    share * D**2 / 3 to the variance of a cell and moves its mean by share * D / 2. The error of the
-    mean is therefore 1.5 / D times the excess of the variance over the usual one nearby. That is
-    the median of the cells in the block, because noise depends on incidence and material.
+    A share of points distributed evenly between the surface and the tolerance D, as with mixed
+    pixels, adds share * D**2 / 3 to the variance of a cell and moves its mean by share * D / 2. The
+    error of the mean is therefore 1.5 / D times the excess of the variance over the usual variance.
+    The latter is the median in a block of cells, because noise depends on incidence and material.
     """
     free = np.maximum(number - 1, 0)
     own = np.maximum(spread_m2, 0.0) * number / np.maximum(free, 1)
@@ -306,7 +307,7 @@ def _cell_variances(
     block = rows // _BLOCK_CELLS * across + columns // _BLOCK_CELLS
     n_blocks = across * (int(rows.max()) // _BLOCK_CELLS + 1)
     order = np.argsort(own)
-    # Sixteen bits, so that the sort takes no comparisons.
+    # 16-bit numbers are sorted without comparisons.
     narrow = block[order].astype(np.uint16 if n_blocks <= 65536 else np.int64)
     order = order[np.argsort(narrow, kind="stable")]
     count = np.bincount(block, minlength=n_blocks)
@@ -330,7 +331,7 @@ def _solved(
     mixture_m2: NDArray[np.float64],
     settled_m: float,
 ) -> CellFit | None:
-    """Solve by weighted least squares and estimate the variance of cells; outliers lose weight."""
+    """Solve by reweighted least squares and estimate the variance of cells."""
     solution = np.zeros(design.shape[1])
     solution[0] = _densest_layer(heights_m)[0]
     usual_m2 = float(np.median(noise_m2 + mixture_m2))
@@ -356,10 +357,10 @@ def _solved(
 
 
 def _densest_layer(heights_m: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the middle of the shortest interval with a share of the heights, and its sigma.
+    """Return the centre of the shortest interval with a share of the heights, and the sigma.
 
-    The "shorth" of Rousseeuw & Leroy 1987 with a smaller share: a panel that covers half of a wall
-    does not affect it.
+    This is the "shorth" of Rousseeuw & Leroy 1987 with a smaller share, so that a panel over half
+    of the wall does not affect it.
     """
     ordered = np.sort(heights_m)
     held = max(2, int(_LAYER_SHARE * len(ordered)))
@@ -370,7 +371,7 @@ def _densest_layer(heights_m: NDArray[np.float64]) -> tuple[float, float]:
 
 
 def _bend(design: NDArray[np.float64], heights_m: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the curvature of the cells' heights, and the share of their variance it explains."""
+    """Return the curvature of cell heights, and the share of their variance that it explains."""
     reach_m = max(float(np.abs(design[:, 1:]).max()), _FLATTEST_M)
     # In units of the reach, so that the normal equations are well conditioned.
     u, v = design[:, 1] / reach_m, design[:, 2] / reach_m
@@ -391,7 +392,8 @@ def stated_covariance(fit: CellFit) -> tuple[NDArray[np.float64], float]:
     """Return the covariance of a robust fit, including correlated and one-sided errors.
 
     Returns:
-        (p, p) of the unknowns, and the number of independent cells that would give the same one.
+        The covariance (p, p) of the unknowns, and the number of independent cells with the same
+        one.
     """
     design, weights = fit.design, fit.weights()
     scores, products, used = _scores(fit)
@@ -408,11 +410,11 @@ def stated_covariance(fit: CellFit) -> tuple[NDArray[np.float64], float]:
         covariance = factor * _left_out(scores, products, tile)
         variance = _mean_variance(design, covariance)
         if variance > reach:
-            # Extrapolated: the correlation across borders of tiles halves with each doubling.
+            # Extrapolation: the correlation across tile borders halves if the tile size doubles.
             beyond = max(1.0, 2.0 - before / variance) if variance else 1.0
             largest, reach = beyond * covariance, variance
         before = variance
-    # How far the unknowns move if cells at twice the distance are used.
+    # The change of the unknowns if cells at twice the distance are used.
     wider = replace(fit, limit_m=_WIDER * fit.limit_m)
     for _ in range(_WIDER_STEPS):
         wider = wider.stepped() or wider
@@ -438,7 +440,7 @@ def independent_covariance(fit: CellFit) -> NDArray[np.float64]:
 def _scores(
     fit: CellFit,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Return (m, p) scores and (m, p, p) products of weighted cells, and (n,) which those are."""
+    """Return scores (m, p), products (m, p, p) and the mask (n,) of cells with a weight."""
     weights = fit.weights()
     used = weights > 0.0
     design, weights = fit.design[used], weights[used]
@@ -455,7 +457,7 @@ def _mean_variance(design: NDArray[np.float64], covariance: NDArray[np.float64])
 def _left_out(
     scores: NDArray[np.float64], products: NDArray[np.float64], tile: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the jackknife covariance of leaving out one tile at a time."""
+    """Return the jackknife covariance, with one tile left out at a time."""
     held = np.bincount(tile) > 0
     n_tiles, size = int(np.count_nonzero(held)), scores.shape[1]
     sums = np.column_stack([np.bincount(tile, column)[held] for column in scores.T])
@@ -464,7 +466,7 @@ def _left_out(
         for j in range(i, size):
             parts[:, i, j] = parts[:, j, i] = np.bincount(tile, products[:, i, j])[held]
     whole = parts.sum(axis=0)
-    # Damped, in case the rest without a tile does not determine a plane.
+    # Damped, in case the other tiles do not determine a plane.
     without = whole - parts + _STEADY * np.diag(np.diag(whole))
     moves = np.linalg.solve(without, sums[:, :, None])[:, :, 0]
     return (n_tiles - 1) / n_tiles * (moves.T @ moves)

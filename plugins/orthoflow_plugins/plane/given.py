@@ -1,4 +1,4 @@
-"""`plane.given`: the reference plane of skarlatos2012, which the user states."""
+"""`plane.given`: a reference plane given by the user, as in skarlatos2012."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ if TYPE_CHECKING:
 
 Vector = tuple[float, float, float]
 
-# Share of the points below the horizontal plane: it lies below the scene and above stray echoes.
+# Share of the points below the horizontal plane, which is below the scene but above stray echoes.
 _GROUND_SHARE: Final = 0.01
-# Share of points beside the rectangle that is reported.
+# A larger share of points outside the rectangle is reported.
 _STRAY_REPORTED: Final = 1e-3
-# The buffer of the paper, three tolerances on either side of a wall.
+# Buffer of skarlatos2012: three tolerances on each side of a wall.
 _BUFFER_TOLERANCES: Final = 3.0
-# Cell size of the robust box, and the share of points outside it per side.
+# Cell size of the robust box, and share of points outside it on each side.
 _BOX_CELL_M: Final = 0.05
 _OUTSIDE_SHARE: Final = 0.0005
 _METRICS: Final = {"n_planes", "labelled_share", "rms_mm", "omega_deg", "phi_deg", "offset_m"}
 _EVERYWHERE_M: Final = 1e9
 _NO_BOUNDS_M: Final = (-_EVERYWHERE_M, _EVERYWHERE_M, -_EVERYWHERE_M, _EVERYWHERE_M)
 
-# A viewpoint stated by the user counts as given, like a normal.
+# A viewpoint set by the user counts as given, as does a normal.
 _SIDES: Final[Mapping[str, SideSource]] = {
     "given": "given",
     "view_from": "given",
@@ -42,22 +42,22 @@ _SIDES: Final[Mapping[str, SideSource]] = {
     "guess": "guess",
 }
 _TOO_FAR: Final = (
-    "no point of the cloud lies within {buffer:g} m of the plane; along its normal the "
-    "points lie between {low:.3f} m and {high:.3f} m of it: check normal and offset_m, points "
-    "or height_m, or raise buffer_m (plane.given)"
+    "no point of the cloud is within {buffer:g} m of the plane; the points are between {low:.3f} m "
+    "and {high:.3f} m from it along its normal: check normal and offset_m, points or height_m, or "
+    "raise buffer_m (plane.given)"
 )
 STRAY_PARTS: Final = DiagnosticSpec(
     code="points-beside-the-plane",
     severity="warning",
-    text="{n} points ({share:.2%}) lie beside the rectangle of the plane, in parts that cover "
-    "less than {part_share:.0%} of what all cover",
+    text="{n} points ({share:.2%}) are outside the rectangle of the plane, in parts that cover "
+    "less than {part_share:.0%} of the total area",
     remedy="{step}.part_min_share=0 keeps them",
     rank_by="share",
 )
 
 
 class StatedPlane(MethodParams):
-    """One plane, stated in exactly one of three ways."""
+    """One plane, given in exactly one of three ways."""
 
     normal: Vector | None = Field(
         None, description="Direction towards the viewer, world axes; any length."
@@ -103,16 +103,17 @@ class StatedPlane(MethodParams):
 
 
 class GivenPlane(Method):
-    """Use the reference plane, or several, that the user states.
+    """Use one or more reference planes given by the user.
 
-    Each is stated in exactly one of three ways: `normal` with `offset_m` (the normal points to the
+    Each is given in exactly one of three ways: `normal` with `offset_m` (the normal points to the
     viewer and is never reversed), three `points` (world metres; the normal is turned towards the
     viewer), or the `horizontal` plane seen from above, which is also the default, as in
-    skarlatos2012. Without `height_m` it lies at the first percentile of the heights of the points.
-    Several planes are listed in `planes`; a point near several belongs to the nearest.
+    skarlatos2012. If `height_m` is not set, its height is the first percentile of the heights of
+    the points. Several planes are listed in `planes`; a point near several of them belongs to the
+    nearest.
 
-    The rectangle spans the points within `buffer_m` of the plane (all points for the horizontal
-    one), without insignificant parts such as stray echoes beside the scene.
+    The rectangle encloses the points within `buffer_m` of the plane (all points for the horizontal
+    one), except insignificant parts such as stray echoes outside the scene.
     """
 
     id = "plane.given"
@@ -126,7 +127,7 @@ class GivenPlane(Method):
     )
 
     class Params(StatedPlane):
-        """The plane, or the planes."""
+        """One plane or several."""
 
         planes: tuple[StatedPlane, ...] = Field(
             (),
@@ -140,16 +141,16 @@ class GivenPlane(Method):
         buffer_m: float | None = Field(
             None,
             gt=0.0,
-            description="Maximum distance of points that span the plane's rectangle; by default "
-            "three times tolerance_m, and unlimited for the horizontal plane.",
+            description="Maximum distance of points enclosed by the rectangle of the plane; by "
+            "default three times tolerance_m, and unlimited for the horizontal plane.",
         )
         part_min_share: float = Field(
             0.03,
             ge=0.0,
             lt=1.0,
             description="Connected parts that cover a smaller share of the area of all parts are "
-            "treated as stray and left out of the rectangle; 0 keeps every part except single "
-            "echoes.",
+            "treated as stray points and excluded from the rectangle; 0 keeps all parts except "
+            "single echoes.",
         )
 
         @model_validator(mode="after")
@@ -172,7 +173,7 @@ class GivenPlane(Method):
 
         cloud, tolerance_m = inputs.cloud, params.tolerance_m
         ctx.progress(0.0, "placing the plane")
-        # With part_min_share = 0 no point is stray.
+        # With part_min_share = 0, no points are treated as stray.
         outside_share = _OUTSIDE_SHARE if params.part_min_share else 0.0
         prepared = prepare(
             cloud, parts=ctx.cores, box_cell_m=_BOX_CELL_M, outside_share=outside_share
@@ -185,7 +186,7 @@ class GivenPlane(Method):
         prepared.assign(slabs, np.insert(everywhere, 0, tolerance_m, axis=1))
         counts = np.bincount(prepared.claims[prepared.claims >= 0], minlength=len(placed_planes))
         order = np.argsort(-counts, kind="stable")
-        # The plane with most points first; the last entry is for points on none.
+        # The plane with the most points comes first; the last entry is for points on no plane.
         prepared.claims[:] = np.append(np.argsort(order), -1).astype(np.int8)[prepared.claims]
         labels = ctx.allocate("labels", "plane_index", (len(cloud),), np.int16).view(np.int16)
         labels[:] = prepared.claims
@@ -203,7 +204,7 @@ class GivenPlane(Method):
             deviations,
             cloud,
             covariances=[np.zeros((4, 4))] * len(placed_planes),
-            # One value for all of them: the least certain.
+            # One value for all planes, the least certain.
             viewpoint="guess" if "guess" in viewpoints else viewpoints[0],
             side_from=sides if len(set(sides)) > 1 else (),
         )
@@ -214,7 +215,7 @@ class GivenPlane(Method):
 def _all_placed(
     params: GivenPlane.Params, cloud: PointCloud, prepared: PreparedCloud, ctx: StepContext
 ) -> list[tuple[FacedPlane, str]]:
-    """Return each plane with the rectangle of the points near it, and how its side was chosen."""
+    """Return each plane with its rectangle, and how its visible side was determined."""
     placed_planes = []
     for nth, stated in enumerate(params.planes or (params,)):
         try:
@@ -232,7 +233,7 @@ def _all_placed(
 def _placed(
     stated: StatedPlane, params: GivenPlane.Params, cloud: PointCloud, prepared: PreparedCloud
 ) -> tuple[FacedPlane, str, int]:
-    """Turn a plane to the viewer; return it, how its side was chosen, and the points beside it."""
+    """Return a plane facing the viewer, how its side was determined, and the stray points."""
     from orthoflow_plugins.plane.planes import (
         face,
         known_viewpoint,
@@ -251,7 +252,7 @@ def _placed(
         buffer_m = _BUFFER_TOLERANCES * params.tolerance_m
     reach_m = _EVERYWHERE_M if buffer_m is None else buffer_m
     near = np.abs(distances_m) <= reach_m
-    # Cells of connected points near the plane. Their size follows from quantiles, because a few
+    # Cells that connect points near the plane. Their size is computed from quantiles, because a few
     # distant echoes would make the cells as large as the scene.
     up = prepared.up
     placed = members[near] @ wall_axes(plane.normal, up).T
@@ -310,7 +311,7 @@ def _plane_of(
             return plane_through(np.array(stated.points) - cloud.origin), False
         except GeometryError as error:
             raise MethodError(
-                f"plane.given needs three points that span a plane, got {stated.points}, "
+                f"plane.given needs three points that define a plane, got {stated.points}, "
                 "which lie on one line"
             ) from error
     up = prepared.up

@@ -1,12 +1,14 @@
-"""`plane.hough2d`: walls from the plan of the cloud, floors and ceilings from its heights.
+"""`plane.hough2d`: walls from the plan of a cloud, floors and ceilings from its heights.
 
-The cells of the plan (a map of the cloud, 2 cm cells) vote for lines. A cell has as many votes as
-points, because with one vote per cell floors and ceilings hide every wall (markiewicz2015, Figure
-10). From each maximum the level of its surroundings at the same angle is subtracted. This level
-comes from surfaces that the line cuts and would favour the longest diagonal through the room.
+The cells of the plan (a map of the cloud, 2 cm cells) vote for lines. The number of points in a
+cell is its number of votes, because with one vote per cell, floors and ceilings hide all walls
+(markiewicz2015, Figure 10). From each maximum, the level of its surroundings at the same angle is
+subtracted. This level is due to surfaces that the line crosses, and would favour the longest
+diagonal of the room.
 
-Counting all points again after each plane would cost a pass over the cloud. The sample gives the
-share of a cell's points that belong to a plane; for a small cloud the sample is the cloud.
+Recounting all points after each plane would need a pass over the cloud. Instead, the share of a
+cell's points that belong to a plane is estimated from the sample. For a small cloud, the sample is
+the whole cloud.
 """
 
 from __future__ import annotations
@@ -35,9 +37,9 @@ from orthoflow_plugins.plane.detector import (
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.search import Search
 
-# Angles on either side of a refused candidate that are excluded.
+# Number of angles excluded on each side of a rejected candidate.
 _NOT_AGAIN_ANGLES: Final = 2
-# Thresholds of the edge detector on the density image of 8 bits.
+# Thresholds of the edge detector for the 8-bit density image.
 _EDGE_LOW: Final = 60
 _EDGE_HIGH: Final = 160
 _VOTERS: Final = {
@@ -53,21 +55,22 @@ class Hough2d(Method):
 
     Points are counted in the cells of a plan. Every occupied cell votes for all lines through it,
     with as many votes as it has points. The best line is refined on a sample of the points with a
-    tolerance that shrinks from `tolerance_m` to `fit_tolerance_m`, bounded by a rectangle, and its
-    points are removed; the sample gives their share of each cell. When all planes are found, they
-    are fitted to all points in one pass (total least squares of cell means; of clouds above 24
-    million points a random part is used), and all points are labelled in another.
+    tolerance that decreases from `tolerance_m` to `fit_tolerance_m`. It is bounded by a rectangle
+    and its points are removed; their share of each cell is estimated from the sample. When all
+    planes are found, they are fitted to all points in one pass (total least squares of cell means;
+    for clouds above 24 million points, a random part is used), and all points are labelled in
+    another.
 
-    Floors, ceilings and other level planes come from the histogram of heights. They compete with
-    walls by their votes and are refitted in 3D.
+    Floors, ceilings and other level planes are found in the histogram of heights. They compete with
+    walls by number of votes and are refitted in 3D.
 
-    The covariance of (normal, offset) accounts for errors that neighbouring points share; it is
-    estimated from the scatter of tiles between 10 and 80 cm, the size with the largest variance.
+    The covariance of (normal, offset) accounts for errors common to neighbouring points. It is
+    estimated from the scatter of tiles of 10 to 80 cm; the size with the largest variance is used.
 
     For comparison, `accumulator: unit` gives every occupied cell one vote (no clear maximum, as in
-    the paper) and `canny` only the cells on edges of the density image. With `coordinates: raw` the
-    points of the sample vote with their coordinates, which takes longer for the same planes.
-    `scoring: votes` proposes the plain maximum, as the transform of the paper does.
+    the paper), and `canny` one to cells on edges of the density image. With `coordinates: raw`, the
+    points of the sample vote with their coordinates, which takes longer and finds the same planes.
+    `scoring: votes` proposes the maximum itself, as in the paper.
     """
 
     id = "plane.hough2d"
@@ -86,16 +89,17 @@ class Hough2d(Method):
         )
         accumulator: Literal["counts", "unit", "canny"] = Field(
             "counts",
-            description="Votes of a cell: its points, one, or one on edges of the density.",
+            description="Votes of a cell: its number of points, one, or one if it is on an edge "
+            "of the density.",
         )
         scoring: Literal["contrast", "votes"] = Field(
             "contrast",
-            description="Score of a line: its votes above those of the emptier side, refined with "
-            "finer angles and bins, or the votes of its bin alone, as in markiewicz2015.",
+            description="Score of a line: its votes minus those of the emptier side, refined with "
+            "finer angles and bins, or only the votes of its bin, as in markiewicz2015.",
         )
         coordinates: Literal["cells", "raw"] = Field(
             "cells",
-            description="Which positions vote: cells of the plan, or single points of the sample.",
+            description="Positions that vote: cells of the plan, or single points of the sample.",
         )
 
         @model_validator(mode="after")
@@ -123,19 +127,20 @@ class Hough2d(Method):
 
 
 class PlanProposer:
-    """Proposes walls from the maxima of the accumulator and levels from those of the heights.
+    """Proposes walls at maxima of the accumulator and level planes at maxima of the heights.
 
     Attributes:
-        grid: the cells of the plan.
-        plan: (e1, e2) points per cell of the whole cloud.
+        grid: the plan and the height bins.
+        plan: (e1, e2) number of points per cell, for the whole cloud.
         centre_m: (2,) centre of the plan in the (e1, e2) frame of the cloud's offsets.
-        reach_m: maximum distance of lines from there, to either side.
-        first: (angles, bins) votes of the whole cloud, VOTE_SHARES each; None for levels alone.
-        voters: description of what votes.
+        reach_m: maximum distance of lines from the centre, on each side.
+        first: (angles, bins) votes of the whole cloud, VOTE_SHARES each; None if only level planes
+            are searched for.
+        voters: description of the voting items.
     """
 
     def __init__(self, search: Search, params: Hough2d.Params) -> None:
-        """Prepare the accumulator; the search's cloud has the counts of its plan."""
+        """Prepare the accumulator; the cloud of the search has a counted plan."""
         cloud = search.cloud
         self._cloud, self._params = cloud, params
         self._is_raw = params.coordinates == "raw"
@@ -153,7 +158,7 @@ class PlanProposer:
         half_m = 0.5 * self._cell_m * math.hypot(rows, columns)
         self._reach_bins = math.ceil(half_m / self._cell_m) + 1
         self.reach_m = self._reach_bins * self._cell_m
-        # At half an angle step, the ends of a wall lie in other bins than its middle.
+        # At half an angle step, the ends of a wall are in other bins than its centre.
         self._smear_bins = max(1, round(0.3 * half_m * self._step_rad / self._cell_m))
         self._barred = np.zeros((n_angles, 2 * self._reach_bins), dtype=np.uint8)
         self._barred_heights = np.zeros((1, storeys), dtype=np.uint8)
@@ -163,7 +168,7 @@ class PlanProposer:
         self.first: NDArray[np.int32] | None = None
 
     def propose(self, search: Search) -> Candidate | None:
-        """Return the better of the best line and the best height."""
+        """Return the best line or the best height, whichever has the higher score."""
         from orthoflow_plugins.plane.votes import VOTE_CAUTION, VOTE_SHARES, best_bin
 
         if self._counted_for != search.n_points:
@@ -237,7 +242,7 @@ class PlanProposer:
                 vote_places(places, ones, normals, -self.reach_m, self._cell_m, votes)
 
         else:
-            # Votes are sums, so those of removed points are subtracted.
+            # Votes are additive, so those of removed points are subtracted.
             cells = vote_counts(self._cells, accumulator) - before * (accumulator == "counts")
             vote = partial(vote_image, cells.astype(np.int32))
         in_threads([partial(vote, *share) for share in zip(*shares, strict=True)])
@@ -246,7 +251,7 @@ class PlanProposer:
 
     @cached_property
     def _left(self) -> Callable[[NDArray[np.int16]], tuple[NDArray[np.int64], NDArray[np.int64]]]:
-        """Return a function of claims (m,) of the sample: remaining points per cell and height."""
+        """Return a function from sample claims (m,) to remaining points per cell and height."""
         from orthoflow_plugins.plane.support import summed_around
 
         sample, counts = self._cloud.sample, (self._cloud.plan, self._cloud.heights[None])
@@ -254,7 +259,7 @@ class PlanProposer:
         inside = (places >= 0) & (places < np.array(self.grid.shape))
         over = inside[:, 0] & inside[:, 1]
         rows, columns, storeys = np.where(over[:, None], places, 0.0).astype(np.int64).T
-        # The last place is for points outside.
+        # The last index is for points outside.
         cell = np.where(over, rows * self.grid.shape[1] + columns, counts[0].size)
         storey = np.where(over & inside[:, 2], storeys, counts[1].size)
 
@@ -286,7 +291,7 @@ class PlanProposer:
 
     @cached_property
     def _voting_cells(self) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-        """Return the centres (3, m) of voting cells from the plan's centre, and (m,) votes."""
+        """Return centres (3, m) of voting cells relative to the plan's centre, and votes (m,)."""
         votes = vote_counts(self._cells, self._params.accumulator)
         cells = np.nonzero(votes)
         places = np.zeros((3, len(cells[0])), dtype=np.float32)
@@ -304,7 +309,8 @@ class PlanProposer:
         n_fine = max(1, math.ceil(step / max(step / 40.0, 0.5 / self._reach_bins)))
         angles = np.float64(angle_rad) + np.arange(-n_fine, n_fine + 1) * (step / n_fine)
         fine = np.zeros((len(angles), 4 * (self._smear_bins + 3)), dtype=np.int32)
-        # A step moves a point by up to half the plan times a step; cells beyond have no effect.
+        # An angle step shifts a line by at most half the plan times the step; cells farther away
+        # have no effect.
         direction = np.array([math.cos(angle_rad), math.sin(angle_rad)], dtype=np.float32)
         apart_m = np.abs(direction @ places[:2] - np.float32(distance_m))
         near = np.flatnonzero(apart_m < reach_m + step * self.reach_m)
@@ -315,7 +321,7 @@ class PlanProposer:
 
 
 def _normals(angles_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(a, 3) directions in the plan."""
+    """Return directions (a, 3) in the plan."""
     return np.stack([np.cos(angles_rad), np.sin(angles_rad), np.zeros(len(angles_rad))], axis=1)
 
 
@@ -335,7 +341,7 @@ def vote_counts(
 
 
 def _edges(counts: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return occupied cells on edges of the density image, the logarithm of the counts."""
+    """Return the occupied cells on edges of the density image (logarithm of the counts)."""
     import cv2
 
     grey = np.log1p(np.maximum(counts, 0))

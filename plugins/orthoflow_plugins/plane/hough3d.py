@@ -1,8 +1,8 @@
 """`plane.hough3d`: planes in any direction from voxels that vote in a 3D accumulator.
 
-Directions are evenly distributed over the hemisphere. At phi = 90 degrees every omega is the same
-plane, so a table of omega by phi would count a floor 180 times. Here the number of directions of
-each phi is proportional to the length of its circle, and the pole occurs once.
+Directions are evenly distributed over the hemisphere. At phi = 90 degrees, every omega describes
+the same plane, so a regular table of omega and phi would count a floor 180 times. Here the number
+of directions for each phi is proportional to the length of its circle, and the pole occurs once.
 """
 
 from __future__ import annotations
@@ -36,14 +36,15 @@ if TYPE_CHECKING:
 
 # Sections of the accumulator in markiewicz2015, Figure 13; degrees.
 _CUTS_DEG: Final = (0.0, 45.0, 90.0)
-# Directions nearer than this represent each other, in steps between directions.
+# Directions within this angle represent each other, and those within the second are excluded after
+# a rejected candidate; in steps between directions.
 _STANDS_FOR_STEPS: Final = 1.5
 _NOT_AGAIN_STEPS: Final = 2.2
-# Slopes around a maximum, in steps between directions: first these, then closer ones.
+# Slopes tested around a maximum, in steps between directions: coarse, then fine.
 _FINE_STEPS: Final = ((-1.0, -0.5, 0.0, 0.5, 1.0), (-0.4, -0.2, 0.0, 0.2, 0.4))
 # Maximum number of entries of all tables together; larger scenes have larger bins.
 _TABLE_MOST: Final = 120_000_000
-# Best scores, votes over omega and over phi by angle, and the reach of distances: `sections_of`.
+# Best scores, votes over omega and over phi by angle, and maximum distance; see `sections_of`.
 _Sections = tuple[
     NDArray[np.float64], dict[float, NDArray[np.float64]], dict[float, NDArray[np.float64]], float
 ]
@@ -52,14 +53,14 @@ _Sections = tuple[
 class Hough3d(Method):
     """Find planes by the 3D Hough transform of markiewicz2015: voxels vote with their points.
 
-    r = x cos(phi) cos(omega) + y cos(phi) sin(omega) + z sin(phi). For each omega the voxels are
-    first counted in an upright image, whose occupied cells then vote over phi. Directions are
+    r = x cos(phi) cos(omega) + y cos(phi) sin(omega) + z sin(phi). For each omega, the voxels are
+    first summed in a vertical image, whose occupied cells then vote for all phi. Directions are
     evenly distributed over the hemisphere, so that a floor is counted once and not for every omega.
 
     `search: coarse-to-fine` votes with twice `cell_m` and twice `angle_step_deg` and refines each
-    maximum; `full` votes with both as given. The rest is common to all detectors: planes are
-    refined on a sample and fitted to all points, and their points are removed. `scoring: votes`
-    proposes the plain maximum, as the transform of the paper does.
+    maximum; `full` votes with both as given. The other stages are common to all detectors: planes
+    are refined on a sample and fitted to all points, and their points are removed. `scoring: votes`
+    proposes the maximum itself, as in the paper.
     """
 
     id = "plane.hough3d"
@@ -84,16 +85,16 @@ class Hough3d(Method):
         )
         search: Literal["coarse-to-fine", "full"] = Field(
             "coarse-to-fine",
-            description="Vote with doubled cells and steps and refine maxima, or vote with the "
-            "given ones.",
+            description="Vote with doubled cell size and angle step and refine the maxima, or "
+            "vote with the given values.",
         )
         scoring: Literal["contrast", "votes"] = Field(
             "contrast",
-            description="Score of a plane: its votes above those of the emptier side, refined with "
-            "finer angles and bins, or the votes of its bin alone, as in markiewicz2015.",
+            description="Score of a plane: its votes minus those of the emptier side, refined "
+            "with finer angles and bins, or only the votes of its bin, as in markiewicz2015.",
         )
         coordinates: Literal["cells", "raw"] = Field(
-            "cells", description="Which positions vote: voxels, or single points of the sample."
+            "cells", description="Positions that vote: voxels, or single points of the sample."
         )
 
     In = DetectorIn
@@ -115,17 +116,17 @@ class SpaceProposer:
     """Proposes planes from the maxima of a 3D accumulator.
 
     The accumulator is linear: when points are removed, the votes of their voxels are subtracted,
-    instead of all others voting again. A voxel whose centre is near enough to a plane is removed as
-    a whole: that is the paper's zeroing of counters, and needs no pass over the points.
+    and the other voxels need not vote again. Voxels whose centre is close enough to a plane are
+    removed completely; the paper sets their counters to zero. This needs no pass over the points.
 
     Attributes:
-        middles_m: (3, m) float32 centres of the voxels with points, from the centre of the box, in
-            the (e1, e2, up) frame.
-        left: (m,) int32 number of their points that belong to no plane.
+        middles_m: (3, m) float32 centres of the voxels with points, relative to the centre of the
+            box, in the (e1, e2, up) frame.
+        left: (m,) int32 number of points in each voxel that belong to no plane.
     """
 
     def __init__(self, search: Search, params: Hough3d.Params) -> None:
-        """Count the points of the search's cloud per voxel; nothing has voted yet."""
+        """Count the points of the cloud per voxel; voting starts later."""
         from orthoflow_plugins.plane.voxels import VoxelTable
 
         cloud, coarser = search.cloud, 1.0 if params.search == "full" else 2.0
@@ -175,7 +176,7 @@ class SpaceProposer:
         point = (place + 0.5 - 0.5 * self._votes.shape[1]) * self._bin_m * normal
         if not self._is_plain:
             normal, point = self._refined(normal, float(normal @ point))
-        # From the frame of the box to offsets.
+        # Transform from the frame of the box to offsets.
         world = normal / np.linalg.norm(normal) @ self._basis
         world = world / np.linalg.norm(world)
         on_plane = (point + self._middle_m) @ self._basis
@@ -192,18 +193,18 @@ class SpaceProposer:
         near = np.cos(_NOT_AGAIN_STEPS * self._directions.step_rad)
         self._unscored = np.flatnonzero(np.abs(cosines) > near)
         for row in self._unscored:
-            # On the other side of the hemisphere distances change sign.
+            # On the opposite side of the hemisphere, distances change sign.
             middle = place if cosines[row] > 0.0 else n_bins - 1 - place
             self._barred[row, max(0, middle - reach) : middle + reach + 1] = 1
 
     def sections(self) -> _Sections:
-        """Return sections of the accumulator of the whole cloud, made by the first proposal."""
+        """Return sections of the accumulator of the whole cloud; requires a first proposal."""
         if self._first is None:
             raise ValueError("no plane was proposed yet")
         return self._first
 
     def _vote(self, search: Search) -> None:
-        """Update the votes: subtract those of voxels that were assigned to planes since."""
+        """Subtract the votes of voxels that were assigned to planes since the last update."""
         from orthoflow_plugins.plane.votes import vote_planes
 
         taken = np.zeros(len(self.left), dtype=bool)
@@ -211,7 +212,7 @@ class SpaceProposer:
             taken |= self._is_within(claim)
         self._n_taken = len(search.taken)
         index = np.flatnonzero(taken & (self.left > 0))
-        # In the memory layout of all voxels, so that the kernel is compiled only once.
+        # In the same memory layout as all voxels, so that the kernel is compiled only once.
         places_m, weights = np.take(self.middles_m, index, axis=1), -self.left[index]
         self.left[index] = 0
         if self._is_raw:
@@ -241,7 +242,7 @@ class SpaceProposer:
         self._unscored = np.arange(len(self._votes))
 
     def _score(self) -> None:
-        """Find the best bin of each direction whose votes or excluded bins changed."""
+        """Find the best bin of each direction whose votes or excluded bins have changed."""
         from orthoflow_plugins.plane.votes import VOTE_SHARES, best_bins
 
         half, tables = 0 if self._is_plain else self._smear_bins, (self._scores, self._places)
@@ -260,7 +261,7 @@ class SpaceProposer:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Refine a maximum with finer slopes and half bins, using the voxels near it.
 
-        Returns a normal, not of unit length, and a point, relative to the centre of the box.
+        Returns a normal (not a unit vector) and a point relative to the centre of the box.
         """
         from orthoflow_plugins.plane.votes import sharpest, vote_places
 
@@ -290,14 +291,14 @@ class SpaceProposer:
         return normal - best @ axes, (distance_m + height_m) * normal + middle @ axes
 
     def _is_within(self, claim: Claim) -> NDArray[np.bool_]:
-        """Return (m,) whether occupied voxels are within a plane's tolerance and rectangle."""
+        """Return (m,) whether occupied voxels are within the tolerance and rectangle of a plane."""
         slab, bounds = claim
         within = np.ones(len(self.left), dtype=bool)
         for row in range(3):
             axis = self._basis @ slab[4 * row : 4 * row + 3]
             shift = slab[4 * row + 3] - float(axis @ self._middle_m)
             along_m = axis.astype(np.float32) @ self.middles_m
-            # A voxel that the plane cuts contains points of it, however large it is.
+            # A voxel that intersects the plane contains points of it, even if the voxel is large.
             half_m = 0.5 * self._voxel_m * float(np.abs(axis).sum())
             reach_m = max(bounds[0], half_m)
             low_m = -reach_m if row == 0 else bounds[2 * row - 1] - half_m
@@ -306,7 +307,7 @@ class SpaceProposer:
         return within
 
 
-# Any: the type of a share of work differs between passes.
+# Any, because the type of a share of work differs between passes.
 def _in_shares(task: Callable[..., None], shares: Sequence[object]) -> None:
     in_threads([partial(task, share) for share in shares])
 
@@ -317,9 +318,9 @@ class Directions:
 
     Attributes:
         angles_rad: (d, 2) omega 0..pi and phi -pi/2..pi/2.
-        starts: (o + 1,) where those of each omega start.
+        starts: (o + 1,) index of the first direction of each omega.
         normals: (d, 3) unit vectors.
-        step_rad: angle between neighbours.
+        step_rad: angle between neighbouring directions.
     """
 
     angles_rad: NDArray[np.float64]
@@ -371,28 +372,28 @@ def sections_of(
     """Return sections of an accumulator.
 
     Args:
-        directions: of the accumulator.
+        directions: directions of the accumulator.
         votes: (d, b) votes per direction and distance.
         scores: (d,) best score of each direction.
-        bin_m: width of a bin of distances.
+        bin_m: width of a distance bin.
 
     Returns:
-        (o, p) best score of any distance over omega 0..180 and phi -90..90 degrees, NaN without a
-        direction of that phi; by angle in degrees the votes over omega and distance at that phi,
-        and those over phi and distance at that omega, NaN without a direction; and the maximum
-        distance, to either side.
+        The best scores (o, p) of any distance over omega 0..180 and phi -90..90 degrees, NaN if
+        there is no direction with that phi; for angles in degrees, the votes over omega and
+        distance at that phi, and over phi and distance at that omega, NaN if there is no direction;
+        and the maximum distance, on each side.
     """
     n_turns = len(directions.starts) - 1
     best = np.full((n_turns, n_turns + 1), np.nan)
     column = np.rint((directions.angles_rad[:, 1] + 0.5 * math.pi) / directions.step_rad)
     row = np.rint(directions.angles_rad[:, 0] / directions.step_rad)
     best[row.astype(int), column.astype(int)] = scores
-    # Each direction represents those of the same phi up to the next one.
+    # Each direction represents the angles omega up to the next direction with the same phi.
     last_asked = np.where(np.isnan(best), 0, np.arange(n_turns)[:, None])
     best = np.take_along_axis(best, np.maximum.accumulate(last_asked, axis=0), axis=0)
     omegas = directions.step_rad * np.arange(n_turns, dtype=np.float64)
     phis = directions.step_rad * np.arange(n_turns + 1, dtype=np.float64) - 0.5 * math.pi
-    # Distances beyond all points are left out.
+    # Distances beyond all points are omitted.
     n_bins = votes.shape[1]
     used = np.flatnonzero(votes.any(axis=0))
     beyond = int(min(used[0], n_bins - 1 - used[-1])) if len(used) else 0
@@ -405,13 +406,13 @@ def sections_of(
 def _section(
     directions: Directions, votes: NDArray[np.int32], omega: ArrayLike, phi: ArrayLike
 ) -> NDArray[np.float64]:
-    """Return votes (n, b) for n directions, those of the nearest direction of the accumulator."""
+    """Return votes (n, b) for n directions, taken from the nearest one of the accumulator."""
     omegas, phis = np.broadcast_arrays(np.asarray(omega, dtype=float), np.asarray(phi, dtype=float))
     cosines = directions.normals @ _normals(omegas, phis)
     nearest = np.abs(cosines).argmax(axis=0)
     cosine = cosines[nearest, np.arange(len(nearest))]
     section: NDArray[np.float64] = votes[nearest].astype(np.float64)
-    # On the other side of the hemisphere distances change sign.
+    # On the opposite side of the hemisphere, distances change sign.
     section[cosine < 0.0] = section[cosine < 0.0, ::-1]
     section[np.abs(cosine) < math.cos(_STANDS_FOR_STEPS * directions.step_rad)] = np.nan
     return section

@@ -1,15 +1,15 @@
-"""Compiled passes over points: blocks, plan, slabs, the robust fit of a plane, scores of many.
+"""Kernels for points: blocks, plan, slabs, robust fit of a plane, scores of many planes.
 
-Kernels read float32 offsets as three contiguous arrays, in blocks of `BLOCK_POINTS` with a box
-each. Work is split into parts, one per thread, each with its own tables. Everything summed across
-parts is an integer (distances as multiples of a fixed step), so the result has the same bits for
-any number of threads.
+Kernels read float32 offsets as three contiguous arrays, in blocks of `BLOCK_POINTS` with a bounding
+box each. Work is split into parts, one per thread, each with its own tables. All sums over parts
+are sums of integers (distances are multiples of a fixed step), so the result is identical for any
+number of threads.
 
 A slab is a row of 12 float64: normal (3) and offset in the cloud's own offsets, then the in-plane
 axes u (3) with its origin and v (3) with its origin. Its bounds are a row of 5: the maximum
-distance of points from the plane, then the smallest and largest u and v. Passes compare blocks only
-with the slabs that their box intersects, mostly one or two, so sixteen planes cost little more than
-one.
+distance of points from the plane, then the smallest and largest u and v. Blocks are compared only
+with the slabs that intersect their box, mostly one or two, so sixteen planes take little more time
+than one.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from orthoflow.geometry.compiling import compiled, kernel_part
 from orthoflow.geometry.slabs import Offsets
 from orthoflow.geometry.threads import even_parts, in_threads
 
-# Small enough that a block of a scan column is a short piece of one surface, so that its box
-# excludes most planes; large enough that boxes of 48 million points fit into the processor's cache.
+# Small enough that a block is a short piece of one surface, so that its box excludes most planes;
+# large enough that the boxes of 48 million points fit into the cache of the processor.
 BLOCK_POINTS: Final = 256
 # Distances are summed in steps of the fit tolerance divided by this: half a micrometre at 15 mm;
 # the squares of 48 million points still fit into 64 bits.
 STEPS_PER_TOLERANCE: Final = 32768
-# Number of bins for the deviations of a plane's points.
+# Number of histogram bins for the deviations of points from their plane.
 HISTOGRAM_BINS: Final = 200
 
 
 def each_part(n_items: int, parts: int, task: Callable[[int, slice], None]) -> None:
-    """Cut a range into parts at multiples of `BLOCK_POINTS` and run a task on each, in threads.
+    """Divide a range at multiples of `BLOCK_POINTS` and run a task on each part, in threads.
 
     Args:
         n_items: length of the range.
@@ -50,11 +50,11 @@ def each_part(n_items: int, parts: int, task: Callable[[int, slice], None]) -> N
 
 
 class BlockedPoints(NamedTuple):
-    """Points in the form that block-wise passes take.
+    """Points in the form that kernels need.
 
     Attributes:
         x: (n,) float32 metres from the cloud's origin; y and z likewise.
-        boxes: (blocks, 6) float32, smallest and largest x, y, z of each block.
+        boxes: (blocks, 6) float32 smallest and largest x, y, z of each block.
     """
 
     x: NDArray[np.float32]
@@ -76,8 +76,8 @@ class PlanGrid:
     Attributes:
         basis: (3, 3) rows e1, e2, up (see `geometry.basis_from_up`).
         low_m: (3,) lower corner in the (e1, e2, up) frame of the cloud's offsets, metres.
-        cell_m: side of a cell, and height of a bin of the height histogram.
-        shape: cells along e1, cells along e2, bins along up.
+        cell_m: side of a cell, and height of a height bin.
+        shape: numbers of cells along e1 and e2, and of bins along up.
     """
 
     basis: NDArray[np.float64]
@@ -91,7 +91,7 @@ class PlanGrid:
         return np.array(self.shape) * self.cell_m
 
     def frame(self) -> NDArray[np.float32]:
-        """Return F (3, 4), with cell and height bin of an offset p: `F[:, :3] @ p - F[:, 3]`."""
+        """Return F (3, 4) for the cell and height bin of an offset p: `F[:, :3] @ p - F[:, 3]`."""
         frame = np.column_stack([self.basis, self.low_m]) / self.cell_m
         return frame.astype(np.float32, order="C")
 
@@ -99,16 +99,16 @@ class PlanGrid:
 def count_points(
     offsets: Offsets, grid: PlanGrid | None, *, parts: int
 ) -> tuple[BlockedPoints, NDArray[np.int64], NDArray[np.int64], bool]:
-    """Find the box of each block and count the points in a plan, in one pass.
+    """Compute the box of each block and count the points in a plan, in one pass.
 
     Args:
         offsets: the points.
-        grid: the plan; None for boxes only.
-        parts: parts of the pass, one per thread.
+        grid: the plan; None if only boxes are needed.
+        parts: number of parts, one per thread.
 
     Returns:
-        The points in blocks; points per plan cell (cells along e1, cells along e2); points in the
-        plan per bin of height; and whether all coordinates are finite.
+        The points in blocks; the numbers of points per plan cell (cells along e1, cells along e2)
+        and, for points in the plan, per height bin; and whether all coordinates are finite.
     """
     shape = (0, 0, 0) if grid is None else grid.shape
     frame = np.zeros((3, 4), dtype=np.float32) if grid is None else grid.frame()
@@ -131,15 +131,15 @@ def count_points(
 
 @kernel_part
 def _set_box(points: BlockedPoints, block: int, sides: NDArray[np.int32]) -> int:
-    """Set the box of a block; return at how many of its sides values are NaN or infinite.
+    """Set the box of a block; return the number of its sides with NaN or infinite values.
 
-    The bits of floats, inverted for negative ones, have the order of the values. Integers are
-    compared several at a time, which floats with NaN are not. Values that are not finite are at
-    the ends of that order.
+    As integers, the bits of floats (inverted if negative) have the same order as the values.
+    Integer comparisons are vectorised, comparisons of floats that may be NaN are not. Values that
+    are not finite are at the ends of the order.
 
     Args:
         points: (n,) offsets in blocks.
-        block: which block.
+        block: index of the block.
         sides: (blocks, 6) the boxes as bits.
     """
     start = block * BLOCK_POINTS
@@ -162,7 +162,7 @@ def _set_box(points: BlockedPoints, block: int, sides: NDArray[np.int32]) -> int
 
 @kernel_part
 def _add_runs(places: NDArray[np.int32], count: int, table: NDArray[np.int32]) -> None:
-    """Count places in a table, ignoring negative ones; neighbours in a scan share a place."""
+    """Count indices in a table by runs of equal ones; skip negative ones."""
     first, place = 0, places[0]
     for i in range(1, count):
         if places[i] != place:
@@ -181,10 +181,10 @@ def _count_points(
     cells: NDArray[np.int32],
     heights: NDArray[np.int32],
 ) -> int:
-    """Set the boxes, count cells and heights; return at how many sides values are unusable.
+    """Set boxes, count cells and heights; return the number of box sides that are not finite.
 
-    Places are computed in a loop of their own without branches, which the compiler vectorises;
-    counting depends on earlier counts.
+    Cells are computed in a separate loop without branches, which the compiler vectorises; the
+    counting loop cannot be vectorised.
     """
     flat = cells.reshape(cells.size)
     cell = np.empty(BLOCK_POINTS, dtype=np.int32)
@@ -224,7 +224,7 @@ def _count_points(
 
 @kernel_part
 def _meet(box: NDArray[np.float32], slab: NDArray[np.float64], bounds: NDArray[np.float64]) -> int:
-    """Return 0 if a slab misses a block's box, 1 if it cuts it, 2 if it contains it."""
+    """Return 0 if a slab is outside a block's box, 1 if it intersects it, 2 if it contains it."""
     verdict = 2
     for row in range(3):
         centre, half = -slab[4 * row + 3], 0.0
@@ -266,9 +266,9 @@ def _list_active(
 def _measure_block(
     points: BlockedPoints, start: int, slab: NDArray[np.float64], distances: NDArray[np.float64]
 ) -> int:
-    """Set the distance from a slab's plane of each point of a block; return their number.
+    """Set the distances of a block's points from the plane of a slab; return their number.
 
-    A loop of its own, which the compiler vectorises.
+    A separate loop, which the compiler vectorises.
     """
     stop = min(start + BLOCK_POINTS, points.x.size)
     xs, ys, zs = points.x[start:stop], points.y[start:stop], points.z[start:stop]
@@ -289,7 +289,7 @@ def _own_block(  # noqa: PLR0913, PLR0917 - compiled code has no objects to bund
     nearest: NDArray[np.float64],
     distances: NDArray[np.float64],
 ) -> int:
-    """Set the nearest slab that contains each point of a block, -1 for none, and its distance.
+    """Set the nearest slab that contains each point of a block (-1 if none) and its distance.
 
     Returns the number of points.
     """
@@ -323,7 +323,7 @@ def _find_cells(
     owner: NDArray[np.int32],
     cells: NDArray[np.int32],
 ) -> None:
-    """Set the cell in the tables of each point of a block that belongs to a slab.
+    """Set the table cell of each point of a block that belongs to a slab.
 
     Without branches, so that the compiler vectorises the loop.
     """
@@ -351,7 +351,7 @@ def _sum_runs(
     counts: NDArray[np.int32],
     sums: NDArray[np.int64],
 ) -> None:
-    """Add points to their cells, -1 for none, one run of points in the same cell at a time."""
+    """Add points to their cells (-1 for none), one run of points in the same cell at a time."""
     per_step = STEPS_PER_TOLERANCE / fit_tolerance_m
     n_find = n_inner = n_fit = total = squares = 0
     for i in range(cells.size):
@@ -382,7 +382,7 @@ def assign_points(
     slabs: NDArray[np.float64],
     bounds: NDArray[np.float64],
 ) -> None:
-    """Assign each point to the nearest slab that contains it, the first among equals.
+    """Assign each point to the nearest slab that contains it; the first one if distances are equal.
 
     Args:
         points: (n,) offsets in blocks.
@@ -398,7 +398,7 @@ def assign_points(
         start = block * BLOCK_POINTS
         taken = claims[start : min(start + BLOCK_POINTS, claims.size)]
         if n_active == 0 or holder >= 0:
-            # Most blocks of a scan are a short piece of one wall and need no test of points.
+            # Most blocks are a short piece of one wall, so their points need no test.
             taken[:] = np.int8(holder)
             continue
         _own_block(points, start, slabs, bounds, listed[:n_active], owner, nearest, distances)
@@ -423,12 +423,12 @@ def sum_assigned(
         slabs: (k, 12) see module.
         bounds: (k, 5) see module.
         rasters: (k, 8) smallest u and v, cells per metre, rows, columns, first cell in the tables,
-            fit tolerance, inner tolerance; the last two are equal for all. Slabs without rows
-            are not summed.
-        drawn: (blocks,) which blocks are summed.
-        counts: (cells, 3) points within the find, inner and fit tolerance; added to.
-        sums: (cells, 2) distances and squared distances of those within the fit tolerance, in
-            steps and squared steps; added to.
+            fit tolerance, inner tolerance; the last two are the same for all slabs. Slabs without
+            rows are not summed.
+        drawn: (blocks,) True for blocks that are summed.
+        counts: (cells, 3) numbers of points within the find, inner and fit tolerance; added to.
+        sums: (cells, 2) sums of distances and squared distances of points within the fit tolerance,
+            in steps and squared steps; added to.
     """
     listed = np.empty(slabs.shape[0], dtype=np.int64)
     owner = np.empty(BLOCK_POINTS, dtype=np.int32)
@@ -487,7 +487,8 @@ def measure_deviations(
             v of the plane's rectangle; metres.
         sums: (k, 6) of points within the find tolerance: number, steps, squared steps, then
             the same within the fit tolerance; added to.
-        histogram: (k, HISTOGRAM_BINS) points per bin of -find tolerance..find tolerance.
+        histogram: (k, HISTOGRAM_BINS) number of points per bin, from -find tolerance to find
+            tolerance.
         extents: (k, 4) smallest and largest u, smallest and largest v of the points within the fit
             tolerance and the rectangle; widened.
     """
@@ -516,17 +517,17 @@ def measure_deviations(
             extents[k, 2], extents[k, 3] = min(extents[k, 2], v), max(extents[k, 3], v)
 
 
-# --- the plane of points ---
+# --- planes through points ---
 
-# The unknowns of a fit: all, with the normal perpendicular to up, or along up.
+# Constraint of a fit: none, normal perpendicular to up, or normal along up.
 FREE: Final = 0
 VERTICAL: Final = 1
 LEVEL: Final = 2
 
 _STEPS_MOST: Final = 20
-# A fit has settled when a point ten metres away moves by less than this share of the tolerance.
+# A fit has converged if a point ten metres away moves by less than this share of the tolerance.
 _SETTLED_SHARE: Final = 5e-4
-# Points nearer to a line than this (root mean square) do not determine a rotation about it.
+# Points closer to a line than this (RMS) do not determine a rotation about it.
 _LINE_WIDTH_M: Final = 1e-4
 
 
@@ -534,12 +535,12 @@ _LINE_WIDTH_M: Final = 1e-4
 def flattest(sums: NDArray[np.float64], plane: NDArray[np.float64]) -> None:
     """Set (9,) plane to normal, centroid, and the variances along the three principal axes.
 
-    The eigenvalues of a symmetric 3 x 3 matrix in closed form: LAPACK takes a hundred times as
-    long for so small a matrix.
+    The eigenvalues of the symmetric 3 x 3 matrix are computed in closed form, which is a hundred
+    times as fast as LAPACK.
 
     Args:
         sums: (10,) number of points, sums of a, b, c, and of aa, ab, ac, bb, bc, cc.
-        plane: set; variances ascend.
+        plane: set; variances are ascending.
     """
     n = sums[0]
     ma, mb, mc = sums[1] / n, sums[2] / n, sums[3] / n
@@ -561,7 +562,8 @@ def flattest(sums: NDArray[np.float64], plane: NDArray[np.float64]) -> None:
     most = mean + 2.0 * size * math.cos(angle)
     least = mean + 2.0 * size * math.cos(angle + 2.0 * math.pi / 3.0)
     plane[6], plane[7], plane[8] = max(least, 0.0), 3.0 * mean - most - least, most
-    # Rows of (matrix - least) are perpendicular to the normal: take their longest cross product.
+    # Rows of (matrix - least) are perpendicular to the normal, so it is their longest cross
+    # product.
     ra, rb, rc = aa - least, bb - least, cc - least
     longest = 0.0
     for p0, p1, p2 in (
@@ -582,13 +584,13 @@ def refine_robustly(
     """Move a plane to the densest layer of points near it: total least squares, reweighted.
 
     Args:
-        points: (m, 3) metres; unless the fit is free, with up as their third axis.
-        plane: (4,) initial normal and offset; changed.
+        points: (m, 3) metres; with up as the third axis unless the fit is free.
+        plane: (4,) initial normal and offset; updated.
         tolerance_m: points farther away have no weight (Tukey's weights).
         freedom: FREE, VERTICAL or LEVEL.
 
     Returns:
-        Whether more than points on a line support the plane; if not, it is meaningless.
+        Whether the points determine a plane; if not, `plane` is meaningless.
     """
     sums, fitted = np.empty(10), np.empty(9)
     for _ in range(_STEPS_MOST):
@@ -612,7 +614,7 @@ def refine_robustly(
         if sums[0] <= 0.0:
             return False
         if freedom == VERTICAL:
-            # Moments whose largest axis is up, so that the normal is horizontal.
+            # Moments whose major axis is up, so that the normal is horizontal.
             x, y, z = sums[1] / sums[0], sums[2] / sums[0], sums[3] / sums[0]
             sums[6], sums[8] = sums[1] * z, sums[2] * z
             sums[9] += sums[4] - sums[1] * x + sums[7] - sums[2] * y
@@ -643,15 +645,16 @@ def consensus_sums(
     n_bins: int,
     sums: NDArray[np.int64],
 ) -> None:
-    """Score many planes by the points near each, in bins of distance.
+    """Score many planes by the points near each of them, using bins of distance.
 
     Args:
         points: (3, m) metres.
         planes: (h, 4) normal and offset.
         reach_m: maximum distance.
         n_bins: bins of 0..reach.
-        sums: (h, 2) added to: points within reach, and 4 n^2 - (2 b + 1)^2 of the bin b of each,
-            which is 4 n^2 (1 - d^2) with the distance d of its middle as a share of the reach.
+        sums: (h, 2) added to: number of points within reach, and the sum of 4 n^2 - (2 b + 1)^2
+            with the bin b of each point, which is 4 n^2 (1 - d^2) for the distance d of the bin
+            centre as a share of the reach.
     """
     per_m, top = np.float32(n_bins / reach_m), np.float32(n_bins)
     most, one = np.int32(4 * n_bins * n_bins), np.int32(1)
@@ -662,7 +665,7 @@ def consensus_sums(
         for start in range(0, points.shape[1], BLOCK_POINTS):
             stop = min(start + BLOCK_POINTS, points.shape[1])
             xs, ys, zs = points[0, start:stop], points[1, start:stop], points[2, start:stop]
-            # Integers of 32 bits, so that the compiler vectorises the loop.
+            # 32-bit integers, so that the compiler vectorises the loop.
             count, worth = nothing, nothing
             for i in range(xs.size):
                 place = np.int32(min(abs(a * xs[i] + b * ys[i] + c * zs[i] - d), top))

@@ -1,12 +1,12 @@
-"""Found planes turned into products: deviations, sides, order, names, rectangles in the world.
+"""Products from detected planes: deviations, visible sides, order, names, world rectangles.
 
-Deviations are those of all points, in one pass. markiewicz2015 regards a plane as correct if they
-look normal (Figures 6c to 14c). With a million points every formal test rejects, so the departure
-itself is stated: skewness, excess kurtosis, shares within one, two and three standard deviations,
-and a quantile-quantile plot.
+Deviations of all points are measured in one pass. markiewicz2015 regards a plane as correct if they
+appear normally distributed (Figures 6c to 14c). With a million points, every formal test of
+normality rejects, so measures of the departure are reported: skewness, excess kurtosis, shares
+within one, two and three standard deviations, and a quantile-quantile plot.
 
-The viewer's side of a plane follows from the scanner stations, or is guessed from the points. The
-wrong side mirrors every image of the wall, so a guess is always reported.
+The visible side of a plane is determined from the scanner stations, or guessed from the points. A
+wrong side mirrors all images of the wall, so guesses are always reported.
 """
 
 from __future__ import annotations
@@ -39,30 +39,30 @@ from orthoflow_plugins.plane.support import SurfaceRaster
 
 Viewpoint = Literal["stations", "view_from", "guess"]
 
-# Minimum number of points of a distribution.
+# Minimum number of points for statistics of a distribution.
 _DISTRIBUTION_LEAST: Final = 100
 _PROBABILITIES: Final = (
     0.001, 0.0025, 0.005, 0.01, 0.025, *(0.05 * step for step in range(1, 20)),
     0.975, 0.99, 0.995, 0.9975, 0.999,
 )  # fmt: skip
-# Points of a plane, and of the cloud, that are used to find its side.
+# Maximum numbers of points of a plane, and of the cloud, used to determine its visible side.
 _MEMBERS_MOST: Final = 5000
 _WITNESSES_MOST: Final = 40_000
 # Cosine of 20 degrees.
 _PARALLEL: Final = 0.94
-# A station nearer to the plane than this lies in it and does not determine its side.
+# A station closer to the plane than this does not determine its visible side.
 _CLEAR_M: Final = 0.05
-# The vote of a point for the side of the room does not grow beyond this distance.
+# The weight of a point in the vote for the side of the room is constant beyond this distance.
 _FULL_VOTE_M: Final = 1.0
-# Points may project this far outside the rectangle, because floor and ceiling lie at its edges.
+# Points may project this far outside the rectangle, because floor and ceiling are at its edges.
 _BESIDE_M: Final = 0.3
-# Minimum majority, as a share of all points, each just clear of the plane.
+# Minimum majority, as a share of all points with the minimum distance from the plane.
 _DOUBT: Final = 0.01
 SIDES_GUESSED: Final = DiagnosticSpec(
     code="plane-sides-unknown",
     severity="warning",
     text="no scanner station shows from which side {n} of {n_planes} planes were seen; the side "
-    "with more of the other points was taken, unless photos decide later (face.photos)",
+    "with more of the other points was assumed, unless photos decide later (face.photos)",
     remedy="if an image comes out mirrored, set view_from of read.scan",
     rank_by="n",
     settled_by=("face.photos",),
@@ -71,15 +71,15 @@ SIDES_GUESSED: Final = DiagnosticSpec(
 
 @dataclass(frozen=True, kw_only=True)
 class Deviations(Rows):
-    """Deviations of the points of each plane from it.
+    """Deviations of points from their planes.
 
     Attributes:
-        n_points: (k,) int64 points that belong to the plane.
+        n_points: (k,) int64 number of points that belong to the plane.
         rms_m: (k,) root mean square of their distances.
-        n_fit: (k,) int64 those of them within the tolerance of the fit.
-        rms_fit_m: (k,) root mean square of the distances of those.
-        mean_fit_m: (k,) mean of the distances of those.
-        histogram: (k, bins) points per bin of -tolerance_m..tolerance_m.
+        n_fit: (k,) int64 number of these points within the tolerance of the fit.
+        rms_fit_m: (k,) root mean square of the distances within the tolerance of the fit.
+        mean_fit_m: (k,) mean of the distances within the tolerance of the fit.
+        histogram: (k, bins) number of points per bin from -tolerance_m to tolerance_m.
         extents_m: (k, 4) smallest and largest u, smallest and largest v of the points within the
             tolerance of the fit in the plane's rectangle.
         tolerance_m: maximum distance of points that belong to a plane.
@@ -102,13 +102,13 @@ class Normality:
     """Shape of a distribution of distances.
 
     Attributes:
-        mean_m: their mean.
-        sigma_m: their standard deviation.
+        mean_m: mean.
+        sigma_m: standard deviation.
         skewness: third standardised moment, 0 for a normal distribution.
-        excess_kurtosis: fourth standardised moment less 3, 0 for a normal distribution.
+        excess_kurtosis: fourth standardised moment minus 3, 0 for a normal distribution.
         within: shares within 1, 2 and 3 sigma of the mean; 0.683, 0.954, 0.997 if normal.
         expected_sigmas: (q,) quantiles of the normal distribution.
-        found_sigmas: (q,) the same quantiles of the distances from their mean, over sigma.
+        found_sigmas: (q,) the same quantiles of the distances, minus the mean and divided by sigma.
     """
 
     mean_m: float
@@ -120,7 +120,7 @@ class Normality:
     found_sigmas: NDArray[np.float64]
 
     def to_json(self) -> JsonValue:
-        """Numbers for the planes' details."""
+        """Return the values for the details of the planes."""
         return {
             "mean_m": self.mean_m,
             "sigma_m": self.sigma_m,
@@ -136,9 +136,9 @@ class FacedPlane:
 
     Attributes:
         plane: the plane.
-        corners_m: (4, 3) top-left first, counter-clockwise for the viewer.
-        part_corners_m: (p, 4, 3) the same of each connected part.
-        is_guessed: whether no station determined the side.
+        corners_m: (4, 3) corners, top-left first, counter-clockwise for the viewer.
+        part_corners_m: (p, 4, 3) corners of each connected part.
+        is_guessed: whether the side was guessed because no station determines it.
     """
 
     plane: Plane
@@ -154,11 +154,11 @@ def assemble(
     tolerance_m: float,
     fit_tolerance_m: float,
 ) -> tuple[Planes, Deviations, list[Normality | None], NDArray[np.intp]]:
-    """Measure planes on their points, and determine their sides, order and names.
+    """Measure planes on their points, and determine their visible sides, order and names.
 
     Returns:
-        The planes, the largest first; their deviations; the normality of these, None for a plane
-        with too few points; and the (k,) index of each plane among those found.
+        The planes, the largest first; their deviations; the normality of the deviations, None for a
+        plane with too few points; and the index (k,) of each plane in `found`.
     """
     deviations = measure_planes(
         prepared,
@@ -174,7 +174,7 @@ def assemble(
     for place, (k, side) in enumerate(zip(order, faced, strict=True)):
         candidate, own = found[k].candidate, _raw(found[k], side.plane, cloud)
         if float(side.plane.normal @ found[k].raster.plane.normal) < 0.0:
-            # Histograms and means follow a normal that was reversed.
+            # The normal was reversed, so reverse histogram and mean.
             ordered.histogram[place] = ordered.histogram[place, ::-1].copy()
             ordered.mean_fit_m[place] *= -1.0
         raw.append(
@@ -225,7 +225,7 @@ def planes_of(
     side_from: tuple[SideSource, ...] = (),
     details: dict[str, JsonValue] | None = None,
 ) -> Planes:
-    """Return the product of planes in their order; covariances (4, 4) are of (normal, offset)."""
+    """Return the product of planes in this order, with covariances (4, 4) of (normal, offset)."""
     normals = np.array([item.plane.normal for item in faced])
     heights_m = np.array([item.corners_m.mean(axis=0) @ cloud.up for item in faced])
     n_parts = [len(item.part_corners_m) for item in faced]
@@ -252,7 +252,7 @@ def planes_of(
 
 
 def _raw(item: FoundPlane, plane: Plane, cloud: PointCloud) -> Plane:
-    """Return a plane as its detector proposed it, in the world, facing the same side."""
+    """Return the plane that the detector proposed, in world coordinates, facing the same side."""
     own = item.candidate.plane
     if float(own.normal @ plane.normal) < 0.0:
         own = own.flipped()
@@ -262,7 +262,7 @@ def _raw(item: FoundPlane, plane: Plane, cloud: PointCloud) -> Plane:
 def report_planes(
     ctx: StepContext, planes: Planes, deviations: Deviations, *, n_points: int
 ) -> None:
-    """Report the number and shares of planes, and the first plane; warn of guessed sides."""
+    """Report the number of planes, their share of points and the first plane; warn of guesses."""
     omega_deg, phi_deg = omega_phi_deg(planes.normal[0], planes.up)
     ctx.metric("n_planes", len(planes), "1")
     ctx.metric("labelled_share", float(deviations.n_points.sum()) / n_points, "1")
@@ -349,8 +349,8 @@ def measure_planes(
         cloud: the cloud with its claims.
         slabs: (k, 12) the planes.
         bounds_m: (k, 4) their rectangles, smallest and largest u, smallest and largest v.
-        tolerance_m: of belonging.
-        fit_tolerance_m: of the fit.
+        tolerance_m: maximum distance of points that belong to a plane.
+        fit_tolerance_m: maximum distance of points used in the fit.
     """
     parts, count = cloud.parts, len(slabs)
     sums = np.zeros((parts, count, 6), dtype=np.int64)
@@ -377,7 +377,7 @@ def measure_planes(
         rms_fit_m=np.sqrt(squares_fit / np.maximum(n_fit, 1)) * step_m,
         mean_fit_m=steps_fit / np.maximum(n_fit, 1) * step_m,
         histogram=histogram.sum(axis=0),
-        # A later, nearer plane may have taken every point within the tolerance of the fit.
+        # All points within the tolerance of the fit may be nearer to another plane.
         extents_m=np.where(np.isfinite(reached), reached, bounds_m),
         tolerance_m=tolerance_m,
         fit_tolerance_m=fit_tolerance_m,
@@ -387,10 +387,10 @@ def measure_planes(
 def normality(
     histogram: NDArray[np.int64], *, tolerance_m: float, fit_tolerance_m: float
 ) -> Normality | None:
-    """Describe the distances within the fit tolerance in a histogram over +-tolerance_m.
+    """Describe the distances within the fit tolerance, given a histogram over +-tolerance_m.
 
     Returns:
-        The shape of the distribution, or None for too few distances or a single bin.
+        The shape of the distribution; None if there are too few distances or all are in one bin.
     """
     edges_m = np.linspace(-tolerance_m, tolerance_m, len(histogram) + 1)
     middles_m = 0.5 * (edges_m[1:] + edges_m[:-1])
@@ -403,7 +403,7 @@ def normality(
     mean_m = float(counts @ middles_m) / total
     away_m = middles_m - mean_m
     second, third, fourth = (float(counts @ away_m**power) / total for power in (2, 3, 4))
-    # Sheppard's corrections: within a bin, points spread over its width.
+    # Sheppard's corrections for the distribution of points within a bin.
     fourth += -0.5 * second * width_m**2 + 7.0 / 240.0 * width_m**4
     second -= width_m**2 / 12.0
     if second <= 0.0:
@@ -429,14 +429,14 @@ def normality(
 
 
 def known_viewpoint(cloud: PointCloud) -> Viewpoint:
-    """Return how the positions from which the cloud was seen are known."""
+    """Return the source of the positions from which the cloud was seen."""
     if cloud.stations is None or len(cloud.stations) == 0:
         return "guess"
     return "view_from" if cloud.stations_source == "view_from" else "stations"
 
 
 def middle_viewpoint_m(cloud: PointCloud, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the middle (3,) of the stations, or of points if none is known; offsets."""
+    """Return the mean (3,) of the stations, or the median of points if none is known; offsets."""
     if cloud.stations is None or len(cloud.stations) == 0:
         return np.asarray(np.median(points_m, axis=0))
     return np.asarray(cloud.stations.mean(axis=0) - cloud.origin)
@@ -466,9 +466,9 @@ def face(
     *,
     is_guessed: bool,
 ) -> FacedPlane:
-    """Return a plane facing a side, with the (4,) extent of its points and its parts (p, 4).
+    """Return a plane facing a side, with rectangles of its points (4,) and of its parts (p, 4).
 
-    Parts are known to a cell; they are clipped to the extent of the points.
+    Parts are multiples of cells, so they are clipped to the extent of the points.
     """
     parts_m = np.clip(parts_m, extent_m[[0, 0, 2, 2]], extent_m[[1, 1, 3, 3]])
     corners = [rectangle_m(raster.plane, raster.axes, bounds) for bounds in (extent_m, *parts_m)]
@@ -476,7 +476,7 @@ def face(
     axes = wall_axes(plane.normal, up)
     around = []
     for corners_m in corners:
-        # The rectangle along the other axes that encloses it: for a flip the same one.
+        # The enclosing rectangle along the new axes; after a flip it is the same rectangle.
         placed = corners_m @ axes.T
         low, high = placed.min(axis=0), placed.max(axis=0)
         around.append(rectangle_m(plane, axes, np.array([low[0], high[0], low[1], high[1]])))
@@ -493,14 +493,14 @@ def side_of_stations(
 ) -> int:
     """Return the side of a plane from which its points were seen.
 
-    The scans of the plane's points decide, each point with one vote; if these are unknown, the
-    station nearest to the middle of the plane decides.
+    Each point of the plane votes for the side of its scan's station; if scans are unknown, the
+    station nearest to the centre of the plane decides.
 
     Args:
         plane: in the cloud's offsets.
-        centre_m: (3,) middle of the plane, offset.
+        centre_m: (3,) centre of the plane, offset.
         cloud: the cloud.
-        index: (m,) some of the plane's points.
+        index: (m,) indices of some points of the plane.
 
     Returns:
         1 for the side of the normal, -1 for the other, 0 if no station decides.
@@ -528,19 +528,19 @@ def side_of_remaining(
     *,
     clear_m: float,
 ) -> int:
-    """Return the side of a plane with more of the other points, which is that of the room.
+    """Return the side of a plane with more of the other points, assumed to be that of the room.
 
-    Points on planes parallel to this one do not count at first: the whole wall lies behind the
-    front of a pilaster, but the room, with its floor, side walls and furniture, on the other side.
-    Of the rest, only points in front of or behind the plane's rectangle have a vote. It grows with
-    the distance up to a metre, because relief and recesses are near and the room is far.
+    At first, points on parallel planes are excluded: behind the front of a pilaster is the whole
+    wall, but the room, with its floor, side walls and furniture, is in front of it. Of the
+    remaining points, only those in front of or behind the plane's rectangle vote. Their weight
+    increases with distance up to a metre, because relief and recesses are near and the room is far.
 
     Args:
         plane: in the cloud's offsets.
         corners_m: (4, 3) rectangle, offsets.
         points_m: (m, 3) sample of the cloud, offsets.
         is_parallel: (m,) whether a point belongs to a plane parallel to this one.
-        clear_m: points nearer than this belong to the plane itself.
+        clear_m: points closer to the plane than this belong to it.
 
     Returns:
         1 for the side of the normal, -1 for the other, 0 if the points do not decide.
@@ -573,7 +573,7 @@ def _faced(
     corners_m = rectangle_m(plane, raster.axes, extent_m)
     claims = prepared.sample_claims
     members = prepared.sample.index[claims == claim]
-    # Evenly thinned, since a plane's first points may all be from one scan.
+    # Thinned evenly, because the first points of a plane may all be from one scan.
     members = members[:: max(1, len(members) // _MEMBERS_MOST)]
     side = side_of_stations(plane, corners_m.mean(axis=0), cloud, members)
     is_guessed = side == 0

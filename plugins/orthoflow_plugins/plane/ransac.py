@@ -1,18 +1,18 @@
-"""`plane.ransac`: the planes with the largest consensus in a sample, fitted to all points.
+"""`plane.ransac`: planes with the largest consensus in a sample, fitted to all points.
 
-Three points drawn from a whole room lie on the same small wall once in a million draws. The sample
-is therefore ordered along a space-filling curve, and the points of a hypothesis are drawn from one
-section of it. The length of the section is random too: short ones find small planes, long ones
-determine large planes well.
+Three points drawn from an entire room are on the same small wall once in a million draws. The
+sample is therefore ordered along a space-filling curve, and the points of a hypothesis are drawn
+from one section of the curve. Its length is random too: short sections find small planes, long
+sections determine large planes well.
 
-The score of a hypothesis follows from the distances of points to it.
+The score of a hypothesis is computed from the distances of points.
 
-- count (Max-Consensus): the points within the tolerance.
+- count (Max-Consensus): number of points within the tolerance.
 - msac: a point within the tolerance counts 1 - (distance / tolerance)^2 (Torr and Zisserman 2000).
-- a-contrario (AC-RANSAC): minus the logarithm of the number of false alarms at the tolerance with
-  the fewest, which is a result (Moisan and Stival 2004; Moisan, Moulon, Monasse 2012). The
-  probability that a point of the background lies within a distance of the plane is the share of the
-  scene's box inside the slab.
+- a-contrario (AC-RANSAC): minus the logarithm of the number of false alarms, at the tolerance that
+  minimises it, which is returned (Moisan and Stival 2004; Moisan, Moulon, Monasse 2012). The
+  probability that a background point is within a distance of the plane is the share of the scene's
+  box inside the slab.
 """
 
 from __future__ import annotations
@@ -51,31 +51,31 @@ _BINS: Final = 100
 # Maximum number of points from which hypotheses are drawn, and on which they are scored.
 _DRAWN_MOST: Final = 50_000
 _ASKED_MOST: Final = 150_000
-# Points on which all hypotheses are scored, and points on which the better ones are scored again.
+# Number of points with which all hypotheses are scored, and with which the best are scored again.
 _FIRST_POINTS: Final = 2_000
 _SECOND_POINTS: Final = 20_000
 _SECOND_SHARE: Final = 0.1
 _SECOND_LEAST: Final = 50
-# Planes from few points are inaccurate: they may be tilted by this much more than requested.
+# Planes through few points are inaccurate, so this additional tilt is tolerated.
 _LEAN_CAUTION_DEG: Final = 5.0
-# Share of the required points that suffices, because hypotheses are rough.
+# Share of the required points that suffices, because hypotheses are inaccurate.
 _SUPPORT_CAUTION: Final = 0.4
 _POLISHED: Final = 4
-# Number of similar hypotheses that are scored again, to find the best of them.
+# Maximum number of similar hypotheses that are scored again to find the best of them.
 _SIMILAR_MOST: Final = 5
-# Minimum share, among points within the tolerance, of those in its inner part; 0.4 by chance.
+# Minimum share of the points within the tolerance that are in its inner part; 0.4 by chance.
 _CROWDED_SHARE: Final = 0.5
-# Number of new draws after all hypotheses were refused.
+# Number of new draws after all hypotheses are rejected.
 _REDRAWS: Final = 2
-# Minimum number of points of a section; each length is half of the one before.
+# Minimum number of points of a section; possible lengths are halved repeatedly.
 _STRETCH_LEAST: Final = 32
 # Minimum ratio of height to longest side of a triangle.
 _FLATTEST: Final = 0.02
 _CURVE_BITS: Final = 10
-# Steps that spread the bits of a number to every third position.
+# Shifts and masks that move the bits of a number to every third position.
 _SPREADS: Final = ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249))
-# A hypothesis within this angle, and within the tolerance, of a refused one is not proposed again
-# unless this share of the points near it was removed since.
+# A hypothesis within this angle and within the tolerance of a rejected one is proposed again only
+# if this share of the points near it has been removed.
 _SIMILAR_DEG: Final = 2.0
 _LOST_SHARE: Final = 0.05
 
@@ -83,16 +83,16 @@ _LOST_SHARE: Final = 0.05
 class Ransac(Method):
     """Find planes by random sample consensus: Max-Consensus, MSAC or AC-RANSAC, in 3D or the plan.
 
-    Planes through random points are scored on a sample of the cloud. The best is refined on the
-    sample with a tolerance that shrinks from `tolerance_m` to `fit_tolerance_m`, and must have
-    enough points that concentrate on it. When all planes are found on the sample, they are fitted
-    to all points in one pass (of clouds above 24 million points a random part is used), and all
-    points are labelled in another.
+    Planes through random points are scored with a sample of the cloud. The best is refined with a
+    tolerance that decreases from `tolerance_m` to `fit_tolerance_m`, and enough points must
+    concentrate on it. When all planes are found in the sample, they are fitted to all points in one
+    pass (for clouds above 24 million points, a random part is used), and all points are labelled in
+    another.
 
-    `model: 2d` draws upright planes through two points of the plan, as in markiewicz2015; it finds
-    walls only. `scoring: a-contrario` estimates its own tolerance, up to `tolerance_m`: the one at
-    which the points are least likely by chance. It is reported as `own_tolerance_mm` for the first
-    plane and with each plane; the common fit with `fit_tolerance_m` follows in any case.
+    `model: 2d` draws vertical planes through two points of the plan, as in markiewicz2015, and
+    finds only walls. `scoring: a-contrario` estimates a tolerance up to `tolerance_m`: the one at
+    which the points are least likely to be near the plane by chance. It is stored with each plane,
+    and reported as `own_tolerance_mm` for the first; the common fit still uses `fit_tolerance_m`.
     """
 
     id = "plane.ransac"
@@ -115,18 +115,19 @@ class Ransac(Method):
         """Parameters; the defaults suit rooms and facades scanned at millimetres."""
 
         model: Model = Field(
-            "3d", description="Planes through three points, or upright ones through two."
+            "3d", description="Planes through three points, or vertical planes through two."
         )
         scoring: Scoring = Field(
             "msac",
-            description="Score of a hypothesis: its points, its points weighted by distance, or "
-            "how unlikely they are by chance at its own tolerance.",
+            description="Score of a hypothesis: its number of points, the number weighted by "
+            "distance, or how unlikely its points are by chance at an estimated tolerance.",
         )
         n_hypotheses: int = Field(
             1000,
             ge=10,
             le=1_000_000,
-            description="Hypotheses for the first plane; half as many for each further one.",
+            description="Number of hypotheses for the first plane; half as many for each further "
+            "plane.",
         )
 
         @model_validator(mode="after")
@@ -152,7 +153,7 @@ class Hypotheses(Rows):
 
     Attributes:
         normals: (h, 3) unit vectors.
-        offsets_m: (h,) normal times point.
+        offsets_m: (h,) product of the normal and a point.
     """
 
     normals: NDArray[np.float64]
@@ -166,7 +167,7 @@ class Hypotheses(Rows):
         return (np.abs(cosines) > limit) & (apart_m < tolerance_m)
 
     def plane(self, place: int) -> Plane:
-        """Return one of them."""
+        """Return one of the planes."""
         normal = self.normals[place]
         return Plane(normal=normal / np.linalg.norm(normal), offset_m=float(self.offsets_m[place]))
 
@@ -176,9 +177,9 @@ class Scores(Rows):
     """Scores of hypotheses.
 
     Attributes:
-        value: (h,) higher is better; for a-contrario positive if meaningful.
-        tolerance_m: (h,) maximum distance of the points that count.
-        n_points: (h,) number of these.
+        value: (h,) score, higher is better; for a-contrario, positive if meaningful.
+        tolerance_m: (h,) maximum distance of the counted points.
+        n_points: (h,) number of counted points.
     """
 
     value: NDArray[np.float64]
@@ -187,11 +188,11 @@ class Scores(Rows):
 
 
 class ConsensusProposer:
-    """Proposes planes with many points of a sample.
+    """Proposes planes that many points of a sample are on.
 
-    Good hypotheses are kept for the next plane and scored again on the remaining points. Refused
-    ones are excluded until points near them are removed, because the verification depends on those
-    points alone.
+    Good hypotheses are kept for the next plane and scored again with the remaining points. Rejected
+    ones are excluded until points near them are removed, because the verification depends only on
+    these points.
     """
 
     def __init__(self, search: Search, params: Ransac.Params, rng: np.random.Generator) -> None:
@@ -199,7 +200,7 @@ class ConsensusProposer:
         self._params, self._rng, self._search = params, rng, search
         points_m = search.cloud.sample.offsets_m
         self._centre_m = np.median(points_m, axis=0)
-        # Shuffled once, so that any first part of the free points represents all of them.
+        # Shuffled once, so that any initial part of the free points represents all of them.
         self._shuffled = rng.permutation(len(points_m))[:_ASKED_MOST]
         drawn = self._shuffled[:_DRAWN_MOST]
         self._order = drawn[curve_order(points_m[drawn])]
@@ -208,7 +209,7 @@ class ConsensusProposer:
         self._box_m = corners.max(axis=0) - corners.min(axis=0)
         self._drawn_for = -1
         self._hypotheses: Hypotheses | None = None
-        # Of the hypotheses, the best first, on the points that were used.
+        # Scores of the hypotheses, the best first, for the points in `_asked_m`.
         self._scores = Scores(value=np.zeros(0), tolerance_m=np.zeros(0), n_points=np.zeros(0, int))
         self._asked_m = points_m[:0]
         self._witnesses = self._shuffled[:_SECOND_POINTS]
@@ -233,7 +234,7 @@ class ConsensusProposer:
         return self._best()
 
     def reject(self, candidate: Candidate) -> None:
-        """Exclude the surroundings of a refused hypothesis."""
+        """Exclude hypotheses similar to a rejected one."""
         plane = candidate.plane
         offset_m = plane.offset_m - float(plane.normal @ self._centre_m)
         self._bar(Hypotheses(normals=plane.normal[None], offsets_m=np.array([offset_m])))
@@ -243,20 +244,20 @@ class ConsensusProposer:
         self._n_near = np.append(self._n_near, self._count_near(hypothesis))
 
     def _is_barred(self, hypotheses: Hypotheses) -> NDArray[np.bool_]:
-        """Return (h,) whether hypotheses are similar to a refused one."""
+        """Return (h,) whether hypotheses are similar to a rejected one."""
         near = hypotheses.are_near(self._rejected, self._search.tolerance_m)
         return np.asarray(np.logical_or.reduce(near, axis=1))
 
     def _count_near(self, hypotheses: Hypotheses) -> NDArray[np.int64]:
-        """Return (h,) the number of free test points near each hypothesis."""
+        """Return the number (h,) of free test points near each hypothesis."""
         apart_m = np.abs(self._free_m @ hypotheses.normals.T - hypotheses.offsets_m)
         return np.asarray(np.sum(apart_m <= self._search.tolerance_m, axis=0, dtype=np.int64))
 
     def _best(self) -> Candidate | None:
         """Return the best hypothesis with enough points that concentrate on its plane.
 
-        A plane through mouldings and clutter has many points too, but spread over its slab. Such
-        planes are excluded here, because the full verification takes ten times as long.
+        A plane through mouldings and clutter has many points too, but they are distributed over its
+        slab. Such planes are excluded here, because the full verification takes ten times as long.
         """
         from orthoflow_plugins.plane.fit import refine_plane
         from orthoflow_plugins.plane.support import INNER_SHARE
@@ -299,7 +300,7 @@ class ConsensusProposer:
         return None
 
     def _draw(self) -> None:
-        """Draw hypotheses; score them and the earlier ones on few points, the best on more."""
+        """Draw hypotheses; score them and the earlier ones with few points, the best with more."""
         search, params = self._search, self._params
         points_m, claims = search.cloud.sample.offsets_m, search.claims
         free = np.flatnonzero(claims[self._order] < 0)
@@ -322,7 +323,7 @@ class ConsensusProposer:
         hypotheses = hypotheses.take(~self._is_barred(hypotheses))
         if len(hypotheses) == 0:
             return
-        # The first of them nearly always contain enough.
+        # These nearly always include enough free points.
         asked = self._shuffled[: 4 * _SECOND_POINTS]
         asked = asked[claims[asked] < 0]
         if len(asked) < _SECOND_POINTS:
@@ -367,7 +368,7 @@ class ConsensusProposer:
     def _distinct(
         self, hypotheses: Hypotheses, ranked: NDArray[np.intp], n_most: int
     ) -> NDArray[np.intp]:
-        """Return the best of some ranked hypotheses, at most `_SIMILAR_MOST` similar ones."""
+        """Return the best of ranked hypotheses, with at most `_SIMILAR_MOST` similar ones."""
         # The best ones nearly always include enough different ones.
         for n_asked in (min(len(ranked), _SIMILAR_MOST * n_most), len(ranked)):
             asked = ranked[:n_asked]
@@ -388,7 +389,7 @@ class ConsensusProposer:
         return Plane(normal=plane.normal, offset_m=offset_m)
 
     def _polished(self, hypothesis: Hypotheses) -> tuple[Hypotheses, float]:
-        """Fit to the points within the own tolerance and estimate that again while it improves."""
+        """Fit to the points within the tolerance and re-estimate it, while the score improves."""
         search = self._search
         relative_m = (search.cloud.sample.offsets_m - self._centre_m)[search.claims < 0]
         best = self._scored(hypothesis, relative_m)
@@ -416,8 +417,8 @@ def draw_hypotheses(
 
     Args:
         points_m: (m, 3) in curve order.
-        count: number of draws; degenerate ones are left out.
-        model: `3d` through three points, `2d` upright through two.
+        count: number of draws; degenerate ones are omitted.
+        model: `3d`: through three points; `2d`: vertical, through two points.
         up: (3,) unit vector.
         rng: random numbers.
     """
@@ -461,10 +462,10 @@ def fewest_false_alarms(
     extents_m: NDArray[np.float64],
     n_corners: int,
 ) -> Scores:
-    """Score hypotheses by the tolerance at which their points are least likely by chance.
+    """Score hypotheses at the tolerance at which their points are least likely by chance.
 
     Args:
-        histograms: (h, bins) points per bin of distance, 0..reach.
+        histograms: (h, bins) number of points per distance bin, 0..reach.
         reach_m: maximum tolerance.
         n_points: total number of points.
         extents_m: (h,) extent of the scene's box along each normal.
@@ -503,7 +504,7 @@ def _log_choose(
 def _fitted(
     points_m: NDArray[np.float64], model: Model, up: NDArray[np.float64]
 ) -> Hypotheses | None:
-    """Return the total least squares plane, upright for the 2D model."""
+    """Return the total least squares plane; vertical for the 2D model."""
     if len(points_m) < 4:
         return None
     mean = points_m.mean(axis=0)

@@ -1,7 +1,7 @@
 """`plane.region`: regions grown over neighbouring points with similar normals on a common plane.
 
-Regions consist of voxels, which are grown over neighbours or grouped by normals alone. The region
-with most free points is proposed first. Points may also be labelled by their region.
+Regions consist of voxels. They are grown over neighbours, or formed by grouping normals alone. The
+region with the most free points is proposed first. Points may also be labelled by their region.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from orthoflow_plugins.plane.search import Search
     from orthoflow_plugins.plane.voxels import Neighbourhood, SurfaceVoxels
 
-# Values of `preset: paper` for parameters that are not set: markiewicz2015, 4.1.2.
+# Values of `preset: paper` for parameters that are not set (markiewicz2015, 4.1.2).
 _PAPER_PRESET: Final[dict[str, object]] = {
     "criterion": "normal",
     "neighbourhood": "cube",
@@ -43,43 +43,45 @@ _PAPER_PRESET: Final[dict[str, object]] = {
     "labels": "region",
     "stop_unclassified_share": 0.1,
 }
-# Parts of a wall are separate regions, which may have enough points only together.
+# Share of the required points that a region needs, because the parts of a wall are separate
+# regions, which may have enough points only together.
 _PART_SHARE: Final = 0.2
-# A region's plane may be tilted by this much more than requested; the fit decides.
+# Additional tilt tolerated for the plane of a region, because the fit may reduce it.
 _LEAN_CAUTION_DEG: Final = 3.0
-# Values of voxels in no region: those that may be added to one, and those that may not.
+# Values of voxels in no region: _FREE if they may be added to one, _NONE if not.
 _FREE: Final = -2
 _NONE: Final = -1
 # Maximum ratio of the deviation from a neighbourhood's plane to its shorter extent.
 _ROUNDEST: Final = 0.5
-# Minimum extent of a neighbourhood in both directions, in sides of a voxel; else it is a line.
+# Minimum width of a neighbourhood, in sides of a voxel; a narrower one is a line.
 _NARROWEST: Final = 0.2
 # Seeds are ordered by flatness, in steps of this share of a voxel.
 _FLATNESS_STEP: Final = 1.0 / 2000.0
 _MEAN_SHIFTS: Final = 12
-# Maximum number of times that voxels are doubled in width, and the limit, as a multiple of the
-# points that a normal needs, below which they are.
+# Maximum number of times that voxels are doubled in width. They are doubled if neighbourhoods have
+# fewer points than this multiple of the number that a normal needs.
 _WIDENINGS: Final = 2
 _THIN: Final = 3.0
 
 
 class Region(Method):
-    """Find planes by region growing on the normals of neighbourhoods, on all points.
+    """Find planes by region growing with normals of neighbourhoods, using all points.
 
     The points are summed into cells once; the sums of neighbouring cells give the normal of each
     neighbourhood. Starting from the flattest cell, neighbours are added whose normal is similar to
     the region's and whose centroid is near its plane, which is refitted as the region grows. The
-    planes of the regions, largest first, are then processed as those of every detector: refined on
-    a sample, fitted to all points, parts of one plane joined, points labelled by the nearest plane.
+    planes of the regions, largest first, are then processed as for every detector: they are refined
+    on a sample and fitted to all points, parts of one plane are joined, and points are labelled by
+    the nearest plane.
 
-    `criterion: normal` uses the normal alone, wherever a cell lies, as in markiewicz2015; with
-    `labels: region` a niche then belongs to its wall, whatever its depth. `preset: paper` sets both
-    and the other values of that paper (a cube of 10 mm, 1 degree, every 10th point, an end at 10 %
-    unclassified), each of which can be overridden.
+    `criterion: normal` uses only the normal and ignores the position of a cell, as in
+    markiewicz2015; with `labels: region`, a niche of any depth then belongs to its wall. `preset:
+    paper` sets both and the other values of that paper (10 mm cube, 1 degree, every 10th point,
+    stop at 10 % unclassified), each of which can be overridden.
 
     If the cloud is so sparse that a neighbourhood would have too few points, it is enlarged;
     `neighbourhood_mm` reports the size. `normal_scatter_deg` reports the scatter of the normals of
-    the first plane: an `angle_deg` below it leaves fragments.
+    the first plane: a smaller `angle_deg` results in fragments.
     """
 
     id = "plane.region"
@@ -107,8 +109,8 @@ class Region(Method):
         )
         neighbourhood: Literal["cube", "radius", "knn"] = Field(
             "cube",
-            description="The points from which a normal is computed: in a cube, in a sphere, or in "
-            "the nearest cells with `n_neighbours` points.",
+            description="Points from which a normal is computed: those in a cube, in a sphere, or "
+            "in the nearest cells with `n_neighbours` points.",
         )
         neighbourhood_m: Annotated[float, Field(gt=0.0, le=2.0)] | Literal["auto"] = Field(
             "auto",
@@ -116,7 +118,7 @@ class Region(Method):
             "the tolerance of the fit if that is more, because noise must not dominate normals.",
         )
         n_neighbours: int = Field(
-            30, ge=3, le=100_000, description="Points of a neighbourhood for knn."
+            30, ge=3, le=100_000, description="Number of points of a neighbourhood for knn."
         )
         cell_m: float | None = Field(
             None,
@@ -127,11 +129,14 @@ class Region(Method):
         )
         criterion: Literal["normal-and-distance", "normal"] = Field(
             "normal-and-distance",
-            description="What must agree with the region: the normal and the distance, or the "
-            "normal alone, wherever the points lie.",
+            description="Criterion for adding cells to a region: the normal and the distance from "
+            "its plane, or only the normal.",
         )
         angle_deg: float = Field(
-            10.0, gt=0.0, le=45.0, description="Maximum angle between a normal and the region's."
+            10.0,
+            gt=0.0,
+            le=45.0,
+            description="Maximum angle between a normal and that of the region.",
         )
         distance_m: Annotated[float, Field(gt=0.0)] | Literal["auto"] = Field(
             "auto",
@@ -140,19 +145,19 @@ class Region(Method):
         )
         labels: Literal["plane", "region"] = Field(
             "plane",
-            description="Label points by the nearest plane, or by the region that they are in.",
+            description="Label points by the nearest plane, or by the region that contains them.",
         )
 
         @model_validator(mode="before")
         @classmethod
         def _preset_fills_in(cls, given: Any) -> Any:
-            # Any: what a user wrote, before it is checked.
+            # Any, because the input of the user has not been validated yet.
             if isinstance(given, dict) and given.get("preset") == "paper":
                 return {**_PAPER_PRESET, **given}
             return given
 
         def neighbourhood_of(self, fit_tolerance_m: float) -> Neighbourhood:
-            """Return the neighbourhood for a cloud fitted with a tolerance."""
+            """Return the neighbourhood for a given tolerance of the fit."""
             from orthoflow_plugins.plane.voxels import Neighbourhood
 
             auto_m = min(2.0, max(0.1, 3.0 * fit_tolerance_m))
@@ -192,11 +197,12 @@ class RegionProposer:
 
     Attributes:
         voxels: the voxels.
-        region_of_voxel: (m,) int32, -1 for none.
-        n_points: (r,) int64 points of each region.
-        planes: of the regions with enough points, by region: total least squares through all
-            their points, in the cloud's offsets.
-        starts: the planes near most points of each region; equal to `planes` for a single layer.
+        region_of_voxel: (m,) int32 region of each voxel, -1 for none.
+        n_points: (r,) int64 number of points of each region.
+        planes: total least squares planes of the regions with enough points, by region, in the
+            cloud's offsets.
+        starts: planes at the densest layer of each region; same as `planes` if points are selected
+            by distance.
     """
 
     def __init__(
@@ -228,7 +234,7 @@ class RegionProposer:
         self._last = -1
 
     def _region_of(self, cloud: PreparedCloud) -> NDArray[np.int32]:
-        """Return the region (s,) of each point of a cloud's sample, -1 for none."""
+        """Return the regions (s,) of the points of a cloud's sample, -1 for none."""
         from orthoflow_plugins.plane.cloud import blocked
 
         # The last entry is for points in no voxel.
@@ -236,7 +242,7 @@ class RegionProposer:
         return regions[self.voxels.table.voxel_of(blocked(cloud.sample.offsets_m))]
 
     def propose(self, search: Search) -> Candidate | None:
-        """Return the plane of the region with most free points."""
+        """Return the plane of the region with the most free points."""
         free = self._region_of_sample[(search.claims < 0) & (self._region_of_sample >= 0)]
         counts = np.bincount(free, minlength=len(self.n_points))
         constraint = self._params.constraint
@@ -248,7 +254,8 @@ class RegionProposer:
             if plane is None or region in self._barred:
                 continue
             leans = leans_as_asked(plane.normal[None], search.cloud.up, constraint, limit_deg)
-            # By the normal alone a region has one plane, even if many of its points lie off it.
+            # If only the normal counts, a region is proposed once, even if many of its points are
+            # off its plane.
             if self._params.criterion == "normal" or not leans.all():
                 self._barred.add(region)
             if not leans.all():
@@ -270,8 +277,8 @@ class RegionProposer:
     def relabel(self, found: list[FoundPlane], cloud: PreparedCloud) -> None:
         """Assign each point to the plane of its region instead of the nearest plane.
 
-        A region belongs to the plane with most of its points according to the cloud's claims, if
-        more than half of its points are on any plane.
+        A region belongs to the plane that contains most of its points, if more than half of its
+        points are on a plane.
         """
         from orthoflow_plugins.plane.kernels import each_part, piece_of
 
@@ -294,12 +301,12 @@ class RegionProposer:
 def region_proposer(
     search: Search, params: Region.Params, *, viewer_m: NDArray[np.float64]
 ) -> RegionProposer:
-    """Grow regions on all points of a search's cloud.
+    """Grow regions using all points of the cloud of a search.
 
     Args:
         search: the search.
-        params: how regions grow.
-        viewer_m: (3,) position that defines the sign of normals if the normal alone counts, in the
+        params: parameters of the growth.
+        viewer_m: (3,) position that defines the sign of normals if only the normal counts, in the
             cloud's offsets.
     """
     from orthoflow_plugins.plane.voxels import surface_voxels
@@ -323,7 +330,7 @@ def _grown(
     once: partial[tuple[NDArray[np.int32], int]],
     least_points: float,
 ) -> tuple[NDArray[np.int32], int]:
-    """Grow regions; if the cloud is sparse, also regions of larger voxels among the rest."""
+    """Grow regions; in a sparse cloud, also grow regions of larger voxels."""
     from orthoflow_plugins.plane.voxels import POINTS_LEAST, SurfaceVoxels
 
     def crumbs_of(some: SurfaceVoxels, own: NDArray[np.int32]) -> NDArray[np.bool_]:
@@ -367,7 +374,7 @@ def _grown_once(
     may_join = (deviation <= reach) & (deviation <= _ROUNDEST * width) & (width > _NARROWEST)
     regions = np.where(may_join, np.int32(_FREE), np.int32(_NONE))
     seeds = np.flatnonzero(may_join)
-    # Sixteen bits, for which numpy uses a radix sort.
+    # 16-bit numbers, for which numpy uses a radix sort.
     flatness = np.minimum(deviation[seeds] / _FLATNESS_STEP, 65535.0).astype(np.uint16)
     n_regions = grow_regions(
         table.places,
@@ -385,10 +392,10 @@ def _grown_once(
 def _grouped(
     voxels: SurfaceVoxels, angle_deg: float, least_points: float, viewer_m: NDArray[np.float64]
 ) -> tuple[NDArray[np.int32], int]:
-    """Group voxels by the direction that most points share, then that of the rest, and so on."""
+    """Group voxels by the most frequent direction, and repeat with the remaining voxels."""
     usable = (voxels.spreads[:, 0] <= _ROUNDEST * voxels.spreads[:, 1]) & (voxels.counts >= 1)
     usable &= voxels.spreads[:, 1] > _NARROWEST
-    # Each towards the viewer.
+    # Normals point towards the viewer.
     normals: NDArray[np.float64] = voxels.normals.astype(np.float64)
     to_viewer = voxels.table.grid.basis @ viewer_m - voxels.table.centroids()
     normals *= np.where(np.einsum("ij,ij->i", normals, to_viewer) < 0.0, -1.0, 1.0)[:, None]
@@ -411,7 +418,7 @@ def _grouped(
 def _common_direction(
     normals: NDArray[np.float64], weights: NDArray[np.float64], angle_deg: float
 ) -> NDArray[np.float64]:
-    """Return the fullest bin of directions, shifted to the mean of those within the angle."""
+    """Return the most frequent direction by mean shift, starting at the fullest bin."""
     step = 2.0 * math.sin(0.5 * math.radians(max(angle_deg, 0.5)))
     bins = np.round(normals / step).astype(np.int64) + 4096
     keys, bin_of = np.unique(
@@ -434,7 +441,7 @@ def _unit_mean(normals: NDArray[np.float64], weights: NDArray[np.float64]) -> ND
 
 
 def _plane(sums: NDArray[np.float64], voxels: SurfaceVoxels) -> Plane | None:
-    """Return the total least squares plane of a region's points; in the cloud's offsets."""
+    """Return the total least squares plane of a region's points, in the cloud's offsets."""
     mean = sums[1:4] / sums[0]
     second = sums[[[4, 5, 6], [5, 7, 8], [6, 8, 9]]]
     variances, directions = np.linalg.eigh(second / sums[0] - np.outer(mean, mean))
@@ -448,7 +455,7 @@ def _plane(sums: NDArray[np.float64], voxels: SurfaceVoxels) -> Plane | None:
 
 
 def _densest(voxels: SurfaceVoxels, member: NDArray[np.bool_], plane: Plane) -> Plane:
-    """Return the plane with the mean normal of a group at the distance of most of its points."""
+    """Return the plane with the mean normal of a group, at the distance of its densest layer."""
     basis, side_m = voxels.table.grid.basis, voxels.table.grid.cell_m
     weights = voxels.counts[member].astype(np.float64)
     normals = voxels.normals[member].astype(np.float64)

@@ -1,10 +1,10 @@
-"""The search that all detectors share: candidates are refined, verified, fitted and labelled.
+"""The search common to all detectors: candidates are refined, verified, fitted and labelled.
 
 Detectors therefore differ in how they propose planes, not in how planes are fitted. A candidate is
-refined on the free points of the sample with a shrinking tolerance; it must have enough points in
-cells where they concentrate on the plane, and is fitted to those cells. All planes are then fitted
-to all points in one pass. Of clouds above 24 million points, randomly drawn blocks are used:
-neighbouring points share their errors, so the blocks left out would add no information.
+refined on the free points of the sample with a decreasing tolerance. It must have enough points in
+cells where they concentrate on the plane, and is fitted to these cells. All planes are then fitted
+to all points in one pass. For clouds above 24 million points, randomly drawn blocks are used:
+errors are common to neighbouring points, so the other blocks would add little information.
 """
 
 from __future__ import annotations
@@ -62,44 +62,48 @@ from orthoflow_plugins.plane.support import (
 )
 from orthoflow_plugins.plane.thickness import measure_thickness, report_thickness, row_points
 
-# Share of the points in a plane's slab and rectangle that must lie in crowded cells.
+# Minimum share of the points in a plane's slab and rectangle that are in crowded cells.
 _CROWDED_LEAST: Final = 0.5
-# Cells that form a line, about which a plane may turn as it likes, are narrower than this.
+# Minimum width of a plane in cells; narrower strips do not determine the rotation of the plane
+# about their axis.
 _STRIP_CELLS: Final = 2.5
-# Surfaces rounder than this radius are no planes, when the rounding is what shows in their cells.
+# Surfaces with a smaller radius are not planes, if the curvature explains this share of the
+# variance of their cells.
 _RADIUS_LEAST_M: Final = 5.0
 _BENT_SHARE: Final = 0.5
-# Passes over the points that one plane may take, and the share of the fit tolerance by which a fit
-# may move without asking for another.
+# Maximum number of passes over the points for one plane, and the share of the fit tolerance by
+# which a fit may move without another pass.
 _PASSES_MOST: Final = 3
 _SETTLED_SHARE: Final = 0.1
-# Planes of a sample are fitted to all points later.
+# Convergence limit for planes of the sample, which are fitted to all points later.
 _SETTLED_ON_SAMPLE_M: Final = 2e-5
 # Share of the required points that suffices before the cells of a candidate are fitted.
 _SAMPLE_CAUTION: Final = 0.7
-# Parts belong to one plane if the common fit is not much worse on the largest than its own.
+# Parts belong to one plane if, on the largest part, the common fit is not much worse than the fit
+# to this part alone.
 _ASKEW: Final = 1.5
 _SAME_M: Final = 2e-4
-# Points used to move a candidate to the nearby surface; the later fits, to the cells of the sample
-# and then of all points, use all.
+# Number of points used to move a candidate to the nearby surface; later fits, to cells of the
+# sample and then of all points, use all of them.
 _FIT_POINTS: Final = 20_000
-# Points used to estimate the extent of a candidate.
+# Number of points used to estimate the extent of a candidate.
 _SPREAD_POINTS: Final = 5_000
-# With this many points every plane is known better than its surface is flat; of larger clouds a
-# part is fitted.
+# With this number of points, planes are determined better than their surfaces are flat, so a part
+# of larger clouds suffices.
 _FITTED_MOST: Final = 12_000_000
-# In small clouds the minimum area is limited to this share of the largest face of the box.
+# In small clouds, the minimum area is reduced to this share of the largest face of the box.
 _SIDE_SHARE: Final = 0.02
-# Maximum number of rectangles per plane: a frame has four sides. Claims are bytes.
+# Maximum number of rectangles per plane (a frame has four sides), and of slabs, since claims are
+# bytes.
 _RECTANGLES_MOST: Final = 8
 _SLABS_MOST: Final = 127
-# Number of consecutive refused candidates after which the search ends.
+# Number of consecutive rejected candidates after which the search ends.
 _REJECTED_MOST: Final = 60
 
-# What may refuse a candidate: too few points, too little surface, none that crowd about it, a strip
-# as narrow as a line, points that only pass through, a rounded surface, or a tilt not asked for.
+# Reasons to reject a candidate: too few points, too small an area, no points that concentrate on
+# it, a narrow strip, points that only pass through it, a curved surface, or an unwanted tilt.
 Criterion = Literal["few", "small", "scattered", "strip", "smear", "bent", "tilt"]
-# Candidates refused for these reasons contain no plane of the required size.
+# Candidates rejected for these reasons contain no plane of the required size.
 _SET_ASIDE: Final[frozenset[Criterion]] = frozenset({"small", "strip", "bent"})
 
 _NO_PLANE: Final = (
@@ -119,28 +123,30 @@ _CRITERIA: Final[Mapping[Criterion, str]] = {
 }
 _NO_CANDIDATE: Final = "no candidate was proposed"
 _ADVICE: Final = (
-    "wider tolerances up to {wider:.3g} m find none either: lower min_area_m2 for "
+    "tolerances up to {wider:.3g} m find none either: lower min_area_m2 for "
     "small planes, min_share for sparse ones, or raise max_tilt_deg"
 )
 _ADVICE_WIDER: Final = "with tolerance_m {wider:.3g} one is found"
-# Tolerances tried for the message, as multiples of the one that found nothing.
+# Larger tolerances tried for the message, as multiples of the one that found nothing.
 _WIDER: Final = (1.5, 2.0, 3.0, 4.0, 6.0)
-# If two sides of a cloud are shorter, its unit may be wrong, and planes are hard to find.
+# If two sides of a cloud are shorter than this, its unit may be wrong, and planes are hard to find.
 _SMALL_M: Final = 1.0
 _SMALL: Final = (
-    ". The cloud is small: check unit of read.scan. A plane must be {least} m wide and high; "
-    "points beside its edges distort one that is not much larger: lower fit_tolerance_m to 0.005, "
-    "with max_tilt_deg 45 if it is tilted, or state the plane (plane.given)"
+    ". The cloud is small: check unit of read.scan. A plane must be at least {least} m wide and "
+    "high, and one that is not much larger is distorted by points near its edges: lower "
+    "fit_tolerance_m to 0.005, with max_tilt_deg 45 if it is tilted, or specify the plane "
+    "(plane.given)"
 )
 _NO_INTENSITY: Final = (
-    "materials are distinguished by the intensity of the points, which this cloud does not have: "
-    "leave out materials, or read a scan with intensity ({method})"
+    "materials are distinguished by the intensity of points, which this cloud does not have: omit "
+    "materials, or read a scan with intensity ({method})"
 )
 UNEXPLAINED: Final = DiagnosticSpec(
     code="points-on-no-plane",
     severity="warning",
-    text="{share:.0%} of the points lie on no plane, more than on the largest one ({largest:.0%}): "
-    "walls may be missing, unless these are vegetation, furniture or curved surfaces",
+    text="{share:.0%} of the points are on no plane, more than on the largest plane "
+    "({largest:.0%}): walls may be missing, unless these points are vegetation, furniture or "
+    "curved surfaces",
     remedy="{step}.min_share={min_share:.2g} finds smaller planes, "
     "{step}.tolerance_m={tolerance_m:.2g} rougher ones",
     rank_by="share",
@@ -148,30 +154,31 @@ UNEXPLAINED: Final = DiagnosticSpec(
 
 
 class Claim(NamedTuple):
-    """A plane to which points are assigned: (12,) its slab and (5,) its bounds, see `kernels`."""
+    """A region to which points are assigned: slab (12,) and bounds (5,), see `kernels`."""
 
     slab: NDArray[np.float64]
     bounds_m: NDArray[np.float64]
 
     @classmethod
     def of(cls, raster: SurfaceRaster, support: Support, tolerance_m: float) -> Claim:
-        """Return the region of a plane: within the tolerance of it and of its rectangle."""
+        """Return the region within the tolerance of a plane and of its rectangle."""
         return cls(raster.slab(), grown(support.bounds_m, tolerance_m))
 
 
 @dataclass(kw_only=True)
 class Search:
-    """The state of a greedy search: which points of the sample are still free.
+    """State of a greedy search: the points of the sample that are still free.
 
     Attributes:
         cloud: the cloud.
-        params: which planes are accepted, and when the search ends.
-        tolerance_m: `params.tolerance_m`, measured where that is `auto`.
-        fit_tolerance_m: `params.fit_tolerance_m`, likewise.
-        claims: (m,) int16, plane of each point of the sample, -1 for none yet.
+        params: criteria for planes and for the end of the search.
+        tolerance_m: `params.tolerance_m`, or the estimated value if that is `auto`.
+        fit_tolerance_m: `params.fit_tolerance_m`, or the estimated value if that is `auto`.
+        claims: (m,) int16 plane of each point of the sample, -1 if not yet assigned.
         taken: the regions from which points were removed, in order.
         n_points: number of free points of the sample.
-        refusals: criterion that refused each candidate, and its share of all points.
+        refusals: for each rejected candidate, the criterion and the candidate's share of all
+            points.
     """
 
     cloud: PreparedCloud
@@ -192,24 +199,24 @@ class Search:
 
     @property
     def min_area_m2(self) -> float:
-        """Minimum area of a plane."""
+        """Return the minimum area of a plane."""
         _, middle, high = np.sort(self.cloud.grid.extent_m)
         return min(self.params.min_area_m2, _SIDE_SHARE * float(middle * high))
 
     @property
     def least_points(self) -> float:
-        """Minimum number of points of the sample on a plane."""
+        """Return the minimum number of sample points on a plane."""
         return self.params.min_share * len(self.claims)
 
     def free(self) -> tuple[NDArray[np.float64], BlockedPoints]:
-        """Return the points that belong to no plane: (m, 3) offsets, and in blocks."""
+        """Return the points that belong to no plane, as offsets (m, 3) and in blocks."""
         if self._free is None:
             offsets_m = self.cloud.sample.offsets_m.take(np.flatnonzero(self.claims < 0), axis=0)
             self._free = offsets_m, blocked(offsets_m)
         return self._free
 
     def claim(self, claim: Claim) -> None:
-        """Assign points to a plane, except those that are nearer to an earlier one."""
+        """Assign points to a plane, except points that are nearer to an earlier plane."""
         rows, bounds = claim.slab.reshape(3, 4), claim.bounds_m
         points_m = self.cloud.sample.offsets_m
         x, y, z = points_m.T
@@ -224,7 +231,7 @@ class Search:
         self._free = None
 
     def refuse(self, criterion: Criterion, n_points: float = 0.0) -> None:
-        """Record the criterion that refused a candidate with `n_points` of the sample."""
+        """Record the criterion that rejects a candidate with `n_points` of the sample."""
         self.refusals.append((criterion, n_points / max(1, len(self.claims))))
 
 
@@ -239,7 +246,7 @@ class Proposer(Protocol):
 
 
 P = TypeVar("P", bound=Proposer)
-# The criterion that refuses a plane, the cells that belong to it, and how it fits them.
+# The criterion that rejects a plane, the cells that belong to it, and its fit.
 _Verdict = tuple[Criterion | None, Support | None, AdjustedPlane | None]
 # Creates the proposer of a search that has just begun.
 ProposerOf = Callable[[Search], P]
@@ -264,14 +271,14 @@ def detect(
         proposer_of: creates the proposer.
         method: id of the method, for messages.
         plan_cell_m: side of the plan's cells; None for detectors that do not use the plan.
-        relabel: changes the claims of the whole cloud after all points were labelled.
+        relabel: changes the claims of the whole cloud after all points are labelled.
 
     Returns:
         Planes and labels, and the proposer.
 
     Raises:
         ProductError: the cloud has fewer than three points, or coordinates that are not finite.
-        MethodError: the points determine no plane, or none has enough of them; or `materials` is
+        MethodError: the points determine no plane, no plane has enough points, or `materials` is
             set for a cloud without intensity.
     """
     if params.materials and cloud.intensity is None:
@@ -318,12 +325,12 @@ def _products(
     search: Search,
     ctx: StepContext,
 ) -> DetectorOut:
-    """Measure, assemble, report and draw the planes that were found."""
+    """Measure, assemble, report and draw the detected planes."""
     ctx.progress(0.8, "measuring deviations")
     planes, deviations, normalities, order = assemble(
         found, whole, cloud, search.tolerance_m, search.fit_tolerance_m
     )
-    # The last name is that of points on no plane, which have a claim of -1.
+    # The last name is for points on no plane, which have a claim of -1.
     names = np.append(np.argsort(order), -1).astype(np.int16)
     labels = ctx.allocate("labels", "plane_index", (len(cloud),), np.int16).view(np.int16)
     whole.write_labels(names, labels)
@@ -356,10 +363,10 @@ def _products(
 def find_planes(
     search: Search, proposer: Proposer, on_found: Callable[[int], None] = lambda _: None
 ) -> list[FoundPlane]:
-    """Find all planes in the sample of a cloud, then fit them to all points and label those.
+    """Find all planes in the sample of a cloud, fit them to all points, and label the points.
 
     Args:
-        search: the search; its claims, and those of its cloud, are filled.
+        search: the search; its claims and those of its cloud are set.
         proposer: the detector.
         on_found: called after each plane with the number of planes so far.
     """
@@ -371,7 +378,7 @@ def find_planes(
 def greedy_search(
     search: Search, proposer: Proposer, on_found: Callable[[int], None] = lambda _: None
 ) -> list[FoundPlane]:
-    """Find planes in the sample one by one until a stop rule applies; see `find_planes`."""
+    """Find planes in the sample one by one until a stopping rule applies; see `find_planes`."""
     params, found, n_rejected = search.params, list[FoundPlane](), 0
     least_left = params.stop_unclassified_share * len(search.claims)
     while len(found) < params.n_planes_max and n_rejected < _REJECTED_MOST:
@@ -397,10 +404,10 @@ def greedy_search(
 def verify(candidate: Candidate, search: Search) -> FoundPlane | None:
     """Refine a candidate and check whether the free points form a plane there.
 
-    Returns None if they do not; `search.refusals` then has the criterion. Clutter near the scanner
-    has more points than a distant wall, and its many slightly different candidates would hide that
-    wall. Points of candidates refused for their size or shape are therefore removed from the
-    search; those that lie on a plane are assigned to it when all points are labelled.
+    Returns None if they do not, and adds the criterion to `search.refusals`. Clutter near the
+    scanner has more points than a distant wall, and its many slightly different candidates would
+    hide the wall. Points of candidates rejected for their size or shape are therefore removed from
+    the search. Those of them on a plane are assigned to it when all points are labelled.
     """
     up, params = search.cloud.up, search.params
     leans = partial(leans_as_asked, up=up, max_tilt_deg=params.max_tilt_deg)
@@ -429,7 +436,7 @@ def verify(candidate: Candidate, search: Search) -> FoundPlane | None:
                 search.claim(Claim.of(raster, support, search.tolerance_m))
             return None
         plane, cell_m = adjusted.plane, raster.cell_m
-        # The points of a plane that moved were selected by a tilted slab: repeat.
+        # If the plane has moved, its points were selected by a tilted slab, so repeat.
         is_settled = adjusted.moved_m < _SETTLED_SHARE * search.fit_tolerance_m
         if is_settled or nth == _PASSES_MOST - 1:
             raster = raster.moved_to(plane, up)
@@ -452,7 +459,7 @@ def _refined(candidate: Candidate, search: Search, freedom: Freedom) -> tuple[Pl
         return None
     near = np.abs(free_points @ plane.normal - plane.offset_m) <= search.tolerance_m
     near_m = free_points.take(np.flatnonzero(near), axis=0)
-    # The cell size follows from the extent of the points.
+    # The cell size depends on the extent of the points.
     placed = _some(near_m @ wall_axes(plane.normal, up).T, _SPREAD_POINTS)
     low, high = np.quantile(placed, (0.02, 0.98), axis=0) if len(near_m) else np.zeros((2, 2))
     cell_m = max(search.tolerance_m, cell_for(len(near_m), float(np.prod(high - low))))
@@ -462,8 +469,8 @@ def _refined(candidate: Candidate, search: Search, freedom: Freedom) -> tuple[Pl
     if support is None or support.n_points < _SAMPLE_CAUTION * search.least_points:
         search.refuse("scattered" if support is None else "few", support.n_points if support else 0)
         return None
-    # A door and a niche in a wall, at different depths, both lie near a plane tilted by a few
-    # degrees that passes through both; a fit to the largest part alone reveals this.
+    # A door and a niche at different depths may both be near a slightly tilted plane that passes
+    # through both; a fit to the largest part alone reveals this.
     near_m = _some(near_m, _FIT_POINTS)
     together = fit(near_m[raster.covers(near_m, support.cells)], plane, first, *rest)
     if len(support.parts_m) > 1:
@@ -486,12 +493,12 @@ def _refined(candidate: Candidate, search: Search, freedom: Freedom) -> tuple[Pl
 
 
 def _some(points: NDArray[np.float64], most: int) -> NDArray[np.float64]:
-    """Return every n-th of the points (m, 3), about `most` of them."""
+    """Return every n-th of points (m, 3), about `most` points."""
     return points[:: max(1, len(points) // most)]
 
 
 def _cells_of(search: Search, raster: SurfaceRaster, parts: int) -> CellSums:
-    """Return sums of the free points of the sample in the cells on a plane."""
+    """Return the sums of the free sample points per cell on a plane."""
     return measure_cells(
         search.free()[1],
         [raster],
@@ -510,7 +517,7 @@ def _judged(
     *,
     settled_m: float = SETTLED_M,
 ) -> _Verdict:
-    """Return the criterion that refuses a plane, the cells that belong to it, and its fit."""
+    """Return the criterion that rejects a plane, the cells that belong to it, and its fit."""
     support = support_of(raster, crowded_cells(sums), sums, join_parts=search.params.join_parts)
     if support is None:
         search.refuse("scattered")
@@ -537,24 +544,24 @@ def _judged(
             freedom=freedom,
             settled_m=settled_m,
         )
-        # A column or barrel that the plane only touches.
+        # The surface is a column or barrel that the plane only touches.
         if adjusted is None or (
             adjusted.bend_per_m > 1.0 / _RADIUS_LEAST_M and adjusted.bend_share > _BENT_SHARE
         ):
             criterion, adjusted = "bent", None
     if criterion is not None:
-        # As a share of all points, however many of them were used.
+        # As a share of all points, even if not all of them were used.
         share = support.n_points / max(least_points, 1e-9)
         search.refuse(criterion, share * search.least_points)
     return criterion, support, adjusted
 
 
 def fit_to_all(found: list[FoundPlane], search: Search) -> list[FoundPlane]:
-    """Fit planes of the sample to all points; drop those that all points do not confirm."""
+    """Fit planes of the sample to all points; omit planes that all points do not confirm."""
     cloud = search.cloud
     every = max(1, len(cloud.claims) // _FITTED_MOST)
     least_points = search.params.min_share * len(cloud.claims) / every
-    # A fixed step would coincide with the columns of a scan and leave out stripes.
+    # A fixed step would coincide with scan columns and omit stripes.
     drawn = np.random.default_rng(0).permutation(len(cloud.points.boxes)) % every == 0
     is_open = [True] * len(found)
 
@@ -599,7 +606,7 @@ def fit_to_all(found: list[FoundPlane], search: Search) -> list[FoundPlane]:
 
 
 def _fine_raster(item: FoundPlane, search: Search, every: int) -> SurfaceRaster:
-    """Return cells over the plane's rectangle alone, as fine as the number of points allows."""
+    """Return a raster of the plane's rectangle, as fine as the number of points permits."""
     area_m2 = float(item.support.cells.sum()) * item.raster.cell_m**2
     share = search.cloud.sample.n_represented / every
     cell_m = min(item.raster.cell_m, cell_for(item.support.n_points * share, area_m2))
@@ -610,7 +617,7 @@ def _fine_raster(item: FoundPlane, search: Search, every: int) -> SurfaceRaster:
 
 
 def _bounds(found: list[FoundPlane], tolerance_m: float) -> list[NDArray[np.float64]]:
-    """Return bounds (r, 5) of each plane: one rectangle, or several if it is sparsely covered."""
+    """Return bounds (r, 5) of each plane: one rectangle, or several if that is sparsely covered."""
     bounds, n_spare = [], _SLABS_MOST - len(found)
     for item in found:
         most = min(_RECTANGLES_MOST, n_spare + 1)
@@ -621,17 +628,17 @@ def _bounds(found: list[FoundPlane], tolerance_m: float) -> list[NDArray[np.floa
 
 
 def label(found: list[FoundPlane], cloud: PreparedCloud, tolerance_m: float) -> None:
-    """Assign all points to the nearest plane in whose rectangles they lie."""
+    """Assign all points to the nearest plane whose rectangles contain them."""
     bounds = _bounds(found, tolerance_m)
     plane_of_slab = np.repeat(np.arange(len(found)), [len(own) for own in bounds])
     slabs = np.array([item.raster.slab() for item in found]).reshape(-1, 12)[plane_of_slab]
-    # The last entry is that of a claim of -1.
+    # The last entry is for a claim of -1.
     names = np.append(plane_of_slab, -1).astype(np.int8) if len(slabs) > len(found) else None
     cloud.assign(slabs, np.concatenate([np.zeros((0, 5)), *bounds]), names)
 
 
 def _as_proposed(item: FoundPlane, up: NDArray[np.float64]) -> FoundPlane:
-    """Return a plane as its detector proposed it, with the rectangle found for it."""
+    """Return the plane that the detector proposed, with the detected rectangle."""
     plane = item.candidate.plane
     if float(plane.normal @ item.raster.plane.normal) < 0.0:
         plane = plane.flipped()
@@ -639,7 +646,7 @@ def _as_proposed(item: FoundPlane, up: NDArray[np.float64]) -> FoundPlane:
 
 
 def _why_none(cloud: PointCloud, search: Search, proposer_of: ProposerOf[P], method: str) -> str:
-    """Return the message for no plane: the criterion of the largest candidate, and what helps."""
+    """Return the message for no plane: why the largest candidate was rejected, and advice."""
     why = _NO_CANDIDATE
     if search.refusals:
         criterion, share = max(search.refusals, key=lambda refusal: refusal[1])
@@ -669,12 +676,12 @@ def _why_none(cloud: PointCloud, search: Search, proposer_of: ProposerOf[P], met
 
 
 def _report_times(ctx: StepContext, passed_s: NDArray[np.float64]) -> None:
-    """Report the times of a detection, without loading, as Table 1 of markiewicz2015 does.
+    """Report the times of a detection without loading, as in Table 1 of markiewicz2015.
 
     Args:
-        ctx: takes the metrics.
-        passed_s: (n, 2) seconds up to each plane, and from the last one to the labels of all
-            points; elapsed and processor seconds.
+        ctx: receives the metrics.
+        passed_s: (n, 2) elapsed and processor seconds: one row for the time spent on each plane,
+            then one from the last plane to the labels of all points.
     """
     times_s = {"detection": passed_s.sum(axis=0), "first_plane": passed_s[0]}
     if len(passed_s) > 2:

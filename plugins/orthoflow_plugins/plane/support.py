@@ -1,8 +1,8 @@
-"""What supports a plane: a coarse raster on it, the cells that belong, parts and rectangles.
+"""Support of a plane: a coarse raster on it, the cells that belong to it, parts, rectangles.
 
-A cell belongs to the plane if its points concentrate near the plane. The points of clutter, or of a
-floor that a vertical plane cuts, are spread evenly over the slab instead. This distinguishes a wall
-from the smear that floors and ceilings leave in an accumulator.
+A cell belongs to the plane if its points concentrate near the plane. Points of clutter, or of a
+floor that a vertical plane intersects, are distributed evenly over the slab instead. This
+distinguishes walls from planes that cut floors and ceilings.
 """
 
 from __future__ import annotations
@@ -26,18 +26,19 @@ from orthoflow_plugins.plane.kernels import (
 
 CELL_LEAST_M: Final = 0.05
 _CELLS_MOST: Final = 1_000_000
-# Average number of points per cell that the test of concentration needs.
+# Mean number of points per cell needed for the test of concentration.
 _POINTS_PER_CELL: Final = 12.0
-# Thickness of the inner slab as a share of the tolerance, and its share of evenly spread points.
+# Thickness of the inner slab as a share of the tolerance, and minimum share of points in it.
 INNER_SHARE: Final = 0.4
 _CROWDED_SHARE: Final = 0.6
-# A part with a smaller share of the plane's cells is there by chance and not a piece of the wall.
+# A part with a smaller share of the plane's cells is accidental and not a piece of the wall.
 PART_SHARE: Final = 0.03
-# Parts are connected over gaps of twice as many cells.
+# Cells are connected over gaps of up to twice this number of cells.
 _GAP_CELLS: Final = 2
-# A plane whose cells cover less of its rectangle is a frame or scattered parts.
+# A plane whose cells cover a smaller share of its rectangle is a frame or consists of separate
+# parts.
 _FILLED_SHARE: Final = 0.5
-# Maximum number of cells along a side when cuts are searched for.
+# Maximum number of cells along a side in the search for cuts.
 _CUT_CELLS: Final = 64
 
 
@@ -63,7 +64,7 @@ class SurfaceRaster:
     def over(
         cls, plane: Plane, box_corners: NDArray[np.float64], up: NDArray[np.float64], cell_m: float
     ) -> SurfaceRaster:
-        """Return a raster on a plane that covers a box of (8, 3) corners; limits the cell count."""
+        """Return a raster on a plane that covers a box with corners (8, 3); limits its size."""
         axes = wall_axes(plane.normal, up)
         placed = box_corners @ axes.T
         low, high = placed.min(axis=0), placed.max(axis=0)
@@ -77,11 +78,11 @@ class SurfaceRaster:
         return replace(self, plane=plane, axes=wall_axes(plane.normal, up))
 
     def slab(self) -> NDArray[np.float64]:
-        """Return the row of 12 numbers for compiled passes, see `kernels`; u and v count from 0."""
+        """Return the row of 12 numbers for kernels, see `kernels`; u and v have origin 0."""
         return slab_of(self.plane, self.axes)
 
     def bounds_m(self, cells: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
-        """Return (4,) smallest and largest u, smallest and largest v of some cells, or of all."""
+        """Return (4,) smallest and largest u, smallest and largest v of cells; all by default."""
         edges = np.array([0, self.shape[1], 0, self.shape[0]], dtype=np.float64)
         if cells is not None:
             rows, columns = (np.flatnonzero(cells.any(axis=axis)) for axis in (1, 0))
@@ -89,7 +90,7 @@ class SurfaceRaster:
         return np.repeat(self.low_m, 2) + edges * self.cell_m
 
     def centres_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return (rows, columns) u and v of the cell centres, metres."""
+        """Return u and v (rows, columns) of the cell centres, metres."""
         rows, columns = np.indices(self.shape)
         return (
             self.low_m[0] + (columns + 0.5) * self.cell_m,
@@ -97,7 +98,7 @@ class SurfaceRaster:
         )
 
     def covers(self, points: NDArray[np.float64], cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return (m,) whether points project into some cells (rows, columns)."""
+        """Return (m,) whether points project into the given cells (rows, columns)."""
         placed = np.floor((points @ self.axes.T - self.low_m) / self.cell_m).astype(np.int64)
         row = np.clip(placed[:, 1], 0, self.shape[0] - 1)
         return cells[row, np.clip(placed[:, 0], 0, self.shape[1] - 1)]
@@ -107,11 +108,11 @@ class CellSums(NamedTuple):
     """Sums over the points in each cell of a surface raster, (rows, columns) int64 each.
 
     Attributes:
-        n_near: points within the tolerance.
-        n_inner: the same within `INNER_SHARE` of it.
-        n_fit: the same within the tolerance of the fit.
-        steps: sum of distances of those, in steps.
-        squared_steps: sum of squared distances, in squared steps.
+        n_near: number of points within the tolerance.
+        n_inner: number of points within `INNER_SHARE` of the tolerance.
+        n_fit: number of points within the tolerance of the fit.
+        steps: sum of distances within the tolerance of the fit, in steps.
+        squared_steps: sum of squares of these distances, in squared steps.
     """
 
     n_near: NDArray[np.int64]
@@ -126,12 +127,12 @@ class Support:
     """The cells that belong to a plane.
 
     Attributes:
-        cells: (rows, columns) bool.
-        part_of_cell: (rows, columns) int32, which part a cell belongs to, -1 for none.
+        cells: (rows, columns) bool, True for cells that belong to the plane.
+        part_of_cell: (rows, columns) int32 part of each cell, -1 for none.
         parts_m: (p, 4) smallest u, largest u, smallest v, largest v of each connected part, the
-            part with most points first.
-        bounds_m: (4,) the same of all parts together.
-        n_points: points within the tolerance in those cells.
+            part with the most points first.
+        bounds_m: (4,) bounds of all parts together.
+        n_points: number of points within the tolerance in these cells.
     """
 
     cells: NDArray[np.bool_]
@@ -142,24 +143,24 @@ class Support:
 
     @property
     def area_m2(self) -> float:
-        """Return the area of the rectangles around its parts; sparse points leave cells empty."""
+        """Return the total area of the parts' rectangles, because their cells may be empty."""
         sides_m = self.parts_m[:, 1::2] - self.parts_m[:, ::2]
         return float(np.prod(sides_m, axis=1).sum())
 
 
 def slab_of(plane: Plane, axes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the row of 12 numbers that stands for a plane in compiled passes, see `kernels`."""
+    """Return the row of 12 numbers that represents a plane in kernels, see `kernels`."""
     return np.concatenate([plane.normal, [plane.offset_m], axes[0], [0.0], axes[1], [0.0]])
 
 
 def grown(bounds_m: NDArray[np.float64], tolerance_m: float) -> NDArray[np.float64]:
-    """Return bounds (..., 5) of slabs: a tolerance, and (..., 4) rectangles widened by it."""
+    """Return bounds (..., 5) of slabs: the tolerance, and rectangles (..., 4) widened by it."""
     wider = bounds_m + tolerance_m * np.array([-1.0, 1.0, -1.0, 1.0])
     return np.concatenate([np.full((*wider.shape[:-1], 1), tolerance_m), wider], axis=-1)
 
 
 def cell_for(n_points: float, area_m2: float) -> float:
-    """Return the side of a cell, metres, that contains enough of the points spread over an area."""
+    """Return a cell size in metres with enough points per cell, for points spread over an area."""
     if n_points <= 0.0 or area_m2 <= 0.0:
         return CELL_LEAST_M
     return max(CELL_LEAST_M, math.sqrt(_POINTS_PER_CELL * area_m2 / n_points))
@@ -175,16 +176,16 @@ def measure_cells(
     bounds_m: Sequence[NDArray[np.float64]] | None = None,
     drawn: NDArray[np.bool_] | None = None,
 ) -> list[CellSums]:
-    """Sum the points near planes per cell, each point on its nearest plane, in one pass.
+    """Sum the points near planes per cell in one pass, each point on its nearest plane.
 
     Args:
         points: the points.
-        rasters: cells on each plane; planes without rows attract points, but are not summed.
+        rasters: cells on each plane; planes without rows receive points, but these are not summed.
         tolerance_m: maximum distance of points that belong to a plane.
         fit_tolerance_m: maximum distance of points used in the fit.
-        parts: parts of the pass, one per thread.
+        parts: number of parts, one per thread.
         bounds_m: (r, 5) rectangles of each plane that contain its points; by default its raster.
-        drawn: (blocks,) which blocks are summed; None for all.
+        drawn: (blocks,) True for blocks that are summed; None for all.
     """
     if bounds_m is None:
         bounds_m = [np.append(tolerance_m, raster.bounds_m())[None] for raster in rasters]
@@ -222,22 +223,22 @@ def measure_cells(
 
 
 def crowded_cells(sums: CellSums) -> NDArray[np.bool_]:
-    """Cells whose points crowd about the plane instead of filling the slab, with like neighbours.
+    """Return the cells whose points concentrate on the plane instead of filling the slab.
 
-    A cell needs three points, and more of them in the inner slab than chance would put there; and
-    three of its eight neighbours must agree, which scattered clutter does not manage.
+    A cell needs three points, and significantly more of them in the inner slab than by chance.
+    Three of its eight neighbours must meet the same criteria, which excludes scattered clutter.
     """
     wanted = _CROWDED_SHARE * sums.n_near + 0.5 * np.sqrt(sums.n_near)
     crowded = (sums.n_near >= 3) & (sums.n_inner >= wanted)
     if crowded.any():
-        # Far below the usual density a cell is a stray echo beside the wall, not the wall.
+        # Cells with far fewer points than usual contain stray echoes and no wall.
         crowded &= sums.n_near >= 0.02 * np.median(sums.n_near[crowded])
-    # The cell itself is one of those around it.
+    # The sum includes the cell itself.
     return crowded & (summed_around(crowded) >= 4)
 
 
 def summed_around(values: NDArray[np.int64] | NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Sum each value of a (rows, columns) array with its eight neighbours."""
+    """Return the sum of each value of an array (rows, columns) and its eight neighbours."""
     import cv2
 
     zero = cv2.BORDER_CONSTANT
@@ -253,14 +254,14 @@ def support_of(
     join_parts: bool = True,
     part_share: float = PART_SHARE,
 ) -> Support | None:
-    """Join cells into parts and put rectangles about them.
+    """Connect cells to parts and compute their rectangles.
 
-    Parts are connected over gaps of up to four cells. Every part with `part_share` of the cells
-    counts, so that the rectangle holds the entire wall, also where a pilaster cuts it in two;
-    without `join_parts` only the one with most points.
+    Cells are connected over gaps of up to four cells. All parts with `part_share` of the cells are
+    kept, so that the rectangle contains the entire wall, even if a pilaster divides it; without
+    `join_parts`, only the part with the most points is kept.
 
     Returns:
-        The support, or None where no cell belongs, or all lie scattered: no part is large enough.
+        The support, or None if no cell belongs to the plane or no part is large enough.
     """
     import cv2
     from scipy import ndimage
@@ -296,9 +297,9 @@ def covering_rectangles(
 ) -> NDArray[np.float64]:
     """Return rectangles (r, 4) that cover cells: smallest and largest u, smallest and largest v.
 
-    A well-covered rectangle stays whole. Otherwise the cut that leaves the smallest area is
-    repeated until `_FILLED_SHARE` is reached, so that a frame does not compete for the points of
-    the wall that it surrounds.
+    A well-covered rectangle is not divided. Otherwise, the cut that leaves the smallest area is
+    repeated until `_FILLED_SHARE` is reached, so that a frame does not receive points of the wall
+    inside it.
     """
     every = max(1, math.ceil(max(cells.shape) / _CUT_CELLS))
     rows, columns = (math.ceil(side / every) for side in cells.shape)
@@ -322,7 +323,7 @@ _Rectangle = tuple[int, int, int, int]
 
 
 def _best_cut(cells: NDArray[np.bool_], rectangle: _Rectangle) -> list[_Rectangle]:
-    """Cut a rectangle into the two smallest that cover its cells, or return it if no cut helps."""
+    """Divide a rectangle into the two smallest that cover its cells; return it if no cut helps."""
     top, bottom, left, right = rectangle
     pairs = [((top, k, left, right), (k, bottom, left, right)) for k in range(top + 1, bottom)]
     pairs += [((top, bottom, left, k), (top, bottom, k, right)) for k in range(left + 1, right)]
@@ -331,7 +332,7 @@ def _best_cut(cells: NDArray[np.bool_], rectangle: _Rectangle) -> list[_Rectangl
 
 
 def _tight(cells: NDArray[np.bool_], rectangle: _Rectangle) -> _Rectangle:
-    """Shrink a rectangle to the cells in it; without cells its area is zero."""
+    """Return the smallest rectangle that contains the cells; its area is zero if there are none."""
     top, bottom, left, right = rectangle
     rows, columns = np.nonzero(cells[top:bottom, left:right])
     if not len(rows):

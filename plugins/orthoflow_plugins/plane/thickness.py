@@ -1,10 +1,10 @@
 """Thickness of the cloud on each plane, and along one row of a scan.
 
-Thickness is the noise of the scanner on the wall, which markiewicz2015 recommends to inspect first
-(3.1, Figure 3). Relief and bow are not thickness, so distances refer to the mean of a small tile of
-the wall. It is measured on the sample. Along one row of a scan, read from the whole cloud, neither
-the footprint nor a second station contributes: what remains is the noise of single distances, on
-one material after the other.
+Thickness is the noise of the scanner on the wall; markiewicz2015 recommends inspecting it first
+(3.1, Figure 3). Relief and bow do not count as thickness, so distances refer to the mean of a small
+tile of the wall. It is measured on the sample. In addition, it is measured along one scan row of
+the whole cloud, where other rows and stations do not contribute, so that only the noise of single
+distances remains, on each material along the row.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from orthoflow.sdk import StepContext
 from orthoflow_plugins.plane.cloud import PreparedCloud
 from orthoflow_plugins.plane.detector import Materials
 
-# Side of a tile of a wall, and length of a piece of a row, to whose mean distances refer.
+# Side of the tiles of a wall, and length of the pieces of a row, to whose means distances refer.
 _TILE_M: Final = 0.1
 _TILE_LEAST: Final = 4
 # Minimum number of points for a standard deviation.
 _SPREAD_LEAST: Final = 50
 _INCIDENCE_DEG: Final = tuple(float(edge) for edge in range(0, 91, 10))
 _CLASSES: Final = 6
-# Half the share of a normal distribution outside the reported width.
+# Share of the distances outside the reported width, on each side.
 _TAIL: Final = 0.025
 # Minimum number of points of a scan row on a plane.
 _ROW_LEAST: Final = 20
@@ -40,11 +40,11 @@ class RowPoints:
     """The points of one row of one scan on the first plane.
 
     Attributes:
-        row: its index.
-        scan: the scan it belongs to.
+        row: index of the row.
+        scan: index of the scan.
         along_m: (n,) position along the plane, to the viewer's right; ascending.
         distance_m: (n,) distance from the plane, positive towards the viewer.
-        intensity: (n,) 0..1, or None if the cloud has none.
+        intensity: (n,) intensity, 0 to 1; None if the cloud has no intensity.
     """
 
     row: int
@@ -80,11 +80,11 @@ def measure_thickness(
     """Measure the thickness of each plane; None for a plane with too few points.
 
     Args:
-        planes: the planes, world.
-        plane_of_sample: (s,) plane of each point of the sample, -1 for none.
+        planes: the planes, in world coordinates.
+        plane_of_sample: (s,) plane of each sample point, -1 for none.
         prepared: the prepared cloud with its sample.
         cloud: the cloud.
-        reach_m: points farther than this from their plane are relief or belong to other surfaces.
+        reach_m: points farther from their plane are relief or belong to other surfaces.
         materials: lowest and highest intensity of each material.
     """
     sample, found = prepared.sample, list[Thickness | None]()
@@ -96,7 +96,7 @@ def measure_thickness(
         members, distance_m = members[near], distance_m[near]
         axes = wall_axes(normal, planes.up)
         placed = np.floor(sample.offsets_m[members] @ axes.T / _TILE_M).astype(np.int64)
-        # One number per tile, since pairs take many times as long to sort.
+        # One number per tile, because sorting pairs takes many times as long.
         keys = placed[:, 0] * 2**31 + placed[:, 1]
         _, tile, count = np.unique(keys, return_inverse=True, return_counts=True)
         crowded, deviation_m, usual = _from_tiles(distance_m, tile, count)
@@ -127,7 +127,7 @@ def measure_thickness(
 def row_points(
     planes: Planes, plane_of_sample: NDArray[np.int64], prepared: PreparedCloud, cloud: PointCloud
 ) -> RowPoints | None:
-    """Return the scan row with most points of the first plane; None without rows."""
+    """Return the scan row with the most points of the first plane; None if there are no rows."""
     members = prepared.sample.index[plane_of_sample == 0]
     if cloud.row is None or not len(members):
         return None
@@ -179,17 +179,17 @@ def _from_tiles(
 
     Args:
         distance_m: (m,) distances.
-        tile: (m,) index of the tile of each.
-        count: (t,) points of each tile.
+        tile: (m,) index of the tile of each distance.
+        count: (t,) number of points of each tile.
 
     Returns:
-        (m,) which distances lie in tiles with enough points, their deviations, and the median
-        number of points of such a tile.
+        Whether distances (m,) are in tiles with enough points, the deviations of those that are,
+        and the median number of points of such a tile.
     """
     mean_m = np.bincount(tile, distance_m) / np.maximum(count, 1)
     crowded = count[tile] >= _TILE_LEAST
     tile = tile[crowded]
-    # Deviations from a mean of n values are too small by this factor.
+    # Deviations from the mean of n values are too small by this factor.
     deviation_m = (distance_m[crowded] - mean_m[tile]) / np.sqrt(1.0 - 1.0 / count[tile])
     usual = float(np.median(count[count >= _TILE_LEAST])) if len(tile) else 0.0
     return crowded, deviation_m, usual
@@ -204,7 +204,7 @@ def _by_class(
     cloud: PointCloud,
     materials: Materials,
 ) -> Thickness:
-    """Add the thickness by class; `index` has the positions of the points in the cloud."""
+    """Add the thickness by class; `index` contains the indices of the points in the cloud."""
     stations_m = _stations_of(index, cloud)
     if stations_m is not None:
         rays_m = points_m - stations_m
@@ -230,7 +230,7 @@ def _by_class(
 
 
 def _stations_of(index: NDArray[np.int64], cloud: PointCloud) -> NDArray[np.float64] | None:
-    """Return the offset (m, 3) or (3,) of the station of each point; None if unknown."""
+    """Return the station of each point, offsets (m, 3) or (3,) for one station; None if unknown."""
     stations = cloud.stations
     if stations is None or len(stations) == 0 or cloud.stations_source == "view_from":
         return None
@@ -249,7 +249,7 @@ def _even_edges(values: NDArray[np.float64]) -> NDArray[np.float64]:
 def _spreads(
     values: NDArray[np.float64], edges: NDArray[np.float64], deviation_m: NDArray[np.float64]
 ) -> tuple[Spread, ...]:
-    """Return the spread of each class of points; classes with too few points are left out."""
+    """Return the spread of each class of points; classes with too few points are omitted."""
     place = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(0, len(edges) - 2))
     classes = [
         _spread(None, float(edges[k]), float(edges[k + 1]), deviation_m[place == k])
@@ -261,7 +261,7 @@ def _spreads(
 def _by_material(
     intensity: NDArray[np.float64], materials: Materials, deviation_m: NDArray[np.float64]
 ) -> tuple[Spread, ...]:
-    """Return the spread on each material; those with too few points are left out."""
+    """Return the spread on each material; materials with too few points are omitted."""
     classes = [
         _spread(name, low, high, deviation_m[(intensity >= low) & (intensity <= high)])
         for name, (low, high) in materials.items()

@@ -1,8 +1,8 @@
-"""Compiled votes of the Hough transforms: for lines of a plan, and for planes in space.
+"""Kernels for the votes of Hough transforms: for lines in a plan, and for planes in space.
 
-Votes are computed from an image. For each direction its rows, or columns, are shifted and added to
-one line: the sums over all lines of that slope. This equals voting cell by cell up to rounding to
-cells and is many times faster, because whole rows are added.
+Votes are computed from an image. For each direction, its rows or columns are shifted and added up,
+which gives the sums over all lines of that slope. Except for rounding to cells, this is the same as
+voting cell by cell, and it is many times faster, because entire rows are added.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.compiling import compiled, kernel_part
 
-# Votes are counted in quarters, so that one can be shared between two bins without rounding errors
-# when it is subtracted.
+# Votes are counted in quarters, so that a vote can be divided between two bins and subtracted later
+# without rounding errors.
 VOTE_SHARES: Final = 4
-# Share of the required points that a candidate's votes must have, as it may be smeared over several
-# bins until it is refined.
+# Minimum votes of a candidate as a share of the required points, because its votes may be
+# distributed over several bins until it is refined.
 VOTE_CAUTION: Final = 0.25
 # Side of the tiles in which an image is transposed.
 _TILE: Final = 16
@@ -33,9 +33,10 @@ def vote_image(
 
     Args:
         image: (rows, columns) votes of each cell; negative ones subtract votes.
-        angles_rad: (a,) directions of the lines' normals, from the rows' axis to the columns'.
+        angles_rad: (a,) directions of the normals of lines, from the axis of rows towards that of
+            columns.
         votes: (a, bins) added to, VOTE_SHARES per vote; bins are as wide as cells, and the middle
-            edge is the line through the middle of the image. Equation 4 of markiewicz2015.
+            edge is the line through the centre of the image. Equation 4 of markiewicz2015.
     """
     n_rows, n_columns = image.shape
     turned = np.zeros((n_columns, n_rows), dtype=np.int32)
@@ -64,9 +65,9 @@ def _count_upright(
     cells: NDArray[np.int32],
     image: NDArray[np.int32],
 ) -> tuple[int, int, int, int]:
-    """Count positions in an upright image along a direction; (m,) cells is scratch.
+    """Count positions in a vertical image along a direction; `cells` (m,) is scratch space.
 
-    Returns the window that contains them: first row, row after the last, and likewise for columns.
+    Returns the window that contains them: first row, row after the last, and the same for columns.
     """
     n_rows, n_columns = image.shape
     cosine, sine = np.float32(math.cos(omega_rad) / bin_m), np.float32(math.sin(omega_rad) / bin_m)
@@ -110,16 +111,17 @@ def vote_planes(
 ) -> None:
     """Let positions vote for all planes through them, in two stages.
 
-    For each direction in plan the positions are counted in an upright image (distance along that
-    direction, height). For each phi the rows of the image are shifted and added up, or its columns
-    for planes that are more level than upright: a hundred times faster than voting one by one.
+    For each direction in the plan, the positions are counted in a vertical image (distance along
+    that direction, height). For each phi, the rows of the image are shifted and added up, or its
+    columns for planes that are closer to level than to vertical. This is a hundred times as fast as
+    voting one by one.
 
     Args:
         places: (3, m) e1, e2 and height, metres from the centre of the box.
-        weights: (m,) votes of each; negative ones subtract votes.
+        weights: (m,) votes of each position; negative ones subtract votes.
         angles: (d, 2) omega and phi of each direction, grouped by omega; radians.
-        starts: (o + 1,) where the directions of each omega start.
-        image: (rows, columns) scratch, zeros; its centre is that of the box.
+        starts: (o + 1,) index of the first direction of each omega.
+        image: (rows, columns) scratch space with zeros; its centre is that of the box.
         bin_m: side of a cell of the image, width of a bin.
         votes: (d, bins) added to, VOTE_SHARES per vote; the middle edge is distance zero.
     """
@@ -157,14 +159,14 @@ def best_bins(
     scores: NDArray[np.int64],
     places: NDArray[np.int64],
 ) -> None:
-    """Find in each row the window that exceeds the emptier window beside it by most votes.
+    """Find the window in each row with the largest excess over the emptier adjacent window.
 
     Args:
         votes: (d, bins).
         rows: (m,) rows to search.
-        half: a window has 2 half + 1 bins; the windows beside it begin one bin farther away.
-        is_plain: ignore the windows beside it.
-        barred: (d, bins) 1 where no window may have its middle.
+        half: a window has 2 half + 1 bins and is separated from adjacent windows by one bin.
+        is_plain: ignore adjacent windows.
+        barred: (d, bins) 1 for bins that must not be the centre of a window.
         scores: (d,) set for these rows.
         places: (d,) set to the middle bin.
     """
@@ -208,12 +210,12 @@ def vote_places(
     bin_m: float,
     votes: NDArray[np.int32],
 ) -> None:
-    """Let positions vote one by one, for the planes, or lines of a plan, through them.
+    """Let positions vote one by one for the planes, or lines in a plan, through them.
 
     Args:
         places: (3, m) metres; the third coordinate is 0 in a plan.
-        weights: (m,) votes of each.
-        normals: (t, 3) directions along which distances count. Equation 4 of markiewicz2015.
+        weights: (m,) votes of each position.
+        normals: (t, 3) directions of distances, as in Equation 4 of markiewicz2015.
         low_m: lower edge of the first bin; positions outside the bins do not vote.
         bin_m: width of a bin.
         votes: (t, bins) added to.
@@ -242,10 +244,10 @@ def add_sheared(
     shear: float,
     line: NDArray[np.int32],
 ) -> tuple[int, int]:
-    """Add the rows of an image to a line, shifted by their height above the middle times a shear.
+    """Add the rows of an image to a line, shifted by the distance from the centre times a shear.
 
-    Without a shift the first column is added at half the number of rows plus one. The line is zero
-    before; returns the part that is changed.
+    If the shift is zero, the first column is added at index half the number of rows plus one. The
+    line must be zero. Returns the part that is changed.
     """
     n_rows = image.shape[0]
     low, high = line.size, 0
@@ -270,11 +272,11 @@ def share_out(
     scale: float,
     votes: NDArray[np.int32],
 ) -> None:
-    """Add part of a line to a row of votes with narrower bins, in quarters; clears the line.
+    """Add part of a line to a row of votes with narrower bins, in quarters; clear the line.
 
     Args:
         line: see `add_sheared`.
-        piece: its part that is not zero.
+        piece: part of the line that is not zero.
         shape: rows and columns of the image.
         scale: width of a cell of the line, in bins; negative for the opposite direction.
         votes: (bins,) added to.
@@ -298,9 +300,9 @@ def share_out(
 def span_rows(
     image: NDArray[np.int32], window: tuple[int, int, int, int], spans: NDArray[np.int32]
 ) -> None:
-    """Set (rows, 2) spans to the first column with votes and the one after the last.
+    """Set spans (rows, 2) to the first column with votes and the column after the last.
 
-    All votes lie in the window: first row, row after the last, and likewise for columns.
+    All votes are in the window: first row, row after the last, and the same for columns.
     """
     spans[:] = 0
     for row in range(window[0], window[1]):
@@ -327,7 +329,7 @@ def turn_image(
 def best_bin(
     votes: NDArray[np.int32], barred: NDArray[np.uint8], half: int, *, is_plain: bool
 ) -> tuple[int, int, int]:
-    """Return score, row and bin of the best window in a table; see `best_bins`."""
+    """Return the score, row and bin of the best window in a table; see `best_bins`."""
     scores, places = np.zeros((2, len(votes)), dtype=np.int64)
     best_bins(votes, np.arange(len(votes)), half, is_plain, barred, scores, places)
     row = int(np.argmax(scores))
@@ -335,7 +337,7 @@ def best_bin(
 
 
 def contrast(votes: NDArray[np.int32], half: int) -> NDArray[np.float64]:
-    """Return the votes in windows of 2 half + 1 bins above those of the emptier window beside."""
+    """Return the votes in windows of 2 half + 1 bins minus those of the emptier adjacent window."""
     width = 2 * half + 1
     gap = width + 1
     padded = np.pad(votes, ((0, 0), (half + gap + 1, half + gap)))
@@ -348,7 +350,7 @@ def contrast(votes: NDArray[np.int32], half: int) -> NDArray[np.float64]:
 
 
 def sharpest(votes: NDArray[np.int32]) -> tuple[int, float]:
-    """Return the row of (rows, bins) votes with the best maximum, and its position in bins."""
+    """Return the row of votes (rows, bins) with the best maximum, and its position in bins."""
     scores = contrast(votes, 1)
     row, column = np.unravel_index(int(np.argmax(scores)), scores.shape)
     values, place = scores[row], int(column)
@@ -356,6 +358,6 @@ def sharpest(votes: NDArray[np.int32]) -> tuple[int, float]:
     if 0 < place < len(values) - 1:
         before, here, after = values[place - 1 : place + 2]
         bend = before - 2.0 * here + after
-        # The vertex of a parabola through the three.
+        # Vertex of the parabola through the three values.
         shift = 0.0 if bend >= 0.0 else float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5))
     return int(row), place + 0.5 + shift

@@ -1,17 +1,17 @@
-"""Voxels of a cloud as moments of their points, the planes of their neighbourhoods, regions.
+"""Voxels of a cloud with moments of their points, planes of neighbourhoods, and regions.
 
-Region growing needs the neighbours of every point. Voxels make that cheap: one pass adds each point
-to ten sums of its voxel, and the sums of neighbouring voxels give the plane through all their
-points exactly. A room with fifty million points has half a million voxels. For votes alone the
-first of the sums, the number of points, suffices.
+Region growing needs the neighbours of each point. Voxels make this fast: one pass adds each point
+to ten sums of its voxel, and the sums of neighbouring voxels give the exact plane through all their
+points. A room with fifty million points has half a million voxels. Hough transforms need only the
+first sum, the number of points.
 
-Voxels are stored in bricks of 8 x 8 x 8, and only bricks with points have memory: a full table of
-two-centimetre voxels would be larger than the scan. Moments are sums of integer steps from the
-centre of a voxel, so they depend neither on threads nor on the order of points. Lengths in kernels
-are in sides of a voxel.
+Voxels are stored in bricks of 8 x 8 x 8, and only bricks with points are stored, because a full
+table of 2 cm voxels would be larger than the scan. Moments are sums of integer steps from the
+centre of a voxel, so they depend neither on the number of threads nor on the order of points.
+Lengths in kernels are in units of the side of a voxel.
 
-A cloud that is dense on one wall may have a point per decimetre on another, where voxels that suit
-the first leave fragments. Moments are additive, so the fragments are summed into larger voxels
+A cloud that is dense on one wall may have one point per decimetre on another, where regions of
+small voxels are fragmented. Moments are additive, so such voxels are merged into larger ones
 without another pass over the points.
 """
 
@@ -37,10 +37,11 @@ from orthoflow_plugins.plane.kernels import (
 
 BRICK_SIDE: Final = 8
 VOXELS: Final = BRICK_SIDE**3
-# Half steps from the centre of a voxel to its sides: a step is 20 micrometres in voxels of two
-# centimetres, and its middle is an odd number of half steps away.
+# Number of half steps from the centre of a voxel to its sides. A step is 20 micrometres in 2 cm
+# voxels, and its centre is an odd number of half steps from the centre of the voxel.
 HALF_STEPS: Final = 1024
-# Sums of a voxel: points, half steps along a, b, c, then their products aa, ab, ac, bb, bc, cc.
+# Sums of a voxel: number of points, half steps along a, b, c, and their products aa, ab, ac, bb,
+# bc, cc.
 N_SUMS: Final = 10
 # The products among the moments, as pairs of axes.
 _PAIRS: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
@@ -53,9 +54,9 @@ _VOXEL_SHARE_MOST: Final = 0.05
 # Initial numbers of rows and voxels of tables.
 _ROWS_FIRST: Final = 2_048
 _VOXELS_FIRST: Final = 131_072
-# Maximum reach of a neighbourhood in voxels each way: 9 x 9 x 9.
+# Maximum reach of a neighbourhood in voxels on each side, for 9 x 9 x 9 voxels.
 _REACH_MOST: Final = 4
-# A region's plane is refitted whenever the region has grown by this share.
+# The plane of a region is refitted whenever the region has grown by this share.
 _REFIT_SHARE: Final = 0.2
 # Maximum number of passes over the voxels of a region.
 _SWEEPS_MOST: Final = 3
@@ -68,8 +69,8 @@ class Neighbourhood:
 
     Attributes:
         shape: a cube, a sphere, or the nearest voxels with `n_points`.
-        size_m: side of the cube, radius of the sphere; not used by `knn`.
-        n_points: see above.
+        size_m: side of the cube, or radius of the sphere; not used by `knn`.
+        n_points: minimum number of points for `knn`.
         voxel_m: side of a voxel.
     """
 
@@ -98,7 +99,7 @@ class Neighbourhood:
         return np.column_stack([steps[order], shell[order]]).astype(np.int32)
 
     def width_voxels(self) -> float:
-        """Return the width in voxels; the neighbourhood of a surface has its square."""
+        """Return the width in voxels; its square is the number of voxels of a surface."""
         if self.shape == "knn":
             return 3.0
         return 2.0 * float(np.abs(self.around()[:, :3]).max(initial=0)) + 1.0
@@ -110,14 +111,14 @@ class Neighbourhood:
 
 @dataclass(frozen=True, kw_only=True)
 class VoxelTable:
-    """The voxels of a cloud that have points, numbered by position.
+    """The voxels with points of a cloud, numbered by position.
 
     Attributes:
         grid: axes, corner and side of the voxels.
-        bricks: (a, b, c) int32 row of each brick in `numbers`, -1 without points.
-        numbers: (rows, VOXELS) int32 number of each voxel, -1 without points.
+        bricks: (a, b, c) int32 row of each brick in `numbers`, -1 for bricks without points.
+        numbers: (rows, VOXELS) int32 number of each voxel, -1 for voxels without points.
         places: (m, 3) int32 position of each voxel along e1, e2, up.
-        sums: (m, N_SUMS) int64 moments, or (m, 1) points alone.
+        sums: (m, N_SUMS) int64 moments, or (m, 1) numbers of points.
     """
 
     grid: PlanGrid
@@ -128,9 +129,9 @@ class VoxelTable:
 
     @classmethod
     def over(cls, cloud: PreparedCloud, voxel_m: float, *, n_sums: int = N_SUMS) -> VoxelTable:
-        """Sum all points of a cloud into voxels over its box, larger ones if these are too many.
+        """Sum the points of a cloud into voxels over its box; enlarge these if there are too many.
 
-        Each part of the pass has its own tables, which are then joined.
+        Each part of the pass has its own tables, which are then merged.
         """
         extent_m = cloud.grid.extent_m
         brick_m3 = float(np.prod(extent_m + BRICK_SIDE * voxel_m)) / _BRICKS_MOST
@@ -159,7 +160,8 @@ class VoxelTable:
             tables[part] = (bricks, numbers, sums, n_used)
 
         each_part(len(cloud.claims), cloud.parts, gather)
-        # Numbered by position, independent of threads and of the order of points.
+        # Numbered by position, so that numbers depend neither on threads nor on the order of
+        # points.
         occupied = np.flatnonzero(np.max([table[0] for table in tables], axis=0) >= 0)
         bricks = np.full(n_bricks, -1, dtype=np.int32)
         bricks[occupied] = np.arange(len(occupied), dtype=np.int32)
@@ -191,7 +193,7 @@ class VoxelTable:
         )
 
     def coarser(self, member: NDArray[np.int64]) -> tuple[VoxelTable, NDArray[np.int64]]:
-        """Sum voxels (k,) into voxels twice as wide; return these, and the one of each voxel."""
+        """Merge voxels (k,) into voxels twice as wide; return these and (k,) their new voxels."""
         places, odd = np.divmod(self.places[member].astype(np.int64), 2)
         a, b, c = (math.ceil(size / 2) for size in self.grid.shape)
         shape = tuple(-(-size // BRICK_SIDE) for size in (a, b, c))
@@ -206,7 +208,7 @@ class VoxelTable:
         bricks[occupied] = np.arange(len(occupied), dtype=np.int32)
         numbers = np.full((len(occupied), VOXELS), -1, dtype=np.int32)
         numbers[rows, keys % VOXELS] = np.arange(len(keys), dtype=np.int32)
-        # Half steps are twice as long, and count from the centre of the larger voxel.
+        # Half steps are twice as long, and are counted from the centre of the larger voxel.
         moved = _moved(self.sums[member], (2 * odd - 1) * HALF_STEPS)
         moved *= 0.5 ** np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2])
         sums = np.rint(_totals(moved, of_member, len(keys))).astype(np.int64)
@@ -220,7 +222,7 @@ class VoxelTable:
         return wider, of_member
 
     def sums_of(self, regions: NDArray[np.int32], n_regions: int) -> NDArray[np.float64]:
-        """Return moments (r, N_SUMS) of regions (m,), from the corner of the grid, in voxels."""
+        """Return moments (r, N_SUMS) of regions (m,) relative to the grid's corner, in voxels."""
         held = np.flatnonzero(regions >= 0)
         unit = 1.0 / (2 * HALF_STEPS)
         moved = _moved(self.sums[held], (2 * self.places[held] + 1) * HALF_STEPS)
@@ -228,13 +230,13 @@ class VoxelTable:
         return _totals(moved, regions[held], n_regions)
 
     def centroids(self) -> NDArray[np.float64]:
-        """Return the centroids (m, 3) of voxels along e1, e2, up; metres, the cloud's offsets."""
+        """Return centroids (m, 3) of voxels along e1, e2, up, in metres from the cloud's origin."""
         half_steps = self.sums[:, 1:4] / self.sums[:, :1]
         middles = self.places + 0.5 + half_steps / (2 * HALF_STEPS)
         return self.grid.low_m + self.grid.cell_m * middles
 
     def voxel_of(self, points: BlockedPoints) -> NDArray[np.int32]:
-        """Return the voxel (n,) of each point, -1 for none."""
+        """Return the voxels (n,) of points, -1 for none."""
         found = np.empty(len(points.x), dtype=np.int32)
         find_voxels(points, self.grid.frame(), self.bricks, self.numbers, found)
         return found
@@ -248,7 +250,7 @@ def _with_room(values: NDArray[T], n_used: int, n_free: int) -> NDArray[T]:
 
 
 def _moved(sums: NDArray[np.int64], shift: NDArray[np.integer[Any]]) -> NDArray[np.float64]:
-    """Return moments (k, N_SUMS) about origins that are (k, 3) lower."""
+    """Return the moments (k, N_SUMS) about origins shifted by -shift (k, 3)."""
     number, linear, away = sums[:, 0], sums[:, 1:4], shift.astype(np.float64)
     columns = [number, *(linear + number[:, None] * away).T]
     for k, (i, j) in enumerate(_PAIRS):
@@ -266,12 +268,12 @@ def _totals(
 
 @dataclass(frozen=True, kw_only=True)
 class SurfaceVoxels:
-    """Voxels and the plane of each one's neighbourhood.
+    """Voxels and the planes of their neighbourhoods.
 
     Attributes:
-        neighbourhood: the points of a normal; its voxels may be larger than requested.
+        neighbourhood: points used for normals; the voxels may be larger than requested.
         table: the voxels.
-        normals: (m, 3) float32 along e1, e2, up, of the neighbourhoods; of either sign.
+        normals: (m, 3) float32 normals of the neighbourhoods along e1, e2, up, with arbitrary sign.
         spreads: (m, 3) float32 standard deviations across the neighbourhood's plane and along it,
             in sides of a voxel.
     """
@@ -287,7 +289,7 @@ class SurfaceVoxels:
         neighbourhood = wanted.with_voxels(table.grid.cell_m)
         places, around = table.places, neighbourhood.around()
         normals, spreads = np.empty((2, len(places), 3), dtype=np.float32)
-        # Number of points at which a knn neighbourhood ends; the others use all their voxels.
+        # Number of points that completes a knn neighbourhood; the others use all their voxels.
         enough = neighbourhood.n_points if neighbourhood.shape == "knn" else 2**62
 
         def fit(_part: int, piece: slice) -> None:
@@ -300,7 +302,7 @@ class SurfaceVoxels:
 
     @property
     def counts(self) -> NDArray[np.int64]:
-        """Return the number of points (m,) of each voxel."""
+        """Return the numbers of points (m,) of voxels."""
         return self.table.sums[:, 0]
 
 
@@ -316,7 +318,7 @@ def surface_voxels(cloud: PreparedCloud, wanted: Neighbourhood) -> SurfaceVoxels
     shape = np.ceil(grid.extent_m / wanted.voxel_m).astype(np.int64) + 1
     keys = np.sort(np.ravel_multi_index(tuple(placed[inside].astype(np.int64).T), tuple(shape)))
     counts = np.diff(np.flatnonzero(np.diff(keys, prepend=-1, append=-1)))
-    # Mean number of other points of the sample in a point's voxel.
+    # Mean number of other sample points in the voxel of a point.
     others = float((counts * (counts - 1)).sum()) / max(1, len(sample.index))
     in_neighbourhood = others * sample.n_represented * wanted.width_voxels() ** 2
     voxel_m = wanted.voxel_m * max(1.0, math.sqrt(POINTS_LEAST / max(in_neighbourhood, 1e-9)))
@@ -329,9 +331,9 @@ def surface_voxels(cloud: PreparedCloud, wanted: Neighbourhood) -> SurfaceVoxels
 def _place_block(
     points: BlockedPoints, start: int, frame: NDArray[np.float32], places: NDArray[np.float32]
 ) -> int:
-    """Set (3, BLOCK_POINTS) places of a block's points, in voxels; return their number.
+    """Set the positions (3, BLOCK_POINTS) of a block's points, in voxels; return their number.
 
-    Loops of their own without branches, each writing one array, which the compiler vectorises.
+    Separate loops without branches, each writing one array, which the compiler vectorises.
     """
     stop = min(start + BLOCK_POINTS, points.x.size)
     xs, ys, zs = points.x[start:stop], points.y[start:stop], points.z[start:stop]
@@ -347,7 +349,7 @@ def _place_block(
 def _set_keys(
     places: NDArray[np.float32], shape: tuple[int, int, int], keys: NDArray[np.int64]
 ) -> None:
-    """Set (BLOCK_POINTS,) keys: brick times VOXELS plus the voxel within it, -1 outside."""
+    """Set keys (BLOCK_POINTS,): brick times VOXELS plus the voxel in the brick; -1 outside."""
     zero, low = np.float32(0.0), np.int32(BRICK_SIDE - 1)
     top_a = np.float32(shape[0] * BRICK_SIDE)
     top_b = np.float32(shape[1] * BRICK_SIDE)
@@ -361,7 +363,7 @@ def _set_keys(
         p = np.int32(a if within else zero)
         q = np.int32(b if within else zero)
         r = np.int32(c if within else zero)
-        # A brick has eight voxels along each side, three bits.
+        # A brick has eight voxels along each side, which are three bits.
         brick = np.int32(((p >> np.int32(3)) * n_b + (q >> np.int32(3))) * n_c + (r >> np.int32(3)))
         voxel = np.int32(((p & low) * side + (q & low)) * side + (r & low))
         keys[i] = brick * voxels + voxel if within else nowhere
@@ -371,7 +373,7 @@ def _set_keys(
 def _voxel(
     key: int, bricks: NDArray[np.int32], numbers: NDArray[np.int32], n_used: NDArray[np.int64]
 ) -> int:
-    """Return the number of the voxel with a key; assigns one if it had none."""
+    """Return the number of the voxel with a key; assign a number to new voxels."""
     brick, voxel = key // VOXELS, key % VOXELS
     row = bricks[brick]
     if row < 0:
@@ -400,18 +402,18 @@ def gather_moments(  # noqa: PLR0913, PLR0917 - compiled code has no objects to 
 ) -> int:
     """Add points to the moments of their voxels, adding voxels as needed, until tables are full.
 
-    A scan is ordered by column, so consecutive points share a voxel: their sums are added when the
-    voxel changes.
+    Consecutive points of a scan are often in the same voxel, so their sums are added when the voxel
+    changes.
 
     Args:
         points: (n,) offsets in blocks.
         start: first point, at the start of a block.
         frame: (3, 4) voxel of a point: `frame[:, :3] @ p - frame[:, 3]`.
         shape: bricks along a, b, c.
-        bricks: (a * b * c,) row of each brick in `numbers`, -1 for none yet.
-        numbers: (rows, VOXELS) number of each voxel, -1 for none yet.
-        sums: (voxels, N_SUMS) added to; (voxels, 1) for the number of points alone.
-        n_used: rows and voxels in use.
+        bricks: (a * b * c,) row of each brick in `numbers`, -1 if not yet assigned.
+        numbers: (rows, VOXELS) number of each voxel, -1 if not yet assigned.
+        sums: (voxels, N_SUMS) added to; (voxels, 1) if only points are counted.
+        n_used: numbers of rows and voxels in use.
 
     Returns:
         The first point that was not added, or the number of points.
@@ -459,7 +461,7 @@ def find_voxels(
     numbers: NDArray[np.int32],
     found: NDArray[np.int32],
 ) -> None:
-    """Set (n,) found to the voxel of each point, -1 outside."""
+    """Set `found` (n,) to the voxel of each point, -1 outside."""
     keys = np.empty(BLOCK_POINTS, dtype=np.int64)
     places = np.zeros((3, BLOCK_POINTS), dtype=np.float32)
     flat = bricks.reshape(bricks.size)
@@ -489,7 +491,7 @@ def _voxel_at(a: int, b: int, c: int, bricks: NDArray[np.int32], numbers: NDArra
 def _add_moments(
     total: NDArray[np.float64], sums: NDArray[np.int64], k: int, at: tuple[float, float, float]
 ) -> None:
-    """Add voxel k to (10,) total, in voxels; its centre is at `at` in the frame of the total."""
+    """Add voxel k with centre `at` to the moments `total` (10,), in voxels."""
     n, (a, b, c) = float(sums[k, 0]), at
     unit = 1.0 / (2 * HALF_STEPS)
     sa, sb, sc = sums[k, 1] * unit, sums[k, 2] * unit, sums[k, 3] * unit
@@ -521,16 +523,18 @@ def fit_neighbourhoods(  # noqa: PLR0913, PLR0917 - compiled code has no objects
     """Fit a plane to the neighbourhood of each voxel.
 
     Args:
-        places: (m, 3) voxels to fit, of which the first has the number `first`.
-        first: see above.
+        places: (m, 3) positions of the voxels.
+        first: number of the first of these voxels.
         bricks: (a, b, c) number of each brick.
         numbers: (bricks, VOXELS) number of each voxel.
         sums: (n, N_SUMS) moments of all voxels.
-        around: (o, 4) steps to the voxels of a neighbourhood by distance, and their shells.
-        enough: a neighbourhood ends with the shell in which it reaches this number of points.
-        normals: (m, 3) set; of either sign.
-        spreads: (m, 3) set to the standard deviations across the plane and along it, sides of a
-            voxel; the first is infinite with fewer than three points.
+        around: (o, 4) steps to the voxels of a neighbourhood, ordered by distance, and their
+            shells.
+        enough: a neighbourhood is complete with the shell in which it reaches this number of
+            points.
+        normals: (m, 3) set; arbitrary sign.
+        spreads: (m, 3) set to the standard deviations across the plane and along it, in sides of a
+            voxel; the first is infinite if there are fewer than three points.
     """
     total, plane = np.empty(10), np.empty(9)
     for i in range(places.shape[0]):
@@ -568,19 +572,19 @@ def grow_regions(  # noqa: C901, PLR0912, PLR0913, PLR0917 - the loop that growi
     limits: NDArray[np.float64],
     regions: NDArray[np.int32],
 ) -> int:
-    """Grow regions over neighbouring voxels with similar normals and near the region's plane.
+    """Grow regions over neighbouring voxels near the region's plane with similar normals.
 
-    The plane is that of all points of the region so far and is refitted as the region grows. When
-    no voxel is added any more, all neighbours of the region are tested again with the last plane.
+    The plane is fitted to all points of the region and refitted as the region grows. When no more
+    voxels are added, all neighbours of the region are tested again with the last plane.
 
     Args:
         places: (n, 3) positions of voxels.
         bricks: (a, b, c) number of each brick.
         numbers: (bricks, VOXELS) number of each voxel.
         sums: (n, N_SUMS) moments.
-        normals: (n, 3) of their neighbourhoods.
-        seeds: (s,) voxels that may belong to a region, in the order of seeds.
-        limits: smallest cosine between normals, largest distance in sides of a voxel.
+        normals: (n, 3) normals of the neighbourhoods.
+        seeds: (s,) voxels that may belong to a region, in the order in which they become seeds.
+        limits: smallest cosine between normals, and largest distance in sides of a voxel.
         regions: (n,) -2 for voxels that may be added; set to the region.
 
     Returns:
@@ -598,7 +602,8 @@ def grow_regions(  # noqa: C901, PLR0912, PLR0913, PLR0917 - the loop that growi
         regions[seed] = n_regions
         queue[0] = seed
         length = 1
-        # Relative to the seed, so that regions far from the corner of the box lose no precision.
+        # Moments are relative to the seed, so that regions far from the corner of the box lose no
+        # precision.
         oa, ob, oc = places[seed, 0], places[seed, 1], places[seed, 2]
         total[:] = 0.0
         _add_moments(total, sums, seed, (0.0, 0.0, 0.0))
@@ -642,7 +647,7 @@ def grow_regions(  # noqa: C901, PLR0912, PLR0913, PLR0917 - the loop that growi
                 if length >= refit:
                     flattest(total, plane)
                     refit = int((1.0 + _REFIT_SHARE) * length) + 1
-            # Earlier planes may have excluded voxels that the present one includes.
+            # Earlier planes may have excluded voxels that the current one includes.
             if length == before:
                 break
             if length >= 8:

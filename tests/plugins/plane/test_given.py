@@ -94,7 +94,7 @@ def test_contradicting_parameters_are_refused(params: dict[str, object], message
     [
         (
             {"points": ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (2.0, 2.0, 2.0))},
-            "three points that span a plane",
+            "three points that define a plane",
         ),
         (
             {"normal": (0.0, 1.0, 0.0), "offset_m": 10.0},
@@ -102,7 +102,7 @@ def test_contradicting_parameters_are_refused(params: dict[str, object], message
         ),
         (
             {"planes": (TRIPLE, {"normal": (0.0, 1.0, 0.0), "offset_m": 10.0})},
-            r"planes\[1\]: no point of the cloud lies within",
+            r"planes\[1\]: no point of the cloud is within",
         ),
     ],
 )
@@ -170,4 +170,4 @@ def test_a_plan_reports_parts_that_it_leaves_out_and_takes_them_when_asked(tmp_p
         assert out.planes.corners[0].max(axis=0)[:2] == pytest.approx(corner, abs=1e-3)
         assert len(ctx.warnings) == n_warnings
         for warning in ctx.warnings:
-            assert "401 points (0.66%) lie beside the rectangle of the plane" in warning
+            assert "401 points (0.66%) are outside the rectangle of the plane" in warning

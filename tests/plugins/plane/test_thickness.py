@@ -89,7 +89,7 @@ def test_materials_have_a_thickness_each_on_the_plane_and_along_a_row(tmp_path: 
     # By classes of intensity as well.
     assert thickness.intensity[0].sigma_m == pytest.approx(0.004, rel=0.05)
     assert thickness.intensity[-1].sigma_m == pytest.approx(0.001, rel=0.05)
-    with pytest.raises(MethodError, match="leave out materials"):
+    with pytest.raises(MethodError, match="omit materials"):
         detect(cloud_of(wall(0.002)), tmp_path, materials=names)
 
 
