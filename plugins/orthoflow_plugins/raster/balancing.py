@@ -1,10 +1,10 @@
-"""Intensities of several scans brought to one scale, from where the scans overlap.
+"""Adjustment of the intensities of several scans to a common scale, using their overlaps.
 
-The intensity of a scanner falls with range and incidence, and each scan may have a scale of its
-own. At a place shown by two scans the surface is the same: the ratio of their intensities separates
-the three effects, whatever the texture is. On a single wall range and incidence are coupled (cosine
-times range is the distance of the station from the plane), so that only their joint effect is
-known, which is all that this wall needs.
+Intensity decreases with range and incidence angle, and each scan may have its own scale. Where two
+scans overlap, the surface is the same, so the ratios of their intensities separate the three
+effects, independently of the texture. On a single wall, range and incidence are coupled (cosine
+times range is the distance of the station from the plane), so only their joint effect is known,
+which suffices for this wall.
 """
 
 from __future__ import annotations
@@ -20,12 +20,13 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
 from orthoflow.sdk import DiagnosticSpec, StepContext
 
-# Places are squares of this side: many points of each scan, and mostly a single colour.
+# Side of the squares in which scans are compared: large enough for many points of each scan, and
+# small enough to have a single colour in most cases.
 _PLACE_M: Final = 0.05
 _POINTS_MOST: Final = 2_000_000
 _PLACES_LEAST: Final = 20
 _COSINE_LEAST: Final = 0.05
-# At this range and perpendicular incidence, the first scan keeps its intensities.
+# At this range and perpendicular incidence, intensities of the first scan are unchanged.
 _RANGE_M: Final = 3.0
 _DARKEST: Final = 1.0e-4
 _CHUNK: Final = 1 << 21
@@ -38,12 +39,12 @@ NOT_BALANCED: Final = DiagnosticSpec(
 
 @dataclass(frozen=True)
 class _Trend:
-    """log intensity = scale of the scan + range * log(metres) + incidence * log(cosine) + texture.
+    """log intensity = scan scale + range_power * log(m) + cosine_power * log(cosine) + texture.
 
     Attributes:
-        scales: (scans,) of which the first is 0.
-        range_power: how intensity changes with range.
-        cosine_power: how it changes with the cosine of incidence.
+        scales: (scans,) scales of the scans; the first is 0.
+        range_power: power of the range.
+        cosine_power: power of the cosine of the incidence angle.
     """
 
     scales: NDArray[np.float64]
@@ -52,13 +53,13 @@ class _Trend:
 
 
 def balanced(cloud: PointCloud, slabs: list[Slab], ctx: StepContext) -> PointCloud:
-    """Return the cloud with intensities as if all scans had been taken under equal conditions.
+    """Return the cloud with intensities as if all scans were taken under the same conditions.
 
-    Points on a wall are corrected by the incidence on it, all others are unchanged. Without overlap
-    between scans the cloud is unchanged, which is reported.
+    Only points on walls are corrected. If scans do not overlap, the cloud is unchanged and a
+    warning is reported.
     """
     if cloud.intensity is None or cloud.scan is None or cloud.stations is None:
-        ctx.report(NOT_BALANCED, reason="balancing takes scans with known stations")
+        ctx.report(NOT_BALANCED, reason="balancing needs scans with known stations")
         return cloud
     samples = [_places(cloud, slab) for slab in slabs]
     table = np.vstack(samples)
@@ -86,7 +87,7 @@ def balanced(cloud: PointCloud, slabs: list[Slab], ctx: StepContext) -> PointClo
 
 @dataclass(frozen=True)
 class _Looks:
-    """The scan geometry of the points in a slab; all (n,)."""
+    """Scan geometry of the points in a slab; all arrays (n,)."""
 
     points: NDArray[np.int64]
     place: NDArray[np.int64]
@@ -118,7 +119,7 @@ def _looks(cloud: PointCloud, slab: Slab, points: NDArray[np.int64]) -> _Looks:
 
 
 def _places(cloud: PointCloud, slab: Slab) -> NDArray[np.float64]:
-    """Return differences between two scans at one place, as rows.
+    """Return differences between two scans in the same square, as rows.
 
     Returns:
         (n, 5): scan, other scan, and the differences (first minus second) of the means of log
@@ -137,14 +138,14 @@ def _places(cloud: PointCloud, slab: Slab) -> NDArray[np.float64]:
         np.log(looks.cosine),
     )
     means = np.column_stack([np.bincount(members, values) / counts for values in logs])
-    # Scans of one place are adjacent in the order of the keys.
+    # Scans of the same square are adjacent in the order of the keys.
     pairs = np.flatnonzero(keys[1:] // n_scans == keys[:-1] // n_scans)
     scans = np.column_stack([keys[pairs] % n_scans, keys[pairs + 1] % n_scans])
     return np.column_stack([scans, means[pairs] - means[pairs + 1]])
 
 
 def _trend(table: NDArray[np.float64], n_scans: int) -> _Trend | None:
-    """Fit the differences by the L1 norm, which is robust to edges of the texture."""
+    """Fit the differences with the L1 norm, which is robust to edges of the texture."""
     if len(table) < _PLACES_LEAST:
         return None
     first, second = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)
@@ -153,7 +154,7 @@ def _trend(table: NDArray[np.float64], n_scans: int) -> _Trend | None:
     design[rows, first] += 1.0
     design[rows, second] -= 1.0
     design[:, n_scans:] = table[:, 3:]
-    # The first scan defines the scale, and a scan without overlap keeps its own.
+    # The first scan defines the scale; scans without overlap are unchanged.
     held = np.full(n_scans + 2, 1e-3)
     held[0] += 1e3
     solution = least_absolute(design, table[:, 2], held)

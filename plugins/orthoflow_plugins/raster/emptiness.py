@@ -1,4 +1,4 @@
-"""Why cells of a wall are empty: before or behind the buffer, hidden, beside points, unseen."""
+"""Causes of empty cells of a wall: points outside the buffer, occlusion, sparse or no points."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from orthoflow_plugins.raster.extents import SampledPoints, points_in
 
 # Causes are determined on tiles of about this side, each with some points of the sample.
 _TILE_M: Final = 0.05
-# Number of points of the sample that make a surface.
+# Minimum number of sample points of a surface.
 _POINTS_LEAST: Final = 2
-# Points farther behind a wall are another room or the street; objects farther in front, such as a
-# portico or a balcony, hide it only if a station is known to look past them.
+# Points farther behind a wall belong to another room or the street. Objects farther in front, such
+# as a portico or a balcony, count as hiding it only if stations are known.
 _BEHIND_MOST_M: Final = 4.0
 _BEFORE_MOST_M: Final = 5.0
-# Share of what is in front of a wall that a suggested buffer includes.
+# Share of the points in front of a wall that a suggested buffer includes, per cent.
 _BEFORE_PERCENT: Final = 95.0
-# Rays from the wall to the stations: side of a voxel, their number and that along one axis, margin
-# at both ends, and number of tiles tested.
+# Rays from the wall to the stations: side of a voxel, maximum number of voxels in total and along
+# one axis, margin at both ends, and maximum number of tested tiles.
 _VOXEL_M: Final = 0.1
 _VOXELS_MOST: Final = 1 << 24
 _VOXELS_MOST_ALONG: Final = 1 << 11
@@ -36,16 +36,17 @@ _RAYS_MOST: Final = 4000
 
 @dataclass(frozen=True, kw_only=True)
 class Emptiness:
-    """The share of a wall's cells that is empty, by cause.
+    """Shares of the cells of a wall that are empty, by cause.
 
     Attributes:
-        behind_share: scanned points there are behind the buffer.
-        behind_m: their depth behind the plane, median; NaN without any.
-        before_share: objects are directly in front of the wall, beyond the buffer.
-        before_m: depth in front of the plane of 95 % of them; NaN without any.
-        hidden_share: objects are between the wall and every scanner.
-        sparse_share: points of the wall surround the cell: gaps, shadows of relief, borders.
-        unseen_share: nothing was scanned there.
+        behind_share: cells whose points are behind the buffer.
+        behind_m: median depth of these points behind the plane; NaN if there are none.
+        before_share: cells with objects directly in front of the wall, beyond the buffer.
+        before_m: depth in front of the plane that includes 95 % of these objects; NaN if there are
+            none.
+        hidden_share: cells with objects between them and every scanner.
+        sparse_share: cells close to points of the wall: gaps, shadows of relief, borders.
+        unseen_share: cells where nothing was scanned.
     """
 
     behind_share: float
@@ -58,7 +59,7 @@ class Emptiness:
 
     @property
     def share(self) -> float:
-        """Share of all empty cells."""
+        """Return the share of all empty cells."""
         around = self.behind_share + self.before_share
         return around + self.hidden_share + self.sparse_share + self.unseen_share
 
@@ -68,8 +69,8 @@ class Sight:
     """The scanned points and their stations.
 
     Attributes:
-        points: of the cloud.
-        stations: (k, 3) world; None if unknown.
+        points: sample of the cloud.
+        stations: (k, 3) world coordinates; None if unknown.
     """
 
     points: SampledPoints
@@ -77,20 +78,20 @@ class Sight:
 
     @cached_property
     def room(self) -> _Room:
-        """Return the voxels that contain points; computed once, because few walls need them."""
+        """Return the voxels with points; computed on demand, because few walls need them."""
         return _Room.of(self.points)
 
 
 def emptiness_of(
     wall: Wall, slab: Slab, sight: Sight, *, free_m: float = math.inf, threads: int
 ) -> Emptiness:
-    """Determine why cells of a wall are empty.
+    """Determine the causes of empty cells of a wall.
 
     Args:
         wall: the wall.
         slab: its raster and buffer.
         sight: the scanned points.
-        free_m: objects farther in front of the wall belong to what faces it.
+        free_m: objects farther in front of the wall belong to the opposite surface.
         threads: number of threads.
     """
     points = sight.points
@@ -111,7 +112,7 @@ def emptiness_of(
         is_hidden.ravel()[open_tiles] |= blocked
     is_behind_tile = ~is_sparse & ~is_before_tile & ~is_hidden & (n_behind >= _POINTS_LEAST)
     stands = is_before_tile.ravel()[around.cells] & is_before
-    # Of tiles with some void cells only.
+    # Only tiles with void cells.
     stands &= (n_void > 0).ravel()[around.cells]
     far_m = np.percentile(around.depth_m[stands], _BEFORE_PERCENT) if stands.any() else math.nan
     of_tile = is_behind_tile.ravel()[around.cells] & is_behind
@@ -137,7 +138,7 @@ class _Tiles:
     """Blocks of cells of a wall.
 
     Attributes:
-        frame: a cell for each tile; those at the right and below may be cut off by the wall's end.
+        frame: raster with a cell for each tile; tiles at the right and bottom may be incomplete.
         n_void: (rows, cols) number of void cells.
         n_measured: (rows, cols) number of cells with a point.
     """
@@ -151,7 +152,7 @@ def _tiles(wall: Wall, points: SampledPoints) -> _Tiles:
     frame = wall.frame
     rows, columns = frame.shape
     n_points = max(1.0, float(wall.count.sum(dtype=np.int64)) / points.n_represented)
-    # Three times the spacing of the sample if its points were spread over the whole wall.
+    # Three times the spacing of sample points distributed over the entire wall.
     side_m = max(_TILE_M, 3.0 * frame.gsd_m * math.sqrt(rows * columns / n_points))
     side = max(1, min(round(side_m / frame.gsd_m), rows, columns))
     starts = np.arange(0, columns, side)
@@ -177,7 +178,7 @@ def _blocked(
     sight: Sight,
     stations: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Whether objects are between tiles (n,) of a wall's plane and every station."""
+    """Return (n,) whether objects are between tiles (n,) of a wall and every station."""
     every = -(-len(tiles) // _RAYS_MOST)
     asked = tiles[::every]
     places = np.column_stack([asked % frame.width, asked // frame.width]).astype(np.float64) + 0.5
@@ -189,8 +190,8 @@ def _blocked(
         lengths_m = np.linalg.norm(rays, axis=1)
         is_met = rays @ frame.normal_world <= 0.0
         rays /= np.maximum(lengths_m, 1e-9)[:, None]
-        # A station may be far from all points, or at the origin of a survey grid: nothing hides a
-        # wall beyond the voxels.
+        # A station may be far from all points, or at the origin of a survey grid, so rays are only
+        # followed inside the voxels.
         enter_m, leave_m = room.crossed_m(starts, rays)
         enter_m = np.maximum(enter_m, _ENDS_M)
         leave_m = np.minimum(leave_m, lengths_m - _ENDS_M)
@@ -206,7 +207,7 @@ def _blocked(
 
 @dataclass(frozen=True, kw_only=True)
 class _Room:
-    """The voxels of the room that contain points; positions are offsets of the cloud."""
+    """The voxels that contain points; positions are offsets of the cloud."""
 
     low_m: NDArray[np.float64]
     side_m: float
@@ -215,7 +216,7 @@ class _Room:
     @classmethod
     def of(cls, points: SampledPoints) -> _Room:
         axes = (points.x, points.y, points.z)
-        # Isolated distant points must not make voxels coarse.
+        # Quantiles, so that isolated distant points do not enlarge the voxels.
         low, high = np.array([np.percentile(axis, (0.1, 99.9)) for axis in axes]).T
         low, high = low - 2.0 * _VOXEL_M, high + 2.0 * _VOXEL_M
         side_m = max(
@@ -229,27 +230,27 @@ class _Room:
         )
         inside = ((places >= 0.0) & (places < shape)).all(axis=1)
         voxels = np.ravel_multi_index(tuple(places[inside].astype(np.int64).T), tuple(shape))
-        # A single stray point hides nothing.
+        # A single stray point does not hide a wall.
         counts = np.bincount(voxels, minlength=int(shape.prod())).reshape(tuple(shape))
         return cls(low_m=low, side_m=side_m, occupied=counts >= _POINTS_LEAST)
 
     def crossed_m(
         self, starts: NDArray[np.float64], ways: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return where rays (n, 3) from positions (n, 3) enter and leave the voxels, metres.
+        """Return where rays (n, 3) from positions (n, 3) enter and leave the voxels, in metres.
 
-        For a ray that misses them the exit precedes the entry.
+        If a ray misses the voxels, the exit is before the entry.
         """
         high_m = self.low_m + self.side_m * np.array(self.occupied.shape)
         with np.errstate(divide="ignore", invalid="ignore"):
             first_m, second_m = (self.low_m - starts) / ways, (high_m - starts) / ways
-        # A ray along a face of the voxels (0 / 0) is bounded by the other axes.
+        # Rays along a face of the voxels (0 / 0) are bounded by the other axes.
         enter_m = np.nanmax(np.fmin(first_m, second_m), axis=1)
         leave_m = np.nanmin(np.fmax(first_m, second_m), axis=1)
         return enter_m, leave_m
 
     def holds(self, places: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether the voxels of positions (n, 3) contain points."""
+        """Return (n,) whether the voxels at positions (n, 3) contain points."""
         voxels = np.floor((places - self.low_m) / self.side_m).astype(np.int64)
         inside = ((voxels >= 0) & (voxels < self.occupied.shape)).all(axis=1)
         held = np.zeros(len(places), dtype=np.bool_)

@@ -1,10 +1,10 @@
-"""The extent of a wall: up to the surfaces that adjoin it, and including its relief.
+"""The extent of a wall, up to adjoining surfaces and including its relief.
 
-In markiewicz2015 (section 6) each plane defines the range in front of and behind it that is
-rastered. Here both this range and the rectangle follow from the points connected to the wall:
-voxels of a sample of the cloud, step by step along the wall and in depth, from those on the plane.
-A detected plane that adjoins the wall ends it where it comes nearest: beyond, a rectangle would
-show that plane, too. Without a detected one, it ends with the points.
+In markiewicz2015 (section 6), a range in front of and behind each plane is rastered. Here both this
+range and the rectangle are determined from the points connected to the wall, by growing voxels of a
+sample of the cloud along the wall and in depth, starting at those on the plane. If a detected plane
+adjoins the wall, the rectangle ends at its nearest point, because a larger rectangle would show the
+adjoining plane. Otherwise, it ends with the points.
 """
 
 from __future__ import annotations
@@ -25,58 +25,60 @@ from orthoflow_plugins.raster.selection import area_m2, frame_of
 Side = Literal["left", "right", "top", "bottom"]
 _SIDES: Final[tuple[Side, ...]] = ("left", "right", "top", "bottom")
 
-# Maximum number of points that are read, one of every n, chosen by hashing.
+# Maximum number of points in the sample: one of every n points, chosen by hashing.
 _POINTS_MOST: Final = 1 << 21
-# Multiples of this do not coincide with rows or columns of a scan (Fibonacci hashing).
+# Fibonacci hashing, so that the sample does not coincide with rows or columns of a scan.
 _TURN: Final = np.uint64(0x9E3779B97F4A7C15)
 # Maximum growth of a rectangle on each side, and maximum depth of relief.
 _GROWTH_MOST_M: Final = 1.0
 _FRONT_MOST_M: Final = 0.5
 _BEHIND_MOST_M: Final = 1.0
-# Voxels: their number, their smallest side along the wall, in points of the sample, and in depth.
+# Voxels: maximum number, minimum side along the wall in metres and in spacings of sample points,
+# and side in depth.
 _VOXELS_MOST: Final = 1 << 22
 _SIDE_LEAST_M: Final = 0.03
 _SIDE_STEPS: Final = 3.0
 _DEPTH_STEP_M: Final = 0.025
-# Sides of relief are seldom scanned: surfaces are connected across this many steps of depth.
+# Surfaces are connected across this many depth steps, because sides of relief are seldom scanned.
 _BRIDGED_STEPS: Final = 5
-# A part of the surface has at least this many voxels on the plane.
+# Minimum number of voxels on the plane for a part of the surface.
 _SEEDS_LEAST: Final = 4
-# A line of cells beside the rectangle belongs to the wall if this share of it is covered.
+# A line of cells outside the rectangle belongs to the wall if this share of it is covered.
 _COVERED_LEAST: Final = 0.2
-# Share of the outermost points that may be stray ones.
+# Share of the outermost points that may be stray points.
 _STRAY_SHARE: Final = 0.02
-# Additional depth that is searched: objects that continue there, as the cornices of adjoining walls
-# and the sides of furniture do, have no front within reach that a buffer could include.
+# Additional search depth: objects that extend into it, such as cornices of adjoining walls and
+# sides of furniture, have no front that a buffer could include.
 _BEYOND_MOST_M: Final = 0.1
-# An object farther in front of a wall and connected to it, such as a fountain in front of its
-# facade, belongs to it if it covers this share of the wall that nothing else covers, up to this
-# distance, and no farther than halfway to a surface that faces the wall or to a scanner.
+# An object farther in front of a wall and connected to it, such as a fountain on a facade, belongs
+# to the wall up to this distance if the part of the wall that only this object covers exceeds this
+# share. The distance is limited to halfway to a surface that faces the wall, or to a scanner.
 _FAR_FRONT_MOST_M: Final = 3.0
 _FAR_SHARE_LEAST: Final = 0.03
 _HALFWAY: Final = 0.5
 _FACING_COSINE: Final = -0.7
-# Opposite walls of a room cover similar areas, objects in front of a wall a few per cent of it.
+# Opposite walls of a room have similar areas; objects in front of a wall cover a few per cent of
+# it.
 _OPPOSITE_SHARE: Final = 0.25
 _UPRIGHT_SINE: Final = math.sin(math.radians(10.0))
-# This close to the lowest and the highest points in front of a wall, ground and ceiling connect
-# everything.
+# Points this close to the lowest and highest points in front of a wall are ignored, because ground
+# and ceiling connect everything.
 _GROUND_M: Final = 0.15
 # Relief that covers less than this share of the wall does not influence the buffer.
 _RELIEF_LEAST: Final = 5e-4
 _BEYOND_RELIEF_M: Final = 0.02
 _RELIEF_USUAL_M: Final = 0.15
-# Which planes adjoin: minimum angle, and the share of the side along which their points are within
-# this range of depths in front of the wall, or behind it. The undersides of cornices are not as
-# deep.
+# Criteria for adjoining planes: angle to the wall, and minimum share of the side along which their
+# points are in this range of depths in front of or behind the wall. The undersides of cornices are
+# not as deep.
 _ADJOINING_COSINE: Final = 0.7
 _BESIDE_SINE: Final = 0.9
 _BESIDE_SHARE: Final = 0.3
 _STANDING_M: Final = (0.35, 1.0)
 _BESIDE_STEP_M: Final = 0.1
-# How far inside the rectangle of the points their line may be.
+# Maximum distance of their line inside the rectangle of the points.
 _WITHIN_M: Final = 0.1
-# Points of an adjoining surface are within this many of its sigmas, and no farther than this.
+# Maximum distance of points from an adjoining surface, in its sigmas and in metres.
 _NOISE_SIGMAS: Final = 3.0
 _NOISE_MOST_M: Final = 0.02
 
@@ -86,11 +88,11 @@ class SampledPoints:
     """A sample of the points of a cloud.
 
     Attributes:
-        origin: (3,) metres, of the cloud.
-        x: (n,) float32 metres from the origin along x.
-        y: (n,) likewise along y.
-        z: (n,) likewise along z.
-        n_represented: number of points of the cloud that each represents.
+        origin: (3,) origin of the cloud, metres.
+        x: (n,) float32 coordinates relative to the origin, metres.
+        y: see x.
+        z: see x.
+        n_represented: number of points of the cloud per sample point.
     """
 
     origin: NDArray[np.float64]
@@ -101,7 +103,7 @@ class SampledPoints:
 
     @property
     def boxes_m(self) -> None:
-        """Return no boxes: points drawn from the whole cloud are everywhere."""
+        """Return None, because blocks of points from the whole cloud have no compact boxes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +122,7 @@ class PointsInside:
 
 
 def sampled(cloud: PointCloud) -> SampledPoints:
-    """Take one point of every n, so that all walls are checked quickly."""
+    """Return one of every n points, so that all walls are examined quickly."""
     every = -(-len(cloud) // _POINTS_MOST)
     index = np.arange(0, len(cloud), every)
     if every > 1:
@@ -151,10 +153,11 @@ class Extent:
     """The extent of a wall.
 
     Attributes:
-        growth_m: growth beyond the rectangle of its points, to the left, right, top and bottom.
-        front_m: from the plane towards the viewer.
-        behind_m: behind the plane.
-        cut_m: how much of the wall a plane that is askew cuts off beyond its end, by side.
+        growth_m: growth beyond the rectangle of the points, at the left, right, top and bottom.
+        front_m: depth from the plane towards the viewer.
+        behind_m: depth behind the plane.
+        cut_m: by side, the width of the part of the wall that is excluded because the adjoining
+            plane is oblique to the side.
     """
 
     growth_m: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
@@ -163,7 +166,7 @@ class Extent:
     cut_m: Mapping[Side, float] = field(default_factory=dict)
 
     def widened(self, frame: WallFrame) -> WallFrame:
-        """Add whole cells on each side, so that the others keep their position."""
+        """Add whole cells on each side, so that the positions of the other cells are unchanged."""
         # A tolerance of a millionth of a cell, as in `frame_over`.
         left, right, top, bottom = (int(grown / frame.gsd_m + 1e-6) for grown in self.growth_m)
         corner = np.array([[-left, -top]], dtype=np.float64)
@@ -180,9 +183,9 @@ class Reach:
     """The depth to search, and the minimum buffer.
 
     Attributes:
-        front_m: buffer towards the viewer that is set; None to find it.
-        behind_m: buffer behind the plane that is set; None to find it.
-        least_m: minimum of a buffer that is found.
+        front_m: buffer towards the viewer; None to determine it.
+        behind_m: buffer behind the plane; None to determine it.
+        least_m: minimum of a determined buffer.
     """
 
     front_m: float | None
@@ -191,7 +194,7 @@ class Reach:
 
     @property
     def is_set(self) -> bool:
-        """Whether both buffers are set."""
+        """Return whether both buffers are set."""
         return self.front_m is not None and self.behind_m is not None
 
     @property
@@ -212,14 +215,14 @@ def extent_of(
     stations: NDArray[np.float64] | None = None,
     threads: int,
 ) -> Extent:
-    """Find the extent of the wall of a plane.
+    """Determine the extent of the wall of a plane.
 
     Args:
-        points: of the cloud.
+        points: sample of the cloud.
         planes: all detected planes.
-        index: of the wall's plane.
+        index: index of the wall's plane.
         reach: depths of the wall.
-        stations: (k, 3) world, positions of scanners; None if unknown.
+        stations: (k, 3) world coordinates of scanners; None if unknown.
         threads: number of threads.
     """
     search = _Search.of(points, planes, index, reach)
@@ -254,15 +257,15 @@ def extent_of(
 
 @dataclass(frozen=True, kw_only=True)
 class _Bound:
-    """An adjoining plane: distance of (right, down, depth) in metres from it, positive inside.
+    """An adjoining plane: the distance of positions (right, down, depth) from it, positive inside.
 
     Attributes:
-        side: side of the rectangle that it bounds.
-        slopes: (3,) change of the distance along right, down and depth.
+        side: side of the rectangle that the plane bounds.
+        slopes: (3,) derivatives of the distance along right, down and depth.
         offset_m: distance at the top-left corner of the rectangle of the points.
-        noise_m: distance of its points from it.
-        beyond_m: its distance beyond the rectangle's side, where it is nearest.
-        askew_m: additional distance where it is farthest.
+        noise_m: maximum distance of its points from it.
+        beyond_m: smallest distance of the plane from the rectangle's side, positive outside.
+        askew_m: difference between its largest and smallest distance from the side.
     """
 
     side: Side
@@ -274,20 +277,20 @@ class _Bound:
 
     @property
     def line_m(self) -> float:
-        """Return how far a wall that it ends extends beyond the rectangle's side."""
-        # Points closer to the adjoining surface may belong to either.
+        """Return how far a wall bounded by the plane extends beyond the rectangle's side."""
+        # Points closer to the adjoining surface may belong to either surface.
         return self.beyond_m - self.noise_m
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Search:
-    """The region that is searched for the points of a wall.
+    """The region in which points of a wall are searched for.
 
     Attributes:
-        slab: voxels' cells along the wall, and the range of depths.
-        width_m: of the rectangle of the points.
-        height_m: of the rectangle of the points.
-        seed_m: points this close to the plane are on it.
+        slab: cells of the voxels along the wall, and the range of depths.
+        width_m: width of the rectangle of the points.
+        height_m: height of the rectangle of the points.
+        seed_m: maximum distance of points on the plane.
         bounds: adjoining planes.
     """
 
@@ -315,7 +318,7 @@ class _Search:
         )
         size_m = width_m, height_m
         around = _Around.of(points, rectangle, size_m)
-        # Whole cells of growth: a cell begins at the rectangle's corner.
+        # Whole cells of growth, so that a cell begins at the rectangle's corner.
         growth_m = side_m * math.ceil(_GROWTH_MOST_M / side_m)
         frame = frame_of(planes, index, gsd_m=side_m, margin_m=growth_m)
         return cls(
@@ -327,17 +330,17 @@ class _Search:
         )
 
     def places_m(self, points: PointsInside) -> NDArray[np.float64]:
-        """Return metres (2, n) to the right of and below the rectangle's top-left corner."""
+        """Return positions (2, n), metres right of and below the rectangle's top-left corner."""
         return self.slab.frame.gsd_m * (points.places - self.n_beside).T
 
     @property
     def n_beside(self) -> int:
-        """Return the cells between the frame's and the rectangle's side."""
+        """Return the number of cells between the sides of the frame and of the rectangle."""
         return math.ceil(_GROWTH_MOST_M / self.slab.frame.gsd_m)
 
     @property
     def inside(self) -> tuple[slice, slice]:
-        """Return rows and columns of the cells in the rectangle of the points."""
+        """Return the rows and columns of cells in the rectangle of the points."""
         side_m, first = self.slab.frame.gsd_m, self.n_beside
         rows, columns = (
             max(1, int(length_m / side_m)) for length_m in (self.height_m, self.width_m)
@@ -350,10 +353,10 @@ class _Surface:
     """The points connected to the wall.
 
     Attributes:
-        is_covered: (rows, cols) cells of the surface, without strays.
-        front_m: (rows, cols) its largest depth there; -inf without any.
-        behind_m: (rows, cols) its smallest; inf without any.
-        is_own: (n,) which points are on it.
+        is_covered: (rows, cols) True for cells of the surface, without stray ones.
+        front_m: (rows, cols) largest depth of the surface; -inf if there is none.
+        behind_m: (rows, cols) smallest depth of the surface; inf if there is none.
+        is_own: (n,) True for points on the surface.
     """
 
     is_covered: NDArray[np.bool_]
@@ -372,20 +375,20 @@ def _far_front_m(
     near_m: float,
     threads: int,
 ) -> float:
-    """Return the depth of objects connected to a wall that hide much of it; 0 for none.
+    """Return the depth of objects connected to a wall that hide much of it; 0 if there are none.
 
     Args:
-        points: of the cloud.
+        points: sample of the cloud.
         planes: all detected planes.
-        index: of the wall's plane.
+        index: index of the wall's plane.
         search: the region of the wall.
-        stations: (k, 3) world, or None.
-        near_m: nearer relief belongs to the wall in any case.
+        stations: (k, 3) world coordinates, or None.
+        near_m: relief up to this depth always belongs to the wall.
         threads: number of threads.
     """
     from scipy import ndimage
 
-    # Objects on floors are not part of them.
+    # Objects on floors are not part of the floor.
     is_upright = abs(float(planes.normal[index] @ planes.up)) < _UPRIGHT_SINE
     most_m = min(_FAR_FRONT_MOST_M, free_before_m(planes, index, stations))
     if not is_upright or most_m <= near_m + _BEYOND_RELIEF_M:
@@ -397,7 +400,7 @@ def _far_front_m(
         return 0.0
     is_far = surface.front_m > near_m
     is_far &= ~(surface.behind_m <= near_m)
-    # Sides of objects that continue, such as adjoining walls, are thin beyond this depth.
+    # Beyond this depth, objects that extend farther, such as adjoining walls, are thin.
     is_far = np.asarray(ndimage.binary_opening(is_far, np.ones((3, 3), dtype=np.bool_)))
     rows, columns = far.inside
     gained_m = surface.front_m[rows, columns][is_far[rows, columns]]
@@ -411,9 +414,10 @@ def _far_front_m(
 def free_before_m(planes: Planes, index: int, stations: NDArray[np.float64] | None) -> float:
     """Return half the distance from a wall to the nearest surface that faces it, or to a scanner.
 
-    Objects farther in front may belong to that surface; infinite if there is none. Planes whose
-    visible side was guessed may be fronts of objects that belong to the wall, turned the wrong way.
-    They face it only where they, and nearer ones, cover enough area to be the other side of a room.
+    Objects farther in front may belong to that surface; the distance is infinite if there is none.
+    Planes whose visible side was guessed may be fronts of objects on the wall with a wrong side.
+    They count as facing the wall only if they, together with nearer ones, have enough area to be
+    the other side of a room.
     """
     normal, offset_m = planes.normal[index], float(planes.offset[index])
     facing = [
@@ -435,7 +439,7 @@ def free_before_m(planes: Planes, index: int, stations: NDArray[np.float64] | No
 
 
 def _without_ground(inside: PointsInside, search: _Search, near_m: float) -> PointsInside:
-    """Drop ground and ceiling in front of a wall, which connect objects there with it."""
+    """Remove ground and ceiling in front of a wall, because they connect objects to it."""
     _, down_m = search.places_m(inside)
     is_before = inside.depth_m > near_m
     if not is_before.any():
@@ -449,7 +453,7 @@ def _without_ground(inside: PointsInside, search: _Search, near_m: float) -> Poi
 
 
 def _surface(inside: PointsInside, search: _Search) -> _Surface | None:
-    """Find the voxels connected to those on the plane; None without any of these."""
+    """Return the voxels connected to those on the plane; None if no voxels are on the plane."""
     from scipy import ndimage
 
     slab = search.slab
@@ -495,16 +499,16 @@ def _surface(inside: PointsInside, search: _Search) -> _Surface | None:
 
 
 def _searched_m(set_m: float | None, most_m: float) -> float:
-    """Return the depth in which a wall is searched; found or set, it does not grow beyond it."""
+    """Return the search depth of a wall, which limits its growth."""
     return most_m + _BEYOND_MOST_M if set_m is None else min(set_m, most_m)
 
 
 def _relief_m(depth_m: NDArray[np.float64], most_m: float, search: _Search) -> float:
-    """Return the depth of the wall's relief, except where it is thin or tiny."""
+    """Return the depth of the wall's relief, ignoring thin and tiny parts."""
     from scipy import ndimage
 
     inner = np.where(np.isfinite(depth_m) & (depth_m <= most_m), depth_m, -np.inf)
-    # A floor or ceiling that was not detected, and the sides of relief, are thin from here.
+    # Undetected floors and ceilings, and sides of relief, are thin in this view.
     opened = np.asarray(ndimage.minimum_filter(inner, 3, mode="constant", cval=-np.inf))
     opened = np.sort(opened[np.isfinite(opened)])
     rows, columns = search.inside
@@ -525,7 +529,7 @@ def _growth_m(side: Side, surface: _Surface, inside: PointsInside, search: _Sear
         is_within = (down_m >= 0.0) & (down_m <= search.height_m)
     else:
         is_within = (right_m >= 0.0) & (right_m <= search.width_m)
-    # Lines of cells from the rectangle outwards; the first may be partly inside it.
+    # Lines of cells outside the rectangle, from the inside out; the first may be partly inside.
     lines, beyond_m, within_m = {
         "left": (is_covered[rows, :first].T[::-1], -right_m, 0.0),
         "right": (
@@ -554,7 +558,7 @@ def _growth_m(side: Side, surface: _Surface, inside: PointsInside, search: _Sear
 
 
 def _covered_m2(planes: Planes, index: int) -> float:
-    """Return the area of the connected parts of a plane, or of its rectangle without parts."""
+    """Return the area of a plane's connected parts, or of its rectangle if there are no parts."""
     whole = area_m2(planes.corners[index])
     parts = sum(area_m2(corners) for corners in _parts(planes, index))
     return min(whole, parts) if parts > 0.0 else whole
@@ -570,10 +574,10 @@ def _parts(planes: Planes, index: int) -> NDArray[np.float64]:
 def _bounds(
     planes: Planes, index: int, rectangle: WallFrame, size_m: tuple[float, float], around: _Around
 ) -> Iterator[_Bound]:
-    """Return the planes that adjoin a wall along one of its sides, the innermost of several.
+    """Yield the planes that adjoin the sides of a wall, the innermost plane for each side.
 
-    A part of an adjoining wall that projects from it farther on, such as a chimney breast, does not
-    end the wall: the wall's own surface continues to the next plane.
+    A part of an adjoining wall that projects from it at some distance, such as a chimney breast,
+    does not bound the wall, because the wall's own surface continues to the next plane.
     """
     found: dict[Side, list[_Bound]] = {}
     for other in range(len(planes)):
@@ -606,7 +610,7 @@ def _bound(
     middle = np.array([0.5 * size_m[0], 0.5 * size_m[1], 0.0])
     if offset_m + float(slopes @ middle) < 0.0:
         slopes, offset_m = -slopes, -offset_m
-    # Inside is to the right of a left wall and below a ceiling: there distances increase.
+    # Distances increase to the right of a left wall and below a ceiling, which are inside.
     sides: tuple[Side, Side] = ("left", "right") if axis == 0 else ("top", "bottom")
     is_first = bool(slopes[axis] > 0.0)
     along = 1 - axis
@@ -629,12 +633,12 @@ def _bound(
 
 @dataclass(frozen=True, kw_only=True)
 class _Around:
-    """Points in and beside a wall, in metres of its rectangle.
+    """Points in and around a wall, in metres relative to its rectangle.
 
     Attributes:
-        places_m: (3, n) right of and below the top-left corner, and in front of the plane, of those
-            that are clearly in front of or behind it.
-        own_m: (3, n) of those on the plane, or on relief of the usual depth.
+        places_m: (3, n) metres right of and below the top-left corner, and in front of the plane,
+            for points clearly in front of or behind it.
+        own_m: (3, n) the same for points on the plane or on relief of the usual depth.
     """
 
     places_m: NDArray[np.float64]
@@ -647,7 +651,7 @@ class _Around:
         growth_m = _GROWTH_MOST_M
         corner = rectangle.world_from_wall(np.array([[-growth_m, -growth_m]]) / rectangle.gsd_m)[0]
         width_m, height_m = (length_m + 2.0 * growth_m for length_m in size_m)
-        # In 32 x 32 pieces; any cells would do, because only positions are used.
+        # 32 x 32 cells; any size would do, because only positions are used.
         gsd_m = max(width_m, height_m) / 32.0
         frame = replace(
             rectangle,
@@ -668,7 +672,7 @@ class _Around:
 
 
 def _stands(bound: _Bound, size_m: tuple[float, float], around: _Around) -> bool:
-    """Whether points of a plane run along a side of a wall, towards the front or back."""
+    """Return whether points of a plane extend along a side of a wall, in front of or behind it."""
     places_m = around.places_m
     is_near = np.abs(bound.offset_m + bound.slopes @ places_m) <= bound.noise_m
     return any(
@@ -678,7 +682,7 @@ def _stands(bound: _Bound, size_m: tuple[float, float], around: _Around) -> bool
 
 
 def _goes_on(inner: _Bound, outer: _Bound, size_m: tuple[float, float], around: _Around) -> bool:
-    """Whether a wall has points between two planes beside it."""
+    """Return whether a wall has points between two planes at the same side."""
     places_m = around.own_m
     is_between = inner.offset_m + inner.slopes @ places_m < -inner.noise_m
     is_between &= outer.offset_m + outer.slopes @ places_m > outer.noise_m
@@ -686,7 +690,7 @@ def _goes_on(inner: _Bound, outer: _Bound, size_m: tuple[float, float], around: 
 
 
 def _runs_along(bound: _Bound, places_m: NDArray[np.float64], size_m: tuple[float, float]) -> bool:
-    """Whether positions (3, n) cover enough of a bound's side."""
+    """Return whether positions (3, n) cover enough of a bound's side."""
     along = 1 if bound.side in {"left", "right"} else 0
     length_m = size_m[along]
     n_steps = max(1, round(length_m / _BESIDE_STEP_M))

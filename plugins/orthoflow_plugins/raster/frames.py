@@ -1,4 +1,4 @@
-"""Grids of walls: the requested part of one, and those of level planes that are maps."""
+"""Grids of walls: crops, and maps of level planes."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ Rectangle = tuple[float, float, float, float]
 Polygon = tuple[tuple[float, float], ...]
 
 _UP: Final = np.array([0.0, 0.0, 1.0])
-# Maximum displacement of a point in the map of a tilted raster.
+# Maximum displacement of a point in the map of a tilted raster, in cells.
 _OFF_CELLS_MOST: Final = 0.5
 TILTED: Final = DiagnosticSpec(
     code="map-of-a-tilted-plane",
     severity="warning",
     text="{subject} is tilted by {tilt_deg:.2g} deg, which would shift points by up to "
-    "{off_mm:.2g} mm in a map: its raster stays in its plane",
+    "{off_mm:.2g} mm in a map: its raster remains in its plane",
     remedy="use plane.given with horizontal, or a smaller buffer",
     rank_by="off_mm",
 )
 NO_MAP: Final = DiagnosticSpec(
     code="map-without-a-level-plane",
     severity="warning",
-    text="crs {crs} places no raster: none of the planes is level and seen from above",
-    remedy="leave {step}.crs out, or raster a floor",
+    text="crs {crs} applies to no raster: none of the planes is level and seen from above",
+    remedy="omit {step}.crs, or raster a floor",
 )
 
 
 def outline_m(crop: Rectangle | Polygon) -> NDArray[np.float64]:
-    """Corners (n, 2) of a crop as (right, down) in metres from the top-left corner of a raster."""
+    """Return corners (n, 2) of a crop, metres right of and below the raster's top-left corner."""
     corners = np.array(crop, dtype=np.float64)
     if corners.ndim == 2:
         return corners
@@ -49,7 +49,7 @@ def outline_m(crop: Rectangle | Polygon) -> NDArray[np.float64]:
 
 
 def area_m2(crop: Rectangle | Polygon) -> float:
-    """Return the area of a crop; 0 if its corners span none."""
+    """Return the area of a crop; 0 if its corners are collinear."""
     corners = outline_m(crop)
     if len(corners) < 3:
         return 0.0
@@ -57,12 +57,12 @@ def area_m2(crop: Rectangle | Polygon) -> float:
 
 
 def cropped(frame: WallFrame, crop: Rectangle | Polygon) -> WallFrame | None:
-    """Remove whole columns and rows outside a crop from a grid; None if the crop misses it.
+    """Remove columns and rows outside a crop from a grid; return None if no cell is inside.
 
-    The remaining cells are unchanged, so that rasters of two crops fit onto each other.
+    The other cells are unchanged, so the cells of different crops coincide.
     """
     outline_px = outline_m(crop) / frame.gsd_m
-    # A tolerance of a millionth of a cell, as in `frame_over`.
+    # Tolerance of a millionth of a cell, as in `frame_over`.
     first = np.floor(outline_px.min(axis=0) + 1e-6).clip(0, None).astype(np.int64)
     last = np.ceil(outline_px.max(axis=0) - 1e-6).astype(np.int64)
     width, height = np.minimum(last, [frame.width, frame.height]) - first
@@ -78,9 +78,9 @@ def cropped(frame: WallFrame, crop: Rectangle | Polygon) -> WallFrame | None:
 
 
 def blank_outside(wall: Wall, crop: Rectangle | Polygon) -> None:
-    """Make the cells of a cropped wall void whose centres are outside the crop (even-odd rule)."""
+    """Make cells of a cropped wall void if their centres are outside the crop (even-odd rule)."""
     corners = outline_m(crop) / wall.frame.gsd_m
-    # From the first cell of the cropped grid.
+    # Relative to the first cell of the cropped grid.
     corners -= np.floor(corners.min(axis=0) + 1e-6).clip(0, None)
     columns = np.arange(wall.frame.width) + 0.5
     for rows in row_bands(wall.mask.shape):
@@ -103,17 +103,17 @@ def blank_outside(wall: Wall, crop: Rectangle | Polygon) -> None:
 def mapped(
     frames: Mapping[int, WallFrame], planes: Planes, crs: str, *, reach_m: float, ctx: StepContext
 ) -> dict[int, WallFrame]:
-    """Return the grids with level planes placed in the map; the others stay in their planes.
+    """Return grids with those of level planes in the map; others remain in their planes.
 
     Args:
         frames: grid of each plane by index.
         planes: the planes.
-        crs: coordinate system of the cloud, whose x is east and y north.
-        reach_m: maximum distance of points from a plane, which a tilt displaces.
+        crs: coordinate system of the cloud, with x as easting and y as northing.
+        reach_m: maximum distance of points from a plane, for the displacement caused by a tilt.
         ctx: receives warnings.
 
     Raises:
-        MethodError: there is no such system, or z is not up.
+        MethodError: the system does not exist, or z is not up.
     """
     from orthoflow.files.geotiff import require_map_crs
 
@@ -124,8 +124,7 @@ def mapped(
     if not np.allclose(planes.up, _UP, atol=1e-9):
         raise MethodError(
             f"crs {crs} needs a cloud whose z is up, x east and y north, got up "
-            f"{planes.up.tolist()}: bring it into the coordinate system with register.similarity, "
-            "or leave crs out"
+            f"{planes.up.tolist()}: transform it with register.similarity, or omit crs"
         )
     placed = dict(frames)
     for index, frame in frames.items():
@@ -133,14 +132,14 @@ def mapped(
         tilt_rad = math.atan2(math.hypot(east, north), up)
         if math.degrees(tilt_rad) > LEVEL_LIMIT_DEG:
             continue
-        # How far a point is displaced at most, by its depth and by foreshortening of slopes.
+        # Maximum displacement of a point, due to its depth and to the foreshortening of the slope.
         extent_m = frame.gsd_m * math.hypot(frame.width, frame.height)
         off_m = reach_m * math.sin(tilt_rad) + extent_m * (1.0 - math.cos(tilt_rad))
         if off_m > _OFF_CELLS_MOST * frame.gsd_m:
             name, tilt_deg = planes.names[index], math.degrees(tilt_rad)
             ctx.report(TILTED, subject=name, tilt_deg=tilt_deg, off_mm=1e3 * off_m)
             continue
-        # The part of whole cells beyond the rectangle is distributed evenly to all sides.
+        # The excess of whole cells over the rectangle is distributed evenly to all sides.
         middle = frame.wall_from_world(planes.corners[index].mean(axis=0)[None])[0, :2]
         beyond = middle - 0.5 * np.array([frame.width, frame.height])
         origin = frame.world_from_wall(beyond[None])[0]

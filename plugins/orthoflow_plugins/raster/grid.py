@@ -51,16 +51,16 @@ from orthoflow_plugins.raster.walls import rastered_wall, require_memory
 
 ExtentOf = Callable[[int], Extent]
 
-# A point wrongly assumed to be on a wall is farther from it than any relief.
+# Points of `near` farther from the wall than this are probably wrong.
 _FAR_M: Final = 1.0
-# A larger missing share would be noticed in a drawing.
+# A larger missing width would be noticed in a drawing.
 _LARGE_CUT_M: Final = 0.05
 NEAR_RELIEF: Final = DiagnosticSpec(
     code="near-takes-relief",
     severity="warning",
-    text="near selects {subject}, which is relief of {wall}",
-    remedy="where that wall is meant, set {step}.ranks=[{index}] and leave near out "
-    "({step}.skip_covered=false states that the relief is)",
+    text="near selects {subject}, which is part of the relief of {wall}",
+    remedy="to select that wall, set {step}.ranks=[{index}] and omit near "
+    "({step}.skip_covered=false confirms that the relief is meant)",
 )
 NEAR_FAR: Final = DiagnosticSpec(
     code="near-is-far",
@@ -72,19 +72,19 @@ NEAR_FAR: Final = DiagnosticSpec(
 CROP_OF_SEVERAL: Final = DiagnosticSpec(
     code="crop-of-several-walls",
     severity="warning",
-    text="crop cuts the same part out of {n_walls} walls",
+    text="crop is applied to {n_walls} walls",
     remedy="choose one with {step}.near or {step}.ranks",
 )
 
 
 class RasterGrid(Method):
-    """Bin the cloud into a raster on each wall: depth, spread, count, intensity, colour.
+    """Raster the cloud on each wall: depth, spread, count, intensity and colour.
 
-    Narrow gaps are closed: between neighbours of the scan's own rows and columns if these are
-    known, otherwise between the measured cells around them, from the positions of their points.
-    Wider ones, such as windows, stay void. In cells with few points, up to 16, the means of
-    intensities and colours are extrapolated along their slope from the position of the points to
-    the centre.
+    Narrow gaps are interpolated: between neighbouring points of a scan if its rows and columns are
+    known, otherwise between the measured cells around the gap, from the positions of their points.
+    Wider gaps, such as windows, remain void. In cells with up to 16 points, mean intensities and
+    colours are extrapolated along their gradient from the mean position of the points to the centre
+    of the cell.
     """
 
     id: ClassVar[str] = "raster.grid"
@@ -92,7 +92,7 @@ class RasterGrid(Method):
     result_version: ClassVar[int] = 2
     metrics: ClassVar[tuple[MetricSpec, ...]] = (
         MetricSpec("n_walls", label="walls"),
-        # Which wall is the first.
+        # Identifies the first wall.
         MetricSpec("omega_deg", label="direction of the first normal (omega)"),
         MetricSpec("phi_deg", label="inclination of the first normal (phi)"),
         MetricSpec("area_m2", label="area of the first wall's raster"),
@@ -104,7 +104,7 @@ class RasterGrid(Method):
         MetricSpec(
             "sigma_median_mm", label="spread of the depths in a cell, median", better="lower"
         ),
-        # Including the causes.
+        # Also by cause.
         MetricSpec("void_share", label="cells without a depth"),
         MetricSpec("void_*_share", label="cells without a depth, by cause"),
         MetricSpec("empty*_share", label="cells without a depth, by cause"),
@@ -132,7 +132,7 @@ class RasterGrid(Method):
         walls: Walls
 
     def run(self, inputs: In, params: RasterParams, ctx: StepContext) -> Out:
-        """Raster the chosen planes, with one or a few passes over the cloud for each."""
+        """Raster the selected planes, with one or a few passes over the cloud for each."""
         from orthoflow.geometry.cloud_quality import scan_step_m
 
         cloud, planes = inputs.cloud, inputs.planes
@@ -176,7 +176,7 @@ class RasterGrid(Method):
         if not any(wall.count.any() for wall in walls):
             first = next(iter(slabs.values()))
             raise MethodError(
-                f"no point of the cloud lies inside the rectangle and the buffer of a wall "
+                f"no point of the cloud is inside the rectangle and the buffer of a wall "
                 f"({first.front_m:g} m in front, {first.behind_m:g} m behind): the planes do not "
                 "belong to this cloud, or buffer_m is too small"
             )
@@ -210,7 +210,7 @@ def _extents(
     params: RasterParams,
     ctx: StepContext,
 ) -> ExtentOf:
-    """Return a function that finds the extent of each plane's wall on first use."""
+    """Return a function that determines the extent of a plane's wall on first use."""
     reach = Reach(
         front_m=params.buffer_m if params.buffer_front_m is None else params.buffer_front_m,
         behind_m=params.buffer_m if params.buffer_behind_m is None else params.buffer_behind_m,
@@ -232,10 +232,10 @@ def _extents(
 def _frames(
     planes: Planes, params: RasterParams, extent_of: ExtentOf, ctx: StepContext
 ) -> tuple[dict[int, WallFrame], dict[int, int]]:
-    """Return the grid of each chosen plane by index, whole or cropped, and the planes left out.
+    """Return the grids of the selected planes by index, cropped if requested, and covered planes.
 
     Raises:
-        MethodError: there is no such plane, or no wall contains the requested part.
+        MethodError: a selected plane does not exist, or no wall contains the requested part.
     """
 
     def buffer_m(index: int) -> tuple[float, float]:
@@ -270,7 +270,7 @@ def _frames(
     if not crops:
         frame = next(iter(frames.values()))
         raise MethodError(
-            f"crop {list(params.crop)} lies beside every wall: the raster of "
+            f"crop {list(params.crop)} is outside every wall: the raster of "
             f"{planes.names[next(iter(frames))]} is {frame.width * frame.gsd_m:.3f} m wide and "
             f"{frame.height * frame.gsd_m:.3f} m high"
         )
@@ -286,17 +286,16 @@ def _log_cuts(
     extent_of: ExtentOf,
     ctx: StepContext,
 ) -> None:
-    """Report what part of a wall is beyond its rectangle because an adjoining plane is askew."""
+    """Report the parts of walls outside their rectangles because adjoining planes are oblique."""
     for index, frame in frames.items():
         for side, askew_m in extent_of(index).cut_m.items():
             cut_m = askew_m - params.margin_m
             if cut_m > frame.gsd_m:
                 notify = ctx.warn if cut_m >= _LARGE_CUT_M else ctx.log
                 notify(
-                    f"{planes.names[index]}: the surface that adjoins it at its {side} is "
-                    "askew, and its "
-                    f"raster ends where that comes nearest: up to {1e3 * cut_m:.0f} mm of its "
-                    "plane are left out there, more of its relief; margin_m adds them"
+                    f"{planes.names[index]}: the adjoining surface at its {side} is oblique, and "
+                    f"the raster ends at its nearest point: up to {1e3 * cut_m:.0f} mm of its "
+                    "plane are left out there, and more of its relief; margin_m adds them"
                 )
 
 

@@ -1,6 +1,6 @@
-"""Compiled passes that compute the surface of a wall from points, and close gaps between these.
+"""Kernels that compute the surface of a wall from points, and close gaps between points.
 
-Those over the entries of `geometry.rastering` run in each thread on the cells it owns.
+Kernels for the entries of `geometry.rastering` run in all threads, each on the cells it owns.
 """
 
 from __future__ import annotations
@@ -15,22 +15,24 @@ from orthoflow.geometry.compiling import compiled
 from orthoflow.geometry.rastering import Entries, is_own
 from orthoflow.geometry.slabs import Offsets
 
-# With more points the mean is near the centre of the cell. With few it may be off, and over many
-# cells in the same way: by up to half a point spacing if the cell is a multiple of it.
+# With more points, their mean position is near the centre of the cell. With few points, it may be
+# off by up to half a point spacing, and in the same direction in many cells if the cell size is a
+# multiple of the spacing.
 FEW_POINTS: Final = 16
-# Slightly outside of a triangle still counts: a centre on an edge belongs to at least one of two.
+# Tolerance outside a triangle, so that a centre on an edge belongs to at least one triangle.
 _ON_EDGE: Final = 1e-9
 
 
 class FewPoints(NamedTuple):
-    """Positions of the points of cells with few of them, all flat over cells.
+    """Positions of points in cells with few points; all arrays flat over cells.
 
     Attributes:
-        n_inside: points in each cell.
-        depths_m: the surface.
-        layer_m: a point farther than this from the surface belongs to another layer.
-        n_summed: uint8, points on the surface in cells with few points.
-        places: (cells, 2) float32, sum of their positions right of and below the centre, in cells.
+        n_inside: number of points in each cell.
+        depths_m: depth of the surface.
+        layer_m: points farther than this from the surface belong to another layer.
+        n_summed: uint8 number of points on the surface, in cells with few points.
+        places: (cells, 2) float32 sums of the positions of these points right of and below the
+            centre, in cells.
     """
 
     n_inside: NDArray[np.uint32]
@@ -50,13 +52,13 @@ def keep_nearest_around(
     owners: int,
     owner: int,
 ) -> None:
-    """Let the point nearest the centre win, of the cell itself or its eight neighbours.
+    """Keep the point nearest to the centre of each cell, from the cell and its eight neighbours.
 
     Args:
         entries: one chunk.
-        offsets: of the whole cloud.
+        offsets: points of the whole cloud.
         wall_from_offset: (3, 4) as in `Target`.
-        winners: (cells,) of `WINNER`, updated; points count in their own cell.
+        winners: (cells,) of `WINNER`, updated; points are counted in their own cells.
         width: columns of the raster.
         owners: number of threads that share the cells, a power of two.
         owner: the thread whose cells to visit.
@@ -93,7 +95,7 @@ def add_moments(
     owners: int,
     owner: int,
 ) -> None:
-    """Count the points of each cell (cells,); sum depths and their squares (cells, 2)."""
+    """Count points per cell (cells,), and sum their depths and squared depths (cells, 2)."""
     for k in range(entries.cells.size):
         cell = entries.cells[k]
         if is_own(cell, owners, owner):
@@ -112,12 +114,12 @@ def sort_into_cells(
     owners: int,
     owner: int,
 ) -> None:
-    """Append each depth to those of its cell.
+    """Append depths to those of their cells.
 
     Args:
         entries: one chunk.
-        first_cell: first of the requested cells; points in others are skipped.
-        cursors: (requested cells,) where the cell's next depth goes; advanced.
+        first_cell: first of the requested cells; points in other cells are skipped.
+        cursors: (requested cells,) index of the next depth of each cell; incremented.
         sorted_m: (points inside,) depths grouped by cell.
         owners: number of threads that share the cells, a power of two.
         owner: the thread whose cells to visit.
@@ -140,17 +142,17 @@ def median_depths(
     first: int,
     end: int,
 ) -> None:
-    """Set the median depth of each cell's best supported layer.
+    """Set the median depth of the layer with the most points in each cell.
 
-    The depths of a cell are split into layers at differences of more than `layer_m`; the layer with
-    the most points is used, among equals the one nearest the viewer. So no depth is between two
-    surfaces, and a stray point does not matter.
+    The depths of a cell are divided into layers at differences of more than `layer_m`. If layers
+    have the same number of points, the one nearest to the viewer is used. Thus no depth is between
+    two surfaces, and stray points have no influence.
 
     Args:
         ends: (cells,) end of each cell's depths in `sorted_m`.
         sorted_m: depths grouped by cell; sorted in place.
         layer_m: depth step that separates two layers.
-        medians_m: (cells,) metres, overwritten; NaN where the cell is void.
+        medians_m: (cells,) metres, overwritten; NaN if the cell is void.
         first: first cell to visit.
         end: the cell after the last one.
     """
@@ -166,7 +168,7 @@ def median_depths(
 
 @compiled
 def _sort(values: NDArray[np.float32]) -> None:
-    """Shell's sort with gaps of one third: numba's own takes seconds to compile."""
+    """Sort by Shell's method with gap ratio 3, because numba's sort takes seconds to compile."""
     gap = 1
     while gap < values.size // 3:
         gap = 3 * gap + 1
@@ -186,7 +188,7 @@ def _layer_median(depths: NDArray[np.float32], layer_m: float) -> float:
     best_size, best_first, first = 1, 0, 0
     for k in range(1, depths.size + 1):
         if k == depths.size or depths[k] - depths[k - 1] > layer_m:
-            # At least as large: depths ascend, the later layer is nearer to the viewer.
+            # `>=`, because depths are ascending and later layers are nearer to the viewer.
             if k - first >= best_size:
                 best_size, best_first = k - first, first
             first = k
@@ -206,13 +208,13 @@ def add_values(  # noqa: PLR0913, PLR0917
     owners: int,
     owner: int,
 ) -> None:
-    """Sum the values of the points on the surface of their cell.
+    """Sum the values of points on the surface of their cells.
 
     Args:
         entries: one chunk.
         values: (points of the cloud, channels); points whose first channel is NaN are ignored.
-        has_value: (points of the cloud,) which points to use, or empty: all.
-        depths_m: (cells,) the surface.
+        has_value: (points of the cloud,) True for points to use; empty to use all.
+        depths_m: (cells,) depth of the surface.
         layer_m: a point farther than this from the surface belongs to another layer.
         sums: (cells, channels + 1); the last channel counts the points.
         owners: number of threads that share the cells, a power of two.
@@ -244,11 +246,11 @@ def add_places(
     owners: int,
     owner: int,
 ) -> None:
-    """Sum the positions of the points on the surface, of cells with few points.
+    """Sum the positions of points on the surface, in cells with few points.
 
     Args:
         entries: one chunk.
-        offsets: of the whole cloud.
+        offsets: points of the whole cloud.
         wall_from_offset: (3, 4) as in `Target`.
         few: added to.
         owners: number of threads that share the cells, a power of two.
@@ -275,9 +277,9 @@ class ScanGrid(NamedTuple):
     """Points of one scan by row and column.
 
     Attributes:
-        points: (rows, cols) int64 index in the cloud, -1 without one.
-        offsets: of the cloud.
-        wall_from_offset: (3, 4) float64; rows give column, row and depth in metres of an offset.
+        points: (rows, cols) int64 index in the cloud, -1 if there is no point.
+        offsets: points of the cloud.
+        wall_from_offset: (3, 4) float64 matrix from offsets to column, row and depth in metres.
     """
 
     points: NDArray[np.int64]
@@ -289,8 +291,8 @@ class Reach(NamedTuple):
     """Limits for neighbours on one surface.
 
     Attributes:
-        step: rows and columns of the scan between them.
-        side_cells: maximum distance on the wall along u and along v.
+        step: number of rows and columns of the scan between them.
+        side_cells: maximum distance on the wall along u and along v, in cells.
         step_m: maximum difference of their depths.
     """
 
@@ -304,9 +306,9 @@ class Sums(NamedTuple):
 
     Attributes:
         n: uint16 number of triangles.
-        depth_m: float32.
-        intensity: float32.
-        rgb: (cells, 3) float32.
+        depth_m: float32 sum of depths.
+        intensity: float32 sum of intensities.
+        rgb: (cells, 3) float32 sums of colours.
     """
 
     n: NDArray[np.uint16]
@@ -324,16 +326,16 @@ def recover_between(
     is_void: NDArray[np.bool_],
     sums: Sums,
 ) -> None:
-    """Add the triangles of neighbours to void cells, interpolated linearly.
+    """Add the linearly interpolated values of triangles of neighbouring points to void cells.
 
-    A square of four neighbours is cut along both of its diagonals, so that both have equal weight.
+    A square of four neighbours is divided along both diagonals, which have equal weight.
 
     Args:
         grid: one scan.
-        intensity: of the cloud, or empty.
-        rgb: of the cloud, or empty.
+        intensity: intensities of the cloud, or empty.
+        rgb: colours of the cloud, or empty.
         reach: limits for neighbours.
-        is_void: (rows, cols) of the wall.
+        is_void: (rows, cols) True for void cells of the wall.
         sums: added to.
     """
     rows, columns = grid.points.shape
@@ -346,7 +348,8 @@ def recover_between(
             if chosen[0] < 0:
                 continue
             _place(grid, chosen[0], corners[0])
-            # The four squares around a point, of each the half with its right angle there.
+            # In each of the four squares around a point, the triangle with its right angle at the
+            # point.
             for quarter in range(4):
                 across = column + (step if quarter % 2 else -step)
                 down = row + (step if quarter // 2 else -step)
@@ -364,7 +367,7 @@ def recover_between(
 
 @compiled
 def _place(grid: ScanGrid, point: int, place: NDArray[np.float64]) -> None:
-    """Return column, row and depth of a point."""
+    """Set `place` to the column, row and depth of a point."""
     offsets = grid.offsets
     x, y, z = offsets.x[point], offsets.y[point], offsets.z[point]
     m = grid.wall_from_offset
@@ -391,7 +394,7 @@ def _fill(
     is_void: NDArray[np.bool_],
     sums: Sums,
 ) -> None:
-    """Add a triangle to the void cells whose centres are in it."""
+    """Add a triangle to the void cells whose centres are inside."""
     ax, ay, bx, by = corners[0, 0], corners[0, 1], corners[1, 0], corners[1, 1]
     cx, cy = corners[2, 0], corners[2, 1]
     area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)

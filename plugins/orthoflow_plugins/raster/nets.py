@@ -1,4 +1,4 @@
-"""The surface `tin`: a triangulation of one point per cell, over the whole wall at once."""
+"""The surface `tin`: a triangulation of one point per cell, for the whole wall."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ _ROWS_AT_ONCE: Final = 256
 _ROUNDING_CELLS: Final = 1e-6
 
 
-# Values at the centres of the cells: depth, intensity and colour (cells, 3) if the cloud has them;
-# NaN and 0 without a triangle.
+# Values at the centres of the cells: depth, and intensity and colour (cells, 3) if the cloud has
+# them; NaN and 0 outside all triangles.
 Net = tuple[NDArray[np.float32], NDArray[np.float32] | None, NDArray[np.uint8] | None]
 
 
@@ -31,13 +31,14 @@ def interpolate_net(
 ) -> Net:
     """Interpolate values at all cell centres linearly in a Delaunay triangulation.
 
-    The triangulation spans gaps, including windows, and makes slopes where depths step. Computed as
-    by scipy's LinearNDInterpolator, which tests all triangles for each position outside of them.
+    The triangulation closes gaps, including windows, and turns steps into slopes. The result is
+    that of scipy's LinearNDInterpolator, which is slow because it tests all triangles for positions
+    outside them.
 
     Args:
         cloud: the points.
-        slab: of the wall.
-        point: (cells,) index in the cloud of the vertex of each cell; `NO_POINT` without one.
+        slab: raster and buffer of the wall.
+        point: (cells,) index in the cloud of the vertex of each cell; `NO_POINT` if there is none.
         depth_m: (cells,) depth of the vertices.
 
     Raises:
@@ -55,7 +56,7 @@ def interpolate_net(
             rgb[~np.asarray(cloud.has_rgb)[taken]] = np.nan
         values.append(rgb)
     table = np.column_stack([np.asarray(part, dtype=np.float64) for part in values])
-    # Columns and rows, cell centres at .5.
+    # Columns and rows; the centres of cells are at .5.
     matrix = wall_from_offset(slab.frame, cloud.origin)
     offsets = np.stack([axis[taken] for axis in (cloud.x, cloud.y, cloud.z)]).astype(np.float64)
     found = np.full((slab.n_cells, table.shape[1]), np.nan, dtype=np.float32)
@@ -64,8 +65,8 @@ def interpolate_net(
         _interpolate(delaunay, table, slab, found)
     if np.isnan(found).all():
         raise MethodError(
-            "surface tin needs points that span triangles about the cells of each wall, and the "
-            f"{len(taken)} cells with points of this one do not: take another surface"
+            "surface tin needs points that span triangles around the cells of each wall, but the "
+            f"{len(taken)} cells with points of this wall do not: use another surface"
         )
     intensity = None if cloud.intensity is None else found[:, 1].copy()
     rgb = None if cloud.rgb is None else np.rint(np.nan_to_num(found[:, -3:])).astype(np.uint8)
@@ -75,7 +76,7 @@ def interpolate_net(
 def _interpolate(
     delaunay: Delaunay, table: NDArray[np.float64], slab: Slab, found: NDArray[np.float32]
 ) -> None:
-    """Set the values (cells, channels) of cells within triangles from those of the vertices."""
+    """Interpolate values (cells, channels) of cells in triangles from those of the vertices."""
     hull = delaunay.points[delaunay.convex_hull]
     for top in range(0, slab.frame.height, _ROWS_AT_ONCE):
         bottom = min(top + _ROWS_AT_ONCE, slab.frame.height)

@@ -14,20 +14,20 @@ Place = tuple[float, float, float]
 
 
 class RasterParams(MethodParams):
-    """Cell size, depth of the surface, choice of planes, and how gaps are closed."""
+    """Cell size, depth of the surface, selection of planes, and closing of gaps."""
 
     gsd_m: float = Field(
-        default=0.005, gt=0, description="Side of a cell; not finer than the point spacing."
+        default=0.005,
+        gt=0,
+        description="Side of a cell; should not be smaller than the point spacing.",
     )
     buffer_m: float | None = Field(
         default=None,
         gt=0,
-        description="Distance from the plane, on both sides, within which points are used; "
-        "by default as far as the relief that is connected to the wall, 0.5 m in front "
-        "and 1 m behind at most, and at "
-        "least three times the tolerance of the planes (markiewicz2015: 3 x 5 cm); 3 m "
-        "in front of an upright wall "
-        "if connected objects hide 3 % of it.",
+        description="Distance from the plane, on both sides, within which points are used; by "
+        "default, the depth of the relief connected to the wall, at most 0.5 m in front (3 m for "
+        "vertical walls if connected objects hide 3 % of them) and 1 m behind, and at least three "
+        "times the tolerance of the planes (markiewicz2015: 3 x 5 cm).",
     )
     buffer_front_m: float | None = Field(
         default=None, ge=0, description="Depth towards the viewer instead of buffer_m."
@@ -37,92 +37,98 @@ class RasterParams(MethodParams):
     )
     rectangle: Literal["points", "room"] = Field(
         default="room",
-        description="room: the wall as far as its surface goes, cornices and pilasters in, up "
-        "to adjoining walls, floor and ceiling, where they run askew to where they come "
-        "nearest; points: the rectangle of its plane's points.",
+        description="room: the whole surface of the wall with cornices and pilasters, up to the "
+        "nearest points of adjoining walls, floor and ceiling; points: the rectangle of the "
+        "points on its plane.",
     )
     surface: Literal["median", "denoised", "nearest", "centre", "topmost", "mean", "tin"] = Field(
         default="median",
-        description="Depth of a cell: median of the layer with most points (layers are more than "
-        "2 cm apart), without outliers; the same denoised, with steps preserved; of the "
-        "nearest point, also of the next cells (markiewicz2015); of its point nearest "
-        "the centre; of the topmost point (skarlatos2012); mean of all; or tin, a triangulation, "
-        "which closes windows (for comparison).",
+        description="Depth of a cell. median: median of the layer with the most points (layers "
+        "are more than 2 cm apart), without outliers; denoised: the same after edge-preserving "
+        "smoothing; nearest: depth of the point nearest to the centre, also from neighbouring "
+        "cells (markiewicz2015); centre: the same, from the cell only; topmost: depth of the "
+        "point nearest to the viewer (skarlatos2012); mean: mean of all points; tin: a "
+        "triangulation, which closes windows (for comparison).",
     )
     percentiles: tuple[Annotated[float, Field(ge=0, le=100)], ...] = Field(
         default=(),
         max_length=9,
-        description=("Percentiles of the depths of a cell's points, written as separate rasters."),
+        description="Percentiles of the depths of the points in a cell, written as separate "
+        "rasters.",
     )
     balance_intensity: bool = Field(
         default=False,
-        description="Correct the intensity for range, incidence "
-        "and scan, estimated where scans overlap.",
+        description="Correct intensities for range, incidence and scan, using overlaps of scans.",
     )
     recover_gap_cells: int = Field(
         default=2,
         ge=0,
         le=50,
-        description="Void cells are recovered where no disc of this radius fits into the gap; "
-        "0 recovers nothing.",
+        description="Void cells are interpolated in gaps that do not contain a disc of this "
+        "radius; 0 disables this.",
     )
     recover_scan_steps: int = Field(
         default=2,
         ge=0,
         le=10,
-        description="Where the scan's rows and columns are known, void cells between points so "
-        "many rows or columns apart are recovered first, linear between them, if the points "
-        "lie on one layer and at most four times recover_gap_cells apart.",
+        description="If the rows and columns of the scan are known, void cells between points "
+        "that are up to this number of rows or columns apart are interpolated linearly first, if "
+        "the points are on one layer and at most four times recover_gap_cells apart.",
     )
     constraint: Constraint = Field(
-        default="any", description="Raster only vertical, only horizontal, or any planes."
+        default="any", description="Orientation of the planes to raster."
     )
     min_area_m2: float = Field(
         default=1.0,
         ge=0,
-        description="Smallest rectangle of a plane; the one with the most support is exempt.",
+        description="Minimum area of a plane's rectangle; the plane with the most points is "
+        "exempt.",
     )
     n_walls_max: int = Field(
-        default=12, ge=1, le=1000, description="Maximum number of planes, by support."
+        default=12,
+        ge=1,
+        le=1000,
+        description="Maximum number of planes; those with the most points are used.",
     )
     ranks: tuple[Annotated[int, Field(ge=0)], ...] = Field(
         default=(),
-        description="Raster exactly these planes, by their place in planes.json, where 0 has "
-        "the most support: other planes where a tolerance, detector or scan finds others (near "
-        "takes the one at a point); empty: as constraint, min_area_m2, n_walls_max and "
-        "skip_covered.",
+        description="Raster exactly these planes, by index in planes.json, where 0 has the most "
+        "points. Indices change with the scan, the detector and its tolerances; near selects "
+        "planes by position. If empty, planes are selected by constraint, min_area_m2, "
+        "n_walls_max and skip_covered.",
     )
     near: tuple[Place, ...] = Field(
         default=(),
-        description="Raster the wall nearest to each of these points and no others, "
-        "[[x, y, z], ...] in world metres, among planes of the right direction (constraint).",
+        description="Raster only the walls nearest to these points, [[x, y, z], ...] in world "
+        "metres, among planes of the required orientation (constraint).",
     )
     crop: Rectangle | Polygon | None = Field(
         default=None,
-        description="Part of the wall to raster, metres to the right and down from the "
-        "top-left corner of its whole raster: a rectangle [left, top, right, bottom], or a "
-        "polygon [[right, down], ...] beyond which cells stay void. Photos are matched to this "
-        "part only: orient them on the whole wall first, and pass on their cameras.",
+        description="Part of the wall to raster, in metres right of and below the top-left corner "
+        "of its whole raster: a rectangle [left, top, right, bottom], or a polygon [[right, "
+        "down], ...] outside which cells are void. Photos are matched only to this part, so "
+        "orient them on the whole wall first and use these cameras.",
     )
     skip_covered: bool = Field(
         default=True,
-        description="Leave out a plane that lies within the buffer of a larger parallel wall, "
-        "which shows it as relief.",
+        description="Omit planes in the buffer of a larger parallel wall, whose raster shows them "
+        "as relief.",
     )
     margin_m: float = Field(
-        default=0.0, ge=0, description="Widens the rectangle of a plane on all sides."
+        default=0.0, ge=0, description="Margin added to the rectangle of a plane on all sides."
     )
     crs: str | None = Field(
         default=None,
         pattern=r"^(EPSG:[0-9]{4,6}|site)$",
-        description="Coordinate system of the cloud, EPSG:nnnn, or site for one without a "
-        "name: rasters of level planes seen from above are maps of it, x east, y north.",
+        description="Coordinate system of the cloud, EPSG:nnnn, or site for an unnamed system: "
+        "rasters of level planes seen from above are maps in it, with x as easting and y as "
+        "northing.",
     )
 
     @model_validator(mode="after")
     def _one_choice_of_walls(self) -> Self:
         if self.ranks and self.near:
-            raise ValueError("walls are chosen by ranks or by near, got both; leave one out")
+            raise ValueError("walls are chosen by ranks or by near, got both; omit one")
         return self
 
     @field_validator("crop")

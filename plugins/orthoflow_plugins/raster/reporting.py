@@ -1,4 +1,4 @@
-"""Metrics of rastered walls, and what limits them."""
+"""Metrics and diagnostics of rastered walls."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from orthoflow.products import PointCloud, SurfaceMask, Wall
 from orthoflow.sdk import DiagnosticSpec, StepContext
 from orthoflow_plugins.raster.emptiness import Emptiness
 
-# Medians of larger walls are estimated from some of their rows.
+# For walls with more cells, medians are estimated from some of the rows.
 _CELLS_ASKED: Final = 1 << 26
 # Maximum spacing of the points of a scan, in cells.
 _STEP_MOST_CELLS: Final = 2.0 / 3.0
-# Share of a wall that is empty or interpolated before a warning, and share of a cause in it.
+# Minimum share of empty or interpolated cells for a warning, and minimum share of a cause.
 _SHARE_WORTH_WORDS: Final = 0.1
 _CAUSE_WORTH_WORDS: Final = 0.01
-# Objects in front of a wall that are left out are reported from a smaller share on.
+# Minimum share for a warning about omitted objects in front of a wall.
 _LEFT_OUT_WORTH_WORDS: Final = 0.05
-# The smallest share that is not printed as 0.0 %.
+# Smallest share that is not printed as 0.0 %.
 _SHARE_LEAST: Final = 0.0005
-# If cells with points have this many, no cell is empty because cells are too small.
+# If cells with points have this mean number of points, cells are not too small.
 _DENSE_POINTS: Final = 4.0
 
 FRONT_LEFT_OUT: Final = DiagnosticSpec(
     code="wall-front-left-out",
     severity="error",
-    text="{subject}: {share:.1%} of it is left out: objects there, up to {before_m} m in "
-    "front of its plane, are not considered part of the wall",
-    remedy="{step}.buffer_front_m={buffer_front_m} shows it",
+    text="{subject}: {share:.1%} of it is missing: objects up to {before_m} m in front of its "
+    "plane are not considered part of the wall",
+    remedy="{step}.buffer_front_m={buffer_front_m} includes them",
     rank_by="share",
 )
 STOOD_ON: Final = DiagnosticSpec(
@@ -52,9 +52,9 @@ STOOD_ON: Final = DiagnosticSpec(
 BEHIND_BUFFER: Final = DiagnosticSpec(
     code="wall-behind-buffer",
     severity="warning",
-    text="{subject}: {share:.1%} of its cells are empty: the points scanned "
-    "there are about {behind_m} m behind its plane",
-    remedy="{step}.buffer_behind_m={buffer_behind_m} shows them, if they are the wall",
+    text="{subject}: {share:.1%} of its cells are empty: the points there are about {behind_m} m "
+    "behind its plane",
+    remedy="{step}.buffer_behind_m={buffer_behind_m} includes them, if they belong to the wall",
     rank_by="share",
 )
 HIDDEN: Final = DiagnosticSpec(
@@ -68,7 +68,7 @@ HIDDEN: Final = DiagnosticSpec(
 SPARSE: Final = DiagnosticSpec(
     code="wall-sparse",
     severity="warning",
-    text="{subject}: {share:.1%} of its cells are empty beside scanned ones: gaps between points, "
+    text="{subject}: {share:.1%} of its cells are empty near scanned ones: gaps between points, "
     "shadows of relief, borders",
     remedy="a larger {step}.gsd_m or {step}.recover_gap_cells closes narrow gaps",
     rank_by="share",
@@ -77,9 +77,8 @@ SPARSE_DENSE: Final = replace(SPARSE, remedy="{step}.recover_gap_cells closes na
 UNSEEN: Final = DiagnosticSpec(
     code="wall-unseen",
     severity="warning",
-    text="{subject}: {share:.1%} of its cells are empty: nothing was scanned there (sky, "
-    "glass, or hidden "
-    "from all stations)",
+    text="{subject}: {share:.1%} of its cells are empty: nothing was scanned there (sky, glass, "
+    "or hidden from all stations)",
     rank_by="share",
 )
 PLAIN: Final = DiagnosticSpec(
@@ -92,13 +91,14 @@ PLAIN: Final = DiagnosticSpec(
 COVERED: Final = DiagnosticSpec(
     code="wall-includes-others",
     severity="warning",
-    text="{subject} shows {included} as its relief, so these have no orthoimages of their own",
-    remedy="{step}.skip_covered=false makes one for each",
+    text="{subject} shows {included} as relief, so these planes have no orthoimages of their own",
+    remedy="{step}.skip_covered=false creates one for each",
 )
 NO_INTENSITY: Final = DiagnosticSpec(
     code="scan-without-intensity",
     severity="warning",
-    text="the cloud has no laser intensity; the grey of its colours (Rec. 601) is used instead",
+    text="the cloud has no laser intensity; the luminance of its colours (Rec. 601) is used "
+    "instead",
 )
 DEPTH_ONLY: Final = DiagnosticSpec(
     code="scan-without-intensity-and-colour",
@@ -108,7 +108,7 @@ DEPTH_ONLY: Final = DiagnosticSpec(
 NO_POINT: Final = DiagnosticSpec(
     code="wall-without-points",
     severity="error",
-    text="{subject}: no point lies within its buffer",
+    text="{subject}: no points are within its buffer",
     remedy="check {step}.buffer_front_m and {step}.buffer_behind_m",
 )
 CLOSE_CELLS: Final = DiagnosticSpec(
@@ -133,7 +133,7 @@ _Number = TypeVar("_Number", np.float32, np.uint32)
 def warn(
     ctx: StepContext, walls: Sequence[Wall], steps_m: Sequence[float], intensity_source: str
 ) -> None:
-    """Report what limits the walls: missing data of the cloud, and cells finer than its points."""
+    """Report limitations of walls: missing data of the cloud, and cells finer than its points."""
     if intensity_source == "luminance":
         ctx.report(NO_INTENSITY)
     if intensity_source == "none":
@@ -166,15 +166,15 @@ def warn(
 
 
 def _least_gsd_m(step_m: float) -> float:
-    """Return the smallest cell size, of two digits, that is not too fine for a point spacing."""
+    """Return the smallest cell size with two digits that is not too fine for a point spacing."""
     least_m = step_m / _STEP_MOST_CELLS
     digit_m = 10.0 ** (math.floor(math.log10(least_m)) - 1)
-    # Rounded up: the nearest number of two digits may be too fine.
+    # Rounded up, because the nearest number with two digits may be too fine.
     return float(f"{math.ceil(least_m / digit_m - 1e-6) * digit_m:.2g}")
 
 
 def report_tones(ctx: StepContext, walls: Sequence[Wall], cloud: PointCloud) -> None:
-    """Report walls whose intensity or colour is nearly all black, white or one value."""
+    """Report walls whose intensity or colour is almost everywhere black, white or one value."""
     scans = cloud.source.get("scans")
     scales: dict[str, None] = {}
     colours: dict[str, None] = {}
@@ -215,12 +215,12 @@ def report_tones(ctx: StepContext, walls: Sequence[Wall], cloud: PointCloud) -> 
 
 
 def warn_of_covered(ctx: StepContext, names: Sequence[str], covered: Mapping[int, int]) -> None:
-    """Report which planes are not rastered although smaller ones are: a larger wall shows them.
+    """Report planes that are not rastered because a larger wall shows them.
 
     Args:
-        ctx: of the step.
-        names: of all planes.
-        covered: place of such a plane -> place of the wall that shows it.
+        ctx: context of the step.
+        names: names of all planes.
+        covered: for the index of each such plane, the index of the wall that shows it.
     """
     for wall in sorted(set(covered.values())):
         left_out = [names[index] for index, shown_by in covered.items() if shown_by == wall]
@@ -231,9 +231,9 @@ def report(ctx: StepContext, walls: Sequence[Wall], step_m: float, up: NDArray[n
     """Report metrics of the walls.
 
     Args:
-        ctx: of the step.
-        walls: at least one.
-        step_m: point spacing on the first.
+        ctx: context of the step.
+        walls: at least one wall.
+        step_m: point spacing on the first wall.
         up: (3,) unit vector.
     """
     frame = walls[0].frame
@@ -262,7 +262,7 @@ def report(ctx: StepContext, walls: Sequence[Wall], step_m: float, up: NDArray[n
 
 
 def report_empty(ctx: StepContext, walls: Sequence[Wall], empty: Sequence[Emptiness]) -> None:
-    """Report why cells are empty: as metrics, and by cause if it affects much of a wall."""
+    """Report the causes of empty cells as metrics, and as diagnostics if they affect much."""
     sizes = np.array([wall.mask.size for wall in walls], dtype=np.float64)
     for cause in _CAUSES:
         shares = [getattr(of_wall, f"{cause}_share") for of_wall in empty]
@@ -275,8 +275,7 @@ def report_empty(ctx: StepContext, walls: Sequence[Wall], empty: Sequence[Emptin
             f"{wall.name}: {of_wall.share:.1%} of its cells are empty: "
             + ", ".join(f"{share:.1%} {cause}" for cause, share in shares_of.items())
         )
-        # Tiles at the border of a hole belong to it and to its surroundings: no warning for those
-        # few.
+        # No warning for the few tiles at the border of a hole, which also contain its surroundings.
         least = max(_CAUSE_WORTH_WORDS, 0.1 * of_wall.share)
         is_dense = float(wall.count[wall.count > 0].mean()) >= _DENSE_POINTS
         if shares_of["before"] < _LEFT_OUT_WORTH_WORDS and of_wall.share < _SHARE_WORTH_WORDS:
@@ -302,10 +301,10 @@ def _digits(depth_m: float) -> float | None:
 
 
 def _rounded_up(depth_m: float) -> float | None:
-    """Return a buffer that includes a depth, in whole decimetres."""
+    """Return a buffer in whole decimetres that includes a depth."""
     return math.ceil(10.0 * depth_m) / 10.0 if math.isfinite(depth_m) else None
 
 
 def _sampled(values: NDArray[_Number]) -> NDArray[_Number]:
-    """Return rows of a raster, all of them unless it is large."""
+    """Return all rows of a raster, or some if it is large."""
     return values[:: max(1, values.size // _CELLS_ASKED)]

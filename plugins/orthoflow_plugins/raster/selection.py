@@ -1,4 +1,4 @@
-"""Which planes become walls, and the raster over each."""
+"""Selection of the planes that become walls, and their rasters."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from orthoflow_plugins.raster.parameters import Constraint, RasterParams
 
 # Maximum tilt of a plane that counts as vertical or horizontal.
 _LEAN_DEG: Final = 10.0
-# A plane belongs to a larger wall's relief below this angle and above this overlap.
+# A plane belongs to the relief of a larger wall if the angle is smaller and the overlap is larger.
 _PARALLEL_DEG: Final = 5.0
 _COVERED_SHARE: Final = 0.8
 
 
-# Returns the depths of a plane's wall in front of and behind it.
+# Returns the buffers in front of and behind the plane of a wall.
 BufferOf = Callable[[int], tuple[float, float]]
 
 
 def chosen_planes(planes: Planes, params: RasterParams, buffer_m: BufferOf) -> list[int]:
-    """Return indices of the planes to raster, by support, largest first.
+    """Return the indices of the planes to raster, those with the most points first.
 
     Raises:
-        MethodError: no plane has the requested direction or rank, or there is none at all.
+        MethodError: there are no planes, or none has the requested orientation or rank.
     """
     if len(planes) == 0:
-        raise MethodError("no plane was found in the cloud, at least one is needed for a wall")
+        raise MethodError("no plane was found in the cloud, but at least one is needed for a wall")
     if params.ranks:
         missing = sorted(rank for rank in params.ranks if rank >= len(planes))
         if missing:
             raise MethodError(
                 f"ranks names plane {missing[0]}, but {len(planes)} planes were found, 0 to "
-                f"{len(planes) - 1}: look at planes.json"
+                f"{len(planes) - 1}: see planes.json"
             )
         return sorted(set(params.ranks))
     fitting = [k for k in range(len(planes)) if _fits(planes, k, params.constraint)]
@@ -51,8 +51,8 @@ def chosen_planes(planes: Planes, params: RasterParams, buffer_m: BufferOf) -> l
     if params.near:
         return sorted({nearest_plane(planes, fitting, np.array(place)) for place in params.near})
     large = [k for k in fitting if area_m2(planes.corners[k]) >= params.min_area_m2]
-    # The plane with the most support is exempt from the size: a scan of one small object has a wall
-    # too.
+    # The plane with the most points is exempt from the minimum area, so that a scan of one small
+    # object has a wall.
     chosen: list[int] = []
     for index in sorted({fitting[0], *large}):
         if len(chosen) == params.n_walls_max:
@@ -62,7 +62,7 @@ def chosen_planes(planes: Planes, params: RasterParams, buffer_m: BufferOf) -> l
         chosen.append(index)
     if not params.skip_covered:
         return chosen
-    # A larger wall of less support may show one that was chosen before it, too.
+    # A larger wall with fewer points may also cover one that was selected before.
     return [
         index
         for index in chosen
@@ -77,13 +77,13 @@ def chosen_planes(planes: Planes, params: RasterParams, buffer_m: BufferOf) -> l
 def covered_planes(
     planes: Planes, params: RasterParams, buffer_m: BufferOf, chosen: Sequence[int]
 ) -> dict[int, int]:
-    """Return planes left out, up to the last that was examined -> the wall that shows them.
+    """Return the wall that shows each omitted plane, by index of the plane.
 
     Args:
-        planes: by support.
+        planes: all planes, those with the most points first.
         params: the criteria.
-        buffer_m: depths of walls.
-        chosen: result of `chosen_planes` for them.
+        buffer_m: returns the buffers of walls.
+        chosen: result of `chosen_planes`.
     """
     if not params.skip_covered or params.ranks or params.near:
         return {}
@@ -106,13 +106,13 @@ def covered_planes(
 def chosen_relief(
     planes: Planes, params: RasterParams, buffer_m: BufferOf, chosen: Sequence[int]
 ) -> dict[int, int]:
-    """Return planes chosen by a nearby point that lie on a better supported wall -> that wall.
+    """Return the wall with more points that shows each plane selected by `near`, by plane index.
 
     Args:
-        planes: by support.
-        params: the criteria; empty without `near`, and if relief is not left out anyway.
-        buffer_m: depths of walls.
-        chosen: result of `chosen_planes` for them.
+        planes: all planes, those with the most points first.
+        params: the criteria; the result is empty if `near` is empty or relief is not omitted.
+        buffer_m: returns the buffers of walls.
+        chosen: result of `chosen_planes`.
     """
     if not params.skip_covered or not params.near:
         return {}
@@ -126,14 +126,14 @@ def chosen_relief(
 
 
 def nearest_plane(planes: Planes, among: Sequence[int], place: NDArray[np.float64]) -> int:
-    """Return the plane nearest to a point (3,), of equally near ones the better supported."""
+    """Return the plane nearest to a point (3,); if several are, the one with the most points."""
     return min(among, key=lambda index: (round(distance_m(planes, index, place), 6), index))
 
 
 def distance_m(planes: Planes, index: int, place: NDArray[np.float64]) -> float:
     """Return the distance of a point (3,) from the measured surface of a plane.
 
-    That is the nearest of its connected parts, or its rectangle without parts.
+    This is the nearest of its connected parts, or its rectangle if there are no parts.
     """
     rectangles = planes.corners[index][None]
     if planes.part_corners is not None and planes.part_plane is not None:
@@ -149,7 +149,7 @@ def area_m2(corners: NDArray[np.float64]) -> float:
 
 
 def frame_of(planes: Planes, index: int, *, gsd_m: float, margin_m: float) -> WallFrame:
-    """Place the raster over a plane's rectangle, widened on all sides."""
+    """Return the raster over the rectangle of a plane, widened on all sides."""
     corners = planes.corners[index]
     right = _unit(corners[3] - corners[0])
     down = _unit(corners[1] - corners[0])
@@ -169,7 +169,7 @@ def _distance_m(corners: NDArray[np.float64], place: NDArray[np.float64]) -> flo
 
 
 def _covers(planes: Planes, wall: int, index: int, buffer_m: BufferOf) -> bool:
-    """Whether a plane is within a wall's buffer, parallel to it and mostly inside its frame."""
+    """Return whether a plane is in a wall's buffer, parallel to it and mostly inside its frame."""
     normal = planes.normal[wall]
     if float(normal @ planes.normal[index]) < math.cos(math.radians(_PARALLEL_DEG)):
         return False

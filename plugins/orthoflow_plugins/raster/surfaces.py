@@ -1,4 +1,4 @@
-"""The surface of a wall: one depth per cell, and the measurements of its points."""
+"""The surface of a wall: one depth per cell, and values of its points."""
 
 from __future__ import annotations
 
@@ -33,43 +33,43 @@ from orthoflow_plugins.raster import kernels
 from orthoflow_plugins.raster.nets import NO_POINT, interpolate_net
 from orthoflow_plugins.raster.parameters import RasterParams
 
-# A cell takes the values of one of its points, not the mean of several.
+# Rules for which a cell has the values of a single point, not the mean of several.
 ONE_POINT: Final = frozenset({"nearest", "centre", "topmost", "tin"})
-# Layers within a cell are more than this apart.
+# Minimum difference of depth between layers in a cell.
 LAYER_M: Final = 0.02
-# Radius of the filter of the surface denoised; half of it is the sigma of the Gaussian weight.
+# Radius of the filter of the surface `denoised`; the sigma of its Gaussian weight is half of it.
 DENOISE_CELLS: Final = 4
-# Temporary arrays are limited to this many cells.
+# Maximum number of cells of temporary arrays.
 CELLS_AT_ONCE: Final = 1 << 20
 # Maximum distance of neighbours in the scan, in radii of a narrow gap.
 SPAN_GAPS: Final = 4
-# In a scan with more rows times columns than this the numbers are not a grid (2 GB of indices).
+# In a scan with more rows times columns, these numbers are not a grid (2 GB of indices).
 _GRID_CELLS_MOST: Final = 1 << 28
-# Number of depths sorted at once: 256 MB.
+# Number of depths sorted at once (256 MB).
 _POINTS_AT_ONCE: Final = 1 << 26
 
-# Neighbours are within this many rows and columns.
+# Maximum distance of neighbours in rows and columns.
 _NEAR_CELLS: Final = 2
-# With fewer known neighbours nothing is decided; with fewer that agree a cell is a speck.
+# Minimum number of known neighbours for a decision; a cell with fewer agreeing ones is a speck.
 _KNOWN_LEAST: Final = 6
 _AGREEING_LEAST: Final = 2
-# Where cells are sparse more neighbours are used, and more must agree: at least half of the known.
+# For sparse cells, more neighbours are used, and more must agree: at least half of the known ones.
 _SPARSE_CELLS: Final = 4
 _SPARSE_LEAST: Final = 3
-# Steepest surface whose sparse cells agree: 27 degrees.
+# Maximum slope of a surface whose sparse cells agree (27 degrees).
 _SLOPE: Final = 0.5
-# A cell is sparse if the share of known cells is below this fraction of the maximum nearby.
+# A cell is sparse if the number of known neighbours is below this fraction of the maximum nearby.
 _SPARSE_SHARE: Final = 0.35
 # The shadow of an edge is narrower than twice this reach, in cells.
 _AROUND_CELLS: Final = 16
-# Cells on one surface differ by noise, in standard deviations, and by its slope.
+# Maximum difference of cells on one surface due to noise, in standard deviations.
 _CLOSE_SIGMAS: Final = 4.0
-# The first pass removes most of the noise; the second, on what remains, can be stricter at steps.
-# In standard deviations of the noise of a cell.
+# Maximum differences in the two passes, in standard deviations of the noise of a cell. The first
+# pass removes most of the noise, so the second one can be stricter at steps.
 _REACHES: Final = (3.0, 1.5)
-# Void cells have no weight: they are this many reaches below everything.
+# Void cells are set this many maximum differences below all others, so that they have no weight.
 _VOID_REACHES: Final = 8.0
-# Smaller differences of depth need no filter: a tenth of a cell at 1 mm.
+# Lower noise needs no filter.
 _NOISE_LEAST_M: Final = 2.0e-5
 
 _Number = TypeVar("_Number", np.float32, np.uint8)
@@ -77,18 +77,18 @@ _Number = TypeVar("_Number", np.float32, np.uint8)
 
 @dataclass(frozen=True, kw_only=True)
 class CellSurface:
-    """The surface over one wall, all arrays flat over its cells.
+    """The surface of one wall; all arrays are flat over its cells.
 
     Attributes:
-        depth_m: float32, NaN where void.
-        sigma_m: float32, NaN with fewer than two points.
-        count: uint32.
-        intensity: float32, NaN where void, or None.
-        rgb: (cells, 3) uint8, 0 where void, or None.
-        has_rgb: (cells,) which have a colour; None if all with points have.
+        depth_m: float32 depths, NaN for void cells.
+        sigma_m: float32 standard deviations, NaN for fewer than two points.
+        count: uint32 numbers of points.
+        intensity: float32, NaN for void cells, or None.
+        rgb: (cells, 3) uint8, 0 for void cells, or None.
+        has_rgb: (cells,) True for cells with a colour; None if all cells with points have one.
         percentiles_m: (cells, k) float32, NaN in cells without points, or None.
-        places: (cells, 2) float32, position of the points of a cell right of and below its centre,
-            in cells; (0, 0) for many points, NaN for none.
+        places: (cells, 2) float32 mean position of the points of a cell right of and below its
+            centre, in cells; (0, 0) for many points, NaN for none.
     """
 
     depth_m: NDArray[np.float32]
@@ -102,12 +102,12 @@ class CellSurface:
 
 
 def surface_of(cloud: PointCloud, slab: Slab, params: RasterParams, *, threads: int) -> CellSurface:
-    """Bin a cloud into the raster of a wall.
+    """Compute the surface of a wall from a cloud.
 
     Args:
         cloud: the points.
-        slab: of the wall, or of a part of it.
-        params: how depths follow from points.
+        slab: raster and buffer of the wall or of a part of it.
+        params: parameters, with the rule for depths.
         threads: number of threads.
     """
     if params.surface in ONE_POINT:
@@ -123,9 +123,9 @@ def surface_of(cloud: PointCloud, slab: Slab, params: RasterParams, *, threads: 
 def carried_to_centres(
     surface: CellSurface, slab: Slab, params: RasterParams, *, threads: int
 ) -> CellSurface:
-    """Extrapolate intensity and colour of cells with few points from these to the cell's centre.
+    """Extrapolate intensity and colour of cells with few points to the centres of the cells.
 
-    Rules that use a single point take its values unchanged.
+    Rules that use a single point keep its values unchanged.
     """
     if params.surface in ONE_POINT or (surface.intensity is None and surface.rgb is None):
         return surface
@@ -143,7 +143,7 @@ def carried_to_centres(
         threads=threads,
     )
     if intensity is not None and surface.intensity is not None:
-        # Next to cells without intensity a cell keeps its own.
+        # Cells next to cells without intensity keep their value.
         is_lost = few[~np.isfinite(intensity[few])]
         intensity[is_lost] = surface.intensity[is_lost]
     if surface.has_rgb is not None:
@@ -154,7 +154,7 @@ def carried_to_centres(
 def _surface_of_winners(
     cloud: PointCloud, slab: Slab, params: RasterParams, *, threads: int
 ) -> CellSurface:
-    """One pass: the winning point gives depth, intensity and colour."""
+    """Return the surface with the depth, intensity and colour of one point per cell; one pass."""
     winners = empty_winners(slab.n_cells)
     count, moments = np.zeros(slab.n_cells, dtype=np.uint32), np.zeros((slab.n_cells, 2))
     for entries in entries_inside(cloud, slab, threads=threads):
@@ -169,7 +169,8 @@ def _surface_of_winners(
     if has_rgb is not None:
         has_rgb = values_of_winners(winners, has_rgb[:, np.newaxis], 0)[:, 0]
     surface = CellSurface(
-        # A nearest neighbour may be in the next cell; a cell without its own point stays void.
+        # The nearest point may be in a neighbouring cell; cells without points of their own remain
+        # void.
         depth_m=np.where(count > 0, winners["depth_m"], np.float32(np.nan)),
         sigma_m=_spread_m(count, moments),
         count=count,
@@ -181,7 +182,7 @@ def _surface_of_winners(
     if params.surface != "tin":
         return surface
     vertices = np.where(winners["n_points"] > 0, winners["point"], NO_POINT)
-    # The values of the triangulation at the centres replace those of points in cells.
+    # The values of the triangulation at cell centres replace those of points.
     depth_m, intensity, rgb = interpolate_net(cloud, slab, vertices, winners["depth_m"])
     is_known = np.isfinite(depth_m)[:, np.newaxis]
     places = np.where(is_known, np.float32(0.0), np.float32(np.nan)).repeat(2, 1)
@@ -211,14 +212,14 @@ def _contest(
 def _surface_of_all(
     cloud: PointCloud, slab: Slab, params: RasterParams, *, threads: int
 ) -> CellSurface:
-    """Two or three passes: count, sort for a median, average the points on the surface."""
+    """Compute a surface in two or three passes: count, sort for medians, average points on it."""
     count, moments = np.zeros(slab.n_cells, dtype=np.uint32), np.zeros((slab.n_cells, 2))
     for entries in entries_inside(cloud, slab, threads=threads):
         share_cells(threads, partial(kernels.add_moments, entries, count, moments))
     with np.errstate(invalid="ignore"):
         depth_m, layer_m = (moments[:, 0] / count).astype(np.float32), np.inf
     sigma_m = _spread_m(count, moments)
-    del moments  # A third of what is held here, and what follows takes more.
+    del moments  # A third of the memory used so far; the next passes need more.
     if params.surface != "mean":
         layer_m, gsd_m = LAYER_M, slab.frame.gsd_m
         depth_m = np.empty(count.size, dtype=np.float32)
@@ -237,7 +238,7 @@ def _surface_of_all(
         places=np.zeros((slab.n_cells, 2), dtype=np.float32),
     )
     intensity, rgb, has_rgb = _averaged_values(cloud, slab, few, threads=threads)
-    # Means of positions: NaN without a point, 0 in cells with many.
+    # Means of positions: NaN if there is no point, 0 in cells with many points.
     n_summed = np.where(count <= kernels.FEW_POINTS, few.n_summed, np.uint8(1))[:, np.newaxis]
     with np.errstate(invalid="ignore"):
         np.divide(few.places, n_summed, out=few.places)
@@ -253,21 +254,21 @@ def _surface_of_all(
 
 
 def _spread_m(n_points: NDArray[np.uint32], moments: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Sample standard deviation of the depths in each cell.
+    """Return the sample standard deviation of the depths in each cell.
 
     Args:
-        n_points: (cells,).
+        n_points: (cells,) numbers of points.
         moments: (cells, 2) sums of depths and squared depths; overwritten.
 
     Returns:
-        (cells,) metres, NaN with fewer than two points.
+        (cells,) metres, NaN for fewer than two points.
     """
     mean, squares = moments.T
     with np.errstate(divide="ignore", invalid="ignore"):
         np.divide(mean, n_points, out=mean)
         squares -= mean * mean * n_points
         np.maximum(squares, 0.0, out=squares)
-        # 1.0, not 1: unsigned, 0 - 1 would be four thousand million points.
+        # 1.0 instead of 1, because 0 - 1 overflows in unsigned integers.
         np.divide(squares, n_points - 1.0, out=squares)
         np.sqrt(squares, out=squares)
     squares[n_points < 2] = np.nan
@@ -278,12 +279,12 @@ def _spread_m(n_points: NDArray[np.uint32], moments: NDArray[np.float64]) -> NDA
 def _grouped(
     cloud: PointCloud, slab: Slab, count: NDArray[np.uint32], *, threads: int
 ) -> Iterator[tuple[slice, NDArray[np.float32], NDArray[np.int64]]]:
-    """Yield a range of cells, the depths of all points inside them, and where each cell's end."""
+    """Yield ranges of cells, the depths of all points in them, and the end index of each cell."""
     width = slab.frame.width
     totals = np.cumsum(count, dtype=np.int64)
     first = n_before = 0
     while first < count.size:
-        # At least one cell, however many points it has.
+        # At least one cell, even if it has more points.
         end = int(np.searchsorted(totals, n_before + _POINTS_AT_ONCE, side="right"))
         end = max(first + 1, end)
         ends = totals[first:end] - n_before
@@ -318,7 +319,7 @@ def _percentiles_m(
     *,
     threads: int,
 ) -> NDArray[np.float32]:
-    """Return percentiles (cells, k) of all points of a cell, interpolated as by numpy."""
+    """Return percentiles (cells, k) of the depths of all points, interpolated as in numpy."""
     percentiles_m = np.full((count.size, len(percentiles)), np.nan, dtype=np.float32)
     for cells, depths_m, ends in _grouped(cloud, slab, count, threads=threads):
         _sort_depths(depths_m, ends, np.empty(len(ends), np.float32), math.inf, threads=threads)
@@ -340,8 +341,9 @@ def _percentiles_m(
 def _averaged_values(
     cloud: PointCloud, slab: Slab, few: kernels.FewPoints, *, threads: int
 ) -> tuple[NDArray[np.float32] | None, NDArray[np.uint8] | None, NDArray[np.bool_] | None]:
-    """Return means of intensity (cells,) and colour (cells, 3), and which cells have a colour."""
-    # Values of the points, which have one (empty if all have, or if NaN marks them), and sums.
+    """Return means of intensity (cells,) and colour (cells, 3), and a mask (cells,) of colours."""
+    # Values of points, a mask of points that have one (empty if all have, or if NaN marks the
+    # others), and sums.
     of_all = np.empty(0, dtype=np.bool_)
     of_intensity, of_colour = np.empty((0, 2)), np.empty((0, 4), dtype=np.uint32)
     channels: list[tuple[NDArray[np.generic], NDArray[np.bool_], NDArray[np.generic]]] = []
@@ -349,7 +351,7 @@ def _averaged_values(
         of_intensity = np.zeros((slab.n_cells, 2))
         channels.append((np.asarray(cloud.intensity)[:, np.newaxis], of_all, of_intensity))
     if cloud.rgb is not None:
-        # Integers: half the memory, and exact.
+        # Integers need half the memory and are exact.
         of_colour = np.zeros((slab.n_cells, 4), dtype=np.uint32)
         has_rgb = of_all if cloud.has_rgb is None else np.asarray(cloud.has_rgb)
         channels.append((np.asarray(cloud.rgb), has_rgb, of_colour))
@@ -365,7 +367,7 @@ def _averaged_values(
         share_cells(threads, *passes)
     intensity = None if cloud.intensity is None else np.empty(slab.n_cells, dtype=np.float32)
     rgb = None if cloud.rgb is None else np.empty((slab.n_cells, 3), dtype=np.uint8)
-    # Means take several times the memory of the result.
+    # In parts, because the computation needs several times the memory of the result.
     for first in range(0, slab.n_cells, CELLS_AT_ONCE):
         part = slice(first, first + CELLS_AT_ONCE)
         with np.errstate(invalid="ignore"):
@@ -380,16 +382,16 @@ def _averaged_values(
 def without_specks(
     depth_m: NDArray[np.float32], *, gsd_m: float, layer_m: float, threads: int
 ) -> NDArray[np.float32]:
-    """Make void what only an outlier measured: cells with which hardly any neighbour agrees.
+    """Set cells to void that only an outlier measured, with which hardly any neighbour agrees.
 
-    A photo would paint such a cell with a distant place. In the shadow of an edge in the scan,
-    where cells are sparse that are dense beside it, there are outliers and mixed distances of both
-    sides of the edge: there most of the few neighbours must agree, allowing for a slope.
+    Otherwise such a cell would show a distant part of a photo. In the scan shadow of an edge, cells
+    are sparser than around it, and there are outliers and mixed pixels of both sides of the edge.
+    In such regions most of the few neighbours must agree, allowing for a slope.
 
     Args:
         depth_m: (rows, cols) metres, NaN where void.
         gsd_m: side of a cell.
-        layer_m: depths that differ by more are of different layers.
+        layer_m: depths that differ by more belong to different layers.
         threads: number of threads.
     """
     noise_m = min(layer_m, _CLOSE_SIGMAS * depth_noise_m(depth_m))
@@ -401,7 +403,7 @@ def without_specks(
 
 
 def _sparse(is_known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Report known cells with far fewer known neighbours than there are nearby."""
+    """Return the mask of known cells with far fewer known neighbours than cells nearby."""
     import cv2
 
     near = 2 * _NEAR_CELLS + 1
@@ -421,14 +423,14 @@ def _sparse(is_known: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def denoised(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
     """Average depths over neighbours on the same surface (bilateral filter, Tomasi 1998).
 
-    The permitted difference of depth follows from the noise of the raster, so that steps of more
-    than about six standard deviations are preserved, to the cell.
+    The maximum difference of depth depends on the noise of the raster, so that steps of more than
+    about six standard deviations are preserved exactly.
 
     Args:
         depth_m: (rows, cols) metres, NaN where void.
 
     Returns:
-        (rows, cols) metres, NaN where it was.
+        (rows, cols) metres, NaN for void cells.
     """
     import cv2
 
@@ -463,16 +465,16 @@ def _find_specks(
     first_row: int,
     end_row: int,
 ) -> None:
-    """Report the specks among the cells of some rows.
+    """Find the specks in some rows.
 
     Args:
         depth_m: (rows, cols) metres, NaN where void.
-        is_sparse: (rows, cols) cells in gaps of an otherwise well known surface.
-        agree_m: maximum difference of depths that agree; that of sparse cells; and what the slope
-            of a surface adds to the latter for each row or column between.
-        is_speck: (rows, cols), set for known cells with which fewer than two of at least six known
-            ones in the 5 x 5 neighbourhood agree, and for sparse ones with which fewer than three,
-            or fewer than half of the known ones, in the 9 x 9 neighbourhood agree.
+        is_sparse: (rows, cols) True for sparse cells of an otherwise dense surface.
+        agree_m: maximum difference of depths that agree; the same for sparse cells; and the
+            increase of the latter per row or column of distance, due to a slope.
+        is_speck: (rows, cols) set for known cells if fewer than two of at least six known cells in
+            the 5 x 5 neighbourhood agree, and for sparse cells if fewer than three, or fewer than
+            half of the known ones, in the 9 x 9 neighbourhood agree.
         first_row: first row to visit.
         end_row: the row after the last one.
     """
@@ -503,7 +505,7 @@ def _count_around(
 ) -> tuple[int, int]:
     """Count the known cells around a cell, and those that agree with it.
 
-    Depths agree that differ by at most `agree_m`, plus `slope_m` for each row or column between.
+    Depths agree if they differ by at most `agree_m` plus `slope_m` per row or column of distance.
     """
     rows, columns = depth_m.shape
     here = depth_m[row, column]
@@ -527,10 +529,10 @@ def close_gaps(
     *,
     threads: int,
 ) -> NDArray[np.uint8]:
-    """Fill the narrow gaps of a surface in place; their spread stays unknown, their count 0.
+    """Interpolate the narrow gaps of a surface in place; their spread is NaN and their count 0.
 
-    A gap is recovered between points that are neighbours in a scan if its rows and columns are
-    known; otherwise between the measured cells around it.
+    Gaps are interpolated between neighbouring points of a scan if its rows and columns are known,
+    otherwise between the measured cells around them.
 
     Returns:
         (cells,) `SurfaceMask`.
@@ -565,15 +567,15 @@ def _recover_between_neighbours(
     *,
     threads: int,
 ) -> NDArray[np.bool_]:
-    """Fill void cells of a surface between neighbours in the scans' grids by linear interpolation.
+    """Fill void cells of a surface by linear interpolation between neighbours in the scan grids.
 
-    A point that the scanner missed lies between its neighbours in the scan, whatever their distance
-    on the raster. So a gap between points that are neighbours, or nearly, and on one surface is
-    recovered between them; one through which the scanner looked is not, since no neighbours span
-    it. A cloud without rows and columns has no neighbours.
+    A point that the scanner missed is between its neighbours in the scan, at any distance on the
+    raster. A gap between points that are close neighbours on one surface is therefore interpolated.
+    A gap through which the scanner looked is not, because there are no neighbours on both sides.
+    Clouds without rows and columns have no neighbours.
 
     Returns:
-        (cells,) which were filled; their spreads stay unknown and their counts 0.
+        (cells,) True for filled cells; their spread is NaN and their count 0.
     """
     import cv2
 
@@ -603,7 +605,7 @@ def _recover_between_neighbours(
             grid = kernels.ScanGrid(points, offsets, matrix)
             voids = is_void.reshape(slab.frame.shape)
             kernels.recover_between(grid, intensity, rgb, reach, voids, sums)
-        # A cell takes the mean of the triangles that cover it.
+        # The value of a cell is the mean of the triangles that cover it.
         filled = np.flatnonzero(is_void & (sums.n > 0))
         n = sums.n[filled].astype(np.float32)
         is_void[filled] = False
@@ -617,14 +619,14 @@ def _recover_between_neighbours(
 
 
 def _unchanged(values: NDArray[_Number]) -> NDArray[_Number]:
-    """Return an array in the form for which kernels are compiled."""
+    """Return a read-only array of the type for which kernels are compiled."""
     view = np.asarray(values).view(np.ndarray)
     view.flags.writeable = False
     return view
 
 
 def _grids(cloud: PointCloud, chosen: NDArray[np.uint32]) -> Iterator[NDArray[np.int64]]:
-    """Return for each scan the indices of its chosen points by row and column."""
+    """Yield the indices of the chosen points of each scan by row and column."""
     if cloud.row is None or cloud.column is None:
         raise AssertionError("a grid was asked of a cloud without rows and columns")
     scans = np.zeros(len(chosen), dtype=np.uint16) if cloud.scan is None else cloud.scan[chosen]
@@ -648,7 +650,7 @@ def _points_on(
     *,
     threads: int,
 ) -> NDArray[np.uint32]:
-    """Return indices of the points on the surface of some cells (cells,)."""
+    """Return the indices of points on the surface of the cells in a mask (cells,)."""
     found = [np.empty(0, dtype=np.uint32)]
     for entries in entries_inside(cloud, slab, threads=threads):
         beside = is_near[entries.cells]

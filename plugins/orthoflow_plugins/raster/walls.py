@@ -1,4 +1,4 @@
-"""Walls rastered one by one: surface and narrow gaps, a large wall in bands of rows."""
+"""Rasters of single walls: surface and narrow gaps; large walls are processed in bands of rows."""
 
 from __future__ import annotations
 
@@ -17,26 +17,27 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Planes, PointCloud, SurfaceMask, Wall
 from orthoflow_plugins.raster.parameters import RasterParams
 
-# Bytes per cell: of a finished wall, and additionally during the passes over one wall.
+# Bytes per cell of a finished wall, and additional bytes per cell while a wall is processed.
 _BYTES_KEPT: Final = 25
 _BYTES_WORKING: Final = 90
-# Per vertex of a triangulation, which has no bands.
+# Bytes per vertex of a triangulation, which is not processed in bands.
 _BYTES_VERTEX: Final = 700
 _MEMORY_SHARE: Final = 0.75
-# Larger walls are rastered in bands of this many cells: 1.5 GB of memory.
+# Larger walls are processed in bands of this number of cells, which need 1.5 GB of memory.
 _BAND_CELLS: Final = 1 << 24
-# Outliers are detected within 20 cells.
+# Margin in rows; outliers are detected within 20 cells.
 _REACH_OF_OUTLIERS: Final = 32
 
 
 def require_memory(frames: Sequence[WallFrame], *, is_tin: bool = False) -> None:
-    """Refuse cells that are too fine for the machine.
+    """Raise an error if cells are too fine for the memory of the machine.
 
     Raises:
         MethodError: the rasters would not fit into memory.
     """
     sizes = [frame.width * frame.height for frame in frames]
-    # A large wall is kept in files when finished; processed in bands it takes the memory of a band.
+    # Finished large walls are kept in files, and need the memory of one band while they are
+    # processed.
     kept = sum(size for size in sizes if size <= IN_MEMORY_CELLS)
     needed = _BYTES_KEPT * kept + _BYTES_WORKING * min(max(sizes), _BAND_CELLS)
     if is_tin:
@@ -62,23 +63,23 @@ def rastered_wall(
     allocate: Allocate,
     threads: int,
 ) -> Wall:
-    """Raster the wall of a plane, a large one in bands of rows.
+    """Raster the wall of a plane; large walls are processed in bands of rows.
 
     Args:
         cloud: the points.
-        slab: of the wall.
-        params: how.
-        planes: all planes, of which the wall is one.
-        index: of the wall's plane.
-        allocate: returns the arrays of a large wall, by name.
+        slab: raster and buffer of the wall.
+        params: parameters.
+        planes: all planes.
+        index: index of the wall's plane.
+        allocate: creates the arrays of a large wall.
         threads: number of threads.
     """
     from orthoflow_plugins.raster.surfaces import DENOISE_CELLS, SPAN_GAPS
 
     frame, width = slab.frame, slab.frame.width
     cells_most = _BAND_CELLS + (slab.n_cells if params.surface == "tin" else 0)
-    # Noise is filtered twice, and a gap is as wide as what spans it plus a disc on either side and
-    # a margin, between which it is interpolated.
+    # The filter for noise is applied twice. The interpolation of gaps needs the distance of
+    # neighbours across a gap, a disc on each side, and a margin.
     reach_rows = _REACH_OF_OUTLIERS + 2 * DENOISE_CELLS
     reach_rows += (SPAN_GAPS + 2) * params.recover_gap_cells + 2
     whole: dict[str, NDArray[np.generic]] = {}
@@ -93,7 +94,7 @@ def rastered_wall(
                 whole[name] = allocate(name, shape, values.dtype)
             of_band = values.reshape(-1, width, *values.shape[1:])
             whole[name][band.rows] = of_band[band.inner]
-    # The arrays have the types of the bands' own.
+    # The arrays have the types of those of the bands.
     arrays = cast("dict[str, Any]", whole)
     return Wall(frame=frame, plane_index=index, name=planes.names[index], **arrays)
 
@@ -105,7 +106,7 @@ def _rastered(
     *,
     threads: int,
 ) -> dict[str, NDArray[np.generic]]:
-    """Return the arrays of a `Wall` over a slab, flat over the cells."""
+    """Return the arrays of a `Wall` for a slab, flat over cells."""
     from orthoflow_plugins.raster.surfaces import carried_to_centres, close_gaps, surface_of
 
     surface = surface_of(cloud, slab, params, threads=threads)

@@ -87,7 +87,7 @@ def test_without_scans_that_are_known_nothing_changes_and_that_is_said(
     plain = replace(known, **missing)
     ctx = scenes.context(tmp_path)
     assert balanced(plain, [slab()], ctx) is plain
-    assert any("balancing takes scans with known stations" in text for text in ctx.warnings)
+    assert any("balancing needs scans with known stations" in text for text in ctx.warnings)
     assert not ctx.metrics
 
 

@@ -148,7 +148,7 @@ def test_a_floor_that_slopes_ends_the_wall_at_its_highest_place_and_this_is_said
     chosen = RasterGrid.Params(gsd_m=GSD_M, ranks=(0,))
     walls = RasterGrid().run(inputs, chosen, ctx).walls
     assert edges_m(walls)[2] == pytest.approx(rise * WIDTH_M, abs=CORNER_M)
-    (warning,) = [text for text in ctx.warnings if "askew" in text]
+    (warning,) = [text for text in ctx.warnings if "oblique" in text]
     assert "up to 80 mm of its plane are left out there" in warning
 
 

@@ -216,7 +216,7 @@ def test_what_gives_no_raster_is_refused(tmp_path: Path) -> None:
     cases: list[tuple[PointCloud, dict[str, object], str]] = [
         (nothing, {}, "has 0 points"),
         (broken, {}, "NaN or infinite"),
-        (far, {}, "no point of the cloud lies inside"),
+        (far, {}, "no point of the cloud is inside"),
         (cloud, {"constraint": "horizontal"}, "is horizontal within"),
         # Before memory is allocated.
         (cloud, {"gsd_m": 1e-6}, "gsd_m = 1e-06 m .* raise gsd_m"),

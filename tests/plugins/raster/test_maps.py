@@ -66,7 +66,7 @@ def test_a_slightly_tilted_plane_is_a_map_and_a_tilted_one_is_not(tmp_path: Path
     frame, warnings = placed(level(0.1), tmp_path)
     assert frame.map_crs is None
     assert "floor 1 is tilted by 5.7 deg" in warnings[0]
-    assert "places no raster" in warnings[1]
+    assert "applies to no raster" in warnings[1]
 
 
 def test_a_ceiling_is_no_map(tmp_path: Path) -> None:
