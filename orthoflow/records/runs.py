@@ -275,21 +275,43 @@ class Run:
         """Cells by address, in the order of the graph."""
         return {cell.address: cell for cell in self.record.cells}
 
-    def cell(self, address: str) -> RecordedCell:
+    def cell(self, address: str, **variants: str) -> RecordedCell:
         """Return one cell.
 
+        Args:
+            address: its address; with `variants`, its step suffices.
+            variants: `data` for the dataset, or a step with variants -> the one wanted; those on
+                which the cell does not depend are ignored.
+
         Raises:
-            ArgumentError: the run has no such cell.
+            ArgumentError: the run has no such cell, or several.
         """
-        if address not in self.cells:
-            steps = dict.fromkeys(cell.step for cell in self.record.cells)
-            own = [cell.address for cell in self.record.cells if cell.step == address]
-            known = first_few(own or [*steps], most=_MOST_NAMED)
-            instead = " alone, but" if own else f"{did_you_mean(address, steps)}; it has"
+        if address in self.cells and not variants:
+            return self.cells[address]
+        every = self.record.cells
+        own = [cell for cell in every if address in (cell.step, cell.address)]
+        varied = {pair for cell in every for pair in cell.assignment.items()}
+        found = [
+            cell
+            for cell in own
+            if all(cell.assignment.get(step, name) == name for step, name in variants.items())
+            if variants and varied >= variants.items()
+            if cell.address == address or cell.repeat == 0
+        ]
+        if len(found) == 1:
+            return found[0]
+        asked = ", ".join([repr(address), *(f"{step}={name}" for step, name in variants.items())])
+        if found:
+            named = first_few([cell.address for cell in found], most=_MOST_NAMED)
             raise ArgumentError(
-                f"the run {self.record.run_id} has no step {address!r}{instead} {known}"
+                f"the run {self.record.run_id} has several cells of {asked}: {named}; choose one"
             )
-        return self.cells[address]
+        steps = dict.fromkeys(cell.step for cell in every)
+        known = first_few([cell.address for cell in own] or [*steps], most=_MOST_NAMED)
+        instead = f"{did_you_mean(address, steps)}; it has"
+        if own:
+            instead = "; it has" if variants else " alone, but"
+        raise ArgumentError(f"the run {self.record.run_id} has no step {asked}{instead} {known}")
 
     def upstream(self, address: str) -> Iterator[RecordedCell]:
         """Yield a cell and all cells upstream of it, nearest first."""
@@ -387,8 +409,13 @@ class Run:
                 "`--store` from another folder than the run's) puts every product into a record"
             )
 
-    def product(self, address: str, port: str) -> Product:
+    def product(self, address: str, port: str, **variants: str) -> Product:
         """Return an output as an object of its product class.
+
+        Args:
+            address: address of the cell; with `variants`, its step suffices.
+            port: name of the output.
+            variants: see `cell`.
 
         Raises:
             ArgumentError: the run has no such cell, or the cell has no such output.
@@ -397,6 +424,7 @@ class Run:
         """
         from orthoflow.catalog.discovery import discover_catalog  # noqa: PLC0415 - only products need it
 
+        address = self.cell(address, **variants).address
         payload = self.payload(address, port)
         try:
             cls = discover_catalog().product_class(payload.type_name)

@@ -220,15 +220,15 @@ def _curve(parameter: str, column: MetricRow, lines: Mapping[str, _Line], n_data
     # Absolute errors are not negative; metrics between 0 and 1 where higher is better are shares.
     is_size = column.better == "lower" and all(point.y >= 0.0 for point in every)
     is_share = column.better == "higher" and all(0.0 <= point.y <= 1.0 for point in every)
-    notes = [_points_text(lines, column.unit, n_datasets)]
+    notes = [_points_text(lines, column, n_datasets)]
     if column.better in BETTER:
-        notes.append(BETTER[column.better])
+        notes.append(BETTER[column.better].capitalize())
     if any(point.is_filled for point in every):
-        notes.append("filled points are the baseline")
+        notes.append("Filled points are the baseline")
     return Curve(
         name=f"{column.step}.{column.metric}_over_{parameter}",
         title=f"{column.titled} ({column.step}) over {parameter}",
-        caption=f"Points are {'; '.join(notes)}.",
+        caption=f"{'. '.join(notes)}.",
         lines=drawn,
         below=parameter,
         beside=column.titled,
@@ -251,18 +251,17 @@ def _point(x: float, found: Sequence[_Value], column: MetricRow, *, is_over: boo
     )
 
 
-def _points_text(lines: Mapping[str, _Line], unit: str, n_datasets: int) -> str:
-    """Return the explanation of the points, with the number of datasets without failures."""
+def _points_text(lines: Mapping[str, _Line], column: MetricRow, n_datasets: int) -> str:
+    """Return sentences on the points and bars, with the number of datasets without failures."""
     found = [values for line in lines.values() for values in line.values()]
     if n_datasets < 2:
         if any(math.isfinite(one.spread) for values in found for one in values):
-            return "means of the repeats, bars their standard deviation"
-        return "single values without repeats"
+            return "Points are means of the repeats. Bars are their standard deviations"
+        return "Points are single values without repeats"
     counts = sorted({len(values) for values in found})
     counted = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
-    if is_flag(unit):
-        return f"shares of {counted} of {n_datasets} datasets, and of their repeats"
-    return (
-        f"medians of {counted} of {n_datasets} datasets, of errors with signs of their sizes, "
-        "bars 1.4826 times the median absolute deviation"
-    )
+    if is_flag(column.unit):
+        return f"Points are shares of {counted} of {n_datasets} datasets, and of their repeats"
+    absolute = ". Errors count without their sign" if column.better == "lower" else ""
+    bars = ". Bars are 1.4826 times the median absolute deviation" if counts[-1] > 1 else ""
+    return f"Points are medians of {counted} of {n_datasets} datasets{absolute}{bars}"

@@ -133,14 +133,17 @@ class OpenedRun(Run):
             }
         )
 
-    def product(self, address: str, port: str, *, store: str | Path = ".orthoflow") -> Product:
+    def product(
+        self, address: str, port: str, *, store: str | Path = ".orthoflow", **variants: str
+    ) -> Product:
         """Return an output as an object of its product class.
 
         Args:
-            address: address of the cell.
+            address: address of the cell; with `variants`, its step suffices.
             port: name of the output.
             store: folder of stored results, for products that the record references but does not
                 contain.
+            variants: `data` for the dataset, or a step with variants -> the one wanted.
 
         Raises:
             ArgumentError: the run does not have this cell, or the cell does not have this output.
@@ -152,7 +155,8 @@ class OpenedRun(Run):
         from orthoflow.catalog.discovery import discover_catalog  # noqa: PLC0415 - loads plugins
         from orthoflow.engine.store import stores_at  # noqa: PLC0415 - rarely needed
 
-        output = self.cell(address).outputs.get(port)
+        cell = self.cell(address, **variants)
+        address, output = cell.address, cell.outputs.get(port)
         if output is None or output.embedded:
             return super().product(address, port)
         cls = discover_catalog().product_class(output.type_name)
@@ -194,11 +198,10 @@ class OpenedRun(Run):
         if not (cell or baseline):
             warnings.warn(f"the baseline has no orthoimages; this is of {chosen}", stacklevel=2)
         images = Orthoimages.from_payload(self.payload(chosen, places[chosen])).images
-        found = [image for image in images if number is None or image.number == number]
-        if not found:
+        image = next((image for image in images if number in (None, image.number)), None)
+        if image is None:
             numbers = ", ".join(str(image.number) for image in images)
             raise ArgumentError(f"{chosen} has no orthoimage of wall {number}; walls: {numbers}")
-        image = found[0]
         name = f"wall_{image.number}_ortho.tif"
         files = [file for file in self.files.get(chosen, ()) if file.name == name]
         return WallImage(image=image, cell=chosen, file=files[0] if files else None)

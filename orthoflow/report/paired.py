@@ -352,8 +352,8 @@ def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
         return ""
     if not any(one.paired and math.isfinite(one.paired.p) for _, one in rows):
         return (
-            f"No difference is shown: it takes {_MIN_SHOWN} of the {n_datasets} datasets that "
-            "differ, computed in one environment"
+            f"No claim is possible with {n_datasets} datasets: at least {_MIN_SHOWN} on which the "
+            "results differ, computed in one environment, are needed"
         )
     leads, level = [], []
     for name in dict.fromkeys(one.name for _, one in rows):

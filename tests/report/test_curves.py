@@ -157,11 +157,15 @@ def test_a_line_is_over_the_rooms_that_all_its_points_have(tmp_path: Path) -> No
     }
     (curve,) = curves([*over_rooms(tmp_path, values, "rms_mm").values()])
     assert points(curve) == [(1.0, 2.5), (2.0, 3.0)]
-    assert "medians of 2 of 3 datasets" in curve.caption
+    assert curve.caption.startswith(
+        "Points are medians of 2 of 3 datasets. Errors count without their sign. "
+        "Bars are 1.4826 times the median absolute deviation. Less is better."
+    )
     # Repeats of one room are no spread of rooms.
     alone = {"calm": values["calm"], "dark": {1.0: (None,), 2.0: (None,)}}
     (curve,) = curves([*over_rooms(tmp_path, alone, "rms_mm").values()])
-    assert "medians of 1 of 2 datasets" in curve.caption
+    assert "Points are medians of 1 of 2 datasets. " in curve.caption
+    assert "Bars" not in curve.caption
     assert bars(curve) == []
 
 

@@ -303,3 +303,36 @@ def test_what_is_wrong_with_a_workflow_is_raised(
         with pytest.raises(OrthoflowError, match=message):
             orthoflow.run("direct.yaml", datasets={"hall": said})  # type: ignore[dict-item]
     assert not (tmp_path / "runs").exists()
+
+
+def test_a_cell_is_found_by_its_step_and_what_varies(tmp_path: Path) -> None:
+    address = "plane@data={},plane={}".format
+    zeros = np.zeros(3, np.float32)
+    cloud = PointCloud(origin=np.zeros(3), x=zeros, y=zeros, z=zeros, up=np.eye(3)[2])
+    digest = Store(tmp_path / "store").put_product(cloud).digest
+    output = RecordedProduct(type_name="cloud", encoding_version=1, digest=digest)
+    cells = [
+        cell("scan"),
+        *(
+            cell(address(data, plane) + again)
+            for data in ("hall", "yard")
+            for plane in ("fine", "coarse")
+            for again in ("", "#1")
+        ),
+        cell("merge@data=yard", outputs={"cloud": output}),
+    ]
+    run = OpenedRun(path=tmp_path / "run.h5", record=record(cells))
+    assert run.cell("plane", data="yard", plane="fine").address == address("yard", "fine")
+    assert run.cell(address("yard", "fine"), data="yard").address == address("yard", "fine")
+    # What a step does not depend on chooses nothing among its cells.
+    assert run.cell("scan", data="yard").address == "scan"
+    assert run.cell("merge", data="yard", plane="fine").address == "merge@data=yard"
+    with pytest.raises(ArgumentError, match=r"several cells of 'plane', data=hall: plane@.*choose"):
+        run.cell("plane", data="hall")
+    with pytest.raises(ArgumentError, match=r"no step 'plane', data=attic; it has plane@data=hall"):
+        run.cell("plane", data="attic")
+    with pytest.raises(ArgumentError, match="no step 'scan', room=hall; it has scan"):
+        run.cell("scan", room="hall")
+    found = run.product("merge", "cloud", data="yard", store=tmp_path / "store")
+    assert isinstance(found, PointCloud)
+    assert len(found) == 3

@@ -182,12 +182,23 @@ def _coarse(walls: Sequence[WallResult], scale: int) -> str:
     if not coarse:
         return ""
     worst = min(coarse, key=lambda wall: _ppi(wall, scale))
-    enough = math.ceil(scale * _LEAST_PPI / _ppi(worst, scale))
+    enough = usual_scale(scale * _LEAST_PPI / _ppi(worst, scale))
     names = ", ".join(wall.name for wall in coarse)
     return (
         f"; coarser than print, {_ppi(worst, scale):.0f} pixels per inch instead of "
         f"{_LEAST_PPI:.0f}: {names}; from 1:{enough} on they are fine enough"
     )
+
+
+def usual_scale(least: float) -> int:
+    """Return the smallest n of a usual scale 1 : n that is at least as large.
+
+    >>> usual_scale(30.2), usual_scale(20.1), usual_scale(200.0), usual_scale(2.4), usual_scale(9)
+    (50, 25, 200, 5, 10)
+    """
+    power = 10.0 ** math.floor(math.log10(least))
+    usual = (factor * power for factor in (1.0, 2.0, 2.5, 5.0, 10.0))
+    return next(round(n) for n in usual if n.is_integer() and n >= least * (1.0 - 1e-9))
 
 
 def _ppi(wall: WallResult, scale: int) -> float:

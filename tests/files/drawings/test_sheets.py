@@ -19,6 +19,7 @@ from fontTools.fontBuilder import FontBuilder
 from fontTools.pens.t2CharStringPen import T2CharStringPen
 from PIL import Image
 
+from orthoflow.cli.exports.sheets import usual_scale
 from orthoflow.cli.program import program
 from orthoflow.errors import ArgumentError
 from orthoflow.files.drawings import pens
@@ -478,3 +479,10 @@ def test_a_reflected_ceiling_lies_over_its_floor(tmp_path: Path) -> None:
 def cell_centres(shape: tuple[int, int]) -> np.ndarray:
     rows, columns = np.mgrid[: shape[0], : shape[1]] + 0.5
     return np.column_stack([columns.ravel(), rows.ravel()])
+
+
+def test_the_scale_at_which_cells_print_finely_is_a_usual_one(run: Path, tmp_path: Path) -> None:
+    # Cells of 10 mm have 150 to the inch from 1:59.06 on.
+    said = export(run, tmp_path / "out", "--scale", 20).output
+    assert "from 1:100 on they are fine enough" in said
+    assert (usual_scale(41.0), usual_scale(20.1), usual_scale(2.1)) == (50, 25, 5)
