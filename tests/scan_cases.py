@@ -418,7 +418,7 @@ def e57_colour_limit_wrong(draw: Draw) -> Case:
         paths=[path],
         rgb=True,
         intensity="linear",
-        warnings=(str(limit), "colours reach"),
+        warnings=(str(limit), "colours can reach"),
     )
 
 
@@ -565,7 +565,7 @@ def points_at_one_place(draw: Draw) -> Case:
         shift=shift,
         rgb=True,
         left_out={"one_place": n_lost},
-        warnings=(f"{n_lost} points lie at exactly",),
+        warnings=(f"{n_lost} points are at exactly",),
     )
 
 
@@ -622,7 +622,7 @@ def las_bounds_stale(draw: Draw) -> Case:
         shift=shift,
         rgb=True,
         intensity="linear",
-        warnings=("outside the bounds",),
+        warnings=("outside the bounding box",),
     )
 
 

@@ -73,7 +73,7 @@ def read_calibration(path: Path) -> CalibratedLenses:
         path,
         MOST_BYTES,
         "a calibration file (YAML)",
-        way_out=": give photos of one camera one entry, by a pattern",
+        way_out=": use one entry with a pattern for all photos of a camera",
     )
     found, problems = read_model(text, _File, MOST_VALUES)
     if found is None:
@@ -152,10 +152,10 @@ def lens_for(
     if (camera.width, camera.height) == (width, height):
         return camera
     way_out = (
-        "it seems to be for the turned photo: calibrate the pixels as they are stored, without "
-        "the EXIF rotation, or give photos that are stored upright an entry of their own"
+        "it seems to be for the rotated photo: calibrate the pixels as they are stored, without "
+        "the EXIF rotation, or add a separate entry for photos that are stored upright"
         if (camera.width, camera.height) == (height, width)
-        else "calibrate at the size of the photos, or give this one an entry of its own"
+        else "calibrate at the size of the photos, or add a separate entry for this one"
     )
     raise InputError(
         f'photo {photo_name} has {width} x {height} pixels, but its calibration "{pattern}" is '
@@ -215,7 +215,7 @@ class _Lens(BaseModel):
         if len(info.data) == _FIELDS_ABOVE and (problem := _problem(_lens(info.data, values))):
             raise ValueError(
                 f"{problem}; expected {', '.join(terms)} of a calibration that covers the whole "
-                "image, or of a fisheye a smaller field_of_view_deg"
+                "image, or, for a fisheye, a smaller field_of_view_deg"
             )
         return values
 
@@ -232,8 +232,8 @@ class _File(BaseModel):
     def _are_not_many(cls, values: object) -> object:
         if isinstance(values, dict) and len(values) > MOST_CAMERAS:
             raise ValueError(
-                f"expected at most {MOST_CAMERAS} entries, got {len(values)}; give photos of one "
-                "camera one entry, by a pattern"
+                f"expected at most {MOST_CAMERAS} entries, got {len(values)}; use one entry with a "
+                "pattern for all photos of a camera"
             )
         return values
 
@@ -262,7 +262,7 @@ def _problem(lens: Intrinsics | FisheyeLens) -> str:
         two = "the lens model folds back inside the image, so that two directions share a pixel"
         return two if _folds(lens) else ""
     problem = problem_of(lens)
-    return f"the fisheye lens is none: {problem}" if problem else ""
+    return f"the fisheye lens is invalid: {problem}" if problem else ""
 
 
 def _folds(camera: Intrinsics) -> bool:

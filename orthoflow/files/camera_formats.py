@@ -54,7 +54,7 @@ def read_given_cameras(paths: Sequence[Path]) -> tuple[GivenCamera, ...]:
     """
     found = _read(paths)
     if len(found) > MOST_CAMERAS:
-        raise InputError(f"{paths[0].name} holds more than {MOST_CAMERAS} cameras: split it")
+        raise InputError(f"{paths[0].name} contains more than {MOST_CAMERAS} cameras: split it")
     return found
 
 
@@ -82,12 +82,12 @@ def _read(paths: Sequence[Path]) -> tuple[GivenCamera, ...]:
         if len(files) == 1 or len(usual) == 1:
             return reader((usual or files)[0])
         if files and not several:
-            several = f"{len(files)} {suffix} files, of which one must be named; "
+            several = f"{len(files)} {suffix} files, of which one must be chosen; "
     names = first_few([path.name for path in paths])
     raise InputError(
-        f"{names or 'nothing'} holds no cameras that orthoflow reads: {several}expected one "
+        f"{names or 'nothing'} contains no cameras that orthoflow can read: {several}expected a "
         "cameras.json of a run, a folder with COLMAP's cameras.txt and images.txt (or .bin), "
-        "Metashape's .xml, Bundler's .out with its list of photos (.txt) beside it, "
+        "Metashape's .xml, Bundler's .out with its list of photos (.txt) next to it, "
         "RealityCapture's .csv, or an E57 file with photos"
     )
 
@@ -136,8 +136,8 @@ def _photo_list(path: Path, paths: Sequence[Path]) -> list[str]:
         return list(of_photos.pop())
     counts = ", ".join(f"{name} ({len(names)} lines)" for name, names in lists.items())
     raise InputError(
-        f"{path.name} has {n_cameras} cameras without names: give the folder with it and one "
-        f"list of as many photos (.txt), one line each; there is {counts or 'no such file'}"
+        f"{path.name} has {n_cameras} cameras without names: use the folder with it and a "
+        f"list (.txt) of as many photos, one per line; found {counts or 'no such file'}"
     )
 
 
@@ -203,7 +203,7 @@ def bundler_count(path: Path) -> int:
     words = list(islice(_words_of(path), 2))
     counts = numbers_of(words, path, "the counts of cameras and points")
     if len(counts) < 2 or not 0.0 <= counts[0] <= MOST_CAMERAS:
-        raise damaged(path, "it states no count of cameras")
+        raise damaged(path, "it does not contain the number of cameras")
     return int(counts[0])
 
 

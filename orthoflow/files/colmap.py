@@ -85,7 +85,7 @@ def write_colmap_model(folder: Path, cameras: Cameras) -> ColmapModel:
     for camera in oriented:
         if len(camera.photo.split()) != 1:
             raise ArgumentError(
-                f'a COLMAP text model ends the name of a photo at its first space, but one is "'
+                f'in a COLMAP text model, photo names end at the first space, but there is "'
                 f'{camera.photo}": rename the photo and run again'
             )
     lenses = list(dict.fromkeys(_lens(camera) for camera in oriented))
@@ -128,7 +128,7 @@ def write_colmap_model(folder: Path, cameras: Cameras) -> ColmapModel:
         model.points3D[point].error = float(tied[own, 5].mean())
     try:
         model.write_text(str(folder))
-    except Exception as error:  # pycolmap raises what its checks in C++ become
+    except Exception as error:  # pycolmap raises various errors
         raise StoreError(f"the COLMAP model cannot be written: {error}; free some space") from error
     return ColmapModel(n_cameras=len(lenses), n_images=len(oriented), n_points=len(places))
 
@@ -175,7 +175,7 @@ def read_colmap_model(parts: Sequence[Path]) -> tuple[GivenCamera, ...]:
     images = next(path for path in parts if path.stem.lower() == "images")
     suffix = images.suffix.lower()
     for path in parts:
-        with reading(path, MOST_MODEL_BYTES, "a file of cameras"):
+        with reading(path, MOST_MODEL_BYTES, "a camera file"):
             pass
     if suffix == ".bin":
         for path in parts:
@@ -187,14 +187,14 @@ def read_colmap_model(parts: Sequence[Path]) -> tuple[GivenCamera, ...]:
         (Path(folder) / f"points3D{suffix}").write_bytes(bytes(8) if suffix == ".bin" else b"")
         try:
             model = pycolmap.Reconstruction(folder)
-        except Exception as error:  # pycolmap raises what its checks in C++ become
+        except Exception as error:  # pycolmap raises various errors
             # pycolmap's messages begin with a position in its C++ source.
             reason = " ".join(str(error).rpartition("] ")[2].split())[:_MAX_SAID]
             raise damaged(images, f"pycolmap cannot read the COLMAP model ({reason})") from error
     if not model.images:
         raise damaged(images, "the model has no images")
     if len(model.images) > MOST_CAMERAS or len(model.cameras) > MOST_CAMERAS:
-        raise InputError(f"{images.name} holds more than {MOST_CAMERAS} cameras: split it")
+        raise InputError(f"{images.name} contains more than {MOST_CAMERAS} cameras: split it")
     lenses = {number: _lens_of(camera, images) for number, camera in model.cameras.items()}
     by_number = sorted(model.images.items())
     names = _whole_names(images) if suffix == ".txt" else {}
@@ -222,7 +222,7 @@ def _require_whole(path: Path) -> None:
             if at > len(content):
                 break
     if at > len(content) or count > len(content):
-        raise damaged(path, "it ends too early, it is cut off")
+        raise damaged(path, "it is cut off")
 
 
 def _end_of_image(content: bytes, at: int) -> int:

@@ -156,7 +156,7 @@ def problem_of(lens: WideLens) -> str:
     """Return why a lens is invalid, or "" if it is valid."""
     if isinstance(lens, PanoramaLens):
         is_valid = 1 <= lens.width <= MOST_PX
-        return "" if is_valid else f"it has {lens.width} columns, at most {MOST_PX} can be read"
+        return "" if is_valid else f"it has {lens.width} columns; the limit is {MOST_PX}"
     return _problem_of_numbers(lens) or _problem_of_faces(lens)
 
 
@@ -184,7 +184,7 @@ def _problem_of_faces(lens: FisheyeLens) -> str:
         )
     finest = max(lens.finest_px(0.0), lens.finest_px(0.5 * math.pi))
     if not finest < MOST_PX:
-        return f"{finest:.0f} pixels per radian, at most {MOST_PX} are taken"
+        return f"{finest:.0f} pixels per radian; the limit is {MOST_PX}"
     faces = face_lenses(lens)
     large = [
         face
@@ -348,7 +348,7 @@ def faces_of(
     """
     problem = problem_of(lens)
     if problem:
-        raise InputError(f"the lens of photo {stem} is none: {problem}")
+        raise InputError(f"the lens of photo {stem} is invalid: {problem}")
     return tuple(
         CubeFace(name=f"{stem}_{face}.png", photo=photo, face=face, lens=own, whole=lens, used=used)
         for face, own in face_lenses(lens).items()

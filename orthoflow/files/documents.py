@@ -212,7 +212,7 @@ def type_text(node: Mapping[str, Any], definitions: Mapping[str, Mapping[str, An
 def _unknown_key(name: str, known: Sequence[str], value: JsonValue, owner: str) -> str:
     meant = meant_parameter(name, known, value) or did_you_mean(name, known)
     if owner and name in _BESIDE:
-        meant = f" ({name} belongs beside params, not in it)"
+        meant = f" ({name} belongs next to params, not in it)"
     inside = "; parameters of the method belong in params" if "params" in known else ""
     whose = f"{owner} has" if owner else "known here:"
     listed = f"; {whose} {', '.join(known) or 'none'}" if known or not owner else ""

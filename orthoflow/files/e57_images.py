@@ -70,7 +70,7 @@ def read_e57_images(path: Path) -> tuple[E57Image, ...]:
             for image in _image(path, index, pye57.libe57.StructureNode(node))
         )
     if not images:
-        raise InputError(f"{path.name} holds no photos (images2D as JPEG or PNG)")
+        raise InputError(f"{path.name} contains no photos (images2D as JPEG or PNG)")
     return images
 
 
@@ -140,7 +140,7 @@ def _name(path: Path, index: int, node: Any, suffix: str) -> str:
 def _content(path: Path, blob: Any) -> bytes:
     count = int(blob.byteCount())
     if not 0 < count <= path.stat().st_size:
-        raise InputError(f"{path.name} is damaged: it states a photo of {count} bytes")
+        raise InputError(f"{path.name} is damaged: it declares a photo of {count} bytes")
     content = bytearray(count)
     blob.read(content, 0, count)
     return bytes(content)
@@ -148,15 +148,19 @@ def _content(path: Path, blob: Any) -> bytes:
 
 def _camera(path: Path, name: str, node: Any, kind: str, shown: Any) -> GivenCamera:
     if kind == "visualReference":
-        return GivenCamera(name=name, reason="the E57 file shows it for reference only, unposed")
+        return GivenCamera(
+            name=name, reason="the E57 file contains it only for reference, without a pose"
+        )
     if kind == "cylindrical":
-        return GivenCamera(name=name, reason=f"it is a {kind} image, which cannot be painted from")
+        return GivenCamera(
+            name=name, reason=f"it is a {kind} image, which cannot be used for orthoimages"
+        )
     if not node.isDefined("pose"):
-        return GivenCamera(name=name, reason="the E57 file states no pose of it")
+        return GivenCamera(name=name, reason="the E57 file contains no pose for it")
     world_from_camera, centre = pose_of(node)
     if kind == "spherical":
         if not _is_whole(shown):
-            reason = "it is a part of a panorama, only whole ones are taken"
+            reason = "it is a part of a panorama; only full panoramas can be used"
             return GivenCamera(name=name, reason=reason)
         width, height = (round(number_of(shown[field])) for field in ("imageWidth", "imageHeight"))
         rotation: NDArray[np.float64] = _FROM_PANORAMA @ world_from_camera.T
@@ -170,7 +174,7 @@ def _camera(path: Path, name: str, node: Any, kind: str, shown: Any) -> GivenCam
     if not all(math.isfinite(value) for value in values.values()) or not all(
         values[field] > 0.0 for field in ("focalLength", "pixelWidth", "pixelHeight")
     ):
-        raise InputError(f"{path.name}: the lens of photo {name} is none: {values}")
+        raise InputError(f"{path.name}: the lens of photo {name} is invalid: {values}")
     rotation = _FROM_Y_UP @ world_from_camera.T
     return GivenCamera(
         name=name,

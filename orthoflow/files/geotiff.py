@@ -309,7 +309,7 @@ def _require_written(path: Path, values: NDArray[np.generic]) -> None:
             rows = _rows(window)
             written = np.moveaxis(dataset.read(window=window), 0, 2)
             if not np.array_equal(written, values[rows], equal_nan=True):
-                raise OSError(f"rows {rows.start} to {rows.stop} do not read back")
+                raise OSError(f"rows {rows.start} to {rows.stop} cannot be read back")
 
 
 def world_file_text(place: GridPlace, *, rows: float = 1.0, columns: float = 1.0) -> str:
@@ -341,8 +341,8 @@ def read_raster(path: Path) -> RasterFile:
         # Check the declared size before memory is allocated.
         if rows * columns > MOST_CELLS or raster.bands > MOST_BANDS:
             raise InputError(
-                f"{path.name} is too large: {columns} x {rows} cells in {raster.bands} bands, at "
-                f"most {MOST_CELLS} cells and {MOST_BANDS} bands are read; export it with larger "
+                f"{path.name} is too large: {columns} x {rows} cells in {raster.bands} bands; "
+                f"the limit is {MOST_CELLS} cells and {MOST_BANDS} bands; export it with larger "
                 "cells or in parts"
             )
         values, shown = raster.read((0.0, 0.0, float(columns), float(rows)), raster.shape)
@@ -368,7 +368,7 @@ def _reading(path: Path) -> Iterator[None]:
     except (RasterioError, OSError, UnicodeDecodeError) as error:
         # UnicodeDecodeError: GDAL's messages and tags can contain bytes of the file.
         raise InputError(
-            f"{path} cannot be read as a GeoTIFF: {error}; expected a whole TIFF file"
+            f"{path} cannot be read as a GeoTIFF: {error}; expected a complete TIFF file"
         ) from error
 
 
@@ -483,15 +483,14 @@ def check_header(path: Path, dataset: DatasetReader) -> None:
     # GDAL would read overviews from that file, even over the network.
     if dataset.tags(ns="OVERVIEWS"):
         raise InputError(
-            f"{path.name} names another file for its overviews: expected a TIFF file that needs "
-            "nothing beside it"
+            f"{path.name} stores its overviews in another file: expected a self-contained TIFF file"
         )
     declared = dataset.width * dataset.height * dataset.count
     stored = path.stat().st_size
     if declared > max(_ALWAYS_ALLOWED_VALUES, _LARGEST_RATIO * stored):
         raise InputError(
-            f"{path.name} states {dataset.width} x {dataset.height} cells in "
-            f"{dataset.count} bands, but {stored} bytes cannot hold as many: export it again"
+            f"{path.name} declares {dataset.width} x {dataset.height} cells in "
+            f"{dataset.count} bands, but its {stored} bytes cannot contain them: export it again"
         )
 
 
@@ -505,8 +504,8 @@ def _gsd_m(path: Path, transform: Affine) -> float:
         or abs(abs(transform.e) - side) > limit
     ):
         raise InputError(
-            f"{path.name} has cells that are not square and upright (geotransform "
-            f"{transform.to_gdal()}): export it again as metres in the plane of the wall, X to "
+            f"{path.name} has cells that are not square or not aligned with the axes (geotransform "
+            f"{transform.to_gdal()}): export it again in metres in the plane of the wall, X to "
             "the right, Y upwards"
         )
     low, high = _SIDES_M

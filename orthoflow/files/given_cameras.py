@@ -37,7 +37,7 @@ MOST_MODEL_BYTES: Final = 500_000_000
 MOST_BYTES: Final = 50_000_000
 #: characters of a line of a file of cameras
 MOST_LINE: Final = 20_000_000
-_WHAT: Final = "a file of cameras"
+_WHAT: Final = "a camera file"
 #: cameras of one file
 MOST_CAMERAS: Final = 100_000
 _LONGEST_NUMBER: Final = 12
@@ -118,7 +118,7 @@ class GivenCamera:
         problem = problem_of(self.lens)
         if problem or face not in face_lenses(self.lens):
             reason = (
-                f"its lens is none: {problem}" if problem else "its lens does not show that face"
+                f"its lens is invalid: {problem}" if problem else "its lens does not show that face"
             )
             return GivenCamera(name=self.name, reason=reason)
         axes = FACES[face]
@@ -148,7 +148,7 @@ def lines_of(path: Path) -> Iterator[str]:
     with reading(path, MOST_MODEL_BYTES, _WHAT), open_text(path) as stream:
         while line := stream.readline(MOST_LINE):
             if len(line) == MOST_LINE:
-                raise InputError(f"{path.name} has a line of more than {MOST_LINE} letters")
+                raise InputError(f"{path.name} has a line of more than {MOST_LINE} characters")
             yield line.rstrip("\n")
 
 
@@ -278,10 +278,10 @@ def lens_or_reason(
     """Return a lens and a note on ignored terms, or the reason why the lens cannot be used."""
     if worst_px <= NEGLIGIBLE_PX:
         return lens, ""
-    size = f"{worst_px:.2g} pixels" if worst_px < _FAR_PX else "more than any pixels"
+    size = f"{worst_px:.2g} pixels" if worst_px < _FAR_PX else f"over {_FAR_PX:.0f} pixels"
     if worst_px > MAX_LEFT_OUT_PX:
-        return f"{whose} differs from the nearest lens of OpenCV by up to {size}: {way_out}", ""
-    return lens, f"{whose} is replaced by OpenCV's nearest lens, with a deviation of up to {size}"
+        return f"{whose} differs from the closest OpenCV lens by up to {size}: {way_out}", ""
+    return lens, f"{whose} is replaced by the closest OpenCV lens, with a deviation of up to {size}"
 
 
 def damaged(path: Path, what: str, line: int | None = None) -> InputError:
@@ -329,7 +329,9 @@ def checked_lens(lens: Intrinsics, path: Path, whose: str) -> Intrinsics:
     """
     values = (lens.fx, lens.fy, lens.cx, lens.cy, lens.skew or 0.0, *lens.distortion)
     if not (all(map(math.isfinite, values)) and lens.fx > 0.0 and lens.fy > 0.0):
-        raise damaged(path, f"the lens of {whose} is none: focal length {lens.fx:g}, {lens.fy:g}")
+        raise damaged(
+            path, f"the lens of {whose} is invalid: focal length {lens.fx:g}, {lens.fy:g}"
+        )
     if min(lens.width, lens.height) < 1 or lens.width * lens.height > MOST_PIXELS:
         size = f"{_cut(lens.width)} x {_cut(lens.height)}"
         raise damaged(path, f"the photo {whose} is {size} pixels, expected 1 to {MOST_PIXELS}")

@@ -91,8 +91,8 @@ def _decoded(encoded: bytes, name: str, *, is_deep: bool) -> Colours:
     size = stated_size(encoded)
     if size is not None and size[0] * size[1] > MOST_PIXELS:
         raise InputError(
-            f"{name} is too large: {size[0]} x {size[1]} pixels, at most {MOST_PIXELS} are "
-            "decoded; make it smaller or cut it into parts"
+            f"{name} is too large: {size[0]} x {size[1]} pixels; the limit is {MOST_PIXELS}; "
+            "reduce it or cut it into parts"
         )
     try:
         if kind in ("TIFF", "BigTIFF"):
@@ -104,7 +104,7 @@ def _decoded(encoded: bytes, name: str, *, is_deep: bool) -> Colours:
             depth = cv2.IMREAD_ANYDEPTH if is_deep else 0
             flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION | depth
             decoded = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), flags)
-    except Exception as error:  # cv2.error, and whatever the plugins of Pillow raise
+    except Exception as error:  # cv2.error, or any error of a Pillow plugin
         reason = "" if kind in ("JPEG", "PNG", "WebP") else str(error)
         raise InputError(_not_an_image(encoded, name, reason)) from error
     if decoded is None:
@@ -313,8 +313,8 @@ def _encode(suffix: str, image: Colours, options: list[int]) -> bytes:
 def _not_an_image(encoded: bytes, name: str, reason: str = "") -> str:
     return (
         f"{name} cannot be decoded as an image ({len(encoded)} bytes"
-        f"{f': {reason}' if reason else ''}): expected a whole JPEG, PNG or TIFF file; open it in "
-        "an image viewer, or copy it again from the camera"
+        f"{f': {reason}' if reason else ''}): expected a complete JPEG, PNG or TIFF file; open it "
+        "in an image viewer, or copy it again from the camera"
     )
 
 

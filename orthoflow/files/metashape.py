@@ -60,7 +60,7 @@ def read_metashape_xml(path: Path) -> tuple[GivenCamera, ...]:
     cameras = (camera for chunk in chunks for camera in _of_chunk(chunk, path))
     found = list(islice(cameras, MOST_CAMERAS + 1))
     if not found:
-        raise damaged(path, "it holds no cameras of Metashape (document/chunk/cameras/camera)")
+        raise damaged(path, "it contains no Metashape cameras (document/chunk/cameras/camera)")
     return tuple(found)
 
 
@@ -70,8 +70,8 @@ def _root(path: Path) -> ET.Element:
     # Entities can expand without limit, and only a document type can define them.
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise InputError(
-            f"{path.name} defines a document type, which no export of Metashape "
-            "contains, so it is not read"
+            f"{path.name} defines a document type, which Metashape exports do not "
+            "contain, so it is not read"
         )
     if text.count("<") > MOST_TAGS:
         raise InputError(f"{path.name} has more than {MOST_TAGS} tags, too many for cameras")
@@ -132,8 +132,8 @@ def _site(wkt: str, path: Path) -> Callable[[GivenCamera], GivenCamera] | None:
             return None
         if crs.is_geographic:
             raise InputError(
-                f"{path.name} is in degrees ({crs.name}): set a projected coordinate system of "
-                "the scan for the chunk in Metashape and export again"
+                f"{path.name} is in degrees ({crs.name}): in Metashape, set the chunk to "
+                "the projected coordinate system of the scan and export again"
             )
         metres = crs.axis_info[0].unit_conversion_factor
         convert = _from_geocentric(crs, path).transform
@@ -151,7 +151,7 @@ def _site(wkt: str, path: Path) -> Callable[[GivenCamera], GivenCamera] | None:
         places = centre + _STEP_M * np.vstack([np.eye(3), -np.eye(3)])
         there = to_site(np.vstack([centre, places]))
         if not np.isfinite(there).all():
-            raise damaged(path, f"{given.name} is nowhere in {crs.name}")
+            raise damaged(path, f"{given.name} has no position in {crs.name}")
         # Axes of the system at the camera, without the remaining scale and shear.
         left, _, right = np.linalg.svd((there[1:4] - there[4:]).T / (2.0 * _STEP_M))
         turned = rotation @ (left @ right).T
@@ -192,7 +192,7 @@ def _from_geocentric(crs: Any, path: Path) -> Any:
         }
     )
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what is raised here
+        warnings.simplefilter("ignore")  # reported below instead
         group = pyproj.transformer.TransformerGroup(geocentric, crs, always_xy=True)
     # A negative accuracy means that heights are not converted.
     if crs.is_compound and not (group.best_available and group.transformers[0].accuracy >= 0.0):
@@ -258,7 +258,7 @@ class _Sensor:
             return PanoramaLens(width=width, height=height), ""
         if kind not in ("frame", "fisheye"):
             return (
-                f"its sensor {self.label} is of type {kind}; orthoflow takes frame, fisheye and "
+                f"its sensor {self.label} is of type {kind}; orthoflow supports frame, fisheye and "
                 "spherical"
             ), ""
         calibrations = element.findall("calibration")
@@ -291,7 +291,7 @@ def _size(owner: ET.Element, label: str, path: Path) -> tuple[int, int]:
     words = [] if size is None else [size.get("width", ""), size.get("height", "")]
     values = numbers_of(words, path, f"the size of sensor {label}")
     if len(values) != 2 or min(values) < 1.0 or values[0] * values[1] > MOST_PIXELS:
-        raise damaged(path, f"sensor {label} does not state its size in pixels")
+        raise damaged(path, f"the size of sensor {label} in pixels is missing")
     return round(values[0]), round(values[1])
 
 
@@ -304,7 +304,7 @@ def _camera(
 ) -> GivenCamera:
     name = photo_path(element.get("label", ""))
     if sensor is None:
-        return GivenCamera(name=name, reason="it names no sensor")
+        return GivenCamera(name=name, reason="it has no sensor")
     if isinstance(sensor.lens, str):
         return GivenCamera(name=name, reason=sensor.lens)
     master = masters.get(element.get("master_id", ""), element)
@@ -349,7 +349,7 @@ def _rolling_shutter(element: ET.Element, sensor: _Sensor) -> str:
         moved = f" by up to {0.5 * focal * math.acos(cosine):.2g} pixels"
     return (
         f"sensor {sensor.label} has a rolling shutter, for which Metashape compensates and "
-        f"orthoflow does not: places near the first and last rows are off{moved}"
+        f"orthoflow does not: the first and last rows are displaced{moved}"
     )
 
 

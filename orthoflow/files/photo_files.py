@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 # Formats that can be decoded; HEIC and AVIF only if Pillow supports them.
 READABLE: Final = frozenset({"JPEG", "PNG", "TIFF", "BigTIFF", "WebP", "HEIC", "AVIF"})
-HOW_TO_DEVELOP: Final = "develop to TIFF of 16 bits or JPEG first, without lens corrections"
+HOW_TO_DEVELOP: Final = "develop it first to 16-bit TIFF or JPEG, without lens corrections"
 HOW_TO_READ_HEIC: Final = "install orthoflow-tls[heic], or convert it to JPEG at full size"
 # 800 MB as RGB, twice the size of the largest sensors; a PNG of 100 kB can declare more.
 #: pixels declared by a photo, before it is decoded
@@ -115,7 +115,7 @@ def unreadable(encoded: bytes) -> str:
     if kind in READABLE:
         return ""
     way_out = HOW_TO_DEVELOP if "raw" in kind else "convert it to JPEG or TIFF, at full size"
-    return f"is {kind}, which is not read: {way_out}"
+    return f"is {kind}, which is not supported: {way_out}"
 
 
 def _media_format(encoded: bytes) -> str:
@@ -234,11 +234,11 @@ def tiff_pixels(encoded: bytes) -> Colours:
     """
     found = photo_page(encoded)
     if found is None:
-        raise ValueError("it has no page that can be read")
+        raise ValueError("it has no readable page")
     start, tags = found
     kind = tags.get(_PHOTOMETRIC_TAG)
     if kind not in _COLOURS_OF_TIFF:
-        raise ValueError(f"its colours (photometric {kind}) are not read: save it as RGB")
+        raise ValueError(f"its colours (photometric {kind}) are not supported: save it as RGB")
     with _tiff_page(encoded, start) as page:
         if page.dtypes[0] not in ("uint8", "uint16"):
             raise ValueError(f"its samples are {page.dtypes[0]}: save it with 8 or 16 bits")
@@ -679,7 +679,7 @@ def _doubt(what: str, value_mm: float | None, possible_mm: tuple[float, float]) 
     if value_mm is None or shortest <= value_mm <= longest:
         return ""
     limits = f"{shortest:g} to {longest:g} mm"
-    return f"EXIF states a {what} of {value_mm:g} mm, which no lens has ({limits})"
+    return f"EXIF contains a {what} of {value_mm:g} mm, outside the possible range ({limits})"
 
 
 def _believed_focal_length(exif: Exif, width: int, height: int) -> FocalLength:
@@ -688,7 +688,7 @@ def _believed_focal_length(exif: Exif, width: int, height: int) -> FocalLength:
     if _is_cropped(exif, width, height):
         return FocalLength(
             value_px=None,
-            reason=f"the photo was cut after it was taken ({exif.width} x {exif.height} became "
+            reason=f"the photo was cropped after it was taken ({exif.width} x {exif.height} became "
             f"{width} x {height}), so its EXIF data no longer apply",
         )
     by_pitch = _by_pitch(exif, max(width, height))
@@ -704,7 +704,7 @@ def _believed_focal_length(exif: Exif, width: int, height: int) -> FocalLength:
         return FocalLength(value_px=by_equivalent, reason="35 mm equivalent over the diagonal")
     return FocalLength(
         value_px=None,
-        reason=f"EXIF states {exif.focal_mm:g} mm but neither the pixel pitch nor the 35 mm "
+        reason=f"EXIF contains {exif.focal_mm:g} mm but neither the pixel pitch nor the 35 mm "
         "equivalent",
     )
 

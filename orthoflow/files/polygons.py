@@ -75,7 +75,7 @@ def read_polygons(path: Path, name: str, *, what: str) -> list[NamedPolygon]:
         except (TypeError, ValueError, KeyError, IndexError, OverflowError) as error:
             raise InputError(f"{expected} (feature {number})") from error
         if len(found) > MOST_POLYGONS:
-            raise InputError(f"{path.name} holds more than {MOST_POLYGONS} polygons: split it")
+            raise InputError(f"{path.name} contains more than {MOST_POLYGONS} polygons: split it")
     return found
 
 

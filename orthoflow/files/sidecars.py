@@ -21,7 +21,7 @@ from orthoflow.geometry.levels import eight_bits
 from orthoflow.products import JsonValue, LayerMask, OrthoMask, SurfaceMask
 from orthoflow.untrusted_text import json_bytes, parse_json, text_of_file
 
-#: bytes of the JSON file beside it
+#: bytes of the JSON file of a raster
 MOST_SIDECAR_BYTES: Final = 1 << 20
 # Wall numbers are stored in 16 bits.
 #: largest number of a wall
@@ -112,7 +112,7 @@ def sidecar_of(text: str, name: str) -> dict[str, object]:
     try:
         content = parse_json(text)
     except ValueError as error:
-        raise InputError(f"{name}: no JSON, {error}") from error
+        raise InputError(f"{name}: not valid JSON, {error}") from error
     if not isinstance(content, dict):
         raise InputError(f"{name}: expected a JSON object with origin_world, u_world ...")
     return content
@@ -177,7 +177,7 @@ def frame_of_raster(
         if placed.raster_down != raster.down:
             raise InputError(
                 f"{name}: its rows go {'up' if raster.down > 0.0 else 'down'} along Y, but those "
-                "of the wall that the file beside it describes go the other way: export it with "
+                "of the wall described in the file next to it go the other way: export it with "
                 "the rows in the order of orthoflow's own GeoTIFF"
             )
         right_m = raster.corner_m[0] - left_m
@@ -361,7 +361,7 @@ class OrthoFile:
             if raster.bands < _COLOURS or raster.dtype not in ("uint8", "uint16"):
                 raise InputError(
                     f"{self.path} has {raster.bands} bands of {raster.dtype}, expected "
-                    f"{_COLOURS} of 8 or 16 bits"
+                    f"{_COLOURS} with 8 or 16 bits"
                 )
             bands, shown = raster.read((left, top, right, bottom), shape)
         return eight_bits(np.ascontiguousarray(bands[:, :, :_COLOURS])), shown

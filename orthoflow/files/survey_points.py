@@ -127,7 +127,7 @@ def read_survey_points(path: Path) -> tuple[SurveyPoint, ...]:
         if not name:
             table.add(line, "the name is missing")
         elif lines.setdefault(name, line) != line:
-            table.add(line, f"the name {name} is there already, in line {lines[name]}")
+            table.add(line, f"the name {name} is already used in line {lines[name]}")
         x, y, z = table.numbers(line, cells, _POSITION)
         group = table.measured_by(line, {key for key in measured if cells.get(key)})
         place = tuple(table.numbers(line, cells, group))
@@ -193,7 +193,7 @@ class _Table:
         if not first:
             if not self.problems:
                 self.problems.append(
-                    f"{self.path.name} holds no {self.content}: expected {names} per line"
+                    f"{self.path.name} contains no {self.content}: expected {names} per line"
                 )
             return
         # In a header, the columns of numbers contain no numbers.
@@ -211,7 +211,7 @@ class _Table:
             hint = "; write decimal points, not commas" if len(cells) > len(columns) else ""
             self.add(number, f"expected {len(columns)} columns, got {len(cells)}{hint}")
         if not n_rows and not self.problems:
-            self.add(line, f"only the names of the columns, no {self.content}")
+            self.add(line, f"there is only a header, but no {self.content}")
 
     def numbers(self, line: int, cells: Mapping[str, str], keys: Collection[str]) -> list[float]:
         """Return numbers; NaN for cells that are not finite numbers."""
@@ -260,9 +260,9 @@ class _Table:
         separator = next((mark for mark in _SEPARATORS if mark in first), ",")
         for place, (number, line) in enumerate(numbered):
             if len(line) > MOST_LINE:
-                problem = f"the line is longer than {MOST_LINE} letters: this is not such a table"
+                problem = f"the line is longer than {MOST_LINE} characters: not such a table"
             elif place >= MOST_POINTS:
-                problem = f"the file holds more than {MOST_POINTS} {self.content}: split it"
+                problem = f"the file contains more than {MOST_POINTS} {self.content}: split it"
             else:
                 cells = next(csv.reader([line], delimiter=separator))
                 yield number, [cell.strip() for cell in cells]
@@ -291,7 +291,7 @@ class _Table:
                 hint = f" (did you mean {near[0]}?)" if near else ""
                 self.add(line, f"unknown column {name}{hint}; known are {', '.join(known)}")
             elif names.count(name) > 1:
-                self.add(line, f"the column {name} is there {names.count(name)} times")
+                self.add(line, f"the column {name} occurs {names.count(name)} times")
         missing = [name for name in self.required if name not in names]
         if missing:
             self.add(line, f"the column {', '.join(missing)} is missing")

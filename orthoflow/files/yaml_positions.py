@@ -297,7 +297,7 @@ def _unreadable(error: MarkedYAMLError, text: str) -> _UnreadableError:
         where = f"noticed in line {noticed.line}"
         return _UnreadableError(opened, f"this is not YAML: {_OPENED[context]}; {where}: {problem}")
     if "block end" in problem:
-        words = "this line is indented as none above it is, or a line above lacks its end"
+        words = "the indentation of this line matches no line above, or a line above is incomplete"
     return _UnreadableError(noticed, f"this is not YAML: {words}")
 
 
@@ -351,7 +351,7 @@ class _Converter:
             here = (*at, key)
             if key in entries:
                 first = self.keys[here].line
-                message = f"the key is there already, in line {first}; remove one of them"
+                message = f"the key is already used in line {first}; remove one of them"
                 self.log.add(position, path_text(here), message)
                 continue
             self.keys[here] = position
@@ -435,7 +435,7 @@ def _parse_scalar(kind: str, text: str) -> Scalar:
             return {"true": True, "false": False}[text.lower()]
         case "int":
             if len(text) > MOST_DIGITS:
-                # Python refuses long decimal numbers itself, but could not print others.
+                # Python itself refuses only long decimal numbers, but can print no long ones.
                 raise ValueError(f"more than {MOST_DIGITS} digits")
             return int(text, {"0o": 8, "0x": 16}.get(text[:2], 10))
         case "float":

@@ -67,11 +67,11 @@ ELSEWHERE = "/vsicurl/http://127.0.0.1:9/a.tif"
 @pytest.mark.parametrize(
     ("cells", "sentence"),
     [
-        ((100_000, 100_000, 0.01, {}), "states 100000 x 100000 cells in 3 bands, but "),
-        *long_only(((1_000_000, 30, 0.01, {}), "states 1000000 x 30 cells in 3 bands, but ")),
+        ((100_000, 100_000, 0.01, {}), "declares 100000 x 100000 cells in 3 bands, but its "),
+        *long_only(((1_000_000, 30, 0.01, {}), "declares 1000000 x 30 cells in 3 bands, but its ")),
         ((60, 40, 1e-300, {}), "has cells of 1e-300 m, expected 1e-06 to 1e+06 m"),
         *long_only(((60, 40, 1e300, {}), "has cells of 1e+300 m, expected 1e-06 to 1e+06 m")),
-        ((600, 400, 0.01, {"OVERVIEW_FILE": ELSEWHERE}), "names another file for its overviews"),
+        ((600, 400, 0.01, {"OVERVIEW_FILE": ELSEWHERE}), "stores its overviews in another file"),
     ],
 )
 def test_a_picture_that_no_wall_can_have_is_refused_at_once(

@@ -156,6 +156,6 @@ def test_another_size_is_refused_and_a_turned_one_named() -> None:
     ):
         lens_for(calibration, "a.jpg", 2000, 1500)
     with pytest.raises(
-        InputError, match=r"it seems to be for the turned photo.*as they are stored"
+        InputError, match=r"it seems to be for the rotated photo.*as they are stored"
     ):
         lens_for(calibration, "a.jpg", 3000, 4000)

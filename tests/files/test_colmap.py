@@ -94,7 +94,10 @@ def test_what_colmap_cannot_hold_is_refused(tmp_path: Path) -> None:
     camera = oriented().cameras[0]
     assert camera.intrinsics is not None
     for one, message in (
-        (replace(camera, photo="north wall 1.jpg"), r'first space, but one is "north wall 1\.jpg"'),
+        (
+            replace(camera, photo="north wall 1.jpg"),
+            r'first space, but there is "north wall 1\.jpg"',
+        ),
         (Camera(photo="a.png", status="too few ties"), "no photo is oriented"),
         (
             replace(camera, intrinsics=replace(camera.intrinsics, skew=-2.0)),

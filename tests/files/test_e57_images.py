@@ -85,8 +85,8 @@ def test_images_without_a_pose_are_photos_with_the_reason(tmp_path: Path) -> Non
     images = read_e57_images(written(tmp_path, reference, unposed, pinhole()))
     assert [image.name for image in images] == ["room_000.png", "room_001.jpg", "room_002.jpg"]
     reasons = [image.camera.reason for image in images]
-    assert "for reference only" in reasons[0]
-    assert "states no pose of it" in reasons[1]
+    assert "only for reference" in reasons[0]
+    assert "contains no pose for it" in reasons[1]
     assert reasons[2] == ""
     assert images[0].content == encode_png(PICTURE)
     photos, cameras = read(tmp_path / "room.e57")
@@ -152,12 +152,12 @@ def test_what_is_no_photo_is_refused_with_the_reason(tmp_path: Path) -> None:
     half = spherical()
     half["numbers"] = half["numbers"] | {"pixelHeight": 0.5 * np.pi / 360}
     (image,) = read_e57_images(written(tmp_path, half))
-    assert "a part of a panorama, only whole ones are taken" in image.camera.reason
-    with pytest.raises(InputError, match=r"room\.e57 holds no photos"):
+    assert "a part of a panorama; only full panoramas" in image.camera.reason
+    with pytest.raises(InputError, match=r"room\.e57 contains no photos"):
         read(written(tmp_path))
     for change, message in (
-        ({"imageWidth": 65}, "has 64 x 48 pixels, but its file states 65 x 48"),
-        ({"pixelWidth": 0.0}, r"the lens of photo room_000\.jpg is none"),
+        ({"imageWidth": 65}, "has 64 x 48 pixels, but its file declares 65 x 48"),
+        ({"pixelWidth": 0.0}, r"the lens of photo room_000\.jpg is invalid"),
     ):
         with pytest.raises(InputError, match=message):
             read(written(tmp_path, pinhole(numbers=NUMBERS | change)))

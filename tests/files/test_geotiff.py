@@ -39,12 +39,12 @@ def stored(folder: Path, n_bytes: int) -> Path:
 def test_a_larger_one_states_eleven_hundred_values_a_byte(tmp_path: Path) -> None:
     path = stored(tmp_path, 1_000_000)
     check_header(path, stated(1_100_000, 1000))
-    with pytest.raises(InputError, match="1100001 x 1000 cells in 1 bands, but 1000000 bytes"):
+    with pytest.raises(InputError, match="1100001 x 1000 cells in 1 bands, but its 1000000 bytes"):
         check_header(path, stated(1_100_001, 1000))
 
 
 def test_a_file_that_names_another_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"^wall\.tif names another file for its overviews"):
+    with pytest.raises(InputError, match=r"^wall\.tif stores its overviews in another file"):
         check_header(stored(tmp_path, 100), stated(4, OVERVIEW_FILE="http://a/b.ovr"))
 
 

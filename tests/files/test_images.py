@@ -46,7 +46,9 @@ def test_a_file_that_states_more_pixels_than_anyone_has_is_not_decoded() -> None
     def stating(width: int, height: int) -> bytes:
         return plain[:16] + struct.pack(">II", width, height) + plain[24:]
 
-    with pytest.raises(InputError, match=r"a\.png is too large: 16385 x 16384 pixels, at most"):
+    with pytest.raises(
+        InputError, match=r"a\.png is too large: 16385 x 16384 pixels; the limit is"
+    ):
         images.decode_image(stating(16_385, 16_384), "a.png")
     # As many as are decoded, but they are not in the file.
     with pytest.raises(InputError, match=r"a\.png cannot be decoded as an image \(\d+ bytes\)"):
@@ -61,7 +63,7 @@ def test_no_room_is_made_for_what_a_png_only_says_that_it_has(
     monkeypatch.setattr("cv2.imdecode", lambda *_: pytest.fail("it was handed to the decoder"))
     for stated in (2**31 - 1, 3_332_046_943):
         hostile = whole[:at] + struct.pack(">I", stated) + whole[at + 4 :]
-        with pytest.raises(InputError, match="expected a whole JPEG, PNG or TIFF file"):
+        with pytest.raises(InputError, match="expected a complete JPEG, PNG or TIFF file"):
             images.decode_image(hostile)
 
 

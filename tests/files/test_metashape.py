@@ -66,9 +66,9 @@ def test_the_last_calibration_holds_an_adjusted_one_before_others(
     [
         (SENSOR.replace(ADJUSTED, ""), "its sensor NIKON has no calibration"),
         (SENSOR.replace("<f>500</f>", "<k1>0</k1>"), "has no focal length f (Metashape 1.2 or"),
-        (SENSOR.replace('"frame"', '"rpc"', 1), "orthoflow takes frame, fisheye and spherical"),
+        (SENSOR.replace('"frame"', '"rpc"', 1), "orthoflow supports frame, fisheye and spherical"),
         (SENSOR.replace(' label="NIKON"', "").replace(ADJUSTED, ""), "its sensor 0 has no calib"),
-        ("", "it names no sensor"),
+        ("", "it has no sensor"),
     ],
 )
 def test_a_camera_without_a_lens_says_why(tmp_path: Path, sensor: str, reason: str) -> None:

@@ -76,5 +76,7 @@ def test_depths_are_no_colours(tmp_path: Path) -> None:
     write_raster(
         one.path, np.zeros((ROWS, COLUMNS), np.float32), place=GridPlace(gsd_m=0.5), tags={}
     )
-    with pytest.raises(InputError, match=r"ortho\.tif has 1 bands of float32, expected 3 of 8 or"):
+    with pytest.raises(
+        InputError, match=r"ortho\.tif has 1 bands of float32, expected 3 with 8 or"
+    ):
         one.shrunk(9)

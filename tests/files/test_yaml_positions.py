@@ -88,7 +88,7 @@ NO_YAML = "this is not YAML: "
     ("text", "place", "words"),
     [
         ("", (1, 1, ""), "the document is empty"),
-        ("a: 1\na: 3", (2, 1, "a"), "the key is there already, in line 1; remove one of them"),
+        ("a: 1\na: 3", (2, 1, "a"), "the key is already used in line 1; remove one of them"),
         ("a: {3: x}", (1, 5, "a"), "a key must be text, got 3"),
         ("a: {~: x}", (1, 5, "a"), "a key must be text, got ~"),
         ("a:\n  ? [x]\n  : 1", (2, 5, "a"), "a key must be text, got a list or mapping"),
@@ -108,7 +108,8 @@ NO_YAML = "this is not YAML: "
         ("a: \x01", (1, 4, ""), NO_YAML + "unacceptable character #x0001"),
         ("a:\n\tb: 1", (2, 1, ""), NO_YAML + "there is a tab here; indent with spaces"),
         ("a:\n    b: 1\n  c: 2", (3, 3, ""),
-         NO_YAML + "this line is indented as none above it is, or a line above lacks its end"),
+         NO_YAML + "the indentation of this line matches no line above, "
+         "or a line above is incomplete"),
         ("a:\n  b: [1, 2\nc: }", (2, 6, ""),
          NO_YAML + "the bracket [ that opens here is not closed; noticed in line 3: "),
         ("a: {b: 1\n", (1, 4, ""),

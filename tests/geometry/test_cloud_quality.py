@@ -129,8 +129,8 @@ def test_another_axis_is_told_with_the_setting(tmp_path: Path) -> None:
     warn_of_up(fallen, "z", ctx)
     (said,) = ctx.warnings
     assert said == (
-        "y looks like the axis that points up, not z: 96% of the surfaces are level or upright by "
-        "it, 37% by z: {step}.up=y, or -y where floors come out as ceilings"
+        "the up axis seems to be y, not z: 96% of the surfaces are horizontal or vertical with "
+        "respect to it, 37% with respect to z: {step}.up=y, or -y if floors become ceilings"
     )
     for right in ("y", "-y"):
         warn_of_up(fallen, right, ctx)
@@ -172,7 +172,7 @@ def test_what_is_wrong_is_said_with_numbers(tmp_path: Path) -> None:
         "point is 2.0 mm away: planes and depths"
     )
     assert apart == (
-        "the scans disagree: where two show one surface they are 9.4 mm apart (median), "
+        "the scans disagree: where two show the same surface, they are 9.4 mm apart (median), "
         "while the scatter of each is 3.1 mm: register them again, or use one at a time"
     )
     thin = context(tmp_path)

@@ -85,7 +85,9 @@ def test_a_folder_becomes_a_workflow_that_is_fine_as_it_is(data: Path) -> None:
     assert "ties: ties.csv, 1 tie" in out
     assert "not used: notes.txt: text, left out beside scans of other formats" in out
     assert "not used: plan.dwg: no method reads such files" in out
-    assert "not used: IMG_7.CR2: camera raw, which is not read: develop to TIFF of 16 bits" in out
+    assert (
+        "not used: IMG_7.CR2: camera raw, which is not read: develop it first to 16-bit TIFF" in out
+    )
     assert "next: orthoflow check 'jobs/hall 1.yaml'" in out
 
 
@@ -210,7 +212,7 @@ def test_the_unit_that_a_scan_states_is_used_and_degrees_are_refused(data: Path)
     assert "note:" not in out
     result = asked("new", data / "degrees.las", "-o", "degrees.yaml")
     assert result.exit_code == 2
-    assert "degrees.las states geographic coordinates in degrees" in result.output
+    assert "degrees.las has geographic coordinates in degrees" in result.output
 
 
 @pytest.mark.parametrize("up", ["x", "z"])

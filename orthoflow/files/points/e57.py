@@ -258,7 +258,9 @@ def check_xml(path: Path) -> None:
     """
     xml = _xml_of(path)
     if b"<!DOCTYPE" in xml or b"<!ENTITY" in xml:
-        raise _refusal(path, "it declares a document type or entities, which no E57 has")
+        raise _refusal(
+            path, "it declares a document type or entities, which E57 files do not contain"
+        )
     names: set[bytes] = set()
     n_elements = depth = 0
     for tag in _TAG.finditer(xml):
@@ -281,7 +283,7 @@ def _xml_of(path: Path) -> bytes:
             raise _refusal(path, "the file ends within its header")
         _, _, _, _, start, length, _ = _HEADER.unpack(head)
         if length > MOST_XML_BYTES:
-            raise _refusal(path, f"it has {length} bytes, at most {MOST_XML_BYTES} are read")
+            raise _refusal(path, f"it has {length} bytes; the limit is {MOST_XML_BYTES}")
         offset = start % _PAGE
         file.seek(min(start - offset, path.stat().st_size))
         raw = file.read((offset + length) // _PAYLOAD * _PAGE + 2 * _PAGE)
@@ -292,5 +294,5 @@ def _xml_of(path: Path) -> bytes:
 def _refusal(path: Path, reason: str) -> InputError:
     return InputError(
         f"{path.name} cannot be read as E57: its XML is refused, {reason}; the file is damaged or "
-        "was not written by a scanner's program, copy or export it again"
+        "was not written by scanner software; copy or export it again"
     )

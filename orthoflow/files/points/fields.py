@@ -233,7 +233,7 @@ def columns_of_values(
         raise InputError(
             f"{file_name} has {n_columns} columns and no header that names them; its first line is "
             f"{first_line[:80]!r}: name them with cloud.columns, e.g. "
-            "--set 'cloud.columns=[x, y, z, r, g, b, intensity]', with _ for one to skip"
+            "--set 'cloud.columns=[x, y, z, r, g, b, intensity]', with _ for columns to skip"
         )
     return Columns(names=(*lead, "x", "y", "z", *readings[0]))
 

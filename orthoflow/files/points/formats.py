@@ -63,7 +63,7 @@ def find_format(path: Path) -> Format:
     """
     if not path.is_file():
         found = "a folder" if path.is_dir() else "nothing"
-        raise InputError(f"{path.name} must be a point file, but there is {found} at that place")
+        raise InputError(f"{path.name} must be a point file, but there is {found} at this path")
     try:
         with path.open("rb") as file:
             start = file.read(_SNIFFED_BYTES)
@@ -82,9 +82,9 @@ def find_format(path: Path) -> Format:
         )
     if named.beginning or (named is PCD and b"\0" in start[:64]):
         raise InputError(
-            f"{path.name} is named as {named.name} but does not begin with "
-            f"{named.beginning or '# .PCD'!r}: the file is damaged or of another format; export it "
-            "again or give it its right suffix"
+            f"{path.name} has the suffix of {named.name} files but does not begin with "
+            f"{named.beginning or '# .PCD'!r}: the file is damaged or has another format; export "
+            "it again or correct its suffix"
         )
     return named
 
@@ -122,7 +122,7 @@ def open_scan(
     n_bytes = path.stat().st_size
     if scan.n_most > MOST_POINTS_PER_BYTE * n_bytes:
         raise InputError(
-            f"{path.name} states {scan.n_most} points but has {n_bytes} bytes, which cannot hold "
-            "them: the file is damaged or cut off, copy or export it again"
+            f"{path.name} declares {scan.n_most} points, but its {n_bytes} bytes cannot contain "
+            "them: the file is damaged or cut off; copy or export it again"
         )
     return scan

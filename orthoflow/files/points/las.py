@@ -159,7 +159,7 @@ def _count_points(path: Path, header: Any, notes: list[str]) -> int:
     if present <= stated or rest:
         return stated
     notes.append(
-        f"{path.name}: its header states {stated} points, but it holds {present}: all are read"
+        f"{path.name}: its header declares {stated} points, but it contains {present}: all are read"
     )
     return int(present)
 
@@ -229,8 +229,8 @@ def _blocks(
         raise cut_off(path, "data", f"{n_read} points", f"{n_points}")
     if n_outside:
         notes.append(
-            f"{path.name}: {n_outside} points lie outside the bounds its header states; they are "
-            "kept, but check that the file is whole"
+            f"{path.name}: {n_outside} points are outside the bounding box in its header; they are "
+            "kept, but check that the file is complete"
         )
 
 
@@ -283,8 +283,8 @@ def _count_outside(path: Path, header: Any, block: PointBlock) -> int:
         is_moved = is_outside.mean() > 0.5 and np.ptp(ends, axis=0).max() < 2.0 * extent
         if not is_moved:
             raise InputError(
-                f"{path.name} is damaged: points lie {far:.0f} units outside the bounds "
-                f"its header states ({low.tolist()} to {high.tolist()}); copy or "
+                f"{path.name} is damaged: points are {far:.0f} units outside the bounding box "
+                f"in its header ({low.tolist()} to {high.tolist()}); copy or "
                 "export it again"
             )
     return int(np.count_nonzero(is_outside))
@@ -305,7 +305,7 @@ def _check_header(path: Path) -> None:
     if not header_size <= start <= n_file:
         raise _damaged(path, "its points begin outside the file, which is cut off")
     if n_records * _VLR_BYTES > start - header_size:
-        raise _damaged(path, f"its header states {n_records} records that do not fit")
+        raise _damaged(path, f"its header declares {n_records} records, which do not fit")
     if header[25] >= 4 and len(header) >= _HEADER_BYTES:
         first, n_extended = struct.unpack_from("<QI", header, 235)
         if n_extended and first + n_extended * _EVLR_BYTES > n_file:
@@ -333,7 +333,7 @@ def _checked_chunks(path: Path, header: Any) -> list[_Chunk]:
     lazrs = load_library("lazrs", path)
     compression = lazrs.LazVlr(record)
     if compression.item_size() != header.point_format.size:
-        raise _damaged(path, "its points are not as large as its header states")
+        raise _damaged(path, "the size of its points differs from that in its header")
     start, n_stated = int(header.offset_to_point_data), int(header.point_count)
     n_file = path.stat().st_size
     with path.open("rb") as file:
@@ -342,11 +342,11 @@ def _checked_chunks(path: Path, header: Any) -> list[_Chunk]:
             # Programs that could not seek back wrote the offset at the end of the file.
             at = _offset_at(path, file, n_file - _OFFSET_BYTES)
         if not start + _OFFSET_BYTES <= at <= n_file - _OFFSET_BYTES:
-            raise _damaged(path, "its chunk table lies outside the file, which is cut off")
+            raise _damaged(path, "its chunk table is outside the file, which is cut off")
         n_bytes = at - start - _OFFSET_BYTES
         n_chunks = _offset_at(path, file, at) >> 32 & 0xFFFFFFFF
         if n_chunks > min(n_stated, n_bytes):
-            raise _damaged(path, f"its chunk table states {n_chunks} chunks")
+            raise _damaged(path, f"its chunk table declares {n_chunks} chunks")
         file.seek(start)
         table = lazrs.read_chunk_table(file, compression)
     _check_chunks(path, header, compression, table, n_bytes)
@@ -372,9 +372,13 @@ def _check_chunks(
         raise _damaged(path, "its chunks are larger than the file")
     is_variable = compression.uses_variable_size_chunks()
     if not is_variable and compression.chunk_size() > max(MOST_FIXED_CHUNK, 2 * n_stated):
-        raise _damaged(path, f"its header states chunks of {compression.chunk_size()} points each")
+        raise _damaged(
+            path, f"its header declares chunks of {compression.chunk_size()} points each"
+        )
     if n_points < n_stated or (is_variable and n_points != n_stated):
-        raise _damaged(path, f"its chunks hold {n_points} points, its header states {n_stated}")
+        raise _damaged(
+            path, f"its chunks contain {n_points} points, but its header declares {n_stated}"
+        )
 
 
 def _check_layers(path: Path, record: bytes, start: int, chunks: list[int]) -> None:
@@ -386,7 +390,7 @@ def _check_layers(path: Path, record: bytes, start: int, chunks: list[int]) -> N
     (n_items,) = struct.unpack_from("<H", record, _ITEMS_AT)
     items = [struct.unpack_from("<HH", record, _ITEMS_AT + 2 + 6 * k) for k in range(n_items)]
     if not all(kind in _LAYERS or kind == _EXTRA_BYTES for kind, _ in items):
-        raise _damaged(path, "its compression is none of point formats 6 and up")
+        raise _damaged(path, "its compression is not one of point formats 6 and up")
     n_layers = sum(size if kind == _EXTRA_BYTES else _LAYERS[kind] for kind, size in items)
     sizes = struct.Struct(f"<I{n_layers}I")
     n_head = sum(size for _, size in items) + sizes.size
@@ -395,7 +399,7 @@ def _check_layers(path: Path, record: bytes, start: int, chunks: list[int]) -> N
             file.seek(start + n_head - sizes.size)
             raw = file.read(sizes.size)
             if len(raw) < sizes.size or n_head + sum(sizes.unpack(raw)[1:]) != n_bytes:
-                raise _damaged(path, "the layers of its chunks do not have the stated sizes")
+                raise _damaged(path, "the layers of its chunks do not have the declared sizes")
             start += n_bytes
 
 
@@ -486,10 +490,10 @@ def _chosen_nodes(path: Path, chunks: Sequence[_Chunk], query: PointQuery) -> li
         start, _HEADER_BYTES + _COPC_RECORD.size
     )
     if not (np.isfinite([*middle, half, spacing]).all() and half > 0.0 and spacing > 0.0):
-        raise _bad_octree(path, "its root has no size")
+        raise _bad_octree(path, "the size or spacing of its root is invalid")
     nodes = _read_nodes(path, (offset, n_bytes))
     if not set(nodes.values()) <= set(chunks):
-        raise _bad_octree(path, "it names chunks that the file does not have")
+        raise _bad_octree(path, "it references chunks that the file does not contain")
     last = _LEVELS_MOST
     if query.spacing is not None:
         # Separate logarithms: a damaged file's spacing may be so large that the quotient overflows.
@@ -522,13 +526,13 @@ def _read_nodes(path: Path, root: tuple[int, int]) -> dict[tuple[int, ...], _Chu
             # Pages do not overlap, so their total size cannot exceed that of the file.
             n_left -= n_bytes
             if offset + n_bytes > n_file or n_left < 0:
-                raise _bad_octree(path, "its pages lie outside the file")
+                raise _bad_octree(path, "its pages are outside the file")
             file.seek(offset)
             page = file.read(n_bytes // _COPC_ENTRY.size * _COPC_ENTRY.size)
             for level, x, y, z, begin, size, count in _COPC_ENTRY.iter_unpack(page):
                 is_inside = 0 <= level < _LEVELS_MOST and min(x, y, z) >= 0
                 if not is_inside or max(x, y, z) >= 2**level or size < 0 or count < _PAGE:
-                    raise _bad_octree(path, "a node lies outside the root")
+                    raise _bad_octree(path, "a node is outside the root")
                 if count == _PAGE and (begin, size) not in seen:
                     seen.add((begin, size))
                     pages.append((begin, size))
@@ -542,5 +546,5 @@ def _read_nodes(path: Path, root: tuple[int, int]) -> dict[tuple[int, ...], _Chu
 def _bad_octree(path: Path, reason: str) -> InputError:
     return InputError(
         f"{path.name} cannot be read as COPC: its octree is damaged, {reason}; copy or export it "
-        "again, or leave out box and gsd_m, without which all of its points are read"
+        "again, or remove box and gsd_m to read all of its points"
     )

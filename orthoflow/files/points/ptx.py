@@ -105,9 +105,9 @@ def open_ptx(path: Path, *, intensity_field: str | None = None) -> ScanFile:
     with path.open("rb") as file:
         parts = [_read_header(path, file, *first, *behind) for first, behind in pairwise(places)]
     notes = [
-        f"{path.name}: scan {k} has {part.n_points} lines of points, its header states "
+        f"{path.name}: scan {k} has {part.n_points} lines of points, but its header declares "
         f"{part.n_places // part.n_rows if part.n_rows else 0} x {part.n_rows} = {part.n_places}: "
-        "they are read without their places in the scan's grid"
+        "their positions in the scan's grid are ignored"
         for k, part in enumerate(parts)
         if not part.is_whole
     ]
@@ -207,7 +207,7 @@ def _read_header(
     if layout is None and n_points:
         raise InputError(
             f"{path.name}, line {line_at(path, begin)}: expected x y z, with intensity and r g "
-            f"b where the scan has them, got {first[:60]!r}"
+            f"b if the scan has them, got {first[:60]!r}"
         )
     return _Part(
         start=begin,

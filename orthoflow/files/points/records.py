@@ -78,7 +78,7 @@ def open_ply(path: Path, *, intensity_field: str | None = None) -> ScanFile:
         )
     except (ValueError, KeyError, IndexError) as error:
         raise InputError(
-            f"{path.name} has no PLY header that can be read ({error}); export it again"
+            f"{path.name} has no readable PLY header ({error}); export it again"
         ) from error
     known = [name.lower() for name, *_ in elements]
     position = next((known.index(name) for name in _VERTEX_NAMES if name in known), -1)
@@ -151,7 +151,7 @@ def _ply_header(text: str) -> tuple[str, list[_Element], list[str]]:
             names.append(words[-1])
             kinds.append(_LIST if words[0] == "list" else _PLY_TYPES[words[0]])
     if byte_order is None:
-        raise ValueError("it has no line that names the format")
+        raise ValueError("it has no format line")
     return byte_order, elements, comments
 
 
@@ -177,7 +177,7 @@ def open_pcd(path: Path, *, intensity_field: str | None = None) -> ScanFile:
         missing = [key for key in _PCD_KEYS if key not in entries]
         reason = f"without {', '.join(missing)}" if missing else str(error)
         raise InputError(
-            f"{path.name} has no PCD header that can be read ({reason}); export it again"
+            f"{path.name} has no readable PCD header ({reason}); export it again"
         ) from error
 
 

@@ -119,13 +119,13 @@ class ScanFile:
     def __post_init__(self) -> None:
         if self.n_most <= 0:
             raise InputError(
-                f"{self.name} holds no points: expected a scan; export it again from the program "
-                "that wrote it"
+                f"{self.name} contains no points: expected a scan; export it again from the "
+                "program that wrote it"
             )
         if self.n_most >= MOST_POINTS:
             raise InputError(
-                f"{self.name} states {self.n_most} points, at most {MOST_POINTS - 1} can be read: "
-                "thin it or split it, or export it again if that number is wrong"
+                f"{self.name} declares {self.n_most} points; the limit is {MOST_POINTS - 1}: "
+                "thin or split it, or export it again if the number is wrong"
             )
 
     @property
@@ -225,8 +225,8 @@ def _unpacked(packed: NDArray[Any]) -> NDArray[np.uint8]:
 def cut_off(path: Path, what: str, found: str, expected: str) -> InputError:
     """Return the error for a file that is shorter than its header declares."""
     return InputError(
-        f"{path.name} is cut off: its {what} holds {found}, its header states {expected}; copy or "
-        "export it again"
+        f"{path.name} is cut off: its {what} contains {found}, but its header declares {expected}; "
+        "copy or export it again"
     )
 
 
@@ -245,7 +245,7 @@ def reading(path: Path, format_name: str) -> Iterator[None]:
         # BaseException: a panic in a Rust library is not an Exception.
         raise InputError(
             f"{path.name} cannot be read as {format_name}: {_first_line(error)}; the file is "
-            "damaged or cut off, copy or export it again"
+            "damaged or cut off; copy or export it again"
         ) from error
 
 
@@ -260,8 +260,8 @@ def load_library(name: str, path: Path) -> Any:
         return import_module(name)
     except ImportError as error:
         raise PluginError(
-            f"{path.name} needs the library {name}, which does not load ({_first_line(error)}): "
-            f"install it with `python -m pip install {name}`"
+            f"{path.name} needs the library {name}, which cannot be imported "
+            f"({_first_line(error)}): install it with `python -m pip install {name}`"
         ) from error
 
 

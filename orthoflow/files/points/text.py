@@ -202,7 +202,7 @@ def _columns_of_header(
             f"{layout.n_columns} columns below it (first line {line[:80]!r})"
         )
         if any(re.match(r"lat(?!er)|lon(?!ger)", label, re.IGNORECASE) for label in labels):
-            text += "; if these are degrees, project them to a plane system in metres first"
+            text += "; if these are degrees, project them to metres first"
         # Keep known columns; missing x, y, z are assumed to be the last of the unknown ones.
         names = [meaning_of(label) for label in labels] if fits else []
         missing = [axis for axis in "xyz" if axis not in names]
@@ -214,7 +214,7 @@ def _columns_of_header(
             names = [*"xyz", *[IGNORED] * layout.n_columns][: layout.n_columns]
         raise InputError(
             f"{text}: name the columns with cloud.columns, e.g. --set "
-            f"'cloud.columns=[{', '.join(names)}]', with {IGNORED} for one to skip"
+            f"'cloud.columns=[{', '.join(names)}]', with {IGNORED} for columns to skip"
         )
     return None
 
@@ -243,8 +243,8 @@ def _first_lines(path: Path) -> list[str]:
         raise InputError(f"{path.name} is UTF-16 text: save it as UTF-8 or plain ASCII")
     if any(b"\0" in line for line in raw):
         raise InputError(
-            f"{path.name} is named as a text file but holds binary data: give it the suffix of "
-            "its format, or export it as text"
+            f"{path.name} has the suffix of a text file but contains binary data: give it the "
+            "suffix of its format, or export it as text"
         )
     if raw:
         raw[0] = raw[0].removeprefix(codecs.BOM_UTF8)
@@ -403,7 +403,7 @@ def read_tables(
             raise _unread_line(Path(file.name), start, block, layout, wanted) from error
         if n_left is not None:
             n_left -= len(table[0])
-            if n_left < 0:  # the parser ends lines at these too
+            if n_left < 0:  # the parser ends lines at CR, too
                 raise _ended_by_returns(Path(file.name))
         yield table
 

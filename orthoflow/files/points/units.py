@@ -171,10 +171,10 @@ def refuse_degrees(file_name: str, unit: StatedUnit) -> None:
     """
     if unit.name == "deg":
         raise InputError(
-            f"{file_name} states geographic coordinates in degrees ({unit.source}): expected "
-            "metres or feet in a plane system. Project it, e.g. with `pdal translate ... "
+            f"{file_name} has geographic coordinates in degrees ({unit.source}): expected "
+            "metres or feet in a projected system. Project it, e.g. with `pdal translate ... "
             "reprojection --filters.reprojection.out_srs=EPSG:nnnn`, or set cloud.unit=m if its "
-            "numbers are metres all the same"
+            "numbers are metres in fact"
         )
 
 
@@ -182,7 +182,7 @@ def _unit_of_factors(level_m: float, height_m: float, source: str) -> StatedUnit
     """Build a unit from its factors to metres; None if they are not lengths."""
     if not (level_m > 0.0 and height_m > 0.0):
         return None
-    # Feet differ in the sixth digit.
+    # International and US survey feet differ in the sixth digit.
     names = [
         next((n for n, unit_m in UNITS_M.items() if abs(m / unit_m - 1.0) < 1e-7), f"{m:.10g} m")
         for m in (level_m, height_m)

@@ -170,8 +170,8 @@ class CloudAssembly:
         if not is_choice and not any(count.n_kept for count in counts):
             causes = ", ".join(f"{n} {c.replace('_', ' ')}" for c, n in left_out.items() if n)
             raise InputError(
-                f"{file.name} holds no usable points: of {sum(c.n_read for c in counts)}, left out "
-                f"are {causes}; export it again"
+                f"{file.name} contains no usable points: of {sum(c.n_read for c in counts)}, left "
+                f"out are {causes}; export it again"
             )
 
     def require_points(self) -> None:
@@ -186,10 +186,10 @@ class CloudAssembly:
             sum(count.left_out[cause] for count in self.counts)
             for cause in ("other_class", "outside_box")
         )
-        text = f"no point is left: {n_unwanted} are of other classes than those asked for"
+        text = f"no point is left: {n_unwanted} are of other classes than requested"
         if n_outside:
             low, high = (", ".join(f"{value:.2f}" for value in corner) for corner in self._reach_m)
-            text += f", {n_outside} lie outside the box: the points reach from ({low}) to ({high})"
+            text += f", {n_outside} are outside the box; the points extend from ({low}) to ({high})"
         raise InputError(f"{text}; change classes or box (read.scan)")
 
     @property
@@ -225,7 +225,7 @@ class CloudAssembly:
         if not len(usable):
             return
         if part.stop > self._capacity:
-            raise InputError(f"{count.file} holds more points than its header states")
+            raise InputError(f"{count.file} contains more points than its header declares")
         if scan > 0 and "scan" not in self._arrays:
             # Zeros are correct for all previous points.
             self._arrays["scan"] = self._new("scan", np.uint16)

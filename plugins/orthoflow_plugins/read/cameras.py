@@ -107,7 +107,7 @@ class ReadCameras(Method):
         if not n_oriented:
             raise InputError(
                 f"the input {inputs.files.name} orients none of the {len(photos)} photos, such as "
-                f"{photos[0].name if photos else 'none'}: it speaks of "
+                f"{photos[0].name if photos else 'none'}: it contains "
                 f"{first_few([item.name for item in given])}; "
                 f"{cameras[0].status if cameras else ''}"
                 "; without these files, photos are oriented by matching with the scan"
@@ -131,7 +131,7 @@ class ReadCameras(Method):
 def _camera(photo: Photo, given: GivenByName, unit_m: float, notes: dict[str, list[str]]) -> Camera:
     found = given.of_photo(photo.name, photo.folder)
     if found is None:
-        return Camera(photo=photo.name, status="the files of given cameras do not mention it")
+        return Camera(photo=photo.name, status="the files of given cameras do not contain it")
     if found.lens is None or found.rotation is None or found.translation is None:
         return Camera(photo=photo.name, status=found.reason)
     lens, note = found.lens, found.note
@@ -144,16 +144,16 @@ def _camera(photo: Photo, given: GivenByName, unit_m: float, notes: dict[str, li
     if isinstance(lens, WideLens):
         return Camera(
             photo=photo.name,
-            status="its lens is a fisheye or a panorama: wire the same files to read.photos as "
-            "cameras, which makes photos of it that can be painted from",
+            status="its lens is a fisheye or a panorama: connect the same files to read.photos as "
+            "cameras, which splits it into photos that can be used",
         )
     if note:
         notes.setdefault(note, []).append(photo.name)
     if (lens.width, lens.height) != (photo.width, photo.height):
         raise InputError(
             f"photo {photo.name} has {photo.width} x {photo.height} pixels, but its given camera "
-            f"{lens.width} x {lens.height}: give the photos that were oriented, at the same size "
-            "and not turned"
+            f"has {lens.width} x {lens.height}: use the photos that were oriented, at the same "
+            "size and not rotated"
         )
     translation_m = unit_m * np.asarray(found.translation, dtype=np.float64)
     # Negated, so that NaN is refused, too.
@@ -249,6 +249,6 @@ def _nearest(found: Sequence[GivenCamera], folder: str, *, is_only: bool) -> Giv
     count = f"{len(best)} cameras of its name ({names})" if len(best) > 1 else f"only {names}"
     return GivenCamera(
         name=found[0].name,
-        reason=f"the files of given cameras have {count}, and folders do not decide which is "
-        "its own: give photos and cameras the same folders",
+        reason=f"the files of given cameras contain {count}, and the folder names do not tell "
+        "which one belongs to this photo: use the same folders for photos and cameras",
     )

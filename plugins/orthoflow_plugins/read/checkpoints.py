@@ -57,7 +57,7 @@ class ReadCheckpoints(Method):
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Read all files as described for the class."""
         if not inputs.files.paths:
-            raise InputError(f"the input {inputs.files.name} names no files: expected check points")
+            raise InputError(f"the input {inputs.files.name} has no files: expected check points")
         points: list[SurveyPoint] = []
         places: dict[str, str] = {}
         for index, path in enumerate(inputs.files.paths):

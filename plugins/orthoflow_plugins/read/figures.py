@@ -178,8 +178,8 @@ class ContactSheet:
         else:
             which = "The photos, as they are stored"
         return (
-            f"{which}: a wall is painted well where several show it squarely; blur, or a part of "
-            "it that none shows, cannot be made good later."
+            f"{which}: orthoimages are good where several photos show a wall frontally; blur, "
+            "and parts that no photo shows, cannot be corrected later."
         )
 
     def add(self, name: str, image: NDArray[np.uint8]) -> None:

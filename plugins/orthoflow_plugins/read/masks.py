@@ -20,13 +20,13 @@ _ENDING: Final = "_mask"
 _POLYGONS: Final = (".geojson", ".json")
 UNUSED: Final = DiagnosticSpec(
     code="masks-of-no-photo",
-    text="masks of no photo: {names}",
+    text="masks without a photo: {names}",
     remedy="photos are identified by their names",
     rank_by="n",
 )
 NO_MASKS: Final = DiagnosticSpec(
     code="files-are-no-masks",
-    text="left out of the masks, neither picture (PNG, JPEG, TIFF) nor polygons (GeoJSON): {names}",
+    text="ignored masks, neither pictures (PNG, JPEG, TIFF) nor polygons (GeoJSON): {names}",
     rank_by="n",
 )
 
@@ -68,12 +68,12 @@ class Masks:
                 others.append(path.name)
             elif pictures.setdefault(_key(path.stem), path) != path:
                 raise InputError(
-                    f"{path.name} and {pictures[_key(path.stem)].name} are masks of one photo: "
-                    "leave one of them"
+                    f"{path.name} and {pictures[_key(path.stem)].name} are masks of the same "
+                    "photo: remove one of them"
                 )
         if others and len(others) == len(given):
             raise InputError(
-                f"no file of the masks is a picture (PNG, JPEG, TIFF) or polygons (GeoJSON), only "
+                f"the masks contain no pictures (PNG, JPEG, TIFF) or polygons (GeoJSON), only "
                 f"{first_few(sorted(set(others)))}"
             )
         return cls(pictures, polygons, others)
@@ -121,7 +121,7 @@ class Masks:
         if used.shape != size[::-1]:
             raise InputError(
                 f"mask {path.name} has {used.shape[1]} x {used.shape[0]} pixels, but {photo} "
-                f"{size[0]} x {size[1]}: a mask has the pixels of its photo, not turned"
+                f"has {size[0]} x {size[1]}: a mask must have the size of its photo, not rotated"
             )
         return used
 

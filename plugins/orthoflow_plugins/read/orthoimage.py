@@ -52,8 +52,8 @@ class ReadOrthoimage(Method):
         wall: int = Field(
             0,
             ge=0,
-            description="Wall of images whose JSON file does not state it: the place of its "
-            "plane in planes.json, as in the names of the files.",
+            description="Wall of images whose JSON file does not contain it: the index of its "
+            "plane in planes.json, as in file names.",
         )
 
     class In(Ports):
@@ -75,7 +75,7 @@ class ReadOrthoimage(Method):
         ]
         if not paths:
             raise InputError(
-                f"the input {inputs.files.name} holds no GeoTIFF: expected orthoimages, .tif"
+                f"the input {inputs.files.name} contains no GeoTIFF: expected orthoimages, .tif"
             )
         images: dict[int, Orthoimage] = {}
         for place, path in enumerate(paths):
@@ -83,8 +83,8 @@ class ReadOrthoimage(Method):
             image = _read(path, inputs.files.paths, params.wall)
             if image.wall in images:
                 raise InputError(
-                    f"{path.name} and {images[image.wall].sources[0]} are both of wall "
-                    f"{image.wall}: name another `wall` in the JSON file of one of them"
+                    f"{path.name} and {images[image.wall].sources[0]} both show wall "
+                    f"{image.wall}: set another `wall` in the JSON file of one of them"
                 )
             images[image.wall] = image
             ctx.log(f"{path.name}: wall {image.wall}, cells of {1e3 * image.frame.gsd_m:g} mm")
@@ -135,8 +135,8 @@ def _place(path: Path, among: Sequence[Path], raster: RasterFile) -> dict[str, o
         tags = {"name": raster.tags.get("name", path.stem)}
         return sidecar_of(raster.tags["frame"], path.name) | tags
     raise InputError(
-        f"{path.name} does not state its position in the world: put {path.stem}.json with "
-        "origin_world, u_world, v_world and normal_world among the files, e.g. a copy of the "
+        f"{path.name} does not contain its position in the world: add {path.stem}.json with "
+        "origin_world, u_world, v_world and normal_world to the files, e.g. a copy of the "
         "wall_<k>_intensity.json that orthoflow wrote"
     )
 
@@ -148,7 +148,7 @@ def _rgb(path: Path, raster: RasterFile) -> Colours:
     if bands.shape[2] not in (1, 3, 4) or bands.dtype not in (np.uint8, np.uint16):
         raise InputError(
             f"{path.name} has {bands.shape[2]} bands of {bands.dtype}: expected grey, RGB or RGBA "
-            "of 8 or 16 bits"
+            "with 8 or 16 bits"
         )
     colours = np.repeat(bands, 3, axis=2) if bands.shape[2] == 1 else bands[..., :3]
     level = np.uint16 if colours.dtype == np.uint16 else np.uint8

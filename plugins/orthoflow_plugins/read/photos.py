@@ -80,13 +80,13 @@ REMARK: Final = DiagnosticSpec(
 )
 EXIF_IMPOSSIBLE: Final = DiagnosticSpec(
     code="exif-impossible",
-    text="{photos}: {doubt}: it is not used",
+    text="{photos}: {doubt}: it is ignored",
     rank_by="n",
 )
 FOCAL_UNKNOWN: Final = DiagnosticSpec(
     code="focal-length-unknown",
     text="the focal length of {photos} is unknown ({reason}, and no calibration): the orientation "
-    "has to find it, needs more ties for that and may refuse",
+    "must estimate it, needs more ties for this and may fail",
     remedy="a calibration file helps",
     rank_by="n",
 )
@@ -351,7 +351,7 @@ def _masked(read: _ReadPhoto, source: _Source, masks: Masks) -> _ReadPhoto:
         used = _both(own, given)
         if used is None or not used.any():
             raise InputError(
-                f"nothing of photo {photo.name} is opaque and unmasked: leave the photo out"
+                f"no pixel of photo {photo.name} is opaque and unmasked: remove the photo"
             )
         mask = encode_png(np.where(used, np.uint8(255), np.uint8(0)))
     return replace(read, photo=replace(photo, mask=mask))
@@ -360,7 +360,7 @@ def _masked(read: _ReadPhoto, source: _Source, masks: Masks) -> _ReadPhoto:
 def _sources(ctx: StepContext, files: InputFiles, masks: Set[Path], cubes: _Cubes) -> list[_Source]:
     """Return the photos ordered by name; warn about other files."""
     if not files.paths:
-        raise InputError(f"the input {files.name} names no files: expected photos")
+        raise InputError(f"the input {files.name} has no files: expected photos")
     photos = [path for path in files.paths if path not in masks]
     folders = _folders(photos)
     sources, others = [], []
@@ -373,7 +373,7 @@ def _sources(ctx: StepContext, files: InputFiles, masks: Set[Path], cubes: _Cube
     _refuse_raw(files.name, [source.name for source in sources], others)
     if not sources:
         raise InputError(
-            f"the input {files.name} holds no photo, only {len(others)} other files: "
+            f"the input {files.name} contains no photo, only {len(others)} other files: "
             f"{first_few(others)}; expected JPEG, PNG, TIFF, WebP or HEIC (.jpg, .png, .tif ...)"
         )
     if others:
@@ -411,9 +411,9 @@ def _refuse_raw(input_name: str, photos: Sequence[str], others: Sequence[str]) -
     ]
     if raw:
         raise InputError(
-            f"the input {input_name} holds camera raw, which is not read: {_counted(raw)}; "
-            f"{HOW_TO_DEVELOP}, so that a calibration holds, or name the photos without it, e.g. "
-            "'FOLDER/*.jpg'"
+            f"the input {input_name} contains camera raw, which is not supported: {_counted(raw)}; "
+            f"{HOW_TO_DEVELOP}, so that a calibration stays valid, or list only the other photos, "
+            "e.g. 'FOLDER/*.jpg'"
         )
 
 
@@ -429,8 +429,8 @@ def _calibration(files: InputFiles | None) -> CalibratedLenses | None:
         return None
     if len(files.paths) != 1:
         raise InputError(
-            f"the input {files.name} names {len(files.paths)} files: expected one calibration "
-            "file, which may hold several cameras"
+            f"the input {files.name} has {len(files.paths)} files: expected one calibration "
+            "file, which may contain several cameras"
         )
     return read_calibration(files.paths[0])
 
@@ -448,7 +448,7 @@ def _require_whole(name: str, encoded: bytes) -> str:
     if is_lost:
         raise InputError(
             f"photo {name} is damaged or cut off: a part of its {len(encoded)} bytes cannot be "
-            f"decoded ({found}); copy it again from the camera, or take it out"
+            f"decoded ({found}); copy it again from the camera, or remove it"
         )
     return found
 
@@ -468,13 +468,13 @@ def _read_photo(
         calibrated = lens_for(calibration, name, width, height)
         if isinstance(calibrated, FisheyeLens):
             raise InputError(
-                f"photo {name} is inside an E57 file, but its calibration is that of a fisheye: "
-                "give the photo as a file of its own"
+                f"photo {name} is in an E57 file, but its calibration is for a fisheye lens: "
+                "provide the photo as a separate file"
             )
         intrinsics = calibrated or intrinsics
     if intrinsics is not None and (intrinsics.width, intrinsics.height) != (width, height):
         raise InputError(
-            f"photo {name} has {width} x {height} pixels, but its file states "
+            f"photo {name} has {width} x {height} pixels, but its file declares "
             f"{intrinsics.width} x {intrinsics.height}: export it again"
         )
     photo = Photo(
@@ -495,7 +495,7 @@ def _read_photo(
         ""
         if row is None
         else f"seems damaged from row {row} on, where colours change abruptly at the "
-        "blocks of the JPEG: check it, copy it again from the camera, or take it out",
+        "blocks of the JPEG: check it, copy it again from the camera, or remove it",
         f"holds bytes that its decoder skips ({odd}), so it may be damaged" if odd else "",
         f"has {n_pages} pages, of which the largest is read" if n_pages > 1 else "",
     )

@@ -44,13 +44,13 @@ COLOURS_ZERO: Final = DiagnosticSpec(
 )
 COLOUR_LIMIT: Final = DiagnosticSpec(
     code="scan-colour-limit-misfit",
-    text="{subject}: it states that colours reach {limit:g}, but its colours reach {largest:g}: "
+    text="{subject}: colours can reach {limit:g} according to the file, but reach {largest:g}: "
     "they are read as {scale}",
 )
 COLOUR_DEPTH: Final = DiagnosticSpec(
     code="scan-colour-depth-small",
-    text="{subject}: it states no limit of its colours, which reach {largest:g}: they are read as "
-    "{scale}",
+    text="{subject}: the file contains no limit of colours, which reach {largest:g}: they are read "
+    "as {scale}",
     rank_by="largest",
 )
 COLOURS_GREY: Final = DiagnosticSpec(
@@ -63,35 +63,35 @@ INTENSITY_ZERO: Final = DiagnosticSpec(
 )
 INTENSITY_LIMITS: Final = DiagnosticSpec(
     code="scan-intensity-limits-misfit",
-    text="{subject}: it states intensities from {stated_low:g} to {stated_high:g}, which its data "
-    "do not fit: they are scaled from {low:g} to {high:g}",
+    text="{subject}: intensities are {stated_low:g} to {stated_high:g} according to the file, but "
+    "the data do not fit: they are scaled from {low:g} to {high:g}",
     remedy="{step}.intensity_max=NUMBER sets the value of white",
 )
 INTENSITY_CLIPPED: Final = DiagnosticSpec(
     code="scan-intensity-clipped",
-    text="{subject}: {n_points} intensities lie beyond {low:g} to {high:g} ({rule}) and were "
+    text="{subject}: {n_points} intensities are outside {low:g} to {high:g} ({rule}) and were "
     "clipped",
     rank_by="n_points",
 )
 INTENSITY_RANGES: Final = DiagnosticSpec(
     code="scan-intensity-ranges-differ",
-    text="the scans have intensities of different range and state none: {ranges}; each is scaled "
-    "by its own, so equal surfaces may differ in brightness",
+    text="the scans have different intensity ranges, and their files contain none: {ranges}; each "
+    "is scaled by its own range, so the same surface may differ in brightness",
     remedy="{step}.intensity_max=NUMBER sets one for all",
 )
 INTENSITY_LUMINANCE: Final = DiagnosticSpec(
     code="scan-intensity-is-luminance",
-    text="the intensity is not the laser's but the luminance of the colours (correlation "
+    text="the intensity is not laser intensity but the luminance of the colours (correlation "
     "{correlation:.5f}): it is ignored, the colours contain it",
 )
 SCAN_WITHOUT: Final = DiagnosticSpec(
     code="scan-without-field",
-    text="{subject} has no {field}: its {n_points} points have a position only",
+    text="{subject} has no {field}: its {n_points} points have only coordinates",
     rank_by="n_points",
 )
 POINTS_WITHOUT: Final = DiagnosticSpec(
     code="points-without-field",
-    text="{n_points} points have no valid {field}: they have a position only",
+    text="{n_points} points have no valid {field}: they have only coordinates",
     rank_by="n_points",
 )
 NO_INTENSITY: Final = DiagnosticSpec(
@@ -101,13 +101,13 @@ NO_INTENSITY: Final = DiagnosticSpec(
 )
 FEW_STATIONS: Final = DiagnosticSpec(
     code="scan-stations-missing",
-    text="only {n_stations} of {n_scans} scans state where the scanner stood; the nearest "
+    text="only {n_stations} of {n_scans} scans contain a scanner position; the nearest "
     "station determines the front of a wall",
 )
 COARSE_OFFSETS: Final = DiagnosticSpec(
     code="scan-offsets-coarse",
     text="the points reach {farthest_m:.0f} m from the origin of the cloud, where coordinates are "
-    "kept to {resolution_mm:.2f} mm only",
+    "rounded to {resolution_mm:.2f} mm",
     remedy="check {step}.unit, or cut stray points off with {step}.box",
 )
 ROUNDED: Final = DiagnosticSpec(
@@ -123,14 +123,14 @@ SIZE: Final = DiagnosticSpec(
 )
 TOO_FAR: Final = DiagnosticSpec(
     code="points-too-far",
-    text="{subject}: {n_points} points lie farther than {farthest_m:g} m from the origin, the "
+    text="{subject}: {n_points} points are farther than {farthest_m:g} m from the origin, the "
     "first at {place}, and were left out",
     remedy="check the file and {step}.unit",
     rank_by="n_points",
 )
 ONE_PLACE: Final = DiagnosticSpec(
     code="points-at-one-place",
-    text="{subject}: {n_points} points lie at exactly {place}: they are not returns of the scanner "
+    text="{subject}: {n_points} points are at exactly {place}: they are not returns of the scanner "
     "and were left out",
     rank_by="n_points",
 )
@@ -146,9 +146,9 @@ NOT_FINITE: Final = DiagnosticSpec(
 )
 OTHER_UP: Final = DiagnosticSpec(
     code="scan-up-doubtful",
-    text="{axis} looks like the axis that points up, not {up}: {share:.0%} of the surfaces are "
-    "level or upright by it, {share_up:.0%} by {up}",
-    remedy="{step}.up={axis}, or -{axis} where floors come out as ceilings",
+    text="the up axis seems to be {axis}, not {up}: {share:.0%} of the surfaces are horizontal or "
+    "vertical with respect to it, {share_up:.0%} with respect to {up}",
+    remedy="{step}.up={axis}, or -{axis} if floors become ceilings",
 )
 THICK: Final = DiagnosticSpec(
     code="scan-thick",
@@ -161,14 +161,14 @@ THICK: Final = DiagnosticSpec(
 )
 DISAGREE: Final = DiagnosticSpec(
     code="scans-disagree",
-    text="the scans disagree: where two show one surface they are {apart_mm:.1f} "
+    text="the scans disagree: where two show the same surface, they are {apart_mm:.1f} "
     "mm apart (median), while the scatter of each is {sigma_mm:.1f} mm",
     remedy="register them again, or use one at a time",
     rank_by="apart_mm",
 )
 RULES: Final = {
     "intensity_max": "intensity_max",
-    "stated": "limits that the scan states",
+    "stated": "limits in the file",
     "nominal": "usual range of such data",
     "data": "range of its data",
 }
@@ -267,7 +267,7 @@ def report_precision(
         ctx.report(
             SIZE,
             size=_size(high - low),
-            unit="no file states a unit" if is_assumed else f"unit {units[0][0]}",
+            unit="no file contains a unit" if is_assumed else f"unit {units[0][0]}",
             other="mm" if side_m > _LARGE_M else "m" if units[0][0] in ("mm", "cm") else "km",
         )
     return {"resolution_m": resolution, "rounding_m": max(roundings.values())}

@@ -76,9 +76,9 @@ class ReadScan(Method):
         MetricSpec(
             "thickness_width_mm", label="width that holds 95 % of the distances to the first plane"
         ),
-        MetricSpec("thickness_scan_steps", label="that thickness over the point spacing"),
+        MetricSpec("thickness_scan_steps", label="thickness divided by the point spacing"),
         MetricSpec("scan_step_mm", label="point spacing"),
-        MetricSpec("scans_apart_mm", label="scans apart from each other"),
+        MetricSpec("scans_apart_mm", label="distance between scans"),
     )
     citations: ClassVar[tuple[str, ...]] = (
         "ASTM E2807, E57 file format for 3D imaging data exchange",
@@ -91,8 +91,8 @@ class ReadScan(Method):
         up: UpDirection = Field("z", description="World direction that is up in the files.")
         unit: Unit | None = Field(
             None,
-            description="Unit of the files' coordinates, whatever they state; None: what each "
-            "file states, metres where it states none. The cloud is in metres.",
+            description="Unit of the files' coordinates, which overrides the files; None: the unit "
+            "in each file, or metres if there is none. The cloud is in metres.",
         )
         view_from: tuple[float, float, float] | None = Field(
             None,
@@ -103,18 +103,18 @@ class ReadScan(Method):
         columns: str | tuple[str, ...] | None = Field(
             None,
             description="Columns of text files, [x, y, z, r, g, b, intensity] or 'x y z _'; _ "
-            "skips one. None: the header names them, else their number and values.",
+            "skips one. None: from the header, or else from their number and values.",
         )
         intensity_field: str | None = Field(
             None,
-            description="Name of the field that is the intensity, e.g. Reflectance; None: the "
-            "usual one of the format, else reflectance, amplitude or remission.",
+            description="Name of the field to use as intensity, e.g. Reflectance; None: the usual "
+            "one of the format, or else reflectance, amplitude or remission.",
         )
         intensity_max: float | None = Field(
             None,
             gt=0,
-            description="Intensity in the files that becomes 1 (0 becomes 0); None: for each scan "
-            "the limits it states, if its data fit them, else the range of its data.",
+            description="Intensity in the files that maps to 1 (0 maps to 0); None: for each scan "
+            "the limits in its file if the data fit them, or else the range of the data.",
         )
 
         box: tuple[Corner, Corner] | None = Field(
@@ -125,12 +125,12 @@ class ReadScan(Method):
         gsd_m: float | None = Field(
             None,
             gt=0,
-            description="Of a COPC file read points only as dense as this, in metres: levels of "
-            "its octree down to the first whose points are no farther apart. None reads all.",
+            description="Point spacing down to which COPC files are read, in metres: the levels of "
+            "the octree up to the first with this spacing or less. None reads all points.",
         )
         classes: tuple[Annotated[int, Field(ge=0, le=255)], ...] = Field(
             (),
-            description="Classes of LAS and LAZ points that are kept, e.g. [1, 6] (ASPRS: 6 is "
+            description="Classes of LAS and LAZ points to keep, e.g. [1, 6] (ASPRS: 6 is "
             "building); empty for all.",
         )
 
@@ -159,7 +159,7 @@ class ReadScan(Method):
         """Read all files as described for the class."""
         columns = None if params.columns is None else columns_of_user(params.columns)
         if not inputs.files.paths:
-            raise InputError(f"the input {inputs.files.name} names no files: expected a scan")
+            raise InputError(f"the input {inputs.files.name} has no files: expected a scan")
         box_m = None if params.box is None else np.array(params.box)
         files = [_opened(path, columns, box_m, params) for path in inputs.files.paths]
         _check_settings(ctx, files, params)
@@ -267,7 +267,7 @@ def _finish(ctx: StepContext, assembly: CloudAssembly, params: ReadScan.Params) 
     if is_from_files and stations is not None and not is_per_scan:
         ctx.report(FEW_STATIONS, n_stations=len(stations), n_scans=len(counts))
     if is_from_files and params.view_from is not None:
-        ctx.report(NO_EFFECT, setting="view_from", why="the files state where the scanner stood")
+        ctx.report(NO_EFFECT, setting="view_from", why="the files contain scanner positions")
     precision = report_precision(ctx, assembly, extents, params.unit)
     x, y, z = assembly.offsets
     cloud = PointCloud(

@@ -43,7 +43,7 @@ class ReadTies(Method):
         sigma_px: float = Field(
             1.0,
             gt=0,
-            description="Standard deviation of each pixel coordinate if the files state none.",
+            description="Standard deviation of each pixel coordinate if the files contain none.",
         )
         sigma_m: float = Field(
             0.002,
@@ -66,7 +66,7 @@ class ReadTies(Method):
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Read all files as described for the class."""
         if not inputs.files.paths:
-            raise InputError(f"the input {inputs.files.name} names no files: expected ties")
+            raise InputError(f"the input {inputs.files.name} has no files: expected ties")
         ctx.progress(0.0, inputs.files.name)
         found = [tie for path in inputs.files.paths for tie in read_measured_ties(path)]
         photos = {photo.name: photo for photo in inputs.photos.photos}
@@ -104,7 +104,7 @@ def _problem(tie: MeasuredTie, photos: Mapping[str, Photo]) -> str:
         return f"{tie.where}: there is no photo {tie.photo} among those given{hint}"
     u, v = tie.pixel
     return (
-        f"{tie.where}: (u {u:g}, v {v:g}) lies outside photo {tie.photo}, which is "
+        f"{tie.where}: (u {u:g}, v {v:g}) is outside photo {tie.photo}, which is "
         f"{photo.width} x {photo.height} pixels as it is stored"
     )
 

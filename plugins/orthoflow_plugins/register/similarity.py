@@ -154,7 +154,7 @@ def fit_similarity(
     spread = np.linalg.svd(source, compute_uv=False)
     if not spread[1] > _LINE_SHARE * spread[0]:
         raise GeometryError(
-            "the points of a similarity lie on one line: a rotation about it is undetermined"
+            "the points of a similarity are on one line: a rotation about it is undetermined"
         )
     u, values, vt = np.linalg.svd(target.T @ source)
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])

@@ -100,15 +100,19 @@ def hierarchy(content: bytes) -> tuple[int, int]:
 @pytest.mark.parametrize(
     ("where", "change", "reason"),
     [
-        ("info", struct.pack("<d", -1.0), "its root has no size"),
-        ("info", struct.pack("<d", float("nan")), "its root has no size"),
-        ("root", struct.pack("<2Q", 1 << 60, 32), "its pages lie outside the file"),
+        ("info", struct.pack("<d", -1.0), "the size or spacing of its root is invalid"),
+        ("info", struct.pack("<d", float("nan")), "the size or spacing of its root is invalid"),
+        ("root", struct.pack("<2Q", 1 << 60, 32), "its pages are outside the file"),
         ("root", struct.pack("<2Q", 0, 0), "it has no nodes"),
-        ("level", struct.pack("<4i", 40, 0, 0, 0), "a node lies outside the root"),
-        ("level", struct.pack("<4i", 1, 0, 2, 0), "a node lies outside the root"),
-        ("chunk", struct.pack("<Q", 500), "it names chunks that the file does not have"),
-        ("count", struct.pack("<i", 1 << 30), "it names chunks that the file does not have"),
-        ("count", struct.pack("<i", -7), "a node lies outside the root"),
+        ("level", struct.pack("<4i", 40, 0, 0, 0), "a node is outside the root"),
+        ("level", struct.pack("<4i", 1, 0, 2, 0), "a node is outside the root"),
+        ("chunk", struct.pack("<Q", 500), "it references chunks that the file does not contain"),
+        (
+            "count",
+            struct.pack("<i", 1 << 30),
+            "it references chunks that the file does not contain",
+        ),
+        ("count", struct.pack("<i", -7), "a node is outside the root"),
     ],
 )
 def test_a_damaged_octree_is_told_before_anything_is_decoded(

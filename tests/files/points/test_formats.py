@@ -92,24 +92,24 @@ PLY = "ply\nformat ascii 1.0\n"
 EMPTY = "".join(f"property float {axis}\n" for axis in "xyz")
 REFUSED: list[tuple[Make, str]] = [
     # Not what they are called.
-    (text("a.e57", "this is text"), "a.e57 is named as E57 but does not begin with 'ASTM-E57'"),
-    (text("a.laz", "this is text"), "a.laz is named as LAS/LAZ but does not begin with 'LASF'"),
-    (text("a.ply", "this is text"), "a.ply is named as PLY but does not begin with 'ply'"),
-    (text("a.pcd", "this is text"), "a.pcd has no PCD header that can be read"),
+    (text("a.e57", "this is text"), "suffix of E57 files but does not begin with 'ASTM-E57'"),
+    (text("a.laz", "this is text"), "has the suffix of LAS/LAZ files but does not begin with"),
+    (text("a.ply", "this is text"), "has the suffix of PLY files but does not begin with 'ply'"),
+    (text("a.pcd", "this is text"), "a.pcd has no readable PCD header"),
     (text("a.rcp", "this is text"), "a.rcp is not a point file .* one of .e57 .las .laz"),
     (text("a.xyz", ""), "a.xyz is empty"),
     (text("a.e57", "ASTM-E57 and then nothing"), "a.e57 cannot be read as E57"),
     (text("a.laz", "LASF and then nothing"), "a.laz cannot be read as LAS/LAZ"),
     (lambda folder: folder, "must be a point file, but there is a folder"),
     (lambda folder: folder / "a.las", "a.las must be a point file, but there is nothing"),
-    (text("a.xyz", b"1 2 3\n\0\1\2"), "a.xyz is named as a text file but holds binary data"),
+    (text("a.xyz", b"1 2 3\n\0\1\2"), "has the suffix of a text file but contains binary data"),
     (text("a.xyz", "1 2 3\n".encode("utf-16")), "a.xyz is UTF-16 text"),
     # PLY
     (text("a.ply", PLY), "no end_header"),
-    (text("a.ply", "ply\nelement vertex 3\nend_header\n"), "it has no line that names the format"),
-    (text("a.ply", f"{PLY}element vertex many\nend_header\n"), "no PLY header"),
+    (text("a.ply", "ply\nelement vertex 3\nend_header\n"), "it has no format line"),
+    (text("a.ply", f"{PLY}element vertex many\nend_header\n"), "no readable PLY header"),
     (text("a.ply", f"{PLY}element vertex 3\nend_header\n"), "no element vertex with single"),
-    (text("a.ply", f"{PLY}element vertex 0\n{EMPTY}end_header\n"), "a.ply holds no points"),
+    (text("a.ply", f"{PLY}element vertex 0\n{EMPTY}end_header\n"), "a.ply contains no points"),
     # PCD
     (changed(pcd, b"FIELDS", b"FIELDZ"), "without FIELDS"),
     (changed(pcd, b"DATA binary", b"DATA zipped"), "data are zipped, expected ascii"),
@@ -133,9 +133,9 @@ REFUSED: list[tuple[Make, str]] = [
     (text("a.xyz", "1 2 3\n4 5 6 7 8\n"), r"a\.xyz, line 2: expected 3 numbers"),
     (text("a.xyz", "1 2 3\r4 5 6\r"), r"a\.xyz ends lines with a carriage return only"),
     (text("a.xyz", "# only\n# comments\n"), r"no line with three numbers among its first 2"),
-    (text("a.xyz", "5\n1 2 3\n4 5 6\n"), "a.xyz is cut off: its list holds 2 points, .* states 5"),
+    (text("a.xyz", "5\n1 2 3\n4 5 6\n"), "a.xyz is cut off: its list contains 2 points, .* 5"),
     # E57
-    (e57, r"a\.e57 holds no points"),
+    (e57, r"a\.e57 contains no points"),
     (lambda folder: e57(folder, {"intensity": np.arange(3.0)}), "scan 0 has the fields intensity"),
     (flipped_e57, r"a\.e57 cannot be read as E57: .*export it again"),
     (text("a.e57", b"ASTM-E57" + bytes(39)), "the file ends within its header"),
@@ -161,7 +161,7 @@ def test_points_are_counted_in_four_bytes() -> None:
         return ScanFile(name="a", format_name="LAS", n_most=n_most, scans=[], read=lambda: iter(()))
 
     assert stated(2**32 - 1).n_most == 4_294_967_295
-    with pytest.raises(InputError, match="states 4294967296 points, at most 4294967295 can be"):
+    with pytest.raises(InputError, match="declares 4294967296 points; the limit is 4294967295"):
         stated(2**32)
 
 
@@ -306,7 +306,7 @@ def test_a_ptx_file_of_fewer_lines_than_places_is_read_without_its_grid(tmp_path
     (block,) = scan.read()
     np.testing.assert_allclose(block.points, POINTS[:-3], atol=1e-9)
     assert (block.row, scan.fields) == (None, frozenset())
-    assert "scan 0 has 37 lines of points, its header states 5 x 8 = 40" in scan.notes[0]
+    assert "scan 0 has 37 lines of points, but its header declares 5 x 8 = 40" in scan.notes[0]
 
 
 # E57
@@ -391,7 +391,7 @@ def test_the_xml_of_an_e57_file_is_read_up_to_its_limits(
     content = bytearray(e57_of(bytes(48), b"<a/>"))
     content[32:40] = struct.pack("<Q", (1 << 25) + 1)
     path.write_bytes(content)
-    with pytest.raises(InputError, match="at most 33554432 are read"):
+    with pytest.raises(InputError, match="the limit is 33554432"):
         e57_reader.check_xml(path)
 
 

@@ -62,12 +62,12 @@ def test_laz_points_far_outside_the_stated_bounds_are_damage_and_las_points_a_no
         path = scan_files.write_las(tmp_path / f"a{suffix}", stray)
         for axis, offset in enumerate((179, 195, 211)):
             change(path, offset, np.float64(points[:, axis].max()).tobytes())
-    with pytest.raises(InputError, match=r"a\.laz is damaged: points lie \d+ units outside"):
+    with pytest.raises(InputError, match=r"a\.laz is damaged: points are \d+ units outside"):
         read_all(tmp_path / "a.laz")
     # Without compression there is nothing that a changed byte could spoil but itself.
     scan = open_scan(tmp_path / "a.las")
     assert sum(len(block.points) for block in scan.read()) == 41
-    assert ": 1 points lie outside the bounds its header states" in scan.notes[0]
+    assert ": 1 points are outside the bounding box in its header" in scan.notes[0]
 
 
 def test_las_points_a_little_outside_the_stated_bounds_are_kept_with_a_note(
@@ -87,7 +87,7 @@ def test_las_points_a_little_outside_the_stated_bounds_are_kept_with_a_note(
         monkeypatch.setattr(las, "BLOCK_POINTS", block_points)
         scan = open_scan(path)
         assert sum(len(block.points) for block in scan.read()) == 40
-        assert f": {n_outside} points lie outside the bounds its header states" in scan.notes[0]
+        assert f": {n_outside} points are outside the bounding box in its header" in scan.notes[0]
 
 
 def change(path: Path, position: int, content: bytes) -> Path:
@@ -108,11 +108,15 @@ def chunk_table(path: Path) -> int:
     ("position", "content", "message"),
     [
         (96, b"\xff\xff\xff\x00", "its points begin outside the file, which is cut off"),
-        (100, b"\xff\xff\xff\x7f", "its header states 2147483647 records that do not fit"),
+        (100, b"\xff\xff\xff\x7f", "its header declares 2147483647 records, which do not fit"),
         (243, b"\x05\x00\x00\x00", "records at its end are missing"),
         # Of the chunk table: 3 thousand million chunks of 16 bytes each would end the process.
-        (4, b"\xff\xff\xff\xbf", "its chunk table states 3221225471 chunks"),
-        (247, struct.pack("<Q", 400_000), "its chunks hold 50000 points, its header states 400000"),
+        (4, b"\xff\xff\xff\xbf", "its chunk table declares 3221225471 chunks"),
+        (
+            247,
+            struct.pack("<Q", 400_000),
+            "its chunks contain 50000 points, but its header declares 400000",
+        ),
     ],
 )
 def test_a_damaged_las_header_is_found_before_a_library_believes_it(

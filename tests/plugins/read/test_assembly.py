@@ -136,14 +136,14 @@ def test_a_file_without_a_point_that_can_be_used_is_refused_with_its_counts(tmp_
     with pytest.raises(InputError) as caught:
         assembled(tmp_path, file("a", lost))
     assert str(caught.value) == (
-        "a holds no usable points: of 9, left out are 3 invalid, 2 withheld, 4 not finite; export "
-        "it again"
+        "a contains no usable points: of 9, left out are 3 invalid, 2 withheld, 4 not finite; "
+        "export it again"
     )
 
 
 def test_more_points_than_a_header_states_are_refused(tmp_path: Path) -> None:
     short = replace(file("a", block(1, 10), block(2, 10)), n_most=19)
-    with pytest.raises(InputError, match=r"^a holds more points than its header states$"):
+    with pytest.raises(InputError, match=r"^a contains more points than its header declares$"):
         assembled(tmp_path, short)
     exact = replace(short, n_most=20)
     assert assembled(tmp_path / "exact", exact).n_points == 20

@@ -74,10 +74,10 @@ def test_what_is_left_out_of_a_lens_is_reported_or_refused(tmp_path: Path) -> No
     cameras, warnings = read(tmp_path, rows, [photo(name) for name in rows])
     assert places(cameras) == [1, 2, None]
     assert (
-        "nearest lens, with a deviation of up to 0.11 pixels (1 photos, such as slight.jpg)"
+        "closest OpenCV lens, with a deviation of up to 0.11 pixels (1 photos, such as slight.jpg)"
         in warnings[0]
     )
-    assert "differs from the nearest lens of OpenCV by up to 11 pixels" in warnings[1]
+    assert "differs from the closest OpenCV lens by up to 11 pixels" in warnings[1]
 
 
 def test_files_that_orient_no_photo_are_refused(tmp_path: Path) -> None:

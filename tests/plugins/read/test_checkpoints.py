@@ -51,5 +51,5 @@ def test_files_are_joined_in_order(read: PointReader) -> None:
     }
     with pytest.raises(InputError, match=r"P1 is in points0\.csv and again in points1\.csv"):
         read("P1,1,2,3\n", "P1,1,2,4\n")
-    with pytest.raises(InputError, match="the input checkpoints names no files"):
+    with pytest.raises(InputError, match="the input checkpoints has no files"):
         read()

@@ -114,19 +114,19 @@ def test_our_own_files_need_no_frame_beside_them(tmp_path: Path) -> None:
 
 def test_what_cannot_be_placed_says_why(tmp_path: Path) -> None:
     image, place = foreign(tmp_path)
-    with pytest.raises(InputError, match=r"theirs\.tif does not state its position"):
+    with pytest.raises(InputError, match=r"theirs\.tif does not contain its position"):
         read(tmp_path, image)
-    with pytest.raises(InputError, match="holds no GeoTIFF"):
+    with pytest.raises(InputError, match="contains no GeoTIFF"):
         read(tmp_path, place)
     place.write_text("{")
-    with pytest.raises(InputError, match=r"theirs\.json: no JSON"):
+    with pytest.raises(InputError, match=r"theirs\.json: not valid JSON"):
         read(tmp_path, image, place)
     place.write_text('{"origin_world": [1, 2]}')
     with pytest.raises(InputError, match="origin_world must be three numbers"):
         read(tmp_path, image, place)
     values = np.zeros((3, 4, 5), dtype=np.uint8)
     write(image, values, Affine(0.01, 0, 0, 0, -0.02, 0))
-    with pytest.raises(InputError, match="not square and upright"):
+    with pytest.raises(InputError, match="not square or not aligned"):
         read(tmp_path, image, place)
     image, place = foreign(tmp_path)
     write(image, values[:3], Affine(0.01, 0, 0, 0, 0.01, 0))
@@ -139,7 +139,7 @@ def test_two_images_of_one_wall_are_refused(tmp_path: Path) -> None:
     other, there = (path.with_stem("others") for path in (image, place))
     other.write_bytes(image.read_bytes())
     there.write_text(place.read_text())
-    with pytest.raises(InputError, match="are both of wall 0"):
+    with pytest.raises(InputError, match="both show wall 0"):
         read(tmp_path, image, place, other, there)
     there.write_text(json.dumps(json.loads(place.read_text()) | {"wall": 2}))
     assert [found.wall for found in read(tmp_path, image, place, other, there)] == [0, 2]

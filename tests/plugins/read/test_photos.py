@@ -149,7 +149,7 @@ def test_a_wide_photo_that_cameras_speak_of_needs_no_calibration(
 
     assert run(given) == tuple(f"a_{face}.png: ok" for face in faces)
     # Whoever wires the poses only is told what is missing.
-    with pytest.raises(InputError, match="its lens is a fisheye or a panorama: wire the same"):
+    with pytest.raises(InputError, match="its lens is a fisheye or a panorama: connect the same"):
         run(None)
 
 
@@ -181,9 +181,9 @@ def test_raw_photos_that_nobody_developed_are_refused_with_the_way_out(
     with pytest.raises(InputError) as refused:
         read(*paths)
     assert str(refused.value) == (
-        f"the input photos holds camera raw, which is not read: {raw}; develop to TIFF of 16 bits "
-        "or JPEG first, without lens corrections, so that a calibration holds, or name the photos "
-        "without it, e.g. 'FOLDER/*.jpg'"
+        f"the input photos contains camera raw, which is not supported: {raw}; develop it first to "
+        "16-bit TIFF or JPEG, without lens corrections, so that a calibration stays valid, or list "
+        "only the other photos, e.g. 'FOLDER/*.jpg'"
     )
 
 
@@ -216,9 +216,9 @@ def test_sixteen_bits_are_read_in_every_layout(
 
 def test_an_input_without_a_photo_is_refused(tmp_path: Path, read: PhotoReader) -> None:
     paths = made.write(tmp_path, {"a.doc": b"x", "b.txt": b"x"})
-    with pytest.raises(InputError, match=r"holds no photo, only 2 other files: a\.doc, b\.txt"):
+    with pytest.raises(InputError, match=r"contains no photo, only 2 other files: a\.doc, b\.txt"):
         read(*paths)
-    with pytest.raises(InputError, match="the input photos names no files: expected photos"):
+    with pytest.raises(InputError, match="the input photos has no files: expected photos"):
         read()
 
 
@@ -291,8 +291,11 @@ def test_a_photo_whose_blocks_are_shifted_is_named_with_the_row(read: PhotoReade
     ("content", "named"),
     [
         (b"<html>", "is not a JPEG"),
-        (b"\0\0\0\x18ftypcrx \0\0\0\1crx isom", r"is camera raw \(Canon CR3\).*develop to TIFF"),
-        (b"%PDF-1.7", "is PDF, which is not read: convert it"),
+        (
+            b"\0\0\0\x18ftypcrx \0\0\0\1crx isom",
+            r"is camera raw \(Canon CR3\).*develop it first to 16-bit TIFF",
+        ),
+        (b"%PDF-1.7", "is PDF, which is not supported: convert it"),
         (b"\0\0\0\x1cftypheic\0\0\0\0mif1heic", r"is a HEIC file: install orthoflow-tls\[heic\]"),
     ],
 )

@@ -88,7 +88,7 @@ def test_a_box_keeps_the_points_in_it_and_on_its_faces(tmp_path: Path, read: Sca
     path = write_text(tmp_path / "b.xyz", steps)
     far = [[10, 10, 10], [11, 11, 11]]
     with pytest.raises(
-        InputError, match=r"125 lie outside .* from \(1.00, 1.00, 1.00\) to \(5.00, "
+        InputError, match=r"125 are outside .* from \(1.00, 1.00, 1.00\) to \(5.00, "
     ):
         read(path, box=far)
     # Of several files, one may lie beside the box as a whole.
@@ -127,7 +127,7 @@ def test_classes_choose_points_of_las_files(tmp_path: Path, read: ScanReader) ->
     cloud = read(path, classes=[0, 2])
     np.testing.assert_allclose(cloud.points_world(), POINTS[classes != 1], atol=6e-5)
     assert scan_of(cloud)["left_out"] == {"other_class": 133}
-    with pytest.raises(InputError, match="400 are of other classes than those asked for; change"):
+    with pytest.raises(InputError, match="400 are of other classes than requested; change"):
         read(path, classes=[9])
     read(write_text(tmp_path / "a.xyz", POINTS), classes=[2])
     assert "classes has no effect: it only concerns LAS and LAZ files" in read.warnings
@@ -138,7 +138,7 @@ def test_stray_points_do_not_cost_the_scan_its_precision(tmp_path: Path, read: S
     world[:3] = 1.0
     cloud = read(write_text(tmp_path / "a.xyz", world))
     np.testing.assert_allclose(cloud.points_world()[3:], world[3:], atol=1e-5)
-    assert "coordinates are kept to 62.50 mm only" in read.warnings
+    assert "coordinates are rounded to 62.50 mm" in read.warnings
 
 
 @pytest.mark.parametrize("up", ["x", "-y"])
@@ -158,7 +158,7 @@ def test_finite_points_beyond_any_survey_are_named(tmp_path: Path, read: ScanRea
     cloud = read(write_text(tmp_path / "a.xyz", points))
     assert len(cloud) == 397
     assert (
-        "a.xyz, scan 0: 2 points lie farther than 1e+09 m from the origin, the first at 0.5 1e+30 "
+        "a.xyz, scan 0: 2 points are farther than 1e+09 m from the origin, the first at 0.5 1e+30 "
         "-2, and were left out"
     ) in read.warnings
 
@@ -200,7 +200,7 @@ def test_several_files_become_one_cloud(tmp_path: Path, read: ScanReader) -> Non
         cloud.points_world()[400:800], POINTS + np.array([10.0, 0, 0]), atol=1e-6
     )
     np.testing.assert_array_equal(cloud.stations, [[10.0, 0, 0], [20.0, 0, 0]])
-    assert "only 2 of 3 scans state where the scanner stood" in read.warnings
+    assert "only 2 of 3 scans contain a scanner position" in read.warnings
     scans = [(item["file"], item["scan"]) for item in cloud.source["scans"]]  # type: ignore[union-attr, call-overload, index]
     assert scans == [("a.xyz", 0), ("b.e57", 0), ("b.e57", 1)]
 
@@ -246,7 +246,7 @@ def test_the_user_can_set_full_intensity(tmp_path: Path, read: ScanReader) -> No
     table = np.column_stack([POINTS, np.arange(400)])
     cloud = read(write_text(tmp_path / "a.xyz", table), intensity_max=200.0)
     np.testing.assert_allclose(cloud.intensity, np.minimum(np.arange(400) / 200, 1), atol=1e-6)
-    assert "199 intensities lie beyond 0 to 200 (intensity_max) and were clipped" in read.warnings
+    assert "199 intensities are outside 0 to 200 (intensity_max) and were clipped" in read.warnings
     cloud = read(write_text(tmp_path / "a.xyz", table), intensity_max=399.0)
     np.testing.assert_allclose(cloud.intensity, np.arange(400) / 399, atol=1e-6)
     assert "were clipped" not in read.warnings
@@ -274,7 +274,7 @@ def test_an_intensity_that_repeats_the_colours_is_no_laser_intensity(
     cloud = read(path)
     assert cloud.intensity is None
     assert cloud.source["intensity_source"] == "luminance"
-    assert "the intensity is not the laser's but the luminance of the colours" in read.warnings
+    assert "the intensity is not laser intensity but the luminance of the colours" in read.warnings
 
 
 def test_grey_colours_made_from_the_intensity_leave_it_a_laser_intensity(

@@ -50,7 +50,7 @@ def test_ties_come_out_with_our_pixels_and_the_sigmas_that_are_said(tmp_path: Pa
     [
         ("photo,u_px,v_px,x,y,z\nA.jpg,1,2,3,4,5\n", "ties0.csv:2: there is no photo A.jpg among"),
         ("A.jpg,1,2,3,4,5\n", r"photo A.jpg among those given \(did you mean a.jpg\?\)"),
-        ("a.jpg,64,2,3,4,5\n", r"ties0.csv:1: \(u 64, v 2\) lies outside photo a.jpg, which"),
+        ("a.jpg,64,2,3,4,5\n", r"ties0.csv:1: \(u 64, v 2\) is outside photo a.jpg, which"),
         ("a.jpg,1,47.6,3,4,5\n", "photo a.jpg, which is 64 x 48 pixels as it is stored"),
     ],
 )  # fmt: skip
