@@ -1,4 +1,4 @@
-"""Hooks of the built-in plugin: its kinds, product types and methods, as import strings."""
+"""Hooks of the built-in plugin: kinds, product types and methods, given as import strings."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Final
 
 from orthoflow.sdk.hooks import FILES, KindSpec, MethodSpec, ProductSpec, hookimpl
 
-# Module and class of each method -> summary. The id of a method is the name of its module, with
+# Summary of each method by module and class. The id of a method is the name of its module, with
 # hyphens instead of underscores.
 _METHODS: Final = {
     "read.scan:ReadScan": "E57, LAS/LAZ, PLY, PCD, PTX and text scans -> cloud",
@@ -59,7 +59,7 @@ _METHODS: Final = {
     "inspect.checkpoints:InspectCheckpoints": "compare orthoimages with surveyed points: "
     "residuals, outliers, classes",
 }
-# Ids of methods that differ from the name of their module.
+# Ids that differ from the name of the module.
 _IDS: Final = {
     "match.sides": "face.photos",
     "orient.bundle": "orient.colmap-bundle",
@@ -70,7 +70,7 @@ _IDS: Final = {
 
 @hookimpl
 def orthoflow_kinds() -> list[KindSpec]:
-    """Return the built-in kinds, in the order from scan to inspection."""
+    """Return the built-in kinds in order, from scan to inspection."""
     return [
         KindSpec(name="read", summary="files -> products", is_source=True),
         KindSpec(name="simulate", summary="scenes with exact truth", is_source=True),
@@ -206,7 +206,7 @@ def orthoflow_products() -> list[ProductSpec]:
 
 
 def _product(name: str, where: str, summary: str, *, publisher: str = "") -> ProductSpec:
-    """Return the spec of a type in `orthoflow.products`; `publisher` is in `orthoflow.files`."""
+    """Return the spec of a type in `orthoflow.products`; the publisher is in `orthoflow.files`."""
     return ProductSpec(
         type_name=name,
         target=f"orthoflow.products.{where}",

@@ -34,7 +34,7 @@ _UNIFORM: Final = 1.0 / math.sqrt(12.0)
 # A cell crossed by a border may be on either side, so the border is uncertain by two cells.
 _BORDER_CELLS: Final = 2.0
 
-# --- edges of the picture ---
+# --- edges in the image ---
 
 _LONG_CELLS: Final = 20.0
 _PROFILE_ENDS_CELLS: Final = 4.0
@@ -278,7 +278,7 @@ def _sigma(side: _Side, spacing: float) -> float:
 
 
 def _seen_shares(corners: NDArray[np.float64], is_face: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the share (n,) of each side along which the wall's face was measured."""
+    """Return the shares (n,) of sides along which the wall's face was measured."""
     rows, columns = is_face.shape
     shares = np.zeros(len(corners))
     for k, (begin, end) in enumerate(zip(corners, np.roll(corners, -1, axis=0), strict=True)):

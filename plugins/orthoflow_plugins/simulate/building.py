@@ -186,7 +186,7 @@ class Side:
         return extent
 
     def true_plane(self, name: str, extent: Extent, depth_m: float = 0.0) -> int:
-        """Register a plane parallel to the wall; return its number."""
+        """Register a plane parallel to the wall; return its index."""
         a0, a1, b0, b1 = extent
         foot = self.foot + depth_m * self.normal
         outline = np.array(

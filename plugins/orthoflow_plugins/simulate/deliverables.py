@@ -48,7 +48,7 @@ class Delivery:
     """A scanned room and its position in the world.
 
     Attributes:
-        room: the room, in its own frame.
+        room: the room in its own frame.
         scan: the scans, in the room frame.
         world_from_room: (3, 3) rotation; without rounding errors if its elements are 0, 1 or -1.
         shift_world_m: (3,) world position of the room's origin.
@@ -260,7 +260,7 @@ def _true_planes(
 
 
 def _rms_m(cloud: PointCloud, planes: Planes, labels: NDArray[np.int16]) -> NDArray[np.float64]:
-    """Return the RMS distance of each plane's points, summed block by block in order."""
+    """Return the RMS distances of points from their planes, summed block by block in order."""
     offsets = planes.offset - planes.normal @ cloud.origin
     sums = np.zeros(len(planes))
     for start in range(0, len(cloud), _CHUNK):

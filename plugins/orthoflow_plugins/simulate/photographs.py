@@ -70,7 +70,7 @@ class Shot:
 
 @dataclass(frozen=True, kw_only=True)
 class Film:
-    """The degradation of the pictures.
+    """The degradation of images.
 
     Attributes:
         noise_grey: standard deviation of the noise per pixel and channel, grey levels.
@@ -229,7 +229,7 @@ def take_photos(
     Args:
         views: the room, or the scene of each photo.
         shots: the photos.
-        film: their degradation.
+        film: degradation of the images.
         ctx: context of the step.
         rng: random generator of all noise.
         intrinsics: known calibration of the camera, or None.

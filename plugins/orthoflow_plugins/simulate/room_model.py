@@ -395,7 +395,7 @@ def _visible_rectangle(item: TruePlane, bounds: list[Plane]) -> NDArray[np.float
 
 
 def _cut(polygon: NDArray[np.float64], bound: Plane) -> NDArray[np.float64]:
-    """Keep the part of a convex polygon (n, 3) in front of a plane (Sutherland and Hodgman)."""
+    """Return the part of a convex polygon (n, 3) in front of a plane (Sutherland and Hodgman)."""
     distances = bound.distances_m(polygon)
     kept: list[NDArray[np.float64]] = []
     for start in range(len(polygon)):

@@ -196,7 +196,7 @@ def planned_sweeps(
             the station meets the main wall.
         main_wall: plane of the main wall.
         outline: (4, 3) corners of the main wall in the room frame.
-        seeds: two per station.
+        seeds: two seeds per station.
     """
     lowest, highest = math.radians(LOWEST_ELEVATION_DEG), math.radians(HIGHEST_ELEVATION_DEG)
     _, towards = main_wall_axes()
@@ -362,7 +362,7 @@ class Scanner:
 def shared_errors(
     points: NDArray[np.float64], station: NDArray[np.float64], errors: Errors
 ) -> NDArray[np.float64]:
-    """Return the common errors of points (3, n) of a station, metres."""
+    """Return the correlated errors of points (3, n) of a station, metres."""
     off = np.zeros_like(points)
     if errors.registration_m:
         place_mm = np.rint(1e3 * station).astype(np.int64) % 2**31
