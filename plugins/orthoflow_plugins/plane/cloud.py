@@ -156,13 +156,13 @@ def prepare(
 
     Raises:
         ProductError: the cloud has fewer than three points, or coordinates that are not finite.
-        MethodError: the points coincide or lie on one line.
+        MethodError: the points coincide or are collinear.
     """
     sample = draw_sample(cloud)
     centred = sample.offsets_m - sample.offsets_m.mean(axis=0)
     spread_m2 = np.linalg.eigvalsh(centred.T @ centred) / len(sample.index)
     if spread_m2[1] < _THINNEST_M**2:
-        where = "coincide" if spread_m2[2] < _THINNEST_M**2 else "lie on one line"
+        where = "coincide" if spread_m2[2] < _THINNEST_M**2 else "are collinear"
         raise MethodError(f"the {len(cloud)} points of the cloud {where}, so they define no plane")
     basis, parts = basis_from_up(cloud.up), max(1, min(parts, _PARTS_MOST))
     cell_m = box_cell_m if plan_cell_m is None else plan_cell_m

@@ -95,9 +95,9 @@ def draw_deviations(
         figure,
         "Distances of the points to their plane, positive towards the viewer; the curve is the "
         f"normal distribution of those within {1000.0 * deviations.fit_tolerance_m:.0f} mm. "
-        "Right, their "
-        "quantiles against those of a normal distribution, which would lie on the line: a second "
-        "peak, or ends that leave the line early, are relief or another surface on the plane.",
+        "Right: their quantiles against those of a normal distribution, for which all points would "
+        "be on the line. A second peak, or ends that leave the line early, indicate relief or "
+        "another surface near the plane.",
     )
 
 
@@ -159,11 +159,10 @@ def draw_planes(
     ctx.figure(
         "planes",
         figure,
-        "Above: a sample of the points, coloured by plane, without planes seen from behind; on "
-        f"none (grey) are {np.mean(on_none):.1%}. Below: the rectangles of the planes' connected "
-        "parts. "
-        "Each wall should have one colour: two side by side are one wall taken for two, and a grey "
-        "one was missed.",
+        "Above: a sample of the points, coloured by plane, without planes seen from behind; "
+        f"{np.mean(on_none):.1%} are on no plane (grey). Below: the rectangles of the planes' "
+        "connected parts. Each wall should have one colour: a wall with two colours was divided, "
+        "and a grey wall was missed.",
     )
 
 
@@ -221,10 +220,10 @@ def draw_thickness(
     ctx.figure(
         "thickness",
         figure,
-        "Thickness of the cloud, one standard deviation in millimetres: on each plane beside the "
-        f"scan step there{''.join(f', by {name}' for name in drawn)}."
-        f"{'' if row is None else ' Below, one row of the scan on the first plane.'} "
-        "A cloud thicker than its scan step shows noise, or scans that do not fit each other.",
+        "Thickness of the cloud, one standard deviation in millimetres: on each plane, with the "
+        f"scan step{''.join(f', by {name}' for name in drawn)}."
+        f"{'' if row is None else ' Below: one row of the scan on the first plane.'} "
+        "If the thickness exceeds the scan step, the cloud is noisy or its scans are misaligned.",
     )
 
 
@@ -356,8 +355,8 @@ def draw_accumulator(ctx: StepContext, votes: PlanVotes, planes: Planes, cloud: 
         figure,
         "Above: points per plan cell with the walls found. Below: the parameter space, in which "
         f"{votes.voters}; circles mark the walls, the cross and the dotted line the "
-        "fullest bin. A wall stands out as a sharp bright spot; a "
-        "bright spot without a circle is a wall that was missed, a circle on grey ground a chance.",
+        "bin with the most votes. A wall is a sharp bright spot; a bright spot without a circle is "
+        "a missed wall, and a circle on grey background may be accidental.",
     )
 
 
@@ -396,8 +395,8 @@ def draw_space(
         "accumulator",
         figure,
         "The best score of any distance over the direction of the normal; circles mark the planes. "
-        "Directions are even over the hemisphere: towards the poles one stands for several. A "
-        "bright spot without a circle is a direction whose plane was missed.",
+        "Directions are distributed evenly over the hemisphere, so near the poles one direction "
+        "covers several pixels. A bright spot without a circle is the direction of a missed plane.",
     )
     figure = column_figure(5.0)
     panels = figure.subplots(3, 2, sharex="col", sharey=True)
@@ -417,8 +416,8 @@ def draw_space(
         "accumulator-sections",
         figure,
         "Votes over direction and distance from the middle before any plane was taken, in sections "
-        "of one phi (left) and of one omega (right); the brighter the more, by the square root. "
-        "Planes are sharp spots where bands cross; without any, there is no plane to find.",
+        "of constant phi (left) and omega (right); brightness is the square root of the votes. "
+        "Planes are sharp spots where bands cross; without such spots there are no planes.",
     )
 
 
@@ -562,11 +561,11 @@ def _draw_normals(
     ctx.figure(
         "normals",
         figure,
-        "Left: how the normals of the neighbourhoods lie to the first plane, by points. Right: "
-        "how far they point along the second horizontal axis (markiewicz2015, Figure 8). Below: "
-        f"the first over the plane's rectangle, up to {1000.0 * _MAP_DEPTH_M:.0f} mm before and "
-        "behind it; what has the wall's colour is told from it by its distance alone. Normals of a "
-        "good wall gather near 0 degrees; a broad hill means noise or relief.",
+        "Left: angles between the normals of neighbourhoods and of the first plane, weighted by "
+        "points. Right: their inclination to the second horizontal axis (markiewicz2015, Figure "
+        f"8). Below: map of the first angle, up to {1000.0 * _MAP_DEPTH_M:.0f} mm in front of and "
+        "behind the plane; surfaces with the wall's colour differ from it only in depth. Normals "
+        "of a good wall are close to 0 degrees; a wide peak indicates noise or relief.",
     )
 
 

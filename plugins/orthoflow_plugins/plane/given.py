@@ -157,7 +157,7 @@ class GivenPlane(Method):
         def _one_or_several(self) -> Self:
             if self.planes and self.ways:
                 raise ValueError(
-                    f"plane.given takes one plane, or several in planes, got {self.ways[0]} beside "
+                    f"plane.given takes one plane, or several in planes, got {self.ways[0]} and "
                     "planes: move it into the list"
                 )
             return self
@@ -311,8 +311,8 @@ def _plane_of(
             return plane_through(np.array(stated.points) - cloud.origin), False
         except GeometryError as error:
             raise MethodError(
-                f"plane.given needs three points that define a plane, got {stated.points}, "
-                "which lie on one line"
+                f"plane.given needs three points that define a plane, but {stated.points} are "
+                "collinear"
             ) from error
     up = prepared.up
     if stated.height_m is not None:

@@ -133,7 +133,7 @@ class Ransac(Method):
         @model_validator(mode="after")
         def _upright_planes_are_walls(self) -> Self:
             if self.model == "2d" and self.constraint == "horizontal":
-                raise ValueError("model: 2d finds upright planes only, got constraint: horizontal")
+                raise ValueError("model: 2d finds only vertical planes, got constraint: horizontal")
             return self
 
     In = DetectorIn

@@ -149,7 +149,9 @@ def warn(
             measured = np.count_nonzero(wall.count) / wall.count.size
             empty = 1.0 - measured - filled
             finer = (
-                "are finer than the scan, whose points lie" if step_m > gsd_m else "lie on points"
+                "are finer than the scan, whose points are"
+                if step_m > gsd_m
+                else "are used for points"
             )
             larger = f"{{step}}.gsd_m={_least_gsd_m(step_m):g} or more leaves fewer"
             ctx.report(

@@ -233,7 +233,7 @@ def test_thinning_finds_the_same_planes_and_labels_every_point(
 @pytest.mark.parametrize(
     ("points", "message"),
     [
-        (np.outer(np.linspace(0, 5, 500), [1.0, 2.0, 0.5]), "lie on one line"),
+        (np.outer(np.linspace(0, 5, 500), [1.0, 2.0, 0.5]), "are collinear"),
         (np.ones((500, 3)), "coincide"),
         (
             np.random.default_rng(1).uniform(-2.0, 2.0, (4_000, 3)),

@@ -53,7 +53,7 @@ def test_the_plan_model_finds_the_walls_and_lets_them_lean(tmp_path: Path) -> No
     assert abs(planes.normal[0] @ UP) == pytest.approx(np.sin(np.radians(0.4)), abs=2e-4)
     raw = np.array([item["normal"] for item in planes.details["raw"]])
     np.testing.assert_allclose(raw @ UP, 0.0, atol=1e-9)
-    with pytest.raises(ValidationError, match="model: 2d finds upright planes only"):
+    with pytest.raises(ValidationError, match="model: 2d finds only vertical planes"):
         Ransac.Params(model="2d", constraint="horizontal")
 
 

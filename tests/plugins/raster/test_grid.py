@@ -270,7 +270,7 @@ def test_what_an_adjoining_plane_cuts_off_is_told_of_beyond_a_cell_and_warned_of
     assert len(kinds) == (told is not None)
     assert len(ctx.warnings) == (told == "warn")
     if told == "warn":
-        assert "at its left is askew" in ctx.warnings[0]
+        assert "at its left is oblique" in ctx.warnings[0]
         assert "up to 51 mm of its plane are left out" in ctx.warnings[0]
 
 
