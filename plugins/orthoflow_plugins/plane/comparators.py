@@ -125,7 +125,7 @@ class SegmentProposer:
 
     # Any: the library has no types.
     def __init__(self, search: Search, params: Open3dRansac.Params, open3d: Any) -> None:
-        """Store the settings; open3d has no constraints: unsuitable planes are rejected later."""
+        """Store the settings; open3d has no constraints, so unsuitable planes are refused later."""
         self._params, self._open3d = params, open3d
         self._passed_over = np.zeros(len(search.claims), dtype=bool)
         self._last = np.zeros(0, dtype=np.int64)

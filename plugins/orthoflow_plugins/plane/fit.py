@@ -63,7 +63,8 @@ _FULL_SHARE: Final = 0.571
 # The densest layer contains this share of the cells; a normal distribution has it within +-0.385.
 _LAYER_SHARE: Final = 0.3
 _LAYER_SIGMAS: Final = 0.7706
-# Number of points as which the usual variance near a cell is weighted against that of the cell.
+# Weight of the usual variance near a cell, as a number of points, when it is averaged with the
+# cell's own variance.
 _USUAL_POINTS: Final = 40
 # The usual variance is the median in a block of this width, if it has at least this many cells.
 _BLOCK_CELLS: Final = 8

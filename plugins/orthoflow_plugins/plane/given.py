@@ -233,7 +233,7 @@ def _all_placed(
 def _placed(
     stated: StatedPlane, params: GivenPlane.Params, cloud: PointCloud, prepared: PreparedCloud
 ) -> tuple[FacedPlane, str, int]:
-    """Return a plane facing the viewer, how its side was determined, and the stray points."""
+    """Return a plane facing the viewer, the source of its side, and the number of stray points."""
     from orthoflow_plugins.plane.planes import (
         face,
         known_viewpoint,

@@ -328,10 +328,10 @@ def _normals(angles_rad: NDArray[np.float64]) -> NDArray[np.float64]:
 def vote_counts(
     counts: NDArray[np.int64], accumulator: Literal["counts", "unit", "canny"]
 ) -> NDArray[np.int64]:
-    """Return the votes (e1, e2) of the cells of a plan with (e1, e2) points.
+    """Return the votes (e1, e2) of plan cells from their numbers of points (e1, e2).
 
-    With one vote per cell, votes are multiplied by the mean number of points, to be comparable with
-    the heights, which are counted in points.
+    With one vote per cell, votes are multiplied by the mean number of points, so that they can be
+    compared with the heights, which are counted in points.
     """
     if accumulator == "counts":
         return counts

@@ -53,7 +53,9 @@ class BlockedPoints(NamedTuple):
     """Points in the form that kernels need.
 
     Attributes:
-        x: (n,) float32 metres from the cloud's origin; y and z likewise.
+        x: (n,) float32 metres from the cloud's origin.
+        y: see x.
+        z: see x.
         boxes: (blocks, 6) float32 smallest and largest x, y, z of each block.
     """
 
@@ -248,9 +250,9 @@ def _list_active(
     bounds: NDArray[np.float64],
     active: NDArray[np.int64],
 ) -> tuple[int, int]:
-    """List the slabs that intersect a block; return their number, and the holder.
+    """List the slabs that intersect a block; return their number and the holder.
 
-    The holder is the only such slab if it contains the entire block, else -1.
+    The holder is the only intersecting slab if it contains the entire block, otherwise -1.
     """
     n_active, last = 0, 0
     for k in range(slabs.shape[0]):
@@ -462,7 +464,7 @@ def sum_assigned(
 def name_labels(
     claims: NDArray[np.int8], names: NDArray[np.int16], labels: NDArray[np.int16]
 ) -> None:
-    """Set (n,) labels to the (k + 1,) names of (n,) claims; the last name is for a claim of -1."""
+    """Set labels (n,) to the names (k + 1,) of claims (n,); the last name is for a claim of -1."""
     for i in range(claims.size):
         labels[i] = names[claims[i]]
 
@@ -533,7 +535,7 @@ _LINE_WIDTH_M: Final = 1e-4
 
 @compiled
 def flattest(sums: NDArray[np.float64], plane: NDArray[np.float64]) -> None:
-    """Set (9,) plane to normal, centroid, and the variances along the three principal axes.
+    """Set `plane` (9,) to normal, centroid, and the variances along the three principal axes.
 
     The eigenvalues of the symmetric 3 x 3 matrix are computed in closed form, which is a hundred
     times as fast as LAPACK.
@@ -562,8 +564,7 @@ def flattest(sums: NDArray[np.float64], plane: NDArray[np.float64]) -> None:
     most = mean + 2.0 * size * math.cos(angle)
     least = mean + 2.0 * size * math.cos(angle + 2.0 * math.pi / 3.0)
     plane[6], plane[7], plane[8] = max(least, 0.0), 3.0 * mean - most - least, most
-    # Rows of (matrix - least) are perpendicular to the normal, so it is their longest cross
-    # product.
+    # The normal is perpendicular to the rows of (matrix - least); use their longest cross product.
     ra, rb, rc = aa - least, bb - least, cc - least
     longest = 0.0
     for p0, p1, p2 in (

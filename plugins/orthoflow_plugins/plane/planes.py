@@ -497,7 +497,7 @@ def side_of_stations(
     station nearest to the centre of the plane decides.
 
     Args:
-        plane: in the cloud's offsets.
+        plane: the plane in the cloud's offsets.
         centre_m: (3,) centre of the plane, offset.
         cloud: the cloud.
         index: (m,) indices of some points of the plane.
@@ -536,7 +536,7 @@ def side_of_remaining(
     increases with distance up to a metre, because relief and recesses are near and the room is far.
 
     Args:
-        plane: in the cloud's offsets.
+        plane: the plane in the cloud's offsets.
         corners_m: (4, 3) rectangle, offsets.
         points_m: (m, 3) sample of the cloud, offsets.
         is_parallel: (m,) whether a point belongs to a plane parallel to this one.

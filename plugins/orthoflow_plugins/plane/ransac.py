@@ -188,7 +188,7 @@ class Scores(Rows):
 
 
 class ConsensusProposer:
-    """Proposes planes that many points of a sample are on.
+    """Proposes planes that contain many points of a sample.
 
     Good hypotheses are kept for the next plane and scored again with the remaining points. Rejected
     ones are excluded until points near them are removed, because the verification depends only on

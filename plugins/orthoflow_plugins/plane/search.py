@@ -248,7 +248,7 @@ class Proposer(Protocol):
 P = TypeVar("P", bound=Proposer)
 # The criterion that rejects a plane, the cells that belong to it, and its fit.
 _Verdict = tuple[Criterion | None, Support | None, AdjustedPlane | None]
-# Creates the proposer of a search that has just begun.
+# Creates the proposer at the beginning of a search.
 ProposerOf = Callable[[Search], P]
 
 
@@ -557,7 +557,7 @@ def _judged(
 
 
 def fit_to_all(found: list[FoundPlane], search: Search) -> list[FoundPlane]:
-    """Fit planes of the sample to all points; omit planes that all points do not confirm."""
+    """Fit planes of the sample to all points; omit planes that are not confirmed by them."""
     cloud = search.cloud
     every = max(1, len(cloud.claims) // _FITTED_MOST)
     least_points = search.params.min_share * len(cloud.claims) / every

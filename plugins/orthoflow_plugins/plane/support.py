@@ -254,7 +254,7 @@ def support_of(
     join_parts: bool = True,
     part_share: float = PART_SHARE,
 ) -> Support | None:
-    """Connect cells to parts and compute their rectangles.
+    """Group cells into connected parts and compute their rectangles.
 
     Cells are connected over gaps of up to four cells. All parts with `part_share` of the cells are
     kept, so that the rectangle contains the entire wall, even if a pilaster divides it; without

@@ -111,7 +111,7 @@ class Neighbourhood:
 
 @dataclass(frozen=True, kw_only=True)
 class VoxelTable:
-    """The voxels with points of a cloud, numbered by position.
+    """The non-empty voxels of a cloud, numbered by position.
 
     Attributes:
         grid: axes, corner and side of the voxels.

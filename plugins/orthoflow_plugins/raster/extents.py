@@ -156,8 +156,8 @@ class Extent:
         growth_m: growth beyond the rectangle of the points, at the left, right, top and bottom.
         front_m: depth from the plane towards the viewer.
         behind_m: depth behind the plane.
-        cut_m: by side, the width of the part of the wall that is excluded because the adjoining
-            plane is oblique to the side.
+        cut_m: for each side, the maximum width of the wall's part that is excluded because the
+            adjoining plane is oblique to the side.
     """
 
     growth_m: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
@@ -167,7 +167,7 @@ class Extent:
 
     def widened(self, frame: WallFrame) -> WallFrame:
         """Add whole cells on each side, so that the positions of the other cells are unchanged."""
-        # A tolerance of a millionth of a cell, as in `frame_over`.
+        # Tolerance of a millionth of a cell, as in `frame_over`.
         left, right, top, bottom = (int(grown / frame.gsd_m + 1e-6) for grown in self.growth_m)
         corner = np.array([[-left, -top]], dtype=np.float64)
         return replace(

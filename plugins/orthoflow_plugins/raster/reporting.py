@@ -264,7 +264,7 @@ def report(ctx: StepContext, walls: Sequence[Wall], step_m: float, up: NDArray[n
 
 
 def report_empty(ctx: StepContext, walls: Sequence[Wall], empty: Sequence[Emptiness]) -> None:
-    """Report the causes of empty cells as metrics, and as diagnostics if they affect much."""
+    """Report the causes of empty cells as metrics, and as diagnostics if many are affected."""
     sizes = np.array([wall.mask.size for wall in walls], dtype=np.float64)
     for cause in _CAUSES:
         shares = [getattr(of_wall, f"{cause}_share") for of_wall in empty]

@@ -69,7 +69,7 @@ _CLOSE_SIGMAS: Final = 4.0
 _REACHES: Final = (3.0, 1.5)
 # Void cells are set this many maximum differences below all others, so that they have no weight.
 _VOID_REACHES: Final = 8.0
-# Lower noise needs no filter.
+# Noise below this needs no filter.
 _NOISE_LEAST_M: Final = 2.0e-5
 
 _Number = TypeVar("_Number", np.float32, np.uint8)
