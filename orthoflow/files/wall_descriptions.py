@@ -34,7 +34,7 @@ class WallDescription(BaseModel):
         expected_mm_median: expected error of a point measured in the image, one standard deviation,
             median over the image; None if it was not checked.
         expected_mm_p95: the same, exceeded in 5 % of the image.
-        n_check_points: number of check points on this wall; 0 if there is no image.
+        n_check_points: number of withheld tie points on this wall; 0 if there is no image.
         orthoimage: path of the GeoTIFF, relative to the file with this description.
     """
 
@@ -62,7 +62,16 @@ class WallDescription(BaseModel):
             return Phrase(key="not_checked")
         errors = {"median": self.expected_mm_median, "high": self.expected_mm_p95}
         texts: dict[str, object] = {name: f"{error_mm:.1f}" for name, error_mm in errors.items()}
-        return Phrase(key="expected_error", values=texts | {"count": self.n_check_points})
+        return Phrase(key="expected_error", values=texts | {"count": f"{self.n_check_points:,}"})
+
+    @property
+    def objection(self) -> Phrase | None:
+        """Reason not to deliver the orthoimage, as a phrase for drawings; None if there is none."""
+        if self.recommended:
+            return None
+        if (share := self.painted_share or 0.0) < _MIN_PAINTED_SHARE:
+            return Phrase(key="barely_painted", values={"percent": f"{100.0 * share:.0f}"})
+        return Phrase(key="no_ties")
 
     @property
     def sentence(self) -> str:
@@ -91,7 +100,7 @@ def described(path: Path, sidecar: Mapping[str, object]) -> WallDescription:
     counts = _table(sidecar.get("mask_counts"))
     n_painted = sum(_number(counts.get(str(int(state)))) or 0.0 for state in PAINTED_STATES)
     n_cells = sum(_number(count) or 0.0 for count in counts.values())
-    painted = n_painted / n_cells if n_cells else 0.0
+    painted = round(n_painted / n_cells, 4) if n_cells else 0.0
     accuracy = _table(sidecar.get("accuracy"))
     is_assessed = accuracy.get("assessed") is True
     median, high = (
@@ -119,7 +128,7 @@ def described(path: Path, sidecar: Mapping[str, object]) -> WallDescription:
         width_m=round(gsd_m * width, 4),
         height_m=round(gsd_m * height, 4),
         area_m2=round(gsd_m**2 * width * height, 3),
-        painted_share=round(painted, 4),
+        painted_share=painted,
         height_of_top_m=_number(sidecar.get("height_of_top_m")),
         expected_mm_median=median,
         expected_mm_p95=high,

@@ -446,14 +446,13 @@ def _unmeasured(run: Run) -> Phrase:
 
 
 def _accuracy(inspections: dict[str, Inspection], wall: int) -> Iterator[Phrase]:
-    for address, inspection in inspections.items():
+    for inspection in inspections.values():
         own = {item.name: item.value for item in inspection.findings if item.wall == wall}
         for first, second, key, counts in _ACCURACY:
             if first in own and second in own:
-                values = {"step": address, "first": f"{own[first]:.1f}"}
                 yield Phrase(
                     key=key,
-                    values={**values, "second": f"{own[second]:.1f}"},
+                    values={"first": f"{own[first]:.1f}", "second": f"{own[second]:.1f}"},
                     asides=tuple(_of_how_many(own, counts)),
                 )
 
@@ -484,4 +483,4 @@ def _colours(run: Run, address: str) -> Phrase:
         return Phrase(key="colours_raw")
     if not any(metric.name == "gain_max" for metric in cell.metrics):
         return Phrase(key="colours_agree")
-    return Phrase(key="colours_balanced", values={"gains": gains})
+    return Phrase(key="colours_balanced")

@@ -86,12 +86,12 @@ def test_an_inspection_says_how_exact_a_wall_is_by_findings_on_it() -> None:
     half = inspection(("rmse_x_mm", 1.0, 3), ("n_points", 5.0, 3))
     found = {"check": own, "truth": every, "half": half, "first": first}
     assert [said.text() for said in module._accuracy(found, 3)] == [
-        "check: RMSE horizontal 1.2 mm, vertical 2.0 mm (check points: 6)",
-        "check, with depth: RMS 3.0 mm, largest 9.0 mm",
+        "measured: RMSE horizontal 1.2 mm, vertical 2.0 mm (check points: 6)",
+        "measured with depth: RMS 3.0 mm, largest 9.0 mm",
     ]
     # What was found of all walls together says nothing of one.
     (first_said,) = module._accuracy(found, 0)
-    assert first_said.text("de") == "first: RMSE seitlich 4.0 mm, in der Höhe 5.0 mm"
+    assert first_said.text("de") == "gemessen: RMSE seitlich 4,0 mm, in der Höhe 5,0 mm"
 
 
 def checkpoints(count: int) -> Any:
@@ -139,7 +139,7 @@ def test_given_check_points_are_not_asked_for_again(count: int, check: Any, said
         (
             {"gains": "local"},
             (SimpleNamespace(name="gain_max", value=1.5),),
-            "colours balanced between photos (gains: local)",
+            "colours balanced between photos",
         ),
     ],
 )

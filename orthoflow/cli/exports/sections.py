@@ -80,7 +80,7 @@ def _write(
                 kind=kind,
                 section=section,
                 scale=scale,
-                origin=origin_of(run),
+                origin=origin_of(run, chosen.language or "en"),
                 has_dimensions=chosen.dimensions,
                 language=chosen.language or "en",
             )

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+from orthoflow.cli.commands import echo_error
 from orthoflow.cli.exports.choices import Choices
 from orthoflow.cli.exports.drawings import chosen_walls
 from orthoflow.cli.exports.products import make_empty
@@ -36,15 +37,17 @@ from orthoflow.files.drawings.sheet_contents import (
     read_title_block,
 )
 from orthoflow.files.drawings.sheets import fitting_scale, lay_out, write_sheet
-from orthoflow.files.drawings.words import Phrase, label, surface_name
+from orthoflow.files.drawings.words import Language, Phrase, label, numerals, surface_name
 from orthoflow.products import Opening
 from orthoflow.records.runs import Run
 from orthoflow.records.walls import RoomResults, WallResult, room_results
+from orthoflow.untrusted_text import first_few
 
 _USUAL_PAPER: Final = "A3"
 _GRID_MM: Final = 20.0
 _LEAST_PPI: Final = 150.0
 _MM_PER_INCH: Final = 25.4
+_MOST_NAMED: Final = 8
 _KINDS: Final = {"through": "through_opening", "niche": "niche", "no data": "no_data"}
 
 
@@ -89,13 +92,14 @@ def text_of(run: Run, name: str, chosen: Choices, notes: tuple[Phrase, ...] = ()
         block=read_title_block(chosen.title_block) if chosen.title_block else TitleBlock(),
         notes=notes,
         digest=run.content_sha256,
-        run=origin_of(run),
+        run=origin_of(run, chosen.language or "en"),
     )
 
 
-def origin_of(run: Run) -> str:
+def origin_of(run: Run, language: Language) -> str:
     """Return one line about the origin of the drawings."""
-    return f"run {run.record.run_id} of {run.record.name}, {run.record.created_by}"
+    about = run.record
+    return label("origin", language, run=about.run_id, name=about.name, program=about.created_by)
 
 
 def grid_of(chosen: Choices, scale: int) -> float:
@@ -128,6 +132,7 @@ def export_sheets(run: Run, folder: Path, chosen: Choices) -> str:
         return [_scaled(drawing, wall, chosen, scale) for drawing, wall in pairs]
 
     scale, n_sheets = write_drawings(folder, drawn, chosen)
+    _warn(walls)
     said = f"{counted(n_sheets, 'sheet')} of {counted(len(walls), 'wall')} at 1:{scale}"
     return said + _coarse(walls, scale)
 
@@ -155,9 +160,11 @@ def export_elevations(run: Run, folder: Path, chosen: Choices) -> str:
     known: dict[str, list[str]] = {}
     for wall in results.walls:
         if wall.frame.raster_axes == "wall":
-            about = wall.about.accuracy if wall.about else Phrase(key="not_checked")
-            name = surface_name(wall.name, language)
-            known.setdefault(about.text(language), []).append(name)
+            about = [wall.about.accuracy if wall.about else Phrase(key="not_checked")]
+            if wall.about and wall.about.objection:
+                about.insert(0, wall.about.objection)
+            said = "; ".join(phrase.text(language) for phrase in about)
+            known.setdefault(said, []).append(surface_name(wall.name, language))
     notes = tuple(
         Phrase(key="of_wall", values={"wall": ", ".join(names), "text": said})
         for said, names in known.items()
@@ -170,10 +177,22 @@ def export_elevations(run: Run, folder: Path, chosen: Choices) -> str:
 
     pattern = "{stem}_{number}"
     scale, n_sheets = write_drawings(folder, drawn, chosen, alone=pattern, several=pattern)
+    _warn([wall for wall in results.walls if wall.frame.raster_axes == "wall"])
     side = "inside" if is_inside else "outside"
     return f"{counted(len(walls), 'wall')} as seen from {side} at 1:{scale} on " + counted(
         n_sheets, "sheet"
     )
+
+
+def _warn(walls: Sequence[WallResult]) -> None:
+    """Name the walls that are drawn although their orthoimages should not be delivered."""
+    few = [
+        f"{wall.name} ({wall.about.reason})"
+        for wall in walls
+        if wall.about and not wall.about.recommended
+    ]
+    if few:
+        echo_error(f"warning: not recommended for delivery: {first_few(few, most=_MOST_NAMED)}")
 
 
 def _coarse(walls: Sequence[WallResult], scale: int) -> str:
@@ -215,6 +234,8 @@ def _drawing(text: SheetText, results: RoomResults, wall: WallResult, chosen: Ch
     for _, outline_m in areas:
         edges |= {round(float(outline_m[:, 1].min()), 4), round(float(outline_m[:, 1].max()), 4)}
     notes = wall.accuracy or (Phrase(key="not_checked"),)
+    if wall.about and wall.about.objection:
+        notes = (wall.about.objection, *notes)
     planes = results.planes
     plan = None if planes is None else key_plan(planes, frame, wall.number)
     pictures: dict[str, Picture] = {}
@@ -266,7 +287,8 @@ def _area(wall: WallResult, opening: Opening, chosen: Choices) -> Area:
     outline_m = frame.gsd_m * frame.wall_from_raster(opening.outline_m)
     unit_m, unit = (FOOT_M, "ft") if chosen.units == "ft" else (1.0, "m")
     wide, high = opening.width_m / unit_m, opening.height_m / unit_m
-    return f"{label(_KINDS[opening.kind], language)}, {wide:.2f} x {high:.2f} {unit}", outline_m
+    size = " x ".join((numerals(f"{wide:.2f}", language), numerals(f"{high:.2f} {unit}", language)))
+    return f"{label(_KINDS[opening.kind], language)}, {size}", outline_m
 
 
 def _first_kind(wall: WallResult) -> str:

@@ -33,7 +33,7 @@ from orthoflow.files.drawings.sheet_contents import (
     up_words,
     whole_of,
 )
-from orthoflow.files.drawings.words import Language, Phrase, label
+from orthoflow.files.drawings.words import Language, Phrase, label, numerals
 from orthoflow.files.geotiff import RasterParts, writing
 from orthoflow.files.polygons import Feature, write_features
 from orthoflow.geometry import WallFrame
@@ -359,7 +359,7 @@ def wall_picture(
     def draw(placed: Placed) -> None:
         draw_raster(placed, raster, is_flipped=is_flipped)
         if is_depth:
-            _draw_contours(placed, raster, is_flipped=is_flipped)
+            _draw_contours(placed, raster, is_flipped=is_flipped, language=language)
         _draw_areas(placed, areas)
 
     legend: list[LegendRow] = []
@@ -398,7 +398,7 @@ def draw_raster(placed: Placed, raster: Path, *, is_flipped: bool = False) -> No
     )
 
 
-def _draw_contours(placed: Placed, raster: Path, *, is_flipped: bool) -> None:
+def _draw_contours(placed: Placed, raster: Path, *, is_flipped: bool, language: Language) -> None:
     found = contours(
         raster,
         placed.view.part,
@@ -411,7 +411,7 @@ def _draw_contours(placed: Placed, raster: Path, *, is_flipped: bool) -> None:
         colour = pens.BEFORE if level > 0.0 else pens.BEHIND
         on_paper = placed.on_paper(points)
         pens.line(placed.canvas, on_paper, width_mm=pens.FINE_MM, colour=colour)
-        text = f"{round(1e3 * level, 6):+g}"
+        text = numerals(f"{round(1e3 * level, 6):+g}", language)
         place = label_place(on_paper, pens.text_width_mm(text), labelled)
         if place is not None:
             middle_mm, turned_deg = place

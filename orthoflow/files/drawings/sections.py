@@ -32,7 +32,7 @@ from orthoflow.files.drawings.sheet_contents import (
     SheetText,
     up_words,
 )
-from orthoflow.files.drawings.words import Language, Phrase, label
+from orthoflow.files.drawings.words import Language, Phrase, label, numerals
 from orthoflow.geometry.frames import basis_from_up
 from orthoflow.geometry.outlines import edges_between
 from orthoflow.products import Opening, Planes, PointCloud, PointLabels
@@ -151,10 +151,10 @@ def plan_cut(planes: Planes, height_m: float, language: Language = "en") -> Cut:
         floor = int(large[np.argmin(heights[large])])
         world_m = float(heights[floor]) + height_m
         floor_words = f"{label('floor', language)} {floor}"
-        title = f"{height_m:.2f} m {label('above', language)} {floor_words}, "
+        title = label("above", language, height=f"{height_m:.2f} m", floor=floor_words) + ", "
     else:
         world_m, title = height_m, ""
-    title += f"{label('height', language)} {world_m:.3f} m"
+    title += f"{label('height', language)} {numerals(f'{world_m:.3f} m', language)}"
     return Cut(origin_world=world_m * up, x_world=e1, y_world=e2, forward_world=-up, title=title)
 
 
@@ -170,13 +170,13 @@ def section_cut(planes: Planes, through: Sequence[float], language: Language = "
     if length_m < 1e-6:
         raise ArgumentError("--through takes two different places, X,Y,X,Y, got one twice")
     right = (second - first) / length_m
-    words = ", ".join(f"({x:.2f}, {y:.2f})" for x, y in np.reshape(through, (2, 2)))
+    values = dict(zip("abcd", (f"{value:.2f}" for value in through), strict=True))
     return Cut(
         origin_world=first,
         x_world=right,
         y_world=up,
         forward_world=np.cross(up, right),
-        title=f"{label('through', language)} {words}",
+        title=label("through", language, **values),
     )
 
 

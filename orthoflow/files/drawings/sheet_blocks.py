@@ -28,7 +28,7 @@ from orthoflow.files.drawings.sheet_contents import (
     Sheet,
     round_below,
 )
-from orthoflow.files.drawings.words import label
+from orthoflow.files.drawings.words import label, numerals
 
 if TYPE_CHECKING:
     from reportlab.pdfgen.canvas import Canvas
@@ -219,7 +219,7 @@ def _scale_bar(drawing: Drawing) -> _Picture:
             pens.line(canvas, sides, is_closed=True)
         for place, text in ((0, "0"), (count, f"{count * length:g} {drawing.unit}")):
             at = (4.0 + place * segment, 4.2)
-            pens.write_text(canvas, text, at, is_centred=True)
+            pens.write_text(canvas, numerals(text, drawing.language), at, is_centred=True)
 
     return _Picture(8.0, draw)
 
@@ -292,9 +292,8 @@ def _plan(
 
 def _key_plan(drawing: Drawing, plan: KeyPlan) -> tuple[str, NDArray[np.float64], Any]:
     """Return a plan of the room with the number of the marked wall."""
-    lines = [*plan.walls, *plan.outlines, plan.marked]
-    if plan.arrow is not None:
-        lines.append(plan.arrow)
+    arrows = [] if plan.arrow is None else [plan.arrow]
+    lines = [*plan.walls, *plan.outlines, plan.marked, *arrows]
 
     def draw(canvas: Canvas, place: Any, wide_mm: float) -> None:
         for wall in plan.walls:
@@ -386,9 +385,8 @@ def _title_table(drawing: Drawing, sheet: Sheet, wide_mm: float) -> Any:
         cells.append((head, True))
     if block.project:
         cells.append(([_bold(block.project)], True))
-    title = [_bold(block.title or drawing.text.name)]
-    if block.title:
-        title.append(pens.paragraph(drawing.text.name))
+    names = [block.title, drawing.text.name] if block.title else [drawing.text.name]
+    title = [_bold(names[0]), *map(pens.paragraph, names[1:])]
     cells.append(
         (
             [*title, pens.paragraph(", ".join(dict.fromkeys(view.kind for view in sheet.views)))],

@@ -507,11 +507,8 @@ def axes_of(frame: WallFrame) -> Axes:
     left_m, top_m = frame.raster_corner_m
     if frame.raster_down > 0.0:
         top_m += frame.height * frame.gsd_m
-    kind = frame.raster_axes
-    values: dict[str, object] = {"crs": frame.map_crs} if kind == "map" else {}
-    if kind == "wall":
-        values = {"up": up_words(np.array(frame.up))}
-    phrase = Phrase(key=f"axes_{kind}", values=values)
+    values = {"crs": frame.map_crs, "up": up_words(np.array(frame.up))}
+    phrase = Phrase(key=f"axes_{frame.raster_axes}", values=values)
     return Axes(across=(left_m, 1.0), down=(top_m, -1.0), phrase=phrase)
 
 

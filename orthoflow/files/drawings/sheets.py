@@ -32,7 +32,7 @@ from orthoflow.files.drawings.sheet_contents import (
     usual_papers,
     whole_of,
 )
-from orthoflow.files.drawings.words import label
+from orthoflow.files.drawings.words import label, numerals
 from orthoflow.files.sidecars import write_bytes
 from orthoflow.untrusted_text import shown
 
@@ -105,8 +105,6 @@ def _draw_grid(placed: Placed, drawing: Drawing) -> None:
         value: float(placed.on_paper([(part.left_m, place)])[0, 1])
         for place, value in _marks(drawing.axes.down, (part.top_m, bottom_m), drawing)
     }
-    # A quarter of a metre needs two digits.
-    digits = len(f"{drawing.grid:.4f}".rstrip("0").partition(".")[2])
     for x in columns.values():
         pens.line(canvas, [(x, bottom), (x, bottom - _TICK_MM)])
         pens.line(canvas, [(x, top), (x, top + _TICK_MM)])
@@ -115,11 +113,11 @@ def _draw_grid(placed: Placed, drawing: Drawing) -> None:
         pens.line(canvas, [(right, y), (right + _TICK_MM, y)])
         if not columns:
             pens.line(canvas, [(left, y), (right, y)], width_mm=pens.FINE_MM)
-    for text, x in _with_room(columns, digits, (left - 4.0, right + 4.0)):
+    for text, x in _with_room(columns, drawing, (left - 4.0, right + 4.0)):
         at = (x, bottom - _TICK_MM - 1.0 - pens.TEXT_MM)
         pens.write_text(canvas, text, at, is_centred=True)
     # Beside the picture, without overlapping the coordinates below it.
-    for text, y in _with_room(rows, digits, (bottom, top)):
+    for text, y in _with_room(rows, drawing, (bottom, top)):
         pens.write_text(canvas, text, (left - _TICK_MM - 1.0, y), turned_deg=90.0, is_centred=True)
     for x in columns.values():
         for y in rows.values():
@@ -127,15 +125,17 @@ def _draw_grid(placed: Placed, drawing: Drawing) -> None:
 
 
 def _with_room(
-    places: dict[float, float], digits: int, limits_mm: tuple[float, float]
+    places: dict[float, float], drawing: Drawing, limits_mm: tuple[float, float]
 ) -> Iterator[tuple[str, float]]:
     """Yield coordinates at multiples of the smallest step of 1, 2, 5 ... marks with which all fit.
 
     Args:
         places: coordinate -> its position along the edge.
-        digits: number of decimals.
+        drawing: the drawing.
         limits_mm: limits of the text; a coordinate at an end is moved inside them.
     """
+    # A quarter of a metre needs two digits.
+    digits = len(f"{drawing.grid:.4f}".rstrip("0").partition(".")[2])
     values = sorted(places)
     step = values[1] - values[0] if len(values) > 1 else 1.0
     found: list[tuple[str, float]] = []
@@ -143,7 +143,7 @@ def _with_room(
         found, ends = [], []
         for value in values:
             if round(value / step) % every == 0:
-                text = f"{value:.{digits}f}"
+                text = numerals(f"{value:.{digits}f}", drawing.language)
                 half = 0.5 * pens.text_width_mm(text)
                 low, high = limits_mm[0] + half, max(limits_mm[1] - half, limits_mm[0] + half)
                 middle = min(max(places[value], low), high)
@@ -190,7 +190,7 @@ def _draw_heights(placed: Placed, drawing: Drawing) -> None:
         limit = places[k] - _MARK_ROW_MM
     for place, (level, value) in zip(places, levels, strict=True):
         pens.line(canvas, [(right + _TICK_MM, level), (right + 4.0, place)])
-        pens.height_mark(canvas, (right + 6.0, place), f"{value:+.2f}")
+        pens.height_mark(canvas, (right + 6.0, place), numerals(f"{value:+.2f}", drawing.language))
 
 
 def _draw_match_lines(placed: Placed, drawing: Drawing, sheet: Sheet) -> None:

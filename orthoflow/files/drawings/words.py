@@ -13,26 +13,36 @@ Language = Literal["en", "de", "fr", "pl", "es"]
 LANGUAGES: Final = ("en", "de", "fr", "pl", "es")
 _TEXTS: Final = Path(__file__).with_name("labels.txt")
 _NUMBERED: Final = re.compile(r"(wall|floor|ceiling) (\d+)")
+_NUMBER: Final = re.compile(r"[+-]?[\d,]+(\.\d+)?( \w+)?")
+_SPACED: Final = str.maketrans(".,", ",\N{NO-BREAK SPACE}")
+_SEPARATORS: Final = {"de": str.maketrans(".,", ",."), "fr": _SPACED, "pl": _SPACED, "es": _SPACED}
 
 
 @lru_cache(maxsize=1)
 def _labels() -> dict[str, tuple[str, ...]]:
-    rows = (
-        [part.strip() for part in row.split(" | ")]
-        for row in _TEXTS.read_text(encoding="utf-8").splitlines()
-        if row and not row.startswith("#")
-    )
+    lines = _TEXTS.read_text(encoding="utf-8").splitlines()
+    rows = (line.split(" | ") for line in lines if line and not line.startswith("#"))
     return {key: tuple(texts) for key, *texts in rows}
 
 
 def label(key: str, language: Language = "en", **values: object) -> str:
-    """Return a text in a language, with values filled in.
+    """Return a text in a language, with values filled in; numbers get its separators.
 
-    >>> label("section", "de"), label("sheet_of", "pl", number=1, count=3)
-    ('Schnitt', 'arkusz 1 z 3')
+    >>> label("section", "de"), label("n_pairs", "de", count="1,234")
+    ('Schnitt', 'Paare: 1.234')
     """
     text = _labels()[key][LANGUAGES.index(language)]
-    return text.format(**values) if values else text
+    filled = {name: numerals(str(value), language) for name, value in values.items()}
+    return text.format(**filled) if values else text
+
+
+def numerals(text: str, language: Language) -> str:
+    """Return a number formatted by Python with the separators of a language, or another text.
+
+    >>> numerals("+13,694.5 m", "de"), numerals("+13,694.5 m", "en"), numerals("1.2, 3", "de")
+    ('+13.694,5 m', '+13,694.5 m', '1.2, 3')
+    """
+    return text.translate(_SEPARATORS.get(language, {})) if _NUMBER.fullmatch(text) else text
 
 
 def surface_name(name: str, language: Language = "en") -> str:

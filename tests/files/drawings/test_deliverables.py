@@ -197,8 +197,8 @@ def test_every_export_states_the_same_of_a_wall(tmp_path: Path) -> None:
     assert wall.about is not None
     assert wall.about.sentence == (
         "3.80 x 2.30 m; 97% painted; expected error of a point measured in this image: median "
-        "2.0 mm, 95 % below 2.0 mm (one standard deviation, from orientation, depth and parallax; "
-        "check points on this wall: 12)"
+        "2.0 mm, 95 % below 2.0 mm (one standard deviation, relative to the scan and without its "
+        "errors, from orientation, depth and parallax; withheld tie points on this wall: 12)"
     )
     for target, file in (
         ("qgis", "walls.qgs"),

@@ -42,9 +42,10 @@ from orthoflow.files.drawings.sheets import fitting_scale, lay_out
 from orthoflow.files.drawings.words import LANGUAGES, _labels, label
 from orthoflow.files.geotiff import GridPlace, write_raster
 from orthoflow.geometry.frames import frame_over
+from orthoflow.products import OrthoMask
 from orthoflow.records.open import open_run
 from tests import samples
-from tests.drawing_runs import WALL, write_drawing_run
+from tests.drawing_runs import WALL, box_image, write_drawing_run
 from tests.long_loops import long_only
 
 MM = 25.4 / 72.0
@@ -486,3 +487,69 @@ def test_the_scale_at_which_cells_print_finely_is_a_usual_one(run: Path, tmp_pat
     said = export(run, tmp_path / "out", "--scale", 20).output
     assert "from 1:100 on they are fine enough" in said
     assert (usual_scale(41.0), usual_scale(20.1), usual_scale(2.1)) == (50, 25, 5)
+
+
+@pytest.mark.parametrize(
+    ("language", "said"),
+    [
+        ("en", ("reference plane: 4,000 points", "RMSE horizontal 0.7 mm", "niche 0.80 x 1.20 m")),
+        ("de", ("Bezugsebene aus 4.000 Punkten", "RMSE seitlich 0,7 mm", "Nische 0,80 x 1,20 m")),
+        ("fr", ("référence : 4 000 points", "RMSE en largeur 0,7 mm", "niche 0,80 x 1,20 m")),
+    ],
+)
+def test_numbers_have_the_separators_of_the_language(
+    tmp_path: Path, language: str, said: tuple[str, ...]
+) -> None:
+    errors_m = np.full(box_image().frame.shape, 0.002, np.float32)
+    image = replace(box_image(), error_m=errors_m, n_check_points=1288)
+    run = write_drawing_run(tmp_path / "run", gains="global", differ=True, image=image)
+    done = export(run, tmp_path / "out", "--scale", 25, "--language", language)
+    assert (done.exit_code, done.stderr) == (0, "")
+    with page_of(tmp_path / "out" / f"wall_{WALL}_sheet_1.pdf") as page:
+        text, letters = words_of(page), "".join(char["text"] for char in page.chars)
+    for part in said:
+        assert part in text, part
+    # Heights beside the picture: the upper edge of the niche.
+    assert ("+101.80" if language == "en" else "+101,80") in letters
+    if language == "de":
+        for part in (
+            "zu erwartender Fehler eines in diesem Bild gemessenen Punktes 2,0 mm",
+            "relativ zum Scan und ohne dessen Fehler",
+            "zurückgehaltene Verknüpfungspunkte auf dieser Wand: 1.288",
+        ):
+            assert part in text, part
+        for part in ("Kontrollpunkte", "check", "gains", "run r1 of"):
+            assert part not in text, part
+        assert "Lauf r1 von box" in text
+
+
+@pytest.mark.parametrize(
+    ("share", "has_ties", "said", "note"),
+    [
+        (0.35, True, "only 35% painted", "nur 35 % dieses Bildes haben Farben"),
+        (0.60, False, "no tie point lies", "auf dieser Wand liegt kein Verknüpfungspunkt"),
+        (0.60, True, "", ""),
+    ],
+)
+def test_a_wall_that_is_not_recommended_says_so_on_its_sheet(
+    tmp_path: Path, share: float, said: str, note: str, *, has_ties: bool
+) -> None:
+    image = box_image()
+    mask = np.full(image.frame.shape, OrthoMask.NONE, dtype=np.uint8)
+    mask[:, : round(share * mask.shape[1])] = OrthoMask.PAINTED
+    errors_m = np.full(mask.shape, 0.002 if has_ties else np.nan, np.float32)
+    errors_m[mask == OrthoMask.NONE] = np.nan
+    rgb = np.where(mask[:, :, None] == OrthoMask.PAINTED, image.rgb, 0).astype(np.uint8)
+    source = np.where(mask == OrthoMask.PAINTED, 0, -1).astype(np.int16)
+    image = replace(
+        image, mask=mask, rgb=rgb, source=source, error_m=errors_m, n_check_points=12 * has_ties
+    )
+    run = write_drawing_run(tmp_path / "run", image=image)
+    done = export(run, tmp_path / "out", "--scale", 25, "--language", "de")
+    assert done.exit_code == 0, done.output
+    assert (f"warning: not recommended for delivery: wall {WALL} (" in done.stderr) == bool(said)
+    assert said in done.stderr
+    with page_of(tmp_path / "out" / f"wall_{WALL}_sheet_1.pdf") as page:
+        text = words_of(page)
+    assert ("nicht empfohlen" in text) == bool(said)
+    assert note in text
