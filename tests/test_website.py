@@ -65,10 +65,10 @@ def test_the_reference_has_every_method_product_metric_and_command(
     assert {name for name in catalog.methods if f"### {name}\n" not in pages["methods"]} == set()
     assert {name for name in catalog.products if f"## {name}\n" not in pages["products"]} == set()
     assert {
-        "| `rmse_[uv]_mm` | error along ..., RMS | mm | less is better | inspect.truth |",
-        "| `rms_mm` | check points, RMS | mm | less is better | inspect.checkpoints |",
+        "| `rmse_[uv]_mm` | error along ..., RMS | mm | lower is better | inspect.truth |",
+        "| `rms_mm` | check points, RMS | mm | lower is better | inspect.checkpoints |",
         "| `scale_ppm` | scale, from 1 | ppm |  | register.similarity |",
-        "| `peak_rss_mib` | memory | MiB | less is better | all |",
+        "| `peak_rss_mib` | memory | MiB | lower is better | all |",
     } <= set(pages["metrics"].splitlines())
     # What a product consists of, and what its numbers stand for.
     products = pages["products"]

@@ -22,7 +22,7 @@ from orthoflow.cli.tables import counted, echo, echo_json, echo_table, size
 _SUMMARIES: Final = {
     "list": "List the stored results with their size and age.",
     "gc": "Remove objects that no stored result needs.",
-    "verify": "Check every byte of the store, and remove what is damaged.",
+    "verify": "Check every byte of the store, and remove damaged parts.",
 }
 
 
@@ -115,11 +115,11 @@ def cache_verify(store: Path, *, as_json: bool) -> int:
         echo(f"{item.name}: {item.what}")
     echo(
         f"{counted(found.n_results, 'result')} and {counted(found.n_objects, 'object')} in {store} "
-        "are as they were stored"
+        "are unchanged"
     )
     if found.damaged:
         echo_error(
-            f"error: {counted(len(found.damaged), 'part')} of {store} were damaged and removed, "
-            "see above; the next run computes what it needs of them again"
+            f"error: {counted(len(found.damaged), 'part')} of {store} were damaged and have been "
+            "removed (see above); the next run recomputes those it needs"
         )
     return code

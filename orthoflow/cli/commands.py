@@ -98,7 +98,7 @@ class Command(click.Command):
                 raise
             sentence = (
                 f"{error.message.rstrip('.')}; {found} was split at its "
-                "spaces: quote the whole value, as --set 'wall.near=[[1, 2, 3]]'"
+                "spaces: quote the whole value, as in --set 'wall.near=[[1, 2, 3]]'"
             )
             raise click.UsageError(sentence, ctx) from error
 
@@ -115,7 +115,7 @@ class RecordCommand(Command):
         try:
             return super().invoke(ctx)
         except (GeometryError, ProductError) as error:
-            raise RecordError(f"a product of this run breaks its own rules: {error}") from error
+            raise RecordError(f"a product of this run is invalid: {error}") from error
         except (OrthoflowError, OSError, click.ClickException, click.Abort, click.exceptions.Exit):
             raise
         except Exception as error:
@@ -371,9 +371,7 @@ def explain(error: Exception, session: Session) -> int:
         echo_error(*([hint] if hint else _sentences(error)))
         return error.exit_code
     if is_for_want_of_memory(error):
-        echo_error(
-            "error: not enough memory to continue; free memory, or raise the limit on memory"
-        )
+        echo_error("error: not enough memory to continue; free memory or raise the memory limit")
         return EXIT_CELL_FAILED
     if isinstance(error, OSError) and error.strerror:
         where = f"{error.filename}: " if error.filename else ""
@@ -381,8 +379,8 @@ def explain(error: Exception, session: Session) -> int:
         return EXIT_CELL_FAILED
     if isinstance(error, ImportError):
         echo_error(
-            f"error: a library fails to import: {one_line(error)}; `orthoflow doctor` lists what "
-            "is missing"
+            f"error: a library cannot be imported: {one_line(error)}; `orthoflow doctor` lists "
+            "missing libraries"
         )
         return EXIT_PLUGIN_MISSING
     echo_error(

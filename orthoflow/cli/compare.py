@@ -109,22 +109,22 @@ def _print(comparison: RunComparison, *, most: int | None = None) -> None:
     if comparison.inputs:
         _print_pairs("inputs", comparison.inputs, _files_text, most)
     else:
-        echo("", "inputs: neither has any")
+        echo("", "inputs: none in either run")
     if comparison.workflow:
         echo("", "workflow, A (-) against B (+)")
         for line in comparison.workflow[2:]:
             echo(line)
     else:
-        echo("", "workflow: same text")
+        echo("", "workflow: the texts are the same")
     _print_pairs("options", [comparison.overrides], " ".join, most)
     steps = [_differing_parts(pair) for pair in comparison.cells]
     _print_pairs("steps", steps, str, most, step_of)
     if comparison.readdressed:
         pairs = [f"{ours} (A) and {theirs} (B)" for theirs, ours in comparison.readdressed.items()]
         named = first_few(pairs, len(pairs) if most is None else _READDRESSED_MOST)
-        echo(f"compared despite different names: {named}")
+        echo(f"paired although the addresses differ: {named}")
     _print_pairs(
-        "parameters (* set, others are defaults)",
+        "parameters (* set, others default)",
         comparison.shared(comparison.parameters),
         _parameter_text,
         most,
@@ -194,7 +194,7 @@ def _counts(rows: Sequence[Pair[Any]]) -> str:
     alone = ((found.n_left, "only in A"), (found.n_right, "only in B"))
     counts += [f"{n} {where}" for n, where in alone if n]
     if found.n_rounded:
-        counts.append(f"another {found.n_rounded} differ by less than a millionth")
+        counts.append(f"{found.n_rounded} more differ by less than a millionth")
     return ", ".join(counts) or "none"
 
 

@@ -47,24 +47,24 @@ LIBRARIES: Final[Mapping[str, tuple[str, str]]] = {
     "numba": ("numba", "methods of simulate, plane, raster, ortho and inspect"),
     "scipy": ("scipy", "methods of plane and inspect"),
     "opencv-python-headless": ("cv2", "photos, previews: simulate.room, raster and ortho"),
-    "rasterio": ("rasterio", "GeoTIFF files: what raster and mosaic publish"),
+    "rasterio": ("rasterio", "GeoTIFF files: raster and mosaic"),
     "laspy": ("laspy", "LAS and LAZ files: read.scan, --to laz"),
     "lazrs": ("lazrs", "compressed LAZ files: read.scan, --to laz"),
     "pye57": ("pye57", "E57 files: read.scan, --to e57"),
     "pyproj": ("pyproj", "coordinate systems: read.scan, cameras of Metashape"),
-    "plyfile": ("plyfile", "PLY files with lists: read.scan"),
-    "pandas": ("pandas", "text files of points: read.scan"),
+    "plyfile": ("plyfile", "PLY files with list properties: read.scan"),
+    "pandas": ("pandas", "point clouds as text files: read.scan"),
     "pillow": ("PIL", "EXIF data of photos: read.photos, ortho"),
-    "simplejpeg": ("simplejpeg", "damage in JPEG files: read.photos"),
+    "simplejpeg": ("simplejpeg", "detection of damaged JPEG files: read.photos"),
     "psutil": ("psutil", "free memory: methods of raster"),
-    "threadpoolctl": ("threadpoolctl", "cores of each step"),
-    "matplotlib": ("matplotlib", "methods of plane, which draw their plans with it"),
+    "threadpoolctl": ("threadpoolctl", "number of cores per step"),
+    "matplotlib": ("matplotlib", "methods of plane, for drawing plans"),
     "mahotas": ("mahotas", "inspection by SURF features"),
     "pycolmap": ("pycolmap", "bundle adjustment"),
     "pyceres": ("pyceres", "bundle adjustment"),
     "libusb-package": ("libusb_package", "open3d on machines without libusb-1.0"),
     "open3d-cpu": ("open3d", "comparators of open3d; the default methods work without it"),
-    "fonttools": ("fontTools", "fonts of the system in sheets"),
+    "fonttools": ("fontTools", "system fonts in sheets"),
     "ezdxf": ("ezdxf", "CAD drawings: --to dxf"),
     "prov": ("prov", "PROV documents: --to prov"),
     "reportlab": ("reportlab", "sheets: --to sheet"),
@@ -151,7 +151,7 @@ def _print(findings: list[Finding], *, is_broken: bool) -> None:
     )
     costs = [f"- {item.name}: {item.cost}" for item in findings if item.cost]
     if costs:
-        echo("", "What that costs:", *costs)
+        echo("", "Consequences:", *costs)
     if is_broken:
         echo("", "a required library is missing")
     elif costs:
@@ -189,13 +189,15 @@ def _import_problem(module: str) -> str:
     try:
         done = subprocess.run(command, capture_output=True, timeout=_IMPORT_TIMEOUT_S, check=False)
     except subprocess.TimeoutExpired:
-        return f"its import takes longer than {_IMPORT_TIMEOUT_S} s"
+        return f"importing it takes longer than {_IMPORT_TIMEOUT_S} s"
     if done.returncode == 0:
         return ""
     if done.returncode < 0:
-        return f"its import crashes (signal {-done.returncode})"
+        return f"importing it crashes (signal {-done.returncode})"
     lines = done.stderr.decode(errors="replace").split("\n")
-    return f"its import fails: {next(filter(None, map(str.strip, reversed(lines))), 'no message')}"
+    return (
+        f"importing it fails: {next(filter(None, map(str.strip, reversed(lines))), 'no message')}"
+    )
 
 
 def _machine() -> Iterator[Finding]:
@@ -213,7 +215,7 @@ def _machine() -> Iterator[Finding]:
         # A missing library is reported separately.
         yield Finding("memory", "limited", "unknown", "cannot be measured")
         return
-    cost = "scans of many millions of points will not fit"
+    cost = "scans with many millions of points will not fit"
     yield _enough("memory", n_bytes, _COMFORTABLE_MEMORY_BYTES, "available", cost)
 
 
@@ -251,18 +253,18 @@ def _plugins() -> Iterator[Finding]:
 
         catalog = discover_catalog()
     except ImportError as error:
-        cost = "no method can be found; install what is missing"
+        cost = "no methods can be found; install the missing parts"
         yield Finding("plugins", "missing", str(error), cost)
         return
     yield Finding("plugins", "ok", counted(len(catalog.methods), "method"))
     for broken in catalog.broken:
         cost = f"its methods are missing: {broken.error}"
         name = f"plugin {broken.entry_point}"
-        yield Finding(name, "missing", f"{broken.distribution} fails to load", cost)
+        yield Finding(name, "missing", f"{broken.distribution} cannot be loaded", cost)
     for name in catalog.disabled:
-        cost = f"its methods are missing: {DISABLED} names it"
+        cost = f"its methods are missing: it is disabled by {DISABLED}"
         yield Finding(f"plugin {name}", "limited", "switched off", cost)
     looked_at = [entry.looked_at() for entry in catalog.methods.values()]
     entries = (*catalog.products.values(), *catalog.kinds.values(), *looked_at)
     for problem in dict.fromkeys(entry.problem for entry in entries if entry.problem):
-        yield Finding("plugins", "limited", "not usable as it is", problem)
+        yield Finding("plugins", "limited", "not usable in its current state", problem)

@@ -249,14 +249,14 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     hands_on = chosen.embed or chosen.split or target in ("ro-crate", "sheet")
     finding = broken_seal(opened, of_all=hands_on)
     if finding and hands_on:
-        raise RecordError(f"{finding}; changed records are not exported: use another copy")
+        raise RecordError(f"{finding}; changed records are not exported: use an unchanged copy")
     with whole_folder(folder) as aside, working_on(f"writing {name}"):
         if target:
             summary = _export_to(FORMATS[target], opened, aside, chosen)
         else:
             summary = (_export_split if chosen.split else _export_embedded)(opened, aside, chosen)
     echo(f"{name}: {folder}: {summary}")
-    return code_for([finding], f"do not use anything in {folder}")
+    return code_for([finding], f"do not use the files in {folder}")
 
 
 def format_options() -> list[FormatOption]:
@@ -291,7 +291,11 @@ def _export_embedded(run: Run, folder: Path, chosen: Choices) -> str:
     return (
         f"{record.path.name} with {counted(n_products, 'product')} and "
         f"{counted(n_files, 'input file')}, {record.path.stat().st_size:,} bytes, "
-        + ("everything was embedded already, the seal is the same" if is_same else "sealed again")
+        + (
+            "everything was already embedded, so the seal is the same"
+            if is_same
+            else "sealed again"
+        )
         + f": sha256:{after}"
     )
 
@@ -304,9 +308,7 @@ def _export_split(run: Run, folder: Path, chosen: Choices) -> str:
 
     parts = parts_of(run)
     if not parts:
-        raise ArgumentError(
-            f"the run {run.record.run_id} ran on no datasets, so there is nothing to split"
-        )
+        raise ArgumentError(f"the run {run.record.run_id} has no datasets, so it cannot be split")
     make_empty(folder)
     for name, part in parts.items():
         written = write_part(part, path_inside(folder, name), Store(chosen.store))
@@ -320,7 +322,9 @@ def _folder_inside(run: Run, *names: str) -> Path:
     for name in names:
         folder /= name
         if folder.is_symlink():
-            raise ArgumentError(f"{folder} is a link: choose a folder with -o, or remove it")
+            raise ArgumentError(
+                f"{folder} is a link: choose another folder with -o, or remove the link"
+            )
     return folder
 
 

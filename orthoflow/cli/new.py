@@ -48,7 +48,7 @@ def new(files: tuple[Path, ...], output: Path, *, recipe: Recipe | None, as_json
 
     if output.exists():
         raise ArgumentError(f"{output} exists already: choose another name with -o")
-    with working_on("looking at the files"):
+    with working_on("inspecting the files"):
         from orthoflow.workflow.draft import draft_workflow, recognised
 
         draft = draft_workflow(recognised(files), output, recipe)
@@ -87,8 +87,8 @@ def _print(draft: Draft, output: Path) -> None:
         echo_folded(f"note: {text}")
     name = shlex.quote(str(output))
     echo(
-        f"wrote {output}, after the recipe {draft.recipe}",
+        f"wrote {output}, based on the recipe {draft.recipe}",
         "",
         f"next: orthoflow check {name}",
-        f"      orthoflow run {name} --set wall.gsd_m=0.02    # a coarse first look",
+        f"      orthoflow run {name} --set wall.gsd_m=0.02    # a coarse first run",
     )

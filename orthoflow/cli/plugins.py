@@ -31,9 +31,9 @@ from orthoflow.cli.tables import counted, echo, echo_json, echo_table
 from orthoflow.errors import PluginError
 
 _SUMMARIES: Final = {
-    "list": "List every method, and problems of plugins that do not load.",
+    "list": "List all methods, and problems of plugins that cannot be loaded.",
     "show": "Show a method's parameters, ports, origin and citations.",
-    "new": "Write a plugin of your own that works and passes its tests at once.",
+    "new": "Write a working plugin with tests, as a basis for your own.",
     "check": "Run the conformance suite on a method.",
 }
 
@@ -79,7 +79,7 @@ def plugins_list(*, as_json: bool) -> int:
         )
     problems = [one["problem"] for rows in found.values() for one in rows if one["problem"]]
     if problems:
-        echo("", "what is wrong:", *(f"- {problem}" for problem in problems))
+        echo("", "problems:", *(f"- {problem}" for problem in problems))
     for one in found["broken"]:
         echo(f"`orthoflow plugins show {one['plugin']}` prints its traceback")
     return EXIT_GOOD
@@ -330,12 +330,12 @@ def plugins_new(
 
     if about["kind"] and new_kind:
         raise click.UsageError(
-            f"--kind {about['kind']} (a kind that is there) and --new-kind {new_kind} (a kind of "
+            f"--kind {about['kind']} (an existing kind) and --new-kind {new_kind} (a kind of "
             "its own) exclude each other: omit one of them"
         )
     if not (about["kind"] or new_kind):
         raise click.UsageError(
-            "give --kind, the kind of the method (`orthoflow plugins list`), or --new-kind"
+            "pass --kind, the kind of the method (see `orthoflow plugins list`), or --new-kind"
         )
     catalog = discover_catalog()
     taken, given = (
@@ -409,7 +409,9 @@ def plugins_check(method_id: str, *, as_json: bool, golden: Path | None, quick: 
             first = next((one["check"] for one in results if one["problem"] == problem != ""), "")
             state = "broken" if problem else "left out" if is_left_out else "kept"
             state, text = (
-                ("skipped", f"stopped by the same as {first}") if first else (state, problem)
+                ("skipped", f"stopped by the same problem as {first}")
+                if first
+                else (state, problem)
             )
             results.append({"check": name, "state": state, "rule": rule, "problem": problem})
             if not as_json:
@@ -420,15 +422,18 @@ def plugins_check(method_id: str, *, as_json: bool, golden: Path | None, quick: 
         echo_json({"method": method_id, "checks": results, "unwritten": list(left)})
     else:
         words = {
-            "kept": f"{method_id} keeps {counted(counts['kept'], 'rule')}",
-            "broken": f"breaks {counts['broken']}",
+            "kept": f"{method_id} meets {counted(counts['kept'], 'rule')}",
+            "broken": f"violates {counts['broken']}",
             "skipped": f"{counts['skipped']} skipped",
             "left out": f"{counts['left out']} left out (--quick)",
         }
         parts = [text for state, text in words.items() if state == "kept" or counts[state]]
         echo("", ", ".join(parts))
         if left:
-            echo(f"warning: as `plugins new` wrote it, write your own: {', '.join(left)}")
+            echo(
+                "warning: still the text from `plugins new`; replace it with your own: "
+                f"{', '.join(left)}"
+            )
     return EXIT_CELL_FAILED if counts["broken"] else EXIT_GOOD
 
 

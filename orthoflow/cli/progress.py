@@ -106,10 +106,10 @@ def left_of_run(cells: Iterable[CellState], now_s: float, *, jobs: int = 1) -> s
         return ""
     # Otherwise a few short steps would suggest that a run of minutes is nearly finished.
     if not known or n_unknown > len(known):
-        return "remaining time not yet known"
+        return "remaining time still unknown"
     seconds = about(max(*known, sum(known) / jobs, 0.0))
     if n_unknown:
-        return f"at least {seconds} left; {counted(n_unknown, 'step')} without an estimate"
+        return f"at least {seconds} left; {counted(n_unknown, 'step')} not estimated"
     return f"about {seconds} left"
 
 
@@ -189,7 +189,7 @@ class Progress:
         with self._lock:
             match event:
                 case RunStarted():
-                    what = "going on with run" if event.is_resumed else "run"
+                    what = "resuming run" if event.is_resumed else "run"
                     return f"{what} {event.run_id}: {counted(event.n_cells, 'step')}"
                 case CellStarted():
                     cell = self._cells.setdefault(event.address, CellState())
@@ -209,7 +209,11 @@ class Progress:
                         wall_s=result.wall_s,
                     )
                     n_similar = self._n_similar.pop(event.address, 0)
-                    more = f", {counted(n_similar, 'warning')} like one above" if n_similar else ""
+                    more = (
+                        f", {counted(n_similar, 'warning')} with a code shown above"
+                        if n_similar
+                        else ""
+                    )
                     return f"{_end_text(event)}{more}"
         return ""
 

@@ -138,7 +138,7 @@ def replay(
         echo(*_metric_lines(metrics))
         echo(f"record of the replay: {made.path}", f"report: {folder / REPORT_FILE}")
     if differs:
-        echo_error(f"error: the replay of {original.path} differs, see above")
+        echo_error(f"error: the replay of {original.path} differs from the record (see above)")
     return EXIT_RECORD_DIFFERS if differs else EXIT_GOOD
 
 
@@ -171,9 +171,9 @@ def _metric_lines(metrics: Sequence[ReplayedMetric]) -> list[str]:
     """Count and list metrics that differ; unexpected differences first, on a line of their own."""
     what = "metrics, without times"
     kinds = (
-        ("different", "differ though the products of their steps are identical"),
-        ("code changed", "differ, and the code of a method behind them is not that of the record"),
-        ("products", "differ with the products of their steps, which are not the same bits"),
+        ("different", "differ although the products of their steps are identical"),
+        ("code changed", "differ, and the code of a method on which they depend has changed"),
+        ("products", "differ, as do the products of their steps"),
         ("not in the record", "are not in the record"),
         ("rounding", "differ by rounding"),
     )

@@ -39,15 +39,15 @@ def report(runs: tuple[str, ...], output: Path | None, store: Path) -> int:
     opened = [open_run(run) for run in runs]
     if output is None and len(opened) > 1:
         raise ArgumentError(
-            f"{len(opened)} runs were given: give -o FILE, where their common report goes"
+            f"{len(opened)} runs were given: pass -o FILE, the path of their common report"
         )
     target = output if output is not None else opened[0].home_folder / REPORT_FILE
     if not target.parent.is_dir():
-        raise ArgumentError(f"{target.parent} does not exist: make the folder, or choose another")
+        raise ArgumentError(f"{target.parent} does not exist: create the folder or choose another")
     broken_seals = {run.path: broken for run in opened if (broken := broken_seal(run))}
     if output is None:
         write_page(opened[0], target, broken_seals=broken_seals)
     else:
         write_report(opened, target, broken_seals=broken_seals, stores=stores_at(store))
     echo(f"report: {target}")
-    return code_for(broken_seals.values(), "the page states it")
+    return code_for(broken_seals.values(), "the page shows a warning")

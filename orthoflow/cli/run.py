@@ -109,7 +109,7 @@ def prepared(
     """
     from orthoflow.cli.progress import working_on
 
-    with working_on("reading the workflow, its inputs and what is stored"):
+    with working_on("reading the workflow, its inputs and the store"):
         # Import slow modules here.
         import orthoflow.report  # noqa: F401
         from orthoflow.catalog.discovery import discover_catalog
@@ -232,8 +232,7 @@ def executed(  # noqa: PLR0913 - parts of a run
     from orthoflow.records.write import executed_and_written, write_run
 
     current_session().resume_hint = (
-        "interrupted; finished steps are kept, and "
-        f"the same command with -o {folder} goes on from there"
+        f"interrupted; finished steps are kept; to resume, repeat the command with -o {folder}"
     )
 
     def run() -> RunOutcome:
@@ -313,7 +312,7 @@ def _print_summary(run: Run, report: Path, kept: Collection[str]) -> None:
     from orthoflow.workflow.expand import variants_text
 
     if baseline := variants_text(baseline_of(run)):
-        echo(f"baseline: {baseline}, with which the others are compared")
+        echo(f"baseline: {baseline}, with which all others are compared")
     echo(f"products: {run.products_folder}")
     echo(f"report: {report}")
     echo(f"record: {run.path}")
@@ -327,7 +326,7 @@ def _cached_text(cells: Iterable[RecordedCell], kept: Collection[str]) -> str:
     n_cells = len(counted_cells)
     n_cached = sum(bool(cell.cached_from) for cell in counted_cells)
     n_kept = sum(cell.address in kept for cell in counted_cells)
-    before = f", {n_kept} kept from before the interruption" if n_kept else ""
+    before = f", {n_kept} from before the interruption" if n_kept else ""
     return f"{n_cached} of {counted(n_cells, 'step')} cached{before}"
 
 

@@ -123,7 +123,7 @@ def _write_table(folders: Sequence[Path], table: Path) -> int:
     from orthoflow.report.browsing import run_folders
 
     if not table.absolute().parent.is_dir():
-        raise ArgumentError(f"{table.parent} does not exist: make the folder, or choose another")
+        raise ArgumentError(f"{table.parent} does not exist: create the folder or choose another")
     places: dict[Path, None] = {}
     for folder in folders or (Path(),):
         if folder.is_dir() and not (folder / RECORD_FILE).is_file():
@@ -136,7 +136,7 @@ def _write_table(folders: Sequence[Path], table: Path) -> int:
     with writing_to(table):
         write_whole(table, joined_csv(joined).encode("utf-8", "backslashreplace"))
     n_shared = sum(len(one.found) > 1 for one in joined.cells)
-    shared = f", {n_shared} of them in several" if n_shared else ""
+    shared = f", {n_shared} of them in several runs" if n_shared else ""
     echo(
         f"{counted(len(joined.runs), 'run')}, {counted(len(joined.cells), 'cell')}{shared}: {table}"
     )
@@ -192,7 +192,7 @@ def print_runs(
             counts = {name: (run.n_values[name],) for name in names if name in run.n_values}
             echo_folded(f"{run.folder}: {medians(counts, run.n_datasets, run.flags)}")
     n_left_out = len(found) - len(kept)
-    others = f", {counted(n_left_out, 'other')} left out" if n_left_out else ""
+    others = f", {counted(n_left_out, 'other')} omitted" if n_left_out else ""
     echo(f"{counted(len(kept), 'run')}{others}")
 
 
@@ -259,7 +259,7 @@ def _require_known(names: Sequence[str], found: Sequence[RunSummary]) -> None:
             # Users often enter only the last part of a parameter's name, without step and method.
             ends = sorted(one for one in known if one.endswith(f".{name}"))
             near = ends[0] if ends else nearest(name, known)
-            hint = f"did you mean {near!r}?" if near else "--json has the names of all"
+            hint = f"did you mean {near!r}?" if near else "--json lists all names"
             raise click.UsageError(f"no run has a metric or parameter {name!r}; {hint}")
 
 

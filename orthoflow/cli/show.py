@@ -158,7 +158,7 @@ def _print_comparison(run: Run) -> bool:
         shown = dict(zip(names[:_COLUMNS_MOST], over, strict=False))
         counts = {name: [one.n for one in metric.methods] for name, metric in shown.items()}
         about = (
-            "± is 1.4826 times the median absolute deviation; of repeats their mean, "
+            "± is 1.4826 times the median absolute deviation; repeats are averaged; "
             f"{medians(counts, len(parts))}"
         )
     elif table := comparison_table([run]):
@@ -167,7 +167,7 @@ def _print_comparison(run: Run) -> bool:
             (row.name, *(value.text or _NOTHING for value in row.values[: len(names)]))
             for row in table.rows
         ]
-        leaders, about = "", "means of the repeats ± their standard deviation, where there are some"
+        leaders, about = "", "means over repeats ± standard deviation, where a step was repeated"
     else:
         return False
     if not names:
@@ -177,7 +177,7 @@ def _print_comparison(run: Run) -> bool:
     echo_table(("combination", *names)[:width], [row[:width] for row in rows])
     n_more = len(names) - _COLUMNS_MOST
     more = f"; {counted(n_more, 'more metric')} in the report" if n_more > 0 else ""
-    echo(f"{about}{more}; --all prints every number", *([f"{leaders}."] if leaders else []))
+    echo(f"{about}{more}; --all prints all metrics", *([f"{leaders}."] if leaders else []))
     return True
 
 
@@ -219,17 +219,17 @@ def _print_environments(run: Run) -> None:
             f"{commit}",
         )
         used = [name for name in packages if name.lower() in LIBRARIES]
-        others = f" and {len(packages) - len(used)} others (--json names them)"
+        others = f" and {len(packages) - len(used)} others (listed by --json)"
         echo(", ".join(f"{name} {packages[name]}" for name in used) + others)
 
 
 def _print_files(run: Run) -> None:
     published = run.record.published
     n_files = sum((run.folder / file.path).exists() for file in published)
-    of_all = "" if n_files == len(published) else f" of the {len(published)} that were published"
+    of_all = "" if n_files == len(published) else f" of {len(published)} published"
     where = f"{run.products_folder}, {counted(n_files, 'file')}{of_all}"
     if published and not n_files:
-        where = f"none of the {len(published)} published files is beside the record"
+        where = f"none of the {len(published)} published files is next to the record"
     echo("", f"products: {where}")
     for image in run.orthoimages:
         echo(f"orthoimage: {image}")

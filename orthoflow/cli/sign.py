@@ -43,7 +43,7 @@ def sign(run: Path, key: Path) -> int:
 def _password(key: Path) -> str:
     if not sys.stdin.isatty():
         raise ArgumentError(
-            f"the key {key} is protected by a password, and there is no terminal to ask for it: "
+            f"the key {key} has a passphrase, but there is no terminal to prompt for it: "
             "sign on a terminal, or with another key"
         )
-    return click.prompt(shown(f"password of {key}"), hide_input=True, err=True)
+    return click.prompt(shown(f"passphrase of {key}"), hide_input=True, err=True)

@@ -140,7 +140,7 @@ def first_rows(
 def echo_left_out(n_rows: int, most: int | None) -> None:
     """Print how many rows of a table were omitted, and how to see them."""
     if most is not None and n_rows > most:
-        echo(f"and {n_rows - most} more, which --all prints")
+        echo(f"and {n_rows - most} more, shown by --all")
 
 
 def verify_hint(*runs: Path) -> str:

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 @click.option(
     "--strict",
     is_flag=True,
-    help="Also fail for notes: published files that are missing or not the record's, a changed "
-    "report, a signature that was not checked.",
+    help="Also fail for missing or unknown published files, a changed report, or an unchecked "
+    "signature.",
 )
 @json_option
 def verify(run: Path, signer: Path | None, *, strict: bool, as_json: bool) -> int:
@@ -71,8 +71,8 @@ def verify(run: Path, signer: Path | None, *, strict: bool, as_json: bool) -> in
     else:
         for finding in findings:
             echo(finding)
-        beside = f"the seal of {verification.path} holds, but files beside it are not as written"
-        echo_error(f"error: {verification.wrong or beside}, see above")
+        beside = f"the seal of {verification.path} is intact, but files next to it were changed"
+        echo_error(f"error: {verification.wrong or beside} (see above)")
     return EXIT_RECORD_DIFFERS if findings else EXIT_GOOD
 
 
@@ -86,7 +86,7 @@ def _summary(verification: Verification) -> str:
     if verification.n_published:
         parts.append(f"{counted(verification.n_published, 'published file')} unchanged")
     if verification.n_pages:
-        parts.append(f"{counted(verification.n_pages, 'report page')} as written")
+        parts.append(f"{counted(verification.n_pages, 'report page')} unchanged")
     if verification.signed_with:
         parts.append(f"signed with {verification.signed_with}")
     return f"verified: {', '.join(parts)}"

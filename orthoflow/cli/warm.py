@@ -29,7 +29,7 @@ _RECIPES: Final[Mapping[str, tuple[str, ...]]] = {
     "orient-methods": _WITH_PHOTOS,
     "ortho-methods": _WITH_PHOTOS,
 }
-_UNKNOWN: Final = "no simulated room uses it: it is compiled when it first runs"
+_UNKNOWN: Final = "no simulated room uses it; it is compiled in its first run"
 
 
 @click.command(cls=Command)
@@ -167,9 +167,9 @@ def _n_kernels(folder: Path) -> int:
 def _print(warmed: Warmed) -> None:
     for method, reason in {**warmed.left_out, **warmed.failed}.items():
         echo(f"{method}: {reason}")
-    before = f", {warmed.n_before} were there" if warmed.n_before else ""
+    before = f", {warmed.n_before} already existed" if warmed.n_before else ""
     echo(
         f"compiled {counted(warmed.n_compiled, 'kernel')} of "
         f"{counted(len(warmed.methods), 'method')} in {duration(warmed.wall_s)}{before}",
-        f"runs of this user find them: {warmed.folder}, {size(warmed.size_bytes)}",
+        f"available to runs of this user: {warmed.folder}, {size(warmed.size_bytes)}",
     )

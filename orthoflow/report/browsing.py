@@ -104,7 +104,7 @@ def run_folders(folders: Sequence[Path]) -> list[Path]:
     found: dict[Path, None] = {}
     for folder in folders:
         if not folder.is_dir():
-            raise ArgumentError(f"{folder} is not a folder: give folders that contain runs")
+            raise ArgumentError(f"{folder} is not a folder: pass folders that contain runs")
         found.update(dict.fromkeys(_below(folder)))
     return list(found)
 
@@ -172,7 +172,7 @@ def _summary(folder: Path) -> RunSummary:
             return RunSummary(folder=folder, state="damaged", reason=doubt)
         return _of_run(folder, run)
     except Exception as error:  # noqa: BLE001 - a record may contain anything
-        unforeseen = f"the record is not as one was written: {type(error).__name__}: "
+        unforeseen = f"the record has invalid content: {type(error).__name__}: "
         reason = f"{'' if isinstance(error, OrthoflowError) else unforeseen}{error}"
         return RunSummary(folder=folder, state="damaged", reason=reason)
 
@@ -246,7 +246,7 @@ def _unfinished(folder: Path) -> RunSummary:
     return RunSummary(
         folder=folder,
         state="running" if is_under_way else "unfinished",
-        reason="" if is_under_way else f"continues with the same command and -o {folder}",
+        reason="" if is_under_way else f"resume with the same command and -o {folder}",
         workflow=str(stated.get("workflow", "")),
         run_id=str(stated.get("run_id", "")),
         started=str(stated.get("time", "")),

@@ -153,12 +153,12 @@ def unequal_walls(combinations: Iterable[Combination]) -> str:
             if not _may_be_one_wall(wall, usual)
         ]
         if odd:
-            groups.append(f"{first_few(odd, most=_ODD_MOST)}, most {_wall_words(usual)}")
+            groups.append(f"{first_few(odd, most=_ODD_MOST)}, most others {_wall_words(usual)}")
     if not groups:
         return ""
     return (
-        "not all combinations show the same wall first, so numbers of it speak of different ones "
-        "(near of the wall takes the one at a point, where it was found): "
+        "the first wall is not the same in all combinations, so its metrics are of different walls "
+        "(the parameter `near` of the wall step selects the wall at a point): "
         f"{first_few(groups, most=_ROOMS_MOST)}"
     )
 
@@ -396,7 +396,7 @@ def _other_packages(own: Mapping[str, str], others: Mapping[str, str]) -> str:
     """Return the packages in which an environment differs from another; empty if in none."""
     texts = [f"{name} {own[name]}" for name in own if own[name] != others.get(name)]
     texts += [f"no {name}" for name in others if name not in own]
-    return f"; unlike the first with {first_few(texts)}" if texts else ""
+    return f"; differs from the first in {first_few(texts)}" if texts else ""
 
 
 def _packages(environment: RecordedEnvironment, used: Collection[str] | None) -> dict[str, str]:

@@ -274,7 +274,7 @@ def _value(one: Combination, origins: Origins, column: MetricRow) -> Value:
         if measured.n_repeats < measured.n_all
         else ""
     )
-    sizes = "the sizes of errors of both signs in " if measured.is_of_sizes else ""
+    sizes = "absolute errors in " if measured.is_of_sizes else ""
     of_what = f"mean and standard deviation of {sizes}{measured.n_repeats} repeats"
     return Value(
         text=f"{measured_text(measured)}{of_all}",

@@ -224,10 +224,10 @@ def _curve(parameter: str, column: MetricRow, lines: Mapping[str, _Line], n_data
     if column.better in BETTER:
         notes.append(BETTER[column.better].capitalize())
     if any(point.is_filled for point in every):
-        notes.append("Filled points are the baseline")
+        notes.append("Filled points show the baseline")
     return Curve(
         name=f"{column.step}.{column.metric}_over_{parameter}",
-        title=f"{column.titled} ({column.step}) over {parameter}",
+        title=f"{column.titled} ({column.step}) against {parameter}",
         caption=f"{'. '.join(notes)}.",
         lines=drawn,
         below=parameter,

@@ -70,7 +70,7 @@ def differences(comparison: RunComparison) -> tuple[DifferenceTable, ...]:
         _table("Environment", comparison.environment, str),
         # Time and memory always differ, and are in the comparison table.
         _table(
-            "Metrics, time and memory left aside",
+            "Metrics, without time and memory",
             comparison.measured,
             lambda metric: number_with_unit(metric.value, metric.unit),
             step_of,

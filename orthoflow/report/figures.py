@@ -117,9 +117,9 @@ def graph_picture(run: Run) -> Picture:
     """Return the graph as a picture on a page."""
     return Picture(
         uri=as_image(graph_file(run)),
-        title="What each step passes on",
-        caption="Each box is a step with its method and time; arrows are products. Green frames "
-        "come from the cache, thick red ones failed, dashed ones were not computed.",
+        title="Steps and their products",
+        caption="Each box is a step with its method and time; arrows are products. Frames are "
+        "green for steps from the cache, thick red for failed ones, dashed for steps not computed.",
     )
 
 

@@ -163,8 +163,8 @@ class OpenedRun(Run):
         payload = RunProducts(run=self, stores=stores_at(store)).payload(address, port, cls)
         if payload is None:
             raise RecordError(
-                f"{self.path} has only the digest of {address}.{port}, and the store {store} does "
-                "not have the product: name the store of the run, as store='FOLDER/.orthoflow'"
+                f"{self.path} contains only the digest of {address}.{port}, and the store {store} "
+                "does not contain it: pass the store of the run, as store='FOLDER/.orthoflow'"
             )
         return cls.from_payload(payload)
 
@@ -193,10 +193,14 @@ class OpenedRun(Run):
         if chosen not in places:
             lacks = f"the run {self.record.run_id} has no orthoimages"
             if places:
-                raise ArgumentError(f"{lacks} of {cell}; steps with some: {', '.join(places)}")
+                raise ArgumentError(
+                    f"{lacks} of {cell}; steps with orthoimages: {', '.join(places)}"
+                )
             raise ArgumentError(f"{self.with_failure(lacks)}{self._way_to_logs()}")
         if not (cell or baseline):
-            warnings.warn(f"the baseline has no orthoimages; this is of {chosen}", stacklevel=2)
+            warnings.warn(
+                f"the baseline has no orthoimages; this one is from {chosen}", stacklevel=2
+            )
         images = Orthoimages.from_payload(self.payload(chosen, places[chosen])).images
         image = next((image for image in images if number in (None, image.number)), None)
         if image is None:
@@ -270,7 +274,7 @@ def open_run(path: str | Path) -> OpenedRun:
     """
     plain = open_plain_run(path)
     if doubt := broken_seal(plain):
-        warnings.warn(f"{doubt}; rely on nothing shown of it here", stacklevel=2)
+        warnings.warn(f"{doubt}; do not rely on this output", stacklevel=2)
     return OpenedRun(path=plain.path, record=plain.record)
 
 

@@ -74,7 +74,7 @@ def overlays(run: Run, walls: Sequence[Picture], *, share: float = 1.0) -> Itera
                     f"Displacements in the orthoimage of {ground.name}, {address}",
                     side,
                     # The metrics of the method exclude these.
-                    remark="points beside depth steps included; ",
+                    remark="points next to depth steps are included; ",
                 )
 
 

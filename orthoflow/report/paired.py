@@ -365,7 +365,7 @@ def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
             "worse": [title for title, pair in shown if pair.effect <= 0],
         }
         words = [
-            f"{side} in {len(titles)} of {len(own)} numbers ({', '.join(titles)})"
+            f"{side} in {len(titles)} of {len(own)} metrics ({', '.join(titles)})"
             for side, titles in sides.items()
             if titles
         ]
@@ -374,10 +374,10 @@ def who_leads(over: Sequence[MetricOverDatasets], n_datasets: int) -> str:
         else:
             level.append(name)
     if not leads:
-        return f"No difference is shown in any of {len(judged)} numbers ({_TEST})"
-    rest = f". No difference is shown of {first_few(level, most=_MAX_NAMED)}" if level else ""
+        return f"No difference is significant in any of {len(judged)} metrics ({_TEST})"
+    rest = f". No significant difference: {first_few(level, most=_MAX_NAMED)}" if level else ""
     return (
-        f"Shown over the datasets against {judged[0].reference.name} ({_TEST}): "
+        f"Significant over the datasets, compared with {judged[0].reference.name} ({_TEST}): "
         f"{first_few(leads, most=_MAX_NAMED)}{rest}"
     )
 

@@ -45,7 +45,7 @@ class PhotoPlan:
         """The plan as a picture on a page."""
         return Picture(
             uri=as_image(self.file("svg")),
-            title="Photos and walls from above",
+            title="Plan of photos and walls",
             caption=self.caption,
         )
 
@@ -107,7 +107,7 @@ def _table(orientation: Cameras) -> Table:
         rows.append((camera.photo, *values, camera.status))
     return Table(
         name="photos",
-        caption="how well each photo is oriented, of one coordinate on the wall",
+        caption="accuracy of the orientation of each photo, per coordinate on the wall",
         columns=(
             Column("photo", is_numeric=False),
             *(
@@ -136,12 +136,14 @@ def _up(run: Run) -> NDArray[np.float64]:
 
 def _caption(address: str, cameras: Sequence[Camera], oriented: Sequence[Camera]) -> str:
     refused = [one.photo for one in cameras if one.status != "ok"]
-    missing = f" Not oriented, and so not drawn: {first_few(refused, most=6)}." if refused else ""
+    missing = (
+        f" Not oriented and therefore not shown: {first_few(refused, most=6)}." if refused else ""
+    )
     return (
-        f"{len(oriented)} of {len(cameras)} photos, {address}: walls from above, dots where photos "
-        "were taken, strokes which way they look. A photo behind a wall, or one that looks away "
-        f"from all of them, is oriented wrongly; a wall that none looks at squarely is painted "
-        f"badly.{missing}"
+        f"{len(oriented)} of {len(cameras)} photos, {address}: plan of the walls, with dots at the "
+        "positions of photos and lines in their viewing directions. A photo behind a wall, or one "
+        "that faces no wall, is oriented wrongly; a wall seen only at oblique angles has a poor "
+        f"orthoimage.{missing}"
     )
 
 

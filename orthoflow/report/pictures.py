@@ -206,15 +206,15 @@ def _orthoimage(run: Run, address: str, image: Orthoimage) -> _Drawing:
         Picture(
             uri="",
             title=_title(image.name, address),
-            caption=f"{frame_words(image.frame)}; of all cells {_states(image)}",
+            caption=f"{frame_words(image.frame)}, of which {_states(image)}",
             file=_published(run, address, f"wall_{image.number}_ortho.tif"),
             cell=address,
             wall=image.wall,
             number=image.number,
             name=image.name,
             frame=image.frame,
-            reading="Lines of the building run through unbroken; doubled or broken ones, and blur, "
-            "are photos or depths that do not fit, the chequered ground is where nothing was seen.",
+            reading="Lines of the building should be continuous; doubled or broken lines and blur "
+            "indicate wrong orientations or depths. Chequered areas are not visible in any source.",
         ),
     )
 
@@ -223,11 +223,11 @@ def _states(image: Orthoimage) -> str:
     """Return the shares of the cell states, which add up to 100 %."""
     words = {
         OrthoMask.PAINTED: "painted",
-        OrthoMask.CONTRADICTED: "painted by one photo alone against the colours of the scan",
-        OrthoMask.FILLED: "filled from neighbours",
-        OrthoMask.NO_SURFACE: "with no point of the scan near enough",
-        OrthoMask.OCCLUDED: "hidden from every photo",
-        OrthoMask.NONE: "in no oriented photo",
+        OrthoMask.CONTRADICTED: "painted from a single photo that contradicts the scan",
+        OrthoMask.FILLED: "interpolated from neighbours",
+        OrthoMask.NO_SURFACE: "without scan points nearby",
+        OrthoMask.OCCLUDED: "hidden in every photo",
+        OrthoMask.NONE: "outside all oriented photos",
     }
     shares = {text: count_cells(image.mask, state) for state, text in words.items()}
     texts = [f"{_percent(n / image.mask.size)} {text}" for text, n in shares.items() if n]
@@ -246,10 +246,10 @@ def _depth(run: Run, address: str, index: int, wall: Wall) -> _Drawing:
         lambda side: cells_webp(wall.mask.shape, cells, longest_side_px=side),
         replace(
             _raster(run, address, index, wall, "depth"),
-            caption=f"{_percent(known)} of the cells known"
-            + (f"; causes of the others: log of {address}" if known < 1.0 and log else ""),
-            reading="Relief shows as even colours with sharp edges; stripes, or a slope over the "
-            "whole wall, are scans or a plane that do not fit.",
+            caption=f"{_percent(known)} of the depths known"
+            + (f"; for the reasons, see the log of {address}" if known < 1.0 and log else ""),
+            reading="Relief appears as uniform colours with sharp edges; stripes or a slope across "
+            "the wall indicate misaligned scans or a wrong plane.",
             depths=coarse_depths(wall.depth_m),
             depth_limit_m=limit_m,
         ),
@@ -265,10 +265,10 @@ def _intensity(
             _raster(run, address, index, wall, "intensity"),
             caption={
                 "laser": "laser intensity",
-                "luminance": "no laser intensity in the scan: grey of its colours instead",
+                "luminance": "grey of the scan's colours, because the scan has no laser intensity",
             }.get(source, source),
-            reading="What photos are matched with: texture everywhere is good; where it is flat "
-            "grey, ties cannot be found.",
+            reading="Photos are matched with this picture: texture everywhere is good; no ties can "
+            "be found in uniform grey areas.",
         ),
     )
 
@@ -456,7 +456,7 @@ def _placed(picture: Picture, reference: WallFrame) -> dict[str, object]:
 def frame_of(picture: Picture) -> WallFrame:
     """Return the frame of a raster of a wall."""
     if picture.frame is None:
-        raise ValueError(f"{picture.title} is no raster of a wall")
+        raise ValueError(f"{picture.title} is not a raster of a wall")
     return picture.frame
 
 

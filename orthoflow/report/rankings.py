@@ -87,8 +87,8 @@ class Mark(Enum):
 
     NONE = ""
     BEST = "best"
-    NEAR = "among the best, no difference shown"
-    FEWER = "over fewer items, not ranked"
+    NEAR = "among the best, no significant difference"
+    FEWER = "over fewer items, so not ranked"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,7 +178,7 @@ def cost_share(unit: str) -> float:
 
 
 # Better direction as declared by a method (`MetricSpec.better`); others are not ranked.
-BETTER: Final = {"lower": "less is better", "higher": "more is better", "one": "1 is best"}
+BETTER: Final = {"lower": "lower is better", "higher": "higher is better", "one": "1 is best"}
 
 
 def is_flag(unit: str) -> bool:
@@ -198,4 +198,4 @@ def badness(value: float, better: str) -> float:
         return -value
     if better == "one":
         return abs(math.log(value)) if value > 0 else math.inf
-    raise ValueError("a metric without a good side cannot be ranked")
+    raise ValueError("a metric without a better direction cannot be ranked")

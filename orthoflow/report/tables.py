@@ -180,8 +180,8 @@ def _plane_table(planes: Planes) -> Table:
         columns=tuple(
             Column(label, is_numeric=label not in ("plane", "rectangle"))
             for label in (
-                *("plane", "omega / deg", "phi / deg", "offset / m", "sigma at its centre / mm"),
-                *("rectangle", "points", "RMS / mm", "thickness / mm", "step there / mm"),
+                *("plane", "omega / deg", "phi / deg", "offset / m", "sigma at centre / mm"),
+                *("rectangle", "points", "RMS / mm", "thickness / mm", "point spacing / mm"),
             )
         ),
         rows=tuple(rows),

@@ -57,7 +57,7 @@ def test_a_run_says_what_it_found_damaged(say: Said, tmp_path: Path) -> None:
     code, text = say(*RUN, "again")
     assert code == 0
     assert "range: warning: stored-result-damaged" in text
-    assert "1 warning like one above" in next(
+    assert "1 warning with a code shown above" in next(
         line for line in text.splitlines() if line.startswith("dots: ok")
     )
     code, text = say(*RUN, "third")
@@ -65,7 +65,7 @@ def test_a_run_says_what_it_found_damaged(say: Said, tmp_path: Path) -> None:
 
 
 def test_the_store_is_listed_verified_and_collected(say: Said, tmp_path: Path) -> None:
-    as_stored = "0 results and 0 objects in .orthoflow are as they were stored\n"
+    as_stored = "0 results and 0 objects in .orthoflow are unchanged\n"
     assert say("cache", "verify") == (0, as_stored)
     assert say(*RUN, "first")[0] == 0
     assert say("cache", "verify") == (0, as_stored.replace("0", "2"))

@@ -71,4 +71,4 @@ def test_a_failure_on_a_changed_record_is_that_records(tmp_path: Path) -> None:
     for kind in (GeometryError, ProductError):
         raised = failing(kind("no plane"), intact)
         assert isinstance(raised, RecordError)
-        assert str(raised) == "a product of this run breaks its own rules: no plane"
+        assert str(raised) == "a product of this run is invalid: no plane"

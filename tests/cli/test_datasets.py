@@ -120,7 +120,7 @@ def test_later_rows_compute_nothing_again(folder: Path) -> None:
 
 def test_check_counts_the_datasets_and_names_every_missing_file(folder: Path) -> None:
     done = orthoflow(folder, "check", "rooms.yaml", "--datasets", "rooms.csv")
-    assert done.stdout == "rooms is fine: 4 steps, 3 datasets, run 8 times in all\n"
+    assert done.stdout == "rooms is valid: 4 steps, 3 datasets, 8 step runs in total\n"
     graph = orthoflow(folder, "graph", "rooms.yaml", "--datasets", "rooms.csv").stdout
     assert 'input0[/"number<br/>of 3 datasets"/]' in graph
     (folder / "gone.csv").write_text("name,number\nhall,data/hall.txt\na,a.txt\nb,b.txt\n")
@@ -160,5 +160,5 @@ def test_what_ran_on_no_datasets_is_not_split(folder: Path) -> None:
     assert orthoflow(folder, "run", "rooms.yaml", "-o", "plain", *INLINE).exit_code == 0
     done = orthoflow(folder, "export", "plain", "--split")
     assert done.exit_code == 2
-    assert "ran on no datasets, so there is nothing to split" in done.stderr
+    assert "has no datasets, so it cannot be split" in done.stderr
     assert not (folder / "plain" / "datasets").exists()

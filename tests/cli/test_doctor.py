@@ -87,7 +87,7 @@ LOST = "not available: E57 "
             "raise ImportError('libGL.so.1: lost')",
             (
                 "missing",
-                "1.0, but its import fails: ImportError: libGL.so.1: lost",
+                "1.0, but importing it fails: ImportError: libGL.so.1: lost",
                 f"{LOST}(apt-get install libgl1)",
             ),
             0,
@@ -95,7 +95,7 @@ LOST = "not available: E57 "
         (
             "rasterio",
             "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)",
-            ("missing", "1.0, but its import crashes (signal 11)", f"{LOST}(reinstall it)"),
+            ("missing", "1.0, but importing it crashes (signal 11)", f"{LOST}(reinstall it)"),
             0,
         ),
         ("rasterio", "", ("ok", "1.0", ""), 0),
@@ -147,7 +147,7 @@ def test_broken_and_disabled_plugins_cost_their_methods(monkeypatch: pytest.Monk
     (info / "entry_points.txt").write_text("[orthoflow.plugins]\nodd = odd_hooks\n")
     monkeypatch.syspath_prepend(packages)
     (packages / "odd_hooks.py").write_text("raise NameError('no such name')")
-    assert findings()["plugin odd"]["found"] == "odd 1.0 fails to load"
+    assert findings()["plugin odd"]["found"] == "odd 1.0 cannot be loaded"
     result = CliRunner().invoke(program, ["doctor"])
     assert "- plugin odd: its methods are missing: NameError: no such name" in result.output
     assert result.output.splitlines()[-1] == "orthoflow works, with 1 restriction"

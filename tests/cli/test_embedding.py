@@ -70,7 +70,7 @@ def test_a_run_is_embedded_afterwards(studio: Studio) -> None:
     assert again.exit_code == 0
     seal = done.output.rpartition("sha256:")[2]
     assert again.output.endswith(
-        f"everything was embedded already, the seal is the same: sha256:{seal}"
+        f"everything was already embedded, so the seal is the same: sha256:{seal}"
     )
     first, second = (studio.folder / name / "run.h5" for name in ("whole", "twice"))
     assert first.read_bytes() == second.read_bytes()
@@ -88,7 +88,7 @@ def test_of_a_record_with_changed_arrays_neither_it_nor_its_seal_is_handed_on(
         refused = studio("export", "first", *words, "-o", "whole")
         assert refused.exit_code == 3, refused.output
         assert "its seal does not hold for /products/" in refused.stderr
-        assert "; changed records are not exported: use another copy" in refused.stderr
+        assert "; changed records are not exported: use an unchanged copy" in refused.stderr
         assert not (studio.folder / "whole").exists()
     with pytest.raises(RecordError, match=r"has the digest .*, the record states .* another copy"):
         open_run("first").product("survey", "planes")

@@ -30,7 +30,7 @@ MASKS = (
     (r"\b\d+(\.\d+)? [KMG]iB\b", "SIZE"),
     (r"[\d,]+ bytes", "SIZE"),
     (r"orthoflow(-tls)? \d+\.\d+[.\w]*", "orthoflow VERSION"),
-    (r"environment: .*\n.*--json names them\)", "environment: MACHINE"),
+    (r"environment: .*\n.*listed by --json\)", "environment: MACHINE"),
     (r" +(?=\n|$)|(?<=\S)  +(?=\S)", "  "),
 )
 

@@ -106,7 +106,7 @@ NO_MEMORY = "not enough memory to continue"
         (MemoryError(), 1, NO_MEMORY),
         (OSError(errno.ENOMEM, "Cannot allocate memory"), 1, NO_MEMORY),
         (ImportError("libhdf5.so: failed to map segment from shared object"), 1, NO_MEMORY),
-        (ImportError("libGL.so.1: cannot open"), 4, "a library fails to import: libGL.so.1: cann"),
+        (ImportError("libGL.so.1: cannot open"), 4, "a library cannot be imported: libGL.so.1: c"),
     ],
     ids=str,
 )

@@ -102,11 +102,11 @@ def test_a_log_has_a_line_per_start_end_and_code(capsys: pytest.CaptureFixture[s
         "plane: started",
         "plane: warning: the side is a [guess]",
         "plane: warning: empty-wall (wall 2)",
-        "plane: failed in 1 min 15 s: no plane, 1 warning like one above (2 of 5)",
+        "plane: failed in 1 min 15 s: no plane, 1 warning with a code shown above (2 of 5)",
         "wall: skipped (3 of 5)",
         "other: ok in 1.2 s (4 of 5)",
         "last: ok in 1.2 s, plus 45.0 s of loading and compiling (5 of 5)",
-        "going on with run r1: 1 step",
+        "resuming run r1: 1 step",
     ]
 
 
@@ -141,7 +141,7 @@ def test_the_live_table_shows_every_state_and_keeps_warnings(
         assert columns[0] == ["cloud", "plane", "wall", "other"]
         assert columns[1] == ["cached", " 50 %", "waiting", "waiting"]
         assert columns[4] == ["", "peeling", "", ""]
-        whole = "1 of 4 steps ended, remaining time not yet known"
+        whole = "1 of 4 steps ended, remaining time still unknown"
         assert str(progress.drawn().renderables[1]) == whole
         progress.take(CellStarted(address="plane"))
         assert str(list(progress.table().columns[1].cells)[1]) == "  0 %"
@@ -201,7 +201,7 @@ def test_a_notebook_keeps_one_output_with_a_line_per_step(
         "cloud: cached",
         "plane: warning: the side is a [guess]",
         "plane: warning: empty-wall (wall 2)",
-        "plane: failed in 1 min 15 s: no plane, 1 warning like one above",
+        "plane: failed in 1 min 15 s: no plane, 1 warning with a code shown above",
         "wall: skipped",
         "other: ok in 1.2 s",
         "last: ok in 1.2 s, plus 45.0 s of loading and compiling",
@@ -264,7 +264,7 @@ def test_a_cell_is_predicted_by_its_last_run_then_by_its_progress(
     assert cell.left_s(now_s) == (None if left_s is None else pytest.approx(left_s))
 
 
-UNKNOWN = "remaining time not yet known"
+UNKNOWN = "remaining time still unknown"
 LEFT = [running(took_s=50.0), CellState(took_s=40.0), CellState(took_s=40.0)]
 
 
@@ -278,7 +278,7 @@ LEFT = [running(took_s=50.0), CellState(took_s=40.0), CellState(took_s=40.0)]
         (
             [CellState(took_s=40.0), CellState(took_s=4.0), CellState(), CellState()],
             1,
-            "at least 45 s left; 2 steps without an estimate",
+            "at least 45 s left; 2 steps not estimated",
         ),
         # A few seconds of one cell would make a run of minutes look short; skipped and stored ones
         # predict nothing.

@@ -198,7 +198,7 @@ def test_a_metric_that_the_replay_does_not_confirm_is_named(studio: Studio) -> N
     assert done.stdout.splitlines()[-4:-2] == [
         "2 products: 2 identical",
         (
-            "metrics, without times: 1 of 2 differ though the products of their steps are "
+            "metrics, without times: 1 of 2 differ although the products of their steps are "
             "identical: survey.offset_m 7 -> 1.5"
         ),
     ]

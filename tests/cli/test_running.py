@@ -99,7 +99,7 @@ def test_until_leaves_out_what_follows_and_says_so(finished: tuple[Path, str, st
     part = open_run(folder / "part")
     assert (list(part.cells), part.record.overrides) == (["survey"], ("--until survey",))
     page = (folder / "part" / "report.html").read_text(encoding="utf-8")
-    assert "A part of the workflow was asked for: <code>--until survey</code>." in page
+    assert "Only a part of the workflow was run: <code>--until survey</code>." in page
 
 
 @pytest.mark.parametrize(
@@ -161,7 +161,7 @@ def test_an_interrupted_run_ends_with_130_and_goes_on_with_the_same_folder(
     assert running.returncode == 130
     assert rest.splitlines()[-2:] == [
         "report of the finished steps: r/report.html",
-        "interrupted; finished steps are kept, and the same command with -o r goes on from there",
+        "interrupted; finished steps are kept; to resume, repeat the command with -o r",
     ]
     assert "Traceback" not in rest
     assert {path.name for path in (tmp_path / "r").iterdir()} == {
@@ -172,15 +172,15 @@ def test_an_interrupted_run_ends_with_130_and_goes_on_with_the_same_folder(
     assert shown.returncode == 0, shown.stderr
     assert "skipped" in {cell["status"] for cell in json.loads(shown.stdout)["cells"]}
     page = (tmp_path / "r" / "report.html").read_text()
-    assert "<li>There: survey</li>" in page
+    assert "<li>Finished: survey</li>" in page
     assert "<li>Not reached: paint</li>" in page
     assert "<pre>orthoflow run studio.yaml --set survey.offset_m=2 -o r</pre>" in page
     assert "not finished" in page
     write_studio(tmp_path, "paint.plain")
     again = orthoflow(tmp_path, *arguments)
     assert again.returncode == 0, again.stderr
-    assert any(line.startswith("going on with run ") for line in again.stderr.splitlines())
-    assert "0 of 2 steps cached, 1 kept from before the interruption" in again.stdout.splitlines()
+    assert any(line.startswith("resuming run ") for line in again.stderr.splitlines())
+    assert "0 of 2 steps cached, 1 from before the interruption" in again.stdout.splitlines()
     assert ["survey", "survey.offset", "kept"] in [
         line.split()[:3] for line in again.stdout.splitlines()
     ]

@@ -75,7 +75,7 @@ def test_the_table_says_when_how_good_and_in_what_runs_differ(runs: Path) -> Non
     # Of the other workflow there is one run: nothing that it differs from.
     assert rows[0] == ["runs/other", "2026-01-02", "07:04", "court", "ok", "4", "2", "9"]
     assert rows[4] == ["runs/going", "2026-01-02", "11:00", "hall", "unfinished"]
-    assert lines[6].startswith("runs/going unfinished: continues with the same command and -o ")
+    assert lines[6].startswith("runs/going unfinished: resume with the same command and -o ")
     assert lines[-1] == "5 runs"
 
 
@@ -91,7 +91,7 @@ def test_runs_are_chosen_and_ordered(runs: Path) -> None:
         "runs/other", "runs/b", "runs/a", "deep/er/c", "runs/going",
     ]  # fmt: skip
     assert folders("deep", "deep/er") == ["deep/er/c"]
-    assert "1 run, 4 others left out" in said("runs", "--workflow", "court")
+    assert "1 run, 4 others omitted" in said("runs", "--workflow", "court")
 
 
 def test_json_has_every_number(runs: Path) -> None:

@@ -22,6 +22,6 @@ def test_of_a_comparison_a_row_per_combination_is_shown(
     assert list(rows) == ["plane=fine", "plane=coarse", "plane=broken"]
     assert "1.10 ± 0.10" in rows["plane=fine"]
     assert rows["plane=broken"].split()[1:] == ["-"] * (len(told[1].split()) - 1)
-    assert told[5].startswith("means of the repeats ± their standard deviation")
+    assert told[5].startswith("means over repeats ± standard deviation")
     alone: Any = SimpleNamespace(record=SimpleNamespace(cells=(cell("plane"), cell("a@data=b"))))
     assert not module._print_comparison(alone)

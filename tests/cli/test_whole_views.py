@@ -31,7 +31,7 @@ def test_a_whole_record_is_verified_and_a_changed_one_named(tmp_path: Path) -> N
         "signed_with": "",
     }
     path.write_bytes(path.read_bytes()[:-1])
-    assert "is not as it was written, see above\n" in said("verify", path, code=3)
+    assert "is not as it was written (see above)\n" in said("verify", path, code=3)
     told = json.loads(said("verify", path, "--json", code=3))
     assert (told["ok"], len(told["findings"])) == (False, 1)
 

@@ -86,7 +86,12 @@ def test_the_same_workflow_computed_twice_is_the_same(studio: Studio) -> None:
     assert not any(changes(studio, "again").values())
     assert verdicts(studio, "again") == [("survey", "identical", []), ("paint", "identical", [])]
     shown = studio("compare", "first", "again").stdout
-    for line in ("inputs: same", "workflow: same text", "steps: same", "environment: same"):
+    for line in (
+        "inputs: same",
+        "workflow: the texts are the same",
+        "steps: same",
+        "environment: same",
+    ):
         assert line in shown.splitlines()
     assert "metrics: 0 of 2 differ" in shown.splitlines()
     verify = "`orthoflow verify first` and `orthoflow verify again`"
@@ -110,9 +115,9 @@ def test_a_plain_run_is_compared_with_the_variant_that_does_the_same(studio: Stu
     assert repr(told).endswith(", 2 steps in one run only>")
     shown = studio("compare", "first", "swept").stdout
     assert "steps: 0 of 2 differ, 2 only in B" in shown
-    assert "compared despite different names: paint (A) and paint@paint=grey-128 (B)" in shown
+    assert "paired although the addresses differ: paint (A) and paint@paint=grey-128 (B)" in shown
     of_both = re.findall("^(.*): .*, of the 2 steps that both have$", shown, re.MULTILINE)
-    assert of_both == ["parameters (* set, others are defaults)", "metrics"]
+    assert of_both == ["parameters (* set, others default)", "metrics"]
     assert compare_runs(variants, plain).readdressed == {"paint": "paint@paint=grey-128"}
 
 

@@ -303,7 +303,7 @@ def test_pictures_that_cannot_be_decoded_are_not_counted(finished: Studio, folde
     run = hostile.changed(finished.folder / "first", folder / "run", draw)
     done = finished("export", run, "--to", "figures", "-o", "drawn")
     assert done.exit_code == 0, done.output
-    assert "1 figure and the graph; 1 left out, damaged or more than a drawing" in done.stdout
+    assert "1 figure and the graph; 1 omitted (damaged or unsafe)" in done.stdout
     assert [path.name for path in Path("drawn/paint").iterdir()] == ["good.png"]
 
 

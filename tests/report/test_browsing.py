@@ -45,7 +45,7 @@ def test_runs_are_found_down_to_six_folders_and_not_in_each_other(tmp_path: Path
     (tmp_path / "elsewhere").symlink_to(tmp_path / "a", target_is_directory=True)
     assert run_folders([tmp_path]) == [tmp_path / name for name in found]
     with pytest.raises(
-        ArgumentError, match=r"b/run\.h5 is not a folder: give folders that contain runs"
+        ArgumentError, match=r"b/run\.h5 is not a folder: pass folders that contain runs"
     ):
         run_folders([tmp_path, tmp_path / "b" / "run.h5"])
 
@@ -173,7 +173,7 @@ def test_a_run_without_a_record_says_what_its_journal_begins_with(tmp_path: Path
     assert recorded == RunSummary(
         folder=folder,
         state="unfinished",
-        reason=f"continues with the same command and -o {folder}",
+        reason=f"resume with the same command and -o {folder}",
         workflow="hall",
         run_id="x",
         started="2026-01-02T11:00:00Z",
@@ -205,7 +205,7 @@ def test_a_record_that_nobody_foresaw_is_damaged(
     folder = written(tmp_path / "odd", cell("plane"))
     (recorded,) = summaries([folder])
     assert (recorded.state, recorded.reason) == (
-        *("damaged", "the record is not as one was written: RecursionError: too deep"),
+        *("damaged", "the record has invalid content: RecursionError: too deep"),
     )
     monkeypatch.setattr(module, "broken_seal", lambda _run: "its seal does not hold")
     (recorded,) = summaries([folder])

@@ -91,7 +91,9 @@ def test_what_is_asked_for_is_drawn_and_what_hangs_on_no_sweep_is_not(tmp_path: 
         plain,
         record=replace(plain.record, workflow_resolved=compared_resolved("*.rms_mm", "*.n_planes")),
     )
-    titles = [[one.title.partition(" over ")[0] for one in curves([run])] for run in (plain, asked)]
+    titles = [
+        [one.title.partition(" against ")[0] for one in curves([run])] for run in (plain, asked)
+    ]
     error = "points to the first plane, RMS / mm (plane)"
     assert titles == [[], [error, "planes found (plane)"]]
 
@@ -159,7 +161,7 @@ def test_a_line_is_over_the_rooms_that_all_its_points_have(tmp_path: Path) -> No
     assert points(curve) == [(1.0, 2.5), (2.0, 3.0)]
     assert curve.caption.startswith(
         "Points are medians of 2 of 3 datasets. Errors count without their sign. "
-        "Bars are 1.4826 times the median absolute deviation. Less is better."
+        "Bars are 1.4826 times the median absolute deviation. Lower is better."
     )
     # Repeats of one room are no spread of rooms.
     alone = {"calm": values["calm"], "dark": {1.0: (None,), 2.0: (None,)}}

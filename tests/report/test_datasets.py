@@ -116,7 +116,9 @@ def swept(folder: Path, n_rooms: int, *, step_mm: float) -> HeldRun:
 def test_what_leads_over_datasets_is_stated_first(tmp_path: Path) -> None:
     run = swept(tmp_path, 12, step_mm=0.5)
     leads = who_leads(over_datasets(parts_of(run)), 12)
-    assert leads.startswith("Shown over the datasets against plane=hough-tolerance_m-0_02")
+    assert leads.startswith(
+        "Significant over the datasets, compared with plane=hough-tolerance_m-0_02"
+    )
     write_report([run], tmp_path / "report.html")
     first_screen = (tmp_path / "report.html").read_text().partition("<h2")[0]
     assert leads in html.unescape(first_screen)

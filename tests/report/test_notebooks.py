@@ -163,7 +163,9 @@ def test_an_orthoimage_is_an_array_by_its_wall_s_number(tmp_path: Path) -> None:
     assert image.file is None
     with pytest.raises(ArgumentError, match="mosaic has no orthoimage of wall 0; walls: 3, 8"):
         run.orthoimage(0)
-    with pytest.raises(ArgumentError, match="no orthoimages of first; steps with some: mosaic"):
+    with pytest.raises(
+        ArgumentError, match="no orthoimages of first; steps with orthoimages: mosaic"
+    ):
         run.orthoimage(cell="first")
 
 
@@ -187,7 +189,8 @@ def test_an_orthoimage_is_of_the_dataset_that_is_named(tmp_path: Path) -> None:
     ]
     run = Painted(path=run.path, record=record([*failed, *varied], workflow_resolved=resolved))
     with pytest.warns(
-        UserWarning, match="the baseline has no orthoimages; this is of mosaic@data=noisy,plane=b"
+        UserWarning,
+        match="the baseline has no orthoimages; this one is from mosaic@data=noisy,plane=b",
     ):
         assert run.orthoimage(8, data="noisy").cell == "mosaic@data=noisy,plane=b"
     with pytest.raises(ArgumentError, match=r"no dataset noise \(did you mean noisy\?\)"):
@@ -223,8 +226,8 @@ def test_a_comparison_shows_what_moved() -> None:
     assert html.count("<tr") == 2
     assert "<td>0.5</td>" in html
     assert "plane.a: 1 -&gt; 2" in html
-    assert "<p>No number that both runs have differs" in shown(still, near, alone)
-    assert "<p>They have no number in common" in shown(alone)
+    assert "<p>No common metric differs" in shown(still, near, alone)
+    assert "<p>The runs have no metrics in common" in shown(alone)
 
 
 def test_a_comparison_shows_first_what_says_how_good_it_is() -> None:
@@ -241,7 +244,7 @@ def test_a_comparison_shows_first_what_says_how_good_it_is() -> None:
     html = shown(*counts, check)
     assert html.index("<td>check</td>") < html.index("<td>first</td>")
     assert html.count("<tr") == 61
-    assert html.endswith("<p>11 more, which <code>metric_table()</code> has.</p>")
+    assert html.endswith("<p>11 more in <code>metric_table()</code>.</p>")
 
 
 def test_a_record_that_was_changed_opens_with_a_warning(tmp_path: Path) -> None:
@@ -249,7 +252,7 @@ def test_a_record_that_was_changed_opens_with_a_warning(tmp_path: Path) -> None:
     assert orthoflow.open_run(path).verify().findings == ()
     with h5py.File(path, "r+") as file:
         file.attrs["seed"] = type(file.attrs["seed"])(b"8")
-    with pytest.warns(UserWarning, match="does not hold for /; rely on nothing shown of it"):
+    with pytest.warns(UserWarning, match="does not hold for /; do not rely on this output"):
         run = orthoflow.open_run(path)
     assert run.verify().findings[0].startswith("/: its attribute 'seed' is not what")
 
@@ -269,7 +272,7 @@ def test_products_that_a_record_only_names_come_from_the_store(tmp_path: Path) -
         run.product("scan", "cloud", store=tmp_path / "none")
     Store(tmp_path / "other").put_product(other)
     with pytest.raises(
-        RecordError, match=r"other does not have the product: name the store of the run, as store="
+        RecordError, match=r"other does not contain it: pass the store of the run, as store="
     ):
         run.product("scan", "cloud", store=tmp_path / "other")
     with pytest.raises(ArgumentError, match=r"^the run has no figure scan/plan; it has none$"):

@@ -56,7 +56,7 @@ def test_the_page_is_whole_and_fetches_nothing(page: Page) -> None:
     text = page.evaluate("document.querySelector('main').innerText")
     summary = text[: text.index("At a glance")]
     assert summary.count("no plane & no <wall>") == 1
-    assert "the numbers are of the baseline, plane=fine, with which the others" in summary
+    assert "the values are those of the baseline, plane=fine, with which the others" in summary
     nameless = page.evaluate(
         "[...document.querySelectorAll('button, select, input, a, [role=region]')]"
         ".filter(element => !(element.textContent || element.ariaLabel || element.labels?.length))"
@@ -149,7 +149,7 @@ def test_clicks_are_saved_as_check_points_and_as_ties(page: Page, tmp_path: Path
     assert second[1:4] == second[5:8]
     page.evaluate(f"{panel}.querySelector('[data-part=ties]').click()")
     told = f"{panel}.querySelector('[data-part=told]').innerText"
-    assert page.evaluate(told).startswith("0 ties; 2 points lack a photo")
+    assert page.evaluate(told).startswith("0 ties; 2 points without a photo")
     page.evaluate(
         f"(() => {{ const row = {panel}.querySelector('[data-part=list] > div');"
         " const [, photo, u, v] = row.querySelectorAll('input');"
@@ -164,10 +164,7 @@ def test_clicks_are_saved_as_check_points_and_as_ties(page: Page, tmp_path: Path
     (read,) = read_measured_ties(tmp_path / "ties.csv")
     assert (read.photo, read.pixel) == ("a, b.jpg", (12.5, 7.0))
     assert read.position == points[0].position
-    assert (
-        page.evaluate(told)
-        == "1 ties; 1 points lack a photo or where it shows them, and are left out"
-    )
+    assert page.evaluate(told) == "1 ties; 1 points without a photo or pixel position are omitted"
     assert page.complaints == []
 
 

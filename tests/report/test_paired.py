@@ -212,11 +212,13 @@ def test_what_is_shown_to_lead_is_stated_of_six_at_most() -> None:
     assert who_leads([over({"a": (1.0, 2.0)})], 2) == ""
     few = who_leads([leading(1, 0, 4)], 4)
     assert few.startswith("No claim is possible with 4 datasets: at least 6 on which the results ")
-    assert who_leads([leading(0, 2)], 12).startswith("No difference is shown in any of 1 numbers")
+    assert who_leads([leading(0, 2)], 12).startswith(
+        "No difference is significant in any of 1 metrics"
+    )
     both = who_leads([leading(1, 1)], 12)
-    assert "against plane=reference" in both
-    assert "plane=good0 better in 1 of 1 numbers (size)" in both
-    assert both.endswith("No difference is shown of plane=level0")
+    assert "compared with plane=reference" in both
+    assert "plane=good0 better in 1 of 1 metrics (size)" in both
+    assert both.endswith("No significant difference: plane=level0")
     six, seven = (who_leads([leading(n, 0)], 12) for n in (6, 7))
     assert (six.count(" better in "), "more" in six) == (6, False)
     assert (seven.count(" better in "), seven.endswith(" and 1 more")) == (6, True)

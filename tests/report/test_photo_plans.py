@@ -59,7 +59,7 @@ def test_refused_photos_are_named_and_names_are_escaped(tmp_path: Path) -> None:
     plan = photo_plan(run, list(wall_pictures(run)))
     assert plan is not None
     assert "1 of 2 photos" in plan.caption
-    assert "Not oriented, and so not drawn: gone.jpg." in plan.caption
+    assert "Not oriented and therefore not shown: gone.jpg." in plan.caption
     # Names are outlines, and only the caption and the table have them as text.
     assert b"<b>" not in plan.file("svg")
 

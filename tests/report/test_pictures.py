@@ -96,8 +96,8 @@ def test_the_baseline_is_shown_down_to_its_cells() -> None:
 def test_an_orthoimage_says_what_became_of_its_cells() -> None:
     one, _ = orthoimage_pictures(run(orthoimages(), orthoimages()))
     assert one.caption == (
-        "12.00 x 3.00 m at 10 mm, 1200 x 300 cells; of all cells 85.0 % painted, 10.0 % filled "
-        "from neighbours, 2.0 % hidden from every photo, 3.0 % in no oriented photo"
+        "12.00 x 3.00 m at 10 mm, 1200 x 300 cells, of which 85.0 % painted, 10.0 % interpolated "
+        "from neighbours, 2.0 % hidden in every photo, 3.0 % outside all oriented photos"
     )
     assert (one.title, one.name, one.wall, one.number) == ("wall 4 (plane=fine)", "wall 4", 0, 4)
     assert (one.cell, one.frame, one.file) == ("mosaic@plane=fine", FRAME, "")
@@ -149,7 +149,7 @@ def walls(*, has_intensity: bool = True, source: str = "laser") -> Walls:
 def test_causes_of_unknown_cells_are_found_where_the_step_has_told_them() -> None:
     recorded = run(walls(), type_name="walls", variants="fine", log="4.0% show nothing")
     *_, depth = wall_pictures(recorded)
-    words = "96.0 % of the cells known; causes of the others: log of mosaic@plane=fine"
+    words = "96.0 % of the depths known; for the reasons, see the log of mosaic@plane=fine"
     assert depth.caption == words
 
 
@@ -160,7 +160,7 @@ def test_a_wall_has_pictures_of_its_intensity_and_its_depth() -> None:
         *("wall 8, intensity (plane=fine)", "wall 8, depth (plane=fine)"),
     )
     assert intensity.caption == "laser intensity"
-    assert depth.caption == "96.0 % of the cells known"
+    assert depth.caption == "96.0 % of the depths known"
     for one in (intensity, depth):
         assert (one.wall, one.number, one.name, one.frame) == (0, 8, "wall 8", FRAME)
         assert one.cell == "mosaic@plane=fine"
@@ -178,7 +178,7 @@ def test_a_wall_has_pictures_of_its_intensity_and_its_depth() -> None:
 def test_grey_of_colours_is_no_laser_intensity() -> None:
     recorded = run(walls(source="luminance"), type_name="walls", variants="fine")
     assert next(wall_pictures(recorded)).caption == (
-        "no laser intensity in the scan: grey of its colours instead"
+        "grey of the scan's colours, because the scan has no laser intensity"
     )
 
 

@@ -123,7 +123,7 @@ def test_products_that_differ_stand_first_with_their_distances() -> None:
     products = (distance("one", "identical"), distance("two", "different", "shapes", far, odd))
     page = environment().get_template("sections/differences.html.j2")
     html = page.render(compared=replace(compared(rows), products=products), differences=())
-    words = "0.25 m at most in offset; names cannot be subtracted; shapes"
+    words = "0.25 m at most in offset; names cannot be compared numerically; shapes"
     assert html.index("two (planes)") < html.index(words) < html.index("one (planes)")
 
 

@@ -65,7 +65,9 @@ def test_the_orientation_is_exported_to_colmap(quick: Shell) -> None:
     ended = quick("export", "run", "--to", "colmap", "-o", "model")
     assert ended.code == 0, ended.said
     # Those of the room are the true ones.
-    assert "note: the orientations of orient; --step takes others: room, first" in ended.said
+    assert (
+        "note: using the orientations of orient; --step selects others: room, first" in ended.said
+    )
     assert ended.out.startswith(f"colmap: model: {len(cameras)} photos, 1 camera, ")
     assert ended.out.rstrip().endswith(" of orient")
     scene = pycolmap.Reconstruction(str(quick.folder / "model"))
@@ -80,7 +82,7 @@ def test_the_orientation_is_exported_to_colmap(quick: Shell) -> None:
 def test_the_cloud_is_exported(quick: Shell) -> None:
     run = orthoflow.open_run(quick.folder / "run")
     cloud, labels = run.product("room", "cloud"), run.product("plane", "labels")
-    said = f": cloud.laz: {len(cloud)} points by photos, cloud of plane"
+    said = f": cloud.laz: {len(cloud)} points coloured by photos, cloud of plane"
     ended = quick("export", "run", "--to", "laz", "-o", "planes")
     assert ended.code == 0, ended.said
     assert ended.out.rstrip().endswith(said)

@@ -467,7 +467,7 @@ def test_what_stops_every_run_is_told_once_and_where(cheat: str) -> None:
     assert result.exit_code == 1
     assert re.findall(rf"^broken   {check}: {said}$", result.stdout, re.MULTILINE)
     assert result.stdout.count("broken ") == 1
-    skipped = f"skipped  inputs-stay-untouched: stopped by the same as {check}"
+    skipped = f"skipped  inputs-stay-untouched: stopped by the same problem as {check}"
     assert skipped in result.stdout
     assert "a cloud with" not in result.stdout
 

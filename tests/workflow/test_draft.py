@@ -69,7 +69,7 @@ def inputs_of(workflow: Path) -> dict[str, list[str]]:
 
 def test_a_folder_becomes_a_workflow_that_is_fine_as_it_is(data: Path) -> None:
     out = said("new", data, "-o", "jobs/hall 1.yaml")
-    assert said("check", "jobs/hall 1.yaml").startswith("hall-1 is fine: 20 steps")
+    assert said("check", "jobs/hall 1.yaml").startswith("hall-1 is valid: 20 steps")
     assert inputs_of(Path("jobs/hall 1.yaml")) == {
         "scan": ["hall.las"],
         "photos": ["a.jpg", "b.jpg", "c.jpg"],
@@ -98,7 +98,7 @@ def test_a_scan_alone_is_painted_from_its_own_colours_without_a_stand_in(data: P
     assert "room" not in text
     assert "orthoflow run direct.yaml" not in text
     # No step waits for a simulated room, none is skipped.
-    assert said("check", "workflow.yaml") == "workflow is fine: 7 steps\n"
+    assert said("check", "workflow.yaml") == "workflow is valid: 7 steps\n"
 
 
 def test_a_table_of_coordinates_is_a_scan_and_no_list_of_points(tmp_path: Path) -> None:
@@ -187,7 +187,7 @@ def test_a_scan_with_empty_fields_is_no_source_of_colours(data: Path) -> None:
     assert not Path("workflow.yaml").exists()
     out = said("new", data / "bare.las", data / "photos")
     assert "nothing in its fields for intensity and colours" in out
-    assert "after the recipe photos-on-scan" in out
+    assert "based on the recipe photos-on-scan" in out
     said("new", data / "bare.las", "--recipe", "direct", "-o", "asked.yaml")
 
 
@@ -229,7 +229,7 @@ def test_the_axis_that_surfaces_show_to_be_up_is_set_and_reported(data: Path, up
     steps = Path("workflow.yaml").read_text()
     assert (f"cloud.up is {up} in the workflow" in " ".join(out.split())) is (up != "z")
     assert (f"    params: {{up: {up}}}\n" in steps) is (up != "z")
-    assert said("check", "workflow.yaml").startswith("workflow is fine")
+    assert said("check", "workflow.yaml").startswith("workflow is valid")
 
 
 # --- drafts by themselves ---

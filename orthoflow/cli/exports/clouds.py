@@ -57,18 +57,18 @@ def _export(
         taken = [item.digest for item in recorded.inputs.values() if item.type_name == "cloud"]
         if len(taken) != 1:
             raise ArgumentError(
-                f"the step {address} labels no cloud of its own: it takes {len(taken)} clouds"
+                f"the step {address} has no cloud of its own: it has {len(taken)} input clouds"
             )
         labels = product_of(run, digest, PointLabels, chosen.store)
         digest = taken[0]
         planes = last_product(run, {address: recorded}, Planes, chosen.store)
     cloud = product_of(run, digest, PointCloud, chosen.store)
     if len(cloud) == 0:
-        raise ArgumentError(f"the cloud of {address} has no points, so there is nothing to write")
+        raise ArgumentError(f"the cloud of {address} has no points to write")
     cloud.require_points(1)
     if labels is not None and len(labels.plane_index) != len(cloud):
         raise ArgumentError(
-            f"the labels are of {len(labels.plane_index)} points, but the cloud has {len(cloud)}"
+            f"the labels have {len(labels.plane_index)} points, but the cloud has {len(cloud)}"
         )
     # Read only if their colours may be used; an error message lists them in any case.
     is_wanted = chosen.colour in {None, "photos"}
@@ -86,8 +86,8 @@ def _export(
     colouring = chosen.colour or can_show[0]
     if colouring not in can_show:
         raise ArgumentError(
-            f"--colour {colouring}: the run has nothing for it ({address}); it has what is needed "
-            f"for {', '.join(can_show)}"
+            f"--colour {colouring}: the run lacks the data for it ({address}); available: "
+            f"{', '.join(can_show)}"
         )
     walls = last_product(run, cells, Walls, chosen.store)
     wall, wall_plane = _wall(walls, chosen.wall)
@@ -107,7 +107,7 @@ def _export(
     )
     if attributed.is_empty:
         raise ArgumentError(
-            f"no point of the cloud of {address} is left: choose another --wall or --box"
+            f"no points of the cloud of {address} are selected: choose another --wall or --box"
         )
     make_empty(folder)
     with tempfile.TemporaryDirectory(dir=folder) as scratch:
@@ -117,7 +117,9 @@ def _export(
         n_written = write(folder / name, attributed)
         describe_cloud(folder / "cloud.json", attributed, name, n_written)
     of_all = "" if n_written == len(cloud) else f" of {len(cloud)}"
-    return f"{name}: {counted(n_written, 'point')}{of_all} by {colouring}, cloud of {address}"
+    return (
+        f"{name}: {counted(n_written, 'point')}{of_all} coloured by {colouring}, cloud of {address}"
+    )
 
 
 export_laz = partial(_export, "cloud.laz", write_laz)

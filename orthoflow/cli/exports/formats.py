@@ -182,12 +182,12 @@ def check_choices(chosen: Choices, target: str | None, options: Sequence[FormatO
     """
     if target is None and not chosen.embed and not chosen.split:
         raise ArgumentError(
-            f"choose what to write: --to {listed(tuple(FORMATS))}, or --embed or --split"
+            f"choose a format: --to {listed(tuple(FORMATS))}, or --embed or --split"
         )
     beside = f"--to {target}" if target else "--embed"
     if chosen.split and (target or chosen.embed):
         raise ArgumentError(
-            f"--split writes records of its own, so it cannot be combined with {beside}: split "
+            f"--split cannot be combined with {beside}: split "
             f"first, then export each, as orthoflow export RUN/datasets/NAME {beside}"
         )
     said = "--split" if chosen.split else beside
@@ -197,11 +197,11 @@ def check_choices(chosen: Choices, target: str | None, options: Sequence[FormatO
         is_given = value is not None and value is not False and value != ()
         if is_given and target not in option.formats:
             owners = [name for name in FORMATS if name in option.formats]
-            raise ArgumentError(f"{option.opts[0]} belongs to --to {listed(owners)}, not to {said}")
+            raise ArgumentError(f"{option.opts[0]} applies to --to {listed(owners)}, not to {said}")
     if chosen.embed and target not in {None, "ro-crate"}:
         raise ArgumentError(f"{said} writes no record, so nothing can be embedded with --embed")
     if chosen.inputs and not chosen.embed:
-        raise ArgumentError(f"--input belongs to --embed, not to {said}")
+        raise ArgumentError(f"--input applies to --embed, not to {said}")
 
 
 def listed(names: Sequence[str]) -> str:

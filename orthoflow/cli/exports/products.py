@@ -48,8 +48,8 @@ def product_of(run: Run, digest: str, cls: type[ProductT], store: Path) -> Produ
         return Store(store).get_product(digest, cls)
     except StoreError as error:
         raise ArgumentError(
-            f"neither its record nor the store {store} holds the {cls.type_name} of this run "
-            f"({error}): name its store with --store, or run the workflow again with --embed"
+            f"neither its record nor the store {store} contains the {cls.type_name} of this run "
+            f"({error}): pass its store with --store, or run the workflow again with --embed"
         ) from error
 
 
@@ -72,7 +72,7 @@ def output_of(run: Run, type_name: str, cell: str | None) -> tuple[str, str]:
         run.cell(cell)
         if cell not in found:
             raise ArgumentError(
-                f"the step {cell} holds no {named}; those of this run: {', '.join(found) or 'none'}"
+                f"the step {cell} has no {named}; steps with {named}: {', '.join(found) or 'none'}"
             )
         return cell, found[cell]
     if not found:
@@ -80,7 +80,7 @@ def output_of(run: Run, type_name: str, cell: str | None) -> tuple[str, str]:
     *others, last = found
     if others:
         few = first_few(others, most=_MOST_NAMED)
-        echo_error(f"note: the {named} of {last}; --step takes others: {few}")
+        echo_error(f"note: using the {named} of {last}; --step selects others: {few}")
     return last, found[last]
 
 
@@ -120,7 +120,7 @@ def numbers_of(text: str, count: int, expected: str) -> list[float]:
     except ValueError:
         values = []
     if len(values) != count or not all(map(math.isfinite, values)):
-        raise ArgumentError(f"{expected} with commas between, got {text!r}")
+        raise ArgumentError(f"{expected} separated by commas, got {text!r}")
     return values
 
 
@@ -133,7 +133,7 @@ def make_empty(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ArgumentError(f"{folder} cannot be made: {error.strerror}") from error
+        raise ArgumentError(f"{folder} cannot be created: {error.strerror}") from error
 
 
 def branch_of(run: Run, address: str) -> dict[str, RecordedCell]:

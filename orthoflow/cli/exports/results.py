@@ -66,7 +66,7 @@ def export_figures(run: Run, folder: Path, chosen: Choices) -> str:
     n_written = write_figures(run, folder, addresses, as_pdf=suffix == "pdf")
     left_out = ""
     if n_written < n_figures:
-        left_out = f"; {n_figures - n_written} left out, damaged or more than a drawing"
+        left_out = f"; {n_figures - n_written} omitted (damaged or unsafe)"
     curves = curve_files(run, suffix) if chosen.cell is None else {}
     charts = {f"curves/{name}": data for name, data in curves.items()}
     plan = photo_plan(run, list(wall_pictures(run))) if chosen.cell is None else None
@@ -107,7 +107,7 @@ def export_crate(run: Run, folder: Path, chosen: Choices) -> str:
         for flag, said in (("--license", chosen.license_text), ("--author", author))
         if not said
     ]
-    told = f"; it does not state what {' and '.join(lacking)} would" if lacking else ""
+    told = f"; {' and '.join(lacking)} would add missing information" if lacking else ""
     return f"{counted(len(files), 'file')}, described in {files[0].name}{told}"
 
 
@@ -146,7 +146,7 @@ def export_stac(run: Run, folder: Path, _chosen: Choices) -> str:
 
     make_empty(folder)
     n_items = write_stac(run, folder)
-    return f"{COLLECTION_FILE} and {counted(n_items, 'item')} beside the orthoimages"
+    return f"{COLLECTION_FILE} and {counted(n_items, 'item')} next to the orthoimages"
 
 
 def embedded(run: Run, folder: Path, chosen: Choices) -> Run:

@@ -43,7 +43,7 @@ def export_sections(run: Run, folder: Path, chosen: Choices) -> str:
     """Write `section_<n>.dxf`, `.svg` and `.pdf` for each pair of points."""
     if not chosen.through:
         raise ArgumentError(
-            "--to section needs --through X,Y,X,Y, two places of the plan in metres "
+            "--to section needs --through X,Y,X,Y, two points of the plan in metres "
             "(`--to plan` shows the coordinates)"
         )
     results, planes = _room(run, chosen)
@@ -57,7 +57,7 @@ def export_sections(run: Run, folder: Path, chosen: Choices) -> str:
 def _room(run: Run, chosen: Choices) -> tuple[RoomResults, Planes]:
     results = room_results(run, chosen.cell)
     if results.planes is None:
-        raise ArgumentError(f"the run {run.record.run_id} has no planes, so nothing can be cut")
+        raise ArgumentError(f"the run {run.record.run_id} has no planes to cut")
     return results, results.planes
 
 
@@ -107,11 +107,11 @@ def _write(
         write_section(folder, f"{kind}_{number}", drawing)
         said.append(
             f"{kind}_{number} at 1:{scale}, {section.cut.title}: "
-            f"{counted(len(section.lines), 'line')} cut, {section.n_points:,} points in a slab of "
+            f"{counted(len(section.lines), 'cut line')}, {section.n_points:,} points in a slab of "
             f"{1e3 * section.slab_m:.0f} mm"
         )
     if cloud is None:
-        said.append("without the cloud, which neither record nor store holds: openings are missing")
+        said.append("neither record nor store contains the cloud, so openings are missing")
     return "; ".join(said)
 
 

@@ -114,7 +114,7 @@ def grid_of(chosen: Choices, scale: int) -> float:
         return 0.0
     if 0.0 < grid * unit_m < 2e-3 * scale:
         raise ArgumentError(
-            f"--grid {grid:g} puts crosses closer than 2 mm at 1:{scale}: take at least "
+            f"--grid {grid:g} puts crosses closer together than 2 mm at 1:{scale}: use at least "
             f"{2e-3 * scale / unit_m:g}, or 0 for none"
         )
     return grid
@@ -151,9 +151,7 @@ def export_elevations(run: Run, folder: Path, chosen: Choices) -> str:
         if wall.frame.raster_axes == "wall"
     ]
     if results.planes is None or not walls:
-        raise ArgumentError(
-            f"the run {run.record.run_id} shows no upright wall, so there is nothing to unfold"
-        )
+        raise ArgumentError(f"the run {run.record.run_id} has no upright walls for an elevation")
     up = results.planes.up
     order, is_inside = unfolded(walls, up)
     # Accuracy is known per wall; walls with the same notes are listed together.
@@ -205,7 +203,7 @@ def _coarse(walls: Sequence[WallResult], scale: int) -> str:
     names = ", ".join(wall.name for wall in coarse)
     return (
         f"; coarser than print, {_ppi(worst, scale):.0f} pixels per inch instead of "
-        f"{_LEAST_PPI:.0f}: {names}; from 1:{enough} on they are fine enough"
+        f"{_LEAST_PPI:.0f}: {names}; 1:{enough} is fine enough"
     )
 
 

@@ -60,7 +60,7 @@ def _depths(
     for ortho in orthos:
         if ortho.wall not in found:
             raise ArgumentError(
-                f"--relief: the run has no depth of wall {ortho.wall}; without --relief the model "
+                f"--relief: the run has no depth of wall {ortho.wall}; without --relief, the model "
                 "has planes"
             )
     return found
@@ -119,7 +119,7 @@ def _orthos(run: Run, chosen: Choices) -> tuple[str, tuple[OrthoFile, ...]]:
     found = ortho_files(paths)
     if not found:
         raise ArgumentError(
-            f"no orthoimages of {address} lie below {run.products_folder}: pass the "
+            f"no orthoimages of {address} were found in {run.products_folder}: pass the "
             "unmodified run folder"
         )
     if chosen.wall is not None:

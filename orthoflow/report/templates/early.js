@@ -1,5 +1,5 @@
 "use strict";
-// Before the first paint, so that nothing moves when the page's own script has come: what only a script can use
-// is shown, and the contents are folded on narrow screens.
+// Runs before the first paint, so that nothing moves when the main script is loaded: shows elements that need
+// scripts, and collapses the contents on narrow screens.
 document.documentElement.classList.add("scripted");
 document.querySelector(".contents details").open = matchMedia("(min-width: 72rem)").matches;

@@ -2,8 +2,8 @@
 (() => {
   const root = document.documentElement;
 
-  // Colours: as the system, light, dark. What was chosen is remembered where the browser allows it.
-  const themes = { auto: "as the system", light: "light", dark: "dark" };
+  // Colours: system setting, light, dark. The choice is stored if the browser permits it.
+  const themes = { auto: "system setting", light: "light", dark: "dark" };
   const store = {
     read(key) { try { return localStorage.getItem(key); } catch { return null; } },
     write(key, value) { try { localStorage.setItem(key, value); } catch { /* private windows */ } },
@@ -24,7 +24,7 @@
     show(theme);
   });
 
-  // Tables: a heading with data-sort becomes a button. Rows without a value stay last either way.
+  // Tables: a heading with data-sort becomes a button. Rows without a value are last in both orders.
   const placeOf = (row, index) => row.cells[index];
   const keyOf = (row, index, kind) => {
     const place = placeOf(row, index);
@@ -55,10 +55,10 @@
     });
   }
 
-  // Wide tables: columns are chosen, rows filtered, and metrics stand as rows where there are few combinations.
+  // Wide tables: columns can be chosen and rows filtered; metrics are rows if there are few combinations.
   const MANY = 9, LEAST = 3, FEW_ROWS = 6;
   const isShown = (element) => !element.hidden;
-  // A table of the same places with columns as rows, so many combinations beside each other.
+  // The transposed table, with at most this many combinations as columns.
   const turned = (table, most) => {
     const bodyRows = [...table.tBodies[0].rows].filter(isShown);
     const headings = [...table.tHead.rows[0].cells].filter(isShown);
@@ -76,7 +76,7 @@
         heading.scope = "col";
         heading.className = "n";
         const names = [...from.cells].slice(0, table.dataset.names).filter((place) => place.textContent.trim() !== "-");
-        // With the links that lead from a name to what stands behind it.
+        // Keep the links in the names.
         names.forEach((place, index) => heading.append(index ? ", " : "", ...place.cloneNode(true).childNodes));
         top.append(heading);
       }
@@ -124,11 +124,11 @@
       return box;
     });
     const judging = optional.map((heading) => "key" in heading.dataset);
-    // Where few of them judge quality, those that the workflow names first.
+    // If few columns measure quality, show the first ones of the workflow.
     const keys = judging.filter(Boolean).length < 4 ? optional.map((_, index) => index < MANY) : judging;
     const isMuch = optional.length > MANY || region.scrollWidth > region.clientWidth;
     let isTurned = region.dataset.chooser === "either" && isMuch && table.tBodies[0].rows.length <= FEW_ROWS;
-    // Of more than fits those that judge quality come first; all are one click away.
+    // If not all columns fit, show those that measure quality; a click shows all.
     const hide = (index) => {
       for (const row of table.rows) row.cells[optional[index].cellIndex].hidden = !boxes[index].checked;
     };
@@ -159,7 +159,7 @@
       draw();
     });
     draw();
-    // Paper has no columns to scroll to.
+    // Columns cannot be scrolled in print.
     addEventListener("beforeprint", () => {
       if (boxes.length <= 6) return;
       const paper = document.createElement("div");
@@ -176,7 +176,7 @@
     });
   }
 
-  // A picture of few cells is shown larger than they are, and keeps its form in doing so.
+  // Pictures with few cells are enlarged, preserving their aspect ratio.
   for (const image of document.querySelectorAll(".raster .picture > img")) {
     const enlarge = () => {
       const { naturalWidth: width, naturalHeight: height } = image, longest = Math.max(width, height);
@@ -188,7 +188,7 @@
     image.addEventListener("load", enlarge);
   }
 
-  // Pictures are in the page once; where one is needed again, it is taken from its first place.
+  // Each picture is in the page once; copies refer to the first one.
   const pictureOf = (id) => {
     const copy = document.createElement("img");
     copy.src = document.querySelector(`#${CSS.escape(id)} img`).src;
@@ -196,7 +196,7 @@
     return copy;
   };
 
-  // Two pictures of a wall, the left one cut off at the dividing line.
+  // Two superimposed pictures of a wall, clipped at the dividing line.
   for (const slider of document.querySelectorAll("[data-slider]")) {
     const groups = JSON.parse(document.getElementById(slider.dataset.slider).textContent);
     const part = Object.fromEntries(
@@ -223,10 +223,10 @@
       right.style.clipPath = `inset(0 0 0 ${position}%)`;
       line.style.left = `${position}%`;
     };
-    // What was looked at is looked at again: on another wall, and when the page is opened once more.
+    // The selected layers are kept for other walls, and when the page is opened again.
     const memory = `orthoflow-slider-${slider.dataset.remember}`;
     let chosen = {};
-    try { chosen = JSON.parse(store.read(memory)) ?? {}; } catch { /* nothing was kept */ }
+    try { chosen = JSON.parse(store.read(memory)) ?? {}; } catch { /* nothing stored */ }
     const keep = () => store.write(memory, JSON.stringify(chosen));
     const layerOf = (select) => groups[part.wall.value].pictures[select.value].layer;
     const lay = () => {
@@ -237,7 +237,7 @@
     const choose = () => {
       const { pictures, ratio } = groups[part.wall.value];
       const names = pictures.map((picture) => picture.layer);
-      // Where one step alone has variants, its name tells nothing, and takes the room of what does.
+      // If only one step has variants, its name is redundant and is omitted to save space.
       const steps = new Set(names.flatMap((name) => [...name.matchAll(/([^\s(,=]+)=/g)].map((found) => found[1])));
       const told = steps.size === 1 ? names.map((name) => name.replace(`${[...steps][0]}=`, "")) : names;
       const at = (name, otherwise) => {
@@ -275,7 +275,7 @@
     choose();
   }
 
-  // Orthoimages tell what lies under the cursor, and clicks are collected as check points or ties.
+  // Orthoimages show coordinates at the cursor; clicks collect check points or ties.
   const pointing = new Map();
   for (const panel of document.querySelectorAll("[data-points]")) {
     const places = JSON.parse(document.getElementById(panel.dataset.points).textContent);
@@ -284,7 +284,7 @@
       [...panel.querySelectorAll("[data-part]")].map((element) => [element.dataset.part, element]));
     const points = [];
     const under = (place, image, event) => {
-      // The enlarged view scales the box, but not what the picture says of its own size.
+      // The enlarged view scales the bounding box, but not offsetWidth and offsetHeight.
       const box = image.getBoundingClientRect(), across = box.width / image.offsetWidth, down = box.height / image.offsetHeight;
       const x = ((event.clientX - box.left) / across - image.clientLeft) / image.clientWidth;
       const y = ((event.clientY - box.top) / down - image.clientTop) / image.clientHeight;
@@ -298,7 +298,7 @@
       return { id: place.id, x, y, wall: place.wall, of: place.name, u, v, depth, world };
     };
     const words = (point) => `u ${point.u.toFixed(1)} px, v ${point.v.toFixed(1)} px, depth ${
-      Number.isNaN(point.depth) ? "unknown (the plane is taken)" : `${point.depth.toFixed(3)} m`}, ${
+      Number.isNaN(point.depth) ? "unknown (plane used)" : `${point.depth.toFixed(3)} m`}, ${
       point.world.map((value, axis) => `${"xyz"[axis]} ${value.toFixed(3)}`).join(", ")} m`;
     const field = (label, size, hint, list) => {
       const input = document.createElement("input");
@@ -308,7 +308,7 @@
       if (list) input.setAttribute("list", list);
       return input;
     };
-    // A cross with its number where a point was collected, small and enlarged.
+    // A numbered cross at each collected point, in both views.
     const cross = (point) => {
       const mark = document.createElement("span"), number = document.createElement("b");
       Object.assign(mark.style, { left: `${100 * point.x}%`, top: `${100 * point.y}%` });
@@ -360,17 +360,17 @@
       setTimeout(() => URL.revokeObjectURL(link.href), 60000);
     };
     part.checkpoints.addEventListener("click", () => {
-      // What is shown there holds for any cell size; x, y, z are the survey's to fill in.
+      // shown_x and shown_y are independent of the cell size; x, y, z are to be filled in from the survey.
       save("checkpoints.csv", ["name", "x", "y", "z", "wall", "shown_x", "shown_y", "shown_z"],
         points.map((point) => [point.name.value, ...point.world, point.wall, ...point.world]));
-      part.told.textContent = `${points.length} check points: now put the surveyed x, y, z into the file`;
+      part.told.textContent = `${points.length} check points saved: add the surveyed x, y, z to the file`;
     });
     part.ties.addEventListener("click", () => {
       const isNumber = (input) => input.value.trim() !== "" && Number.isFinite(Number(input.value));
       const whole = points.filter((point) =>
         point.photo.value.trim() && isNumber(point.photoU) && isNumber(point.photoV));
       const left = points.length - whole.length;
-      const lacking = left ? `; ${left} points lack a photo or where it shows them, and are left out` : "";
+      const lacking = left ? `; ${left} points without a photo or pixel position are omitted` : "";
       part.told.textContent = `${whole.length} ties${lacking}`;
       if (whole.length) save("ties.csv", ["photo", "u_px", "v_px", "x", "y", "z"], whole.map((point) =>
         [point.photo.value, Number(point.photoU.value), Number(point.photoV.value), ...point.world]));
@@ -397,7 +397,7 @@
       image.addEventListener("pointermove", follow);
       image.addEventListener("pointerdown", follow);
       image.addEventListener("click", (event) => {
-        // A click is told in whole pixels of the screen; the pointer that made it knows its place within one.
+        // Click events have whole pixels; the preceding pointer event has subpixel coordinates.
         const isIts = pointer && Math.abs(pointer.clientX - event.clientX) < 1 && Math.abs(pointer.clientY - event.clientY) < 1;
         const point = under(place, image, isIts ? pointer : event);
         if (point) readout.textContent = collected(point);
@@ -410,12 +410,12 @@
     }
   }
 
-  // Every picture opens large: drag and wheel, arrow keys for the next one, a link to its file.
+  // Enlarged view of all pictures: drag and wheel, arrow keys for the next one, a link to the file.
   const viewer = document.getElementById("viewer");
   const view = Object.fromEntries(
     [...viewer.querySelectorAll("[data-part]")].map((element) => [element.dataset.part, element]));
   const every = [...document.querySelectorAll("figure[data-large]")];
-  // Arrow keys lead through what is unfolded.
+  // Arrow keys step through the pictures that are not collapsed.
   const unfolded = () => every.filter((figure) => !figure.closest("details:not([open])"));
   let now = null, place = { scale: 1, x: 0, y: 0 }, size = { width: 1, height: 1, cells: 1, metres: 0 };
   const lie = () => {
@@ -478,7 +478,7 @@
     button.addEventListener("click", () => open(figure));
     const picture = figure.querySelector(".picture");
     picture.append(button);
-    // On orthoimages and walls a click collects a point.
+    // On orthoimages and walls, a click collects a point instead.
     if (!figure.classList.contains("raster")) {
       picture.querySelector("img").addEventListener("click", () => open(figure));
     }
@@ -504,7 +504,7 @@
     const told = pointing.get(now)?.(view.stage.querySelector("img"), event, isClick);
     if (told) view.readout.textContent = told;
   };
-  // Where the pointer went down, as long as it may become a click; beyond a hand's tremble it drags.
+  // Position of pointerdown, while it may still become a click; larger movements are drags.
   const TREMBLE_PX = 3;
   let pressed = null;
   view.stage.addEventListener("pointerdown", (event) => {
@@ -524,7 +524,7 @@
   });
   addEventListener("resize", () => { if (viewer.open) fit(); });
 
-  // Contents: a column that stays, folded on narrow screens; where the reader is stands out.
+  // Contents: a fixed column, collapsed on narrow screens; the current section is highlighted.
   const contents = document.querySelector(".contents details");
   const wide = matchMedia("(min-width: 72rem)");
   wide.addEventListener("change", () => { contents.open = wide.matches; });
@@ -545,7 +545,7 @@
   }, { passive: true });
   mark();
   contents.addEventListener("click", (event) => { if (event.target.closest("a") && !wide.matches) contents.open = false; });
-  // Links lead into what is folded.
+  // Expand collapsed parts that contain the target of a link.
   const unfoldTarget = () => {
     const target = location.hash && document.getElementById(location.hash.slice(1));
     for (let at = target; at; at = at.parentElement) if (at.tagName === "DETAILS") at.open = true;
@@ -553,12 +553,12 @@
   addEventListener("hashchange", unfoldTarget);
   unfoldTarget();
 
-  // Browsers put pictures into a PDF bit by bit, but JPEG as it is: paper gets one of each, made while nobody
-  // waits, because at printing it is too late to.
+  // Browsers store pictures uncompressed in PDFs, except JPEG: JPEG copies for printing are made while the page
+  // is idle, since there is no time for it when printing starts.
   const PAPER_PX = 1100, LARGE_PNG = 130000;
   const onPaper = new Map(), made = new Map();
   const paperOf = (image) => {
-    // The picture of a wall lies under others, too.
+    // The same picture may be used several times.
     if (made.has(image.src)) return made.get(image.src);
     const scale = Math.min(1, PAPER_PX / Math.max(image.naturalWidth, image.naturalHeight));
     const canvas = document.createElement("canvas");
@@ -595,7 +595,7 @@
   });
   addEventListener("afterprint", () => { for (const [image, was] of onScreen) image.src = was; });
 
-  // On paper nothing can be unfolded: results are, other parts only where the reader unfolded them.
+  // In print, results are expanded; other parts only if the reader expanded them.
   let folded = [];
   addEventListener("beforeprint", () => {
     folded = [...document.querySelectorAll(":is(details.paper, .warnings details):not([open])")]

@@ -108,9 +108,11 @@ def exported(folder: Path, run: Any, **choices: Any) -> tuple[str, AttributedClo
 def test_a_box_leaves_points_out_and_says_so(tmp_path: Path) -> None:
     # Corners in any order.
     said, attributed = exported(tmp_path, labelled(), box="0.5,1,1,0,0,-1")
-    assert said == "cloud.toy: 72 points of 144 by intensity, cloud of plane"
+    assert said == "cloud.toy: 72 points of 144 coloured by intensity, cloud of plane"
     np.testing.assert_array_equal(attributed.box_world, [[0.0, 0.0, -1.0], [0.5, 1.0, 1.0]])
-    with pytest.raises(ArgumentError, match=r"^no point of the cloud of plane is left: choose"):
+    with pytest.raises(
+        ArgumentError, match=r"^no points of the cloud of plane are selected: choose"
+    ):
         exported(tmp_path, labelled(), box="5,5,5,6,6,6")
 
 
@@ -138,7 +140,7 @@ def test_the_best_colours_that_there_are_come_first(
     with pytest.raises(ArgumentError) as caught:
         exported(tmp_path, run, colour="photos")
     assert str(caught.value) == (
-        "--colour photos: the run has nothing for it (plane); it has what is needed for "
+        "--colour photos: the run lacks the data for it (plane); available: "
         + ", ".join([first, *others])
     )
 
@@ -155,7 +157,7 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
         }
     )
     # Photos that the run oriented are named, though they were not read.
-    with pytest.raises(ArgumentError, match=r"needed for photos, plane, deviation$"):
+    with pytest.raises(ArgumentError, match=r"available: photos, plane, deviation$"):
         exported(folder, turned, colour="intensity")
     grey = ToyRun({"scan": ({}, {"cloud": bare})})
     with pytest.raises(ArgumentError, match="of scan has no colours, intensities or planes"):
@@ -164,7 +166,7 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
     empty = PointCloud(origin=np.zeros(3), x=none, y=none, z=none, up=np.array([0.0, 0.0, 1.0]))
     with pytest.raises(ArgumentError, match="the cloud of scan has no points"):
         exported(folder, ToyRun({"scan": ({}, {"cloud": empty})}))
-    with pytest.raises(ArgumentError, match=r"^the labels are of 9 points, but the cloud has 144$"):
+    with pytest.raises(ArgumentError, match=r"^the labels have 9 points, but the cloud has 144$"):
         exported(folder, labelled(marks=labels(9)))
     two = ToyRun(
         {
@@ -172,7 +174,7 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
             "plane": ({"cloud": "scan", "cloud2": "scan"}, {"labels": labels()}),
         }
     )
-    with pytest.raises(ArgumentError, match="plane labels no cloud of its own: it takes 2 clouds"):
+    with pytest.raises(ArgumentError, match="plane has no cloud of its own: it has 2 input clouds"):
         exported(folder, two)
     with pytest.raises(ArgumentError, match="--wall 3: the run has no wall 3; it has none"):
         exported(folder, labelled(), wall=3)
@@ -217,7 +219,7 @@ def test_photos_colour_what_they_see_and_the_rest_stays_grey(
     if colour == "intensity":
         assert (attributed.photo_colours, attributed.photo_names) == (None, ())
         return
-    assert said == "cloud.toy: 144 points by photos, cloud of plane"
+    assert said == "cloud.toy: 144 points coloured by photos, cloud of plane"
     assert (attributed.colouring, attributed.photo_names) == ("photos", ("a.jpg",))
     colours = attributed.photo_colours
     assert colours is not None

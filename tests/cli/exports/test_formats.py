@@ -39,7 +39,7 @@ def test_an_option_goes_with_the_formats_that_it_belongs_to(option: FormatOption
             continue
         with pytest.raises(ArgumentError) as caught:
             check_choices(chosen, target, OPTIONS)
-        said = f"{option.opts[0]} belongs to --to {listed(owners)}, not to --to {target}"
+        said = f"{option.opts[0]} applies to --to {listed(owners)}, not to --to {target}"
         assert str(caught.value) == said
 
 
@@ -54,12 +54,16 @@ def test_nothing_else_is_refused() -> None:
 @pytest.mark.parametrize(
     ("chosen", "target", "said"),
     [
-        (Choices(), None, "choose what to write: --to "),
-        (Choices(split=True), "csv", "so it cannot be combined with --to csv: split first"),
-        (Choices(split=True, embed=True), None, "so it cannot be combined with --embed: split fir"),
+        (Choices(), None, "choose a format: --to "),
+        (Choices(split=True), "csv", "--split cannot be combined with --to csv: split first"),
+        (
+            Choices(split=True, embed=True),
+            None,
+            "--split cannot be combined with --embed: split fir",
+        ),
         (Choices(embed=True), "csv", "--to csv writes no record, so nothing can be embedded"),
-        (Choices(inputs=("a=b",)), "csv", "--input belongs to --embed, not to --to csv"),
-        (Choices(inputs=("a=b",), split=True), None, "--input belongs to --embed, not to --split"),
+        (Choices(inputs=("a=b",)), "csv", "--input applies to --embed, not to --to csv"),
+        (Choices(inputs=("a=b",), split=True), None, "--input applies to --embed, not to --split"),
         (Choices(wall=1, embed=True), None, ", not to --embed"),
         (Choices(wall=1, split=True), None, ", not to --split"),
     ],

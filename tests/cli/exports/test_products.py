@@ -37,7 +37,7 @@ def test_the_last_cell_is_taken_and_the_first_five_others_are_named(
     seven = [f"plane@plane=v{k}" for k in range(7)]
     assert output_of(run_of(*seven), "labels", None) == (seven[-1], "out")
     said = capsys.readouterr().err
-    assert f"note: the labels of points of {seven[-1]}; --step takes others: " in said
+    assert f"note: using the labels of points of {seven[-1]}; --step selects others: " in said
     assert ", ".join(seven[:5]) in said
     assert "and 1 more" in said
     assert output_of(run_of(*seven[:6]), "labels", None)[0] == seven[5]
@@ -50,10 +50,12 @@ def test_a_cell_that_gives_nothing_of_the_kind_is_refused() -> None:
     run = run_of("a", "b")
     with pytest.raises(ArgumentError) as caught:
         output_of(run, "labels", "scan")
-    assert str(caught.value) == ("the step scan holds no labels of points; those of this run: a, b")
+    assert str(caught.value) == (
+        "the step scan has no labels of points; steps with labels of points: a, b"
+    )
     with pytest.raises(ArgumentError, match=r"^the run r1 has read no cloud$"):
         output_of(run, "cloud", None)
-    with pytest.raises(ArgumentError, match="those of this run: none"):
+    with pytest.raises(ArgumentError, match="steps with clouds: none"):
         output_of(run, "cloud", "a")
 
 
@@ -68,7 +70,7 @@ def test_the_last_of_some_cells_gives_a_product(tmp_path: Path) -> None:
     only = {"a": run.cells["a"]}
     assert last_product(held, only, PointLabels, tmp_path).plane_index.tolist() == [1, 1, 1]  # type: ignore[union-attr]
     assert last_product(held, {"scan": run.cells["scan"]}, PointLabels, tmp_path) is None
-    with pytest.raises(ArgumentError, match="name its store with --store, or run the workflow"):
+    with pytest.raises(ArgumentError, match="pass its store with --store, or run the workflow"):
         product_of(held, "sha256:" + "f" * 64, PointLabels, tmp_path / "store")
 
 
@@ -76,5 +78,5 @@ def test_a_folder_is_made_with_those_above_it(tmp_path: Path) -> None:
     make_empty(tmp_path / "a" / "b")
     make_empty(tmp_path / "a" / "b")
     (tmp_path / "a" / "b" / "file").touch()
-    with pytest.raises(ArgumentError, match="file/c cannot be made: Not a directory"):
+    with pytest.raises(ArgumentError, match="file/c cannot be created: Not a directory"):
         make_empty(tmp_path / "a" / "b" / "file" / "c")

@@ -41,8 +41,8 @@ def test_figures_are_written_in_the_format_that_is_asked_for(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("choices", "lacking"),
     [
-        ({}, "; it does not state what --license and --author would"),
-        ({"license_text": "CC0-1.0", "author": "  "}, "; it does not state what --author would"),
+        ({}, "; --license and --author would add missing information"),
+        ({"license_text": "CC0-1.0", "author": "  "}, "; --author would add missing information"),
         ({"license_text": "CC0-1.0", "author": " A. Nobody ", "embed": True}, ""),
     ],
 )

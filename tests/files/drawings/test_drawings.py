@@ -249,7 +249,7 @@ def test_one_wall_is_drawn_without_the_files_of_another(run: Path) -> None:
     [
         (("--wall", 0), "--wall 0: mosaic shows no wall 0; it shows 2"),
         (("--paper", "B7"), "--paper must be A0"),
-        (("--grid", "0.01"), "--grid 0.01 puts crosses closer than 2 mm at 1:"),
+        (("--grid", "0.01"), "--grid 0.01 puts crosses closer together than 2 mm at 1:"),
         (("--step", "plane"), "the step plane holds no orthoimages or walls; those of this run:"),
         (("--step", "none"), "has no step 'none'"),
         (("--title-block", "missing.yaml"), "missing.yaml cannot be read"),
@@ -267,7 +267,7 @@ def test_what_cannot_be_drawn_is_refused_and_nothing_is_written(
 
 def test_options_of_sheets_belong_to_sheets(run: Path, tmp_path: Path) -> None:
     done = export(run, "dxf", tmp_path / "out", "--scale", 50)
-    assert (done.exit_code, "--scale belongs to --to" in done.output) == (2, True)
+    assert (done.exit_code, "--scale applies to --to" in done.output) == (2, True)
 
 
 def test_a_changed_picture_is_not_drawn(tmp_path: Path) -> None:
