@@ -53,7 +53,7 @@ _HELP: Final = "\n\n".join(
         (
             "--embed: only run.h5, which can be verified and replayed without any other file. "
             "Missing parts are taken from the store and from the input files, which are located "
-            "by their content: at the paths given with --input, or else as by `replay`."
+            "by their content: at the paths given with --input, or where `replay` looks for them."
         ),
         (
             "--split: for a run on several datasets, a run folder for each, with record, report "

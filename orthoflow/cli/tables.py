@@ -147,11 +147,12 @@ def verify_hint(*runs: Path) -> str:
     """Return a sentence about the command that also checks large arrays.
 
     >>> verify_hint(Path("first"))
-    '`orthoflow verify first` checks that nothing changed since it was written'
+    '`orthoflow verify first` checks that the run has not changed since it was written'
     """
     commands = " and ".join(f"`orthoflow verify {shlex.quote(str(run))}`" for run in runs)
-    checks = "checks" if len(runs) == 1 else "check"
-    return f"{commands} {checks} that nothing changed since it was written"
+    if len(runs) == 1:
+        return f"{commands} checks that the run has not changed since it was written"
+    return f"{commands} check that the runs have not changed since they were written"
 
 
 def verdict_counts(distances: Sequence[ProductDistance]) -> str:

@@ -366,7 +366,7 @@ def _client(address: str, capacity: Capacity) -> Client:
             return Client(address, timeout=_CONNECT_S, set_as_default=False)
         except (OSError, ValueError) as error:
             raise ArgumentError(
-                f"--scheduler {address}: no scheduler of dask answers there "
+                f"--scheduler {address}: no Dask scheduler responds there "
                 f"({one_line(error) or type(error).__name__}); expected tcp://HOST:PORT"
             ) from error
     with dask.config.set(_QUIET):

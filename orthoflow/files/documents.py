@@ -277,7 +277,7 @@ _NUMBER: Final = re.compile(r"([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)\s*([a-zÂµÂ
 
 
 def meant_number(parameter: str, text: object) -> str:
-    """Return a hint how a number given as text is written; empty if it does not look like one.
+    """Return a hint on how to write a number given as text; empty if it looks like none.
 
     >>> meant_number("tolerance_m", "0,02")
     '; decimals have a point: 0.02'

@@ -279,9 +279,9 @@ def publish_cameras(product: Cameras, folder: Path, digest: str) -> None:
         {
             "pixel_convention": PIXEL_CONVENTION,
             "camera_axes": "x right, y down, z forward; X_camera = R X_world + t, metres",
-            "errors": "one standard deviation; sigma_wall_mm: that the orientation is expected to "
-            "cause on the wall; sigma0_px: of a pixel coordinate of a control tie, as stated, "
-            "times the sigma of unit weight",
+            "errors": "one standard deviation; sigma_wall_mm: expected error on the wall due to "
+            "the orientation; sigma0_px: a priori error of a pixel coordinate of a control tie, "
+            "times the standard deviation of unit weight",
             "cameras": {camera.photo: _camera_json(camera) for camera in product.cameras},
             "product_digest": digest,
         },

@@ -404,9 +404,9 @@ class Run:
             )
         if not outputs[port].embedded:
             raise RecordError(
-                f"{self.path} names {address}.{port} only by its digest: it is in the store of the "
-                f"run, from which `orthoflow export {shlex.quote(str(self.path))} --embed` (with "
-                "`--store` from another folder than the run's) puts every product into a record"
+                f"{self.path} contains only the digest of {address}.{port}; to embed all products, "
+                f"run `orthoflow export {shlex.quote(str(self.path))} --embed`, with "
+                "`--store FOLDER` if the store of the run is not in this folder"
             )
 
     def product(self, address: str, port: str, **variants: str) -> Product:

@@ -166,8 +166,8 @@ def _collection(run: Run, orthos: list[_Ortho]) -> dict[str, JsonValue]:
     text = f"Orthoimages of the run {record.run_id} of the workflow {record.name}."
     if len(on_earth) < len(orthos):
         text += (
-            " Those without a geometry lie in the plane of their wall: their coordinate system is "
-            "none on Earth, and the extent of the collection does not include them."
+            " Items without a geometry use local coordinates in the plane of their wall, which are "
+            "not georeferenced; the extent of the collection does not include them."
         )
     bbox: list[JsonValue] = list(_bbox(on_earth) if on_earth else _EVERYWHERE)
     items: list[JsonValue] = [

@@ -188,8 +188,8 @@ def _private_key(path: Path, password: Callable[[], str]) -> Ed25519PrivateKey:
 
     if data.startswith(b"ssh-"):
         raise InputError(
-            f"{path} is the public half of a key, by which others check: sign with the private one"
-            f", {path.with_suffix('')}"
+            f"{path} is a public key, which others use to verify: sign with the private key, "
+            f"{path.with_suffix('')}"
         )
     load = serialization.load_ssh_private_key
     with _key_errors(path, "private", "or the password is wrong: {}"):

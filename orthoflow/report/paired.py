@@ -30,7 +30,7 @@ from orthoflow.workflow.model import DATA
 
 # With four datasets p is at least 0.125, so no difference can be significant.
 _MIN_TESTED: Final = 5
-# Minimum for ranks; for two methods, signed ranks are more powerful.
+# Minimum number of methods for mean ranks; for two, the signed-rank test is more powerful.
 _MIN_RANKED: Final = 3
 # If all differences agree, p is 0.031 for six datasets and 0.0625 for five.
 _MIN_SHOWN: Final = 6

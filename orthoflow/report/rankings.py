@@ -117,12 +117,12 @@ class Value:
 def rank(values: Sequence[Value], better: str, unit: str = "1") -> list[Value]:
     """Mark the best value of each group, unless all values of the group are level.
 
-    Groups with a value of a single run are not ranked: with another machine or seed, another value
-    may be the best. A value is near the best if its distance from the best does not exceed their
-    standard deviations combined in quadrature; or, if there are none or the repeats of one are
-    identical, 1 % of the best (10 % for memory, 30 % for times), or rounding. If any value is near
-    the best, the best is also marked as near. A value that sums over fewer items than another in
-    its group is not ranked: a method that rejects difficult photos has smaller errors for the
+    Groups that contain a value from a single run are not ranked: with another machine or seed,
+    another value may be the best. A value is near the best if its distance from it does not exceed
+    their standard deviations combined in quadrature; or, without repeats or with identical ones,
+    1 % of the best (10 % for memory, 30 % for times), or rounding. If any value is near the best,
+    the best is also marked as near. A value that sums over fewer items than another in its group is
+    not ranked: a method that rejects difficult photos has smaller errors for the
     remaining ones.
 
     Args:

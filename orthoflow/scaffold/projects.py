@@ -182,7 +182,7 @@ def _check_new_kind(project: Project, catalog: Catalog) -> None:
             )
     if project.product in catalog.products:
         raise ArgumentError(
-            f"product {project.product} is announced already: name another with --gives"
+            f"product {project.product} is already registered: choose another name with --gives"
         )
     for name in (*project.takes, *project.gives):
         if name not in catalog.products:

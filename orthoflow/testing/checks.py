@@ -308,7 +308,7 @@ def cancel_is_honoured(subject: Subject) -> None:
         return
     raise AssertionError(
         "a cancelled step ran to its end: call ctx.progress(fraction, text) between parts of the "
-        "work, which stops it"
+        "work; it raises when the step is cancelled"
     )
 
 

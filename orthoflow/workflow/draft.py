@@ -510,7 +510,7 @@ def _place(path: Path, target: Path) -> str:
     """Return a path relative to the workflow's folder."""
     here, place = (Path(os.path.normpath(one.absolute())) for one in (target.parent, path))
     if not place.is_relative_to(here):
-        # `..` after a symbolic link leads to another folder than the text of the path suggests.
+        # `..` after a symbolic link may lead to a different folder than the path suggests.
         here, place = here.resolve(), place.resolve()
     return Path(os.path.relpath(place, here)).as_posix()
 

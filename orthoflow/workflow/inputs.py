@@ -414,8 +414,8 @@ class DatasetReader:
             if not log.has((*here, key)) and not spec.files and not spec.optional:
                 log.report(
                     here,
-                    f"the dataset names no files for the input {key}, and neither does the "
-                    f"workflow; give it {key}",
+                    f"neither the dataset nor the workflow names files for the input {key}; add "
+                    f"{key} to the dataset",
                     at_key=True,
                 )
         seeds: tuple[int, ...] = ()

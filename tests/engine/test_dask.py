@@ -237,7 +237,7 @@ def test_an_address_without_scheduler_is_refused(
     monkeypatch.setattr(engine_dask, "_CONNECT_S", 1.0)
     for address in ("tcp://127.0.0.1:9", "nonsense"):
         plan = office.world.plan(STEPS, executor="dask", scheduler=address)
-        with pytest.raises(ArgumentError, match=f"--scheduler {address}: no scheduler of dask"):
+        with pytest.raises(ArgumentError, match=f"--scheduler {address}: no Dask scheduler"):
             execute(plan, office.world.folder / "nowhere", office.world.store)
 
 

@@ -98,7 +98,7 @@ def test_the_same_workflow_computed_twice_is_the_same(studio: Studio) -> None:
     assert shown.splitlines()[-3:] == [
         "2 products: 2 identical",
         "",
-        f"{verify} check that nothing changed since it was written",
+        f"{verify} check that the runs have not changed since they were written",
     ]
 
 

@@ -232,7 +232,7 @@ def test_what_a_run_does_not_have_is_said(run: Run) -> None:
         with pytest.raises(ArgumentError, match=f"step cloud gave no 'cloud', it {how}: no file"):
             other.payload("cloud", "cloud")
     with pytest.raises(
-        RecordError, match=r"names cloud\.cloud only by its digest: it is in the st"
+        RecordError, match=r"contains only the digest of cloud\.cloud; to embed all"
     ):
         run.payload("cloud", "cloud")
     with pytest.raises(ArgumentError, match="has no step 'roof'; it has cloud, "):

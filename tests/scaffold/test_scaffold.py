@@ -209,7 +209,7 @@ PARTS = {"kind": "part", "product": "parts", "takes": ("cloud",)}
     [
         ({**PARTS, "kind": "plane"}, "kind plane is announced by an installed plugin already"),
         ({**PARTS, "kind": "my-parts"}, "lower-case letters, digits and underscores, got 'my-par"),
-        ({**PARTS, "product": "planes"}, "product planes is announced already"),
+        ({**PARTS, "product": "planes"}, "product planes is already registered"),
         ({**PARTS, "takes": ("clouds",)}, r"no product type clouds \(did you mean cloud\?\)"),
         ({"name": "My Detector"}, "a plugin's name must be 2 to 32 lower-case letters"),
         ({"name": "x"}, "a plugin's name must be 2 to 32 lower-case letters"),

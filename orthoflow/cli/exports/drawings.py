@@ -92,7 +92,7 @@ def export_relief(run: Run, folder: Path, chosen: Choices) -> str:
         write_depth_figure(depth, frame, Path(f"{stem}_relief.png"), light)
         interval_m = write_contours(depth, frame, Path(f"{stem}_contours.geojson"))
         intervals.append(f"{wall.name} {1e3 * interval_m:g} mm")
-    return f"{counted(len(walls), 'wall')}, contour lines every: {', '.join(intervals)}"
+    return f"{counted(len(walls), 'wall')}, contour intervals: {', '.join(intervals)}"
 
 
 def _light(text: str | None) -> Light:

@@ -84,7 +84,7 @@ def wall_picture(
 
 
 def filled_smoothly(values: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Interpolate NaN values, more coarsely with the distance from known values (push-pull)."""
+    """Interpolate NaN values, more coarsely the farther from known values (push-pull)."""
     import cv2
 
     known = np.isfinite(values)

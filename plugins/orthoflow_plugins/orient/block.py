@@ -47,8 +47,9 @@ _N_VALUES: Final = 12
 _COLUMNS: Final = {"cx": 2, "cy": 3, "k1": 4, "k2": 5, "p1": 6, "p2": 7}
 # COLMAP estimates fx and fy separately; this prior keeps their ratio fixed.
 _TIED_ASPECT: Final = 1e-5
-# An observation with this residual has no weight under a loss of this scale.
+# Pixel coordinate of dummy observations, far outside the photo.
 _FAR_PX: Final = -1e6
+# Scale of a robust loss under which they have no weight.
 _NOTHING: Final = 1e-9
 LENS_CONFUSED: Final = DiagnosticSpec(
     code="lens-correlated-with-pose",

@@ -381,7 +381,7 @@ class Candidate:
 
     @property
     def before_wall_m(self) -> float | None:
-        """Smallest distance in front of a wall that has control points and a known front."""
+        """Distance of the camera from the nearest wall with control points and a known side."""
         centre = self.estimate.resection.camera.centre_world
         used = self.walls[self.control]
         return min(

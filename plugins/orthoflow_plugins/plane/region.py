@@ -306,8 +306,8 @@ def region_proposer(
     Args:
         search: the search.
         params: parameters of the growth.
-        viewer_m: (3,) position that defines the sign of normals if only the normal counts, in the
-            cloud's offsets.
+        viewer_m: (3,) viewpoint that defines the sign of normals for `criterion: normal`, relative
+            to the cloud's origin.
     """
     from orthoflow_plugins.plane.voxels import surface_voxels
 

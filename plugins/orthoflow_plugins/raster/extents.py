@@ -47,8 +47,8 @@ _SEEDS_LEAST: Final = 4
 _COVERED_LEAST: Final = 0.2
 # Share of the outermost points that may be stray points.
 _STRAY_SHARE: Final = 0.02
-# Additional search depth: objects that extend into it, such as cornices of adjoining walls and
-# sides of furniture, have no front that a buffer could include.
+# Depth searched beyond the limit: an object that extends into it, such as a cornice of an adjoining
+# wall or the side of a piece of furniture, has no front within the limit.
 _BEYOND_MOST_M: Final = 0.1
 # An object farther in front of a wall and connected to it, such as a fountain on a facade, belongs
 # to the wall up to this distance if the part of the wall that only this object covers exceeds this

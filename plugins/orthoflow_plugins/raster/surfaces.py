@@ -50,8 +50,9 @@ _POINTS_AT_ONCE: Final = 1 << 26
 
 # Maximum distance of neighbours in rows and columns.
 _NEAR_CELLS: Final = 2
-# Minimum number of known neighbours for a decision; a cell with fewer agreeing ones is a speck.
+# Minimum number of known neighbours for a decision.
 _KNOWN_LEAST: Final = 6
+# A cell that agrees with fewer neighbours is a speck.
 _AGREEING_LEAST: Final = 2
 # For sparse cells, more neighbours are used, and more must agree: at least half of the known ones.
 _SPARSE_CELLS: Final = 4

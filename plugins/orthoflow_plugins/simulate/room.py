@@ -102,7 +102,7 @@ class SimulateRoom(Method):
             0.0015,
             ge=0.0,
             le=0.1,
-            description="Standard deviation of a distance at 3 m, square onto a plain wall.",
+            description="Standard deviation of a range at 3 m, normal to a plain wall.",
         )
         registration_error_m: float = Field(
             0.0,

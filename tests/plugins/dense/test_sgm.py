@@ -35,6 +35,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> SimulateRoom.Out:
 def matched(
     folder: Path, inputs: DenseSgm.In, **params: object
 ) -> tuple[PointCloud, dict[str, float]]:
+    folder.mkdir(exist_ok=True)
     ctx = scenes.context(folder)
     out = DenseSgm().run(inputs, DenseSgm.Params.model_validate({**NEAR_FAR, **params}), ctx)
     return out.cloud, {metric.name: metric.value for metric in ctx.metrics}
