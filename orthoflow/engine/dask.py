@@ -102,7 +102,7 @@ def run_attempt(task: Task, name: str, topic: str, retries: int, methods: str) -
 def describe_loss(who: str, times: int) -> str:
     """Return the error message for a task that was given up because workers were lost."""
     lost = "its worker was lost" if times == 1 else f"its workers were lost, {times} in a row"
-    return f"{who} was given up: {lost}; the logs of the workers may state why"
+    return f"{who} was given up: {lost}; see the logs of the workers"
 
 
 def _result(executor: LocalExecutor, home: Path, worker: Worker, name: str) -> CellResult:
@@ -312,8 +312,8 @@ class DaskExecutor:
     def _lost(self) -> ClusterError:
         who = f"of {self._address}" if self._address else "of this run"
         return ClusterError(
-            f"the scheduler or all workers {who} are gone; what is finished is kept, and the same "
-            f"command with the same -o goes on, with any executor"
+            f"the scheduler or all workers {who} were lost; finished steps are kept, and the same "
+            f"command with the same -o continues, with any executor"
         )
 
     # `Any`: the scheduler's description of its workers.
@@ -329,7 +329,7 @@ class DaskExecutor:
         while not (workers := self._workers()):
             if time.monotonic() - self._with_workers > _PATIENCE_S:
                 raise ArgumentError(
-                    f"--scheduler {self._address}: no worker there states how many cores it has; "
+                    f"--scheduler {self._address}: no worker there reports its number of cores; "
                     f"start workers with `dask worker {self._address} --resources {CORES}=N`"
                 )
             time.sleep(0.1)
@@ -350,12 +350,14 @@ class DaskExecutor:
             seen, wrong = answer
             if seen != word:
                 raise ArgumentError(
-                    f"worker {address} does not see the store {scratch.parent.parent} "
+                    f"worker {address} cannot access the store {scratch.parent.parent} "
                     f"({one_line(seen)}): give a --store on a file system that all workers "
-                    f"have at the same place"
+                    f"have mounted at the same path"
                 )
             if wrong:
-                raise PluginError(f"worker {address}: {wrong}; install there what the plan has")
+                raise PluginError(
+                    f"worker {address}: {wrong}; install the version of the plan there"
+                )
 
 
 def _client(address: str, capacity: Capacity) -> Client:

@@ -32,9 +32,7 @@ def is_broken(error: OSError, folder: Path) -> bool:
 def store_error(error: OSError, folder: Path) -> StoreError:
     """Convert an OSError into a StoreError of one sentence that contains the folder."""
     reason = error.strerror or str(error)
-    failure = StoreError(
-        f"cannot write to {folder}: {reason}; make that possible, or choose another folder"
-    )
+    failure = StoreError(f"cannot write to {folder}: {reason}; fix this, or choose another folder")
     failure.errno = error.errno
     return failure
 
@@ -203,8 +201,7 @@ def lock_file(path: Path, descriptor: int, *, is_shared: bool = False, waits: bo
         return False
     except OSError as error:
         raise StoreError(
-            f"cannot lock {path}: {error.strerror or error}; it must lie on a file system with "
-            "locks"
+            f"cannot lock {path}: {error.strerror or error}; it must be on a file system with locks"
         ) from error
     return True
 

@@ -64,8 +64,8 @@ class FileDigests:
         """
         if problem := name_problem(path.name):
             raise InputError(
-                f"the input file {path} has a name that {problem}, which other systems refuse: "
-                "rename it"
+                f"the input file {path} has a name that {problem}, which some systems do not "
+                "allow: rename it"
             )
         if text_of_path(path) is None:
             raise InputError(
@@ -73,7 +73,10 @@ class FileDigests:
             )
         try:
             if not stat.S_ISREG(path.stat().st_mode):
-                raise InputError(f"the input {path} is not a regular file, which can be read again")
+                raise InputError(
+                    f"the input {path} must be a regular file, because inputs are read "
+                    "more than once"
+                )
             identity = file_identity(path)
             known = self._known.get(identity)
             sha256 = known or file_sha256(path)

@@ -270,14 +270,14 @@ def kept_from_others(folder: Path) -> Iterator[None]:
 
 def _is_in_use(folder: Path) -> ArgumentError:
     return ArgumentError(
-        f"the run folder {folder} is in use by another run; wait for its end, or {_ANOTHER}"
+        f"the run folder {folder} is in use by another run; wait until it has ended, or {_ANOTHER}"
     )
 
 
 def _check_workflow(folder: Path, first: JournalLine, name: str) -> None:
     if first.workflow != name:
         raise ArgumentError(
-            f"{folder} holds an unfinished run of {first.workflow}, not of {name}; {_ANOTHER}"
+            f"{folder} contains an unfinished run of {first.workflow}, not of {name}; {_ANOTHER}"
         )
 
 
@@ -290,28 +290,26 @@ def readable_lines(folder: Path) -> list[JournalLine]:
 
 def _is_finished(folder: Path) -> ArgumentError:
     return ArgumentError(
-        f"{folder} holds a finished run ({RECORD_FILE}); {_ANOTHER}, or look at this one "
+        f"{folder} contains a finished run ({RECORD_FILE}); {_ANOTHER}, or view this one "
         "(orthoflow show, orthoflow.open_run)"
     )
 
 
 def _check_folder(folder: Path) -> None:
     if files := [place for place in (folder, *folder.parents) if place.is_file()]:
-        raise ArgumentError(
-            f"{folder} cannot be a folder, because {files[0]} is a file; {_ANOTHER}"
-        )
+        raise ArgumentError(f"{folder} cannot be created, because {files[0]} is a file; {_ANOTHER}")
     for path in folder.iterdir() if folder.is_dir() else ():
         if path.is_symlink() or not (path.is_file() or path.is_dir()):
             what = "a link" if path.is_symlink() else "a pipe or a device"
             raise ArgumentError(
-                f"{folder} holds {what}, {path.name}, as no run makes them; {_ANOTHER}"
+                f"{folder} contains {what}, {path.name}, which no run creates; {_ANOTHER}"
             )
     if (folder / RECORD_FILE).exists():
         raise _is_finished(folder)
     if not folder.is_dir():
         return
     if not (folder / JOURNAL).exists() and any(folder.iterdir()):
-        raise ArgumentError(f"{folder} is not empty and holds no unfinished run; {_ANOTHER}")
+        raise ArgumentError(f"{folder} is not empty and contains no unfinished run; {_ANOTHER}")
 
 
 def is_running(folder: Path) -> bool:
@@ -334,7 +332,7 @@ def new_run_folder(name: str, run_id: str) -> Path:
         return path_below(Path("runs"), f"{name}-{run_id}")
     except UnsafeFileError as error:
         raise RecordError(
-            f"the run cannot lie below runs/: {error}; name its folder with -o"
+            f"no folder can be created in runs/: {error}; choose a folder with -o"
         ) from error
 
 

@@ -205,7 +205,8 @@ def _tools(cls: type[Method]) -> dict[str, str]:
         raise
     except BaseException as error:
         raise PluginError(
-            f"method {cls.id} cannot state the versions of its libraries: {describe_error(error)}"
+            f"method {cls.id} failed to report the versions of its libraries: "
+            f"{describe_error(error)}"
         ) from error
 
 
@@ -334,7 +335,7 @@ def misfit(methods: str) -> str:
             if before != now:
                 return f"{name} has {what} {now} there, {before} in the plan"
         if planned[_CODE] != here[_CODE]:
-            return f"{name} has other code there"
+            return f"{name} has different code there"
     return ""
 
 

@@ -232,8 +232,8 @@ def start_process(
             else:
                 return process
     raise StepFailedError(
-        f"{one_line(failure) or type(failure).__name__}; close other programs, or raise the limits "
-        "of open files and processes (`ulimit`)"
+        f"{one_line(failure) or type(failure).__name__}; close other programs, or increase the "
+        "limits of open files and processes (`ulimit`)"
     ) from failure
 
 
@@ -509,20 +509,20 @@ def describe_exit(who: str, code: int, n_bytes: int, tail: str) -> str:
         return f"{who} ended its process without a result (exit status {code}){last}"
     kind = "was killed from outside" if -code in _FROM_OUTSIDE else "crashed"
     reason = signal.strsignal(-code) or f"signal {-code}"
-    return f"{who} {kind} ({reason.lower()}) while it held {n_bytes / GIB:.1f} GiB of memory"
+    return f"{who} {kind} ({reason.lower()}) while using {n_bytes / GIB:.1f} GiB of memory"
 
 
 def describe_memory(who: str, n_bytes: int) -> StepFailedError:
     """Return the error for a step that was stopped for lack of memory."""
     return StepFailedError(
         f"{who} needed more memory than the machine has ({n_bytes / GIB:.1f} GiB when "
-        f"stopped); give it less data or coarser parameters"
+        f"stopped); use less data or coarser parameters"
     )
 
 
 def describe_timeout(who: str, limit_s: float) -> StepFailedError:
     """Return the error for a step that exceeded its timeout."""
-    return StepFailedError(f"{who} ran past its timeout of {duration(limit_s)} and was stopped")
+    return StepFailedError(f"{who} exceeded its timeout of {duration(limit_s)} and was stopped")
 
 
 def duration(seconds: float) -> str:

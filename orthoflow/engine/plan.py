@@ -211,7 +211,7 @@ def _require_distinct(
                 if first != file.path:
                     raise InputError(
                         f"the input of {cell.step}.{port}: {first} and {file.path} have the same "
-                        "content, which would count twice; leave one of them out"
+                        "content, which would be counted twice; remove one of them"
                     )
 
 
@@ -262,7 +262,7 @@ class _Planner:
             planned = replace(planned, status="will run", reason=_FORCED)
         elif planned.status == "unknown yet" and took_s is None:
             # If a method has no results in the store, none can be found whatever its inputs are.
-            reason = "no result of its method is stored"
+            reason = "no result of this method is stored"
             planned = replace(planned, status="will run", reason=reason)
         self.planned[cell.address] = replace(planned, took_s=took_s)
 
@@ -354,7 +354,7 @@ def _product_targets(
         entry = catalog.products.get(type_name)
         if entry is None or entry.state != "fine":
             raise PluginError(
-                entry.problem if entry else f"no installed plugin brings the product {type_name}"
+                entry.problem if entry else f"no installed plugin provides the product {type_name}"
             )
         targets[type_name] = ProductTarget(
             type_name=type_name,
@@ -383,7 +383,7 @@ def explain(key: CellKey, earlier: Sequence[CellResult]) -> str:
     )
     changes = _changed(before, now)
     if not changes:
-        return "its key is made in another way than before"
+        return "the composition of its key has changed"
     named = list(dict.fromkeys(_sentence(name, before, now) for name in changes))
     return first_few(named, most=_MOST_NAMED)
 

@@ -64,7 +64,7 @@ _CODE_CHANGED: Final = DiagnosticSpec(
 _STORED_RESULT_DAMAGED: Final = DiagnosticSpec(
     code="stored-result-damaged",
     severity="warning",
-    text="the stored result was damaged ({damage}) and is computed again",
+    text="the stored result was damaged ({damage}) and is recomputed",
 )
 
 
@@ -306,7 +306,7 @@ class _Run:
         """Check all bytes of the products that a cell uses; remove damaged ones."""
         for port, ref in refs.items():
             if isinstance(cell.inputs[port], CellOutput) and not self._store.is_sound(ref.digest):
-                raise DamageError(f"{cell.inputs[port]}, which {cell.address} takes, was damaged")
+                raise DamageError(f"{cell.inputs[port]}, which {cell.address} uses, was damaged")
 
     def _is_under_way(self, key: CellKey) -> bool:
         """Whether a cell with the same key is running; both then share its result."""

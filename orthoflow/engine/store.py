@@ -94,9 +94,9 @@ def require_store(folder: Path) -> None:
         foreign = sorted(name for name in names if name[0] != "." and name not in _OURS)
     if foreign:
         raise ArgumentError(
-            f"{folder} is not a store of orthoflow: it holds {foreign[0]}"
-            f"{f' and {len(foreign) - 1} more' if foreign[1:] else ''}; name a store, or a folder "
-            "that is empty or not there yet, with --store"
+            f"{folder} is not a store of orthoflow: it contains {foreign[0]}"
+            f"{f' and {len(foreign) - 1} more' if foreign[1:] else ''}; give a store, or a folder "
+            "that is empty or does not exist yet, with --store"
         )
 
 
@@ -254,7 +254,7 @@ class Store:
         if not path.exists():
             raise DamageError(f"the store {self.folder} has no product {digest}")
         what = f"the stored product {digest[:19]} in {self.folder}"
-        damaged = f"{what} was damaged; run again to compute it again"
+        damaged = f"{what} was damaged; run again to recompute it"
         if not is_checked and not self.is_sound(digest):
             raise DamageError(damaged)
         try:
@@ -280,7 +280,7 @@ class Store:
         folder = self._object(digest)
         found = _read_description(folder)
         if found is None:
-            raise DamageError(f"the store {self.folder} has no sound product {digest}")
+            raise DamageError(f"the store {self.folder} has no intact product {digest}")
         files = sorted(found.files.items())
         return {folder / name: sha256 for name, (_, sha256) in files if _is_published(name)}
 

@@ -332,7 +332,7 @@ def explain_failure(task: Task, error: BaseException) -> OrthoflowError:
         return error
     if is_for_want_of_memory(error):
         return StepFailedError(
-            f"{task.who} needed more memory than it could get: "
+            f"{task.who} needed more memory than was available: "
             f"{one_line(error) or 'an allocation failed'}"
         )
     if isinstance(error, ImportError):
@@ -344,7 +344,7 @@ def explain_failure(task: Task, error: BaseException) -> OrthoflowError:
         return refused
     if isinstance(error, ValueError) and "read-only" in one_line(error):
         return MethodError(
-            f"{task.who} writes to an array that is read-only, as all its inputs are ({error}); it "
+            f"{task.who} writes to a read-only array, probably one of its inputs ({error}); it "
             f"must work on a copy"
         )
     reason = f"failed unexpectedly: {type(error).__name__}: {one_line(error)}".removesuffix(": ")
@@ -459,7 +459,7 @@ class _Call:
             # Thread clocks can be a few ticks ahead of their process's clock.
             self._processor_s = max(0.0, round(self._cpu_s() - cpu_s - drawing_cpu_s, 4))
         # Do not use `progress`, which checks for cancellation: a finished step has a result.
-        self._context.listen(StepEvent(kind="progress", text="keeping the results", fraction=1.0))
+        self._context.listen(StepEvent(kind="progress", text="storing the results", fraction=1.0))
         for given in self.task.inputs.values():
             for file in given.files:
                 _check_file(file)
@@ -514,7 +514,7 @@ class _Call:
             try:
                 product.check_against(others | given)
             except ProductError as error:
-                raise MethodError(f"{self.task.who} gives impossible {port}: {error}") from error
+                raise MethodError(f"{self.task.who} returns an invalid {port}: {error}") from error
         return products
 
     def _keep(self, products: Mapping[str, Product]) -> dict[str, ProductRef]:
@@ -561,7 +561,7 @@ def _check_file(file: FileRef) -> None:
         is_same = file_identity(path) == file.identity or file_sha256(path) == file.sha256
     except OSError as error:
         raise InputError(
-            f"the input file {path} cannot be read any more: {error.strerror}"
+            f"the input file {path} can no longer be read: {error.strerror}"
         ) from error
     if not is_same:
         raise InputError(f"the input file {path} changed while it was read; run again")

@@ -45,7 +45,7 @@ from orthoflow.records.verify import SIGNATURE_SUFFIX, page_of
 from orthoflow.version import DISTRIBUTION
 
 Entity: TypeAlias = dict[str, JsonValue]
-NO_LICENSE: Final = "not stated: ask who made these results"
+NO_LICENSE: Final = "not specified: ask the author of these results"
 METADATA_FILE: Final = "ro-crate-metadata.json"
 WORKFLOW_FILE: Final = "workflow.yaml"
 RESOLVED_FILE: Final = "workflow-resolved.json"
@@ -301,13 +301,13 @@ def _add_run(crate: _Crate, record: RunRecord, files: list[str], license_text: s
     for profile, name in _PROFILES.items():
         crate.add(profile, "CreativeWork", name=name, version=profile.rpartition("/")[2])
     options = " ".join(record.overrides)
-    note = f"ran with {options}" if options else "ran as it stands"
+    note = f"ran with {options}" if options else "ran unchanged"
     crate.add(
         WORKFLOW_FILE,
         ["File", "SoftwareSourceCode", "ComputationalWorkflow", "HowTo"],
         name=record.name,
-        description=f"The workflow as its author wrote it; it {note}. {RESOLVED_FILE} has what "
-        "ran, with every parameter.",
+        description=f"The workflow as written by its author; it {note}. {RESOLVED_FILE} is the "
+        "workflow that ran, with all parameters.",
         version=record.created_by,
         encodingFormat="text/yaml",
         conformsTo=_ref(_BIOSCHEMAS),
@@ -350,8 +350,8 @@ def _add_run(crate: _Crate, record: RunRecord, files: list[str], license_text: s
         "SoftwareApplication",
         name=name,
         softwareVersion=version,
-        description=f"Python package: pip install {DISTRIBUTION}=={version}, or, where no index "
-        "has that version, of its wheel or sources, which those who made this crate have",
+        description=f"Python package: pip install {DISTRIBUTION}=={version}; if no index "
+        "has that version, ask the authors of this crate for its wheel or sources",
     )
 
 
@@ -436,8 +436,9 @@ def _add_cell(
         owner, _, name = product.source.rpartition(".")
         if owner != "inputs" and product.source not in given:
             raise RecordError(
-                f"the record states that {product.source} was taken, which no step that ran gave: "
-                "`orthoflow verify` reports what else does not fit"
+                f"according to the record, {product.source} was used, but no executed step made "
+                f"it: "
+                "`orthoflow verify` reports other contradictions"
             )
         source = f"{WORKFLOW_FILE}#inputs/{name}" if owner == "inputs" else given[product.source]
         target = f"{tool}/{port}"
@@ -560,9 +561,9 @@ def _how_to_read(record: RunRecord) -> str:
     """Return instructions for reading the record and checking the files of the crate."""
     version = record.created_by.partition(" ")[2]
     given = [entry.embedded for entry in record.inputs if entry.files]
-    source = "the input files" if given else "it alone"
+    source = "the input files" if given else "the record alone"
     if given and all(given):
-        source += ", which lie in it"
+        source += ", which are embedded in it"
     return (
         f"With the Python package {DISTRIBUTION} {version} (of an index, or its wheel from those "
         f"who made this crate) `orthoflow verify {RECORD_FILE}` in "

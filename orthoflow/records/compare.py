@@ -148,7 +148,7 @@ def _distance(
         right=digests[1],
     )
     if not all(digests):
-        return distance(verdict="different", reason="only one of the runs has it")
+        return distance(verdict="different", reason="it exists in only one of the runs")
     if digests[0] == digests[1]:
         return distance(verdict="identical")
     try:
@@ -158,7 +158,7 @@ def _distance(
         return distance(verdict="not measured", reason=f"the digests differ, and {error}")
     if ours is None or theirs is None:
         reason = (
-            "the digests differ, and its arrays are in no record and no store at hand; run with "
+            "the digests differ, and its arrays are in no record or available store; run with "
             "--embed to keep them"
         )
         return distance(verdict="not measured", reason=reason)
@@ -273,7 +273,7 @@ class Pair(Generic[Side]):
         """The value of the first run or, if there is none, of the second."""
         side = self.right if self.left is None else self.left
         if side is None:
-            raise AssertionError("a pair stands for something that a run has")
+            raise AssertionError("at least one run must have a value")
         return side
 
 
@@ -440,7 +440,7 @@ class RunComparison:
         verdicts = Counter(item.verdict for item in self.products)
         parts.append(f"{verdicts['different']} of {len(self.products)} products differ")
         parts.append(f"{verdicts['not measured']} products not measured")
-        parts.append(f"{sum(not row.is_shared for row in self.cells)} steps in one run only")
+        parts.append(f"{sum(not row.is_shared for row in self.cells)} steps only in one run")
         runs = f"{self.left.run_id!r} and {self.right.run_id!r}"
         return f"<RunComparison of {runs}: {', '.join(parts)}>"
 

@@ -218,16 +218,16 @@ def _problem(name: str, file: RecordedFile, rival: Path | None, given: tuple[Pat
     expected = f"{file.size_bytes} bytes with the {digest}"
     if rival is not None:
         return (
-            f"input {name}: {rival} is not the {file.name} of the record: it was changed "
+            f"input {name}: {rival} differs from the recorded {file.name}: it was changed "
             f"(expected {expected})"
         )
     if given:
         return (
-            f"input {name}: {file.name} of the record is not among what was given, "
+            f"input {name}: the recorded {file.name} is not among the given files, "
             f"{first_few([str(path) for path in given])} (expected {expected}, under any name)"
         )
     return (
-        f"input {name}: {file.name} ({file.size_bytes} bytes, {digest}) is not to be found; give it"
+        f"input {name}: {file.name} ({file.size_bytes} bytes, {digest}) was not found; give it"
         f" with --input {name}=PATH"
     )
 

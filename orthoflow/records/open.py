@@ -77,7 +77,7 @@ def open_unfinished(folder: Path, *, publish: bool = False) -> Run:
         sources, embedded = content["sources"], frozenset(content["embedded"])
     except (OSError, RecordFormatError, KeyError, TypeError) as error:
         raise ArgumentError(
-            f"{folder} holds a run that is not finished, and what it has so far cannot be read: "
+            f"{folder} contains an unfinished run, whose results so far cannot be read: "
             f"{error}; repeat the run with -o {folder} to finish it"
         ) from error
     lines = readable_lines(folder)

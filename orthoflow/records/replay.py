@@ -160,7 +160,7 @@ def _inconsistencies(run: Run) -> Iterator[str]:
     for cell in run.record.cells:
         for port, product in cell.inputs.items():
             if files.get(product.source, product.digest) != product.digest:
-                yield f"{cell.address}: {port} is not made of the files of {product.source}"
+                yield f"{cell.address}: {port} does not match the files of {product.source}"
         if not cell.key_preimage:
             continue
         preimage = read_preimage(cell.key_preimage)
@@ -176,7 +176,7 @@ def _inconsistencies(run: Run) -> Iterator[str]:
         }
         for name, value in stated.items():
             if preimage.get(name) != value:
-                yield f"{cell.address}: {name} is not what its key was made from"
+                yield f"{cell.address}: {name} does not match its key"
 
 
 def _loose_ends(run: Run) -> Iterator[str]:
@@ -188,7 +188,7 @@ def _loose_ends(run: Run) -> Iterator[str]:
             # A skipped cell may lack an output of an upstream cell, which is why it was skipped.
             is_lacking = cell.status == "skipped" and owner != "inputs" and owner in given
             if not is_lacking and name not in given.get(owner, ()):
-                yield f"{cell.address}: nothing before it gives {product.source!r}, its {port}"
+                yield f"{cell.address}: no earlier step outputs {product.source!r}, its {port}"
         given.setdefault(cell.address, set(cell.outputs))
 
 
@@ -211,7 +211,7 @@ def _method_problems(run: Run, catalog: Catalog) -> tuple[tuple[str, ...], tuple
 def _differences(cell: RecordedCell, catalog: Catalog, origin: str) -> Iterator[str]:
     """Yield differences between an installed and a recorded method that prevent a replay."""
     if cell.seed is not None and cell.seed < 0:
-        yield f"step {cell.address}: a seed is not negative, got {cell.seed}"
+        yield f"step {cell.address}: the seed must not be negative, got {cell.seed}"
     cls = catalog.method(cell.method).load()
     for product in cell.outputs.values():
         found = catalog.product_class(product.type_name).encoding_version
@@ -282,7 +282,7 @@ def _changes(run: Run, plan: RunPlan) -> tuple[frozenset[str], tuple[str, ...]]:
         if stated_versions(preimage, "code") != dict(facts.code):
             changed.add(cell.method)
             notes.append(
-                f"{cell.method}: its code is not that of the record, though both state result "
+                f"{cell.method}: its code differs from the record, although both have result "
                 f"version {cell.result_version}"
             )
         recorded_tools = stated_versions(preimage, "tools")

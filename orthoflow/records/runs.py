@@ -195,7 +195,7 @@ def require_unchanged(run: Run, *paths: Path) -> None:
         expected = known.get(path.relative_to(run.folder).as_posix())
         if expected is None:
             raise RecordError(
-                f"{path} is not named in the record of the run, so it cannot be checked"
+                f"{path} is not listed in the record of the run, so it cannot be checked"
             )
         state = published_state(run.folder, expected)
         if state == "changed":
@@ -395,7 +395,7 @@ class Run:
         if not outputs and cell.error_message:
             how = "failed" if cell.status == "failed" else "was skipped"
             raise ArgumentError(
-                f"the step {address} gave no {port!r}, it {how}: {cell.error_message}"
+                f"the step {address} has no {port!r}, because it {how}: {cell.error_message}"
             )
         if port not in outputs:
             raise ArgumentError(
@@ -430,7 +430,7 @@ class Run:
             cls = discover_catalog().product_class(payload.type_name)
         except PluginError as error:
             raise PluginError(
-                f"{error}; payload({address!r}, {port!r}) gives its arrays without one"
+                f"{error}; payload({address!r}, {port!r}) gives its arrays without the plugin"
             ) from error
         return cls.from_payload(payload)
 
@@ -488,10 +488,10 @@ def find_record(path: str | Path) -> Path:
             return inside
         if is_running(given):
             raise ArgumentError(
-                f"{given} holds no {RECORD_FILE} yet: its run has not ended yet; wait for it"
+                f"{given} contains no {RECORD_FILE} yet: its run has not ended yet; wait for it"
             )
         raise ArgumentError(
-            f"{given} holds no {RECORD_FILE}: it is not a run folder, or its run was not finished; "
+            f"{given} contains no {RECORD_FILE}: it is not a run folder, or its run is unfinished; "
             f"repeat the run with -o {given} to finish it"
         )
     if not given.exists():
@@ -563,9 +563,9 @@ def figure_files(run: Run, addresses: Iterable[str]) -> Mapping[str, RecordedFig
             if sentence := name_problem(figure.name) or path_problem(path):
                 problems.append(f"the figure {figure.name!r} of {address} {sentence}")
     if twice := colliding(path for path, _ in named):
-        problems.append(f"two figures are named {twice!r}, as some systems see it")
+        problems.append(f"two figures have names that some systems treat as the same, {twice!r}")
     if problems:
-        raise RecordError(f"{run.path}: {problems[0]}, so no file can be written for it")
+        raise RecordError(f"{run.path}: {problems[0]}, so its file cannot be written")
     return dict(named)
 
 
@@ -664,7 +664,9 @@ def _check_size(path: Path, found: os.stat_result, expected: PublishedFile | Non
         )
     # A copy of a sparse file of a terabyte would fill the disk.
     if found.st_size > _ALWAYS_COPIED_BYTES and found.st_size > 8 * 512 * found.st_blocks:
-        raise RecordError(f"{path} claims {found.st_size} bytes, but most of it is a hole")
+        raise RecordError(
+            f"{path} has {found.st_size} bytes, but most of them are not stored (a sparse file)"
+        )
 
 
 def _suffix(run: Run, figure: RecordedFigure) -> str:

@@ -96,7 +96,7 @@ def sign_record(path: Path, key_file: Path, password: Callable[[], str]) -> Sign
     public_key = _openssh(key.public_key())
     if earlier is not None and earlier.public_key != public_key:
         raise ArgumentError(
-            f"beside {path} there is a signature already, which names the key "
+            f"there is already a signature next to {path}, with the key "
             f"{earlier.fingerprint}: remove {path.name}{SIGNATURE_SUFFIX} to sign with another"
         )
     content_sha256 = read_run(path).content_sha256
@@ -140,13 +140,13 @@ def check_signature(record: Path, signer: Path) -> Signature:
     found = read_signature(record)
     if found is None:
         raise RecordError(
-            f"{record.name} is not signed: there is no {record.name}{SIGNATURE_SUFFIX} beside it"
+            f"{record.name} is not signed: there is no {record.name}{SIGNATURE_SUFFIX} next to it"
         )
     wanted = _openssh(key)
     if found.public_key != wanted:
         raise RecordError(
-            f"the signature beside {record.name} names the key {found.fingerprint}, "
-            f"not of {_fingerprint(wanted)} in {signer}"
+            f"the signature of {record.name} was made with the key {found.fingerprint}, "
+            f"not with {_fingerprint(wanted)} in {signer}"
         )
     from cryptography.exceptions import InvalidSignature  # noqa: PLC0415 - only those who sign
 
@@ -155,7 +155,7 @@ def check_signature(record: Path, signer: Path) -> Signature:
         key.verify(base64.b64decode(found.signature, validate=True), message)
     except (InvalidSignature, binascii.Error) as error:
         raise RecordError(
-            f"the signature beside {record.name} does not fit it: it is another record's, or "
+            f"the signature does not match {record.name}: it belongs to another record, or "
             "was changed"
         ) from error
     return found
@@ -170,7 +170,7 @@ def _fingerprint(public_key: str) -> str:
     try:
         blob = base64.b64decode(public_key.split()[1], validate=True)
     except (IndexError, binascii.Error):
-        return "of no known form"
+        return "of unknown format"
     return f"SHA256:{base64.b64encode(hashlib.sha256(blob).digest()).decode('ascii').rstrip('=')}"
 
 
@@ -199,7 +199,7 @@ def _private_key(path: Path, password: Callable[[], str]) -> Ed25519PrivateKey:
             # The key is protected; an empty password would be treated as no password.
             key = load(data, password=password().encode("utf-8") or b"\0")
     if not isinstance(key, ed25519.Ed25519PrivateKey):
-        raise InputError(f"{path} must be an Ed25519 key; `ssh-keygen -t ed25519` makes one")
+        raise InputError(f"{path} must be an Ed25519 key; create one with `ssh-keygen -t ed25519`")
     return key
 
 
@@ -211,7 +211,7 @@ def _public_key(path: Path) -> Ed25519PublicKey:
     with _key_errors(path, "public", "{}; the signer's file ends with .pub"):
         key = serialization.load_ssh_public_key(data)
     if not isinstance(key, ed25519.Ed25519PublicKey):
-        raise InputError(f"{path} must be an Ed25519 key, as records are signed with these")
+        raise InputError(f"{path} must be an Ed25519 key, the only type used for signatures")
     return key
 
 
@@ -253,7 +253,7 @@ _LARGEST_PAGE_BYTES: Final = 1 << 30
 _WRONG: Final[dict[PublishedState, str]] = {
     "changed": "changed since it was published",
     "unreadable": "unreadable since it was published",
-    "no file": "a link, a folder or a device stands where a file was published; it was not read",
+    "no file": "a link, a folder or a device in place of the published file, so it was not read",
 }
 
 
@@ -346,10 +346,10 @@ def verify_run(
             record_path, record, [file.path for file, state in checked if state == "missing"]
         )
     beside = [
-        *(["its signature is not the one asked for"] if unsigned else []),
-        *(["published files beside it are not as they were written"] if changed else []),
+        *(["its signature is not from the given signer"] if unsigned else []),
+        *(["published files next to it were changed"] if changed else []),
     ]
-    wrong = f"the seal of {record_path} holds, but {' and '.join(beside)}" if beside else ""
+    wrong = f"the seal of {record_path} is intact, but {' and '.join(beside)}" if beside else ""
     products = [product for cell in record.cells for product in cell.outputs.values()]
     n_products = sum(product.embedded for product in products)
     return Verification(
@@ -388,7 +388,7 @@ def _contradictions(opened: OpenRecord, cell: RecordedCell) -> Iterator[str]:
             values = first_few([f"{value:g} {unit}" for value, unit in sorted(stated[name])])
             yield (
                 f"/cells/{cell.address}: the metric {metric.name} is {metric.value:g} "
-                f"{metric.unit}, its inspection has {values}"
+                f"{metric.unit}, but its inspection contains {values}"
             )
 
 
@@ -429,7 +429,7 @@ def _is_own_page(folder: Path, name: str, content_sha256: str) -> bool:
 def _page_note(folder: Path, name: str) -> Note:
     text = (
         f"{name} does not show this record, or was changed since it was written; `orthoflow report "
-        f"{shlex.quote(str(folder))}` makes it again"
+        f"{shlex.quote(str(folder))}` recreates it"
     )
     return Note(code="page", text=text)
 
@@ -459,8 +459,8 @@ def _check_signature(record: Path, signer: Path | None) -> tuple[str, list[str],
         if (found := read_signature(record)) is None:
             return "", [], []
         text = (
-            f"there is a signature, which names the key {found.fingerprint}, that was not "
-            "checked: name the signer's public key with --signer"
+            f"there is a signature with the key {found.fingerprint}, which was not "
+            "checked: give the signer's public key with --signer"
         )
     except RecordError as error:
         if signer is not None:
@@ -478,7 +478,7 @@ def _published_notes(path: Path, record: RunRecord, missing: list[str]) -> Itera
             f"{first_few(missing)}"
         )
         if len(missing) == n_published:
-            text = f"the {n_published} published files of the record are not beside it, so they "
+            text = f"the {n_published} published files of the record are not next to it, so they "
             text += "were not checked"
         yield Note(code="missing", text=text)
         if len(missing) == n_published:
@@ -487,7 +487,7 @@ def _published_notes(path: Path, record: RunRecord, missing: list[str]) -> Itera
     if unnamed := _unnamed(path, record):
         rest = first_few(unnamed)
         yield Note(
-            code="foreign", text=f"the record does not name {rest}, among its published files"
+            code="foreign", text=f"the record does not list {rest}, found among its published files"
         )
 
 

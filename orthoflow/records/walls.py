@@ -217,10 +217,10 @@ def uncounted_points(run: Run) -> UncountedPoints | None:
         return None
     n_points = len(CheckPoints.from_payload(run.payload(*place)).names)
     were = "check point was" if n_points == 1 else "check points were"
-    why = looking[0][0].error_message if looking else "no step has looked for them"
+    why = looking[0][0].error_message if looking else "no step used them"
     return UncountedPoints(
         cell=looking[0][0].address if looking else "",
-        sentence=f"though {n_points} {were} given: {why}",
+        sentence=f"although {n_points} {were} given: {why}",
     )
 
 
@@ -254,7 +254,7 @@ def room_results(run: Run, cell: str | None = None, wall: int | None = None) -> 
                 files.setdefault(int(found[1]), {})[found[2]] = path
     if not files:
         raise ArgumentError(
-            f"no rasters of walls lie beside {run.path}, below {run.products_folder}: pass the "
+            f"no rasters of walls were found for {run.path} in {run.products_folder}: pass the "
             "unmodified run folder"
         )
     planes = _upstream_product(run, upstream, "planes")
@@ -299,8 +299,8 @@ def _require_orthoimages(run: Run, address: str, wall: int | None) -> None:
         is_wanted = kind == "ortho" and wall in {None, number}
         if is_wanted and not (run.folder / path).exists():
             raise RecordError(
-                f"{path} is gone from {run.folder}, where the run left it: copy it back, or "
-                f"make it again with `orthoflow replay {shlex.quote(str(run.path))} -o NEW`"
+                f"{path} is missing in {run.folder}, where the run published it: copy it back, or "
+                f"recreate it with `orthoflow replay {shlex.quote(str(run.path))} -o NEW`"
             )
 
 
@@ -340,7 +340,7 @@ def _pictured(run: Run, cell: str | None) -> str:
     everything = [*found["orthoimages"], *found["walls"]]
     if cell not in everything:
         raise ArgumentError(
-            f"the step {cell} holds no orthoimages or walls; those of this run: "
+            f"the step {cell} has no orthoimages or walls; steps of this run that have: "
             f"{', '.join(everything) or 'none'}"
         )
     return cell

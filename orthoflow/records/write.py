@@ -295,7 +295,7 @@ def write_run(
         if result.error_type in (StoreError.__name__, DamageError.__name__):
             raise StoreError(
                 f"{address} failed: {result.error_message}; finished steps are kept, and "
-                f"the same command with -o {run_folder} goes on from there"
+                f"the same command with -o {run_folder} continues from there"
             )
     try:
         with kept_from_others(run_folder):
@@ -316,8 +316,8 @@ def write_run(
         if not damaged and not isinstance(error, DamageError):
             raise
         raise DamageError(
-            f"the store {store.folder} does not hold any more what the record needs ({error}); the "
-            f"same command with -o {run_folder} computes it again"
+            f"the store {store.folder} has lost data that the record needs ({error}); the "
+            f"same command with -o {run_folder} recomputes it"
         ) from error
 
 
@@ -512,7 +512,7 @@ def write_embedded(run: Run, path: Path, store: Store, inputs: Sequence[str] = (
     if missing:
         raise ArgumentError(
             f"neither the record {run.path} nor the store {store.folder} has "
-            f"{first_few(missing)}: name the store of the run with --store, or replay the run"
+            f"{first_few(missing)}: give the store of the run with --store, or replay the run"
         )
     whole = tuple(
         dataclasses.replace(entry, embedded=bool(entry.files)) for entry in run.record.inputs
@@ -645,8 +645,8 @@ def with_files(run: Run, report: Callable[[str], None] = lambda _: None) -> Iter
         folder.mkdir()
         made = publish_products(folder, run.record.cells, files_of, run.record.run_id)
         report(
-            f"{run.path} stands alone: its rasters are made again from the products in it, and "
-            "other files that were published are left out"
+            f"{run.path} has no files next to it: its rasters are recreated from its products, and "
+            "other published files are omitted"
         )
         record = replace(run.record, published=made)
         yield replace(opened, record=record, files_folder=folder)

@@ -121,7 +121,7 @@ def _check_required(step: DraftStep, log: ProblemLog) -> None:
                 log.report(
                     (*call.location, "use"),
                     f"{call.id} needs port {needed.name}, {_article(needed.type_name)}, "
-                    "which is not wired",
+                    "which is not connected",
                     shown=(*step.location, "in"),
                 )
 
@@ -230,7 +230,7 @@ def _check_baseline(comparison: Comparison, log: ProblemLog) -> None:
             listed = ", ".join(f"{step}: {variant}" for step, variant in combination.items())
             log.report(
                 ("compare",),
-                f"the baseline contains the excluded combination {{{listed}}}; name another "
+                f"the baseline contains the excluded combination {{{listed}}}; choose another "
                 "baseline",
                 at_key=True,
                 shown=("compare", "exclude"),
@@ -330,8 +330,8 @@ def _metric_problem(pattern: str, steps: Sequence[DraftStep], step_names: Sequen
     if lacking and all(lacking):
         ports = " and ".join(lacking[0])
         return (
-            f"step {names} reports {metric} only with {ports} wired; wire that under in:, or take "
-            "the metric out"
+            f"step {names} reports {metric} only if {ports} is connected; connect it under in:, or "
+            "remove the metric"
         )
     if matching:
         return ""
@@ -381,10 +381,10 @@ def _idle_inputs(workflow: Workflow) -> Iterator[str]:
     }
     for name in workflow.inputs:
         if name not in taken:
-            yield f"no step takes the input {name}: wire it as inputs.{name}, or remove it"
+            yield f"no step uses the input {name}: connect it as inputs.{name}, or remove it"
     is_idle = not workflow.data_calls and workflow.data_inputs.isdisjoint(taken)
     if workflow.datasets and is_idle and not workflow.has_data_seeds:
-        yield "the datasets change nothing: they name no input that a step takes, and no parameter"
+        yield "the datasets have no effect: they set no parameter, and no input that a step uses"
 
 
 def _cell_sizes(workflow: Workflow) -> Iterator[str]:
@@ -395,9 +395,9 @@ def _cell_sizes(workflow: Workflow) -> Iterator[str]:
             meant_m = gsd_m / _MILLIMETRES
             hint = ""
             if _MIN_GSD_M <= meant_m <= _MAX_GSD_M:
-                hint = f"; {gsd_m:g} mm are written {_GSD}: {meant_m:g}"
+                hint = f"; for {gsd_m:g} mm write {_GSD}: {meant_m:g}"
             yield (
-                f"{place}{whose} is {gsd_m:g} m, which can hardly be meant: cells are "
+                f"{place}{whose} is {gsd_m:g} m, which is implausible: cells are "
                 f"{_MIN_GSD_M:g} to {_MAX_GSD_M:g} m wide{hint}"
             )
 
@@ -419,9 +419,9 @@ def _cropped_matching(workflow: Workflow) -> Iterator[str]:
     for first in matching[:1]:
         for wall in cropped.intersection(first.upstream()):
             yield (
-                f"{wall}.{_CROP} leaves {first.name} less to match photos to: fewer are oriented, "
-                "and less well; run without it first, and hand on the cameras which that run "
-                "found: --input cameras=RUN/products/orient/cameras.json"
+                f"{wall}.{_CROP} leaves a smaller area for {first.name}, so fewer photos are "
+                "oriented, and less accurately; run without it first, and use the cameras of that "
+                "run: --input cameras=RUN/products/orient/cameras.json"
             )
 
 

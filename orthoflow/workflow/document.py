@@ -90,7 +90,7 @@ def load_workflow(  # noqa: PLR0913 - an argument for each option of the command
     log = ProblemLog(file=str(name_or_path), lines=tuple(source.splitlines()))
     if not _is_mapping(log, source):
         log.raise_any()
-        raise WorkflowError(f"{name_or_path} holds no workflow")
+        raise WorkflowError(f"{name_or_path} is empty; expected a workflow")
     for key, needed in (
         ("orthoflow", "a workflow begins with orthoflow: 1"),
         (_STEPS, "a workflow needs the key steps"),
@@ -129,7 +129,7 @@ def _sections(log: ProblemLog) -> WorkflowFile:
 def _read_profile(path: Path, log: ProblemLog) -> ProblemLog:
     """Read a settings file given with `--set-file`."""
     try:
-        text = read_text(path, "a file of parameters")
+        text = read_text(path, "a settings file")
     except WorkflowError as error:
         log.report_option(f"--set-file {path}", str(error))
         text = "{}"
@@ -257,7 +257,9 @@ class _Reader:
         for name, section in sections.items():
             location = (_STEPS, name)
             if name == INPUTS:
-                message = "a step cannot be called inputs, which names files"
+                message = (
+                    "a step cannot be called inputs, because inputs.NAME refers to input files"
+                )
                 self.log.report(location, message, at_key=True)
                 continue
             is_varied = section.variants is not None
@@ -289,19 +291,22 @@ class _Reader:
             if call.kind is None:
                 continue
             if call.kind.is_source:
-                message = f"{call.id} is a source, and sources take no variants; give it a step"
+                message = (
+                    f"{call.id} is a source, and sources cannot have variants; make it a separate "
+                    "step"
+                )
                 self.log.report((*call.location, "use"), message)
             elif call.kind.name != kinds[0]:
                 message = (
-                    "variants of a step must be of one kind, got "
-                    f"{call.kind.name} beside {kinds[0]}"
+                    "all variants of a step must have the same kind, got "
+                    f"{call.kind.name} and {kinds[0]}"
                 )
                 self.log.report((*call.location, "use"), message)
         return tuple(calls)
 
     def _call(self, name: str, call: CallSection, location: Location) -> DraftCall:
         if self.log.get((*location, "use")) is None:
-            message = "needs the key use, a method such as plane.hough2d"
+            message = "the key use is missing; it selects a method, such as plane.hough2d"
             self.log.report(location, message, at_key=True)
         kind = self.catalog.kinds.get((call.use or "").partition(".")[0])
         return DraftCall(

@@ -92,7 +92,9 @@ def recognised(paths: Sequence[Path]) -> list[Recognised]:
             raise InputError(f"{path} does not exist: give scans, photos, and folders with them")
         found += _in_folder(path, 0) if path.is_dir() else [_file(path)]
         if len(found) > MOST_FILES:
-            raise InputError(f"{path} holds more than {MOST_FILES} files: name those that count")
+            raise InputError(
+                f"{path} contains more than {MOST_FILES} files: give only the relevant ones"
+            )
     return found
 
 
@@ -101,7 +103,7 @@ def _in_folder(folder: Path, depth: int) -> Iterator[Recognised]:
     files = [path for path in inside if path.is_file()]
     names = {path.name.lower() for path in files}
     if depth and not _OF_RUNS.isdisjoint(names):
-        yield _unknown(folder, "a folder of results")
+        yield _unknown(folder, "a run folder")
         return
     if any({f"images{end}", f"cameras{end}"} <= names for end in (".bin", ".txt")):
         yield _read("cameras", folder, lambda _: _cameras_summary(files))
@@ -123,9 +125,9 @@ def _file(path: Path) -> Recognised:
     if text_of_path(path) is None:
         return _unknown(path, "its path is not UTF-8: rename it")
     if suffix in _RASTERS and path.with_suffix(".json").is_file():
-        return Recognised(kind="other", path=path, summary="an orthoimage with its frame beside it")
+        return Recognised(kind="other", path=path, summary="an orthoimage with a frame file")
     if suffix in RAW_SUFFIXES:
-        return _unknown(path, f"camera raw, which is not read: {HOW_TO_DEVELOP}")
+        return _unknown(path, f"camera raw format, which cannot be read: {HOW_TO_DEVELOP}")
     readers: list[tuple[Sequence[str], Callable[[Path], Recognised]]] = [
         (PHOTO_SUFFIXES, _photo),
         (TEXT.suffixes, _table),
@@ -138,7 +140,7 @@ def _file(path: Path) -> Recognised:
     for suffixes, reader in readers:
         if suffix in suffixes and not is_odd:
             return reader(path)
-    return _unknown(path, "no method reads such files")
+    return _unknown(path, "no method reads files of this type")
 
 
 def _photo(path: Path) -> Recognised:
@@ -183,8 +185,8 @@ def _scan(path: Path) -> Recognised:
     advice = _about_extent(path.name, extent_m, "m" if unit is None else unit.name)
     if up:
         advice.append(
-            f"{_word(path.name)}: by its surfaces {up} points up, not z: cloud.up is {up} in the "
-            f"workflow; make it -{up} where floors come out as ceilings"
+            f"{_word(path.name)}: its surfaces suggest that {up} points up, not z: cloud.up is "
+            f"{up} in the workflow; change it to -{up} if floors are labelled as ceilings"
         )
     return Recognised(
         kind="scan",
@@ -234,7 +236,7 @@ def _about_extent(name: str, extent_m: float, unit: str) -> list[str]:
         size, hint = f"{extent_m:,.0f} m", "if its coordinates are millimetres, set cloud.unit=mm"
     elif 0 < extent_m < _MIN_EXTENT_M:
         size = f"{extent_m * 1000:.3g} mm"
-        hint = "check the unit that it was exported in, and set cloud.unit"
+        hint = "check the unit of the export, and set cloud.unit"
     else:
         return []
     return [f"{_word(name)} is {size} long if its unit is {unit}: {hint}"]
@@ -269,7 +271,7 @@ def _table(path: Path) -> Recognised:
         if found.kind == "cameras":
             return found
     elif columns >= _CAMERA_COLUMNS:
-        return _unknown(path, "a list of cameras, which is read from .csv: rename it")
+        return _unknown(path, "a list of cameras, which must have the suffix .csv: rename it")
     try:
         return _scan(path)
     except InputError as error:
@@ -307,7 +309,7 @@ def _yaml(path: Path) -> Recognised:
     with path.open("rb") as file:
         is_workflow = re.search(rb"^steps:", file.read(_WORKFLOW_BYTES), re.MULTILINE)
     if found.kind == "unknown" and is_workflow:
-        return _unknown(path, f"{path.name} is a workflow itself")
+        return _unknown(path, f"{path.name} is already a workflow")
     return found
 
 
@@ -375,7 +377,7 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
     if not scans:
         others = "; ".join(f"{item.path.name}: {item.summary}" for item in found[:_MOST_LISTED])
         raise InputError(
-            "there is no scan among the files, and a workflow needs one (E57, LAS, LAZ, PLY, PCD, "
+            "there is no scan among the files, but a workflow needs one (E57, LAS, LAZ, PLY, PCD, "
             f"PTX or text); found {others or 'nothing'}"
         )
     own_formats = [scan for scan in scans if scan.path.suffix.lower() not in TEXT.suffixes]
@@ -384,7 +386,11 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
         by_kind["unknown"] = [
             *by_kind.get("unknown", []),
             *(
-                replace(scan, summary="text, left out beside scans of other formats", advice=())
+                replace(
+                    scan,
+                    summary="text file, ignored because there are scans in other formats",
+                    advice=(),
+                )
                 for scan in scans
                 if scan not in own_formats
             ),
@@ -396,20 +402,24 @@ def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | N
     is_usual = bool(by_kind.get("photos") or has_posed)
     chosen: Recipe = recipe or ("photos-on-scan" if is_usual else "direct")
     if chosen == "photos-on-scan" and not (own_photos or is_usual):
-        raise InputError("photos-on-scan needs photos, and there are none among the files")
+        raise InputError("photos-on-scan needs photos, but there are none among the files")
     has_paint = any({"intensity", "rgb"} & scan.fields for scan in scans)
     if recipe is None and chosen == "direct" and not has_paint:
         raise InputError(
             f"{_some([scan.path.name for scan in scans])}: the points have neither colours nor "
-            "intensity, so no orthoimage can be painted from them: give photos too, or export the "
-            "scan with its colours (--recipe direct writes the workflow all the same)"
+            "intensity, so they cannot be used for orthoimages: give photos too, or export the "
+            "scan with its colours (--recipe direct writes the workflow anyway)"
         )
     if own_photos and "photos" not in by_kind:
         # Photos taken by a scanner are in the scan file, with their poses.
-        inside = [replace(scan, summary="the photos in it", n_points=0) for scan in own_photos]
+        inside = [
+            replace(scan, summary="the photos in this file", n_points=0) for scan in own_photos
+        ]
         by_kind["photos"] = inside
         if len(inside) == 1 and has_posed:
-            by_kind.setdefault("cameras", [replace(inside[0], summary="the poses of its photos")])
+            by_kind.setdefault(
+                "cameras", [replace(inside[0], summary="the poses of the photos in this file")]
+            )
     return _drafted(by_kind, target, chosen)
 
 
@@ -437,11 +447,11 @@ def _drafted(by_kind: _ByKind, target: Path, recipe: Recipe) -> Draft:
         *(f"# Not used: {text}" for text in left_out[:_MOST_LISTED]),
         *(f"# Note: {text}" for text in advice[:_MOST_LISTED]),
         "#",
-        f"#   orthoflow check {run}       is anything wrong with it?",
-        f"#   orthoflow plan {run}        what would run",
-        f"#   orthoflow run {run} --set wall.gsd_m=0.02    a coarse first look; then without",
+        f"#   orthoflow check {run}       check it for mistakes",
+        f"#   orthoflow plan {run}        show what would run",
+        f"#   orthoflow run {run} --set wall.gsd_m=0.02    a fast coarse run; then without",
         "#",
-        "# The following comments are those of the recipe.",
+        "# The following comments are from the recipe.",
         "#",
     ]
     paragraphs = start.rstrip("\n").split("\n#\n")
@@ -463,8 +473,8 @@ def _advice(by_kind: _ByKind) -> list[str]:
     without = [item.path.name for item in photos if not item.lens]
     if without and not {"calibration", "cameras"} & by_kind.keys():
         advice.append(
-            f"{len(without)} of {len(photos)} photos state no focal length: {_some(without)}; "
-            "give a calibration, if there is one"
+            f"{len(without)} of {len(photos)} photos have no focal length in EXIF: {_some(without)}"
+            "; give a calibration if you have one"
         )
     return advice
 
@@ -488,7 +498,7 @@ def _assigned(
             ]
         elif len(items) > 1 and kind not in ("scan", "photos", "other"):
             each = ", ".join(item.path.name for item in items)
-            left_out.append(f"{each}: {kind} may be one of them only; name it under inputs")
+            left_out.append(f"{each}: only one file is allowed as {kind}; choose it under inputs")
         elif items:
             taken[kind] = items
     return taken, left_out

@@ -235,7 +235,7 @@ def select_cells(
         chosen &= set(selection.only)
     if not chosen:
         raise ArgumentError(
-            f"no step of workflow {workflow.name} is left by {' '.join(selection.words)} together"
+            f"no step of workflow {workflow.name} meets all of {' '.join(selection.words)}"
         )
     sources = {cell.address: cell.sources for cell in cells}
     wanted = [cell.address for cell in cells if cell.step in chosen]

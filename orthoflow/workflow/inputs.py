@@ -159,7 +159,7 @@ def check_shared_inputs(
             example = workflow.chosen_data[0].inputs[option.name].name
             log.report_option(
                 str(option),
-                f"every dataset has its own {option.name}; name that of one of them, as in --input "
+                f"every dataset has its own {option.name}; choose a dataset, as in --input "
                 f"{example}=PATH",
             )
 
@@ -225,7 +225,7 @@ def _resolve(spec: WorkflowInputSpec) -> InputFiles | None:
         if spec.optional:
             return None
         raise InputError(
-            f"input {spec.name} has no files; name them in the workflow or with "
+            f"input {spec.name} has no files; give them in the workflow or with "
             f"--input {spec.name}=PATH"
         )
     try:
@@ -240,17 +240,17 @@ def _resolve(spec: WorkflowInputSpec) -> InputFiles | None:
 def _find(spec: WorkflowInputSpec, pattern: str) -> list[Path]:
     path = spec.folder / pattern
     beside = f"the table {spec.table}" if spec.table else "the workflow"
-    where = " in the working directory" if spec.is_given else f" beside {beside} ({path})"
+    where = " in the working directory" if spec.is_given else f" next to {beside} ({path})"
     if Path(pattern).is_absolute():
         where = ""
     if path.is_dir():
         files = [item for item in _below(path) if item.is_file()]
-        missing = f"the folder {pattern}{where} holds no files"
+        missing = f"the folder {pattern}{where} contains no files"
     elif path.exists():
         files, missing = [path], ""
     elif path.is_symlink():
         files = []
-        missing = f"{pattern}{where} is a link to {path.readlink()}, which is not there"
+        missing = f"{pattern}{where} is a link to {path.readlink()}, which does not exist"
     elif glob.has_magic(pattern):
         # Names may contain brackets, so only a path that does not exist is treated as a pattern.
         # Path.glob does not support absolute patterns.
@@ -290,7 +290,7 @@ def check_no_step(
         what = {DATA: "the dataset", SEED: "the seed"}[factor]
         log.report(
             location,
-            f"a step is called {factor}, which stands for {what} in addresses; give the step "
+            f"a step is called {factor}, which means {what} in addresses; give the step "
             "another name",
             at_key=True,
         )
@@ -365,14 +365,14 @@ class DatasetReader:
         try:
             text = read_text(path, "a table of datasets", MOST_TABLE_BYTES)
         except WorkflowError as error:
-            missing = f"there is no table of datasets {path}"
+            missing = f"the datasets table {path} does not exist"
             report(str(error) if os.path.lexists(path) else missing)
             return {}
         log = self.log.beside(name, text)
         log.document, log.unnamed = read_rows(log), _DATASETS
         if not log.get((_DATASETS,)):
             if not log.has_any:
-                report(f"the table {name} holds no dataset")
+                report(f"the table {name} contains no datasets")
             return {}
         return self._named(_Origin(log=log, folder=path.resolve().parent, table=name))
 
@@ -435,10 +435,10 @@ class DatasetReader:
         step, _, parameter = key.partition(".")
         meant = ""
         if key == SEED or (parameter and any(one.name == step for one in self.steps)):
-            meant = f"; parameters go in set: {{set: {{{key}: VALUE}}}}"
+            meant = f"; parameters belong in set: {{set: {{{key}: VALUE}}}}"
         elif origin.table:
             # In a table, names of parameter columns contain a dot.
-            meant = "; columns of parameters are called step.parameter"
+            meant = "; parameter columns are named step.parameter"
         origin.log.report(
             location,
             f"there is no input {key}{did_you_mean(key, self.inputs)}; inputs: "
@@ -509,7 +509,9 @@ def read_rows(log: ProblemLog) -> Document:
     header = next(rows, None)
     start = Position(line=1, column=1)
     if header is None:
-        log.add(start, "", "a table of datasets begins with a line of column names, got none")
+        log.add(
+            start, "", "the table is empty; a datasets table begins with a line of column names"
+        )
     columns = _columns(header, log) if header else []
     datasets: dict[str, JsonValue] = {}
     places: dict[Location, Position] = {(): start, (_DATASETS,): start}
@@ -523,7 +525,7 @@ def read_rows(log: ProblemLog) -> Document:
             log.add(
                 name.position,
                 "name",
-                f"the dataset {name.text} is there already, in line {keys[here].line}; give it "
+                f"the dataset {name.text} already exists in line {keys[here].line}; give it "
                 "another name",
             )
             continue
@@ -583,7 +585,7 @@ def _columns(header: Sequence[_Field], log: ProblemLog) -> list[_Field]:
     names = [field.text for field in header]
     for index, (name, position) in enumerate(header):
         if name and name in names[:index]:
-            message = f"the column {name} is there twice; remove one of them"
+            message = f"the column {name} occurs twice; remove one of them"
             log.add(position, name, message)
     if "name" in names:
         return list(header)

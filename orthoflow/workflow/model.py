@@ -47,7 +47,7 @@ DATA: Final = "data"
 SEED: Final = "seed"
 NAME_RULE: Final = (
     "a name starts with a lower-case letter, has at most 32 lower-case letters, digits, - or _, "
-    "and is not that of a device (con, prn, aux, nul, com1, lpt1 ...)"
+    "and is not a device name of Windows (con, prn, aux, nul, com1, lpt1 ...)"
 )
 Design = Literal["product", "one-at-a-time"]
 _TIME: Final = re.compile(r"(\d+(?:\.\d+)?) *(s|min|h)")
@@ -133,7 +133,7 @@ def _format_version(version: int) -> int:
     if version > FORMAT:
         raise PydanticCustomError(
             "format",
-            f"the file has workflow format {version}, this orthoflow reads {FORMAT}; upgrade "
+            f"the file has workflow format {version}, but this orthoflow reads {FORMAT}; upgrade "
             "orthoflow",
         )
     return version
@@ -146,7 +146,9 @@ def _listed(raw: object) -> object:
 
 def _each_once(values: list[_Item]) -> list[_Item]:
     if again := [value for index, value in enumerate(values) if value in values[:index]]:
-        raise PydanticCustomError("twice", f"{again[0]} is swept twice; leave one of them out")
+        raise PydanticCustomError(
+            "twice", f"{again[0]} occurs twice in the sweep; remove one of them"
+        )
     return values
 
 

@@ -223,8 +223,8 @@ def _assign(
         )
     if any(keys[0] in (call.swept or ()) for call in chosen):
         raise ArgumentError(
-            f"{keys[0]} is swept in step {step.name}, so its variants have its values; take the "
-            "sweep away, or this"
+            f"{keys[0]} is swept in step {step.name}, so its variants set the values; remove the "
+            "sweep or this setting"
         )
     override = Override(report=report, keys=tuple(keys), value=value)
     for call in chosen:
@@ -331,7 +331,7 @@ def _put(params: dict[str, JsonValue], override: Override) -> None:
     for key in outer:
         inner = place.setdefault(key, {})
         if not isinstance(inner, dict):
-            override.report(f"{key} is not a mapping, so nothing in it can be set")
+            override.report(f"{key} is not a mapping, so keys in it cannot be set")
             return
         place = inner
     # Copy it, because several calls may use the same value and later settings modify it.
@@ -401,7 +401,7 @@ def _sweeps_of(
             except ValidationError:
                 override.report(
                     f"expected {{{SWEEP}: [VALUE, VALUE, ...]}} with 2 to {MOST_SWEPT} values and "
-                    "nothing beside it"
+                    "no other keys"
                 )
             continue
         found.pop(parameter, None)
@@ -420,8 +420,10 @@ def _once(values: list[tuple[JsonValue, Report]]) -> list[tuple[JsonValue, Repor
     for value, report in values:
         text = _canonical(value)
         if text in kept:
-            comma = "; if it begins numbers, decimals have a point: 0.5" if value == 0 else ""
-            report(f"{json.dumps(value)} is swept twice; leave one of them out{comma}")
+            comma = (
+                "; if it is the start of a decimal number, use a point: 0.5" if value == 0 else ""
+            )
+            report(f"{json.dumps(value)} occurs twice in the sweep; remove one of them{comma}")
         kept.setdefault(text, (value, report))
     return list(kept.values())
 
@@ -444,8 +446,8 @@ def _may_vary(step: DraftStep, draft: DraftCall, log: ProblemLog) -> bool:
         return True
     log.report(
         (*draft.location, "use"),
-        f"{draft.id} is a source, and sources take no variants, so nothing of it can be "
-        f"swept; datasets can: {{a: {{set: {{{step.name}.<parameter>: VALUE}}}}, ...}}",
+        f"{draft.id} is a source, and sources cannot have variants, so they cannot be "
+        f"swept; use datasets instead: {{a: {{set: {{{step.name}.<parameter>: VALUE}}}}, ...}}",
         shown=(*draft.location, "params"),
     )
     return False

@@ -39,7 +39,7 @@ def shipped_workflow(name: str) -> Path:
     if wanted.parent in (Path(), Path("workflows")) and stem in recipes:
         return recipes[stem]
     raise WorkflowError(
-        f"there is no workflow file {name} and no shipped workflow of that name"
+        f"there is no workflow file {name} and no shipped workflow with that name"
         f"{did_you_mean(stem, recipes)}; shipped: {', '.join(recipes)}"
     )
 
@@ -71,7 +71,7 @@ def read_text(path: Path, what: str = "a workflow file", most_bytes: int = MOST_
     except OSError as error:
         raise WorkflowError(f"{path} cannot be read: {error.strerror}") from error
     if len(content) > most_bytes:
-        raise WorkflowError(f"{path} is too large: {what} has at most {most_bytes} bytes")
+        raise WorkflowError(f"{path} is too large: {what} may have at most {most_bytes} bytes")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

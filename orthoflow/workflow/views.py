@@ -353,13 +353,13 @@ def _check_resolved(workflow: Workflow) -> None:
     factors = factors_of(workflow)
     for dataset in workflow.datasets.values():
         if unknown := dataset.inputs.keys() - workflow.inputs.keys():
-            raise ValueError(f"dataset {dataset.name} names an unknown input {min(unknown)!r}")
+            raise ValueError(f"dataset {dataset.name} refers to an unknown input {min(unknown)!r}")
     if taken := factors & workflow.steps.keys():
         raise ValueError(f"a step is called {min(taken)}, which is a factor of addresses")
     for step in workflow.steps.values():
         _check_resolved_step(workflow, step)
     if not is_acyclic({name: step.upstream() for name, step in workflow.steps.items()}):
-        raise ValueError("its steps need each other in a circle")
+        raise ValueError("its steps form a cycle")
     compare = workflow.compare or Comparison()
     named = [pair for one in (compare.baseline, *compare.exclude) for pair in one.items()]
     for name, variant in named:
@@ -373,14 +373,14 @@ def _check_resolved_step(workflow: Workflow, step: WorkflowStep) -> None:
     if not step.variants or not (step.is_varied or len(step.variants) == 1):
         raise ValueError(f"step {step.name} has {len(step.variants)} variants")
     if not step.is_varied and step.variants[0].name:
-        raise ValueError(f"step {step.name} has a variant, but is stated to have none")
+        raise ValueError(f"step {step.name} has a variant, but is marked as having none")
     for variant in step.variants if step.is_varied else ():
         check_name(variant.name)
     if len({variant.name for variant in step.variants}) != len(step.variants):
-        raise ValueError(f"step {step.name} has two variants of one name")
+        raise ValueError(f"step {step.name} has two variants with the same name")
     if not step.conditions <= workflow.inputs.keys():
         raise ValueError(f"step {step.name} depends on an unknown input")
     for reference in step.references:
         known = workflow.inputs if reference.is_input else workflow.steps
         if (reference.name if reference.is_input else reference.source) not in known:
-            raise ValueError(f"step {step.name} takes {reference}, which is not there")
+            raise ValueError(f"step {step.name} uses {reference}, which does not exist")

@@ -103,5 +103,5 @@ def test_a_folder_of_something_else_is_no_store(
     before = {path for path in tmp_path.iterdir() if path.name != "site"}
     code, text = say(*command, "--store", ".")
     assert code == 2
-    assert f"error: {tmp_path} is not a store of orthoflow: it holds " in text
+    assert f"error: {tmp_path} is not a store of orthoflow: it contains " in text
     assert {path for path in tmp_path.iterdir() if path.name != "site"} == before

@@ -43,7 +43,7 @@ def assert_record_alone_is_enough(studio: Studio, record: Path) -> None:
         0,
         "verified: 2 products, 1 input file, seal ok",
     )
-    assert "published files of the record are not beside it" in verified.stdout
+    assert "published files of the record are not next to it" in verified.stdout
     said = studio.json("replay", "alone/run.h5", "-o", "again")
     assert [row["verdict"] for row in said["products"]] == ["identical", "identical"]
     assert sorted(path.name for path in studio.folder.iterdir()) == ["again", "alone"]
@@ -105,7 +105,7 @@ def test_a_refused_export_of_a_record_alone_leaves_nothing(
     for command in (("export", "run.h5", "--embed"), ("replay", "run.h5")):
         refused = studio(*command)
         assert refused.exit_code == 2
-        assert "is not to be found; give it with --input number=PATH" in refused.stderr
+        assert "was not found; give it with --input number=PATH" in refused.stderr
     assert [path.name for path in alone.iterdir()] == ["run.h5"]
 
 
@@ -131,7 +131,7 @@ def test_what_cannot_be_embedded_is_named(studio: Studio) -> None:
     (studio.folder / "n.txt").write_text("1.6")
     refused = studio("export", "first", "--embed", "-o", "whole")
     assert refused.exit_code == 3
-    assert "input number: n.txt is not the n.txt of the record: it was changed" in refused.stderr
+    assert "input number: n.txt differs from the recorded n.txt: it was changed" in refused.stderr
 
 
 def test_what_is_noted_fails_a_strict_check_alone(studio: Studio) -> None:
@@ -146,7 +146,7 @@ def test_what_is_noted_fails_a_strict_check_alone(studio: Studio) -> None:
     refused = studio("verify", "first")
     assert refused.exit_code == 3
     assert "products/metrics.csv: changed since it was published" in refused.stdout
-    assert "holds, but published files beside it are not" in refused.stderr
+    assert "is intact, but published files next to it were" in refused.stderr
     table.write_text(written)
     for path, text in (
         (products / "mine.tif", ""),

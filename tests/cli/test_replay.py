@@ -84,10 +84,10 @@ def test_inputs_are_found_by_content_where_a_user_says(studio: Studio) -> None:
     (studio.folder / "n.txt").rename(renamed)
     missing = refused(studio, code=2)
     assert "input number: n.txt (3 bytes, SHA-256 " in missing
-    assert "is not to be found; give it with --input number=PATH" in missing
+    assert "was not found; give it with --input number=PATH" in missing
     (studio.folder / "o.txt").write_text("1.6")
     wrong = refused(studio, "--input", "number=o.txt", code=2)
-    assert "n.txt of the record is not among what was given, " in wrong
+    assert "the recorded n.txt is not among the given files, " in wrong
     assert "o.txt (expected 3 bytes with the SHA-256 " in wrong
     done = studio("replay", "first", "-o", "again", "--input", "number=elsewhere")
     assert done.exit_code == 0, done.output

@@ -83,7 +83,7 @@ def test_an_input_that_is_no_file_is_refused_without_waiting_for_it(world: World
     path = world.folder / "numbers.txt"
     path.unlink()
     os.mkfifo(path)
-    with pytest.raises(InputError, match=r"numbers\.txt is not a regular file, which can be"):
+    with pytest.raises(InputError, match=r"numbers\.txt must be a regular file, because"):
         world.plan(STEPS)
 
 

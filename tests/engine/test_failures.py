@@ -77,8 +77,8 @@ RAISED = {
     "changes_input": (
         "MethodError",
         (
-            f"method work.changes_input {TOYS} writes to an array that is read-only, as all "
-            "its inputs are (output array is read-only); it must work on a copy"
+            f"method work.changes_input {TOYS} writes to a read-only array, probably one of "
+            "its inputs (output array is read-only); it must work on a copy"
         ),
         1,
     ),
@@ -150,18 +150,18 @@ def test_what_disk_and_memory_refuse_is_an_error_of_whoever_is_at_fault(world: W
                 assert results[address].error_message.startswith(expected)
     assert results["none"].error_type == "StepFailedError"
     assert results["none"].error_message.startswith(
-        f"method work.no_memory {TOYS} needed more memory than it could get: Unable to allocate"
+        f"method work.no_memory {TOYS} needed more memory than was available: Unable to allocate"
     )
 
 
 CRASHES = {
-    "segfault": f"method work.segfault {TOYS} crashed (segmentation fault) while it held ",
-    "abort": f"method work.abort {TOYS} crashed (aborted) while it held ",
+    "segfault": f"method work.segfault {TOYS} crashed (segmentation fault) while using ",
+    "abort": f"method work.abort {TOYS} crashed (aborted) while using ",
     "quit": (
         f"method work.quit {TOYS} ended its process without a result (exit status 7); its log ends "
         "with: last words"
     ),
-    "hang": f"method work.hang {TOYS} ran past its timeout of 1.5 s and was stopped",
+    "hang": f"method work.hang {TOYS} exceeded its timeout of 1.5 s and was stopped",
 }
 
 
@@ -189,7 +189,7 @@ def test_a_method_that_ignores_being_asked_is_killed(
 ) -> None:
     monkeypatch.setattr("orthoflow.engine.local._GRACE_S", 0.5)
     result = bad_result(world, "stubborn", "1.5s")
-    assert "ran past its timeout of 1.5 s" in result.error_message
+    assert "exceeded its timeout of 1.5 s" in result.error_message
 
 
 def test_processes_that_a_method_leaves_behind_are_killed(world: World) -> None:
@@ -213,7 +213,7 @@ def test_a_method_that_eats_all_memory_is_stopped_and_the_coordinator_lives(
     assert result.error_type == "StepFailedError"
     assert result.error_message == (
         f"method work.eat {TOYS} needed more memory than the machine has "
-        f"({result.peak_rss_mib / 1024:.1f} GiB when stopped); give it less data or coarser "
+        f"({result.peak_rss_mib / 1024:.1f} GiB when stopped); use less data or coarser "
         "parameters"
     )
     # What other children of this test hold (the server of processes) is missing from it.
@@ -259,6 +259,6 @@ def test_a_run_folder_that_cannot_be_written_is_one_sentence(world: World) -> No
     plan_first = "steps: {a: {use: make.range}}"
     (world.folder / "file").write_text("no folder")
     with pytest.raises(
-        ArgumentError, match=r"file/run cannot be a folder, because .*/file is a file; "
+        ArgumentError, match=r"file/run cannot be created, because .*/file is a file; "
     ):
         world.run(plan_first, into="file/run")

@@ -124,10 +124,10 @@ def test_a_run_in_progress_is_left_alone_and_goes_on_after_a_kill(world: World) 
     grandchild = int(log.read_text().removeprefix("started "))
     step = int(Path(f"/proc/{grandchild}/stat").read_text().rpartition(")")[2].split()[1])
     try:
-        with pytest.raises(ArgumentError, match="is in use by another run; wait for its end"):
+        with pytest.raises(ArgumentError, match="is in use by another run; wait until it has"):
             world.run(STEPS)
         assert is_running(world.folder / "run")
-        with pytest.raises(ArgumentError, match=r"holds no run\.h5 yet: its run has not ended"):
+        with pytest.raises(ArgumentError, match=r"contains no run\.h5 yet: its run has not ended"):
             find_record(world.folder / "run")
         with pytest.raises(StoreError, match="is in use by a run"):
             collect_garbage(world.store)

@@ -173,7 +173,7 @@ def test_the_changed_ingredient_is_named(earlier: CellResult, reason: str) -> No
 def test_an_unreadable_earlier_preimage_does_no_harm(text: str) -> None:
     earlier = dataclasses.replace(result_of(), key="x", key_preimage=text)
     assert explain(CellKey(key="k", preimage="{}"), [earlier]) == (
-        "its key is made in another way than before"
+        "the composition of its key has changed"
     )
 
 

@@ -35,11 +35,15 @@ def test_a_run_folder_is_of_one_run_at_a_time(tmp_path: Path) -> None:
     with Journal(tmp_path / "run", "hall"):
         assert is_running(tmp_path / "run")
         for refused in (Journal, require_run_folder):
-            with pytest.raises(ArgumentError, match="is in use by another run; wait for its end, "):
+            with pytest.raises(
+                ArgumentError, match="is in use by another run; wait until it has ended, "
+            ):
                 refused(tmp_path / "run", "hall")
     assert not is_running(tmp_path / "run")
     require_run_folder(tmp_path / "run", "hall")
-    with pytest.raises(ArgumentError, match="holds an unfinished run of hall, not of court; choo"):
+    with pytest.raises(
+        ArgumentError, match="contains an unfinished run of hall, not of court; choo"
+    ):
         require_run_folder(tmp_path / "run", "court")
 
 
@@ -48,12 +52,16 @@ def test_nobody_goes_on_with_a_run_while_what_came_out_is_written(tmp_path: Path
         pass
     with kept_from_others(tmp_path / "run"):
         assert is_running(tmp_path / "run")
-        with pytest.raises(ArgumentError, match="is in use by another run; wait for its end, or"):
+        with pytest.raises(
+            ArgumentError, match="is in use by another run; wait until it has ended, or"
+        ):
             Journal(tmp_path / "run", "hall")
     with Journal(tmp_path / "run", "hall") as journal:
         assert journal.is_resumed
         with (
-            pytest.raises(ArgumentError, match="is in use by another run; wait for its end, or"),
+            pytest.raises(
+                ArgumentError, match="is in use by another run; wait until it has ended, or"
+            ),
             kept_from_others(tmp_path / "run"),
         ):
             pass
@@ -88,27 +96,31 @@ def test_a_finished_run_is_not_continued(tmp_path: Path) -> None:
         journal.write("finished", **ended("a", "failed", error="MethodError"))
         journal.write("ended")
     (tmp_path / RECORD_FILE).write_text("the record")
-    with pytest.raises(ArgumentError, match=r"holds a finished run \(run\.h5\); choose another"):
+    with pytest.raises(ArgumentError, match=r"contains a finished run \(run\.h5\); choose another"):
         Journal(tmp_path, "hall")
     assert (tmp_path / RECORD_FILE).read_text() == "the record"
 
 
 def test_a_folder_of_something_else_is_refused_as_it_is(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").touch()
-    with pytest.raises(ArgumentError, match="is not empty and holds no unfinished run; choose"):
+    with pytest.raises(ArgumentError, match="is not empty and contains no unfinished run; choose"):
         Journal(tmp_path, "hall")
     (tmp_path / "notes.txt").unlink()
     (tmp_path / JOURNAL).symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(ArgumentError, match=r"holds a link, journal\.jsonl, as no run makes them"):
+    with pytest.raises(
+        ArgumentError, match=r"contains a link, journal\.jsonl, which no run creates"
+    ):
         Journal(tmp_path, "hall")
     (tmp_path / JOURNAL).unlink()
     os.mkfifo(tmp_path / JOURNAL)
-    with pytest.raises(ArgumentError, match=r"holds a pipe or a device, journal\.jsonl, as no run"):
+    with pytest.raises(
+        ArgumentError, match=r"contains a pipe or a device, journal\.jsonl, which no run"
+    ):
         Journal(tmp_path, "hall")
     assert [path.name for path in tmp_path.iterdir()] == [JOURNAL]
     # A record whose journal nobody can read is of a finished run.
     (tmp_path / JOURNAL).unlink()
     (tmp_path / JOURNAL).write_text("nothing\n")
     (tmp_path / RECORD_FILE).touch()
-    with pytest.raises(ArgumentError, match="holds a finished run"):
+    with pytest.raises(ArgumentError, match="contains a finished run"):
         Journal(tmp_path, "hall")

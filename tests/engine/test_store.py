@@ -148,7 +148,7 @@ def test_an_equal_object_of_another_run_is_left_in_place(store: Store) -> None:
 def test_reading_a_damaged_product_says_so_and_removes_it(store: Store) -> None:
     ref = store.put_product(heights())
     flip_middle(object_folder(store, ref) / "product.h5")
-    with pytest.raises(DamageError, match=r"was damaged; run again to compute it again"):
+    with pytest.raises(DamageError, match=r"was damaged; run again to recompute it"):
         store.get_product(ref.digest, Heights)
     assert not object_folder(store, ref).exists()
     with pytest.raises(DamageError, match="has no product sha256:"):
@@ -290,12 +290,12 @@ def test_a_folder_of_something_else_is_refused_and_left_as_it_was(
     (folder / "HEAD").write_text("ref: refs/heads/main")
     before = {path: path.is_dir() or path.read_bytes() for path in folder.rglob("*")}
     with pytest.raises(
-        ArgumentError, match=r"\.git is not a store of orthoflow: it holds HEAD; name"
+        ArgumentError, match=r"\.git is not a store of orthoflow: it contains HEAD; give"
     ):
         command(Store(folder))
     assert {path: path.is_dir() or path.read_bytes() for path in folder.rglob("*")} == before
     (folder / "refs").mkdir()
-    with pytest.raises(ArgumentError, match=r"it holds HEAD and 1 more;"):
+    with pytest.raises(ArgumentError, match=r"it contains HEAD and 1 more;"):
         command(Store(folder))
 
 
@@ -325,5 +325,5 @@ def test_the_last_path_of_a_file_is_remembered(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["aux.laz", "a\nb.laz", "hall.", "c:hall.laz"], ids=ascii)
 def test_an_input_file_that_no_record_can_name_is_refused(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("points")
-    with pytest.raises(InputError, match=r"which other systems refuse: rename it"):
+    with pytest.raises(InputError, match=r"which some systems do not allow: rename it"):
         FileDigests(tmp_path / "memo").digest(tmp_path / name)

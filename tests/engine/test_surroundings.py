@@ -205,7 +205,7 @@ def test_the_store_of_another_user_serves_as_far_as_it_may_be_written(
         check_finished(desk, "second")
     else:
         assert code == 1, said
-        check_sentence(said, "Permission denied; make that possible, or choose")
+        check_sentence(said, "Permission denied; fix this, or choose")
     assert desk("cache", "gc")[0] == (0 if is_open else 1)
 
 

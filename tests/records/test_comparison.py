@@ -33,7 +33,7 @@ def test_a_comparison_is_a_sentence_and_a_table_of_what_moved() -> None:
     comparison = compared(*rows, alone=("wall",))
     assert repr(comparison) == (
         "<RunComparison of 'r1' and 'r2': 0 of 0 inputs, 1 of 2 parameters, 1 of 2 metrics, "
-        "1 of 3 products differ, 1 products not measured, 1 steps in one run only>"
+        "1 of 3 products differ, 1 products not measured, 1 steps only in one run>"
     )
     assert comparison.measured == rows[:2]
     table = comparison.metric_table()
@@ -112,7 +112,7 @@ def test_a_plain_run_is_compared_with_the_variant_that_does_the_same(studio: Stu
         ("paint", "identical"),
     ]
     assert {row.cell for row in told.shared(told.parameters)} == {"survey", "paint"}
-    assert repr(told).endswith(", 2 steps in one run only>")
+    assert repr(told).endswith(", 2 steps only in one run>")
     shown = studio("compare", "first", "swept").stdout
     assert "steps: 0 of 2 differ, 2 only in B" in shown
     assert "paired although the addresses differ: paint (A) and paint@paint=grey-128 (B)" in shown
@@ -144,7 +144,7 @@ def test_the_workflow_is_compared_line_by_line(studio: Studio) -> None:
     ]
     [row] = [row for row in said["cells"] if not row["same"]]
     assert (row["left"]["status"], row["right"]["status"]) == ("ok", "failed")
-    assert said["products"][1]["reason"] == "only one of the runs has it"
+    assert said["products"][1]["reason"] == "it exists in only one of the runs"
     rates = [row for row in said["metrics"] if row["name"] == "painted_share"]
     assert [row["right"] for row in rates] == [None]
 

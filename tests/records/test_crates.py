@@ -268,5 +268,5 @@ def test_what_no_cell_gave_is_told(studio: Studio) -> None:
     record = open_run(studio.folder / "first").record
     without = replace(record, cells=tuple(cell for cell in record.cells if cell.step != "survey"))
     assert len(without.cells) < len(record.cells)
-    with pytest.raises(RecordError, match=r"survey\.planes was taken, which no step that ran gave"):
+    with pytest.raises(RecordError, match=r"survey\.planes was used, but no executed step made"):
         crate_metadata(without, [], license_text="none")

@@ -40,9 +40,9 @@ def test_rasters_are_made_of_the_products_and_go_away_again(alone: Run) -> None:
         # What was made is what the run now calls its own.
         states = {published_state(found.folder, file) for file in found.record.published}
         assert states == {"same"}
-    left_out = "and other files that were published are left out"
-    made_anew = "its rasters are made again from the products in it"
-    assert said == [f"{alone.path} stands alone: {made_anew}, {left_out}"]
+    left_out = "and other published files are omitted"
+    made_anew = "its rasters are recreated from its products"
+    assert said == [f"{alone.path} has no files next to it: {made_anew}, {left_out}"]
     assert not ortho.exists()
 
 

@@ -96,7 +96,7 @@ def test_figures_with_impossible_names_are_found_and_not_written(
     for command in (("report", run), ("export", run, "--to", "figures", "-o", "drawn")):
         done = finished(*command)
         assert done.exit_code == 3, done.output
-        assert "so no file can be written for it" in done.output
+        assert "so its file cannot be written" in done.output
     assert sorted(path.name for path in folder.iterdir()) == ["run"]
     assert not (run / "report.html").exists()
 
@@ -127,7 +127,7 @@ def test_figures_that_some_systems_take_for_one_are_not_laid_over_each_other(
     for command in (("verify", run), ("export", run, "--to", "figures"), ("report", run)):
         done = finished(*command)
         assert done.exit_code == 3
-        assert "as some systems see it" in done.output
+        assert "some systems" in done.output
     assert not list((run / "figures").rglob("*epth*"))
 
 
@@ -146,7 +146,7 @@ def test_links_and_devices_beside_a_record_are_not_followed(
     os.mkfifo(run / "products" / "paint" / "c")
     done = finished("verify", run)
     assert done.exit_code == 3
-    assert done.output.count("a link, a folder or a device stands where a file was published") == 3
+    assert done.output.count("a link, a folder or a device in place of the published file") == 3
     done = finished("export", run, "--to", "ro-crate", "-o", "crate")
     assert done.exit_code == 0, done.output
     assert not [path for path in Path("crate").rglob("*") if path.is_symlink()]
@@ -169,7 +169,7 @@ def test_a_folder_of_products_elsewhere_is_not_followed(
     (run / "products").symlink_to(tmp_path / "elsewhere")
     done = finished("verify", run)
     assert done.exit_code == 3
-    assert "a link, a folder or a device stands where a file was published" in done.output
+    assert "a link, a folder or a device in place of the published file" in done.output
     assert finished.json("show", run)["files"] == []
 
 
@@ -189,7 +189,7 @@ def test_a_sparse_file_is_told_by_its_size(finished: Studio, folder: Path) -> No
     os.truncate(run / "report.html", 1 << 40)
     done = finished("export", run, "--to", "ro-crate", "-o", "other")
     assert done.exit_code == 3
-    assert "report.html claims 1099511627776 bytes, but most of it is a hole" in done.output
+    assert "report.html has 1099511627776 bytes, but most of them are not stored" in done.output
     assert after.user + after.system - before.user - before.system < 5
 
 
@@ -370,17 +370,17 @@ REFUSES = "step paint: the installed paint.plain refuses the recorded parameter"
 IMPOSSIBLE: tuple[tuple[Callable[[hostile.Record], None], str], ...] = (
     (with_preimage(""), "key_preimage must not be empty"),
     *(
-        (with_preimage(text), "inputs is not what its key was made")
+        (with_preimage(text), "inputs does not match its key")
         for text in ("[1]", "[" * 50_000, f'{{"seed": {"9" * 5000}}}', '{"inputs": [1]}')
     ),
     (with_parameters(grey=128, gsd_m=0.5, x=1), f"{REFUSES} x: Extra inputs are not permitted"),
     (with_parameters(grey=10**40, gsd_m=0.5), f"{REFUSES} grey: Input should be less than or equ"),
     (with_parameters(grey=[[]], gsd_m={}), f"{REFUSES} gsd_m: Input should be a valid number"),
     *(
-        (with_source(source), f"paint: nothing before it gives {source!a}, its planes")
+        (with_source(source), f"paint: no earlier step outputs {source!a}, its planes")
         for source in ("survey.nothing", "inputs.nothing", "", "a\x1b[2J.planes")
     ),
-    (close_a_circle, "paint: nothing before it gives 'paint.planes', its planes"),
+    (close_a_circle, "paint: no earlier step outputs 'paint.planes', its planes"),
 )
 
 

@@ -229,7 +229,9 @@ def test_what_a_run_does_not_have_is_said(run: Run) -> None:
     for status, how in (("failed", "failed"), ("skipped", "was skipped")):
         lost = cell("cloud", status=status, error_message="no file")
         other = dataclasses.replace(run, record=dataclasses.replace(run.record, cells=(lost,)))
-        with pytest.raises(ArgumentError, match=f"step cloud gave no 'cloud', it {how}: no file"):
+        with pytest.raises(
+            ArgumentError, match=f"step cloud has no 'cloud', because it {how}: no file"
+        ):
             other.payload("cloud", "cloud")
     with pytest.raises(
         RecordError, match=r"contains only the digest of cloud\.cloud; to embed all"
@@ -246,7 +248,7 @@ def test_what_a_run_does_not_have_is_said(run: Run) -> None:
 def test_what_is_no_finished_record_is_refused(run_folder: Path, tmp_path: Path) -> None:
     with pytest.raises(ArgumentError, match="does not exist; give a run folder or its "):
         open_run(tmp_path / "none")
-    with pytest.raises(ArgumentError, match=r"holds no run.h5: .* repeat the run with -o "):
+    with pytest.raises(ArgumentError, match=r"contains no run.h5: .* repeat the run with -o "):
         open_run(tmp_path)
     path = run_folder / "run.h5"
     verification = verify_run(run_folder)

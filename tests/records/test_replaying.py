@@ -77,7 +77,7 @@ def test_another_code_of_a_method_is_noted_and_not_refused(world: World) -> None
     works = world.site / "toy_plugin" / "works.py"
     works.write_text(works.read_text() + "\nCHANGED = True\n")
     replay = plan_replay(run, world.catalog(), Store(world.folder / "fresh"), INLINE)
-    assert "work.noise: its code is not that of the record, though both state result version 1" in (
+    assert "work.noise: its code differs from the record, although both have result version 1" in (
         replay.notes
     )
 

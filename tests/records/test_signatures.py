@@ -87,21 +87,21 @@ def test_a_signed_record_verifies_with_the_key_of_its_signer(finished: Studio, r
 def test_a_missing_signature_and_anothers_are_findings(finished: Studio, run: Path) -> None:
     done = finished("verify", run, "--signer", "jane.pub")
     assert done.exit_code == 3
-    assert "run.h5 is not signed: there is no run.h5.sig beside it" in done.output
-    assert "run.h5 holds, but its signature is not the one asked for" in done.output
+    assert "run.h5 is not signed: there is no run.h5.sig next to it" in done.output
+    assert "run.h5 is intact, but its signature is not from the given signer" in done.output
     finished("sign", run, "--key", "joe")
     done = finished("verify", run, "--signer", "jane.pub")
     assert done.exit_code == 3
     # Nobody has checked that it is joe's: it may be what is left of another record.
-    assert "the signature beside run.h5 names the key SHA256:" in done.output
-    assert ", not of SHA256:" in done.output
+    assert "the signature of run.h5 was made with the key SHA256:" in done.output
+    assert ", not with SHA256:" in done.output
     # Who says to be jane has not her key.
     signature = json.loads((run / "run.h5.sig").read_text())
     signature["public_key"] = " ".join(Path("jane.pub").read_text().split()[:2])
     (run / "run.h5.sig").write_text(json.dumps(signature))
     done = finished("verify", run, "--signer", "jane.pub")
     assert done.exit_code == 3
-    assert "the signature beside run.h5 does not fit it" in done.output
+    assert "the signature does not match run.h5" in done.output
 
 
 def test_the_password_of_a_key_is_asked_for(
@@ -156,7 +156,10 @@ def test_a_signature_of_something_else_does_not_fit(finished: Studio, run: Path)
     hostile.reseal(run / "run.h5", lambda record: record.cell("paint").update(log="nothing wrong"))
     assert finished("verify", run).exit_code == 0
     done = finished("verify", run, "--signer", "jane.pub")
-    assert (done.exit_code, "does not fit it: it is another record's" in done.output) == (3, True)
+    assert (
+        done.exit_code,
+        "does not match run.h5: it belongs to another record" in done.output,
+    ) == (3, True)
     for content in ("{}", "[" * 60_000, '{"format": "orthoflow-signature"}', "link"):
         path = run / "run.h5.sig"
         path.unlink()
@@ -177,8 +180,8 @@ def test_a_signature_of_something_else_does_not_fit(finished: Studio, run: Path)
     ("arguments", "sentence"),
     [
         (("sign", "--key", "nothing"), "there is no key file nothing"),
-        (("sign", "--key", "jane.pub"), "check: sign with the private one, jane"),
-        (("sign", "--key", "other"), "other must be an Ed25519 key; `ssh-keygen -t ed25519` makes"),
+        (("sign", "--key", "jane.pub"), "to verify: sign with the private key, jane"),
+        (("sign", "--key", "other"), "other must be an Ed25519 key; create one with `ssh-keygen"),
         (("sign", "--key", "jane-protected"), "is protected by a password, and there is no term"),
         (("verify", "--signer", "jane"), "jane is not a public key in OpenSSH format"),
         (("verify", "--signer", "other.pub"), "other.pub must be an Ed25519 key"),

@@ -73,7 +73,7 @@ def test_files_beside_a_record_are_counted_and_named(folder: Path) -> None:
     assert found.findings == (
         *(f"products/{name}: changed since it was published" for name in changed),
         *(
-            f"products/{name}: a link, a folder or a device stands where a file was published; "
+            f"products/{name}: a link, a folder or a device in place of the published file, so "
             "it was not read"
             for name in no_file
         ),
@@ -127,7 +127,7 @@ def test_only_what_the_record_vouches_for_is_used(folder: Path) -> None:
     require_unchanged(run, products / "same")
     require_unchanged(run)
     for name, sentence in (
-        ("folder", "is not named in the record of the run, so it cannot be checked"),
+        ("folder", "is not listed in the record of the run, so it cannot be checked"),
         ("other", "other was changed after the run: the record states the digest"),
         ("link", "link cannot be read: no file"),
         ("gone", "gone cannot be read: missing"),

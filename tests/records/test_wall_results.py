@@ -114,8 +114,8 @@ def looking(status: str, message: str = "") -> Any:
     ("count", "check", "said"),
     [
         (3, looking("failed", "none was found: P0 (57 m left of wall 0)"),
-         ", though 3 check points were given: none was found: P0 (57 m left of wall 0)"),
-        (1, cell(), ", though 1 check point was given: no step has looked for them"),
+         ", although 3 check points were given: none was found: P0 (57 m left of wall 0)"),
+        (1, cell(), ", although 1 check point was given: no step used them"),
         (3, looking("ok"), ": surveyed check points would show"),
     ],
     ids=["none counted", "not looked for", "counted on another wall"],
@@ -164,10 +164,10 @@ def test_the_last_orthoimages_are_meant_or_else_the_last_walls() -> None:
     nothing: Any = ToyRun(e=cell(outputs={"cloud": output("cloud")}))
     with pytest.raises(ArgumentError, match=r"r1 has no orthoimages and no walls; plane failed$"):
         module._pictured(nothing, None)
-    with pytest.raises(ArgumentError, match=r"e holds no orthoimages or walls; .*: none"):
+    with pytest.raises(ArgumentError, match=r"e has no orthoimages or walls; .*: none"):
         module._pictured(nothing, "e")
     run.cells["e"] = nothing.cells["e"]
-    with pytest.raises(ArgumentError, match="those of this run: b, c, a, d"):
+    with pytest.raises(ArgumentError, match="steps of this run that have: b, c, a, d"):
         module._pictured(run, "e")
 
 
@@ -188,7 +188,7 @@ def test_an_orthoimage_that_is_gone_is_asked_for(
 ) -> None:
     run: Any = ToyRun(folder=tmp_path, published=PUBLISHED)
     if is_asked:
-        with pytest.raises(RecordError, match=r"wall_2_ortho.tif is gone from .* copy it back"):
+        with pytest.raises(RecordError, match=r"wall_2_ortho.tif is missing in .* copy it back"):
             module._require_orthoimages(run, "mosaic", wall)
         (tmp_path / "products/mosaic").mkdir(parents=True)
         (tmp_path / PUBLISHED[0]).touch()

@@ -208,7 +208,7 @@ def test_what_the_store_lost_is_named(executed: Executed) -> None:
     with pytest.raises(StoreError, match=r"needs \(the figure plan is damaged\)"):
         dataclasses.replace(executed, outcome=outcome).write()
     shutil.rmtree(executed.store.objects)
-    with pytest.raises(StoreError, match="has no sound product sha256:"):
+    with pytest.raises(StoreError, match="has no intact product sha256:"):
         executed.write()
     assert not (executed.folder / "run.h5").exists()
 
@@ -223,7 +223,7 @@ def test_a_run_is_not_finished_in_which_the_disk_refused_a_step(executed: Execut
     )
     results = {**executed.outcome.results, "paint": refused}
     outcome = dataclasses.replace(executed.outcome, results=results)
-    with pytest.raises(StoreError, match=r"paint failed: .* the same command with -o .* goes on"):
+    with pytest.raises(StoreError, match=r"paint failed: .* the same command with -o .* continues"):
         dataclasses.replace(executed, outcome=outcome).write()
     assert not (executed.folder / "run.h5").exists()
 

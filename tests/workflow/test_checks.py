@@ -19,13 +19,13 @@ from tests.laboratories import GOOD, load
         (
             "3",
             (
-                "wall.gsd_m is 3 m, which can hardly be meant: cells are 0.0001 to 0.5 m wide; "
-                "3 mm are written gsd_m: 0.003"
+                "wall.gsd_m is 3 m, which is implausible: cells are 0.0001 to 0.5 m wide; "
+                "for 3 mm write gsd_m: 0.003"
             ),
         ),
         (
             "5e-6",
-            "wall.gsd_m is 5e-06 m, which can hardly be meant: cells are 0.0001 to 0.5 m wide",
+            "wall.gsd_m is 5e-06 m, which is implausible: cells are 0.0001 to 0.5 m wide",
         ),
         ("0.003", ""),
         ("0.5", ""),
@@ -54,7 +54,7 @@ def test_inputs_that_nothing_takes_are_told(catalog: Catalog, tmp_path: Path) ->
     text = GOOD.replace("{gsd_m: 1}", "{gsd_m: 0.01}")
     more = text.replace("inputs:\n", "inputs:\n  other: {optional: true}\n")
     assert lint_workflow(load(more, tmp_path / "flow.yaml", catalog)) == (
-        "no step takes the input other: wire it as inputs.other, or remove it",
+        "no step uses the input other: connect it as inputs.other, or remove it",
     )
     # One that only says whether a step runs is of use.
     asked = more.replace("wall:   {use", "wall:   {unless: inputs.other, use")

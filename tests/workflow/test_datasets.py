@@ -53,7 +53,7 @@ def test_mistakes_of_steps_and_of_datasets_and_missing_files_are_told_in_one_pas
         (9, "datasets.lost.set.plane.tolerance_m"),
     ]
     assert caught.value.problems[3].message == (
-        f"input scan@lost: there is no file lost.e57 beside the workflow ({folder / 'lost.e57'}) "
+        f"input scan@lost: there is no file lost.e57 next to the workflow ({folder / 'lost.e57'}) "
         "(did you mean stairs.e57?)"
     )
 
@@ -221,12 +221,12 @@ def test_a_changed_record_of_datasets_is_refused(catalog: Catalog, folder: Path)
 def test_datasets_that_can_hardly_be_meant_are_doubted(catalog: Catalog) -> None:
     idle = load(ROOMS + "datasets: {hall: {}, attic: {}}\n", catalog)
     assert lint_workflow(idle) == (
-        "the datasets change nothing: they name no input that a step takes, and no parameter",
+        "the datasets have no effect: they set no parameter, and no input that a step uses",
         *lint_workflow(load(ROOMS, catalog)),
     )
     coarse = load(ROOMS + "datasets: {hall: {set: {wall.gsd_m: 3}}, attic: {}}\n", catalog)
     (said,) = set(lint_workflow(coarse)) - set(lint_workflow(load(ROOMS, catalog)))
-    assert said.startswith("wall.gsd_m of dataset hall is 3 m, which can hardly be meant")
+    assert said.startswith("wall.gsd_m of dataset hall is 3 m, which is implausible")
 
 
 # --- tables ---

@@ -55,7 +55,7 @@ def test_a_file_that_is_not_utf8_is_refused_with_its_line(catalog: Catalog, writ
 
 def test_a_file_of_megabytes_is_refused_before_it_is_parsed(catalog: Catalog, write: Path) -> None:
     write.write_text("a" * 2_000_000)
-    with pytest.raises(WorkflowError, match="a workflow file has at most 400000"):
+    with pytest.raises(WorkflowError, match="a workflow file may have at most 400000"):
         load_workflow(write, catalog)
 
 

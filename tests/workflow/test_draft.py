@@ -83,10 +83,11 @@ def test_a_folder_becomes_a_workflow_that_is_fine_as_it_is(data: Path) -> None:
     assert "calibration: calibration.yaml, a calibration of *" in out
     assert "checkpoints: checks.csv, 2 surveyed points" in out
     assert "ties: ties.csv, 1 tie" in out
-    assert "not used: notes.txt: text, left out beside scans of other formats" in out
-    assert "not used: plan.dwg: no method reads such files" in out
+    assert "not used: notes.txt: text file, ignored because there are scans in other formats" in out
+    assert "not used: plan.dwg: no method reads files of this type" in out
     assert (
-        "not used: IMG_7.CR2: camera raw, which is not read: develop it first to 16-bit TIFF" in out
+        "not used: IMG_7.CR2: camera raw format, which cannot be read: develop it first to 16-bit "
+        "TIFF" in out
     )
     assert "next: orthoflow check 'jobs/hall 1.yaml'" in out
 
@@ -113,8 +114,8 @@ def test_a_table_of_coordinates_is_a_scan_and_no_list_of_points(tmp_path: Path) 
     ("arguments", "sentence"),
     [
         (("nowhere",), "nowhere does not exist: give scans, photos, and folders with them"),
-        (("photos",), "there is no scan among the files, and a workflow needs one (E57, LAS"),
-        (("hall.las", "--recipe", "photos-on-scan"), "photos-on-scan needs photos, and there are"),
+        (("photos",), "there is no scan among the files, but a workflow needs one (E57, LAS"),
+        (("hall.las", "--recipe", "photos-on-scan"), "photos-on-scan needs photos, but there are"),
         (
             ("hall.las", "-o", "notes.txt"),
             "notes.txt exists already: choose another name with -o",
@@ -252,8 +253,8 @@ def test_photos_in_a_scan_are_taken_where_there_are_no_others() -> None:
     scan = found("scan", "hall.e57", "a scan", 3)
     inside = draft_workflow([scan], Path("flow.yaml"), None)
     assert inside.recipe == "photos-on-scan"
-    assert inside.inputs["photos"] == "hall.e57, the photos in it"
-    assert inside.inputs["cameras"] == "hall.e57, the poses of its photos"
+    assert inside.inputs["photos"] == "hall.e57, the photos in this file"
+    assert inside.inputs["cameras"] == "hall.e57, the poses of the photos in this file"
     beside = draft_workflow([scan, found("photos", "a.jpg", "a photo", 1)], Path("flow.yaml"), None)
     assert beside.inputs["photos"] == "a.jpg, a photo"
     assert "cameras" not in beside.inputs
@@ -277,7 +278,7 @@ def test_an_orthoimage_is_taken_with_the_frame_beside_it(tmp_path: Path) -> None
     assert one(tmp_path / "wall.tif", b"II*\0").kind == "photos"
     (tmp_path / "wall.json").write_text("{}")
     (image,) = recognised([tmp_path / "wall.tif"])
-    assert (image.kind, image.summary) == ("other", "an orthoimage with its frame beside it")
+    assert (image.kind, image.summary) == ("other", "an orthoimage with a frame file")
     photos = [found("scan", "hall.laz"), found("photos", "a.jpg", "a photo", 1)]
     text = draft_workflow([*photos, image], tmp_path / "w.yaml", None).text
     assert "    files:\n      - wall.tif\n      - wall.json\n" in text
@@ -331,7 +332,7 @@ def test_results_of_runs_are_no_photos_of_the_next(tmp_path: Path) -> None:
     found = {one.path: (one.kind, one.summary) for one in recognised([tmp_path])}
     assert found == {
         tmp_path / "photo.jpg": ("photos", "a photo"),
-        run: ("unknown", "a folder of results"),
+        run: ("unknown", "a run folder"),
     }
     # Who names it means it.
     assert {one.kind for one in recognised([run])} == {"photos", "unknown"}

@@ -347,6 +347,6 @@ def test_an_unknown_step_of_a_selection_is_refused(catalog: Catalog, write: Path
     with pytest.raises(ArgumentError, match=r"--force plan: .* \(did you mean plane\?\)"):
         check_step_names(workflow, ["plan"], "--force")
 
-    message = "no step of workflow palace-room is left by --from ortho --until wall together"
+    message = "no step of workflow palace-room meets all of --from ortho --until wall"
     with pytest.raises(ArgumentError, match=message):
         select_cells(workflow, (), Selection(from_=("ortho",), until=("wall",)))

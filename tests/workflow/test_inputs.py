@@ -70,15 +70,15 @@ def test_files_are_found_beside_the_workflow_and_sorted_by_name(
             "{files: nowhere.jpg}",
             r"\.yaml:\d+:\d+: inputs.photos.files: input photos: there is no file nowhere.jpg",
         ),
-        ("{files: '*.png'}", r"input photos: no file matches \*.png beside the workflow"),
+        ("{files: '*.png'}", r"input photos: no file matches \*.png next to the workflow"),
         (
             "{files: empty}",
-            r"input photos: the folder empty beside the workflow \(.*\) holds no files",
+            r"input photos: the folder empty next to the workflow \(.*\) contains no files",
         ),
         ("{files: /nowhere/x.jpg}", r"input photos: there is no file /nowhere/x\.jpg$"),
-        ("{files: photos/b_.jpg}", r"no file photos/b_\.jpg beside .* \(did you mean b\.jpg\?\)"),
+        ("{files: photos/b_.jpg}", r"no file photos/b_\.jpg next to .* \(did you mean b\.jpg\?\)"),
         ("{files: [photos/a.jpg, x.jpg]}", "input photos: there is no file x.jpg"),
-        ("{}", r"input photos has no files; name them .* or with --input photos=PATH"),
+        ("{}", r"input photos has no files; give them .* or with --input photos=PATH"),
     ],
 )
 def test_missing_files_are_one_sentence(

@@ -379,7 +379,7 @@ def test_metrics_that_the_wiring_cannot_produce_are_refused(
     assert [asked(metric) for metric in ("shots.lens_x_px", "'shots.lens_*'")] == ["", ""]
     for metric in ("lens_x_px", "lens_*"):
         assert asked(f"'shots.{metric}'", alone).startswith(
-            f"compare.metrics[0]: step shots reports {metric} only with calibration wired"
+            f"compare.metrics[0]: step shots reports {metric} only if calibration is connected"
         )
     assert asked("'shots.*'", alone) == asked("'*.n_photos'", alone) == ""
     assert "step shots reports no metric depth_mm" in asked("shots.depth_mm")

@@ -203,7 +203,7 @@ def test_a_record_alone_is_drawn_as_its_run_is(run: Path, tmp_path: Path, target
     for source, name in ((run, "of-run"), (alone, "alone")):
         done = export(source, target, tmp_path / name)
         assert done.exit_code == 0, done.output
-    assert f"note: {alone} stands alone: its rasters are made again" in done.output
+    assert f"note: {alone} has no files next to it: its rasters are recreated" in done.output
     made, wanted = (
         {
             path.relative_to(tmp_path / name): path.read_bytes()
@@ -237,7 +237,7 @@ def test_one_wall_is_drawn_without_the_files_of_another(run: Path) -> None:
     )
     published = (*whole.record.published, gone)
     partly = replace(whole, record=replace(whole.record, published=published))
-    with pytest.raises(RecordError, match=f"wall_{WALL + 1}_ortho.tif is gone from"):
+    with pytest.raises(RecordError, match=f"wall_{WALL + 1}_ortho.tif is missing in"):
         room_results(partly)
     (wall,) = room_results(partly, wall=WALL).walls
     assert wall.number == WALL
@@ -250,7 +250,10 @@ def test_one_wall_is_drawn_without_the_files_of_another(run: Path) -> None:
         (("--wall", 0), "--wall 0: mosaic shows no wall 0; it shows 2"),
         (("--paper", "B7"), "--paper must be A0"),
         (("--grid", "0.01"), "--grid 0.01 puts crosses closer together than 2 mm at 1:"),
-        (("--step", "plane"), "the step plane holds no orthoimages or walls; those of this run:"),
+        (
+            ("--step", "plane"),
+            "the step plane has no orthoimages or walls; steps of this run that have:",
+        ),
         (("--step", "none"), "has no step 'none'"),
         (("--title-block", "missing.yaml"), "missing.yaml cannot be read"),
     ],
