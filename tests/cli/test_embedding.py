@@ -120,7 +120,7 @@ def test_products_that_nobody_has_are_named_and_no_store_is_made(studio: Studio)
     with pytest.raises(ArgumentError) as caught:
         write_embedded(named, studio.folder / "whole.h5", store)
     assert str(caught.value) == (
-        f"neither the record {run.path} nor the store {store.folder} has paint.{port}: name the "
+        f"neither the record {run.path} nor the store {store.folder} has paint.{port}: give the "
         "store of the run with --store, or replay the run"
     )
     assert not store.folder.exists()

@@ -182,7 +182,7 @@ def test_a_signature_of_something_else_does_not_fit(finished: Studio, run: Path)
         (("sign", "--key", "nothing"), "there is no key file nothing"),
         (("sign", "--key", "jane.pub"), "to verify: sign with the private key, jane"),
         (("sign", "--key", "other"), "other must be an Ed25519 key; create one with `ssh-keygen"),
-        (("sign", "--key", "jane-protected"), "is protected by a password, and there is no term"),
+        (("sign", "--key", "jane-protected"), "has a passphrase, but there is no term"),
         (("verify", "--signer", "jane"), "jane is not a public key in OpenSSH format"),
         (("verify", "--signer", "other.pub"), "other.pub must be an Ed25519 key"),
     ],
