@@ -91,7 +91,8 @@ def test_what_the_author_has_not_written_is_found(
     checked = CliRunner().invoke(program, words)
     assert checked.exit_code == 0, checked.output
     assert checked.output.splitlines()[-1] == (
-        "warning: as `plugins new` wrote it, write your own: the summary of method "
+        "warning: still the text from `plugins new`; replace it with your own: "
+        "the summary of method "
         "plane.left-finder, the docstring of LeftFinder"
     )
     assert len(json.loads(CliRunner().invoke(program, [*words, "--json"]).output)["unwritten"]) == 2
