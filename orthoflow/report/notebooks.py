@@ -193,14 +193,10 @@ class OpenedRun(Run):
         if chosen not in places:
             lacks = f"the run {self.record.run_id} has no orthoimages"
             if places:
-                raise ArgumentError(
-                    f"{lacks} of {cell}; steps with orthoimages: {', '.join(places)}"
-                )
+                raise ArgumentError(f"{lacks} of {cell}, only of {', '.join(places)}")
             raise ArgumentError(f"{self.with_failure(lacks)}{self._way_to_logs()}")
         if not (cell or baseline):
-            warnings.warn(
-                f"the baseline has no orthoimages; this one is from {chosen}", stacklevel=2
-            )
+            warnings.warn(f"the baseline has no orthoimages; showing {chosen}", stacklevel=2)
         images = Orthoimages.from_payload(self.payload(chosen, places[chosen])).images
         image = next((image for image in images if number in (None, image.number)), None)
         if image is None:

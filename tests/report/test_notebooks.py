@@ -163,9 +163,7 @@ def test_an_orthoimage_is_an_array_by_its_wall_s_number(tmp_path: Path) -> None:
     assert image.file is None
     with pytest.raises(ArgumentError, match="mosaic has no orthoimage of wall 0; walls: 3, 8"):
         run.orthoimage(0)
-    with pytest.raises(
-        ArgumentError, match="no orthoimages of first; steps with orthoimages: mosaic"
-    ):
+    with pytest.raises(ArgumentError, match="no orthoimages of first, only of mosaic"):
         run.orthoimage(cell="first")
 
 
@@ -190,7 +188,7 @@ def test_an_orthoimage_is_of_the_dataset_that_is_named(tmp_path: Path) -> None:
     run = Painted(path=run.path, record=record([*failed, *varied], workflow_resolved=resolved))
     with pytest.warns(
         UserWarning,
-        match="the baseline has no orthoimages; this one is from mosaic@data=noisy,plane=b",
+        match="the baseline has no orthoimages; showing mosaic@data=noisy,plane=b",
     ):
         assert run.orthoimage(8, data="noisy").cell == "mosaic@data=noisy,plane=b"
     with pytest.raises(ArgumentError, match=r"no dataset noise \(did you mean noisy\?\)"):
