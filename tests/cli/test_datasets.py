@@ -127,9 +127,9 @@ def test_check_counts_the_datasets_and_names_every_missing_file(folder: Path) ->
     done = orthoflow(folder, "check", "rooms.yaml", "--datasets", "gone.csv")
     assert done.exit_code == 2
     said = done.stderr
-    assert "input number@a: there is no file a.txt beside the table gone.csv:3 (" in said
+    assert "input number@a: there is no file a.txt next to the table gone.csv:3 (" in said
     at = "\ngone.csv:4:3: b.number: input number@b: "
-    assert f"{at}there is no file b.txt beside the table gone.csv:4 (" in said
+    assert f"{at}there is no file b.txt next to the table gone.csv:4 (" in said
 
 
 def test_each_dataset_becomes_a_run_folder_that_stands_alone(folder: Path, tmp_path: Path) -> None:

@@ -485,7 +485,7 @@ def cell_centres(shape: tuple[int, int]) -> np.ndarray:
 def test_the_scale_at_which_cells_print_finely_is_a_usual_one(run: Path, tmp_path: Path) -> None:
     # Cells of 10 mm have 150 to the inch from 1:59.06 on.
     said = export(run, tmp_path / "out", "--scale", 20).output
-    assert "from 1:100 on they are fine enough" in said
+    assert "1:100 is fine enough" in said
     assert (usual_scale(41.0), usual_scale(20.1), usual_scale(2.1)) == (50, 25, 5)
 
 

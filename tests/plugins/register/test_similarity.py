@@ -86,7 +86,7 @@ def test_too_few_pairs_and_lines_are_refused(tmp_path: Path) -> None:
     with pytest.raises(MethodError, match=r"2 names are in both lists of points \(P2, P3\)"):
         register(tmp_path, points_at(source), other)
     line = np.outer(np.arange(5.0), [1.0, 2.0, 3.0])
-    with pytest.raises(MethodError, match="lie on one line"):
+    with pytest.raises(MethodError, match="are on one line"):
         register(tmp_path, points_at(line), points_at(line))
 
 
