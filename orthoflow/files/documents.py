@@ -126,8 +126,9 @@ def mistakes(
     keys = {loc for loc, at_key in places if at_key}
     for (loc, at_key), alternatives in places.items():
         # Skip consequences: a list too short because of invalid items, a wrong value of an invalid
-        # key, a key that is missing because it is misspelt.
-        follows = any(len(other) > len(loc) and other[: len(loc)] == loc for other, _ in places)
+        # key (but not the key itself), a key that is missing because it is misspelt.
+        is_outer = any(len(other) > len(loc) and other[: len(loc)] == loc for other, _ in places)
+        follows = is_outer and not at_key
         is_missing = alternatives[0]["type"] == "missing"
         beside = [str(key[-1]) for key in keys if key[:-1] == loc[:-1]]
         follows |= is_missing and any(nearest(name, [str(loc[-1])]) for name in beside)

@@ -65,6 +65,7 @@ STEPS = [
     "x: {variants: {a: {use: plane.hough2d, in: {cloud: cloud.cloud}}}}",
     "x: !python {use: simulate.room}",
     "3: {use: simulate.room}",
+    '"": {in: {cloud: cloud.cloud}, variants: {a: ~, b: {use: plane.hough2d}}}',
     "a: {use: plain.hough2d}\nb: {use: plane.hough2d, in: {cloud: a.cloud}}",
     (
         "p: {use: plane.unheard-of, in: {cloud: cloud.cloud}}\n"
