@@ -107,8 +107,8 @@ def export_crate(run: Run, folder: Path, chosen: Choices) -> str:
         for flag, said in (("--license", chosen.license_text), ("--author", author))
         if not said
     ]
-    told = f"; {' and '.join(lacking)} would add missing information" if lacking else ""
-    return f"{counted(len(files), 'file')}, described in {files[0].name}{told}"
+    advice = f"; {' and '.join(lacking)} would add missing information" if lacking else ""
+    return f"{counted(len(files), 'file')}, described in {files[0].name}{advice}"
 
 
 def export_layers(run: Run, folder: Path, chosen: Choices) -> str:

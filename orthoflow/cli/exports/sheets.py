@@ -213,9 +213,7 @@ def usual_scale(least: float) -> int:
     >>> usual_scale(30.2), usual_scale(20.1), usual_scale(200.0), usual_scale(2.4), usual_scale(9)
     (50, 25, 200, 5, 10)
     """
-    power = 10.0 ** math.floor(math.log10(least))
-    usual = (factor * power for factor in (1.0, 2.0, 2.5, 5.0, 10.0))
-    return next(round(n) for n in usual if n.is_integer() and n >= least * (1.0 - 1e-9))
+    return next((n for n in SCALES if n >= least * (1.0 - 1e-9)), round(nice_step(least)))
 
 
 def _ppi(wall: WallResult, scale: int) -> float:

@@ -454,9 +454,10 @@ def _report(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:
             [1e3 * item.image.frame.gsd_m * item.shifts_cells for item in verdicts]
         )
         rms = np.sqrt(np.mean(np.hstack([shifts_cells, shifts_mm]) ** 2, axis=0))
-        names = ("u_rms_cells", "v_rms_cells", "u_rms_mm", "v_rms_mm")
-        for name, value in zip(names, rms, strict=True):
-            ctx.metric(f"overlap_{name}", value, name.rpartition("_")[2])
+        ctx.metric("overlap_u_rms_cells", rms[0], "cells")
+        ctx.metric("overlap_v_rms_cells", rms[1], "cells")
+        ctx.metric("overlap_u_rms_mm", rms[2], "mm")
+        ctx.metric("overlap_v_rms_mm", rms[3], "mm")
     grey = np.concatenate([item.steps[0] for item in verdicts])
     if len(grey):
         delta_e = np.concatenate([item.steps[1] for item in verdicts])
