@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -11,7 +12,7 @@ import click
 from orthoflow.cli.commands import RecordCommand, code_for, echo_error, input_option, store_option
 from orthoflow.cli.exports.choices import Choices
 from orthoflow.cli.exports.formats import FORMATS, Format, FormatOption, check_choices
-from orthoflow.cli.exports.products import make_empty
+from orthoflow.cli.exports.products import make_empty, store_of
 from orthoflow.cli.tables import counted, echo
 from orthoflow.errors import ArgumentError, RecordError
 
@@ -242,6 +243,7 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     chosen = Choices(**choices)
     check_choices(chosen, target, format_options())
     opened = open_run(run)
+    chosen = replace(chosen, store=store_of(opened, chosen.store))
     name = target or ("datasets" if chosen.split else "embedded")
     folder = output or _folder_inside(opened, *((_EXPORT_FOLDER,) if target else ()), name)
     _refuse_filled(folder)

@@ -265,6 +265,10 @@ class Store:
             raise DamageError(f"{damaged} ({error})") from error
         return cls.from_payload(Payload(**shared_fields(stored, Payload)))
 
+    def has_product(self, digest: str) -> bool:
+        """Return whether the store contains a product; its bytes are not checked."""
+        return (self._object(digest) / PRODUCT).exists()
+
     def product_file(self, digest: str) -> Path | None:
         """Return the HDF5 file of a product; None if it is missing or damaged."""
         return self._object(digest) / PRODUCT if self.is_sound(digest) else None

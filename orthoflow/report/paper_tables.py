@@ -36,6 +36,7 @@ def paper_files(run: Run) -> dict[str, str]:
     files = {"results.csv": _values(run).csv()}
     tables = [_results(run)]
     if over := over_datasets(parts_of(run)):
+        files["datasets.csv"] = over_table(over).csv()
         names = ("label", "better", "combination", "datasets", "median", "median_difference")
         tables.append(over_table(over).only(*names, "interval_low", "interval_high", "p_holm"))
     for table in tables:

@@ -10,6 +10,8 @@ from pathlib import Path
 import h5py
 import pytest
 
+from orthoflow.cli.commands import DEFAULT_STORE
+from orthoflow.cli.exports.products import store_of
 from orthoflow.engine.store import Store
 from orthoflow.errors import ArgumentError, RecordError
 from orthoflow.records.open import open_run
@@ -109,7 +111,9 @@ def test_a_refused_export_of_a_record_alone_leaves_nothing(
     assert [path.name for path in alone.iterdir()] == ["run.h5"]
 
 
-def test_products_that_nobody_has_are_named_and_no_store_is_made(studio: Studio) -> None:
+def test_products_that_nobody_has_are_named_and_no_store_is_made(
+    studio: Studio, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run = open_run(studio.folder / "first")
     survey, paint = run.record.cells
     (port,) = paint.outputs
@@ -125,6 +129,12 @@ def test_products_that_nobody_has_are_named_and_no_store_is_made(studio: Studio)
     )
     assert not store.folder.exists()
     assert not (studio.folder / "whole.h5").exists()
+    # The default store is found from other folders, too; another one is used as given.
+    (elsewhere := studio.folder / "elsewhere").mkdir()
+    monkeypatch.chdir(elsewhere)
+    assert store_of(named, DEFAULT_STORE) == studio.folder / DEFAULT_STORE
+    assert store_of(named, elsewhere) == elsewhere
+    assert store_of(run, DEFAULT_STORE) == DEFAULT_STORE
 
 
 def test_what_cannot_be_embedded_is_named(studio: Studio) -> None:

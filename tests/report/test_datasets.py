@@ -18,7 +18,8 @@ from orthoflow.records.runs import Run, datasets_of, parts_of
 from orthoflow.records.write import NOT_YET
 from orthoflow.report import write_page, write_report
 from orthoflow.report.comparisons import dataset_table
-from orthoflow.report.paired import over_datasets, over_table, who_leads
+from orthoflow.report.paired import over_datasets, who_leads
+from orthoflow.report.paper_tables import paper_files
 from tests.report_runs import (
     HeldRun,
     cell,
@@ -80,8 +81,7 @@ def rooms(tmp_path: Path) -> HeldRun:
 
 def test_the_table_over_datasets_has_a_row_per_combination(tmp_path: Path) -> None:
     run = run_of(tmp_path, {"hall": (6.0, 1.0), "stairs": (3.0, 1.0), "attic": (4.0, None)})
-    table = over_table(over_datasets(parts_of(run)))
-    slow, quick = csv.DictReader(io.StringIO(table.csv()))
+    slow, quick = csv.DictReader(io.StringIO(paper_files(run)["datasets.csv"]))
     assert {row["metric"] for row in (slow, quick)} == {"rms_mm"}
     assert (slow["combination"], slow["median"], slow["pairs"]) == ("plane=slow", "4.0", "")
     wanted = ("datasets", "failed", "pairs", "wins", "losses", "median_difference", "p")

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from orthoflow.cli.commands import echo_error
+from orthoflow.cli.commands import DEFAULT_STORE, echo_error
 from orthoflow.errors import ArgumentError, StoreError
 from orthoflow.untrusted_text import first_few
 
@@ -51,6 +51,25 @@ def product_of(run: Run, digest: str, cls: type[ProductT], store: Path) -> Produ
             f"neither its record nor the store {store} contains the {cls.type_name} of this run "
             f"({error}): pass its store with --store, or run the workflow again with --embed"
         ) from error
+
+
+def store_of(run: Run, given: Path) -> Path:
+    """Return the store with the products that a record references but does not contain.
+
+    If `given` is the default, stores above the run folder are considered, too, because a run may be
+    exported from another folder than the one in which it was made.
+    """
+    from orthoflow.engine.store import Store
+
+    missing = {
+        output.digest
+        for recorded in run.cells.values()
+        for output in recorded.outputs.values()
+        if not output.embedded
+    }
+    above = [folder / DEFAULT_STORE for folder in run.home_folder.absolute().parents]
+    stores = [given, *(above if given == DEFAULT_STORE else [])]
+    return max(stores, key=lambda store: sum(map(Store(store).has_product, missing)))
 
 
 def output_of(run: Run, type_name: str, cell: str | None) -> tuple[str, str]:
