@@ -41,8 +41,8 @@ _EVERY_S: Final = 10.0
 _NOTEBOOK_EVERY_S: Final = 1.0
 # While running, a notebook shows only the last lines, so that the running steps below stay visible.
 _NOTEBOOK_LINES: Final = 40
-# Shorter times of loading and compiling are not reported.
-_MIN_COMPILE_S: Final = 2.0
+# Shorter times of starting, loading and compiling are not reported.
+_MIN_MORE_S: Final = 2.0
 _STYLES: Final = {
     "running": "cyan",
     "ok": "green",
@@ -203,6 +203,8 @@ class Progress:
                     return self._reported_line(event.address, event.event.diagnostic)
                 case CellFinished():
                     result = event.result
+                    started = self._cells.get(event.address, CellState()).started
+                    more_s = time.monotonic() - started - result.wall_s if started else 0.0
                     self._cells[event.address] = CellState(
                         state="cached" if event.cached else result.status,
                         text=result.error_message,
@@ -214,7 +216,7 @@ class Progress:
                         if n_similar
                         else ""
                     )
-                    return f"{_end_text(event)}{more}"
+                    return f"{_end_text(event, more_s)}{more}"
         return ""
 
     def _reported_line(self, address: str, one: Diagnostic) -> str:
@@ -307,14 +309,19 @@ class Progress:
         return table
 
 
-def _end_text(event: CellFinished) -> str:
-    """Describe the outcome of a cell, its duration, and the reason for a failure."""
+def _end_text(event: CellFinished, more_s: float) -> str:
+    """Describe the outcome of a cell, its duration, and the reason for a failure.
+
+    Args:
+        event: the end of the cell.
+        more_s: time since its start that is not part of its duration.
+    """
     result = event.result
     if event.cached:
         return f"{event.address}: cached"
     took = f" in {duration(result.wall_s)}" if result.started else ""
-    if took and (result.compile_s or 0.0) >= _MIN_COMPILE_S:
-        took += f", plus {duration(result.compile_s or 0.0)} of loading and compiling"
+    if took and more_s >= _MIN_MORE_S:
+        took += f", plus {duration(more_s)} of starting, loading and compiling"
     # The summary contains the reasons for skipped cells.
     why = f": {result.error_message}" if result.status == "failed" else ""
     return f"{event.address}: {result.status}{took}{why}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -148,6 +149,7 @@ class Call:
         from orthoflow.engine.journal import LOGS, cell_file_name
         from orthoflow.records.runs import REPORT_FILE
 
+        began_s = time.monotonic()
         outcome, run = self.make()
         folder = run.folder
         report = folder / REPORT_FILE
@@ -156,7 +158,7 @@ class Call:
                 log = folder / LOGS / f"{cell_file_name(address)}.log"
                 echo_error(f"{address}: traceback: {log}")
         try:
-            _print_summary(run, report, outcome.resumed)
+            _print_summary(run, report, outcome.resumed, time.monotonic() - began_s)
         except BrokenPipeError:
             # The reader has closed the pipe; the exit code still gives the outcome of the run.
             silence_stdout()
@@ -281,13 +283,14 @@ def _json_log(path: Path | None, plan: RunPlan) -> Iterator[RunListener]:
         yield listen
 
 
-def _print_summary(run: Run, report: Path, kept: Collection[str]) -> None:
+def _print_summary(run: Run, report: Path, kept: Collection[str], took_s: float) -> None:
     """Print the table of cells, the warnings, and the paths of report, record and images.
 
     Args:
         run: the finished run.
         report: path of its report.
         kept: addresses of the cells computed before an interruption.
+        took_s: duration of the whole run.
     """
     cells = run.record.cells
     echo()
@@ -308,6 +311,7 @@ def _print_summary(run: Run, report: Path, kept: Collection[str]) -> None:
         echo()
     echo_diagnostics(cells, run.folder)
     echo("", _cached_text(cells, kept))
+    echo(f"total time: {duration(took_s)}, including starting, loading and compiling")
     from orthoflow.report.combinations import baseline_of
     from orthoflow.workflow.expand import variants_text
 

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 # Number of columns of metrics that fit in a wide window.
 _COLUMNS_MOST: Final = 5
 _NOTHING: Final = "-"
+_COST_UNITS: Final = ("s", "MiB")
 
 
 @click.command(cls=RecordCommand)
@@ -199,7 +200,13 @@ def _print_metrics(run: Run, *, most: int | None = None) -> None:
         for cell, metric in first_rows(
             metrics,
             most,
-            lambda one: (not one[1].headline, not one[1].better, -steps.index(one[0].step)),
+            # Quality first, later steps before earlier ones; times and memory last.
+            lambda one: (
+                one[1].unit in _COST_UNITS,
+                not one[1].headline,
+                not one[1].better,
+                -steps.index(one[0].step),
+            ),
         )
     ]
     if rows:
@@ -224,6 +231,8 @@ def _print_environments(run: Run) -> None:
 
 
 def _print_files(run: Run) -> None:
+    from orthoflow.records.walls import delivered_walls
+
     published = run.record.published
     n_files = sum((run.folder / file.path).exists() for file in published)
     of_all = "" if n_files == len(published) else f" of {len(published)} published"
@@ -231,8 +240,10 @@ def _print_files(run: Run) -> None:
     if published and not n_files:
         where = f"none of the {len(published)} published files is next to the record"
     echo("", f"products: {where}")
+    about = {wall.orthoimage: wall.sentence for wall in delivered_walls(run.products_folder)}
     for image in run.orthoimages:
-        echo(f"orthoimage: {image}")
+        sentence = about.get(image.relative_to(run.products_folder).as_posix())
+        echo(f"orthoimage: {image}" + (f" ({sentence})" if sentence else ""))
 
 
 def _as_json(run: Run) -> dict[str, object]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import itertools
 import re
 import sys
 import time
@@ -32,7 +33,6 @@ from orthoflow.sdk.context import StepEvent
 from orthoflow.workflow.expand import Cell
 
 OK = CellResult(status="ok", started="2026-01-02T03:04:05.000Z", wall_s=1.25, compile_s=1.9)
-COMPILED = dataclasses.replace(OK, compile_s=45.0)
 FAILED = CellResult(
     status="failed", started="2026-01-02T03:04:05.000Z", wall_s=75.0, error_message="no plane"
 )
@@ -66,7 +66,8 @@ EVENTS: list[RunEvent] = [
     CellFinished(address="plane", result=FAILED, cached=False),
     CellFinished(address="wall", result=SKIPPED, cached=False),
     CellFinished(address="other", result=OK, cached=False),
-    CellFinished(address="last", result=COMPILED, cached=False),
+    CellStarted(address="last"),
+    CellFinished(address="last", result=OK, cached=False),
 ]
 
 
@@ -89,7 +90,11 @@ def running(*, fraction: float = 0.0, took_s: float | None = None) -> CellState:
 # Lines --------------------------------------------------------------------------------------------
 
 
-def test_a_log_has_a_line_per_start_end_and_code(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_log_has_a_line_per_start_end_and_code(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock_s = itertools.count(100.0, 46.25)
+    monkeypatch.setattr(time, "monotonic", lambda: next(clock_s))
     with Progress() as progress:
         for event in EVENTS:
             progress.take(event)
@@ -105,7 +110,8 @@ def test_a_log_has_a_line_per_start_end_and_code(capsys: pytest.CaptureFixture[s
         "plane: failed in 1 min 15 s: no plane, 1 warning with a code shown above (2 of 5)",
         "wall: skipped (3 of 5)",
         "other: ok in 1.2 s (4 of 5)",
-        "last: ok in 1.2 s, plus 45.0 s of loading and compiling (5 of 5)",
+        "last: started",
+        "last: ok in 1.2 s, plus 45.0 s of starting, loading and compiling (5 of 5)",
         "resuming run r1: 1 step",
     ]
 
@@ -204,7 +210,7 @@ def test_a_notebook_keeps_one_output_with_a_line_per_step(
         "plane: failed in 1 min 15 s: no plane, 1 warning with a code shown above",
         "wall: skipped",
         "other: ok in 1.2 s",
-        "last: ok in 1.2 s, plus 45.0 s of loading and compiling",
+        "last: ok in 1.2 s",
     ]
     assert capsys.readouterr().err == ""
 

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from orthoflow_provenance.document import Metric
 
 from orthoflow.cli import show as module
 from tests.report_runs import cell, compared_run
@@ -23,5 +24,27 @@ def test_of_a_comparison_a_row_per_combination_is_shown(
     assert "1.10 ± 0.10" in rows["plane=fine"]
     assert rows["plane=broken"].split()[1:] == ["-"] * (len(told[1].split()) - 1)
     assert told[5].startswith("means over repeats ± standard deviation")
+    values = [("peak_mib", "MiB"), ("n_points", "1"), ("sigma_mm", "mm"), ("rms_mm", "mm")]
+    metrics = [
+        Metric(
+            name=name,
+            value=1.0,
+            unit=unit,
+            better="" if unit == "1" else "lower",
+            headline=name == "rms_mm",
+        )
+        for name, unit in values
+    ]
+    plane: Any = SimpleNamespace(
+        record=SimpleNamespace(cells=(cell("plane", metrics=tuple(metrics)),))
+    )
+    module._print_metrics(plane, most=3)
+    rows = capsys.readouterr().out.splitlines()[2:]
+    assert [row.split()[1] for row in rows] == [
+        "rms_mm",
+        "sigma_mm",
+        "n_points",
+        "1",
+    ]  # "and 1 more"
     alone: Any = SimpleNamespace(record=SimpleNamespace(cells=(cell("plane"), cell("a@data=b"))))
     assert not module._print_comparison(alone)

@@ -55,7 +55,7 @@ def test_a_new_plugin_of_every_kind_loads_and_its_comparison_is_valid(
         cells = [one for one in expand_cells(workflow, catalog) if one.method == project.method_id]
         assert [one.skip_reason for one in cells] == [""]
     else:
-        assert f"`{kind}: {{use: {project.method_id}}}`" in told
+        assert f"`{kind}: {{use: {project.method_id}" in told
 
 
 def test_a_new_plugin_passes_the_suite_as_it_is(
@@ -135,6 +135,8 @@ def test_a_new_kind_takes_and_gives_what_is_asked_and_passes_the_suite(
     comparison = folder / "compare.yaml"
     assert comparison.exists() == bool(set(gives.split(",")) - known)
     if not comparison.exists():
+        readme = (folder / "README.md").read_text(encoding="utf-8")
+        assert f"{name}, in: {{cloud: STEP.cloud}}}}`" in readme
         return
     workflow = load_workflow(folder / "compare.yaml", catalog)
     cells = [cell for cell in expand_cells(workflow, catalog) if cell.step == kind]

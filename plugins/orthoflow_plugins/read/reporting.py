@@ -30,8 +30,8 @@ SUMMARY: Final = DiagnosticSpec(
     code="scan-summary",
     severity="note",
     is_summary=True,
-    text="{format}: {n_scans} scan{plural}, {n_points:,} points; fields used {used}; not used "
-    "{not_used}; unit {unit}; up {up}; extent {extent} m; left out {left_out}",
+    text="{format}: {n_scans} scan{plural}, {n_points:,} points; fields used: {used}; not used: "
+    "{not_used}; unit: {unit}; up: {up}; extent: {extent} m; points left out: {left_out}",
 )
 NO_EFFECT: Final = DiagnosticSpec(
     code="scan-setting-without-effect",
