@@ -85,19 +85,18 @@ def test_ties_and_displacements_are_drawn_on_the_wall_of_their_cell(tmp_path: Pa
 
 def test_marks_are_left_out_evenly_where_there_are_many(tmp_path: Path) -> None:
     run = compared_run(tmp_path)
-    (cameras,) = (run.products[place] for place in run.products if place[0] == "orient@plane=fine")
+    place = ("orient@plane=fine", "cameras")
+    cameras = run.products[place]
     ties = cameras.ties
-    many = replace(
-        ties,
-        **{
-            field.name: np.concatenate([getattr(ties, field.name)] * 30)
-            for field in fields(ties)
-            if isinstance(getattr(ties, field.name), np.ndarray)
-            and len(getattr(ties, field.name)) == len(ties.photo)
-        },
-    )
-    products = {**run.products, ("orient@plane=fine", "cameras"): replace(cameras, ties=many)}
-    found = next(overlays(replace(run, products=products), list(wall_pictures(run))))
+    repeated = {
+        field.name: np.concatenate([value] * 30)
+        for field in fields(ties)
+        if isinstance(value := getattr(ties, field.name), np.ndarray)
+        and len(value) == len(ties.photo)
+    }
+    many = replace(cameras, ties=replace(ties, **repeated))
+    crowded = replace(run, products={**run.products, place: many})
+    found = next(overlays(crowded, list(wall_pictures(run))))
     assert found.caption.endswith(", 600 of them shown")
 
 

@@ -198,19 +198,15 @@ def test_a_click_is_where_the_pointer_was_told_to_be(page: Page) -> None:
 
 
 def test_the_theme_follows_the_system_until_it_is_chosen(page: Page) -> None:
-    colour = "getComputedStyle(document.body).backgroundColor"
-    button = "document.getElementById('theme')"
+    seen = []
+    for theme, is_pressed in (("light", 0), ("dark", 0), ("dark", 1), ("dark", 1), ("light", 0)):
+        page.show_as(1440, theme=theme)
+        if is_pressed:
+            page.evaluate("document.getElementById('theme').click()")
+        seen.append(page.evaluate("getComputedStyle(document.body).backgroundColor"))
     light, dark = "rgb(255, 255, 255)", "rgb(20, 23, 26)"
-    assert page.evaluate(colour) == light
-    page.show_as(1440, theme="dark")
-    assert page.evaluate(colour) == dark
-    page.evaluate(f"{button}.click()")
-    assert page.evaluate(colour) == light
-    page.evaluate(f"{button}.click()")
-    page.show_as(1440, theme="light")
-    assert page.evaluate(colour) == dark
-    page.evaluate(f"{button}.click()")
-    assert page.evaluate(colour) == light
+    assert seen == [light, dark, light, dark, dark]
+    page.evaluate("document.getElementById('theme').click()")
 
 
 def test_nothing_sticks_out_of_a_phone(page: Page) -> None:
@@ -333,45 +329,12 @@ def test_rows_are_filtered_columns_chosen_and_the_table_turned(page: Page) -> No
 
 def test_few_combinations_stand_beside_each_other_where_their_row_would_be_cut(page: Page) -> None:
     region = "document.querySelector('[data-chooser]')"
-    is_turned, is_cut = (
-        f"!!{region}.querySelector('.turned')",
-        f"{region}.scrollWidth > {region}.clientWidth",
-    )
-    seen = {}
+    is_cut = f"{region}.scrollWidth > {region}.clientWidth"
     for width in (700, 1440):
         page.show_as(width)
         page.open(Path(page.evaluate("location.pathname")))
-        seen[width] = (page.evaluate(is_turned), page.evaluate(is_cut))
-    assert seen[700] == (True, False)
-    assert not seen[1440][1]
-
-
-def test_of_many_columns_as_many_stand_as_fit_and_all_are_a_click_away(
-    page: Page, tmp_path: Path
-) -> None:
-    was = page.evaluate("location.pathname")
-    text = Path(was).read_text(encoding="utf-8")
-    # Rows of their own for eight combinations, and each metric's column four times.
-    told = re.search(r'data-chooser="either">.*?</table>', text, re.DOTALL)
-    assert told is not None
-    table = re.sub(r"(<th[^>]* data-name=.*?</th>)", r"\1" * 4, told[0], flags=re.DOTALL)
-    table = re.sub(r'(<td class="n.*?</td>)', r"\1" * 4, table, flags=re.DOTALL)
-    head, body = table.split("<tbody>")
-    rows, end = body.split("</tbody>")
-    wide = tmp_path / "wide.html"
-    wide.write_text(text.replace(told[0], f"{head}<tbody>{rows * 3}</tbody>{end}"))
-    page.show_as(1440)
-    page.open(wide)
-    region = "document.querySelector('[data-chooser]')"
-    shown = f"[...{region}.querySelectorAll('th[data-name]')].filter(one => !one.hidden).length"
-    is_cut = f"{region}.scrollWidth > {region}.clientWidth"
-    n_all = page.evaluate(f"{region}.querySelectorAll('th[data-name]').length")
-    assert n_all > 30
-    assert 3 <= page.evaluate(shown) < n_all
-    assert not page.evaluate(is_cut)
-    page.evaluate("document.querySelectorAll('.chooser button')[1].click()")
-    assert page.evaluate(shown) == n_all
-    page.open(Path(was))
+        assert not page.evaluate(is_cut)
+        assert width > 700 or page.evaluate(f"!!{region}.querySelector('.turned')")
 
 
 def test_what_stands_behind_a_row_opens_from_it(page: Page) -> None:
@@ -429,19 +392,6 @@ def test_on_paper_results_are_unfolded(page: Page) -> None:
     page.evaluate(UNFOLD)
 
 
-def test_no_method_is_printed_letter_below_letter(page: Page) -> None:
-    page.show_as(700)
-    page.tab.emulate_media(media="print")
-    widths = page.evaluate(
-        "[...document.querySelectorAll('.steps tbody td:nth-child(2)')].map(e => e.clientWidth)"
-    )
-    page.tab.emulate_media(media="screen")
-    page.show_as(1440)
-    assert len(widths) > 2
-    # Ten letters of 7.5 points.
-    assert min(widths) > 45
-
-
 def test_two_environments_on_a_page_fit_a_phone(page: Page, tmp_path: Path) -> None:
     run = compared_run(tmp_path)
     [here] = run.record.environments
@@ -453,10 +403,6 @@ def test_two_environments_on_a_page_fit_a_phone(page: Page, tmp_path: Path) -> N
     page.open(tmp_path / "both.html")
     assert len(page.evaluate("document.querySelector('.legend').innerText").splitlines()) == 2
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
-    # The names stay in sight beside numbers that are scrolled: they leave these most of the room.
-    long = "document.querySelector('.scroll tbody th').textContent = 'plane=hough2d'.repeat(9)"
-    names = "Array.from(document.querySelectorAll('.scroll tbody th'))"
-    assert page.evaluate(f"{long}; Math.max(...{names}.map(one => one.offsetWidth))") <= 0.5 * 390
     assert page.complaints == []
 
 
@@ -527,10 +473,6 @@ def test_what_strangers_write_is_no_script_and_the_page_still_works(
     drawn = "[...document.images].filter(image => image.src.startsWith('data:image/svg'))"
     assert 40 in page.evaluate(f"{drawn}.map(image => image.naturalWidth)")
     page.evaluate(UNFOLD)
-    page.evaluate("document.querySelector('[data-part=position]').focus()")
-    page.press("ArrowRight")
-    cut = page.evaluate("document.querySelectorAll('.stage .layer')[1].style.clipPath")
-    assert cut == "inset(0px 49.5% 0px 0px)"
     page.evaluate("document.querySelector('th[data-sort] button').click()")
     assert page.evaluate("document.querySelectorAll('[aria-sort=ascending]').length") == 1
     assert page.complaints == []

@@ -46,28 +46,27 @@ def over(
         elsewhere: method and room whose value is of another environment.
     """
 
-    def number(name: str, value: float, **more: Any) -> Metric:
-        return Metric(name=name, value=value, unit=unit, **more)
-
+    judged: dict[str, Any] = {"better": better, "headline": True, "label": "size"}
     cells = []
     for method, values in methods.items():
         for room, given in enumerate(values):
             for repeat, value in enumerate(given if isinstance(given, list) else [given]):
-                found = []
-                if value is not None:
-                    counted = "n_photos" if n_photos else ""
-                    found = [
-                        number("size", value, better=better, headline=True, label="size",
-                               counted_by=counted)
-                    ]  # fmt: skip
-                    if n_photos:
-                        found.append(number("n_photos", float(n_photos[method][room])))
-                is_failed = given is None
+                counts = {"n_photos": float(n_photos[method][room])} if n_photos else {}
+                sizes = {} if value is None else {"size": value, **counts}
+                counted = {"counted_by": "n_photos"} if n_photos else {}
                 cells.append(
                     cell(
                         f"plane@data=r{room},plane={method}{f'#{repeat}' if repeat else ''}",
-                        status="failed" if is_failed else "ok",
-                        metrics=tuple(found),
+                        status="failed" if given is None else "ok",
+                        metrics=tuple(
+                            Metric(
+                                name=name,
+                                value=size,
+                                unit=unit,
+                                **(judged | counted if name == "size" else {}),
+                            )
+                            for name, size in sizes.items()
+                        ),
                         environment="e2" if (method, room) in elsewhere else "e1",
                     )
                 )

@@ -7,8 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+from orthoflow_provenance.document import RecordedProduct
 from scipy.spatial.transform import Rotation
 
 from orthoflow.files.images import decode_image
@@ -101,85 +103,66 @@ def test_an_orthoimage_says_what_became_of_its_cells() -> None:
     )
     assert (one.title, one.name, one.wall, one.number) == ("wall 4 (plane=fine)", "wall 4", 0, 4)
     assert (one.cell, one.frame, one.file) == ("mosaic@plane=fine", FRAME, "")
-    assert one.width_m == pytest.approx(12.0)
     # A bar of at most three tenths of it.
-    assert one.scale == ("2 m", pytest.approx(100 / 6))
+    assert (one.width_m, one.scale) == (pytest.approx(12.0), ("2 m", pytest.approx(100 / 6)))
     assert one.layer == "orthoimage (plane=fine)"
-    assert Picture(uri="", title="error map", caption="").width_m == 0.0
-
-
-def test_what_cannot_be_seen_is_transparent() -> None:
-    (one,) = orthoimage_pictures(run(orthoimages()))
+    # What cannot be seen is transparent.
     content = base64.b64decode(one.uri.partition(",")[2])
-    import cv2
-
     alpha = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)[..., 3]
     assert (alpha[:30] == 255).all()
     assert (alpha[31:44] == 0).all()
     assert (alpha[46:] == 255).all()
 
 
-def walls(*, has_intensity: bool = True, source: str = "laser") -> Walls:
+def walls(*, source: str = "laser") -> Walls:
     depth_m = np.zeros(FRAME.shape, dtype=np.float32)
     # One row of 300 is 5 cm before the plane: less than a hundredth of the cells.
     depth_m[:2] = 0.05
     depth_m[2] = np.nan
     mask = np.ones(FRAME.shape, dtype=np.uint8)
     mask[2:14] = SurfaceMask.VOID
+    shades = np.linspace(0, 1, depth_m.size, dtype=np.float32).reshape(FRAME.shape)
     wall = samples.wall(
         FRAME,
         depth_m=depth_m,
         sigma_m=np.zeros_like(depth_m),
         mask=mask,
-        intensity=np.linspace(0, 1, depth_m.size, dtype=np.float32).reshape(FRAME.shape)
-        if has_intensity
-        else None,
+        intensity=None if source == "none" else shades,
         name="wall 8",
         plane_index=8,
     )
-    return Walls(
-        walls=(wall,),
-        up=np.array([0.0, 0.0, 1.0]),
-        intensity_source=source if has_intensity else "none",
-        buffer_front_m=0.1,
-        buffer_behind_m=0.1,
-    )
-
-
-def test_causes_of_unknown_cells_are_found_where_the_step_has_told_them() -> None:
-    recorded = run(walls(), type_name="walls", variants="fine", log="4.0% show nothing")
-    *_, depth = wall_pictures(recorded)
-    words = "96.0 % of the depths known; for the reasons, see the log of mosaic@plane=fine"
-    assert depth.caption == words
+    up = np.array([0.0, 0.0, 1.0])
+    buffers_m = {"buffer_front_m": 0.1, "buffer_behind_m": 0.1}
+    return Walls(walls=(wall,), up=up, intensity_source=source, **buffers_m)
 
 
 def test_a_wall_has_pictures_of_its_intensity_and_its_depth() -> None:
-    recorded = run(walls(), type_name="walls", variants="fine")
-    intensity, depth = wall_pictures(recorded)
-    assert (intensity.title, depth.title) == (
-        *("wall 8, intensity (plane=fine)", "wall 8, depth (plane=fine)"),
-    )
-    assert intensity.caption == "laser intensity"
-    assert depth.caption == "96.0 % of the depths known"
+    def pictured(source: str, **more: Any) -> list[Picture]:
+        made = walls(source=source)
+        log = "4.0% show nothing" if source == "none" else ""
+        recorded = run(made, type_name="walls", variants="fine", log=log)
+        return list(wall_pictures(recorded, **more))
+
+    intensity, depth = pictured("laser")
+    titles = [f"wall 8, {what} (plane=fine)" for what in ("intensity", "depth")]
+    assert [intensity.title, depth.title] == titles
+    assert (intensity.caption, depth.caption) == ("laser intensity", "96.0 % of the depths known")
     for one in (intensity, depth):
         assert (one.wall, one.number, one.name, one.frame) == (0, 8, "wall 8", FRAME)
         assert one.cell == "mosaic@plane=fine"
         assert shown(one) == (250, 1000)
     # 99 of 100 cells lie on the plane: the scale is the smallest that there is.
     assert depth.depth_limit_m == 0.001
-    assert depth.depths is not None
-    assert intensity.depths is None
+    assert (intensity.depths is None, depth.depths is None) == (True, False)
     # Only half as large where a page gives them a fiftieth of its bytes: one product is fifty.
-    assert shown(next(wall_pictures(recorded, share=0.02)))[1] == 490
-    (alone,) = wall_pictures(run(walls(has_intensity=False), type_name="walls", variants="fine"))
-    assert alone.title == "wall 8, depth (plane=fine)"
-
-
-def test_grey_of_colours_is_no_laser_intensity() -> None:
-    recorded = run(walls(source="luminance"), type_name="walls", variants="fine")
-    assert next(wall_pictures(recorded)).caption == (
+    assert shown(pictured("laser", share=0.02)[0])[1] == 490
+    assert pictured("luminance")[0].caption == (
         "grey of the scan's colours, because the scan has no laser intensity"
     )
+    # Causes of unknown cells are found where the step has told them.
+    (alone,) = pictured("none")
+    reasons = "for the reasons, see the log of mosaic@plane=fine"
+    assert (alone.title, alone.caption) == (titles[1], f"96.0 % of the depths known; {reasons}")
 
 
 def test_depths_take_the_colours_between_those_of_the_classes() -> None:
@@ -200,20 +183,20 @@ def test_depths_take_the_colours_between_those_of_the_classes() -> None:
 
 
 def test_equal_products_and_repeats_are_shown_once() -> None:
-    out = given("", "a", "walls")
+    def made(digest: str, type_name: str = "walls") -> dict[str, RecordedProduct]:
+        return {"walls": given("", digest, type_name)}
+
+    named = {"walls": replace(given("", "d", "walls"), embedded=False)}
     cells = [
-        cell("wall@plane=fine", outputs={"walls": out, "more": given("", "b", "walls")}),
-        cell("wall@plane=other", outputs={"walls": out}),
-        cell("wall@plane=fine#1", outputs={"walls": given("", "c", "walls")}),
-        cell(
-            "wall@plane=named", outputs={"walls": replace(given("", "d", "walls"), embedded=False)}
-        ),
-        cell("mosaic", outputs={"walls": given("", "e", "orthoimages")}),
+        cell("wall@plane=fine", outputs={**made("a"), "more": given("", "b", "walls")}),
+        cell("wall@plane=other", outputs=made("a")),
+        cell("wall@plane=fine#1", outputs=made("c")),
+        cell("wall@plane=named", outputs=named),
+        cell("mosaic", outputs=made("e", "orthoimages")),
     ]
     recorded = HeldRun(path=Path("run.h5"), record=record(cells))
-    assert embedded_products(recorded, "walls") == (
-        *(("wall@plane=fine", "walls"), ("wall@plane=fine", "more")),
-    )
+    found = [("wall@plane=fine", "walls"), ("wall@plane=fine", "more")]
+    assert [*embedded_products(recorded, "walls")] == found
     assert embedded_products(recorded, "orthoimages") == (("mosaic", "walls"),)
 
 
@@ -285,15 +268,11 @@ def test_a_bar_is_as_long_as_it_says(width_m: float) -> None:
     assert 10 <= percent <= 30
 
 
-def test_few_depths_are_all_told_in_millimetres() -> None:
-    depth_m = np.array([[0.0014, -0.0016, np.nan], [1.2344, 0.0, np.inf]], dtype=np.float32)
-    assert coarse_depths(depth_m) == {
-        "columns": 3, "rows": 2, "mm": [1, -2, None, 1234, 0, None]
-    }  # fmt: skip
-
-
 @pytest.mark.parametrize("shape", [(400, 800), (1, 7000)])
 def test_many_depths_are_told_at_about_eight_thousand_places(shape: tuple[int, int]) -> None:
+    few_m = np.array([[0.0014, -0.0016, np.nan], [1.2344, 0.0, np.inf]], dtype=np.float32)
+    few = {"columns": 3, "rows": 2, "mm": [1, -2, None, 1234, 0, None]}
+    assert coarse_depths(few_m) == few
     columns = np.arange(shape[1], dtype=np.float32)
     # A depth tells its column, in millimetres.
     found: Any = coarse_depths(np.broadcast_to(columns / np.float32(1000.0), shape).copy())

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from orthoflow_provenance.document import RecordedCell
 
 from orthoflow.products import Planes, ScanRow, Spread, Thickness
 from orthoflow.report.tables import PlaneTables, plane_tables
 from tests.report_runs import HeldRun, cell, given, record
 
-PLACE = ("plane@plane=toy", "planes")
 FABRIC = Spread(low=0.0, high=0.3, n_points=70, sigma_m=0.004, name="fabric")
 PLASTER = Spread(low=0.3, high=1.0, n_points=90, sigma_m=0.001, name="plaster")
 
@@ -33,12 +34,15 @@ def wall_and_floor() -> Planes:
     )
 
 
-def table(planes: Planes) -> PlaneTables:
-    outputs = {PLACE[1]: given("", "a", "planes")}
-    cells = [cell(PLACE[0], outputs=outputs)]
-    run = HeldRun(path=Path("run.h5"), record=record(cells), products={PLACE: planes})
-    (found,) = plane_tables(run)
-    return found
+def tables(*made: tuple[RecordedCell, Planes]) -> list[PlaneTables]:
+    """The tables of cells that give planes."""
+    products = {(cell.address, "planes"): planes for cell, planes in made}
+    recorded = record([cell for cell, _ in made])
+    return list(plane_tables(HeldRun(path=Path("run.h5"), record=recorded, products=products)))
+
+
+def giving(address: str, digest: str, **more: Any) -> RecordedCell:
+    return cell(address, outputs={"planes": given("", digest, "planes")}, **more)
 
 
 def test_thickness_and_materials_stand_in_the_tables() -> None:
@@ -46,7 +50,8 @@ def test_thickness_and_materials_stand_in_the_tables() -> None:
         sigma_m=0.002, width_95_m=0.008, scan_step_m=0.005, material=(FABRIC, PLASTER)
     )
     row = ScanRow(row=7, scan=1, n_points=40, sigma_m=0.001, material=(PLASTER,))
-    found = table(replace(wall_and_floor(), thickness=(thickness, None), scan_row=row))
+    planes = replace(wall_and_floor(), thickness=(thickness, None), scan_row=row)
+    (found,) = tables((giving("plane@plane=toy", "a"), planes))
     assert [row[-2:] for row in found.planes.rows] == [("2.00", "5.00"), ("-", "-")]
     assert found.materials.rows == (
         ("wall 0", "fabric", "70", "4.00"),
@@ -57,46 +62,31 @@ def test_thickness_and_materials_stand_in_the_tables() -> None:
 
 def test_planes_state_where_their_sides_come_from() -> None:
     planes = wall_and_floor()
-    moved = replace(planes, offset=np.array([-2.5, 0.0]))
-    seen = {"plane": planes, "turned": replace(planes, viewpoint="photos")}
-    seen |= {"moved": moved}
-    cells = [
-        cell(name, outputs={"planes": given("", digest, "planes")})
-        for name, digest in zip(seen, "abc", strict=True)
-    ]
-    products = {(name, "planes"): product for name, product in seen.items()}
     # Sides that photos found one by one: a table said `guess`, as the planes began.
-    products["mixed", "planes"] = replace(
-        planes, viewpoint="guess", side_from=("photos", *["guess"] * (len(planes) - 1))
+    mixed = replace(planes, viewpoint="guess", side_from=("photos", "guess"))
+    found = tables(
+        (giving("plane", "a"), planes),
+        (giving("turned", "b"), replace(planes, viewpoint="photos")),
+        (giving("moved", "c"), replace(planes, offset=np.array([-2.5, 0.0]))),
+        (giving("mixed", "e"), mixed),
     )
-    cells.append(cell("mixed", outputs={"planes": given("", "e", "planes")}))
-    tables = plane_tables(HeldRun(path=Path("run.h5"), record=record(cells), products=products))
-    told = [(table.cell, table.viewpoint) for table in tables]
-    assert told == [
+    assert [(table.cell, table.viewpoint) for table in found] == [
         ("plane", "stations"),
         ("turned", "photos"),
         ("moved", "stations"),
         ("mixed", "photos (1), guess (1)"),
     ]
-    assert not any(table.taken_further(tables) for table in tables)
+    assert not any(table.taken_further(found) for table in found)
 
 
 def test_planes_that_a_later_step_changed_are_taken_further() -> None:
     planes = wall_and_floor()
-    products = {
-        ("plane", "planes"): planes,
-        ("sides", "planes"): replace(planes, viewpoint="photos"),
-    }
-    cells = [
-        cell("plane", outputs={"planes": given("", "a", "planes")}),
-        cell(
-            "sides",
-            inputs={"planes": given("plane.planes", "a", "planes")},
-            outputs={"planes": given("", "b", "planes")},
-        ),
-    ]
-    tables = plane_tables(HeldRun(path=Path("run.h5"), record=record(cells), products=products))
-    assert [(one.cell, one.taken_further(tables)) for one in tables] == [
+    sides = giving("sides", "b", inputs={"planes": given("plane.planes", "a", "planes")})
+    found = tables(
+        (giving("plane", "a"), planes),
+        (sides, replace(planes, viewpoint="photos")),
+    )
+    assert [(one.cell, one.taken_further(found)) for one in found] == [
         ("plane", True),
         ("sides", False),
     ]

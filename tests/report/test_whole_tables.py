@@ -54,27 +54,17 @@ def test_the_baseline_is_what_the_workflow_says() -> None:
 
 # --- differences ---
 
-FACTS = CellFacts(
-    status="ok",
-    method="plane.a",
-    distribution="",
-    result_version=1,
-    determinism="exact",
-    seed=None,
-    code={},
-    tools={},
-    error="",
-)
-OTHER_FACTS = CellFacts(
-    status="failed",
-    method="plane.b",
-    distribution="toys 1.0",
-    result_version=2,
-    determinism="seeded",
-    seed=0,
-    code={"toys": "abcdef0123456789"},
-    tools={"colmap": "4.2"},
-    error="no plane",
+NAMES = ("status", "method", "distribution", "result_version", "determinism", "seed", "error")
+FACTS, OTHER_FACTS = (
+    CellFacts(**dict(zip(NAMES, values, strict=True)), code=code, tools=tools)
+    for values, code, tools in (
+        (("ok", "plane.a", "", 1, "exact", None, ""), {}, {}),
+        (
+            ("failed", "plane.b", "toys 1.0", 2, "seeded", 0, "no plane"),
+            {"toys": "abcdef0123456789"},
+            {"colmap": "4.2"},
+        ),
+    )
 )
 
 
