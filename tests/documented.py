@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from textwrap import dedent
-from typing import Final
+from typing import Any, Final
 
 import click
 
@@ -112,59 +112,30 @@ def _split(path: str, line: str, *, is_block: bool) -> Iterator[Documented]:
         words = []
 
 
-@dataclass(frozen=True)
-class Called:
-    """A command of `orthoflow` as it was understood.
-
-    Attributes:
-        name: such as `run` or `plugins new`.
-        values: of its parameters; those of files as texts.
-    """
-
-    name: str
-    values: dict[str, object]
-
-
-def called(words: Sequence[str]) -> Called:
-    """Understand the words behind `orthoflow` as the program does.
+# Any: values of parameters.
+def called(words: Sequence[str]) -> dict[str, Any]:
+    """The parameters that the program makes of the words behind `orthoflow`.
 
     Raises:
         UsageError: the program would refuse them.
     """
     command: click.Command = program
     context = click.Context(program, info_name="orthoflow")
-    rest = [word for word in map(_filled, words) if word]
-    names: list[str] = []
+    # What is left open or for a reader to choose.
+    filled = {"N": "1", "FORMAT": "csv", "...": ""}
+    bare = (word.strip("[]") for word in words)
+    rest = [word for word in (filled.get(word, word) for word in bare) if word]
     while isinstance(command, click.Group):
-        if not rest or rest[0].startswith("-"):
-            raise click.UsageError("names no command")
-        found = command.get_command(context, rest[0])
-        if found is None:
-            raise click.UsageError(f"there is no command {rest[0]}")
-        names.append(rest.pop(0))
-        command, context = found, click.Context(found, info_name=rest[0] if rest else "")
-    given, left, _ = command.make_parser(context).parse_args(list(rest))
-    if left:
-        raise click.UsageError(f"takes no {left[0]!r}")
-    values: dict[str, object] = {}
-    for parameter in command.params:
-        value = given.get(str(parameter.name))
-        # Where a word is missing, click says so in its own way.
-        is_missing = not isinstance(value, str | list | tuple | bool | int) or value == ()
-        # A name alone is a mention, and what is left open is the reader's.
-        if is_missing and parameter.required and rest and "..." not in words:
-            raise click.MissingParameter(ctx=context, param=parameter)
-        if not is_missing and not isinstance(parameter.type, click.Path):
-            value = parameter.type_cast_value(context, value)
-        values[str(parameter.name)] = None if is_missing else value
-    return Called(" ".join(names), values)
-
-
-def _filled(word: str) -> str:
-    """Put something in the place of what a reader would."""
-    if word.strip("[]") == "...":
-        return ""
-    return {"N": "1", "FORMAT": "csv"}.get(word.strip("[]"), word.strip("[]"))
+        name, found, rest = command.resolve_command(context, rest)
+        assert found is not None
+        command, context = found, click.Context(found, info_name=name)
+    try:
+        return command.make_context(command.name, list(rest)).params
+    except click.MissingParameter:
+        # A name alone is a mention.
+        if rest and "..." not in words:
+            raise
+        return {}
 
 
 def mentioned_options() -> Iterator[tuple[str, str, str]]:
