@@ -15,7 +15,8 @@ from orthoflow.geometry import angle_between_deg
 from tests.road.conftest import Shell, metrics_of
 
 SHIFT_M = (634512.347, 486215.781, 112.193)
-SMALL = ("--set", "room.scan_step_m=0.012", "--set", "wall.gsd_m=0.018")
+# The room of tests/road/test_openings.py, which is simulated once for both.
+SMALL = ("--set", "room.scan_step_m=0.016", "--set", "wall.gsd_m=0.024")
 # What is compared with the truth and with itself is the main wall.
 ONE_WALL = ("--set", "wall.n_walls_max=1")
 SMALL_WALL = (*SMALL, *ONE_WALL)
@@ -60,28 +61,18 @@ def test_the_record_verifies_and_a_second_run_comes_from_the_cache(road: Shell) 
     assert again.code == 0, again.said
     assert "6 of 6 steps cached" in again.out
     run = orthoflow.open_run(road.folder / "run")
-    assert set(run.cells) == {
-        "cloud",
-        "room",
-        "survey",
-        "plane",
-        "wall",
-        "ortho",
-        "mosaic",
-        "points",
-        "check",
-    }
-    assert run.cells["cloud"].status == "skipped"
-    assert run.cells["check"].status == "ok"
+    cells = ["cloud", "room", "survey", "plane", "wall", "ortho", "mosaic", "points", "check"]
+    assert sorted(run.cells) == sorted(cells)
+    assert (run.cells["cloud"].status, run.cells["check"].status) == ("skipped", "ok")
 
 
 def test_the_main_wall_and_its_orthoimage_agree_with_the_truth(road: Shell) -> None:
     metrics = metrics_of(road.folder / "run")
     assert metrics["check", "plane_angle_deg"] <= 0.02
     assert metrics["check", "plane_offset_mm"] <= 1.0
-    # A third of an 18 mm cell: the scan step is 12 mm, each cell shows one point.
-    assert metrics["check", "rmse_u_mm"] <= 6.0
-    assert metrics["check", "rmse_v_mm"] <= 6.0
+    # A third of a 24 mm cell: the scan step is 16 mm, each cell shows one point.
+    assert metrics["check", "rmse_u_mm"] <= 8.0
+    assert metrics["check", "rmse_v_mm"] <= 8.0
 
 
 def test_survey_coordinates_change_nothing_but_the_origin(road: Shell) -> None:

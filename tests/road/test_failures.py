@@ -11,29 +11,17 @@ from orthoflow.cli.program import program
 from tests.road.conftest import Shell
 
 
-def no_traceback(said: str) -> bool:
-    return "Traceback" not in said and "site-packages" not in said
-
-
-BAD_SCANS: dict[str, bytes] = {
-    "corrupt.laz": b"LASF" + bytes(range(256)) * 8,
-    "empty.las": b"",
-    "photo.jpg": b"\xff\xd8\xff\xe0 not a scan",
-}
-
-
-@pytest.mark.parametrize("name", BAD_SCANS, ids=str)
 def test_a_bad_scan_ends_in_one_sentence_with_exit_code_two(
-    shell: Shell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+    shell: Shell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / name).write_bytes(BAD_SCANS[name])
+    (tmp_path / "corrupt.laz").write_bytes(b"LASF" + bytes(range(256)) * 8)
     monkeypatch.chdir(tmp_path)
-    # In this process, whose steps come from one server; the next tests start one of their own.
-    words = ["run", "direct.yaml", "--input", f"scan={name}", "-o", "run", "--store"]
+    # In this process, whose steps come from one server; the next test starts one of its own.
+    words = ["run", "direct.yaml", "--input", "scan=corrupt.laz", "-o", "run", "--store"]
     ended = CliRunner().invoke(program, [*words, str(shell.store)])
     assert ended.exit_code == 2
-    assert no_traceback(ended.output)
-    assert name in ended.output
+    assert "Traceback" not in ended.output
+    assert "corrupt.laz" in ended.output
 
 
 def test_a_truncated_laz_is_named(shell: Shell, tmp_path: Path, shared_data: Path) -> None:
@@ -41,5 +29,5 @@ def test_a_truncated_laz_is_named(shell: Shell, tmp_path: Path, shared_data: Pat
     (tmp_path / "half.laz").write_bytes(whole[: len(whole) // 2])
     ended = shell("run", "direct.yaml", "--input", "scan=half.laz", "-o", "run")
     assert ended.code == 2
-    assert no_traceback(ended.said)
+    assert "Traceback" not in ended.said
     assert "half.laz" in ended.said

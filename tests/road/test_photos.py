@@ -162,7 +162,8 @@ def test_own_files_give_the_same_accuracy_wherever_they_lie(quick: Shell) -> Non
         *("--input", f"calibration={folder / 'calibration.yaml'}"),
     ]
     ended = quick(
-        *("run", "photos-on-scan.yaml", "-o", folder / "run", *said, "--executor", "inline"),
+        *("run", "photos-on-scan.yaml", "--until", "orient", *said, "-o", folder / "run"),
+        *("--executor", "inline"),
         timeout_s=900,
     )
     assert ended.code == 0, ended.said
