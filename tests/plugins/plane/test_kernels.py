@@ -98,18 +98,6 @@ def test_points_are_counted_in_their_cell_and_storey(seed: int, parts: int) -> N
         np.testing.assert_array_equal(box, sides)
 
 
-@pytest.mark.parametrize(
-    ("value", "is_finite"),
-    [(np.nan, False), (-np.inf, False), (np.finfo(np.float32).max, True)],
-)
-def test_coordinates_that_are_no_numbers_are_seen(value: float, is_finite: bool) -> None:
-    points_m = np.random.default_rng(0).normal(size=(N_POINTS, 3))
-    points_m[300, 1] = value
-    grid = PlanGrid(basis=np.eye(3), low_m=np.zeros(3), cell_m=1.0, shape=(2, 2, 2))
-    for plan in (None, grid):
-        assert count_points(offsets_of(points_m), plan, parts=2)[3] == is_finite
-
-
 # --- one slab, and many ---
 
 
@@ -175,16 +163,6 @@ def test_all_planes_at_once_sum_the_points_that_they_own(seed: int) -> None:
         table = slice(starts[k], starts[k + 1])
         np.testing.assert_array_equal(counts[table], expected[0])
         np.testing.assert_array_equal(sums[table], expected[1])
-
-
-def test_blocks_that_are_not_drawn_are_not_summed() -> None:
-    points = points_of(np.random.default_rng(0).uniform(-0.1, 0.1, (9 * BLOCK_POINTS, 3)))
-    slabs = np.array([[0.0, 0.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
-    bounds, rasters = np.array([[0.2, -1, 1, -1, 1]]), np.array([[-1, -1, 0.5, 1, 1, 0, 0.1, 0.05]])
-    counts, sums = np.zeros((1, 3), dtype=np.int32), np.zeros((1, 2), dtype=np.int64)
-    drawn = np.arange(9) % 3 == 1
-    sum_assigned(points, slabs, bounds, rasters, drawn, counts, sums)
-    assert counts[0, 0] == 3 * BLOCK_POINTS
 
 
 # --- hypotheses ---

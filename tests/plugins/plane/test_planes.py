@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.cloud import PreparedCloud
-from orthoflow_plugins.plane.detector import Candidate
-from orthoflow_plugins.plane.fit import FoundPlane
+from orthoflow_plugins.plane.hough2d import Hough2d
 from orthoflow_plugins.plane.planes import (
-    Deviations,
-    assemble,
     measure_planes,
     normality,
     plane_names,
@@ -22,11 +19,10 @@ from orthoflow_plugins.plane.planes import (
     side_of_remaining,
     side_of_stations,
 )
-from orthoflow_plugins.plane.search import Claim, label, verify
 
 from orthoflow.geometry import Plane, wall_axes
-from orthoflow.products import Planes, PointCloud
-from tests.plane_scenes import FIT_TOLERANCE_M, TOLERANCE_M, cloud_of, prepared, search_in
+from orthoflow.products import Planes
+from tests.plane_scenes import cloud_of, detect, prepared
 
 UP = np.array([0.0, 0.0, 1.0])
 # At y = 2, its normal to the south; 4 x 2 m about (0, 2, 0).
@@ -123,109 +119,69 @@ def test_a_small_difference_decides_nothing() -> None:
 
 # --- products ---
 
-ORIGIN = np.array([300.0, -200.0, 40.0])
+ORIGIN = (300.0, -200.0, 40.0)
 
 
-@dataclass(frozen=True)
-class Scene:
-    """Two walls as a detector found them, the smaller first: its normal points to the origin."""
-
-    cloud: PointCloud
-    prepared: PreparedCloud
-    found: list[FoundPlane]
-    deviations: Deviations
-
-
-@pytest.fixture(scope="module")
-def scene() -> Scene:
+def two_walls(
+    folder: Path,
+    *stations: tuple[float, float, float],
+    source: str = "file",
+    origin: tuple[float, float, float] = ORIGIN,
+) -> Planes:
+    """A wall in the north and, with a third of its points, one in the west: points lie beyond."""
     rng = np.random.default_rng(4)
     west = rng.uniform([-2.0, -1.9, -1.0], [-2.0, 1.9, 1.0], (8_000, 3))
     north = rng.uniform([-1.9, 2.0, -1.0], [2.0, 2.0, 1.0], (24_000, 3))
-    # More of them beyond the wall than before it.
     north[:, 1] += rng.exponential(0.003, 24_000)
     west[:, 0] -= rng.exponential(0.002, 8_000)
-    seen = cloud_of(np.vstack([west, north, [[0.3, 0.0, 0.0]]]), origin=tuple(ORIGIN))
-    search = search_in(prepared(np.column_stack([seen.x, seen.y, seen.z]), parts=2))
-    found = []
-    for normal, offset_m, votes in (([1.0, 0.0, 0.0], -2.0, 77.0), ([0.0, 1.0, 0.0], 2.0, 99.0)):
-        plane = Plane(normal=np.array(normal), offset_m=offset_m)
-        item = verify(Candidate(plane=plane, constraint="vertical", votes=votes), search)
-        assert item is not None
-        search.claim(Claim.of(item.raster, item.support, TOLERANCE_M))
-        found.append(item)
-    label(found, search.cloud, TOLERANCE_M)
-    deviations = measure_planes(
-        search.cloud,
-        np.array([item.raster.slab() for item in found]),
-        np.array([item.support.bounds_m for item in found]),
-        tolerance_m=TOLERANCE_M,
-        fit_tolerance_m=FIT_TOLERANCE_M,
+    cloud = cloud_of(
+        np.vstack([west, north, [[0.3, 0.0, 0.0]]]),
+        origin=origin,
+        stations=np.array(stations) if stations else None,
+        source=source,
     )
-    return Scene(cloud=seen, prepared=search.cloud, found=found, deviations=deviations)
+    planes: Planes = detect(Hough2d, cloud, folder)[0].planes
+    return planes
 
 
-def assembled(
-    scene: Scene, *stations: tuple[float, float, float], source: str = "file"
-) -> tuple[Planes, Deviations]:
-    known: Any = scene.cloud
-    if stations:
-        known = replace(known, stations=np.array(stations) + ORIGIN, stations_source=source)
-    return assemble(scene.found, scene.prepared, known, TOLERANCE_M, FIT_TOLERANCE_M)[:2]
-
-
-def test_planes_are_ordered_by_their_points_and_face_the_station(scene: Scene) -> None:
-    planes, _ = assembled(scene, (0.0, 0.0, 0.0))
-    details: Any = planes.details
+def test_planes_are_ordered_by_their_points_and_face_the_station(tmp_path: Path) -> None:
+    planes = two_walls(tmp_path, (0.0, 0.0, 0.0))
     assert planes.names == ("wall 0", "wall 1")
-    assert planes.n_points.tolist() == sorted(planes.n_points, reverse=True)
+    np.testing.assert_allclose(planes.n_points, [24_000, 8_000], atol=100)
     np.testing.assert_allclose(planes.normal, [[0, -1, 0], [1, 0, 0]], atol=2e-3)
     assert (planes.viewpoint, planes.side_from) == ("stations", ())
-    for k, item in enumerate(reversed(scene.found)):
-        sign = -1.0 if k == 0 else 1.0
-        own = item.raster.plane
-        np.testing.assert_array_equal(planes.normal[k], sign * own.normal)
-        assert planes.offset[k] == sign * own.offset_m + float(planes.normal[k] @ ORIGIN)
-        # The offset counts from the world's origin: it moves with the normal.
-        shift = np.eye(4)
-        shift[3, :3] = ORIGIN
-        covariance, n_independent = item.adjusted.stated()
-        np.testing.assert_allclose(
-            planes.covariance[k], shift @ covariance @ shift.T, rtol=1e-6, atol=1e-15
-        )
-        assert details["n_independent"][k] == n_independent
-        raw = details["raw"][k]
-        np.testing.assert_array_equal(raw["normal"], sign * item.candidate.plane.normal)
-        assert raw["offset_m"] == pytest.approx(
-            sign * item.candidate.plane.offset_m + float(np.array(raw["normal"]) @ ORIGIN)
-        )
-        assert raw["support"] == item.candidate.votes
-    assert planes.tolerance_m == TOLERANCE_M
+    # The offset counts from the world's origin: it and its covariance move with the cloud.
+    near = two_walls(tmp_path, (0.0, 0.0, 0.0), origin=(0.0, 0.0, 0.0))
+    shift = np.eye(4)
+    shift[3, :3] = ORIGIN
+    for k, wall in enumerate(planes.normal):
+        assert planes.offset[k] == pytest.approx(near.offset[k] + wall @ ORIGIN, abs=1e-9)
+        moved = shift @ near.covariance[k] @ shift.T
+        np.testing.assert_allclose(planes.covariance[k], moved, rtol=1e-6, atol=1e-15)
+        raw: Any = [found.details["raw"][k] for found in (planes, near)]  # type: ignore[index, call-overload]
+        assert raw[0]["normal"] @ wall > 0.99
+        expected = raw[1]["offset_m"] + raw[1]["normal"] @ np.array(ORIGIN)
+        assert raw[0]["offset_m"] == pytest.approx(expected)
 
 
-def test_deviations_follow_a_normal_that_was_turned(scene: Scene) -> None:
-    before, after = scene.deviations, assembled(scene, (0.0, 0.0, 0.0))[1]
-    assert not np.array_equal(before.histogram[1], before.histogram[1, ::-1])
-    np.testing.assert_array_equal(after.histogram, [before.histogram[1, ::-1], before.histogram[0]])
-    np.testing.assert_array_equal(after.mean_fit_m, [-before.mean_fit_m[1], before.mean_fit_m[0]])
-    np.testing.assert_array_equal(after.n_fit, before.n_fit[::-1])
-    np.testing.assert_array_equal(after.rms_m, before.rms_m[::-1])
-    # From behind it is the other way round.
-    after = assembled(scene, (-3.0, 3.0, 0.0))[1]
-    np.testing.assert_array_equal(after.histogram, [before.histogram[1], before.histogram[0, ::-1]])
-
-
-def test_rectangles_end_with_the_points(scene: Scene) -> None:
-    planes = assembled(scene, (0.0, 0.0, 0.0))[0]
-    north, west = planes.corners - ORIGIN
+def test_deviations_and_rectangles_are_those_for_who_sees_the_wall(tmp_path: Path) -> None:
+    before, behind = (two_walls(tmp_path, at) for at in ((0.0, 0.0, 0.0), (-3.0, 3.0, 0.0)))
+    for k in range(2):
+        # Points lie beyond the walls: negative from within, positive from outside.
+        shapes: Any = [found.details["normality"][k] for found in (before, behind)]  # type: ignore[index, call-overload]
+        assert shapes[0]["skewness"] == pytest.approx(-shapes[1]["skewness"])
+        assert shapes[0]["mean_m"] == pytest.approx(-shapes[1]["mean_m"])
+        assert shapes[1]["skewness"] > 0.5
+    north, west = before.corners - ORIGIN
     # From the top left, counter-clockwise.
     for found, axis, left, right in ((north, 0, -1.9, 2.0), (west, 1, -1.9, 1.9)):
         expected = [[left, 1], [left, -1], [right, -1], [right, 1]]
         np.testing.assert_allclose(found[:, [axis, 2]], expected, atol=0.005)
-    np.testing.assert_array_equal(planes.part_plane, [0, 1])
-    assert planes.part_corners is not None
+    np.testing.assert_array_equal(before.part_plane, [0, 1])
+    assert before.part_corners is not None
     # Parts are known to a cell, and none reaches beyond the points.
-    np.testing.assert_allclose(planes.part_corners, planes.corners, atol=0.06)
-    for part, whole in zip(planes.part_corners, planes.corners, strict=True):
+    np.testing.assert_allclose(before.part_corners, before.corners, atol=0.06)
+    for part, whole in zip(before.part_corners, before.corners, strict=True):
         assert (part.max(axis=0) <= whole.max(axis=0) + 1e-9).all()
         assert (part.min(axis=0) >= whole.min(axis=0) - 1e-9).all()
 
@@ -241,14 +197,14 @@ def test_rectangles_end_with_the_points(scene: Scene) -> None:
     ],
 )
 def test_sides_that_no_station_knows_are_guessed(
-    scene: Scene,
     stations: list[tuple[float, float, float]],
     source: str,
     viewpoint: str,
     side_from: tuple[str, ...],
     guessed: list[int],
+    tmp_path: Path,
 ) -> None:
-    planes = assembled(scene, *stations, source=source)[0]
+    planes = two_walls(tmp_path, *stations, source=source)
     assert (planes.viewpoint, planes.side_from) == (viewpoint, side_from)
     # The other wall lies before each of them.
     np.testing.assert_allclose(planes.normal, [[0, -1, 0], [1, 0, 0]], atol=2e-3)

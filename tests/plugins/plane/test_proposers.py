@@ -11,7 +11,7 @@ from orthoflow_plugins.plane.hough2d import Hough2d, PlanProposer
 from orthoflow_plugins.plane.hough3d import Hough3d, SpaceProposer
 from orthoflow_plugins.plane.ransac import ConsensusProposer, Ransac
 from orthoflow_plugins.plane.region import Region, region_proposer
-from orthoflow_plugins.plane.search import Claim, Search
+from orthoflow_plugins.plane.search import Search
 
 from orthoflow.geometry import angle_between_deg
 from tests.plane_scenes import ROOM, Rectangle, prepared, sampled, search_in, turned
@@ -70,19 +70,6 @@ def test_the_fullest_wall_is_proposed_first_and_after_rejections_another_surface
         if min(away) < 1.5:
             surfaces.add(int(np.argmin(away)))
     assert surfaces - {0}
-
-
-@pytest.mark.parametrize("name", ["hough2d", "hough3d", "ransac", "region"])
-def test_the_next_plane_is_proposed_once_the_first_took_its_points(name: str) -> None:
-    search = room_search(angle_deg=0.0)
-    proposer = proposer_of(name, search)
-    proposer.propose(search)
-    slab = np.array([0.0, 1.0, 0.0, 2.0, 1.0, 0, 0, 0, 0, 0, 1.0, 0])
-    search.claim(Claim(slab, np.array([0.05, -9.0, 9.0, -9.0, 9.0])))
-    candidate = proposer.propose(search)
-    # Floor and ceiling have the most points of what is left.
-    assert min(errors(candidate, truth, 0.0)[1] for truth in ROOM[4:6]) < 0.03
-    assert abs(candidate.plane.normal[2]) > 0.999
 
 
 @pytest.mark.parametrize(

@@ -132,16 +132,6 @@ def test_exact_walls_and_floors_lean_by_nothing(exact: bool) -> None:
         assert not exact or abs(normal[2]) == pytest.approx(rise, abs=1e-12)
 
 
-def test_a_niche_at_another_depth_does_not_pull_its_wall_askew() -> None:
-    niche = Rectangle("niche", (1.6, 2.03, 0), (0.4, 0, 0), (0, 0, 1), 3_000)
-    main = Rectangle("main", (-0.8, 2, 0), (1.2, 0, 0), (0, 0, 1), 8_000)
-    search = search_in(prepared(sampled((main, niche), noise_m=0.001)))
-    found = verify(proposed((0.012, -1.0, 0.0), -2.008), search)
-    assert found is not None
-    assert angle_between_deg(found.raster.plane.normal, np.array([0.0, -1.0, 0.0])) < 0.02
-    assert found.raster.plane.offset_m == pytest.approx(-2.0, abs=2e-4)
-
-
 class Listed:
     """Proposes what it is given, one after the other."""
 
