@@ -43,43 +43,37 @@ def plane_name(kind: PlaneKind, place: int) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Spread:
-    """Thickness of the cloud for one class of points.
+    """Thickness of the cloud on one material.
 
     Attributes:
-        low: lower limit of the class, in its unit.
-        high: upper limit of the class.
+        low: lowest intensity of the material.
+        high: highest intensity of the material.
         n_points: number of measured points.
         sigma_m: robust standard deviation of their distances.
-        name: name of the class, or empty.
+        name: name of the material.
     """
 
     low: float
     high: float
     n_points: int
     sigma_m: float
-    name: str | None = None
+    name: str
 
 
 @dataclass(frozen=True, kw_only=True)
 class Thickness:
-    """Thickness of the cloud on one plane; classes are empty if their values are unknown.
+    """Thickness of the cloud on one plane.
 
     Attributes:
         sigma_m: robust standard deviation of the distances, relief removed.
         width_95_m: width of the range that contains 95 % of the distances.
         scan_step_m: median distance between neighbouring points on the plane.
-        incidence_deg: classes of the angle of incidence.
-        range_m: classes of the distance from the scanner.
-        intensity: classes of the intensity, 0 to 1.
-        material: classes by material.
+        material: thickness by material.
     """
 
     sigma_m: float
     width_95_m: float
     scan_step_m: float
-    incidence_deg: tuple[Spread, ...] = ()
-    range_m: tuple[Spread, ...] = ()
-    intensity: tuple[Spread, ...] = ()
     material: tuple[Spread, ...] = ()
 
 
@@ -93,7 +87,7 @@ class ScanRow:
         n_points: number of points of the row on the plane.
         sigma_m: robust standard deviation of their distances, relief removed; None if there are too
             few points.
-        material: classes by material.
+        material: thickness by material.
     """
 
     row: int

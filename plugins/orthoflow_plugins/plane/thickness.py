@@ -9,7 +9,7 @@ distances remains, on each material along the row.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -27,8 +27,6 @@ _TILE_M: Final = 0.1
 _TILE_LEAST: Final = 4
 # Minimum number of points for a standard deviation.
 _SPREAD_LEAST: Final = 50
-_INCIDENCE_DEG: Final = tuple(float(edge) for edge in range(0, 91, 10))
-_CLASSES: Final = 6
 # Share of the distances outside the reported width, on each side.
 _TAIL: Final = 0.025
 # Minimum number of points of a scan row on a plane.
@@ -104,21 +102,16 @@ def measure_thickness(
             found.append(None)
             continue
         low_m, high_m = np.quantile(deviation_m, (_TAIL, 1.0 - _TAIL))
-        whole = Thickness(
-            sigma_m=median_deviation(deviation_m, 0.0),
-            width_95_m=float(high_m - low_m),
-            scan_step_m=_TILE_M / float(np.sqrt(usual * sample.n_represented)),
-        )
-        kept = members[crowded]
+        material: tuple[Spread, ...] = ()
+        if cloud.intensity is not None:
+            intensity = cloud.intensity[sample.index[members[crowded]]].astype(np.float64)
+            material = _by_material(intensity, materials, deviation_m)
         found.append(
-            _by_class(
-                whole,
-                sample.offsets_m[kept],
-                normal,
-                deviation_m,
-                sample.index[kept],
-                cloud,
-                materials,
+            Thickness(
+                sigma_m=median_deviation(deviation_m, 0.0),
+                width_95_m=float(high_m - low_m),
+                scan_step_m=_TILE_M / float(np.sqrt(usual * sample.n_represented)),
+                material=material,
             )
         )
     return tuple(found)
@@ -195,84 +188,16 @@ def _from_tiles(
     return crowded, deviation_m, usual
 
 
-def _by_class(
-    whole: Thickness,
-    points_m: NDArray[np.float64],
-    normal: NDArray[np.float64],
-    deviation_m: NDArray[np.float64],
-    index: NDArray[np.int64],
-    cloud: PointCloud,
-    materials: Materials,
-) -> Thickness:
-    """Add the thickness by class; `index` contains the indices of the points in the cloud."""
-    stations_m = _stations_of(index, cloud)
-    if stations_m is not None:
-        rays_m = points_m - stations_m
-        range_m = np.linalg.norm(rays_m, axis=1)
-        cosine = np.abs(rays_m @ normal) / np.maximum(range_m, 1e-9)
-        incidence_deg = np.degrees(np.arccos(np.clip(cosine, 0.0, 1.0)))
-        whole = replace(
-            whole,
-            incidence_deg=_spreads(incidence_deg, np.array(_INCIDENCE_DEG), deviation_m),
-            range_m=_spreads(range_m, _even_edges(range_m), deviation_m),
-        )
-    if cloud.intensity is not None:
-        intensity = cloud.intensity[index].astype(np.float64)
-        known = np.isfinite(intensity)
-        intensity, of_known_m = intensity[known], deviation_m[known]
-        if len(intensity):
-            whole = replace(
-                whole,
-                intensity=_spreads(intensity, _even_edges(intensity), of_known_m),
-                material=_by_material(intensity, materials, of_known_m),
-            )
-    return whole
-
-
-def _stations_of(index: NDArray[np.int64], cloud: PointCloud) -> NDArray[np.float64] | None:
-    """Return the station of each point, offsets (m, 3) or (3,) for one station; None if unknown."""
-    stations = cloud.stations
-    if stations is None or len(stations) == 0 or cloud.stations_source == "view_from":
-        return None
-    if len(stations) == 1:
-        return np.asarray(stations[0] - cloud.origin)
-    if cloud.scan is None or not len(index) or int(cloud.scan[index].max()) >= len(stations):
-        return None
-    return stations[cloud.scan[index]] - cloud.origin
-
-
-def _even_edges(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the edges of classes with equal numbers of points."""
-    return np.unique(np.quantile(values, np.linspace(0.0, 1.0, _CLASSES + 1)))
-
-
-def _spreads(
-    values: NDArray[np.float64], edges: NDArray[np.float64], deviation_m: NDArray[np.float64]
-) -> tuple[Spread, ...]:
-    """Return the spread of each class of points; classes with too few points are omitted."""
-    place = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(0, len(edges) - 2))
-    classes = [
-        _spread(None, float(edges[k]), float(edges[k + 1]), deviation_m[place == k])
-        for k in range(len(edges) - 1)
-    ]
-    return tuple(found for found in classes if found is not None)
-
-
 def _by_material(
     intensity: NDArray[np.float64], materials: Materials, deviation_m: NDArray[np.float64]
 ) -> tuple[Spread, ...]:
     """Return the spread on each material; materials with too few points are omitted."""
-    classes = [
-        _spread(name, low, high, deviation_m[(intensity >= low) & (intensity <= high)])
-        for name, (low, high) in materials.items()
-    ]
-    return tuple(found for found in classes if found is not None)
-
-
-def _spread(
-    name: str | None, low: float, high: float, deviation_m: NDArray[np.float64]
-) -> Spread | None:
-    if len(deviation_m) < _SPREAD_LEAST:
-        return None
-    sigma_m = median_deviation(deviation_m, 0.0)
-    return Spread(low=low, high=high, n_points=len(deviation_m), sigma_m=sigma_m, name=name)
+    found = []
+    for name, (low, high) in materials.items():
+        own_m = deviation_m[(intensity >= low) & (intensity <= high)]
+        if len(own_m) >= _SPREAD_LEAST:
+            sigma_m = median_deviation(own_m, 0.0)
+            found.append(
+                Spread(low=low, high=high, n_points=len(own_m), sigma_m=sigma_m, name=name)
+            )
+    return tuple(found)

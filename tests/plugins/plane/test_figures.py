@@ -21,12 +21,12 @@ from orthoflow_plugins.plane.figures import (
     draw_thickness,
 )
 from orthoflow_plugins.plane.kernels import HISTOGRAM_BINS, PlanGrid
-from orthoflow_plugins.plane.planes import Deviations, normality
+from orthoflow_plugins.plane.planes import Deviations, normality, rectangle_m
 from orthoflow_plugins.plane.region import Region, region_proposer
 from orthoflow_plugins.plane.thickness import RowPoints
 
 from orthoflow.files.drawing import plane_ink
-from orthoflow.geometry import wall_axes
+from orthoflow.geometry import Plane, wall_axes
 from orthoflow.products import Planes, Spread, Thickness
 from tests import samples
 from tests.plane_scenes import Rectangle, cloud_of, context, prepared, sampled, search_in
@@ -42,19 +42,17 @@ def planes_of() -> Planes:
     The front wall has two parts.
     """
     normals = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    centres = np.array([[0.0, 2.0, 0.0], [-3.0, 0.0, 0.0], [0.0, 0.0, -1.5]]) + ORIGIN
-    boxes = []
-    for normal, middle, (a, b) in zip(normals, centres, [(3, 1.5), (2, 1.5), (3, 2)], strict=True):
-        u, v = wall_axes(normal, UP)
-        boxes.append(
-            [middle + a * x * u + b * y * v for x, y in ((-1, -1), (-1, 1), (1, 1), (1, -1))]
-        )
-    box = np.array(boxes)
+    halves = np.array([[3.0, 1.5], [2.0, 1.5], [3.0, 2.0]])
+    corners = []
+    for normal, offset_m, (a, b) in zip(normals, (-2.0, -3.0, -1.5), halves, strict=True):
+        plane = Plane(normal=normal, offset_m=offset_m)
+        corners.append(rectangle_m(plane, wall_axes(normal, UP), np.array([-a, a, -b, b])))
+    box = np.array(corners) + ORIGIN
     half = box[:1].copy()
     half[:, 2:] = 0.5 * (box[:1, 2:] + box[:1, [1, 0]])
     return samples.planes(
         normal=normals,
-        offset=np.einsum("ij,ij->i", normals, centres),
+        offset=np.array([-2.0, -3.0, -1.5]) + normals @ ORIGIN,
         corners=box,
         n_points=np.array([3000, 2000, 1000]),
         rms_m=np.full(3, 0.002),
@@ -146,24 +144,15 @@ def test_planes_are_drawn_with_their_points_and_rectangles(
     assert [text.get_text() for text in drawings["planes"].legends[0].texts] == list(NAMES)
 
 
-def spreads(*sigmas_m: float, name: str | None = None) -> tuple[Spread, ...]:
-    return tuple(
-        Spread(low=10.0 * k, high=10.0 * k + 4.0, n_points=99, sigma_m=sigma_m, name=name)
-        for k, sigma_m in enumerate(sigmas_m)
-    )
-
-
-def test_thickness_is_drawn_by_plane_class_material_and_row(
+def test_thickness_is_drawn_by_plane_material_and_row(
     drawings: dict[str, Any], tmp_path: Path
 ) -> None:
-    first = Thickness(
-        sigma_m=0.001,
-        width_95_m=0.004,
-        scan_step_m=0.005,
-        incidence_deg=spreads(0.001, 0.002),
-        material=spreads(0.003, 0.004, name="brick"),
+    bricks = tuple(
+        Spread(low=0.0, high=1.0, n_points=99, sigma_m=sigma_m, name="brick")
+        for sigma_m in (0.003, 0.004)
     )
-    third = Thickness(sigma_m=0.002, width_95_m=0.008, scan_step_m=0.006, range_m=spreads(0.005))
+    first = Thickness(sigma_m=0.001, width_95_m=0.004, scan_step_m=0.005, material=bricks)
+    third = Thickness(sigma_m=0.002, width_95_m=0.008, scan_step_m=0.006)
     along = np.linspace(0.0, 2.0, 9)
     row = RowPoints(
         row=17, scan=3, along_m=along, distance_m=0.001 * along, intensity=np.linspace(0.0, 1.0, 9)
@@ -172,13 +161,10 @@ def test_thickness_is_drawn_by_plane_class_material_and_row(
     draw_thickness(context(tmp_path), planes_of(), (None, None, None), None, {})
     assert not drawings
     draw_thickness(context(tmp_path), planes_of(), (first, None, third), row, materials)
-    sigmas, incidence, ranges, by_material, in_row = drawings["thickness"].axes
+    sigmas, by_material, in_row = drawings["thickness"].axes
     np.testing.assert_allclose([bar.get_width() for bar in sigmas.patches], [1.0, 2.0])
     assert [text.get_text() for text in sigmas.get_yticklabels()] == ["front", "floor"]
     np.testing.assert_allclose(lines(sigmas)[0], [[5.0, 6.0], [0.0, 1.0]])
-    np.testing.assert_allclose(lines(incidence)[0], [[2.0, 12.0], [1.0, 2.0]])
-    assert lines(incidence)[1].size == lines(ranges)[0].size == 0
-    np.testing.assert_allclose(lines(ranges)[1], [[2.0], [5.0]])
     np.testing.assert_allclose([bar.get_width() for bar in by_material.patches], [3.0, 4.0])
     labels = [text.get_text() for text in by_material.get_yticklabels()]
     assert labels == ["brick, front", "brick, front"]
