@@ -11,6 +11,7 @@ from orthoflow_plugins.inspect.patches import GreyImage, measure_shifts
 from orthoflow_plugins.simulate.photographs import PhotoLayout, planned_shots
 from orthoflow_plugins.simulate.room import SimulateRoom
 from orthoflow_plugins.simulate.room_model import build_room
+from scipy.ndimage import map_coordinates
 
 from orthoflow.files.images import decode_image
 from orthoflow.geometry import frame_over
@@ -43,6 +44,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> SimulateRoom.Out:
         photo_noise_grey=0.0,
         photo_vignetting_share=0.0,
         photo_supersample=2,
+        check_points_most=8,
     )
 
 
@@ -73,16 +75,7 @@ def cameras_of(truth: Truth) -> tuple[ViewingCamera, ...]:
 
 def bilinear(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """Grey levels at pixels (n, 2) whose first centre is at (0.5, 0.5)."""
-    at = pixels - 0.5
-    low = np.floor(at).astype(int)
-    s, t = (at - low).T
-    (u, v), values = low.T, image
-    return (
-        (1 - s) * (1 - t) * values[v, u]
-        + s * (1 - t) * values[v, u + 1]
-        + (1 - s) * t * values[v + 1, u]
-        + s * t * values[v + 1, u + 1]
-    )
+    return np.asarray(map_coordinates(image, pixels.T[::-1] - 0.5, order=1))
 
 
 @pytest.mark.parametrize("place", [0, 3, 5])
@@ -143,9 +136,19 @@ def test_a_pixel_is_the_mean_of_what_lies_behind_it(room: SimulateRoom.Out) -> N
     assert {SurfaceRole.OBJECT, SurfaceRole.WALL} <= set(truth.scene.role[hits.rectangle])
 
 
-def test_flat_check_points_are_crossings_of_painted_lines(room: SimulateRoom.Out) -> None:
+def test_check_points_are_crossings_of_painted_lines_and_corners_of_mouldings(
+    room: SimulateRoom.Out,
+) -> None:
     truth, points = room.truth, room.checkpoints
-    flat = points.points_world[np.array(points.classes) == "flat"]
+    assert points.classes == ("flat",) * 8 + ("vertical edge",) * 8
+    assert points.names == tuple(f"{kind}{k:02d}" for kind in "FV" for k in range(8))
+    off_m = truth.planes.plane(0).distances_m(points.points_world)
+    np.testing.assert_allclose(off_m[:8], 0.0, atol=1e-9)
+    # Mouldings stand out by two to fifteen centimetres.
+    assert 0.015 < off_m[8:].min() < off_m[8:].max() < 0.16
+    flat = points.points_world[:8]
+    apart = np.linalg.norm(flat[:, None] - flat, axis=2)
+    assert apart[~np.eye(8, dtype=bool)].min() > 0.3
     frame = frame_over(truth.planes.corners[0], truth.planes.normal[0], gsd_m=0.001)
     scene = truth.scene
     on_wall = (scene.plane_index == 0) & (scene.role == SurfaceRole.WALL) & (scene.texture == 1)

@@ -15,6 +15,7 @@ from orthoflow_plugins.simulate.scanning import (
     Scanned,
     Scanner,
     Sweep,
+    laser_reflectance,
     scan_scene,
     shared_errors,
 )
@@ -32,7 +33,10 @@ NO_ERRORS = Errors(
 
 
 def surface(
-    distance_m: float, incidence_deg: float = 0.0, kind: TextureKind = TextureKind.PLAIN
+    distance_m: float,
+    incidence_deg: float = 0.0,
+    kind: TextureKind = TextureKind.PLAIN,
+    material: float = 7.0,
 ) -> Scene:
     """A rectangle met by the x axis at a distance, turned about the vertical by an angle."""
     turn = math.radians(incidence_deg)
@@ -45,25 +49,20 @@ def surface(
         plane_index=np.zeros(1, dtype=np.int16),
         role=np.array([SurfaceRole.WALL], dtype=np.uint8),
         texture=np.array([kind], dtype=np.int32),
-        texture_params=np.array([[200.0, 180.0, 160.0, 0.5, 0.3, 0.3, 7.0, 0.0]]),
+        texture_params=np.array([[200.0, 180.0, 160.0, 0.5, 0.3, 0.3, material, 0.0]]),
         hole_rectangle=np.zeros(0, dtype=np.int32),
         hole_extent=np.zeros((0, 4)),
     )
 
 
-def step_in_depth(near_m: float, far_m: float) -> Scene:
-    """Two surfaces across the x axis; the near one ends at it, on the side of negative y."""
-    near, far = surface(near_m), surface(far_m)
+def together(one: Scene, other: Scene) -> Scene:
+    """Two surfaces in one scene."""
+    names = ("centre", "axis_a", "axis_b", "extent", "plane_index", "role", "texture")
     joined = {
-        name: np.concatenate([getattr(near, name), getattr(far, name)])
-        for name in ("centre", "axis_a", "axis_b", "plane_index", "role", "texture")
+        name: np.concatenate([getattr(one, name), getattr(other, name)])
+        for name in (*names, "texture_params")
     }
-    return replace(
-        near,
-        **joined,
-        extent=np.array([[-1.0, 0.0, -1.0, 1.0], [-1.0, 1.0, -1.0, 1.0]]),
-        texture_params=np.vstack([near.texture_params, far.texture_params]),
-    )
+    return replace(one, **joined)
 
 
 def scanned(scene: Scene, step: float = STEP, **errors: float) -> Scanned:
@@ -151,7 +150,10 @@ def test_gross_outliers_fall_short_four_times_in_five() -> None:
 
 def test_distances_mix_where_the_spot_falls_on_two_surfaces() -> None:
     step, beam_m = 2e-5, 0.006
-    points = scanned(step_in_depth(3.0, 3.5), step, beam_m=beam_m)
+    # The near surface ends at the x axis, on the side of negative y.
+    scene = together(surface(3.0), surface(3.5))
+    scene.extent[0, 1] = 0.0
+    points = scanned(scene, step, beam_m=beam_m)
     distance, azimuth = distances_m(points), azimuths(step)
     for side, own_m, other_m in ((azimuth < 0.0, 3.0, 3.5), (azimuth > 0.0, 3.5, 3.0)):
         mixed = side & (points.rectangle == SPOILT)
@@ -243,3 +245,51 @@ def test_a_bent_cloud_is_off_by_the_stated_bend_five_metres_from_its_middle() ->
     points = np.array([[0.0, 5.0, -5.0], [1.0, 1.0, 1.0], [2.0, 2.0, 2.0]])
     off = shared_errors(points, np.zeros(3), replace(NO_ERRORS, bending_m=0.02))
     np.testing.assert_allclose(np.linalg.norm(off, axis=0), [0.0, 0.02, 0.02])
+
+
+# --- what the laser sees of materials ---
+
+MATERIALS = together(surface(3.0), surface(3.0, material=8.0))
+
+
+def seen(
+    red: NDArray[np.float64], green: NDArray[np.float64], inversion: float = 1.0, material: int = 0
+) -> NDArray[np.float64]:
+    """Reflectance of colours 0..255, all at one place."""
+    n = len(red)
+    points = np.tile(np.array([[3.0], [0.1], [0.1]]), n)
+    colours = np.array([red, green, np.full(n, 90.0), np.full(n, 0.5)], dtype=np.float32)
+    rectangle = np.full(n, material, dtype=np.int32)
+    return laser_reflectance(MATERIALS, rectangle, points, colours, inversion, 3)
+
+
+@pytest.mark.parametrize("material", [0, 1])
+def test_reflectance_falls_with_red_and_rises_with_green(material: int) -> None:
+    rising, fixed = np.linspace(0.0, 255.0, 9), np.full(9, 120.0)
+    assert (np.diff(seen(rising, fixed, material=material)) < 0.0).all()
+    assert (np.diff(seen(fixed, rising, material=material)) > 0.0).all()
+    # Without inversion the laser sees what the textures say, and half way with half of it.
+    none, half, all_of = (seen(rising, fixed, inversion=share) for share in (0.0, 0.5, 1.0))
+    np.testing.assert_array_equal(none, 0.5)
+    np.testing.assert_allclose(half, 0.5 * (none + all_of), atol=1e-12)
+
+
+def test_wet_patches_are_darker_and_spots_blind() -> None:
+    rng = np.random.default_rng(5)
+    n = 200_000
+    points = np.vstack([np.full(n, 3.0), rng.uniform(-10.0, 10.0, (2, n))])
+    colours = np.tile(np.array([[100.0], [100.0], [100.0], [0.5]], dtype=np.float32), n)
+    rectangle = np.zeros(n, dtype=np.int32)
+    values = laser_reflectance(MATERIALS, rectangle, points, colours, 1.0, 3)
+    dry = float(np.median(values))
+    # One spot of 12 mm in every twentieth square of 0.4 m: 1.4e-4 of the area.
+    assert 0.5e-4 < np.mean(values == 1.0) < 3e-4
+    wet = values < 0.8 * dry
+    assert 0.05 < wet.mean() < 0.5
+    assert values[wet].min() == pytest.approx(0.55 * dry, rel=0.02)
+    # What a place shows does not hang on what else is asked about.
+    some = slice(1000, 1010)
+    alone = laser_reflectance(MATERIALS, rectangle[some], points[:, some], colours[:, some], 1.0, 3)
+    np.testing.assert_array_equal(alone, values[some])
+    other = laser_reflectance(MATERIALS, rectangle, points, colours, 1.0, 4)
+    assert not np.array_equal(other, values)
