@@ -72,52 +72,45 @@ def test_a_blurred_edge_is_found_in_its_middle() -> None:
         assert left_side(moved) == pytest.approx(-place, abs=0.08)
 
 
-def test_sides_that_were_not_seen_stay() -> None:
-    grey = picture(step_at(LEFT + 0.3))
-    assert left_side(moved_to_edges(outline(seen=np.array([0.4, 1, 1, 1])), grey)) is None
-    assert left_side(moved_to_edges(outline(seen=np.array([0.6, 0, 0, 0])), grey)) is not None
+def has_moved(
+    *rows: NDArray[np.float64],
+    sigma: float = 1.0,
+    seen: float | NDArray[np.float64] = 1.0,
+    grey: float = 60.0,
+) -> bool:
+    moved = moved_to_edges(outline(sigma=sigma, seen=seen), picture(*rows, grey=grey))
+    return left_side(moved) is not None
 
 
-@pytest.mark.parametrize(("sigma", "is_moved"), [(0.49, False), (0.501, True)])
-def test_a_side_that_depth_places_better_stays(sigma: float, is_moved: bool) -> None:
-    moved = moved_to_edges(outline(sigma=sigma), picture(step_at(LEFT)))
-    assert (left_side(moved) is not None) == is_moved
+def test_only_sides_that_were_seen_and_that_depth_places_worse_move() -> None:
+    edge = step_at(LEFT + 0.3)
+    assert not has_moved(edge, seen=np.array([0.4, 1, 1, 1]))
+    assert has_moved(edge, seen=np.array([0.6, 0, 0, 0]))
+    assert not has_moved(edge, sigma=0.49)
+    assert has_moved(edge, sigma=0.501)
 
 
-@pytest.mark.parametrize(("sigma", "is_moved"), [(0.8, False), (1.0, True), (2.0, True)])
-@pytest.mark.parametrize("place", [-1.35, 1.35])
-def test_an_edge_farther_off_than_depth_errs_is_of_something_else(
-    place: float, sigma: float, is_moved: bool
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_an_edge_farther_off_than_depth_errs_and_one_of_two_are_of_something_else(
+    side: float,
 ) -> None:
-    moved = moved_to_edges(outline(sigma=sigma), picture(step_at(LEFT + place)))
-    assert (left_side(moved) is not None) == is_moved
-
-
-@pytest.mark.parametrize(("height", "is_moved"), [(3.9, False), (4.1, True), (-4.1, True)])
-def test_paler_edges_than_four_grey_levels_are_stains(height: float, is_moved: bool) -> None:
-    moved = moved_to_edges(outline(), picture(step_at(LEFT, height)))
-    assert (left_side(moved) is not None) == is_moved
-
-
-@pytest.mark.parametrize(("height", "is_moved"), [(15.0, False), (25.0, True)])
-def test_an_edge_is_three_times_as_steep_as_what_is_around(height: float, is_moved: bool) -> None:
-    # Ten grey levels a cell everywhere, and those of the step on top.
-    slope = 1.0 * np.arange(SHAPE[1]) * 10.0
-    moved = moved_to_edges(outline(), picture(step_at(LEFT, height), slope, grey=-300.0))
-    assert (left_side(moved) is not None) == is_moved
-
-
-@pytest.mark.parametrize("aside", [-3.0, -2.0, 2.0, 3.0])
-@pytest.mark.parametrize(("share", "is_moved"), [(0.5, True), (0.7, False)])
-def test_of_two_edges_nearly_as_strong_none_is_taken(
-    aside: float, share: float, is_moved: bool
-) -> None:
-    second = share * step_at(LEFT + aside)
-    moved = moved_to_edges(outline(), picture(step_at(LEFT), second))
-    assert (left_side(moved) is not None) == is_moved
+    for sigma in (0.8, 1.0, 2.0):
+        assert has_moved(step_at(LEFT + 1.35 * side), sigma=sigma) == (sigma > 0.9)
+    for aside in (2.0, 3.0):
+        for share in (0.5, 0.7):
+            second = share * step_at(LEFT + aside * side)
+            assert has_moved(step_at(LEFT), second) == (share < 0.6)
     # Beyond reach there may be any.
-    far = 3.0 * step_at(LEFT + np.sign(aside) * 6.0)
-    assert left_side(moved_to_edges(outline(), picture(step_at(LEFT), far))) is not None
+    assert has_moved(step_at(LEFT), 3.0 * step_at(LEFT + 6.0 * side))
+
+
+def test_edges_have_four_grey_levels_and_are_three_times_as_steep_as_what_is_around() -> None:
+    for height in (3.9, 4.1, -4.1):
+        assert has_moved(step_at(LEFT, height)) == (abs(height) > 4.0)
+    # Ten grey levels a cell everywhere, and those of the step on top.
+    slope = 10.0 * np.arange(SHAPE[1])
+    for height in (15.0, 25.0):
+        assert has_moved(step_at(LEFT, height), slope, grey=-300.0) == (height > 20.0)
 
 
 @pytest.mark.parametrize(("n_pieces", "is_moved"), [(5, True), (4, True), (3, False)])

@@ -10,18 +10,10 @@ import pytest
 from orthoflow_plugins.segment.openings import SegmentOpenings
 
 from orthoflow.errors import MethodError
-from orthoflow.products import (
-    Opening,
-    Openings,
-    Orthoimage,
-    Orthoimages,
-    OrthoMask,
-    OutlineSource,
-    PointCloud,
-    Walls,
-)
+from orthoflow.products import Openings, Orthoimages, OutlineSource, PointCloud, Walls
 from orthoflow.sdk import StepContext
 from tests import opening_scenes as scenes
+from tests import samples
 from tests.raster_scenes import context
 
 
@@ -37,11 +29,6 @@ def found(
     inputs = SegmentOpenings.In(walls=walls or scenes.walls(), cloud=cloud, orthoimages=images)
     outputs = SegmentOpenings().run(inputs, SegmentOpenings.Params.model_validate(params), ctx)
     return outputs.openings, ctx
-
-
-def cells_of(opening: Opening) -> np.ndarray:
-    places: np.ndarray = opening.outline_m / [scenes.GSD_M, -scenes.GSD_M]
-    return places
 
 
 def test_each_area_is_what_the_rays_say(tmp_path: Path) -> None:
@@ -88,17 +75,15 @@ def test_an_empty_area_as_shadows_have_it_is_none(tmp_path: Path) -> None:
     assert {metric.name: metric.value for metric in ctx.metrics}["n_unbounded"] == 1
 
 
-def test_a_plane_before_most_of_the_wall_is_not_its_face(tmp_path: Path) -> None:
+def test_a_plane_before_the_wall_is_not_its_face_and_far_before_it_of_something_else(
+    tmp_path: Path,
+) -> None:
     openings, ctx = found(tmp_path, walls=scenes.walls(face_m=-0.1), cloud=scenes.cloud())
     assert [opening.kind for opening in openings.openings] == ["niche", "through", "no data"]
     assert openings.openings[0].depth_m == pytest.approx(scenes.NICHE_M, abs=0.001)
     assert any("lies 0.10 m behind its plane" in warning for warning in ctx.warnings)
-
-
-def test_a_plane_far_before_a_wall_is_of_something_else(tmp_path: Path) -> None:
     openings, ctx = found(tmp_path, walls=scenes.walls(face_m=-0.35), cloud=scenes.cloud())
-    assert openings.openings == ()
-    assert openings.walls == (4,)
+    assert (openings.openings, openings.walls) == ((), (4,))
     assert any("it is another surface, with no openings" in text for text in ctx.warnings)
 
 
@@ -120,37 +105,15 @@ def test_parameters_leave_out_what_is_less(
 
 def image(source: str, out_cells: float = 0.35) -> Orthoimages:
     """The window dark on a grey wall, its border so much farther out than that of the depth."""
+    low, high = scenes.WINDOW.min(axis=0) - out_cells, scenes.WINDOW.max(axis=0) + out_cells
     places = scenes.centres()
-    grown = scenes.WINDOW + out_cells * np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])
-    # Means over cells: a sixteenth of a cell apart.
-    steps = (np.arange(16) + 0.5) / 16.0 - 0.5
-    along = [
-        np.mean(
-            [
-                (places[..., axis] + step >= low) & (places[..., axis] + step <= high)
-                for step in steps
-            ],
-            axis=0,
-        )
-        for axis, (low, high) in enumerate(zip(grown.min(axis=0), grown.max(axis=0), strict=True))
-    ]
-    rng = np.random.default_rng(5)
-    grey = 170.0 - 110.0 * along[0] * along[1] + 3.0 * rng.normal(size=scenes.SHAPE)
-    level = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
-    return Orthoimages(
-        images=(
-            Orthoimage(
-                frame=scenes.frame(),
-                wall=0,
-                name="wall 4",
-                rgb=np.repeat(level[:, :, None], 3, axis=2),
-                mask=np.full(scenes.SHAPE, OrthoMask.PAINTED, dtype=np.uint8),
-                source=np.zeros(scenes.SHAPE, dtype=np.int16),
-                sources=(source,),
-                plane_index=4,
-            ),
-        )
-    )
+    # The share of a cell that is of the window.
+    covered = np.minimum(places + 0.5, high) - np.maximum(places - 0.5, low)
+    noise = 3.0 * np.random.default_rng(5).normal(size=scenes.SHAPE)
+    grey = 170.0 - 110.0 * np.clip(covered, 0.0, 1.0).prod(axis=2) + noise
+    rgb = np.repeat(np.rint(grey).astype(np.uint8)[:, :, None], 3, axis=2)
+    made = samples.orthoimage(scenes.frame(), rgb=rgb, sources=(source,), plane_index=4)
+    return Orthoimages(images=(made,))
 
 
 def test_photos_place_sides_that_the_scan_is_too_coarse_for(tmp_path: Path) -> None:
@@ -160,7 +123,7 @@ def test_photos_place_sides_that_the_scan_is_too_coarse_for(tmp_path: Path) -> N
     niche, window, _ = openings.openings
     assert set(window.side_source.tolist()) == {OutlineSource.IMAGE}
     assert set(niche.side_source.tolist()) == {OutlineSource.DEPTH}
-    cells = cells_of(window)
+    cells = window.outline_m / [scenes.GSD_M, -scenes.GSD_M]
     sides = (cells.min(axis=0), cells.max(axis=0))
     true = (scenes.WINDOW.min(axis=0) - 0.35, scenes.WINDOW.max(axis=0) + 0.35)
     np.testing.assert_allclose(sides, true, atol=0.15)
@@ -170,15 +133,14 @@ def test_photos_place_sides_that_the_scan_is_too_coarse_for(tmp_path: Path) -> N
     assert numbers["image_side_share"] == pytest.approx(4 / 12)
 
 
-@pytest.mark.parametrize("far_cells", [2.0, -2.0])
-def test_an_edge_that_is_elsewhere_moves_no_side(tmp_path: Path, far_cells: float) -> None:
-    openings, _ = found(tmp_path, cloud=scenes.cloud(), images=image("a.jpg", far_cells))
-    assert set(openings.openings[1].side_source.tolist()) == {OutlineSource.DEPTH}
-
-
-def test_what_the_cloud_painted_moves_no_side(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("source", "out_cells"), [("a.jpg", 2.0), ("a.jpg", -2.0), ("cloud", 0.35)]
+)
+def test_an_edge_elsewhere_and_what_the_cloud_painted_move_no_side(
+    tmp_path: Path, source: str, out_cells: float
+) -> None:
     without, _ = found(tmp_path, cloud=scenes.cloud())
-    painted, _ = found(tmp_path, cloud=scenes.cloud(), images=image("cloud"))
+    painted, _ = found(tmp_path, cloud=scenes.cloud(), images=image(source, out_cells))
     for one, other in zip(without.openings, painted.openings, strict=True):
         np.testing.assert_array_equal(one.outline_m, other.outline_m)
 
@@ -191,16 +153,11 @@ def leaning(rise_deg: float) -> Walls:
 
 
 @pytest.mark.parametrize("rise_deg", [90.0, 33.0, -33.0])
-def test_floors_and_slopes_alone_are_refused_and_looked_at_when_asked(
+def test_floors_and_slopes_alone_are_refused_unless_asked_for_and_a_wall_may_lean(
     tmp_path: Path, rise_deg: float
 ) -> None:
     with pytest.raises(MethodError, match="none of the 1 walls is upright: level: true"):
         found(tmp_path, walls=leaning(rise_deg))
     if rise_deg == 90.0:
-        openings, _ = found(tmp_path, walls=leaning(rise_deg), level=True)
-        assert openings.openings
-
-
-def test_a_wall_may_lean(tmp_path: Path) -> None:
-    openings, _ = found(tmp_path, walls=leaning(27.0))
-    assert openings.openings
+        assert found(tmp_path, walls=leaning(rise_deg), level=True)[0].openings
+    assert found(tmp_path, walls=leaning(27.0))[0].openings
